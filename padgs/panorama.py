@@ -1,0 +1,120 @@
+"""The panoramic (equirectangular, ERP) camera: direction <-> longitude/latitude <-> pixel. Paper Eq. 6-7.
+
+Camera frame: x right, y down, z forward. Longitude = atan2(x, z), 0 straight ahead, positive to the right;
+latitude = asin(y / r), 0 at the horizon, positive *down*. Pixels are continuous: u = (longitude / 2 pi + 1/2) W,
+v = (latitude / pi + 1/2) H, and the centre of the pixel in row i, column j is (u, v) = (j + 1/2, i + 1/2).
+This is COLMAP's EQUIRECTANGULAR camera. The paper's Eq. 6 is the same map with renamed axes:
+(x, y, z) of the paper = (-z, x, y) here.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+
+def longitude_latitude(points: Tensor) -> tuple[Tensor, Tensor]:
+    """Longitude in (-pi, pi] and latitude in [-pi/2, pi/2] of camera-frame points (Eq. 6).
+
+    The latitude is atan2(y, rho), which keeps its digits near the poles where asin(y / r) loses them.
+
+    Args:
+        points: [..., 3] camera frame, any length but zero.
+
+    Returns:
+        longitude [...], latitude [...], both in radians.
+
+    >>> longitude, latitude = longitude_latitude(torch.tensor([1.0, 0.0, 0.0]))
+    >>> round(longitude.item() / math.pi, 6), latitude.item()
+    (0.5, 0.0)
+    """
+    x, y, z = points.unbind(-1)
+    return torch.atan2(x, z), torch.atan2(y, torch.sqrt(x * x + z * z))
+
+
+def direction(longitude: Tensor, latitude: Tensor) -> Tensor:
+    """Unit direction [..., 3] in the camera frame at a longitude and latitude in radians (inverse of Eq. 6)."""
+    cos_latitude = torch.cos(latitude)
+    return torch.stack(
+        (cos_latitude * torch.sin(longitude), torch.sin(latitude), cos_latitude * torch.cos(longitude)), dim=-1
+    )
+
+
+def pixel_from_angles(longitude: Tensor, latitude: Tensor, width: int, height: int) -> Tensor:
+    """Continuous pixel coordinates (u, v) [..., 2] of a longitude and latitude (Eq. 7)."""
+    return torch.stack(((longitude / (2 * math.pi) + 0.5) * width, (latitude / math.pi + 0.5) * height), dim=-1)
+
+
+def angles_from_pixel(pixels: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
+    """Longitude and latitude in radians of continuous pixel coordinates (u, v) [..., 2] (inverse of Eq. 7)."""
+    u, v = pixels.unbind(-1)
+    return (u / width - 0.5) * (2 * math.pi), (v / height - 0.5) * math.pi
+
+
+def project(points: Tensor, width: int, height: int) -> Tensor:
+    """Pixel (u, v) [..., 2] of camera-frame points [..., 3] (Eq. 6 and 7).
+
+    >>> project(torch.tensor([0.0, 0.0, 2.0]), 8, 4)
+    tensor([4., 2.])
+    """
+    return pixel_from_angles(*longitude_latitude(points), width, height)
+
+
+def unproject(pixels: Tensor, width: int, height: int) -> Tensor:
+    """Unit direction [..., 3] in the camera frame through continuous pixel coordinates (u, v) [..., 2]."""
+    return direction(*angles_from_pixel(pixels, width, height))
+
+
+def row_latitudes(height: int, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
+    """Latitude in radians at the centre of each image row, [H], from nearly -pi/2 (up) to nearly +pi/2 (down).
+
+    >>> row_latitudes(2) / math.pi
+    tensor([-0.2500,  0.2500])
+    """
+    rows = torch.arange(height, dtype=dtype, device=device)
+    return ((rows + 0.5) / height - 0.5) * math.pi
+
+
+def rays(width: int, height: int, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
+    """Unit directions [H, W, 3] in the camera frame through all pixel centres."""
+    columns = torch.arange(width, dtype=dtype, device=device)
+    longitude = ((columns + 0.5) / width - 0.5) * (2 * math.pi)
+    latitude = row_latitudes(height, dtype=dtype, device=device)
+    return direction(longitude.expand(height, width), latitude[:, None].expand(height, width))
+
+
+def projection_jacobian(points: Tensor, width: int, height: int, *, min_cos_latitude: float = 0.0) -> Tensor:
+    """Jacobian d(u, v) / d(x, y, z) of `project`, in pixels per unit length, [..., 2, 3].
+
+    With r = |p|, rho^2 = x^2 + z^2, c = rho / r = cos(latitude):
+    first row (W / 2 pi) east / (r c), second row (H / pi) down / r, where east = (z, 0, -x) / rho and
+    down = (-x y, rho^2, -y z) / (rho r).
+
+    Args:
+        points: [..., 3] camera frame.
+        min_cos_latitude: lower limit of c in the first row; it is unbounded at the poles otherwise.
+
+    Returns:
+        [..., 2, 3]. Exactly on the polar axis, where no direction is east, camera x is taken for east.
+    """
+    x, y, z = points.unbind(-1)
+    rho_squared = x * x + z * z
+    r_squared = rho_squared + y * y
+    r = torch.sqrt(r_squared)
+    on_axis = rho_squared == 0
+    rho = torch.sqrt(torch.where(on_axis, torch.ones_like(rho_squared), rho_squared))
+    east_x = torch.where(on_axis, torch.ones_like(x), z / rho)
+    east_z = torch.where(on_axis, torch.zeros_like(x), -x / rho)
+    sin_latitude = y / r
+    cos_latitude = torch.where(on_axis, torch.zeros_like(rho), rho) / r
+    per_east = width / (2 * math.pi) / (r * cos_latitude.clamp(min=min_cos_latitude))
+    per_down = height / math.pi / r
+    zero = torch.zeros_like(x)
+    # down = latitude direction: -sin(latitude) * horizontal + cos(latitude) * y; horizontal = (-east_z, 0, east_x).
+    row_u = torch.stack((per_east * east_x, zero, per_east * east_z), dim=-1)
+    row_v = torch.stack(
+        (per_down * sin_latitude * east_z, per_down * cos_latitude, -per_down * sin_latitude * east_x), dim=-1
+    )
+    return torch.stack((row_u, row_v), dim=-2)

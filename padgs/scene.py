@@ -1,0 +1,83 @@
+"""What every method is given: views with known poses, a split, and a point cloud.
+
+Transforms are named a_from_b: `cam_from_world` maps world points to the camera frame (x right, y down, z forward).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class View:
+    """One panorama: its pose and size, and how to get its pixels.
+
+    `load_pixels` and `load_mask` are called whenever pixels are asked for; the loader decides what is cached. A view
+    without `load_pixels` can be rendered but not compared with anything.
+    """
+
+    name: str
+    cam_from_world: Tensor  # [4, 4] float64, rigid
+    width: int
+    height: int
+    load_pixels: Callable[[], Tensor] | None = None  # () -> [H, W, 3] uint8
+    load_mask: Callable[[], Tensor] | None = None  # () -> [H, W] float32 in [0, 1], 0 = ignore this pixel
+
+    @property
+    def center(self) -> Tensor:
+        """Camera centre in the world frame, [3]."""
+        rotation, translation = self.cam_from_world[:3, :3], self.cam_from_world[:3, 3]
+        return -rotation.transpose(0, 1) @ translation
+
+    def image(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
+        """The panorama as floats in [0, 1], [H, W, 3], linear in the stored values.
+
+        Raises:
+            ValueError: the view has no pixels.
+        """
+        if self.load_pixels is None:
+            raise ValueError(f"view {self.name!r} has a pose but no image; it can only be rendered")
+        return self.load_pixels().to(device=device, dtype=dtype) / 255
+
+    def mask(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor | None:
+        """Per-pixel weight [H, W] in [0, 1] (0 = ignore), or None where every pixel counts."""
+        return None if self.load_mask is None else self.load_mask().to(device=device, dtype=dtype)
+
+    def at(self, cam_from_world: Tensor) -> View:
+        """The same camera at another pose [4, 4], without pixels."""
+        return replace(self, cam_from_world=cam_from_world, load_pixels=None, load_mask=None)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Views split into train and test, and the point cloud that methods start from. All in one world frame."""
+
+    name: str
+    train: tuple[View, ...]
+    test: tuple[View, ...]
+    points: Tensor  # [P, 3] float32 world
+    point_colors: Tensor  # [P, 3] uint8
+    fingerprint: str  # hex digest of everything read: images, poses, points, split, masks, size
+    notes: tuple[str, ...] = ()  # what the loader decided by itself, for the user to read
+
+    @cached_property
+    def extent(self) -> float:
+        """1.1 x the largest distance of a training camera from their mean, in world units (as 3DGS defines it)."""
+        centers = torch.stack([view.center for view in self.train])
+        return 1.1 * (centers - centers.mean(0)).norm(dim=-1).max().item()
+
+    @cached_property
+    def unit(self) -> float:
+        """The scene's own unit of length: the median distance from a training camera to a point, in world units.
+
+        Lengths that the user does not give in world units are multiples of it, so that scaling a scene and its poses
+        together changes nothing.
+        """
+        points = self.points[:: max(1, len(self.points) // 20_000)].double()
+        medians = [(points - view.center.double()).norm(dim=-1).median() for view in self.train]
+        return torch.stack(medians).median().item()
