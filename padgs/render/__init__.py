@@ -1,0 +1,69 @@
+"""Rendering: one function, several backends. `render(gaussians, view)` is all that models and methods call.
+
+Backends are entries of `BACKENDS`; each is a function with the signature of `torch_backend.rasterize`. The torch one
+is the definition.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from padgs.gaussians import Gaussians
+from padgs.registry import lookup
+from padgs.render.contract import RenderOptions, Rendering, check_inputs
+from padgs.scene import View
+
+BACKENDS = {
+    "torch": "padgs.render.torch_backend:rasterize",
+    "cpu": "padgs.render.cpu_backend:rasterize",
+}
+RELEASED = RenderOptions(near=0.2, wrap=False, bounds="square")  # the published rasterizer, near in scene units
+
+__all__ = ["BACKENDS", "RELEASED", "RenderOptions", "Rendering", "render", "resolve_backend"]
+
+
+def render(
+    gaussians: Gaussians,
+    view: View,
+    options: RenderOptions = RenderOptions(),  # noqa: B008 - frozen dataclass
+    *,
+    background: Tensor | None = None,
+    probe: Tensor | None = None,
+    backend: str = "auto",
+    check_values: bool = False,
+) -> Rendering:
+    """Render a panorama of the Gaussians as the view sees them.
+
+    Args:
+        gaussians: N Gaussians in the world frame, float32 (any backend) or float64 (torch only).
+        view: pose and image size.
+        options: projection, bounds, culling.
+        background: [3] RGB behind everything; black if not given.
+        probe: [N, 2] zeros added to the projected means in normalised image units (x and y each run over 2 across the
+            image, as in 3DGS); its gradient after `backward` is the densification signal.
+        backend: a name of `BACKENDS`, or auto: cpu for float32 tensors on the CPU where the library is built, else torch.
+        check_values: also check that all numbers are sane; a pass over the tensors, meant for tests and debugging.
+
+    Raises:
+        ValueError: unknown backend, or inputs that break the contract.
+    """
+    means = gaussians.means
+    cam_from_world = view.cam_from_world.to(device=means.device, dtype=means.dtype)
+    if background is None:
+        background = means.new_zeros(3)
+    check_inputs(gaussians, cam_from_world, view.width, view.height, background, probe, check_values=check_values)
+    rasterize = lookup(BACKENDS, resolve_backend(backend, means), "backend")
+    return rasterize(gaussians, cam_from_world, view.width, view.height, options, background, probe)
+
+
+def resolve_backend(backend: str, means: Tensor) -> str:
+    """The backend that `auto` stands for, given the tensors to draw; other names are returned as they are."""
+    if backend != "auto":
+        return backend
+    from padgs.render import native
+
+    native_fits = means.device.type == "cpu" and means.dtype == torch.float32
+    return "cpu" if native_fits and native.available() else "torch"

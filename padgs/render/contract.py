@@ -1,0 +1,122 @@
+"""The contract of every rasterizer backend: what goes in, what comes out, and what must hold.
+
+The definition (all backends match it, values and gradients): each Gaussian that is not culled acts on a pixel through a
+squared distance q >= 0 given by the projection; alpha = min(0.99, opacity * exp(-q / 2)); pairs with alpha < 1/255 are
+skipped. Gaussians are blended front to back by the radial distance of their mean (ties by index), and a pixel stops
+*before* the Gaussian that would bring its transmittance below 1e-4. Where alpha is limited to 0.99 its derivative is 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from padgs.gaussians import Gaussians
+
+ALPHA_MIN = 1 / 255
+ALPHA_MAX = 0.99
+TRANSMITTANCE_MIN = 1e-4
+BOUNDS = ("exact", "square")
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """How Gaussians become an image. The defaults are ours; `RELEASED` in `padgs.render` is the published behaviour."""
+
+    projection: str = "erp"
+    near: float = 0.0  # world units; Gaussians whose mean is at most this far away are culled
+    low_pass: float = 0.3  # px^2 added to both diagonal entries of the projected covariance
+    wrap: bool = True  # continue footprints across the +-180 degree seam
+    bounds: str = "exact"  # exact: every pixel with alpha >= 1/255; square: 3 sigma of the longest axis, as published
+
+    def __post_init__(self) -> None:
+        """Reject values that no backend can honour."""
+        if self.bounds not in BOUNDS:
+            raise ValueError(f"unknown bounds {self.bounds!r}; known: {', '.join(BOUNDS)}")
+        if not self.near >= 0:
+            raise ValueError(f"near is {self.near}; it must be a distance >= 0 in world units")
+        if not self.low_pass >= 0:
+            raise ValueError(f"low_pass is {self.low_pass}; it must be a variance >= 0 in square pixels")
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """What a backend returns. Differentiable by image, transmittance and depth."""
+
+    image: Tensor  # [H, W, 3]
+    transmittance: Tensor  # [H, W] in [0, 1], what is left for the background
+    depth: Tensor  # [H, W] world units: mean radial distance weighted by contribution; 0 where nothing contributes
+    visible: Tensor  # [N] bool: not culled and inside the image
+    counters: Mapping[str, int] = field(default_factory=dict)  # gaussians, visible, instances, evaluated pairs, ...
+
+
+def check_inputs(
+    gaussians: Gaussians,
+    cam_from_world: Tensor,
+    width: int,
+    height: int,
+    background: Tensor,
+    probe: Tensor | None,
+    *,
+    check_values: bool,
+) -> None:
+    """Check what native code relies on and name the culprit.
+
+    Args:
+        gaussians, cam_from_world, width, height, background, probe: as in `padgs.render.render`.
+        check_values: also look at every number (finite, positive scales, ...); costs a pass over the tensors.
+
+    Raises:
+        ValueError: a shape, dtype, device or value breaks the contract.
+    """
+    count = gaussians.means.shape[0] if gaussians.means.ndim else 0
+    shapes = {
+        "means": (gaussians.means, (count, 3)),
+        "quats": (gaussians.quats, (count, 4)),
+        "scales": (gaussians.scales, (count, 3)),
+        "opacities": (gaussians.opacities, (count,)),
+        "colors": (gaussians.colors, (count, 3)),
+        "cam_from_world": (cam_from_world, (4, 4)),
+        "background": (background, (3,)),
+    }
+    if probe is not None:
+        shapes["probe"] = (probe, (count, 2))
+    dtype, device = gaussians.means.dtype, gaussians.means.device
+    if dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"means has dtype {dtype}; renderers take torch.float32 or torch.float64")
+    for name, (tensor, shape) in shapes.items():
+        if tuple(tensor.shape) != shape:
+            raise ValueError(f"{name} has shape {tuple(tensor.shape)}; with {count} means it must be {shape}")
+        if tensor.dtype != dtype:
+            raise ValueError(f"{name} has dtype {tensor.dtype} but means has {dtype}; convert one of them")
+        if tensor.device != device:
+            raise ValueError(f"{name} is on {tensor.device} but means is on {device}; move one of them")
+    if width < 1 or height < 1:
+        raise ValueError(f"image size is {width}x{height}; both sides must be at least 1 pixel")
+    if check_values:
+        _check_values(gaussians, cam_from_world)
+
+
+def _check_values(gaussians: Gaussians, cam_from_world: Tensor) -> None:
+    for name in ("means", "quats", "scales", "opacities", "colors"):
+        tensor = getattr(gaussians, name)
+        bad = ~torch.isfinite(tensor)
+        if bad.any():
+            raise ValueError(f"{name} holds {int(bad.sum())} non-finite values, first at {bad.nonzero()[0].tolist()}")
+    rules = {
+        "scales": (gaussians.scales > 0, "must be > 0"),
+        "opacities": ((gaussians.opacities >= 0) & (gaussians.opacities <= 1), "must be in [0, 1]"),
+        "quats": (gaussians.quats.norm(dim=-1) > 0, "must not be zero"),
+    }
+    for name, (good, rule) in rules.items():
+        if not good.all():
+            index = (~good).nonzero()[0].tolist()
+            value = getattr(gaussians, name)[tuple(index)].tolist()
+            raise ValueError(f"{name}{index} is {value}; {name} {rule}")
+    rotation = cam_from_world[:3, :3].detach()
+    identity = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
+    if not torch.allclose(rotation @ rotation.T, identity, atol=1e-3):
+        raise ValueError("cam_from_world has a 3x3 part that is not a rotation; poses must be rigid (no scale, no shear)")
