@@ -1,8 +1,8 @@
 """Removing and adding rows of per-anchor or per-Gaussian parameters while an Adam optimiser holds them.
 
-The `nn.Parameter` objects keep their identity, so the optimiser, its groups and the model go on referring to them; their
-`.data` and Adam moments are replaced, and their gradients are dropped. No graph that was built on the old rows may be
-alive when the next one is built.
+The `nn.Parameter` objects keep their identity, so the optimiser, its groups and the model go on referring to them;
+their `.data` and Adam moments are replaced, and their gradients are dropped. No graph that was built on the old rows
+may be alive when the next one is built.
 """
 
 from __future__ import annotations
@@ -54,9 +54,8 @@ def append_rows(parameters: Mapping[str, nn.Parameter], optimizer: torch.optim.A
         raise ValueError(f"new rows differ in number: { ({name: len(rows) for name, rows in new.items()}) }")
     for name, parameter in parameters.items():
         if new[name].shape[1:] != parameter.shape[1:]:
-            raise ValueError(
-                f"new rows of {name} have shape {tuple(new[name].shape)}; they must be [M, *{list(parameter.shape[1:])}]"
-            )
+            wanted = ["M", *parameter.shape[1:]]
+            raise ValueError(f"new rows of {name} have shape {list(new[name].shape)}; it must be {wanted}")
     for name, parameter in parameters.items():
         rows = new[name].detach().to(parameter)
         parameter.data = torch.cat((parameter.data, rows))
