@@ -1,8 +1,139 @@
-"""Finds and loads the native library; importing this module loads nothing."""
+"""Finds and loads the native library; importing this module loads nothing.
+
+The library is plain C: pointers and sizes in, nothing out but numbers. The structures here mirror `csrc/abi.h`.
+"""
 
 from __future__ import annotations
 
+import ctypes
+import functools
+import importlib.util
+import os
+import sys
+from pathlib import Path
 
+import torch  # first: the library then shares torch's OpenMP threads, and torch.set_num_threads holds for it too
+from torch import Tensor
+
+Pointer = ctypes.c_void_p
+
+
+class Camera(ctypes.Structure):
+    """`padgs::Camera`."""
+
+    _fields_ = [
+        ("width", ctypes.c_int32),
+        ("height", ctypes.c_int32),
+        ("cam_from_world", ctypes.c_float * 12),
+        ("near_radius", ctypes.c_float),
+        ("low_pass", ctypes.c_float),
+        ("wrap", ctypes.c_int32),
+        ("square", ctypes.c_int32),
+    ]
+
+
+class Inputs(ctypes.Structure):
+    """`padgs::Inputs`."""
+
+    _fields_ = [("count", ctypes.c_int64)] + [
+        (name, Pointer) for name in ("means", "quats", "scales", "opacities", "colors", "probe")
+    ]
+
+
+class Gradients(ctypes.Structure):
+    """`padgs::Gradients`."""
+
+    _fields_ = [(name, Pointer) for name in ("means", "quats", "scales", "opacities", "colors", "probe", "pose")]
+
+
+class BlendArguments(ctypes.Structure):
+    """`padgs::BlendArguments`."""
+
+    _fields_ = [
+        (name, ctypes.c_int32) for name in ("width", "height", "wrap", "first_tile_row", "end_tile_row")
+    ] + [
+        (name, Pointer)
+        for name in (
+            "footprints",
+            "tile_start",
+            "instances",
+            "slots",
+            "background",
+            "image",
+            "transmittance",
+            "depth",
+            "last",
+            "pair_counts",
+        )
+    ]
+
+
+class BlendGradientArguments(ctypes.Structure):
+    """`padgs::BlendGradientArguments`."""
+
+    _fields_ = [("forward", BlendArguments)] + [
+        (name, Pointer) for name in ("grad_image", "grad_transmittance", "grad_depth", "moments")
+    ]
+
+
+def pointer(tensor: Tensor | None) -> int | None:
+    """Address of a contiguous tensor, or None."""
+    if tensor is None:
+        return None
+    assert tensor.is_contiguous(), f"native code takes contiguous tensors, got strides {tensor.stride()}"
+    return tensor.data_ptr()
+
+
+@functools.cache
+def library() -> ctypes.CDLL:
+    """The loaded library.
+
+    Raises:
+        OSError: it was not built (no compiler at install time) or does not load; the message says where it was sought.
+    """
+    suffix = {"darwin": ".dylib", "win32": ".dll"}.get(sys.platform, ".so")
+    name = ("" if sys.platform == "win32" else "lib") + "padgs_cpu" + suffix
+    folders = [Path(folder) for folder in _package_folders()]
+    if "PADGS_LIBRARY_DIR" in os.environ:  # a build folder, while working on the kernels
+        folders.insert(0, Path(os.environ["PADGS_LIBRARY_DIR"]))
+    for folder in folders:
+        if (folder / name).exists():
+            loaded = ctypes.CDLL(str(folder / name))
+            _declare(loaded)
+            return loaded
+    raise OSError(
+        f"{name} not found in {', '.join(map(str, folders))}; install padgs where a C++ compiler is on the PATH, "
+        "or render with backend=torch"
+    )
+
+
+def _package_folders() -> list[str]:
+    spec = importlib.util.find_spec("padgs.render")
+    return list(spec.submodule_search_locations or []) if spec else []
+
+
+def _declare(loaded: ctypes.CDLL) -> None:
+    i32, i64 = ctypes.c_int32, ctypes.c_int64
+    signatures = {
+        "padgs_isa": ([], ctypes.c_char_p),
+        "padgs_project": ([Pointer] * 4, None),
+        "padgs_project_backward": ([Pointer] * 5, None),
+        "padgs_depth_order": ([Pointer, Pointer, i64, Pointer], i64),
+        "padgs_count_instances": ([Pointer, i64, i32, Pointer], None),
+        "padgs_bin": ([Pointer, i64, Pointer, i64, i32, i32, i32, Pointer, Pointer, Pointer, Pointer], None),
+        "padgs_blend_forward": ([Pointer], None),
+        "padgs_blend_backward": ([Pointer], None),
+    }
+    for name, (arguments, result) in signatures.items():
+        function = getattr(loaded, name)
+        function.argtypes, function.restype = arguments, result
+
+
+@functools.cache
 def available() -> bool:
     """Whether the native CPU library is built and loads."""
-    return False
+    try:
+        library()
+    except OSError:
+        return False
+    return True
