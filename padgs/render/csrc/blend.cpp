@@ -53,10 +53,29 @@ struct Evaluator {
 };
 
 struct ForwardRow {
-  Vec transmittance{};  // negative once the pixel has stopped
-  Vec red{}, green{}, blue{}, depth{};
-  VecI last{};
+  Vec transmittance = zero();  // negative once the pixel has stopped
+  Vec red = zero(), green = zero(), blue = zero(), depth = zero();
+  VecI last = zero_int();
 };
+
+void store_row(const BlendArguments &args, const Tile &tile, int y, const ForwardRow &row) {
+  const int64_t pixel = int64_t(tile.y0 + y) * args.width + tile.x0;
+  const Vec t = maximum(row.transmittance, -row.transmittance), coverage = 1.0f - t;
+  float lanes[6][kLanes];
+  store(lanes[0], row.red + t * args.background[0]);
+  store(lanes[1], row.green + t * args.background[1]);
+  store(lanes[2], row.blue + t * args.background[2]);
+  store(lanes[3], t);
+  store(lanes[4], select(less(zero(), coverage), row.depth / coverage, zero()));
+  int32_t last[kLanes];
+  store_int(last, row.last);
+  for (int x = 0; x < tile.columns; ++x) {
+    for (int channel = 0; channel < 3; ++channel) args.image[3 * (pixel + x) + channel] = lanes[channel][x];
+    args.transmittance[pixel + x] = lanes[3][x];
+    args.depth[pixel + x] = lanes[4][x];
+    args.last[pixel + x] = last[x];
+  }
+}
 
 void forward_tile(const BlendArguments &args, int64_t index) {
   const Tile tile = tile_at(args, index);
@@ -78,7 +97,7 @@ void forward_tile(const BlendArguments &args, int64_t index) {
       ForwardRow &row = rows[y];
       const Vec alpha = minimum(exp2_fast(exponent), splat(kAlphaMax));
       const Vec next = row.transmittance * (1.0f - alpha);
-      const Mask running = both(reached, at_least(row.transmittance, Vec{}));
+      const Mask running = both(reached, at_least(row.transmittance, zero()));
       const Mask drawn = both(running, at_least(next, splat(kTransmittanceMin)));
       const Mask stopped = without(running, drawn);
       const Vec weight = keep(drawn, alpha * row.transmittance);
@@ -91,58 +110,47 @@ void forward_tile(const BlendArguments &args, int64_t index) {
       contributing += count(drawn);
       if (any(stopped)) {
         row.transmittance = select(stopped, -row.transmittance, row.transmittance);
-        if (!any(at_least(row.transmittance, Vec{}))) alive &= ~(1u << y);
+        if (!any(at_least(row.transmittance, zero()))) alive &= ~(1u << y);
       }
     }
   }
 
-  for (int y = 0; y < tile.rows; ++y) {
-    const ForwardRow &row = rows[y];
-    const int64_t pixel = int64_t(tile.y0 + y) * args.width + tile.x0;
-    for (int x = 0; x < tile.columns; ++x) {
-      const float t = std::fabs(row.transmittance[x]), coverage = 1.0f - t;
-      args.image[3 * (pixel + x) + 0] = row.red[x] + t * args.background[0];
-      args.image[3 * (pixel + x) + 1] = row.green[x] + t * args.background[1];
-      args.image[3 * (pixel + x) + 2] = row.blue[x] + t * args.background[2];
-      args.transmittance[pixel + x] = t;
-      args.depth[pixel + x] = coverage > 0 ? row.depth[x] / coverage : 0.0f;
-      args.last[pixel + x] = row.last[x];
-    }
-  }
+  for (int y = 0; y < tile.rows; ++y) store_row(args, tile, y, rows[y]);
   args.pair_counts[2 * index] = evaluated;
   args.pair_counts[2 * index + 1] = contributing;
 }
 
 struct BackwardRow {
-  Vec transmittance = splat(1.0f);  // in front of the Gaussian being visited
-  Vec behind{};                     // sum of weight * (dL/dcolour . colour) behind it, background included
-  Vec grad_red{}, grad_green{}, grad_blue{}, grad_depth{};
-  VecI last{};
+  Vec transmittance;  // in front of the Gaussian being visited
+  Vec behind;         // sum of weight * (dL/dcolour . colour) behind it, background included
+  Vec grad_red, grad_green, grad_blue, grad_depth;
+  VecI last;
 };
 
 // Loads one row of upstream gradients; returns the largest `last` of its pixels.
 int load_row(const BlendGradientArguments &args, const Tile &tile, int y, BackwardRow &row) {
   const BlendArguments &forward = args.forward;
   const int64_t pixel = int64_t(tile.y0 + y) * forward.width + tile.x0;
-  int furthest = 0;
+  float t[kLanes], behind[kLanes] = {}, grad[3][kLanes] = {}, grad_depth[kLanes] = {};
+  int32_t last[kLanes] = {}, furthest = 0;
+  std::fill_n(t, kLanes, 1.0f);
   for (int x = 0; x < tile.columns; ++x) {
     const int64_t p = pixel + x;
-    const float t = forward.transmittance[p], coverage = 1.0f - t;
-    const float *g = args.grad_image + 3 * p;
-    float grad_t = g[0] * forward.background[0] + g[1] * forward.background[1] + g[2] * forward.background[2];
-    if (args.grad_transmittance) grad_t += args.grad_transmittance[p];
-    if (args.grad_depth && coverage > 0) {  // depth = sum(w r) / (1 - T)
-      row.grad_depth[x] = args.grad_depth[p] / coverage;
-      grad_t += row.grad_depth[x] * forward.depth[p];
+    t[x] = forward.transmittance[p];
+    float grad_t = args.grad_transmittance ? args.grad_transmittance[p] : 0.0f;
+    for (int channel = 0; channel < 3; ++channel) {
+      grad[channel][x] = args.grad_image[3 * p + channel];
+      grad_t += grad[channel][x] * forward.background[channel];
     }
-    row.transmittance[x] = t;
-    row.behind[x] = t * grad_t;
-    row.grad_red[x] = g[0];
-    row.grad_green[x] = g[1];
-    row.grad_blue[x] = g[2];
-    row.last[x] = forward.last[p];
-    furthest = std::max(furthest, forward.last[p]);
+    if (args.grad_depth && t[x] < 1) {  // depth = sum(w r) / (1 - T)
+      grad_depth[x] = args.grad_depth[p] / (1.0f - t[x]);
+      grad_t += grad_depth[x] * forward.depth[p];
+    }
+    behind[x] = t[x] * grad_t;
+    last[x] = forward.last[p];
+    furthest = std::max(furthest, last[x]);
   }
+  row = {load(t), load(behind), load(grad[0]), load(grad[1]), load(grad[2]), load(grad_depth), load_int(last)};
   return furthest;
 }
 
@@ -160,7 +168,7 @@ void backward_tile(const BlendGradientArguments &args, int64_t index) {
     const Footprint &f = forward.footprints[forward.instances[i]];
     const Evaluator at(f, tile, forward);
     const VecI position = splat_int(int32_t(i - tile.first) + 1);
-    Vec m0{}, m1{}, m2{}, red{}, green{}, blue{}, depth{};
+    Vec m0 = zero(), m1 = zero(), m2 = zero(), red = zero(), green = zero(), blue = zero(), depth = zero();
     for (int y = at.row; y < at.row_end; ++y) {
       const Vec exponent = at.log2_alpha(y);
       BackwardRow &row = rows[y];
@@ -175,7 +183,7 @@ void backward_tile(const BlendGradientArguments &args, int64_t index) {
       if (kWithDepth) signal += row.grad_depth * f.depth;
       // dL/dalpha = T (c . G) - (what is behind) / (1 - alpha); alpha dL/dalpha, and 0 where alpha is limited.
       Vec m = weight * signal - row.behind * (inverse * alpha);
-      m = select(less(full, splat(kAlphaMax)), m, Vec{});
+      m = select(less(full, splat(kAlphaMax)), m, zero());
       row.behind += weight * signal;
       row.transmittance = transmittance;
       red += weight * row.grad_red;

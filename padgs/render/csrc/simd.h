@@ -1,7 +1,7 @@
 // Sixteen floats at a time, with the same few operations on every instruction set.
 //
-// AVX-512 uses its mask registers; everything else uses GCC/Clang vector extensions, which the compiler splits into
-// the width that the machine has. Lanes are the 16 pixels of one tile row, or 16 independent items.
+// A Vec is one AVX-512 register, two AVX2 registers, or four of the 16-byte registers that every other machine has;
+// GCC/Clang vector extensions do the arithmetic. Lanes are the 16 pixels of one tile row, or 16 independent items.
 #pragma once
 
 #include <cstdint>
@@ -15,107 +15,141 @@ namespace padgs {
 namespace PADGS_ISA {
 
 constexpr int kLanes = 16;
-typedef float Vec __attribute__((vector_size(64), aligned(64)));
-typedef int32_t VecI __attribute__((vector_size(64), aligned(64)));
+#if defined(__AVX512F__)
+constexpr int kPartBytes = 64;
+#elif defined(__AVX2__)
+constexpr int kPartBytes = 32;
+#else
+constexpr int kPartBytes = 16;
+#endif
+constexpr int kParts = 64 / kPartBytes;
+typedef float Part __attribute__((vector_size(kPartBytes)));
+typedef int32_t PartI __attribute__((vector_size(kPartBytes)));
 
-static inline Vec splat(float x) { return x - Vec{}; }
-static inline VecI splat_int(int32_t x) { return x - VecI{}; }
-static inline Vec iota() { return Vec{0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15}; }
-static inline Vec load(const float *p) { Vec v; std::memcpy(&v, p, sizeof v); return v; }
-static inline void store(float *p, Vec v) { std::memcpy(p, &v, sizeof v); }
-static inline VecI load_int(const int32_t *p) { VecI v; std::memcpy(&v, p, sizeof v); return v; }
-static inline void store_int(int32_t *p, VecI v) { std::memcpy(p, &v, sizeof v); }
+#define PADGS_INLINE static inline __attribute__((always_inline))
+#define PADGS_EACH_PART for (int i = 0; i < kParts; ++i)
+
+struct Vec {
+  Part p[kParts];
+};
+struct VecI {
+  PartI p[kParts];
+};
+
+PADGS_INLINE Vec splat(float x) { Vec r; PADGS_EACH_PART r.p[i] = x - Part{}; return r; }
+PADGS_INLINE VecI splat_int(int32_t x) { VecI r; PADGS_EACH_PART r.p[i] = x - PartI{}; return r; }
+PADGS_INLINE Vec zero() { Vec r; PADGS_EACH_PART r.p[i] = Part{}; return r; }
+PADGS_INLINE VecI zero_int() { VecI r; PADGS_EACH_PART r.p[i] = PartI{}; return r; }
+PADGS_INLINE Vec load(const float *from) { Vec r; std::memcpy(&r, from, sizeof r); return r; }
+PADGS_INLINE VecI load_int(const int32_t *from) { VecI r; std::memcpy(&r, from, sizeof r); return r; }
+PADGS_INLINE void store(float *to, Vec v) { std::memcpy(to, &v, sizeof v); }
+PADGS_INLINE void store_int(int32_t *to, VecI v) { std::memcpy(to, &v, sizeof v); }
+
+alignas(64) static const float kIota[kLanes] = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
+PADGS_INLINE Vec iota() { return load(kIota); }
+
+#define PADGS_OPERATOR(op)                                                                              \
+  PADGS_INLINE Vec operator op(Vec a, Vec b) { Vec r; PADGS_EACH_PART r.p[i] = a.p[i] op b.p[i]; return r; } \
+  PADGS_INLINE Vec operator op(Vec a, float b) { Vec r; PADGS_EACH_PART r.p[i] = a.p[i] op b; return r; }    \
+  PADGS_INLINE Vec operator op(float a, Vec b) { Vec r; PADGS_EACH_PART r.p[i] = a op b.p[i]; return r; }
+PADGS_OPERATOR(+)
+PADGS_OPERATOR(-)
+PADGS_OPERATOR(*)
+PADGS_OPERATOR(/)
+#undef PADGS_OPERATOR
+PADGS_INLINE Vec operator-(Vec a) { Vec r; PADGS_EACH_PART r.p[i] = -a.p[i]; return r; }
+PADGS_INLINE Vec &operator+=(Vec &a, Vec b) { return a = a + b; }
 
 #if defined(__AVX512F__)
 
 typedef __mmask16 Mask;
-static inline __m512 raw(Vec v) { return (__m512)v; }
-static inline Mask less(Vec a, Vec b) { return _mm512_cmp_ps_mask(raw(a), raw(b), _CMP_LT_OQ); }
-static inline Mask at_least(Vec a, Vec b) { return _mm512_cmp_ps_mask(raw(a), raw(b), _CMP_GE_OQ); }
-static inline Mask at_most(VecI a, VecI b) { return _mm512_cmple_epi32_mask((__m512i)a, (__m512i)b); }
-static inline Mask both(Mask a, Mask b) { return a & b; }
-static inline Mask without(Mask a, Mask b) { return a & ~b; }
-static inline bool any(Mask m) { return m != 0; }
-static inline int count(Mask m) { return __builtin_popcount(m); }
-static inline Vec select(Mask m, Vec a, Vec b) { return (Vec)_mm512_mask_blend_ps(m, raw(b), raw(a)); }
-static inline VecI select_int(Mask m, VecI a, VecI b) {
-  return (VecI)_mm512_mask_blend_epi32(m, (__m512i)b, (__m512i)a);
+PADGS_INLINE __m512 raw(Vec v) { return (__m512)v.p[0]; }
+PADGS_INLINE Vec vec(__m512 v) { return {{(Part)v}}; }
+PADGS_INLINE Mask less(Vec a, Vec b) { return _mm512_cmp_ps_mask(raw(a), raw(b), _CMP_LT_OQ); }
+PADGS_INLINE Mask at_least(Vec a, Vec b) { return _mm512_cmp_ps_mask(raw(a), raw(b), _CMP_GE_OQ); }
+PADGS_INLINE Mask at_most(VecI a, VecI b) { return _mm512_cmple_epi32_mask((__m512i)a.p[0], (__m512i)b.p[0]); }
+PADGS_INLINE Mask both(Mask a, Mask b) { return a & b; }
+PADGS_INLINE Mask without(Mask a, Mask b) { return a & ~b; }
+PADGS_INLINE bool any(Mask m) { return m != 0; }
+PADGS_INLINE int count(Mask m) { return __builtin_popcount(m); }
+PADGS_INLINE Vec select(Mask m, Vec a, Vec b) { return vec(_mm512_mask_blend_ps(m, raw(b), raw(a))); }
+PADGS_INLINE VecI select_int(Mask m, VecI a, VecI b) {
+  return {{(PartI)_mm512_mask_blend_epi32(m, (__m512i)b.p[0], (__m512i)a.p[0])}};
 }
-static inline Vec minimum(Vec a, Vec b) { return (Vec)_mm512_min_ps(raw(a), raw(b)); }
-static inline Vec maximum(Vec a, Vec b) { return (Vec)_mm512_max_ps(raw(a), raw(b)); }
-static inline Vec round_nearest(Vec a) { return (Vec)_mm512_roundscale_ps(raw(a), 0); }
-static inline Vec round_down(Vec a) { return (Vec)_mm512_roundscale_ps(raw(a), 1); }
-static inline Vec scale_by_power(Vec a, Vec n) { return (Vec)_mm512_scalef_ps(raw(a), raw(n)); }
+PADGS_INLINE Vec minimum(Vec a, Vec b) { return vec(_mm512_min_ps(raw(a), raw(b))); }
+PADGS_INLINE Vec maximum(Vec a, Vec b) { return vec(_mm512_max_ps(raw(a), raw(b))); }
+PADGS_INLINE Vec round_nearest(Vec a) { return vec(_mm512_roundscale_ps(raw(a), 0)); }
+PADGS_INLINE Vec round_down(Vec a) { return vec(_mm512_roundscale_ps(raw(a), 1)); }
+PADGS_INLINE Vec scale_by_power(Vec a, Vec n) { return vec(_mm512_scalef_ps(raw(a), raw(n))); }
 
 #else
 
-typedef VecI Mask;
-static inline Mask less(Vec a, Vec b) { return a < b; }
-static inline Mask at_least(Vec a, Vec b) { return a >= b; }
-static inline Mask at_most(VecI a, VecI b) { return a <= b; }
-static inline Mask both(Mask a, Mask b) { return a & b; }
-static inline Mask without(Mask a, Mask b) { return a & ~b; }
-static inline uint32_t bits(Mask m) {
+struct Mask {
+  PartI p[kParts];
+};
+PADGS_INLINE Mask less(Vec a, Vec b) { Mask r; PADGS_EACH_PART r.p[i] = a.p[i] < b.p[i]; return r; }
+PADGS_INLINE Mask at_least(Vec a, Vec b) { Mask r; PADGS_EACH_PART r.p[i] = a.p[i] >= b.p[i]; return r; }
+PADGS_INLINE Mask at_most(VecI a, VecI b) { Mask r; PADGS_EACH_PART r.p[i] = a.p[i] <= b.p[i]; return r; }
+PADGS_INLINE Mask both(Mask a, Mask b) { Mask r; PADGS_EACH_PART r.p[i] = a.p[i] & b.p[i]; return r; }
+PADGS_INLINE Mask without(Mask a, Mask b) { Mask r; PADGS_EACH_PART r.p[i] = a.p[i] & ~b.p[i]; return r; }
+PADGS_INLINE uint32_t bits(Mask m) {
+  uint32_t result = 0;
 #if defined(__AVX2__)
-  __m256i halves[2];
-  std::memcpy(halves, &m, sizeof m);
-  return uint32_t(_mm256_movemask_ps(_mm256_castsi256_ps(halves[0]))) |
-         uint32_t(_mm256_movemask_ps(_mm256_castsi256_ps(halves[1]))) << 8;
+  PADGS_EACH_PART result |= uint32_t(_mm256_movemask_ps((__m256)m.p[i])) << (8 * i);
 #elif defined(__SSE2__)
-  __m128i quarters[4];
-  std::memcpy(quarters, &m, sizeof m);
-  uint32_t result = 0;
-  for (int i = 0; i < 4; ++i) result |= uint32_t(_mm_movemask_ps(_mm_castsi128_ps(quarters[i]))) << (4 * i);
-  return result;
+  PADGS_EACH_PART result |= uint32_t(_mm_movemask_ps((__m128)m.p[i])) << (4 * i);
 #else
-  uint32_t result = 0;
-  for (int i = 0; i < kLanes; ++i) result |= uint32_t(m[i] != 0) << i;
+  for (int lane = 0; lane < kLanes; ++lane) result |= uint32_t(m.p[lane / 4][lane % 4] != 0) << lane;
+#endif
   return result;
-#endif
 }
-static inline bool any(Mask m) { return bits(m) != 0; }
-static inline int count(Mask m) { return __builtin_popcount(bits(m)); }
-static inline Vec select(Mask m, Vec a, Vec b) { return (Vec)(((VecI)a & m) | ((VecI)b & ~m)); }
-static inline VecI select_int(Mask m, VecI a, VecI b) { return (a & m) | (b & ~m); }
-static inline Vec minimum(Vec a, Vec b) { return select(a < b, a, b); }
-static inline Vec maximum(Vec a, Vec b) { return select(a > b, a, b); }
+PADGS_INLINE bool any(Mask m) { return bits(m) != 0; }
+PADGS_INLINE int count(Mask m) { return __builtin_popcount(bits(m)); }
+PADGS_INLINE Vec select(Mask m, Vec a, Vec b) {
+  Vec r;
+  PADGS_EACH_PART r.p[i] = (Part)(((PartI)a.p[i] & m.p[i]) | ((PartI)b.p[i] & ~m.p[i]));
+  return r;
+}
+PADGS_INLINE VecI select_int(Mask m, VecI a, VecI b) {
+  VecI r;
+  PADGS_EACH_PART r.p[i] = (a.p[i] & m.p[i]) | (b.p[i] & ~m.p[i]);
+  return r;
+}
+PADGS_INLINE Vec minimum(Vec a, Vec b) { return select(less(a, b), a, b); }
+PADGS_INLINE Vec maximum(Vec a, Vec b) { return select(less(a, b), b, a); }
 // Adding and subtracting 1.5 * 2^23 rounds to the nearest integer; right for |a| < 2^22, which is all we have.
-static inline Vec round_nearest(Vec a) { return (a + 12582912.0f) - 12582912.0f; }
-static inline Vec round_down(Vec a) {
-  Vec n = round_nearest(a);
-  return n - select(n > a, splat(1.0f), Vec{});
+constexpr float kRounder = 12582912.0f;
+PADGS_INLINE Vec round_nearest(Vec a) { return (a + kRounder) - kRounder; }
+PADGS_INLINE Vec round_down(Vec a) {
+  const Vec n = round_nearest(a);
+  return n - select(less(a, n), splat(1.0f), zero());
 }
-static inline Vec scale_by_power(Vec a, Vec n) {
-  VecI exponent;
-  Vec shifted = n + 12582912.0f;  // the integer is now in the low mantissa bits
-  std::memcpy(&exponent, &shifted, sizeof shifted);
-  VecI result;
-  std::memcpy(&result, &a, sizeof a);
-  result += exponent << 23;
-  Vec scaled;
-  std::memcpy(&scaled, &result, sizeof result);
-  return scaled;
+// a * 2^n for integers n: once n + kRounder is formed, n sits in the low bits of the mantissa.
+PADGS_INLINE Vec scale_by_power(Vec a, Vec n) {
+  Vec r;
+  PADGS_EACH_PART r.p[i] = (Part)((PartI)a.p[i] + ((PartI)(n.p[i] + kRounder) << 23));
+  return r;
 }
 
 #endif
 
-static inline Vec keep(Mask m, Vec a) { return select(m, a, Vec{}); }
+PADGS_INLINE Vec keep(Mask m, Vec a) { return select(m, a, zero()); }
 
 // Sum of all lanes by halving.
-static inline float sum(Vec v) {
-  typedef float Half __attribute__((vector_size(32)));
+PADGS_INLINE float sum(Vec v) {
+  alignas(64) float lanes[kLanes];
+  store(lanes, v);
   typedef float Quarter __attribute__((vector_size(16)));
-  Half h = __builtin_shufflevector(v, v, 0, 1, 2, 3, 4, 5, 6, 7) +
-           __builtin_shufflevector(v, v, 8, 9, 10, 11, 12, 13, 14, 15);
-  Quarter q = __builtin_shufflevector(h, h, 0, 1, 2, 3) + __builtin_shufflevector(h, h, 4, 5, 6, 7);
-  q += __builtin_shufflevector(q, q, 2, 3, 0, 1);
-  return q[0] + q[1];
+  Quarter q[4];
+  std::memcpy(q, lanes, sizeof q);
+  const Quarter s = (q[0] + q[2]) + (q[1] + q[3]);
+  return (s[0] + s[2]) + (s[1] + s[3]);
 }
 
 // 2^x to 2.3e-7 relative for x in [-100, 100]: 2^round(x) times a degree-5 minimax polynomial of the rest.
-static inline Vec exp2_fast(Vec x) {
-  Vec n = round_nearest(x);
-  Vec r = x - n;
+PADGS_INLINE Vec exp2_fast(Vec x) {
+  const Vec n = round_nearest(x);
+  const Vec r = x - n;
   Vec p = r * 0.0013276471f + 0.0096755419f;
   p = p * r + 0.0555071309f;
   p = p * r + 0.2402212024f;
