@@ -52,9 +52,7 @@ def solid_angle_weight(
     return torch.cos(row_latitudes(height, dtype=dtype, device=device))
 
 
-def end_row_weight(
-    height: int, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
-) -> Tensor:
+def end_row_weight(height: int, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
     """The row weight [H] of the released code: cos(pi i / (H - 1) - pi / 2), which is 0 in the first and last row."""
     rows = torch.arange(height, dtype=dtype, device=device)
     return torch.cos(math.pi * rows / (height - 1) - math.pi / 2)

@@ -36,6 +36,8 @@ class RenderOptions:
         """Reject values that no backend can honour."""
         if self.bounds not in BOUNDS:
             raise ValueError(f"unknown bounds {self.bounds!r}; known: {', '.join(BOUNDS)}")
+        if self.bounds == "square" and self.wrap:
+            raise ValueError("bounds=square are the published bounds, which end at the seam; set wrap=false with them")
         if not self.near >= 0:
             raise ValueError(f"near is {self.near}; it must be a distance >= 0 in world units")
         if not self.low_pass >= 0:
@@ -119,4 +121,6 @@ def _check_values(gaussians: Gaussians, cam_from_world: Tensor) -> None:
     rotation = cam_from_world[:3, :3].detach()
     identity = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
     if not torch.allclose(rotation @ rotation.T, identity, atol=1e-3):
-        raise ValueError("cam_from_world has a 3x3 part that is not a rotation; poses must be rigid (no scale, no shear)")
+        raise ValueError(
+            "cam_from_world has a 3x3 part that is not a rotation; poses must be rigid (no scale, no shear)"
+        )

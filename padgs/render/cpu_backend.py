@@ -140,9 +140,7 @@ class _Tiles:
         self.rows, self.count = rows, rows * columns
         self.footprints = torch.empty(count, 12)
         self.boxes = torch.empty(count, 5, dtype=torch.int32)
-        library.padgs_project(
-            ctypes.byref(camera), ctypes.byref(inputs), pointer(self.footprints), pointer(self.boxes)
-        )
+        library.padgs_project(ctypes.byref(camera), ctypes.byref(inputs), pointer(self.footprints), pointer(self.boxes))
         order = torch.empty(count, dtype=torch.int32)
         self.visible = library.padgs_depth_order(pointer(self.footprints), pointer(self.boxes), count, pointer(order))
         per_row = torch.empty(rows, dtype=torch.int64)

@@ -49,9 +49,7 @@ class Gradients(ctypes.Structure):
 class BlendArguments(ctypes.Structure):
     """`padgs::BlendArguments`."""
 
-    _fields_ = [
-        (name, ctypes.c_int32) for name in ("width", "height", "wrap", "first_tile_row", "end_tile_row")
-    ] + [
+    _fields_ = [(name, ctypes.c_int32) for name in ("width", "height", "wrap", "first_tile_row", "end_tile_row")] + [
         (name, Pointer)
         for name in (
             "footprints",

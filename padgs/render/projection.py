@@ -30,7 +30,7 @@ class Footprints:
     opacities: Tensor  # [N]
     depths: Tensor  # [N] radial distance, world units
     sort_key: Tensor  # [N] ascending = front to back
-    half_extents: Tensor  # [N, 2] pixels: |delta| beyond which the footprint is cut
+    boxes: Tensor  # [N, 4] pixel indices drawn: first column, end column, first row, end row; columns not reduced mod W
     visible: Tensor  # [N] bool
     width: int
     height: int
@@ -38,8 +38,8 @@ class Footprints:
 
     def touches_rows(self, indices: Tensor, first_row: int, last_row: int) -> Tensor:
         """Which of the Gaussians [K] may reach the pixel centres of rows first_row .. last_row - 1, [K] bool."""
-        v, half = self.centers[indices, 1].detach(), self.half_extents[indices, 1]
-        return (v + half >= first_row + 0.5) & (v - half <= last_row - 0.5)
+        boxes = self.boxes[indices]
+        return (boxes[:, 2] < last_row) & (boxes[:, 3] > first_row)
 
     def squared_distance(self, indices: Tensor, first_row: int, last_row: int) -> tuple[Tensor, Tensor]:
         """Squared distance q of each Gaussian [K] at each pixel centre of some rows, and whether it is in bounds.
@@ -47,17 +47,22 @@ class Footprints:
         Returns:
             q [rows, W, K], inside [rows, W, K] bool.
         """
-        centers, conics, half = self.centers[indices], self.conics[indices], self.half_extents[indices]
-        rows = torch.arange(first_row, last_row, dtype=centers.dtype, device=centers.device) + 0.5
-        columns = torch.arange(self.width, dtype=centers.dtype, device=centers.device) + 0.5
-        dv = rows[:, None, None] - centers[:, 1]
-        du = columns[None, :, None] - centers[:, 0]
-        if self.wrap:  # into [-W/2, W/2)
+        centers, conics, boxes = self.centers[indices], self.conics[indices], self.boxes[indices]
+        rows = torch.arange(first_row, last_row, dtype=centers.dtype, device=centers.device)
+        columns = torch.arange(self.width, dtype=centers.dtype, device=centers.device)
+        dv = rows[:, None, None] + 0.5 - centers[:, 1]
+        du = columns[None, :, None] + 0.5 - centers[:, 0]
+        if self.wrap:  # into [-W/2, W/2): the nearest copy across the seam
             turns = torch.floor((du.detach() + self.width / 2) / self.width)
             du = du - turns * self.width
+            columns = columns[None, :, None] - turns * self.width
+        else:
+            columns = columns[None, :, None]
         a, b, c = conics.unbind(-1)
         q = a * du * du + 2 * b * du * dv + c * dv * dv
-        return q, (du.detach().abs() <= half[:, 0]) & (dv.detach().abs() <= half[:, 1])
+        rows = rows[:, None, None]
+        inside = (columns >= boxes[:, 0]) & (columns < boxes[:, 1]) & (rows >= boxes[:, 2]) & (rows < boxes[:, 3])
+        return q, inside
 
 
 def project(
@@ -89,6 +94,9 @@ def project_erp(
     in_front = squared_radius.detach() > options.near**2
     # A culled mean may lie on the camera, where nothing is differentiable: move it before any division.
     means = torch.where(in_front[:, None], means, means.new_tensor([0.0, 0.0, 1.0]))
+    # So near the axis the chart has no derivative worth the name; such a footprint is held constant.
+    near_axis = (means[:, 0] ** 2 + means[:, 2] ** 2).detach() < (MIN_COS_LATITUDE**2) * squared_radius.detach()
+    means = torch.where(near_axis[:, None], means.detach(), means)
     radius = means.norm(dim=-1)
     centers = pixel_from_angles(*longitude_latitude(means), width, height)
     if probe is not None:
@@ -103,31 +111,38 @@ def project_erp(
     determinant = (minors**2).sum(-1) + options.low_pass * (var_u + var_v) + options.low_pass**2
     var_u, var_v = var_u + options.low_pass, var_v + options.low_pass
     conics = torch.stack((var_v, -cov_uv, var_u), dim=-1) / determinant[:, None]
-    half_extents, drawn = _half_extents(var_u.detach(), var_v.detach(), cov_uv.detach(), gaussians, options)
-    v = centers[:, 1].detach()
-    u = centers[:, 0].detach()
-    on_image = (v + half_extents[:, 1] >= 0.5) & (v - half_extents[:, 1] <= height - 0.5)
-    if not options.wrap:
-        on_image &= (u + half_extents[:, 0] >= 0.5) & (u - half_extents[:, 0] <= width - 0.5)
-    visible = in_front & drawn & on_image & torch.isfinite(conics.detach()).all(-1)
-    return Footprints(
-        centers, conics, gaussians.opacities, radius, radius, half_extents, visible, width, height, options.wrap
+    covariance = torch.stack((var_u, cov_uv, var_v), dim=-1).detach()
+    drawn = gaussians.opacities.detach() >= ALPHA_MIN
+    boxes = (_square_boxes if options.bounds == "square" else _exact_boxes)(
+        centers.detach(), covariance, gaussians.opacities.detach()
     )
+    on_image = (boxes[:, 3] > boxes[:, 2]) & (boxes[:, 3] > 0) & (boxes[:, 2] < height) & (boxes[:, 1] > boxes[:, 0])
+    if not options.wrap:
+        on_image &= (boxes[:, 1] > 0) & (boxes[:, 0] < width)
+    visible = in_front & drawn & on_image & torch.isfinite(conics.detach()).all(-1)
+    return Footprints(centers, conics, gaussians.opacities, radius, radius, boxes, visible, width, height, options.wrap)
 
 
-def _half_extents(
-    var_u: Tensor, var_v: Tensor, cov_uv: Tensor, gaussians: Gaussians, options: RenderOptions
-) -> tuple[Tensor, Tensor]:
-    """Half widths [N, 2] in pixels of the box that is drawn, and which Gaussians are drawn at all [N]."""
-    opacities = gaussians.opacities.detach()
-    if options.bounds == "square":
-        middle = 0.5 * (var_u + var_v)
-        determinant = var_u * var_v - cov_uv * cov_uv
-        longest = middle + torch.sqrt((middle * middle - determinant).clamp(min=0.1))
-        radius = torch.ceil(3 * torch.sqrt(longest))
-        return torch.stack((radius, radius), dim=-1), torch.ones_like(radius, dtype=torch.bool)
-    # opacity exp(-q / 2) >= 1/255  <=>  q <= k; the box of that ellipse has half widths sqrt(k var).
-    drawn = opacities >= ALPHA_MIN
+def _exact_boxes(centers: Tensor, covariance: Tensor, opacities: Tensor) -> Tensor:
+    """Pixels [N, 4] that can have alpha >= 1/255.
+
+    opacity exp(-q / 2) >= 1/255 is the ellipse q <= k with k = 2 ln(255 opacity); its box has half widths sqrt(k var).
+    """
     k = 2 * torch.log((opacities / ALPHA_MIN).clamp(min=1))
     slack = 1 + 1e-4  # rounding must never cost a contribution
-    return torch.sqrt(k[:, None] * torch.stack((var_u, var_v), dim=-1)) * slack + 1e-3, drawn
+    half = torch.sqrt(k[:, None] * covariance[:, [0, 2]]) * slack + 1e-3
+    first = torch.ceil(centers - half - 0.5)
+    end = torch.floor(centers + half - 0.5) + 1
+    return torch.stack((first[:, 0], end[:, 0], first[:, 1], end[:, 1]), dim=-1)
+
+
+def _square_boxes(centers: Tensor, covariance: Tensor, _opacities: Tensor) -> Tensor:
+    """Pixels [N, 4] drawn by the published code: 3 sigma of the longest axis both ways, rounded out to 16-pixel tiles."""
+    var_u, cov_uv, var_v = covariance.unbind(-1)
+    middle = 0.5 * (var_u + var_v)
+    determinant = var_u * var_v - cov_uv * cov_uv
+    longest = middle + torch.sqrt((middle * middle - determinant).clamp(min=0.1))
+    radius = torch.ceil(3 * torch.sqrt(longest))[:, None]
+    first = 16 * torch.floor((centers - 0.5 - radius) / 16)
+    end = 16 * torch.floor((centers - 0.5 + radius + 15) / 16)
+    return torch.stack((first[:, 0], end[:, 0], first[:, 1], end[:, 1]), dim=-1)

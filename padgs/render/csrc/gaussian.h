@@ -92,7 +92,7 @@ PADGS_HD Chart chart_at(Vec3 mean, float width, float height) {
   chart.cos_latitude = rho * inverse_r;
   chart.east = rho > 0 ? Vec3{mean.z / rho, 0, -mean.x / rho} : Vec3{1, 0, 0};
   chart.down = {chart.sin_latitude * chart.east.z, chart.cos_latitude, -chart.sin_latitude * chart.east.x};
-  chart.near_axis = chart.cos_latitude < kMinCosLatitude;
+  chart.near_axis = rho2 < kMinCosLatitude * kMinCosLatitude * (rho2 + mean.y * mean.y);
   chart.per_east = width / (2 * kPi) * inverse_r / std::fmax(chart.cos_latitude, kMinCosLatitude);
   chart.per_down = height / kPi * inverse_r;
   return chart;
