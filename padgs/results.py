@@ -1,0 +1,184 @@
+"""What a run has to say for itself, and its file `result.json`. Standard library only, so that reports need no torch.
+
+The file is written last and atomically: where it exists, the run is done. A run that failed has a result too, with its
+status instead of scores; it appears in the tables as such.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+SCHEMA = 1
+FILE_NAME = "result.json"
+STATUSES = {
+    "ok": "trained to the end and evaluated",
+    "oom": "an allocation failed, or memory would have passed the declared limit",
+    "nan": "a loss, gradient or parameter was not finite",
+    "diverged": "the loss rose well above its best and stayed there",
+    "collapsed": "next to nothing was left to draw",
+    "exploded": "sizes or counts left all bounds",
+    "degenerate": "the loss fell although the geometry was wrong",
+    "timeout": "the time limit came before the last iteration",
+    "rejected": "the input was refused with a clear error",
+}
+
+
+class ResultError(ValueError):
+    """A result file cannot be used; the message names the file, what is wrong with it, and the way out."""
+
+
+@dataclass(frozen=True)
+class Scores:
+    """The marks of one run under one protocol."""
+
+    metrics: dict[str, float]  # name -> mean over the test views
+    views: dict[str, dict[str, float]]  # view -> metric -> value
+    bands: dict[str, dict[str, float]] = field(default_factory=dict)  # latitude band -> metric -> mean over the views
+
+
+@dataclass(frozen=True)
+class Result:
+    """One finished run. Times are in seconds unless the name says ms; memory in bytes."""
+
+    run: str  # run id = name of the run folder
+    status: str  # key of STATUSES
+    method: str  # name in `baselines.METHODS`
+    variant: str  # row of an ablation; empty for none
+    dataset: str
+    scene: str
+    width: int  # of the test views, pixels
+    height: int
+    iterations: int  # asked for
+    iterations_done: int
+    seed: int
+    code_version: str
+    machine: str
+    config_hash: str
+    fingerprint: str  # of the data
+    finished: str  # UTC, ISO 8601
+    reason: str = ""  # why a run failed
+    scores: dict[str, Scores] = field(default_factory=dict)  # protocol -> marks
+    timing: dict[str, float] = field(default_factory=dict)  # train_seconds, render_ms_median, render_ms_p95, ...
+    counts: dict[str, int] = field(default_factory=dict)  # anchors, gaussians, ...
+    model_bytes: int = 0
+    peak_memory_bytes: int = 0
+    config: dict[str, Any] = field(default_factory=dict)  # the resolved configuration
+
+    def __post_init__(self) -> None:
+        """Reject a status that no table knows."""
+        if self.status not in STATUSES:
+            raise ValueError(f"unknown status {self.status!r}; known: {', '.join(STATUSES)}")
+
+    @property
+    def ok(self) -> bool:
+        """Whether the scores count."""
+        return self.status == "ok"
+
+
+def write(result: Result, folder: Path) -> Path:
+    """Write `result.json` into the run folder, whole or not at all; returns its path.
+
+    Raises:
+        OSError: the disk is full, the folder is read-only, ...; no file is left behind, an older one stays.
+    """
+    content = _encode(asdict(result))
+    document = {"schema": SCHEMA, "sha256": _digest(content), **content}
+    path = folder / FILE_NAME
+    replace_file(path, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
+    return path
+
+
+def read(path: Path) -> Result:
+    """Read one `result.json`.
+
+    Raises:
+        ResultError: it is missing, truncated, of another version, or was edited.
+    """
+    try:
+        document = json.loads(path.read_bytes())
+    except OSError as error:
+        raise ResultError(f"cannot read {path}: {error.strerror}") from error
+    except ValueError as error:
+        raise ResultError(f"{path} is not JSON ({error}); delete it and run again") from error
+    if not isinstance(document, dict) or "schema" not in document:
+        raise ResultError(f"{path} is not a result file (no schema); delete it and run again")
+    if document.pop("schema") != SCHEMA:
+        raise ResultError(f"{path} was written by another version (schema is not {SCHEMA}); run again with this one")
+    digest = document.pop("sha256", None)
+    known = {field.name for field in fields(Result)}
+    if document.keys() != known:
+        raise ResultError(
+            f"{path}: missing {sorted(known - document.keys())}, unknown {sorted(document.keys() - known)}; "
+            "delete it and run again"
+        )
+    if digest != _digest(document):
+        raise ResultError(f"{path} was edited after it was written (SHA-256 differs); delete it and run again")
+    try:
+        return Result(**document | {key: _DECODERS[key](document[key]) for key in _DECODERS})
+    except (ValueError, TypeError, AttributeError) as error:
+        raise ResultError(f"{path}: {error}; delete it and run again") from error
+
+
+def read_all(folder: Path) -> tuple[list[Result], list[ResultError]]:
+    """Results of all runs in a folder of run folders, in the order of their names, and what could not be read."""
+    results: list[Result] = []
+    errors: list[ResultError] = []
+    for path in sorted(folder.glob(f"*/{FILE_NAME}")):
+        try:
+            results.append(read(path))
+        except ResultError as error:
+            errors.append(error)
+    return results, errors
+
+
+def replace_file(path: Path, content: bytes) -> None:
+    """Write a file atomically: under a temporary name, forced to the disk, then renamed; or leave nothing behind."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        with temporary.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise
+
+
+def _digest(content: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True, allow_nan=False).encode()).hexdigest()
+
+
+def _encode(value: Any) -> Any:
+    """JSON has no infinity (the PSNR of a perfect image); such numbers are written as strings."""
+    if isinstance(value, dict):
+        return {str(key): _encode(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_encode(item) for item in value]
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _floats(table: dict[str, Any]) -> dict[str, float]:
+    return {name: float(value) for name, value in table.items()}
+
+
+def _scores(table: dict[str, Any]) -> dict[str, Scores]:
+    return {
+        protocol: Scores(
+            _floats(scores["metrics"]),
+            {view: _floats(values) for view, values in scores["views"].items()},
+            {band: _floats(values) for band, values in scores["bands"].items()},
+        )
+        for protocol, scores in table.items()
+    }
+
+
+_DECODERS = {"scores": _scores, "timing": _floats}

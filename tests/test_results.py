@@ -1,0 +1,114 @@
+import errno
+import json
+import math
+from dataclasses import replace
+
+import pytest
+
+from padgs import results
+from padgs.results import Result, ResultError, Scores
+
+
+@pytest.fixture
+def result() -> Result:
+    scores = Scores(
+        metrics={"psnr": 24.25, "ssim": 0.5},
+        views={"a": {"psnr": math.inf, "ssim": 1.0}, "b": {"psnr": 24.25, "ssim": 0.0}},
+        bands={"equator": {"psnr": 25.0}},
+    )
+    return Result(
+        run="padgs-room-0123456789",
+        status="ok",
+        method="padgs",
+        variant="full",
+        dataset="synthetic",
+        scene="room",
+        width=512,
+        height=256,
+        iterations=1500,
+        iterations_done=1500,
+        seed=0,
+        code_version="0.1.0",
+        machine="2 cores",
+        config_hash="ab",
+        fingerprint="cd",
+        finished="2026-11-21T00:00:00+00:00",
+        scores={"sphere": scores},
+        timing={"train_seconds": 0.1},
+        counts={"anchors": 3},
+        config={"method": {"tau": 0.9, "sizes": [1, 2]}},
+    )
+
+
+def test_what_is_written_is_read_again(result, tmp_path):
+    path = results.write(result, tmp_path)
+    assert results.read(path) == result
+    assert [p.name for p in tmp_path.iterdir()] == ["result.json"]
+
+
+def test_the_file_is_standard_json(result, tmp_path):
+    def refuse(name):
+        raise AssertionError(f"{name} is not JSON")
+
+    text = results.write(result, tmp_path).read_text()
+    assert json.loads(text, parse_constant=refuse)["scores"]["sphere"]["views"]["a"]["psnr"] == "inf"
+
+
+@pytest.mark.parametrize("bytes_left", [0, 1, 100, -2])
+def test_a_truncated_file_is_named(result, tmp_path, bytes_left):
+    path = results.write(result, tmp_path)
+    path.write_bytes(path.read_bytes()[:bytes_left])
+    with pytest.raises(ResultError, match=str(path)):
+        results.read(path)
+
+
+def test_an_edited_number_is_noticed(result, tmp_path):
+    path = results.write(result, tmp_path)
+    path.write_text(path.read_text().replace("25.0", "35.0"))
+    with pytest.raises(ResultError, match="edited"):
+        results.read(path)
+
+
+def test_another_schema_is_named(result, tmp_path):
+    path = results.write(result, tmp_path)
+    path.write_text(path.read_text().replace('"schema": 1', '"schema": 2'))
+    with pytest.raises(ResultError, match="another version"):
+        results.read(path)
+
+
+def test_missing_and_unknown_keys_are_listed(result, tmp_path):
+    path = results.write(result, tmp_path)
+    document = json.loads(path.read_text())
+    document["colour"] = document.pop("seed")
+    path.write_text(json.dumps(document))
+    with pytest.raises(ResultError, match=r"missing \['seed'\], unknown \['colour'\]"):
+        results.read(path)
+
+
+def test_unknown_status_lists_the_known(result):
+    with pytest.raises(ValueError, match="unknown status 'fine'; known: ok, oom, nan"):
+        replace(result, status="fine")
+
+
+def test_a_full_disk_leaves_the_old_file_and_no_litter(result, tmp_path, monkeypatch):
+    path = results.write(result, tmp_path)
+
+    def full(descriptor):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(results.os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        results.write(replace(result, seed=1), tmp_path)
+    assert results.read(path) == result
+    assert [p.name for p in tmp_path.iterdir()] == ["result.json"]
+
+
+def test_read_all_keeps_the_good_and_names_the_bad(result, tmp_path):
+    for name in ("b", "a", "c"):
+        (tmp_path / name).mkdir()
+        results.write(replace(result, run=name), tmp_path / name)
+    (tmp_path / "b" / "result.json").write_text("{")
+    (tmp_path / "unfinished").mkdir()
+    good, bad = results.read_all(tmp_path)
+    assert [r.run for r in good] == ["a", "c"]
+    assert len(bad) == 1 and "b/result.json" in str(bad[0])
