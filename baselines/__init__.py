@@ -1,0 +1,6 @@
+"""The methods that are compared, one file each; `padgs.method.Method` is what they have in common."""
+
+METHODS = {
+    "padgs": "baselines.padgs:PaDGSMethod",
+    "omnigs": "baselines.omnigs:OmniGSMethod",
+}

@@ -1,0 +1,153 @@
+"""Densification of explicit Gaussians, as 3DGS and OmniGS do it: clone the small, split the large, prune the faint.
+
+A Gaussian whose projected mean is pulled hard, on average over the views since the last round, marks a place where
+there are too few. Where it is small it is copied, where it is large two smaller ones sampled from it take its place.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from padgs.gaussians import rotation_matrices
+from padgs.rows import append_rows, keep_rows
+from padgs.schedule import scaled
+from padgs.splats import Splats
+
+MIN_DENSIFY_EVERY = 50  # iterations; the mean gradient over fewer views is mostly noise
+MIN_RESET_EVERY = 500  # iterations; after a reset opacities need some 200 steps of Adam, however long the run
+PIECES = 2  # a split Gaussian becomes this many
+SHRINK = 0.8 * PIECES  # ... each smaller by this factor
+RESET_OPACITY = 0.01
+
+
+@dataclass(frozen=True)
+class CloneSplitOptions:
+    """When and where Gaussians multiply and vanish. Iterations are those of a published run; see `for_run`."""
+
+    densify_from: int = 500  # Gaussians multiply and are pruned after this iteration
+    densify_until: int = 15_000  # ... and before this one
+    densify_every: int = 100
+    gradient_threshold: float = 2e-4  # in the units of a render's probe, for a loss that is a plain mean
+    percent_dense: float = 0.01  # largest scale that is cloned rather than split, in extents
+    min_opacity: float = 0.005  # fainter Gaussians are pruned
+    prune_by_extent: bool = False  # also prune scales above max_scale; empties scenes of tiny camera motion
+    max_scale: float = 0.1  # in extents
+    reset_every: int = 3000  # iterations between opacity resets
+    max_gaussians: int | None = 1_000_000  # with more candidates, those with the largest gradients multiply
+    released_start: bool = False  # bug of the released OmniGS: densify_from is read as 0
+    released_reset: bool = False  # bug of the released OmniGS: resets clear Adam moments but keep the opacities
+
+    def __post_init__(self) -> None:
+        """Reject intervals and limits without a meaning."""
+        for name in ("densify_every", "reset_every"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1 iteration")
+        if self.max_gaussians is not None and self.max_gaussians < 1:
+            raise ValueError(f"max_gaussians is {self.max_gaussians}; it must be at least 1, or none for no limit")
+
+    def for_run(self, iterations: int) -> CloneSplitOptions:
+        """The same phases in a run of another length: every window is the same share of the run as published.
+
+        The intervals shrink too, but not below `MIN_DENSIFY_EVERY` and `MIN_RESET_EVERY`: short runs have fewer rounds
+        and fewer resets.
+        """
+        every = scaled(self.densify_every, iterations)
+        return replace(
+            self,
+            densify_from=scaled(self.densify_from, iterations),
+            densify_until=scaled(self.densify_until, iterations),
+            densify_every=max(min(MIN_DENSIFY_EVERY, self.densify_every), every),
+            reset_every=max(min(MIN_RESET_EVERY, self.reset_every), scaled(self.reset_every, iterations)),
+        )
+
+
+class CloneSplit:
+    """Densification of one model.
+
+    Attributes:
+        statistics: sums since the last round, one row per Gaussian: gradient [N] norms, seen [N] iterations.
+        generator: source of the random positions of split Gaussians, on the CPU.
+    """
+
+    def __init__(self, splats: Splats, options: CloneSplitOptions, *, extent: float, seed: int = 0) -> None:
+        """Start with empty statistics; `extent` is the length that sizes are compared with, in world units."""
+        self.splats, self.options, self.extent = splats, options, extent
+        self.generator = torch.Generator().manual_seed(seed)
+        self.statistics = self._empty()
+
+    def observe(self, gradient: Tensor, visible: Tensor, iteration: int) -> None:
+        """Add one view: gradient [N, 2] of the loss by the probe of `padgs.render.render`, and visible [N] bool."""
+        if iteration < self.options.densify_until:
+            self.statistics["gradient"] += torch.where(visible, gradient.norm(dim=-1), 0.0)
+            self.statistics["seen"] += visible
+
+    @torch.no_grad()
+    def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
+        """Clone, split, prune and reset opacities where it is time to; returns what happened."""
+        options = self.options
+        if iteration >= options.densify_until:
+            return ()
+        events = []
+        begin = 0 if options.released_start else options.densify_from
+        if iteration > begin and iteration % options.densify_every == 0:
+            cloned, split = self._multiply(optimizer)
+            pruned = self._prune(optimizer)
+            self.statistics = self._empty()
+            events.append(f"cloned {cloned}, split {split}, pruned {pruned} Gaussians")
+        if iteration % options.reset_every == 0:
+            self._reset_opacities(optimizer)
+            events.append("reset opacities")
+        return tuple(events)
+
+    def _multiply(self, optimizer: torch.optim.Adam) -> tuple[int, int]:
+        """Clone and split; returns how many of each. Each adds one Gaussian to the count, within `max_gaussians`."""
+        rows = self.splats.rows()
+        mean_gradient = self.statistics["gradient"] / self.statistics["seen"].clamp(min=1)
+        chosen = mean_gradient >= self.options.gradient_threshold
+        if self.options.max_gaussians is not None:
+            room = max(0, self.options.max_gaussians - len(chosen))
+            if int(chosen.sum()) > room:
+                strongest = torch.argsort(mean_gradient, descending=True, stable=True)[:room]
+                chosen = torch.zeros_like(chosen).index_fill(0, strongest, True)
+        small = torch.exp(self.splats.log_scales).amax(-1) <= self.options.percent_dense * self.extent
+        clones = {name: parameter[chosen & small] for name, parameter in rows.items()}
+        pieces = self._pieces(chosen & ~small)
+        append_rows(rows, optimizer, {name: torch.cat((clones[name], pieces[name])) for name in rows})
+        replaced = torch.zeros(len(self.splats), dtype=torch.bool, device=chosen.device)
+        replaced[: len(chosen)] = chosen & ~small
+        keep_rows(rows, optimizer, ~replaced)
+        return len(clones["means"]), len(pieces["means"]) // PIECES
+
+    def _pieces(self, split: Tensor) -> dict[str, Tensor]:
+        """What takes the place of the Gaussians marked in split [N]: smaller ones, at random places inside them."""
+        pieces = {name: parameter[split].repeat_interleave(PIECES, 0) for name, parameter in self.splats.rows().items()}
+        scales = torch.exp(pieces["log_scales"])
+        steps = torch.randn(scales.shape, generator=self.generator).to(scales) * scales
+        pieces["means"] = pieces["means"] + (rotation_matrices(pieces["quats"]) @ steps[..., None])[..., 0]
+        pieces["log_scales"] = pieces["log_scales"] - math.log(SHRINK)
+        return pieces
+
+    def _prune(self, optimizer: torch.optim.Adam) -> int:
+        keep = torch.sigmoid(self.splats.opacity_logits) >= self.options.min_opacity
+        if self.options.prune_by_extent:
+            keep &= torch.exp(self.splats.log_scales).amax(-1) <= self.options.max_scale * self.extent
+        keep_rows(self.splats.rows(), optimizer, keep)
+        return int((~keep).sum())
+
+    def _reset_opacities(self, optimizer: torch.optim.Adam) -> None:
+        """Make everything nearly transparent, so that only what the images ask for comes back."""
+        logits = self.splats.opacity_logits
+        if not self.options.released_reset:
+            logits.clamp_(max=math.log(RESET_OPACITY / (1 - RESET_OPACITY)))
+        moments = optimizer.state.get(logits, {})
+        for name in ("exp_avg", "exp_avg_sq"):
+            if name in moments:
+                moments[name].zero_()
+
+    def _empty(self) -> dict[str, Tensor]:
+        zeros = self.splats.means.new_zeros(len(self.splats))
+        return {"gradient": zeros, "seen": zeros.clone()}
