@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 import torch
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from padgs.scene import Scene
@@ -40,14 +40,14 @@ def points_from_cells(cells: Tensor, size: float, dtype: torch.dtype = torch.flo
 def cell_keys(cells: Tensor) -> Tensor:
     """One int64 for each row [N] of cells [N, 3], equal exactly where the rows are equal, in lexicographic order.
 
-    A number with three digits, one per axis. Where the ranges are too wide for 64 bits (a far outlier in the cloud) the
-    digits are ranks among the values that occur, of which there are at most N.
+    A number with three digits, one per axis; or, where those are too wide for 64 bits (a far outlier in the cloud), the
+    rank among the distinct rows, which takes longer to find.
     """
     if len(cells) == 0:
         return cells.new_zeros(0)
     digits = cells - cells.min(0).values
     if math.prod(side + 1 for side in digits.max(0).values.tolist()) >= 2**63:
-        digits = torch.stack([torch.unique(axis, return_inverse=True)[1] for axis in cells.unbind(-1)], dim=-1)
+        return torch.unique(cells, dim=0, return_inverse=True)[1]
     _, base_y, base_z = (digits.max(0).values + 1).unbind(-1)
     return (digits[:, 0] * base_y + digits[:, 1]) * base_z + digits[:, 2]
 
@@ -78,7 +78,7 @@ def anchors_from_points(points: Tensor, voxel_size: float) -> Tensor:
     if len(points) == 0:
         raise ValueError("the point cloud is empty; anchors start from points, so the scene needs at least one")
     if not torch.isfinite(points).all():
-        bad = (~torch.isfinite(points).all(-1)).nonzero()[0].item()
+        bad = int((~torch.isfinite(points).all(-1)).nonzero()[0])
         raise ValueError(f"point {bad} of the cloud is {points[bad].tolist()}; remove points that are not finite")
     cells, _ = unique_cells(cells_from_points(points, voxel_size))
     return points_from_cells(cells, voxel_size)
@@ -93,6 +93,6 @@ def initial_log_scales(positions: Tensor, voxel_size: float) -> Tensor:
     if neighbours < 1:
         return positions.new_full((len(positions), 6), math.log(voxel_size))
     xyz = positions.double().cpu().numpy()
-    distances, _ = cKDTree(xyz).query(xyz, k=neighbours + 1)  # the first is the anchor itself, at distance 0
+    distances, _ = KDTree(xyz).query(xyz, k=neighbours + 1)  # the first is the anchor itself, at distance 0
     mean_square = torch.from_numpy(distances[:, 1:]).square().mean(-1)
     return (0.5 * torch.log(mean_square)).to(positions)[:, None].repeat(1, 6)

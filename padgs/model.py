@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -136,6 +137,26 @@ class PaDGS(nn.Module):
     def rows(self) -> dict[str, nn.Parameter]:
         """The parameters that have one row per anchor."""
         return {"offsets": self.offsets, "features": self.features, "log_scales": self.log_scales}
+
+    def load(self, tensors: Mapping[str, Tensor]) -> None:
+        """Take over what `state_dict` of another model gave; the number of anchors may differ, all else may not.
+
+        The parameters stay the same objects, so an optimiser that holds them goes on doing so.
+
+        Raises:
+            ValueError: a tensor is missing, or has another shape than the options of this model make it.
+        """
+        own = self.state_dict()
+        count = len(tensors["positions"]) if "positions" in tensors else 0
+        for name, mine in own.items():
+            shape = [count, *mine.shape[1:]] if name in (*self.rows(), "positions") else list(mine.shape)
+            given = list(tensors[name].shape) if name in tensors else None
+            if given != shape:
+                raise ValueError(f"{name} of the stored model has shape {given}; with these options it is {shape}")
+        for name, parameter in self.named_parameters():
+            parameter.data = tensors[name].to(parameter).clone()
+            parameter.grad = None
+        self.positions = tensors["positions"].to(self.positions).clone()
 
     @torch.no_grad()
     def centers(self) -> Tensor:

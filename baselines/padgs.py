@@ -1,0 +1,182 @@
+"""PaD-GS as a method: anchors whose Gaussians are decoded for each view, with distortion-aware opacity.
+
+Presets: `padgs`, the paper as written, and `padgs_release`, the released code where it differs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+
+from padgs.anchor_training import TrainablePaDGS
+from padgs.grow import RELEASED_GROWTH, Growth, GrowthOptions
+from padgs.method import Budget, Record, RenderConfig, Size, State
+from padgs.model import RELEASED_MODEL, PaDGS, PaDGSOptions
+from padgs.render import Rendering, render
+from padgs.scene import Scene, View
+from padgs.schedule import Constant, LogLinear, ParameterGroup
+from padgs.train import Trainer, TrainOptions, model_state
+
+OFFSET_RATE_UNITS = ("scene", "world")
+MIN_TRAVEL = 0.1  # scene units; cameras that hardly move, or a single one, must still be able to place Gaussians
+
+
+@dataclass(frozen=True)
+class LearningRates:
+    """Learning rates of Adam; pairs are the first and the last of a log-linear decay over the run."""
+
+    offsets: tuple[float, float] = (0.01, 0.0001)  # times the extent of the cameras in `offset_unit`
+    offset_unit: str = "scene"  # scene: Scene.unit, so the world's units do not matter | world: as published
+    features: float = 0.0075
+    log_scales: float = 0.007
+    opacity: tuple[float, float] = (0.002, 2e-5)
+    color: tuple[float, float] = (0.008, 5e-5)
+    covariance: tuple[float, float] = (0.004, 0.004)
+
+    def __post_init__(self) -> None:
+        """Reject unknown units."""
+        if self.offset_unit not in OFFSET_RATE_UNITS:
+            raise ValueError(f"unknown offset_unit {self.offset_unit!r}; known: {', '.join(OFFSET_RATE_UNITS)}")
+
+    def groups(self, model: PaDGS, scene: Scene, iterations: int) -> list[ParameterGroup]:
+        """The parameters of a model with their rates in a run of `iterations` on a scene."""
+        travel = max(scene.extent, MIN_TRAVEL * scene.unit) / (scene.unit if self.offset_unit == "scene" else 1.0)
+        groups = [
+            ParameterGroup(
+                "offsets", (model.offsets,), LogLinear(*(travel * r for r in self.offsets), steps=iterations)
+            ),
+            ParameterGroup("features", (model.features,), Constant(self.features)),
+            ParameterGroup("log_scales", (model.log_scales,), Constant(self.log_scales)),
+        ]
+        for head in ("opacity", "color", "covariance"):
+            weights = tuple(getattr(model.decoder, head).values())
+            groups.append(ParameterGroup(head, weights, LogLinear(*getattr(self, head), steps=iterations)))
+        return groups
+
+
+@dataclass(frozen=True)
+class PaDGSMethodOptions:
+    """The `method` group of the configuration."""
+
+    model: PaDGSOptions = field(default_factory=PaDGSOptions)
+    growth: GrowthOptions = field(default_factory=GrowthOptions)
+    rates: LearningRates = field(default_factory=LearningRates)
+    scale_windows: bool = True  # growth keeps its share of the run; false: its iterations are taken as they stand
+
+
+PRESETS: dict[str, dict[str, dict[str, Any]]] = {
+    "padgs": {"model": {}, "growth": {}, "rates": {}, "render": {}, "train": {}},
+    "padgs_release": {
+        "model": RELEASED_MODEL,
+        "growth": RELEASED_GROWTH,
+        "rates": {"offset_unit": "world"},
+        "render": {"near": 0.2, "near_unit": "world", "wrap": False, "bounds": "square"},
+        "train": {"weight": "end_rows", "normalisation": "channel_sum"},
+    },
+}
+
+
+def preset(name: str) -> tuple[PaDGSMethodOptions, RenderConfig, TrainOptions]:
+    """The three groups of options of a preset.
+
+    Raises:
+        ValueError: no such preset.
+    """
+    if name not in PRESETS:
+        raise ValueError(f"unknown preset {name!r}; known: {', '.join(PRESETS)}")
+    of = PRESETS[name]
+    method = PaDGSMethodOptions(
+        PaDGSOptions(**of["model"]), GrowthOptions(**of["growth"]), LearningRates(**of["rates"])
+    )
+    return method, RenderConfig(**of["render"]), TrainOptions(**of["train"])
+
+
+class PaDGSMethod:
+    """`padgs.method.Method`."""
+
+    Options = PaDGSMethodOptions
+
+    def __init__(
+        self,
+        options: PaDGSMethodOptions = PaDGSMethodOptions(),
+        render: RenderConfig = RenderConfig(),  # noqa: B008
+        train: TrainOptions = TrainOptions(),  # noqa: B008
+        seed: int = 0,
+    ) -> None:
+        """A method without a model yet; `fit` or `load_state` makes it."""
+        self.options, self.render_config, self.train_options, self.seed = options, render, train, seed
+        self._model: PaDGS | None = None
+        self._scene_unit = 0.0
+        self._trainer: Trainer | None = None
+        self._start: State | None = None
+
+    def fit(self, scene: Scene, budget: Budget) -> Iterator[Record]:
+        """Train, from the point cloud or from where the loaded state was taken; see `padgs.method.Method`."""
+        if self._start is None:
+            self._model = PaDGS.from_scene(scene, self.options.model, seed=self.seed)
+        self._scene_unit = scene.unit
+        windows = self.options.growth
+        windows = windows.for_run(budget.iterations) if self.options.scale_windows else windows
+        trainee = TrainablePaDGS(
+            self.model,
+            Growth(self.model, windows, seed=self.seed),
+            self.options.rates.groups(self.model, scene, budget.iterations),
+            self.render_config.options(scene.unit),
+            self.render_config.backend,
+        )
+        self._trainer = Trainer(trainee, scene, budget, self.train_options, self.seed)
+        if self._start is not None:
+            self._trainer.load_state(self._start)
+        return self._trainer.records()
+
+    @property
+    def model(self) -> PaDGS:
+        """The model.
+
+        Raises:
+            RuntimeError: neither `fit` nor `load_state` has been called.
+        """
+        if self._model is None:
+            raise RuntimeError("PaD-GS has no model yet; call fit or load_state first")
+        return self._model
+
+    @torch.no_grad()
+    def render(self, view: View) -> Rendering:
+        """Decode and render a view without gradients."""
+        options = self.render_config.options(self._scene_unit)
+        return render(self.model.decode(view).gaussians, view, options, backend=self.render_config.backend)
+
+    def state(self) -> State:
+        """Everything that going on bit-identically needs.
+
+        Raises:
+            RuntimeError: training has not begun.
+        """
+        if self._trainer is None:
+            raise RuntimeError("PaD-GS has no training state; call fit first")
+        state = self._trainer.state()
+        return State(state.tensors, {**state.values, "scene_unit": self._scene_unit})
+
+    def load_state(self, state: State) -> None:
+        """Become the method that `state` was taken of; `render` works at once, `fit` goes on from there."""
+        stored = model_state(state)
+        positions, log_scales = stored.tensors["positions"], stored.tensors["log_scales"]
+        unit, voxel_size = stored.values["unit"], stored.values["voxel_size"]
+        model = PaDGS(positions, log_scales, self.options.model, voxel_size=voxel_size, unit=unit)
+        model.load(stored.tensors)
+        self._model, self._start, self._trainer = model, state, None
+        self._scene_unit = state.values["scene_unit"]
+
+    def size(self) -> Size:
+        """Anchors, the Gaussians that they can show, and the bytes of the stored model."""
+        model = self.model
+        counts = {"anchors": len(model), "gaussians": len(model) * model.options.offsets}
+        tensors = model.state_dict().values()
+        return Size(
+            counts,
+            parameters=sum(p.numel() for p in model.parameters()),
+            bytes=sum(t.numel() * t.element_size() for t in tensors),
+        )
