@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from padgs.distortion import end_row_weight, solid_angle_weight
+from padgs.fused_loss import fits, fused_photometric_loss
 
 WINDOW, SIGMA = 11, 1.5  # SSIM window in pixels
 C1, C2 = 0.01**2, 0.03**2
@@ -64,6 +65,8 @@ def photometric_loss(
         raise ValueError(f"unknown normalisation {normalisation!r}; known: {', '.join(NORMALISATIONS)}")
     height, width, channels = image.shape
     total = weight.expand(height, width).sum() * (channels if normalisation == "mean" else 1)
+    if fits(image):
+        return fused_photometric_loss(image, target, weight, lambda_l1, float(total))
     per_channel = lambda_l1 * (image - target).abs() + (1 - lambda_l1) * (1 - ssim_map(image, target, moments))
     return (weight[..., None] * per_channel).sum() / total
 

@@ -6,14 +6,12 @@ is the definition.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
 from padgs.gaussians import Gaussians
 from padgs.registry import lookup
-from padgs.render.contract import RenderOptions, Rendering, check_inputs
+from padgs.render.contract import Rendering, RenderOptions, check_inputs
 from padgs.scene import View
 
 BACKENDS = {
@@ -44,7 +42,7 @@ def render(
         background: [3] RGB behind everything; black if not given.
         probe: [N, 2] zeros added to the projected means in normalised image units (x and y each run over 2 across the
             image, as in 3DGS); its gradient after `backward` is the densification signal.
-        backend: a name of `BACKENDS`, or auto: cpu for float32 tensors on the CPU where the library is built, else torch.
+        backend: a name of `BACKENDS`, or auto: cpu for float32 tensors on the CPU if the library is built, else torch.
         check_values: also check that all numbers are sane; a pass over the tensors, meant for tests and debugging.
 
     Raises:

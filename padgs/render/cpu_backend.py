@@ -1,7 +1,7 @@
 """The native CPU rasterizer: tiles, SIMD, OpenMP (csrc/), wrapped as one `torch.autograd.Function`. float32 only.
 
-Results do not depend on the number of threads: tiles write their own pixels, every (Gaussian, tile) instance has its own
-slot for the moments of the backward pass, and the slots of a Gaussian are summed in order.
+Results do not depend on the number of threads: tiles write their own pixels, every (Gaussian, tile) instance has its
+own slot for the moments of the backward pass, and the slots of a Gaussian are summed in order.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from torch.autograd.function import once_differentiable
 
 from padgs.gaussians import Gaussians
 from padgs.render import native
-from padgs.render.contract import RenderOptions, Rendering
+from padgs.render.contract import Rendering, RenderOptions
 from padgs.render.native import pointer
 
 TILE = 16

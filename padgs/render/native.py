@@ -12,7 +12,7 @@ import os
 import sys
 from pathlib import Path
 
-import torch  # first: the library then shares torch's OpenMP threads, and torch.set_num_threads holds for it too
+import torch  # noqa: F401 - first: the library then shares torch's OpenMP threads and thread count
 from torch import Tensor
 
 Pointer = ctypes.c_void_p
@@ -74,6 +74,24 @@ class BlendGradientArguments(ctypes.Structure):
     ]
 
 
+class LossArguments(ctypes.Structure):
+    """`padgs::LossArguments`."""
+
+    _fields_ = [
+        ("width", ctypes.c_int32),
+        ("height", ctypes.c_int32),
+        ("image", Pointer),
+        ("target", Pointer),
+        ("weight", Pointer),
+        ("weight_row_stride", ctypes.c_int64),
+        ("weight_column_stride", ctypes.c_int64),
+        ("lambda_l1", ctypes.c_float),
+        ("normalizer", ctypes.c_float),
+        ("workspace", Pointer),
+        ("gradient", Pointer),
+    ]
+
+
 def pointer(tensor: Tensor | None) -> int | None:
     """Address of a contiguous tensor, or None."""
     if tensor is None:
@@ -121,6 +139,8 @@ def _declare(loaded: ctypes.CDLL) -> None:
         "padgs_bin": ([Pointer, i64, Pointer, i64, i32, i32, i32, Pointer, Pointer, Pointer, Pointer], None),
         "padgs_blend_forward": ([Pointer], None),
         "padgs_blend_backward": ([Pointer], None),
+        "padgs_photometric_loss": ([Pointer], ctypes.c_double),
+        "padgs_loss_workspace": ([i32, i32], i64),
     }
     for name, (arguments, result) in signatures.items():
         function = getattr(loaded, name)

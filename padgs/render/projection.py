@@ -6,7 +6,6 @@ J of Eq. 6-7 at the mean (Eq. 3), and q = delta^T S^-1 delta in pixels.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -137,7 +136,7 @@ def _exact_boxes(centers: Tensor, covariance: Tensor, opacities: Tensor) -> Tens
 
 
 def _square_boxes(centers: Tensor, covariance: Tensor, _opacities: Tensor) -> Tensor:
-    """Pixels [N, 4] drawn by the published code: 3 sigma of the longest axis both ways, rounded out to 16-pixel tiles."""
+    """Pixels [N, 4] that the published code draws: 3 sigma of the longest axis, rounded out to 16-pixel tiles."""
     var_u, cov_uv, var_v = covariance.unbind(-1)
     middle = 0.5 * (var_u + var_v)
     determinant = var_u * var_v - cov_uv * cov_uv

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from padgs.gaussians import Gaussians
-from padgs.render.contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, RenderOptions, Rendering
+from padgs.render.contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Rendering, RenderOptions
 from padgs.render.projection import project
 
 PAIRS_PER_CHUNK = 1 << 22  # (pixel, Gaussian) pairs held at once

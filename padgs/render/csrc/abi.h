@@ -80,4 +80,15 @@ struct BlendGradientArguments {
   float *moments;                                             // [I, kMoments] by slot
 };
 
+struct LossArguments {
+  int32_t width, height;
+  const float *image, *target;  // [H,W,3]
+  const float *weight;          // [H,W], or fewer values with a stride of 0
+  int64_t weight_row_stride, weight_column_stride;
+  float lambda_l1;
+  float normalizer;  // 1 / (sum of weights, times 3 for a mean over channels)
+  float *workspace;  // padgs_loss_workspace(H, W) floats, zero before the first call
+  float *gradient;   // [H,W,3], dL/dimage, or null
+};
+
 }  // namespace padgs

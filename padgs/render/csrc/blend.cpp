@@ -232,8 +232,8 @@ void blend_backward(const BlendGradientArguments &args) {
 
 }  // namespace
 
-extern const Kernels table;
-const Kernels table = {PADGS_ISA_NAME, blend_forward, blend_backward};
+extern const BlendKernels blend_kernels;
+const BlendKernels blend_kernels = {blend_forward, blend_backward};
 
 }  // namespace PADGS_ISA
 }  // namespace padgs

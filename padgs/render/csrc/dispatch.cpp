@@ -1,40 +1,62 @@
-// Chooses the instruction set once, at the first call. PADGS_ISA=baseline|avx2|avx512 forces one, for tests.
+// Chooses the instruction set once, at the first call. PADGS_ISA=baseline|avx2|avx512 asks for at most that one.
 #include <cstdlib>
 #include <cstring>
 
 #include "kernels.h"
 
 namespace padgs {
-namespace baseline { extern const Kernels table; }
+
+#define PADGS_DECLARE(isa)                    \
+  namespace isa {                             \
+  extern const BlendKernels blend_kernels;    \
+  extern const LossKernels loss_kernels;      \
+  }
+PADGS_DECLARE(baseline)
 #if PADGS_ISA_COUNT > 1
-namespace avx2 { extern const Kernels table; }
-namespace avx512 { extern const Kernels table; }
+PADGS_DECLARE(avx2)
+PADGS_DECLARE(avx512)
 #endif
 
-static const Kernels &choose() {
+struct Kernels {
+  const char *name;
+  const BlendKernels &blend;
+  const LossKernels &loss;
+};
+
+#define PADGS_KERNELS(isa) {#isa, isa::blend_kernels, isa::loss_kernels}
+
+static Kernels choose() {
 #if PADGS_ISA_COUNT > 1
+  const char *limit = std::getenv("PADGS_ISA");
+  const auto allowed = [&](const char *isa) {
+    return !limit || std::strcmp(limit, isa) == 0 || std::strcmp(limit, "avx512") == 0;
+  };
   const bool has_avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
   const bool has_avx512 = has_avx2 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
                           __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl");
-  const char *forced = std::getenv("PADGS_ISA");
-  const bool any = forced == nullptr;
-  if (has_avx512 && (any || std::strcmp(forced, "avx512") == 0)) return avx512::table;
-  if (has_avx2 && (any || std::strcmp(forced, "avx512") == 0 || std::strcmp(forced, "avx2") == 0)) return avx2::table;
+  if (has_avx512 && allowed("avx512")) return PADGS_KERNELS(avx512);
+  if (has_avx2 && allowed("avx2")) return PADGS_KERNELS(avx2);
 #endif
-  return baseline::table;
+  return PADGS_KERNELS(baseline);
 }
 
-const Kernels &kernels() {
-  static const Kernels &chosen = choose();
+static const Kernels &kernels() {
+  static const Kernels chosen = choose();
   return chosen;
 }
 
 }  // namespace padgs
 
-PADGS_API const char *padgs_isa() { return padgs::kernels().name; }
+using namespace padgs;
 
-PADGS_API void padgs_blend_forward(const padgs::BlendArguments *args) { padgs::kernels().blend_forward(*args); }
+PADGS_API const char *padgs_isa() { return kernels().name; }
 
-PADGS_API void padgs_blend_backward(const padgs::BlendGradientArguments *args) {
-  padgs::kernels().blend_backward(*args);
+PADGS_API void padgs_blend_forward(const BlendArguments *args) { kernels().blend.forward(*args); }
+
+PADGS_API void padgs_blend_backward(const BlendGradientArguments *args) { kernels().blend.backward(*args); }
+
+PADGS_API double padgs_photometric_loss(const LossArguments *args) { return kernels().loss.photometric(*args); }
+
+PADGS_API int64_t padgs_loss_workspace(int32_t height, int32_t width) {
+  return kernels().loss.workspace(height, width);
 }

@@ -5,12 +5,14 @@
 
 namespace padgs {
 
-struct Kernels {
-  const char *name;
-  void (*blend_forward)(const BlendArguments &);
-  void (*blend_backward)(const BlendGradientArguments &);
+struct BlendKernels {
+  void (*forward)(const BlendArguments &);
+  void (*backward)(const BlendGradientArguments &);
 };
 
-const Kernels &kernels();  // the best set that this processor can run; see dispatch.cpp
+struct LossKernels {
+  double (*photometric)(const LossArguments &);
+  int64_t (*workspace)(int32_t height, int32_t width);
+};
 
 }  // namespace padgs
