@@ -1,0 +1,156 @@
+"""Time, memory and the machine they were measured on, as plain dicts that go into results as they are.
+
+Both clocks are read: wall time is what the user waits, CPU time what the work costs; on a machine that others use too
+they come apart, and then the smallest of several repeats says most.
+"""
+
+from __future__ import annotations
+
+import datetime
+import os
+import platform
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from importlib import metadata
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+
+T = TypeVar("T")
+Device = torch.device | str
+
+
+def synchronise(device: Device = "cpu") -> None:
+    """Wait until the device has done all it was given; without it a GPU is timed at being asked, not at working."""
+    if torch.device(device).type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def timed(work: Callable[[], T], device: Device = "cpu") -> tuple[T, float]:
+    """The value of `work()` and the wall time in seconds that it took, on the device too."""
+    synchronise(device)
+    start = time.perf_counter()
+    value = work()
+    synchronise(device)
+    return value, time.perf_counter() - start
+
+
+def measure(
+    work: Callable[[], object], *, repeats: int = 10, warm_up: int = 2, device: Device = "cpu"
+) -> dict[str, Any]:
+    """Time `work()` several times after some that do not count.
+
+    Returns:
+        {"repeats": n, "wall": {"median", "p95", "min"}, "cpu": {the same}} in seconds; CPU time is summed over threads.
+
+    Raises:
+        ValueError: fewer than one repeat, or a negative warm-up.
+    """
+    if repeats < 1 or warm_up < 0:
+        raise ValueError(f"repeats is {repeats} and warm_up {warm_up}; they must be at least 1 and 0")
+    for _ in range(warm_up):
+        work()
+    wall, cpu = [], []
+    for _ in range(repeats):
+        cpu_start = time.process_time()
+        wall.append(timed(work, device)[1])
+        cpu.append(time.process_time() - cpu_start)
+    return {"repeats": repeats, "wall": summary(wall), "cpu": summary(cpu)}
+
+
+def summary(seconds: list[float]) -> dict[str, float]:
+    """Median, 95th percentile (the smallest value that 95 % do not exceed) and minimum.
+
+    >>> summary([3.0, 1.0, 2.0])
+    {'median': 2.0, 'p95': 3.0, 'min': 1.0}
+    """
+    ordered = sorted(seconds)
+    rank = -(-95 * len(ordered) // 100)
+    return {"median": statistics.median(ordered), "p95": ordered[rank - 1], "min": ordered[0]}
+
+
+def reset_peak_memory(device: Device = "cpu") -> None:
+    """Forget the peak so far, so that several runs in one process are told apart (host: Linux only)."""
+    if torch.device(device).type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:
+        return  # not Linux, or not allowed: the peak is that of the whole process
+
+
+def peak_memory(device: Device = "cpu") -> dict[str, int | None]:
+    """Peak memory in bytes since `reset_peak_memory` or the start: of the process, and of its tensors on the device.
+
+    {"host": bytes, "device": bytes, or None on the CPU}
+    """
+    on_device = torch.cuda.max_memory_allocated(device) if torch.device(device).type == "cuda" else None
+    return {"host": _peak_resident(), "device": on_device}
+
+
+def machine(device: Device = "cpu") -> dict[str, Any]:
+    """What a measurement needs to be read later: hardware, versions, code, date."""
+    gpu = torch.device(device) if torch.device(device).type == "cuda" else None
+    return {
+        "cpu": _cpu_model(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "memory": os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
+        "gpu": torch.cuda.get_device_name(gpu) if gpu else None,
+        "os": platform.platform(),
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "cuda": torch.version.cuda if gpu else None,
+        "padgs": _package_version(),
+        "commit": commit(),
+        "date": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
+    }
+
+
+def commit(folder: Path | None = None) -> str | None:
+    """Commit of the checkout that this code is run from, with "+" if files differ from it; None outside a checkout."""
+    folder = Path(__file__).resolve().parent.parent if folder is None else folder
+    if not (folder / ".git").exists():
+        return None  # without this check, an installed package would report whatever repository lies around it
+    head = _git(folder, "rev-parse", "HEAD")
+    changed = _git(folder, "status", "--porcelain", "--untracked-files=no")
+    return head and head + ("+" if changed else "")
+
+
+def _git(folder: Path, *arguments: str) -> str | None:
+    try:
+        done = subprocess.run(["git", "-C", str(folder), *arguments], capture_output=True, text=True, timeout=10)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None
+
+
+def _peak_resident() -> int:
+    # VmHWM and not ru_maxrss where there is one: ru_maxrss survives exec, so a process that a large one started
+    # reports its parent's peak.
+    try:
+        status = Path("/proc/self/status").read_text()
+        return next(int(line.split()[1]) * 1024 for line in status.splitlines() if line.startswith("VmHWM"))
+    except (OSError, StopIteration):
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return peak if sys.platform == "darwin" else peak * 1024
+
+
+def _cpu_model() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
+
+
+def _package_version() -> str | None:
+    try:
+        return metadata.version("padgs")
+    except metadata.PackageNotFoundError:
+        return None
