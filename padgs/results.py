@@ -36,11 +36,12 @@ class ResultError(ValueError):
 
 @dataclass(frozen=True)
 class Scores:
-    """The marks of one run under one protocol."""
+    """The marks of one run under one protocol. Numbers of different protocols cannot be compared."""
 
-    metrics: dict[str, float]  # name -> mean over the test views
-    views: dict[str, dict[str, float]]  # view -> metric -> value
-    bands: dict[str, dict[str, float]] = field(default_factory=dict)  # latitude band -> metric -> mean over the views
+    protocol: dict[str, Any]  # all its rules
+    metrics: dict[str, float | None]  # metric -> mean over the test views; None = missing
+    views: dict[str, dict[str, float | None]]  # view -> metric -> value
+    notes: tuple[str, ...] = ()  # what is missing and why
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ class Result:
     iterations_done: int
     seed: int
     code_version: str
-    machine: str
+    machine: dict[str, Any]  # as `padgs.clock.machine` describes it
     config_hash: str
     fingerprint: str  # of the data
     finished: str  # UTC, ISO 8601
@@ -122,7 +123,7 @@ def read(path: Path) -> Result:
         raise ResultError(f"{path} was edited after it was written (SHA-256 differs); delete it and run again")
     try:
         return Result(**document | {key: _DECODERS[key](document[key]) for key in _DECODERS})
-    except (ValueError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ResultError(f"{path}: {error}; delete it and run again") from error
 
 
@@ -166,19 +167,20 @@ def _encode(value: Any) -> Any:
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _floats(table: dict[str, Any]) -> dict[str, float]:
-    return {name: float(value) for name, value in table.items()}
+def _numbers(table: dict[str, Any]) -> dict[str, Any]:
+    return {name: None if value is None else float(value) for name, value in table.items()}
 
 
 def _scores(table: dict[str, Any]) -> dict[str, Scores]:
     return {
-        protocol: Scores(
-            _floats(scores["metrics"]),
-            {view: _floats(values) for view, values in scores["views"].items()},
-            {band: _floats(values) for band, values in scores["bands"].items()},
+        name: Scores(
+            scores["protocol"],
+            _numbers(scores["metrics"]),
+            {view: _numbers(values) for view, values in scores["views"].items()},
+            tuple(scores["notes"]),
         )
-        for protocol, scores in table.items()
+        for name, scores in table.items()
     }
 
 
-_DECODERS = {"scores": _scores, "timing": _floats}
+_DECODERS = {"scores": _scores, "timing": _numbers}

@@ -12,9 +12,10 @@ from padgs.results import Result, ResultError, Scores
 @pytest.fixture
 def result() -> Result:
     scores = Scores(
-        metrics={"psnr": 24.25, "ssim": 0.5},
+        protocol={"name": "sphere", "metrics": ["psnr", "ssim"]},
+        metrics={"psnr": 24.25, "ssim": 0.5, "lpips": None},
         views={"a": {"psnr": math.inf, "ssim": 1.0}, "b": {"psnr": 24.25, "ssim": 0.0}},
-        bands={"equator": {"psnr": 25.0}},
+        notes=("lpips is missing: no weights",),
     )
     return Result(
         run="padgs-room-0123456789",
@@ -29,7 +30,7 @@ def result() -> Result:
         iterations_done=1500,
         seed=0,
         code_version="0.1.0",
-        machine="2 cores",
+        machine={"cores": 2},
         config_hash="ab",
         fingerprint="cd",
         finished="2026-11-21T00:00:00+00:00",
@@ -64,7 +65,7 @@ def test_a_truncated_file_is_named(result, tmp_path, bytes_left):
 
 def test_an_edited_number_is_noticed(result, tmp_path):
     path = results.write(result, tmp_path)
-    path.write_text(path.read_text().replace("25.0", "35.0"))
+    path.write_text(path.read_text().replace("24.25", "34.25"))
     with pytest.raises(ResultError, match="edited"):
         results.read(path)
 
