@@ -44,6 +44,12 @@ class View:
             raise ValueError(f"view {self.name!r} has a pose but no image; it can only be rendered")
         return self.load_pixels().to(device=device, dtype=dtype) / 255
 
+    def prefetch(self) -> None:
+        """Have the pixels loaded in the background, where the source can; the next `image` is then quicker."""
+        start = getattr(self.load_pixels, "prefetch", None)
+        if start is not None:
+            start()
+
     def mask(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor | None:
         """Per-pixel weight [H, W] in [0, 1] (0 = ignore), or None where every pixel counts."""
         return None if self.load_mask is None else self.load_mask().to(device=device, dtype=dtype)

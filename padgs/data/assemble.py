@@ -1,0 +1,164 @@
+"""From what a format says to a scene: find the images, check them, split, mask, and take the fingerprint."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+
+from padgs.data.capture import Capture, Frame
+from padgs.data.cloud import starting_cloud
+from padgs.data.errors import DataError, listed
+from padgs.data.images import EXTENSIONS, ImageFile, inspect
+from padgs.data.masks import find_masks
+from padgs.data.options import DataOptions
+from padgs.data.splits import split_frames
+from padgs.data.store import ImageStore, StoredImage
+from padgs.scene import Scene, View
+
+
+def assemble(capture: Capture, options: DataOptions) -> Scene:
+    """The scene of a capture. Images are looked at, not decoded.
+
+    Raises:
+        DataError: anything about images, poses, points, split or masks that training could not use.
+    """
+    capture = replace(capture, frames=tuple(sorted(capture.frames, key=lambda frame: frame.name)))
+    names = [frame.name for frame in capture.frames]
+    _refuse_clashes(names, capture)
+    _refuse_absent(capture)
+    images = [inspect(frame.image) for frame in capture.frames]
+    notes = [*capture.notes, *_camera_notes(capture.frames, images)]
+    target = options.width or capture.width
+    sizes = [_view_size(image, target) for image in images]
+    reduced = {(image.width, image.height) for image, size in zip(images, sizes, strict=True) if size[0] < image.width}
+    if reduced:
+        stored = listed(f"{width}x{height}" for width, height in sorted(reduced))
+        notes.append(f"images: reduced from {stored} to {target}x{sizes[0][1]} by an area filter")
+    unposed = _unposed(capture)
+    if unposed:
+        notes.append(f"{len(unposed)} images have no pose and are not used: {listed(unposed)}")
+    split = split_frames(
+        names, capture.folder, mode=options.split, every=options.test_every, stated=capture.split, unposed=unposed
+    )
+    points, colors, cloud_notes = starting_cloud(capture, options.points)
+    store = ImageStore(options.cache_bytes, options.read_ahead, options.device)
+    masks, mask_digests, mask_notes = find_masks(capture, options.mask, images, sizes, store)
+    views = [
+        View(
+            view_name(frame.name),
+            frame.cam_from_world,
+            width,
+            height,
+            StoredImage(frame.image, width, height, store),
+            mask,
+        )
+        for frame, (width, height), mask in zip(capture.frames, sizes, masks, strict=True)
+    ]
+    digest = hashlib.sha256()
+    for view, image in zip(views, images, strict=True):
+        digest.update(f"{view.name}|{view.width}x{view.height}|{image.digest}|".encode())
+        digest.update(view.cam_from_world.numpy().tobytes())
+    digest.update(f"train{split.train}test{split.test}masks{mask_digests}".encode())
+    digest.update(points.numpy().tobytes())
+    digest.update(colors.numpy().tobytes())
+    return Scene(
+        name=capture.folder.name,
+        train=tuple(views[i] for i in split.train),
+        test=tuple(views[i] for i in split.test),
+        points=points,
+        point_colors=colors,
+        fingerprint=digest.hexdigest(),
+        notes=(*notes, *split.notes, *mask_notes, *cloud_notes),
+    )
+
+
+def view_name(frame_name: str) -> str:
+    """What a view is called: its image's path in the image folder, without extension."""
+    return str(PurePosixPath(frame_name).with_suffix(""))
+
+
+def image_folder(folder: Path, given: str | None, usual: Sequence[str] = ("images", "imgs", "image", "rgb")) -> Path:
+    """The folder with the images of a data set: the given one, else the first usual one, else the data set's own.
+
+    Raises:
+        DataError: the given one is not there.
+    """
+    if given is not None:
+        if not (folder / given).is_dir():
+            raise DataError(f"data.images={given}: there is no folder {folder / given}")
+        return folder / given
+    return next((folder / name for name in usual if (folder / name).is_dir()), folder)
+
+
+def image_names(folder: Path) -> list[str]:
+    """All images below a folder, relative to it, sorted; hidden files left out."""
+    found: list[str] = []
+    for parent, folders, files in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        for name in files:
+            if name.lower().endswith(EXTENSIONS) and not name.startswith("."):
+                found.append((Path(parent) / name).relative_to(folder).as_posix())
+    return sorted(found)
+
+
+def _refuse_clashes(names: Sequence[str], capture: Capture) -> None:
+    if not names:
+        raise DataError(f"the {capture.format} model in {capture.folder} holds no posed image")
+    seen: dict[str, str] = {}
+    for name in names:
+        key = view_name(name).casefold()
+        if key in seen:
+            raise DataError(f"the images {seen[key]!r} and {name!r} would share one name (without case and extension)")
+        seen[key] = name
+
+
+def _refuse_absent(capture: Capture) -> None:
+    absent = [frame.name for frame in capture.frames if not frame.image.is_file()]
+    if not absent:
+        return
+    present = {name.casefold(): name for name in image_names(capture.image_folder)}
+    hint = next((present[name.casefold()] for name in absent if name.casefold() in present), None)
+    remedy = (
+        f"there is {hint!r}, in another case: rename it" if hint else "set data.images to the folder that holds them"
+    )
+    raise DataError(
+        f"{len(absent)} of {len(capture.frames)} poses have no image in {capture.image_folder}: "
+        f"{listed(absent)}; {remedy}"
+    )
+
+
+def _unposed(capture: Capture) -> list[str]:
+    if capture.image_folder == capture.folder:  # masks and pictures of all kinds may lie there
+        return []
+    posed = {frame.image for frame in capture.frames}
+    return [name for name in image_names(capture.image_folder) if capture.image_folder / name not in posed]
+
+
+def _camera_notes(frames: Sequence[Frame], images: Sequence[ImageFile]) -> list[str]:
+    """A panorama may be stored smaller or larger than its camera says, but all of them alike."""
+    scales: dict[float, str] = {}
+    for frame, image in zip(frames, images, strict=True):
+        if frame.width is None or frame.height is None:
+            continue
+        if frame.width != 2 * frame.height:
+            raise DataError(f"the camera of {frame.name} is {frame.width}x{frame.height}; a full panorama is 2:1")
+        scales.setdefault(
+            image.width / frame.width,
+            f"{image.path} is {image.width}x{image.height}, its camera {frame.width}x{frame.height}",
+        )
+    if len(scales) > 1:
+        raise DataError(
+            f"images and cameras disagree in size: {'; but '.join(list(scales.values())[:2])}; make them agree"
+        )
+    return [f"images: {text}; used as they are" for scale, text in scales.items() if scale != 1]
+
+
+def _view_size(image: ImageFile, width: int | None) -> tuple[int, int]:
+    if width is None:
+        return image.width, image.height
+    if width > image.width:
+        raise DataError(f"data.width={width} is wider than {image.path} ({image.width}); images are only ever reduced")
+    return width, width // 2

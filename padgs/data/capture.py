@@ -1,0 +1,58 @@
+"""What a file format says, before any pixel is read: frames with poses, points, split lists.
+
+Every file format has one reader, `read(path, options) -> Capture`; `padgs.data.assemble` makes the scene of it, and
+`padgs.data.convert` writes it in another format.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One posed panorama of a capture."""
+
+    name: str  # path relative to the image folder, with its extension, "/" between folders
+    image: Path
+    cam_from_world: Tensor  # [4, 4] float64, rigid; x right, y down, z forward
+    width: int | None = None  # of the camera, where the format states it
+    height: int | None = None
+    mask: Path | None = None  # where the format names one
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """A point cloud in the world frame."""
+
+    points: Tensor  # [P, 3] float64
+    colors: Tensor | None  # [P, 3] uint8
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Observations: point `point[i]` was seen in frame `frame[i]` at `pixels[i]`."""
+
+    frame: Tensor  # [T] int64, index into Capture.frames
+    point: Tensor  # [T] int64, index into Cloud.points
+    pixels: Tensor  # [T, 2] float64, continuous (u, v) at the camera's size
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Everything a format holds."""
+
+    format: str
+    folder: Path  # of the data set; masks and split lists are looked for here
+    image_folder: Path
+    frames: tuple[Frame, ...]
+    cloud: Cloud | None
+    split: Mapping[str, tuple[str, ...]] | None = None  # "train", "test" -> names, where the format states them
+    mask: str = "auto"  # what data.mask=auto means for this format
+    width: int | None = None  # what data.width=null means for this format; None = as stored
+    tracks: Callable[[], Tracks] | None = None
+    notes: tuple[str, ...] = ()

@@ -1,0 +1,129 @@
+"""Image files: what they must be, and how they become pixels.
+
+A panorama is an 8-bit colour image, twice as wide as high, stored upright. Whatever is not is refused with its name
+when the scene is loaded, before any training.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+
+from padgs.data.errors import DataError
+
+EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
+_ORIENTATION = 0x0112  # EXIF tag; 1 = stored upright
+_GREY = ("1", "L", "LA", "La")
+
+
+@dataclass(frozen=True)
+class ImageFile:
+    """An image file that was looked at: its size in pixels and the digest of its bytes."""
+
+    path: Path
+    width: int
+    height: int
+    digest: str
+
+
+def inspect(path: Path, *, mask: bool = False) -> ImageFile:
+    """Check that a file is a usable panorama (or mask: grey is then fine), without decoding it.
+
+    Raises:
+        DataError: not there, unreadable, not an image, cut short, turned by EXIF, 16-bit, grey, CMYK or not 2:1.
+    """
+    data = _read(path)
+    try:
+        with Image.open(BytesIO(data)) as image:
+            width, height, mode = image.width, image.height, image.mode
+            orientation = 1 if image.format == "PNG" and "exif" not in image.info else image.getexif().get(_ORIENTATION)
+            deep = _is_deep(image, data)
+    except (UnidentifiedImageError, OSError, SyntaxError, Image.DecompressionBombError) as error:
+        raise DataError(f"{path} is not an image that Pillow can read ({error}); replace or remove it") from error
+    if orientation not in (None, 0, 1):
+        raise DataError(
+            f"{path} carries EXIF orientation {orientation}: its pixels are stored turned, and which way the poses "
+            "mean them cannot be known; store it upright (`mogrify -auto-orient`) or remove the flag"
+        )
+    if deep and not mask:
+        raise DataError(f"{path} has 16 bits or more per channel ({mode}); convert it to 8 bits (`mogrify -depth 8`)")
+    if mode in _GREY and not mask:
+        raise DataError(f"{path} is grey ({mode}); panoramas must be colour, 3 x 8 bits: convert it or remove it")
+    if mode == "CMYK":
+        raise DataError(f"{path} is CMYK; convert it to RGB")
+    if width != 2 * height:
+        raise DataError(
+            f"{path} is {width}x{height}, which is not 2:1; an equirectangular panorama covers 360 x 180 degrees "
+            "(a dual-fisheye or cropped image must be stitched or padded first)"
+        )
+    if _looks_cut(data):
+        _decode(BytesIO(data), path, "L" if mask else "RGB")
+    return ImageFile(path, width, height, hashlib.sha256(data).hexdigest())
+
+
+def decode(path: Path, mode: str = "RGB") -> NDArray[np.uint8]:
+    """The pixels of a file, [H, W, 3] for RGB and [H, W, 1] for L, uint8.
+
+    Raises:
+        DataError: the file is cut short or damaged, or partly transparent.
+    """
+    return _decode(BytesIO(_read(path)), path, mode)
+
+
+def _decode(file: BytesIO, path: Path, mode: str) -> NDArray[np.uint8]:
+    try:
+        with Image.open(file) as image:
+            image.load()
+            if mode == "RGB" and "A" in image.getbands() and np.asarray(image.getchannel("A")).min() < 255:
+                raise DataError(
+                    f"{path} has transparent pixels; save it without alpha and say which pixels to ignore in a mask "
+                    "file (data.mask)"
+                )
+            pixels = np.array(_eight_bit(image).convert(mode))
+    except DataError:
+        raise
+    except (OSError, SyntaxError, ValueError) as error:
+        raise DataError(f"{path} is cut short or damaged ({error}); copy it again or remove it") from error
+    return pixels if mode == "RGB" else pixels[..., None]
+
+
+def _eight_bit(image: Image.Image) -> Image.Image:
+    """16-bit masks scaled to 8 bits; Pillow's own conversion would clip them."""
+    if not image.mode.startswith("I"):
+        return image
+    return Image.fromarray((np.asarray(image).astype(np.int64) >> 8).clip(0, 255).astype(np.uint8))
+
+
+def _read(path: Path) -> bytes:
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError as error:
+        raise DataError(f"{path} does not exist") from error
+    except OSError as error:
+        raise DataError(f"{path} cannot be read ({error.strerror}); check its permissions") from error
+    if not data:
+        raise DataError(f"{path} is empty (0 bytes); copy it again or remove it")
+    return data
+
+
+def _is_deep(image: Image.Image, data: bytes) -> bool:
+    """More than 8 bits per channel. Pillow opens a 16-bit RGB PNG as 8-bit without a word, so look at its header."""
+    if image.format == "PNG":
+        return data[24] > 8
+    if image.format == "TIFF":
+        bits = getattr(image, "tag_v2", {}).get(258, (8,))
+        return max(bits if isinstance(bits, tuple) else (bits,)) > 8
+    return image.mode in ("I", "F") or image.mode.startswith("I;")
+
+
+def _looks_cut(data: bytes) -> bool:
+    """Whether a JPEG or PNG seems to end early; a cheap suspicion, to be confirmed by decoding."""
+    if data[:2] == b"\xff\xd8":  # a scan without an end-of-image marker behind it
+        return data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda")
+    return data[:4] == b"\x89PNG" and b"IEND" not in data[-4096:]

@@ -1,0 +1,61 @@
+"""Point clouds in PLY files, ASCII or binary, through plyfile."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from padgs.data.capture import Cloud
+from padgs.data.errors import DataError
+
+_COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+
+
+def read_ply(path: Path) -> Cloud:
+    """Read the vertices of a PLY file with x, y, z and, where present, red, green, blue (0..255, or floats in 0..1).
+
+    Raises:
+        DataError: not there, not a PLY file, cut short, or without x, y, z.
+    """
+    from plyfile import PlyData, PlyParseError
+
+    try:
+        vertex = PlyData.read(str(path), mmap=False)["vertex"]
+    except FileNotFoundError as error:
+        raise DataError(f"the point cloud {path} does not exist") from error
+    except KeyError as error:
+        raise DataError(f"{path} has no element 'vertex'; it must be a point cloud") from error
+    except (PlyParseError, OSError, ValueError, MemoryError, OverflowError, EOFError) as error:
+        raise DataError(
+            f"{path} is not a readable PLY file ({error or type(error).__name__}); export it again"
+        ) from error
+    names = {prop.name for prop in vertex.properties}
+    if not {"x", "y", "z"} <= names:
+        raise DataError(f"{path} has the properties {', '.join(sorted(names))}; a point cloud needs x, y and z")
+    points = np.stack([np.asarray(vertex[axis], dtype=np.float64) for axis in "xyz"], axis=1)
+    channels = next((group for group in _COLORS if set(group) <= names), None)
+    colors = None
+    if channels is not None:
+        values = np.stack([np.asarray(vertex[channel]) for channel in channels], axis=1)
+        if values.dtype.kind == "f":
+            values = np.nan_to_num(values) * (255 if len(values) == 0 or np.nanmax(values) <= 1 else 1)
+        colors = torch.from_numpy(np.rint(values).clip(0, 255).astype(np.uint8))
+    return Cloud(torch.from_numpy(points), colors)
+
+
+def write_ply(path: Path, cloud: Cloud) -> None:
+    """Write a binary PLY file with x, y, z as doubles (nothing is lost) and red, green, blue if there are colours."""
+    from plyfile import PlyData, PlyElement
+
+    fields: list[tuple[str, str]] = [(axis, "f8") for axis in "xyz"]
+    if cloud.colors is not None:
+        fields += [(channel, "u1") for channel in _COLORS[0]]
+    vertex = np.empty(len(cloud.points), dtype=fields)
+    for i, axis in enumerate("xyz"):
+        vertex[axis] = cloud.points[:, i].numpy()
+    if cloud.colors is not None:
+        for i, channel in enumerate(_COLORS[0]):
+            vertex[channel] = cloud.colors[:, i].numpy()
+    PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(path))

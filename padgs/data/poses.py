@@ -1,0 +1,96 @@
+"""Poses as files state them, checked once for all formats, and turned into `cam_from_world`.
+
+Whatever is not a rotation is refused: a pose that is a little wrong costs quality without a word.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from padgs.data.errors import DataError
+
+TOLERANCE = 1e-3  # of R R^T against the identity; files with four digits pass, scaled or sheared matrices do not
+
+# Rotations between the camera frames in use: `OPENCV_FROM_OPENGL @ x_gl` is x right, y down, z forward.
+OPENCV_FROM_OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))  # y up, z backward
+
+
+def rigid(rotation: Tensor, translation: Tensor) -> Tensor:
+    """[4, 4] float64 of a rotation [3, 3] and a translation [3]."""
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[:3, :3], matrix[:3, 3] = rotation, translation
+    return matrix
+
+
+def cam_from_world(rotation: Tensor, translation: Tensor, where: str) -> Tensor:
+    """[4, 4] float64 of a cam-from-world rotation [3, 3] and translation [3]; `where` names the pose in errors."""
+    return rigid(checked_rotation(rotation, where), _finite(translation, where))
+
+
+def cam_from_center(rotation: Tensor, center: Tensor, where: str) -> Tensor:
+    """[4, 4] float64 of a cam-from-world rotation [3, 3] and the camera centre [3] in the world."""
+    rotation = checked_rotation(rotation, where)
+    return rigid(rotation, -rotation @ _finite(center, where))
+
+
+def cam_from_pose(world_from_cam: Tensor, where: str) -> Tensor:
+    """[4, 4] float64 of a world-from-cam matrix [3 or 4, 4] of an OpenCV camera."""
+    matrix = torch.as_tensor(world_from_cam, dtype=torch.float64)
+    if matrix.dim() != 2 or matrix.shape[0] not in (3, 4) or matrix.shape[1] != 4:
+        raise DataError(f"{where}: a pose has the shape {list(matrix.shape)}; it must be 4x4 (or 3x4)")
+    if matrix.shape[0] == 4:
+        _finite(matrix, where)
+        if torch.allclose(matrix[:3, 3], torch.zeros(3, dtype=torch.float64)) and matrix[3, :3].abs().max() > 1e-9:
+            raise DataError(
+                f"{where}: the pose is transposed, its last row {_numbers(matrix[3])} holds the translation; write it "
+                "with the translation in the last column"
+            )
+        if not torch.allclose(matrix[3], torch.tensor([0, 0, 0, 1], dtype=torch.float64), atol=1e-6):
+            raise DataError(f"{where}: the last row of the pose is {_numbers(matrix[3])}; it must be 0 0 0 1")
+    return cam_from_center(checked_rotation(matrix[:3, :3], where).T, matrix[:3, 3], where)
+
+
+def checked_rotation(rotation: Tensor, where: str) -> Tensor:
+    """The rotation nearest to a [3, 3] matrix that is one up to rounding, float64.
+
+    Raises:
+        DataError: not finite, scaled, left-handed or not orthogonal; the message says which.
+    """
+    rotation = _finite(rotation, where)
+    if rotation.shape != (3, 3):
+        raise DataError(f"{where}: a rotation has the shape {list(rotation.shape)}; it must be 3x3")
+    gram = rotation @ rotation.T
+    identity = torch.eye(3, dtype=torch.float64)
+    determinant = torch.linalg.det(rotation).item()
+    if (gram - identity).abs().max() > TOLERANCE:
+        scale = gram.diagonal().mean().sqrt().item()
+        if scale > 0 and (gram / scale**2 - identity).abs().max() <= TOLERANCE:
+            raise DataError(
+                f"{where}: the pose holds a rotation times {scale:.6g}; scale belongs to the positions, divide the "
+                "3x3 part by it"
+            )
+        raise DataError(
+            f"{where}: the 3x3 part of the pose is not a rotation: R R^T differs from the identity by "
+            f"{(gram - identity).abs().max().item():.3g} (at most {TOLERANCE:g} is taken for rounding)"
+        )
+    if determinant < 0:
+        raise DataError(
+            f"{where}: the pose is left-handed (determinant {determinant:.3f}); one axis is mirrored, negate the "
+            "column of the axis that points the wrong way"
+        )
+    left, _, right = torch.linalg.svd(rotation)
+    return left @ right
+
+
+def _finite(values: Tensor, where: str) -> Tensor:
+    values = torch.as_tensor(values, dtype=torch.float64)
+    if not values.isfinite().all():
+        raise DataError(
+            f"{where}: the pose contains {_numbers(values[~values.isfinite()][:1])}; remove the image or redo it"
+        )
+    return values
+
+
+def _numbers(values: Tensor) -> str:
+    return " ".join(f"{value:g}" for value in values.tolist())

@@ -1,0 +1,150 @@
+"""Which views are trained on and which are held out: two list files, or every k-th view."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath, PureWindowsPath
+
+from padgs.data.errors import DataError, listed
+
+LISTS = {"train": "train.txt", "test": "test.txt"}
+
+
+@dataclass(frozen=True)
+class Split:
+    """Indices into the frames, ascending, and what was decided."""
+
+    train: tuple[int, ...]
+    test: tuple[int, ...]
+    notes: tuple[str, ...] = ()
+
+
+def split_frames(
+    names: Sequence[str],
+    folder: Path,
+    *,
+    mode: str = "auto",
+    every: int = 8,
+    stated: Mapping[str, tuple[str, ...]] | None = None,
+    unposed: Sequence[str] = (),
+) -> Split:
+    """Decide for each frame whether it is trained on, held out, or unused.
+
+    Args:
+        names: frame names with extension, sorted.
+        folder: where `train.txt` and `test.txt` are looked for; one name a line, with or without extension.
+        mode: files; every (view 0, k, 2k, ... are held out); all (nothing held out); auto: what the format states,
+            else files if there is a list, else every.
+        every: k.
+        stated: lists that the format itself holds.
+        unposed: names of images that have no pose, to tell them from absent ones.
+
+    Raises:
+        DataError: a list names what is not there or is ambiguous, lists overlap, or a side is empty.
+    """
+    if mode == "all":
+        return Split(tuple(range(len(names))), (), ("split: every view is trained on, none held out (data.split=all)",))
+    lists = dict(stated or {}) if mode == "auto" else {}
+    origin = "the split that the data set states"
+    if not lists and mode != "every":
+        lists = {side: read_list(folder / file) for side, file in LISTS.items() if (folder / file).is_file()}
+        origin = " and ".join(LISTS[side] for side in lists)
+    if not lists:
+        if mode == "files":
+            raise DataError(
+                f"data.split=files, but {folder} holds neither train.txt nor test.txt; write them or use every"
+            )
+        return _every(names, every, mode)
+    chosen = {side: _resolve(lines, names, f"{side} list", unposed) for side, lines in lists.items()}
+    notes = [f"split: {origin}"]
+    for side, other in (("train", "test"), ("test", "train")):
+        if side not in chosen:
+            chosen[side] = set(range(len(names))) - chosen[other]
+            notes.append(f"there is no {side} list; it is what the {other} list leaves")
+    both = chosen["train"] & chosen["test"]
+    if both:
+        raise DataError(
+            f"train and test list overlap: {listed(names[i] for i in sorted(both))}; a view is one or the other"
+        )
+    for side in ("train", "test"):
+        if not chosen[side]:
+            raise DataError(f"the {side} split is empty; name at least one view, or set data.split=every")
+    unused = len(names) - len(chosen["train"]) - len(chosen["test"])
+    if unused:
+        notes.append(f"{unused} posed views are in neither list and are not used")
+    return Split(tuple(sorted(chosen["train"])), tuple(sorted(chosen["test"])), tuple(notes))
+
+
+def read_list(path: Path) -> tuple[str, ...]:
+    """The names in a list file: one a line, blank lines skipped, any line ending, optional byte-order mark.
+
+    Raises:
+        DataError: not text, or a name that points outside the image folder.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path} cannot be read as UTF-8 text ({error}); write one image name a line") from error
+    names = tuple(line.strip().replace("\\", "/") for line in lines if line.strip())
+    for name in names:
+        check_inside(name, f"{path}")
+    return names
+
+
+def check_inside(name: str, where: str) -> str:
+    """The name, if it stays inside the folder it is relative to.
+
+    Raises:
+        DataError: absolute, or with `..` in it; a list from elsewhere must not reach other files.
+    """
+    parts = PurePosixPath(name.replace("\\", "/"))
+    if parts.is_absolute() or PureWindowsPath(name).drive or ".." in parts.parts or not parts.name or "\0" in name:
+        raise DataError(f"{where} names {name!r}; names must be relative and stay inside the image folder (no '..')")
+    return name
+
+
+def _every(names: Sequence[str], every: int, mode: str) -> Split:
+    test = tuple(range(0, len(names), every))
+    train = tuple(i for i in range(len(names)) if i % every)
+    if not train:
+        raise DataError(
+            f"{len(names)} posed view(s) cannot be split; at least 2 are needed to train on one and test on one"
+        )
+    why = "no train.txt or test.txt" if mode == "auto" else "data.split=every"
+    return Split(train, test, (f"split: every {every}th view is held out ({why})",))
+
+
+def _resolve(lines: Sequence[str], names: Sequence[str], which: str, unposed: Sequence[str]) -> set[int]:
+    exact: dict[str, set[int]] = {}
+    loose: dict[str, set[int]] = {}
+    for i, name in enumerate(names):
+        exact.setdefault(name, set()).add(i)
+        for key in _keys(name):
+            loose.setdefault(key, set()).add(i)
+    chosen: set[int] = set()
+    absent: list[str] = []
+    for line in lines:
+        found = exact.get(line) or loose.get(line) or loose.get(PurePosixPath(line).name) or set()
+        if len(found) > 1:
+            raise DataError(
+                f"the {which} names {line!r}, which fits {listed(names[i] for i in sorted(found))}; be specific"
+            )
+        if not found:
+            absent.append(line)
+        chosen |= found
+    if absent:
+        known = {key for name in unposed for key in (name, *_keys(name))}
+        without = [line for line in absent if line in known]
+        if without:
+            raise DataError(f"the {which} names images that have no pose: {listed(without)}; take them off the list")
+        raise DataError(
+            f"the {which} names images that are not there: {listed(absent)}; the data set has {listed(names)}"
+        )
+    return chosen
+
+
+def _keys(name: str) -> set[str]:
+    """What a list may call a frame besides its full name: without extension, without folders, without both."""
+    path = PurePosixPath(name)
+    return {str(path.with_suffix("")), path.name, path.stem}
