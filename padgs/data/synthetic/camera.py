@@ -1,0 +1,84 @@
+"""Panoramas of a synthetic world: supersampled colour, and exact depth and object id through pixel centres.
+
+Poses are in metres here. The sub-pixel jitter of a pixel depends on its row only, never on its column or the view:
+turning the camera by whole pixels about its vertical therefore shifts the image exactly.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+from padgs.data.synthetic.textures import Array
+from padgs.data.synthetic.world import World
+
+_BLOCK = (32, 64)  # pixels; rays of a block share the list of shapes that they can hit, and fit into the cache
+
+
+def directions(rows: Array, columns: Array, width: int, height: int) -> Array:
+    """Unit camera-frame directions [3, n] through continuous pixel positions (u = columns, v = rows), each [n]."""
+    longitude = (columns / width - 0.5) * (2 * math.pi)
+    latitude = (rows / height - 0.5) * math.pi
+    flat = np.cos(latitude)
+    return np.stack((flat * np.sin(longitude), np.sin(latitude), flat * np.cos(longitude)))
+
+
+def draw(world: World, cam_from_world: Array, width: int, samples: int, seed: int = 0, gain: float = 1.0) -> Array:
+    """The panorama [H, W, 3] uint8 that a camera at `cam_from_world` [4, 4] sees, with `samples` rays a pixel."""
+    height = width // 2
+    image = np.empty((height, width, 3), np.uint8)
+    jitter = _jitter(height, samples, seed)
+    blocks = [(i, j) for i in range(0, height, _BLOCK[0]) for j in range(0, width, _BLOCK[1])]
+
+    def fill(block: tuple[int, int]) -> None:
+        rows = np.arange(block[0], min(block[0] + _BLOCK[0], height))
+        columns = np.arange(block[1], min(block[1] + _BLOCK[1], width))
+        v = np.broadcast_to((rows[:, None] + jitter[rows, :, 1])[:, None, :], (len(rows), len(columns), samples))
+        u = columns[None, :, None] + jitter[rows, :, 0][:, None, :]
+        rays = directions(*(axis.ravel().astype(np.float32) for axis in (v, u)), width, height)
+        color = _colors(world, cam_from_world, rays)
+        mean = color.reshape(3, len(rows), len(columns), samples).mean(-1)
+        image[np.ix_(rows, columns)] = np.clip(mean * (255 * gain) + 0.5, 0, 255).astype(np.uint8).transpose(1, 2, 0)
+
+    with ThreadPoolExecutor(workers()) as pool:  # numpy lets go of the interpreter lock
+        list(pool.map(fill, blocks))
+    return image
+
+
+def trace(world: World, cam_from_world: Array, width: int) -> tuple[Array, Array]:
+    """Exact distance [H, W] float64 in metres (inf = sky) and object id [H, W] (-1 = sky) at pixel centres."""
+    height = width // 2
+    rows, columns = np.indices((height, width)) + 0.5
+    world_rays = cam_from_world[:3, :3].T @ directions(rows.ravel(), columns.ravel(), width, height)
+    distance, object_id = world.nearest(center(cam_from_world)[:, None], world_rays)
+    return distance.reshape(height, width), object_id.reshape(height, width)
+
+
+def center(cam_from_world: Array) -> Array:
+    """Camera centre [3] of a pose [4, 4]."""
+    return -cam_from_world[:3, :3].T @ cam_from_world[:3, 3]
+
+
+def workers() -> int:
+    """Threads to draw with: one per processor that this process may use, at most 8."""
+    return min(8, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
+
+
+def _colors(world: World, cam_from_world: Array, camera_rays: Array) -> Array:
+    origin = center(cam_from_world)
+    rays = cam_from_world[:3, :3].T.astype(np.float32) @ camera_rays
+    axis = rays.mean(1)
+    axis /= np.linalg.norm(axis)
+    half_angle = math.acos(min(1.0, max(-1.0, float((axis @ rays).min()))))
+    candidates = world.within(origin, axis, half_angle + 1e-3)
+    return world.color(origin[:, None].astype(np.float32), rays, candidates)
+
+
+def _jitter(height: int, samples: int, seed: int) -> Array:
+    """Positions [H, samples, 2] within a pixel, one in each cell of a square grid."""
+    side = math.isqrt(samples)
+    cell = np.stack(np.divmod(np.arange(samples), side)[::-1], axis=-1)
+    return (cell + np.random.default_rng((seed, 0x5EED)).random((height, samples, 2))) / side

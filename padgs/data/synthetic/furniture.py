@@ -1,0 +1,184 @@
+"""Things to put into synthetic scenes, each a list of shapes. Positions in metres, z = 0 is the floor."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from padgs.data.errors import DataError
+from padgs.data.synthetic import textures as tx
+from padgs.data.synthetic.shapes import Box, Material, Point, Rod, Shape, Sphere
+from padgs.data.synthetic.textures import Array, Texture
+
+OAK = ((0.42, 0.26, 0.13), (0.78, 0.56, 0.33))
+WALNUT = ((0.2, 0.12, 0.07), (0.5, 0.32, 0.18))
+BRIGHT = (
+    (0.85, 0.2, 0.16),
+    (0.95, 0.75, 0.2),
+    (0.16, 0.45, 0.75),
+    (0.2, 0.6, 0.35),
+    (0.9, 0.5, 0.15),
+    (0.55, 0.25, 0.6),
+)
+SPINES = (*BRIGHT, (0.3, 0.16, 0.1), (0.1, 0.2, 0.3), (0.75, 0.7, 0.6), (0.15, 0.3, 0.2))
+
+
+def matt(texture: Texture, reflectance: float = 0.0) -> tuple[Material, ...]:
+    """One material for every face."""
+    return (Material(texture, reflectance),)
+
+
+def metal(color: tx.Color = (0.75, 0.75, 0.78)) -> tuple[Material, ...]:
+    """The material of rods: plain with fine bands, so that it is not featureless."""
+    darker = tuple(0.8 * c for c in color)
+    return matt(tx.stripes((color, color, color, darker), 0.06, 0.0))
+
+
+def table(x: float, y: float, width: float, depth: float, height: float, yaw: float = 0.0) -> list[Shape]:
+    """A wooden table top on four thin legs."""
+    top = Box((x, y, height - 0.02), (width / 2, depth / 2, 0.02), matt(tx.planks(*OAK, width=0.11)), yaw)
+    legs: list[Shape] = []
+    for i, j in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+        a, b = i * (width / 2 - 0.05), j * (depth / 2 - 0.05)
+        px, py = x + a * math.cos(yaw) - b * math.sin(yaw), y + a * math.sin(yaw) + b * math.cos(yaw)
+        legs.append(Rod((px, py, 0), (px, py, height - 0.04), 0.018, metal((0.25, 0.25, 0.27))))
+    return [top, *legs]
+
+
+def bookshelf(x: float, y: float, width: float, height: float, yaw: float = 0.0) -> list[Shape]:
+    """A shelf full of books."""
+    wood = Material(tx.planks(*WALNUT))
+    front = Material(tx.books(SPINES, (0.45, 0.3, 0.18)))
+    return [Box((x, y, height / 2), (width / 2, 0.15, height / 2), (wood, wood, front, front, wood, wood), yaw)]
+
+
+def sofa(x: float, y: float, yaw: float = 0.0) -> list[Shape]:
+    """A sofa of four cushions' worth of boxes; its back is towards local +y."""
+    cloth = matt(tx.wallpaper((0.2, 0.36, 0.4), (0.75, 0.78, 0.68), 0.16))
+    pillow = matt(tx.checker((0.85, 0.55, 0.2), (0.95, 0.9, 0.8), 0.08))
+    parts = (
+        ((0, -0.08, 0.22), (0.9, 0.37, 0.2), cloth),
+        ((0, 0.34, 0.45), (0.9, 0.1, 0.43), cloth),
+        ((-0.97, 0, 0.3), (0.08, 0.45, 0.3), cloth),
+        ((0.97, 0, 0.3), (0.08, 0.45, 0.3), cloth),
+        ((-0.55, 0.1, 0.56), (0.2, 0.07, 0.15), pillow),
+        ((0.5, 0.1, 0.55), (0.2, 0.07, 0.14), pillow),
+    )
+    c, s = math.cos(yaw), math.sin(yaw)
+    return [Box((x + c * a - s * b, y + s * a + c * b, z), half, skin, yaw) for (a, b, z), half, skin in parts]
+
+
+def floor_lamp(x: float, y: float, height: float = 1.7) -> list[Shape]:
+    """A thin vertical rod with a glowing globe; thin structure against the wall."""
+    return [
+        Rod((x, y, 0.02), (x, y, height), 0.012, metal((0.8, 0.65, 0.3))),
+        Sphere(
+            (x, y, height + 0.11), 0.13, (Material(tx.stripes(((1, 0.95, 0.8), (0.98, 0.85, 0.6)), 0.04), glows=True),)
+        ),
+        Box((x, y, 0.015), (0.15, 0.15, 0.015), matt(tx.plain((0.3, 0.25, 0.15), 0.4))),
+    ]
+
+
+def pendant(x: float, y: float, ceiling: float, drop: float) -> list[Shape]:
+    """A glowing globe on a thin cord from the ceiling."""
+    globe = Material(tx.stripes(((1, 0.98, 0.9), (1, 0.9, 0.7)), 0.05), glows=True)
+    return [
+        Sphere((x, y, ceiling - drop), 0.14, (globe,)),
+        Rod((x, y, ceiling - drop + 0.13), (x, y, ceiling), 0.008, metal((0.15, 0.15, 0.15))),
+    ]
+
+
+def plant(x: float, y: float, height: float, rng: np.random.Generator) -> list[Shape]:
+    """A pot with thin leaning stems that carry small leaves and blossoms."""
+    shapes: list[Shape] = [
+        Box(
+            (x, y, 0.2),
+            (0.16, 0.16, 0.2),
+            matt(tx.bricks((0.5, 0.22, 0.14), (0.8, 0.45, 0.3), (0.9, 0.8, 0.7), 0.1, 0.05)),
+        )
+    ]
+    leaf = matt(tx.plain((0.2, 0.5, 0.2), 0.6, 0.2))
+    for k in range(9):
+        angle, lean = 2 * math.pi * k / 9 + rng.uniform(-0.2, 0.2), rng.uniform(0.1, 0.35)
+        tip = (x + lean * math.cos(angle), y + lean * math.sin(angle), height * rng.uniform(0.7, 1.0))
+        shapes.append(Rod((x, y, 0.4), tip, 0.007, matt(tx.plain((0.25, 0.42, 0.16), 0.5, 0.3))))
+        bloom = matt(tx.plain(BRIGHT[k % 2], 0.4, 0.1)) if k % 3 == 0 else leaf
+        shapes.append(Sphere(tip, rng.uniform(0.04, 0.07), bloom))
+    return shapes
+
+
+def crates(x: float, y: float, rng: np.random.Generator) -> list[Shape]:
+    """A stack of printed wooden crates."""
+    shapes: list[Shape] = []
+    z = 0.0
+    for half in (0.3, 0.24, 0.17):
+        label = tx.print_of((0.9, 0.86, 0.75), (0.2, 0.12, 0.08), half / 4)
+        skin = tx.framed(tx.planks(*OAK, width=half / 3), ((0.0, 0.0, half, 0.7 * half, label),))
+        shapes.append(Box((x, y, z + 0.8 * half), (half, half, 0.8 * half), matt(skin), rng.uniform(-0.6, 0.6)))
+        z += 1.6 * half
+    return shapes
+
+
+def loose_object(where: Point, size: float, rng: np.random.Generator, reflectance: float = 0.0) -> Shape:
+    """A random ball, box or bar of the given radius about a point."""
+    first, second = (BRIGHT[i] for i in rng.choice(len(BRIGHT), 2, replace=False))
+    pale = (0.93, 0.9, 0.84)
+    kind = rng.integers(4)
+    if kind == 0:
+        return Sphere(where, size, matt(tx.sectors((first, pale, second, pale), 8, size), reflectance))
+    if kind == 1:
+        half = tuple(size / math.sqrt(3) * rng.uniform(0.7, 1.0, 3))
+        pattern = tx.checker(first, pale, size / 3) if rng.random() < 0.5 else tx.print_of(pale, first, size / 5)
+        return Box(where, half, matt(pattern, reflectance), rng.uniform(0, math.pi))
+    if kind == 2:
+        return Sphere(where, size, matt(tx.stripes((first, second, pale), size / 4), reflectance))
+    tilt = rng.normal(size=3) * (1, 1, 0.6)
+    half = size * tilt / np.linalg.norm(tilt)
+    ends = tuple(tuple(float(v) for v in np.add(where, sign * half)) for sign in (-1, 1))
+    return Rod(ends[0], ends[1], size / 6, matt(tx.stripes((first, pale), size / 5), reflectance), rounded=True)
+
+
+def scatter(
+    count: int,
+    path: Array,
+    low: Point,
+    high: Point,
+    clearance: float,
+    rng: np.random.Generator,
+    reflectance: float = 0.0,
+) -> list[Shape]:
+    """Loose objects within a box, each hung or stood on a thin rod, at least `clearance` from the camera path."""
+    shapes: list[Shape] = []
+    for _ in range(count):
+        size = rng.uniform(0.07, 0.16)
+        for _attempt in range(200):
+            where = rng.uniform(low, high)
+            if np.linalg.norm(path - where, axis=1).min() > clearance + size:
+                break
+        else:
+            raise DataError(
+                f"found no place for object {len(shapes) // 2 + 1} of {count}; set data.generator.objects lower"
+            )
+        shapes.append(loose_object(tuple(float(v) for v in where), size, rng, reflectance))
+        x, y, z = (float(v) for v in where)
+        if z < high[2] * 0.6:  # the support must not stand in the way of the cameras
+            shapes.append(Rod((x, y, 0), (x, y, z), 0.01, metal()))
+    return shapes
+
+
+def beside(count: int, path: Array, nearest: float, farthest: float, rng: np.random.Generator) -> list[Shape]:
+    """Small objects whose surface lies between `nearest` and `farthest` metres from the camera path."""
+    shapes: list[Shape] = []
+    attempts = 0
+    while len(shapes) < count:
+        attempts += 1
+        if attempts > 200 * count:
+            raise DataError(f"found no place for {count} objects beside the path; set data.generator.objects lower")
+        size = rng.uniform(0.02, 0.07)
+        way = rng.normal(size=3) * (1, 1, 0.7)
+        gap = rng.uniform(nearest, farthest)
+        where = path[rng.integers(len(path))] + way / np.linalg.norm(way) * (gap + size)
+        if np.linalg.norm(path - where, axis=1).min() >= nearest + size:
+            shapes.append(loose_object(tuple(float(v) for v in where), size, rng))
+    return shapes

@@ -1,0 +1,72 @@
+"""The knobs of the synthetic scenes. A configuration determines every pixel, pose and point, and is the cache key."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from padgs.data.errors import DataError
+
+SCENES = ("room", "two_rooms", "outdoor", "pole_torture", "bare_room", "near_clutter", "glossy")
+PATHS = ("roaming", "cross", "line")
+HEADINGS = ("path", "fixed", "random")
+
+
+@dataclass(frozen=True)
+class SyntheticOptions:
+    """What to generate. The defaults are the embedded scene of a run without arguments.
+
+    Everything is built and drawn in metres; `world_scale` and `world_rotation` then move poses, points and depth, so
+    the images do not depend on them. Pose noise and exposure touch training views only: test views are the truth.
+    """
+
+    scene: str = "room"
+    width: int = 512  # pixels; the height is half of it
+    train_views: int = 24
+    test_views: int = 6  # spread evenly between the training views along the path
+    path: str | None = None  # roaming | cross | line; None = the scene's own
+    heading: str = "path"  # path = look along the path; fixed = along world x; random = any, per view
+    yaw: float = 0.0  # degrees, added to every heading
+    tilt: float = 0.0  # degrees, standard deviation of roll and of pitch per view
+    samples: int = 16  # rays per pixel, a square number: stratified and jittered
+    seed: int = 0
+    texture_frequency: float = 1.0  # multiplies the spatial frequency of every pattern
+    objects: int | None = None  # number of loose objects besides the furniture; None = the scene's own
+    spokes: int = 16  # of the Siemens stars in pole_torture
+    points: int = 20_000
+    point_noise: float = 0.002  # standard deviation per axis, relative to the distance from the observing camera
+    outliers: float = 0.01  # share of points that are nowhere near a surface
+    pose_noise_translation: float = 0.0  # standard deviation per axis, relative to the scene's median depth
+    pose_noise_rotation: float = 0.0  # degrees, standard deviation of the angle
+    exposure: float = 0.0  # training views are brightened by a factor 2^e, e uniform in [-exposure, exposure]
+    world_scale: float = 1.0  # world units per metre
+    world_rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)  # degrees about world x, then y, then z
+
+    def __post_init__(self) -> None:
+        """Reject what cannot be generated, naming the value, the rule and the way out."""
+        for field, known in (("scene", SCENES), ("path", (None, *PATHS)), ("heading", HEADINGS)):
+            if getattr(self, field) not in known:
+                names = ", ".join(sorted(name for name in known if name is not None))
+                raise DataError(f"unknown synthetic {field} {getattr(self, field)!r}; known: {names}")
+        if self.width < 8 or self.width % 2:
+            raise DataError(f"width {self.width} is not an even number >= 8; a panorama is 2:1 (data.width)")
+        if math.isqrt(max(self.samples, 0)) ** 2 != self.samples or self.samples < 1:
+            raise DataError(f"samples {self.samples} is not a square number; use 1, 4, 9, 16, 25, ...")
+        for field, least in (("train_views", 2), ("test_views", 0), ("points", 1), ("spokes", 1)):
+            if getattr(self, field) < least:
+                raise DataError(f"{field} {getattr(self, field)} is less than {least}")
+        for field in ("point_noise", "pose_noise_translation", "pose_noise_rotation", "exposure", "tilt"):
+            if not 0 <= getattr(self, field) < math.inf:
+                raise DataError(f"{field} {getattr(self, field)} is not a finite number >= 0")
+        if not 0 <= self.outliers < 1:
+            raise DataError(f"outliers {self.outliers} is not a share in [0, 1)")
+        for field in ("texture_frequency", "world_scale"):
+            if not 0 < getattr(self, field) < math.inf:
+                raise DataError(f"{field} {getattr(self, field)} is not a finite number > 0")
+        if self.objects is not None and self.objects < 0:
+            raise DataError(f"objects {self.objects} is negative; use null for the scene's own number")
+
+    @property
+    def height(self) -> int:
+        """Image height in pixels."""
+        return self.width // 2

@@ -1,0 +1,197 @@
+"""The scenes S1-S7 of the stress suite, as blueprints of one generator.
+
+S1 room, S2 two_rooms (a door between them), S3 outdoor (far ring and sky), S4 pole_torture (Siemens stars and rods
+at both poles), S5 bare_room (posters on a tenth of the walls), S6 near_clutter (objects 5-30 cm from the path),
+S7 glossy (mirror-like materials, so colours depend on the view).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from padgs.data.synthetic import furniture as fu
+from padgs.data.synthetic import textures as tx
+from padgs.data.synthetic.options import SyntheticOptions
+from padgs.data.synthetic.outdoor import outdoor
+from padgs.data.synthetic.paths import Walk
+from padgs.data.synthetic.shapes import Box, Material, Point, Rod, Room, Shape
+from padgs.data.synthetic.textures import Array, Texture, scaled
+from padgs.data.synthetic.world import Light, World
+
+Furnish = Callable[[SyntheticOptions, Array, np.random.Generator], World]  # options, dense path [n, 3], random
+
+
+@dataclass(frozen=True)
+class Blueprint:
+    """A scene before it is built."""
+
+    walk: Walk
+    path: str  # the kind of path it has unless asked otherwise
+    objects: int  # likewise, loose objects
+    furnish: Furnish
+
+
+PLASTER: tx.Color = (0.82, 0.79, 0.73)
+PAPER: tx.Color = (0.93, 0.91, 0.86)
+INK: tx.Color = (0.16, 0.13, 0.12)
+
+
+def _posters(count: int, width: float, size: float) -> list[tuple[float, float, float, float, Texture]]:
+    """`count` posters of height `size` in a row along a wall of the given width."""
+    looks = (
+        tx.picture((0.35, 0.6, 0.85), (0.12, 0.32, 0.22), (0.98, 0.75, 0.25), size),
+        tx.print_of(PAPER, INK, size / 16),
+        tx.picture((0.9, 0.55, 0.4), (0.25, 0.14, 0.3), (1.0, 0.9, 0.6), size),
+        tx.medallion((0.12, 0.18, 0.3), (0.85, 0.7, 0.4), (0.9, 0.9, 0.85), size / 2.2, 7),
+    )
+    places = (np.arange(count) + 0.5) / count * width - width / 2
+    return [(float(u), 0.15, 0.72 * size, size, looks[k % len(looks)]) for k, u in enumerate(places)]
+
+
+def _room_materials(options: SyntheticOptions, width: float, depth: float, gloss: float = 0.0) -> tuple[Material, ...]:
+    f = options.texture_frequency
+    brick = scaled(tx.bricks((0.45, 0.2, 0.14), (0.78, 0.45, 0.33), (0.78, 0.74, 0.68)), f)
+    paper = scaled(tx.wallpaper((0.55, 0.62, 0.52), (0.86, 0.83, 0.68)), f)
+    tiles = scaled(tx.checker((0.28, 0.42, 0.5), (0.86, 0.87, 0.83), 0.2), f)
+    rough = scaled(tx.plain(PLASTER, 0.35, 2.0), f)
+    rug = scaled(tx.medallion((0.55, 0.13, 0.12), (0.14, 0.17, 0.32), (0.9, 0.76, 0.45), 1.7 * f, 8), f)
+    rosette = scaled(tx.medallion((0.88, 0.86, 0.8), (0.62, 0.58, 0.5), (0.8, 0.6, 0.25), 1.5 * f, 12), f)
+    view = tx.window((0.45, 0.68, 0.95), (0.9, 0.88, 0.83))
+    return (
+        Material(tx.framed(brick, _posters(2, depth * 0.8, 0.9)[:1])),
+        Material(tx.framed(rough, [*_posters(3, depth * 0.85, 0.8)])),
+        Material(tx.framed(tiles, ((0.9, 0.25, 1.0, 1.1, view), (-0.9, 0.25, 1.0, 1.1, view)))),
+        Material(tx.framed(paper, _posters(3, width * 0.7, 0.75))),
+        Material(tx.disc(scaled(tx.planks(*fu.OAK), f), rug, 1.7), gloss),
+        Material(tx.disc(scaled(tx.checker((0.84, 0.82, 0.77), (0.8, 0.78, 0.73), 0.6), f), rosette, 1.5)),
+    )
+
+
+def _furniture(rng: np.random.Generator) -> list[Shape]:
+    """What stands along the walls of the 6 x 5 x 2.8 m room, and the rods that cross it."""
+    steel = fu.metal()
+    return [
+        *fu.bookshelf(-1.5, 2.3, 1.6, 2.0),
+        *fu.sofa(1.3, 1.95),
+        *fu.table(2.35, -1.5, 0.9, 1.2, 0.75),
+        fu.loose_object((2.35, -1.3, 0.9), 0.15, rng),
+        Box((2.35, -1.75, 0.88), (0.12, 0.17, 0.13), fu.matt(tx.print_of(PAPER, INK, 0.04)), 0.4),
+        *fu.crates(-2.45, -1.9, rng),
+        *fu.plant(-2.5, 1.3, 1.5, rng),
+        *fu.floor_lamp(2.6, 0.7),
+        *fu.pendant(0.0, 0.0, 2.8, 0.4),
+        Rod((-3, -0.9, 2.35), (3, -0.9, 2.35), 0.015, steel),
+        Rod((-3, 0.95, 2.3), (3, 0.95, 2.3), 0.01, steel),
+        Rod((-1.9, -2.4, 2.15), (1.9, -2.4, 2.15), 0.02, fu.metal((0.8, 0.65, 0.3))),
+        Rod((0.35, -1.75, 0), (0.35, -1.75, 2.8), 0.012, steel),
+        Rod((-2.1, 0.1, 0), (-2.1, 0.1, 2.8), 0.015, fu.metal((0.75, 0.3, 0.25))),
+    ]
+
+
+def _room(low: Point, high: Point, materials: tuple[Material, ...]) -> Room:
+    return Room(low, high, materials)
+
+
+_LOW, _HIGH = (-3.0, -2.5, 0.0), (3.0, 2.5, 2.8)
+_LIGHT = Light((((0.0, 0.0, 2.4), 0.85), ((2.6, 0.7, 1.75), 0.35)))
+
+
+def room(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
+    """S1: a furnished room, 6 x 5 x 2.8 m."""
+    shapes = [_room(_LOW, _HIGH, _room_materials(options, 6, 5)), *_furniture(rng)]
+    shapes += fu.scatter(_objects(options), path, (-2.0, -1.8, 0.5), (2.0, 1.5, 2.5), 0.35, rng)
+    return World(tuple(shapes), _LIGHT)
+
+
+def near_clutter(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
+    """S6: the room with small objects hanging 5-30 cm from the camera path."""
+    shapes = [_room(_LOW, _HIGH, _room_materials(options, 6, 5)), *_furniture(rng)]
+    return World((*shapes, *fu.beside(_objects(options), path, 0.05, 0.3, rng)), _LIGHT)
+
+
+def glossy(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
+    """S7: the room with a polished floor and mirror-like objects."""
+    shapes = [_room(_LOW, _HIGH, _room_materials(options, 6, 5, gloss=0.12)), *_furniture(rng)]
+    shapes += fu.scatter(_objects(options), path, (-2.0, -1.8, 0.5), (2.0, 1.5, 2.5), 0.35, rng, reflectance=0.3)
+    return World(tuple(shapes), _LIGHT)
+
+
+def bare_room(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
+    """S5: smooth one-coloured surfaces; posters cover a tenth of the walls."""
+    white, gray = tx.plain((0.8, 0.8, 0.78)), tx.plain((0.55, 0.55, 0.55))
+    # 4 walls are 61.6 m2; 9 posters of 0.72 x 0.975 m cover a tenth.
+    rows = [
+        Material(tx.framed(white, _posters(count, extent, 0.975))) for count, extent in ((2, 5), (2, 5), (2, 6), (3, 6))
+    ]
+    shapes: list[Shape] = [_room(_LOW, _HIGH, (*rows, Material(gray), Material(white)))]
+    shapes += fu.scatter(_objects(options), path, (-2.0, -1.8, 0.3), (2.0, 1.5, 1.2), 0.35, rng)
+    return World(tuple(shapes), Light((((0.0, 0.0, 2.5), 0.9),)))
+
+
+def pole_torture(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
+    """S4: Siemens stars on floor and ceiling, and thin rods across, above, below and beside the cameras."""
+    f = options.texture_frequency
+    star = tx.siemens_star(INK, PAPER, options.spokes, 1.0 / f)
+    walls = _room_materials(options, 6, 5)[:4]
+    shapes: list[Shape] = [_room(_LOW, _HIGH, (*walls, Material(star), Material(star)))]
+    for k, offset in enumerate(np.linspace(-1.2, 1.2, 5)):
+        skin = fu.metal(fu.BRIGHT[k])
+        shapes += [
+            Rod((offset, -2.5, 2.3), (offset, 2.5, 2.3), 0.008 + 0.003 * k, skin),
+            Rod((-3, offset, 0.5), (3, offset, 0.5), 0.008 + 0.003 * k, skin),
+            Rod((-3, 0.8 * offset, 2.45), (3, 0.8 * offset, 2.45), 0.006, skin),
+            Rod((1.7 * offset, 1.9, 0), (1.7 * offset, 1.9, 2.8), 0.01, skin),
+            Rod((1.7 * offset, -1.9, 0), (1.7 * offset, -1.9, 2.8), 0.01, skin),
+        ]
+    shapes += fu.scatter(_objects(options), path, (-2.0, -1.8, 0.6), (2.0, 1.8, 2.2), 0.35, rng)
+    return World(tuple(shapes), Light((((1.5, 0.0, 2.1), 0.6), ((-1.5, 0.0, 2.1), 0.6)), ambient=(0.5, 0.5, 0.52)))
+
+
+def two_rooms(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
+    """S2: two furnished rooms of 5 x 5 m with an open door between them; most things are hidden from most views."""
+    f = options.texture_frequency
+    partition = Material(scaled(tx.wallpaper((0.62, 0.5, 0.42), (0.9, 0.82, 0.7)), f))
+    frame = fu.matt(tx.planks(*fu.WALNUT, width=0.06))
+    shapes: list[Shape] = [
+        _room((-5.0, -2.5, 0.0), (5.0, 2.5, 2.8), _room_materials(options, 10, 5)),
+        Box((0, -1.5, 1.4), (0.08, 1.0, 1.4), (partition,)),
+        Box((0, 1.5, 1.4), (0.08, 1.0, 1.4), (partition,)),
+        Box((0, 0, 2.45), (0.08, 0.5, 0.35), (partition,)),
+        *(Box((0, y, 1.05), (0.1, 0.03, 1.05), frame) for y in (-0.5, 0.5)),
+        Box((0, 0, 2.1), (0.1, 0.53, 0.03), frame),
+        *fu.bookshelf(-2.4, 2.3, 1.8, 2.1),
+        *fu.table(-3.9, -1.6, 1.2, 0.8, 0.75),
+        *fu.crates(-0.6, -2.0, rng),
+        *fu.plant(-4.5, 1.9, 1.5, rng),
+        *fu.pendant(-2.6, 0.0, 2.8, 0.45),
+        *fu.sofa(2.6, 1.95),
+        *fu.floor_lamp(4.5, 1.6),
+        *fu.table(1.0, -2.0, 0.8, 0.6, 0.6),
+        *fu.plant(4.4, -1.9, 1.6, rng),
+        *fu.pendant(2.6, 0.0, 2.8, 0.45),
+        Rod((0.1, -0.95, 2.3), (5, -0.95, 2.3), 0.012, fu.metal()),
+        Rod((-1.2, 1.6, 0), (-1.2, 1.6, 2.8), 0.015, fu.metal()),
+    ]
+    shapes += fu.scatter(_objects(options), path, (-4.3, -1.9, 0.5), (4.3, 1.7, 2.2), 0.35, rng)
+    return World(tuple(shapes), Light((((-2.6, 0.0, 2.35), 0.7), ((2.6, 0.0, 2.35), 0.7))))
+
+
+def _objects(options: SyntheticOptions) -> int:
+    return options.objects or 0  # the blueprint's number has been filled in by SyntheticTruth
+
+
+_DOOR_ROUTE = ((0.0, 0.05), (-1.3, 0.3), (-2.4, 1.1), (-3.7, 0.7), (-3.6, -0.6), (-2.2, -1.0), (-1.2, -0.3),
+               (0.0, -0.05), (1.3, -0.4), (2.4, -1.1), (3.6, -0.8), (3.7, 0.6), (2.4, 1.0), (1.2, 0.35))  # fmt: skip
+
+BLUEPRINTS: dict[str, Blueprint] = {
+    "room": Blueprint(Walk((-0.1, -0.1), (1.4, 1.15)), "roaming", 6, room),
+    "two_rooms": Blueprint(Walk((0.0, 0.0), (3.8, 1.1), waypoints=_DOOR_ROUTE), "roaming", 8, two_rooms),
+    "outdoor": Blueprint(Walk((0.0, 0.0), (4.0, 3.0), height=1.7), "roaming", 12, outdoor),
+    "pole_torture": Blueprint(Walk((0.0, 0.0), (0.9, 0.7), height=1.4), "cross", 4, pole_torture),
+    "bare_room": Blueprint(Walk((-0.1, -0.1), (1.4, 1.15)), "roaming", 3, bare_room),
+    "near_clutter": Blueprint(Walk((-0.1, -0.1), (1.4, 1.15)), "line", 40, near_clutter),
+    "glossy": Blueprint(Walk((-0.1, -0.1), (1.4, 1.15)), "roaming", 8, glossy),
+}

@@ -1,0 +1,307 @@
+"""The solids that synthetic scenes are made of, each with a closed-form nearest hit along a ray.
+
+Arrays are component-first, [3, n], because numpy is fastest on contiguous components. World axes: x, y horizontal,
+z up, metres. `hit` works in the precision of the directions (float32 for colour, float64 for exact depth).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+
+from padgs.data.synthetic.textures import Array, Texture
+
+Point = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Material:
+    """How a surface looks."""
+
+    texture: Texture
+    reflectance: float = 0.0  # at normal incidence: 0 = matt, 1 = mirror
+    glows: bool = False  # shows its texture unlit, and casts no shadow
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Where rays met a shape."""
+
+    normal: Array  # [3, n] towards the side that is seen
+    uv: Array  # [2, n] metres from the centre of the face
+    face: Array  # [n] int, index into the shape's materials
+
+
+class Shape(Protocol):
+    """A solid (or the inside of one)."""
+
+    materials: tuple[Material, ...]
+
+    @property
+    def bounds(self) -> tuple[Point, float] | None:
+        """A sphere (centre, radius) around it, or None where it surrounds the camera."""
+        ...
+
+    def hit(self, origin: Array, direction: Array) -> Array:
+        """Distance [n] along unit directions [3, n] from origins [3, 1] or [3, n] to the first hit; inf = missed."""
+        ...
+
+    def surface(self, points: Array) -> Surface:
+        """Normal, texture coordinates and face of points [3, n] on it."""
+        ...
+
+
+def _column(point: Point, like: Array) -> Array:
+    return np.asarray(point, like.dtype).reshape(3, 1)
+
+
+_FACE_AXES = np.array(((1, 1, 0, 0, 0, 0), (2, 2, 2, 2, 1, 1)))  # which coordinate is u, which v
+_FACE_SIGNS = np.array((-1, 1, 1, -1, 1, 1))  # of u, seen from outside
+
+
+def _face_uv(local: Array, face: Array, side: float) -> Array:
+    """Texture coordinates on the six faces of a box; `side` = 1 seen from outside, -1 from inside."""
+    first, second = _FACE_AXES[:, face]
+    sign = (_FACE_SIGNS * side).astype(local.dtype)  # floors and ceilings are not mirrored
+    sign[4:] = 1
+    columns = np.arange(local.shape[1])
+    return np.stack((sign[face] * local[first, columns], local[second, columns]))
+
+
+def _face_normal(face: Array, dtype: np.dtype) -> Array:
+    normals = np.zeros((6, 3), dtype)
+    for index in range(6):
+        normals[index, index // 2] = 1 if index % 2 else -1
+    return normals[face].T
+
+
+@dataclass(frozen=True)
+class Room:
+    """The inside of an axis-aligned box. Faces in the order -x, +x, -y, +y, -z (floor), +z (ceiling)."""
+
+    low: Point
+    high: Point
+    materials: tuple[Material, ...]
+
+    bounds = None
+
+    def hit(self, origin: Array, direction: Array) -> Array:
+        """See Shape."""
+        low, high = _column(self.low, direction), _column(self.high, direction)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = np.where(direction > 0, high - origin, low - origin) / direction
+        return np.fmin(np.fmin(t[0], t[1]), t[2])  # 0 / 0 on a wall that the ray is parallel to is NaN: not a hit
+
+    def surface(self, points: Array) -> Surface:
+        """See Shape."""
+        gaps = np.empty((6, points.shape[1]), points.dtype)
+        gaps[0::2], gaps[1::2] = points - _column(self.low, points), _column(self.high, points) - points
+        face = np.argmin(np.abs(gaps), axis=0)
+        middle = (np.asarray(self.low) + np.asarray(self.high)) / 2
+        local = points - _column(tuple(middle), points)
+        return Surface(-_face_normal(face, points.dtype), _face_uv(local, face, -1), face)
+
+    def size(self, face: int) -> tuple[float, float]:
+        """Extent (u, v) of a face in metres."""
+        extent = np.subtract(self.high, self.low)
+        return ((extent[1], extent[2]), (extent[0], extent[2]), (extent[0], extent[1]))[face // 2]
+
+    def point_at(self, face: int, uv: Array) -> Array:
+        """The point [3, n] of a face at texture coordinates [2, n]: the inverse of `surface`."""
+        axis, sign = face // 2, 1.0 if face % 2 else -1.0
+        points = np.empty((3, uv.shape[1]), uv.dtype)
+        points[axis] = sign * (self.high[axis] - self.low[axis]) / 2
+        points[(1, 0, 0)[axis]] = uv[0] * (-sign if axis == 0 else sign if axis == 1 else 1.0)
+        points[(2, 2, 1)[axis]] = uv[1]
+        return points + _column(tuple((np.asarray(self.low) + np.asarray(self.high)) / 2), points)
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box, turned about the vertical. Faces as in Room; a single material covers all of them."""
+
+    center: Point
+    half: Point
+    materials: tuple[Material, ...]
+    yaw: float = 0.0  # rad
+
+    @property
+    def bounds(self) -> tuple[Point, float]:
+        """See Shape."""
+        return self.center, math.hypot(*self.half)
+
+    def _local(self, vectors: Array) -> Array:
+        if self.yaw == 0:
+            return vectors
+        c, s = math.cos(self.yaw), math.sin(self.yaw)
+        return np.stack((c * vectors[0] + s * vectors[1], c * vectors[1] - s * vectors[0], vectors[2]))
+
+    def hit(self, origin: Array, direction: Array) -> Array:
+        """See Shape."""
+        start, ray = self._local(origin - _column(self.center, direction)), self._local(direction)
+        half = _column(self.half, direction)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inverse = 1 / ray
+            middle, reach = -start * inverse, np.abs(half * inverse)
+            near, far = middle - reach, middle + reach
+        enter = np.fmax(np.fmax(near[0], near[1]), near[2])
+        leave = np.fmin(np.fmin(far[0], far[1]), far[2])
+        return np.where((enter <= leave) & (enter > 0), enter, np.inf)
+
+    def surface(self, points: Array) -> Surface:
+        """See Shape."""
+        local = self._local(points - _column(self.center, points))
+        outside = np.abs(local) - _column(self.half, points)
+        axis = np.argmax(outside, axis=0)
+        face = 2 * axis + (np.take_along_axis(local, axis[None], 0)[0] > 0)
+        normal = _face_normal(face, points.dtype)
+        if self.yaw:
+            c, s = math.cos(self.yaw), math.sin(self.yaw)
+            normal = np.stack((c * normal[0] - s * normal[1], s * normal[0] + c * normal[1], normal[2]))
+        return Surface(normal, _face_uv(local, face, 1), face)
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A sphere. uv = (longitude, latitude) x radius."""
+
+    center: Point
+    radius: float
+    materials: tuple[Material, ...]
+
+    @property
+    def bounds(self) -> tuple[Point, float]:
+        """See Shape."""
+        return self.center, self.radius
+
+    def hit(self, origin: Array, direction: Array) -> Array:
+        """See Shape."""
+        start = origin - _column(self.center, direction)
+        along = (start * direction).sum(0)
+        miss = start - along * direction  # from the centre to the ray: no cancellation, unlike |start|^2 - r^2
+        inside = self.radius**2 - (miss * miss).sum(0)
+        t = -along - np.sqrt(np.maximum(inside, 0))
+        return np.where((inside > 0) & (t > 0), t, np.inf)
+
+    def surface(self, points: Array) -> Surface:
+        """See Shape."""
+        normal = (points - _column(self.center, points)) / np.asarray(self.radius, points.dtype)
+        latitude = np.arcsin(np.clip(normal[2], -1, 1))
+        uv = np.stack((np.arctan2(normal[1], normal[0]), latitude)) * np.asarray(self.radius, points.dtype)
+        return Surface(normal, uv, np.zeros(points.shape[1], np.int64))
+
+
+@dataclass(frozen=True)
+class Rod:
+    """A round bar from `start` to `end`, open or with spherical ends. uv = (angle x radius, length along)."""
+
+    start: Point
+    end: Point
+    radius: float
+    materials: tuple[Material, ...]
+    rounded: bool = False  # not needed where both ends stick in something
+
+    @property
+    def bounds(self) -> tuple[Point, float]:
+        """See Shape."""
+        a, b = np.asarray(self.start), np.asarray(self.end)
+        return tuple((a + b) / 2), float(np.linalg.norm(b - a)) / 2 + self.radius
+
+    @cached_property
+    def _axis(self) -> tuple[Array, float]:
+        span = np.subtract(self.end, self.start)
+        length = float(np.linalg.norm(span))
+        return span / length, length
+
+    def hit(self, origin: Array, direction: Array) -> Array:
+        """See Shape."""
+        unit, length = self._axis
+        axis = _column(tuple(unit), direction)
+        start = origin - _column(self.start, direction)
+        ray_along, start_along = axis[:, 0] @ direction, axis[:, 0] @ start
+        ray_across, start_across = direction - ray_along * axis, start - start_along * axis
+        a = (ray_across * ray_across).sum(0)
+        b = (ray_across * start_across).sum(0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            miss = start_across - (b / a) * ray_across
+            inside = self.radius**2 - (miss * miss).sum(0)
+            t = (-b - np.sqrt(np.maximum(inside, 0) * a)) / a
+            height = start_along + t * ray_along
+        side = np.where((inside > 0) & (t > 0) & (height >= 0) & (height <= length), t, np.inf)
+        if not self.rounded:
+            return side
+        ends = (Sphere(end, self.radius, ()).hit(origin, direction) for end in (self.start, self.end))
+        return np.minimum(side, np.minimum(*ends))
+
+    def surface(self, points: Array) -> Surface:
+        """See Shape."""
+        unit, length = self._axis
+        axis = _column(tuple(unit), points)
+        start = points - _column(self.start, points)
+        along = (axis * start).sum(0)
+        normal = (start - np.clip(along, 0, length) * axis) / np.asarray(self.radius, points.dtype)
+        helper = np.eye(3)[int(np.argmin(np.abs(unit)))]
+        first = np.cross(unit, helper)
+        first /= np.linalg.norm(first)
+        second = np.cross(unit, first)
+        angle = np.arctan2(*((_column(tuple(e), points) * normal).sum(0) for e in (second, first)))
+        uv = np.stack((angle * np.asarray(self.radius, points.dtype), along))
+        return Surface(normal, uv, np.zeros(points.shape[1], np.int64))
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The plane z = 0, seen from above."""
+
+    materials: tuple[Material, ...]
+
+    bounds = None
+
+    def hit(self, origin: Array, direction: Array) -> Array:
+        """See Shape."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = -origin[2] / direction[2]
+        return np.where((direction[2] < 0) & (t > 0), t, np.inf)
+
+    def surface(self, points: Array) -> Surface:
+        """See Shape."""
+        normal = np.zeros_like(points)
+        normal[2] = 1
+        return Surface(normal, points[:2], np.zeros(points.shape[1], np.int64))
+
+
+@dataclass(frozen=True)
+class Ring:
+    """The inside of an upright cylinder about the z axis with a jagged top: mountains far away."""
+
+    radius: float
+    height: float  # of the highest peaks
+    materials: tuple[Material, ...]
+
+    bounds = None
+
+    def ridge(self, angle: Array) -> Array:
+        """Height of the top at an azimuth in radians; periodic."""
+        waves = sum(np.sin(k * angle + 1.7 * k * k) / k for k in (2, 3, 5, 9, 17, 31))
+        return self.height * (0.55 + 0.3 * waves)
+
+    def hit(self, origin: Array, direction: Array) -> Array:
+        """See Shape."""
+        a = direction[0] ** 2 + direction[1] ** 2
+        b = origin[0] * direction[0] + origin[1] * direction[1]
+        c = origin[0] ** 2 + origin[1] ** 2 - self.radius**2
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = (-b + np.sqrt(b * b - a * c)) / a
+            x, y, z = origin + t * direction
+            return np.where((z >= 0) & (z < self.ridge(np.arctan2(y, x))), t, np.inf)
+
+    def surface(self, points: Array) -> Surface:
+        """See Shape."""
+        normal = -points / np.asarray(self.radius, points.dtype)
+        normal[2] = 0
+        angle = np.arctan2(points[1], points[0])
+        return Surface(normal, np.stack((angle * self.radius, points[2])), np.zeros(points.shape[1], np.int64))
