@@ -1,0 +1,141 @@
+import pytest
+import torch
+from tiny_scene import tiny_scene
+
+from baselines import METHODS
+from baselines.omnigs import RELEASED, OmniGSMethod, OmniGSOptions
+from padgs import checkpoint
+from padgs.method import Budget, Failure, RenderConfig, State
+from padgs.registry import lookup
+from padgs.scene import Scene, View
+from padgs.train import TrainOptions
+
+ITERATIONS = 120  # densifies at 50, and goes through all degrees
+
+
+def method(seed: int = 0, **options) -> OmniGSMethod:
+    options = {"densify_until": 20_000, "max_gaussians": 60} | options
+    return OmniGSMethod(OmniGSOptions(**options), RenderConfig(backend="torch"), TrainOptions(), seed)
+
+
+def psnr(trained: OmniGSMethod, view: View) -> float:
+    error = trained.render(view).image.clamp(0, 1) - view.image()
+    return -10 * torch.log10(error.square().mean()).item()
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return tiny_scene()
+
+
+@pytest.fixture(scope="module")
+def finished(scene) -> State:
+    trained = method()
+    for _ in trained.fit(scene, Budget(ITERATIONS)):
+        pass
+    return trained.state()
+
+
+def assert_same_but_time(a: State, b: State) -> None:
+    assert {**a.values, "seconds": 0} == {**b.values, "seconds": 0}
+    assert a.tensors.keys() == b.tensors.keys()
+    for name, tensor in a.tensors.items():
+        assert torch.equal(tensor, b.tensors[name]), name
+
+
+def test_is_registered():
+    assert lookup(METHODS, "omnigs", "method") is OmniGSMethod
+
+
+def test_sixty_iterations_learn_the_scene(scene):
+    trained = method()
+    records = trained.fit(scene, Budget(60))
+    next(records)
+    start = psnr(trained, scene.test[0])
+    losses = [record.loss for record in records]
+    assert losses[-1] < 0.6 * losses[0]
+    assert psnr(trained, scene.test[0]) > start + 3  # measured: 18.8 to 22.2 dB
+
+
+def test_densification_and_degrees_follow_the_run(scene, finished):
+    assert finished.values["model"]["active_degree"] == 3
+    assert finished.tensors["model/splats/means"].shape == (60, 3), "40 points have grown to the cap"
+
+
+@pytest.mark.parametrize("stop", [1, 49, 50, 51, 97])
+def test_killed_and_resumed_is_bit_identical(scene, finished, tmp_path, stop):
+    first = method()
+    records = first.fit(scene, Budget(ITERATIONS))
+    for _ in range(stop):
+        next(records)
+    state = first.state()
+    checkpoint.save(state, tmp_path)
+    torch.manual_seed(stop)  # another process
+
+    second = method()
+    second.load_state(checkpoint.load(tmp_path))
+    assert_same_but_time(second.state(), state)
+    rest = [record.iteration for record in second.fit(scene, Budget(ITERATIONS))]
+    assert rest == list(range(stop + 1, ITERATIONS + 1))
+    assert_same_but_time(second.state(), finished)
+
+
+def test_a_loaded_state_renders_without_the_scene(scene, finished):
+    trained, shown = method(), method()
+    for _ in trained.fit(scene, Budget(ITERATIONS)):
+        pass
+    shown.load_state(finished)
+    assert torch.equal(shown.render(scene.test[0]).image, trained.render(scene.test[0]).image)
+    assert shown.size() == trained.size()
+
+
+def test_size_counts_59_numbers_per_gaussian(finished):
+    shown = method()
+    shown.load_state(finished)
+    size = shown.size()
+    assert size.counts == {"gaussians": 60} and size.parameters == 60 * 59 and size.bytes == 60 * 236
+
+
+def test_a_poisoned_gaussian_stops_the_run_by_name(scene):
+    trained = method()
+    records = trained.fit(scene, Budget(60))
+    state = None
+    for record in records:
+        if record.iteration == 20:
+            state = trained.state()
+            break
+    assert state is not None
+    state.tensors["model/splats/log_scales"][3, 1] = float("nan")
+    poisoned = method()
+    poisoned.load_state(state)
+    with pytest.raises(Failure, match=r"log_scales\[3, 1\] is nan at iteration \d+") as caught:
+        list(poisoned.fit(scene, Budget(60)))
+    assert caught.value.status == "nan"
+
+
+def test_seeds_differ_and_repeat(scene):
+    means = []
+    for seed in (1, 1, 2):
+        trained = method(seed)
+        for _ in trained.fit(scene, Budget(10)):
+            pass
+        means.append(trained.state().tensors["model/splats/means"])
+    assert torch.equal(means[0], means[1]) and not torch.equal(means[0], means[2])
+
+
+def test_released_bugs_are_off_unless_asked_for():
+    assert not any((OmniGSOptions().released_start, OmniGSOptions().released_reset))
+    released = OmniGSOptions(**RELEASED)
+    assert released.released_start and released.released_reset and released.max_gaussians is None
+
+
+def test_before_training_there_is_nothing(scene):
+    with pytest.raises(RuntimeError, match="no model before fit"):
+        method().render(scene.test[0])
+    with pytest.raises(RuntimeError, match="no state before fit"):
+        method().state()
+
+
+def test_other_options_than_the_state_are_refused(finished):
+    with pytest.raises(ValueError, match=r"sh_rest of the stored model has shape \[60, 15, 3\]"):
+        method(sh_degree=1).load_state(finished)

@@ -1,0 +1,35 @@
+"""A scene small enough to train on in a second: eight coloured Gaussians seen by six cameras."""
+
+import torch
+
+from padgs.gaussians import Gaussians
+from padgs.render import RenderOptions, render
+from padgs.scene import Scene, View
+
+WIDTH, HEIGHT = 32, 16
+
+
+def truth() -> Gaussians:
+    corners = torch.tensor([[x, y, z] for x in (-2.0, 2.0) for y in (-1.5, 1.5) for z in (-2.0, 2.0)])
+    return Gaussians(
+        means=corners,
+        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(8, 1),
+        scales=torch.full((8, 3), 0.6),
+        opacities=torch.full((8,), 0.9),
+        colors=0.1 + 0.8 * (corners > 0).float(),
+    )
+
+
+def tiny_scene() -> Scene:
+    views = []
+    for number in range(6):
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, 3] = 0.3 * torch.tensor([number % 2, (number // 2) % 2, number / 3], dtype=torch.float64)
+        view = View(f"{number:02d}", pose, WIDTH, HEIGHT)
+        image = render(truth(), view, RenderOptions(), backend="torch").image
+        pixels = (image.clamp(0, 1) * 255).round().to(torch.uint8)
+        views.append(View(view.name, pose, WIDTH, HEIGHT, load_pixels=lambda pixels=pixels: pixels))
+    noise = 0.2 * torch.randn(40, 3, generator=torch.Generator().manual_seed(1))
+    points = truth().means.repeat(5, 1) + noise
+    grey = torch.full((40, 3), 128, dtype=torch.uint8)
+    return Scene("tiny", tuple(views[:5]), tuple(views[5:]), points, grey, fingerprint="tiny")
