@@ -6,7 +6,7 @@ Presets: `padgs`, the paper as written, and `padgs_release`, the released code w
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -28,51 +28,52 @@ MIN_TRAVEL = 0.1  # scene units; cameras that hardly move, or a single one, must
 class LearningRates:
     """Learning rates of Adam; pairs are the first and the last of a log-linear decay over the run."""
 
-    offsets: tuple[float, float] = (0.01, 0.0001)  # times the extent of the cameras in `offset_unit`
-    offset_unit: str = "scene"  # scene: Scene.unit, so the world's units do not matter | world: as published
-    features: float = 0.0075
-    log_scales: float = 0.007
-    opacity: tuple[float, float] = (0.002, 2e-5)
-    color: tuple[float, float] = (0.008, 5e-5)
-    covariance: tuple[float, float] = (0.004, 0.004)
+    offset_rate: tuple[float, float] = (0.01, 0.0001)  # times the extent of the cameras in `offset_rate_unit`
+    offset_rate_unit: str = "scene"  # scene: Scene.unit, so the world's units do not matter | world: as published
+    feature_rate: float = 0.0075
+    log_scale_rate: float = 0.007
+    opacity_rate: tuple[float, float] = (0.002, 2e-5)  # the three networks
+    color_rate: tuple[float, float] = (0.008, 5e-5)
+    covariance_rate: tuple[float, float] = (0.004, 0.004)
 
     def __post_init__(self) -> None:
         """Reject unknown units."""
-        if self.offset_unit not in OFFSET_RATE_UNITS:
-            raise ValueError(f"unknown offset_unit {self.offset_unit!r}; known: {', '.join(OFFSET_RATE_UNITS)}")
+        if self.offset_rate_unit not in OFFSET_RATE_UNITS:
+            known = ", ".join(OFFSET_RATE_UNITS)
+            raise ValueError(f"unknown offset_rate_unit {self.offset_rate_unit!r}; known: {known}")
 
     def groups(self, model: PaDGS, scene: Scene, iterations: int) -> list[ParameterGroup]:
         """The parameters of a model with their rates in a run of `iterations` on a scene."""
-        travel = max(scene.extent, MIN_TRAVEL * scene.unit) / (scene.unit if self.offset_unit == "scene" else 1.0)
+        travel = max(scene.extent, MIN_TRAVEL * scene.unit) / (scene.unit if self.offset_rate_unit == "scene" else 1.0)
+        first, last = self.offset_rate
         groups = [
-            ParameterGroup(
-                "offsets", (model.offsets,), LogLinear(*(travel * r for r in self.offsets), steps=iterations)
-            ),
-            ParameterGroup("features", (model.features,), Constant(self.features)),
-            ParameterGroup("log_scales", (model.log_scales,), Constant(self.log_scales)),
+            ParameterGroup("offsets", (model.offsets,), LogLinear(travel * first, travel * last, iterations)),
+            ParameterGroup("features", (model.features,), Constant(self.feature_rate)),
+            ParameterGroup("log_scales", (model.log_scales,), Constant(self.log_scale_rate)),
         ]
         for head in ("opacity", "color", "covariance"):
             weights = tuple(getattr(model.decoder, head).values())
-            groups.append(ParameterGroup(head, weights, LogLinear(*getattr(self, head), steps=iterations)))
+            first, last = getattr(self, f"{head}_rate")
+            groups.append(ParameterGroup(head, weights, LogLinear(first, last, iterations)))
         return groups
 
 
 @dataclass(frozen=True)
-class PaDGSMethodOptions:
-    """The `method` group of the configuration."""
+class PaDGSMethodOptions(PaDGSOptions, GrowthOptions, LearningRates):
+    """The `method` group of the configuration: the model, its growth and its learning rates, all in one list."""
 
-    model: PaDGSOptions = field(default_factory=PaDGSOptions)
-    growth: GrowthOptions = field(default_factory=GrowthOptions)
-    rates: LearningRates = field(default_factory=LearningRates)
     scale_windows: bool = True  # growth keeps its share of the run; false: its iterations are taken as they stand
+
+    def __post_init__(self) -> None:
+        """Check every part."""
+        for part in (PaDGSOptions, GrowthOptions, LearningRates):
+            part.__post_init__(self)
 
 
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
-    "padgs": {"model": {}, "growth": {}, "rates": {}, "render": {}, "train": {}},
+    "padgs": {"method": {}, "render": {}, "train": {}},
     "padgs_release": {
-        "model": RELEASED_MODEL,
-        "growth": RELEASED_GROWTH,
-        "rates": {"offset_unit": "world"},
+        "method": {**RELEASED_MODEL, **RELEASED_GROWTH, "offset_rate_unit": "world"},
         "render": {"near": 0.2, "near_unit": "world", "wrap": False, "bounds": "square"},
         "train": {"weight": "end_rows", "normalisation": "channel_sum"},
     },
@@ -88,10 +89,7 @@ def preset(name: str) -> tuple[PaDGSMethodOptions, RenderConfig, TrainOptions]:
     if name not in PRESETS:
         raise ValueError(f"unknown preset {name!r}; known: {', '.join(PRESETS)}")
     of = PRESETS[name]
-    method = PaDGSMethodOptions(
-        PaDGSOptions(**of["model"]), GrowthOptions(**of["growth"]), LearningRates(**of["rates"])
-    )
-    return method, RenderConfig(**of["render"]), TrainOptions(**of["train"])
+    return PaDGSMethodOptions(**of["method"]), RenderConfig(**of["render"]), TrainOptions(**of["train"])
 
 
 class PaDGSMethod:
@@ -116,20 +114,20 @@ class PaDGSMethod:
     def fit(self, scene: Scene, budget: Budget) -> Iterator[Record]:
         """Train, from the point cloud or from where the loaded state was taken; see `padgs.method.Method`."""
         if self._start is None:
-            self._model = PaDGS.from_scene(scene, self.options.model, seed=self.seed)
+            self._model = PaDGS.from_scene(scene, self.options, seed=self.seed)
         self._scene_unit = scene.unit
-        windows = self.options.growth
-        windows = windows.for_run(budget.iterations) if self.options.scale_windows else windows
+        growth = self.options.for_run(budget.iterations) if self.options.scale_windows else self.options
         trainee = TrainablePaDGS(
             self.model,
-            Growth(self.model, windows, seed=self.seed),
-            self.options.rates.groups(self.model, scene, budget.iterations),
+            Growth(self.model, growth, seed=self.seed),
+            self.options.groups(self.model, scene, budget.iterations),
             self.render_config.options(scene.unit),
             self.render_config.backend,
         )
         self._trainer = Trainer(trainee, scene, budget, self.train_options, self.seed)
         if self._start is not None:
             self._trainer.load_state(self._start)
+            self._start = None
         return self._trainer.records()
 
     @property
@@ -153,19 +151,21 @@ class PaDGSMethod:
         """Everything that going on bit-identically needs.
 
         Raises:
-            RuntimeError: training has not begun.
+            RuntimeError: neither `fit` nor `load_state` has been called.
         """
-        if self._trainer is None:
-            raise RuntimeError("PaD-GS has no training state; call fit first")
-        state = self._trainer.state()
-        return State(state.tensors, {**state.values, "scene_unit": self._scene_unit})
+        if self._trainer is not None:
+            state = self._trainer.state()
+            return State(state.tensors, {**state.values, "scene_unit": self._scene_unit})
+        if self._start is not None:
+            return self._start
+        raise RuntimeError("PaD-GS has no state yet; call fit or load_state first")
 
     def load_state(self, state: State) -> None:
         """Become the method that `state` was taken of; `render` works at once, `fit` goes on from there."""
         stored = model_state(state)
         positions, log_scales = stored.tensors["positions"], stored.tensors["log_scales"]
         unit, voxel_size = stored.values["unit"], stored.values["voxel_size"]
-        model = PaDGS(positions, log_scales, self.options.model, voxel_size=voxel_size, unit=unit)
+        model = PaDGS(positions, log_scales, self.options, voxel_size=voxel_size, unit=unit)
         model.load(stored.tensors)
         self._model, self._start, self._trainer = model, state, None
         self._scene_unit = state.values["scene_unit"]

@@ -40,7 +40,7 @@ class GrowthOptions:
     max_anchors: int | None = 1_000_000  # where there are more candidates, those with the largest gradients are kept
 
     def __post_init__(self) -> None:
-        """Reject grids that are not multiples of a voxel, and windows that never open."""
+        """Reject grids that are not multiples of a voxel, and limits without a meaning."""
         if self.levels < 1 or self.refinement < 2 or self.coarsest % self.refinement ** (self.levels - 1):
             raise ValueError(
                 f"coarsest is {self.coarsest} voxels; it must be a multiple of refinement ** (levels - 1), "

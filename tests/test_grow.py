@@ -15,7 +15,7 @@ PUBLISHED = GrowthOptions(**RELEASED_GROWTH)
 
 
 @pytest.fixture
-def lucky(lucky) -> None:
+def lucky(monkeypatch) -> None:
     """No candidate is left out by chance."""
     monkeypatch.setattr(torch, "rand", lambda *size, **_: torch.ones(size))
 
