@@ -248,11 +248,13 @@ class Trainer:
             for number, parameter in enumerate(group.parameters)
         }
 
-    @staticmethod
-    def _refuse_non_finite(tensors: Mapping[str, Tensor | None], iteration: int) -> None:
+    def _refuse_non_finite(self, tensors: Mapping[str, Tensor | None], iteration: int) -> None:
         bad = first_non_finite(tensors)
         if bad is not None:
-            raise Failure("nan", f"{bad} at iteration {iteration}")
+            every = self._options.check_every
+            raise Failure(
+                "nan", f"{bad} at iteration {iteration} (all parameters are checked every {every} iterations)"
+            )
 
 
 def model_state(state: State) -> State:
