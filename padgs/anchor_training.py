@@ -69,5 +69,5 @@ class TrainablePaDGS:
         self.model.load(state.tensors)
         self.model.voxel_size, self.model.unit = state.values["voxel_size"], state.values["unit"]
         for name in self.growth.statistics:
-            self.growth.statistics[name] = state.tensors[f"growth/{name}"].clone()
-        self.growth.generator.set_state(state.tensors["random/growth"])
+            self.growth.statistics[name] = state.tensors[f"growth/{name}"].to(self.model.positions.device, copy=True)
+        self.growth.generator.set_state(state.tensors["random/growth"].cpu())

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 OPACITY_VALUES, COLOR_VALUES, COVARIANCE_VALUES = 1, 3, 7  # outputs of each head per Gaussian
+SORT_OUT_BELOW = 0.9  # share of anchors with a positive opacity
 
 
 class Head(NamedTuple):
@@ -51,7 +52,8 @@ def decode(weights: DecoderWeights, inputs: Tensor) -> Attributes:
     """Decode anchors (Eq. 13): opacity by tanh, colour and shrinkage by sigmoid.
 
     Opacity comes first; the other two networks, nine tenths of the work, see only anchors with a positive one. The
-    values of the others are never used, so the result is exact.
+    values of the others are never used, so the result is exact. Where few anchors are dead, sorting them out costs more
+    than it saves, and all are decoded.
 
     Args:
         weights: the three networks.
@@ -62,7 +64,7 @@ def decode(weights: DecoderWeights, inputs: Tensor) -> Attributes:
     selected = raw_opacities.detach() > 0
     alive = selected.any(-1).nonzero()[:, 0]  # [B]
     slots = selected.view(-1).nonzero()[:, 0]
-    if len(alive) < count:
+    if len(alive) < SORT_OUT_BELOW * count:
         inputs = take_rows(inputs, alive)
         decoded_slots = selected[alive].view(-1).nonzero()[:, 0]  # [N] rows among the B K decoded Gaussians
     else:
