@@ -101,8 +101,8 @@ def from_lpips_package(network: Network) -> Weights:
     modules = [module for module in model.net.modules() if isinstance(module, torch.nn.Conv2d)]
     linears = [getattr(model, f"lin{index}").model[-1].weight for index in range(5)]
     return Weights(
-        [(_frozen(module.weight), _frozen(module.bias)) for module in modules],
-        [_frozen(linear).flatten() for linear in linears],
+        [(module.weight.data, module.bias.data) for module in modules if module.bias is not None],
+        [linear.data.flatten() for linear in linears],
     )
 
 
@@ -148,10 +148,6 @@ class _ArrayUnpickler(pickle.Unpickler):
         if (module, name) not in allowed:
             raise pickle.UnpicklingError(f"refused to load {module}.{name}; weight files hold NumPy arrays only")
         return allowed[module, name]
-
-
-def _frozen(parameter: Tensor) -> Tensor:
-    return parameter.detach().clone()
 
 
 def _tensor(array: np.ndarray) -> Tensor:

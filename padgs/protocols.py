@@ -75,7 +75,7 @@ ROAM_360_BOTTOM_CROP = 65 / 1024  # 360Roam shows the robot there; the released 
 PAPER_360ROAM = replace(PROTOCOLS["paper"], bottom_crop=ROAM_360_BOTTOM_CROP)
 
 
-def protocol_from_options(name: str, **options: Any) -> Protocol:
+def protocol_from_options(name: str, /, **options: Any) -> Protocol:
     """A protocol of `PROTOCOLS` with some of its fields replaced.
 
     >>> protocol_from_options("paper", lpips="none").lpips
