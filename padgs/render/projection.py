@@ -6,7 +6,7 @@ J of Eq. 6-7 at the mean (Eq. 3), and q = delta^T S^-1 delta in pixels.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -73,9 +73,21 @@ def project(
     probe: Tensor | None = None,
 ) -> Footprints:
     """Footprints under `options.projection`; arguments as in `padgs.render.render`."""
-    return lookup(PROJECTIONS, options.projection, "projection")(
-        gaussians, cam_from_world, width, height, options, probe
+    footprints_of = lookup(PROJECTIONS, options.projection, "projection")
+    with torch.no_grad():
+        visible = footprints_of(gaussians, cam_from_world, width, height, options, probe).visible
+        ahead = cam_from_world[:3, :3].T @ (cam_from_world.new_tensor([0.0, 0.0, 1.0]) - cam_from_world[:3, 3])
+    # What is not drawn may hold anything (a mean on the camera, numbers that overflow), and in the backward pass
+    # 0 * inf is NaN: a harmless Gaussian one unit ahead takes its place.
+    chosen = visible[:, None]
+    harmless = replace(
+        gaussians,
+        means=torch.where(chosen, gaussians.means, ahead),
+        quats=torch.where(chosen, gaussians.quats, gaussians.quats.new_tensor([1.0, 0.0, 0.0, 0.0])),
+        scales=torch.where(chosen, gaussians.scales, torch.ones_like(gaussians.scales)),
     )
+    footprints = footprints_of(harmless, cam_from_world, width, height, options, probe)
+    return replace(footprints, visible=visible)
 
 
 def project_erp(
@@ -91,8 +103,6 @@ def project_erp(
     means = gaussians.means @ rotation.T + translation
     squared_radius = (means * means).sum(-1)
     in_front = squared_radius.detach() > options.near**2
-    # A culled mean may lie on the camera, where nothing is differentiable: move it before any division.
-    means = torch.where(in_front[:, None], means, means.new_tensor([0.0, 0.0, 1.0]))
     # So near the axis the chart has no derivative worth the name; such a footprint is held constant.
     near_axis = (means[:, 0] ** 2 + means[:, 2] ** 2).detach() < (MIN_COS_LATITUDE**2) * squared_radius.detach()
     means = torch.where(near_axis[:, None], means.detach(), means)
@@ -118,7 +128,8 @@ def project_erp(
     on_image = (boxes[:, 3] > boxes[:, 2]) & (boxes[:, 3] > 0) & (boxes[:, 2] < height) & (boxes[:, 1] > boxes[:, 0])
     if not options.wrap:
         on_image &= (boxes[:, 1] > 0) & (boxes[:, 0] < width)
-    visible = in_front & drawn & on_image & torch.isfinite(conics.detach()).all(-1)
+    sound = torch.isfinite(determinant.detach()) & (determinant.detach() > 0)  # else float overflows or nothing spreads
+    visible = in_front & drawn & on_image & sound
     return Footprints(centers, conics, gaussians.opacities, radius, radius, boxes, visible, width, height, options.wrap)
 
 
