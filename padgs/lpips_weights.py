@@ -12,6 +12,7 @@ import importlib
 import importlib.util
 import io
 import pickle
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -94,8 +95,10 @@ def from_lpips_package(network: Network) -> Weights:
     if importlib.util.find_spec("lpips") is None:
         raise LpipsUnavailable("not installed")
     try:
-        package = importlib.import_module("lpips")
-        model = package.LPIPS(net=network.name, verbose=False)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # it calls torchvision in a way that torchvision has deprecated
+            package = importlib.import_module("lpips")
+            model = package.LPIPS(net=network.name, verbose=False)
     except Exception as error:  # whatever a foreign import or download raises, there is a second source
         raise LpipsUnavailable(f"cannot be used ({type(error).__name__}: {error})") from error
     modules = [module for module in model.net.modules() if isinstance(module, torch.nn.Conv2d)]
