@@ -6,6 +6,9 @@ is the definition.
 
 from __future__ import annotations
 
+import warnings
+from functools import cache
+
 import torch
 from torch import Tensor
 
@@ -42,7 +45,8 @@ def render(
         background: [3] RGB behind everything; black if not given.
         probe: [N, 2] zeros added to the projected means in normalised image units (x and y each run over 2 across the
             image, as in 3DGS); its gradient after `backward` is the densification signal.
-        backend: a name of `BACKENDS`, or auto: cpu for float32 tensors on the CPU if the library is built, else torch.
+        backend: a name of `BACKENDS`, or auto: cpu for float32 tensors on the CPU if the library is built, else torch
+            (and a warning, once, if that is because the library is missing).
         check_values: also check that all numbers are sane; a pass over the tensors, meant for tests and debugging.
 
     Raises:
@@ -63,5 +67,19 @@ def resolve_backend(backend: str, means: Tensor) -> str:
         return backend
     from padgs.render import native
 
-    native_fits = means.device.type == "cpu" and means.dtype == torch.float32
-    return "cpu" if native_fits and native.available() else "torch"
+    if means.device.type != "cpu" or means.dtype != torch.float32:
+        return "torch"
+    if native.available():
+        return "cpu"
+    _say_that_native_is_missing()
+    return "torch"
+
+
+@cache  # once in a process, whatever the filters of the warnings module say
+def _say_that_native_is_missing() -> None:
+    from padgs.render import native
+
+    try:
+        native.library()
+    except OSError as error:
+        warnings.warn(f"rendering with backend torch, many times slower than cpu: {error}", stacklevel=4)

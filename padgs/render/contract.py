@@ -99,12 +99,11 @@ def check_inputs(
     if width < 1 or height < 1:
         raise ValueError(f"image size is {width}x{height}; both sides must be at least 1 pixel")
     if check_values:
-        _check_values(gaussians, cam_from_world)
+        _check_values(gaussians, cam_from_world, {name: tensor for name, (tensor, _) in shapes.items()})
 
 
-def _check_values(gaussians: Gaussians, cam_from_world: Tensor) -> None:
-    for name in ("means", "quats", "scales", "opacities", "colors"):
-        tensor = getattr(gaussians, name)
+def _check_values(gaussians: Gaussians, cam_from_world: Tensor, tensors: Mapping[str, Tensor]) -> None:
+    for name, tensor in tensors.items():
         bad = ~torch.isfinite(tensor)
         if bad.any():
             raise ValueError(f"{name} holds {int(bad.sum())} non-finite values, first at {bad.nonzero()[0].tolist()}")
