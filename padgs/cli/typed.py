@@ -67,12 +67,8 @@ def _value(kind: Any, value: Any, where: str) -> Any:
         return None
     if kind is bool and isinstance(value, bool) or kind is str and isinstance(value, str):
         return value
-    if (
-        kind in (int, float)
-        and isinstance(value, (int, float))
-        and not isinstance(value, bool)
-        and kind(value) == value
-    ):
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if number and (kind is float or kind is int and float(value).is_integer()):
         return kind(value)
     raise ConfigError(f"{where} is {value!r}; it must be {_name(kind)}")
 

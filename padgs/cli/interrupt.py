@@ -1,0 +1,41 @@
+"""Ctrl-C means: finish the step, write the checkpoint, then stop. A second one means: now."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from types import FrameType
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)  # SIGTERM is what cluster schedulers send before they kill
+
+
+class Interrupted(KeyboardInterrupt):
+    """A run was stopped from outside; the message says what is safe. Not an error, so that nothing takes it for one."""
+
+
+class Interrupt:
+    """While this context lasts, a signal only sets `requested`; its owner looks there when it is safe to stop."""
+
+    def __init__(self) -> None:
+        """Not requested yet."""
+        self.requested = False
+        self._before: dict[int, object] = {}
+
+    def __enter__(self) -> Interrupt:
+        """Take over the signals; only the main thread can, elsewhere they keep their meaning."""
+        if threading.current_thread() is threading.main_thread():
+            self._before = {number: signal.signal(number, self._request) for number in SIGNALS}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Give the signals back."""
+        self._restore()
+
+    def _request(self, number: int, frame: FrameType | None) -> None:
+        self.requested = True
+        self._restore()
+
+    def _restore(self) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)  # type: ignore[arg-type]
+        self._before = {}

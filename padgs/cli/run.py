@@ -1,0 +1,95 @@
+"""`padgs-run`: one run, or a multirun of many, composed by Hydra from `conf/`."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import sys
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.core.config_store import ConfigStore
+from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
+
+from baselines import METHODS
+from padgs.checkpoint import CheckpointError
+from padgs.cli import session
+from padgs.cli.config import config_from_values, default_fields, method_fields
+from padgs.cli.interrupt import Interrupted
+from padgs.cli.run_folder import RunFolderError
+
+EXPECTED = (ValueError, OSError, CheckpointError, RunFolderError)  # say what to do; a traceback would only hide it
+INTERRUPTED = 130  # exit code of a command that Ctrl-C ended
+
+
+def root() -> Path:
+    """The folder that holds `conf/` and `sweeps/`: the package where it is installed, else the checkout.
+
+    Hydra resolves relative paths against the importing module, which a console script does not have.
+    """
+    package = Path(__file__).resolve().parent.parent
+    return package if (package / "conf").is_dir() else package.parent
+
+
+def register_fields() -> None:
+    """Tell Hydra the keys and defaults of the dataclasses, so that files and commands only name what differs."""
+    store = ConfigStore.instance()
+    store.store(name="fields", node=default_fields())
+    for method in METHODS:
+        store.store(group="fields/method", name=method, node=method_fields(method))
+
+
+def lenient(arguments: list[str]) -> list[str]:
+    """Let unknown keys pass Hydra, so that `config_from_values` refuses them and lists the known ones.
+
+    >>> lenient(["method=padgs", "train.iteration=5", "+experiment=smoke", "-m", "seed=1,2"])
+    ['method=padgs', '++train.iteration=5', '+experiment=smoke', '-m', '++seed=1,2']
+    """
+    groups = {path.name for path in (root() / "conf").iterdir() if path.is_dir()} | {"hydra"}
+
+    def forced(argument: str) -> str:
+        key = re.match(r"([A-Za-z_]\w*)(\.\w+)*=", argument)
+        is_value = key is not None and key[1] != "hydra" and (key[2] is not None or key[1] not in groups)
+        return f"++{argument}" if is_value else argument
+
+    return [forced(argument) for argument in arguments]
+
+
+def main() -> None:
+    """Entry point of `padgs-run`; exit code 0, 1 if any run failed, 130 if stopped by Ctrl-C."""
+    os.environ.setdefault("PADGS_ROOT", str(root()))
+    register_fields()
+    command = shlex.join(["padgs-run", *sys.argv[1:]])
+    sys.argv[1:] = lenient(sys.argv[1:])
+    console, errors = Console(), Console(stderr=True)
+    failed: list[str] = []
+
+    def one(composed: DictConfig) -> str:
+        """One run; what is wrong with it is said here, so that it ends no other run of a multirun."""
+        try:
+            values: Any = OmegaConf.to_container(composed, resolve=True)
+            result = session.run(config_from_values(values), console)
+        except EXPECTED as error:
+            if os.environ.get("HYDRA_FULL_ERROR"):
+                raise
+            errors.print(f"error: {error}", style="red", markup=False, highlight=False, soft_wrap=True)
+            failed.append("rejected")
+            return "rejected"
+        if not result.ok:
+            failed.append(result.status)
+        return result.status
+
+    try:
+        hydra.main(version_base="1.3", config_path=str(root() / "conf"), config_name="config")(one)()
+    except (Interrupted, KeyboardInterrupt) as stopped:
+        reason = str(stopped) or "stopped"
+        errors.print(f"{reason}; to go on: {command}", markup=False, highlight=False, soft_wrap=True)
+        sys.exit(INTERRUPTED)
+    sys.exit(1 if failed else 0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,37 @@
+"""The name of a run: readable, and the same exactly where the same numbers must come out."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Mapping
+from typing import Any
+
+NOT_PART = ("run", "protocol")  # what a machine decides; how the trained model is scored afterwards
+NOT_PART_OF_DATA = ("path", "cache_bytes", "read_ahead", "device")  # the fingerprint says what was read
+HASH_DIGITS = 10
+
+
+def config_hash(values: Mapping[str, Any]) -> str:
+    """SHA-256 of a resolved configuration without paths, machine matters and evaluation.
+
+    Args:
+        values: as `RunConfig.values` gives it, typed, so that 1 and 1.0 of a float field are the same.
+    """
+    kept = {key: value for key, value in values.items() if key not in NOT_PART}
+    kept["data"] = {key: value for key, value in kept["data"].items() if key not in NOT_PART_OF_DATA}
+    return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()
+
+
+def run_id(values: Mapping[str, Any], scene: str, fingerprint: str) -> str:
+    """Scene, method and variant for people, and a hash of configuration and data for the rest.
+
+    >>> values = {"data": {"path": "/x"}, "method": {"name": "padgs"}, "variant": "no m", "seed": 0}
+    >>> run_id(values, "bar", "f00d")
+    'bar_padgs_no-m_37d2ecb9bc'
+    """
+    digest = hashlib.sha256(f"{config_hash(values)}|{fingerprint}".encode()).hexdigest()
+    words = [scene, values["method"]["name"], values["variant"]]
+    readable = [re.sub(r"[^A-Za-z0-9.-]+", "-", word).strip("-.") for word in words]
+    return "_".join([*(word for word in readable if word), digest[:HASH_DIGITS]])

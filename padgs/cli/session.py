@@ -1,0 +1,160 @@
+"""One run from its configuration to its result: load, train or resume, score, write; skip what is done."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import datetime, timezone
+from pathlib import Path
+
+import torch
+from rich.console import Console
+
+from baselines import METHODS
+from padgs import clock, data
+from padgs.cli.config import RunConfig
+from padgs.cli.interrupt import Interrupted
+from padgs.cli.run_folder import RunFolder
+from padgs.cli.run_id import config_hash, run_id
+from padgs.cli.scoring import frame_times, same_rules, scores
+from padgs.cli.summary import show_result
+from padgs.cli.training import Progress, resume, train
+from padgs.guards import is_out_of_memory
+from padgs.method import Failure, Method
+from padgs.registry import lookup
+from padgs.results import Result
+from padgs.scene import Scene
+
+
+def run(config: RunConfig, console: Console) -> Result:
+    """Do what is missing of a run and show its result.
+
+    Raises:
+        DataError: the input cannot be used.
+        ResultError, CheckpointError, RunFolderError: files of the run cannot be read or written.
+        Interrupted: stopped from outside; starting again goes on.
+    """
+    if config.run.threads is not None:
+        torch.set_num_threads(config.run.threads)
+    torch.manual_seed(config.seed)
+    clock.reset_peak_memory()
+    scene = data.load(config.data.path, config.data.format, config.data)
+    values = config.values()
+    folder = RunFolder(Path(config.run.folder) / run_id(values, scene.name, scene.fingerprint))
+    _introduce(config, scene, folder, console)
+    result = folder.result()
+    if result is None:
+        folder.prepare(values)
+        result = _finish(config, scene, folder, console)
+    elif result.ok and not _is_scored(result, config):
+        console.print("finished before; only the new protocol is missing")
+        result = _score_again(result, config, scene, folder)
+    else:
+        advice = "" if result.ok else f"; it failed, delete {folder.path} to try again"
+        console.print(f"finished before, nothing to do{advice}", highlight=False)
+    show_result(result, folder.path, console)
+    return result
+
+
+def _finish(config: RunConfig, scene: Scene, folder: RunFolder, console: Console) -> Result:
+    method = build(config)
+    progress = resume(method, folder)
+    if progress.iteration:
+        console.print(f"resuming after iteration {progress.iteration}", highlight=False)
+    result = _blank(config, scene, folder)
+    try:
+        progress = train(method, scene, config, folder, progress, console)
+        size = method.size()
+        result = replace(
+            result,
+            status="ok" if progress.iteration == config.train.iterations else "timeout",
+            counts={**size.counts, "parameters": size.parameters},
+            model_bytes=size.bytes,
+        )
+        if scene.test:
+            save_picture = folder.save_picture if config.run.pictures else None
+            timing = {"train_seconds": progress.seconds, **frame_times(method, scene)}
+            result = replace(result, scores=scores(method, scene, config.protocols, save_picture), timing=timing)
+    except Interrupted:
+        raise
+    except KeyboardInterrupt as error:
+        raise Interrupted("stopped at once, the last checkpoint stands") from error
+    except (Failure, ValueError, MemoryError, RuntimeError) as error:
+        result = replace(result, status=_status(error), reason=str(error), scores={})
+    result = replace(
+        result,
+        iterations_done=progress.iteration,
+        peak_memory_bytes=clock.peak_memory()["host"] or 0,
+        finished=datetime.now(timezone.utc).isoformat(timespec="seconds"),
+    )
+    folder.finish(result)
+    return result
+
+
+def build(config: RunConfig) -> Method:
+    """The method of a configuration, untrained."""
+    return lookup(METHODS, config.method, "method")(config.options, config.render, config.train, seed=config.seed)
+
+
+def _score_again(result: Result, config: RunConfig, scene: Scene, folder: RunFolder) -> Result:
+    method = build(config)
+    resume(method, folder)
+    missing = {
+        name: protocol
+        for name, protocol in config.protocols.items()
+        if name not in result.scores or not same_rules(result.scores[name], protocol)
+    }
+    result = replace(result, scores={**result.scores, **scores(method, scene, missing, None)})
+    folder.finish(result)
+    return result
+
+
+def _is_scored(result: Result, config: RunConfig) -> bool:
+    return all(
+        name in result.scores and same_rules(result.scores[name], protocol)
+        for name, protocol in config.protocols.items()
+    )
+
+
+def _status(error: BaseException) -> str:
+    if isinstance(error, Failure):
+        return error.status
+    if isinstance(error, ValueError):
+        return "rejected"
+    if is_out_of_memory(error):
+        return "oom"
+    raise error
+
+
+def _blank(config: RunConfig, scene: Scene, folder: RunFolder) -> Result:
+    view = (scene.test or scene.train)[0]
+    machine = clock.machine()
+    values = config.values()
+    return Result(
+        run=folder.path.name,
+        status="ok",
+        method=config.method,
+        variant=config.variant,
+        dataset=config.data.dataset or config.data.format,
+        scene=scene.name,
+        width=view.width,
+        height=view.height,
+        iterations=config.train.iterations,
+        iterations_done=0,
+        seed=config.seed,
+        code_version=" ".join(part for part in (machine["padgs"], (machine["commit"] or "")[:10]) if part) or "unknown",
+        machine=machine,
+        config_hash=config_hash(values),
+        fingerprint=scene.fingerprint,
+        finished="",
+        config=values,
+    )
+
+
+def _introduce(config: RunConfig, scene: Scene, folder: RunFolder, console: Console) -> None:
+    view = scene.train[0]
+    what = f"{config.method}{f' ({config.variant})' if config.variant else ''} on {scene.name}"
+    views = f"{len(scene.train)} training and {len(scene.test)} test views of {view.width}x{view.height}"
+    console.print(f"[bold]{what}[/]: {views}, {len(scene.points)} points, {config.train.iterations} iterations", highlight=False)
+    for note in scene.notes:
+        console.print(f"  {note}", style="dim", highlight=False)
+    console.print(f"  {folder.path}", style="dim", highlight=False, soft_wrap=True)

@@ -1,0 +1,47 @@
+"""The small table at the end of a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from padgs.cli.live import clock, compact
+from padgs.results import Result
+
+MISSING = "–"
+
+
+def show_result(result: Result, folder: Path, console: Console) -> None:
+    """Print the marks of a run, what it cost, and where its files are."""
+    if not result.ok:
+        console.print(f"[bold red]{result.status}[/]: {result.reason or 'stopped early'}", highlight=False)
+    for protocol, scores in result.scores.items():
+        table = Table(title=f"protocol {protocol}, mean of {len(scores.views)} views", title_justify="left")
+        for metric in scores.metrics:
+            table.add_column(metric.replace("_", " "), justify="right")
+        table.add_row(*(number(metric, value) for metric, value in scores.metrics.items()))
+        console.print(table)
+        for note in scores.notes:
+            console.print(note, style="yellow", highlight=False)
+    costs = [f"{compact(count)} {name}" for name, count in result.counts.items()]
+    costs.append(f"{result.model_bytes / 1e6:.1f} MB")
+    if "train_seconds" in result.timing:
+        costs.append(f"trained {clock(result.timing['train_seconds'])}")
+    if "render_ms_median" in result.timing:
+        costs.append(f"{result.timing['render_ms_median']:.1f} ms per frame")
+    costs.append(f"peak memory {result.peak_memory_bytes / 1e9:.2f} GB")
+    console.print(", ".join(costs), highlight=False)
+    console.print(str(folder), style="bold", highlight=False, soft_wrap=True)
+
+
+def number(metric: str, value: float | None) -> str:
+    """A mark as tables show it: decibels with two decimals, all else with three.
+
+    >>> number("ws_psnr", 24.256), number("ssim", 0.5), number("lpips_vgg", None)
+    ('24.26', '0.500', '–')
+    """
+    if value is None:
+        return MISSING
+    return f"{value:.2f}" if "psnr" in metric else f"{value:.3f}"
