@@ -45,7 +45,7 @@ def load(
     """
     options = replace(options, **fields)  # type: ignore[arg-type]
     if format == "synthetic" or path is None:
-        return lookup(LOADERS, "synthetic" if format == "auto" else format, "data.format")(path, options)
+        return lookup(LOADERS, "synthetic" if format == "auto" else format, "data.format")(path or "", options)
     path, format, options, notes = _decide(Path(path), format, options)
     scene: Scene = lookup(LOADERS, format, "data.format")(path, options)
     return replace(scene, notes=(*notes, *scene.notes))
