@@ -36,7 +36,13 @@ class OmniGSMethod:
 
     Options = OmniGSOptions
 
-    def __init__(self, options: OmniGSOptions, render: RenderConfig, train: TrainOptions, seed: int = 0) -> None:
+    def __init__(
+        self,
+        options: OmniGSOptions = OmniGSOptions(),
+        render: RenderConfig = RenderConfig(),  # noqa: B008
+        train: TrainOptions = TrainOptions(),  # noqa: B008
+        seed: int = 0,
+    ) -> None:
         """Prepare; the model comes with `fit` or `load_state`."""
         self._options, self._render, self._train, self._seed = options, render, train, seed
         self._model: TrainableSplats | None = None

@@ -215,15 +215,15 @@ class Trainer:
         )
         value = loss.item()
         if not math.isfinite(value):
-            drawn = {field.name: getattr(drawing.gaussians, field.name) for field in fields(drawing.gaussians)}
-            self._refuse_non_finite({**self._parameters(), **drawn, "image": image, "loss": loss}, iteration)
+            inputs = {field.name: getattr(drawing.gaussians, field.name) for field in fields(drawing.gaussians)}
+            self._refuse_non_finite({**self._parameters(), **inputs, "image": image, "loss": loss}, iteration)
         loss.backward()
         if iteration % options.check_every == 0:
             gradients = {f"gradient of {name}": parameter.grad for name, parameter in self._parameters().items()}
             self._refuse_non_finite({**self._parameters(), **gradients}, iteration)
         with torch.no_grad():
             self._model.observe(drawing, iteration)
-        counts = {**self._model.counts(), "drawn": len(drawing.gaussians)}
+        drawn = len(drawing.gaussians)
         del drawing, image, loss  # the graph must be gone before rows of its leaves come and go
         self._optimizer.step()
         self._optimizer.zero_grad(set_to_none=True)
@@ -231,7 +231,7 @@ class Trainer:
             events = self._model.adapt(iteration, self._optimizer)
         if iteration == self._budget.iterations:
             self._refuse_non_finite(self._parameters(), iteration)
-        return value, counts, events
+        return value, {**self._model.counts(), "drawn": drawn}, events
 
     def _next_view(self) -> int:
         if self._position == len(self._order):

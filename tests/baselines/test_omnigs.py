@@ -57,6 +57,13 @@ def test_sixty_iterations_learn_the_scene(scene):
     assert psnr(trained, scene.test[0]) > start + 3  # measured: 18.8 to 22.2 dB
 
 
+def test_counts_are_those_after_the_iteration(scene):
+    counts = [record.counts for record in method().fit(scene, Budget(ITERATIONS))]
+    assert counts[48] == {"gaussians": 40, "drawn": 40}
+    assert counts[49] == {"gaussians": 60, "drawn": 40}
+    assert counts[50] == {"gaussians": 60, "drawn": 60}
+
+
 def test_densification_and_degrees_follow_the_run(scene, finished):
     assert finished.values["model"]["active_degree"] == 3
     assert finished.tensors["model/splats/means"].shape == (60, 3), "40 points have grown to the cap"
