@@ -1,0 +1,44 @@
+import subprocess
+import sys
+
+import pytest
+
+from baselines import METHODS
+from padgs.data import LOADERS
+from padgs.registry import lookup
+from padgs.render import BACKENDS
+from padgs.render.projection import PROJECTIONS
+
+REGISTRIES = {"backend": BACKENDS, "projection": PROJECTIONS, "loader": LOADERS, "method": METHODS}
+ENTRIES = [(kind, name) for kind, registry in REGISTRIES.items() for name in registry]
+
+
+@pytest.mark.parametrize(("kind", "name"), ENTRIES, ids=lambda value: value)
+def test_every_entry_of_every_registry_can_be_had(kind, name):
+    assert callable(lookup(REGISTRIES[kind], name, kind))
+
+
+@pytest.mark.parametrize("kind", REGISTRIES)
+def test_an_unknown_name_lists_the_known_ones(kind):
+    registry = REGISTRIES[kind]
+    with pytest.raises(ValueError, match=f"unknown {kind} 'cud'; known: ") as caught:
+        lookup(registry, "cud", kind)
+    assert str(caught.value).endswith(", ".join(sorted(registry)))
+
+
+def test_nothing_is_imported_before_it_is_asked_for(root):
+    code = (
+        "import sys\n"
+        "from padgs.registry import lookup\n"
+        "registry = {'wanted': 'colorsys:rgb_to_hsv', 'broken': 'no_such_module:thing'}\n"
+        "assert 'colorsys' not in sys.modules and 'torch' not in sys.modules\n"
+        "assert lookup(registry, 'wanted', 'thing')(1, 1, 1) == (0.0, 0.0, 1)\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=root)
+
+
+def test_a_broken_entry_names_what_is_missing():
+    with pytest.raises(ModuleNotFoundError, match="no_such_module"):
+        lookup({"broken": "no_such_module:thing"}, "broken", "thing")
+    with pytest.raises(AttributeError, match="no_such_thing"):
+        lookup({"broken": "math:no_such_thing"}, "broken", "thing")

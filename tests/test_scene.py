@@ -1,0 +1,106 @@
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from padgs.gaussians import rotation_matrices
+from padgs.scene import Scene, View
+
+H, W = 4, 8
+
+
+def pose(center: torch.Tensor, quaternion=(1.0, 0.0, 0.0, 0.0)) -> torch.Tensor:
+    """cam_from_world of a camera at `center`."""
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[:3, :3] = rotation_matrices(torch.tensor(quaternion, dtype=torch.float64))
+    matrix[:3, 3] = -matrix[:3, :3] @ center.double()
+    return matrix
+
+
+def view_at(*center: float, **options) -> View:
+    return View("view", pose(torch.tensor(center)), W, H, **options)
+
+
+def scene_of(centers: list[tuple[float, float, float]], points: torch.Tensor) -> Scene:
+    train = tuple(view_at(*center) for center in centers)
+    return Scene("scene", train, (), points, torch.zeros(len(points), 3, dtype=torch.uint8), fingerprint="0")
+
+
+def test_the_centre_is_where_the_camera_stands():
+    center = torch.tensor((1.0, -2.0, 3.0), dtype=torch.float64)
+    view = View("view", pose(center, (0.3, -0.5, 0.1, 0.8)), W, H)
+    torch.testing.assert_close(view.center, center)
+    homogeneous = torch.cat((view.center, torch.ones(1).double()))
+    torch.testing.assert_close((view.cam_from_world @ homogeneous)[:3], torch.zeros(3).double())
+
+
+def test_pixels_become_floats_in_the_unit_range_and_are_read_when_asked_for():
+    pixels = torch.arange(H * W * 3).reshape(H, W, 3).remainder(256).byte()
+    pixels[0, 0] = 255
+    reads = []
+    view = view_at(0, 0, 0, load_pixels=lambda: reads.append(1) or pixels)
+    assert not reads
+    image = view.image(dtype=torch.float64)
+    assert reads and image.dtype == torch.float64 and image[0, 0].tolist() == [1.0, 1.0, 1.0]
+    assert torch.equal((image * 255).round().byte(), pixels)
+    assert view.image().dtype == torch.float32
+
+
+def test_a_mask_is_optional_and_a_missing_image_is_an_error():
+    mask = torch.rand(H, W)
+    assert torch.equal(view_at(0, 0, 0, load_mask=lambda: mask).mask(dtype=torch.float64), mask.double())
+    assert view_at(0, 0, 0).mask() is None
+    with pytest.raises(ValueError, match="view 'view' has a pose but no image; it can only be rendered"):
+        view_at(0, 0, 0).image()
+
+
+def test_the_same_camera_elsewhere_has_no_pixels():
+    view = view_at(0, 0, 0, load_pixels=lambda: torch.zeros(H, W, 3).byte(), load_mask=lambda: torch.zeros(H, W))
+    moved = view.at(pose(torch.tensor((5.0, 0, 0))))
+    assert moved.center.tolist() == [5, 0, 0] and (moved.width, moved.height, moved.name) == (W, H, "view")
+    assert moved.load_pixels is None and moved.mask() is None
+
+
+def test_extent_is_a_tenth_more_than_the_farthest_camera():
+    scene = scene_of([(-1, 0, 0), (1, 0, 0), (0, 3, 0), (0, -3, 0)], torch.rand(10, 3))
+    assert scene.extent == pytest.approx(1.1 * 3)
+
+
+def test_the_unit_is_the_median_distance_to_the_points():
+    distances = torch.tensor([1.0, 2.0, 3.0, 4.0, 500.0])  # one far outlier does not matter
+    points = torch.stack((distances, torch.zeros(5), torch.zeros(5)), dim=-1)
+    assert scene_of([(0, 0, 0)], points).unit == pytest.approx(3.0)
+    # From (0, 4, 0) they are sqrt(d^2 + 16) away, median 5; the lower of two medians is taken.
+    assert scene_of([(0, 0, 0), (0, 4, 0)], points).unit == pytest.approx(3.0)
+    assert scene_of([(0, 4, 0), (0, 4, 0), (0, 0, 0)], points).unit == pytest.approx(5.0)
+
+
+def test_a_large_cloud_is_thinned_for_the_unit(generator):
+    points = torch.randn(100_000, 3, generator=generator)
+    scene = scene_of([(0.1, 0, 0)], points)
+    exact = (points - torch.tensor((0.1, 0, 0))).norm(dim=-1).median().item()
+    assert scene.unit == pytest.approx(exact, rel=0.02)
+
+
+@pytest.mark.parametrize("factor", [1e-3, 100.0])
+def test_lengths_of_a_scene_grow_with_it(generator, factor):
+    centers = [(0.0, 0.0, 0.0), (1.0, 0.5, 0.0), (0.0, -2.0, 1.0)]
+    points = torch.randn(500, 3, generator=generator) * 4
+    scene = scene_of(centers, points)
+    grown = scene_of([tuple(factor * value for value in center) for center in centers], points * factor)
+    assert grown.unit == pytest.approx(factor * scene.unit, rel=1e-5)
+    assert grown.extent == pytest.approx(factor * scene.extent, rel=1e-5)
+
+
+def test_lengths_do_not_depend_on_where_the_world_has_its_origin(generator):
+    points = torch.randn(500, 3, generator=generator)
+    scene = scene_of([(0.0, 0.0, 0.0), (1.0, 0.5, 0.0)], points)
+    moved = scene_of([(10.0, 0.0, -7.0), (11.0, 0.5, -7.0)], points + torch.tensor((10.0, 0.0, -7.0)))
+    assert moved.unit == pytest.approx(scene.unit, rel=1e-5) and moved.extent == pytest.approx(scene.extent)
+
+
+def test_a_changed_scene_measures_itself_anew():
+    scene = scene_of([(0, 0, 0)], torch.ones(3, 3))
+    assert scene.unit == pytest.approx(math.sqrt(3))
+    assert replace(scene, points=2 * scene.points).unit == pytest.approx(2 * math.sqrt(3))
