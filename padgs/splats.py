@@ -117,7 +117,7 @@ class Splats(nn.Module):
             rays = self.means - view.center.to(self.means)
             directions = rays / torch.sqrt((rays * rays).sum(-1, keepdim=True) + (TINY * self.unit) ** 2)
             values = spherical_harmonics.basis(directions, self.active_degree)[:, 1:]  # [N, K]
-            colors = colors + (values[..., None] * self.sh_rest[:, : values.shape[1]]).sum(1)
+            colors = colors + torch.einsum("nk,nkc->nc", values, self.sh_rest[:, : values.shape[1]])
         return colors.clamp(min=0)
 
 
