@@ -1,0 +1,73 @@
+"""Every golden render case on every backend: values, number of pairs, derivatives. Rules: shared/golden/README.md."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from render_cases import INPUTS, each_engine
+
+from padgs.gaussians import Gaussians
+from padgs.render import RenderOptions, render
+from padgs.render.projection import PROJECTIONS
+from padgs.scene import View
+
+FOLDER = Path(__file__).resolve().parents[2].parent / "shared" / "golden"
+CASES = sorted(path.stem for projection in PROJECTIONS for path in FOLDER.glob(f"{projection}_*.npz"))
+VALUE_TOLERANCE, DEPTH_TOLERANCE, GRADIENT_TOLERANCE = 2e-5, 1e-4, 2e-3
+
+
+def options_of(meta: dict) -> RenderOptions:
+    """The options under which a case was made; a meta key that is not listed here or below is an error."""
+    option_of = {"projection": "projection", "near": "near", "wrap": "wrap", "dilation": "low_pass"}
+    described = {"format", "scene", "width", "height", "margin", "pairs", "close_pairs"}
+    unknown = set(meta) - set(option_of) - described
+    assert not unknown, f"the case depends on {sorted(unknown)}, which this test does not pass on"
+    return RenderOptions(**{option: meta[key] for key, option in option_of.items() if key in meta})
+
+
+@pytest.mark.skipif(not FOLDER.is_dir(), reason=f"no golden cases: {FOLDER} is not there")
+def test_every_projection_has_golden_cases():
+    for projection in PROJECTIONS:
+        assert any(case.startswith(f"{projection}_") for case in CASES), projection
+
+
+@pytest.mark.parametrize("case", CASES)
+@each_engine
+def test_golden_case(case: str, backend: str, dtype: torch.dtype):
+    data = np.load(FOLDER / f"{case}.npz")
+    meta = json.loads(str(data["meta"]))
+
+    def tensor(key: str) -> torch.Tensor:
+        return torch.tensor(data[key], dtype=dtype)
+
+    inputs = {name: tensor(name).requires_grad_() for name in INPUTS}
+    pose = torch.eye(4, dtype=dtype)
+    pose[:3, :3], pose[:3, 3] = tensor("R"), tensor("t")
+    view = View(case, pose, meta["width"], meta["height"])
+    rendering = render(
+        Gaussians(**inputs), view, options_of(meta), background=tensor("background"), backend=backend, check_values=True
+    )
+
+    stable = torch.tensor(data["stable"])
+    for name in ("image", "transmittance"):
+        error = (getattr(rendering, name) - tensor(name))[stable].abs().max()
+        assert error <= VALUE_TOLERANCE, name
+    depth = tensor("depth")
+    assert ((rendering.depth - depth).abs() <= DEPTH_TOLERANCE * depth)[stable].all()
+    assert abs(rendering.counters["contributing"] - meta["pairs"]) <= meta["close_pairs"]
+
+    (rendering.image * tensor("image_weight")).sum().backward()
+    index = torch.tensor(data["grad_index"]).long()
+    for name, leaf in inputs.items():
+        assert leaf.grad is not None
+        actual, expected = leaf.grad[index], tensor(f"grad_{name}")
+        valid = torch.tensor(data[f"valid_{name}"])
+        rows = [x.reshape(len(index), -1) for x in (actual, expected, valid)]
+        norms = rows[1].norm(dim=-1, keepdim=True)
+        limit = GRADIENT_TOLERANCE * (norms + 1e-3 * norms.max())
+        wrong = ((rows[0] - rows[1]).abs() > limit) & rows[2].bool()
+        assert not wrong.any(), f"{name} of Gaussians {index[wrong.any(-1)].tolist()}"
