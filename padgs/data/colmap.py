@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -64,14 +65,16 @@ def read(path: Path, options: DataOptions, model: Path | None = None) -> Capture
     reconstruction = _open(model, str(suffix))
     images = [image for _, image in sorted(reconstruction.images.items()) if image.has_pose]
     notes = _part_notes(path, model)
+    names = _names(model) if suffix == ".txt" else {}
     without = [image.name for image in reconstruction.images.values() if not image.has_pose]
     if without:
         notes.append(f"{len(without)} images of the model are not registered: {listed(sorted(without))}")
-    frames = tuple(_frame(image, folder, model) for image in images)
-    points = reconstruction.points3D
+    frames = tuple(_frame(image, names.get(image.image_id) or str(image.name), folder, model) for image in images)
+    point_ids = sorted(reconstruction.points3D.keys())
+    points = [reconstruction.points3D[point_id] for point_id in point_ids]
     cloud = Cloud(
-        torch.from_numpy(np.array([point.xyz for point in points.values()], np.float64).reshape(-1, 3)),
-        torch.from_numpy(np.array([point.color for point in points.values()], np.uint8).reshape(-1, 3)),
+        torch.from_numpy(np.array([point.xyz for point in points], np.float64).reshape(-1, 3)),
+        torch.from_numpy(np.array([point.color for point in points], np.uint8).reshape(-1, 3)),
     )
     return Capture(
         format="colmap",
@@ -79,7 +82,7 @@ def read(path: Path, options: DataOptions, model: Path | None = None) -> Capture
         image_folder=folder,
         frames=frames,
         cloud=cloud,
-        tracks=lambda: _tracks(images, list(points.keys())),
+        tracks=lambda: _tracks(images, point_ids),
         notes=tuple(notes),
     )
 
@@ -126,24 +129,36 @@ def _open(model: Path, suffix: str) -> Any:
     return reconstruction
 
 
-def _frame(image: Any, folder: Path, model: Path) -> Frame:
+def _names(model: Path) -> dict[int, str]:
+    """Image id -> name. pycolmap ends the names of text models at the first space."""
+    lines = iter((model / "images.txt").read_text(encoding="utf-8", errors="surrogateescape").splitlines())
+    names = {}
+    for line in lines:
+        fields = line.split(None, 9)
+        if fields and not line.startswith("#") and len(fields) == 10 and fields[0].isdecimal():
+            names[int(fields[0])] = fields[9].rstrip()
+            next(lines, None)  # its observations
+    return names
+
+
+def _frame(image: Any, name: str, folder: Path, model: Path) -> Frame:
     camera = image.camera
-    if not camera.is_spherical:
+    if camera.model_name != "EQUIRECTANGULAR":
         raise DataError(
-            f"{image.name} has a {camera.model_name} camera ({model}); only panoramas (EQUIRECTANGULAR) can be used: "
+            f"{name} has a {camera.model_name} camera ({model}); only panoramas (EQUIRECTANGULAR) can be used: "
             "reconstruct from the panoramas themselves (`padgs prepare`), or give the sparse_equirectangular model"
         )
     pose = torch.from_numpy(np.asarray(image.cam_from_world().matrix(), np.float64))
     return Frame(
-        name=check_inside(image.name, str(model)),
-        image=folder / image.name,
-        cam_from_world=cam_from_world(pose[:, :3], pose[:, 3], f"{image.name} in {model}"),
+        name=check_inside(name, str(model)),
+        image=folder / name,
+        cam_from_world=cam_from_world(pose[:, :3], pose[:, 3], f"{name} in {model}"),
         width=camera.width,
         height=camera.height,
     )
 
 
-def _tracks(images: list[Any], point_ids: list[int]) -> Tracks:
+def _tracks(images: list[Any], point_ids: Sequence[int]) -> Tracks:
     index = {point_id: i for i, point_id in enumerate(point_ids)}
     frame: list[int] = []
     point: list[int] = []

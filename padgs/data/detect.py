@@ -57,9 +57,9 @@ def detect(path: Path) -> tuple[str, str]:
         inside = listed(sorted(child.name for child in path.iterdir())) if path.is_dir() else "a file"
         raise DataError(
             f"{path} has no known format; it holds {inside or 'nothing'}. Known are a COLMAP model (sparse/0), "
-            "transforms.json, sfm_data.json, reconstruction.json, pose_c2w.json (360Roam), output_dir/colmap (Ricoh360),"
-            " transform.json (OmniBlender), data_views.json with data_extrinsics.json. Panoramas without poses: run "
-            "`padgs prepare IMAGES OUT` first"
+            "transforms.json, sfm_data.json, reconstruction.json, pose_c2w.json (360Roam), output_dir/colmap "
+            "(Ricoh360), transform.json (OmniBlender), data_views.json with data_extrinsics.json. Panoramas without "
+            "poses: run `padgs prepare IMAGES OUT` first"
         )
     name, *others = found
     reason = f"format: {name}, because there is {found[name]}"

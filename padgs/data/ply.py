@@ -22,7 +22,7 @@ def read_ply(path: Path) -> Cloud:
     from plyfile import PlyData, PlyParseError
 
     try:
-        vertex = PlyData.read(str(path), mmap=False)["vertex"]
+        vertex = PlyData.read(str(path), mmap=False)["vertex"]  # type: ignore[arg-type]
     except FileNotFoundError as error:
         raise DataError(f"the point cloud {path} does not exist") from error
     except KeyError as error:

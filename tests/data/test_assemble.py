@@ -1,0 +1,121 @@
+"""What is decided when a scene is put together: sizes, names, points, notes, fingerprint."""
+
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from fixtures import World, write_colmap_text
+from PIL import Image
+
+from padgs.data import DATASETS, LOADERS, DataError, DataOptions, load
+
+
+@pytest.fixture
+def folder(world: World, tmp_path: Path) -> Path:
+    write_colmap_text(world, tmp_path / "scene")
+    return tmp_path / "scene"
+
+
+def test_reducing_keeps_poses_and_points(folder: Path) -> None:
+    full, half = load(folder), load(folder, width=32)
+    assert (half.train[0].width, half.train[0].height) == (32, 16)
+    assert half.train[0].image().shape == (16, 32, 3)
+    assert torch.equal(full.train[0].cam_from_world, half.train[0].cam_from_world)
+    mean = full.train[0].image().unflatten(0, (16, 2)).unflatten(2, (32, 2)).mean((1, 3))
+    assert (half.train[0].image() - mean).abs().max() <= 0.5 / 255 + 1e-6
+    with pytest.raises(DataError, match=r"data.width=128 is wider than .*pano_00.png \(64\); images are only"):
+        load(folder, width=128)
+
+
+def test_the_fingerprint_follows_content_and_not_place(folder: Path) -> None:
+    first = load(folder).fingerprint
+    moved = folder.with_name("elsewhere")
+    shutil.copytree(folder, moved)
+    assert load(moved).fingerprint == first
+    changed = {load(folder, width=32).fingerprint, load(folder, split="every", test_every=3).fingerprint}
+    image = moved / "images" / "pano_02.png"
+    pixels = np.array(Image.open(image))
+    pixels[0, 0, 0] ^= 1
+    Image.fromarray(pixels).save(image)
+    changed.add(load(moved).fingerprint)
+    points = folder / "sparse/0/points3D.txt"
+    points.write_text(re.sub(r"\n7 \S+ ", "\n7 0.25 ", points.read_text()))
+    changed.add(load(folder).fingerprint)
+    assert len(changed - {first}) == 4
+
+
+def test_images_and_cameras_of_different_size(folder: Path) -> None:
+    for path in (folder / "images").glob("*.png"):
+        Image.open(path).resize((32, 16)).save(path)
+    assert any("pano_00.png is 32x16, its camera 64x32; used as they are" in note for note in load(folder).notes)
+    Image.new("RGB", (64, 32)).save(folder / "images" / "pano_03.png")
+    with pytest.raises(DataError, match="images and cameras disagree in size: .*pano_00.png .*pano_03.png"):
+        load(folder)
+
+
+def test_clashing_names(folder: Path) -> None:
+    lines = (folder / "sparse/0/images.txt").read_text()
+    (folder / "sparse/0/images.txt").write_text(lines.replace("pano_03.png", "PANO_02.jpg"))
+    with pytest.raises(DataError, match="'PANO_02.jpg' and 'pano_02.png' would share one name"):
+        load(folder)
+
+
+def test_points_from_elsewhere(folder: Path) -> None:
+    scene = load(folder, points="random")
+    spread = torch.stack([view.center for view in (*scene.train, *scene.test)])
+    distance = (scene.points.double() - spread.mean(0)).norm(dim=1) / (spread - spread.mean(0)).norm(dim=1).max()
+    assert 0.49 < distance.min() < 0.6 and 40 < distance.max() < 50.1
+    assert torch.equal(scene.points, load(folder, points="random").points)
+    with pytest.raises(DataError, match="the point cloud .*absent.ply does not exist"):
+        load(folder, points="absent.ply")
+
+
+def test_nothing_where_a_scene_should_be(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"there is no .*absent; set data.path to a folder"):
+        load(tmp_path / "absent")
+    (tmp_path / "photo.jpg").touch()
+    with pytest.raises(DataError, match=r"no known format; it holds photo.jpg. Known are .*`padgs prepare IMAGES"):
+        load(tmp_path)
+    with pytest.raises(ValueError, match="unknown data.format 'colmpa'; known: colmap"):
+        load(tmp_path, "colmpa")
+
+
+def test_an_absent_public_data_set_says_how_to_get_it(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"'bar' of 360Roam .*huajianup.* put it into .*360Roam/bar.*pose_c2w.json"):
+        load(tmp_path / "360Roam" / "bar")
+    with pytest.raises(DataError, match=r"'center' of Ricoh360 is not there. Get it from .*EgoNeRF"):
+        load(tmp_path / "Ricoh360" / "center")
+    with pytest.raises(DataError, match=r"'cat' is no scene of Ricoh360; its scenes: bricks, .*cat_tower"):
+        load(tmp_path / "cat", dataset="ricoh360")
+    assert [len(DATASETS[name].scenes) for name in ("roam360", "ricoh360", "omniblender")] == [11, 12, 11]
+
+
+def test_the_data_set_decides_the_mask(folder: Path) -> None:
+    assert load(folder, dataset="roam360").train[0].mask() is not None
+    assert load(folder, dataset="roam360", mask="none").train[0].mask() is None
+    with pytest.raises(DataError, match="unknown data.dataset 'x'; known: roam360, ricoh360, omniblender"):
+        load(folder, dataset="x")
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("split", "half", "unknown data.split 'half'; known: auto, files, every, all"),
+        ("test_every", 1, "data.test_every is 1"),
+        ("width", 511, "data.width is 511; .*an even number"),
+        ("cache_bytes", -1, "must not be negative"),
+    ],
+)
+def test_unusable_options(field: str, value: object, message: str) -> None:
+    with pytest.raises(DataError, match=message):
+        DataOptions(**{field: value})  # type: ignore[arg-type]
+
+
+def test_every_loader_can_be_imported() -> None:
+    from padgs.registry import lookup
+
+    for name in LOADERS:
+        assert callable(lookup(LOADERS, name, "data.format"))

@@ -1,0 +1,131 @@
+"""Every kind of file that is not a panorama is refused by name, with the rule and a remedy."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from padgs.data.errors import DataError
+from padgs.data.images import decode, inspect
+
+PIXELS = np.random.default_rng(3).integers(0, 256, (64, 128, 3), dtype=np.uint8)
+
+
+def _save(path: Path, image: Image.Image, **options: object) -> Path:
+    image.save(path, **options)
+    return path
+
+
+@pytest.mark.parametrize("extension", ["png", "jpg", "tif", "webp", "bmp"])
+def test_panoramas_pass_and_decode(extension: str, tmp_path: Path) -> None:
+    path = _save(tmp_path / f"grüße {extension}.{extension}", Image.fromarray(PIXELS))
+    found = inspect(path)
+    assert (found.width, found.height) == (128, 64)
+    assert decode(path).shape == (64, 128, 3)
+    if extension in ("png", "tif", "bmp"):
+        assert np.array_equal(decode(path), PIXELS)
+
+
+def test_palettes_and_opaque_alpha_are_colour(tmp_path: Path) -> None:
+    palette = Image.fromarray(PIXELS).quantize(64)
+    path = _save(tmp_path / "palette.png", palette)
+    inspect(path)
+    assert np.array_equal(decode(path), np.asarray(palette.convert("RGB")))
+    opaque = _save(tmp_path / "opaque.png", Image.fromarray(PIXELS).convert("RGBA"))
+    assert np.array_equal(decode(opaque), PIXELS)
+
+
+def test_transparent_pixels_are_refused(tmp_path: Path) -> None:
+    image = Image.fromarray(PIXELS).convert("RGBA")
+    image.putpixel((3, 3), (0, 0, 0, 254))
+    with pytest.raises(DataError, match=r"a.png has transparent pixels; .* mask"):
+        decode(_save(tmp_path / "a.png", image))
+
+
+@pytest.mark.parametrize("extension", ["jpg", "png"])
+@pytest.mark.parametrize("share", [0.3, 0.7, 0.98])
+def test_truncated_files_are_found_when_looked_at(extension: str, share: float, tmp_path: Path) -> None:
+    path = _save(tmp_path / f"a.{extension}", Image.fromarray(PIXELS))
+    data = path.read_bytes()
+    path.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(DataError, match=rf"a.{extension} is cut short or damaged .*copy it again"):
+        inspect(path)
+
+
+def test_a_thumbnail_does_not_hide_a_truncated_jpeg_nor_trailing_bytes_a_whole_one(tmp_path: Path) -> None:
+    path = _save(tmp_path / "a.jpg", Image.fromarray(PIXELS))
+    thumbnail = b"\xff\xd8 a small image \xff\xda and its end \xff\xd9"
+    data = path.read_bytes()
+    whole = data[:2] + b"\xff\xe1" + (len(thumbnail) + 2).to_bytes(2, "big") + thumbnail + data[2:]
+    path.write_bytes(whole[:-500])
+    with pytest.raises(DataError, match="cut short"):
+        inspect(path)
+    path.write_bytes(whole + b"trailer of some camera \xff\xda")
+    inspect(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "image", "message"),
+    [
+        ("grey.png", Image.fromarray(PIXELS[..., 0]), r"grey.png is grey \(L\); .* convert it"),
+        ("grey.jpg", Image.fromarray(PIXELS[..., 0]), r"grey.jpg is grey \(L\)"),
+        ("deep.png", Image.fromarray(PIXELS[..., 0].astype(np.uint16) * 257), "deep.png has 16 bits or more"),
+        ("deep.tif", Image.fromarray(PIXELS[..., 0].astype(np.float32)), "deep.tif has 16 bits or more"),
+        ("print.jpg", Image.fromarray(PIXELS).convert("CMYK"), "print.jpg is CMYK; convert it to RGB"),
+        ("square.png", Image.fromarray(PIXELS[:, :64]), r"square.png is 64x64, which is not 2:1; .*360 x 180"),
+        ("one-off.png", Image.fromarray(PIXELS[:63]), "one-off.png is 128x63, which is not 2:1"),
+    ],
+)
+def test_what_is_not_an_eight_bit_colour_panorama(name: str, image: Image.Image, message: str, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=message):
+        inspect(_save(tmp_path / name, image))
+
+
+def test_sixteen_bit_colour_png(tmp_path: Path) -> None:
+    import struct
+    import zlib
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = struct.pack(">IIBBBBB", 8, 4, 16, 2, 0, 0, 0)
+    rows = zlib.compress(b"".join(b"\0" + bytes(8 * 6) for _ in range(4)))
+    path = tmp_path / "a.png"
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", rows) + chunk(b"IEND", b""))
+    with Image.open(path) as image:
+        assert image.mode == "RGB"  # Pillow does not tell
+    with pytest.raises(DataError, match="a.png has 16 bits or more"):
+        inspect(path)
+
+
+@pytest.mark.parametrize(("flag", "fine"), [(1, True), (0, True), (3, False), (6, False), (8, False)])
+@pytest.mark.parametrize("extension", ["jpg", "png"])
+def test_orientation_flags(flag: int, fine: bool, extension: str, tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = flag
+    path = _save(tmp_path / f"a.{extension}", Image.fromarray(PIXELS), exif=exif.tobytes())
+    if fine:
+        inspect(path)
+    else:
+        with pytest.raises(DataError, match=f"carries EXIF orientation {flag}: .*remove the flag"):
+            inspect(path)
+
+
+def test_not_an_image_empty_absent_and_forbidden(tmp_path: Path) -> None:
+    text, empty, forbidden = tmp_path / "a.jpg", tmp_path / "b.jpg", tmp_path / "c.jpg"
+    text.write_text("<html>404</html>")
+    empty.touch()
+    with pytest.raises(DataError, match=r"a.jpg is not an image that Pillow can read"):
+        inspect(text)
+    with pytest.raises(DataError, match=r"b.jpg is empty \(0 bytes\)"):
+        inspect(empty)
+    with pytest.raises(DataError, match=r"absent.jpg does not exist"):
+        inspect(tmp_path / "absent.jpg")
+    with pytest.raises(DataError, match="cannot be read"):
+        inspect(tmp_path)
+    if os.geteuid() != 0:  # root may read everything
+        _save(forbidden, Image.fromarray(PIXELS)).chmod(0)
+        with pytest.raises(DataError, match=r"c.jpg cannot be read \(Permission denied\); check its permissions"):
+            inspect(forbidden)

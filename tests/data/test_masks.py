@@ -1,0 +1,90 @@
+"""Masks weigh pixels, and never touch them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from fixtures import World, write_colmap_text
+from PIL import Image
+
+from padgs.data import DataError, load
+from padgs.data.masks import row_weights
+
+
+@pytest.fixture
+def folder(world: World, tmp_path: Path) -> Path:
+    write_colmap_text(world, tmp_path)
+    return tmp_path
+
+
+def _mask(path: Path, hidden_rows: int = 8, size: tuple[int, int] = (64, 32)) -> None:
+    path.parent.mkdir(exist_ok=True)
+    mask = np.full((size[1], size[0]), 255, np.uint8)
+    mask[size[1] - hidden_rows :] = 0
+    Image.fromarray(mask).save(path)
+
+
+def test_the_rule_of_360roam() -> None:
+    assert torch.equal(row_weights(959, 1024, 1024)[:, 0], (torch.arange(1024) < 959).float())
+    half = row_weights(959, 1024, 512)[:, 0]
+    assert half[478:481].tolist() == [1.0, 0.5, 0.0]
+    assert half.sum() == 479.5
+
+
+def test_one_mask_for_the_scene(folder: Path) -> None:
+    _mask(folder / "mask.png")
+    scene = load(folder, width=32)
+    for view in (*scene.train, *scene.test):
+        mask = view.mask()
+        assert mask is not None and mask.shape == (16, 32)
+        assert mask[:12].eq(1).all() and mask[12:].eq(0).all()
+    assert "mask: mask.png for every view" in scene.notes
+    assert load(folder, mask="none").train[0].mask() is None
+
+
+@pytest.mark.parametrize("spelling", ["{}.png", "{}.png.png", "{}.bmp"])
+def test_masks_per_image(spelling: str, folder: Path) -> None:
+    _mask(folder / "masks" / spelling.format("pano_00"), hidden_rows=16)
+    views = {view.name: view for view in load(folder).train}
+    assert views["pano_00"].mask().mean() == 0.5
+    assert views["pano_02"].mask() is None
+
+
+def test_grey_values_are_weights_and_rows_multiply(folder: Path) -> None:
+    Image.fromarray(np.full((32, 64), 51, np.uint8)).save(folder / "weights.png")
+    scene = load(folder, mask="weights.png")
+    torch.testing.assert_close(scene.train[0].mask(), torch.full((32, 64), 0.2))
+    _mask(folder / "mask.png")
+    assert load(folder, mask="rows:16/32").train[0].mask().sum() == 16 * 64
+
+
+def test_pixels_stay_as_they_are(folder: Path, world: World) -> None:
+    _mask(folder / "mask.png")
+    view = load(folder).train[0]
+    assert torch.equal(view.load_pixels(), torch.from_numpy(world.images[world.names.index(view.name)]))
+
+
+def test_a_mask_changes_the_fingerprint(folder: Path) -> None:
+    plain = load(folder).fingerprint
+    _mask(folder / "mask.png")
+    first = load(folder).fingerprint
+    _mask(folder / "mask.png", hidden_rows=9)
+    assert len({plain, first, load(folder).fingerprint, load(folder, mask="rows:31/32").fingerprint}) == 4
+    assert load(folder, mask="none").fingerprint == plain
+
+
+def test_unusable_masks(folder: Path) -> None:
+    _mask(folder / "mask.png", size=(62, 31))
+    with pytest.raises(DataError, match=r"mask.png is 62x31 but pano_00.png is 64x32; a mask must have the size"):
+        load(folder)
+    _mask(folder / "mask.png", hidden_rows=32)
+    with pytest.raises(DataError, match=r"mask.png hides every pixel of pano_00.png; in a mask 255 means use"):
+        load(folder)
+    with pytest.raises(DataError, match="absent.png: there is no such file or folder; known words: auto, none, rows"):
+        load(folder, mask="absent.png")
+    with pytest.raises(DataError, match="rows:40/32: the first number"):
+        load(folder, mask="rows:40/32")
+    (folder / "empty").mkdir()
+    with pytest.raises(DataError, match="holds no mask named like an image"):
+        load(folder, mask="empty")

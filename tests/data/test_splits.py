@@ -1,0 +1,95 @@
+from pathlib import Path
+
+import pytest
+
+from padgs.data.errors import DataError
+from padgs.data.splits import read_list, split_frames
+
+NAMES = ("a.jpg", "b.jpg", "c.jpg", "sub/d.png", "sub/e.png")
+
+
+def _lists(folder: Path, train: str | None, test: str | None) -> Path:
+    for name, text in (("train.txt", train), ("test.txt", test)):
+        if text is not None:
+            (folder / name).write_bytes(text.encode())
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("train", "test"),
+    [
+        ("a.jpg\nb.jpg\nsub/d.png\n", "c.jpg\nsub/e.png\n"),
+        ("a\nb\nsub/d", "c\nsub/e"),
+        ("\ufeffa\r\n\r\n  b  \r\nd.png\r\n", "\r\nc\r\nsub\\e.png\r\n"),
+        ("images/a.jpg\nimages/b.jpg\nd\n", "images/c\ne"),
+    ],
+    ids=["full names", "stems", "windows", "other folders"],
+)
+def test_lists_in_every_spelling(train: str, test: str, tmp_path: Path) -> None:
+    split = split_frames(NAMES, _lists(tmp_path, train, test))
+    assert (split.train, split.test) == ((0, 1, 3), (2, 4))
+    assert split.notes == ("split: train.txt and test.txt",)
+
+
+def test_one_list_leaves_the_other_side_the_rest(tmp_path: Path) -> None:
+    split = split_frames(NAMES, _lists(tmp_path, None, "b"))
+    assert (split.train, split.test) == ((0, 2, 3, 4), (1,))
+    assert "there is no train list; it is what the test list leaves" in split.notes
+
+
+def test_every_kth(tmp_path: Path) -> None:
+    names = [f"{i:02}.jpg" for i in range(17)]
+    assert split_frames(names, tmp_path).test == (0, 8, 16)
+    assert split_frames(names, _lists(tmp_path, "01", "02"), mode="every", every=5).test == (0, 5, 10, 15)
+    everything = split_frames(names, tmp_path, mode="all")
+    assert (len(everything.train), everything.test) == (17, ())
+
+
+def test_what_the_format_states_comes_before_files(tmp_path: Path) -> None:
+    _lists(tmp_path, "a", "b")
+    stated = {"train": ("c.jpg",), "test": ("sub/d.png",)}
+    assert split_frames(NAMES, tmp_path, stated=stated).train == (2,)
+    assert split_frames(NAMES, tmp_path, stated=stated, mode="files").train == (0,)
+
+
+def test_unused_views_are_reported(tmp_path: Path) -> None:
+    assert "3 posed views are in neither list and are not used" in split_frames(NAMES, _lists(tmp_path, "a", "b")).notes
+
+
+@pytest.mark.parametrize(
+    ("train", "test", "message"),
+    [
+        ("a\nb", "b\nc", "train and test list overlap: b.jpg; a view is one or the other"),
+        ("a\nx\ny", "b", r"the train list names images that are not there: x, y; the data set has a.jpg, b.jpg"),
+        ("a\nlost", "b", "the train list names images that have no pose: lost; take them off"),
+        ("a", "\n\n", "the test split is empty; name at least one view, or set data.split=every"),
+        ("", "a", "the train split is empty"),
+        ("../../etc/passwd", "a", r"train.txt names '../../etc/passwd'; names must be relative .*no '\.\.'"),
+        ("/a.jpg", "b", "names '/a.jpg'; names must be relative"),
+        ("..\\a.jpg", "b", "must be relative"),
+        ("C:\\a.jpg", "b", "must be relative"),
+    ],
+)
+def test_unusable_lists(train: str, test: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=message):
+        split_frames(NAMES, _lists(tmp_path, train, test), unposed=["lost.jpg"])
+
+
+def test_ambiguous_names(tmp_path: Path) -> None:
+    names = ("left/a.jpg", "right/a.jpg", "b.jpg")
+    with pytest.raises(DataError, match="names 'a', which fits left/a.jpg, right/a.jpg; be specific"):
+        split_frames(names, _lists(tmp_path, "a", "b"))
+    assert split_frames(names, _lists(tmp_path, "left/a", "b")).train == (0,)
+
+
+def test_too_few_views_and_no_lists(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="cannot be split; at least 2"):
+        split_frames(["a.jpg"], tmp_path)
+    with pytest.raises(DataError, match="holds neither train.txt nor test.txt"):
+        split_frames(NAMES, tmp_path, mode="files")
+
+
+def test_lists_that_are_not_text(tmp_path: Path) -> None:
+    (tmp_path / "train.txt").write_bytes(b"\xff\xfe\x00\x81")
+    with pytest.raises(DataError, match="train.txt cannot be read as UTF-8 text"):
+        read_list(tmp_path / "train.txt")
