@@ -31,6 +31,8 @@ def draw(world: World, cam_from_world: Array, width: int, samples: int, seed: in
     height = width // 2
     image = np.empty((height, width, 3), np.uint8)
     jitter = _jitter(height, samples, seed)
+    world_from_cam = cam_from_world[:3, :3].T.astype(np.float32)
+    origin = center(cam_from_world)[:, None].astype(np.float32)
     blocks = [(i, j) for i in range(0, height, _BLOCK[0]) for j in range(0, width, _BLOCK[1])]
 
     def fill(block: tuple[int, int]) -> None:
@@ -38,8 +40,8 @@ def draw(world: World, cam_from_world: Array, width: int, samples: int, seed: in
         columns = np.arange(block[1], min(block[1] + _BLOCK[1], width))
         v = np.broadcast_to((rows[:, None] + jitter[rows, :, 1])[:, None, :], (len(rows), len(columns), samples))
         u = columns[None, :, None] + jitter[rows, :, 0][:, None, :]
-        rays = directions(*(axis.ravel().astype(np.float32) for axis in (v, u)), width, height)
-        color = _colors(world, cam_from_world, rays)
+        rays = directions(v.ravel().astype(np.float32), u.ravel().astype(np.float32), width, height)
+        color = world.color(origin, world_from_cam @ rays)
         mean = color.reshape(3, len(rows), len(columns), samples).mean(-1)
         image[np.ix_(rows, columns)] = np.clip(mean * (255 * gain) + 0.5, 0, 255).astype(np.uint8).transpose(1, 2, 0)
 
@@ -65,16 +67,6 @@ def center(cam_from_world: Array) -> Array:
 def workers() -> int:
     """Threads to draw with: one per processor that this process may use, at most 8."""
     return min(8, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
-
-
-def _colors(world: World, cam_from_world: Array, camera_rays: Array) -> Array:
-    origin = center(cam_from_world)
-    rays = cam_from_world[:3, :3].T.astype(np.float32) @ camera_rays
-    axis = rays.mean(1)
-    axis /= np.linalg.norm(axis)
-    half_angle = math.acos(min(1.0, max(-1.0, float((axis @ rays).min()))))
-    candidates = world.within(origin, axis, half_angle + 1e-3)
-    return world.color(origin[:, None].astype(np.float32), rays, candidates)
 
 
 def _jitter(height: int, samples: int, seed: int) -> Array:

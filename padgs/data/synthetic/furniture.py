@@ -24,6 +24,12 @@ BRIGHT = (
 SPINES = (*BRIGHT, (0.3, 0.16, 0.1), (0.1, 0.2, 0.3), (0.75, 0.7, 0.6), (0.15, 0.3, 0.2))
 
 
+def point(values: Array) -> Point:
+    """Three numbers of an array as a point."""
+    x, y, z = (float(value) for value in values)
+    return x, y, z
+
+
 def matt(texture: Texture, reflectance: float = 0.0) -> tuple[Material, ...]:
     """One material for every face."""
     return (Material(texture, reflectance),)
@@ -31,7 +37,7 @@ def matt(texture: Texture, reflectance: float = 0.0) -> tuple[Material, ...]:
 
 def metal(color: tx.Color = (0.75, 0.75, 0.78)) -> tuple[Material, ...]:
     """The material of rods: plain with fine bands, so that it is not featureless."""
-    darker = tuple(0.8 * c for c in color)
+    darker = (0.8 * color[0], 0.8 * color[1], 0.8 * color[2])
     return matt(tx.stripes((color, color, color, darker), 0.06, 0.0))
 
 
@@ -128,14 +134,14 @@ def loose_object(where: Point, size: float, rng: np.random.Generator, reflectanc
     if kind == 0:
         return Sphere(where, size, matt(tx.sectors((first, pale, second, pale), 8, size), reflectance))
     if kind == 1:
-        half = tuple(size / math.sqrt(3) * rng.uniform(0.7, 1.0, 3))
+        half = point(size / math.sqrt(3) * rng.uniform(0.7, 1.0, 3))
         pattern = tx.checker(first, pale, size / 3) if rng.random() < 0.5 else tx.print_of(pale, first, size / 5)
         return Box(where, half, matt(pattern, reflectance), rng.uniform(0, math.pi))
     if kind == 2:
         return Sphere(where, size, matt(tx.stripes((first, second, pale), size / 4), reflectance))
     tilt = rng.normal(size=3) * (1, 1, 0.6)
     half = size * tilt / np.linalg.norm(tilt)
-    ends = tuple(tuple(float(v) for v in np.add(where, sign * half)) for sign in (-1, 1))
+    ends = point(np.subtract(where, half)), point(np.add(where, half))
     return Rod(ends[0], ends[1], size / 6, matt(tx.stripes((first, pale), size / 5), reflectance), rounded=True)
 
 
@@ -160,8 +166,8 @@ def scatter(
             raise DataError(
                 f"found no place for object {len(shapes) // 2 + 1} of {count}; set data.generator.objects lower"
             )
-        shapes.append(loose_object(tuple(float(v) for v in where), size, rng, reflectance))
-        x, y, z = (float(v) for v in where)
+        shapes.append(loose_object(point(where), size, rng, reflectance))
+        x, y, z = point(where)
         if z < high[2] * 0.6:  # the support must not stand in the way of the cameras
             shapes.append(Rod((x, y, 0), (x, y, z), 0.01, metal()))
     return shapes
@@ -180,5 +186,5 @@ def beside(count: int, path: Array, nearest: float, farthest: float, rng: np.ran
         gap = rng.uniform(nearest, farthest)
         where = path[rng.integers(len(path))] + way / np.linalg.norm(way) * (gap + size)
         if np.linalg.norm(path - where, axis=1).min() >= nearest + size:
-            shapes.append(loose_object(tuple(float(v) for v in where), size, rng))
+            shapes.append(loose_object(point(where), size, rng))
     return shapes

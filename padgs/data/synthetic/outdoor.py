@@ -8,10 +8,11 @@ import numpy as np
 
 from padgs.data.synthetic import furniture as fu
 from padgs.data.synthetic import textures as tx
+from padgs.data.synthetic.light import Light
 from padgs.data.synthetic.options import SyntheticOptions
 from padgs.data.synthetic.shapes import Box, Ground, Material, Ring, Rod, Shape
 from padgs.data.synthetic.textures import Array, Texture, scaled
-from padgs.data.synthetic.world import Light, World
+from padgs.data.synthetic.world import World
 
 
 def sky(direction: Array) -> Array:
@@ -76,7 +77,7 @@ def outdoor(options: SyntheticOptions, path: Array, rng: np.random.Generator) ->
         half = rng.uniform((2.5, 2.5, 2.5), (4.5, 4.0, 6.0))
         x, y, yaw = far * math.cos(angle), far * math.sin(angle), float(rng.uniform(-0.5, 0.5))
         side = [Material(_facade(scaled(walls[k % 4], f), 2 * half[axis], 2 * half[2])) for axis in (1, 1, 0, 0)]
-        shapes.append(Box((x, y, half[2]), tuple(half), (*side, roof, roof), yaw))
+        shapes.append(Box((x, y, half[2]), fu.point(half), (*side, roof, roof), yaw))
         shapes.append(Box((x, y, 2 * half[2] + 0.15), (half[0] + 0.3, half[1] + 0.3, 0.15), (roof,), yaw))
     for k in range(8):
         angle = math.pi / 4 * k + 0.2
@@ -87,5 +88,5 @@ def outdoor(options: SyntheticOptions, path: Array, rng: np.random.Generator) ->
         end = (6.5 * math.cos(next_angle), 6.5 * math.sin(next_angle), 4.4)
         shapes.append(Rod((x, y, 4.4), end, 0.015, fu.metal((0.2, 0.2, 0.2))))
     shapes += fu.scatter(options.objects or 0, path, (-5.0, -4.0, 0.3), (5.0, 4.0, 1.6), 0.3, rng)
-    sun = ((260.0, 180.0, 330.0), 90.0)  # far and strong: nearly parallel light
-    return World(tuple(shapes), Light((sun,), ambient=(0.45, 0.5, 0.58)), sky)
+    sun = ((260.0, 180.0, 330.0), 90.0)  # far, large and strong: nearly parallel light
+    return World(tuple(shapes), Light((sun,), ambient=(0.45, 0.5, 0.58), size=4.0), sky)

@@ -14,12 +14,13 @@ import numpy as np
 
 from padgs.data.synthetic import furniture as fu
 from padgs.data.synthetic import textures as tx
+from padgs.data.synthetic.light import Light
 from padgs.data.synthetic.options import SyntheticOptions
 from padgs.data.synthetic.outdoor import outdoor
 from padgs.data.synthetic.paths import Walk
-from padgs.data.synthetic.shapes import Box, Material, Point, Rod, Room, Shape
+from padgs.data.synthetic.shapes import Box, Material, Rod, Room, Shape
 from padgs.data.synthetic.textures import Array, Texture, scaled
-from padgs.data.synthetic.world import Light, World
+from padgs.data.synthetic.world import World
 
 Furnish = Callable[[SyntheticOptions, Array, np.random.Generator], World]  # options, dense path [n, 3], random
 
@@ -51,12 +52,18 @@ def _posters(count: int, width: float, size: float) -> list[tuple[float, float, 
     return [(float(u), 0.15, 0.72 * size, size, looks[k % len(looks)]) for k, u in enumerate(places)]
 
 
-def _room_materials(options: SyntheticOptions, width: float, depth: float, gloss: float = 0.0) -> tuple[Material, ...]:
+def _room_materials(
+    options: SyntheticOptions,
+    width: float,
+    depth: float,
+    gloss: float = 0.0,
+    rugs: tuple[tuple[float, float], ...] = ((0.0, 0.0),),
+) -> tuple[Material, ...]:
     f = options.texture_frequency
     brick = scaled(tx.bricks((0.45, 0.2, 0.14), (0.78, 0.45, 0.33), (0.78, 0.74, 0.68)), f)
     paper = scaled(tx.wallpaper((0.55, 0.62, 0.52), (0.86, 0.83, 0.68)), f)
     tiles = scaled(tx.checker((0.28, 0.42, 0.5), (0.86, 0.87, 0.83), 0.2), f)
-    rough = scaled(tx.plain(PLASTER, 0.35, 2.0), f)
+    rough = scaled(tx.plain(PLASTER, 0.22, 2.0), f)
     rug = scaled(tx.medallion((0.55, 0.13, 0.12), (0.14, 0.17, 0.32), (0.9, 0.76, 0.45), 1.7 * f, 8), f)
     rosette = scaled(tx.medallion((0.88, 0.86, 0.8), (0.62, 0.58, 0.5), (0.8, 0.6, 0.25), 1.5 * f, 12), f)
     view = tx.window((0.45, 0.68, 0.95), (0.9, 0.88, 0.83))
@@ -65,8 +72,8 @@ def _room_materials(options: SyntheticOptions, width: float, depth: float, gloss
         Material(tx.framed(rough, [*_posters(3, depth * 0.85, 0.8)])),
         Material(tx.framed(tiles, ((0.9, 0.25, 1.0, 1.1, view), (-0.9, 0.25, 1.0, 1.1, view)))),
         Material(tx.framed(paper, _posters(3, width * 0.7, 0.75))),
-        Material(tx.disc(scaled(tx.planks(*fu.OAK), f), rug, 1.7), gloss),
-        Material(tx.disc(scaled(tx.checker((0.84, 0.82, 0.77), (0.8, 0.78, 0.73), 0.6), f), rosette, 1.5)),
+        Material(tx.disc(scaled(tx.planks(*fu.OAK), f), rug, 1.7, rugs), gloss),
+        Material(tx.disc(scaled(tx.checker((0.84, 0.82, 0.77), (0.8, 0.78, 0.73), 0.6), f), rosette, 1.5, rugs)),
     )
 
 
@@ -91,30 +98,26 @@ def _furniture(rng: np.random.Generator) -> list[Shape]:
     ]
 
 
-def _room(low: Point, high: Point, materials: tuple[Material, ...]) -> Room:
-    return Room(low, high, materials)
-
-
 _LOW, _HIGH = (-3.0, -2.5, 0.0), (3.0, 2.5, 2.8)
 _LIGHT = Light((((0.0, 0.0, 2.4), 0.85), ((2.6, 0.7, 1.75), 0.35)))
 
 
 def room(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
     """S1: a furnished room, 6 x 5 x 2.8 m."""
-    shapes = [_room(_LOW, _HIGH, _room_materials(options, 6, 5)), *_furniture(rng)]
+    shapes = [Room(_LOW, _HIGH, _room_materials(options, 6, 5)), *_furniture(rng)]
     shapes += fu.scatter(_objects(options), path, (-2.0, -1.8, 0.5), (2.0, 1.5, 2.5), 0.35, rng)
     return World(tuple(shapes), _LIGHT)
 
 
 def near_clutter(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
     """S6: the room with small objects hanging 5-30 cm from the camera path."""
-    shapes = [_room(_LOW, _HIGH, _room_materials(options, 6, 5)), *_furniture(rng)]
+    shapes = [Room(_LOW, _HIGH, _room_materials(options, 6, 5)), *_furniture(rng)]
     return World((*shapes, *fu.beside(_objects(options), path, 0.05, 0.3, rng)), _LIGHT)
 
 
 def glossy(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
     """S7: the room with a polished floor and mirror-like objects."""
-    shapes = [_room(_LOW, _HIGH, _room_materials(options, 6, 5, gloss=0.12)), *_furniture(rng)]
+    shapes = [Room(_LOW, _HIGH, _room_materials(options, 6, 5, gloss=0.12)), *_furniture(rng)]
     shapes += fu.scatter(_objects(options), path, (-2.0, -1.8, 0.5), (2.0, 1.5, 2.5), 0.35, rng, reflectance=0.3)
     return World(tuple(shapes), _LIGHT)
 
@@ -126,7 +129,7 @@ def bare_room(options: SyntheticOptions, path: Array, rng: np.random.Generator) 
     rows = [
         Material(tx.framed(white, _posters(count, extent, 0.975))) for count, extent in ((2, 5), (2, 5), (2, 6), (3, 6))
     ]
-    shapes: list[Shape] = [_room(_LOW, _HIGH, (*rows, Material(gray), Material(white)))]
+    shapes: list[Shape] = [Room(_LOW, _HIGH, (*rows, Material(gray), Material(white)))]
     shapes += fu.scatter(_objects(options), path, (-2.0, -1.8, 0.3), (2.0, 1.5, 1.2), 0.35, rng)
     return World(tuple(shapes), Light((((0.0, 0.0, 2.5), 0.9),)))
 
@@ -134,14 +137,14 @@ def bare_room(options: SyntheticOptions, path: Array, rng: np.random.Generator) 
 def pole_torture(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
     """S4: Siemens stars on floor and ceiling, and thin rods across, above, below and beside the cameras."""
     f = options.texture_frequency
-    star = tx.siemens_star(INK, PAPER, options.spokes, 1.0 / f)
+    star = tx.siemens_star(INK, PAPER, options.spokes, 0.8 / f)
     walls = _room_materials(options, 6, 5)[:4]
-    shapes: list[Shape] = [_room(_LOW, _HIGH, (*walls, Material(star), Material(star)))]
+    shapes: list[Shape] = [Room(_LOW, _HIGH, (*walls, Material(star), Material(star)))]
     for k, offset in enumerate(np.linspace(-1.2, 1.2, 5)):
         skin = fu.metal(fu.BRIGHT[k])
         shapes += [
-            Rod((offset, -2.5, 2.3), (offset, 2.5, 2.3), 0.008 + 0.003 * k, skin),
-            Rod((-3, offset, 0.5), (3, offset, 0.5), 0.008 + 0.003 * k, skin),
+            Rod((offset, -2.5, 2.3), (offset, 2.5, 2.3), 0.004 + 0.002 * k, skin),
+            Rod((-3, offset, 0.4), (3, offset, 0.4), 0.004 + 0.002 * k, skin),
             Rod((-3, 0.8 * offset, 2.45), (3, 0.8 * offset, 2.45), 0.006, skin),
             Rod((1.7 * offset, 1.9, 0), (1.7 * offset, 1.9, 2.8), 0.01, skin),
             Rod((1.7 * offset, -1.9, 0), (1.7 * offset, -1.9, 2.8), 0.01, skin),
@@ -156,7 +159,7 @@ def two_rooms(options: SyntheticOptions, path: Array, rng: np.random.Generator) 
     partition = Material(scaled(tx.wallpaper((0.62, 0.5, 0.42), (0.9, 0.82, 0.7)), f))
     frame = fu.matt(tx.planks(*fu.WALNUT, width=0.06))
     shapes: list[Shape] = [
-        _room((-5.0, -2.5, 0.0), (5.0, 2.5, 2.8), _room_materials(options, 10, 5)),
+        Room((-5.0, -2.5, 0.0), (5.0, 2.5, 2.8), _room_materials(options, 10, 5, rugs=((-2.6, 0.0), (2.6, 0.0)))),
         Box((0, -1.5, 1.4), (0.08, 1.0, 1.4), (partition,)),
         Box((0, 1.5, 1.4), (0.08, 1.0, 1.4), (partition,)),
         Box((0, 0, 2.45), (0.08, 0.5, 0.35), (partition,)),

@@ -39,7 +39,10 @@ class Surface:
 class Shape(Protocol):
     """A solid (or the inside of one)."""
 
-    materials: tuple[Material, ...]
+    @property
+    def materials(self) -> tuple[Material, ...]:
+        """One per face, or one for all."""
+        ...
 
     @property
     def bounds(self) -> tuple[Point, float] | None:
@@ -57,6 +60,25 @@ class Shape(Protocol):
 
 def _column(point: Point, like: Array) -> Array:
     return np.asarray(point, like.dtype).reshape(3, 1)
+
+
+class Flat(Protocol):
+    """A shape with flat faces that carry light maps."""
+
+    texel: float  # metres, of the light maps
+    faces: int
+
+    def size(self, face: int) -> tuple[float, float]:
+        """Extent (u, v) of a face in metres."""
+        ...
+
+    def point_at(self, face: int, uv: Array) -> Array:
+        """The point [3, n] of a face at texture coordinates [2, n]: the inverse of `surface`."""
+        ...
+
+    def surface(self, points: Array) -> Surface:
+        """As in Shape."""
+        ...
 
 
 _FACE_AXES = np.array(((1, 1, 0, 0, 0, 0), (2, 2, 2, 2, 1, 1)))  # which coordinate is u, which v
@@ -87,14 +109,14 @@ class Room:
     high: Point
     materials: tuple[Material, ...]
 
-    bounds = None
+    bounds, texel, faces = None, 0.08, 6
 
     def hit(self, origin: Array, direction: Array) -> Array:
         """See Shape."""
         low, high = _column(self.low, direction), _column(self.high, direction)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            t = np.where(direction > 0, high - origin, low - origin) / direction
-        return np.fmin(np.fmin(t[0], t[1]), t[2])  # 0 / 0 on a wall that the ray is parallel to is NaN: not a hit
+        wall = np.where(direction > 0, high - origin, low - origin)
+        t = np.divide(wall, direction, out=np.full_like(wall, np.inf), where=direction != 0)
+        return t.min(0)
 
     def surface(self, points: Array) -> Surface:
         """See Shape."""
@@ -106,12 +128,12 @@ class Room:
         return Surface(-_face_normal(face, points.dtype), _face_uv(local, face, -1), face)
 
     def size(self, face: int) -> tuple[float, float]:
-        """Extent (u, v) of a face in metres."""
+        """See Flat."""
         extent = np.subtract(self.high, self.low)
         return ((extent[1], extent[2]), (extent[0], extent[2]), (extent[0], extent[1]))[face // 2]
 
     def point_at(self, face: int, uv: Array) -> Array:
-        """The point [3, n] of a face at texture coordinates [2, n]: the inverse of `surface`."""
+        """See Flat."""
         axis, sign = face // 2, 1.0 if face % 2 else -1.0
         points = np.empty((3, uv.shape[1]), uv.dtype)
         points[axis] = sign * (self.high[axis] - self.low[axis]) / 2
@@ -255,11 +277,11 @@ class Rod:
 
 @dataclass(frozen=True)
 class Ground:
-    """The plane z = 0, seen from above."""
+    """The plane z = 0, seen from above. Its light map covers the middle."""
 
     materials: tuple[Material, ...]
 
-    bounds = None
+    bounds, texel, faces = None, 0.15, 1
 
     def hit(self, origin: Array, direction: Array) -> Array:
         """See Shape."""
@@ -272,6 +294,14 @@ class Ground:
         normal = np.zeros_like(points)
         normal[2] = 1
         return Surface(normal, points[:2], np.zeros(points.shape[1], np.int64))
+
+    def size(self, face: int) -> tuple[float, float]:
+        """See Flat."""
+        return 64.0, 64.0
+
+    def point_at(self, face: int, uv: Array) -> Array:
+        """See Flat."""
+        return np.concatenate((uv, np.zeros_like(uv[:1])))
 
 
 @dataclass(frozen=True)
@@ -286,7 +316,7 @@ class Ring:
 
     def ridge(self, angle: Array) -> Array:
         """Height of the top at an azimuth in radians; periodic."""
-        waves = sum(np.sin(k * angle + 1.7 * k * k) / k for k in (2, 3, 5, 9, 17, 31))
+        waves = np.sum([np.sin(k * angle + 1.7 * k * k) / k for k in (2, 3, 5, 9, 17, 31)], axis=0)
         return self.height * (0.55 + 0.3 * waves)
 
     def hit(self, origin: Array, direction: Array) -> Array:

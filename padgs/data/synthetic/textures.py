@@ -71,7 +71,7 @@ def random_of(*cells: Array | int) -> Array:
     return _random_table().take((total ^ (total >> 7)) & (_TABLE - 1))
 
 
-def mix(first: Array | Color, second: Array | Color, weight: Array) -> Array:
+def mix(first: Array | Color, second: Array | Color, weight: Array | float) -> Array:
     """(1 - weight) first + weight second for colours [3] or [3, n] and weights [n]."""
     a, b = (np.asarray(c, np.float32).reshape(3, -1) for c in (first, second))
     return a + (b - a) * weight
@@ -202,10 +202,10 @@ def books(spines: Sequence[Color], board: Color, shelf: float = 0.32) -> Texture
 
 
 def siemens_star(dark: Color, light: Color, spokes: int, pitch: float) -> Texture:
-    """A lattice of Siemens stars, one per square of side `pitch`, ringed; detail of every size towards each centre."""
+    """A lattice of Siemens stars, `pitch` apart, one at the origin; detail of every size towards each centre."""
 
     def texture(uv: Array) -> Array:
-        x, y = uv / pitch - np.floor(uv / pitch) - 0.5
+        x, y = uv / pitch - np.round(uv / pitch)
         radius = np.hypot(x, y)
         spoke = (np.arctan2(y, x) * (spokes / (2 * np.pi))) % 1 < 0.5
         ring = (np.floor(radius * 60) % 2 == 0) & (radius > 0.46)
@@ -240,7 +240,7 @@ def picture(sky: Color, land: Color, sun: Color, size: float) -> Texture:
         color = mix(color, sun, 1 - step(0.16, np.hypot(u - 0.15, v - 0.18), 0.01))
         for layer in range(3):
             ridge = 0.05 - 0.13 * layer + 0.22 * (noise(u + 1.7 * layer, u * 0 + 0.31 * layer, 2.0) - 0.5)
-            color = mix(color, mix(land, sky, np.float32(0.55 - 0.25 * layer)), step(0, ridge - v, 0.01))
+            color = mix(color, mix(land, sky, 0.55 - 0.25 * layer), step(0, ridge - v, 0.01))
         return np.where(v < -0.36, caption(uv), color)
 
     return texture
@@ -293,16 +293,22 @@ def framed(base: Texture, patches: Sequence[tuple[float, float, float, float, Te
     return texture
 
 
-def disc(base: Texture, patch: Texture, radius: float) -> Texture:
-    """`patch` within `radius` of the centre of the face, `base` outside."""
+def disc(base: Texture, patch: Texture, radius: float, centers: Sequence[tuple[float, float]] = ((0, 0),)) -> Texture:
+    """`patch` within `radius` of each centre, drawn about it, `base` outside."""
 
     def texture(uv: Array) -> Array:
-        inside = uv[0] * uv[0] + uv[1] * uv[1] < radius * radius
         color = np.empty((3, uv.shape[1]), np.float32)
-        for part, where in ((patch, inside), (base, ~inside)):
-            index = np.flatnonzero(where)
+        outside = np.ones(uv.shape[1], bool)
+        for center in centers:
+            local = uv - np.asarray(center, uv.dtype)[:, None]
+            inside = local[0] * local[0] + local[1] * local[1] < radius * radius
+            index = np.flatnonzero(inside)
             if index.size:
-                color[:, index] = part(uv[:, index])
+                color[:, index] = patch(local[:, index])
+                outside &= ~inside
+        index = np.flatnonzero(outside)
+        if index.size:
+            color[:, index] = base(uv[:, index])
         return color
 
     return texture
