@@ -7,15 +7,16 @@ from baselines.omnigs import RELEASED, OmniGSMethod, OmniGSOptions
 from padgs import checkpoint
 from padgs.method import Budget, Failure, RenderConfig, State
 from padgs.registry import lookup
+from padgs.render import native
 from padgs.scene import Scene, View
 from padgs.train import TrainOptions
 
 ITERATIONS = 120  # densifies at 50, and goes through all degrees
 
 
-def method(seed: int = 0, **options) -> OmniGSMethod:
+def method(seed: int = 0, backend: str = "torch", **options) -> OmniGSMethod:
     options = {"densify_until": 20_000, "max_gaussians": 60} | options
-    return OmniGSMethod(OmniGSOptions(**options), RenderConfig(backend="torch"), TrainOptions(), seed)
+    return OmniGSMethod(OmniGSOptions(**options), RenderConfig(backend=backend), TrainOptions(), seed)
 
 
 def psnr(trained: OmniGSMethod, view: View) -> float:
@@ -85,6 +86,20 @@ def test_killed_and_resumed_is_bit_identical(scene, finished, tmp_path, stop):
     rest = [record.iteration for record in second.fit(scene, Budget(ITERATIONS))]
     assert rest == list(range(stop + 1, ITERATIONS + 1))
     assert_same_but_time(second.state(), finished)
+
+
+@pytest.mark.skipif(not native.available(), reason="the native library is not built")
+def test_killed_and_resumed_is_bit_identical_on_the_native_backend(scene):
+    whole, first, second = (method(backend="cpu") for _ in range(3))
+    for _ in whole.fit(scene, Budget(ITERATIONS)):
+        pass
+    records = first.fit(scene, Budget(ITERATIONS))
+    for _ in range(51):
+        next(records)
+    second.load_state(first.state())
+    for _ in second.fit(scene, Budget(ITERATIONS)):
+        pass
+    assert_same_but_time(second.state(), whole.state())
 
 
 def test_a_loaded_state_renders_without_the_scene(scene, finished):
