@@ -52,7 +52,7 @@ class Result:
     status: str  # key of STATUSES
     method: str  # name in `baselines.METHODS`
     variant: str  # row of an ablation; empty for none
-    dataset: str
+    dataset: str  # synthetic, a name of padgs.data.DATASETS, or empty for a capture of one's own
     scene: str
     width: int  # of the test views, pixels
     height: int

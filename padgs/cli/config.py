@@ -138,4 +138,3 @@ def method_fields(name: str) -> dict[str, Any]:
 class _Top:
     variant: str = ""
     seed: int = 0
-

@@ -66,6 +66,7 @@ def main() -> None:
     sys.argv[1:] = lenient(sys.argv[1:])
     console, errors = Console(), Console(stderr=True)
     failed: list[str] = []
+    said: set[str] = set()  # a missing data set is missing for all rows of a table; once is enough
 
     def one(composed: DictConfig) -> str:
         """One run; what is wrong with it is said here, so that it ends no other run of a multirun."""
@@ -75,7 +76,9 @@ def main() -> None:
         except EXPECTED as error:
             if os.environ.get("HYDRA_FULL_ERROR"):
                 raise
-            errors.print(f"error: {error}", style="red", markup=False, highlight=False, soft_wrap=True)
+            if str(error) not in said:
+                errors.print(f"error: {error}", style="red", markup=False, highlight=False, soft_wrap=True)
+            said.add(str(error))
             failed.append("rejected")
             return "rejected"
         if not result.ok:

@@ -17,7 +17,7 @@ from padgs.cli.run_folder import RunFolder
 from padgs.cli.run_id import config_hash, run_id
 from padgs.cli.scoring import frame_times, same_rules, scores
 from padgs.cli.summary import show_result
-from padgs.cli.training import Progress, resume, train
+from padgs.cli.training import resume, train
 from padgs.guards import is_out_of_memory
 from padgs.method import Failure, Method
 from padgs.registry import lookup
@@ -50,7 +50,7 @@ def run(config: RunConfig, console: Console) -> Result:
         result = _score_again(result, config, scene, folder)
     else:
         advice = "" if result.ok else f"; it failed, delete {folder.path} to try again"
-        console.print(f"finished before, nothing to do{advice}", highlight=False)
+        console.print(f"finished before, nothing to do{advice}", highlight=False, soft_wrap=True)
     show_result(result, folder.path, console)
     return result
 
@@ -134,7 +134,7 @@ def _blank(config: RunConfig, scene: Scene, folder: RunFolder) -> Result:
         status="ok",
         method=config.method,
         variant=config.variant,
-        dataset=config.data.dataset or config.data.format,
+        dataset=config.data.dataset or ("" if config.data.path else "synthetic"),
         scene=scene.name,
         width=view.width,
         height=view.height,
@@ -154,7 +154,11 @@ def _introduce(config: RunConfig, scene: Scene, folder: RunFolder, console: Cons
     view = scene.train[0]
     what = f"{config.method}{f' ({config.variant})' if config.variant else ''} on {scene.name}"
     views = f"{len(scene.train)} training and {len(scene.test)} test views of {view.width}x{view.height}"
-    console.print(f"[bold]{what}[/]: {views}, {len(scene.points)} points, {config.train.iterations} iterations", highlight=False)
+    console.print(
+        f"[bold]{what}[/]: {views}, {len(scene.points)} points, {config.train.iterations} iterations",
+        highlight=False,
+        soft_wrap=True,
+    )
     for note in scene.notes:
-        console.print(f"  {note}", style="dim", highlight=False)
+        console.print(f"  {note}", style="dim", highlight=False, soft_wrap=True)
     console.print(f"  {folder.path}", style="dim", highlight=False, soft_wrap=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
@@ -16,15 +17,13 @@ MISSING = "–"
 def show_result(result: Result, folder: Path, console: Console) -> None:
     """Print the marks of a run, what it cost, and where its files are."""
     if not result.ok:
-        console.print(f"[bold red]{result.status}[/]: {result.reason or 'stopped early'}", highlight=False)
-    for protocol, scores in result.scores.items():
-        table = Table(title=f"protocol {protocol}, mean of {len(scores.views)} views", title_justify="left")
-        for metric in scores.metrics:
-            table.add_column(metric.replace("_", " "), justify="right")
-        table.add_row(*(number(metric, value) for metric, value in scores.metrics.items()))
-        console.print(table)
-        for note in scores.notes:
-            console.print(note, style="yellow", highlight=False)
+        console.print(
+            f"[bold red]{result.status}[/]: {result.reason or 'stopped early'}", highlight=False, soft_wrap=True
+        )
+    if result.scores:
+        console.print(marks(result))
+    for note in dict.fromkeys(note for scores in result.scores.values() for note in scores.notes):
+        console.print(note, style="yellow", highlight=False, soft_wrap=True)
     costs = [f"{compact(count)} {name}" for name, count in result.counts.items()]
     costs.append(f"{result.model_bytes / 1e6:.1f} MB")
     if "train_seconds" in result.timing:
@@ -32,8 +31,19 @@ def show_result(result: Result, folder: Path, console: Console) -> None:
     if "render_ms_median" in result.timing:
         costs.append(f"{result.timing['render_ms_median']:.1f} ms per frame")
     costs.append(f"peak memory {result.peak_memory_bytes / 1e9:.2f} GB")
-    console.print(", ".join(costs), highlight=False)
+    console.print(", ".join(costs), highlight=False, soft_wrap=True)
     console.print(str(folder), style="bold", highlight=False, soft_wrap=True)
+
+
+def marks(result: Result) -> Table:
+    """One row per metric, one column per protocol."""
+    table = Table("metric", box=SIMPLE_HEAD)
+    for protocol in result.scores:
+        table.add_column(protocol, justify="right")
+    for metric in dict.fromkeys(name for scores in result.scores.values() for name in scores.metrics):
+        values = [scores.metrics.get(metric) for scores in result.scores.values()]
+        table.add_row(metric, *(number(metric, value) for value in values))
+    return table
 
 
 def number(metric: str, value: float | None) -> str:

@@ -1,0 +1,78 @@
+"""From results to cells: mean and spread over seeds, failures by their status."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from padgs.results import Result
+from reports.published import Published
+from reports.table import Cell, ReportError
+
+
+def one_setting(results: Sequence[Result], where: str) -> list[Result]:
+    """Results of one cell, sorted by seed.
+
+    Raises:
+        ReportError: they differ in more than the seed, so that their mean would mean nothing.
+    """
+    ordered = sorted(results, key=lambda result: result.seed)
+    for result in ordered[1:]:
+        differing = different_keys(ordered[0].config, result.config)
+        if differing:
+            raise ReportError(
+                f"{where}: runs {ordered[0].run} and {result.run} differ in {', '.join(differing)}; "
+                f"choose one with --where {differing[0]}=..."
+            )
+        if result.seed == ordered[0].seed:
+            raise ReportError(
+                f"{where}: runs {ordered[0].run} and {result.run} are the same setting; delete one of them"
+            )
+    return ordered
+
+
+def different_keys(first: Mapping[str, Any], second: Mapping[str, Any], where: str = "") -> list[str]:
+    """Dotted keys in which two configurations differ, seeds and what no number depends on left out."""
+    found = []
+    for key in dict.fromkeys((*first, *second)):
+        name = f"{where}{key}"
+        if name in ("seed", "run", "protocol", "data.path", "data.cache_bytes", "data.read_ahead", "data.device"):
+            continue
+        mine, theirs = first.get(key), second.get(key)
+        if isinstance(mine, Mapping) and isinstance(theirs, Mapping):
+            found += different_keys(mine, theirs, f"{name}.")
+        elif mine != theirs:
+            found.append(name)
+    return found
+
+
+def measured(results: Sequence[Result], protocol: str, metric: str) -> Cell:
+    """The cell of a metric over the seeds of one setting; missing where nothing was run."""
+    return over_seeds(results, lambda r: r.scores[protocol].metrics.get(metric) if protocol in r.scores else None)
+
+
+def over_seeds(results: Sequence[Result], number: Any) -> Cell:
+    """Mean and standard deviation of `number(result)` over the runs that are ok; else why there is none."""
+    failed = " ".join(dict.fromkeys(result.status for result in results if not result.ok))
+    values = [value for result in results if result.ok and (value := number(result)) is not None]
+    if not values:
+        return Cell(status=failed)
+    finite = all(math.isfinite(value) for value in values)
+    std = statistics.stdev(values) if len(values) > 1 and finite else None
+    return Cell(math.fsum(values) / len(values), std, len(values), failed)
+
+
+def of_the_paper(number: Published | None) -> Cell:
+    """A published number; what the paper does not have is missing."""
+    if number is None or number.status == "missing":
+        return Cell()
+    return Cell(number.value, status="" if number.status == "ok" else number.status)
+
+
+def difference(ours: Cell, theirs: Cell) -> Cell:
+    """Ours minus the paper's; missing where either is."""
+    if ours.value is None or theirs.value is None:
+        return Cell()
+    return Cell(ours.value - theirs.value)

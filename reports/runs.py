@@ -1,0 +1,56 @@
+"""All runs, one line each: marks under both protocols, latitude bands, and what the model cost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from padgs.results import Result
+from reports.cells import over_seeds
+from reports.footnotes import conditions
+from reports.metrics import column
+from reports.published import scene_title
+from reports.request import Request
+from reports.table import Block, Column, Row, Table
+
+Number = Callable[[Result], "float | None"]
+
+FLAT = ("psnr", "ssim", "lpips_vgg_01")
+SPHERE = ("ws_psnr", "ws_ssim", "ws_lpips_alex", *(f"ws_psnr_{band}" for band in ("equator", "middle", "high", "pole")))
+
+
+def build(results: Sequence[Result], request: Request) -> Table:
+    """A block per scene and resolution, a row per run."""
+    chosen = [result for result in results if request.admits(result)]
+    columns = {**_marks("paper", FLAT), **_marks("sphere", SPHERE), **COSTS}
+    places = dict.fromkeys((r.dataset, r.scene, r.width, r.height, r.iterations) for r in chosen)
+    blocks, notes = [], []
+    for place in places:
+        dataset, scene, width, height, iterations = place
+        title = f"{scene_title(dataset, scene)}, {width}x{height}, {iterations} iterations"
+        own = [r for r in chosen if (r.dataset, r.scene, r.width, r.height, r.iterations) == place]
+        rows = [Row(_title(r), tuple(over_seeds([r], number) for number in columns.values())) for r in own]
+        blocks.append(Block(title, tuple(rows)))
+        notes += [conditions(f"{scene}, {protocol}", own, protocol) for protocol in ("paper", "sphere")]
+    return Table("runs", "Runs", "Run", tuple(columns), tuple(blocks), tuple(notes))
+
+
+def _title(result: Result) -> str:
+    words = [result.method, result.variant, f"seed {result.seed}", result.run.rpartition("_")[2]]
+    return ", ".join(word for word in words if word)
+
+
+def _marks(protocol: str, metrics: Sequence[str]) -> dict[Column, Number]:
+    def number(metric: str) -> Number:
+        return lambda result: result.scores[protocol].metrics.get(metric) if protocol in result.scores else None
+
+    return {column(metric, group=protocol): number(metric) for metric in metrics}
+
+
+COSTS: dict[Column, Number] = {
+    Column("anchors", 0, group="cost"): lambda r: r.counts.get("anchors"),
+    Column("Gaussians", 0, group="cost"): lambda r: r.counts.get("gaussians"),
+    Column("MB", 1, False, group="cost"): lambda r: r.model_bytes / 1e6,
+    Column("training s", 0, False, group="cost"): lambda r: r.timing.get("train_seconds"),
+    Column("ms per frame", 1, False, group="cost"): lambda r: r.timing.get("render_ms_median"),
+    Column("peak GB", 2, False, group="cost"): lambda r: r.peak_memory_bytes / 1e9,
+}

@@ -1,0 +1,100 @@
+"""What a table is before anyone writes it down: columns, blocks of rows, cells that may be missing, and footnotes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+MISSING = "–"
+
+
+class ReportError(ValueError):
+    """A table that must not be made from these results; the message says why and what to do."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """How the numbers of a column are read."""
+
+    title: str
+    decimals: int
+    higher_is_better: bool | None = None  # None: neither end is best
+    signed: bool = False  # a difference: always with its sign
+    group: str = ""  # heading over neighbouring columns
+
+    @property
+    def heading(self) -> str:
+        """The title with an arrow towards the better end."""
+        return self.title + {True: " ↑", False: " ↓", None: ""}[self.higher_is_better]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A number with its spread over seeds, or the reason why there is none."""
+
+    value: float | None = None
+    std: float | None = None  # over seeds; None for a single run
+    count: int = 1
+    status: str = ""  # of failed runs: oom, nan, ...
+
+    def text(self, column: Column) -> str:
+        """What stands in the cell, without emphasis.
+
+        >>> Cell(26.018, 0.04, 5).text(Column("PSNR", 2)), Cell(status="oom").text(Column("PSNR", 2))
+        ('26.02 ± 0.04 (n=5)', 'OOM')
+        """
+        if self.value is None:
+            return self.status.upper() or MISSING
+        text = shown(self.value, column)
+        if self.std is not None:
+            text += f" ± {self.std:.{column.decimals}f} (n={self.count})"
+        return text + (f" [{self.status.upper()}]" if self.status else "")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line; a cell for each column."""
+
+    title: str
+    cells: tuple[Cell, ...]
+
+
+@dataclass(frozen=True)
+class Block:
+    """Rows that are compared with each other, such as those of one scene."""
+
+    title: str
+    rows: tuple[Row, ...]
+
+
+@dataclass(frozen=True)
+class Table:
+    """A whole table; `corner` is the heading over the titles of the rows."""
+
+    name: str  # table3; the file name and the LaTeX label
+    title: str
+    corner: str
+    columns: tuple[Column, ...]
+    blocks: tuple[Block, ...]
+    notes: tuple[str, ...] = field(default=())
+
+
+def shown(value: float, column: Column) -> str:
+    """A number as it stands in a column."""
+    if not math.isfinite(value):
+        return str(value)
+    return f"{value:{'+' if column.signed else ''}.{column.decimals}f}"
+
+
+def best_rows(block: Block, column: int, columns: tuple[Column, ...]) -> set[int]:
+    """Indices of the rows with the best number of a column, as shown: what prints the same is equally good.
+
+    Empty where a direction is not given, or with fewer than two numbers to compare.
+    """
+    better = columns[column].higher_is_better
+    cells = [row.cells[column] for row in block.rows]
+    numbers = {i: float(shown(cell.value, columns[column])) for i, cell in enumerate(cells) if cell.value is not None}
+    if better is None or len(numbers) < 2:
+        return set()
+    best = max(numbers.values()) if better else min(numbers.values())
+    return {i for i, number in numbers.items() if number == best}
