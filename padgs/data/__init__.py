@@ -19,6 +19,13 @@ from padgs.scene import Scene
 # Each is `load(path, options) -> Scene`. All but synthetic read files; their modules also have `read`, to a Capture.
 LOADERS = {
     "colmap": "padgs.data.colmap:load",
+    "transforms": "padgs.data.transforms:load",
+    "openmvg": "padgs.data.openmvg:load",
+    "opensfm": "padgs.data.opensfm:load",
+    "roam360": "padgs.data.roam360:load",
+    "ricoh360": "padgs.data.ricoh360:load",
+    "omniblender": "padgs.data.omniblender:load",
+    "released": "padgs.data.released:load",
     "synthetic": "padgs.data.synthetic:load",
 }
 

@@ -51,6 +51,33 @@ def cam_from_pose(world_from_cam: Tensor, where: str) -> Tensor:
     return cam_from_center(checked_rotation(matrix[:3, :3], where).T, matrix[:3, 3], where)
 
 
+def cam_from_opengl_pose(world_from_cam: Tensor, where: str) -> Tensor:
+    """[4, 4] float64 of a world-from-cam matrix [3 or 4, 4] of an OpenGL camera: x right, y up, z backward."""
+    return rigid(OPENCV_FROM_OPENGL, torch.zeros(3, dtype=torch.float64)) @ cam_from_pose(world_from_cam, where)
+
+
+def rotation_from_quaternion(quaternion: Tensor, where: str) -> Tensor:
+    """[3, 3] of a quaternion (w, x, y, z); its length must be 1 up to rounding."""
+    quaternion = _finite(quaternion, where)
+    length = quaternion.norm().item()
+    if abs(length - 1) > 0.01:
+        raise DataError(f"{where}: the quaternion has the length {length:.4g}; it must be 1")
+    w, x, y, z = (quaternion / length).tolist()
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+def rotation_from_vector(vector: Tensor, where: str) -> Tensor:
+    """[3, 3] of a rotation vector: axis times angle in radians."""
+    x, y, z = _finite(vector, where).tolist()
+    cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
+    return torch.linalg.matrix_exp(cross)
+
+
 def checked_rotation(rotation: Tensor, where: str) -> Tensor:
     """The rotation nearest to a [3, 3] matrix that is one up to rounding, float64.
 

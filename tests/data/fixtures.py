@@ -71,7 +71,8 @@ def paint(points: NDArray[np.float64]) -> NDArray[np.uint8]:
 def write_images(world: World, folder: Path, extension: str = "png") -> None:
     folder.mkdir(parents=True)
     for name, image in zip(world.names, world.images, strict=True):
-        Image.fromarray(image).save(folder / f"{name}.{extension}")
+        options = {"quality": 100, "subsampling": 0} if extension == "jpg" else {}
+        Image.fromarray(image).save(folder / f"{name}.{extension}", **options)
 
 
 def write_lists(world: World, folder: Path, extension: str = "") -> None:
