@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from padgs.fused_loss import fits
 from padgs.loss import TargetMoments, pixel_weight, target_moments
 from padgs.scene import View
 
@@ -20,7 +21,7 @@ class Target:
 
     image: Tensor  # [H, W, 3]
     weight: Tensor  # [H, W] or [H, 1]
-    moments: TargetMoments
+    moments: TargetMoments | None  # None where the loss does without
 
 
 class Targets(Sequence[Target]):
@@ -52,11 +53,14 @@ class Targets(Sequence[Target]):
             weight = pixel_weight(self._weight, view.height, mask, device=self._device)
         except ValueError as error:
             raise ValueError(f"view {view.name!r}: {error}") from error
-        moments = self._moments.get(index)
-        if moments is None:
-            moments = target_moments(image)
-            size = 2 * image.numel() * image.element_size()
-            if size <= self._bytes_left:
-                self._bytes_left -= size
-                self._moments[index] = moments
-        return Target(image, weight, moments)
+        return Target(image, weight, None if fits(image) else self._moments_of(index, image))
+
+    def _moments_of(self, index: int, image: Tensor) -> TargetMoments:
+        if index in self._moments:
+            return self._moments[index]
+        moments = target_moments(image)
+        size = 2 * image.numel() * image.element_size()
+        if size <= self._bytes_left:
+            self._bytes_left -= size
+            self._moments[index] = moments
+        return moments

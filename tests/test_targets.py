@@ -12,6 +12,12 @@ def view(pixels: torch.Tensor, mask: torch.Tensor | None = None) -> View:
     return View("v", torch.eye(4, dtype=torch.float64), 8, 4, load_pixels=lambda: pixels, load_mask=load_mask)
 
 
+@pytest.fixture(autouse=True)
+def without_fused_loss(monkeypatch):
+    """The native loss keeps no moments."""
+    monkeypatch.setattr(padgs.targets, "fits", lambda image: False)
+
+
 PIXELS = torch.arange(96, dtype=torch.uint8).reshape(4, 8, 3)
 
 
@@ -21,6 +27,7 @@ def test_image_weight_and_moments():
     target = Targets([view(PIXELS, mask)], "uniform")[0]
     assert torch.equal(target.image, PIXELS / 255)
     assert torch.equal(target.weight, mask)
+    assert target.moments is not None
     assert torch.equal(target.moments.mean, target_moments(PIXELS / 255).mean)
 
 
@@ -29,7 +36,11 @@ def test_moments_are_kept_only_while_there_is_room(monkeypatch):
     targets = Targets([view(PIXELS), view(255 - PIXELS)], "uniform")
     assert targets[0].moments is targets[0].moments
     assert targets[1].moments is not targets[1].moments
-    assert torch.equal(targets[1].moments.variance, targets[1].moments.variance)
+
+
+def test_the_fused_loss_needs_no_moments(monkeypatch):
+    monkeypatch.setattr(padgs.targets, "fits", lambda image: True)
+    assert Targets([view(PIXELS)], "uniform")[0].moments is None
 
 
 def test_wrong_sizes_are_named():
