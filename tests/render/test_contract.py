@@ -1,0 +1,158 @@
+"""Bad input gets an error that names the tensor, the rule and the way out; no input crashes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from render_cases import INPUTS, each_engine, gaussians_of, identity_pose, leaves, needs_native
+
+from padgs.gaussians import Gaussians
+from padgs.render import RenderOptions, render
+from padgs.scene import View
+
+VIEW = View("v", identity_pose(), 32, 16)
+
+
+@pytest.fixture
+def gaussians(generator: torch.Generator) -> Gaussians:
+    return gaussians_of("ordinary", 5, generator).to(torch.float32)
+
+
+@pytest.mark.parametrize("name", INPUTS)
+def test_a_wrong_shape_is_named(name: str, gaussians: Gaussians):
+    for wrong in (getattr(gaussians, name)[:4], getattr(gaussians, name)[..., None], torch.zeros(())):
+        if name == "means" and wrong.shape == (4, 3):
+            message = r"quats has shape \(5, 4\); with 4 means it must be \(4, 4\)"
+        else:
+            message = rf"{name} has shape \({', '.join(map(str, wrong.shape))},?\); with \d means it must be"
+        with pytest.raises(ValueError, match=message):
+            render(replace(gaussians, **{name: wrong}), VIEW)
+
+
+@pytest.mark.parametrize("name", INPUTS)
+def test_mixed_dtypes_and_devices_are_named(name: str, gaussians: Gaussians):
+    other = getattr(gaussians, name)
+    with pytest.raises(ValueError, match=rf"{'quats' if name == 'means' else name} has dtype torch.float.*convert"):
+        render(replace(gaussians, **{name: other.double()}), VIEW)
+    with pytest.raises(ValueError, match=rf"{'quats' if name == 'means' else name} is on .*; move one of them"):
+        render(replace(gaussians, **{name: other.to("meta")}), VIEW.at(identity_pose()))
+
+
+def test_unusable_dtypes_are_named(gaussians: Gaussians):
+    for dtype in (torch.float16, torch.int64):
+        with pytest.raises(ValueError, match=f"means has dtype {dtype}; renderers take torch.float32 or torch.float64"):
+            render(gaussians.to(dtype), VIEW)
+
+
+def test_background_probe_and_pose_are_checked(gaussians: Gaussians):
+    with pytest.raises(ValueError, match=r"background has shape \(4,\); .* must be \(3,\)"):
+        render(gaussians, VIEW, background=torch.zeros(4))
+    with pytest.raises(ValueError, match="background has dtype torch.float64 but means has torch.float32"):
+        render(gaussians, VIEW, background=torch.zeros(3, dtype=torch.float64))
+    with pytest.raises(ValueError, match=r"probe has shape \(5, 3\); with 5 means it must be \(5, 2\)"):
+        render(gaussians, VIEW, probe=torch.zeros(5, 3))
+    with pytest.raises(ValueError, match=r"cam_from_world has shape \(3, 4\)"):
+        render(gaussians, VIEW.at(identity_pose()[:3]))
+
+
+@pytest.mark.parametrize(("width", "height"), [(0, 16), (32, 0), (-32, 16)])
+@each_engine
+def test_an_empty_image_is_refused(width: int, height: int, backend: str, dtype: torch.dtype, gaussians: Gaussians):
+    with pytest.raises(ValueError, match=f"image size is {width}x{height}; both sides must be at least 1 pixel"):
+        render(gaussians.to(dtype), View("v", identity_pose(), width, height), backend=backend)
+
+
+@pytest.mark.parametrize(
+    ("name", "index", "value", "message"),
+    [
+        ("scales", (3, 1), 0.0, r"scales\[3, 1\] is 0.0; scales must be > 0"),
+        ("scales", (0, 2), -0.5, r"scales\[0, 2\] is -0.5; scales must be > 0"),
+        ("opacities", (4,), 1.5, r"opacities\[4\] is 1.5; opacities must be in \[0, 1\]"),
+        ("opacities", (0,), -0.25, r"opacities\[0\] is -0.25; opacities must be in \[0, 1\]"),
+        ("quats", (2,), 0.0, r"quats\[2\] is \[0.0, 0.0, 0.0, 0.0\]; quats must not be zero"),
+        ("means", (1, 2), float("nan"), r"means holds 1 non-finite values, first at \[1, 2\]"),
+        ("colors", (1, 0), float("inf"), r"colors holds 1 non-finite values, first at \[1, 0\]"),
+    ],
+)
+@each_engine
+def test_bad_values_are_named_when_checked(name, index, value, message, backend, dtype, gaussians: Gaussians):
+    broken = leaves(gaussians, dtype)
+    getattr(broken, name).data[index] = value
+    with pytest.raises(ValueError, match=message):
+        render(broken, VIEW, backend=backend, check_values=True)
+    render(broken, VIEW, backend=backend)  # the switch is off: drawn as well as can be, without a crash
+
+
+def test_bad_poses_backgrounds_and_probes_are_named_when_checked(gaussians: Gaussians):
+    stretched, lost = 2 * identity_pose(), identity_pose()
+    lost[1, 3] = float("nan")
+    with pytest.raises(ValueError, match="cam_from_world has a 3x3 part that is not a rotation"):
+        render(gaussians, VIEW.at(stretched), check_values=True)
+    with pytest.raises(ValueError, match=r"cam_from_world holds 1 non-finite values, first at \[1, 3\]"):
+        render(gaussians, VIEW.at(lost), check_values=True)
+    with pytest.raises(ValueError, match="background holds 3 non-finite values"):
+        render(gaussians, VIEW, background=torch.full((3,), float("nan")), check_values=True)
+    with pytest.raises(ValueError, match="probe holds 10 non-finite values"):
+        render(gaussians, VIEW, probe=torch.full((5, 2), float("inf")), check_values=True)
+
+
+def test_unknown_names_list_the_known_ones(gaussians: Gaussians):
+    with pytest.raises(ValueError, match="unknown backend 'gpu'; known: .*cpu.*torch"):
+        render(gaussians, VIEW, backend="gpu")
+    with pytest.raises(ValueError, match="unknown bounds 'tight'; known: exact, square"):
+        RenderOptions(bounds="tight")
+
+
+@each_engine
+def test_unknown_projections_list_the_known_ones(backend: str, dtype: torch.dtype, gaussians: Gaussians):
+    with pytest.raises(ValueError, match="'mercator'; known: .*erp"):
+        render(gaussians.to(dtype), VIEW, RenderOptions(projection="mercator"), backend=backend)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"bounds": "square"}, "bounds=square are the published bounds.*; set wrap=false"),
+        ({"near": -1.0}, "near is -1.0; it must be a distance >= 0"),
+        ({"near": float("nan")}, "near is nan; it must be a distance >= 0"),
+        ({"low_pass": -0.1}, "low_pass is -0.1; it must be a variance >= 0"),
+    ],
+)
+def test_options_that_no_backend_can_honour_are_refused(options: dict, message: str):
+    with pytest.raises(ValueError, match=message):
+        RenderOptions(**options)
+
+
+@needs_native
+def test_the_cpu_backend_refuses_float64(gaussians: Gaussians):
+    with pytest.raises(ValueError, match="backend cpu takes float32 .* got torch.float64 .*use backend=torch"):
+        render(gaussians.to(torch.float64), VIEW, backend="cpu")
+
+
+@each_engine
+def test_no_gaussians_are_the_background(backend: str, dtype: torch.dtype):
+    nothing = Gaussians(
+        *(torch.zeros(0, *shape, dtype=dtype, requires_grad=True) for shape in ((3,), (4,), (3,), (), (3,)))
+    )
+    background = torch.tensor([0.25, 0.5, 0.75], dtype=dtype, requires_grad=True)
+    options = {"background": background, "probe": torch.zeros(0, 2, dtype=dtype), "backend": backend}
+    rendering = render(nothing, VIEW, check_values=True, **options)
+    assert torch.equal(rendering.image, background.expand(16, 32, 3))
+    assert torch.equal(rendering.transmittance, torch.ones(16, 32, dtype=dtype))
+    assert torch.equal(rendering.depth, torch.zeros(16, 32, dtype=dtype))
+    assert rendering.visible.shape == (0,) and rendering.counters["contributing"] == 0
+    rendering.image.sum().backward()
+    assert background.grad.tolist() == [512.0] * 3
+
+
+@each_engine
+def test_gaussians_that_are_not_contiguous_are_drawn_the_same(backend: str, dtype: torch.dtype, gaussians: Gaussians):
+    reference = render(gaussians.to(dtype), VIEW, backend=backend).image
+    strided = {}
+    for name, tensor in vars(gaussians.to(dtype)).items():
+        wide = torch.stack((tensor, -torch.ones_like(tensor)), dim=-1)
+        strided[name] = wide[..., 0]
+        assert not strided[name].is_contiguous()
+    assert torch.equal(render(Gaussians(**strided), VIEW, backend=backend).image, reference)
