@@ -50,8 +50,8 @@ LAYERS = {
     "data sources": ("padgs.data",),
     "results": ("padgs.results", "padgs.checkpoint"),
     "methods": ("baselines",),
-    "entry points": ("padgs.cli",),
     "reporting": ("reports",),
+    "entry points": ("padgs.cli",),
 }
 # Closed doors besides the order of the layers: module or package -> layers that it must not know.
 STRANGERS = {
