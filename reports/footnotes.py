@@ -30,4 +30,4 @@ _SHOWN = ("protocol", "resolution", "iterations")
 
 
 def _listed(values) -> str:
-    return " / ".join(dict.fromkeys(values))
+    return " / ".join(dict.fromkeys(value for value in values if value is not None)) or "none"
