@@ -8,6 +8,7 @@ namespace padgs {
 
 #define PADGS_DECLARE(isa)                    \
   namespace isa {                             \
+  extern const ProjectKernels project_kernels; \
   extern const BlendKernels blend_kernels;    \
   extern const LossKernels loss_kernels;      \
   }
@@ -19,11 +20,12 @@ PADGS_DECLARE(avx512)
 
 struct Kernels {
   const char *name;
+  const ProjectKernels &project;
   const BlendKernels &blend;
   const LossKernels &loss;
 };
 
-#define PADGS_KERNELS(isa) {#isa, isa::blend_kernels, isa::loss_kernels}
+#define PADGS_KERNELS(isa) {#isa, isa::project_kernels, isa::blend_kernels, isa::loss_kernels}
 
 static Kernels choose() {
 #if PADGS_ISA_COUNT > 1
@@ -50,6 +52,15 @@ static const Kernels &kernels() {
 using namespace padgs;
 
 PADGS_API const char *padgs_isa() { return kernels().name; }
+
+PADGS_API void padgs_project(const Camera *camera, const Inputs *in, Footprint *footprints, PixelBox *boxes) {
+  kernels().project.forward(*camera, *in, footprints, boxes);
+}
+
+// Gradients of every input from the moments [N, kMoments], already summed over the instances of each Gaussian.
+PADGS_API void padgs_project_backward(const Camera *camera, const Inputs *in, const float *moments, const Gradients *out) {
+  kernels().project.backward(*camera, *in, moments, *out);
+}
 
 PADGS_API void padgs_blend_forward(const BlendArguments *args) { kernels().blend.forward(*args); }
 

@@ -5,6 +5,11 @@
 
 namespace padgs {
 
+struct ProjectKernels {
+  void (*forward)(const Camera &, const Inputs &, Footprint *, PixelBox *);
+  void (*backward)(const Camera &, const Inputs &, const float *moments, const Gradients &);
+};
+
 struct BlendKernels {
   void (*forward)(const BlendArguments &);
   void (*backward)(const BlendGradientArguments &);
