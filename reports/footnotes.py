@@ -16,10 +16,7 @@ def conditions(title: str, results: Sequence[Result], protocol: str) -> str:
     seeds = _listed(str(seed) for seed in sorted({result.seed for result in results}))
     versions = _listed(result.code_version for result in results)
     machines = _listed(machine(result) for result in results)
-    return (
-        f"{title}: protocol {protocol} ({rules}), {sizes}, {iterations} iterations, seeds {seeds}, "
-        f"padgs {versions}, {machines}."
-    )
+    return f"{title}: protocol {rules}, {sizes}, {iterations} iterations, seeds {seeds}, padgs {versions}, {machines}."
 
 
 def machine(result: Result) -> str:
@@ -33,4 +30,4 @@ _SHOWN = ("protocol", "resolution", "iterations")
 
 
 def _listed(values) -> str:
-    return " / ".join(dict.fromkeys(values))
+    return " / ".join(dict.fromkeys(value for value in values if value is not None)) or "none"

@@ -23,6 +23,9 @@ class Request:
         return all(str(setting(result, key)) == value for key, value in self.where.items())
 
 
+INPUT_RANGES = {"01": "[0, 1]", "11": "[-1, 1]"}
+
+
 def setting(result: Result, key: str) -> Any:
     """The value of a dotted key of a result's configuration.
 
@@ -50,7 +53,9 @@ def refuse_mixture(results: Sequence[Result], request: Request, where: str) -> N
     for what, of in CONDITIONS.items():
         found: dict[str, str] = {}
         for result in results:
-            found.setdefault(of(result, request.protocol), result.run)
+            value = of(result, request.protocol)
+            if value is not None:
+                found.setdefault(value, result.run)
         if len(found) > 1:
             examples = "; ".join(f"{value} in {run}" for value, run in found.items())
             raise ReportError(
@@ -58,10 +63,15 @@ def refuse_mixture(results: Sequence[Result], request: Request, where: str) -> N
             )
 
 
-def _rules(result: Result, protocol: str) -> str:
+def _rules(result: Result, protocol: str) -> str | None:
     scores = result.scores.get(protocol)
-    rules = scores.protocol if scores else result.config.get("protocol", {}).get(protocol, {})
-    return ", ".join(f"{key} {value}" for key, value in sorted(rules.items()))
+    rules = scores.protocol if scores else result.config.get("protocol", {}).get(protocol)
+    if rules is None:
+        return None  # a run that was never scored under this protocol contradicts nothing
+    words = [protocol, f"LPIPS-{rules.get('lpips')} fed {INPUT_RANGES.get(rules.get('lpips_inputs', ''))}"]
+    if rules.get("bottom_crop"):
+        words.append(f"without the last {100 * rules['bottom_crop']:.1f} % of the rows")
+    return ", ".join(words)
 
 
 CONDITIONS = {

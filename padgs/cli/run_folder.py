@@ -51,10 +51,11 @@ class RunFolder:
         path = self.path / results.FILE_NAME
         return results.read(path) if path.exists() else None
 
-    def finish(self, result: Result) -> None:
-        """Write result.json; from then on the run is done."""
+    def finish(self, result: Result) -> Result:
+        """Write result.json; from then on the run is done. Returns what the file says, as any later reader sees it."""
         with self._writing():
-            results.write(result, self.path)
+            path = results.write(result, self.path)
+        return results.read(path)
 
     def log(self, line: Mapping[str, Any]) -> None:
         """Append a line to log.jsonl."""

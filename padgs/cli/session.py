@@ -86,8 +86,7 @@ def _finish(config: RunConfig, scene: Scene, folder: RunFolder, console: Console
         peak_memory_bytes=clock.peak_memory()["host"] or 0,
         finished=datetime.now(timezone.utc).isoformat(timespec="seconds"),
     )
-    folder.finish(result)
-    return result
+    return folder.finish(result)
 
 
 def build(config: RunConfig) -> Method:
@@ -104,8 +103,7 @@ def _score_again(result: Result, config: RunConfig, scene: Scene, folder: RunFol
         if name not in result.scores or not same_rules(result.scores[name], protocol)
     }
     result = replace(result, scores={**result.scores, **scores(method, scene, missing, None)})
-    folder.finish(result)
-    return result
+    return folder.finish(result)
 
 
 def _is_scored(result: Result, config: RunConfig) -> bool:

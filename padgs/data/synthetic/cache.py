@@ -11,9 +11,11 @@ import json
 import os
 import shutil
 import tempfile
+import zlib
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 from PIL import Image
@@ -55,13 +57,14 @@ def read(options: SyntheticOptions) -> Stored | None:
     """The stored scene of a configuration, or None if there is none, or a damaged one."""
     place = folder() / key(options)
     try:
-        with np.load(place / "scene.npz", allow_pickle=False) as table:
+        # Opened here, because numpy leaves a file that is not a zip archive open.
+        with open(place / "scene.npz", "rb") as file, np.load(file, allow_pickle=False) as table:
             count = len(table["poses"])
             images = [place / f"{index:03d}.png" for index in range(count)]
             if not all(path.is_file() for path in images):
                 return None
             return Stored(images, table["poses"], table["points"], table["colors"], str(table["fingerprint"]))
-    except (OSError, KeyError, ValueError, EOFError):
+    except (OSError, KeyError, ValueError, EOFError, BadZipFile, zlib.error):
         return None
 
 

@@ -154,18 +154,22 @@ def scatter(
     rng: np.random.Generator,
     reflectance: float = 0.0,
 ) -> list[Shape]:
-    """Loose objects within a box, each hung or stood on a thin rod, at least `clearance` from the camera path."""
+    """Loose objects within a box that touch neither each other nor anything within `clearance` of the camera path.
+
+    Those in the lower part stand on thin rods, the others float.
+    """
     shapes: list[Shape] = []
+    places, sizes = np.empty((0, 3)), np.empty(0)
     for _ in range(count):
         size = rng.uniform(0.07, 0.16)
         for _attempt in range(200):
             where = rng.uniform(low, high)
-            if np.linalg.norm(path - where, axis=1).min() > clearance + size:
+            apart = (np.linalg.norm(places - where, axis=1) > sizes + size).all()
+            if apart and np.linalg.norm(path - where, axis=1).min() > clearance + size:
                 break
         else:
-            raise DataError(
-                f"found no place for object {len(shapes) // 2 + 1} of {count}; set data.generator.objects lower"
-            )
+            raise DataError(f"found no place for object {len(sizes) + 1} of {count}; set data.generator.objects lower")
+        places, sizes = np.vstack((places, where)), np.append(sizes, size)
         shapes.append(loose_object(point(where), size, rng, reflectance))
         x, y, z = point(where)
         if z < high[2] * 0.6:  # the support must not stand in the way of the cameras

@@ -160,11 +160,11 @@ def two_rooms(options: SyntheticOptions, path: Array, rng: np.random.Generator) 
     frame = fu.matt(tx.planks(*fu.WALNUT, width=0.06))
     shapes: list[Shape] = [
         Room((-5.0, -2.5, 0.0), (5.0, 2.5, 2.8), _room_materials(options, 10, 5, rugs=((-2.6, 0.0), (2.6, 0.0)))),
-        Box((0, -1.5, 1.4), (0.08, 1.0, 1.4), (partition,)),
-        Box((0, 1.5, 1.4), (0.08, 1.0, 1.4), (partition,)),
-        Box((0, 0, 2.45), (0.08, 0.5, 0.35), (partition,)),
-        *(Box((0, y, 1.05), (0.1, 0.03, 1.05), frame) for y in (-0.5, 0.5)),
-        Box((0, 0, 2.1), (0.1, 0.53, 0.03), frame),
+        Box((0, -1.45, 1.4), (0.08, 1.05, 1.4), (partition,)),
+        Box((0, 1.45, 1.4), (0.08, 1.05, 1.4), (partition,)),
+        Box((0, 0, 2.45), (0.08, 0.4, 0.35), (partition,)),
+        *(Box((0, y, 1.05), (0.1, 0.03, 1.05), frame) for y in (-0.4, 0.4)),
+        Box((0, 0, 2.1), (0.1, 0.43, 0.03), frame),
         *fu.bookshelf(-2.4, 2.3, 1.8, 2.1),
         *fu.table(-3.9, -1.6, 1.2, 0.8, 0.75),
         *fu.crates(-0.6, -2.0, rng),

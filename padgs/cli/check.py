@@ -1,0 +1,86 @@
+"""`padgs check`: is this folder ready for training?"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from padgs.data.check import Report
+
+
+def check(
+    path: Annotated[str, typer.Argument(help="folder with panoramas and poses, or the file that describes them")],
+    format: Annotated[str, typer.Option(help="auto, or the format's name")] = "auto",
+    overlay: Annotated[str, typer.Option(help="picture of the points on a panorama; '' for none")] = "check.png",
+    mask: Annotated[str, typer.Option(help="auto, none, rows:959/1024, or a file or folder")] = "auto",
+    images: Annotated[str, typer.Option(help="image folder, if not the usual one")] = "",
+    split: Annotated[str, typer.Option(help="auto, files, every or all")] = "auto",
+) -> None:
+    """Look a data set through and list what is wrong with it. Exit code 1 if anything is."""
+    from pathlib import Path
+
+    from rich.console import Console
+
+    from padgs.data.check import check as look_through
+    from padgs.data.errors import DataError
+    from padgs.data.options import DataOptions
+
+    console = Console(highlight=False, soft_wrap=True)
+    try:
+        options = DataOptions(mask=mask, images=images or None, split=split)
+        with console.status("looking at the images") as status:
+            report = look_through(
+                Path(path),
+                format=format,
+                options=options,
+                overlay=Path(overlay) if overlay else None,
+                progress=lambda done, total: status.update(f"looking at image {done} of {total}"),
+            )
+    except (DataError, ValueError) as error:
+        console.print(str(error), markup=False)
+        raise typer.Exit(1) from error
+    for line in lines(report):
+        console.print(line, markup=False)
+    raise typer.Exit(1 if report.problems else 0)
+
+
+def lines(report: Report) -> list[str]:
+    """The report as text."""
+    out = [f"{report.path}"]
+    if report.train:
+        out += [
+            f"  format         {report.format}",
+            f"  views          {report.train} train, {report.test} test, {report.unused} unused; {report.resolution}",
+            f"  points         {report.points}{'' if report.coloured else ', without colours of their own'}",
+            f"  camera path    {report.path_length:.4g} long; median depth {report.median_depth:.4g}",
+        ]
+    if report.gravity is not None:
+        found = report.gravity
+        if found.agreement > 0.5:
+            out.append(
+                f"  gravity        up is {found.axis} within {found.off_axis:.1f} degrees; cameras tilt by "
+                f"{found.tilt:.1f} degrees (median)"
+            )
+        else:
+            out.append("  gravity        the cameras have no common up direction")
+    if report.reprojection_median is not None:
+        out.append(
+            f"  reprojection   {report.reprojection_median:.2f} pixels median, {report.reprojection_95:.2f} at 95 % "
+            f"({report.observations} observations)"
+        )
+    if report.colour_correlation is not None:
+        out.append(f"  colours        points and panoramas correlate by {report.colour_correlation:.2f}")
+    if report.masked:
+        shares = sorted(report.masked.values())
+        which = f"{len(shares)} of {report.train + report.test} views"
+        out.append(f"  masked         {shares[0]:.1%} to {shares[-1]:.1%} of each image, in {which}")
+    if report.overlay is not None:
+        out.append(f"  picture        {report.overlay}")
+    out += [f"  note           {note}" for note in report.notes]
+    out += [f"  PROBLEM        {problem}" for problem in report.problems]
+    if report.suggestion is not None:
+        out.append(f"  SUGGESTION     the points fit if {report.suggestion}")
+    out.append(f"  {len(report.problems)} problem(s)" if report.problems else "  ready for training")
+    return out

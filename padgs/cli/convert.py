@@ -1,0 +1,47 @@
+"""`padgs convert`: from any known format to any other."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+
+def convert(
+    source: Annotated[str, typer.Argument(help="folder with panoramas and poses, or the file that describes them")],
+    destination: Annotated[str, typer.Argument(help="a folder that does not exist yet")],
+    to: Annotated[str, typer.Option(help="the format to write")],
+    format: Annotated[str, typer.Option(help="format of the source: auto, or its name")] = "auto",
+    width: Annotated[int, typer.Option(help="reduce the panoramas to this width; 0 copies them as they are")] = 0,
+    points: Annotated[str, typer.Option(help="auto, random, or a PLY file in the source's folder")] = "auto",
+    mask: Annotated[str, typer.Option(help="auto, none, rows:959/1024, or a file or folder")] = "auto",
+    split: Annotated[str, typer.Option(help="auto, files, every or all")] = "auto",
+) -> None:
+    """Write a data set in another format. Exit code 1, and nothing written, if that is impossible."""
+    from pathlib import Path
+
+    from rich.console import Console
+
+    from padgs.data.convert import convert as write
+    from padgs.data.errors import DataError
+    from padgs.data.options import DataOptions
+
+    console = Console(highlight=False, soft_wrap=True)
+    try:
+        options = DataOptions(width=width or None, points=points, mask=mask, split=split)
+        with console.status("reading") as status:
+            scene = write(
+                Path(source),
+                Path(destination),
+                to,
+                format=format,
+                options=options,
+                progress=lambda done, total: status.update(f"image {done} of {total}"),
+            )
+    except (DataError, ValueError) as error:
+        console.print(str(error), markup=False)
+        raise typer.Exit(1) from error
+    for note in scene.notes:
+        console.print(f"  {note}", markup=False)
+    views = f"{len(scene.train)} train and {len(scene.test)} test views, {len(scene.points)} points"
+    console.print(f"{destination}: {views}, as {to}", markup=False)

@@ -1,0 +1,127 @@
+"""Every solid by distances known in advance, and by where its hits lie."""
+
+import numpy as np
+import pytest
+
+from padgs.data.synthetic.shapes import Box, Ground, Material, Ring, Rod, Room, Sphere
+from padgs.data.synthetic.textures import plain
+
+SKIN = (Material(plain((0.5, 0.5, 0.5))),)
+
+
+def ray(x, y, z):
+    direction = np.array([[x], [y], [z]], float)
+    return direction / np.linalg.norm(direction)
+
+
+def at(x, y, z):
+    return np.array([[x], [y], [z]], float)
+
+
+def random_rays(count, origin, dtype=np.float64):
+    direction = np.random.default_rng(5).normal(size=(3, count))
+    return at(*origin).astype(dtype), (direction / np.linalg.norm(direction, axis=0)).astype(dtype)
+
+
+@pytest.mark.parametrize(
+    ("direction", "distance"),
+    [((1, 0, 0), 2.5), ((-1, 0, 0), 3.5), ((0, 1, 0), 2.0), ((0, -1, 0), 3.0), ((0, 0, 1), 1.8), ((0, 0, -1), 1.0)],
+)
+def test_room_walls_along_the_axes(direction, distance):
+    room = Room((-3, -2.5, 0), (3, 2.5, 2.8), SKIN)
+    assert room.hit(at(0.5, 0.5, 1.0), ray(*direction))[0] == pytest.approx(distance, abs=1e-12)
+
+
+def test_known_distances():
+    # The sphere's near side is one radius before its centre; so is the rod's; a ray past either misses.
+    assert Sphere((0, 5, 0), 2, SKIN).hit(at(0, 0, 0), ray(0, 1, 0))[0] == pytest.approx(3)
+    assert Sphere((0, 5, 0), 2, SKIN).hit(at(0, 0, 2.01), ray(0, 1, 0))[0] == np.inf
+    assert Sphere((0, -5, 0), 2, SKIN).hit(at(0, 0, 0), ray(0, 1, 0))[0] == np.inf
+    rod = Rod((0, 2, -1), (0, 2, 1), 0.25, SKIN)
+    assert rod.hit(at(0, 0, 0.5), ray(0, 1, 0))[0] == pytest.approx(1.75)
+    assert rod.hit(at(0, 0, 1.1), ray(0, 1, 0))[0] == np.inf
+    rounded = Rod((0, 2, -1), (0, 2, 1), 0.25, SKIN, rounded=True)  # 0.15 above the end: 0.2 before the axis
+    assert rounded.hit(at(0, 0, 1.15), ray(0, 1, 0))[0] == pytest.approx(1.8)
+    # A unit cube turned by 45 degrees shows its edge, sqrt(2) from the centre.
+    assert Box((4, 0, 0), (1, 1, 1), SKIN).hit(at(0, 0, 0), ray(1, 0, 0))[0] == pytest.approx(3)
+    turned = Box((4, 0, 0), (1, 1, 1), SKIN, yaw=np.pi / 4)
+    assert turned.hit(at(0, 0, 0), ray(1, 0, 0))[0] == pytest.approx(4 - np.sqrt(2))
+    assert Ground(SKIN).hit(at(0, 0, 3), ray(4, 0, -3))[0] == pytest.approx(5)  # 3-4-5 triangle
+    assert Ground(SKIN).hit(at(0, 0, 3), ray(1, 0, 0))[0] == np.inf
+    assert Ring(10, 8, SKIN).hit(at(-2, 0, 1), ray(1, 0, 0))[0] == pytest.approx(12)
+    assert Ring(10, 8, SKIN).hit(at(0, 0, 9), ray(1, 0, 0))[0] == np.inf
+
+
+SOLIDS = {
+    "sphere": (Sphere((1, 2, 0.5), 1.2, SKIN), lambda p: np.linalg.norm(p - at(1, 2, 0.5), axis=0) - 1.2),
+    "box": (
+        Box((1, 2, 0.5), (0.5, 0.7, 1.0), SKIN),
+        lambda p: np.abs((p - at(1, 2, 0.5)) / at(0.5, 0.7, 1)).max(0) - 1,
+    ),
+    "rod": (Rod((1, -1, 2), (1, 3, 2), 0.3, SKIN), lambda p: np.hypot(p[0] - 1, p[2] - 2) - 0.3),
+    "room": (Room((-3, -3, -2), (3, 4, 3), SKIN), lambda p: np.abs((p - at(0, 0.5, 0.5)) / at(3, 3.5, 2.5)).max(0) - 1),
+}
+
+
+@pytest.mark.parametrize("name", SOLIDS)
+def test_hits_lie_on_the_surface_and_face_the_camera(name):
+    shape, implicit = SOLIDS[name]
+    origin, rays = random_rays(4000, (0, 0, 0))
+    t = shape.hit(origin, rays)
+    hit = np.isfinite(t)
+    assert hit.sum() > 50
+    points = origin + t[hit] * rays[:, hit]
+    np.testing.assert_allclose(implicit(points), 0, atol=1e-9)
+    surface = shape.surface(points)
+    np.testing.assert_allclose(np.linalg.norm(surface.normal, axis=0), 1, atol=1e-9)
+    assert ((surface.normal * rays[:, hit]).sum(0) < 0).all()
+
+
+@pytest.mark.parametrize("name", SOLIDS)
+def test_bounding_spheres_hold_the_shape(name):
+    shape, _ = SOLIDS[name]
+    if shape.bounds is None:
+        pytest.skip("surrounds the camera")
+    origin, rays = random_rays(4000, (0, 0, 0))
+    t = shape.hit(origin, rays)
+    points = (origin + np.where(np.isfinite(t), t, 0) * rays)[:, np.isfinite(t)]
+    center, radius = shape.bounds
+    assert np.linalg.norm(points - at(*center), axis=0).max() <= radius + 1e-9
+
+
+def test_single_precision_stays_single_and_agrees():
+    """A float64 that slips in doubles the time of drawing; a thin far rod is where float32 could fail."""
+    thin = Rod((-5, 8, 1), (5, 8, 1), 0.006, SKIN)
+    center = np.linspace(0.9, 1.1, 4001)
+    rays = np.stack((0 * center, 0 * center + 8, center)) / np.hypot(8, center)
+    exact = thin.hit(at(0, 0, 0), rays)
+    single = thin.hit(at(0, 0, 0).astype(np.float32), rays.astype(np.float32))
+    assert single.dtype == np.float32
+    assert (np.isfinite(exact) != np.isfinite(single)).mean() < 2e-3
+    for shape, _ in SOLIDS.values():
+        origin, rays = random_rays(100, (0, 0, 0), np.float32)
+        t = shape.hit(origin, rays)
+        surface = shape.surface((origin + np.where(np.isfinite(t), t, 1) * rays).astype(np.float32))
+        assert (t.dtype, surface.normal.dtype, surface.uv.dtype) == (np.float32,) * 3
+
+
+@pytest.mark.parametrize("face", range(6))
+def test_point_at_inverts_the_texture_coordinates(face):
+    room = Room((-3, -2.5, 0), (3, 2.5, 2.8), SKIN)
+    width, height = room.size(face)
+    uv = np.random.default_rng(face).uniform(-0.49, 0.49, (2, 50)) * np.array([[width], [height]])
+    surface = room.surface(room.point_at(face, uv))
+    np.testing.assert_allclose(surface.uv, uv, atol=1e-12)
+    assert (surface.face == face).all()
+
+
+def test_writing_on_walls_is_not_mirrored():
+    """Seen from the middle of a room, or from outside a box, u grows to the right and v upwards."""
+    room, box = Room((-1, -1, -1), (1, 1, 1), SKIN), Box((0, 0, 0), (1, 1, 1), SKIN)
+    for forward in ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)):
+        right = np.cross(forward, (0, 0, 1))
+        for shape, place in ((room, np.array(forward)), (box, -np.array(forward))):
+            points = np.stack((place, place + 0.1 * right, place + 0.1 * np.array((0, 0, 1))), axis=1).astype(float)
+            uv = shape.surface(points).uv
+            np.testing.assert_allclose(uv[:, 1] - uv[:, 0], (0.1, 0), atol=1e-12)
+            np.testing.assert_allclose(uv[:, 2] - uv[:, 0], (0, 0.1), atol=1e-12)

@@ -1,0 +1,197 @@
+"""Whole scenes: deterministic, cached, each of S1-S7 with the property that it is there for."""
+
+import os
+
+import numpy as np
+import pytest
+import torch
+
+from padgs.data import DataError, DataOptions
+from padgs.data.synthetic import SCENES, SyntheticOptions, SyntheticTruth, cache, camera, generate, load
+from padgs.data.synthetic.paths import curve
+from padgs.data.synthetic.scenes import BLUEPRINTS
+
+TINY = {"scene": "bare_room", "width": 64, "train_views": 4, "test_views": 2, "points": 300, "samples": 4}
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("PADGS_CACHE", str(tmp_path / "cache"))
+
+
+def same(first, second):
+    assert first.fingerprint == second.fingerprint
+    assert torch.equal(first.points, second.points)
+    assert torch.equal(first.point_colors, second.point_colors)
+    for a, b in zip((*first.train, *first.test), (*second.train, *second.test), strict=True):
+        assert a.name == b.name
+        assert torch.equal(a.cam_from_world, b.cam_from_world)
+        assert torch.equal(a.load_pixels(), b.load_pixels())
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_every_scene_generates(name):
+    scene = generate(SyntheticOptions(**(TINY | {"scene": name})))
+    assert (len(scene.train), len(scene.test), scene.name) == (4, 2, f"synthetic-{name}")
+    for view in (*scene.train, *scene.test):
+        pixels = view.load_pixels()
+        assert (pixels.shape, pixels.dtype) == ((32, 64, 3), torch.uint8)
+        assert pixels.float().std() > 10
+    assert scene.points.shape == (300, 3)
+    assert scene.points.isfinite().all()
+    assert scene.notes == ()
+
+
+def test_cache_gives_identical_scenes(tmp_path):
+    options = SyntheticOptions(**TINY)
+    first = generate(options)
+    files = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()}
+    assert len(files) == 7  # six images and a table, nothing left over
+    same(first, generate(options))
+    assert {path: path.stat().st_mtime_ns for path in files} == files
+    os.environ["PADGS_CACHE"] = str(tmp_path / "elsewhere")  # restored by the fixture
+    same(first, generate(options))  # drawn again
+
+
+def test_damaged_cache_is_made_anew(tmp_path):
+    options = SyntheticOptions(**TINY)
+    first = generate(options)
+    table = next(tmp_path.rglob("scene.npz"))
+    table.write_bytes(table.read_bytes()[:100])
+    same(first, generate(options))
+    next(tmp_path.rglob("003.png")).unlink()
+    same(first, generate(options))
+    assert cache.read(options) is not None
+
+
+def test_a_cache_that_cannot_be_written_is_done_without(tmp_path, monkeypatch):
+    expected = generate(SyntheticOptions(**TINY))
+    (tmp_path / "file").write_text("not a folder")
+    monkeypatch.setenv("PADGS_CACHE", str(tmp_path / "file"))
+    scene = generate(SyntheticOptions(**TINY))
+    assert len(scene.notes) == 1
+    assert "not cached" in scene.notes[0]
+    same(scene, expected)
+
+
+def test_every_knob_changes_the_key():
+    base = SyntheticOptions(**TINY)
+    assert cache.key(base) == cache.key(SyntheticOptions(**TINY))
+    others = [SyntheticOptions(**TINY, seed=1), SyntheticOptions(**(TINY | {"points": 301}))]
+    assert len({cache.key(options) for options in (base, *others)}) == 3
+
+
+def test_seeds_differ():
+    first, second = (generate(SyntheticOptions(**TINY, seed=seed)) for seed in (0, 1))
+    assert first.fingerprint != second.fingerprint
+    assert not torch.equal(first.train[0].cam_from_world, second.train[0].cam_from_world)
+
+
+def test_load_takes_name_width_and_knobs_from_the_data_options():
+    scene = load("outdoor", DataOptions(width=32, generator={"train_views": 3, "test_views": 1, "points": 100}))
+    assert scene.name == "synthetic-outdoor"
+    assert (len(scene.train), scene.train[0].width, scene.train[0].height) == (3, 32, 16)
+    with pytest.raises(DataError, match=r"unknown data.generator.wdith; known: .*train_views.*width"):
+        load("room", DataOptions(generator={"wdith": 3}))
+    with pytest.raises(DataError, match="unknown synthetic scene 'rom'; known: bare_room, .*room"):
+        load("rom", DataOptions())
+
+
+@pytest.mark.parametrize(
+    ("knobs", "message"),
+    [
+        ({"width": 15}, "even number"),
+        ({"samples": 5}, "square number"),
+        ({"train_views": 1}, "train_views 1 is less than 2"),
+        ({"outliers": 1.0}, "share"),
+        ({"world_scale": 0.0}, "world_scale 0.0"),
+        ({"point_noise": float("nan")}, "finite"),
+        ({"path": "zigzag"}, "known: cross, line, roaming"),
+        ({"objects": 2000}, "no place"),
+    ],
+)
+def test_bad_knobs_are_refused(knobs, message):
+    with pytest.raises(DataError, match=message):
+        SyntheticTruth(SyntheticOptions(**knobs))
+
+
+def depths(name, width=128):
+    truth = SyntheticTruth(SyntheticOptions(scene=name))
+    return truth, [camera.trace(truth.world, pose, width) for pose in truth.poses]
+
+
+def test_outdoor_spans_three_orders_of_magnitude_and_has_sky():
+    _, views = depths("outdoor")
+    finite = np.concatenate([depth[np.isfinite(depth)] for depth, _ in views])
+    near = np.quantile(finite, 1e-4)
+    assert near < 0.8
+    assert finite.max() > 290
+    assert finite.max() / finite.min() > 500
+    assert 0.2 < np.mean([(object_id == -1).mean() for _, object_id in views]) < 0.6
+
+
+def test_each_room_of_two_hides_most_of_the_other():
+    truth, _ = depths("two_rooms", 16)
+    rng = np.random.default_rng(0)
+    middle = rng.uniform((-4.8, -2.3, 0.1), (-0.3, 2.3, 2.7), (400, 3)).T
+    right = [pose for pose in truth.poses if camera.center(pose)[0] > 1.5]
+    left = [pose for pose in truth.poses if camera.center(pose)[0] < -1.5]
+
+    def seen(poses):
+        shares = []
+        for pose in poses:
+            toward = middle - camera.center(pose)[:, None]
+            far = np.linalg.norm(toward, axis=0)
+            shares.append((truth.world.nearest(camera.center(pose)[:, None], toward / far)[0] > far).mean())
+        return np.mean(shares)
+
+    assert min(len(left), len(right)) >= 8
+    assert seen(right) < 0.3
+    assert seen(left) > 0.8
+
+
+def test_rods_pass_over_and_under_the_cameras_of_pole_torture():
+    truth, views = depths("pole_torture")
+    thin = [depth[[0, -1]].min(axis=1) for depth, _ in views]
+    assert np.mean([rows[0] < 1.2 for rows in thin]) > 0.4  # the ceiling is 1.4 m above
+    assert np.mean([rows[1] < 1.1 for rows in thin]) > 0.4
+
+
+def test_posters_cover_a_tenth_of_the_bare_walls():
+    truth = SyntheticTruth(SyntheticOptions(scene="bare_room", objects=0))
+    room = truth.world.shapes[0]
+    area = covered = 0.0
+    for face in range(4):
+        width, height = room.size(face)
+        u, v = np.meshgrid(np.linspace(-width / 2, width / 2, 600), np.linspace(-height / 2, height / 2, 300))
+        color = room.materials[face].texture(np.stack((u.ravel(), v.ravel())).astype(np.float32))
+        covered += width * height * (np.abs(color - np.array([[0.8], [0.8], [0.78]])) > 0.02).any(0).mean()
+        area += width * height
+    assert covered / area == pytest.approx(0.10, abs=0.02)
+
+
+def test_near_clutter_is_5_to_30_cm_from_the_path():
+    options = SyntheticOptions(scene="near_clutter")
+    truth, blueprint = SyntheticTruth(options), BLUEPRINTS["near_clutter"]
+    path = curve(blueprint.walk, blueprint.path, truth.random("path"))
+    near = truth.world.shapes[-blueprint.objects :]
+    for shape in near:
+        center, radius = shape.bounds
+        gap = np.linalg.norm(path - center, axis=1).min() - radius
+        assert -0.01 < gap < 0.3  # bounding spheres: those of bars reach farther than the bars
+    nearest = min(camera.trace(truth.world, pose, 128)[0].min() for pose in truth.poses)
+    assert 0.04 < nearest < 0.2
+
+
+@pytest.mark.parametrize(("name", "changes"), [("glossy", True), ("room", False)])
+def test_only_glossy_surfaces_depend_on_the_view(name, changes):
+    """The same point of the floor from two cameras."""
+    truth = SyntheticTruth(SyntheticOptions(scene=name))
+    rng = np.random.default_rng(3)
+    points = np.stack((rng.uniform(-1.2, 1.2, 400), rng.uniform(-1.2, 1.2, 400), np.zeros(400)))
+    colors = []
+    for pose in (truth.poses[0], truth.poses[15]):
+        origin = camera.center(pose)[:, None]
+        far = np.linalg.norm(points - origin, axis=0)
+        colors.append(truth.world.color(origin.astype(np.float32), ((points - origin) / far).astype(np.float32)))
+    assert (np.median(np.abs(colors[0] - colors[1])) > 0.01) == changes

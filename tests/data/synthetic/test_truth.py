@@ -1,0 +1,98 @@
+"""Exact truth under every knob that changes what methods are given."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from padgs.data.synthetic import SyntheticOptions, SyntheticTruth, generate
+from padgs.scene import View
+
+SMALL = {"scene": "bare_room", "width": 64, "train_views": 4, "test_views": 2, "points": 300, "samples": 4}
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("PADGS_CACHE", str(tmp_path))
+
+
+def test_scaling_and_turning_the_world_changes_no_pixel():
+    plain = SyntheticOptions(**SMALL)
+    moved = SyntheticOptions(**SMALL, world_scale=100.0, world_rotation=(20.0, -35.0, 50.0))
+    scene, other = generate(plain), generate(moved)
+    truth, turned = SyntheticTruth(plain), SyntheticTruth(moved)
+    pairs = zip((*scene.train, *scene.test), (*other.train, *other.test), strict=True)
+    for view, far in pairs:
+        assert torch.equal(view.image(), far.image())
+        torch.testing.assert_close(far.center.norm(), 100 * view.center.norm())
+        torch.testing.assert_close(turned.depth(far), 100 * truth.depth(view), rtol=1e-9, atol=0)
+        rotation = far.cam_from_world[:3, :3]
+        torch.testing.assert_close(rotation @ rotation.T, torch.eye(3, dtype=torch.float64))
+    # Points in camera frames: 100 times as far in the same direction.
+    view, far = scene.train[0], other.train[0]
+    near_frame = view.cam_from_world[:3, :3] @ scene.points.double().T + view.cam_from_world[:3, 3:]
+    far_frame = far.cam_from_world[:3, :3] @ other.points.double().T + far.cam_from_world[:3, 3:]
+    torch.testing.assert_close(far_frame, 100 * near_frame, rtol=0, atol=1e-3)
+    assert other.unit == pytest.approx(100 * scene.unit, rel=1e-5)
+
+
+def test_world_rotation_is_about_x_then_y_then_z():
+    """A quarter turn about x sends up (+z) to -y, one about z then sends -y to +x: camera 'up' is world +x."""
+    truth = SyntheticTruth(SyntheticOptions(**SMALL, world_rotation=(90.0, 0.0, 90.0)))
+    up_in_camera = truth.exact_pose("000")[:3, :3] @ torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
+    torch.testing.assert_close(up_in_camera, torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64))
+
+
+def test_pose_noise_moves_training_poses_only_and_the_truth_knows():
+    options = SyntheticOptions(
+        **(SMALL | {"width": 16, "train_views": 40}), pose_noise_translation=0.01, pose_noise_rotation=0.5
+    )
+    truth = SyntheticTruth(options)
+    scene = generate(options)
+    clean = generate(SyntheticOptions(**(SMALL | {"width": 16, "train_views": 40})))
+    shifts, angles = [], []
+    for view, exact in zip(scene.train, clean.train, strict=True):
+        assert torch.equal(view.image(), exact.image())
+        torch.testing.assert_close(truth.exact_pose(view.name), exact.cam_from_world)
+        shifts.append((view.center - exact.center).numpy())
+        turn = view.cam_from_world[:3, :3] @ exact.cam_from_world[:3, :3].T
+        angles.append(math.degrees(math.acos(min(1.0, (turn.trace().item() - 1) / 2))))
+        torch.testing.assert_close(truth.depth(view), truth.depth(exact))  # depth belongs to the image
+    assert np.std(shifts) == pytest.approx(0.01 * truth.median_depth, rel=0.2)
+    assert np.sqrt(np.mean(np.square(angles))) == pytest.approx(0.5, rel=0.3)
+    for view, exact in zip(scene.test, clean.test, strict=True):
+        assert torch.equal(view.cam_from_world, exact.cam_from_world)
+
+
+def test_any_other_pose_is_taken_as_it_is():
+    truth = SyntheticTruth(SyntheticOptions(**SMALL, world_scale=10.0))
+    pose = truth.exact_pose("001").clone()
+    pose[:3, 3] -= pose[:3, :3] @ torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64)  # up by 0.2 m
+    nearer = truth.depth(View("001", pose, 64, 32))[0].min()
+    assert truth.depth(View("001", truth.exact_pose("001"), 64, 32))[0].min() - nearer == pytest.approx(2.0, abs=0.02)
+    assert truth.image(View("new", pose, 64, 32)).shape == (32, 64, 3)
+
+
+def test_exposure_brightens_training_views_only():
+    plain, exposed = generate(SyntheticOptions(**SMALL)), generate(SyntheticOptions(**SMALL, exposure=1.0))
+    gains = [
+        math.log2((b.image().clamp(max=0.95).median() / a.image().median()).item())
+        for a, b in zip(plain.train, exposed.train, strict=True)
+    ]
+    assert max(gains) - min(gains) > 0.2
+    assert max(map(abs, gains)) < 1.05
+    assert all(torch.equal(a.image(), b.image()) for a, b in zip(plain.test, exposed.test, strict=True))
+
+
+def test_one_knob_leaves_everything_else_alone():
+    base, denser = generate(SyntheticOptions(**SMALL)), generate(SyntheticOptions(**(SMALL | {"points": 500})))
+    for view, same in zip(base.train, denser.train, strict=True):
+        assert torch.equal(view.image(), same.image())
+        assert torch.equal(view.cam_from_world, same.cam_from_world)
+    assert len(denser.points) == 500
+
+
+def test_unknown_view():
+    with pytest.raises(ValueError, match="unknown view 'x'; known: 000 to 005"):
+        SyntheticTruth(SyntheticOptions(**SMALL)).exact_pose("x")

@@ -1,0 +1,43 @@
+import csv
+
+import pytest
+
+from reports import published
+from reports.published import Key, load
+
+
+def test_a_number_of_each_table():
+    numbers = load()
+    assert numbers[Key(1, "360roam", "bar", "padgs", "psnr")].value == 23.40
+    assert numbers[Key(2, "ricoh360", "farm", "op43dgs", "psnr")].status == "oom"
+    assert numbers[Key(3, "ricoh360", "cat_tower", "padgs/full", "lpips")].value == 0.187
+    assert numbers[Key(4, "360roam", "average", "padgs", "fps")].value == 29.87
+
+
+def test_every_cell_has_a_number_or_a_reason():
+    for key, cell in load().items():
+        assert (cell.value is not None) == (cell.status == "ok"), key
+
+
+def test_averages_are_those_of_the_scenes():
+    numbers = load()
+    columns = {(k.table, k.dataset, k.method, k.metric) for k in numbers if k.scene == "average" and k.table < 3}
+    for table, dataset, method, metric in columns:
+        average = numbers[Key(table, dataset, "average", method, metric)]
+        cells = [
+            cell
+            for key, cell in numbers.items()
+            if (key.table, key.dataset, key.method, key.metric) == (table, dataset, method, metric)
+            and key.scene != "average"
+        ]
+        if average.value is None:
+            assert any(cell.value is None for cell in cells)
+            continue
+        mean = sum(cell.value for cell in cells) / len(cells)
+        half_a_digit = 0.0051 if metric == "psnr" else 0.00051
+        assert mean == pytest.approx(average.value, abs=2 * half_a_digit), (table, method, metric)
+
+
+def test_it_is_the_file_that_came_with_the_paper(shared):
+    with (shared / "paper" / "published.csv").open() as theirs, published.default_path().open() as ours:
+        assert list(csv.reader(ours)) == list(csv.reader(theirs))

@@ -1,0 +1,70 @@
+import subprocess
+import sys
+
+import pytest
+from made_up import result
+from typer.testing import CliRunner
+
+from padgs import results
+from padgs.cli.app import app
+
+
+@pytest.fixture
+def runs(tmp_path):
+    for variant in ("baseline", "full"):
+        (tmp_path / variant).mkdir()
+        results.write(result(variant), tmp_path / variant)
+    return tmp_path
+
+
+def report(*arguments):
+    return CliRunner().invoke(app, ["report", *map(str, arguments)])
+
+
+def test_it_writes_markdown_and_latex_and_shows_the_first(runs, tmp_path):
+    done = report("table3", "--runs", runs, "--out", tmp_path / "out")
+    assert done.exit_code == 0
+    written = {path.name: path.read_text() for path in (tmp_path / "out").iterdir()}
+    assert written.keys() == {"table3.md", "table3.tex"}
+    assert written["table3.md"] in done.output
+
+
+def test_the_same_results_give_the_same_bytes(runs, tmp_path):
+    for name in ("one", "two"):
+        report("table3", "--runs", runs, "--out", tmp_path / name)
+    assert (tmp_path / "one" / "table3.tex").read_bytes() == (tmp_path / "two" / "table3.tex").read_bytes()
+
+
+def test_a_broken_file_is_named_and_left_out_and_strict_fails(runs):
+    (runs / "full" / "result.json").write_text("{")
+    done = report("table3", "--runs", runs)
+    assert done.exit_code == 0 and "left out" in done.output and "full/result.json" in done.output
+    assert report("table3", "--runs", runs, "--strict").exit_code == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["table9"], "unknown table 'table9'; known: runs, table3"),
+        (["table3", "--where", "x"], "--where x is not KEY=VALUE"),
+        (["table3", "--protocol", "x"], "unknown protocol 'x'"),
+    ],
+)
+def test_what_is_wrong_is_said(runs, arguments, message):
+    done = report(*arguments, "--runs", runs)
+    assert done.exit_code == 1 and message in done.output
+
+
+def test_a_folder_that_is_not_there(tmp_path):
+    done = report("table3", "--runs", tmp_path / "none")
+    assert done.exit_code == 1 and "there is no folder" in done.output
+
+
+def test_reports_need_no_torch(root):
+    code = "import sys, reports.table3, reports.runs, reports.latex, reports.markdown; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], cwd=root).returncode == 0
+
+
+def test_help_is_quick(root):
+    code = "import sys, padgs.cli.app; sys.exit('torch' in sys.modules or 'hydra' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], cwd=root).returncode == 0
