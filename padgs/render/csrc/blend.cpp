@@ -42,7 +42,7 @@ void for_each_tile(const BlendArguments &args, Visit visit) {
 }
 
 // Footprints are scattered in memory; ask for those of the instances to come.
-constexpr int kAhead = 4;
+constexpr int kAhead = 8;
 void prefetch(const BlendArguments &args, int64_t instance, int64_t end) {
   if (instance < end) __builtin_prefetch(args.footprints + args.instances[instance].gaussian);
 }
