@@ -85,21 +85,45 @@ class BlendGradientArguments(ctypes.Structure):
     ]
 
 
+class HeadWeights(ctypes.Structure):
+    """`padgs::HeadWeights`."""
+
+    _fields_ = _fields(Pointer, "w1", "b1", "w2", "b2")
+
+
+class DecodeArguments(ctypes.Structure):
+    """`padgs::DecodeArguments`."""
+
+    _fields_ = [
+        ("anchors", ctypes.c_int64),
+        *_fields(ctypes.c_int32, "offsets", "inputs", "hidden"),
+        *_fields(HeadWeights, "opacity", "color", "covariance"),
+        *_fields(Pointer, "input_rows", "positions", "offset_rows", "log_scales", "attenuation"),
+        *_fields(Pointer, "raw_opacities", "slot_start", "slots"),
+        *_fields(Pointer, "means", "quats", "scales", "opacities", "colors"),
+    ]
+
+
+class DecodeGradientArguments(ctypes.Structure):
+    """`padgs::DecodeGradientArguments`."""
+
+    _fields_ = [
+        ("forward", DecodeArguments),
+        *_fields(Pointer, "means", "quats", "scales", "opacities", "colors"),
+        ("features", ctypes.c_int32),
+        *_fields(Pointer, "features_out", "offsets_out", "log_scales_out", "weights_out"),
+    ]
+
+
 class LossArguments(ctypes.Structure):
     """`padgs::LossArguments`."""
 
     _fields_ = [
-        ("width", ctypes.c_int32),
-        ("height", ctypes.c_int32),
-        ("image", Pointer),
-        ("target", Pointer),
-        ("weight", Pointer),
-        ("weight_row_stride", ctypes.c_int64),
-        ("weight_column_stride", ctypes.c_int64),
-        ("lambda_l1", ctypes.c_float),
-        ("normalizer", ctypes.c_float),
-        ("workspace", Pointer),
-        ("gradient", Pointer),
+        *_fields(ctypes.c_int32, "width", "height"),
+        *_fields(Pointer, "image", "target", "weight"),
+        *_fields(ctypes.c_int64, "weight_row_stride", "weight_column_stride"),
+        *_fields(ctypes.c_float, "lambda_l1", "normalizer"),
+        *_fields(Pointer, "workspace", "gradient"),
     ]
 
 
@@ -152,6 +176,9 @@ def _declare(loaded: ctypes.CDLL) -> None:
         "padgs_sum_moments": ([Pointer, Pointer, i64, Pointer], None),
         "padgs_blend_forward": ([Pointer], None),
         "padgs_blend_backward": ([Pointer], None),
+        "padgs_decode_select": ([Pointer], None),
+        "padgs_decode_place": ([Pointer], None),
+        "padgs_decode_backward": ([Pointer], None),
         "padgs_photometric_loss": ([Pointer], ctypes.c_double),
         "padgs_loss_workspace": ([i32, i32], i64),
     }

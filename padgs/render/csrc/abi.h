@@ -105,6 +105,34 @@ struct BlendGradientArguments {
   float *grad_rays;                                           // [H, 3, padded W] or null
 };
 
+// One network w2 relu(w1 x + b1) + b2; w1 [hidden, I], w2 [outputs, hidden].
+struct HeadWeights {
+  const float *w1, *b1, *w2, *b2;
+};
+
+// A anchors with K Gaussians each, N of the A K selected.
+struct DecodeArguments {
+  int64_t anchors;
+  int32_t offsets, inputs, hidden;         // K, I, hidden units
+  HeadWeights opacity, color, covariance;  // K, 3 K and 7 K outputs
+  const float *input_rows;                 // [A, I]
+  const float *positions, *offset_rows;    // [A, 3] [A, K, 3]
+  const float *log_scales;                 // [A, 6]
+  const float *attenuation;                // [A] 1 - tau Omega
+  float *raw_opacities;                    // [A, K]
+  int64_t *slot_start;                     // [A + 1]: where each anchor's selected Gaussians begin
+  int64_t *slots;                          // [N] anchor K + k
+  float *means, *quats, *scales, *opacities, *colors;  // [N, ...]
+};
+
+struct DecodeGradientArguments {
+  DecodeArguments forward;
+  const float *means, *quats, *scales, *opacities, *colors;  // upstream, [N, ...]
+  int32_t features;                                          // the first so many inputs want a gradient
+  float *features_out, *offsets_out, *log_scales_out;        // [A, features] [A, K, 3] [A, 6]
+  float *weights_out;  // all of opacity, color, covariance: w1, b1, w2, b2 each
+};
+
 struct LossArguments {
   int32_t width, height;
   const float *image, *target;  // [H,W,3]

@@ -11,6 +11,7 @@ namespace padgs {
   extern const ProjectKernels project_kernels; \
   extern const BlendKernels blend_kernels;    \
   extern const LossKernels loss_kernels;      \
+  extern const DecodeKernels decode_kernels;  \
   }
 PADGS_DECLARE(baseline)
 #if PADGS_ISA_COUNT > 1
@@ -23,9 +24,10 @@ struct Kernels {
   const ProjectKernels &project;
   const BlendKernels &blend;
   const LossKernels &loss;
+  const DecodeKernels &decode;
 };
 
-#define PADGS_KERNELS(isa) {#isa, isa::project_kernels, isa::blend_kernels, isa::loss_kernels}
+#define PADGS_KERNELS(isa) {#isa, isa::project_kernels, isa::blend_kernels, isa::loss_kernels, isa::decode_kernels}
 
 static Kernels choose() {
 #if PADGS_ISA_COUNT > 1
@@ -71,3 +73,9 @@ PADGS_API double padgs_photometric_loss(const LossArguments *args) { return kern
 PADGS_API int64_t padgs_loss_workspace(int32_t height, int32_t width) {
   return kernels().loss.workspace(height, width);
 }
+
+PADGS_API void padgs_decode_select(const DecodeArguments *args) { kernels().decode.select(*args); }
+
+PADGS_API void padgs_decode_place(const DecodeArguments *args) { kernels().decode.place(*args); }
+
+PADGS_API void padgs_decode_backward(const DecodeGradientArguments *args) { kernels().decode.backward(*args); }
