@@ -3,46 +3,54 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
+
+import typer
 
 from padgs import results
 from padgs.registry import lookup
 from reports import TABLES, WRITERS
 from reports.request import Request
-from reports.table import ReportError
+from reports.table import ReportError, Table
 
 
-def write_report(
-    table: str, runs: str, out: str, protocol: str, where: Sequence[str], *, mix: bool, strict: bool
-) -> int:
-    """Write a table in all formats and print the Markdown; returns the exit code."""
+def report(
+    table: Annotated[str, typer.Argument(help="table3 or another table; `padgs report list` names all")],
+    runs: Annotated[str, typer.Option(help="folder of run folders")] = "runs",
+    out: Annotated[str, typer.Option(help="where the files go; RUNS/tables if not given")] = "",
+    protocol: Annotated[str, typer.Option(help="which scores: paper or sphere")] = "paper",
+    where: Annotated[list[str] | None, typer.Option(help="only runs with KEY=VALUE; repeatable")] = None,
+    mix: Annotated[bool, typer.Option(help="let other rules, sizes and run lengths stand together")] = False,
+    strict: Annotated[bool, typer.Option(help="exit code 1 if a result file cannot be used")] = False,
+) -> None:
+    """Make a table from result files, as Markdown and LaTeX, and show it."""
     if table == "list":
         print("\n".join(TABLES))
-        return 0
+        return
     folder = Path(runs)
     if not folder.is_dir():
-        return _refuse(f"there is no folder {folder}; name the folder of the runs with --runs")
+        raise _refused(f"there is no folder {folder}; name the folder of the runs with --runs")
     found, broken = results.read_all(folder)
     for error in broken:
         print(f"left out: {error}", file=sys.stderr)
     try:
-        request = Request(protocol, mix, dict(_pair(setting) for setting in where))
-        made = lookup(TABLES, table, "table")(found, request)
+        request = Request(protocol, mix, dict(_pair(setting) for setting in where or []))
+        made: Table = lookup(TABLES, table, "table")(found, request)
     except ValueError as error:
-        return _refuse(str(error))
+        raise _refused(str(error)) from error
     target = Path(out) if out else folder / "tables"
+    texts = {extension: lookup(WRITERS, extension, "format")(made) for extension in WRITERS}
     try:
         target.mkdir(parents=True, exist_ok=True)
-        for extension in WRITERS:
-            text = lookup(WRITERS, extension, "format")(made)
+        for extension, text in texts.items():
             results.replace_file(target / f"{made.name}.{extension}", text.encode())
-            if extension == "md":
-                print(text)
     except OSError as error:
-        return _refuse(f"cannot write to {target}: {error.strerror}; name another folder with --out")
-    print(f"{len(found)} results; written: {', '.join(f'{target / made.name}.{e}' for e in WRITERS)}", file=sys.stderr)
-    return 1 if strict and broken else 0
+        raise _refused(f"cannot write to {target}: {error.strerror}; name another folder with --out") from error
+    print(texts["md"])
+    print(f"{len(found)} results; written: {', '.join(f'{target / made.name}.{e}' for e in texts)}", file=sys.stderr)
+    if strict and broken:
+        raise typer.Exit(1)
 
 
 def _pair(setting: str) -> tuple[str, str]:
@@ -52,6 +60,6 @@ def _pair(setting: str) -> tuple[str, str]:
     return key, value
 
 
-def _refuse(message: str) -> int:
+def _refused(message: str) -> typer.Exit:
     print(f"error: {message}", file=sys.stderr)
-    return 1
+    return typer.Exit(1)

@@ -51,7 +51,7 @@ def load(
         ValueError: unknown format.
     """
     options = replace(options, **fields)  # type: ignore[arg-type]
-    if format == "synthetic" or path is None:
+    if path is None or format == "synthetic":
         return lookup(LOADERS, "synthetic" if format == "auto" else format, "data.format")(path or "", options)
     path, format, options, notes = _decide(Path(path), format, options)
     scene: Scene = lookup(LOADERS, format, "data.format")(path, options)

@@ -119,3 +119,9 @@ def test_every_loader_can_be_imported() -> None:
 
     for name in LOADERS:
         assert callable(lookup(LOADERS, name, "data.format"))
+
+
+@pytest.mark.parametrize(("path", "format"), [(None, "auto"), (None, "synthetic"), ("nowhere", "synthetic")])
+def test_a_scene_that_is_generated_needs_no_path(path: str | None, format: str) -> None:
+    with pytest.raises(DataError, match=f"unknown synthetic scene '{path or 'cloud castle'}'"):
+        load(path, format, generator={"scene": "cloud castle"})

