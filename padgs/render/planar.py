@@ -14,7 +14,7 @@ from padgs.camera import Panorama, Pinhole
 from padgs.gaussians import Gaussians
 from padgs.panorama import longitude_latitude, pixel_from_angles, projection_jacobian
 from padgs.render.contract import ALPHA_MIN, RenderOptions
-from padgs.render.projection import camera_frame, move_hidden
+from padgs.render.projection import camera_frame
 
 MIN_COS_LATITUDE = 1e-4  # an erp footprint nearer to the axis than 0.006 degrees is undefined; see design.md section 3
 SLOPE_LIMIT = 1.3  # pinhole: slopes in the Jacobian are limited to this times the half field of view
@@ -59,7 +59,6 @@ def project_erp(
     means, orientations = camera_frame(gaussians, cam_from_world)
     squared_radius = (means * means).sum(-1).detach()
     in_front = squared_radius > options.near**2
-    means = move_hidden(means, in_front)
     # Next to the axis the chart has no derivative worth the name; such a footprint is held constant.
     near_axis = (means[:, 0] ** 2 + means[:, 2] ** 2).detach() < MIN_COS_LATITUDE**2 * squared_radius
     means = torch.where(near_axis[:, None], means.detach(), means)
@@ -78,7 +77,6 @@ def project_pinhole(
     """The perspective model of 3D Gaussian splatting: u = fx x / z + cx, Jacobian with limited slopes."""
     means, orientations = camera_frame(gaussians, cam_from_world)
     in_front = means[:, 2].detach() > options.near
-    means = move_hidden(means, in_front)
     x, y, z = means.unbind(-1)
     centers = torch.stack((camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy), dim=-1)
     limit_x = SLOPE_LIMIT * 0.5 * camera.width / camera.fx
@@ -120,7 +118,8 @@ def _footprints(
     wrap = options.wrap and isinstance(camera, Panorama)
     if not wrap:
         on_image &= (boxes[:, 1] > 0) & (boxes[:, 0] < camera.width)
-    visible = in_front & (opacities >= ALPHA_MIN) & on_image & torch.isfinite(conics.detach()).all(-1)
+    sound = torch.isfinite(determinant.detach()) & (determinant.detach() > 0)  # else float overflows or nothing spreads
+    visible = in_front & (opacities >= ALPHA_MIN) & on_image & sound
     turn = float(camera.width) if wrap else torch.inf
     return PlanarFootprints(centers, conics, gaussians.opacities, means.norm(dim=-1), boxes, visible, turn)
 

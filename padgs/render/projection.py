@@ -6,7 +6,8 @@ a squared distance q; everything after that (order, alpha, blending) is the same
 
 from __future__ import annotations
 
-from typing import Protocol
+from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,16 +25,10 @@ PROJECTIONS = {
 }
 
 
-class Footprints(Protocol):
-    """N projected Gaussians of one view. Entries of Gaussians that are not visible are finite but mean nothing."""
-
-    opacities: Tensor  # [N]
-    depths: Tensor  # [N] radial distance of the mean, world units; ascending = front to back
-    visible: Tensor  # [N] bool
-
-    def squared_distance(self, indices: Tensor, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
-        """Squared distance q [P, K] of the Gaussians [K] at the pixels [P], and whether they act there, [P, K] bool."""
-        ...
+Footprints = Any  # N projected Gaussians of one view: a frozen dataclass with
+#   opacities [N], depths [N] (radial distance of the mean, world units; ascending = front to back), visible [N] bool,
+#   squared_distance(indices [K], rows [P], columns [P]) -> q [P, K], and whether they act there [P, K] bool.
+# Entries of Gaussians that are not visible may hold anything.
 
 
 def project(
@@ -44,15 +39,24 @@ def project(
     probe: Tensor | None = None,
 ) -> Footprints:
     """Footprints under `options.projection`; arguments as in `torch_backend.rasterize`."""
-    return lookup(PROJECTIONS, options.projection, "projection")(gaussians, cam_from_world, camera, options, probe)
+    footprints_of = lookup(PROJECTIONS, options.projection, "projection")
+    with torch.no_grad():
+        visible = footprints_of(gaussians, cam_from_world, camera, options, probe).visible
+        rotation, translation = cam_from_world[:3, :3], cam_from_world[:3, 3]
+        ahead = rotation.T @ (rotation.new_tensor([0.0, 0.0, 1.0]) - translation)
+    # What is not drawn may hold anything (a mean on the camera, numbers that overflow), and in the backward pass
+    # 0 * inf is NaN: a harmless Gaussian one unit ahead takes its place.
+    chosen = visible[:, None]
+    harmless = replace(
+        gaussians,
+        means=torch.where(chosen, gaussians.means, ahead),
+        quats=torch.where(chosen, gaussians.quats, gaussians.quats.new_tensor([1.0, 0.0, 0.0, 0.0])),
+        scales=torch.where(chosen, gaussians.scales, torch.ones_like(gaussians.scales)),
+    )
+    return replace(footprints_of(harmless, cam_from_world, camera, options, probe), visible=visible)
 
 
 def camera_frame(gaussians: Gaussians, cam_from_world: Tensor) -> tuple[Tensor, Tensor]:
     """Means [N, 3] and orientations R_cam R(q) [N, 3, 3] in the camera frame; Sigma = (R diag(s)) (R diag(s))^T."""
     rotation, translation = cam_from_world[:3, :3], cam_from_world[:3, 3]
     return gaussians.means @ rotation.T + translation, rotation @ rotation_matrices(gaussians.quats)
-
-
-def move_hidden(means: Tensor, in_front: Tensor) -> Tensor:
-    """Means [N, 3] with those that are culled put in front of the camera: on the camera nothing is differentiable."""
-    return torch.where(in_front[:, None], means, means.new_tensor([0.0, 0.0, 1.0]))

@@ -16,7 +16,7 @@ from torch import Tensor
 from padgs.camera import Camera
 from padgs.gaussians import Gaussians
 from padgs.render.contract import ALPHA_MIN, RenderOptions
-from padgs.render.projection import camera_frame, move_hidden
+from padgs.render.projection import camera_frame
 
 
 @dataclass(frozen=True)
@@ -72,16 +72,23 @@ def project_tangent(
     """S = E Sigma E^T / r^2 + low_pass / f^2 I on the tangent plane spanned by E, f pixels per radian."""
     means, orientations = camera_frame(gaussians, cam_from_world)
     in_front = (means * means).sum(-1).detach() > options.near**2
-    means = _probed(move_hidden(means, in_front), probe)
+    means = _probed(means, probe)
     radius = means.norm(dim=-1)
     normal = means / radius[:, None]
     tangent = _tangent_basis(normal)  # [N, 2, 3]
-    half = tangent @ (orientations * gaussians.scales[:, None, :]) / radius[:, None, None]
+    half = tangent @ (orientations * gaussians.scales[:, None, :]) / radius[:, None, None]  # [N, 2, 3]
     low_pass = options.low_pass / camera.focal**2
-    covariance = half @ half.transpose(-1, -2) + low_pass * torch.eye(2, dtype=means.dtype, device=means.device)
-    factor = torch.linalg.cholesky(torch.where(in_front[:, None, None], covariance, torch.eye(2).to(covariance)))
-    whitening = torch.linalg.solve_triangular(factor, tangent, upper=False)
-    visible = in_front & (gaussians.opacities.detach() >= ALPHA_MIN)
+    var_0, var_1 = (half**2).sum(-1).unbind(-1)
+    covariance = (half[:, 0] * half[:, 1]).sum(-1)
+    minors = torch.linalg.cross(half[:, 0], half[:, 1])  # det(S) without a difference that cancels
+    determinant = (minors**2).sum(-1) + low_pass * (var_0 + var_1) + low_pass**2
+    var_0 = var_0 + low_pass
+    # L = C^-1 E with the Cholesky factor C of S: its first row is E_0 / c, its second orthogonal to it under S.
+    first = tangent[:, 0] / torch.sqrt(var_0)[:, None]
+    second = (tangent[:, 1] - (covariance / var_0)[:, None] * tangent[:, 0]) * torch.sqrt(var_0 / determinant)[:, None]
+    whitening = torch.stack((first, second), dim=-2)
+    sound = torch.isfinite(determinant.detach()) & (determinant.detach() > 0)  # else float overflows or nothing spreads
+    visible = in_front & (gaussians.opacities.detach() >= ALPHA_MIN) & sound
     return TangentFootprints(normal, whitening, gaussians.opacities, radius, visible, _rays(camera, means))
 
 
@@ -95,7 +102,7 @@ def project_ray(
     """Sigma' = Sigma + low_pass (r / f)^2 I, opacity times sqrt(det Sigma / det Sigma'); not drawn from inside."""
     means, orientations = camera_frame(gaussians, cam_from_world)
     in_front = (means * means).sum(-1).detach() > options.near**2
-    means = _probed(move_hidden(means, in_front), probe)
+    means = _probed(means, probe)
     radius = means.norm(dim=-1)
     low_pass = options.low_pass / camera.focal**2
     wide = torch.sqrt(gaussians.scales**2 + (low_pass * radius * radius)[:, None])
@@ -104,7 +111,8 @@ def project_ray(
     distance = (torch.einsum("kic,kc->ki", whitening, means) ** 2).sum(-1).detach()
     drawn = opacities.detach() >= ALPHA_MIN
     outside = distance > 2 * torch.log((opacities.detach() / ALPHA_MIN).clamp(min=1))
-    visible = in_front & drawn & outside
+    sound = torch.isfinite(whitening.detach()).flatten(1).all(-1)  # else float overflows or nothing spreads
+    visible = in_front & drawn & outside & sound
     return RayFootprints(means, whitening, opacities, radius, visible, _rays(camera, means), options.near)
 
 
