@@ -32,7 +32,9 @@ class NativeRays:
 
     def native(self) -> native.Rays:
         """Pointers to the tensors; they must outlive it."""
-        return native.Rays(*map(pointer, (self.column_sine, self.column_cosine, self.row_sine, self.row_cosine, self.table)))
+        return native.Rays(
+            *map(pointer, (self.column_sine, self.column_cosine, self.row_sine, self.row_cosine, self.table))
+        )
 
 
 def native_camera(cam_from_world: Tensor, camera: Camera, options: RenderOptions) -> native.Camera:
@@ -42,7 +44,9 @@ def native_camera(cam_from_world: Tensor, camera: Camera, options: RenderOptions
         ValueError: a projection that the library does not know.
     """
     if options.projection not in PROJECTIONS:
-        raise ValueError(f"backend cpu does not know projection {options.projection!r}; known: {', '.join(PROJECTIONS)}")
+        raise ValueError(
+            f"backend cpu does not know projection {options.projection!r}; known: {', '.join(PROJECTIONS)}"
+        )
     planar = options.projection in ("erp", "pinhole")
     lens = (camera.fx, camera.fy, camera.cx, camera.cy) if isinstance(camera, Pinhole) else (0.0, 0.0, 0.0, 0.0)
     return native.Camera(
@@ -73,7 +77,9 @@ def _formula_rays(camera: Panorama | Pinhole) -> NativeRays:
     padded = -(-camera.width // CHUNK) * CHUNK
     longitude = ((torch.arange(padded, dtype=torch.float64) + 0.5) / camera.width - 0.5) * (2 * torch.pi)
     latitude = row_latitudes(camera.height, dtype=torch.float64)
-    return NativeRays(*(angles.float() for angles in (longitude.sin(), longitude.cos(), latitude.sin(), latitude.cos())))
+    return NativeRays(
+        *(angles.float() for angles in (longitude.sin(), longitude.cos(), latitude.sin(), latitude.cos()))
+    )
 
 
 def _padded_table(rays: Tensor) -> Tensor:

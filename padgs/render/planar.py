@@ -14,22 +14,19 @@ from padgs.camera import Panorama, Pinhole
 from padgs.gaussians import Gaussians
 from padgs.panorama import longitude_latitude, pixel_from_angles, projection_jacobian
 from padgs.render.contract import ALPHA_MIN, RenderOptions
-from padgs.render.projection import camera_frame
+from padgs.render.projection import Footprints, camera_frame
 
 MIN_COS_LATITUDE = 1e-4  # an erp footprint nearer to the axis than 0.006 degrees is undefined; see design.md section 3
 SLOPE_LIMIT = 1.3  # pinhole: slopes in the Jacobian are limited to this times the half field of view
 
 
 @dataclass(frozen=True)
-class PlanarFootprints:
-    """Projected Gaussians in pixels; see `padgs.render.projection.Footprints`."""
+class PlanarFootprints(Footprints):
+    """Projected Gaussians in pixels."""
 
     centers: Tensor  # [N, 2] (u, v)
     conics: Tensor  # [N, 3] (A, B, C) of the inverse covariance [[A, B], [B, C]]
-    opacities: Tensor  # [N]
-    depths: Tensor  # [N]
     boxes: Tensor  # [N, 4] pixel indices drawn: first column, end column, first row, end row; columns not reduced mod W
-    visible: Tensor  # [N] bool
     turn: float  # pixels after which columns repeat (the width, with wrap), or infinity
 
     def squared_distance(self, indices: Tensor, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
@@ -121,7 +118,7 @@ def _footprints(
     sound = torch.isfinite(determinant.detach()) & (determinant.detach() > 0)  # else float overflows or nothing spreads
     visible = in_front & (opacities >= ALPHA_MIN) & on_image & sound
     turn = float(camera.width) if wrap else torch.inf
-    return PlanarFootprints(centers, conics, gaussians.opacities, means.norm(dim=-1), boxes, visible, turn)
+    return PlanarFootprints(gaussians.opacities, means.norm(dim=-1), visible, centers, conics, boxes, turn)
 
 
 def _exact_boxes(centers: Tensor, covariance: Tensor, opacities: Tensor) -> Tensor:

@@ -6,8 +6,8 @@ a squared distance q; everything after that (order, alpha, blending) is the same
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -25,10 +25,17 @@ PROJECTIONS = {
 }
 
 
-Footprints = Any  # N projected Gaussians of one view: a frozen dataclass with
-#   opacities [N], depths [N] (radial distance of the mean, world units; ascending = front to back), visible [N] bool,
-#   squared_distance(indices [K], rows [P], columns [P]) -> q [P, K], and whether they act there [P, K] bool.
-# Entries of Gaussians that are not visible may hold anything.
+@dataclass(frozen=True)
+class Footprints(ABC):
+    """N projected Gaussians of one view. Entries of Gaussians that are not visible may hold anything."""
+
+    opacities: Tensor  # [N]
+    depths: Tensor  # [N] radial distance of the mean, world units; ascending = front to back
+    visible: Tensor  # [N] bool
+
+    @abstractmethod
+    def squared_distance(self, indices: Tensor, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
+        """Squared distance q [P, K] of the Gaussians [K] at the pixels [P], and whether they act there, [P, K] bool."""
 
 
 def project(

@@ -16,18 +16,15 @@ from torch import Tensor
 from padgs.camera import Camera
 from padgs.gaussians import Gaussians
 from padgs.render.contract import ALPHA_MIN, RenderOptions
-from padgs.render.projection import camera_frame
+from padgs.render.projection import Footprints, camera_frame
 
 
 @dataclass(frozen=True)
-class TangentFootprints:
-    """Projected Gaussians on their tangent planes; see `padgs.render.projection.Footprints`."""
+class TangentFootprints(Footprints):
+    """Projected Gaussians on their tangent planes."""
 
     normals: Tensor  # [N, 3] direction of the mean
     whitening: Tensor  # [N, 2, 3] L: q = |L d|^2 / (n.d)^2
-    opacities: Tensor  # [N]
-    depths: Tensor  # [N]
-    visible: Tensor  # [N] bool
     rays: Tensor  # [H, W, 3]
 
     def squared_distance(self, indices: Tensor, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
@@ -41,14 +38,11 @@ class TangentFootprints:
 
 
 @dataclass(frozen=True)
-class RayFootprints:
-    """Projected Gaussians as the ray meets them; see `padgs.render.projection.Footprints`."""
+class RayFootprints(Footprints):
+    """Projected Gaussians as the ray meets them; opacities are compensated for the low-pass."""
 
     means: Tensor  # [N, 3] camera frame
     whitening: Tensor  # [N, 3, 3] M^-1 with Sigma' = M M^T
-    opacities: Tensor  # [N] compensated for the low-pass
-    depths: Tensor  # [N]
-    visible: Tensor  # [N] bool
     rays: Tensor  # [H, W, 3]
     near: float
 
@@ -89,7 +83,7 @@ def project_tangent(
     whitening = torch.stack((first, second), dim=-2)
     sound = torch.isfinite(determinant.detach()) & (determinant.detach() > 0)  # else float overflows or nothing spreads
     visible = in_front & (gaussians.opacities.detach() >= ALPHA_MIN) & sound
-    return TangentFootprints(normal, whitening, gaussians.opacities, radius, visible, _rays(camera, means))
+    return TangentFootprints(gaussians.opacities, radius, visible, normal, whitening, _rays(camera, means))
 
 
 def project_ray(
@@ -113,7 +107,7 @@ def project_ray(
     outside = distance > 2 * torch.log((opacities.detach() / ALPHA_MIN).clamp(min=1))
     sound = torch.isfinite(whitening.detach()).flatten(1).all(-1)  # else float overflows or nothing spreads
     visible = in_front & drawn & outside & sound
-    return RayFootprints(means, whitening, opacities, radius, visible, _rays(camera, means), options.near)
+    return RayFootprints(opacities, radius, visible, means, whitening, _rays(camera, means), options.near)
 
 
 def _probed(means: Tensor, probe: Tensor | None) -> Tensor:

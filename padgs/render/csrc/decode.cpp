@@ -15,6 +15,7 @@ namespace PADGS_ISA {
 namespace {
 
 constexpr int64_t kBlock = 1024;  // anchors per partial sum
+constexpr int kGroups = 4;        // groups of sixteen anchors that share one visit to the sums
 constexpr float kLog2E = 1.44269504088896341f;
 
 Vec sigmoid(Vec x) {
@@ -22,35 +23,39 @@ Vec sigmoid(Vec x) {
   return 1.0f / (1.0f + exp2_fast(limited * -kLog2E));
 }
 
-// out[o] = bias[o] + sum_i weight[o][i] in[i], several rows at a time so that each input is loaded once for them.
+// Rows o .. o + kRows - 1 of out = bias + weight in: each input is loaded once for all of them, and there are enough
+// running sums to hide the latency of one.
+template <int kRows>
+void affine_rows(const float *weight, const float *bias, int o, int inputs, const Vec *in, Vec *out) {
+  Vec sums[kRows];
+  const float *rows = weight + size_t(o) * inputs;
+  for (int r = 0; r < kRows; ++r) sums[r] = splat(bias[o + r]);
+  for (int i = 0; i < inputs; ++i) {
+    const Vec x = in[i];
+    for (int r = 0; r < kRows; ++r) sums[r] += x * rows[r * inputs + i];
+  }
+  for (int r = 0; r < kRows; ++r) out[o + r] = sums[r];
+}
+
 void affine(const float *weight, const float *bias, int outputs, int inputs, const Vec *in, Vec *out) {
   int o = 0;
-  for (; o + 4 <= outputs; o += 4) {
-    const float *w0 = weight + o * inputs, *w1 = w0 + inputs, *w2 = w1 + inputs, *w3 = w2 + inputs;
-    Vec a = splat(bias[o]), b = splat(bias[o + 1]), c = splat(bias[o + 2]), d = splat(bias[o + 3]);
-    for (int i = 0; i < inputs; ++i) {
-      const Vec x = in[i];
-      a += x * w0[i], b += x * w1[i], c += x * w2[i], d += x * w3[i];
-    }
-    out[o] = a, out[o + 1] = b, out[o + 2] = c, out[o + 3] = d;
-  }
-  for (; o < outputs; ++o) {
-    Vec a = splat(bias[o]);
-    for (int i = 0; i < inputs; ++i) a += in[i] * weight[o * inputs + i];
-    out[o] = a;
-  }
+  for (; o + 10 <= outputs; o += 10) affine_rows<10>(weight, bias, o, inputs, in, out);
+  for (; o + 4 <= outputs; o += 4) affine_rows<4>(weight, bias, o, inputs, in, out);
+  for (; o < outputs; ++o) affine_rows<1>(weight, bias, o, inputs, in, out);
 }
 
 // out[i] += sum_o weight[o][i] grad[o], for the first `wanted` inputs.
 void affine_transposed(const float *weight, int outputs, int inputs, int wanted, const Vec *grad, Vec *out) {
-  int o = 0;
-  for (; o + 4 <= outputs; o += 4) {
-    const float *w0 = weight + o * inputs, *w1 = w0 + inputs, *w2 = w1 + inputs, *w3 = w2 + inputs;
-    const Vec a = grad[o], b = grad[o + 1], c = grad[o + 2], d = grad[o + 3];
-    for (int i = 0; i < wanted; ++i) out[i] = out[i] + a * w0[i] + b * w1[i] + c * w2[i] + d * w3[i];
+  int i = 0;
+  for (; i + 8 <= wanted; i += 8) {
+    Vec sums[8];
+    for (int r = 0; r < 8; ++r) sums[r] = out[i + r];
+    for (int o = 0; o < outputs; ++o)
+      for (int r = 0; r < 8; ++r) sums[r] += grad[o] * weight[o * inputs + i + r];
+    for (int r = 0; r < 8; ++r) out[i + r] = sums[r];
   }
-  for (; o < outputs; ++o)
-    for (int i = 0; i < wanted; ++i) out[i] += grad[o] * weight[o * inputs + i];
+  for (; i < wanted; ++i)
+    for (int o = 0; o < outputs; ++o) out[i] += grad[o] * weight[o * inputs + i];
 }
 
 // Running sums, lane by lane, of the gradients of one layer.
@@ -63,12 +68,13 @@ struct LayerSums {
     std::fill(weight.begin(), weight.end(), zero());
     std::fill(bias.begin(), bias.end(), zero());
   }
-  void add(const Vec *grad, const Vec *in) {
+  // Several groups of anchors at once, so that each sum is loaded and stored once for all of them.
+  void add(const Vec *const (&grad)[kGroups], const Vec *const (&in)[kGroups]) {
     for (int o = 0; o < outputs; ++o) {
-      const Vec g = grad[o];
+      const Vec g0 = grad[0][o], g1 = grad[1][o], g2 = grad[2][o], g3 = grad[3][o];
       Vec *row = weight.data() + size_t(o) * inputs;
-      for (int i = 0; i < inputs; ++i) row[i] += g * in[i];
-      bias[o] += g;
+      for (int i = 0; i < inputs; ++i) row[i] += (g0 * in[0][i] + g1 * in[1][i]) + (g2 * in[2][i] + g3 * in[3][i]);
+      bias[o] += (g0 + g1) + (g2 + g3);
     }
   }
   float *store_sums(float *out) const {
@@ -87,29 +93,42 @@ void load_rows(const float *rows, int width, int64_t first, int64_t count, Vec *
   }
 }
 
-// Sixteen anchors on their way through the networks.
+// Sixteen anchors on their way through the networks. Lanes past the end repeat the last anchor.
 struct Group {
   const DecodeArguments &args;
-  int64_t first;
-  int lanes;  // of them that exist
-  std::vector<Vec> &memory;
+  int64_t first = 0;
+  int lanes = 0;  // of them that exist
+  std::vector<Vec> memory;
   Vec *inputs, *hidden, *outputs;  // [I], [hidden], [7 K]
 
-  Group(const DecodeArguments &a, int64_t f, std::vector<Vec> &m)
-      : args(a), first(f), lanes(int(std::min<int64_t>(kLanes, a.anchors - f))), memory(m) {
-    memory.resize(a.inputs + a.hidden + 7 * a.offsets);
+  explicit Group(const DecodeArguments &a) : args(a), memory(a.inputs + a.hidden + 7 * a.offsets) {
     inputs = memory.data(), hidden = inputs + a.inputs, outputs = hidden + a.hidden;
-    load_rows(a.input_rows, a.inputs, first, a.anchors, inputs);
   }
-  void run(const HeadWeights &head, int count) {
+  void load_anchors(int64_t anchor) {
+    first = anchor;
+    lanes = int(std::min<int64_t>(kLanes, args.anchors - first));
+    load_rows(args.input_rows, args.inputs, first, args.anchors, inputs);
+  }
+  void run_hidden(const HeadWeights &head) {
     affine(head.w1, head.b1, args.hidden, args.inputs, inputs, hidden);
     for (int h = 0; h < args.hidden; ++h) hidden[h] = maximum(hidden[h], zero());
+  }
+  void run(const HeadWeights &head, int count) {
+    run_hidden(head);
     affine(head.w2, head.b2, count, args.hidden, hidden, outputs);
   }
 };
 
-void opacities_of(const DecodeArguments &args, int64_t first, std::vector<Vec> &memory) {
-  Group group(args, first, memory);
+// exp of the six log-scales of sixteen anchors, [6][lanes].
+void reaches(const DecodeArguments &args, int64_t first, float *out) {
+  Vec logs[6];
+  load_rows(args.log_scales, 6, first, args.anchors, logs);
+  for (int c = 0; c < 6; ++c)
+    store(out + c * kLanes, exp2_fast(maximum(minimum(logs[c], splat(60.0f)), splat(-60.0f)) * kLog2E));
+}
+
+void opacities_of(const DecodeArguments &args, int64_t first, Group &group) {
+  group.load_anchors(first);
   const int k = args.offsets;
   group.run(args.opacity, k);
   int32_t selected[kLanes] = {};
@@ -128,10 +147,10 @@ void opacities_of(const DecodeArguments &args, int64_t first, std::vector<Vec> &
 }
 
 // Places the Gaussians of an anchor, with the decoded values of lane `lane`.
-void gaussians_of(const DecodeArguments &args, int64_t first, std::vector<Vec> &memory) {
+void gaussians_of(const DecodeArguments &args, int64_t first, Group &group) {
   const int64_t end = std::min(first + kLanes, args.anchors);
   if (args.slot_start[first] == args.slot_start[end]) return;
-  Group group(args, first, memory);
+  group.load_anchors(first);
   const int k = args.offsets;
   std::vector<float> values(size_t(kLanes) * 10 * k);  // [10 K][lanes]: colour 3 K, then covariance 7 K
   const auto keep_outputs = [&](int count, int at, int activated_of_seven) {
@@ -143,11 +162,13 @@ void gaussians_of(const DecodeArguments &args, int64_t first, std::vector<Vec> &
   keep_outputs(3 * k, 0, 7);
   group.run(args.covariance, 7 * k);
   keep_outputs(7 * k, 3 * k, 3);
+  float all_reaches[6 * kLanes];
+  reaches(args, first, all_reaches);
   for (int lane = 0; lane < group.lanes; ++lane) {
     const int64_t anchor = first + lane;
     int64_t n = args.slot_start[anchor];
     float reach[6];
-    for (int c = 0; c < 6; ++c) reach[c] = std::exp(args.log_scales[6 * anchor + c]);
+    for (int c = 0; c < 6; ++c) reach[c] = all_reaches[c * kLanes + lane];
     const auto value = [&](int o) { return values[size_t(o) * kLanes + lane]; };
     for (int i = 0; i < k; ++i) {
       const float raw = args.raw_opacities[anchor * k + i];
@@ -165,22 +186,13 @@ void gaussians_of(const DecodeArguments &args, int64_t first, std::vector<Vec> &
   }
 }
 
-// One head's share of the backward pass: gradients of its outputs to its weights, and on to the inputs.
-struct HeadBackward {
+// Running sums of one network.
+struct HeadSums {
   const HeadWeights &weights;
   LayerSums first, second;
 
-  HeadBackward(const DecodeArguments &args, const HeadWeights &w, int outputs)
+  HeadSums(const DecodeArguments &args, const HeadWeights &w, int outputs)
       : weights(w), first(args.hidden, args.inputs), second(outputs, args.hidden) {}
-  void add(const Group &group, const Vec *grad_outputs, Vec *grad_hidden, Vec *grad_inputs, int features) {
-    const DecodeArguments &args = group.args;
-    second.add(grad_outputs, group.hidden);
-    std::fill_n(grad_hidden, args.hidden, zero());
-    affine_transposed(weights.w2, second.outputs, args.hidden, args.hidden, grad_outputs, grad_hidden);
-    for (int h = 0; h < args.hidden; ++h) grad_hidden[h] = keep(less(zero(), group.hidden[h]), grad_hidden[h]);
-    first.add(grad_hidden, group.inputs);
-    affine_transposed(weights.w1, args.hidden, args.inputs, features, grad_hidden, grad_inputs);
-  }
 };
 
 class BlockBackward {
@@ -188,47 +200,82 @@ class BlockBackward {
   explicit BlockBackward(const DecodeGradientArguments &args)
       : args_(args), forward_(args.forward), opacity_(forward_, forward_.opacity, forward_.offsets),
         color_(forward_, forward_.color, 3 * forward_.offsets),
-        covariance_(forward_, forward_.covariance, 7 * forward_.offsets), grad_hidden_(forward_.hidden),
-        grad_inputs_(forward_.inputs), grads_(size_t(11) * forward_.offsets * kLanes), grad_outputs_(7 * forward_.offsets) {}
+        covariance_(forward_, forward_.covariance, 7 * forward_.offsets), groups_(kGroups, Group(forward_)) {
+    for (Group &group : groups_) {  // copies share no memory: point each into its own
+      group.inputs = group.memory.data(), group.hidden = group.inputs + forward_.inputs;
+      group.outputs = group.hidden + forward_.hidden;
+    }
+    for (int g = 0; g < kGroups; ++g) {
+      grads_[g].resize(size_t(11) * forward_.offsets * kLanes);
+      grad_outputs_[g].resize(7 * forward_.offsets);
+      grad_hidden_[g].resize(forward_.hidden);
+      grad_inputs_[g].resize(args_.features);
+    }
+  }
 
   void run(int64_t block, float *weight_sums) {
-    for (HeadBackward *head : {&opacity_, &color_, &covariance_}) head->first.clear(), head->second.clear();
+    for (HeadSums *head : {&opacity_, &color_, &covariance_}) head->first.clear(), head->second.clear();
     const int64_t end = std::min(forward_.anchors, (block + 1) * kBlock);
-    for (int64_t first = block * kBlock; first < end; first += kLanes) group(first);
-    for (HeadBackward *head : {&opacity_, &color_, &covariance_})
+    for (int64_t first = block * kBlock; first < end; first += kGroups * kLanes) groups(first);
+    for (HeadSums *head : {&opacity_, &color_, &covariance_})
       weight_sums = head->second.store_sums(head->first.store_sums(weight_sums));
   }
 
  private:
   // Gradients arrive by slot; they are laid out as the networks' outputs, [11 K][lanes]: opacity, colour, covariance.
-  void group(int64_t first) {
+  void groups(int64_t first) {
     const int k = forward_.offsets;
-    Group group(forward_, first, memory_);
-    std::fill(grads_.begin(), grads_.end(), 0.0f);
-    std::fill(grad_inputs_.begin(), grad_inputs_.end(), zero());
-    for (int lane = 0; lane < group.lanes; ++lane) anchor(first + lane, lane);
-    const auto head = [&](HeadBackward &backward, int at, int count) {
-      group.run(backward.weights, count);
-      for (int o = 0; o < count; ++o) grad_outputs_[o] = load(grads_.data() + size_t(at + o) * kLanes);
-      backward.add(group, grad_outputs_.data(), grad_hidden_.data(), grad_inputs_.data(), args_.features);
-    };
+    for (int g = 0; g < kGroups; ++g) {
+      Group &group = groups_[g];
+      group.load_anchors(std::min(first + g * kLanes, forward_.anchors - 1));
+      if (first + g * kLanes >= forward_.anchors) group.lanes = 0;  // beyond the end: no anchor, no gradient
+      std::fill(grads_[g].begin(), grads_[g].end(), 0.0f);
+      std::fill(grad_inputs_[g].begin(), grad_inputs_[g].end(), zero());
+      float all_reaches[6 * kLanes];
+      reaches(forward_, group.first, all_reaches);
+      for (int lane = 0; lane < group.lanes; ++lane) anchor(group.first + lane, grads_[g].data() + lane, all_reaches + lane);
+    }
     head(opacity_, 0, k);
     head(color_, k, 3 * k);
     head(covariance_, 4 * k, 7 * k);
-    for (int f = 0; f < args_.features; ++f) {
-      float lanes[kLanes];
-      store(lanes, grad_inputs_[f]);
-      for (int lane = 0; lane < group.lanes; ++lane) args_.features_out[(first + lane) * args_.features + f] = lanes[lane];
-    }
+    for (int g = 0; g < kGroups; ++g)
+      for (int f = 0; f < args_.features; ++f) {
+        float lanes[kLanes];
+        store(lanes, grad_inputs_[g][f]);
+        for (int lane = 0; lane < groups_[g].lanes; ++lane)
+          args_.features_out[(groups_[g].first + lane) * args_.features + f] = lanes[lane];
+      }
   }
 
-  void anchor(int64_t anchor, int lane) {
+  // One network: from the gradients of its outputs to those of its weights and of the inputs.
+  void head(HeadSums &sums, int at, int count) {
+    const HeadWeights &w = sums.weights;
+    const Vec *outputs[kGroups], *hidden[kGroups], *grad_hidden[kGroups], *inputs[kGroups];
+    for (int g = 0; g < kGroups; ++g) {
+      Group &group = groups_[g];
+      group.run_hidden(w);
+      for (int o = 0; o < count; ++o) grad_outputs_[g][o] = load(grads_[g].data() + size_t(at + o) * kLanes);
+      std::fill(grad_hidden_[g].begin(), grad_hidden_[g].end(), zero());
+      affine_transposed(w.w2, count, forward_.hidden, forward_.hidden, grad_outputs_[g].data(), grad_hidden_[g].data());
+      for (int h = 0; h < forward_.hidden; ++h)
+        grad_hidden_[g][h] = keep(less(zero(), group.hidden[h]), grad_hidden_[g][h]);
+      affine_transposed(w.w1, forward_.hidden, forward_.inputs, args_.features, grad_hidden_[g].data(),
+                        grad_inputs_[g].data());
+      outputs[g] = grad_outputs_[g].data(), hidden[g] = group.hidden;
+      grad_hidden[g] = grad_hidden_[g].data(), inputs[g] = group.inputs;
+    }
+    sums.second.add(outputs, hidden);
+    sums.first.add(grad_hidden, inputs);
+  }
+
+  // What one anchor's selected Gaussians pass on: to its offsets and scales at once, to the networks through `grads`.
+  void anchor(int64_t anchor, float *grads, const float *lane_reaches) {
     const DecodeArguments &in = forward_;
     const int k = in.offsets;
     int64_t n = in.slot_start[anchor];
     float reach[6], grad_log[6] = {};
-    for (int c = 0; c < 6; ++c) reach[c] = std::exp(in.log_scales[6 * anchor + c]);
-    const auto grad = [&](int o) -> float & { return grads_[size_t(o) * kLanes + lane]; };
+    for (int c = 0; c < 6; ++c) reach[c] = lane_reaches[c * kLanes];
+    const auto grad = [&](int o) -> float & { return grads[size_t(o) * kLanes]; };
     for (int i = 0; i < k; ++i) {
       const int64_t slot = anchor * k + i;
       float *grad_offset = args_.offsets_out + 3 * slot;
@@ -256,19 +303,19 @@ class BlockBackward {
 
   const DecodeGradientArguments &args_;
   const DecodeArguments &forward_;
-  HeadBackward opacity_, color_, covariance_;
-  std::vector<Vec> memory_, grad_hidden_, grad_inputs_;
-  std::vector<float> grads_;
-  std::vector<Vec> grad_outputs_;
+  HeadSums opacity_, color_, covariance_;
+  std::vector<Group> groups_;
+  std::vector<float> grads_[kGroups];
+  std::vector<Vec> grad_outputs_[kGroups], grad_hidden_[kGroups], grad_inputs_[kGroups];
 };
 
 template <typename Visit>
 void for_each_group(const DecodeArguments &args, Visit visit) {
 #pragma omp parallel
   {
-    std::vector<Vec> memory;
+    Group group(args);
 #pragma omp for schedule(dynamic, 8)
-    for (int64_t first = 0; first < args.anchors; first += kLanes) visit(args, first, memory);
+    for (int64_t first = 0; first < args.anchors; first += kLanes) visit(args, first, group);
   }
 }
 
