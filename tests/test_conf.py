@@ -43,6 +43,12 @@ def test_every_choice_composes(choice):
     composed(choice)
 
 
+def test_sweeps_are_found_and_multiply_with_experiments():
+    assert [job.seed for job in jobs("+sweep=seeds")] == [0, 1, 2]
+    both = jobs("+experiment=ablation", "+sweep=seeds")
+    assert len({(job.variant, job.seed) for job in both}) == 12
+
+
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_every_experiment_composes_and_says_how_to_run_it(name):
     assert jobs(f"+experiment={name}")

@@ -6,6 +6,7 @@ import os
 import re
 import shlex
 import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -86,7 +87,9 @@ def main() -> None:
         return result.status
 
     try:
-        hydra.main(version_base="1.3", config_path=str(root() / "conf"), config_name="config")(one)()
+        with tempfile.TemporaryDirectory() as scratch:  # Hydra insists on writing down the overrides of a multirun
+            sys.argv.insert(1, f"hydra.sweep.dir={scratch}")
+            hydra.main(version_base="1.3", config_path=str(root() / "conf"), config_name="config")(one)()
     except (Interrupted, KeyboardInterrupt) as stopped:
         reason = str(stopped) or "stopped"
         errors.print(f"{reason}; to go on: {command}", markup=False, highlight=False, soft_wrap=True)

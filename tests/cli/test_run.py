@@ -130,8 +130,9 @@ def test_a_missing_data_set_says_where_to_get_it_and_where_to_put_it(start, tmp_
 
 def test_a_folder_that_cannot_be_written_is_a_clear_error(start, tmp_path):
     (tmp_path / "runs").write_text("a file where the folder should be")
-    code, _, error = finish(start(*TINY))
-    assert code == 1 and "cannot write run folder runs/" in error and "Traceback" not in error
+    for arguments in ([], ["+sweep=seeds"]):
+        code, _, error = finish(start(*TINY, *arguments))
+        assert code == 1 and "cannot write run folder runs/" in error and "Traceback" not in error
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,19 @@
+"""The examples in docstrings, which are there to be believed."""
+
+import doctest
+import pkgutil
+from importlib import import_module
+
+import pytest
+
+PACKAGES = ("padgs", "baselines", "reports")
+MODULES = sorted(
+    module.name
+    for package in PACKAGES
+    for module in pkgutil.walk_packages(import_module(package).__path__, f"{package}.")
+)
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_examples_come_out_as_written(name):
+    assert doctest.testmod(import_module(name)).failed == 0
