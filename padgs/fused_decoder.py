@@ -31,8 +31,8 @@ def fused_decode(
 ) -> tuple[Tensor, ...]:
     """Means, quaternions, scales, opacities, colours, slots and raw opacities of the selected Gaussians.
 
-    Arguments and results are those of `padgs.decoder.decode_gaussians`, with the twelve tensors of the weights in a row.
-    Differentiable by weights, features, offsets and log-scales; the rest are constants.
+    Arguments and results are those of `padgs.decoder.decode_gaussians`, with the twelve tensors of the weights in a
+    row. Differentiable by weights, features, offsets and log-scales; the rest are constants.
     """
     return _FusedDecode.apply(features, seen, positions, offsets, log_scales, attenuation, *weights)
 
@@ -88,7 +88,8 @@ class _FusedDecode(torch.autograd.Function):
         )
 
 
-def _arguments(weights, constants, raw, slot_start, slots=None, outputs=(None,) * len(OUTPUTS)):
+def _arguments(weights, constants, raw, slot_start, slots=None, outputs=None):
+    outputs = [None] * len(OUTPUTS) if outputs is None else outputs
     inputs, positions, offsets, log_scales, attenuation = constants
     heads = [native.HeadWeights(*map(pointer, weights[i : i + 4])) for i in (0, 4, 8)]
     return native.DecodeArguments(

@@ -1,7 +1,7 @@
 """How one Gaussian becomes a footprint on the image (torch): the entries of `PROJECTIONS`.
 
-Each entry is a function (gaussians, cam_from_world, camera, options, probe) -> Footprints. A footprint gives every pixel
-a squared distance q; everything after that (order, alpha, blending) is the same for all.
+Each entry is a function (gaussians, cam_from_world, camera, options, probe) -> Footprints. A footprint gives every
+pixel a squared distance q; everything after that (order, alpha, blending) is the same for all.
 """
 
 from __future__ import annotations
