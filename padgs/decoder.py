@@ -1,7 +1,7 @@
 """The decoder: three small networks that turn an anchor as seen from a camera into K Gaussians (paper Eq. 13-14).
 
-`decode_gaussians` is a pure function of tensors. Where the native library can do it in one pass (float32 on the CPU) that
-is called instead; `define_gaussians` is the definition that it has to match.
+`decode_gaussians` is a pure function of tensors. Where the native library can do it in one pass (float32 on the CPU)
+that is called; `define_gaussians` is the definition that it has to match.
 """
 
 from __future__ import annotations

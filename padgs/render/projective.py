@@ -47,7 +47,7 @@ class RayFootprints(Footprints):
     near: float
 
     def squared_distance(self, indices: Tensor, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
-        """q = |o - t w|^2 with o = M^-1 mean, w = M^-1 d, and t = o.w / w.w where the Gaussian is largest on the ray."""
+        """q = |o - t w|^2 with o = M^-1 mean, w = M^-1 d, and t = o.w / w.w where the ray meets its maximum."""
         whitening = self.whitening[indices]
         o = torch.einsum("kic,kc->ki", whitening, self.means[indices])  # [K, 3]
         w = torch.einsum("kic,pc->pki", whitening, self.rays[rows, columns])  # [P, K, 3]
