@@ -1,6 +1,7 @@
 """The decoder: three small networks that turn an anchor as seen from a camera into K Gaussians (paper Eq. 13-14).
 
-`decode` is a pure function of weights and inputs, the definition that a fused kernel has to match.
+`decode_gaussians` is a pure function of tensors. Where the native library can do it in one pass (float32 on the CPU)
+that is called; `define_gaussians` is the definition that it has to match.
 """
 
 from __future__ import annotations
@@ -10,6 +11,9 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
+
+from padgs.fused_decoder import fits, fused_decode
+from padgs.gaussians import Gaussians
 
 OPACITY_VALUES, COLOR_VALUES, COVARIANCE_VALUES = 1, 3, 7  # outputs of each head per Gaussian
 SORT_OUT_BELOW = 0.9  # share of anchors with a positive opacity
@@ -80,6 +84,59 @@ def decode(weights: DecoderWeights, inputs: Tensor) -> Attributes:
         torch.sigmoid(shrinkage),
         quats,
     )
+
+
+def decode_gaussians(
+    weights: DecoderWeights,
+    features: Tensor,
+    seen: Tensor,
+    positions: Tensor,
+    offsets: Tensor,
+    log_scales: Tensor,
+    attenuation: Tensor,
+) -> tuple[Gaussians, Tensor, Tensor]:
+    """The selected Gaussians of all anchors (Eq. 13-15); differentiable by weights, features, offsets and log-scales.
+
+    Args:
+        weights: the three networks, of I inputs.
+        features: [A, C].
+        seen: [A, I - C], how the camera sees each anchor: direction, and distance and distortion if they are inputs.
+        positions: [A, 3] world.
+        offsets: [A, K, 3] in units of the anchor's scale.
+        log_scales: [A, 6]; the first three scale the offsets, the last three the Gaussians.
+        attenuation: [A], what Eq. 15 multiplies opacities by.
+
+    Returns:
+        N Gaussians in the order of their slots; slots [N] int64, anchor K + k; raw opacities [A, K] without gradient.
+    """
+    if fits(features):
+        flat = tuple(tensor for head in weights for tensor in head)
+        *values, slots, raw = fused_decode(flat, features, seen, positions, offsets, log_scales, attenuation)
+        return Gaussians(*values), slots, raw
+    return define_gaussians(weights, features, seen, positions, offsets, log_scales, attenuation)
+
+
+def define_gaussians(
+    weights: DecoderWeights,
+    features: Tensor,
+    seen: Tensor,
+    positions: Tensor,
+    offsets: Tensor,
+    log_scales: Tensor,
+    attenuation: Tensor,
+) -> tuple[Gaussians, Tensor, Tensor]:
+    """`decode_gaussians` in torch, for any dtype and device."""
+    said = decode(weights, torch.cat((features, seen), dim=-1))
+    anchors = said.slots // offsets.shape[1]
+    reach, size = take_rows(torch.exp(log_scales), anchors).split((3, 3), dim=-1)
+    gaussians = Gaussians(
+        means=take_rows(positions, anchors) + reach * take_rows(offsets.view(-1, 3), said.slots),
+        quats=said.quats,
+        scales=size * said.shrinkage,
+        opacities=said.opacities * attenuation[anchors],
+        colors=said.colors,
+    )
+    return gaussians, said.slots, said.raw_opacities.detach()
 
 
 def take_rows(table: Tensor, rows: Tensor) -> Tensor:

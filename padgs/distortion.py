@@ -1,8 +1,8 @@
 """The distortion map and the solid-angle weight of a panorama. Paper Eq. 8-12 and 17.
 
 An ERP pixel at latitude t covers a solid angle proportional to cos(t): the image stretches the sphere by 1 / cos(t)
-(Eq. 11). The paper turns this into a distortion degree, Omega = 1 - cos^2(t) = sin^2(t) in [0, 1]: 0 on the horizon, 1 at
-the poles. Latitude is always that of the *camera* frame.
+(Eq. 11). The paper turns this into a distortion degree, Omega = 1 - cos^2(t) = sin^2(t) in [0, 1]: 0 on the horizon,
+1 at the poles. Latitude is always that of the *camera* frame.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from padgs.anchors import anchors_from_points, automatic_voxel_size, initial_log_scales
-from padgs.decoder import Decoder, decode, take_rows
+from padgs.decoder import Decoder, decode_gaussians
 from padgs.gaussians import Gaussians
 from padgs.modulation import OMEGA_AXES, direction_distortion, modulate, polar_axis
 from padgs.scene import Scene, View
@@ -181,21 +181,20 @@ class PaDGS(nn.Module):
         """The Gaussians that this view shows (Eq. 13-15)."""
         options = self.options
         direction, distance, omega = self.seen_from(view)
-        inputs = [self.features, direction]
+        seen = [direction]
         if options.use_distance:
-            inputs.append(distance[:, None])
+            seen.append(distance[:, None])
         if options.use_distortion:
             seen_omega = omega if options.omega_input == "sin2" else torch.sqrt((1 - omega).clamp(min=0))
-            inputs.append(seen_omega[:, None])
-        said = decode(self.decoder.weights(), torch.cat(inputs, dim=-1))
-        anchors = said.slots // options.offsets
-        reach, size = take_rows(torch.exp(self.log_scales), anchors).split((3, 3), dim=-1)
-        offsets = take_rows(self.offsets.view(-1, 3), said.slots)
-        gaussians = Gaussians(
-            means=take_rows(self.positions, anchors) + reach * offsets,
-            quats=said.quats,
-            scales=size * said.shrinkage,
-            opacities=modulate(said.opacities, omega[anchors], options.tau, options.max_modulated_omega),
-            colors=said.colors,
+            seen.append(seen_omega[:, None])
+        attenuation = modulate(torch.ones_like(omega), omega, options.tau, options.max_modulated_omega)
+        decoded = decode_gaussians(
+            self.decoder.weights(),
+            self.features,
+            torch.cat(seen, dim=-1),
+            self.positions,
+            self.offsets,
+            self.log_scales,
+            attenuation,
         )
-        return Decoded(gaussians, said.slots, said.raw_opacities.detach())
+        return Decoded(*decoded)

@@ -12,10 +12,12 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from padgs.camera import Camera, Panorama
+
 
 @dataclass(frozen=True)
 class View:
-    """One panorama: its pose and size, and how to get its pixels.
+    """One image: its pose and size, and how to get its pixels. A panorama, unless it says otherwise by `lens`.
 
     `load_pixels` and `load_mask` are called whenever pixels are asked for; the loader decides what is cached. A view
     without `load_pixels` can be rendered but not compared with anything.
@@ -27,6 +29,12 @@ class View:
     height: int
     load_pixels: Callable[[], Tensor] | None = None  # () -> [H, W, 3] uint8
     load_mask: Callable[[], Tensor] | None = None  # () -> [H, W] float32 in [0, 1], 0 = ignore this pixel
+    lens: Camera | None = None  # None: a panorama of this size
+
+    @property
+    def camera(self) -> Camera:
+        """Which direction each pixel looks."""
+        return Panorama(self.width, self.height) if self.lens is None else self.lens
 
     @property
     def center(self) -> Tensor:

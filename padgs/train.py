@@ -199,6 +199,7 @@ class Trainer:
         for group, settings in zip(self._groups, self._optimizer.param_groups, strict=True):
             settings["lr"] = group.learning_rate(iteration)
         index = self._next_view()
+        self._scene.train[self._upcoming()].prefetch()
         target = self._targets[index]
         drawing = self._model.draw(self._scene.train[index])
         if len(drawing.gaussians) == 0:
@@ -239,6 +240,10 @@ class Trainer:
             self._position = 0
         self._position += 1
         return int(self._order[self._position - 1])
+
+    def _upcoming(self) -> int:
+        """The view of the next iteration; at the end of an epoch, where it is not drawn yet, the present one."""
+        return int(self._order[min(self._position, len(self._order) - 1)])
 
     def _parameters(self) -> dict[str, nn.Parameter]:
         """All parameters by a name for messages and checkpoints."""

@@ -14,11 +14,12 @@ import pytest
 # From the ground up; a package stands for all its modules. A file imports from its own layer and those above it here.
 LAYERS = {
     "geometry": ("padgs.registry", "padgs.panorama", "padgs.distortion"),
-    "data types": ("padgs.scene", "padgs.gaussians"),
+    "data types": ("padgs.camera", "padgs.scene", "padgs.gaussians"),
     "rendering": ("padgs.render",),
     "models": (
         "padgs.method",
         "padgs.anchors",
+        "padgs.fused_decoder",
         "padgs.decoder",
         "padgs.modulation",
         "padgs.model",

@@ -36,15 +36,15 @@ def render(
     backend: str = "auto",
     check_values: bool = False,
 ) -> Rendering:
-    """Render a panorama of the Gaussians as the view sees them.
+    """Render the Gaussians as the view sees them.
 
     Args:
         gaussians: N Gaussians in the world frame, float32 (any backend) or float64 (torch only).
         view: pose and image size.
         options: projection, bounds, culling.
         background: [3] RGB behind everything; black if not given.
-        probe: [N, 2] zeros added to the projected means in normalised image units (x and y each run over 2 across the
-            image, as in 3DGS); its gradient after `backward` is the densification signal.
+        probe: [N, 2] zeros that move the projected means, in normalised image units (x and y each run over 2 across
+            the image, as in 3DGS); its gradient after `backward` is the densification signal.
         backend: a name of `BACKENDS`, or auto: cpu for float32 tensors on the CPU if the library is built, else torch
             (and a warning, once, if that is because the library is missing).
         check_values: also check that all numbers are sane; a pass over the tensors, meant for tests and debugging.
@@ -56,9 +56,9 @@ def render(
     cam_from_world = view.cam_from_world.to(device=means.device, dtype=means.dtype)
     if background is None:
         background = means.new_zeros(3)
-    check_inputs(gaussians, cam_from_world, view.width, view.height, background, probe, check_values=check_values)
+    check_inputs(gaussians, cam_from_world, view.camera, options, background, probe, check_values=check_values)
     rasterize = lookup(BACKENDS, resolve_backend(backend, means), "backend")
-    return rasterize(gaussians, cam_from_world, view.width, view.height, options, background, probe)
+    return rasterize(gaussians, cam_from_world, view.camera, options, background, probe)
 
 
 def resolve_backend(backend: str, means: Tensor) -> str:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from padgs.camera import Camera, Panorama, Pinhole, RayTable
 from padgs.gaussians import Gaussians
 
 ALPHA_MIN = 1 / 255
@@ -28,9 +29,10 @@ class RenderOptions:
 
     projection: str = "erp"
     near: float = 0.0  # world units; Gaussians whose mean is at most this far away are culled
-    low_pass: float = 0.3  # px^2 added to both diagonal entries of the projected covariance
-    wrap: bool = True  # continue footprints across the +-180 degree seam
+    low_pass: float = 0.3  # variance of the low-pass filter in square pixels; what it widens is up to the projection
+    wrap: bool = True  # continue footprints across the +-180 degree seam of a panorama
     bounds: str = "exact"  # exact: every pixel with alpha >= 1/255; square: 3 sigma of the longest axis, as published
+    max_instances: int = 1 << 26  # (Gaussian, tile) pairs in memory at once; beyond it the image is drawn in strips
 
     def __post_init__(self) -> None:
         """Reject values that no backend can honour."""
@@ -58,8 +60,8 @@ class Rendering:
 def check_inputs(
     gaussians: Gaussians,
     cam_from_world: Tensor,
-    width: int,
-    height: int,
+    camera: Camera,
+    options: RenderOptions,
     background: Tensor,
     probe: Tensor | None,
     *,
@@ -68,7 +70,7 @@ def check_inputs(
     """Check what native code relies on and name the culprit.
 
     Args:
-        gaussians, cam_from_world, width, height, background, probe: as in `padgs.render.render`.
+        gaussians, cam_from_world, camera, options, background, probe: as in `torch_backend.rasterize`.
         check_values: also look at every number (finite, positive scales, ...); costs a pass over the tensors.
 
     Raises:
@@ -96,10 +98,30 @@ def check_inputs(
             raise ValueError(f"{name} has dtype {tensor.dtype} but means has {dtype}; convert one of them")
         if tensor.device != device:
             raise ValueError(f"{name} is on {tensor.device} but means is on {device}; move one of them")
-    if width < 1 or height < 1:
-        raise ValueError(f"image size is {width}x{height}; both sides must be at least 1 pixel")
+    if camera.width < 1 or camera.height < 1:
+        raise ValueError(f"image size is {camera.width}x{camera.height}; both sides must be at least 1 pixel")
+    _check_camera(camera, options)
     if check_values:
         _check_values(gaussians, cam_from_world, {name: tensor for name, (tensor, _) in shapes.items()})
+        _check_rays(camera)
+
+
+def _check_camera(camera: Camera, options: RenderOptions) -> None:
+    kind = {"erp": Panorama, "pinhole": Pinhole}.get(options.projection)
+    if kind is not None and not isinstance(camera, kind):
+        raise ValueError(
+            f"projection {options.projection!r} is made for a {kind.__name__} camera, not a {type(camera).__name__}; "
+            "tangent and ray take any camera"
+        )
+    if options.bounds == "square" and kind is None:
+        raise ValueError(f"projection {options.projection!r} has no square bounds; use bounds=exact")
+
+
+def _check_rays(camera: Camera) -> None:
+    if isinstance(camera, RayTable):
+        off = ((camera.table.detach() ** 2).sum(-1) - 1).abs().max().item()
+        if not off < 1e-3:
+            raise ValueError(f"the ray table has a direction whose squared length is off 1 by {off:.3g}; normalise it")
 
 
 def _check_values(gaussians: Gaussians, cam_from_world: Tensor, tensors: Mapping[str, Tensor]) -> None:

@@ -18,59 +18,100 @@ from torch import Tensor
 Pointer = ctypes.c_void_p
 
 
+def _fields(kind: type, *names: str) -> list[tuple[str, type]]:
+    return [(name, kind) for name in names]
+
+
 class Camera(ctypes.Structure):
     """`padgs::Camera`."""
 
     _fields_ = [
-        ("width", ctypes.c_int32),
-        ("height", ctypes.c_int32),
+        *_fields(ctypes.c_int32, "width", "height", "projection", "model"),
         ("cam_from_world", ctypes.c_float * 12),
-        ("near_radius", ctypes.c_float),
-        ("low_pass", ctypes.c_float),
-        ("wrap", ctypes.c_int32),
-        ("square", ctypes.c_int32),
+        *_fields(ctypes.c_float, "near_radius", "low_pass"),
+        *_fields(ctypes.c_int32, "wrap", "square"),
+        *_fields(ctypes.c_float, "fx", "fy", "cx", "cy"),
+    ]
+
+
+class TileGrid(ctypes.Structure):
+    """`padgs::TileGrid`."""
+
+    _fields_ = [
+        *_fields(ctypes.c_int32, "width", "height", "first_row", "end_row"),
+        *_fields(Pointer, "level", "row_start"),
     ]
 
 
 class Inputs(ctypes.Structure):
     """`padgs::Inputs`."""
 
-    _fields_ = [("count", ctypes.c_int64)] + [
-        (name, Pointer) for name in ("means", "quats", "scales", "opacities", "colors", "probe")
+    _fields_ = [
+        ("count", ctypes.c_int64),
+        *_fields(Pointer, "means", "quats", "scales", "opacities", "colors", "probe"),
     ]
 
 
 class Gradients(ctypes.Structure):
     """`padgs::Gradients`."""
 
-    _fields_ = [(name, Pointer) for name in ("means", "quats", "scales", "opacities", "colors", "probe", "pose")]
+    _fields_ = _fields(Pointer, "means", "quats", "scales", "opacities", "colors", "probe", "pose")
+
+
+class Rays(ctypes.Structure):
+    """`padgs::Rays`."""
+
+    _fields_ = _fields(Pointer, "column_sine", "column_cosine", "row_sine", "row_cosine", "table")
 
 
 class BlendArguments(ctypes.Structure):
     """`padgs::BlendArguments`."""
 
-    _fields_ = [(name, ctypes.c_int32) for name in ("width", "height", "wrap", "first_tile_row", "end_tile_row")] + [
-        (name, Pointer)
-        for name in (
-            "footprints",
-            "tile_start",
-            "instances",
-            "slots",
-            "background",
-            "image",
-            "transmittance",
-            "depth",
-            "last",
-            "pair_counts",
-        )
+    _fields_ = [
+        ("grid", TileGrid),
+        *_fields(ctypes.c_int32, "projection", "wrap"),
+        ("rays", Rays),
+        *_fields(Pointer, "footprints", "tile_start", "instances", "background"),
+        *_fields(Pointer, "image", "transmittance", "depth", "last", "pair_counts"),
     ]
 
 
 class BlendGradientArguments(ctypes.Structure):
     """`padgs::BlendGradientArguments`."""
 
-    _fields_ = [("forward", BlendArguments)] + [
-        (name, Pointer) for name in ("grad_image", "grad_transmittance", "grad_depth", "moments")
+    _fields_ = [
+        ("forward", BlendArguments),
+        *_fields(Pointer, "grad_image", "grad_transmittance", "grad_depth", "moments", "grad_rays"),
+    ]
+
+
+class HeadWeights(ctypes.Structure):
+    """`padgs::HeadWeights`."""
+
+    _fields_ = _fields(Pointer, "w1", "b1", "w2", "b2")
+
+
+class DecodeArguments(ctypes.Structure):
+    """`padgs::DecodeArguments`."""
+
+    _fields_ = [
+        ("anchors", ctypes.c_int64),
+        *_fields(ctypes.c_int32, "offsets", "inputs", "hidden"),
+        *_fields(HeadWeights, "opacity", "color", "covariance"),
+        *_fields(Pointer, "input_rows", "positions", "offset_rows", "log_scales", "attenuation"),
+        *_fields(Pointer, "raw_opacities", "slot_start", "slots"),
+        *_fields(Pointer, "means", "quats", "scales", "opacities", "colors"),
+    ]
+
+
+class DecodeGradientArguments(ctypes.Structure):
+    """`padgs::DecodeGradientArguments`."""
+
+    _fields_ = [
+        ("forward", DecodeArguments),
+        *_fields(Pointer, "means", "quats", "scales", "opacities", "colors"),
+        ("features", ctypes.c_int32),
+        *_fields(Pointer, "features_out", "offsets_out", "log_scales_out", "weights_out"),
     ]
 
 
@@ -78,17 +119,11 @@ class LossArguments(ctypes.Structure):
     """`padgs::LossArguments`."""
 
     _fields_ = [
-        ("width", ctypes.c_int32),
-        ("height", ctypes.c_int32),
-        ("image", Pointer),
-        ("target", Pointer),
-        ("weight", Pointer),
-        ("weight_row_stride", ctypes.c_int64),
-        ("weight_column_stride", ctypes.c_int64),
-        ("lambda_l1", ctypes.c_float),
-        ("normalizer", ctypes.c_float),
-        ("workspace", Pointer),
-        ("gradient", Pointer),
+        *_fields(ctypes.c_int32, "width", "height"),
+        *_fields(Pointer, "image", "target", "weight"),
+        *_fields(ctypes.c_int64, "weight_row_stride", "weight_column_stride"),
+        *_fields(ctypes.c_float, "lambda_l1", "normalizer"),
+        *_fields(Pointer, "workspace", "gradient"),
     ]
 
 
@@ -133,12 +168,17 @@ def _declare(loaded: ctypes.CDLL) -> None:
     signatures = {
         "padgs_isa": ([], ctypes.c_char_p),
         "padgs_project": ([Pointer] * 4, None),
-        "padgs_project_backward": ([Pointer] * 5, None),
+        "padgs_project_backward": ([Pointer] * 4, None),
+        "padgs_tile_levels": ([Pointer] * 2, None),
         "padgs_depth_order": ([Pointer, Pointer, i64, Pointer], i64),
-        "padgs_count_instances": ([Pointer, i64, i32, Pointer], None),
-        "padgs_bin": ([Pointer, i64, Pointer, i64, i32, i32, i32, Pointer, Pointer, Pointer, Pointer], None),
+        "padgs_count_instances": ([Pointer, i64, Pointer, i32, Pointer], None),
+        "padgs_bin": ([Pointer, i64, Pointer, i64, *[Pointer] * 4], None),
+        "padgs_sum_moments": ([Pointer, Pointer, i64, Pointer], None),
         "padgs_blend_forward": ([Pointer], None),
         "padgs_blend_backward": ([Pointer], None),
+        "padgs_decode_select": ([Pointer], None),
+        "padgs_decode_place": ([Pointer], None),
+        "padgs_decode_backward": ([Pointer], None),
         "padgs_photometric_loss": ([Pointer], ctypes.c_double),
         "padgs_loss_workspace": ([i32, i32], i64),
     }

@@ -12,41 +12,59 @@
 
 namespace padgs {
 
-constexpr int kTile = 16;        // pixels on each side of a tile; one row of a tile is one vector of 16 lanes
-constexpr int kMoments = 10;     // floats that backward blending leaves for each (Gaussian, tile) instance
+constexpr int kTile = 16;        // pixels: height of a tile, and width of a chunk; a chunk's row is one vector
+constexpr int kMaxLevel = 4;     // tiles are up to 2^kMaxLevel chunks wide, near the poles
+constexpr int kMoments = 16;     // floats that backward blending leaves for each (Gaussian, tile) instance
 constexpr float kAlphaMin = 1.0f / 255.0f;
 constexpr float kAlphaMax = 0.99f;
 constexpr float kTransmittanceMin = 1e-4f;
 
+enum Projection : int32_t { kErp = 0, kPinhole = 1, kTangent = 2, kRay = 3 };
+enum CameraModel : int32_t { kPanoramaModel = 0, kPinholeModel = 1, kTableModel = 2 };
+
 // What a camera and its options are to the kernels. Mirrored by `Camera` in native.py.
 struct Camera {
   int32_t width, height;
+  int32_t projection, model;
   float cam_from_world[12];  // rows of [R | t]
   float near_radius;
-  float low_pass;  // px^2
-  int32_t wrap;    // 1: footprints continue across the +-180 degree seam
-  int32_t square;  // 1: published bounds, a square of 3 sigma of the longest axis rounded out to tiles
+  float low_pass;        // erp, pinhole: px^2; tangent: rad^2; ray: rad^2, times r^2 on the 3D covariance
+  int32_t wrap;          // 1: footprints continue across the +-180 degree seam
+  int32_t square;        // 1: published bounds, a square of 3 sigma of the longest axis rounded out to tiles
+  float fx, fy, cx, cy;  // pinhole
 };
 
-// One projected Gaussian as the blender reads it. log2(alpha) at an offset (du, dv) from the centre is
-// log2_opacity - (a du + b dv)^2 - (c dv)^2: a Cholesky factor of the conic, so that nothing cancels.
+// One projected Gaussian as the blender reads it: a cache line.
 struct Footprint {
-  float u, v;
-  float a, b, c;
+  float shape[11];  // planar: u, v, a, b, c;  projective: l0 (3), l1 (3), m (3), kappa, near_ratio
   float log2_opacity;
-  float row_reach;  // |dv| beyond which alpha < 1/255 for every du
   float depth;
   float red, green, blue;
-  float opacity;
 };
-static_assert(sizeof(Footprint) == 48, "padgs/render/cpu_backend.py allocates 12 floats per footprint");
+static_assert(sizeof(Footprint) == 64, "padgs/render/cpu_backend.py allocates 16 floats per footprint");
 
-// Tiles that a footprint touches: columns [first, end) and, after the seam, [0, second_end), of rows [row, row_end).
-struct TileBox {
+// Pixels that a footprint can reach: rows [row, row_end), columns [column, column_end) and, beyond the seam,
+// [0, second_end) with second_end <= column. Nothing where row == row_end.
+struct PixelBox {
   int32_t column, column_end, second_end, row, row_end;
-  int32_t count() const { return (column_end - column + second_end) * (row_end - row); }
 };
-static_assert(sizeof(TileBox) == 20, "padgs/render/cpu_backend.py allocates 5 integers per box");
+static_assert(sizeof(PixelBox) == 20, "padgs/render/cpu_backend.py allocates 5 integers per box");
+
+// Tiles: rows of 16 pixels; in a row of level l a tile is 2^l chunks wide.
+struct TileGrid {
+  int32_t width, height;
+  int32_t first_row, end_row;  // rows of tiles that are drawn
+  const int32_t *level;        // [rows of tiles]
+  const int64_t *row_start;    // [drawn rows + 1] tiles before each drawn row
+};
+
+// One (Gaussian, tile) pair, with the part of the tile that the Gaussian can reach.
+struct Instance {
+  int32_t gaussian;
+  uint32_t slot;                          // where its moments go
+  uint8_t row, row_end, chunk, chunk_end;  // chunk_end is exclusive; rows and chunks count from the tile's corner
+};
+static_assert(sizeof(Instance) == 12, "padgs/render/cpu_backend.py allocates 3 integers per instance");
 
 struct Inputs {
   int64_t count;
@@ -60,14 +78,20 @@ struct Gradients {
   double *pose;                                        // [12] or null
 };
 
+// Directions of the pixels, for projective footprints. Rows are padded to whole chunks.
+struct Rays {
+  const float *column_sine, *column_cosine;  // [padded W] of the longitude   } a panorama
+  const float *row_sine, *row_cosine;        // [H] of the latitude           }
+  const float *table;                        // [H, 3, padded W], or null for a panorama
+};
+
 struct BlendArguments {
-  int32_t width, height;
-  int32_t wrap;                          // as in Camera
-  int32_t first_tile_row, end_tile_row;  // only these rows of tiles are drawn
+  TileGrid grid;
+  int32_t projection, wrap;
+  Rays rays;
   const Footprint *footprints;           // [N]
   const int64_t *tile_start;             // [tiles + 1] over the drawn tiles
-  const int32_t *instances;              // [I] Gaussian of each instance, tile by tile, front to back
-  const int64_t *slots;                  // [I] where the moments of an instance go
+  const Instance *instances;             // [I] tile by tile, front to back
   const float *background;               // [3]
   float *image, *transmittance, *depth;  // [H,W,3] [H,W] [H,W]
   int32_t *last;                         // [H,W] 1 + position in the tile's list of the last contribution
@@ -78,6 +102,35 @@ struct BlendGradientArguments {
   BlendArguments forward;
   const float *grad_image, *grad_transmittance, *grad_depth;  // [H,W,3] [H,W] or null, [H,W] or null
   float *moments;                                             // [I, kMoments] by slot
+  float *grad_rays;                                           // [H, 3, padded W] or null
+};
+
+// One network w2 relu(w1 x + b1) + b2; w1 [hidden, I], w2 [outputs, hidden].
+struct HeadWeights {
+  const float *w1, *b1, *w2, *b2;
+};
+
+// A anchors with K Gaussians each, N of the A K selected.
+struct DecodeArguments {
+  int64_t anchors;
+  int32_t offsets, inputs, hidden;         // K, I, hidden units
+  HeadWeights opacity, color, covariance;  // K, 3 K and 7 K outputs
+  const float *input_rows;                 // [A, I]
+  const float *positions, *offset_rows;    // [A, 3] [A, K, 3]
+  const float *log_scales;                 // [A, 6]
+  const float *attenuation;                // [A] 1 - tau Omega
+  float *raw_opacities;                    // [A, K]
+  int64_t *slot_start;                     // [A + 1]: where each anchor's selected Gaussians begin
+  int64_t *slots;                          // [N] anchor K + k
+  float *means, *quats, *scales, *opacities, *colors;  // [N, ...]
+};
+
+struct DecodeGradientArguments {
+  DecodeArguments forward;
+  const float *means, *quats, *scales, *opacities, *colors;  // upstream, [N, ...]
+  int32_t features;                                          // the first so many inputs want a gradient
+  float *features_out, *offsets_out, *log_scales_out;        // [A, features] [A, K, 3] [A, 6]
+  float *weights_out;  // all of opacity, color, covariance: w1, b1, w2, b2 each
 };
 
 struct LossArguments {

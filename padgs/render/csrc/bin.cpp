@@ -1,6 +1,7 @@
 // Order and tiles: one depth sort of the Gaussians, then a stable counting sort of their tile instances, so that every
 // tile's list is front to back without sorting any tile. The result does not depend on the number of threads.
 #include <algorithm>
+#include <cmath>
 #include <cstring>
 #include <vector>
 
@@ -9,8 +10,10 @@
 namespace padgs {
 namespace {
 
+int64_t chunks(int width) { return (width + kTile - 1) / kTile; }
+
 // Stable radix sort of the indices of visible Gaussians by depth; positive floats order as their bits do.
-void sort_by_depth(const Footprint *footprints, const TileBox *boxes, int64_t count, std::vector<int32_t> &order) {
+std::vector<int32_t> depth_order(const Footprint *footprints, const PixelBox *boxes, int64_t count) {
   constexpr int kBits = 11, kBuckets = 1 << kBits, kPasses = 3;
   struct Item {
     uint32_t key;
@@ -19,7 +22,7 @@ void sort_by_depth(const Footprint *footprints, const TileBox *boxes, int64_t co
   std::vector<Item> items, sorted;
   items.reserve(count);
   for (int64_t i = 0; i < count; ++i) {
-    if (boxes[i].count() == 0) continue;
+    if (boxes[i].row == boxes[i].row_end) continue;
     uint32_t key;
     std::memcpy(&key, &footprints[i].depth, sizeof key);
     items.push_back({key, int32_t(i)});
@@ -33,17 +36,50 @@ void sort_by_depth(const Footprint *footprints, const TileBox *boxes, int64_t co
     for (const Item &item : items) sorted[start[item.key >> shift & (kBuckets - 1)]++] = item;
     items.swap(sorted);
   }
-  order.resize(items.size());
+  std::vector<int32_t> order(items.size());
   for (size_t i = 0; i < items.size(); ++i) order[i] = items[i].index;
+  return order;
 }
 
-// Calls visit(tile) for each tile of the box inside rows [first, end), in a fixed order.
+// A run of tiles in one row, and the chunks [first, end) of the image that the footprint reaches there.
+struct Run {
+  int tile, tile_end, chunk, chunk_end;
+};
+
+// The tiles of one row of level `level` that a box touches: one run, or two across the seam; each tile once.
+int runs_in_row(const PixelBox &box, int level, Run *runs) {
+  const int chunk = box.column / kTile, chunk_end = int(chunks(box.column_end));
+  runs[0] = {chunk >> level, ((chunk_end - 1) >> level) + 1, chunk, chunk_end};
+  if (box.second_end == 0) return 1;
+  const int second_end = int(chunks(box.second_end)), second_tiles = ((second_end - 1) >> level) + 1;
+  if (second_tiles > runs[0].tile) {  // both pieces meet in a tile: take it, and with it the whole row, once
+    runs[0] = {0, runs[0].tile_end, 0, chunk_end};
+    return 1;
+  }
+  runs[1] = {0, second_tiles, 0, second_end};
+  return 2;
+}
+
+// Calls visit(tile, instance part) for each drawn tile of the box, in a fixed order.
 template <typename Visit>
-void for_each_tile(const TileBox &box, int first, int end, int per_row, Visit visit) {
-  for (int row = std::max(box.row, first); row < std::min(box.row_end, end); ++row) {
-    const int64_t base = int64_t(row - first) * per_row;
-    for (int column = box.column; column < box.column_end; ++column) visit(base + column);
-    for (int column = 0; column < box.second_end; ++column) visit(base + column);
+void for_each_tile(const PixelBox &box, const TileGrid &grid, Visit visit) {
+  if (box.row == box.row_end) return;
+  const int end = std::min((box.row_end - 1) / kTile + 1, grid.end_row);
+  for (int row = std::max(box.row / kTile, grid.first_row); row < end; ++row) {
+    const int level = grid.level[row], y0 = row * kTile;
+    const int64_t base = grid.row_start[row - grid.first_row];
+    Instance part{};
+    part.row = uint8_t(std::max(box.row - y0, 0));
+    part.row_end = uint8_t(std::min(box.row_end - y0, kTile));
+    Run runs[2];
+    const int count = runs_in_row(box, level, runs);
+    for (int r = 0; r < count; ++r)
+      for (int tile = runs[r].tile; tile < runs[r].tile_end; ++tile) {
+        const int first = tile << level;
+        part.chunk = uint8_t(std::max(runs[r].chunk - first, 0));
+        part.chunk_end = uint8_t(std::min(runs[r].chunk_end - first, 1 << level));
+        visit(base + tile, part);
+      }
   }
 }
 
@@ -52,35 +88,47 @@ void for_each_tile(const TileBox &box, int first, int end, int per_row, Visit vi
 
 using namespace padgs;
 
+// Widths of tiles by row, so that a tile covers about the same angle at every latitude: level = round(log2(1 / cos)).
+PADGS_API void padgs_tile_levels(const Camera *camera, int32_t *level) {
+  const int rows = int(chunks(camera->height));
+  for (int row = 0; row < rows; ++row) {
+    level[row] = 0;
+    if (camera->model != kPanoramaModel || camera->square) continue;
+    const double latitude = ((row + 0.5) * kTile / camera->height - 0.5) * 3.14159265358979323846;
+    const int wanted = int(std::lround(std::log2(1 / std::max(std::cos(latitude), 1e-3))));
+    while (level[row] < std::min(wanted, kMaxLevel) && (2 << level[row]) <= chunks(camera->width)) ++level[row];
+  }
+}
+
 // Depth order [visible] of the Gaussians; returns how many are visible.
-PADGS_API int64_t padgs_depth_order(const Footprint *footprints, const TileBox *boxes, int64_t count, int32_t *order) {
-  std::vector<int32_t> sorted;
-  sort_by_depth(footprints, boxes, count, sorted);
+PADGS_API int64_t padgs_depth_order(const Footprint *footprints, const PixelBox *boxes, int64_t count, int32_t *order) {
+  const std::vector<int32_t> sorted = depth_order(footprints, boxes, count);
   std::copy(sorted.begin(), sorted.end(), order);
   return int64_t(sorted.size());
 }
 
-// Instances in each row of tiles, [tile rows]: known before anything of their size is allocated.
-PADGS_API void padgs_count_instances(const TileBox *boxes, int64_t count, int32_t tile_rows, int64_t *per_row) {
-  std::fill_n(per_row, tile_rows, int64_t(0));
-  for (int64_t i = 0; i < count; ++i)
-    for (int row = boxes[i].row; row < boxes[i].row_end; ++row)
-      per_row[row] += boxes[i].column_end - boxes[i].column + boxes[i].second_end;
+// Instances in each row of tiles, [rows]: known before anything of their size is allocated.
+PADGS_API void padgs_count_instances(const PixelBox *boxes, int64_t count, const int32_t *level, int32_t rows,
+                                     int64_t *per_row) {
+  std::fill_n(per_row, rows, int64_t(0));
+  for (int64_t i = 0; i < count; ++i) {
+    const PixelBox &box = boxes[i];
+    if (box.row == box.row_end) continue;
+    for (int row = box.row / kTile; row <= (box.row_end - 1) / kTile; ++row) {
+      Run runs[2];
+      const int pieces = runs_in_row(box, level[row], runs);
+      for (int r = 0; r < pieces; ++r) per_row[row] += runs[r].tile_end - runs[r].tile;
+    }
+  }
 }
 
-// Fills the tile lists of tile rows [first, end).
+// Fills the lists of the grid's drawn tiles.
 //   slot_start [N + 1]: where each Gaussian's moments begin; its instances are consecutive there
-//   tile_start [tiles + 1], instances [I], slots [I]
-PADGS_API void padgs_bin(const TileBox *boxes, int64_t count, const int32_t *order, int64_t visible, int32_t per_row,
-                         int32_t first, int32_t end, int64_t *slot_start, int64_t *tile_start, int32_t *instances,
-                         int64_t *slots) {
-  const int64_t tiles = int64_t(end - first) * per_row;
-  slot_start[0] = 0;
-  for (int64_t i = 0; i < count; ++i) {
-    const TileBox &box = boxes[i];
-    const int rows = std::max(0, std::min(box.row_end, end) - std::max(box.row, first));
-    slot_start[i + 1] = slot_start[i] + int64_t(rows) * (box.column_end - box.column + box.second_end);
-  }
+//   tile_start [tiles + 1], instances [I]
+PADGS_API void padgs_bin(const PixelBox *boxes, int64_t count, const int32_t *order, int64_t visible,
+                         const TileGrid *grid, int64_t *slot_start, int64_t *tile_start, Instance *instances) {
+  const int64_t tiles = grid->row_start[grid->end_row - grid->first_row];
+  std::fill_n(slot_start, count + 1, int64_t(0));
   // Each block of Gaussians, in depth order, has its own histogram: blocks can be filled at the same time.
   const int64_t block_size = std::max<int64_t>(4096, (visible + 63) / 64);
   const int64_t blocks = (visible + block_size - 1) / block_size;
@@ -88,9 +136,13 @@ PADGS_API void padgs_bin(const TileBox *boxes, int64_t count, const int32_t *ord
 #pragma omp parallel for schedule(static, 1)
   for (int64_t block = 0; block < blocks; ++block) {
     int64_t *histogram = next.data() + block * tiles;
-    for (int64_t i = block * block_size; i < std::min(visible, (block + 1) * block_size); ++i)
-      for_each_tile(boxes[order[i]], first, end, per_row, [&](int64_t tile) { ++histogram[tile]; });
+    for (int64_t i = block * block_size; i < std::min(visible, (block + 1) * block_size); ++i) {
+      int64_t own = 0;
+      for_each_tile(boxes[order[i]], *grid, [&](int64_t tile, const Instance &) { ++histogram[tile], ++own; });
+      slot_start[order[i] + 1] = own;
+    }
   }
+  for (int64_t i = 0; i < count; ++i) slot_start[i + 1] += slot_start[i];
   int64_t total = 0;
   for (int64_t tile = 0; tile < tiles; ++tile) {
     tile_start[tile] = total;
@@ -106,12 +158,20 @@ PADGS_API void padgs_bin(const TileBox *boxes, int64_t count, const int32_t *ord
     int64_t *cursor = next.data() + block * tiles;
     for (int64_t i = block * block_size; i < std::min(visible, (block + 1) * block_size); ++i) {
       const int32_t index = order[i];
-      int64_t slot = slot_start[index];
-      for_each_tile(boxes[index], first, end, per_row, [&](int64_t tile) {
-        const int64_t position = cursor[tile]++;
-        instances[position] = index;
-        slots[position] = slot++;
+      uint32_t slot = uint32_t(slot_start[index]);
+      for_each_tile(boxes[index], *grid, [&](int64_t tile, Instance part) {
+        part.gaussian = index;
+        part.slot = slot++;
+        instances[cursor[tile]++] = part;
       });
     }
   }
+}
+
+// Adds the moments of each Gaussian's instances, in the order of its slots, to its totals [N, kMoments].
+PADGS_API void padgs_sum_moments(const float *moments, const int64_t *slot_start, int64_t count, float *totals) {
+#pragma omp parallel for schedule(static)
+  for (int64_t i = 0; i < count; ++i)
+    for (int64_t slot = slot_start[i]; slot < slot_start[i + 1]; ++slot)
+      for (int k = 0; k < kMoments; ++k) totals[i * kMoments + k] += moments[slot * kMoments + k];
 }

@@ -8,8 +8,10 @@ namespace padgs {
 
 #define PADGS_DECLARE(isa)                    \
   namespace isa {                             \
+  extern const ProjectKernels project_kernels; \
   extern const BlendKernels blend_kernels;    \
   extern const LossKernels loss_kernels;      \
+  extern const DecodeKernels decode_kernels;  \
   }
 PADGS_DECLARE(baseline)
 #if PADGS_ISA_COUNT > 1
@@ -19,11 +21,13 @@ PADGS_DECLARE(avx512)
 
 struct Kernels {
   const char *name;
+  const ProjectKernels &project;
   const BlendKernels &blend;
   const LossKernels &loss;
+  const DecodeKernels &decode;
 };
 
-#define PADGS_KERNELS(isa) {#isa, isa::blend_kernels, isa::loss_kernels}
+#define PADGS_KERNELS(isa) {#isa, isa::project_kernels, isa::blend_kernels, isa::loss_kernels, isa::decode_kernels}
 
 static Kernels choose() {
 #if PADGS_ISA_COUNT > 1
@@ -51,6 +55,15 @@ using namespace padgs;
 
 PADGS_API const char *padgs_isa() { return kernels().name; }
 
+PADGS_API void padgs_project(const Camera *camera, const Inputs *in, Footprint *footprints, PixelBox *boxes) {
+  kernels().project.forward(*camera, *in, footprints, boxes);
+}
+
+// Gradients of every input from the moments [N, kMoments], already summed over the instances of each Gaussian.
+PADGS_API void padgs_project_backward(const Camera *camera, const Inputs *in, const float *moments, const Gradients *out) {
+  kernels().project.backward(*camera, *in, moments, *out);
+}
+
 PADGS_API void padgs_blend_forward(const BlendArguments *args) { kernels().blend.forward(*args); }
 
 PADGS_API void padgs_blend_backward(const BlendGradientArguments *args) { kernels().blend.backward(*args); }
@@ -60,3 +73,9 @@ PADGS_API double padgs_photometric_loss(const LossArguments *args) { return kern
 PADGS_API int64_t padgs_loss_workspace(int32_t height, int32_t width) {
   return kernels().loss.workspace(height, width);
 }
+
+PADGS_API void padgs_decode_select(const DecodeArguments *args) { kernels().decode.select(*args); }
+
+PADGS_API void padgs_decode_place(const DecodeArguments *args) { kernels().decode.place(*args); }
+
+PADGS_API void padgs_decode_backward(const DecodeGradientArguments *args) { kernels().decode.backward(*args); }

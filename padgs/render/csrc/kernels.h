@@ -5,6 +5,11 @@
 
 namespace padgs {
 
+struct ProjectKernels {
+  void (*forward)(const Camera &, const Inputs &, Footprint *, PixelBox *);
+  void (*backward)(const Camera &, const Inputs &, const float *moments, const Gradients &);
+};
+
 struct BlendKernels {
   void (*forward)(const BlendArguments &);
   void (*backward)(const BlendGradientArguments &);
@@ -13,6 +18,12 @@ struct BlendKernels {
 struct LossKernels {
   double (*photometric)(const LossArguments &);
   int64_t (*workspace)(int32_t height, int32_t width);
+};
+
+struct DecodeKernels {
+  void (*select)(const DecodeArguments &);  // raw opacities and slot_start; after it N is known
+  void (*place)(const DecodeArguments &);   // everything else
+  void (*backward)(const DecodeGradientArguments &);
 };
 
 }  // namespace padgs

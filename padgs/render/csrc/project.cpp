@@ -1,208 +1,334 @@
-// Projection of all Gaussians, forward and backward: one item of work per Gaussian, no shared state.
+// Projection of all Gaussians, forward and backward: sixteen at a time, no shared state.
 #include <algorithm>
 #include <cmath>
+#include <cstring>
 #include <vector>
 
-#include "gaussian.h"
+#include "bounds.h"
+#include "kernels.h"
+#include "planar.h"
+#include "projective.h"
+#include "simd_math.h"
 
 namespace padgs {
+namespace PADGS_ISA {
 namespace {
 
-constexpr float kSlack = 1.0001f;     // rounding must never cost a contribution
-constexpr float kSlackPixels = 1e-3f;
-constexpr int64_t kBlock = 1024;      // Gaussians per partial sum of the pose gradient; fixed, so that sums are too
-
-Vec3 vec3_at(const float *p, int64_t i) { return {p[3 * i], p[3 * i + 1], p[3 * i + 2]}; }
-Quat quat_at(const float *p, int64_t i) { return {p[4 * i], p[4 * i + 1], p[4 * i + 2], p[4 * i + 3]}; }
-
-int tiles(int pixels) { return (pixels + kTile - 1) / kTile; }
+constexpr int64_t kBlock = 1024;  // Gaussians per partial sum of the pose gradient; fixed, so that sums are too
 
 float clamp(float x, float low, float high) { return std::min(std::max(x, low), high); }
 
-// The tiles that hold pixel centres within (half_u, half_v) of (u, v); empty where none does.
-TileBox exact_box(const Camera &camera, float u, float v, float half_u, float half_v) {
-  const float width = float(camera.width), height = float(camera.height);
-  TileBox box{0, 0, 0, 0, 0};
-  const int row = int(std::ceil(clamp(v - half_v - 0.5f, -1.0f, height)));
-  const int row_end = int(std::floor(clamp(v + half_v - 0.5f, -1.0f, height))) + 1;
-  if (std::max(row, 0) >= std::min(row_end, camera.height)) return box;
-  // Columns are not reduced modulo the width yet; a footprint is at most one turn long.
-  int column = int(std::ceil(clamp(u - half_u - 0.5f, -width, 2 * width)));
-  int column_end = int(std::floor(clamp(u + half_u - 0.5f, -width, 2 * width))) + 1;
+// The pixels whose centres lie in a range; empty where none does.
+PixelBox pixel_box(const Camera &camera, const PixelRange &range) {
+  const int width = camera.width, height = camera.height;
+  const int row = int(std::ceil(clamp(range.v0 - 0.5f, -1.0f, float(height))));
+  const int row_end = int(std::floor(clamp(range.v1 - 0.5f, -1.0f, float(height)))) + 1;
+  PixelBox box{0, 0, 0, std::max(row, 0), std::min(row_end, height)};
+  if (box.row >= box.row_end) return {0, 0, 0, 0, 0};
+  int column = int(std::ceil(clamp(range.u0 - 0.5f, -2.0f * width, 3.0f * width)));
+  int column_end = int(std::floor(clamp(range.u1 - 0.5f, -2.0f * width, 3.0f * width))) + 1;
   if (!camera.wrap) {
     column = std::max(column, 0);
-    column_end = std::min(column_end, camera.width);
-  }
-  if (column >= column_end) return box;
-  if (camera.wrap && column_end - column >= camera.width) {
+    column_end = std::min(column_end, width);
+  } else if (column_end - column >= width) {
     column = 0;
-    column_end = camera.width;
+    column_end = width;
   }
-  const int shift = column < 0 ? camera.width : column >= camera.width ? -camera.width : 0;
-  column += shift;
-  column_end += shift;
-  box.column = column / kTile;
-  box.column_end = tiles(std::min(column_end, camera.width));
-  // The piece beyond the seam; where both pieces meet in a tile it is drawn once.
-  box.second_end = std::min(tiles(std::max(column_end - camera.width, 0)), box.column);
-  box.row = std::max(row, 0) / kTile;
-  box.row_end = tiles(std::min(row_end, camera.height));
+  if (column >= column_end) return {0, 0, 0, 0, 0};
+  const int turns = column >= 0 ? column / width : -((-column + width - 1) / width);
+  box.column = column - turns * width;
+  box.column_end = std::min(column_end - turns * width, width);
+  box.second_end = std::max(column_end - turns * width - width, 0);
   return box;
 }
 
 // The published bounds: a square of 3 sigma of the longest axis, rounded out to 16-pixel tiles and cut at the borders.
-TileBox square_box(const Camera &camera, float u, float v, const Covariance2D &s) {
-  const float middle = 0.5f * (s.uu + s.vv);
-  const float longest = middle + std::sqrt(std::max(0.1f, middle * middle - (s.uu * s.vv - s.uv * s.uv)));
+PixelBox square_box(const Camera &camera, float u, float v, float uu, float uv, float vv) {
+  const float middle = 0.5f * (uu + vv);
+  const float longest = middle + std::sqrt(std::max(0.1f, middle * middle - (uu * vv - uv * uv)));
   const float radius = std::ceil(3.0f * std::sqrt(longest));
-  const auto first = [&](float p, int pixels) {
-    return int(clamp(std::floor((p - 0.5f - radius) / kTile), 0.0f, float(tiles(pixels))));
-  };
-  const auto end = [&](float p, int pixels) {
-    return int(clamp(std::floor((p - 0.5f + radius + kTile - 1) / kTile), 0.0f, float(tiles(pixels))));
-  };
-  TileBox box{first(u, camera.width), end(u, camera.width), 0, first(v, camera.height), end(v, camera.height)};
-  if (box.column >= box.column_end || box.row >= box.row_end) return {0, 0, 0, 0, 0};
-  return box;
+  const auto edge = [&](float p, int pixels) { return int(clamp(kTile * std::floor(p / kTile), 0.0f, float(pixels))); };
+  const PixelBox box{edge(u - 0.5f - radius, camera.width), edge(u - 0.5f + radius + kTile - 1, camera.width), 0,
+                     edge(v - 0.5f - radius, camera.height), edge(v - 0.5f + radius + kTile - 1, camera.height)};
+  return box.column < box.column_end && box.row < box.row_end ? box : PixelBox{0, 0, 0, 0, 0};
 }
 
-bool finite(const Covariance2D &s) {
-  return std::isfinite(s.uu) && std::isfinite(s.vv) && std::isfinite(s.uv) && std::isfinite(s.determinant) &&
-         s.determinant > 0;
+// Sixteen items of an array of N x width floats, one vector per component. Lanes past the end repeat the last item.
+template <int kWidth>
+void load_items(const float *array, int64_t first, int64_t count, Vec *out) {
+  float lanes[kWidth][kLanes];
+  for (int lane = 0; lane < kLanes; ++lane) {
+    const float *item = array + std::min(first + lane, count - 1) * kWidth;
+    for (int k = 0; k < kWidth; ++k) lanes[k][lane] = item[k];
+  }
+  for (int k = 0; k < kWidth; ++k) out[k] = load(lanes[k]);
 }
 
-void project_one(const Camera &camera, const Inputs &in, int64_t i, Footprint &f, TileBox &box) {
-  f = {};
-  box = {0, 0, 0, 0, 0};
-  const float opacity = in.opacities[i];
-  if (!(opacity >= kAlphaMin)) return;
-  float norm;
-  const CameraGaussian g = to_camera(camera.cam_from_world, vec3_at(in.means, i), normalized(quat_at(in.quats, i), norm),
-                                     vec3_at(in.scales, i));
-  if (!(dot(g.mean, g.mean) > camera.near_radius * camera.near_radius)) return;
-  const float width = float(camera.width), height = float(camera.height);
-  const Chart chart = chart_at(g.mean, width, height);
-  const Covariance2D s = project_covariance(chart, g.spread, camera.low_pass);
-  if (!finite(s)) return;
-  const float rho = std::sqrt(g.mean.x * g.mean.x + g.mean.z * g.mean.z);
-  f.u = (std::atan2(g.mean.x, g.mean.z) / (2 * kPi) + 0.5f) * width;
-  f.v = (std::atan2(g.mean.y, rho) / kPi + 0.5f) * height;
+template <int kWidth>
+void store_items(float *array, int64_t first, int64_t count, const Vec *in) {
+  float lanes[kWidth][kLanes];
+  for (int k = 0; k < kWidth; ++k) store(lanes[k], in[k]);
+  const int end = int(std::min<int64_t>(kLanes, count - first));
+  for (int lane = 0; lane < end; ++lane)
+    for (int k = 0; k < kWidth; ++k) array[(first + lane) * kWidth + k] = lanes[k][lane];
+}
+
+// Sixteen Gaussians in the camera frame, with what their world-frame gradients need.
+struct Batch {
+  CameraGaussian<Vec> gaussian;
+  Quaternion<Vec> unit;
+  Vec norm;
+  Vec3<Vec> mean;  // world
+  Mat3<Vec> camera;
+
+  Batch(const Camera &cam, const Inputs &in, int64_t first) {
+    const float *p = cam.cam_from_world;
+    const auto column = [&](int k) { return Vec3<Vec>{splat(p[k]), splat(p[4 + k]), splat(p[8 + k])}; };
+    camera = {column(0), column(1), column(2)};
+    Vec m[3], q[4], s[3], o[1];
+    load_items<3>(in.means, first, in.count, m);
+    load_items<4>(in.quats, first, in.count, q);
+    load_items<3>(in.scales, first, in.count, s);
+    load_items<1>(in.opacities, first, in.count, o);
+    mean = {m[0], m[1], m[2]};
+    unit = normalized(Quaternion<Vec>{q[0], q[1], q[2], q[3]}, norm);
+    gaussian.orientation = times(camera, rotation(unit));
+    gaussian.mean = times(camera, mean) + column(3);
+    gaussian.scale = {s[0], s[1], s[2]};
+    gaussian.opacity = o[0];
+  }
+};
+
+// What one batch leaves: shapes and whatever the boxes need, lane by lane.
+struct Projected {
+  float shape[11][kLanes], opacity[kLanes], log2_opacity[kLanes], depth[kLanes], in_front[kLanes];
+  float bounds[10][kLanes];  // planar: half_u, half_v, uu, uv, vv;  projective: frame or dual cone
+};
+
+template <template <class> class Chart>
+void project_planar(const Camera &camera, const Inputs &in, int64_t first, const Batch &batch, Projected &out) {
+  const CameraGaussian<Vec> &g = batch.gaussian;
+  const Chart<Vec> chart(camera, g.mean);
+  const Covariance2D<Vec> s = project_covariance(g.spread(), chart.jacobian_u, chart.jacobian_v, camera.low_pass);
+  Vec u = chart.u, v = chart.v;
   if (in.probe) {
-    f.u += in.probe[2 * i] * 0.5f * width;
-    f.v += in.probe[2 * i + 1] * 0.5f * height;
+    Vec probe[2];
+    load_items<2>(in.probe, first, in.count, probe);
+    u += probe[0] * (0.5f * float(camera.width));
+    v += probe[1] * (0.5f * float(camera.height));
   }
-  const float k = 2 * std::log(opacity * 255.0f);  // alpha >= 1/255  <=>  q <= k
-  const float half_u = std::sqrt(std::max(k, 0.0f) * s.uu) * kSlack + kSlackPixels;
-  const float half_v = std::sqrt(std::max(k, 0.0f) * s.vv) * kSlack + kSlackPixels;
-  box = camera.square ? square_box(camera, f.u, f.v, s) : exact_box(camera, f.u, f.v, half_u, half_v);
-  // q = (s_vv du^2 - 2 s_uv du dv + s_uu dv^2) / det, scaled so that exp(-q / 2) = 2^-(...)
-  const float scale = std::sqrt(0.5f * 1.44269504088896f);
-  f.a = scale * std::sqrt(s.vv / s.determinant);
-  f.b = -scale * s.uv / std::sqrt(s.vv * s.determinant);
-  f.c = scale / std::sqrt(s.vv);
-  f.log2_opacity = std::log2(opacity);
-  f.row_reach = half_v;
-  f.depth = chart.r;
-  f.red = in.colors[3 * i];
-  f.green = in.colors[3 * i + 1];
-  f.blue = in.colors[3 * i + 2];
-  f.opacity = opacity;
+  const Vec log2_opacity = logarithm2(g.opacity);
+  const PlanarShape<Vec> shape = planar_shape(s, log2_opacity);
+  const Vec values[5] = {u, v, shape.a, shape.b, shape.c};
+  for (int k = 0; k < 5; ++k) store(out.shape[k], values[k]);
+  for (int k = 5; k < 11; ++k) store(out.shape[k], zero());
+  store(out.opacity, g.opacity);
+  store(out.log2_opacity, log2_opacity);
+  store(out.depth, chart.depth);
+  store(out.in_front, chart.in_front(camera.near_radius));
+  const Vec bounds[5] = {shape.half_u, shape.half_v, s.uu, s.uv, s.vv};
+  for (int k = 0; k < 5; ++k) store(out.bounds[k], bounds[k]);
 }
 
-// Moments of one Gaussian over all its instances, in the order of its slots.
-void sum_moments(const float *moments, int64_t first, int64_t end, float *total) {
-  std::fill_n(total, kMoments, 0.0f);
-  for (int64_t slot = first; slot < end; ++slot)
-    for (int k = 0; k < kMoments; ++k) total[k] += moments[slot * kMoments + k];
+// The probe of a projective footprint moves the mean itself, by the same share of the image on a panorama.
+Vec3<Vec> probed_mean(const Inputs &in, int64_t first, Vec3<Vec> mean) {
+  if (!in.probe) return mean;
+  Vec probe[2];
+  load_items<2>(in.probe, first, in.count, probe);
+  const SphereFrame<Vec> f = sphere_frame(mean);
+  return mean + scaled(probe[0] * kPi * f.r * f.cos_latitude, f.east) + scaled(probe[1] * (0.5f * kPi) * f.r, f.down);
 }
 
-void project_backward_one(const Camera &camera, const Inputs &in, const float *m, int64_t i, const Gradients &out,
-                          double *pose) {
-  float norm;
-  const Quat unit = normalized(quat_at(in.quats, i), norm);
-  const Vec3 mean = vec3_at(in.means, i), scale = vec3_at(in.scales, i);
-  const CameraGaussian g = to_camera(camera.cam_from_world, mean, unit, scale);
-  const Chart chart = chart_at(g.mean, float(camera.width), float(camera.height));
-  const Covariance2D s = project_covariance(chart, g.spread, camera.low_pass);
-  // M = dL/d(ln alpha), ln alpha = ln o - q / 2, conic C = S^-1:
-  //   dL/d(u, v) = C sum(M delta),  dL/dS = C sum(M delta delta^T) C / 2
-  const float ca = s.vv / s.determinant, cb = -s.uv / s.determinant, cc = s.uu / s.determinant;
-  FootprintGradient f;
-  f.u = ca * m[1] + cb * m[2];
-  f.v = cb * m[1] + cc * m[2];
-  const float t00 = ca * m[3] + cb * m[4], t01 = ca * m[4] + cb * m[5];
-  const float t10 = cb * m[3] + cc * m[4], t11 = cb * m[4] + cc * m[5];
-  f.uu = 0.5f * (t00 * ca + t01 * cb);
-  f.uv = 0.5f * (t00 * cb + t01 * cc);
-  f.vv = 0.5f * (t10 * cb + t11 * cc);
-  f.depth = m[9];
-  Vec3 grad_mean;
-  Mat3 grad_spread;
-  footprint_vjp(chart, s, g.spread, f, grad_mean, grad_spread);
+void store_projective(const ProjectiveShape<Vec> &s, Vec opacity, Vec depth, const Sym3<Vec> &dual, Projected &out) {
+  const Vec values[11] = {s.l0.x, s.l0.y, s.l0.z, s.l1.x, s.l1.y, s.l1.z, s.m.x, s.m.y, s.m.z, s.kappa, s.near_ratio};
+  for (int k = 0; k < 11; ++k) store(out.shape[k], values[k]);
+  const Vec bounds[6] = {dual.xx, dual.xy, dual.xz, dual.yy, dual.yz, dual.zz};
+  for (int k = 0; k < 6; ++k) store(out.bounds[k], bounds[k]);
+  store(out.opacity, opacity);
+  store(out.log2_opacity, logarithm2(larger(opacity, splat(1e-30f))));
+  store(out.depth, depth);
+}
 
-  const float *p = camera.cam_from_world;
-  const Mat3 r{{p[0], p[4], p[8]}, {p[1], p[5], p[9]}, {p[2], p[6], p[10]}};
-  const Vec3 world = transposed_times(r, grad_mean);
-  out.means[3 * i] = world.x, out.means[3 * i + 1] = world.y, out.means[3 * i + 2] = world.z;
-  out.scales[3 * i] = dot(grad_spread.c0, g.orientation.c0);
-  out.scales[3 * i + 1] = dot(grad_spread.c1, g.orientation.c1);
-  out.scales[3 * i + 2] = dot(grad_spread.c2, g.orientation.c2);
-  const Mat3 grad_orientation{scale.x * grad_spread.c0, scale.y * grad_spread.c1, scale.z * grad_spread.c2};
-  const Quat q = rotation_vjp(unit, norm,
-                              {transposed_times(r, grad_orientation.c0), transposed_times(r, grad_orientation.c1),
-                               transposed_times(r, grad_orientation.c2)});
-  out.quats[4 * i] = q.w, out.quats[4 * i + 1] = q.x, out.quats[4 * i + 2] = q.y, out.quats[4 * i + 3] = q.z;
-  out.opacities[i] = m[0] / in.opacities[i];
-  out.colors[3 * i] = m[6], out.colors[3 * i + 1] = m[7], out.colors[3 * i + 2] = m[8];
-  if (out.probe) {
-    out.probe[2 * i] = f.u * 0.5f * float(camera.width);
-    out.probe[2 * i + 1] = f.v * 0.5f * float(camera.height);
+// 2 ln(255 o): the largest q that is drawn.
+Vec largest_q(Vec opacity) {
+  return maximum((logarithm2(larger(opacity, splat(1e-30f))) + 7.994353437f) * (1.0f / kHalfLog2E), zero()) * kSlack;
+}
+
+void project_tangent(const Camera &camera, const Batch &batch, Projected &out) {
+  const CameraGaussian<Vec> &g = batch.gaussian;
+  const TangentModel<Vec> model(g, camera.low_pass);
+  store_projective(model.shape(), g.opacity, model.frame.r, model.dual_cone(largest_q(g.opacity)), out);
+  store(out.in_front, model.frame.r - camera.near_radius);
+}
+
+void project_ray(const Camera &camera, const Batch &batch, Projected &out) {
+  const CameraGaussian<Vec> &g = batch.gaussian;
+  const RayModel<Vec> model(g, camera.low_pass);
+  const Vec k = largest_q(model.opacity);
+  store_projective(model.shape(g, camera.near_radius), model.opacity, model.frame.r, model.dual_cone(g, k), out);
+  // Not drawn from inside: rho^2 <= 2 ln(255 o').
+  const Vec exact = (logarithm2(larger(model.opacity, splat(1e-30f))) + 7.994353437f) * (1.0f / kHalfLog2E);
+  store(out.in_front, minimum(model.frame.r - camera.near_radius, model.rho * model.rho - exact));
+}
+
+PixelBox box_of(const Camera &camera, const Projected &p, int lane) {
+  const auto bound = [&](int k) { return p.bounds[k][lane]; };
+  if (camera.projection == kErp || camera.projection == kPinhole) {
+    const float u = p.shape[0][lane], v = p.shape[1][lane];
+    if (camera.square) return square_box(camera, u, v, bound(2), bound(3), bound(4));
+    const float half_u = bound(0) * kSlack + kSlackPixels, half_v = bound(1) * kSlack + kSlackPixels;
+    return pixel_box(camera, {u - half_u, u + half_u, v - half_v, v + half_v});
   }
-  if (!pose) return;
-  // mean_cam = R mean + t, A = R (R_q diag(scale)): dL/dR = grad_mean mean^T + grad_A (R_q diag(scale))^T.
-  const Mat3 local = rotation(unit);
-  const Vec3 columns[3] = {local.c0, local.c1, local.c2};
-  const Vec3 grads[3] = {grad_orientation.c0, grad_orientation.c1, grad_orientation.c2};
-  const auto add_outer = [&](Vec3 a, Vec3 b) {
-    const float rows[3] = {a.x, a.y, a.z};
-    for (int k = 0; k < 3; ++k) {
-      pose[4 * k] += double(rows[k]) * b.x;
-      pose[4 * k + 1] += double(rows[k]) * b.y;
-      pose[4 * k + 2] += double(rows[k]) * b.z;
-    }
-  };
-  add_outer(grad_mean, mean);
-  for (int k = 0; k < 3; ++k) add_outer(grads[k], columns[k]);
-  pose[3] += grad_mean.x, pose[7] += grad_mean.y, pose[11] += grad_mean.z;
+  const Sym3<float> dual{bound(0), bound(1), bound(2), bound(3), bound(4), bound(5)};
+  const Vec3<float> mean{bound(6), bound(7), bound(8)};
+  if (camera.model == kPanoramaModel)
+    return pixel_box(camera, sphere_range(dual, sphere_frame(mean), float(camera.width), float(camera.height)));
+  if (camera.model == kPinholeModel) {
+    if (mean.z <= 0 && dual.zz < 0) return {0, 0, 0, 0, 0};  // all of it is behind the camera
+    return pixel_box(camera, pinhole_range(dual, camera));
+  }
+  return {0, camera.width, 0, 0, camera.height};  // a table may look anywhere
+}
+
+bool finite(const Projected &p, int lane) {
+  float total = p.depth[lane];
+  for (int k = 0; k < 11; ++k) total += std::fabs(p.shape[k][lane]);
+  return std::isfinite(total);
+}
+
+void forward_batch(const Camera &camera, const Inputs &in, int64_t first, Footprint *footprints, PixelBox *boxes) {
+  Batch batch(camera, in, first);
+  Projected p;
+  if (camera.projection == kErp) {
+    project_planar<ErpChart>(camera, in, first, batch, p);
+  } else if (camera.projection == kPinhole) {
+    project_planar<PinholeChart>(camera, in, first, batch, p);
+  } else {
+    batch.gaussian.mean = probed_mean(in, first, batch.gaussian.mean);
+    camera.projection == kTangent ? project_tangent(camera, batch, p) : project_ray(camera, batch, p);
+    const Vec mean[3] = {batch.gaussian.mean.x, batch.gaussian.mean.y, batch.gaussian.mean.z};
+    for (int k = 0; k < 3; ++k) store(p.bounds[6 + k], mean[k]);
+  }
+  const int end = int(std::min<int64_t>(kLanes, in.count - first));
+  for (int lane = 0; lane < end; ++lane) {
+    Footprint &f = footprints[first + lane];
+    PixelBox &box = boxes[first + lane];
+    box = {0, 0, 0, 0, 0};
+    if (p.opacity[lane] >= kAlphaMin && p.in_front[lane] > 0 && finite(p, lane)) box = box_of(camera, p, lane);
+    for (int k = 0; k < 11; ++k) f.shape[k] = p.shape[k][lane];
+    f.log2_opacity = p.log2_opacity[lane];
+    f.depth = p.depth[lane];
+    std::memcpy(&f.red, in.colors + 3 * (first + lane), 3 * sizeof(float));
+  }
+}
+
+struct Backward {
+  CameraGaussianGradient<Vec> gradient;
+  Vec probe_u, probe_v;
+};
+
+template <template <class> class Chart>
+Backward planar_backward(const Camera &camera, const CameraGaussian<Vec> &g, const Vec *m, Vec grad_depth) {
+  const Chart<Vec> chart(camera, g.mean);
+  const Covariance2D<Vec> s = project_covariance(g.spread(), chart.jacobian_u, chart.jacobian_v, camera.low_pass);
+  PlanarGradient<Vec> f = planar_gradient(s, m);
+  f.depth = grad_depth;
+  Backward out{planar_vjp(g, chart, s, f), f.u * (0.5f * float(camera.width)), f.v * (0.5f * float(camera.height))};
+  out.gradient.log_opacity = m[0];
+  return out;
+}
+
+Backward projective_backward(const Camera &camera, const CameraGaussian<Vec> &g, const Vec *m, Vec grad_depth) {
+  const ProjectiveMoments<Vec> moments = projective_moments(m);
+  Backward out;
+  out.gradient = camera.projection == kTangent ? TangentModel<Vec>(g, camera.low_pass).vjp(g, moments, grad_depth)
+                                               : RayModel<Vec>(g, camera.low_pass).vjp(g, moments, grad_depth);
+  const SphereFrame<Vec> f = sphere_frame(g.mean);
+  out.probe_u = dot(out.gradient.mean, f.east) * f.r * f.cos_latitude * kPi;
+  out.probe_v = dot(out.gradient.mean, f.down) * f.r * (0.5f * kPi);
+  return out;
+}
+
+void add_pose(const Batch &batch, const CameraGaussianGradient<Vec> &g, double *pose) {
+  // mean_cam = R mean + t and orientation = R R_q: dL/dR = grad_mean mean^T + grad_orientation R_q^T.
+  const Mat3<Vec> local = rotation(batch.unit);
+  const Vec3<Vec> a = g.mean, m = batch.mean;
+  const Mat3<Vec> &o = g.orientation;
+  const Vec rows[3][3] = {{a.x, o.c0.x, o.c1.x}, {a.y, o.c0.y, o.c1.y}, {a.z, o.c0.z, o.c1.z}};
+  const Vec last[3] = {o.c2.x, o.c2.y, o.c2.z}, moved[3] = {a.x, a.y, a.z};
+  for (int k = 0; k < 3; ++k) {
+    const Vec *r = rows[k];
+    pose[4 * k] += sum(r[0] * m.x + r[1] * local.c0.x + r[2] * local.c1.x + last[k] * local.c2.x);
+    pose[4 * k + 1] += sum(r[0] * m.y + r[1] * local.c0.y + r[2] * local.c1.y + last[k] * local.c2.y);
+    pose[4 * k + 2] += sum(r[0] * m.z + r[1] * local.c0.z + r[2] * local.c1.z + last[k] * local.c2.z);
+    pose[4 * k + 3] += sum(moved[k]);
+  }
+}
+
+// Gradients of sixteen Gaussians from their moments. Where all moments are 0, so are the gradients.
+void backward_batch(const Camera &camera, const Inputs &in, const float *moments, int64_t first, const Gradients &out,
+                    double *pose) {
+  Batch batch(camera, in, first);
+  Vec m[kMoments], active = zero();
+  load_items<kMoments>(moments, first, in.count, m);
+  for (int k = 0; k < kMoments; ++k) active += magnitude(m[k]);
+  const int end = int(std::min<int64_t>(kLanes, in.count - first));
+  const Vec on = select(less(zero(), active), select(less(iota(), splat(float(end))), splat(1.0f), zero()), zero());
+  const Vec grad_depth = m[13];
+  CameraGaussian<Vec> &g = batch.gaussian;
+  if (camera.projection == kTangent || camera.projection == kRay) g.mean = probed_mean(in, first, g.mean);
+  Backward b = camera.projection == kErp       ? planar_backward<ErpChart>(camera, g, m, grad_depth)
+               : camera.projection == kPinhole ? planar_backward<PinholeChart>(camera, g, m, grad_depth)
+                                               : projective_backward(camera, g, m, grad_depth);
+  // Lanes that drew nothing may hold anything, infinities too; they are replaced, not multiplied.
+  const auto clean = [&](Vec v) { return select(less(zero(), on), v, zero()); };
+  const auto clean3 = [&](Vec3<Vec> v) { return Vec3<Vec>{clean(v.x), clean(v.y), clean(v.z)}; };
+  b.gradient.mean = clean3(b.gradient.mean);
+  b.gradient.scale = clean3(b.gradient.scale);
+  b.gradient.orientation = {clean3(b.gradient.orientation.c0), clean3(b.gradient.orientation.c1),
+                            clean3(b.gradient.orientation.c2)};
+  const Vec3<Vec> mean = transposed_times(batch.camera, b.gradient.mean);
+  const Mat3<Vec> &o = b.gradient.orientation;
+  const Quaternion<Vec> q =
+      rotation_vjp(batch.unit, batch.norm, Mat3<Vec>{transposed_times(batch.camera, o.c0), transposed_times(batch.camera, o.c1),
+                                           transposed_times(batch.camera, o.c2)});
+  const Vec means[3] = {mean.x, mean.y, mean.z}, quats[4] = {clean(q.w), clean(q.x), clean(q.y), clean(q.z)};
+  const Vec scales[3] = {b.gradient.scale.x, b.gradient.scale.y, b.gradient.scale.z};
+  const Vec opacities[1] = {clean(b.gradient.log_opacity / g.opacity)}, colors[3] = {m[10], m[11], m[12]};
+  const Vec probe[2] = {clean(b.probe_u), clean(b.probe_v)};
+  store_items<3>(out.means, first, in.count, means);
+  store_items<4>(out.quats, first, in.count, quats);
+  store_items<3>(out.scales, first, in.count, scales);
+  store_items<1>(out.opacities, first, in.count, opacities);
+  store_items<3>(out.colors, first, in.count, colors);
+  if (out.probe) store_items<2>(out.probe, first, in.count, probe);
+  if (pose) add_pose(batch, b.gradient, pose);
+}
+
+void forward(const Camera &camera, const Inputs &in, Footprint *footprints, PixelBox *boxes) {
+#pragma omp parallel for schedule(static)
+  for (int64_t first = 0; first < in.count; first += kLanes) forward_batch(camera, in, first, footprints, boxes);
+}
+
+void backward(const Camera &camera, const Inputs &in, const float *moments, const Gradients &out) {
+  const int64_t blocks = (in.count + kBlock - 1) / kBlock;
+  std::vector<double> poses(out.pose ? 12 * blocks : 0, 0.0);
+#pragma omp parallel for schedule(static)
+  for (int64_t block = 0; block < blocks; ++block) {
+    double *pose = out.pose ? poses.data() + 12 * block : nullptr;
+    for (int64_t first = block * kBlock; first < std::min(in.count, (block + 1) * kBlock); first += kLanes)
+      backward_batch(camera, in, moments, first, out, pose);
+  }
+  if (!out.pose) return;
+  std::fill_n(out.pose, 12, 0.0);
+  for (int64_t block = 0; block < blocks; ++block)
+    for (int k = 0; k < 12; ++k) out.pose[k] += poses[12 * block + k];
 }
 
 }  // namespace
+
+extern const ProjectKernels project_kernels;
+const ProjectKernels project_kernels = {forward, backward};
+
+}  // namespace PADGS_ISA
 }  // namespace padgs
-
-using namespace padgs;
-
-PADGS_API void padgs_project(const Camera *camera, const Inputs *in, Footprint *footprints, TileBox *boxes) {
-#pragma omp parallel for schedule(static)
-  for (int64_t i = 0; i < in->count; ++i) project_one(*camera, *in, i, footprints[i], boxes[i]);
-}
-
-// Gradients of every input from the moments of the instances; slot_start [N + 1] says whose is which.
-PADGS_API void padgs_project_backward(const Camera *camera, const Inputs *in, const int64_t *slot_start,
-                                      const float *moments, const Gradients *out) {
-  const int64_t blocks = (in->count + kBlock - 1) / kBlock;
-  std::vector<double> poses(out->pose ? 12 * blocks : 0, 0.0);
-#pragma omp parallel for schedule(dynamic, 4)
-  for (int64_t block = 0; block < blocks; ++block) {
-    double *pose = out->pose ? poses.data() + 12 * block : nullptr;
-    for (int64_t i = block * kBlock; i < std::min(in->count, (block + 1) * kBlock); ++i) {
-      if (slot_start[i] == slot_start[i + 1]) continue;  // the caller has filled the outputs with zeros
-      float total[kMoments];
-      sum_moments(moments, slot_start[i], slot_start[i + 1], total);
-      project_backward_one(*camera, *in, total, i, *out, pose);
-    }
-  }
-  if (!out->pose) return;
-  std::fill_n(out->pose, 12, 0.0);
-  for (int64_t block = 0; block < blocks; ++block)
-    for (int k = 0; k < 12; ++k) out->pose[k] += poses[12 * block + k];
-}

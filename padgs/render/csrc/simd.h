@@ -135,15 +135,24 @@ PADGS_INLINE Vec scale_by_power(Vec a, Vec n) {
 
 PADGS_INLINE Vec keep(Mask m, Vec a) { return select(m, a, zero()); }
 
-// Sum of all lanes by halving.
-PADGS_INLINE float sum(Vec v) {
-  alignas(64) float lanes[kLanes];
-  store(lanes, v);
-  typedef float Quarter __attribute__((vector_size(16)));
+// Four registers of 16 bytes that add up to a vector's, and sums of all lanes in a fixed order.
+typedef float Quarter __attribute__((vector_size(16)));
+PADGS_INLINE Quarter folded(Vec v) {
   Quarter q[4];
-  std::memcpy(q, lanes, sizeof q);
-  const Quarter s = (q[0] + q[2]) + (q[1] + q[3]);
+  std::memcpy(q, &v, sizeof q);
+  return (q[0] + q[2]) + (q[1] + q[3]);
+}
+PADGS_INLINE float sum(Vec v) {
+  const Quarter s = folded(v);
   return (s[0] + s[2]) + (s[1] + s[3]);
+}
+// The sums of four vectors at once.
+PADGS_INLINE void sum4(const Vec *v, float *out) {
+  const Quarter a = folded(v[0]), b = folded(v[1]), c = folded(v[2]), d = folded(v[3]);
+  const Quarter ab = __builtin_shufflevector(a, b, 0, 4, 1, 5) + __builtin_shufflevector(a, b, 2, 6, 3, 7);
+  const Quarter cd = __builtin_shufflevector(c, d, 0, 4, 1, 5) + __builtin_shufflevector(c, d, 2, 6, 3, 7);
+  const Quarter total = __builtin_shufflevector(ab, cd, 0, 1, 4, 5) + __builtin_shufflevector(ab, cd, 2, 3, 6, 7);
+  std::memcpy(out, &total, sizeof total);
 }
 
 // 2^x to 2.3e-7 relative for x in [-100, 100]: 2^round(x) times a degree-5 minimax polynomial of the rest.

@@ -1,0 +1,184 @@
+// Projective footprints: one kernel for every model that works with rays. With a pixel's unit ray d,
+//   n = |L d|^2,  b = m.d,  D = b^2 + kappa n,  q = n / D,  accepted where b > 0 and b > near_ratio D.
+// `tangent`: the Gaussian flattened onto the tangent plane at its mean (OP43DGS, corrected). kappa = 0.
+// `ray`: the largest value of the 3D Gaussian along the ray (SPaGS), after a 3D low-pass that grows with distance.
+//
+// Backward blending sums, over the pixels, M = dL/d(ln alpha) times 1, c and c c^T with c = (q, x b / D, y b / D) and
+// (x, y) = L d. Both models' derivatives are linear in these ten sums.
+#pragma once
+
+#include "abi.h"
+#include "vector3.h"
+
+namespace padgs {
+
+template <class T>
+struct ProjectiveShape {
+  Vec3<T> l0, l1, m;
+  T kappa, near_ratio;
+};
+
+// The ten sums, by name.
+template <class T>
+struct ProjectiveMoments {
+  T one, c0, c1, c2, c00, c01, c02, c11, c12, c22;
+};
+template <class T>
+PADGS_HD ProjectiveMoments<T> projective_moments(const T *m) {
+  return {m[0], m[1], m[2], m[3], m[4], m[5], m[6], m[7], m[8], m[9]};
+}
+
+template <class T>
+struct TangentModel {
+  SphereFrame<T> frame;
+  Mat3<T> local;              // orientation in (east, down, normal): rows are components
+  T a_ee, a_ed, a_dd;         // E Sigma E^T
+  T a_en, a_dn;               // E Sigma n
+  T c11, c21, c22;            // Cholesky factor of S = E Sigma E^T / r^2 + low_pass I
+  T opacity;
+
+  PADGS_HD TangentModel(const CameraGaussian<T> &g, float low_pass) : frame(sphere_frame(g.mean)), opacity(g.opacity) {
+    const Mat3<T> spread = g.spread();
+    const Vec3<T> e = transposed_times(spread, frame.east), d = transposed_times(spread, frame.down);
+    const Vec3<T> n = transposed_times(spread, frame.normal);
+    a_ee = dot(e, e), a_ed = dot(e, d), a_dd = dot(d, d), a_en = dot(e, n), a_dn = dot(d, n);
+    const T inverse = 1.0f / (frame.r * frame.r);
+    const Vec3<T> minors = cross(e, d);
+    const T s_ee = a_ee * inverse + low_pass, s_ed = a_ed * inverse;
+    const T determinant = dot(minors, minors) * inverse * inverse + low_pass * (a_ee + a_dd) * inverse + low_pass * low_pass;
+    c11 = root(s_ee);
+    c21 = s_ed / c11;
+    c22 = root(determinant / s_ee);
+  }
+
+  PADGS_HD ProjectiveShape<T> shape() const {
+    const Vec3<T> l0 = scaled(1.0f / c11, frame.east);
+    const Vec3<T> l1 = scaled(1.0f / c22, frame.down - scaled(c21, l0));
+    return {l0, l1, frame.normal, constant(0.0f, c11), constant(0.0f, c11)};
+  }
+
+  // The cone of rays with q <= k as the dual cone K* = k E^T S E - n n^T, with S restored from its factor.
+  PADGS_HD Sym3<T> dual_cone(T k) const {
+    const T ee = k * c11 * c11, ed = k * c11 * c21, dd = k * (c21 * c21 + c22 * c22);
+    const Vec3<T> e = frame.east, d = frame.down, n = frame.normal;
+    const Vec3<T> p = scaled(ee, e) + scaled(ed, d), q = scaled(ed, e) + scaled(dd, d);
+    return {e.x * p.x + d.x * q.x - n.x * n.x, e.x * p.y + d.x * q.y - n.x * n.y, e.x * p.z + d.x * q.z - n.x * n.z,
+            e.y * p.y + d.y * q.y - n.y * n.y, e.y * p.z + d.y * q.z - n.y * n.z, e.z * p.z + d.z * q.z - n.z * n.z};
+  }
+
+  // With y = C^-1 tau, g = S^-1 tau = C^-T y:
+  //   dL/dSigma = E^T (sum M g g^T) E / (2 r^2)
+  //   dL/dmu = [E^T sum M (I + tau tau^T) g - (E^T W v + tr(A W) n) / r^2] / r,  W = sum M g g^T, v = E Sigma n
+  PADGS_HD CameraGaussianGradient<T> vjp(const CameraGaussian<T> &g, const ProjectiveMoments<T> &m, T grad_depth) const {
+    const T i11 = 1.0f / c11, i22 = 1.0f / c22, i21 = -(c21 * i11 * i22);  // C^-1
+    const T w_ee = i11 * i11 * m.c11 + 2.0f * i11 * i21 * m.c12 + i21 * i21 * m.c22;
+    const T w_ed = i22 * (i11 * m.c12 + i21 * m.c22), w_dd = i22 * i22 * m.c22;
+    const T g_e = i11 * m.c1 + i21 * m.c2 + c11 * m.c01;
+    const T g_d = i22 * m.c2 + c21 * m.c01 + c22 * m.c02;
+    const T inverse = 1.0f / frame.r, inverse2 = inverse * inverse;
+    const T along_e = g_e - inverse2 * (w_ee * a_en + w_ed * a_dn);
+    const T along_d = g_d - inverse2 * (w_ed * a_en + w_dd * a_dn);
+    const T along_n = -(inverse2 * (a_ee * w_ee + 2.0f * a_ed * w_ed + a_dd * w_dd));
+    CameraGaussianGradient<T> out;
+    out.mean = scaled(inverse * along_e, frame.east) + scaled(inverse * along_d, frame.down) +
+               scaled(inverse * along_n + grad_depth, frame.normal);
+    out.log_opacity = m.one;
+    // dL/dA = 2 (dL/dSigma) A.
+    const Mat3<T> spread = g.spread();
+    const auto column = [&](Vec3<T> a) {
+      const T e = dot(frame.east, a), d = dot(frame.down, a);
+      return scaled(inverse2 * (w_ee * e + w_ed * d), frame.east) + scaled(inverse2 * (w_ed * e + w_dd * d), frame.down);
+    };
+    spread_vjp(g, Mat3<T>{column(spread.c0), column(spread.c1), column(spread.c2)}, out);
+    return out;
+  }
+};
+
+template <class T>
+struct RayModel {
+  SphereFrame<T> frame;
+  Vec3<T> wide;  // standard deviations after the low-pass: wide^2 = scale^2 + v r^2 / f^2
+  float filter;  // v / f^2
+  Vec3<T> o;     // M^-1 mean, the mean in whitened coordinates
+  T rho;         // |o|: how many standard deviations the camera is away
+  T opacity;     // compensated: o sqrt(det Sigma / det Sigma')
+  Vec3<T> o_hat, u1, u2;
+
+  PADGS_HD RayModel(const CameraGaussian<T> &g, float low_pass) : frame(sphere_frame(g.mean)), filter(low_pass) {
+    const T add = low_pass * frame.r * frame.r;
+    wide = {root(g.scale.x * g.scale.x + add), root(g.scale.y * g.scale.y + add), root(g.scale.z * g.scale.z + add)};
+    const Vec3<T> local = transposed_times(g.orientation, g.mean);
+    o = {local.x / wide.x, local.y / wide.y, local.z / wide.z};
+    rho = root(dot(o, o));
+    opacity = g.opacity * (g.scale.x / wide.x) * (g.scale.y / wide.y) * (g.scale.z / wide.z);
+    o_hat = scaled(1.0f / rho, o);
+    // Any two unit vectors that complete o_hat: cross it with the axis it is least along.
+    const T ax = magnitude(o_hat.x), ay = magnitude(o_hat.y), az = magnitude(o_hat.z);
+    const T zero = constant(0.0f, rho), one = constant(1.0f, rho);
+    const T least = smaller(ax, smaller(ay, az));
+    const T is_x = where(below(least, ax), zero, one), is_y = (1.0f - is_x) * where(below(least, ay), zero, one);
+    const Vec3<T> axis{is_x, is_y, 1.0f - is_x - is_y};
+    const Vec3<T> side = cross(o_hat, axis);
+    u1 = scaled(1.0f / root(dot(side, side)), side);
+    u2 = cross(o_hat, u1);
+  }
+
+  // R diag(1 / wide) applied to a whitened covector: M^-T w.
+  PADGS_HD Vec3<T> from_whitened(const CameraGaussian<T> &g, Vec3<T> w) const {
+    return times(g.orientation, Vec3<T>{w.x / wide.x, w.y / wide.y, w.z / wide.z});
+  }
+
+  PADGS_HD ProjectiveShape<T> shape(const CameraGaussian<T> &g, float near_radius) const {
+    return {scaled(rho, from_whitened(g, u1)), scaled(rho, from_whitened(g, u2)), from_whitened(g, o_hat),
+            1.0f / (rho * rho), near_radius / rho};
+  }
+
+  // K* = k Sigma' / r^2 - n n^T.
+  PADGS_HD Sym3<T> dual_cone(const CameraGaussian<T> &g, T k) const {
+    const T scale = k / (frame.r * frame.r);
+    Sym3<T> s = congruent(g.orientation, {scale * wide.x * wide.x, scale * wide.y * wide.y, scale * wide.z * wide.z});
+    const Vec3<T> n = frame.normal;
+    s.xx = s.xx - n.x * n.x, s.xy = s.xy - n.x * n.y, s.xz = s.xz - n.x * n.z;
+    s.yy = s.yy - n.y * n.y, s.yz = s.yz - n.y * n.z, s.zz = s.zz - n.z * n.z;
+    return s;
+  }
+
+  // The closest point of a ray to the mean, in whitened space, is off by e = [o_hat u1 u2] (c0 / rho, -c1, -c2); with
+  // h = M^-T e:  dL/dmu = -sum M h,  dL/dSigma' = sum M h h^T / 2,  and Sigma' depends on mu by its low-pass.
+  PADGS_HD CameraGaussianGradient<T> vjp(const CameraGaussian<T> &g, const ProjectiveMoments<T> &m, T grad_depth) const {
+    const T inverse_rho = 1.0f / rho;
+    const Mat3<T> basis{scaled(inverse_rho, o_hat), scaled(constant(-1.0f, rho), u1), scaled(constant(-1.0f, rho), u2)};
+    const Vec3<T> e = times(basis, Vec3<T>{m.c0, m.c1, m.c2});
+    const Vec3<T> h = from_whitened(g, e);
+    // E = sum M e e^T in whitened axes; dL/dM^T-frame: dL/dSigma' = R diag(1/w) E diag(1/w) R^T / 2.
+    const Vec3<T> r0 = times(basis, Vec3<T>{m.c00, m.c01, m.c02}), r1 = times(basis, Vec3<T>{m.c01, m.c11, m.c12});
+    const Vec3<T> r2 = times(basis, Vec3<T>{m.c02, m.c12, m.c22});
+    const Mat3<T> half{r0, r1, r2};  // B C, columns
+    const auto entry = [&](Vec3<T> row_of_basis, Vec3<T> row_of_half) { return dot(row_of_basis, row_of_half); };
+    const Vec3<T> b0{basis.c0.x, basis.c1.x, basis.c2.x}, b1{basis.c0.y, basis.c1.y, basis.c2.y};
+    const Vec3<T> b2{basis.c0.z, basis.c1.z, basis.c2.z};
+    const Vec3<T> h0{half.c0.x, half.c1.x, half.c2.x}, h1{half.c0.y, half.c1.y, half.c2.y};
+    const Vec3<T> h2{half.c0.z, half.c1.z, half.c2.z};
+    const T ix = 1.0f / wide.x, iy = 1.0f / wide.y, iz = 1.0f / wide.z;
+    // G = R^T (dL/dSigma') R in the Gaussian's own axes.
+    const T gxx = 0.5f * ix * ix * entry(b0, h0), gyy = 0.5f * iy * iy * entry(b1, h1), gzz = 0.5f * iz * iz * entry(b2, h2);
+    const T gxy = 0.5f * ix * iy * entry(b0, h1), gxz = 0.5f * ix * iz * entry(b0, h2), gyz = 0.5f * iy * iz * entry(b1, h2);
+    CameraGaussianGradient<T> out;
+    out.log_opacity = m.one;
+    // Sigma'_ii = scale_i^2 + add, and ln o' = ln o + sum(ln scale_i - ln wide_i).
+    const T add_grad = gxx + gyy + gzz - 0.5f * m.one * (ix * ix + iy * iy + iz * iz);
+    const Vec3<T> s = g.scale;
+    out.scale = {2.0f * s.x * gxx + m.one * (1.0f / s.x - s.x * ix * ix),
+                 2.0f * s.y * gyy + m.one * (1.0f / s.y - s.y * iy * iy),
+                 2.0f * s.z * gzz + m.one * (1.0f / s.z - s.z * iz * iz)};
+    out.mean = scaled(2.0f * filter * add_grad, g.mean) + scaled(grad_depth, frame.normal) - h;
+    // dL/dR = 2 R G diag(wide^2).
+    const T wx = 2.0f * wide.x * wide.x, wy = 2.0f * wide.y * wide.y, wz = 2.0f * wide.z * wide.z;
+    out.orientation = {scaled(wx, times(g.orientation, Vec3<T>{gxx, gxy, gxz})),
+                       scaled(wy, times(g.orientation, Vec3<T>{gxy, gyy, gyz})),
+                       scaled(wz, times(g.orientation, Vec3<T>{gxz, gyz, gzz}))};
+    return out;
+  }
+};
+
+}  // namespace padgs

@@ -1,0 +1,87 @@
+"""Cameras as the native library takes them."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from padgs.camera import Camera, Panorama, Pinhole, RayTable
+from padgs.panorama import row_latitudes
+from padgs.render import native
+from padgs.render.contract import RenderOptions
+from padgs.render.native import pointer
+
+CHUNK = 16  # pixels; rows of ray tables are padded to whole chunks
+PROJECTIONS = ("erp", "pinhole", "tangent", "ray")  # numbered as in csrc/abi.h
+MODELS = (Panorama, Pinhole, RayTable)
+
+
+@dataclass(frozen=True)
+class NativeRays:
+    """The tensors behind a `native.Rays`, which only points to them."""
+
+    column_sine: Tensor | None = None  # [padded W]
+    column_cosine: Tensor | None = None
+    row_sine: Tensor | None = None  # [H]
+    row_cosine: Tensor | None = None
+    table: Tensor | None = None  # [H, 3, padded W]
+
+    def native(self) -> native.Rays:
+        """Pointers to the tensors; they must outlive it."""
+        return native.Rays(
+            *map(pointer, (self.column_sine, self.column_cosine, self.row_sine, self.row_cosine, self.table))
+        )
+
+
+def native_camera(cam_from_world: Tensor, camera: Camera, options: RenderOptions) -> native.Camera:
+    """Pose, camera and options in one structure.
+
+    Raises:
+        ValueError: a projection that the library does not know.
+    """
+    if options.projection not in PROJECTIONS:
+        raise ValueError(
+            f"backend cpu does not know projection {options.projection!r}; known: {', '.join(PROJECTIONS)}"
+        )
+    planar = options.projection in ("erp", "pinhole")
+    lens = (camera.fx, camera.fy, camera.cx, camera.cy) if isinstance(camera, Pinhole) else (0.0, 0.0, 0.0, 0.0)
+    return native.Camera(
+        camera.width,
+        camera.height,
+        PROJECTIONS.index(options.projection),
+        MODELS.index(type(camera)),
+        (ctypes.c_float * 12)(*cam_from_world[:3].detach().reshape(-1).tolist()),
+        options.near,
+        options.low_pass if planar else options.low_pass / camera.focal**2,
+        options.wrap and isinstance(camera, Panorama),
+        options.bounds == "square",
+        *lens,
+    )
+
+
+def native_rays(camera: Camera) -> NativeRays:
+    """Directions of the pixels; computed once for cameras that are formulas."""
+    if isinstance(camera, RayTable):
+        return NativeRays(table=_padded_table(camera.table.detach()))
+    return _formula_rays(camera)
+
+
+@functools.lru_cache(maxsize=16)
+def _formula_rays(camera: Panorama | Pinhole) -> NativeRays:
+    if isinstance(camera, Pinhole):
+        return NativeRays(table=_padded_table(camera.rays()))
+    padded = -(-camera.width // CHUNK) * CHUNK
+    longitude = ((torch.arange(padded, dtype=torch.float64) + 0.5) / camera.width - 0.5) * (2 * torch.pi)
+    latitude = row_latitudes(camera.height, dtype=torch.float64)
+    return NativeRays(
+        *(angles.float() for angles in (longitude.sin(), longitude.cos(), latitude.sin(), latitude.cos()))
+    )
+
+
+def _padded_table(rays: Tensor) -> Tensor:
+    padding = -rays.shape[1] % CHUNK  # with copies of the last column: any direction, but a direction
+    return torch.nn.functional.pad(rays.permute(0, 2, 1), (0, padding), mode="replicate").contiguous()

@@ -1,0 +1,146 @@
+"""Planar footprints (torch): a 2D Gaussian in pixels, through the Jacobian of the camera at the mean (Eq. 3, 5).
+
+erp is the chart model of OmniGS, ODGS and PaD-GS; pinhole is the one of ordinary 3D Gaussian splatting.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from padgs.camera import Panorama, Pinhole
+from padgs.gaussians import Gaussians
+from padgs.panorama import longitude_latitude, pixel_from_angles, projection_jacobian
+from padgs.render.contract import ALPHA_MIN, RenderOptions
+from padgs.render.projection import Footprints, camera_frame
+
+MIN_COS_LATITUDE = 1e-4  # an erp footprint nearer to the axis than 0.006 degrees is undefined; see design.md section 3
+SLOPE_LIMIT = 1.3  # pinhole: slopes in the Jacobian are limited to this times the half field of view
+
+
+@dataclass(frozen=True)
+class PlanarFootprints(Footprints):
+    """Projected Gaussians in pixels."""
+
+    centers: Tensor  # [N, 2] (u, v)
+    conics: Tensor  # [N, 3] (A, B, C) of the inverse covariance [[A, B], [B, C]]
+    boxes: Tensor  # [N, 4] pixel indices drawn: first column, end column, first row, end row; columns not reduced mod W
+    turn: float  # pixels after which columns repeat (the width, with wrap), or infinity
+
+    def squared_distance(self, indices: Tensor, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
+        """q = delta^T S^-1 delta, delta from the nearest copy of the centre across the seam."""
+        centers, conics, boxes = self.centers[indices], self.conics[indices], self.boxes[indices]
+        dv = rows[:, None] + 0.5 - centers[:, 1]
+        du = columns[:, None] + 0.5 - centers[:, 0]
+        columns = columns[:, None].to(centers)
+        if self.turn < torch.inf:  # into [-W/2, W/2)
+            turns = torch.floor(du.detach() / self.turn + 0.5)
+            du, columns = du - turns * self.turn, columns - turns * self.turn
+        a, b, c = conics.unbind(-1)
+        q = a * du * du + 2 * b * du * dv + c * dv * dv
+        rows = rows[:, None]
+        inside = (columns >= boxes[:, 0]) & (columns < boxes[:, 1]) & (rows >= boxes[:, 2]) & (rows < boxes[:, 3])
+        return q, inside
+
+
+def project_erp(
+    gaussians: Gaussians,
+    cam_from_world: Tensor,
+    camera: Panorama,
+    options: RenderOptions,
+    probe: Tensor | None = None,
+) -> PlanarFootprints:
+    """Chart model: mean through Eq. 6-7, covariance through their Jacobian (Eq. 3, 5)."""
+    means, orientations = camera_frame(gaussians, cam_from_world)
+    squared_radius = (means * means).sum(-1).detach()
+    in_front = squared_radius > options.near**2
+    # Next to the axis the chart has no derivative worth the name; such a footprint is held constant.
+    near_axis = (means[:, 0] ** 2 + means[:, 2] ** 2).detach() < MIN_COS_LATITUDE**2 * squared_radius
+    means = torch.where(near_axis[:, None], means.detach(), means)
+    centers = pixel_from_angles(*longitude_latitude(means), camera.width, camera.height)
+    jacobian = projection_jacobian(means, camera.width, camera.height, min_cos_latitude=MIN_COS_LATITUDE)
+    return _footprints(gaussians, means, orientations, centers, jacobian, in_front, camera, options, probe)
+
+
+def project_pinhole(
+    gaussians: Gaussians,
+    cam_from_world: Tensor,
+    camera: Pinhole,
+    options: RenderOptions,
+    probe: Tensor | None = None,
+) -> PlanarFootprints:
+    """The perspective model of 3D Gaussian splatting: u = fx x / z + cx, Jacobian with limited slopes."""
+    means, orientations = camera_frame(gaussians, cam_from_world)
+    in_front = means[:, 2].detach() > options.near
+    x, y, z = means.unbind(-1)
+    centers = torch.stack((camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy), dim=-1)
+    limit_x = SLOPE_LIMIT * 0.5 * camera.width / camera.fx
+    limit_y = SLOPE_LIMIT * 0.5 * camera.height / camera.fy
+    zero = torch.zeros_like(z)
+    row_u = torch.stack((camera.fx / z, zero, -camera.fx / z * (x / z).clamp(-limit_x, limit_x)), dim=-1)
+    row_v = torch.stack((zero, camera.fy / z, -camera.fy / z * (y / z).clamp(-limit_y, limit_y)), dim=-1)
+    jacobian = torch.stack((row_u, row_v), dim=-2)
+    return _footprints(gaussians, means, orientations, centers, jacobian, in_front, camera, options, probe)
+
+
+def _footprints(
+    gaussians: Gaussians,
+    means: Tensor,
+    orientations: Tensor,
+    centers: Tensor,
+    jacobian: Tensor,
+    in_front: Tensor,
+    camera: Panorama | Pinhole,
+    options: RenderOptions,
+    probe: Tensor | None,
+) -> PlanarFootprints:
+    if probe is not None:
+        centers = centers + probe * centers.new_tensor([camera.width / 2, camera.height / 2])
+    half_covariance = jacobian @ (orientations * gaussians.scales[:, None, :])  # [N, 2, 3]
+    var_u, var_v = (half_covariance**2).sum(-1).unbind(-1)
+    cov_uv = (half_covariance[:, 0] * half_covariance[:, 1]).sum(-1)
+    # det(S) without the cancelling difference var_u var_v - cov_uv^2: Lagrange's identity plus the low-pass terms.
+    minors = torch.linalg.cross(half_covariance[:, 0], half_covariance[:, 1])
+    determinant = (minors**2).sum(-1) + options.low_pass * (var_u + var_v) + options.low_pass**2
+    var_u, var_v = var_u + options.low_pass, var_v + options.low_pass
+    conics = torch.stack((var_v, -cov_uv, var_u), dim=-1) / determinant[:, None]
+    covariance = torch.stack((var_u, cov_uv, var_v), dim=-1).detach()
+    opacities = gaussians.opacities.detach()
+    bound = _square_boxes if options.bounds == "square" else _exact_boxes
+    boxes = bound(centers.detach(), covariance, opacities)
+    on_image = (boxes[:, 3] > boxes[:, 2]) & (boxes[:, 3] > 0) & (boxes[:, 2] < camera.height)
+    on_image &= boxes[:, 1] > boxes[:, 0]
+    wrap = options.wrap and isinstance(camera, Panorama)
+    if not wrap:
+        on_image &= (boxes[:, 1] > 0) & (boxes[:, 0] < camera.width)
+    sound = torch.isfinite(determinant.detach()) & (determinant.detach() > 0)  # else float overflows or nothing spreads
+    visible = in_front & (opacities >= ALPHA_MIN) & on_image & sound
+    turn = float(camera.width) if wrap else torch.inf
+    return PlanarFootprints(gaussians.opacities, means.norm(dim=-1), visible, centers, conics, boxes, turn)
+
+
+def _exact_boxes(centers: Tensor, covariance: Tensor, opacities: Tensor) -> Tensor:
+    """Pixels [N, 4] that can have alpha >= 1/255.
+
+    opacity exp(-q / 2) >= 1/255 is the ellipse q <= k with k = 2 ln(255 opacity); its box has half widths sqrt(k var).
+    """
+    k = 2 * torch.log((opacities / ALPHA_MIN).clamp(min=1))
+    slack = 1 + 1e-4  # rounding must never cost a contribution
+    half = torch.sqrt(k[:, None] * covariance[:, [0, 2]]) * slack + 1e-3
+    first = torch.ceil(centers - half - 0.5)
+    end = torch.floor(centers + half - 0.5) + 1
+    return torch.stack((first[:, 0], end[:, 0], first[:, 1], end[:, 1]), dim=-1)
+
+
+def _square_boxes(centers: Tensor, covariance: Tensor, _opacities: Tensor) -> Tensor:
+    """Pixels [N, 4] that the published code draws: 3 sigma of the longest axis, rounded out to 16-pixel tiles."""
+    var_u, cov_uv, var_v = covariance.unbind(-1)
+    middle = 0.5 * (var_u + var_v)
+    determinant = var_u * var_v - cov_uv * cov_uv
+    longest = middle + torch.sqrt((middle * middle - determinant).clamp(min=0.1))
+    radius = torch.ceil(3 * torch.sqrt(longest))[:, None]
+    first = 16 * torch.floor((centers - 0.5 - radius) / 16)
+    end = 16 * torch.floor((centers - 0.5 + radius + 15) / 16)
+    return torch.stack((first[:, 0], end[:, 0], first[:, 1], end[:, 1]), dim=-1)

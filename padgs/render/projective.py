@@ -1,0 +1,132 @@
+"""Projective footprints (torch): models that work with the ray of a pixel, so that any camera will do.
+
+tangent: the Gaussian flattened onto the tangent plane of the sphere at its mean (OP43DGS, with correct extents).
+ray: the largest value of the 3D Gaussian along the ray (SPaGS), after a 3D low-pass that grows with distance.
+Neither knows of charts: no pole, no seam.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import pi
+
+import torch
+from torch import Tensor
+
+from padgs.camera import Camera
+from padgs.gaussians import Gaussians
+from padgs.render.contract import ALPHA_MIN, RenderOptions
+from padgs.render.projection import Footprints, camera_frame
+
+
+@dataclass(frozen=True)
+class TangentFootprints(Footprints):
+    """Projected Gaussians on their tangent planes."""
+
+    normals: Tensor  # [N, 3] direction of the mean
+    whitening: Tensor  # [N, 2, 3] L: q = |L d|^2 / (n.d)^2
+    rays: Tensor  # [H, W, 3]
+
+    def squared_distance(self, indices: Tensor, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
+        """q = tau^T S^-1 tau with tau = E d / (n.d), on the mean's side of the camera."""
+        d = self.rays[rows, columns]  # [P, 3]
+        ahead = d @ self.normals[indices].T  # [P, K]
+        inside = ahead.detach() > 0
+        ahead = torch.where(inside, ahead, torch.ones_like(ahead))
+        offsets = torch.einsum("pc,kic->pki", d, self.whitening[indices]) / ahead[..., None]
+        return (offsets * offsets).sum(-1), inside
+
+
+@dataclass(frozen=True)
+class RayFootprints(Footprints):
+    """Projected Gaussians as the ray meets them; opacities are compensated for the low-pass."""
+
+    means: Tensor  # [N, 3] camera frame
+    whitening: Tensor  # [N, 3, 3] M^-1 with Sigma' = M M^T
+    rays: Tensor  # [H, W, 3]
+    near: float
+
+    def squared_distance(self, indices: Tensor, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
+        """q = |o - t w|^2 with o = M^-1 mean, w = M^-1 d, and t = o.w / w.w where the ray meets its maximum."""
+        whitening = self.whitening[indices]
+        o = torch.einsum("kic,kc->ki", whitening, self.means[indices])  # [K, 3]
+        w = torch.einsum("kic,pc->pki", whitening, self.rays[rows, columns])  # [P, K, 3]
+        t = (o * w).sum(-1) / (w * w).sum(-1)
+        offset = o - t[..., None] * w
+        return (offset * offset).sum(-1), t.detach() > self.near
+
+
+def project_tangent(
+    gaussians: Gaussians,
+    cam_from_world: Tensor,
+    camera: Camera,
+    options: RenderOptions,
+    probe: Tensor | None = None,
+) -> TangentFootprints:
+    """S = E Sigma E^T / r^2 + low_pass / f^2 I on the tangent plane spanned by E, f pixels per radian."""
+    means, orientations = camera_frame(gaussians, cam_from_world)
+    in_front = (means * means).sum(-1).detach() > options.near**2
+    means = _probed(means, probe)
+    radius = means.norm(dim=-1)
+    normal = means / radius[:, None]
+    tangent = _tangent_basis(normal)  # [N, 2, 3]
+    half = tangent @ (orientations * gaussians.scales[:, None, :]) / radius[:, None, None]  # [N, 2, 3]
+    low_pass = options.low_pass / camera.focal**2
+    var_0, var_1 = (half**2).sum(-1).unbind(-1)
+    covariance = (half[:, 0] * half[:, 1]).sum(-1)
+    minors = torch.linalg.cross(half[:, 0], half[:, 1])  # det(S) without a difference that cancels
+    determinant = (minors**2).sum(-1) + low_pass * (var_0 + var_1) + low_pass**2
+    var_0 = var_0 + low_pass
+    # L = C^-1 E with the Cholesky factor C of S: its first row is E_0 / c, its second orthogonal to it under S.
+    first = tangent[:, 0] / torch.sqrt(var_0)[:, None]
+    second = (tangent[:, 1] - (covariance / var_0)[:, None] * tangent[:, 0]) * torch.sqrt(var_0 / determinant)[:, None]
+    whitening = torch.stack((first, second), dim=-2)
+    sound = torch.isfinite(determinant.detach()) & (determinant.detach() > 0)  # else float overflows or nothing spreads
+    visible = in_front & (gaussians.opacities.detach() >= ALPHA_MIN) & sound
+    return TangentFootprints(gaussians.opacities, radius, visible, normal, whitening, _rays(camera, means))
+
+
+def project_ray(
+    gaussians: Gaussians,
+    cam_from_world: Tensor,
+    camera: Camera,
+    options: RenderOptions,
+    probe: Tensor | None = None,
+) -> RayFootprints:
+    """Sigma' = Sigma + low_pass (r / f)^2 I, opacity times sqrt(det Sigma / det Sigma'); not drawn from inside."""
+    means, orientations = camera_frame(gaussians, cam_from_world)
+    in_front = (means * means).sum(-1).detach() > options.near**2
+    means = _probed(means, probe)
+    radius = means.norm(dim=-1)
+    low_pass = options.low_pass / camera.focal**2
+    wide = torch.sqrt(gaussians.scales**2 + (low_pass * radius * radius)[:, None])
+    opacities = gaussians.opacities * (gaussians.scales / wide).prod(-1)
+    whitening = orientations.transpose(-1, -2) / wide[:, :, None]
+    distance = (torch.einsum("kic,kc->ki", whitening, means) ** 2).sum(-1).detach()
+    drawn = opacities.detach() >= ALPHA_MIN
+    outside = distance > 2 * torch.log((opacities.detach() / ALPHA_MIN).clamp(min=1))
+    sound = torch.isfinite(whitening.detach()).flatten(1).all(-1)  # else float overflows or nothing spreads
+    visible = in_front & drawn & outside & sound
+    return RayFootprints(opacities, radius, visible, means, whitening, _rays(camera, means), options.near)
+
+
+def _probed(means: Tensor, probe: Tensor | None) -> Tensor:
+    """Means moved on their sphere by the probe: as far as it would move them on a panorama of 2 x 2 units."""
+    if probe is None:
+        return means
+    x, y, z = means.detach().unbind(-1)
+    rho = torch.sqrt(x * x + z * z)
+    east = torch.stack((z, torch.zeros_like(x), -x), dim=-1)  # of length rho = r cos(latitude)
+    down = torch.stack((-x * y, rho * rho, -y * z), dim=-1) / rho.clamp(min=1e-30)[:, None]  # of length r
+    return means + probe[:, :1] * pi * east + probe[:, 1:] * (pi / 2) * down
+
+
+def _tangent_basis(normals: Tensor) -> Tensor:
+    """Two orthonormal rows [N, 2, 3] orthogonal to each normal; which ones does not matter."""
+    axis = torch.nn.functional.one_hot(normals.abs().argmin(-1), 3).to(normals)
+    first = torch.nn.functional.normalize(torch.linalg.cross(normals, axis), dim=-1)
+    return torch.stack((first, torch.linalg.cross(normals, first)), dim=-2)
+
+
+def _rays(camera: Camera, like: Tensor) -> Tensor:
+    return camera.rays(dtype=like.dtype, device=like.device)
