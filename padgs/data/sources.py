@@ -1,0 +1,82 @@
+"""What `prepare` starts from: a folder of panoramas with their masks, looked at before any work is done."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from padgs.data.assemble import image_folder, image_names, view_name
+from padgs.data.capture import Capture, Frame
+from padgs.data.errors import DataError
+from padgs.data.images import ImageFile, inspect
+from padgs.data.masks import SCENE_MASKS, Mask, find_masks
+from padgs.data.store import ImageStore
+
+
+@dataclass(frozen=True)
+class Source:
+    """Panoramas without poses."""
+
+    images: dict[str, ImageFile]  # name (path relative to the folder) -> file, sorted by name
+    masks: dict[str, Mask]  # name -> weights; names without one are used wholly
+    fingerprint: str  # of names, image bytes and masks
+    notes: tuple[str, ...]
+
+
+def find_source(path: Path, mask: str) -> Source:
+    """Look through a folder of panoramas.
+
+    Args:
+        path: the folder, or one that holds them in images/.
+        mask: as `data.mask`: auto | none | rows:959/1024 | a file, or a folder of files. auto looks for mask.png and
+            masks/ beside the images and beside an images/ folder.
+
+    Raises:
+        DataError: no folder, fewer than two panoramas, an image that cannot be used, names that differ only in case or
+            extension, a mask that does not fit.
+    """
+    if not path.is_dir():
+        raise DataError(f"{path} is not a folder; give a folder of panoramas, or a video file")
+    folder = image_folder(path, None)
+    base = folder.parent if folder.name == "images" else folder  # where masks are looked for
+    names = [name for name in image_names(folder) if not _is_mask(name)]
+    if len(names) < 2:
+        raise DataError(f"{folder} holds {len(names)} images; structure from motion needs at least two")
+    _refuse_clashes(names)
+    images = {name: inspect(folder / name) for name in names}
+    nowhere = torch.eye(4, dtype=torch.float64)
+    frames = tuple(Frame(name, image.path, nowhere, image.width, image.height) for name, image in images.items())
+    if Path(mask).exists():  # relative to where one stands, not to the images
+        mask = str(Path(mask).absolute())
+    capture = Capture(format="images", folder=base, image_folder=folder, frames=frames, cloud=None)
+    sizes = [(image.width, image.height) for image in images.values()]
+    masks, digests, notes = find_masks(capture, mask, list(images.values()), sizes, ImageStore())
+    digest = hashlib.sha256()
+    for name, image in images.items():
+        digest.update(f"{name}|{image.digest}|".encode())
+    digest.update(repr(digests).encode())
+    return Source(
+        images=images,
+        masks={name: found for name, found in zip(names, masks, strict=True) if found is not None},
+        fingerprint=digest.hexdigest(),
+        notes=tuple(notes),
+    )
+
+
+def _is_mask(name: str) -> bool:
+    return name in SCENE_MASKS or name.startswith("masks/")
+
+
+def _refuse_clashes(names: Sequence[str]) -> None:
+    seen: dict[str, str] = {}
+    for name in names:
+        key = view_name(name).casefold()
+        if key in seen:
+            raise DataError(
+                f"the images {seen[key]!r} and {name!r} would share one name (without case and extension); rename one"
+            )
+        seen[key] = name
