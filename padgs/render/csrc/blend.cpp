@@ -107,24 +107,22 @@ void forward_tile(const BlendArguments &args, const Tile &tile, int64_t index) {
         const Vec next = row.transmittance - row.transmittance * alpha;
         // A stopped pixel has a negative transmittance, so `next` never passes for it.
         const Mask drawn = both(at.reached, at_least(next, splat(kTransmittanceMin)));
+        const Vec stopped = select(at.reached, minimum(row.transmittance, -row.transmittance), row.transmittance);
+        if (!any(drawn)) {
+          row.transmittance = stopped;
+          if (any(at_least(stopped, zero()))) continue;
+          alive[chunk] &= ~(1u << y);
+          alive_chunks -= !alive[chunk];
+          continue;
+        }
         const Vec weight = keep(drawn, alpha * row.transmittance);
         row.red += weight * f.red;
         row.green += weight * f.green;
         row.blue += weight * f.blue;
         row.depth += weight * f.depth;
         row.last = select_int(drawn, position, row.last);
+        row.transmittance = select(drawn, next, stopped);
         contributing += count(drawn);
-        const Mask stopped = without(at.reached, drawn);
-        if (any(stopped)) {
-          row.transmittance = select(stopped, minimum(row.transmittance, -row.transmittance),
-                                     select(drawn, next, row.transmittance));
-          if (!any(at_least(row.transmittance, zero()))) {
-            alive[chunk] &= ~(1u << y);
-            alive_chunks -= !alive[chunk];
-          }
-        } else {
-          row.transmittance = select(drawn, next, row.transmittance);
-        }
       }
     }
   }
