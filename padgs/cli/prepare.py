@@ -9,6 +9,7 @@ import typer
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.progress import TaskID
 
 WORDS = {
     "frames": "choosing frames",
@@ -85,7 +86,7 @@ class _Bars:
             console=console,
             disable=not console.is_terminal,
         )
-        self._tasks: dict[str, tuple[int, int]] = {}  # step -> bar, tenths that were told
+        self._tasks: dict[str, tuple[TaskID, int]] = {}  # step -> bar, tenths that were told
 
     def __enter__(self) -> Callable[[str, int, int], None]:
         self._bars.start()

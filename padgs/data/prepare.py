@@ -36,10 +36,7 @@ from padgs.data.writers import Content, write_colmap
 
 STEPS = ("frames", "images", "views", "features", "matches", "poses", "result")
 LEVEL_AGREEMENT = 0.9  # length of the mean of the cameras' up directions from which they have a common one
-_REMEDIES = (
-    "take them closer together, hide what moves with the camera in a mask (--mask), or try --accurate; pairs that were "
-    "not matched help too (--pairs exhaustive)"
-)
+_REMEDIES = "take them closer together, hide what moves with the camera in a mask (--mask), or try --accurate"
 
 Progress = Callable[[str, int, int], None]  # (one of STEPS, done, in all)
 
