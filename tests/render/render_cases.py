@@ -8,10 +8,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from padgs.camera import Panorama
 from padgs.gaussians import Gaussians, rotation_matrices
 from padgs.panorama import direction
 from padgs.render import BACKENDS, Rendering, RenderOptions, native, render
 from padgs.render.contract import ALPHA_MIN
+from padgs.render.planar import PlanarFootprints
 from padgs.render.projection import project
 from padgs.scene import View
 
@@ -138,18 +140,19 @@ def stable_pixels(
     half a turn, where the pixel is within `margin` pixels of the longitude opposite to the mean.
     """
     pose = identity_pose() if pose is None else pose
-    footprints = project(gaussians, pose.to(gaussians.means.dtype), width, height, options)
+    footprints = project(gaussians, pose.to(gaussians.means.dtype), Panorama(width, height), options)
     everything = torch.arange(len(gaussians))[footprints.visible]
-    q, _ = footprints.squared_distance(everything, 0, height)
+    pixels = torch.arange(height * width)
+    rows, columns = pixels // width, pixels % width
+    q, _ = footprints.squared_distance(everything, rows, columns)
     alpha = footprints.opacities[everything] * torch.exp(-0.5 * q)
     unstable = ((alpha / ALPHA_MIN - 1).abs() < margin) | ((alpha / 0.99 - 1).abs() < margin)
-    if options.wrap and hasattr(footprints, "centers"):
-        columns = torch.arange(width, dtype=alpha.dtype)[:, None] + 0.5
-        across = ((columns - footprints.centers[everything, 0] + width / 2) % width).abs()
+    if isinstance(footprints, PlanarFootprints) and options.wrap:
+        across = ((columns[:, None] + 0.5 - footprints.centers[everything, 0] + width / 2) % width).abs()
         unstable |= (torch.minimum(across, width - across) < max(margin, 1e-3)) & (alpha >= ALPHA_MIN / 2)
-    after = torch.cumprod(1 - alpha.clamp(max=0.99)[..., torch.argsort(footprints.sort_key[everything])], dim=-1)
+    after = torch.cumprod(1 - alpha.clamp(max=0.99)[..., torch.argsort(footprints.depths[everything])], dim=-1)
     unstable |= (after / 1e-4 - 1).abs() < max(margin, 1e-2)
-    return ~unstable.any(-1)
+    return ~unstable.any(-1).view(height, width)
 
 
 def row_error(actual: Tensor, expected: Tensor) -> float:

@@ -10,8 +10,10 @@ import pytest
 import torch
 from render_cases import INPUTS, each_engine
 
+from padgs.camera import Camera, Panorama, Pinhole
 from padgs.gaussians import Gaussians
 from padgs.render import RenderOptions, render
+from padgs.render.planar import SLOPE_LIMIT
 from padgs.render.projection import PROJECTIONS
 from padgs.scene import View
 
@@ -22,11 +24,24 @@ VALUE_TOLERANCE, DEPTH_TOLERANCE, GRADIENT_TOLERANCE = 2e-5, 1e-4, 2e-3
 
 def options_of(meta: dict) -> RenderOptions:
     """The options under which a case was made; a meta key that is not listed here or below is an error."""
-    option_of = {"projection": "projection", "near": "near", "wrap": "wrap", "dilation": "low_pass"}
-    described = {"format", "scene", "width", "height", "margin", "pairs", "close_pairs"}
-    unknown = set(meta) - set(option_of) - described
+    option_of = {
+        "projection": "projection",
+        "near": "near",
+        "wrap": "wrap",
+        "dilation": "low_pass",
+        "filter_variance": "low_pass",
+    }
+    described = {"format", "scene", "width", "height", "margin", "pairs", "close_pairs", "fx", "fy", "cx", "cy"}
+    unknown = set(meta) - set(option_of) - described - {"clamp"}
     assert not unknown, f"the case depends on {sorted(unknown)}, which this test does not pass on"
+    assert meta.get("clamp", SLOPE_LIMIT) == SLOPE_LIMIT
     return RenderOptions(**{option: meta[key] for key, option in option_of.items() if key in meta})
+
+
+def camera_of(meta: dict) -> Camera:
+    if meta["projection"] == "pinhole":
+        return Pinhole(*(meta[key] for key in ("width", "height", "fx", "fy", "cx", "cy")))
+    return Panorama(meta["width"], meta["height"])
 
 
 @pytest.mark.skipif(not FOLDER.is_dir(), reason=f"no golden cases: {FOLDER} is not there")
@@ -47,7 +62,7 @@ def test_golden_case(case: str, backend: str, dtype: torch.dtype):
     inputs = {name: tensor(name).requires_grad_() for name in INPUTS}
     pose = torch.eye(4, dtype=dtype)
     pose[:3, :3], pose[:3, 3] = tensor("R"), tensor("t")
-    view = View(case, pose, meta["width"], meta["height"])
+    view = View(case, pose, meta["width"], meta["height"], lens=camera_of(meta))
     rendering = render(
         Gaussians(**inputs), view, options_of(meta), background=tensor("background"), backend=backend, check_values=True
     )

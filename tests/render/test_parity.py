@@ -60,7 +60,9 @@ def random_weights(width: int, height: int, where: Tensor, generator: torch.Gene
     }
 
 
-def assert_same(gaussians: Gaussians, width: int, height: int, options, generator, *, pose, backend, dtype) -> None:
+def assert_same(
+    gaussians: Gaussians, width: int, height: int, options, generator, *, pose, backend, dtype, limit=2e-3
+) -> None:
     stable = stable_pixels(gaussians, width, height, pose=pose, options=options)
     assert stable.double().mean() > 0.85
     weights = random_weights(width, height, stable, generator)
@@ -75,7 +77,7 @@ def assert_same(gaussians: Gaussians, width: int, height: int, options, generato
     assert abs(pairs[0] - pairs[1]) <= 8 * int((~stable).sum())
     for name, gradient in expected_gradients.items():
         assert gradient.any(), f"{name} has no gradient to compare"
-        assert row_error(gradients[name], gradient) < 2e-3, name
+        assert row_error(gradients[name], gradient) < limit, name
 
 
 @pytest.mark.parametrize("configuration", CONFIGURATIONS)
@@ -102,7 +104,8 @@ def test_n9_a_large_odd_image_agrees():
     generator = torch.Generator().manual_seed(9)
     gaussians = mixture(4, generator, ("ordinary", "polar", "seam"))
     pose = torch.eye(4, dtype=torch.float64)
-    assert_same(gaussians, 1000, 500, RenderOptions(), generator, pose=pose, backend="cpu", dtype=torch.float32)
+    engine = {"backend": "cpu", "dtype": torch.float32}
+    assert_same(gaussians, 1000, 500, RenderOptions(), generator, pose=pose, limit=4e-3, **engine)
 
 
 @pytest.fixture

@@ -80,11 +80,11 @@ def test_pixel_centres_are_half_way():
         assert brightest[-1].tolist() == [8, 16]
 
 
-@pytest.mark.parametrize("pairs", [1, 3000, 1 << 14])
+@pytest.mark.parametrize("pairs", [1, 300, 1 << 12])
 def test_chunks_change_nothing(pairs: int, generator: torch.Generator, monkeypatch: pytest.MonkeyPatch):
     gaussians = mixture(5, generator)
-    view = View("v", identity_pose(), 64, 33)
-    weights = [torch.randn(33, 64, generator=generator, dtype=torch.float64) for _ in OUTPUTS]
+    view = View("v", identity_pose(), 20, 11)
+    weights = [torch.randn(11, 20, generator=generator, dtype=torch.float64) for _ in OUTPUTS]
 
     def run() -> tuple:
         inputs = leaves(gaussians, torch.float64)
@@ -95,14 +95,13 @@ def test_chunks_change_nothing(pairs: int, generator: torch.Generator, monkeypat
         return rendering, torch.autograd.grad(loss, [*vars(inputs).values(), pose])
 
     whole, whole_gradients = run()
-    monkeypatch.setattr(torch_backend, "PAIRS_PER_CHUNK", pairs)
+    monkeypatch.setattr(torch_backend, "PAIRS_PER_BLOCK", pairs)
     chunked, chunked_gradients = run()
     for name in OUTPUTS:
         torch.testing.assert_close(getattr(chunked, name), getattr(whole, name), atol=1e-12, rtol=1e-12)
     for actual, expected in zip(chunked_gradients, whole_gradients, strict=True):
         torch.testing.assert_close(actual, expected, atol=1e-9 * expected.abs().max().item(), rtol=0)
-    assert chunked.counters["contributing"] == whole.counters["contributing"]
-    assert chunked.counters["evaluated"] < whole.counters["evaluated"]  # rows that nothing touches cost nothing
+    assert chunked.counters == whole.counters
 
 
 def test_memory_is_bounded_by_the_chunk(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch):
@@ -110,7 +109,7 @@ def test_memory_is_bounded_by_the_chunk(generator: torch.Generator, monkeypatch:
     gaussians = leaves(gaussians_of("ordinary", 40, generator), torch.float64)
     kept = {}
     for pairs in (1 << 30, 40 * 64):
-        monkeypatch.setattr(torch_backend, "PAIRS_PER_CHUNK", pairs)
+        monkeypatch.setattr(torch_backend, "PAIRS_PER_BLOCK", pairs)
         sizes = []
         with torch.autograd.graph.saved_tensors_hooks(lambda t, s=sizes: s.append(t.numel()) or t, lambda t: t):
             render(gaussians, View("v", identity_pose(), 64, 32), backend="torch")
