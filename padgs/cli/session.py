@@ -69,6 +69,7 @@ def _finish(config: RunConfig, scene: Scene, folder: RunFolder, console: Console
             status="ok" if progress.iteration == config.train.iterations else "timeout",
             counts={**size.counts, "parameters": size.parameters},
             model_bytes=size.bytes,
+            peak_memory_bytes=_peak_memory(),  # of training; scoring has networks of its own
         )
         if scene.test:
             save_picture = folder.save_picture if config.run.pictures else None
@@ -79,11 +80,10 @@ def _finish(config: RunConfig, scene: Scene, folder: RunFolder, console: Console
     except KeyboardInterrupt as error:
         raise Interrupted("stopped at once, the last checkpoint stands") from error
     except (Failure, ValueError, MemoryError, RuntimeError) as error:
-        result = replace(result, status=_status(error), reason=str(error), scores={})
+        result = replace(result, status=_status(error), reason=str(error), scores={}, peak_memory_bytes=_peak_memory())
     result = replace(
         result,
         iterations_done=progress.iteration,
-        peak_memory_bytes=clock.peak_memory()["host"] or 0,
         finished=datetime.now(timezone.utc).isoformat(timespec="seconds"),
     )
     return folder.finish(result)
@@ -111,6 +111,10 @@ def _is_scored(result: Result, config: RunConfig) -> bool:
         name in result.scores and same_rules(result.scores[name], protocol)
         for name, protocol in config.protocols.items()
     )
+
+
+def _peak_memory() -> int:
+    return clock.peak_memory()["host"] or 0
 
 
 def _status(error: BaseException) -> str:
