@@ -29,6 +29,8 @@ class RenderConfig:
     low_pass: float = 0.3
     wrap: bool = True
     bounds: str = "exact"
+    blending: str = "sorted"
+    core_size: int = 16  # of blending hybrid
 
     def __post_init__(self) -> None:
         """Reject unknown units."""
@@ -39,7 +41,13 @@ class RenderConfig:
         """Renderer options for a scene whose own unit of length is `scene_unit` world units."""
         near = self.near * (scene_unit if self.near_unit == "scene" else 1.0)
         return RenderOptions(
-            projection=self.projection, near=near, low_pass=self.low_pass, wrap=self.wrap, bounds=self.bounds
+            projection=self.projection,
+            near=near,
+            low_pass=self.low_pass,
+            wrap=self.wrap,
+            bounds=self.bounds,
+            blending=self.blending,
+            core_size=self.core_size,
         )
 
 

@@ -4,6 +4,7 @@ The definition (all backends match it, values and gradients): each Gaussian that
 squared distance q >= 0 given by the projection; alpha = min(0.99, opacity * exp(-q / 2)); pairs with alpha < 1/255 are
 skipped. Gaussians are blended front to back by the radial distance of their mean (ties by index), and a pixel stops
 *before* the Gaussian that would bring its transmittance below 1e-4. Where alpha is limited to 0.99 its derivative is 0.
+That is blending "sorted"; "hybrid" shares all but the order and the stop, see `padgs.render.hybrid`.
 """
 
 from __future__ import annotations
@@ -20,6 +21,9 @@ from padgs.gaussians import Gaussians
 ALPHA_MIN = 1 / 255
 ALPHA_MAX = 0.99
 TRANSMITTANCE_MIN = 1e-4
+CORE_ALPHA_MIN = 0.05  # hybrid: fainter fragments go to the tail
+MAX_CORE_SIZE = 256
+BLENDINGS = ("sorted", "hybrid")
 BOUNDS = ("exact", "square")
 
 
@@ -31,19 +35,31 @@ class RenderOptions:
     near: float = 0.0  # world units; Gaussians whose mean is at most this far away are culled
     low_pass: float = 0.3  # variance of the low-pass filter in square pixels; what it widens is up to the projection
     wrap: bool = True  # continue footprints across the +-180 degree seam of a panorama
+    cubemap: bool = False  # draw a panorama through the six faces of a cube, each an ordinary perspective view
+    face_size: int | None = None  # cubemap: pixels across the 90 degrees of a face; None: as fine as the panorama
     bounds: str = "exact"  # exact: every pixel with alpha >= 1/255; square: 3 sigma of the longest axis, as published
+    blending: str = "sorted"  # sorted: by distance of the means; hybrid: by distance on each ray, the rest unordered
+    core_size: int = 16  # hybrid: how many fragments of a pixel are kept in order
     max_instances: int = 1 << 26  # (Gaussian, tile) pairs in memory at once; beyond it the image is drawn in strips
 
     def __post_init__(self) -> None:
         """Reject values that no backend can honour."""
         if self.bounds not in BOUNDS:
             raise ValueError(f"unknown bounds {self.bounds!r}; known: {', '.join(BOUNDS)}")
+        if self.blending not in BLENDINGS:
+            raise ValueError(f"unknown blending {self.blending!r}; known: {', '.join(BLENDINGS)}")
+        if not 1 <= self.core_size <= MAX_CORE_SIZE:
+            raise ValueError(f"core_size is {self.core_size}; it must be from 1 to {MAX_CORE_SIZE} fragments a pixel")
         if self.bounds == "square" and self.wrap:
             raise ValueError("bounds=square are the published bounds, which end at the seam; set wrap=false with them")
         if not self.near >= 0:
             raise ValueError(f"near is {self.near}; it must be a distance >= 0 in world units")
         if not self.low_pass >= 0:
             raise ValueError(f"low_pass is {self.low_pass}; it must be a variance >= 0 in square pixels")
+        if self.cubemap and self.projection == "erp":
+            raise ValueError("projection 'erp' draws whole panoramas; the faces of a cubemap take pinhole, tangent or ray")
+        if self.face_size is not None and not self.face_size >= 2:
+            raise ValueError(f"face_size is {self.face_size}; a face must be at least 2 pixels wide, or None")
 
 
 @dataclass(frozen=True)
@@ -108,10 +124,14 @@ def check_inputs(
 
 def _check_camera(camera: Camera, options: RenderOptions) -> None:
     kind = {"erp": Panorama, "pinhole": Pinhole}.get(options.projection)
-    if kind is not None and not isinstance(camera, kind):
+    if options.cubemap:
+        if not isinstance(camera, Panorama):
+            raise ValueError(f"a cubemap is resampled to a Panorama, not to a {type(camera).__name__}; set cubemap=false")
+    elif kind is not None and not isinstance(camera, kind):
+        way_out = "; cubemap=true draws panoramas with it" if kind is Pinhole and isinstance(camera, Panorama) else ""
         raise ValueError(
             f"projection {options.projection!r} is made for a {kind.__name__} camera, not a {type(camera).__name__}; "
-            "tangent and ray take any camera"
+            f"tangent and ray take any camera{way_out}"
         )
     if options.bounds == "square" and kind is None:
         raise ValueError(f"projection {options.projection!r} has no square bounds; use bounds=exact")

@@ -37,6 +37,10 @@ class Footprints(ABC):
     def squared_distance(self, indices: Tensor, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
         """Squared distance q [P, K] of the Gaussians [K] at the pixels [P], and whether they act there, [P, K] bool."""
 
+    def distance(self, indices: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+        """Where the Gaussians [K] lie on the rays of the pixels [P]: [P, K] world units, no gradient; orders hybrid."""
+        return self.depths.detach()[indices].expand(len(rows), -1)
+
 
 def project(
     gaussians: Gaussians,

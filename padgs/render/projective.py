@@ -48,12 +48,21 @@ class RayFootprints(Footprints):
 
     def squared_distance(self, indices: Tensor, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
         """q = |o - t w|^2 with o = M^-1 mean, w = M^-1 d, and t = o.w / w.w where the ray meets its maximum."""
-        whitening = self.whitening[indices]
-        o = torch.einsum("kic,kc->ki", whitening, self.means[indices])  # [K, 3]
-        w = torch.einsum("kic,pc->pki", whitening, self.rays[rows, columns])  # [P, K, 3]
-        t = (o * w).sum(-1) / (w * w).sum(-1)
+        o, w, t = self._meeting(indices, rows, columns)
         offset = o - t[..., None] * w
         return (offset * offset).sum(-1), t.detach() > self.near
+
+    def distance(self, indices: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+        """t, where the ray meets its maximum."""
+        with torch.no_grad():
+            return self._meeting(indices, rows, columns)[2]
+
+    def _meeting(self, indices: Tensor, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """o [K, 3], w [P, K, 3] and t [P, K]."""
+        whitening = self.whitening[indices]
+        o = torch.einsum("kic,kc->ki", whitening, self.means[indices])
+        w = torch.einsum("kic,pc->pki", whitening, self.rays[rows, columns])
+        return o, w, (o * w).sum(-1) / (w * w).sum(-1)
 
 
 def project_tangent(

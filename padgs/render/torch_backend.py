@@ -13,6 +13,7 @@ from torch.utils.checkpoint import checkpoint
 from padgs.camera import Camera
 from padgs.gaussians import Gaussians
 from padgs.render.contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Rendering, RenderOptions
+from padgs.render.hybrid import hybrid_weights
 from padgs.render.projection import Footprints, project
 
 PAIRS_PER_BLOCK = 1 << 21  # (pixel, Gaussian) pairs held at once
@@ -42,7 +43,7 @@ def rasterize(
     parts = []
     for block in blocks:
         rows, columns = torch.div(block, camera.width, rounding_mode="floor"), block % camera.width
-        arguments = (footprints, gaussians.colors, background, order, rows, columns)
+        arguments = (footprints, gaussians.colors, background, order, rows, columns, options)
         if len(blocks) > 1 and torch.is_grad_enabled():
             parts.append(checkpoint(_blend, *arguments, use_reentrant=False, preserve_rng_state=False))
         else:
@@ -65,20 +66,33 @@ def rasterize(
 
 
 def _blend(
-    footprints: Footprints, colors: Tensor, background: Tensor, order: Tensor, rows: Tensor, columns: Tensor
+    footprints: Footprints,
+    colors: Tensor,
+    background: Tensor,
+    order: Tensor,
+    rows: Tensor,
+    columns: Tensor,
+    options: RenderOptions,
 ) -> tuple[Tensor, Tensor, Tensor, int]:
     """Colour [P, 3], transmittance [P] and depth [P] of some pixels, and how many pairs contribute (Eq. 4)."""
     q, inside = footprints.squared_distance(order, rows, columns)  # [P, K] each
     alpha = (footprints.opacities[order] * torch.exp(-0.5 * q)).clamp(max=ALPHA_MAX)
     alpha = torch.where(inside & (alpha.detach() >= ALPHA_MIN), alpha, torch.zeros_like(alpha))
-    running = torch.cumprod(1 - alpha.detach(), dim=-1) >= TRANSMITTANCE_MIN
-    alpha = torch.where(running, alpha, torch.zeros_like(alpha))
-    after = torch.cumprod(1 - alpha, dim=-1)  # transmittance after each Gaussian
-    before = torch.cat((torch.ones_like(after[:, :1]), after[:, :-1]), dim=-1)
-    weights = alpha * before  # [P, K]
-    transmittance = after[:, -1] if len(order) else background.new_ones(len(rows))
+    if options.blending == "hybrid":
+        weights, transmittance = hybrid_weights(alpha, footprints.distance(order, rows, columns), options.core_size)
+    else:
+        weights, transmittance = _sorted_weights(alpha)
     color = weights @ colors[order] + transmittance[:, None] * background
     coverage = weights.sum(-1)
     covered = coverage > 0
     depth = (weights @ footprints.depths[order]) / torch.where(covered, coverage, torch.ones_like(coverage))
     return color, transmittance, depth, int((weights.detach() > 0).sum())
+
+
+def _sorted_weights(alpha: Tensor) -> tuple[Tensor, Tensor]:
+    """Weights [P, K] of fragments [P, K] that are in order, and what is left [P]."""
+    running = torch.cumprod(1 - alpha.detach(), dim=-1) >= TRANSMITTANCE_MIN
+    alpha = torch.where(running, alpha, torch.zeros_like(alpha))
+    after = torch.cumprod(1 - alpha, dim=-1)
+    after = torch.cat((alpha.new_ones(len(alpha), 1), after), dim=-1)  # transmittance before each and behind the last
+    return alpha * after[:, :-1], after[:, -1]
