@@ -97,20 +97,25 @@ def prepare(
     """
     if destination.exists() and (not destination.is_dir() or any(destination.iterdir())):
         raise DataError(f"{destination} exists; nothing is overwritten: remove it or choose another place")
+    work = destination.absolute().with_name(f".{destination.name}.prepare")
     try:
-        return _Job(source, destination.absolute(), options, progress).run()
+        return _Job(source, destination.absolute(), work, options, progress).run()
     except OSError as error:
         raise DataError(
             f"cannot prepare {destination} ({error.strerror or error}); the same command goes on where this stopped"
         ) from error
+    finally:
+        if work.is_dir() and not any(work.glob("*.done")) and not (work / "database.db").exists():
+            shutil.rmtree(work, ignore_errors=True)  # nothing in it that would be worth going on from
 
 
 class _Job:
     """One preparation in its working folder."""
 
-    def __init__(self, source: Path, destination: Path, options: PrepareOptions, progress: Progress) -> None:
-        self.options, self.destination, self.progress = options, destination, progress
-        self.work = destination.with_name(f".{destination.name}.prepare")
+    def __init__(
+        self, source: Path, destination: Path, work: Path, options: PrepareOptions, progress: Progress
+    ) -> None:
+        self.destination, self.work, self.options, self.progress = destination, work, options, progress
         self.threads = options.threads or min(8, os.cpu_count() or 1)
         self.seconds: dict[str, float] = {}
         if is_video(source):

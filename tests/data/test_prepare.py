@@ -169,6 +169,7 @@ def test_bad_input_is_refused(scene, tmp_path):
         prepare(tmp_path / "absent", tmp_path / "out")
     with pytest.raises(DataError, match="cannot be read"):
         prepare(tmp_path / "absent.mp4", tmp_path / "out")
+    assert [path.name for path in tmp_path.iterdir()] == ["there"]
 
 
 def test_rotation_between_is_the_smallest_turn_to_z():
@@ -182,8 +183,7 @@ def test_rotation_between_is_the_smallest_turn_to_z():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("accurate", [False, True])
-@pytest.mark.parametrize("name", ["flat", "garden"])
+@pytest.mark.parametrize(("name", "accurate"), [("flat", False), ("garden", False), ("garden", True)])
 def test_models_of_real_panoramas_are_reproduced(shared, tmp_path, name, accurate):
     given = shared / "data" / name
     prepare(given / "images", tmp_path / "out", PrepareOptions(accurate=accurate))  # finds mask.png beside images/
