@@ -12,6 +12,7 @@ namespace padgs {
   extern const BlendKernels blend_kernels;    \
   extern const LossKernels loss_kernels;      \
   extern const DecodeKernels decode_kernels;  \
+  extern const CeilingKernels ceiling_kernels; \
   }
 PADGS_DECLARE(baseline)
 #if PADGS_ISA_COUNT > 1
@@ -25,9 +26,11 @@ struct Kernels {
   const BlendKernels &blend;
   const LossKernels &loss;
   const DecodeKernels &decode;
+  const CeilingKernels &ceilings;
 };
 
-#define PADGS_KERNELS(isa) {#isa, isa::project_kernels, isa::blend_kernels, isa::loss_kernels, isa::decode_kernels}
+#define PADGS_KERNELS(isa)                                                                                  \
+  {#isa, isa::project_kernels, isa::blend_kernels, isa::loss_kernels, isa::decode_kernels, isa::ceiling_kernels}
 
 static Kernels choose() {
 #if PADGS_ISA_COUNT > 1
@@ -79,3 +82,11 @@ PADGS_API void padgs_decode_select(const DecodeArguments *args) { kernels().deco
 PADGS_API void padgs_decode_place(const DecodeArguments *args) { kernels().decode.place(*args); }
 
 PADGS_API void padgs_decode_backward(const DecodeGradientArguments *args) { kernels().decode.backward(*args); }
+
+// Floating-point operations done: `rounds` steps of fused multiply-adds on every thread.
+PADGS_API double padgs_measure_fma(int64_t rounds) { return kernels().ceilings.fma(rounds); }
+
+// Bytes moved by out = a + 3 b over arrays [count].
+PADGS_API double padgs_measure_triad(float *out, const float *a, const float *b, int64_t count) {
+  return kernels().ceilings.triad(out, a, b, count);
+}

@@ -26,4 +26,9 @@ struct DecodeKernels {
   void (*backward)(const DecodeGradientArguments &);
 };
 
+struct CeilingKernels {
+  double (*fma)(int64_t rounds);
+  double (*triad)(float *out, const float *a, const float *b, int64_t count);
+};
+
 }  // namespace padgs
