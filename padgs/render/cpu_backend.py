@@ -102,7 +102,7 @@ class _Rasterize(torch.autograd.Function):
         pairs = torch.zeros(2, dtype=torch.int64)
         for strip in projected.strips():
             pair_counts = torch.empty(strip.tiles, 2, dtype=torch.int64)
-            arguments = _blend_arguments(native_cam, projected, strip, rays, background, buffers, pair_counts)
+            arguments = _blend_arguments(native_cam, options, projected, strip, rays, background, buffers, pair_counts)
             native.library().padgs_blend_forward(ctypes.byref(arguments))
             pairs += pair_counts.sum(0)
         visible = projected.boxes[:, 3] < projected.boxes[:, 4]
@@ -117,6 +117,7 @@ class _Rasterize(torch.autograd.Function):
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(*tensors, cam_from_world, background, buffers.image, buffers.transmittance, buffers.depth)
         ctx.last, ctx.probe, ctx.projected, ctx.native_cam, ctx.rays = buffers.last, probe, projected, native_cam, rays
+        ctx.options = options
         return buffers.image, buffers.transmittance, buffers.depth, visible
 
     @staticmethod
@@ -131,7 +132,9 @@ class _Rasterize(torch.autograd.Function):
         count = len(tensors[0])
         totals = torch.zeros(count, MOMENTS)
         for strip in projected.strips():
-            forward = _blend_arguments(ctx.native_cam, projected, strip, ctx.rays, background, buffers, None)
+            forward = _blend_arguments(
+                ctx.native_cam, ctx.options, projected, strip, ctx.rays, background, buffers, None
+            )
             moments = torch.empty(len(strip.instances), MOMENTS)
             arguments = native.BlendGradientArguments(
                 forward, *map(pointer, upstream), pointer(moments), pointer(grad_rays)
@@ -159,10 +162,13 @@ class _Rasterize(torch.autograd.Function):
         return *outputs, probe, grad_pose, grad_background, grad_table, None, None, None
 
 
-def _blend_arguments(camera, projected, strip, rays, background, buffers, pair_counts) -> native.BlendArguments:
+def _blend_arguments(
+    camera, options, projected, strip, rays, background, buffers, pair_counts
+) -> native.BlendArguments:
     """Arguments of both blending passes; the tensors must outlive the call."""
     lists = (projected.footprints, strip.tile_start, strip.instances, background)
     outputs = (buffers.image, buffers.transmittance, buffers.depth, buffers.last, pair_counts)
+    core_size = options.core_size if options.blending == "hybrid" else 0
     return native.BlendArguments(
-        strip.grid, camera.projection, camera.wrap, rays.native(), *map(pointer, lists), *map(pointer, outputs)
+        strip.grid, camera.projection, camera.wrap, core_size, rays.native(), *map(pointer, (*lists, *outputs))
     )

@@ -69,7 +69,7 @@ class BlendArguments(ctypes.Structure):
 
     _fields_ = [
         ("grid", TileGrid),
-        *_fields(ctypes.c_int32, "projection", "wrap"),
+        *_fields(ctypes.c_int32, "projection", "wrap", "core_size"),
         ("rays", Rays),
         *_fields(Pointer, "footprints", "tile_start", "instances", "background"),
         *_fields(Pointer, "image", "transmittance", "depth", "last", "pair_counts"),

@@ -88,13 +88,14 @@ struct Rays {
 struct BlendArguments {
   TileGrid grid;
   int32_t projection, wrap;
+  int32_t core_size;  // hybrid blending with so many fragments in order, or 0: sorted
   Rays rays;
   const Footprint *footprints;           // [N]
   const int64_t *tile_start;             // [tiles + 1] over the drawn tiles
   const Instance *instances;             // [I] tile by tile, front to back
   const float *background;               // [3]
   float *image, *transmittance, *depth;  // [H,W,3] [H,W] [H,W]
-  int32_t *last;                         // [H,W] 1 + position in the tile's list of the last contribution
+  int32_t *last;                         // [H,W] 1 + position in the tile's list of the last contribution; sorted only
   int64_t *pair_counts;                  // [tiles, 2] evaluated and contributing pairs
 };
 

@@ -10,6 +10,7 @@ namespace padgs {
   namespace isa {                             \
   extern const ProjectKernels project_kernels; \
   extern const BlendKernels blend_kernels;    \
+  extern const BlendKernels hybrid_kernels;   \
   extern const LossKernels loss_kernels;      \
   extern const DecodeKernels decode_kernels;  \
   extern const CeilingKernels ceiling_kernels; \
@@ -23,14 +24,14 @@ PADGS_DECLARE(avx512)
 struct Kernels {
   const char *name;
   const ProjectKernels &project;
-  const BlendKernels &blend;
+  const BlendKernels &blend, &hybrid;
   const LossKernels &loss;
   const DecodeKernels &decode;
   const CeilingKernels &ceilings;
 };
 
 #define PADGS_KERNELS(isa)                                                                                  \
-  {#isa, isa::project_kernels, isa::blend_kernels, isa::loss_kernels, isa::decode_kernels, isa::ceiling_kernels}
+  {#isa, isa::project_kernels, isa::blend_kernels, isa::hybrid_kernels, isa::loss_kernels, isa::decode_kernels, isa::ceiling_kernels}
 
 static Kernels choose() {
 #if PADGS_ISA_COUNT > 1
@@ -67,9 +68,13 @@ PADGS_API void padgs_project_backward(const Camera *camera, const Inputs *in, co
   kernels().project.backward(*camera, *in, moments, *out);
 }
 
-PADGS_API void padgs_blend_forward(const BlendArguments *args) { kernels().blend.forward(*args); }
+PADGS_API void padgs_blend_forward(const BlendArguments *args) {
+  (args->core_size ? kernels().hybrid : kernels().blend).forward(*args);
+}
 
-PADGS_API void padgs_blend_backward(const BlendGradientArguments *args) { kernels().blend.backward(*args); }
+PADGS_API void padgs_blend_backward(const BlendGradientArguments *args) {
+  (args->forward.core_size ? kernels().hybrid : kernels().blend).backward(*args);
+}
 
 PADGS_API double padgs_photometric_loss(const LossArguments *args) { return kernels().loss.photometric(*args); }
 
