@@ -57,7 +57,9 @@ class RenderOptions:
         if not self.low_pass >= 0:
             raise ValueError(f"low_pass is {self.low_pass}; it must be a variance >= 0 in square pixels")
         if self.cubemap and self.projection == "erp":
-            raise ValueError("projection 'erp' draws whole panoramas; the faces of a cubemap take pinhole, tangent or ray")
+            raise ValueError(
+                "projection 'erp' draws whole panoramas; the faces of a cubemap take pinhole, tangent or ray"
+            )
         if self.face_size is not None and not self.face_size >= 2:
             raise ValueError(f"face_size is {self.face_size}; a face must be at least 2 pixels wide, or None")
 
@@ -126,7 +128,9 @@ def _check_camera(camera: Camera, options: RenderOptions) -> None:
     kind = {"erp": Panorama, "pinhole": Pinhole}.get(options.projection)
     if options.cubemap:
         if not isinstance(camera, Panorama):
-            raise ValueError(f"a cubemap is resampled to a Panorama, not to a {type(camera).__name__}; set cubemap=false")
+            raise ValueError(
+                f"a cubemap is resampled to a Panorama, not to a {type(camera).__name__}; set cubemap=false"
+            )
     elif kind is not None and not isinstance(camera, kind):
         way_out = "; cubemap=true draws panoramas with it" if kind is Pinhole and isinstance(camera, Panorama) else ""
         raise ValueError(
