@@ -7,7 +7,7 @@ is the definition.
 from __future__ import annotations
 
 import warnings
-from functools import cache
+from functools import cache, partial
 
 import torch
 from torch import Tensor
@@ -15,6 +15,7 @@ from torch import Tensor
 from padgs.gaussians import Gaussians
 from padgs.registry import lookup
 from padgs.render.contract import Rendering, RenderOptions, check_inputs
+from padgs.render.cubemap import rasterize_cubemap
 from padgs.scene import View
 
 BACKENDS = {
@@ -41,7 +42,7 @@ def render(
     Args:
         gaussians: N Gaussians in the world frame, float32 (any backend) or float64 (torch only).
         view: pose and image size.
-        options: projection, bounds, culling.
+        options: projection, bounds, culling; whether a panorama is drawn at once or as a cubemap.
         background: [3] RGB behind everything; black if not given.
         probe: [N, 2] zeros that move the projected means, in normalised image units (x and y each run over 2 across
             the image, as in 3DGS); its gradient after `backward` is the densification signal.
@@ -58,6 +59,8 @@ def render(
         background = means.new_zeros(3)
     check_inputs(gaussians, cam_from_world, view.camera, options, background, probe, check_values=check_values)
     rasterize = lookup(BACKENDS, resolve_backend(backend, means), "backend")
+    if options.cubemap:
+        rasterize = partial(rasterize_cubemap, rasterize)
     return rasterize(gaussians, cam_from_world, view.camera, options, background, probe)
 
 

@@ -119,15 +119,17 @@ def project_ray(
     return RayFootprints(opacities, radius, visible, means, whitening, _rays(camera, means), options.near)
 
 
-def _probed(means: Tensor, probe: Tensor | None) -> Tensor:
-    """Means moved on their sphere by the probe: as far as it would move them on a panorama of 2 x 2 units."""
-    if probe is None:
-        return means
+def shift_of_probe(means: Tensor, probe: Tensor) -> Tensor:
+    """What a probe adds to camera-frame means, [N, 3], on their sphere: as on a panorama of 2 x 2 units."""
     x, y, z = means.detach().unbind(-1)
     rho = torch.sqrt(x * x + z * z)
     east = torch.stack((z, torch.zeros_like(x), -x), dim=-1)  # of length rho = r cos(latitude)
     down = torch.stack((-x * y, rho * rho, -y * z), dim=-1) / rho.clamp(min=1e-30)[:, None]  # of length r
-    return means + probe[:, :1] * pi * east + probe[:, 1:] * (pi / 2) * down
+    return probe[:, :1] * pi * east + probe[:, 1:] * (pi / 2) * down
+
+
+def _probed(means: Tensor, probe: Tensor | None) -> Tensor:
+    return means if probe is None else means + shift_of_probe(means, probe)
 
 
 def _tangent_basis(normals: Tensor) -> Tensor:
