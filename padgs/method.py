@@ -29,6 +29,8 @@ class RenderConfig:
     low_pass: float = 0.3
     wrap: bool = True
     bounds: str = "exact"
+    cubemap: bool = False  # through six perspective faces, for the projections pinhole, tangent and ray
+    face_size: int | None = None  # pixels; None: as fine as the panorama
     blending: str = "sorted"
     core_size: int = 16  # of blending hybrid
 
@@ -46,6 +48,8 @@ class RenderConfig:
             low_pass=self.low_pass,
             wrap=self.wrap,
             bounds=self.bounds,
+            cubemap=self.cubemap,
+            face_size=self.face_size,
             blending=self.blending,
             core_size=self.core_size,
         )

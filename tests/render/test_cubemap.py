@@ -1,0 +1,245 @@
+"""A panorama through six faces: geometry of the cube, interpolation, seams, gradients."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from render_cases import (
+    INPUTS,
+    draw,
+    each_engine,
+    gaussians_of,
+    identity_pose,
+    leaves,
+    needs_native,
+    random_pose,
+    row_error,
+)
+
+from padgs.camera import Panorama, Pinhole
+from padgs.gaussians import Gaussians
+from padgs.method import RenderConfig
+from padgs.panorama import rays
+from padgs.render import Rendering, RenderOptions, render
+from padgs.render.cubemap import FACES, _corners, face_camera, panorama_from_faces
+from padgs.scene import View
+
+PROJECTIONS = ("pinhole", "tangent", "ray")
+SIZES = ((64, 32), (70, 44), (33, 17), (8, 4), (2, 1))
+PLACES = {  # where a Gaussian can lie on a cube
+    "middle of a face": (0, 0, 1),
+    "edge": (1, 0.1, 1),
+    "lower edge": (-0.2, 1, 1),
+    "corner": (-1, -1, -1),
+    "pole": (0.05, -1, 0.02),
+    "seam of the panorama": (0.01, 0.3, -1),
+}
+
+
+def broad(place: str, sigma: float = 8.0) -> Gaussians:
+    """One isotropic Gaussian, sigma in degrees, two units away."""
+    mean = 2 * torch.nn.functional.normalize(torch.tensor([PLACES[place]], dtype=torch.float64), dim=-1)
+    scales = torch.full((1, 3), 2 * math.radians(sigma), dtype=torch.float64)
+    quats, opacities = torch.tensor([[1.0, 0, 0, 0]]).double(), torch.tensor([0.9]).double()
+    return Gaussians(mean, quats, scales, opacities, torch.tensor([[1.0, 0.5, 0.25]]).double())
+
+
+def seen_by_faces(panorama: Panorama, lens: Pinhole) -> list[Rendering]:
+    """Renderings of a world in which every direction has its own coordinates for a colour."""
+    local = lens.rays(dtype=torch.float64)
+    empty = local.new_zeros(local.shape[:2])
+    return [Rendering(local @ turn, empty, empty + 3.0, torch.ones(1, dtype=torch.bool)) for turn in FACES]
+
+
+def test_faces_are_turns_and_look_along_all_axes():
+    torch.testing.assert_close(FACES @ FACES.mT, torch.eye(3, dtype=torch.float64).expand(6, 3, 3))
+    assert torch.equal(torch.linalg.det(FACES), torch.ones(6, dtype=torch.float64))
+    assert {tuple(axis) for axis in FACES[:, 2].tolist()} == {
+        (s * a, s * b, s * c) for s in (1.0, -1.0) for a, b, c in torch.eye(3).tolist()
+    }
+
+
+@pytest.mark.parametrize("face_size", [None, 2, 5, 64])
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_every_pixel_is_interpolated_inside_one_face(width: int, height: int, face_size: int | None):
+    panorama = Panorama(width, height)
+    lens = face_camera(panorama, face_size)
+    assert lens.width / 2 / lens.fx >= 1 + 1 / lens.fx  # 90 degrees and a pixel at each border
+    pixels, weights = _corners(panorama, lens, torch.device("cpu"))
+    assert (weights >= 0).all() and torch.allclose(weights.sum(-1), weights.new_ones(len(weights)))
+    face, within = pixels // lens.width**2, pixels % lens.width**2
+    assert (face == face[:, :1]).all() and face.min() >= 0 and face.max() <= 5
+    row, column = within // lens.width, within % lens.width
+    assert (column[:, 1] - column[:, 0] == 1).all() and (row[:, 2] - row[:, 0] == 1).all()
+
+
+def test_a_face_is_as_fine_as_the_panorama_and_can_be_made_finer():
+    assert face_camera(Panorama(1024, 512)).focal == pytest.approx(1024 / (2 * math.pi))
+    assert face_camera(Panorama(100, 100)).focal == pytest.approx(100 / math.pi)
+    assert face_camera(Panorama(1024, 512), 500).fx == 250
+
+
+@pytest.mark.parametrize(("width", "height"), [(64, 32), (70, 44), (256, 128)])
+def test_directions_come_back_to_second_order(width: int, height: int):
+    panorama = Panorama(width, height)
+    lens = face_camera(panorama)
+    result = panorama_from_faces(seen_by_faces(panorama, lens), panorama, lens)
+    error = (result.image - rays(width, height, dtype=torch.float64)).norm(dim=-1)
+    # Along a row of a face the unit ray bends by at most 1 / f^2 a pixel: h^2 / 8 times that, for rows and columns.
+    assert error.max() <= 2 / 8 / lens.fx**2
+    torch.testing.assert_close(result.depth, torch.full_like(result.depth, 3))
+    torch.testing.assert_close(result.transmittance, torch.zeros_like(result.depth))
+
+
+@pytest.mark.parametrize("projection", PROJECTIONS)
+@each_engine
+def test_a_sphere_of_one_colour_stays_so(projection: str, backend: str, dtype: torch.dtype, generator):
+    gaussians = gaussians_of("ordinary", 30, generator)
+    color = torch.tensor([0.25, 0.5, 0.75], dtype=torch.float64)
+    gaussians = replace(gaussians, colors=color.expand(30, 3))
+    options = RenderOptions(projection=projection, cubemap=True)
+    rendering = draw(gaussians, 70, 44, backend=backend, dtype=dtype, options=options, background=color)
+    torch.testing.assert_close(rendering.image, color.to(dtype).expand(44, 70, 3), rtol=0, atol=2e-6)
+    assert rendering.transmittance.min() < 0.9
+
+
+@pytest.mark.parametrize("place", PLACES)
+@each_engine
+def test_rays_see_the_same_through_faces(place: str, backend: str, dtype: torch.dtype):
+    """No seam: at edges and corners of the cube the error is that of interpolation, as in the middle of a face."""
+    options, sigma = RenderOptions(projection="ray", low_pass=0.0), 8.0
+    for width in (128, 256):
+        whole = draw(broad(place, sigma), width, width // 2, backend=backend, dtype=dtype, options=options)
+        options_of_faces = replace(options, cubemap=True)
+        faces = draw(broad(place, sigma), width, width // 2, backend=backend, dtype=dtype, options=options_of_faces)
+        error = (faces.image - whole.image).abs().amax(-1)
+        # Bilinear: (|f_uu| + |f_vv|) / 8 <= 2 o / 8 (h / sigma)^2, a pixel being h = 1 / f at the centre of a face.
+        bound = 0.9 / 4 * (2 * math.pi / width / math.radians(sigma)) ** 2
+        smooth = whole.transmittance < 1 - 4 / 255  # away from where alpha is cut off at 1/255
+        assert error[smooth].max() <= bound
+        assert error.max() <= bound + 1 / 255
+        assert smooth.sum() > 100
+
+
+@each_engine
+def test_depth_is_not_mixed_with_emptiness(backend: str, dtype: torch.dtype):
+    for place in PLACES:
+        options = RenderOptions(projection="ray", cubemap=True)
+        rendering = draw(broad(place), 64, 32, backend=backend, dtype=dtype, options=options)
+        covered = rendering.depth > 0
+        assert torch.equal(covered, rendering.transmittance < 1)
+        torch.testing.assert_close(
+            rendering.depth[covered], torch.full_like(rendering.depth[covered], 2.0), rtol=1e-5, atol=0
+        )
+        assert 20 < covered.sum() < 64 * 32 / 2
+
+
+@pytest.mark.parametrize("projection", PROJECTIONS)
+@needs_native
+def test_native_faces_match_the_definition(projection: str, generator):
+    gaussians = gaussians_of("ordinary", 25, generator)
+    pose = random_pose(generator, shift=0.1)
+    weight = torch.rand(36, 72, 5, generator=generator, dtype=torch.float64)
+    found = {}
+    for backend, dtype in (("torch", torch.float64), ("cpu", torch.float32)):
+        inputs, eye = leaves(gaussians, dtype), pose.to(dtype, copy=True).requires_grad_()
+        probe = torch.zeros(25, 2, dtype=dtype, requires_grad=True)
+        options = RenderOptions(projection=projection, cubemap=True, near=0.05)
+        rendering = render(inputs, View("v", eye, 72, 36), options, backend=backend, probe=probe)
+        outputs = torch.cat(
+            (rendering.image, rendering.transmittance[..., None], 0.1 * rendering.depth[..., None]), dim=-1
+        )
+        (outputs * weight).sum().backward()
+        gradients = {name: getattr(inputs, name).grad for name in INPUTS}
+        turn = eye.grad[:3, :3] @ eye.detach()[:3, :3].T  # by a small rotation: the part that is antisymmetric
+        gradients |= {"shift": eye.grad[:3, 3:], "turn": turn - turn.T, "probe": probe.grad}
+        found[backend] = rendering, gradients
+    (expected, expected_gradients), (actual, gradients) = found["torch"], found["cpu"]
+    assert ((actual.image - expected.image).abs().amax(-1) > 2e-5).double().mean() < 5e-3  # pairs at the cut may flip
+    assert torch.equal(actual.visible, expected.visible)
+    assert actual.counters["contributing"] == pytest.approx(expected.counters["contributing"], rel=1e-3)
+    for name, gradient in gradients.items():
+        assert row_error(gradient, expected_gradients[name]) < 5e-3, name
+
+
+@pytest.mark.parametrize("projection", PROJECTIONS)
+def test_gradients_are_the_slope(projection: str, generator):
+    """Every input and the pose, float64, against central differences; nothing here is near a cut."""
+    count = 4
+    radius = torch.tensor([[2.5], [3.0], [3.5], [4.0]], dtype=torch.float64)  # apart: the order stays
+    gaussians = Gaussians(
+        means=radius * torch.nn.functional.normalize(torch.randn(count, 3, generator=generator).double(), dim=-1),
+        quats=torch.randn(count, 4, generator=generator, dtype=torch.float64),
+        scales=0.4 + 0.4 * torch.rand(count, 3, generator=generator, dtype=torch.float64),
+        opacities=0.4 + 0.2 * torch.rand(count, generator=generator, dtype=torch.float64),
+        colors=torch.rand(count, 3, generator=generator, dtype=torch.float64),
+    )
+    inputs, pose = leaves(gaussians, torch.float64), identity_pose().requires_grad_()
+    probe = torch.zeros(count, 2, dtype=torch.float64, requires_grad=True)
+    variables = {**vars(inputs), "pose": pose, "probe": probe}
+    weight = torch.rand(6, 12, 5, generator=generator, dtype=torch.float64)
+    options = RenderOptions(projection=projection, cubemap=True)
+
+    def value(changed: dict) -> torch.Tensor:
+        drawn = Gaussians(**{name: changed[name] for name in INPUTS})
+        rendering = render(drawn, View("v", changed["pose"], 12, 6), options, probe=changed["probe"])
+        outputs = torch.cat((rendering.image, rendering.transmittance[..., None], rendering.depth[..., None]), dim=-1)
+        return (outputs * weight).sum()
+
+    gradients = torch.autograd.grad(value(variables), list(variables.values()))
+    for (name, variable), gradient in zip(variables.items(), gradients, strict=True):
+        step = 1e-6 * torch.randn(variable.shape, generator=generator, dtype=torch.float64)
+        if name == "pose":
+            step[3] = 0
+        with torch.no_grad():
+            slope = value({**variables, name: variable + step}) - value({**variables, name: variable - step})
+        assert slope.abs() > 1e-9, name
+        assert (gradient * step).sum().item() * 2 == pytest.approx(slope.item(), rel=1e-4), name
+
+
+@each_engine
+def test_the_probe_means_the_same_as_on_the_panorama(backend: str, dtype: torch.dtype):
+    """The densification signal does not depend on how a panorama is drawn."""
+    weight = torch.rand(64, 128, 3, generator=torch.Generator().manual_seed(5)).to(dtype)
+    weight = torch.nn.functional.avg_pool2d(weight.movedim(-1, 0), 9, 1, 4).movedim(0, -1)  # smooth, for interpolation
+    for place in ("middle of a face", "edge", "corner"):
+        signals = []
+        for cubemap in (False, True):
+            probe = torch.zeros(1, 2, dtype=dtype, requires_grad=True)
+            options = RenderOptions(projection="ray", cubemap=cubemap)
+            rendering = draw(broad(place), 128, 64, backend=backend, dtype=dtype, options=options, probe=probe)
+            (signal,) = torch.autograd.grad((rendering.image * weight).sum(), probe)
+            signals.append(signal)
+        assert (signals[0] - signals[1]).norm() < 0.03 * signals[0].norm(), place
+
+
+def test_what_no_face_shows_is_not_visible():
+    gaussians = replace(broad("edge"), opacities=torch.tensor([1e-3]).double())
+    rendering = render(gaussians, View("v", identity_pose(), 32, 16), RenderOptions(projection="ray", cubemap=True))
+    assert rendering.visible.tolist() == [False] and rendering.counters["visible"] == 0
+    shown = render(broad("edge"), View("v", identity_pose(), 32, 16), RenderOptions(projection="ray", cubemap=True))
+    assert shown.visible.tolist() == [True] and shown.counters["gaussians"] == 1
+
+
+def test_misuse_is_named():
+    with pytest.raises(
+        ValueError, match="'erp' draws whole panoramas; the faces of a cubemap take pinhole, tangent or"
+    ):
+        RenderOptions(projection="erp", cubemap=True)
+    with pytest.raises(ValueError, match="face_size is 1; a face must be at least 2 pixels wide, or None"):
+        RenderOptions(projection="ray", cubemap=True, face_size=1)
+    lens = Pinhole(8, 8, 4.0, 4.0, 4.0, 4.0)
+    with pytest.raises(ValueError, match="a cubemap is resampled to a Panorama, not to a Pinhole; set cubemap=false"):
+        render(
+            broad("edge"), View("v", identity_pose(), 8, 8, lens=lens), RenderOptions(projection="ray", cubemap=True)
+        )
+    with pytest.raises(ValueError, match="made for a Pinhole camera, not a Panorama; .*cubemap=true"):
+        render(broad("edge"), View("v", identity_pose(), 8, 4), RenderOptions(projection="pinhole"))
+
+
+def test_it_is_a_setting_of_a_run():
+    options = RenderConfig(projection="pinhole", cubemap=True, face_size=64).options(1.0)
+    assert (options.projection, options.cubemap, options.face_size) == ("pinhole", True, 64)
