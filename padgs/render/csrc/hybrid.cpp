@@ -139,6 +139,7 @@ void forward_all(const BlendArguments &args) {
 struct Upstream {
   Vec red, green, blue, depth, offset;
   Vec unit, mean, behind;  // of the tail
+  Vec furthest;            // distance at which the core ends
 
   Vec signal(Vec r, Vec g, Vec b, Vec d) const { return red * r + green * g + blue * b + depth * d + offset; }
 };
@@ -159,6 +160,8 @@ Upstream differentiate_row(const BlendGradientArguments &args, const Tile &tile,
     }
     if (args.grad_depth) depth[x] = forward.depth[p], grad_depth[x] = args.grad_depth[p];
   }
+  Upstream up;
+  up.furthest = row.filled == row.size ? row.core[row.size - 1].distance : splat(kEmpty);
   Vec left = splat(1.0f), coverage = zero();
   for (int k = 0; k < row.filled; ++k) {
     const Vec weight = row.core[k].alpha * left;
@@ -166,7 +169,6 @@ Upstream differentiate_row(const BlendGradientArguments &args, const Tile &tile,
     coverage += weight;
     left = left_behind(left, weight);
   }
-  Upstream up;
   up.red = load(grad[0]), up.green = load(grad[1]), up.blue = load(grad[2]);
   up.unit = left * opacity_per_alpha(tail);
   coverage += up.unit * tail.alpha;
@@ -199,6 +201,7 @@ void add_moments(const BlendGradientArguments &args, const Tile &tile, const Chu
     const Footprint &f = forward.footprints[instance.gaussian];
     const Pixels pixels(f, forward, chunk.x0);
     const VecI gaussian = splat_int(instance.gaussian);
+    const float reach = ray_reach(forward, f);
     const Vec f_red = splat(f.red), f_green = splat(f.green), f_blue = splat(f.blue), f_depth = splat(f.depth);
     typename Pixels::ChunkMoments in_chunk;
     Vec red = zero(), green = zero(), blue = zero(), depth = zero();
@@ -211,8 +214,9 @@ void add_moments(const BlendGradientArguments &args, const Tile &tile, const Chu
       const Upstream &up = upstream[y];
       const Fragments &row = chunk.rows[y];
       Vec unit = up.unit, mean = up.mean, behind = up.behind;
-      // The margin is for rounding, which may differ from that of `collect`; what is not found is in the tail.
-      Mask sought = at_least(alpha, splat(kCoreAlphaMin * 0.999f));
+      // The margins are for rounding, which may differ from that of `collect`; what is not found is in the tail.
+      const Mask near = at_least(up.furthest * 1.001f, distance(at, f, reach));
+      Mask sought = both(near, at_least(alpha, splat(kCoreAlphaMin * 0.999f)));
       for (int k = 0; k < row.filled && any(sought); ++k) {
         const Mask found = both(sought, equal(row.core[k].gaussian, gaussian));
         unit = select(found, row.core[k].distance, unit);
