@@ -27,6 +27,7 @@ class RenderConfig:
     near: float = 0.01  # Gaussians nearer than this are culled
     near_unit: str = "scene"  # scene: multiples of Scene.unit; world: as the published code does
     low_pass: float = 0.3
+    low_pass_kind: str = "auto"
     wrap: bool = True
     bounds: str = "exact"
     cubemap: bool = False  # through six perspective faces, for the projections pinhole, tangent and ray
@@ -46,6 +47,7 @@ class RenderConfig:
             projection=self.projection,
             near=near,
             low_pass=self.low_pass,
+            low_pass_kind=self.low_pass_kind,
             wrap=self.wrap,
             bounds=self.bounds,
             cubemap=self.cubemap,

@@ -25,6 +25,12 @@ CORE_ALPHA_MIN = 0.05  # hybrid: fainter fragments go to the tail
 MAX_CORE_SIZE = 256
 BLENDINGS = ("sorted", "hybrid")
 BOUNDS = ("exact", "square")
+LOW_PASS_KINDS = {  # of each projection, its natural one first; `padgs.render.low_pass` says what they are
+    "erp": ("pixels", "angular", "solid"),
+    "pinhole": ("pixels", "angular", "solid"),
+    "tangent": ("angular", "solid"),
+    "ray": ("solid", "angular"),
+}
 
 
 @dataclass(frozen=True)
@@ -33,7 +39,8 @@ class RenderOptions:
 
     projection: str = "erp"
     near: float = 0.0  # world units; Gaussians whose mean is at most this far away are culled
-    low_pass: float = 0.3  # variance of the low-pass filter in square pixels; what it widens is up to the projection
+    low_pass: float = 0.3  # variance of the low-pass filter in square pixels (at the centre of a perspective image)
+    low_pass_kind: str = "auto"  # pixels, angular or solid; auto: what the projection was published with
     wrap: bool = True  # continue footprints across the +-180 degree seam of a panorama
     cubemap: bool = False  # draw a panorama through the six faces of a cube, each an ordinary perspective view
     face_size: int | None = None  # cubemap: pixels across the 90 degrees of a face; None: as fine as the panorama
@@ -56,12 +63,23 @@ class RenderOptions:
             raise ValueError(f"near is {self.near}; it must be a distance >= 0 in world units")
         if not self.low_pass >= 0:
             raise ValueError(f"low_pass is {self.low_pass}; it must be a variance >= 0 in square pixels")
+        kinds = LOW_PASS_KINDS.get(self.projection, ())  # of an unknown projection nothing is known; see `PROJECTIONS`
+        if kinds and self.low_pass_kind not in ("auto", *kinds):
+            raise ValueError(
+                f"projection {self.projection!r} has no low_pass_kind {self.low_pass_kind!r}; known: auto, "
+                f"{', '.join(kinds)}"
+            )
         if self.cubemap and self.projection == "erp":
             raise ValueError(
                 "projection 'erp' draws whole panoramas; the faces of a cubemap take pinhole, tangent or ray"
             )
         if self.face_size is not None and not self.face_size >= 2:
             raise ValueError(f"face_size is {self.face_size}; a face must be at least 2 pixels wide, or None")
+
+    @property
+    def resolved_low_pass_kind(self) -> str:
+        """The kind that `auto` stands for; other kinds as they are."""
+        return LOW_PASS_KINDS[self.projection][0] if self.low_pass_kind == "auto" else self.low_pass_kind
 
 
 @dataclass(frozen=True)

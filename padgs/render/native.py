@@ -30,7 +30,8 @@ class Camera(ctypes.Structure):
         ("cam_from_world", ctypes.c_float * 12),
         *_fields(ctypes.c_float, "near_radius", "low_pass"),
         *_fields(ctypes.c_int32, "wrap", "square"),
-        *_fields(ctypes.c_float, "fx", "fy", "cx", "cy"),
+        *_fields(ctypes.c_float, "fx", "fy", "cx", "cy", "widen"),
+        ("compensate", ctypes.c_int32),
     ]
 
 
@@ -127,6 +128,9 @@ class LossArguments(ctypes.Structure):
     ]
 
 
+STRUCTURES = (Camera, Inputs, Gradients, BlendGradientArguments, DecodeGradientArguments, LossArguments)
+
+
 def pointer(tensor: Tensor | None) -> int | None:
     """Address of a contiguous tensor, or None."""
     if tensor is None:
@@ -140,7 +144,8 @@ def library() -> ctypes.CDLL:
     """The loaded library.
 
     Raises:
-        OSError: it was not built (no compiler at install time) or does not load; the message says where it was sought.
+        OSError: it was not built (no compiler at install time), does not load, or was built from other sources; the
+            message says where it was sought.
     """
     suffix = {"darwin": ".dylib", "win32": ".dll"}.get(sys.platform, ".so")
     name = ("" if sys.platform == "win32" else "lib") + "padgs_cpu" + suffix
@@ -167,6 +172,7 @@ def _declare(loaded: ctypes.CDLL) -> None:
     i32, i64 = ctypes.c_int32, ctypes.c_int64
     signatures = {
         "padgs_isa": ([], ctypes.c_char_p),
+        "padgs_structure_bytes": ([i32], i64),
         "padgs_project": ([Pointer] * 4, None),
         "padgs_project_backward": ([Pointer] * 4, None),
         "padgs_tile_levels": ([Pointer] * 2, None),
@@ -185,8 +191,13 @@ def _declare(loaded: ctypes.CDLL) -> None:
         "padgs_measure_triad": ([Pointer, Pointer, Pointer, i64], ctypes.c_double),
     }
     for name, (arguments, result) in signatures.items():
+        if not hasattr(loaded, name):
+            raise OSError(f"{loaded._name} is of another version, without {name}; build it again")
         function = getattr(loaded, name)
         function.argtypes, function.restype = arguments, result
+    for index, structure in enumerate(STRUCTURES):  # what is laid out differently would be read as nonsense
+        if loaded.padgs_structure_bytes(index) != ctypes.sizeof(structure):
+            raise OSError(f"{loaded._name} is of another version, with another {structure.__name__}; build it again")
 
 
 @functools.cache

@@ -13,6 +13,7 @@ from padgs.camera import Camera, Panorama, Pinhole, RayTable
 from padgs.panorama import row_latitudes
 from padgs.render import native
 from padgs.render.contract import RenderOptions
+from padgs.render.low_pass import low_pass_of
 from padgs.render.native import pointer
 
 CHUNK = 16  # pixels; rows of ray tables are padded to whole chunks
@@ -47,7 +48,7 @@ def native_camera(cam_from_world: Tensor, camera: Camera, options: RenderOptions
         raise ValueError(
             f"backend cpu does not know projection {options.projection!r}; known: {', '.join(PROJECTIONS)}"
         )
-    planar = options.projection in ("erp", "pinhole")
+    low_pass = low_pass_of(options, camera)
     lens = (camera.fx, camera.fy, camera.cx, camera.cy) if isinstance(camera, Pinhole) else (0.0, 0.0, 0.0, 0.0)
     return native.Camera(
         camera.width,
@@ -56,10 +57,12 @@ def native_camera(cam_from_world: Tensor, camera: Camera, options: RenderOptions
         MODELS.index(type(camera)),
         (ctypes.c_float * 12)(*cam_from_world[:3].detach().reshape(-1).tolist()),
         options.near,
-        options.low_pass if planar else options.low_pass / camera.focal**2,
+        low_pass.own,
         options.wrap and isinstance(camera, Panorama),
         options.bounds == "square",
         *lens,
+        low_pass.widen,
+        low_pass.compensate,
     )
 
 

@@ -14,6 +14,7 @@ from padgs.camera import Panorama, Pinhole
 from padgs.gaussians import Gaussians
 from padgs.panorama import longitude_latitude, pixel_from_angles, projection_jacobian
 from padgs.render.contract import ALPHA_MIN, RenderOptions
+from padgs.render.low_pass import low_pass_of, widened
 from padgs.render.projection import Footprints, camera_frame
 
 MIN_COS_LATITUDE = 1e-4  # an erp footprint nearer to the axis than 0.006 degrees is undefined; see design.md section 3
@@ -54,6 +55,7 @@ def project_erp(
 ) -> PlanarFootprints:
     """Chart model: mean through Eq. 6-7, covariance through their Jacobian (Eq. 3, 5)."""
     means, orientations = camera_frame(gaussians, cam_from_world)
+    gaussians = widened(gaussians, means, low_pass_of(options, camera))
     squared_radius = (means * means).sum(-1).detach()
     in_front = squared_radius > options.near**2
     # Next to the axis the chart has no derivative worth the name; such a footprint is held constant.
@@ -73,6 +75,7 @@ def project_pinhole(
 ) -> PlanarFootprints:
     """The perspective model of 3D Gaussian splatting: u = fx x / z + cx, Jacobian with limited slopes."""
     means, orientations = camera_frame(gaussians, cam_from_world)
+    gaussians = widened(gaussians, means, low_pass_of(options, camera))
     in_front = means[:, 2].detach() > options.near
     x, y, z = means.unbind(-1)
     centers = torch.stack((camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy), dim=-1)
@@ -103,8 +106,9 @@ def _footprints(
     cov_uv = (half_covariance[:, 0] * half_covariance[:, 1]).sum(-1)
     # det(S) without the cancelling difference var_u var_v - cov_uv^2: Lagrange's identity plus the low-pass terms.
     minors = torch.linalg.cross(half_covariance[:, 0], half_covariance[:, 1])
-    determinant = (minors**2).sum(-1) + options.low_pass * (var_u + var_v) + options.low_pass**2
-    var_u, var_v = var_u + options.low_pass, var_v + options.low_pass
+    low_pass = low_pass_of(options, camera).own
+    determinant = (minors**2).sum(-1) + low_pass * (var_u + var_v) + low_pass**2
+    var_u, var_v = var_u + low_pass, var_v + low_pass
     conics = torch.stack((var_v, -cov_uv, var_u), dim=-1) / determinant[:, None]
     covariance = torch.stack((var_u, cov_uv, var_v), dim=-1).detach()
     opacities = gaussians.opacities.detach()

@@ -1,7 +1,7 @@
 """Projective footprints (torch): models that work with the ray of a pixel, so that any camera will do.
 
 tangent: the Gaussian flattened onto the tangent plane of the sphere at its mean (OP43DGS, with correct extents).
-ray: the largest value of the 3D Gaussian along the ray (SPaGS), after a 3D low-pass that grows with distance.
+ray: the largest value of the 3D Gaussian along the ray (SPaGS).
 Neither knows of charts: no pole, no seam.
 """
 
@@ -16,6 +16,7 @@ from torch import Tensor
 from padgs.camera import Camera
 from padgs.gaussians import Gaussians
 from padgs.render.contract import ALPHA_MIN, RenderOptions
+from padgs.render.low_pass import low_pass_of, widened
 from padgs.render.projection import Footprints, camera_frame
 
 
@@ -39,10 +40,10 @@ class TangentFootprints(Footprints):
 
 @dataclass(frozen=True)
 class RayFootprints(Footprints):
-    """Projected Gaussians as the ray meets them; opacities are compensated for the low-pass."""
+    """Projected Gaussians as the ray meets them."""
 
     means: Tensor  # [N, 3] camera frame
-    whitening: Tensor  # [N, 3, 3] M^-1 with Sigma' = M M^T
+    whitening: Tensor  # [N, 3, 3] M^-1 with Sigma = M M^T
     rays: Tensor  # [H, W, 3]
     near: float
 
@@ -72,15 +73,16 @@ def project_tangent(
     options: RenderOptions,
     probe: Tensor | None = None,
 ) -> TangentFootprints:
-    """S = E Sigma E^T / r^2 + low_pass / f^2 I on the tangent plane spanned by E, f pixels per radian."""
+    """S = E Sigma E^T / r^2 (+ the angular low-pass) on the tangent plane spanned by E."""
     means, orientations = camera_frame(gaussians, cam_from_world)
     in_front = (means * means).sum(-1).detach() > options.near**2
     means = _probed(means, probe)
+    low_pass = low_pass_of(options, camera)
+    gaussians, low_pass = widened(gaussians, means, low_pass), low_pass.own
     radius = means.norm(dim=-1)
     normal = means / radius[:, None]
     tangent = _tangent_basis(normal)  # [N, 2, 3]
     half = tangent @ (orientations * gaussians.scales[:, None, :]) / radius[:, None, None]  # [N, 2, 3]
-    low_pass = options.low_pass / camera.focal**2
     var_0, var_1 = (half**2).sum(-1).unbind(-1)
     covariance = (half[:, 0] * half[:, 1]).sum(-1)
     minors = torch.linalg.cross(half[:, 0], half[:, 1])  # det(S) without a difference that cancels
@@ -102,15 +104,13 @@ def project_ray(
     options: RenderOptions,
     probe: Tensor | None = None,
 ) -> RayFootprints:
-    """Sigma' = Sigma + low_pass (r / f)^2 I, opacity times sqrt(det Sigma / det Sigma'); not drawn from inside."""
+    """M^-1 = diag(1 / scale) R^T; not drawn from inside, that is where |M^-1 mean|^2 <= 2 ln(255 opacity)."""
     means, orientations = camera_frame(gaussians, cam_from_world)
     in_front = (means * means).sum(-1).detach() > options.near**2
     means = _probed(means, probe)
-    radius = means.norm(dim=-1)
-    low_pass = options.low_pass / camera.focal**2
-    wide = torch.sqrt(gaussians.scales**2 + (low_pass * radius * radius)[:, None])
-    opacities = gaussians.opacities * (gaussians.scales / wide).prod(-1)
-    whitening = orientations.transpose(-1, -2) / wide[:, :, None]
+    gaussians = widened(gaussians, means, low_pass_of(options, camera))
+    radius, opacities = means.norm(dim=-1), gaussians.opacities
+    whitening = orientations.transpose(-1, -2) / gaussians.scales[:, :, None]
     distance = (torch.einsum("kic,kc->ki", whitening, means) ** 2).sum(-1).detach()
     drawn = opacities.detach() >= ALPHA_MIN
     outside = distance > 2 * torch.log((opacities.detach() / ALPHA_MIN).clamp(min=1))

@@ -28,10 +28,12 @@ struct Camera {
   int32_t projection, model;
   float cam_from_world[12];  // rows of [R | t]
   float near_radius;
-  float low_pass;        // erp, pinhole: px^2; tangent: rad^2; ray: rad^2, times r^2 on the 3D covariance
+  float low_pass;        // added to the footprint; erp, pinhole: px^2; tangent: rad^2; ray: has none
   int32_t wrap;          // 1: footprints continue across the +-180 degree seam
   int32_t square;        // 1: published bounds, a square of 3 sigma of the longest axis rounded out to tiles
   float fx, fy, cx, cy;  // pinhole
+  float widen;           // rad^2, times r^2 added to the 3D covariance
+  int32_t compensate;    // 1: widening lowers the opacity
 };
 
 // One projected Gaussian as the blender reads it: a cache line.

@@ -57,6 +57,14 @@ static const Kernels &kernels() {
 
 using namespace padgs;
 
+// Bytes of the structures of abi.h that cross the border, in the order of STRUCTURES in native.py, which refuses to talk
+// to a library that was built from other sources.
+PADGS_API int64_t padgs_structure_bytes(int32_t index) {
+  const size_t bytes[] = {sizeof(Camera), sizeof(Inputs), sizeof(Gradients), sizeof(BlendGradientArguments),
+                          sizeof(DecodeGradientArguments), sizeof(LossArguments)};
+  return index >= 0 && size_t(index) < sizeof(bytes) / sizeof(*bytes) ? int64_t(bytes[index]) : -1;
+}
+
 PADGS_API const char *padgs_isa() { return kernels().name; }
 
 PADGS_API void padgs_project(const Camera *camera, const Inputs *in, Footprint *footprints, PixelBox *boxes) {

@@ -6,6 +6,7 @@
 
 #include "bounds.h"
 #include "kernels.h"
+#include "low_pass.h"
 #include "planar.h"
 #include "projective.h"
 #include "simd_math.h"
@@ -106,8 +107,7 @@ struct Projected {
 };
 
 template <template <class> class Chart>
-void project_planar(const Camera &camera, const Inputs &in, int64_t first, const Batch &batch, Projected &out) {
-  const CameraGaussian<Vec> &g = batch.gaussian;
+void project_planar(const Camera &camera, const Inputs &in, int64_t first, const CameraGaussian<Vec> &g, Projected &out) {
   const Chart<Vec> chart(camera, g.mean);
   const Covariance2D<Vec> s = project_covariance(g.spread(), chart.jacobian_u, chart.jacobian_v, camera.low_pass);
   Vec u = chart.u, v = chart.v;
@@ -117,7 +117,7 @@ void project_planar(const Camera &camera, const Inputs &in, int64_t first, const
     u += probe[0] * (0.5f * float(camera.width));
     v += probe[1] * (0.5f * float(camera.height));
   }
-  const Vec log2_opacity = logarithm2(g.opacity);
+  const Vec log2_opacity = logarithm2(larger(g.opacity, splat(1e-30f)));
   const PlanarShape<Vec> shape = planar_shape(s, log2_opacity);
   const Vec values[5] = {u, v, shape.a, shape.b, shape.c};
   for (int k = 0; k < 5; ++k) store(out.shape[k], values[k]);
@@ -154,20 +154,18 @@ Vec largest_q(Vec opacity) {
   return maximum((logarithm2(larger(opacity, splat(1e-30f))) + 7.994353437f) * (1.0f / kHalfLog2E), zero()) * kSlack;
 }
 
-void project_tangent(const Camera &camera, const Batch &batch, Projected &out) {
-  const CameraGaussian<Vec> &g = batch.gaussian;
+void project_tangent(const Camera &camera, const CameraGaussian<Vec> &g, Projected &out) {
   const TangentModel<Vec> model(g, camera.low_pass);
   store_projective(model.shape(), g.opacity, model.frame.r, model.dual_cone(largest_q(g.opacity)), out);
   store(out.in_front, model.frame.r - camera.near_radius);
 }
 
-void project_ray(const Camera &camera, const Batch &batch, Projected &out) {
-  const CameraGaussian<Vec> &g = batch.gaussian;
-  const RayModel<Vec> model(g, camera.low_pass);
-  const Vec k = largest_q(model.opacity);
-  store_projective(model.shape(g, camera.near_radius), model.opacity, model.frame.r, model.dual_cone(g, k), out);
-  // Not drawn from inside: rho^2 <= 2 ln(255 o').
-  const Vec exact = (logarithm2(larger(model.opacity, splat(1e-30f))) + 7.994353437f) * (1.0f / kHalfLog2E);
+void project_ray(const Camera &camera, const CameraGaussian<Vec> &g, Projected &out) {
+  const RayModel<Vec> model(g);
+  const Vec k = largest_q(g.opacity);
+  store_projective(model.shape(g, camera.near_radius), g.opacity, model.frame.r, model.dual_cone(g, k), out);
+  // Not drawn from inside: rho^2 <= 2 ln(255 o).
+  const Vec exact = (logarithm2(larger(g.opacity, splat(1e-30f))) + 7.994353437f) * (1.0f / kHalfLog2E);
   store(out.in_front, minimum(model.frame.r - camera.near_radius, model.rho * model.rho - exact));
 }
 
@@ -199,13 +197,14 @@ bool finite(const Projected &p, int lane) {
 void forward_batch(const Camera &camera, const Inputs &in, int64_t first, Footprint *footprints, PixelBox *boxes) {
   Batch batch(camera, in, first);
   Projected p;
-  if (camera.projection == kErp) {
-    project_planar<ErpChart>(camera, in, first, batch, p);
-  } else if (camera.projection == kPinhole) {
-    project_planar<PinholeChart>(camera, in, first, batch, p);
+  const bool planar = camera.projection == kErp || camera.projection == kPinhole;
+  if (!planar) batch.gaussian.mean = probed_mean(in, first, batch.gaussian.mean);
+  const CameraGaussian<Vec> g = Widened<Vec>(camera, batch.gaussian).gaussian;
+  if (planar) {
+    camera.projection == kErp ? project_planar<ErpChart>(camera, in, first, g, p)
+                              : project_planar<PinholeChart>(camera, in, first, g, p);
   } else {
-    batch.gaussian.mean = probed_mean(in, first, batch.gaussian.mean);
-    camera.projection == kTangent ? project_tangent(camera, batch, p) : project_ray(camera, batch, p);
+    camera.projection == kTangent ? project_tangent(camera, g, p) : project_ray(camera, g, p);
     const Vec mean[3] = {batch.gaussian.mean.x, batch.gaussian.mean.y, batch.gaussian.mean.z};
     for (int k = 0; k < 3; ++k) store(p.bounds[6 + k], mean[k]);
   }
@@ -242,8 +241,8 @@ Backward projective_backward(const Camera &camera, const CameraGaussian<Vec> &g,
   const ProjectiveMoments<Vec> moments = projective_moments(m);
   Backward out;
   out.gradient = camera.projection == kTangent ? TangentModel<Vec>(g, camera.low_pass).vjp(g, moments, grad_depth)
-                                               : RayModel<Vec>(g, camera.low_pass).vjp(g, moments, grad_depth);
-  const SphereFrame<Vec> f = sphere_frame(g.mean);
+                                               : RayModel<Vec>(g).vjp(g, moments, grad_depth);
+  const SphereFrame<Vec> f = sphere_frame(g.mean);  // the probe moves along it, which changes no radius: no widening
   out.probe_u = dot(out.gradient.mean, f.east) * f.r * f.cos_latitude * kPi;
   out.probe_v = dot(out.gradient.mean, f.down) * f.r * (0.5f * kPi);
   return out;
@@ -277,9 +276,11 @@ void backward_batch(const Camera &camera, const Inputs &in, const float *moments
   const Vec grad_depth = m[13];
   CameraGaussian<Vec> &g = batch.gaussian;
   if (camera.projection == kTangent || camera.projection == kRay) g.mean = probed_mean(in, first, g.mean);
-  Backward b = camera.projection == kErp       ? planar_backward<ErpChart>(camera, g, m, grad_depth)
-               : camera.projection == kPinhole ? planar_backward<PinholeChart>(camera, g, m, grad_depth)
-                                               : projective_backward(camera, g, m, grad_depth);
+  const Widened<Vec> wide(camera, g);
+  Backward b = camera.projection == kErp       ? planar_backward<ErpChart>(camera, wide.gaussian, m, grad_depth)
+               : camera.projection == kPinhole ? planar_backward<PinholeChart>(camera, wide.gaussian, m, grad_depth)
+                                               : projective_backward(camera, wide.gaussian, m, grad_depth);
+  wide.vjp(g, b.gradient);
   // Lanes that drew nothing may hold anything, infinities too; they are replaced, not multiplied.
   const auto clean = [&](Vec v) { return select(less(zero(), on), v, zero()); };
   const auto clean3 = [&](Vec3<Vec> v) { return Vec3<Vec>{clean(v.x), clean(v.y), clean(v.z)}; };

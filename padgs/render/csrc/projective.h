@@ -1,7 +1,7 @@
 // Projective footprints: one kernel for every model that works with rays. With a pixel's unit ray d,
 //   n = |L d|^2,  b = m.d,  D = b^2 + kappa n,  q = n / D,  accepted where b > 0 and b > near_ratio D.
 // `tangent`: the Gaussian flattened onto the tangent plane at its mean (OP43DGS, corrected). kappa = 0.
-// `ray`: the largest value of the 3D Gaussian along the ray (SPaGS), after a 3D low-pass that grows with distance.
+// `ray`: the largest value of the 3D Gaussian along the ray (SPaGS).
 //
 // Backward blending sums, over the pixels, M = dL/d(ln alpha) times 1, c and c c^T with c = (q, x b / D, y b / D) and
 // (x, y) = L d. Both models' derivatives are linear in these ten sums.
@@ -97,20 +97,14 @@ struct TangentModel {
 template <class T>
 struct RayModel {
   SphereFrame<T> frame;
-  Vec3<T> wide;  // standard deviations after the low-pass: wide^2 = scale^2 + v r^2 / f^2
-  float filter;  // v / f^2
-  Vec3<T> o;     // M^-1 mean, the mean in whitened coordinates
-  T rho;         // |o|: how many standard deviations the camera is away
-  T opacity;     // compensated: o sqrt(det Sigma / det Sigma')
+  Vec3<T> o;  // M^-1 mean, the mean in whitened coordinates
+  T rho;      // |o|: how many standard deviations the camera is away
   Vec3<T> o_hat, u1, u2;
 
-  PADGS_HD RayModel(const CameraGaussian<T> &g, float low_pass) : frame(sphere_frame(g.mean)), filter(low_pass) {
-    const T add = low_pass * frame.r * frame.r;
-    wide = {root(g.scale.x * g.scale.x + add), root(g.scale.y * g.scale.y + add), root(g.scale.z * g.scale.z + add)};
+  PADGS_HD explicit RayModel(const CameraGaussian<T> &g) : frame(sphere_frame(g.mean)) {
     const Vec3<T> local = transposed_times(g.orientation, g.mean);
-    o = {local.x / wide.x, local.y / wide.y, local.z / wide.z};
+    o = {local.x / g.scale.x, local.y / g.scale.y, local.z / g.scale.z};
     rho = root(dot(o, o));
-    opacity = g.opacity * (g.scale.x / wide.x) * (g.scale.y / wide.y) * (g.scale.z / wide.z);
     o_hat = scaled(1.0f / rho, o);
     // Any two unit vectors that complete o_hat: cross it with the axis it is least along.
     const T ax = magnitude(o_hat.x), ay = magnitude(o_hat.y), az = magnitude(o_hat.z);
@@ -123,9 +117,9 @@ struct RayModel {
     u2 = cross(o_hat, u1);
   }
 
-  // R diag(1 / wide) applied to a whitened covector: M^-T w.
+  // R diag(1 / scale) applied to a whitened covector: M^-T w.
   PADGS_HD Vec3<T> from_whitened(const CameraGaussian<T> &g, Vec3<T> w) const {
-    return times(g.orientation, Vec3<T>{w.x / wide.x, w.y / wide.y, w.z / wide.z});
+    return times(g.orientation, Vec3<T>{w.x / g.scale.x, w.y / g.scale.y, w.z / g.scale.z});
   }
 
   PADGS_HD ProjectiveShape<T> shape(const CameraGaussian<T> &g, float near_radius) const {
@@ -133,10 +127,11 @@ struct RayModel {
             1.0f / (rho * rho), near_radius / rho};
   }
 
-  // K* = k Sigma' / r^2 - n n^T.
+  // K* = k Sigma / r^2 - n n^T.
   PADGS_HD Sym3<T> dual_cone(const CameraGaussian<T> &g, T k) const {
     const T scale = k / (frame.r * frame.r);
-    Sym3<T> s = congruent(g.orientation, {scale * wide.x * wide.x, scale * wide.y * wide.y, scale * wide.z * wide.z});
+    const Vec3<T> a = g.scale;
+    Sym3<T> s = congruent(g.orientation, {scale * a.x * a.x, scale * a.y * a.y, scale * a.z * a.z});
     const Vec3<T> n = frame.normal;
     s.xx = s.xx - n.x * n.x, s.xy = s.xy - n.x * n.y, s.xz = s.xz - n.x * n.z;
     s.yy = s.yy - n.y * n.y, s.yz = s.yz - n.y * n.z, s.zz = s.zz - n.z * n.z;
@@ -144,13 +139,13 @@ struct RayModel {
   }
 
   // The closest point of a ray to the mean, in whitened space, is off by e = [o_hat u1 u2] (c0 / rho, -c1, -c2); with
-  // h = M^-T e:  dL/dmu = -sum M h,  dL/dSigma' = sum M h h^T / 2,  and Sigma' depends on mu by its low-pass.
+  // h = M^-T e:  dL/dmu = -sum M h,  dL/dSigma = sum M h h^T / 2.
   PADGS_HD CameraGaussianGradient<T> vjp(const CameraGaussian<T> &g, const ProjectiveMoments<T> &m, T grad_depth) const {
     const T inverse_rho = 1.0f / rho;
     const Mat3<T> basis{scaled(inverse_rho, o_hat), scaled(constant(-1.0f, rho), u1), scaled(constant(-1.0f, rho), u2)};
     const Vec3<T> e = times(basis, Vec3<T>{m.c0, m.c1, m.c2});
     const Vec3<T> h = from_whitened(g, e);
-    // E = sum M e e^T in whitened axes; dL/dM^T-frame: dL/dSigma' = R diag(1/w) E diag(1/w) R^T / 2.
+    // With E = sum M e e^T in whitened axes and s the scales, dL/dSigma = R diag(1/s) E diag(1/s) R^T / 2.
     const Vec3<T> r0 = times(basis, Vec3<T>{m.c00, m.c01, m.c02}), r1 = times(basis, Vec3<T>{m.c01, m.c11, m.c12});
     const Vec3<T> r2 = times(basis, Vec3<T>{m.c02, m.c12, m.c22});
     const Mat3<T> half{r0, r1, r2};  // B C, columns
@@ -159,21 +154,17 @@ struct RayModel {
     const Vec3<T> b2{basis.c0.z, basis.c1.z, basis.c2.z};
     const Vec3<T> h0{half.c0.x, half.c1.x, half.c2.x}, h1{half.c0.y, half.c1.y, half.c2.y};
     const Vec3<T> h2{half.c0.z, half.c1.z, half.c2.z};
-    const T ix = 1.0f / wide.x, iy = 1.0f / wide.y, iz = 1.0f / wide.z;
-    // G = R^T (dL/dSigma') R in the Gaussian's own axes.
+    const Vec3<T> s = g.scale;
+    const T ix = 1.0f / s.x, iy = 1.0f / s.y, iz = 1.0f / s.z;
+    // G = R^T (dL/dSigma) R in the Gaussian's own axes.
     const T gxx = 0.5f * ix * ix * entry(b0, h0), gyy = 0.5f * iy * iy * entry(b1, h1), gzz = 0.5f * iz * iz * entry(b2, h2);
     const T gxy = 0.5f * ix * iy * entry(b0, h1), gxz = 0.5f * ix * iz * entry(b0, h2), gyz = 0.5f * iy * iz * entry(b1, h2);
     CameraGaussianGradient<T> out;
     out.log_opacity = m.one;
-    // Sigma'_ii = scale_i^2 + add, and ln o' = ln o + sum(ln scale_i - ln wide_i).
-    const T add_grad = gxx + gyy + gzz - 0.5f * m.one * (ix * ix + iy * iy + iz * iz);
-    const Vec3<T> s = g.scale;
-    out.scale = {2.0f * s.x * gxx + m.one * (1.0f / s.x - s.x * ix * ix),
-                 2.0f * s.y * gyy + m.one * (1.0f / s.y - s.y * iy * iy),
-                 2.0f * s.z * gzz + m.one * (1.0f / s.z - s.z * iz * iz)};
-    out.mean = scaled(2.0f * filter * add_grad, g.mean) + scaled(grad_depth, frame.normal) - h;
-    // dL/dR = 2 R G diag(wide^2).
-    const T wx = 2.0f * wide.x * wide.x, wy = 2.0f * wide.y * wide.y, wz = 2.0f * wide.z * wide.z;
+    out.scale = {2.0f * s.x * gxx, 2.0f * s.y * gyy, 2.0f * s.z * gzz};
+    out.mean = scaled(grad_depth, frame.normal) - h;
+    // dL/dR = 2 R G diag(s^2).
+    const T wx = 2.0f * s.x * s.x, wy = 2.0f * s.y * s.y, wz = 2.0f * s.z * s.z;
     out.orientation = {scaled(wx, times(g.orientation, Vec3<T>{gxx, gxy, gxz})),
                        scaled(wy, times(g.orientation, Vec3<T>{gxy, gyy, gyz})),
                        scaled(wz, times(g.orientation, Vec3<T>{gxz, gyz, gzz}))};

@@ -1,0 +1,231 @@
+"""The three kinds of low-pass in every projection: what they widen, how they fade, and their gradients."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from render_cases import INPUTS, identity_pose, leaves, mixture, needs_native, random_pose, row_error
+
+from padgs.camera import Camera, Panorama, Pinhole
+from padgs.gaussians import Gaussians
+from padgs.method import RenderConfig
+from padgs.panorama import direction
+from padgs.render import RenderOptions, native, render
+from padgs.render.contract import ALPHA_MIN, LOW_PASS_KINDS
+from padgs.render.planar import PlanarFootprints
+from padgs.render.projection import PROJECTIONS, project
+from padgs.scene import View
+
+COMBINATIONS = [(projection, kind) for projection, kinds in LOW_PASS_KINDS.items() for kind in kinds]
+each_combination = pytest.mark.parametrize(("projection", "kind"), COMBINATIONS)
+each_projection = pytest.mark.parametrize("projection", LOW_PASS_KINDS)
+VARIANCE = 0.5  # square pixels
+
+
+def camera_of(projection: str, width: int = 64) -> Camera:
+    if projection == "pinhole":
+        return Pinhole(width, width // 2, 0.6 * width, 0.6 * width, 0.5 * width, 0.25 * width)
+    return Panorama(width, width // 2)
+
+
+def options_of(projection: str, kind: str, **more) -> RenderOptions:
+    return RenderOptions(projection=projection, low_pass=VARIANCE, low_pass_kind=kind, **more)
+
+
+def small(latitude: float, scale: float, radius: float = 2.0) -> Gaussians:
+    """One round Gaussian at a latitude in radians; `scale` is relative to its distance."""
+    mean = radius * direction(torch.tensor([0.05]).double(), torch.tensor([latitude]).double())
+    quats, opacities = torch.tensor([[1.0, 0, 0, 0]]).double(), torch.tensor([0.9]).double()
+    scales = torch.full((1, 3), radius * scale, dtype=torch.float64)
+    return Gaussians(mean, quats, scales, opacities, torch.tensor([[1.0, 0.5, 0.25]]).double())
+
+
+def test_every_projection_has_its_kinds_and_the_published_one_is_the_default():
+    assert set(LOW_PASS_KINDS) == set(PROJECTIONS)
+    natural = {projection: RenderOptions(projection=projection).resolved_low_pass_kind for projection in PROJECTIONS}
+    assert natural == {"erp": "pixels", "pinhole": "pixels", "tangent": "angular", "ray": "solid"}
+    assert all("solid" in kinds for kinds in LOW_PASS_KINDS.values())
+
+
+@pytest.mark.parametrize("latitude", [0.0, 0.9, -1.4])
+def test_a_point_on_the_chart_becomes_a_circle_of_pixels_or_of_angle(latitude: float):
+    camera, point = camera_of("erp"), small(latitude, 1e-9)
+    widths = {}
+    for kind in ("pixels", "angular"):
+        footprints = project(point, identity_pose(), camera, options_of("erp", kind))
+        assert isinstance(footprints, PlanarFootprints)
+        a, b, c = footprints.conics[0].tolist()
+        assert abs(b) < 1e-9
+        widths[kind] = 1 / a, 1 / c
+        assert torch.equal(footprints.opacities, point.opacities)
+    assert widths["pixels"] == pytest.approx((VARIANCE, VARIANCE))
+    assert widths["angular"] == pytest.approx((VARIANCE / math.cos(latitude) ** 2, VARIANCE))
+
+
+@each_projection
+def test_a_point_spans_the_same_angle_in_every_projection(projection: str):
+    """Along a meridian: q = (gamma f)^2 / low_pass, for small angles gamma."""
+    camera, point = camera_of(projection, 512), small(0.0, 1e-9)
+    footprints = project(point, identity_pose(), camera, options_of(projection, "angular"))
+    row = camera.height // 2 + torch.arange(-2, 2)
+    column = torch.full_like(row, int(camera.width * 0.5 + 0.05 * camera.focal))
+    q, inside = footprints.squared_distance(torch.tensor([0]), row, column)
+    offset = torch.arange(-2, 2) + 0.5
+    across = camera.rays(dtype=torch.float64)[row, column] @ point.means[0] / 2
+    angle = torch.acos(across.clamp(max=1)) * camera.focal  # pixels
+    assert inside.all() and (angle >= offset.abs() - 3e-3).all()
+    torch.testing.assert_close(q[:, 0], angle**2 / VARIANCE, rtol=2e-3, atol=0)
+
+
+@each_projection
+def test_solid_is_angular_with_the_opacity_of_the_larger_volume(projection: str, generator):
+    gaussians = mixture(20, generator, ("ordinary", "polar", "seam"))
+    camera, pixels = camera_of(projection), torch.arange(64)
+    kinds = ("angular", "solid")
+    angular, solid = (project(gaussians, identity_pose(), camera, options_of(projection, kind)) for kind in kinds)
+    both = (angular.visible & solid.visible).nonzero()[:, 0]
+    assert len(both) >= 2
+    q = [footprints.squared_distance(both, pixels // 4, pixels)[0] for footprints in (angular, solid)]
+    torch.testing.assert_close(q[0], q[1])
+    radius = gaussians.means.norm(dim=-1, keepdim=True)
+    volume = gaussians.scales**2 / (gaussians.scales**2 + VARIANCE * (radius / camera.focal) ** 2)
+    expected = gaussians.opacities * volume.prod(-1).sqrt()
+    torch.testing.assert_close(solid.opacities[both], expected[both])
+    assert torch.equal(angular.opacities[both], gaussians.opacities[both])
+    assert (solid.visible <= angular.visible).all()
+
+
+@each_combination
+def test_a_large_gaussian_hardly_notices(projection: str, kind: str):
+    camera, large = camera_of(projection), small(0.1, 0.15)  # 1.5 pixels of filter on a standard deviation of 6
+    plain = render(large, View("v", identity_pose(), 64, 32, lens=camera), options_of(projection, kind, near=0.1))
+    none = replace(options_of(projection, kind, near=0.1), low_pass=0.0)
+    sharp = render(large, View("v", identity_pose(), 64, 32, lens=camera), none)
+    wider = 1 + VARIANCE / (0.15 * camera.focal) ** 2
+    faded = wider**-1.5 if kind == "solid" else 1.0
+    assert plain.image.max() == pytest.approx(sharp.image.max().item() * faded, rel=0.01)
+    assert plain.image.sum() == pytest.approx(sharp.image.sum().item() * wider * faded, rel=0.04)
+
+
+@each_combination
+def test_the_unit_of_length_does_not_matter(projection: str, kind: str):
+    camera = camera_of(projection)
+    images = []
+    for radius in (0.5, 2.0, 300.0):
+        gaussians = small(0.3, 0.02, radius)
+        view = View("v", identity_pose(), camera.width, camera.height, lens=camera)
+        images.append(render(gaussians, view, options_of(projection, kind)).image)
+    for image in images[1:]:
+        torch.testing.assert_close(image, images[0], rtol=0, atol=1e-9)
+    assert images[0].max() > 0.01
+
+
+def thin_mixture(generator: torch.Generator) -> Gaussians:
+    """Gaussians about as large as the filter, and thin, where it matters most."""
+    gaussians = mixture(25, generator, ("ordinary", "polar", "seam"))
+    shrink = 0.1 + 0.6 * torch.rand(75, 3, generator=generator, dtype=torch.float64)
+    opacities = 0.5 + 0.5 * gaussians.opacities
+    return replace(gaussians, scales=gaussians.scales * shrink, opacities=opacities).to(torch.float32).to(torch.float64)
+
+
+@each_combination
+@needs_native
+def test_native_matches_the_definition(projection: str, kind: str, generator):
+    gaussians, pose = thin_mixture(generator), random_pose(generator, shift=0.05)
+    camera, options = camera_of(projection, 96), options_of(projection, kind, near=0.02)
+    footprints = project(gaussians, pose, camera, options)
+    weight = torch.rand(48, 96, 3, generator=generator, dtype=torch.float64)
+    weight *= stable(footprints, camera)[..., None]
+    found = {}
+    for backend, dtype in (("torch", torch.float64), ("cpu", torch.float32)):
+        inputs, eye = leaves(gaussians, dtype), pose.to(dtype, copy=True).requires_grad_()
+        probe = torch.zeros(75, 2, dtype=dtype, requires_grad=True)
+        view = View("v", eye, camera.width, camera.height, lens=camera)
+        rendering = render(inputs, view, options, backend=backend, probe=probe, check_values=True)
+        (rendering.image * weight).sum().backward()
+        gradients = {name: getattr(inputs, name).grad for name in INPUTS}
+        gradients |= {"shift": eye.grad[:3, 3:], "probe": probe.grad}
+        found[backend] = rendering, gradients
+    (expected, expected_gradients), (actual, gradients) = found["torch"], found["cpu"]
+    assert expected.counters["visible"] >= 5
+    assert ((actual.image - expected.image).abs() * (weight > 0)).max() < 2e-5
+    for name, gradient in gradients.items():
+        assert row_error(gradient, expected_gradients[name]) < 2e-3, name
+
+
+def stable(footprints, camera: Camera) -> torch.Tensor:
+    """Pixels [H, W] bool where no alpha is within 0.1 % of being cut or limited."""
+    drawn = footprints.visible.nonzero()[:, 0]
+    pixels = torch.arange(camera.height * camera.width)
+    q, _ = footprints.squared_distance(drawn, pixels // camera.width, pixels % camera.width)
+    alpha = footprints.opacities[drawn] * torch.exp(-0.5 * q)
+    near = ((alpha / ALPHA_MIN - 1).abs() < 1e-3) | ((alpha / 0.99 - 1).abs() < 1e-3)
+    return ~near.any(-1).view(camera.height, camera.width)
+
+
+@pytest.mark.parametrize("place", ["ordinary", "next to the pole", "across the seam"])
+@each_combination
+def test_gradients_are_the_slope(projection: str, kind: str, place: str, generator):
+    """Of what the filter touches, one input at a time, against central differences in float64."""
+    camera = camera_of(projection, 40)
+    turn = {"ordinary": (0.2, 0.1), "next to the pole": (0.4, math.radians(89.9)), "across the seam": (math.pi, -0.3)}
+    longitude, latitude = (0.2, 0.1) if projection == "pinhole" else turn[place]
+    mean = 2 * direction(torch.tensor([longitude]).double(), torch.tensor([latitude]).double())
+    gaussians = Gaussians(
+        means=mean,
+        quats=torch.randn(1, 4, generator=generator, dtype=torch.float64),
+        scales=2 / camera.focal * torch.tensor([[0.9, 0.6, 1.2]]).double(),
+        opacities=torch.tensor([0.8]).double(),
+        colors=torch.tensor([[0.9, 0.5, 0.3]]).double(),
+    )
+    inputs = leaves(gaussians, torch.float64)
+    view = View("v", identity_pose(), camera.width, camera.height, lens=camera)
+    options = options_of(projection, kind)
+    weight = torch.rand(camera.height, camera.width, 3, generator=generator, dtype=torch.float64)
+
+    def value(drawn: Gaussians) -> torch.Tensor:
+        return (render(drawn, view, options).image * weight).sum()
+
+    gradients = torch.autograd.grad(value(inputs), [inputs.means, inputs.quats, inputs.scales, inputs.opacities])
+    for name, gradient in zip(("means", "quats", "scales", "opacities"), gradients, strict=True):
+        for index in range(gradient.numel()):
+            step = torch.zeros_like(gradient).view(-1)
+            step[index] = 1e-6
+            step = step.view_as(gradient)
+            with torch.no_grad():
+                up, down = (value(replace(inputs, **{name: getattr(inputs, name) + s * step})) for s in (1, -1))
+            assert gradient.flatten()[index].item() == pytest.approx((up - down).item() / 2e-6, rel=1e-4, abs=1e-6), (
+                name
+            )
+    assert (gradients[2].abs() > 1e-3).all(), "scales"
+
+
+@pytest.mark.parametrize(
+    ("projection", "kind", "known"),
+    [
+        ("ray", "pixels", "solid, angular"),
+        ("tangent", "pixels", "angular, solid"),
+        ("erp", "3d", "pixels, angular, solid"),
+    ],
+)
+def test_kinds_that_make_no_sense_are_named(projection: str, kind: str, known: str):
+    with pytest.raises(ValueError, match=f"'{projection}' has no low_pass_kind '{kind}'; known: auto, {known}"):
+        RenderOptions(projection=projection, low_pass_kind=kind)
+
+
+def test_it_is_a_setting_of_a_run():
+    assert RenderConfig(low_pass_kind="angular").options(1.0).resolved_low_pass_kind == "angular"
+
+
+@needs_native
+def test_a_library_of_another_version_is_refused(monkeypatch):
+    class Grown(ctypes.Structure):
+        _fields_ = [*native.Camera._fields_, ("more", ctypes.c_int32)]
+
+    monkeypatch.setattr(native, "STRUCTURES", (Grown, *native.STRUCTURES[1:]))
+    with pytest.raises(OSError, match="libpadgs_cpu.* is of another version, with another Grown; build it again"):
+        native.library.__wrapped__()
