@@ -47,6 +47,7 @@ LAYERS = {
         "padgs.clock",
         "padgs.pictures",
         "padgs.evaluate",
+        "padgs.bench",
     ),
     "data sources": ("padgs.data",),
     "results": ("padgs.results", "padgs.checkpoint"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import typer
 
+from padgs.cli.bench import bench
 from padgs.cli.check import check
 from padgs.cli.convert import convert
 from padgs.cli.report import report
@@ -16,7 +17,7 @@ def commands() -> None:
     """Panoramic Gaussian splatting, measured fairly."""
 
 
-for command in (check, convert, report):
+for command in (bench, check, convert, report):
     app.command()(command)
 
 

@@ -188,7 +188,7 @@ def _declare(loaded: ctypes.CDLL) -> None:
         "padgs_photometric_loss": ([Pointer], ctypes.c_double),
         "padgs_loss_workspace": ([i32, i32], i64),
         "padgs_measure_fma": ([i64], ctypes.c_double),
-        "padgs_measure_triad": ([Pointer, Pointer, Pointer, i64], ctypes.c_double),
+        "padgs_measure_triad": ([Pointer, Pointer, i64], ctypes.c_double),
     }
     for name, (arguments, result) in signatures.items():
         if not hasattr(loaded, name):

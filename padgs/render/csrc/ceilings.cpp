@@ -29,10 +29,10 @@ double fma(int64_t rounds) {
   return sum == -1 ? 0 : done;  // never -1, but the compiler cannot know, and so has to compute it
 }
 
-// Bytes of out = a + 3 b, counted as STREAM does: two arrays read, one written.
-double triad(float *out, const float *a, const float *b, int64_t count) {
-#pragma omp parallel for schedule(static)
-  for (int64_t i = 0; i < count; ++i) out[i] = a[i] + 3.0f * b[i];
+// Bytes of a = a + 3 b. In place, so that no line is fetched only to be overwritten: 12 bytes per element really move.
+double triad(float *a, const float *b, int64_t count) {
+#pragma omp parallel for simd schedule(static)
+  for (int64_t i = 0; i < count; ++i) a[i] = a[i] + 3.0f * b[i];
   return 3.0 * sizeof(float) * double(count);
 }
 

@@ -99,7 +99,7 @@ PADGS_API void padgs_decode_backward(const DecodeGradientArguments *args) { kern
 // Floating-point operations done: `rounds` steps of fused multiply-adds on every thread.
 PADGS_API double padgs_measure_fma(int64_t rounds) { return kernels().ceilings.fma(rounds); }
 
-// Bytes moved by out = a + 3 b over arrays [count].
-PADGS_API double padgs_measure_triad(float *out, const float *a, const float *b, int64_t count) {
-  return kernels().ceilings.triad(out, a, b, count);
+// Bytes moved by a = a + 3 b over arrays [count].
+PADGS_API double padgs_measure_triad(float *a, const float *b, int64_t count) {
+  return kernels().ceilings.triad(a, b, count);
 }

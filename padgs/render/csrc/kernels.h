@@ -28,7 +28,7 @@ struct DecodeKernels {
 
 struct CeilingKernels {
   double (*fma)(int64_t rounds);
-  double (*triad)(float *out, const float *a, const float *b, int64_t count);
+  double (*triad)(float *a, const float *b, int64_t count);
 };
 
 }  // namespace padgs

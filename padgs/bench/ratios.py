@@ -1,0 +1,131 @@
+"""The same work done in two ways, one after the other in the same run: what each of our choices is worth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any
+from unittest import mock
+
+import torch
+from torch import Tensor
+
+import padgs.decoder
+import padgs.loss
+from padgs.bench.tile_counts import BOUNDS
+from padgs.bench.workload import OPTIONS, Workload
+from padgs.clock import measure
+from padgs.gaussians import Gaussians
+from padgs.render import Rendering, RenderOptions, render
+from padgs.targets import Targets
+
+
+def ratios(work: Workload, brute_force: Workload, repeats: int) -> dict[str, dict[str, Any]]:
+    """Name -> how many times longer the slow way takes.
+
+    Args:
+        work: what everything but the torch renderer is timed on.
+        brute_force: less, for the torch renderer, whose work is the product of pixels and Gaussians. On larger images
+            it falls further behind.
+        repeats: of each.
+    """
+    target = Targets(work.scene.train[:1], "solid_angle")[0]
+    exact, square = BOUNDS["exact"], BOUNDS["square"]
+    published = _ratio(
+        "published bounds (square, no wrap)", "exact bounds", _drawing(work, square), _drawing(work, exact), repeats
+    )
+    counts = {name: _draw(_decoded(work), work, options).counters for name, options in BOUNDS.items()}
+    for count in ("instances", "evaluated"):
+        published[count] = counts["square"][count] / counts["exact"][count]
+    slow_renderer = _ratio(
+        "torch renderer", "native renderer", _drawing(brute_force, OPTIONS, "torch"), _drawing(brute_force, OPTIONS), 1
+    )
+    slow_renderer["size"] = [brute_force.size.width, brute_force.size.height, brute_force.size.gaussians]
+    with torch_loss():
+        slow_target = Targets(work.scene.train[:1], "solid_angle")[0]  # with the moments that only this loss needs
+    image = torch.rand(work.size.height, work.size.width, 3, generator=torch.Generator().manual_seed(1))
+    return {
+        "torch_renderer": slow_renderer,
+        "published_bounds": published,
+        "torch_decode": _ratio(
+            "torch decoder", "native decoder", _in(torch_decode, _decoding(work)), _decoding(work), repeats
+        ),
+        "torch_loss": _ratio(
+            "torch loss",
+            "native loss",
+            _in(torch_loss, _comparing(image, slow_target)),
+            _comparing(image, target),
+            repeats,
+        ),
+    }
+
+
+@contextmanager
+def torch_decode() -> Iterator[None]:
+    """Decode by `define_gaussians`, as where there is no native library."""
+    with mock.patch.object(padgs.decoder, "fits", lambda _: False):
+        yield
+
+
+@contextmanager
+def torch_loss() -> Iterator[None]:
+    """Compare in torch, as where there is no native library."""
+    with ExitStack() as stack:
+        for module in ("padgs.loss", "padgs.targets"):
+            stack.enter_context(mock.patch(f"{module}.fits", lambda _: False))
+        yield
+
+
+def render_both_ways(work: Workload, repeats: int) -> dict[str, Any]:
+    """Time drawing fixed Gaussians and going back to their gradients, natively."""
+    return measure(_drawing(work, OPTIONS), repeats=repeats)
+
+
+def _decoded(work: Workload) -> Gaussians:
+    with torch.no_grad():
+        found = work.model.decode(work.view).gaussians
+    leaves = (found.means, found.quats, found.scales, found.opacities, found.colors)
+    return Gaussians(*(leaf.clone().requires_grad_() for leaf in leaves))
+
+
+def _draw(gaussians: Gaussians, work: Workload, options: RenderOptions, backend: str = "cpu") -> Rendering:
+    return render(gaussians, work.view, options, backend=backend)
+
+
+def _drawing(work: Workload, options: RenderOptions, backend: str = "cpu") -> Callable[[], None]:
+    gaussians = _decoded(work)
+    upstream = torch.randn(work.size.height, work.size.width, 3, generator=torch.Generator().manual_seed(2))
+    return lambda: _draw(gaussians, work, options, backend).image.backward(upstream)
+
+
+def _decoding(work: Workload) -> Callable[[], None]:
+    def both_ways() -> None:
+        found = work.model.decode(work.view).gaussians
+        leaves = (found.means, found.quats, found.scales, found.opacities, found.colors)
+        torch.autograd.backward(leaves, tuple(map(torch.ones_like, leaves)))
+        work.model.zero_grad(set_to_none=True)
+
+    return both_ways
+
+
+def _comparing(image: Tensor, target) -> Callable[[], None]:
+    leaf = image.clone().requires_grad_()
+    return lambda: padgs.loss.photometric_loss(leaf, target.image, target.weight, moments=target.moments).backward()
+
+
+def _in(circumstances: Callable, work: Callable[[], None]) -> Callable[[], None]:
+    def there() -> None:
+        with circumstances():
+            work()
+
+    return there
+
+
+def _ratio(slow_name: str, fast_name: str, slow: Callable, fast: Callable, repeats: int) -> dict[str, Any]:
+    slow_time = measure(slow, repeats=repeats, warm_up=1 if repeats > 1 else 0)
+    fast_time = measure(fast, repeats=max(3, repeats), warm_up=1)
+    return {
+        "slow": {"what": slow_name, **slow_time},
+        "fast": {"what": fast_name, **fast_time},
+        **{clock: slow_time[clock]["min"] / fast_time[clock]["min"] for clock in ("wall", "cpu")},
+    }

@@ -1,0 +1,125 @@
+"""One workload, measured from all sides: stages, whole iterations, frames, counters, memory."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import torch
+
+from padgs import clock
+from padgs.anchor_training import TrainablePaDGS
+from padgs.bench.ceilings import Ceiling
+from padgs.bench.cost import add_floors, costs
+from padgs.bench.ratios import render_both_ways
+from padgs.bench.stages import STAGES, Iteration, StageClock, amortised
+from padgs.bench.workload import NEVER, OPTIONS, Size, Workload, build, sigma_quantiles
+from padgs.method import Budget, Record
+from padgs.model import PaDGSOptions
+from padgs.render import render
+from padgs.train import Trainer
+
+MANY = 500_000  # Gaussians from which a few repeats must do
+FEW_REPEATS = 3
+ADAPT_EVENTS = 2
+WARM_UP = 2
+
+
+def measure_size(
+    size: Size, repeats: int, seed: int = 0, progress: Callable[[str], None] = lambda _: None
+) -> dict[str, Any]:
+    """All of one workload, in the layout of `padgs.bench.report`; floors are added once the ceilings are known."""
+    repeats = min(repeats, FEW_REPEATS) if size.gaussians >= MANY else repeats
+    clock.reset_peak_memory()
+    peak = {"start": clock.peak_memory()["host"]}
+    work = build(size, seed)
+    progress("frames")
+    frame = clock.measure(lambda: _frame(work), repeats=repeats)
+    peak["frame"] = clock.peak_memory()["host"]
+    progress("whole iterations")
+    records = _training(work)
+    iteration = clock.measure(lambda: next(records), repeats=repeats, warm_up=WARM_UP)
+    peak["training"] = clock.peak_memory()["host"]
+    progress("whole iterations on one thread")
+    iteration_1_thread = _on_one_thread(lambda: clock.measure(lambda: next(records), repeats=repeats, warm_up=1))
+    progress("stages")
+    stages, total, event, counters = _stages(work, repeats)
+    progress("drawing alone")
+    drawing = render_both_ways(work, repeats)
+    pairs = counters["evaluated"]
+    return {
+        **dataclasses.asdict(size),
+        "counters": {**_counts(work), **_shares(counters, size), "sigma": sigma_quantiles(work)},
+        "stages": stages,
+        "stage_sum": total,
+        "iteration": iteration,
+        "iteration_1_thread": iteration_1_thread,
+        "adapt_event": event,
+        "frame": frame,
+        "render": drawing,
+        "rates": {
+            "forward": pairs / stages["blend"]["cpu"]["min"],
+            "backward": pairs / stages["blend_backward"]["cpu"]["min"],
+        },
+        "peak_bytes": peak,
+    }
+
+
+def add_size_floors(size: dict[str, Any], ceilings: dict[str, Ceiling]) -> None:
+    """Write floors beside the stages, and their sum (CPU seconds) as `floor`."""
+    counters = size["counters"]
+    least = costs(
+        pixels=size["width"] * size["height"],
+        model=PaDGSOptions(),
+        **{name: counters[name] for name in ("anchors", "gaussians", "instances", "evaluated", "parameters")},
+    )
+    add_floors(size["stages"], least, ceilings)
+    size["floor"] = sum(timing.get("floor", 0.0) for timing in size["stages"].values())
+
+
+def _frame(work: Workload) -> None:
+    with torch.no_grad():
+        render(work.model.decode(work.view).gaussians, work.view, OPTIONS, backend="cpu")
+
+
+def _training(work: Workload) -> Iterator[Record]:
+    trainee = TrainablePaDGS(work.model, work.watching_growth(), work.groups(), OPTIONS, "cpu")
+    return Trainer(trainee, work.scene, Budget(NEVER)).records()
+
+
+def _on_one_thread(work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        return work()
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _stages(work: Workload, repeats: int) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any], dict[str, int]]:
+    iteration, cold, measured, adapting = Iteration(work), StageClock(), StageClock(), StageClock()
+    for _ in range(WARM_UP):
+        iteration.run(cold)
+    for _ in range(repeats):
+        iteration.run(measured)
+    for _ in range(ADAPT_EVENTS):
+        iteration.adapt(adapting)
+    event = adapting.stages()["adapt"]
+    stages = {**measured.stages(), "adapt": amortised(event)}
+    return {name: stages[name] for name in STAGES}, measured.total(), event, iteration.counters
+
+
+def _counts(work: Workload) -> dict[str, int]:
+    return {"anchors": len(work.model), "parameters": sum(p.numel() for p in work.model.parameters())}
+
+
+def _shares(counters: dict[str, int], size: Size) -> dict[str, float]:
+    pixels = size.width * size.height
+    return {
+        **counters,
+        "evaluated_per_pixel": counters["evaluated"] / pixels,
+        "contributing_per_pixel": counters["contributing"] / pixels,
+        "evaluated_per_contributing": counters["evaluated"] / max(1, counters["contributing"]),
+        "tiles_per_gaussian": counters["instances"] / max(1, counters["visible"]),
+    }

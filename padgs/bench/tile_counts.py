@@ -1,0 +1,73 @@
+"""How many tiles a Gaussian is listed in, by latitude: our bounds beside the published ones."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from padgs.gaussians import Gaussians
+from padgs.render import RenderOptions, native
+from padgs.render.native import pointer
+from padgs.render.native_camera import native_camera
+from padgs.render.tiles import Projected
+from padgs.scene import View
+
+BANDS = ((0, 30), (30, 60), (60, 75), (75, 85), (85, 90))  # degrees of absolute latitude
+SIGMA = 4.0  # pixels of the equator
+OPACITY = 0.2
+BOUNDS = {
+    "exact": RenderOptions(low_pass=0.0),
+    "square": RenderOptions(low_pass=0.0, bounds="square", wrap=False),  # as published
+}
+
+
+def tiles_by_latitude(width: int = 2048, height: int = 1024, count: int = 50_000, seed: int = 0) -> dict[str, Any]:
+    """Mean and maximum of tiles per Gaussian, over all and by band of latitude, for equal isotropic Gaussians.
+
+    Directions are uniform on the sphere; sizes are `SIGMA`, opacities `OPACITY`.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
+    latitude = torch.rad2deg(directions[:, 1].clamp(-1, 1).asin()).abs()
+    report: dict[str, Any] = {"sigma": SIGMA, "opacity": OPACITY, "width": width, "height": height, "count": count}
+    for name, options in BOUNDS.items():
+        tiles = tiles_per_gaussian(spheres(directions, SIGMA, width), width, height, options).double()
+        report[name] = _statistics(tiles)
+        report[name]["bands"] = {
+            f"{low}-{high}": _statistics(tiles[(latitude >= low) & (latitude < high)]) for low, high in BANDS
+        }
+    return report
+
+
+def spheres(directions: Tensor, sigma: float, width: int) -> Gaussians:
+    """Isotropic Gaussians at distance 1 in directions [N, 3] of the camera at the origin; sigma in equator pixels."""
+    count = len(directions)
+    return Gaussians(
+        means=directions,
+        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        scales=torch.full((count, 3), sigma * 2 * math.pi / width),
+        opacities=torch.full((count,), OPACITY),
+        colors=torch.zeros(count, 3),
+    )
+
+
+def tiles_per_gaussian(gaussians: Gaussians, width: int, height: int, options: RenderOptions) -> Tensor:
+    """Tile instances [N] of each Gaussian, seen by a panorama at the origin."""
+    camera = View("origin", torch.eye(4, dtype=torch.float64), width, height).camera
+    tensors = [
+        tensor.contiguous()
+        for tensor in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors)
+    ]
+    inputs = native.Inputs(len(gaussians), *map(pointer, tensors), None)
+    projected = Projected(native_camera(torch.eye(4), camera, options), inputs, max_instances=1 << 40)
+    (strip,) = projected.strips()
+    return strip.slot_start.diff()
+
+
+def _statistics(tiles: Tensor) -> dict[str, Any]:
+    if not len(tiles):
+        return {"mean": None, "max": None}
+    return {"mean": float(tiles.mean()), "max": int(tiles.max())}
