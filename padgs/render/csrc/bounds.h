@@ -1,8 +1,10 @@
 // Which pixels a footprint can reach with alpha >= 1/255. May be too large, never too small.
 //
-// On the sphere the reached rays form a cone, described by its dual K*: the plane through the camera with normal w touches
-// it iff w^T K* w = 0. Extremes of (a.x) / (b.x) over the cone are the roots t of
-//   (b^T K* b) t^2 - 2 (a^T K* b) t + a^T K* a = 0,   valid iff b^T K* b < 0 (the cone lies in front of the plane b.x = 0).
+// On the sphere the reached rays form a cone, described by its dual K* = M M^T - n n^T with n the direction of the mean:
+// the plane through the camera with normal w touches it iff w^T K* w = 0. M and n stay apart: the square of a small M
+// would drown in the rounding of n n^T. Extremes of (a.x) / (b.x) over the cone are the roots t of
+//   (b^T K* b) t^2 - 2 (a^T K* b) t + a^T K* a = 0,   valid iff b^T K* b < 0 (the cone lies in front of the plane b.x = 0),
+// with the discriminant |M^T w|^2 - |M^T a x M^T b|^2, w = (n.b) a - (n.a) b, where nothing of order 1 cancels.
 #pragma once
 
 #include "abi.h"
@@ -18,24 +20,34 @@ struct PixelRange {
   float u0, u1, v0, v1;
 };
 
-PADGS_HD bool ratio_range(const Sym3<float> &k, Vec3<float> a, Vec3<float> b, float &low, float &high) {
-  const float bb = form(k, b, b), ab = form(k, a, b), aa = form(k, a, a);
+struct Cone {
+  Mat3<float> spread;  // M
+  Vec3<float> normal;  // n
+};
+
+PADGS_HD bool ratio_range(const Cone &k, Vec3<float> a, Vec3<float> b, float &low, float &high) {
+  const Vec3<float> p = transposed_times(k.spread, a), q = transposed_times(k.spread, b);
+  const float na = dot(k.normal, a), nb = dot(k.normal, b);
+  const float bb = dot(q, q) - nb * nb, ab = dot(p, q) - na * nb;
   if (!(bb < 0)) return false;
-  const float spread = root(larger(ab * ab - aa * bb, 0.0f));
+  const Vec3<float> w = scaled(nb, p) - scaled(na, q), minors = cross(p, q);
+  const float spread = root(larger(dot(w, w) - dot(minors, minors), 0.0f));
   low = (ab + spread) / bb;
   high = (ab - spread) / bb;
   return true;
 }
 
 // The latitude-longitude box of a cone on a panorama. Longitude is exact, latitude conservative.
-PADGS_HD PixelRange sphere_range(const Sym3<float> &k, const SphereFrame<float> &f, float width, float height) {
+PADGS_HD PixelRange sphere_range(const Cone &k, const SphereFrame<float> &f, float width, float height) {
   const float c = f.cos_latitude, s = f.sin_latitude;
   const Vec3<float> ahead{f.normal.x, 0, f.normal.z};
   const float norm = root(dot(ahead, ahead));
   const Vec3<float> h = norm > 0 ? scaled(1 / norm, ahead) : Vec3<float>{0, 0, 1};
   // Longitude: the meridian plane at offset delta touches iff b_tt cot^2 - 2 b_rt cot + b_rr = 0.
-  const float b_tt = form(k, f.east, f.east), b_rt = form(k, h, f.east), b_rr = form(k, h, h);
-  const float disc = b_rt * b_rt - b_rr * b_tt;
+  const Vec3<float> along_t = transposed_times(k.spread, f.east), along_r = transposed_times(k.spread, h);
+  const Vec3<float> minors = cross(along_t, along_r);
+  const float b_tt = dot(along_t, along_t), b_rt = dot(along_r, along_t);  // n is orthogonal to east
+  const float disc = c * c * b_tt - dot(minors, minors);
   const bool over_pole = !(disc > 1e-7f * b_rt * b_rt) || !(b_tt > 0) || norm == 0;
   float west = -kPi, east = kPi;
   if (!over_pole) {
@@ -66,7 +78,7 @@ PADGS_HD PixelRange sphere_range(const Sym3<float> &k, const SphereFrame<float> 
 }
 
 // The box of a cone in a pinhole image; the whole image where the cone is not strictly in front of the camera.
-PADGS_HD PixelRange pinhole_range(const Sym3<float> &k, const Camera &camera) {
+PADGS_HD PixelRange pinhole_range(const Cone &k, const Camera &camera) {
   PixelRange range{0, float(camera.width), 0, float(camera.height)};
   float low, high;
   if (ratio_range(k, {1, 0, 0}, {0, 0, 1}, low, high)) {

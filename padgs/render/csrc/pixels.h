@@ -14,7 +14,7 @@ const float kLog2AlphaMin = -7.994353437f;  // log2(1 / 255)
 const float kHalfLog2 = 0.72134752044448170f;  // log2(e) / 2
 
 struct PlanarPixels {
-  Vec du, a_du;
+  Vec a_du;
   float v, b, c, log2_opacity;
 
   struct Row {
@@ -28,8 +28,7 @@ struct PlanarPixels {
     const Vec offset = iota() + (float(x0) + 0.5f - f.shape[0]);
     // With wrap, the nearest copy of the Gaussian across the seam.
     const float width = float(args.grid.width), turns = args.wrap ? 1.0f / width : 0.0f;
-    du = offset - round_down(offset * turns + 0.5f) * width;
-    a_du = du * f.shape[2];
+    a_du = (offset - round_down(offset * turns + 0.5f) * width) * f.shape[2];
   }
   Row row(const BlendArguments &, int y) const {
     Row at;
@@ -42,7 +41,8 @@ struct PlanarPixels {
   }
   void add_ray_gradient(const Footprint &, const Row &, Vec, float *, int, int) const {}
 
-  // M, dv M, dv^2 M: du is the same in all rows of a chunk, so it waits until the rows are summed.
+  // Sums of M times 1, t, dv, t^2, t dv, dv^2, with t = a du + b dv and not du: where a footprint is long and oblique,
+  // those of du nearly cancel in every derivative. du is the same in all rows of a chunk and waits until these are summed.
   struct ChunkMoments {
     Vec m0 = zero(), m1 = zero(), m2 = zero();
     void add(const Row &at, Vec m) {
@@ -52,18 +52,18 @@ struct PlanarPixels {
     }
   };
   struct Moments {
-    Vec one = zero(), u = zero(), v = zero(), uu = zero(), uv = zero(), vv = zero();
+    Vec one = zero(), t = zero(), v = zero(), tt = zero(), tv = zero(), vv = zero();
     void add(const PlanarPixels &p, const ChunkMoments &c) {
-      const Vec m0_du = c.m0 * p.du;
+      const Vec m0_t = p.a_du * c.m0 + c.m1 * p.b, m1_t = p.a_du * c.m1 + c.m2 * p.b;
       one += c.m0;
-      u += m0_du;
+      t += m0_t;
       v += c.m1;
-      uu += m0_du * p.du;
-      uv += c.m1 * p.du;
+      tt += p.a_du * m0_t + m1_t * p.b;
+      tv += m1_t;
       vv += c.m2;
     }
     void finish(Vec *out) const {
-      out[0] = one, out[1] = u, out[2] = v, out[3] = uu, out[4] = uv, out[5] = vv;
+      out[0] = one, out[1] = t, out[2] = v, out[3] = tt, out[4] = tv, out[5] = vv;
       for (int k = 6; k < 10; ++k) out[k] = zero();
     }
   };

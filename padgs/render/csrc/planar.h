@@ -11,10 +11,12 @@ constexpr float kMinCosLatitude = 1e-4f;  // nearer to the axis an erp footprint
 constexpr float kHalfLog2E = 0.72134752044448170f;
 constexpr float kSlopeLimit = 1.3f;  // pinhole: slopes in the Jacobian are limited to this times the half field of view
 
-// dL of a footprint. The covariance's is the symmetric matrix V: dL = V_uu dS_uu + 2 V_uv dS_uv + V_vv dS_vv.
+// dL of a footprint: by its centre, by the rows of P in S = P P^T + low_pass I, and by its depth.
 template <class T>
 struct PlanarGradient {
-  T u, v, uu, uv, vv, depth;
+  T u, v;
+  Vec3<T> row_u, row_v;
+  T depth;
 };
 
 // The projected covariance S = P P^T + low_pass I with P = J A.
@@ -137,35 +139,33 @@ PADGS_HD PlanarShape<T> planar_shape(const Covariance2D<T> &s, T log2_opacity) {
   return shape;
 }
 
-// From the moments of M = dL/d(ln alpha) over the pixels to the footprint's gradient, with the conic C = S^-1:
-// ln alpha = ln o - q / 2, so dL/d(u, v) = C sum(M delta) and dL/dS = C sum(M delta delta^T) C / 2.
+// From the moments of M = dL/d(ln alpha) over the pixels to the footprint's gradient. With S^-1 = K^T K, K the factor
+// [[a, b], [0, c]] of planar_shape over h = sqrt(log2(e) / 2), and y = K delta:
+//   dL/d(u, v) = K^T sum(M y),  dL/dS = K^T Y K / 2 with Y = sum(M y y^T),  dL/dP = K^T Y (K P),
+// in this order, because S^-1 itself holds no digits where the footprint is long and oblique.
 template <class T>
 PADGS_HD PlanarGradient<T> planar_gradient(const Covariance2D<T> &s, const T *m) {
-  const T ca = s.vv / s.determinant, cb = -s.uv / s.determinant, cc = s.uu / s.determinant;
-  const T t00 = ca * m[3] + cb * m[4], t01 = ca * m[4] + cb * m[5];
-  const T t10 = cb * m[3] + cc * m[4], t11 = cb * m[4] + cc * m[5];
-  return {ca * m[1] + cb * m[2],
-          cb * m[1] + cc * m[2],
-          0.5f * (t00 * ca + t01 * cb),
-          0.5f * (t00 * cb + t01 * cc),
-          0.5f * (t10 * cb + t11 * cc),
-          constant(0.0f, ca)};
+  const T inverse_root = 1.0f / root(s.vv), c = inverse_root;  // in units of h
+  const T a = root(s.vv / s.determinant), b = -(s.uv * inverse_root) / root(s.determinant);
+  const T inverse_h = constant(1.17741002251547469f, c);
+  const T t = m[1] * inverse_h, w = c * m[2];
+  const T tt = m[3] * inverse_h * inverse_h, tw = c * inverse_h * m[4], ww = c * c * m[5];
+  const Vec3<T> q_t = scaled(a, s.row_u) + scaled(b, s.row_v), q_w = scaled(c, s.row_v);
+  const Vec3<T> z_t = scaled(tt, q_t) + scaled(tw, q_w), z_w = scaled(tw, q_t) + scaled(ww, q_w);
+  return {a * t, b * t + c * w, scaled(a, z_t), scaled(b, z_t) + scaled(c, z_w), constant(0.0f, c)};
 }
 
 // Back through chart and covariance to the Gaussian in the camera frame.
 template <class T, class Chart>
-PADGS_HD CameraGaussianGradient<T> planar_vjp(const CameraGaussian<T> &g, const Chart &chart, const Covariance2D<T> &s,
-                                              const PlanarGradient<T> &f) {
+PADGS_HD CameraGaussianGradient<T> planar_vjp(const CameraGaussian<T> &g, const Chart &chart, const PlanarGradient<T> &f) {
   CameraGaussianGradient<T> out;
-  const Vec3<T> grad_row_u = scaled(2.0f * f.uu, s.row_u) + scaled(2.0f * f.uv, s.row_v);
-  const Vec3<T> grad_row_v = scaled(2.0f * f.uv, s.row_u) + scaled(2.0f * f.vv, s.row_v);
   const Vec3<T> ju = chart.jacobian_u, jv = chart.jacobian_v;
   spread_vjp(g,
-             Mat3<T>{scaled(grad_row_u.x, ju) + scaled(grad_row_v.x, jv), scaled(grad_row_u.y, ju) + scaled(grad_row_v.y, jv),
-                     scaled(grad_row_u.z, ju) + scaled(grad_row_v.z, jv)},
+             Mat3<T>{scaled(f.row_u.x, ju) + scaled(f.row_v.x, jv), scaled(f.row_u.y, ju) + scaled(f.row_v.y, jv),
+                     scaled(f.row_u.z, ju) + scaled(f.row_v.z, jv)},
              out);
   const Mat3<T> spread = g.spread();
-  out.mean = chart.vjp(f, times(spread, grad_row_u), times(spread, grad_row_v));
+  out.mean = chart.vjp(f, times(spread, f.row_u), times(spread, f.row_v));
   return out;
 }
 

@@ -103,7 +103,7 @@ struct Batch {
 // What one batch leaves: shapes and whatever the boxes need, lane by lane.
 struct Projected {
   float shape[11][kLanes], opacity[kLanes], log2_opacity[kLanes], depth[kLanes], in_front[kLanes];
-  float bounds[10][kLanes];  // planar: half_u, half_v, uu, uv, vv;  projective: frame or dual cone
+  float bounds[12][kLanes];  // planar: half_u, half_v, uu, uv, vv;  projective: mean (3), cone (9)
 };
 
 template <template <class> class Chart>
@@ -139,11 +139,15 @@ Vec3<Vec> probed_mean(const Inputs &in, int64_t first, Vec3<Vec> mean) {
   return mean + scaled(probe[0] * kPi * f.r * f.cos_latitude, f.east) + scaled(probe[1] * (0.5f * kPi) * f.r, f.down);
 }
 
-void store_projective(const ProjectiveShape<Vec> &s, Vec opacity, Vec depth, const Sym3<Vec> &dual, Projected &out) {
+void store_projective(const ProjectiveShape<Vec> &s, Vec opacity, Vec depth, const Mat3<Vec> &cone, Projected &out) {
   const Vec values[11] = {s.l0.x, s.l0.y, s.l0.z, s.l1.x, s.l1.y, s.l1.z, s.m.x, s.m.y, s.m.z, s.kappa, s.near_ratio};
   for (int k = 0; k < 11; ++k) store(out.shape[k], values[k]);
-  const Vec bounds[6] = {dual.xx, dual.xy, dual.xz, dual.yy, dual.yz, dual.zz};
-  for (int k = 0; k < 6; ++k) store(out.bounds[k], bounds[k]);
+  const Vec3<Vec> columns[3] = {cone.c0, cone.c1, cone.c2};
+  for (int k = 0; k < 3; ++k) {
+    store(out.bounds[3 + 3 * k], columns[k].x);
+    store(out.bounds[4 + 3 * k], columns[k].y);
+    store(out.bounds[5 + 3 * k], columns[k].z);
+  }
   store(out.opacity, opacity);
   store(out.log2_opacity, logarithm2(larger(opacity, splat(1e-30f))));
   store(out.depth, depth);
@@ -156,14 +160,14 @@ Vec largest_q(Vec opacity) {
 
 void project_tangent(const Camera &camera, const CameraGaussian<Vec> &g, Projected &out) {
   const TangentModel<Vec> model(g, camera.low_pass);
-  store_projective(model.shape(), g.opacity, model.frame.r, model.dual_cone(largest_q(g.opacity)), out);
+  store_projective(model.shape(), g.opacity, model.frame.r, model.cone(largest_q(g.opacity)), out);
   store(out.in_front, model.frame.r - camera.near_radius);
 }
 
 void project_ray(const Camera &camera, const CameraGaussian<Vec> &g, Projected &out) {
   const RayModel<Vec> model(g);
   const Vec k = largest_q(g.opacity);
-  store_projective(model.shape(g, camera.near_radius), g.opacity, model.frame.r, model.dual_cone(g, k), out);
+  store_projective(model.shape(g, camera.near_radius), g.opacity, model.frame.r, model.cone(g, k), out);
   // Not drawn from inside: rho^2 <= 2 ln(255 o).
   const Vec exact = (logarithm2(larger(g.opacity, splat(1e-30f))) + 7.994353437f) * (1.0f / kHalfLog2E);
   store(out.in_front, minimum(model.frame.r - camera.near_radius, model.rho * model.rho - exact));
@@ -177,15 +181,16 @@ PixelBox box_of(const Camera &camera, const Projected &p, int lane) {
     const float half_u = bound(0) * kSlack + kSlackPixels, half_v = bound(1) * kSlack + kSlackPixels;
     return pixel_box(camera, {u - half_u, u + half_u, v - half_v, v + half_v});
   }
-  const Sym3<float> dual{bound(0), bound(1), bound(2), bound(3), bound(4), bound(5)};
-  const Vec3<float> mean{bound(6), bound(7), bound(8)};
+  if (camera.model == kTableModel) return {0, camera.width, 0, 0, camera.height};  // it may look anywhere
+  const auto vector = [&](int k) { return Vec3<float>{bound(k), bound(k + 1), bound(k + 2)}; };
+  const SphereFrame<float> frame = sphere_frame(vector(0));
+  const Cone cone{{vector(3), vector(6), vector(9)}, frame.normal};
   if (camera.model == kPanoramaModel)
-    return pixel_box(camera, sphere_range(dual, sphere_frame(mean), float(camera.width), float(camera.height)));
-  if (camera.model == kPinholeModel) {
-    if (mean.z <= 0 && dual.zz < 0) return {0, 0, 0, 0, 0};  // all of it is behind the camera
-    return pixel_box(camera, pinhole_range(dual, camera));
-  }
-  return {0, camera.width, 0, 0, camera.height};  // a table may look anywhere
+    return pixel_box(camera, sphere_range(cone, frame, float(camera.width), float(camera.height)));
+  const Vec3<float> along_z = transposed_times(cone.spread, Vec3<float>{0, 0, 1});
+  const float z = frame.normal.z;
+  if (z <= 0 && dot(along_z, along_z) < z * z) return {0, 0, 0, 0, 0};  // all of it is behind the camera
+  return pixel_box(camera, pinhole_range(cone, camera));
 }
 
 bool finite(const Projected &p, int lane) {
@@ -206,7 +211,7 @@ void forward_batch(const Camera &camera, const Inputs &in, int64_t first, Footpr
   } else {
     camera.projection == kTangent ? project_tangent(camera, g, p) : project_ray(camera, g, p);
     const Vec mean[3] = {batch.gaussian.mean.x, batch.gaussian.mean.y, batch.gaussian.mean.z};
-    for (int k = 0; k < 3; ++k) store(p.bounds[6 + k], mean[k]);
+    for (int k = 0; k < 3; ++k) store(p.bounds[k], mean[k]);
   }
   const int end = int(std::min<int64_t>(kLanes, in.count - first));
   for (int lane = 0; lane < end; ++lane) {
@@ -232,7 +237,7 @@ Backward planar_backward(const Camera &camera, const CameraGaussian<Vec> &g, con
   const Covariance2D<Vec> s = project_covariance(g.spread(), chart.jacobian_u, chart.jacobian_v, camera.low_pass);
   PlanarGradient<Vec> f = planar_gradient(s, m);
   f.depth = grad_depth;
-  Backward out{planar_vjp(g, chart, s, f), f.u * (0.5f * float(camera.width)), f.v * (0.5f * float(camera.height))};
+  Backward out{planar_vjp(g, chart, f), f.u * (0.5f * float(camera.width)), f.v * (0.5f * float(camera.height))};
   out.gradient.log_opacity = m[0];
   return out;
 }

@@ -57,13 +57,10 @@ struct TangentModel {
     return {l0, l1, frame.normal, constant(0.0f, c11), constant(0.0f, c11)};
   }
 
-  // The cone of rays with q <= k as the dual cone K* = k E^T S E - n n^T, with S restored from its factor.
-  PADGS_HD Sym3<T> dual_cone(T k) const {
-    const T ee = k * c11 * c11, ed = k * c11 * c21, dd = k * (c21 * c21 + c22 * c22);
-    const Vec3<T> e = frame.east, d = frame.down, n = frame.normal;
-    const Vec3<T> p = scaled(ee, e) + scaled(ed, d), q = scaled(ed, e) + scaled(dd, d);
-    return {e.x * p.x + d.x * q.x - n.x * n.x, e.x * p.y + d.x * q.y - n.x * n.y, e.x * p.z + d.x * q.z - n.x * n.z,
-            e.y * p.y + d.y * q.y - n.y * n.y, e.y * p.z + d.y * q.z - n.y * n.z, e.z * p.z + d.z * q.z - n.z * n.z};
+  // The cone of rays with q <= k has the dual K* = k E^T S E - n n^T = M M^T - n n^T; this is M.
+  PADGS_HD Mat3<T> cone(T k) const {
+    const T h = root(k), zero = constant(0.0f, k);
+    return {scaled(h * c11, frame.east) + scaled(h * c21, frame.down), scaled(h * c22, frame.down), {zero, zero, zero}};
   }
 
   // With y = C^-1 tau, g = S^-1 tau = C^-T y:
@@ -127,15 +124,11 @@ struct RayModel {
             1.0f / (rho * rho), near_radius / rho};
   }
 
-  // K* = k Sigma / r^2 - n n^T.
-  PADGS_HD Sym3<T> dual_cone(const CameraGaussian<T> &g, T k) const {
-    const T scale = k / (frame.r * frame.r);
-    const Vec3<T> a = g.scale;
-    Sym3<T> s = congruent(g.orientation, {scale * a.x * a.x, scale * a.y * a.y, scale * a.z * a.z});
-    const Vec3<T> n = frame.normal;
-    s.xx = s.xx - n.x * n.x, s.xy = s.xy - n.x * n.y, s.xz = s.xz - n.x * n.z;
-    s.yy = s.yy - n.y * n.y, s.yz = s.yz - n.y * n.z, s.zz = s.zz - n.z * n.z;
-    return s;
+  // The cone of rays with q <= k has the dual K* = k Sigma / r^2 - n n^T = M M^T - n n^T; this is M.
+  PADGS_HD Mat3<T> cone(const CameraGaussian<T> &g, T k) const {
+    const T h = root(k) / frame.r;
+    const Mat3<T> &o = g.orientation;
+    return {scaled(h * g.scale.x, o.c0), scaled(h * g.scale.y, o.c1), scaled(h * g.scale.z, o.c2)};
   }
 
   // The closest point of a ray to the mean, in whitened space, is off by e = [o_hat u1 u2] (c0 / rho, -c1, -c2); with

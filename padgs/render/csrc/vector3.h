@@ -34,27 +34,6 @@ PADGS_HD Vec3<T> transposed_times(const Mat3<T> &m, Vec3<T> v) { return {dot(m.c
 template <class T>
 PADGS_HD Mat3<T> times(const Mat3<T> &a, const Mat3<T> &b) { return {times(a, b.c0), times(a, b.c1), times(a, b.c2)}; }
 
-// A symmetric matrix.
-template <class T>
-struct Sym3 {
-  T xx, xy, xz, yy, yz, zz;
-};
-template <class T>
-PADGS_HD Vec3<T> times(const Sym3<T> &s, Vec3<T> v) {
-  return {s.xx * v.x + s.xy * v.y + s.xz * v.z, s.xy * v.x + s.yy * v.y + s.yz * v.z,
-          s.xz * v.x + s.yz * v.y + s.zz * v.z};
-}
-template <class T>
-PADGS_HD T form(const Sym3<T> &s, Vec3<T> a, Vec3<T> b) { return dot(a, times(s, b)); }
-// M diag(d) M^T.
-template <class T>
-PADGS_HD Sym3<T> congruent(const Mat3<T> &m, Vec3<T> d) {
-  const Vec3<T> a = m.c0, b = m.c1, c = m.c2;
-  return {d.x * a.x * a.x + d.y * b.x * b.x + d.z * c.x * c.x, d.x * a.x * a.y + d.y * b.x * b.y + d.z * c.x * c.y,
-          d.x * a.x * a.z + d.y * b.x * b.z + d.z * c.x * c.z, d.x * a.y * a.y + d.y * b.y * b.y + d.z * c.y * c.y,
-          d.x * a.y * a.z + d.y * b.y * b.z + d.z * c.y * c.z, d.x * a.z * a.z + d.y * b.z * b.z + d.z * c.z * c.z};
-}
-
 template <class T>
 struct Quaternion {
   T w, x, y, z;
