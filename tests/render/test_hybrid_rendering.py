@@ -1,0 +1,358 @@
+"""Hybrid blending by every backend and projection: values, derivatives, order, threads, strips, instruction sets."""
+
+from __future__ import annotations
+
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from hybrid_reference import one_pixel
+from render_cases import (
+    INPUTS,
+    each_engine,
+    gaussians_of,
+    identity_pose,
+    leaves,
+    mixture,
+    needs_native,
+    random_pose,
+    row_error,
+)
+from torch import Tensor
+
+from padgs.camera import Camera, Panorama, Pinhole, RayTable
+from padgs.gaussians import Gaussians, rotation_matrices
+from padgs.panorama import direction
+from padgs.render import Rendering, RenderOptions, render
+from padgs.render.planar import PlanarFootprints
+from padgs.render.projection import project
+from padgs.scene import View
+
+PROJECTIONS = ("erp", "pinhole", "tangent", "ray")
+BACKGROUND = torch.tensor([0.3, 0.6, 0.9], dtype=torch.float64)
+each_projection = pytest.mark.parametrize("projection", PROJECTIONS)
+
+
+def camera_of(projection: str, width: int, height: int) -> Camera:
+    if projection == "pinhole":
+        return Pinhole(width, height, 0.4 * width, 0.4 * width, 0.5 * width + 1, 0.5 * height - 2)
+    return Panorama(width, height)
+
+
+def options_of(projection: str, size: int, **more) -> RenderOptions:
+    return RenderOptions(projection=projection, blending="hybrid", core_size=size, **more)
+
+
+def fragments(gaussians: Gaussians, camera: Camera, options: RenderOptions, pose: Tensor) -> tuple[Tensor, ...]:
+    """alpha, distance [P, N], radial depths [N] of every pair, and which pixels [P] are far from any decision."""
+    footprints = project(gaussians, pose, camera, options)
+    everything, pixels = torch.arange(len(gaussians)), torch.arange(camera.height * camera.width)
+    rows, columns = pixels // camera.width, pixels % camera.width
+    q, inside = footprints.squared_distance(everything, rows, columns)
+    alpha = (footprints.opacities * torch.exp(-0.5 * q)).clamp(max=0.99)
+    alpha = torch.where(inside & footprints.visible, alpha, 0.0).detach()
+    means = gaussians.means @ pose[:3, :3].T + pose[:3, 3]
+    radius = means.norm(dim=-1)
+    if options.projection == "ray":  # t = (mu P d) / (d P d) with P = Sigma'^-1
+        axes = pose[:3, :3] @ rotation_matrices(gaussians.quats)
+        variance = gaussians.scales**2 + (options.low_pass / camera.focal**2 * radius**2)[:, None]
+        precision = axes @ torch.diag_embed(1 / variance) @ axes.mT
+        rays = camera.rays(dtype=torch.float64).view(-1, 3)
+        quadratic = torch.einsum("pi,nij,pj->pn", rays, precision, rays)
+        distance = torch.einsum("ni,nij,pj->pn", means, precision, rays) / quadratic
+    else:
+        distance = radius.expand_as(alpha)
+    close = sum(((alpha / limit - 1).abs() < 1e-3).any(-1) for limit in (1 / 255, 0.05, 0.99))
+    if isinstance(footprints, PlanarFootprints) and footprints.turn < math.inf:
+        across = (columns[:, None] + 0.5 - footprints.centers[:, 0] + camera.width / 2) % camera.width
+        opposite = torch.minimum(across, camera.width - across) < 1e-3
+        close = close + (opposite & (alpha >= 0.5 / 255)).any(-1)
+    alpha = torch.where(alpha >= 1 / 255, alpha, 0.0)
+    in_order = torch.where(alpha >= 0.05, distance, torch.inf).sort(-1)[0]
+    close = close + (in_order[:, 1:] - in_order[:, :-1] < 1e-4 * in_order[:, 1:]).any(-1)
+    return alpha, distance.detach(), radius.detach(), close == 0
+
+
+@pytest.mark.parametrize("size", [1, 4, 16])
+@each_projection
+@each_engine
+def test_images_are_those_of_the_published_procedure(projection: str, size: int, backend: str, dtype: torch.dtype):
+    generator = torch.Generator().manual_seed(100 * PROJECTIONS.index(projection) + size)
+    camera, options, pose = camera_of(projection, 33, 17), options_of(projection, size), random_pose(generator, 0.2)
+    gaussians = mixture(6, generator)
+    alpha, distance, radius, stable = fragments(gaussians, camera, options, pose)
+    assert stable.double().mean() > 0.8
+    view = View("v", pose, 33, 17, lens=camera)
+    rendering = render(
+        gaussians.to(dtype), view, options, background=BACKGROUND.to(dtype), backend=backend, check_values=True
+    )
+    contributing, sizes = 0, set()
+    for pixel in stable.nonzero()[:, 0].tolist():
+        row, column = pixel // 33, pixel % 33
+        order = torch.randperm(len(radius), generator=generator)  # the procedure takes fragments as they come
+        found, left = one_pixel(alpha[pixel, order].tolist(), distance[pixel, order].tolist(), size)
+        weights = torch.zeros_like(radius).scatter(0, order, torch.tensor(found, dtype=torch.float64))
+        color = weights @ gaussians.colors + left * BACKGROUND
+        assert (rendering.image[row, column] - color).abs().max() < 2e-5
+        assert abs(rendering.transmittance[row, column] - left) < 2e-5
+        depth = (weights @ radius / weights.sum()).item() if weights.any() else 0.0
+        assert rendering.depth[row, column].item() == pytest.approx(depth, rel=1e-4)
+        contributing += int((weights > 0).sum())
+        sizes.add(int((alpha[pixel] >= 0.05).sum()))
+    assert max(sizes) > 4, "no pixel has an eviction to test"
+    assert abs(rendering.counters["contributing"] - contributing) <= int((alpha[~stable] > 0).sum())
+
+
+def run(
+    gaussians: Gaussians, camera: Camera, options: RenderOptions, pose: Tensor, weights: Tensor, backend: str, dtype
+) -> tuple[Rendering, dict[str, Tensor]]:
+    """A rendering, and the gradients by every input of its outputs [H, W, 5] times the weights."""
+    inputs = leaves(gaussians, dtype)
+    background = BACKGROUND.to(dtype, copy=True).requires_grad_()
+    probe = torch.zeros(len(gaussians), 2, dtype=dtype, requires_grad=True)
+    twist = torch.zeros(6, dtype=dtype, requires_grad=True)  # rigid motions: other matrices are no poses
+    turn = rotation_matrices(torch.cat((torch.ones_like(twist[:1]), 0.5 * twist[:3])))
+    moved = torch.cat((turn @ pose[:3, :3].to(dtype), pose[:3, 3:].to(dtype) + twist[3:, None]), dim=1)
+    found = {**vars(inputs), "background": background, "probe": probe, "twist": twist}
+    if isinstance(camera, RayTable):
+        found["table"] = camera.table.to(dtype, copy=True).requires_grad_()
+        camera = RayTable(found["table"], camera.focal)
+    view = View("v", torch.cat((moved, pose[3:].to(dtype))), camera.width, camera.height, lens=camera)
+    rendering = render(inputs, view, options, background=background, probe=probe, backend=backend)
+    outputs = torch.cat((rendering.image, rendering.transmittance[..., None], rendering.depth[..., None]), dim=-1)
+    (outputs * weights.to(dtype)).sum().backward()
+    return rendering, {name: leaf.grad for name, leaf in found.items()}
+
+
+def assert_native_is_the_definition(gaussians: Gaussians, camera: Camera, options: RenderOptions, generator) -> None:
+    pose = identity_pose()
+    *_, stable = fragments(gaussians, camera, options, pose)
+    stable = stable.view(camera.height, camera.width)
+    assert stable.double().mean() > 0.6
+    weights = torch.randn(*stable.shape, 5, generator=generator, dtype=torch.float64) * stable[..., None]
+    arguments = (gaussians, camera, options, pose, weights)
+    expected, gradients = run(*arguments, "torch", torch.float64)
+    actual, found = run(*arguments, "cpu", torch.float32)
+    assert torch.equal(actual.visible, expected.visible)
+    torch.testing.assert_close(actual.image[stable].double(), expected.image[stable], atol=2e-5, rtol=0)
+    torch.testing.assert_close(actual.transmittance[stable].double(), expected.transmittance[stable], atol=2e-5, rtol=0)
+    torch.testing.assert_close(actual.depth[stable].double(), expected.depth[stable], atol=0, rtol=1e-4)
+    for name, gradient in gradients.items():
+        assert gradient.any(), f"{name} has no gradient to compare"
+        rows = gradient.reshape(-1, 3) if name == "table" else gradient[None] if name == "twist" else gradient
+        assert row_error(found[name].reshape(rows.shape), rows) < 2e-3, name
+
+
+@needs_native
+@pytest.mark.parametrize("size", [1, 5, 16])
+@pytest.mark.parametrize(
+    ("projection", "kind"),
+    [
+        *[(p, kind) for p in ("erp", "tangent", "ray") for kind in ("ordinary", "polar", "pole", "seam", "broad")],
+        *[("pinhole", kind) for kind in ("ordinary", "broad")],
+    ],
+)
+def test_native_values_and_gradients_are_those_of_the_definition(projection: str, kind: str, size: int):
+    generator = torch.Generator().manual_seed(7 + size)
+    gaussians = gaussians_of("huge" if kind == "broad" else kind, 25, generator)
+    gaussians.opacities[0] = 1.0  # reaches the maximum alpha, where the derivative is 0
+    if kind == "broad":  # but with the camera outside, and seen through
+        gaussians = replace(gaussians, scales=0.0625 * gaussians.scales, opacities=0.5 * gaussians.opacities)
+    for width, height in ((70, 44), (33, 17)):
+        camera = camera_of(projection, width, height)
+        assert_native_is_the_definition(gaussians, camera, options_of(projection, size), generator)
+
+
+@needs_native
+@pytest.mark.parametrize("projection", ["tangent", "ray"])
+def test_native_gradients_of_a_table_of_rays(projection: str, generator: torch.Generator):
+    formula = Panorama(45, 23)
+    camera = RayTable(formula.rays(dtype=torch.float64), formula.focal)
+    gaussians = mixture(6, generator, ("ordinary", "polar", "seam"))
+    assert_native_is_the_definition(gaussians, camera, options_of(projection, 3), generator)
+
+
+@needs_native
+def test_native_tiles_wider_than_a_chunk_agree(generator: torch.Generator):
+    gaussians = mixture(8, generator, ("polar", "pole", "seam"))  # tiles near the poles of 330 columns are wide
+    for projection in ("erp", "ray"):
+        assert_native_is_the_definition(gaussians, Panorama(330, 165), options_of(projection, 4), generator)
+
+
+def overlapping(count: int, generator: torch.Generator) -> Gaussians:
+    """Broad and flat Gaussians ahead at about the same distance; the camera is outside all of them."""
+
+    def uniform(low: float, high: float, *shape: int) -> Tensor:
+        return low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+    return replace(
+        gaussians_of("ordinary", count, generator),
+        means=direction(uniform(-0.3, 0.3, count), uniform(-0.2, 0.2, count)) * uniform(2, 2.2, count, 1),
+        scales=uniform(0.2, 0.56, count, 3),
+        opacities=uniform(0.3, 0.6, count),
+    )
+
+
+@each_projection
+@each_engine
+def test_a_large_core_is_exact_blending_in_the_order_of_the_rays(projection: str, backend: str, dtype: torch.dtype):
+    generator = torch.Generator().manual_seed(11)
+    camera, options = camera_of(projection, 128, 64), options_of(projection, 64)
+    gaussians = overlapping(10, generator).to(torch.float32).to(torch.float64)
+    alpha, distance, radius, stable = fragments(gaussians, camera, options, identity_pose())
+    drawn, faint = alpha > 0, (alpha > 0) & (alpha < 0.05)
+    furthest = torch.where(drawn, distance, -1.0).argmax(-1, keepdim=True)
+    stable &= drawn.any(-1)
+    stable &= (faint.sum(-1) == 0) | ((faint.sum(-1) == 1) & faint.gather(1, furthest)[:, 0])  # then no order is lost
+    assert stable.sum() > 100 and drawn[stable].sum(-1).max() > 5
+
+    order = torch.argsort(distance, dim=-1)
+    in_order = alpha.gather(1, order)
+    left = torch.cumprod(torch.cat((torch.ones(len(alpha), 1), 1 - in_order), dim=-1), dim=-1)
+    expected = torch.einsum("pk,pkc->pc", in_order * left[:, :-1], gaussians.colors[order])
+    view = View("v", identity_pose(), 128, 64, lens=camera)
+    rendering = render(gaussians.to(dtype), view, options, backend=backend)
+    assert (rendering.image.view(-1, 3) - expected)[stable].abs().max() < 2e-5
+    assert (rendering.transmittance.view(-1) - left[:, -1])[stable].abs().max() < 2e-5
+
+    # Where rays and means agree on the order, which only `ray` may not, this is the sorted blending too.
+    along = torch.where(drawn, distance, torch.nan)[:, torch.argsort(radius)]
+    agree = stable & torch.stack([pixel[~pixel.isnan()].diff().ge(0).all() for pixel in along])
+    assert agree.sum() > 30 and (agree.equal(stable) or projection == "ray")
+    assert projection != "ray" or agree.sum() < 0.9 * stable.sum()
+    classic = render(gaussians.to(dtype), view, replace(options, blending="sorted"), backend=backend)
+    agree = agree.view(64, 128)
+    for name in ("image", "transmittance", "depth"):
+        torch.testing.assert_close(getattr(rendering, name)[agree], getattr(classic, name)[agree], rtol=1e-4, atol=1e-5)
+
+
+@each_engine
+def test_each_ray_has_its_own_order(backend: str, dtype: torch.dtype):
+    """Two long Gaussians cross ahead, turned by 45 degrees to either side: each is in front on one side."""
+    half_turn = math.pi / 8
+    gaussians = Gaussians(
+        means=torch.tensor([[0.0, 0, 2], [0, 0, 2.001]]),
+        quats=torch.tensor([[math.cos(half_turn), 0, sign * math.sin(half_turn), 0] for sign in (1, -1)]),
+        scales=torch.tensor([[1.0, 0.1, 0.05]] * 2),
+        opacities=torch.tensor([0.9, 0.9]),
+        colors=torch.eye(3)[:2],
+    ).to(dtype)
+    view = View("v", identity_pose(), 64, 9, lens=Pinhole(64, 9, 80.0, 80.0, 32.0, 4.5))
+    hybrid, classic = (
+        render(gaussians, view, RenderOptions(projection="ray", blending=blending), backend=backend).image[4]
+        for blending in ("hybrid", "sorted")
+    )
+    first_leads = hybrid[:, 0] > hybrid[:, 1]  # a turn about y, which is down, brings the +x end of the first nearer
+    assert first_leads[36:54].all() and not first_leads[10:28].any()
+    assert (classic[10:54, 0] > classic[10:54, 1]).all()
+
+
+@each_projection
+@each_engine
+def test_the_order_of_the_gaussians_does_not_matter(projection: str, backend: str, dtype: torch.dtype):
+    generator = torch.Generator().manual_seed(12)
+    gaussians, camera, options = mixture(8, generator), camera_of(projection, 48, 24), options_of(projection, 3)
+    *_, stable = fragments(gaussians, camera, options, identity_pose())
+    weights = torch.randn(24, 48, 5, generator=generator, dtype=torch.float64) * stable.view(24, 48, 1)
+    order = torch.randperm(len(gaussians), generator=generator)
+    permuted = Gaussians(**{name: getattr(gaussians, name)[order] for name in INPUTS})
+    first, gradients = run(gaussians, camera, options, identity_pose(), weights, backend, dtype)
+    second, found = run(permuted, camera, options, identity_pose(), weights, backend, dtype)
+    assert first.counters == second.counters
+    torch.testing.assert_close(second.image, first.image, rtol=0, atol=1e-6)
+    for name in INPUTS:
+        assert row_error(found[name], gradients[name][order]) < 1e-4, name
+
+
+@pytest.fixture
+def restored_threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+@needs_native
+@pytest.mark.parametrize("projection", ["erp", "ray"])
+def test_results_are_bit_equal_for_any_number_of_threads(projection: str, restored_threads: None):
+    generator = torch.Generator().manual_seed(99)
+    gaussians = mixture(800, generator, ("ordinary", "polar", "seam"))
+    weights = torch.randn(125, 250, 5, generator=generator, dtype=torch.float64)
+    results = []
+    for threads in (1, 2, 3):
+        torch.set_num_threads(threads)
+        arguments = (gaussians, Panorama(250, 125), options_of(projection, 8), identity_pose(), weights)
+        results.append(run(*arguments, "cpu", torch.float32))
+    (reference, gradients), *others = results
+    for rendering, found in others:
+        assert rendering.counters == reference.counters
+        for name in ("image", "transmittance", "depth"):
+            assert torch.equal(getattr(rendering, name), getattr(reference, name)), name
+        for name, gradient in gradients.items():
+            assert torch.equal(found[name], gradient), name
+
+
+@needs_native
+def test_strips_change_nothing(generator: torch.Generator):
+    gaussians, camera = mixture(200, generator, ("ordinary", "polar", "seam")), Panorama(128, 64)
+    weights = torch.randn(64, 128, 5, generator=generator, dtype=torch.float64)
+    whole, strips = (
+        run(
+            gaussians, camera, options_of("ray", 4, max_instances=limit), identity_pose(), weights, "cpu", torch.float32
+        )
+        for limit in (1 << 26, 100)
+    )
+    assert torch.equal(whole[0].image, strips[0].image) and whole[0].counters == strips[0].counters
+    for name, gradient in whole[1].items():
+        assert row_error(strips[1][name], gradient) < 1e-4, name
+
+
+DRAW = """
+import sys, torch
+from padgs.gaussians import Gaussians
+from padgs.render import RenderOptions, native, render
+from padgs.scene import View
+inputs = {k: v.requires_grad_() for k, v in torch.load(sys.argv[1]).items()}
+options = RenderOptions(projection="ray", blending="hybrid", core_size=3)
+r = render(Gaussians(**inputs), View("v", torch.eye(4), 72, 36), options, backend="cpu")
+(r.image.square().sum() + r.depth.sum()).backward()
+torch.save({"image": r.image.detach(), **{k: v.grad for k, v in inputs.items()}}, sys.argv[2])
+print(native.library().padgs_isa().decode(), end="")
+"""
+
+
+@needs_native
+def test_every_instruction_set_draws_the_same(tmp_path: Path, generator: torch.Generator):
+    torch.save(vars(mixture(10, generator, ("ordinary", "seam")).to(torch.float32)), tmp_path / "in.pt")
+    root = str(Path(__file__).resolve().parents[2])
+    path = os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))
+    results = {}
+    for isa in ("baseline", "avx2", "avx512"):
+        arguments = [sys.executable, "-c", DRAW, str(tmp_path / "in.pt"), str(tmp_path / f"{isa}.pt")]
+        environment = {**os.environ, "PYTHONPATH": path, "PADGS_ISA": isa}
+        done = subprocess.run(arguments, env=environment, capture_output=True, text=True, timeout=120)
+        assert done.returncode == 0, done.stderr
+        results.setdefault(done.stdout, torch.load(tmp_path / f"{isa}.pt"))
+    if len(results) == 1:
+        pytest.skip("this machine has only the baseline instruction set")
+    reference = results.pop("baseline")
+    for isa, result in results.items():
+        assert (result["image"] - reference["image"]).abs().max() <= 1e-5, isa
+        for name in INPUTS:
+            assert row_error(result[name], reference[name]) < 1e-3, f"{name} with {isa}"
+
+
+@each_engine
+def test_nothing_to_draw_is_the_background(backend: str, dtype: torch.dtype):
+    empty = Gaussians(*(torch.zeros(0, width) for width in (3, 4, 3)), torch.zeros(0), torch.zeros(0, 3)).to(dtype)
+    behind = gaussians_of("ordinary", 3, torch.Generator().manual_seed(1)).to(dtype)
+    for gaussians in (empty, replace(behind, opacities=torch.zeros_like(behind.opacities))):
+        view = View("v", identity_pose(), 20, 10)
+        rendering = render(gaussians, view, options_of("ray", 16), background=BACKGROUND.to(dtype), backend=backend)
+        assert torch.equal(rendering.image, BACKGROUND.to(dtype).expand(10, 20, 3))
+        assert not rendering.depth.any() and rendering.counters["contributing"] == 0
