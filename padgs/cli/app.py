@@ -7,6 +7,7 @@ import typer
 from padgs.cli.bench import bench
 from padgs.cli.check import check
 from padgs.cli.convert import convert
+from padgs.cli.prepare import prepare
 from padgs.cli.report import report
 
 app = typer.Typer(no_args_is_help=True, add_completion=False)
@@ -17,7 +18,7 @@ def commands() -> None:
     """Panoramic Gaussian splatting, measured fairly."""
 
 
-for command in (bench, check, convert, report):
+for command in (bench, check, convert, prepare, report):
     app.command()(command)
 
 

@@ -69,10 +69,10 @@ class ImageStore:
             del self._pending[image]
             self.decoded += 1
             if pixels.nbytes <= self.limit_bytes:
+                while self.bytes + pixels.nbytes > self.limit_bytes:
+                    self.bytes -= self._kept.popitem(last=False)[1].nbytes
                 self._kept[image] = pixels
                 self.bytes += pixels.nbytes
-                while self.bytes > self.limit_bytes:
-                    self.bytes -= self._kept.popitem(last=False)[1].nbytes
         future.set_result(pixels)
 
 
