@@ -17,7 +17,7 @@ from math import ceil, pi
 import torch
 from torch import Tensor
 
-from padgs.camera import Panorama, Pinhole
+from padgs.camera import Camera, Panorama, Pinhole
 from padgs.gaussians import Gaussians
 from padgs.panorama import rays
 from padgs.render.contract import Rendering, RenderOptions
@@ -59,7 +59,7 @@ def rasterize_cubemap(
     rasterize: Callable[..., Rendering],
     gaussians: Gaussians,
     cam_from_world: Tensor,
-    panorama: Panorama,
+    panorama: Camera,
     options: RenderOptions,
     background: Tensor,
     probe: Tensor | None = None,
@@ -70,6 +70,7 @@ def rasterize_cubemap(
         rasterize: the other backend.
         gaussians, cam_from_world, panorama, options, background, probe: as in `torch_backend.rasterize`.
     """
+    assert isinstance(panorama, Panorama), type(panorama)  # `check_inputs` has seen to it
     if probe is not None:  # it is given in units of the panorama, so it moves the means, once for all faces
         means, _ = camera_frame(gaussians, cam_from_world)
         gaussians = replace(gaussians, means=gaussians.means + shift_of_probe(means, probe) @ cam_from_world[:3, :3])
@@ -95,7 +96,7 @@ def panorama_from_faces(faces: list[Rendering], panorama: Panorama, lens: Pinhol
     depth = torch.stack([face.depth for face in faces]) * coverage
     image = torch.stack([face.image for face in faces])
     channels = torch.cat((image, coverage[..., None], depth[..., None]), dim=-1).flatten(0, 2)  # [6 S S, 5]
-    resampled = sum(weights[:, corner, None] * channels[pixels[:, corner]] for corner in range(4))
+    resampled = (weights[:, :, None] * channels[pixels]).sum(1)  # [H W, 5]
     image, coverage, depth = resampled.view(panorama.height, panorama.width, 5).split((3, 1, 1), dim=-1)
     covered = coverage > 0
     depth = torch.where(covered, depth, 0) / torch.where(covered, coverage, 1)

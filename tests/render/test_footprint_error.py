@@ -1,0 +1,71 @@
+"""Errors of footprints against the ray response: known numbers, laws, and the table in the docs."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from padgs.render.footprint_error import LATITUDES, SIGMAS, footprint_error
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "projections.md"
+
+
+@pytest.mark.parametrize("latitude", [0.0, 60.0, -89.0])
+def test_ray_is_the_truth(latitude: float):
+    for sigma in (2.0, 10.0):
+        assert footprint_error("ray", sigma, latitude) < 1e-9
+
+
+def test_the_tangent_plane_does_not_care_for_latitude():
+    errors = [footprint_error("tangent", 5.0, latitude) for latitude in (0.0, 45.0, 89.0, -70.0)]
+    assert errors == pytest.approx([errors[0]] * 4, rel=5e-3)
+    # q = tan^2 instead of sin^2: the relative loss is of order sigma^2.
+    ratio = footprint_error("tangent", 4.0, 0.0) / footprint_error("tangent", 2.0, 0.0)
+    assert ratio == pytest.approx(4, rel=0.1)
+
+
+def test_the_chart_errs_alike_on_both_sides_of_the_horizon():
+    for latitude in (30.0, 85.0):
+        assert footprint_error("erp", 4.0, latitude) == pytest.approx(footprint_error("erp", 4.0, -latitude), rel=1e-9)
+
+
+def test_all_faces_of_a_cube_are_alike():
+    """From the middle of the front face to its edge is from the edge of the lower face to its middle."""
+    for latitude in (10.0, 30.0):
+        above, below = (footprint_error("cubemap", 2.0, angle) for angle in (latitude, 90 - latitude))
+        assert above == pytest.approx(below, rel=0.03)
+
+
+# Computed by another program: baselines-and-projections.md, section 3.8.
+@pytest.mark.parametrize(
+    ("projection", "sigma", "latitude", "percent"),
+    [
+        ("erp", 2, 0, 0.2),
+        ("erp", 2, 70, 3.8),
+        ("erp", 2, 89, 28.9),
+        ("erp", 5, 45, 3.6),
+        ("erp", 5, 85, 27.5),
+        ("erp", 10, 70, 17.3),
+        ("erp", 10, 89, 9.0),
+        ("tangent", 2, 45, 0.5),
+        ("tangent", 5, 45, 3.0),
+        ("tangent", 10, 45, 11.2),
+    ],
+)
+def test_known_numbers(projection: str, sigma: float, latitude: float, percent: float):
+    assert 100 * footprint_error(projection, sigma, latitude) == pytest.approx(percent, abs=0.25)
+
+
+def test_the_table_in_the_docs_is_current():
+    rows = re.findall(r"^\| (erp|tangent|cubemap) \| ([\d.]+)° \| (.*) \|$", PAGE.read_text(), re.MULTILINE)
+    assert [(name, float(sigma)) for name, sigma, _ in rows] == [
+        (name, sigma) for name in ("erp", "tangent", "cubemap") for sigma in SIGMAS
+    ]
+    for projection, sigma, cells in rows:
+        if float(sigma) < 2:
+            continue  # the same code, but slow
+        for latitude, cell in zip(LATITUDES, cells.split(" | "), strict=True):
+            shown = float(cell.split(" ")[0])
+            assert 100 * footprint_error(projection, float(sigma), latitude) == pytest.approx(shown, abs=0.051)
