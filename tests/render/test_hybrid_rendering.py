@@ -253,6 +253,20 @@ def test_each_ray_has_its_own_order(backend: str, dtype: torch.dtype):
     assert (classic[10:54, 0] > classic[10:54, 1]).all()
 
 
+@pytest.mark.parametrize("size", [1, 2])
+@each_projection
+@each_engine
+def test_of_equally_far_gaussians_the_first_is_in_front(projection: str, size: int, backend: str, dtype: torch.dtype):
+    one = {"means": [0.1, 0.0, 2.0], "quats": [1.0, 0.2, 0.0, 0.1], "scales": [0.3, 0.2, 0.1]}
+    twins = {name: torch.tensor([value, value]) for name, value in one.items()}
+    gaussians = Gaussians(**twins, opacities=torch.tensor([0.5, 0.5]), colors=torch.eye(3)[:2]).to(dtype)
+    view = View("v", identity_pose(), 64, 32, lens=camera_of(projection, 64, 32))
+    image = render(gaussians, view, options_of(projection, size), backend=backend).image
+    brightest = image.view(-1, 3)[image[..., 0].argmax()]
+    assert brightest[1] > 0.1
+    torch.testing.assert_close(brightest[1], brightest[0] * (1 - brightest[0]))
+
+
 @each_projection
 @each_engine
 def test_the_order_of_the_gaussians_does_not_matter(projection: str, backend: str, dtype: torch.dtype):
