@@ -59,7 +59,7 @@ def rasterize_cubemap(
     rasterize: Callable[..., Rendering],
     gaussians: Gaussians,
     cam_from_world: Tensor,
-    panorama: Camera,
+    camera: Camera,
     options: RenderOptions,
     background: Tensor,
     probe: Tensor | None = None,
@@ -68,18 +68,18 @@ def rasterize_cubemap(
 
     Args:
         rasterize: the other backend.
-        gaussians, cam_from_world, panorama, options, background, probe: as in `torch_backend.rasterize`.
+        gaussians, cam_from_world, camera, options, background, probe: as in `torch_backend.rasterize`.
     """
-    assert isinstance(panorama, Panorama), type(panorama)  # `check_inputs` has seen to it
+    assert isinstance(camera, Panorama), type(camera)  # `check_inputs` has seen to it
     if probe is not None:  # it is given in units of the panorama, so it moves the means, once for all faces
         means, _ = camera_frame(gaussians, cam_from_world)
         gaussians = replace(gaussians, means=gaussians.means + shift_of_probe(means, probe) @ cam_from_world[:3, :3])
-    lens = face_camera(panorama, options.face_size)
+    lens = face_camera(camera, options.face_size)
     turns = torch.eye(4, dtype=cam_from_world.dtype, device=cam_from_world.device).repeat(6, 1, 1)
     turns[:, :3, :3] = FACES
     each = replace(options, cubemap=False, face_size=None)
     faces = [rasterize(gaussians, turn @ cam_from_world, lens, each, background) for turn in turns]
-    return panorama_from_faces(faces, panorama, lens)
+    return panorama_from_faces(faces, camera, lens)
 
 
 def panorama_from_faces(faces: list[Rendering], panorama: Panorama, lens: Pinhole) -> Rendering:

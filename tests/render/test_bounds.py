@@ -122,7 +122,8 @@ class NativeTiles:
         self.row, self.row_end, self.chunk, self.chunk_end = (packed >> shift & 255 for shift in (0, 8, 16, 24))
         self.tile = torch.repeat_interleave(torch.arange(strip.tiles), strip.tile_start.diff())
         level = self.projected.level.long()
-        per_row = -(-(-(-camera.width // TILE)) // (1 << level))
+        chunks = -(-camera.width // TILE)
+        per_row = -(-chunks // (1 << level))
         self.row_of_tile = torch.repeat_interleave(torch.arange(len(level)), per_row)
         column_of_tile = torch.arange(strip.tiles) - (per_row.cumsum(0) - per_row)[self.row_of_tile]
         self.first_column = column_of_tile * TILE << level[self.row_of_tile]  # [tiles] pixels
