@@ -11,6 +11,7 @@ MODULES = sorted(
     module.name
     for package in PACKAGES
     for module in pkgutil.walk_packages(import_module(package).__path__, f"{package}.")
+    if not module.name.split(".")[-1].startswith("lib")  # the native libraries lie beside the modules that load them
 )
 
 
