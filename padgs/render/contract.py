@@ -41,7 +41,7 @@ class RenderOptions:
     near: float = 0.0  # world units; Gaussians whose mean is at most this far away are culled
     low_pass: float = 0.3  # variance of the low-pass filter in square pixels (at the centre of a perspective image)
     low_pass_kind: str = "auto"  # pixels, angular or solid; auto: what the projection was published with
-    wrap: bool = True  # continue footprints across the +-180 degree seam of a panorama
+    wrap: bool = True  # erp: continue footprints across the +-180 degree seam; tangent and ray know of no seam
     cubemap: bool = False  # draw a panorama through the six faces of a cube, each an ordinary perspective view
     face_size: int | None = None  # cubemap: pixels across the 90 degrees of a face; None: as fine as the panorama
     bounds: str = "exact"  # exact: every pixel with alpha >= 1/255; square: 3 sigma of the longest axis, as published
@@ -134,8 +134,6 @@ def check_inputs(
             raise ValueError(f"{name} has dtype {tensor.dtype} but means has {dtype}; convert one of them")
         if tensor.device != device:
             raise ValueError(f"{name} is on {tensor.device} but means is on {device}; move one of them")
-    if camera.width < 1 or camera.height < 1:
-        raise ValueError(f"image size is {camera.width}x{camera.height}; both sides must be at least 1 pixel")
     _check_camera(camera, options)
     if check_values:
         _check_values(gaussians, cam_from_world, {name: tensor for name, (tensor, _) in shapes.items()})
@@ -143,6 +141,14 @@ def check_inputs(
 
 
 def _check_camera(camera: Camera, options: RenderOptions) -> None:
+    if isinstance(camera, RayTable) and (camera.table.ndim != 3 or camera.table.shape[2] != 3):
+        raise ValueError(f"the ray table has shape {tuple(camera.table.shape)}; it must be (height, width, 3)")
+    if camera.width < 1 or camera.height < 1:
+        raise ValueError(f"image size is {camera.width}x{camera.height}; both sides must be at least 1 pixel")
+    if isinstance(camera, Pinhole) and not (camera.fx > 0 and camera.fy > 0):
+        raise ValueError(f"the pinhole has focal lengths {camera.fx}, {camera.fy}; both must be > 0 pixels")
+    if isinstance(camera, RayTable) and not camera.focal > 0:
+        raise ValueError(f"the ray table has focal length {camera.focal}; it must be > 0 pixels per radian")
     kind = {"erp": Panorama, "pinhole": Pinhole}.get(options.projection)
     if options.cubemap:
         if not isinstance(camera, Panorama):

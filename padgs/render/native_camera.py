@@ -58,7 +58,7 @@ def native_camera(cam_from_world: Tensor, camera: Camera, options: RenderOptions
         (ctypes.c_float * 12)(*cam_from_world[:3].detach().reshape(-1).tolist()),
         options.near,
         low_pass.own,
-        options.wrap and isinstance(camera, Panorama),
+        isinstance(camera, Panorama) and (options.wrap or options.projection != "erp"),
         options.bounds == "square",
         *lens,
         low_pass.widen,
@@ -69,7 +69,7 @@ def native_camera(cam_from_world: Tensor, camera: Camera, options: RenderOptions
 def native_rays(camera: Camera) -> NativeRays:
     """Directions of the pixels; computed once for cameras that are formulas."""
     if isinstance(camera, RayTable):
-        return NativeRays(table=_padded_table(camera.table.detach()))
+        return NativeRays(table=_padded_table(camera.table.detach().to("cpu", torch.float32)))
     return _formula_rays(camera)
 
 

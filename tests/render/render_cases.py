@@ -1,25 +1,37 @@
-"""Gaussians that are hard to draw, poses, and the engines (backend, dtype) that every test of drawing runs on."""
+"""Gaussians that are hard to draw, cameras, poses, and the engines (backend, dtype) that tests of drawing run on."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor
 
-from padgs.camera import Panorama
+from padgs.camera import Camera, Panorama, Pinhole, RayTable
 from padgs.gaussians import Gaussians, rotation_matrices
 from padgs.panorama import direction
 from padgs.render import BACKENDS, Rendering, RenderOptions, native, render
 from padgs.render.contract import ALPHA_MIN
 from padgs.render.planar import PlanarFootprints
 from padgs.render.projection import project
+from padgs.render.projective import RayFootprints
 from padgs.scene import View
 
 INPUTS = ("means", "quats", "scales", "opacities", "colors")
-KINDS = ("ordinary", "polar", "pole", "seam", "near", "huge")
+KINDS = ("ordinary", "polar", "pole", "seam", "near", "huge", "needle")
 ODD_SIZES = ((72, 36), (70, 44), (33, 17))
+SETUPS = (  # every projection with every camera that it takes
+    ("erp", "panorama"),
+    ("tangent", "panorama"),
+    ("ray", "panorama"),
+    ("pinhole", "pinhole"),
+    ("tangent", "pinhole"),
+    ("ray", "pinhole"),
+    ("tangent", "fisheye"),
+    ("ray", "fisheye"),
+)
 
 
 def engines() -> list:
@@ -36,13 +48,33 @@ def engines() -> list:
 
 each_engine = pytest.mark.parametrize(("backend", "dtype"), engines())
 needs_native = pytest.mark.skipif(not native.available(), reason="the native library is not built")
+each_setup = pytest.mark.parametrize(("projection", "lens"), SETUPS, ids=["-".join(setup) for setup in SETUPS])
+each_panorama = pytest.mark.parametrize("projection", ("erp", "tangent", "ray"))
+
+
+def camera_of(lens: str, width: int, height: int) -> Camera:
+    """A panorama, a pinhole with nothing symmetric about it, or a table: a fisheye of 240 degrees across its width."""
+    if lens == "panorama":
+        return Panorama(width, height)
+    pinhole = Pinhole(width, height, 0.5 * width, 0.45 * width, 0.46 * width, 0.55 * height)
+    if lens == "pinhole":
+        return pinhole
+    focal = width / math.radians(240)
+    x = (torch.arange(width, dtype=torch.float64) + 0.5 - pinhole.cx) / focal
+    y = (torch.arange(height, dtype=torch.float64) + 0.5 - pinhole.cy) / focal
+    angle = torch.hypot(x[None], y[:, None])
+    table = torch.stack(
+        (torch.sinc(angle / math.pi) * x, torch.sinc(angle / math.pi) * y[:, None], angle.cos()), dim=-1
+    )
+    return RayTable(table.float().double(), focal)
 
 
 def gaussians_of(kind: str, count: int, generator: torch.Generator) -> Gaussians:
     """Random Gaussians around a camera at the origin, float64 but exactly representable in float32.
 
     ordinary: anywhere; polar: 0.2 to 15 degrees from a pole; pole: broad, covering it; seam: across longitude 180;
-    near: centimetres away where the others are metres; huge: one to five times as broad as far away.
+    near: centimetres away where the others are metres; huge: one to five times as broad as far away; needle: 100 times
+    as long as thick.
     """
 
     def uniform(low: float, high: float, *shape: int) -> Tensor:
@@ -63,6 +95,8 @@ def gaussians_of(kind: str, count: int, generator: torch.Generator) -> Gaussians
         radius, size = uniform(0.002, 0.05, count), uniform(0.1, 0.6, count, 3)
     elif kind == "huge":
         size = uniform(1, 5, count, 3)
+    elif kind == "needle":
+        size = torch.tensor([0.2, 0.002, 0.002], dtype=torch.float64).expand(count, 3)
     if colatitude is not None:
         latitude = (math.pi / 2 - colatitude) * torch.sign(uniform(-1, 1, count))
     quats = torch.randn(count, 4, generator=generator, dtype=torch.float64) + 1e-3
@@ -76,10 +110,19 @@ def gaussians_of(kind: str, count: int, generator: torch.Generator) -> Gaussians
     return gaussians.to(torch.float32).to(torch.float64)
 
 
+def joined(*parts: Gaussians) -> Gaussians:
+    """All Gaussians of several sets in one."""
+    return Gaussians(**{name: torch.cat([getattr(part, name) for part in parts]) for name in INPUTS})
+
+
+def chosen(gaussians: Gaussians, which: Tensor | slice) -> Gaussians:
+    """Some of the Gaussians."""
+    return Gaussians(**{name: getattr(gaussians, name)[which] for name in INPUTS})
+
+
 def mixture(count_of_each: int, generator: torch.Generator, kinds: tuple[str, ...] = KINDS) -> Gaussians:
     """Some of every kind in one set."""
-    parts = [gaussians_of(kind, count_of_each, generator) for kind in kinds]
-    return Gaussians(**{name: torch.cat([getattr(part, name) for part in parts]) for name in INPUTS})
+    return joined(*(gaussians_of(kind, count_of_each, generator) for kind in kinds))
 
 
 def identity_pose() -> Tensor:
@@ -94,6 +137,11 @@ def random_pose(generator: torch.Generator, shift: float = 0.0) -> Tensor:
     return pose.float().double()
 
 
+def view_of(camera: Camera, pose: Tensor | None = None) -> View:
+    """A view without an image."""
+    return View("test", identity_pose() if pose is None else pose, camera.width, camera.height, lens=camera)
+
+
 def draw(
     gaussians: Gaussians,
     width: int,
@@ -101,21 +149,15 @@ def draw(
     *,
     backend: str,
     dtype: torch.dtype,
+    lens: str = "panorama",
     pose: Tensor | None = None,
     options: RenderOptions = RenderOptions(),  # noqa: B008 - frozen dataclass
     **more,
 ) -> Rendering:
     """Render in one engine; the pose may carry a gradient."""
-    pose = identity_pose() if pose is None else pose
     more = {name: value.to(dtype) if isinstance(value, Tensor) else value for name, value in more.items()}
-    return render(
-        gaussians.to(dtype),
-        View("test", pose, width, height),
-        options=options,
-        backend=backend,
-        check_values=True,
-        **more,
-    )
+    view = view_of(camera_of(lens, width, height), pose)
+    return render(gaussians.to(dtype), view, options=options, backend=backend, check_values=True, **more)
 
 
 def leaves(gaussians: Gaussians, dtype: torch.dtype) -> Gaussians:
@@ -130,26 +172,34 @@ def stable_pixels(
     width: int,
     height: int,
     *,
+    lens: str = "panorama",
     pose: Tensor | None = None,
     options: RenderOptions = RenderOptions(),  # noqa: B008 - frozen dataclass
     margin: float = 1e-3,
 ) -> Tensor:
     """Pixels [H, W] bool where no yes/no decision is near: the image is smooth there and rounding flips nothing.
 
-    A decision is near where an alpha is within `margin` (relative) of 1/255 or 0.99, or, for a footprint broader than
-    half a turn, where the pixel is within `margin` pixels of the longitude opposite to the mean.
+    A decision is near where an alpha is within `margin` (relative) of 1/255 or 0.99; for a chart footprint broader than
+    half a turn, where the pixel is within `margin` pixels of the longitude opposite to the mean; for `ray`, where the
+    ray meets a Gaussian within `margin` (relative) of the near radius.
     """
     pose = identity_pose() if pose is None else pose
-    footprints = project(gaussians, pose.to(gaussians.means.dtype), Panorama(width, height), options)
+    footprints = project(gaussians, pose.to(gaussians.means.dtype), camera_of(lens, width, height), options)
     everything = torch.arange(len(gaussians))[footprints.visible]
     pixels = torch.arange(height * width)
     rows, columns = pixels // width, pixels % width
     q, _ = footprints.squared_distance(everything, rows, columns)
     alpha = footprints.opacities[everything] * torch.exp(-0.5 * q)
     unstable = ((alpha / ALPHA_MIN - 1).abs() < margin) | ((alpha / 0.99 - 1).abs() < margin)
-    if isinstance(footprints, PlanarFootprints) and options.wrap:
+    if isinstance(footprints, PlanarFootprints) and footprints.turn < torch.inf:
         across = ((columns[:, None] + 0.5 - footprints.centers[everything, 0] + width / 2) % width).abs()
         unstable |= (torch.minimum(across, width - across) < max(margin, 1e-3)) & (alpha >= ALPHA_MIN / 2)
+    if isinstance(footprints, RayFootprints):
+        closer, further = (
+            replace(footprints, near=options.near * factor).squared_distance(everything, rows, columns)[1]
+            for factor in (1 - margin, 1 + margin)
+        )
+        unstable |= closer & ~further & (alpha >= ALPHA_MIN / 2)
     after = torch.cumprod(1 - alpha.clamp(max=0.99)[..., torch.argsort(footprints.depths[everything])], dim=-1)
     unstable |= (after / 1e-4 - 1).abs() < max(margin, 1e-2)
     return ~unstable.any(-1).view(height, width)

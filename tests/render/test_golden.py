@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from render_cases import INPUTS, each_engine
+from render_cases import INPUTS, engines, needs_native, view_of
 
-from padgs.camera import Camera, Panorama, Pinhole
+from padgs.camera import Camera, Panorama, Pinhole, RayTable
 from padgs.gaussians import Gaussians
 from padgs.render import RenderOptions, render
 from padgs.render.planar import SLOPE_LIMIT
 from padgs.render.projection import PROJECTIONS
-from padgs.scene import View
 
 FOLDER = Path(__file__).resolve().parents[2].parent / "shared" / "golden"
 CASES = sorted(path.stem for projection in PROJECTIONS for path in FOLDER.glob(f"{projection}_*.npz"))
@@ -50,22 +49,45 @@ def test_every_projection_has_golden_cases():
         assert any(case.startswith(f"{projection}_") for case in CASES), projection
 
 
-@pytest.mark.parametrize("case", CASES)
-@each_engine
-def test_golden_case(case: str, backend: str, dtype: torch.dtype):
-    data = np.load(FOLDER / f"{case}.npz")
-    meta = json.loads(str(data["meta"]))
+def cases_on_engines() -> list:
+    found = []
+    for case in CASES:
+        for engine in engines():
+            slow = case == "erp_many" and engine.values == ("torch", torch.float64)  # 3000 Gaussians by brute force
+            marks = [*engine.marks, *([pytest.mark.slow] if slow else [])]
+            found.append(pytest.param(case, *engine.values, id=f"{case}-{engine.id}", marks=marks))
+    return found
 
+
+@pytest.mark.parametrize(("case", "backend", "dtype"), cases_on_engines())
+def test_golden_case(case: str, backend: str, dtype: torch.dtype):
+    data, meta = load(case)
+    check_case(data, meta, camera_of(meta), backend, dtype)
+
+
+@pytest.mark.parametrize("case", [case for case in CASES if case.startswith(("tangent", "ray"))])
+@needs_native
+def test_golden_case_through_a_table_of_rays(case: str):
+    """The same camera without its formula."""
+    data, meta = load(case)
+    panorama = camera_of(meta)
+    check_case(data, meta, RayTable(panorama.rays(), panorama.focal), "cpu", torch.float32)
+
+
+def load(case: str) -> tuple[dict, dict]:
+    data = np.load(FOLDER / f"{case}.npz")
+    return data, json.loads(str(data["meta"]))
+
+
+def check_case(data: dict, meta: dict, camera: Camera, backend: str, dtype: torch.dtype) -> None:
     def tensor(key: str) -> torch.Tensor:
         return torch.tensor(data[key], dtype=dtype)
 
     inputs = {name: tensor(name).requires_grad_() for name in INPUTS}
     pose = torch.eye(4, dtype=dtype)
     pose[:3, :3], pose[:3, 3] = tensor("R"), tensor("t")
-    view = View(case, pose, meta["width"], meta["height"], lens=camera_of(meta))
-    rendering = render(
-        Gaussians(**inputs), view, options_of(meta), background=tensor("background"), backend=backend, check_values=True
-    )
+    arguments = {"background": tensor("background"), "backend": backend, "check_values": True}
+    rendering = render(Gaussians(**inputs), view_of(camera, pose), options_of(meta), **arguments)
 
     stable = torch.tensor(data["stable"])
     for name in ("image", "transmittance"):
