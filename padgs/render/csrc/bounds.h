@@ -77,6 +77,21 @@ PADGS_HD PixelRange sphere_range(const Cone &k, const SphereFrame<float> &f, flo
           top * per_radian_v + 0.5f * height - widen_v, bottom * per_radian_v + 0.5f * height + widen_v};
 }
 
+// Whether a cone lies strictly on the side of a plane through the camera that the plane's normal turns away from.
+PADGS_HD bool behind(const Cone &k, Vec3<float> plane) {
+  const Vec3<float> p = transposed_times(k.spread, plane);
+  const float n = dot(k.normal, plane);
+  return n < 0 && dot(p, p) * kSlack < n * n;
+}
+
+// Whether a cone misses a pinhole image: it lies behind the camera, or beside one of the four sides of the image. Most of
+// what is neither before nor behind the camera does, and would else be given the whole image below.
+PADGS_HD bool misses_pinhole(const Cone &k, const Camera &camera) {
+  const float right = float(camera.width) - camera.cx, bottom = float(camera.height) - camera.cy;
+  return behind(k, {0, 0, 1}) || behind(k, {camera.fx, 0, camera.cx}) || behind(k, {-camera.fx, 0, right}) ||
+         behind(k, {0, camera.fy, camera.cy}) || behind(k, {0, -camera.fy, bottom});
+}
+
 // The box of a cone in a pinhole image; the whole image where the cone is not strictly in front of the camera.
 PADGS_HD PixelRange pinhole_range(const Cone &k, const Camera &camera) {
   PixelRange range{0, float(camera.width), 0, float(camera.height)};

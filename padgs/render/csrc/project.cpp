@@ -187,9 +187,7 @@ PixelBox box_of(const Camera &camera, const Projected &p, int lane) {
   const Cone cone{{vector(3), vector(6), vector(9)}, frame.normal};
   if (camera.model == kPanoramaModel)
     return pixel_box(camera, sphere_range(cone, frame, float(camera.width), float(camera.height)));
-  const Vec3<float> along_z = transposed_times(cone.spread, Vec3<float>{0, 0, 1});
-  const float z = frame.normal.z;
-  if (z <= 0 && dot(along_z, along_z) < z * z) return {0, 0, 0, 0, 0};  // all of it is behind the camera
+  if (misses_pinhole(cone, camera)) return {0, 0, 0, 0, 0};
   return pixel_box(camera, pinhole_range(cone, camera));
 }
 
