@@ -17,19 +17,20 @@ namespace {
 struct ForwardRow {
   Vec transmittance;  // negative once the pixel has stopped
   Vec red, green, blue, depth;
+  Vec coverage;  // sum of weights: 1 - transmittance without the difference, which leaves few digits of a faint pixel
   VecI last;
 };
 
 void store_row(const BlendArguments &args, const Tile &tile, int chunk, int y, const ForwardRow &row) {
   const int x0 = tile.x0 + chunk * kTile, columns = std::min(kTile, args.grid.width - x0);
   const int64_t pixel = int64_t(tile.y0 + y) * args.grid.width + x0;
-  const Vec t = maximum(row.transmittance, -row.transmittance), coverage = 1.0f - t;
+  const Vec t = maximum(row.transmittance, -row.transmittance);
   float lanes[5][kLanes];
   store(lanes[0], row.red + t * args.background[0]);
   store(lanes[1], row.green + t * args.background[1]);
   store(lanes[2], row.blue + t * args.background[2]);
   store(lanes[3], t);
-  store(lanes[4], select(less(zero(), coverage), row.depth / coverage, zero()));
+  store(lanes[4], select(less(zero(), row.coverage), row.depth / row.coverage, zero()));
   int32_t last[kLanes];
   store_int(last, row.last);
   for (int x = 0; x < columns; ++x) {
@@ -51,7 +52,7 @@ void forward_tile(const BlendArguments &args, const Tile &tile, int64_t index) {
     alive[chunk] = (1u << tile.rows) - 1;
     const Vec inside = select(less(iota(), splat(float(tile.columns - chunk * kTile))), splat(1.0f), splat(-1.0f));
     for (int y = 0; y < tile.rows; ++y)
-      rows[chunk * kTile + y] = {inside, zero(), zero(), zero(), zero(), zero_int()};
+      rows[chunk * kTile + y] = {inside, zero(), zero(), zero(), zero(), zero(), zero_int()};
   }
   int64_t evaluated = 0, contributing = 0;
 
@@ -87,6 +88,7 @@ void forward_tile(const BlendArguments &args, const Tile &tile, int64_t index) {
         row.green += weight * f.green;
         row.blue += weight * f.blue;
         row.depth += weight * f.depth;
+        row.coverage += weight;
         row.last = select_int(drawn, position, row.last);
         row.transmittance = select(drawn, next, stopped);
         contributing += count(drawn);
