@@ -1,0 +1,166 @@
+"""One picture, whatever describes the camera: a formula, a table of rays, or another pose (T0, N7)."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from render_cases import (
+    INPUTS,
+    camera_of,
+    each_engine,
+    gaussians_of,
+    joined,
+    leaves,
+    mixture,
+    random_pose,
+    row_error,
+    stable_pixels,
+    view_of,
+)
+from torch import Tensor
+
+from padgs.camera import Camera, Panorama, Pinhole, RayTable
+from padgs.gaussians import Gaussians
+from padgs.panorama import project as pixel_of
+from padgs.render import RenderOptions, render
+
+each_free = pytest.mark.parametrize("projection", ("tangent", "ray"))  # free of charts: any camera will do
+
+
+def picture(
+    gaussians: Gaussians, camera: Camera, projection: str, *, backend, dtype, pose=None, weight=None, **options
+):
+    """The image, and the gradients of its sum times `weight` [H, W, 3] by every input."""
+    inputs, view = leaves(gaussians, dtype), view_of(camera, pose)
+    rendering = render(inputs, view, RenderOptions(projection, **options), backend=backend, check_values=True)
+    if weight is None:
+        return rendering.image
+    return rendering.image, torch.autograd.grad((rendering.image * weight).sum(), list(vars(inputs).values()))
+
+
+@pytest.mark.parametrize("size", [(72, 36), (70, 44), (33, 17)])
+@pytest.mark.parametrize("lens", ["panorama", "pinhole"])
+@each_free
+@each_engine
+def test_a_formula_is_its_table_of_rays(size, lens: str, projection: str, backend: str, dtype: torch.dtype):
+    generator = torch.Generator().manual_seed(31)
+    gaussians, options = mixture(5, generator), RenderOptions(projection, near=0.02)
+    formula = camera_of(lens, *size)
+    stable = stable_pixels(gaussians, *size, lens=lens, options=options)
+    assert stable.double().mean() > 0.85
+    weight = torch.randn(*stable.shape, 3, generator=generator, dtype=torch.float64) * stable[..., None]
+    engine = {"backend": backend, "dtype": dtype, "weight": weight.to(dtype), "near": 0.02}
+    expected, expected_gradients = picture(gaussians, formula, projection, **engine)
+    table = RayTable(formula.rays(dtype=dtype), formula.focal)
+    actual, gradients = picture(gaussians, table, projection, **engine)
+    tolerance = 1e-9 if dtype == torch.float64 else 2e-5
+    assert (actual - expected)[stable].abs().max() <= tolerance
+    for name, gradient, truth in zip(INPUTS, gradients, expected_gradients, strict=True):
+        assert row_error(gradient, truth) < (1e-8 if dtype == torch.float64 else 2e-3), name
+
+
+@each_free
+@each_engine
+def test_n7_turning_the_camera_turns_its_rays(projection: str, backend: str, dtype: torch.dtype):
+    """A panorama from a turned camera is what the unturned camera sees along the turned rays, poles and all."""
+    generator = torch.Generator().manual_seed(32)
+    gaussians = mixture(4, generator)
+    for _ in range(30):
+        pose = random_pose(generator)
+        panorama = Panorama(70, 35)
+        stable = stable_pixels(gaussians, 70, 35, pose=pose, options=RenderOptions(projection))
+        turned = picture(gaussians, panorama, projection, backend=backend, dtype=dtype, pose=pose)
+        rays = panorama.rays(dtype=torch.float64) @ pose[:3, :3]  # d_world = R^T d_camera
+        table = RayTable(torch.nn.functional.normalize(rays, dim=-1).to(dtype), panorama.focal)
+        expected = picture(gaussians, table, projection, backend=backend, dtype=dtype)
+        limit = 1e-6 if dtype == torch.float64 else 5e-5  # R itself is orthonormal to float32 only
+        assert (turned - expected)[stable].abs().max() <= limit
+
+
+def resampled(image: Tensor, directions: Tensor) -> Tensor:
+    """A panorama [H, W, 3] at the directions [..., 3], bilinear and across the seam; rows end at the poles."""
+    height, width, _ = image.shape
+    u, v = (pixel_of(directions, width, height) - 0.5).unbind(-1)
+    column, row = torch.floor(u).long(), torch.floor(v).long()
+    across, down = (u - column)[..., None], (v - row)[..., None]
+
+    def at(row: Tensor, column: Tensor) -> Tensor:
+        return image[row.clamp(0, height - 1), column % width]
+
+    above = (1 - across) * at(row, column) + across * at(row, column + 1)
+    below = (1 - across) * at(row + 1, column) + across * at(row + 1, column + 1)
+    return (1 - down) * above + down * below
+
+
+@each_free
+@each_engine
+def test_n7_a_turned_panorama_is_the_old_one_resampled(projection: str, backend: str, dtype: torch.dtype):
+    generator = torch.Generator().manual_seed(33)
+    gaussians = gaussians_of("ordinary", 25, generator)
+    broad = Gaussians(**{**vars(gaussians), "scales": gaussians.scales.clamp(min=0.1)})
+    panorama = Panorama(300, 150)
+    old = picture(broad, panorama, projection, backend=backend, dtype=dtype)
+    for _ in range(3):
+        pose = random_pose(generator)
+        turned = picture(broad, panorama, projection, backend=backend, dtype=dtype, pose=pose)
+        expected = resampled(old, panorama.rays(dtype=dtype) @ pose[:3, :3].to(dtype))
+        # The cut at 1/255 is an edge, which interpolation blurs.
+        assert -10 * torch.log10(((turned - expected) ** 2).mean()) >= 50
+
+
+@each_engine
+def test_on_the_axis_the_perspective_jacobian_is_the_tangent_plane(backend: str, dtype: torch.dtype):
+    """Where the mean is straight ahead, pinhole and tangent are one model; elsewhere they differ."""
+    generator = torch.Generator().manual_seed(34)
+    camera = Pinhole(64, 48, 60.0, 60.0, 30.0, 22.0)
+    for off_axis in (False, True):
+        gaussians = gaussians_of("ordinary", 1, generator)
+        means = torch.tensor([[1.2 if off_axis else 0.0, 0.0, 3.0]], dtype=torch.float64)
+        quats, scales = gaussians.quats, torch.tensor([[0.5, 0.2, 0.3]], dtype=torch.float64)
+        one = Gaussians(means, quats, scales, gaussians.opacities.clamp(min=0.5), gaussians.colors)
+        images = [
+            picture(one, camera, projection, backend=backend, dtype=dtype) for projection in ("pinhole", "tangent")
+        ]
+        difference = (images[0] - images[1]).abs().max()
+        assert (difference > 0.01) if off_axis else (difference < (1e-9 if dtype == torch.float64 else 1e-5))
+
+
+@each_engine
+def test_the_smaller_a_gaussian_the_less_ray_and_tangent_differ(backend: str, dtype: torch.dtype):
+    """tangent is the limit of ray; halving the angle halves the difference (baselines-and-projections.md 3.4)."""
+    differences = []
+    for size in (0.08, 0.04, 0.02):
+        generator = torch.Generator().manual_seed(35)
+        gaussians = gaussians_of("ordinary", 20, generator)
+        radius = gaussians.means.norm(dim=-1, keepdim=True)
+        shape = size * torch.tensor([1.0, 0.5, 0.8], dtype=torch.float64)
+        small = Gaussians(**{**vars(gaussians), "scales": radius * shape, "opacities": gaussians.opacities.clamp(0.5)})
+        camera = Panorama(256, 128)
+        images = [picture(small, camera, p, backend=backend, dtype=dtype, low_pass=0.0) for p in ("ray", "tangent")]
+        differences.append((images[0] - images[1]).abs().amax().item())
+    assert differences[0] > 0.005
+    for larger, smaller in zip(differences, differences[1:], strict=False):
+        assert 1.6 < larger / smaller < 2.6
+
+
+@each_free
+@each_engine
+def test_the_gradient_of_the_rays_is_that_of_the_pose(projection: str, backend: str, dtype: torch.dtype):
+    """To turn all rays by a small angle is to turn the camera; both derivatives must say the same."""
+    generator = torch.Generator().manual_seed(36)
+    gaussians = joined(gaussians_of("ordinary", 15, generator), gaussians_of("needle", 5, generator))
+    table = camera_of("fisheye", 60, 40).table.to(dtype).requires_grad_()
+    pose = random_pose(generator).to(dtype).requires_grad_()
+    camera = RayTable(table, 25.0)
+    weight = torch.randn(40, 60, 3, generator=generator, dtype=torch.float64).to(dtype)
+    rendering = render(gaussians.to(dtype), view_of(camera, pose), RenderOptions(projection), backend=backend)
+    by_table, by_pose = torch.autograd.grad((rendering.image * weight).sum(), (table, pose))
+    generators = torch.linalg.cross(torch.eye(3)[:, None].expand(3, 3, 3), torch.eye(3).expand(3, 3, 3)).to(dtype)
+    for axis in range(3):
+        turn = generators[axis].T  # d/dangle of the rotation about the axis
+        rays_turn = (by_table * (table @ turn.T)).sum()
+        camera_turn = (by_pose[:3, :3] * (turn.T @ pose[:3, :3])).sum()
+        assert rays_turn.abs() > 0.1
+        torch.testing.assert_close(rays_turn, camera_turn, rtol=1e-6 if dtype == torch.float64 else 1e-3, atol=1e-3)
+    along = (by_table * table).sum(-1)  # the length of a ray means nothing
+    assert along.abs().max() <= 1e-4 * by_table.norm(dim=-1).max()
