@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-from contextlib import suppress
 from pathlib import Path
 
 import safetensors.torch
 
 from padgs.method import State
+from padgs.results import replace_file
 
 FORMAT = 1
 MANIFEST = "state.json"
@@ -45,8 +44,8 @@ def save(state: State, folder: Path) -> None:
     text = json.dumps(manifest, indent=1, allow_nan=False).encode()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        _write_atomically(folder / name, content)
-        _write_atomically(folder / MANIFEST, text)
+        replace_file(folder / name, content)
+        replace_file(folder / MANIFEST, text)
     except OSError as error:
         raise CheckpointError(
             f"cannot write checkpoint {folder}: {error.strerror or error}; the previous one, if any, is still whole. "
@@ -92,23 +91,3 @@ def _read_manifest(path: Path) -> dict:
     if not complete:
         raise CheckpointError(f"{path} is damaged (it has only {sorted(manifest)}); {WAY_OUT}")
     return manifest
-
-
-def _write_atomically(path: Path, content: bytes) -> None:
-    """Write under a temporary name, force it to the disk, rename; leave nothing behind on failure."""
-    temporary = path.with_name(f"{path.name}.part")
-    try:
-        with temporary.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        raise
-    directory = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(directory)  # the rename itself must survive a power cut
-    finally:
-        os.close(directory)

@@ -114,14 +114,14 @@ def test_full_disk_leaves_the_previous_checkpoint_whole(tmp_path):
 
 def test_kill_between_the_two_files_keeps_the_old_checkpoint(tmp_path, monkeypatch):
     checkpoint.save(example(0), tmp_path)
-    write = checkpoint._write_atomically
+    write = checkpoint.replace_file
 
     def killed_before_manifest(path, content):
         if path.name == "state.json":
             raise KeyboardInterrupt
         write(path, content)
 
-    monkeypatch.setattr(checkpoint, "_write_atomically", killed_before_manifest)
+    monkeypatch.setattr(checkpoint, "replace_file", killed_before_manifest)
     with pytest.raises(KeyboardInterrupt):
         checkpoint.save(example(1), tmp_path)
     assert_same(checkpoint.load(tmp_path), example(0))
