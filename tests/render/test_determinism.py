@@ -142,9 +142,9 @@ def test_every_instruction_set_computes_the_same(tmp_path: Path):
         if used != best:  # it is, where the machine does not have what was asked for
             assert used == isa
             others[isa] = result
-    if best == "baseline":
+    if not others and best == "baseline":
         pytest.skip("this machine has only the baseline instruction set")
-    assert "baseline" in others, "PADGS_ISA=baseline is not obeyed"
+    assert "baseline" in (best, *others), "PADGS_ISA=baseline is not obeyed"
     for isa, result in others.items():
         for name, expected in here.items():
             for key, truth in expected.items():
