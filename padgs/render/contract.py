@@ -4,6 +4,7 @@ The definition (all backends match it, values and gradients): each Gaussian that
 squared distance q >= 0 given by the projection; alpha = min(0.99, opacity * exp(-q / 2)); pairs with alpha < 1/255 are
 skipped. Gaussians are blended front to back by the radial distance of their mean (ties by index), and a pixel stops
 *before* the Gaussian that would bring its transmittance below 1e-4. Where alpha is limited to 0.99 its derivative is 0.
+Means nearer than 1e-15 or farther than 1e15 world units are culled too: float32 has no squares of them.
 That is blending "sorted"; "hybrid" shares all but the order and the stop, see `padgs.render.hybrid`.
 """
 
@@ -21,6 +22,7 @@ from padgs.gaussians import Gaussians
 ALPHA_MIN = 1 / 255
 ALPHA_MAX = 0.99
 TRANSMITTANCE_MIN = 1e-4
+NEAREST, FURTHEST = 1e-15, 1e15
 CORE_ALPHA_MIN = 0.05  # hybrid: fainter fragments go to the tail
 MAX_CORE_SIZE = 256
 BLENDINGS = ("sorted", "hybrid")

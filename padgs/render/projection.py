@@ -15,7 +15,7 @@ from torch import Tensor
 from padgs.camera import Camera
 from padgs.gaussians import Gaussians, rotation_matrices
 from padgs.registry import lookup
-from padgs.render.contract import RenderOptions
+from padgs.render.contract import FURTHEST, NEAREST, RenderOptions
 
 PROJECTIONS = {
     "erp": "padgs.render.planar:project_erp",
@@ -52,7 +52,8 @@ def project(
     """Footprints under `options.projection`; arguments as in `torch_backend.rasterize`."""
     footprints_of = lookup(PROJECTIONS, options.projection, "projection")
     with torch.no_grad():
-        visible = footprints_of(gaussians, cam_from_world, camera, options, probe).visible
+        first = footprints_of(gaussians, cam_from_world, camera, options, probe)
+        visible = first.visible & (first.depths >= NEAREST) & (first.depths <= FURTHEST)
         rotation, translation = cam_from_world[:3, :3], cam_from_world[:3, 3]
         ahead = rotation.T @ (rotation.new_tensor([0.0, 0.0, 1.0]) - translation)
     # What is not drawn may hold anything (a mean on the camera, numbers that overflow), and in the backward pass

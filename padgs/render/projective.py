@@ -90,7 +90,7 @@ def project_tangent(
     var_0 = var_0 + low_pass
     # L = C^-1 E with the Cholesky factor C of S: its first row is E_0 / c, its second orthogonal to it under S.
     first = tangent[:, 0] / torch.sqrt(var_0)[:, None]
-    second = (tangent[:, 1] - (covariance / var_0)[:, None] * tangent[:, 0]) * torch.sqrt(var_0 / determinant)[:, None]
+    second = (tangent[:, 1] - (covariance / var_0)[:, None] * tangent[:, 0]) / torch.sqrt(determinant / var_0)[:, None]
     whitening = torch.stack((first, second), dim=-2)
     sound = torch.isfinite(determinant.detach()) & (determinant.detach() > 0)  # else float overflows or nothing spreads
     visible = in_front & (gaussians.opacities.detach() >= ALPHA_MIN) & sound
@@ -114,8 +114,7 @@ def project_ray(
     distance = (torch.einsum("kic,kc->ki", whitening, means) ** 2).sum(-1).detach()
     drawn = opacities.detach() >= ALPHA_MIN
     outside = distance > 2 * torch.log((opacities.detach() / ALPHA_MIN).clamp(min=1))
-    sound = torch.isfinite(whitening.detach()).flatten(1).all(-1)  # else float overflows or nothing spreads
-    visible = in_front & drawn & outside & sound
+    visible = in_front & drawn & outside & torch.isfinite(distance)  # else float overflows or nothing spreads
     return RayFootprints(opacities, radius, visible, means, whitening, _rays(camera, means), options.near)
 
 

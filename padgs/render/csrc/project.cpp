@@ -103,7 +103,7 @@ struct Batch {
 // What one batch leaves: shapes and whatever the boxes need, lane by lane.
 struct Projected {
   float shape[11][kLanes], opacity[kLanes], log2_opacity[kLanes], depth[kLanes], in_front[kLanes];
-  float bounds[12][kLanes];  // planar: half_u, half_v, uu, uv, vv;  projective: mean (3), cone (9)
+  float bounds[12][kLanes];  // planar: half_u, half_v, uu, uv, vv, det;  projective: mean (3), cone (9)
 };
 
 template <template <class> class Chart>
@@ -126,8 +126,8 @@ void project_planar(const Camera &camera, const Inputs &in, int64_t first, const
   store(out.log2_opacity, log2_opacity);
   store(out.depth, chart.depth);
   store(out.in_front, chart.in_front(camera.near_radius));
-  const Vec bounds[5] = {shape.half_u, shape.half_v, s.uu, s.uv, s.vv};
-  for (int k = 0; k < 5; ++k) store(out.bounds[k], bounds[k]);
+  const Vec bounds[6] = {shape.half_u, shape.half_v, s.uu, s.uv, s.vv, s.determinant};
+  for (int k = 0; k < 6; ++k) store(out.bounds[k], bounds[k]);
 }
 
 // The probe of a projective footprint moves the mean itself, by the same share of the image on a panorama.
@@ -191,9 +191,11 @@ PixelBox box_of(const Camera &camera, const Projected &p, int lane) {
   return pixel_box(camera, pinhole_range(cone, camera));
 }
 
-bool finite(const Projected &p, int lane) {
-  float total = p.depth[lane];
+// Whether nothing overflowed on the way to a footprint and its bounds.
+bool finite(const Projected &p, bool planar, int lane) {
+  float total = 0;
   for (int k = 0; k < 11; ++k) total += std::fabs(p.shape[k][lane]);
+  for (int k = 0; k < (planar ? 6 : 12); ++k) total += std::fabs(p.bounds[k][lane]);
   return std::isfinite(total);
 }
 
@@ -216,7 +218,9 @@ void forward_batch(const Camera &camera, const Inputs &in, int64_t first, Footpr
     Footprint &f = footprints[first + lane];
     PixelBox &box = boxes[first + lane];
     box = {0, 0, 0, 0, 0};
-    if (p.opacity[lane] >= kAlphaMin && p.in_front[lane] > 0 && finite(p, lane)) box = box_of(camera, p, lane);
+    const bool within_reach = p.depth[lane] >= kNearest && p.depth[lane] <= kFurthest;
+    if (p.opacity[lane] >= kAlphaMin && p.in_front[lane] > 0 && within_reach && finite(p, planar, lane))
+      box = box_of(camera, p, lane);
     for (int k = 0; k < 11; ++k) f.shape[k] = p.shape[k][lane];
     f.log2_opacity = p.log2_opacity[lane];
     f.depth = p.depth[lane];

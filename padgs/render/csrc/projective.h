@@ -31,24 +31,21 @@ PADGS_HD ProjectiveMoments<T> projective_moments(const T *m) {
 template <class T>
 struct TangentModel {
   SphereFrame<T> frame;
-  Mat3<T> local;              // orientation in (east, down, normal): rows are components
-  T a_ee, a_ed, a_dd;         // E Sigma E^T
-  T a_en, a_dn;               // E Sigma n
-  T c11, c21, c22;            // Cholesky factor of S = E Sigma E^T / r^2 + low_pass I
-  T opacity;
+  Vec3<T> e, d, n;    // east, down and normal rows of A / r, with Sigma = A A^T; P = (e, d), S = P P^T + low_pass I
+  T c11, c21, c22;    // Cholesky factor C of S
 
-  PADGS_HD TangentModel(const CameraGaussian<T> &g, float low_pass) : frame(sphere_frame(g.mean)), opacity(g.opacity) {
+  PADGS_HD TangentModel(const CameraGaussian<T> &g, float low_pass) : frame(sphere_frame(g.mean)) {
     const Mat3<T> spread = g.spread();
-    const Vec3<T> e = transposed_times(spread, frame.east), d = transposed_times(spread, frame.down);
-    const Vec3<T> n = transposed_times(spread, frame.normal);
-    a_ee = dot(e, e), a_ed = dot(e, d), a_dd = dot(d, d), a_en = dot(e, n), a_dn = dot(d, n);
-    const T inverse = 1.0f / (frame.r * frame.r);
+    const T inverse = 1.0f / frame.r;
+    e = scaled(inverse, transposed_times(spread, frame.east));
+    d = scaled(inverse, transposed_times(spread, frame.down));
+    n = scaled(inverse, transposed_times(spread, frame.normal));
+    const T ee = dot(e, e);
     const Vec3<T> minors = cross(e, d);
-    const T s_ee = a_ee * inverse + low_pass, s_ed = a_ed * inverse;
-    const T determinant = dot(minors, minors) * inverse * inverse + low_pass * (a_ee + a_dd) * inverse + low_pass * low_pass;
-    c11 = root(s_ee);
-    c21 = s_ed / c11;
-    c22 = root(determinant / s_ee);
+    const T determinant = dot(minors, minors) + low_pass * (ee + dot(d, d)) + low_pass * low_pass;
+    c11 = root(ee + low_pass);
+    c21 = dot(e, d) / c11;
+    c22 = root(determinant / (ee + low_pass));
   }
 
   PADGS_HD ProjectiveShape<T> shape() const {
@@ -63,30 +60,27 @@ struct TangentModel {
     return {scaled(h * c11, frame.east) + scaled(h * c21, frame.down), scaled(h * c22, frame.down), {zero, zero, zero}};
   }
 
-  // With y = C^-1 tau, g = S^-1 tau = C^-T y:
-  //   dL/dSigma = E^T (sum M g g^T) E / (2 r^2)
-  //   dL/dmu = [E^T sum M (I + tau tau^T) g - (E^T W v + tr(A W) n) / r^2] / r,  W = sum M g g^T, v = E Sigma n
+  // With y = C^-1 tau, g = S^-1 tau = C^-T y, Y = sum M y y^T:
+  //   dL/dP = C^-T Y (C^-1 P), in this order, because S^-1 itself holds no digits where S is long and oblique,
+  //   dL/dA = E^T dL/dP / r,  dL/dmu = [E^T (sum M (I + tau tau^T) g - dL/dP n) - tr(P^T dL/dP) n] / r
   PADGS_HD CameraGaussianGradient<T> vjp(const CameraGaussian<T> &g, const ProjectiveMoments<T> &m, T grad_depth) const {
     const T i11 = 1.0f / c11, i22 = 1.0f / c22, i21 = -(c21 * i11 * i22);  // C^-1
-    const T w_ee = i11 * i11 * m.c11 + 2.0f * i11 * i21 * m.c12 + i21 * i21 * m.c22;
-    const T w_ed = i22 * (i11 * m.c12 + i21 * m.c22), w_dd = i22 * i22 * m.c22;
-    const T g_e = i11 * m.c1 + i21 * m.c2 + c11 * m.c01;
-    const T g_d = i22 * m.c2 + c21 * m.c01 + c22 * m.c02;
-    const T inverse = 1.0f / frame.r, inverse2 = inverse * inverse;
-    const T along_e = g_e - inverse2 * (w_ee * a_en + w_ed * a_dn);
-    const T along_d = g_d - inverse2 * (w_ed * a_en + w_dd * a_dn);
-    const T along_n = -(inverse2 * (a_ee * w_ee + 2.0f * a_ed * w_ed + a_dd * w_dd));
+    const Vec3<T> q1 = scaled(i11, e), q2 = scaled(i21, e) + scaled(i22, d);
+    const Vec3<T> z1 = scaled(m.c11, q1) + scaled(m.c12, q2), z2 = scaled(m.c12, q1) + scaled(m.c22, q2);
+    const Vec3<T> grad_e = scaled(i11, z1) + scaled(i21, z2), grad_d = scaled(i22, z2);
+    const T along_e = i11 * m.c1 + i21 * m.c2 + c11 * m.c01 - dot(grad_e, n);
+    const T along_d = i22 * m.c2 + c21 * m.c01 + c22 * m.c02 - dot(grad_d, n);
+    const T along_n = -(dot(q1, z1) + dot(q2, z2));
+    const T inverse = 1.0f / frame.r;
     CameraGaussianGradient<T> out;
     out.mean = scaled(inverse * along_e, frame.east) + scaled(inverse * along_d, frame.down) +
                scaled(inverse * along_n + grad_depth, frame.normal);
     out.log_opacity = m.one;
-    // dL/dA = 2 (dL/dSigma) A.
-    const Mat3<T> spread = g.spread();
-    const auto column = [&](Vec3<T> a) {
-      const T e = dot(frame.east, a), d = dot(frame.down, a);
-      return scaled(inverse2 * (w_ee * e + w_ed * d), frame.east) + scaled(inverse2 * (w_ed * e + w_dd * d), frame.down);
-    };
-    spread_vjp(g, Mat3<T>{column(spread.c0), column(spread.c1), column(spread.c2)}, out);
+    const Vec3<T> east = scaled(inverse, frame.east), down = scaled(inverse, frame.down);
+    spread_vjp(g,
+               Mat3<T>{scaled(grad_e.x, east) + scaled(grad_d.x, down), scaled(grad_e.y, east) + scaled(grad_d.y, down),
+                       scaled(grad_e.z, east) + scaled(grad_d.z, down)},
+               out);
     return out;
   }
 };
