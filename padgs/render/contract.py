@@ -65,6 +65,8 @@ class RenderOptions:
             raise ValueError(f"near is {self.near}; it must be a distance >= 0 in world units")
         if not self.low_pass >= 0:
             raise ValueError(f"low_pass is {self.low_pass}; it must be a variance >= 0 in square pixels")
+        if not self.max_instances >= 1:
+            raise ValueError(f"max_instances is {self.max_instances}; it must be at least 1")
         kinds = LOW_PASS_KINDS.get(self.projection, ())  # of an unknown projection nothing is known; see `PROJECTIONS`
         if kinds and self.low_pass_kind not in ("auto", *kinds):
             raise ValueError(

@@ -6,8 +6,19 @@ from dataclasses import replace
 
 import pytest
 import torch
-from render_cases import INPUTS, each_engine, gaussians_of, identity_pose, leaves, needs_native
+from render_cases import (
+    INPUTS,
+    camera_of,
+    each_engine,
+    each_setup,
+    gaussians_of,
+    identity_pose,
+    leaves,
+    needs_native,
+    view_of,
+)
 
+from padgs.camera import Panorama, Pinhole, RayTable
 from padgs.gaussians import Gaussians
 from padgs.render import RenderOptions, render
 from padgs.scene import View
@@ -118,11 +129,105 @@ def test_unknown_projections_list_the_known_ones(backend: str, dtype: torch.dtyp
         ({"near": -1.0}, "near is -1.0; it must be a distance >= 0"),
         ({"near": float("nan")}, "near is nan; it must be a distance >= 0"),
         ({"low_pass": -0.1}, "low_pass is -0.1; it must be a variance >= 0"),
+        ({"max_instances": 0}, "max_instances is 0; it must be at least 1"),
     ],
 )
 def test_options_that_no_backend_can_honour_are_refused(options: dict, message: str):
     with pytest.raises(ValueError, match=message):
         RenderOptions(**options)
+
+
+@pytest.mark.parametrize("lens", ["pinhole", "fisheye"])
+@each_engine
+def test_erp_takes_panoramas_only(lens: str, backend: str, dtype: torch.dtype, gaussians: Gaussians):
+    kind = {"pinhole": "Pinhole", "fisheye": "RayTable"}[lens]
+    message = f"projection 'erp' is made for a Panorama camera, not a {kind}; tangent and ray take any camera"
+    with pytest.raises(ValueError, match=message):
+        render(gaussians.to(dtype), view_of(camera_of(lens, 32, 16)), backend=backend)
+
+
+@pytest.mark.parametrize("lens", ["panorama", "fisheye"])
+@each_engine
+def test_pinhole_takes_pinholes_only(lens: str, backend: str, dtype: torch.dtype, gaussians: Gaussians):
+    kind = {"panorama": "Panorama", "fisheye": "RayTable"}[lens]
+    with pytest.raises(ValueError, match=f"projection 'pinhole' is made for a Pinhole camera, not a {kind}"):
+        view = view_of(camera_of(lens, 32, 16))
+        render(gaussians.to(dtype), view, RenderOptions("pinhole"), backend=backend)
+
+
+@pytest.mark.parametrize("projection", ["tangent", "ray"])
+@each_engine
+def test_square_bounds_belong_to_charts(projection: str, backend: str, dtype: torch.dtype, gaussians: Gaussians):
+    options = RenderOptions(projection, wrap=False, bounds="square")
+    with pytest.raises(ValueError, match=f"projection '{projection}' has no square bounds; use bounds=exact"):
+        render(gaussians.to(dtype), VIEW, options, backend=backend)
+
+
+@pytest.mark.parametrize("projection", ["tangent", "ray"])
+@each_engine
+def test_rays_are_of_unit_length(projection: str, backend: str, dtype: torch.dtype, gaussians: Gaussians):
+    options, camera = RenderOptions(projection), camera_of("fisheye", 32, 16)
+    for value, off in ((0.0, "1"), (2.0, "3"), (float("nan"), "nan"), (float("inf"), "inf")):
+        table = camera.table.clone()
+        table[3, 4] = table[3, 4] * value
+        view = view_of(RayTable(table, camera.focal))
+        with pytest.raises(ValueError, match=f"direction whose squared length is off 1 by {off}; normalise it"):
+            render(gaussians.to(dtype), view, options, backend=backend, check_values=True)
+        image = render(gaussians.to(dtype), view, options, backend=backend).image
+        expected = render(gaussians.to(dtype), view_of(camera), options, backend=backend).image
+        others = torch.ones(16, 32, dtype=torch.bool)
+        others[3, 4] = False
+        torch.testing.assert_close(image[others], expected[others])  # a bad ray spoils its own pixel only
+
+
+@pytest.mark.parametrize("shape", [(16, 32), (16, 32, 2), (16, 32, 4), (3, 16, 32, 3), ()])
+@each_engine
+def test_a_ray_table_has_three_axes(shape: tuple[int, ...], backend: str, dtype: torch.dtype, gaussians: Gaussians):
+    view = View("v", identity_pose(), 32, 16, lens=RayTable(torch.zeros(shape), 5.0))
+    with pytest.raises(ValueError, match=r"the ray table has shape \(.*\); it must be \(height, width, 3\)"):
+        render(gaussians.to(dtype), view, RenderOptions("ray"), backend=backend)
+
+
+@pytest.mark.parametrize("lens", ["panorama", "pinhole", "fisheye"])
+@pytest.mark.parametrize(("width", "height"), [(0, 16), (32, 0)])
+@each_engine
+def test_an_empty_camera_is_refused(width, height, lens: str, backend: str, dtype: torch.dtype, gaussians: Gaussians):
+    cameras = {
+        "panorama": Panorama(width, height),
+        "pinhole": Pinhole(width, height, 10, 10, 0, 0),
+        "fisheye": RayTable(torch.zeros(height, width, 3), 5.0),
+    }
+    with pytest.raises(ValueError, match=f"image size is {width}x{height}; both sides must be at least 1 pixel"):
+        render(gaussians.to(dtype), view_of(cameras[lens]), RenderOptions("ray"), backend=backend)
+
+
+@pytest.mark.parametrize("focal", [0.0, -3.0, float("nan")])
+@pytest.mark.parametrize("projection", ["pinhole", "tangent", "ray"])
+@each_engine
+def test_focal_lengths_are_positive(focal: float, projection: str, backend: str, dtype, gaussians: Gaussians):
+    cameras = [Pinhole(32, 16, focal, 10, 16, 8), Pinhole(32, 16, 10, focal, 16, 8)]
+    if projection != "pinhole":
+        cameras.append(RayTable(camera_of("fisheye", 32, 16).table, focal))
+    for camera in cameras:
+        with pytest.raises(ValueError, match=r"focal length.*must be > 0 pixels"):
+            render(gaussians.to(dtype), view_of(camera), RenderOptions(projection), backend=backend)
+
+
+@pytest.mark.parametrize("table_dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("projection", ["tangent", "ray"])
+@each_engine
+def test_the_table_of_rays_may_be_of_any_dtype(projection, table_dtype, backend, dtype, gaussians: Gaussians):
+    camera, weight = camera_of("fisheye", 33, 16), torch.rand(16, 33, 3, dtype=dtype)
+    results = []
+    for table in (camera.table.to(dtype), camera.table.to(table_dtype)):
+        # A strided table is as good as any.
+        table = torch.stack((table, -table), dim=-1)[..., 0].requires_grad_()
+        view = view_of(RayTable(table, camera.focal))
+        image = render(gaussians.to(dtype), view, RenderOptions(projection), backend=backend).image
+        results.append((image, torch.autograd.grad((image * weight).sum(), table)[0]))
+    assert torch.equal(results[0][0], results[1][0]) and results[0][0].any()
+    assert results[1][1].dtype == table_dtype
+    torch.testing.assert_close(results[1][1].to(dtype), results[0][1], rtol=1e-6, atol=1e-6)
 
 
 @needs_native
@@ -131,14 +236,16 @@ def test_the_cpu_backend_refuses_float64(gaussians: Gaussians):
         render(gaussians.to(torch.float64), VIEW, backend="cpu")
 
 
+@each_setup
 @each_engine
-def test_no_gaussians_are_the_background(backend: str, dtype: torch.dtype):
+def test_no_gaussians_are_the_background(projection: str, lens: str, backend: str, dtype: torch.dtype):
     nothing = Gaussians(
         *(torch.zeros(0, *shape, dtype=dtype, requires_grad=True) for shape in ((3,), (4,), (3,), (), (3,)))
     )
     background = torch.tensor([0.25, 0.5, 0.75], dtype=dtype, requires_grad=True)
-    options = {"background": background, "probe": torch.zeros(0, 2, dtype=dtype), "backend": backend}
-    rendering = render(nothing, VIEW, check_values=True, **options)
+    extra = {"background": background, "probe": torch.zeros(0, 2, dtype=dtype), "backend": backend}
+    view = view_of(camera_of(lens, 32, 16))
+    rendering = render(nothing, view, RenderOptions(projection), check_values=True, **extra)
     assert torch.equal(rendering.image, background.expand(16, 32, 3))
     assert torch.equal(rendering.transmittance, torch.ones(16, 32, dtype=dtype))
     assert torch.equal(rendering.depth, torch.zeros(16, 32, dtype=dtype))
@@ -147,12 +254,14 @@ def test_no_gaussians_are_the_background(backend: str, dtype: torch.dtype):
     assert background.grad.tolist() == [512.0] * 3
 
 
+@each_setup
 @each_engine
-def test_gaussians_that_are_not_contiguous_are_drawn_the_same(backend: str, dtype: torch.dtype, gaussians: Gaussians):
-    reference = render(gaussians.to(dtype), VIEW, backend=backend).image
+def test_gaussians_that_are_not_contiguous_are_drawn_the_same(projection, lens, backend, dtype, gaussians: Gaussians):
+    view, options = view_of(camera_of(lens, 32, 16)), RenderOptions(projection)
+    reference = render(gaussians.to(dtype), view, options, backend=backend).image
     strided = {}
     for name, tensor in vars(gaussians.to(dtype)).items():
         wide = torch.stack((tensor, -torch.ones_like(tensor)), dim=-1)
         strided[name] = wide[..., 0]
         assert not strided[name].is_contiguous()
-    assert torch.equal(render(Gaussians(**strided), VIEW, backend=backend).image, reference)
+    assert torch.equal(render(Gaussians(**strided), view, options, backend=backend).image, reference)

@@ -118,8 +118,8 @@ def test_memory_is_bounded_by_the_chunk(generator: torch.Generator, monkeypatch:
 
 
 @pytest.mark.parametrize("output", OUTPUTS)
-@pytest.mark.parametrize("wrap", [True, False])
-def test_gradcheck(output: str, wrap: bool):
+@pytest.mark.parametrize(("projection", "wrap"), [("erp", True), ("erp", False), ("tangent", True), ("ray", True)])
+def test_gradcheck(output: str, projection: str, wrap: bool):
     """Every entry of the Jacobian of every output, against differences, in float64."""
     gaussians = gaussians_of("seam", 3, torch.Generator().manual_seed(21))
     inputs = leaves(gaussians, torch.float64)
@@ -132,7 +132,7 @@ def test_gradcheck(output: str, wrap: bool):
         rendering = render(
             Gaussians(means, quats, scales, opacities, colors),
             View("v", moved, 12, 6),
-            RenderOptions(wrap=wrap),
+            RenderOptions(projection, wrap=wrap),
             background=background,
             probe=probe,
             backend="torch",
