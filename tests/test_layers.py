@@ -35,6 +35,7 @@ LAYERS = {
         "padgs.clone_split",
         "padgs.guards",
         "padgs.targets",
+        "padgs.training_loop",
         "padgs.train",
         "padgs.anchor_training",
         "padgs.splat_training",
