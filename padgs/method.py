@@ -26,6 +26,7 @@ class RenderConfig:
     backend: str = "auto"
     near: float = 0.01  # Gaussians nearer than this are culled
     near_unit: str = "scene"  # scene: multiples of Scene.unit; world: as the published code does
+    near_cull: str = "mean"
     low_pass: float = 0.3
     low_pass_kind: str = "auto"
     wrap: bool = True
@@ -46,6 +47,7 @@ class RenderConfig:
         return RenderOptions(
             projection=self.projection,
             near=near,
+            near_cull=self.near_cull,
             low_pass=self.low_pass,
             low_pass_kind=self.low_pass_kind,
             wrap=self.wrap,

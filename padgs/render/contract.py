@@ -27,6 +27,7 @@ CORE_ALPHA_MIN = 0.05  # hybrid: fainter fragments go to the tail
 MAX_CORE_SIZE = 256
 BLENDINGS = ("sorted", "hybrid")
 BOUNDS = ("exact", "square")
+NEAR_CULLS = ("mean", "ellipsoid")
 LOW_PASS_KINDS = {  # of each projection, its natural one first; `padgs.render.low_pass` says what they are
     "erp": ("pixels", "angular", "solid"),
     "pinhole": ("pixels", "angular", "solid"),
@@ -41,6 +42,7 @@ class RenderOptions:
 
     projection: str = "erp"
     near: float = 0.0  # world units; Gaussians whose mean is at most this far away are culled
+    near_cull: str = "mean"  # what must be farther than near: the mean, or (ray) all that is drawn of the Gaussian
     low_pass: float = 0.3  # variance of the low-pass filter in square pixels (at the centre of a perspective image)
     low_pass_kind: str = "auto"  # pixels, angular or solid; auto: what the projection was published with
     wrap: bool = True  # erp: continue footprints across the +-180 degree seam; tangent and ray know of no seam
@@ -55,6 +57,12 @@ class RenderOptions:
         """Reject values that no backend can honour."""
         if self.bounds not in BOUNDS:
             raise ValueError(f"unknown bounds {self.bounds!r}; known: {', '.join(BOUNDS)}")
+        if self.near_cull not in NEAR_CULLS:
+            raise ValueError(f"unknown near_cull {self.near_cull!r}; known: {', '.join(NEAR_CULLS)}")
+        if self.near_cull == "ellipsoid" and self.projection != "ray":
+            raise ValueError(
+                f"near_cull=ellipsoid is made for projection 'ray', not {self.projection!r}; set near_cull=mean"
+            )
         if self.blending not in BLENDINGS:
             raise ValueError(f"unknown blending {self.blending!r}; known: {', '.join(BLENDINGS)}")
         if not 1 <= self.core_size <= MAX_CORE_SIZE:

@@ -31,7 +31,7 @@ class Camera(ctypes.Structure):
         *_fields(ctypes.c_float, "near_radius", "low_pass"),
         *_fields(ctypes.c_int32, "wrap", "square"),
         *_fields(ctypes.c_float, "fx", "fy", "cx", "cy", "widen"),
-        ("compensate", ctypes.c_int32),
+        *_fields(ctypes.c_int32, "compensate", "cull_ellipsoids"),
     ]
 
 

@@ -63,6 +63,7 @@ def native_camera(cam_from_world: Tensor, camera: Camera, options: RenderOptions
         *lens,
         low_pass.widen,
         low_pass.compensate,
+        options.near_cull == "ellipsoid",
     )
 
 

@@ -104,7 +104,11 @@ def project_ray(
     options: RenderOptions,
     probe: Tensor | None = None,
 ) -> RayFootprints:
-    """M^-1 = diag(1 / scale) R^T; not drawn from inside, that is where |M^-1 mean|^2 <= 2 ln(255 opacity)."""
+    """M^-1 = diag(1 / scale) R^T; not drawn from inside, that is where |M^-1 mean|^2 <= k = 2 ln(255 opacity).
+
+    With near_cull=ellipsoid neither where the ellipsoid of what is drawn reaches the plane n.x = near, n the direction
+    of the mean: r - sqrt(k n^T Sigma n) <= near (SPaGS).
+    """
     means, orientations = camera_frame(gaussians, cam_from_world)
     in_front = (means * means).sum(-1).detach() > options.near**2
     means = _probed(means, probe)
@@ -113,7 +117,11 @@ def project_ray(
     whitening = orientations.transpose(-1, -2) / gaussians.scales[:, :, None]
     distance = (torch.einsum("kic,kc->ki", whitening, means) ** 2).sum(-1).detach()
     drawn = opacities.detach() >= ALPHA_MIN
-    outside = distance > 2 * torch.log((opacities.detach() / ALPHA_MIN).clamp(min=1))
+    largest = 2 * torch.log((opacities.detach() / ALPHA_MIN).clamp(min=1))
+    outside = distance > largest
+    if options.near_cull == "ellipsoid":
+        along = ((orientations * gaussians.scales[:, None, :]).mT @ (means / radius[:, None])[..., None]).detach()
+        outside &= radius.detach() - torch.sqrt(largest * (along[..., 0] ** 2).sum(-1)) > options.near
     visible = in_front & drawn & outside & torch.isfinite(distance)  # else float overflows or nothing spreads
     return RayFootprints(opacities, radius, visible, means, whitening, _rays(camera, means), options.near)
 

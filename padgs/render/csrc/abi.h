@@ -35,6 +35,7 @@ struct Camera {
   float fx, fy, cx, cy;  // pinhole
   float widen;           // rad^2, times r^2 added to the 3D covariance
   int32_t compensate;    // 1: widening lowers the opacity
+  int32_t cull_ellipsoids;  // 1: ray: all that is drawn of a Gaussian must be beyond near_radius, not the mean alone
 };
 
 // One projected Gaussian as the blender reads it: a cache line.

@@ -170,7 +170,13 @@ void project_ray(const Camera &camera, const CameraGaussian<Vec> &g, Projected &
   store_projective(model.shape(g, camera.near_radius), g.opacity, model.frame.r, model.cone(g, k), out);
   // Not drawn from inside: rho^2 <= 2 ln(255 o).
   const Vec exact = (logarithm2(larger(g.opacity, splat(1e-30f))) + 7.994353437f) * (1.0f / kHalfLog2E);
-  store(out.in_front, minimum(model.frame.r - camera.near_radius, model.rho * model.rho - exact));
+  Vec margin = minimum(model.frame.r - camera.near_radius, model.rho * model.rho - exact);
+  if (camera.cull_ellipsoids) {
+    const Vec3<Vec> along = transposed_times(g.spread(), model.frame.normal);
+    const Vec reach = model.frame.r - root(maximum(exact, zero()) * dot(along, along));
+    margin = minimum(margin, reach - camera.near_radius);
+  }
+  store(out.in_front, margin);
 }
 
 PixelBox box_of(const Camera &camera, const Projected &p, int lane) {
