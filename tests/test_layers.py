@@ -39,7 +39,6 @@ LAYERS = {
         "padgs.train",
         "padgs.anchor_training",
         "padgs.splat_training",
-        "padgs.splat_method",
     ),
     "measuring": (
         "padgs.metrics",

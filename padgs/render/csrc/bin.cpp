@@ -5,12 +5,10 @@
 #include <cstring>
 #include <vector>
 
-#include "abi.h"
+#include "runs.h"
 
 namespace padgs {
 namespace {
-
-int64_t chunks(int width) { return (width + kTile - 1) / kTile; }
 
 // Stable radix sort of the indices of visible Gaussians by depth; positive floats order as their bits do.
 std::vector<int32_t> depth_order(const Footprint *footprints, const PixelBox *boxes, int64_t count) {
@@ -39,25 +37,6 @@ std::vector<int32_t> depth_order(const Footprint *footprints, const PixelBox *bo
   std::vector<int32_t> order(items.size());
   for (size_t i = 0; i < items.size(); ++i) order[i] = items[i].index;
   return order;
-}
-
-// A run of tiles in one row, and the chunks [first, end) of the image that the footprint reaches there.
-struct Run {
-  int tile, tile_end, chunk, chunk_end;
-};
-
-// The tiles of one row of level `level` that a box touches: one run, or two across the seam; each tile once.
-int runs_in_row(const PixelBox &box, int level, Run *runs) {
-  const int chunk = box.column / kTile, chunk_end = int(chunks(box.column_end));
-  runs[0] = {chunk >> level, ((chunk_end - 1) >> level) + 1, chunk, chunk_end};
-  if (box.second_end == 0) return 1;
-  const int second_end = int(chunks(box.second_end)), second_tiles = ((second_end - 1) >> level) + 1;
-  if (second_tiles > runs[0].tile) {  // both pieces meet in a tile: take it, and with it the whole row, once
-    runs[0] = {0, runs[0].tile_end, 0, chunk_end};
-    return 1;
-  }
-  runs[1] = {0, second_tiles, 0, second_end};
-  return 2;
 }
 
 // Calls visit(tile, instance part) for each drawn tile of the box, in a fixed order.

@@ -7,6 +7,8 @@
 
 #if defined(__CUDACC__)
 #define PADGS_HD __host__ __device__ inline
+#elif defined(__GNUC__)
+#define PADGS_HD inline __attribute__((always_inline))  // else the linker would keep one instruction set's copy for all
 #else
 #define PADGS_HD inline
 #endif

@@ -72,7 +72,7 @@ struct CameraGaussian {
   Mat3<T> orientation;  // R_cam R(q)
   Vec3<T> scale;
   T opacity;
-  Mat3<T> spread() const {
+  PADGS_HD Mat3<T> spread() const {
     return {scaled(scale.x, orientation.c0), scaled(scale.y, orientation.c1), scaled(scale.z, orientation.c2)};
   }
 };
