@@ -1,116 +1,13 @@
-"""OmniGS: explicit 3D Gaussians with spherical harmonics, optimised through the panoramic rasterizer.
+"""OmniGS: explicit 3D Gaussians with spherical harmonics, drawn through the Jacobian of the panorama.
 
-Also the first row of the ablation (Table 3). The defaults are the method as described; the bugs of its released code
-are options, and `RELEASED` switches all of them on. Its published loss is a plain mean, `TrainOptions.weight` uniform.
+Also the first row of the ablation (Table 3). The defaults of all explicit Gaussians are the method as described;
+conf/method/omnigs_release.yaml switches on what its released code does otherwise.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
-
-import torch
-
-from padgs.clone_split import CloneSplitOptions
-from padgs.method import Budget, Record, RenderConfig, Size, State
-from padgs.render import Rendering
-from padgs.scene import Scene, View
-from padgs.splat_training import TrainableSplats, extent_of
-from padgs.splats import Splats
-from padgs.train import Trainer, TrainOptions, model_state
-
-RELEASED: dict[str, Any] = {"released_start": True, "released_reset": True, "max_gaussians": None}
+from padgs.splat_method import SplatMethod
 
 
-@dataclass(frozen=True)
-class OmniGSOptions(CloneSplitOptions):
-    """The method's own options, those of its densification included."""
-
-    sh_degree: int = 3
-    learning_rate_factor: float = 1.0  # on all learning rates
-
-
-class OmniGSMethod:
+class OmniGSMethod(SplatMethod):
     """See `padgs.method.Method`."""
-
-    Options = OmniGSOptions
-
-    def __init__(
-        self,
-        options: OmniGSOptions = OmniGSOptions(),
-        render: RenderConfig = RenderConfig(),  # noqa: B008
-        train: TrainOptions = TrainOptions(),  # noqa: B008
-        seed: int = 0,
-    ) -> None:
-        """Prepare; the model comes with `fit` or `load_state`."""
-        self._options, self._render, self._train, self._seed = options, render, train, seed
-        self._model: TrainableSplats | None = None
-        self._trainer: Trainer | None = None
-        self._loaded: State | None = None
-
-    def fit(self, scene: Scene, budget: Budget) -> Iterator[Record]:
-        """Train, from the point cloud of the scene or from a loaded state."""
-        if self._loaded is not None and self._model is not None:
-            splats = self._model.splats
-        else:
-            splats = self._from_points(scene)
-        self._model = self._wrap(splats, extent_of(scene), budget.iterations)
-        self._trainer = Trainer(self._model, scene, budget, self._train, self._seed)
-        if self._loaded is not None:
-            self._trainer.load_state(self._loaded)
-            self._loaded = None
-        yield from self._trainer.records()
-
-    def render(self, view: View) -> Rendering:
-        """Render a view without gradients."""
-        return self._trained().render(view)
-
-    def state(self) -> State:
-        """All that going on bit-identically needs."""
-        if self._trainer is not None:
-            return self._trainer.state()
-        if self._loaded is not None:
-            return self._loaded
-        raise RuntimeError("the method has no state before fit or load_state")
-
-    def load_state(self, state: State) -> None:
-        """Become the method that `state` was taken of, ready to render and to go on."""
-        values = model_state(state).values
-        empty = torch.zeros(0, 3)
-        splats = Splats(empty, empty, empty, degree=self._options.sh_degree, unit=values["unit"])
-        self._model = self._wrap(splats, values["extent"], values["iterations"])
-        self._model.load_state(model_state(state))
-        self._trainer, self._loaded = None, state
-
-    def size(self) -> Size:
-        """Counts and bytes of the model."""
-        parameters = self._trained().splats.rows().values()
-        return Size(
-            counts=self._trained().counts(),
-            parameters=sum(p.numel() for p in parameters),
-            bytes=sum(p.numel() * p.element_size() for p in parameters),
-        )
-
-    def _from_points(self, scene: Scene) -> Splats:
-        options = self._options
-        generator = torch.Generator().manual_seed(self._seed)
-        return Splats.from_scene(
-            scene, degree=options.sh_degree, max_gaussians=options.max_gaussians, generator=generator
-        )
-
-    def _wrap(self, splats: Splats, extent: float, iterations: int) -> TrainableSplats:
-        return TrainableSplats(
-            splats,
-            self._options,
-            self._render,
-            extent=extent,
-            iterations=iterations,
-            learning_rate_factor=self._options.learning_rate_factor,
-            seed=self._seed,
-        )
-
-    def _trained(self) -> TrainableSplats:
-        if self._model is None:
-            raise RuntimeError("there is no model before fit or load_state")
-        return self._model

@@ -39,6 +39,7 @@ LAYERS = {
         "padgs.train",
         "padgs.anchor_training",
         "padgs.splat_training",
+        "padgs.splat_method",
     ),
     "measuring": (
         "padgs.metrics",

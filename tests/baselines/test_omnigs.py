@@ -1,14 +1,18 @@
+from dataclasses import replace
+
 import pytest
 import torch
+from composed import composed
 from tiny_scene import tiny_scene
 
 from baselines import METHODS
-from baselines.omnigs import RELEASED, OmniGSMethod, OmniGSOptions
+from baselines.omnigs import OmniGSMethod
 from padgs import checkpoint
 from padgs.method import Budget, Failure, RenderConfig, State
 from padgs.registry import lookup
 from padgs.render import native
 from padgs.scene import Scene, View
+from padgs.splat_method import SplatOptions
 from padgs.train import TrainOptions
 
 ITERATIONS = 120  # densifies at 50, and goes through all degrees
@@ -16,7 +20,7 @@ ITERATIONS = 120  # densifies at 50, and goes through all degrees
 
 def method(seed: int = 0, backend: str = "torch", **options) -> OmniGSMethod:
     options = {"densify_until": 20_000, "max_gaussians": 60} | options
-    return OmniGSMethod(OmniGSOptions(**options), RenderConfig(backend=backend), TrainOptions(), seed)
+    return OmniGSMethod(SplatOptions(**options), RenderConfig(backend=backend), TrainOptions(), seed)
 
 
 def psnr(trained: OmniGSMethod, view: View) -> float:
@@ -146,10 +150,14 @@ def test_seeds_differ_and_repeat(scene):
     assert torch.equal(means[0], means[1]) and not torch.equal(means[0], means[2])
 
 
-def test_released_bugs_are_off_unless_asked_for():
-    assert not any((OmniGSOptions().released_start, OmniGSOptions().released_reset))
-    released = OmniGSOptions(**RELEASED)
-    assert released.released_start and released.released_reset and released.max_gaussians is None
+def test_released_bugs_are_off_unless_asked_for(root, monkeypatch):
+    monkeypatch.setenv("PADGS_ROOT", str(root))
+    described, released = (composed(f"method={name}") for name in ("omnigs", "omnigs_release"))
+    assert not any((described.options.released_start, described.options.released_reset))
+    assert described.render == OmniGSMethod.RENDER and released.render == composed("render=released").render
+    quirks = {"released_start": True, "released_reset": True, "max_gaussians": None}
+    assert released.options == replace(described.options, **quirks)
+    assert described.train == released.train and released.train.weight == "uniform"
 
 
 def test_before_training_there_is_nothing(scene):

@@ -1,0 +1,131 @@
+"""What every method promises, whatever it is: each file of conf/method is trained for a few steps here.
+
+A new method needs no line here, unless its defaults are too large for a test (`TINY`) or it is slow (`SLOW`).
+"""
+
+from pathlib import Path
+
+import pytest
+import torch
+from composed import composed
+
+from baselines import METHODS
+from padgs import checkpoint
+from padgs.cli.session import build
+from padgs.data.synthetic import SCENES, SyntheticOptions, generate
+from padgs.method import Budget, Method, Record, State
+from padgs.scene import Scene
+
+WIDTH = 32
+STEPS = 20
+TINY: dict[str, tuple[str, ...]] = {}  # setting -> overrides that make it small enough for a test
+SLOW: set[str] = set()  # settings that are not fast enough for every run of the tests
+SETTINGS = sorted(path.stem for path in (Path(__file__).resolve().parents[2] / "conf" / "method").glob("*.yaml"))
+EVERY = [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in SETTINGS]
+
+
+@pytest.fixture(autouse=True)
+def padgs_root(monkeypatch, root):
+    monkeypatch.setenv("PADGS_ROOT", str(root))
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory) -> dict[str, Scene]:
+    """All synthetic scenes, tiny."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PADGS_CACHE", str(tmp_path_factory.mktemp("cache")))
+        return {
+            name: generate(SyntheticOptions(name, WIDTH, train_views=3, test_views=1, samples=1, points=200))
+            for name in SCENES
+        }
+
+
+def method_of(setting: str) -> Method:
+    return build(composed(f"method={setting}", *TINY.get(setting, ())))
+
+
+def trained(setting: str, scene: Scene, steps: int = STEPS) -> tuple[Method, list[Record]]:
+    method = method_of(setting)
+    return method, list(method.fit(scene, Budget(steps)))
+
+
+def assert_same_but_time(a: State, b: State) -> None:
+    assert {**a.values, "seconds": 0} == {**b.values, "seconds": 0}
+    assert a.tensors.keys() == b.tensors.keys()
+    for name, tensor in a.tensors.items():
+        assert torch.equal(tensor, b.tensors[name]), name
+
+
+def test_every_method_has_a_setting_of_its_name():
+    assert METHODS.keys() <= set(SETTINGS)
+    assert {composed(f"method={setting}").method for setting in SETTINGS} == METHODS.keys()
+    assert TINY.keys() | SLOW <= set(SETTINGS)
+
+
+def test_every_method_has_a_section_in_the_docs(root):
+    lines = (root / "docs" / "methods.md").read_text().splitlines()
+    headings = [line for line in lines if line.startswith("## ")]
+    assert [name for name in METHODS if not any(f"`{name}`" in line for line in headings)] == []
+
+
+@pytest.mark.parametrize("setting", EVERY)
+def test_twenty_steps_on_a_scene_leave_a_method_that_renders(setting, scenes):
+    survives(setting, scenes["room"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_every_synthetic_scene_is_survived(setting, scene, scenes):
+    survives(setting, scenes[scene])
+
+
+def survives(setting: str, scene: Scene) -> None:
+    method, records = trained(setting, scene)
+    assert [record.iteration for record in records] == list(range(1, STEPS + 1))
+    assert all(record.loss == record.loss and abs(record.loss) < float("inf") for record in records)
+    assert all(a.seconds <= b.seconds for a, b in zip(records, records[1:], strict=False))
+    for view in (scene.train[0], scene.test[0]):
+        rendering = method.render(view)
+        assert rendering.image.shape == (view.height, view.width, 3)
+        assert torch.isfinite(rendering.image).all() and not rendering.image.requires_grad
+        assert rendering.image.std() > 0.01, "it shows something"
+    size = method.size()
+    assert size.parameters > 0 and size.bytes >= size.parameters and all(n > 0 for n in size.counts.values())
+
+
+@pytest.mark.parametrize("setting", EVERY)
+def test_killed_and_resumed_every_method_ends_bit_identically(setting, scenes, tmp_path):
+    scene, steps, stop = scenes["room"], 12, 7
+    whole, _ = trained(setting, scene, steps)
+    first = method_of(setting)
+    records = first.fit(scene, Budget(steps))
+    for _ in range(stop):
+        next(records)
+    checkpoint.save(first.state(), tmp_path)
+    torch.manual_seed(stop)  # another process
+    second = method_of(setting)
+    second.load_state(checkpoint.load(tmp_path))
+    assert second.size() == first.size(), "before the scene is known"
+    assert torch.equal(second.render(scene.test[0]).image, first.render(scene.test[0]).image)
+    assert [record.iteration for record in second.fit(scene, Budget(steps))] == list(range(stop + 1, steps + 1))
+    assert_same_but_time(second.state(), whole.state())
+    assert torch.equal(second.render(scene.test[0]).image, whole.render(scene.test[0]).image)
+
+
+@pytest.mark.parametrize("setting", EVERY)
+def test_before_training_every_method_says_that_there_is_nothing(setting, scenes):
+    method = method_of(setting)
+    for ask in (method.state, method.size, lambda: method.render(scenes["room"].test[0])):
+        with pytest.raises(RuntimeError, match="before fit or load_state|call fit or load_state first"):
+            ask()
+
+
+@pytest.mark.parametrize("setting", EVERY)
+def test_the_same_seed_gives_the_same_images(setting, scenes):
+    images = []
+    for _ in range(2):
+        torch.manual_seed(0)  # as the run does
+        method, _ = trained(setting, scenes["room"], 3)
+        images.append(method.render(scenes["room"].test[0]).image)
+    assert torch.equal(*images)
