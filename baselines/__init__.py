@@ -3,4 +3,5 @@
 METHODS = {
     "padgs": "baselines.padgs:PaDGSMethod",
     "omnigs": "baselines.omnigs:OmniGSMethod",
+    "spags": "baselines.spags:SPaGSMethod",
 }

@@ -1,6 +1,6 @@
 """Densification of explicit Gaussians, as 3DGS and OmniGS do it: clone the small, split the large, prune the faint.
 
-A Gaussian whose projected mean is pulled hard, on average over the views since the last round, marks a place where
+A Gaussian that is pulled hard (`padgs.probes`), on average over the views since the last round, marks a place where
 there are too few. Where it is small it is copied, where it is large two smaller ones sampled from it take its place.
 """
 
@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from padgs.gaussians import rotation_matrices
+from padgs.probes import SIGNALS
 from padgs.rows import append_rows, keep_rows
 from padgs.schedule import scaled
 from padgs.splats import Splats
@@ -21,7 +22,7 @@ MIN_DENSIFY_EVERY = 50  # iterations; the mean gradient over fewer views is most
 MIN_RESET_EVERY = 500  # iterations; after a reset opacities need some 200 steps of Adam, however long the run
 PIECES = 2  # a split Gaussian becomes this many
 SHRINK = 0.8 * PIECES  # ... each smaller by this factor
-RESET_OPACITY = 0.01
+FAINTEST = 1e-6  # opacity that decay stops at
 
 
 @dataclass(frozen=True)
@@ -31,12 +32,16 @@ class CloneSplitOptions:
     densify_from: int = 500  # Gaussians multiply and are pruned after this iteration
     densify_until: int = 15_000  # ... and before this one
     densify_every: int = 100
-    gradient_threshold: float = 2e-4  # in the units of a render's probe, for a loss that is a plain mean
+    signal: str = "image"  # what is compared with the threshold: a name of `padgs.probes.SIGNALS`
+    gradient_threshold: float = 2e-4  # in the units of the signal's probe, for a loss that is a plain mean
     percent_dense: float = 0.01  # largest scale that is cloned rather than split, in extents
+    sample_clones: bool = False  # clones are placed at random inside the Gaussian, not exactly on it (GOF)
     min_opacity: float = 0.005  # fainter Gaussians are pruned
+    opacity_decay: float = 0.0  # taken from all opacities in every round
     prune_by_extent: bool = False  # also prune scales above max_scale; empties scenes of tiny camera motion
     max_scale: float = 0.1  # in extents
     reset_every: int = 3000  # iterations between opacity resets
+    reset_opacity: float = 0.01  # no opacity is larger after a reset
     max_gaussians: int | None = 1_000_000  # with more candidates, those with the largest gradients multiply
     released_start: bool = False  # bug of the released OmniGS: densify_from is read as 0
     released_reset: bool = False  # bug of the released OmniGS: resets clear Adam moments but keep the opacities
@@ -46,6 +51,11 @@ class CloneSplitOptions:
         for name in ("densify_every", "reset_every"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1 iteration")
+        if self.signal not in SIGNALS:
+            raise ValueError(f"unknown signal {self.signal!r}; known: {', '.join(SIGNALS)}")
+        if not (0 < self.reset_opacity < 1 and 0 <= self.opacity_decay < 1):
+            wrong = "opacity_decay" if 0 < self.reset_opacity < 1 else "reset_opacity"
+            raise ValueError(f"{wrong} is {getattr(self, wrong)}; it must be an opacity below 1")
         if self.max_gaussians is not None and self.max_gaussians < 1:
             raise ValueError(f"max_gaussians is {self.max_gaussians}; it must be at least 1, or none for no limit")
 
@@ -80,7 +90,7 @@ class CloneSplit:
         self.statistics = self._empty()
 
     def observe(self, gradient: Tensor, visible: Tensor, iteration: int) -> None:
-        """Add one view: gradient [N, 2] of the loss by the probe of `padgs.render.render`, and visible [N] bool."""
+        """Add one view: gradient [N, 2 or 3] of the loss by the probe (`padgs.probes`), and visible [N] bool."""
         if iteration < self.options.densify_until:
             self.statistics["gradient"] += torch.where(visible, gradient.norm(dim=-1), 0.0)
             self.statistics["seen"] += visible
@@ -95,6 +105,7 @@ class CloneSplit:
         begin = 0 if options.released_start else options.densify_from
         if iteration > begin and iteration % options.densify_every == 0:
             cloned, split = self._multiply(optimizer)
+            self._decay_opacities()
             pruned = self._prune(optimizer)
             self.statistics = self._empty()
             events.append(f"cloned {cloned}, split {split}, pruned {pruned} Gaussians")
@@ -114,7 +125,7 @@ class CloneSplit:
                 strongest = torch.argsort(mean_gradient, descending=True, stable=True)[:room]
                 chosen = torch.zeros_like(chosen).index_fill(0, strongest, True)
         small = torch.exp(self.splats.log_scales).amax(-1) <= self.options.percent_dense * self.extent
-        clones = {name: parameter[chosen & small] for name, parameter in rows.items()}
+        clones = self._copies(chosen & small, 1, sampled=self.options.sample_clones)
         pieces = self._pieces(chosen & ~small)
         append_rows(rows, optimizer, {name: torch.cat((clones[name], pieces[name])) for name in rows})
         replaced = torch.zeros(len(self.splats), dtype=torch.bool, device=chosen.device)
@@ -124,12 +135,18 @@ class CloneSplit:
 
     def _pieces(self, split: Tensor) -> dict[str, Tensor]:
         """What takes the place of the Gaussians marked in split [N]: smaller ones, at random places inside them."""
-        pieces = {name: parameter[split].repeat_interleave(PIECES, 0) for name, parameter in self.splats.rows().items()}
-        scales = torch.exp(pieces["log_scales"])
-        steps = torch.randn(scales.shape, generator=self.generator).to(scales) * scales
-        pieces["means"] = pieces["means"] + (rotation_matrices(pieces["quats"]) @ steps[..., None])[..., 0]
+        pieces = self._copies(split, PIECES, sampled=True)
         pieces["log_scales"] = pieces["log_scales"] - math.log(SHRINK)
         return pieces
+
+    def _copies(self, which: Tensor, times: int, *, sampled: bool) -> dict[str, Tensor]:
+        """Rows of the Gaussians marked in which [N], each so many times; sampled: at random places inside them."""
+        copies = {name: parameter[which].repeat_interleave(times, 0) for name, parameter in self.splats.rows().items()}
+        if sampled:
+            scales = torch.exp(copies["log_scales"])
+            steps = torch.randn(scales.shape, generator=self.generator).to(scales) * scales
+            copies["means"] = copies["means"] + (rotation_matrices(copies["quats"]) @ steps[..., None])[..., 0]
+        return copies
 
     def _prune(self, optimizer: torch.optim.Adam) -> int:
         keep = torch.sigmoid(self.splats.opacity_logits) >= self.options.min_opacity
@@ -138,11 +155,17 @@ class CloneSplit:
         keep_rows(self.splats.rows(), optimizer, keep)
         return int((~keep).sum())
 
+    def _decay_opacities(self) -> None:
+        if self.options.opacity_decay > 0:
+            logits = self.splats.opacity_logits
+            logits.copy_(torch.logit((torch.sigmoid(logits) - self.options.opacity_decay).clamp(min=FAINTEST)))
+
     def _reset_opacities(self, optimizer: torch.optim.Adam) -> None:
         """Make everything nearly transparent, so that only what the images ask for comes back."""
         logits = self.splats.opacity_logits
         if not self.options.released_reset:
-            logits.clamp_(max=math.log(RESET_OPACITY / (1 - RESET_OPACITY)))
+            highest = self.options.reset_opacity
+            logits.clamp_(max=math.log(highest / (1 - highest)))
         moments = optimizer.state.get(logits, {})
         for name in ("exp_avg", "exp_avg_sq"):
             if name in moments:

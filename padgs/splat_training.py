@@ -6,6 +6,7 @@ import torch
 
 from padgs.clone_split import CloneSplit, CloneSplitOptions
 from padgs.method import RenderConfig, State
+from padgs.probes import render_probed
 from padgs.render import Rendering, RenderOptions, render
 from padgs.scene import Scene, View
 from padgs.schedule import Constant, LogLinear, ParameterGroup, scaled
@@ -55,11 +56,15 @@ class TrainableSplats:
 
     def draw(self, view: View) -> Drawing:
         """Render all Gaussians, differentiably."""
-        means = self.splats.means
-        probe = means.new_zeros(len(means), 2).requires_grad_()
         gaussians = self.splats.gaussians(view)
-        rendering = render(gaussians, view, self._render_options(), probe=probe, backend=self._config.backend)
-        return Drawing(rendering, probe, gaussians, torch.arange(len(means), device=means.device))
+        rendering, probe = render_probed(
+            gaussians,
+            view,
+            self._render_options(),
+            signal=self.densifier.options.signal,
+            backend=self._config.backend,
+        )
+        return Drawing(rendering, probe, gaussians, torch.arange(len(probe), device=probe.device))
 
     def observe(self, drawing: Drawing, iteration: int) -> None:
         """Note how hard each Gaussian was pulled."""

@@ -25,7 +25,7 @@ class Drawing:
     """What a model drew of one view, with all that the densification statistics need after `backward`."""
 
     rendering: Rendering
-    probe: Tensor  # [N, 2]; its .grad is filled by backward
+    probe: Tensor  # [N, 2] or [N, 3], see `padgs.probes`; its .grad is filled by backward
     gaussians: Gaussians  # the N that were drawn
     slots: Tensor  # [N] int64: the row of the model's statistics that each drawn Gaussian counts for
 

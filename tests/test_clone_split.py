@@ -125,6 +125,36 @@ def test_opacity_reset_makes_all_nearly_transparent():
     assert optimizer.state[grown.splats.means]["exp_avg_sq"].abs().sum() > 0
 
 
+def test_clones_may_be_samples_of_their_gaussian():
+    """Means N(mean, Sigma), everything else as it was (GOF's way to clone)."""
+    count = 4000
+    grown, optimizer = densifier([SMALL] * count, max_gaussians=None, sample_clones=True)
+    splats, scales = grown.splats, torch.tensor([5e-3, 2e-3, 1e-3])
+    quat = torch.tensor([0.8, 0.3, -0.4, 0.2])
+    splats.log_scales.data, splats.quats.data = scales.log().repeat(count, 1), quat.repeat(count, 1)
+    pull(grown, [1.0] * count)
+    assert grown.adapt(EVERY, optimizer) == (f"cloned {count}, split 0, pruned 0 Gaussians",)
+    steps = splats.means[count:] - splats.means[:count]
+    spread = rotation_matrices(quat) @ torch.diag(scales)
+    assert torch.allclose(steps.T @ steps / count, spread @ spread.T, atol=0.1 * scales[0].item() ** 2)
+    assert torch.equal(splats.log_scales[count:], splats.log_scales[:count])
+
+
+def test_opacities_decay_in_every_round_and_the_faintest_go():
+    grown, optimizer = densifier([SMALL] * 4, opacity_decay=0.001)
+    opacities = torch.tensor([0.0055, 0.0065, 0.5, 0.0005])
+    grown.splats.opacity_logits.data = torch.logit(opacities)
+    assert grown.adapt(EVERY, optimizer) == ("cloned 0, split 0, pruned 2 Gaussians",)
+    assert torch.allclose(torch.sigmoid(grown.splats.opacity_logits), opacities[1:3] - 0.001, rtol=1e-4)
+
+
+def test_the_opacity_after_a_reset_is_an_option():
+    grown, optimizer = densifier([SMALL, SMALL], densify_from=10**6, reset_every=30, reset_opacity=0.1)
+    grown.splats.opacity_logits.data = torch.logit(torch.tensor([0.05, 0.9]))
+    grown.adapt(30, optimizer)
+    assert torch.allclose(torch.sigmoid(grown.splats.opacity_logits), torch.tensor([0.05, 0.1]))
+
+
 def test_released_reset_keeps_the_opacities_and_clears_their_moments():
     grown, optimizer = densifier([SMALL], densify_from=10**6, reset_every=30, released_reset=True)
     grown.splats.opacity_logits.data = torch.logit(torch.tensor([0.9]))
@@ -158,6 +188,10 @@ def test_windows_follow_the_run_length():
 def test_options_without_a_meaning_are_refused():
     with pytest.raises(ValueError, match="densify_every is 0"):
         CloneSplitOptions(densify_every=0)
+    with pytest.raises(ValueError, match="reset_opacity is 0.0; it must be an opacity"):
+        CloneSplitOptions(reset_opacity=0.0)
+    with pytest.raises(ValueError, match="opacity_decay is 1.5; it must be an opacity"):
+        CloneSplitOptions(opacity_decay=1.5)
     with pytest.raises(ValueError, match="max_gaussians is 0"):
         CloneSplitOptions(max_gaussians=0)
     assert pytest.approx(1.6) == SHRINK

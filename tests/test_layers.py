@@ -32,6 +32,7 @@ LAYERS = {
         "padgs.rows",
         "padgs.schedule",
         "padgs.grow",
+        "padgs.probes",
         "padgs.clone_split",
         "padgs.guards",
         "padgs.targets",

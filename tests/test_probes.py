@@ -1,0 +1,100 @@
+"""Densification signals against their formulas."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from padgs.clone_split import CloneSplitOptions
+from padgs.gaussians import Gaussians, rotation_matrices
+from padgs.method import RenderConfig
+from padgs.probes import render_probed
+from padgs.render import RenderOptions, render
+from padgs.scene import View
+from padgs.splat_training import TrainableSplats
+from padgs.splats import Splats
+
+RAY = RenderOptions(projection="ray")
+
+
+def colored_splats(count: int, generator: torch.Generator) -> Splats:
+    """Gaussians all around, float64, whose colours depend on the direction they are seen from."""
+    means = 2 * torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    log_scales = torch.log(0.05 + 0.3 * torch.rand(count, 3, generator=generator, dtype=torch.float64))
+    splats = Splats(means, log_scales, torch.rand(count, 3, generator=generator, dtype=torch.float64))
+    splats.sh_rest.data.normal_(0, 0.1, generator=generator)
+    splats.active_degree = 3
+    return splats
+
+
+def view_at(generator: torch.Generator | None, width: int = 48) -> View:
+    """A panorama from somewhere, turned; without a generator from the origin."""
+    pose = torch.eye(4, dtype=torch.float64)
+    if generator is not None:
+        pose[:3, :3] = rotation_matrices(torch.randn(4, generator=generator, dtype=torch.float64))
+        pose[:3, 3] = 0.3 * torch.randn(3, generator=generator, dtype=torch.float64)
+    return View("v", pose, width, width // 2)
+
+
+@pytest.mark.parametrize("projection", ["erp", "tangent", "ray"])
+def test_the_signal_in_space_is_half_the_distance_times_the_gradient_of_the_mean(projection, generator):
+    """By autograd, in float64, with a pose that is turned and shifted: 0.5 |mean - centre| |dL/dmean|."""
+    splats, view = colored_splats(30, generator), view_at(generator)
+    options, weight = RenderOptions(projection=projection), torch.rand(24, 48, 3, generator=generator).double()
+    gaussians = splats.gaussians(view)
+    rendering, probe = render_probed(gaussians, view, options, signal="space", backend="torch")
+    (weight * rendering.image).sum().backward()
+
+    means = gaussians.means.detach().requires_grad_()
+    rest = {name: tensor.detach() for name, tensor in vars(gaussians).items() if name != "means"}
+    plain = render(Gaussians(means, **rest), view, options)
+    (weight * plain.image).sum().backward()
+    assert means.grad is not None and probe.grad is not None
+    in_camera = view.cam_from_world[:3, :3] @ means.detach().T + view.cam_from_world[:3, 3:]
+    expected = 0.5 * in_camera.norm(dim=0) * means.grad.norm(dim=-1)
+    assert torch.equal(rendering.image, plain.image), "a probe of zeros moves nothing"
+    assert (expected > 0).sum() > 20
+    assert torch.allclose(probe.grad.norm(dim=-1), expected, rtol=1e-9, atol=1e-14)
+
+
+def test_a_small_gaussian_is_pulled_alike_wherever_it_is(generator):
+    """r |dL/dmean| is per radian: neither turning the world nor multiplying its lengths changes the signal."""
+    signals = []
+    for scale, axis in ((1.0, 2), (1.0, 0), (3.0, 2)):
+        splats = colored_splats(1, generator)
+        splats.means.data = torch.zeros(1, 3).double()
+        splats.means.data[0, axis] = 2 * scale
+        splats.log_scales.data[:] = torch.tensor(0.2 * scale).double().log()
+        splats.sh_dc.data[:] = 1.0
+        splats.active_degree = 0
+        view = view_at(None, width=256)
+        rendering, probe = render_probed(splats.gaussians(view), view, RAY, signal="space", backend="torch")
+        rays = view.camera.rays(dtype=torch.float64)
+        aside = (splats.means.detach()[0].roll(1) / (2 * scale) * rays).sum(-1)  # odd about the ball's centre
+        (rendering.image.sum(-1) * aside * (1 - rays[..., 1] ** 2).sqrt()).sum().backward()
+        signals.append(probe.grad.norm().item())
+    assert signals[1] == pytest.approx(signals[0], rel=2e-3)
+    assert signals[2] == pytest.approx(signals[0], rel=1e-6)
+
+
+@pytest.mark.parametrize(("signal", "axes"), [("image", 2), ("space", 3)])
+def test_the_densifier_is_given_the_signal_of_its_options(signal, axes, generator):
+    splats = colored_splats(10, generator)
+    trainee = TrainableSplats(
+        splats, CloneSplitOptions(signal=signal), RenderConfig(backend="torch"), extent=1.0, iterations=100
+    )
+    drawing = trainee.draw(view_at(generator))
+    drawing.rendering.image.sum().backward()
+    assert drawing.probe.grad is not None and drawing.probe.grad.shape == (10, axes)
+    trainee.observe(drawing, 1)
+    norms = torch.where(drawing.rendering.visible, drawing.probe.grad.norm(dim=-1), 0.0)
+    assert torch.equal(trainee.densifier.statistics["gradient"], norms)
+    assert norms.sum() > 0
+
+
+def test_unknown_signals_are_named(generator):
+    with pytest.raises(ValueError, match="unknown signal 'pixels'; known: image, space"):
+        CloneSplitOptions(signal="pixels")
+    view = view_at(generator)
+    with pytest.raises(ValueError, match="unknown signal 'pixels'; known: image, space"):
+        render_probed(colored_splats(1, generator).gaussians(view), view, RAY, signal="pixels")
