@@ -4,4 +4,5 @@ METHODS = {
     "padgs": "baselines.padgs:PaDGSMethod",
     "omnigs": "baselines.omnigs:OmniGSMethod",
     "spags": "baselines.spags:SPaGSMethod",
+    "egonerf": "baselines.egonerf:EgoNeRFMethod",
 }

@@ -25,6 +25,7 @@ LAYERS = {
         "padgs.model",
         "padgs.spherical_harmonics",
         "padgs.splats",
+        "padgs.egonerf",
     ),
     "learning": (
         "padgs.fused_loss",
@@ -40,7 +41,13 @@ LAYERS = {
         "padgs.train",
         "padgs.anchor_training",
         "padgs.splat_training",
+<<<<<<< HEAD
         "padgs.splat_method",
+=======
+        "padgs.ray_pixels",
+        "padgs.ray_training",
+        "padgs.egonerf_training",
+>>>>>>> 0d60107 (Add EgoNeRF)
     ),
     "measuring": (
         "padgs.metrics",
