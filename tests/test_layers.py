@@ -41,13 +41,10 @@ LAYERS = {
         "padgs.train",
         "padgs.anchor_training",
         "padgs.splat_training",
-<<<<<<< HEAD
         "padgs.splat_method",
-=======
         "padgs.ray_pixels",
         "padgs.ray_training",
         "padgs.egonerf_training",
->>>>>>> 0d60107 (Add EgoNeRF)
     ),
     "measuring": (
         "padgs.metrics",
