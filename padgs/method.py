@@ -35,6 +35,7 @@ class RenderConfig:
     face_size: int | None = None  # pixels; None: as fine as the panorama
     blending: str = "sorted"
     core_size: int = 16  # of blending hybrid
+    memory_cap: int | None = None  # bytes; with bounds square, where the published code would run out of memory
 
     def __post_init__(self) -> None:
         """Reject unknown units."""
@@ -56,6 +57,7 @@ class RenderConfig:
             face_size=self.face_size,
             blending=self.blending,
             core_size=self.core_size,
+            memory_cap=self.memory_cap,
         )
 
 

@@ -23,6 +23,7 @@ ALPHA_MIN = 1 / 255
 ALPHA_MAX = 0.99
 TRANSMITTANCE_MIN = 1e-4
 NEAREST, FURTHEST = 1e-15, 1e15
+PUBLISHED_FOCAL = 512  # pixels per radian on the tangent planes of the released OP43DGS, whatever the image
 CORE_ALPHA_MIN = 0.05  # hybrid: fainter fragments go to the tail
 MAX_CORE_SIZE = 256
 BLENDINGS = ("sorted", "hybrid")
@@ -31,7 +32,7 @@ NEAR_CULLS = ("mean", "ellipsoid")
 LOW_PASS_KINDS = {  # of each projection, its natural one first; `padgs.render.low_pass` says what they are
     "erp": ("pixels", "angular", "solid"),
     "pinhole": ("pixels", "angular", "solid"),
-    "tangent": ("angular", "solid"),
+    "tangent": ("angular", "solid", "fixed"),
     "ray": ("solid", "angular"),
 }
 
@@ -44,14 +45,15 @@ class RenderOptions:
     near: float = 0.0  # world units; Gaussians whose mean is at most this far away are culled
     near_cull: str = "mean"  # what must be farther than near: the mean, or (ray) all that is drawn of the Gaussian
     low_pass: float = 0.3  # variance of the low-pass filter in square pixels (at the centre of a perspective image)
-    low_pass_kind: str = "auto"  # pixels, angular or solid; auto: what the projection was published with
+    low_pass_kind: str = "auto"  # pixels, angular, solid or fixed; auto: the first one of the projection
     wrap: bool = True  # erp: continue footprints across the +-180 degree seam; tangent and ray know of no seam
     cubemap: bool = False  # draw a panorama through the six faces of a cube, each an ordinary perspective view
     face_size: int | None = None  # cubemap: pixels across the 90 degrees of a face; None: as fine as the panorama
-    bounds: str = "exact"  # exact: every pixel with alpha >= 1/255; square: 3 sigma of the longest axis, as published
+    bounds: str = "exact"  # exact: every pixel with alpha >= 1/255; square: as published, see `published_bounds`
     blending: str = "sorted"  # sorted: by distance of the means; hybrid: by distance on each ray, the rest unordered
     core_size: int = 16  # hybrid: how many fragments of a pixel are kept in order
     max_instances: int = 1 << 26  # (Gaussian, tile) pairs in memory at once; beyond it the image is drawn in strips
+    memory_cap: int | None = None  # square: bytes of the published lists of all pairs; more than that is a MemoryError
 
     def __post_init__(self) -> None:
         """Reject values that no backend can honour."""
@@ -75,6 +77,13 @@ class RenderOptions:
             raise ValueError(f"low_pass is {self.low_pass}; it must be a variance >= 0 in square pixels")
         if not self.max_instances >= 1:
             raise ValueError(f"max_instances is {self.max_instances}; it must be at least 1")
+        if self.memory_cap is not None and not self.memory_cap >= 1:
+            raise ValueError(f"memory_cap is {self.memory_cap}; it must be at least 1 byte, or None")
+        if self.memory_cap is not None and self.bounds != "square":
+            raise ValueError(
+                "memory_cap is for the published rasterizers (bounds=square), which need all instances at once; with "
+                "bounds=exact the image is drawn in strips of max_instances"
+            )
         kinds = LOW_PASS_KINDS.get(self.projection, ())  # of an unknown projection nothing is known; see `PROJECTIONS`
         if kinds and self.low_pass_kind not in ("auto", *kinds):
             raise ValueError(
@@ -173,8 +182,14 @@ def _check_camera(camera: Camera, options: RenderOptions) -> None:
             f"projection {options.projection!r} is made for a {kind.__name__} camera, not a {type(camera).__name__}; "
             f"tangent and ray take any camera{way_out}"
         )
-    if options.bounds == "square" and kind is None:
-        raise ValueError(f"projection {options.projection!r} has no square bounds; use bounds=exact")
+    if options.bounds == "square" and options.projection == "ray":
+        raise ValueError("projection 'ray' has no square bounds; use bounds=exact")
+    whole = isinstance(camera, Panorama) and not options.cubemap
+    if options.bounds == "square" and options.projection == "tangent" and not whole:
+        raise ValueError(
+            "the square bounds of projection 'tangent' are those of a panorama; use bounds=exact with a "
+            f"{'cubemap' if options.cubemap else type(camera).__name__}"
+        )
 
 
 def _check_rays(camera: Camera) -> None:

@@ -20,6 +20,7 @@ from padgs.render import native
 from padgs.render.contract import Rendering, RenderOptions
 from padgs.render.native import pointer
 from padgs.render.native_camera import native_camera, native_rays
+from padgs.render.published_bounds import check_memory
 from padgs.render.tiles import MOMENTS, Projected
 
 
@@ -97,6 +98,7 @@ class _Rasterize(torch.autograd.Function):
         inputs = native.Inputs(len(means), *map(pointer, tensors), pointer(probe))
         native_cam = native_camera(cam_from_world, camera, options)
         projected = Projected(native_cam, inputs, options.max_instances)
+        check_memory(projected.instances, options)
         rays, background = native_rays(camera), background.detach().contiguous()
         buffers = _Buffers.of_size(camera.width, camera.height)
         pairs = torch.zeros(2, dtype=torch.int64)

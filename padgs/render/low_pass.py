@@ -1,11 +1,12 @@
 """What keeps a Gaussian from falling between the pixels: its footprint, or itself, is widened to about a pixel.
 
-Three kinds. pixels: a variance in the image plane, as in 3D Gaussian splatting; on a panorama that is a circle of the
+Four kinds. pixels: a variance in the image plane, as in 3D Gaussian splatting; on a panorama that is a circle of the
 chart, which spans less and less of the sphere towards the poles. angular: the same angle in every direction of view.
 solid: the same, but in 3D and with the opacity lowered as the volume grows: the mass stays, and a thin one fades
-instead of swelling (the 3D filter of SPaGS).
+instead of swelling (the 3D filter of SPaGS). fixed: as angular, but of pixels at 512 per radian whatever the image (the
+released OP43DGS).
 
-angular and solid both add low_pass (r / f)^2 to the 3D covariance, at distance r and with f pixels per radian. Every
+angular and solid add low_pass (r / f)^2 to the 3D covariance, at distance r and with f pixels per radian. Every
 projection sees that as a circle of low_pass / f^2: charts and tangent planes do not see along the mean's own direction.
 """
 
@@ -18,12 +19,12 @@ from torch import Tensor
 
 from padgs.camera import Camera
 from padgs.gaussians import Gaussians
-from padgs.render.contract import RenderOptions
+from padgs.render.contract import PUBLISHED_FOCAL, RenderOptions
 
 
 @dataclass(frozen=True)
 class LowPass:
-    """One of the three kinds, as the kernels apply it."""
+    """One of the kinds, as the kernels apply it."""
 
     own: float  # variance that the footprint adds: square pixels in a plane, square radians on a tangent plane
     widen: float  # square radians; times r^2 the variance added in 3D, before projecting
@@ -35,6 +36,8 @@ def low_pass_of(options: RenderOptions, camera: Camera) -> LowPass:
     kind, variance = options.resolved_low_pass_kind, options.low_pass
     if kind == "pixels":
         return LowPass(variance, 0.0, False)
+    if kind == "fixed":
+        return LowPass(variance / PUBLISHED_FOCAL**2, 0.0, False)
     angle = variance / camera.focal**2
     if kind == "angular" and options.projection == "tangent":  # its covariance is already one of angles
         return LowPass(angle, 0.0, False)

@@ -16,6 +16,7 @@ from padgs.panorama import longitude_latitude, pixel_from_angles, projection_jac
 from padgs.render.contract import ALPHA_MIN, RenderOptions
 from padgs.render.low_pass import low_pass_of, widened
 from padgs.render.projection import Footprints, camera_frame
+from padgs.render.published_bounds import square_boxes
 
 MIN_COS_LATITUDE = 1e-4  # an erp footprint nearer to the axis than 0.006 degrees is undefined; see design.md section 3
 SLOPE_LIMIT = 1.3  # pinhole: slopes in the Jacobian are limited to this times the half field of view
@@ -25,9 +26,9 @@ SLOPE_LIMIT = 1.3  # pinhole: slopes in the Jacobian are limited to this times t
 class PlanarFootprints(Footprints):
     """Projected Gaussians in pixels."""
 
+    boxes: Tensor  # [N, 4]; columns not reduced mod W
     centers: Tensor  # [N, 2] (u, v)
     conics: Tensor  # [N, 3] (A, B, C) of the inverse covariance [[A, B], [B, C]]
-    boxes: Tensor  # [N, 4] pixel indices drawn: first column, end column, first row, end row; columns not reduced mod W
     turn: float  # pixels after which columns repeat (the width, with wrap), or infinity
 
     def squared_distance(self, indices: Tensor, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
@@ -112,8 +113,10 @@ def _footprints(
     conics = torch.stack((var_v, -cov_uv, var_u), dim=-1) / determinant[:, None]
     covariance = torch.stack((var_u, cov_uv, var_v), dim=-1).detach()
     opacities = gaussians.opacities.detach()
-    bound = _square_boxes if options.bounds == "square" else _exact_boxes
-    boxes = bound(centers.detach(), covariance, opacities)
+    if options.bounds == "square":
+        boxes = square_boxes(centers.detach(), 0.5 * (covariance[:, 0] + covariance[:, 2]), determinant.detach())
+    else:
+        boxes = _exact_boxes(centers.detach(), covariance, opacities)
     on_image = (boxes[:, 3] > boxes[:, 2]) & (boxes[:, 3] > 0) & (boxes[:, 2] < camera.height)
     on_image &= boxes[:, 1] > boxes[:, 0]
     wrap = options.wrap and isinstance(camera, Panorama)
@@ -122,7 +125,7 @@ def _footprints(
     sound = torch.isfinite(determinant.detach()) & (determinant.detach() > 0)  # else float overflows or nothing spreads
     visible = in_front & (opacities >= ALPHA_MIN) & on_image & sound
     turn = float(camera.width) if wrap else torch.inf
-    return PlanarFootprints(gaussians.opacities, means.norm(dim=-1), visible, centers, conics, boxes, turn)
+    return PlanarFootprints(gaussians.opacities, means.norm(dim=-1), visible, boxes, centers, conics, turn)
 
 
 def _exact_boxes(centers: Tensor, covariance: Tensor, opacities: Tensor) -> Tensor:
@@ -135,16 +138,4 @@ def _exact_boxes(centers: Tensor, covariance: Tensor, opacities: Tensor) -> Tens
     half = torch.sqrt(k[:, None] * covariance[:, [0, 2]]) * slack + 1e-3
     first = torch.ceil(centers - half - 0.5)
     end = torch.floor(centers + half - 0.5) + 1
-    return torch.stack((first[:, 0], end[:, 0], first[:, 1], end[:, 1]), dim=-1)
-
-
-def _square_boxes(centers: Tensor, covariance: Tensor, _opacities: Tensor) -> Tensor:
-    """Pixels [N, 4] that the published code draws: 3 sigma of the longest axis, rounded out to 16-pixel tiles."""
-    var_u, cov_uv, var_v = covariance.unbind(-1)
-    middle = 0.5 * (var_u + var_v)
-    determinant = var_u * var_v - cov_uv * cov_uv
-    longest = middle + torch.sqrt((middle * middle - determinant).clamp(min=0.1))
-    radius = torch.ceil(3 * torch.sqrt(longest))[:, None]
-    first = 16 * torch.floor((centers - 0.5 - radius) / 16)
-    end = 16 * torch.floor((centers - 0.5 + radius + 15) / 16)
     return torch.stack((first[:, 0], end[:, 0], first[:, 1], end[:, 1]), dim=-1)

@@ -32,6 +32,7 @@ class Footprints(ABC):
     opacities: Tensor  # [N]
     depths: Tensor  # [N] radial distance of the mean, world units; ascending = front to back
     visible: Tensor  # [N] bool
+    boxes: Tensor | None  # [N, 4] pixel indices drawn: first column, end column, first row, end row; None: all
 
     @abstractmethod
     def squared_distance(self, indices: Tensor, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,6 +1,6 @@
 """Projective footprints (torch): models that work with the ray of a pixel, so that any camera will do.
 
-tangent: the Gaussian flattened onto the tangent plane of the sphere at its mean (OP43DGS, with correct extents).
+tangent: the Gaussian flattened onto the tangent plane of the sphere at its mean (OP43DGS).
 ray: the largest value of the 3D Gaussian along the ray (SPaGS).
 Neither knows of charts: no pole, no seam.
 """
@@ -13,11 +13,12 @@ from math import pi
 import torch
 from torch import Tensor
 
-from padgs.camera import Camera
+from padgs.camera import Camera, Panorama
 from padgs.gaussians import Gaussians
 from padgs.render.contract import ALPHA_MIN, RenderOptions
 from padgs.render.low_pass import low_pass_of, widened
 from padgs.render.projection import Footprints, camera_frame
+from padgs.render.published_bounds import is_on_image, tangent_boxes
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,10 @@ class TangentFootprints(Footprints):
         inside = ahead.detach() > 0
         ahead = torch.where(inside, ahead, torch.ones_like(ahead))
         offsets = torch.einsum("pc,kic->pki", d, self.whitening[indices]) / ahead[..., None]
+        if self.boxes is not None:
+            first_column, end_column, first_row, end_row = self.boxes[indices].unbind(-1)
+            u, v = columns[:, None], rows[:, None]
+            inside = inside & (u >= first_column) & (u < end_column) & (v >= first_row) & (v < end_row)
         return (offsets * offsets).sum(-1), inside
 
 
@@ -82,7 +87,8 @@ def project_tangent(
     radius = means.norm(dim=-1)
     normal = means / radius[:, None]
     tangent = _tangent_basis(normal)  # [N, 2, 3]
-    half = tangent @ (orientations * gaussians.scales[:, None, :]) / radius[:, None, None]  # [N, 2, 3]
+    spread = orientations * gaussians.scales[:, None, :]
+    half = tangent @ spread / radius[:, None, None]  # [N, 2, 3]
     var_0, var_1 = (half**2).sum(-1).unbind(-1)
     covariance = (half[:, 0] * half[:, 1]).sum(-1)
     minors = torch.linalg.cross(half[:, 0], half[:, 1])  # det(S) without a difference that cancels
@@ -94,7 +100,11 @@ def project_tangent(
     whitening = torch.stack((first, second), dim=-2)
     sound = torch.isfinite(determinant.detach()) & (determinant.detach() > 0)  # else float overflows or nothing spreads
     visible = in_front & (gaussians.opacities.detach() >= ALPHA_MIN) & sound
-    return TangentFootprints(gaussians.opacities, radius, visible, normal, whitening, _rays(camera, means))
+    boxes = None
+    if options.bounds == "square" and isinstance(camera, Panorama):
+        boxes = tangent_boxes(means.detach(), spread.detach(), determinant.detach(), low_pass, camera)
+        visible &= is_on_image(boxes, camera.width, camera.height)
+    return TangentFootprints(gaussians.opacities, radius, visible, boxes, normal, whitening, _rays(camera, means))
 
 
 def project_ray(
@@ -123,7 +133,7 @@ def project_ray(
         along = ((orientations * gaussians.scales[:, None, :]).mT @ (means / radius[:, None])[..., None]).detach()
         outside &= radius.detach() - torch.sqrt(largest * (along[..., 0] ** 2).sum(-1)) > options.near
     visible = in_front & drawn & outside & torch.isfinite(distance)  # else float overflows or nothing spreads
-    return RayFootprints(opacities, radius, visible, means, whitening, _rays(camera, means), options.near)
+    return RayFootprints(opacities, radius, visible, None, means, whitening, _rays(camera, means), options.near)
 
 
 def shift_of_probe(means: Tensor, probe: Tensor) -> Tensor:

@@ -15,6 +15,7 @@ from padgs.gaussians import Gaussians
 from padgs.render.contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Rendering, RenderOptions
 from padgs.render.hybrid import hybrid_weights
 from padgs.render.projection import Footprints, project
+from padgs.render.published_bounds import check_memory, instances
 
 PAIRS_PER_BLOCK = 1 << 21  # (pixel, Gaussian) pairs held at once
 
@@ -38,6 +39,8 @@ def rasterize(
     footprints = project(gaussians, cam_from_world, camera, options, probe)
     order = torch.argsort(footprints.depths.detach(), stable=True)
     order = order[footprints.visible[order]]
+    if options.memory_cap is not None and footprints.boxes is not None:
+        check_memory(instances(footprints.boxes[order], camera.width, camera.height), options)
     pixels = torch.arange(camera.height * camera.width, device=background.device)
     blocks = pixels.split(max(1, PAIRS_PER_BLOCK // max(1, len(order))))
     parts = []

@@ -130,6 +130,8 @@ def test_unknown_projections_list_the_known_ones(backend: str, dtype: torch.dtyp
         ({"near": float("nan")}, "near is nan; it must be a distance >= 0"),
         ({"low_pass": -0.1}, "low_pass is -0.1; it must be a variance >= 0"),
         ({"max_instances": 0}, "max_instances is 0; it must be at least 1"),
+        ({"memory_cap": 1000}, "memory_cap is for the published rasterizers .bounds=square."),
+        ({"memory_cap": 0, "bounds": "square", "wrap": False}, "memory_cap is 0; it must be at least 1 byte"),
     ],
 )
 def test_options_that_no_backend_can_honour_are_refused(options: dict, message: str):
@@ -155,12 +157,17 @@ def test_pinhole_takes_pinholes_only(lens: str, backend: str, dtype: torch.dtype
         render(gaussians.to(dtype), view, RenderOptions("pinhole"), backend=backend)
 
 
-@pytest.mark.parametrize("projection", ["tangent", "ray"])
 @each_engine
-def test_square_bounds_belong_to_charts(projection: str, backend: str, dtype: torch.dtype, gaussians: Gaussians):
-    options = RenderOptions(projection, wrap=False, bounds="square")
-    with pytest.raises(ValueError, match=f"projection '{projection}' has no square bounds; use bounds=exact"):
-        render(gaussians.to(dtype), VIEW, options, backend=backend)
+def test_square_bounds_are_those_that_were_published(backend: str, dtype: torch.dtype, gaussians: Gaussians):
+    square = {"wrap": False, "bounds": "square"}
+    with pytest.raises(ValueError, match="projection 'ray' has no square bounds; use bounds=exact"):
+        render(gaussians.to(dtype), VIEW, RenderOptions("ray", **square), backend=backend)
+    for lens, name in (("pinhole", "Pinhole"), ("fisheye", "RayTable")):
+        view = view_of(camera_of(lens, 32, 16))
+        with pytest.raises(ValueError, match=f"'tangent' are those of a panorama; use bounds=exact with a {name}"):
+            render(gaussians.to(dtype), view, RenderOptions("tangent", **square), backend=backend)
+    with pytest.raises(ValueError, match="use bounds=exact with a cubemap"):
+        render(gaussians.to(dtype), VIEW, RenderOptions("tangent", cubemap=True, **square), backend=backend)
 
 
 @pytest.mark.parametrize("projection", ["tangent", "ray"])

@@ -38,7 +38,7 @@ COMBINATIONS = [
     for name in CONFIGURATIONS
     for kind in KINDS
     if not (name == "no wrap" and projection != "erp")
-    and not (name == "published" and projection in ("tangent", "ray"))
+    and not (name == "published" and (projection == "ray" or (projection == "tangent" and lens != "panorama")))
     and not (lens == "pinhole" and kind in ("polar", "pole", "seam"))  # it sees too few of them
 ]
 ENGINES_IN_FLOAT32 = [engine for engine in engines() if torch.float32 in engine.values]

@@ -40,9 +40,9 @@ PADGS_HD int square_edge(float p, int pixels) {
 }
 
 // The published bounds: a square of 3 sigma of the longest axis, rounded out to 16-pixel tiles and cut at the borders.
-PADGS_HD PixelBox square_box(const Camera &camera, float u, float v, float uu, float uv, float vv) {
-  const float middle = 0.5f * (uu + vv);
-  const float longest = middle + root(larger(middle * middle - (uu * vv - uv * uv), 0.1f));
+// From half the trace and the determinant of a covariance in square pixels.
+PADGS_HD PixelBox square_box(const Camera &camera, float u, float v, float middle, float determinant) {
+  const float longest = middle + root(larger(middle * middle - determinant, 0.1f));
   const float radius = ceilf(3.0f * root(longest));
   const PixelBox box{square_edge(u - 0.5f - radius, camera.width), square_edge(u - 0.5f + radius + kTile - 1, camera.width),
                      0, square_edge(v - 0.5f - radius, camera.height),

@@ -105,7 +105,9 @@ PADGS_HD Projected<T> projected(const Camera &camera, const CameraGaussian<T> &p
   if (camera.projection == kTangent) {
     const TangentModel<T> model(g, camera.low_pass);
     const T in_front = model.frame.r - camera.near_radius;
-    return projected_rays(model.shape(), posed.mean, model.cone(k), g.opacity, model.frame.r, in_front);
+    Mat3<T> bounds = model.cone(k);
+    if (camera.square) bounds.c2 = model.published_extent(camera, posed.mean);  // the cone leaves it empty
+    return projected_rays(model.shape(), posed.mean, bounds, g.opacity, model.frame.r, in_front);
   }
   const RayModel<T> model(g);  // not drawn from inside: rho^2 <= 2 ln(255 o)
   T in_front = smaller(model.frame.r - camera.near_radius, model.rho * model.rho - exact);
@@ -121,12 +123,17 @@ PADGS_HD Projected<T> projected(const Camera &camera, const CameraGaussian<T> &p
 PADGS_HD PixelBox box_of(const Camera &camera, const float *shape, const float *b) {
   if (planar(camera.projection)) {
     const float u = shape[0], v = shape[1];
-    if (camera.square) return square_box(camera, u, v, b[2], b[3], b[4]);
+    if (camera.square) return square_box(camera, u, v, 0.5f * (b[2] + b[4]), b[5]);
     const float half_u = b[0] * kSlack + kSlackPixels, half_v = b[1] * kSlack + kSlackPixels;
     return pixel_box(camera, {u - half_u, u + half_u, v - half_v, v + half_v});
   }
   if (camera.model == kTableModel) return {0, camera.width, 0, 0, camera.height};  // it may look anywhere
-  const SphereFrame<float> frame = sphere_frame(Vec3<float>{b[0], b[1], b[2]});
+  const Vec3<float> mean{b[0], b[1], b[2]};
+  if (camera.square) {
+    const ErpChart<float> chart(camera, mean);
+    return square_box(camera, chart.u, chart.v, b[9], b[10]);
+  }
+  const SphereFrame<float> frame = sphere_frame(mean);
   const Cone cone{{{b[3], b[4], b[5]}, {b[6], b[7], b[8]}, {b[9], b[10], b[11]}}, frame.normal};
   if (camera.model == kPanoramaModel)
     return pixel_box(camera, sphere_range(cone, frame, float(camera.width), float(camera.height)));

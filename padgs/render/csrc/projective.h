@@ -8,9 +8,12 @@
 #pragma once
 
 #include "abi.h"
+#include "planar.h"
 #include "vector3.h"
 
 namespace padgs {
+
+constexpr float kPublishedFocal = 512.0f;  // pixels per radian on the tangent planes of the released OP43DGS
 
 template <class T>
 struct ProjectiveShape {
@@ -58,6 +61,19 @@ struct TangentModel {
   PADGS_HD Mat3<T> cone(T k) const {
     const T h = root(k), zero = constant(0.0f, k);
     return {scaled(h * c11, frame.east) + scaled(h * c21, frame.down), scaled(h * c22, frame.down), {zero, zero, zero}};
+  }
+
+  // What the released OP43DGS takes the radius of its bounds from: half a trace and a determinant, in square pixels. The
+  // trace is that of the footprint in the panorama, by a Jacobian whose lower row is divided by sqrt(x^2 + z^2 r^2) where
+  // r^2 sqrt(x^2 + z^2) belongs; the determinant is that of S at 512 pixels per radian. Grows with the distance.
+  PADGS_HD Vec3<T> published_extent(const Camera &camera, Vec3<T> mean) const {
+    const ErpChart<T> chart(camera, mean);
+    const T x2 = mean.x * mean.x, z2 = mean.z * mean.z, r2 = frame.r * frame.r;
+    const T wrong = r2 * root(x2 + z2) / larger(root(x2 + z2 * r2), constant(1e-20f, r2));
+    const T u = chart.per_east * frame.r, v = chart.per_down * frame.r * wrong;  // pixels per radian
+    const T across = kPublishedFocal * kPublishedFocal * c11 * c22;
+    const T half_trace = 0.5f * (u * u * dot(e, e) + v * v * dot(d, d)) + camera.low_pass * kPublishedFocal * kPublishedFocal;
+    return {half_trace, across * across, constant(0.0f, r2)};
   }
 
   // With y = C^-1 tau, g = S^-1 tau = C^-T y, Y = sum M y y^T:
