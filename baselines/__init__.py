@@ -4,5 +4,4 @@ METHODS = {
     "padgs": "baselines.padgs:PaDGSMethod",
     "omnigs": "baselines.omnigs:OmniGSMethod",
     "spags": "baselines.spags:SPaGSMethod",
-    "egonerf": "baselines.egonerf:EgoNeRFMethod",
 }

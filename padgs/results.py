@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-SCHEMA = 1
+SCHEMA = 2
 FILE_NAME = "result.json"
 STATUSES = {
     "ok": "trained to the end and evaluated",
@@ -51,6 +51,7 @@ class Result:
     run: str  # run id = name of the run folder
     status: str  # key of STATUSES
     method: str  # name in `baselines.METHODS`
+    preset: str  # name of the file in conf/method that the run was started with
     variant: str  # row of an ablation; empty for none
     dataset: str  # synthetic, a name of padgs.data.DATASETS, or empty for a capture of one's own
     scene: str
@@ -71,6 +72,7 @@ class Result:
     model_bytes: int = 0
     peak_memory_bytes: int = 0
     config: dict[str, Any] = field(default_factory=dict)  # the resolved configuration
+    experiments: tuple[str, ...] = ()  # experiments and sweeps that it belongs to, sorted
 
     def __post_init__(self) -> None:
         """Reject a status that no table knows."""
@@ -188,4 +190,4 @@ def _scores(table: dict[str, Any]) -> dict[str, Scores]:
     }
 
 
-_DECODERS = {"scores": _scores, "timing": _numbers}
+_DECODERS = {"scores": _scores, "timing": _numbers, "experiments": tuple}

@@ -1,30 +1,64 @@
 """What Hydra makes of a command line, without running it."""
 
-import itertools
+import re
+from contextlib import contextmanager
 
 from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import OmegaConf, open_dict
 
 from padgs.cli.config import RunConfig, config_from_values
-from padgs.cli.run import lenient, register_fields, root
+from padgs.cli.labels import labels
+from padgs.cli.overrides import expand, lenient, root
+from padgs.cli.run import register_fields
 
 
 def composed(*overrides: str) -> RunConfig:
     """The typed configuration of `padgs-run OVERRIDES`."""
-    return config_from_values(_values(overrides))
+    with hydra_loader():
+        return _config(overrides)
 
 
 def jobs(*overrides: str) -> list[RunConfig]:
     """The typed configurations of all jobs that `padgs-run OVERRIDES` starts; one, if it is no multirun."""
-    params = _values(overrides, with_hydra=True)["hydra"]["sweeper"]["params"]
-    choices = [[f"{key}={value}" for value in str(values).split(",")] for key, values in params.items()]
-    return [composed(*overrides, *job) for job in itertools.product(*choices)]
+    with hydra_loader() as loader:
+        return [_config((*overrides, *job)) for job in _expanded(overrides, loader)]
 
 
-def _values(overrides, *, with_hydra: bool = False) -> dict:
+def covering_jobs(*overrides: str) -> list[RunConfig]:
+    """Some of the jobs of `padgs-run OVERRIDES`: all that is swept occurs, but few scenes."""
+    with hydra_loader() as loader:
+        seen: set[str] = set()
+        chosen = []
+        for job in _expanded(overrides, loader):
+            settings = {re.sub(r"(\+scene=[a-z]+360).*", r"\1", setting) for setting in job}
+            if not settings <= seen or not chosen:
+                seen |= settings
+                chosen.append(_config((*overrides, *job)))
+        return chosen
+
+
+def expanded(*overrides: str) -> list[list[str]]:
+    """What the jobs of `padgs-run OVERRIDES` differ in."""
+    with hydra_loader() as loader:
+        return _expanded(overrides, loader)
+
+
+def _expanded(overrides, loader) -> list[list[str]]:
+    config = compose("config", lenient(overrides), return_hydra_config=True)
+    return expand(config.hydra.sweeper.params or {}, [], loader)
+
+
+@contextmanager
+def hydra_loader():
     register_fields()
     with initialize_config_dir(str(root() / "conf"), version_base="1.3"):
-        config = compose("config", lenient(list(overrides)), return_hydra_config=with_hydra)
-        if with_hydra:
-            return {"hydra": {"sweeper": {"params": dict(config.hydra.sweeper.params or {})}}}
-        return OmegaConf.to_container(config, resolve=True)
+        yield GlobalHydra.instance().config_loader()
+
+
+def _config(overrides) -> RunConfig:
+    config = compose("config", lenient(overrides), return_hydra_config=True)
+    choices = config.hydra.runtime.choices
+    with open_dict(config):
+        del config["hydra"]
+    return config_from_values(OmegaConf.to_container(config, resolve=True), labels(choices))

@@ -5,10 +5,11 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
-from composed import composed, jobs
+from composed import composed, covering_jobs, expanded, hydra_loader, jobs
 
 from baselines.padgs import preset
 from padgs.cli.config import RunOptions, TrainConfig
+from padgs.cli.overrides import expand
 from padgs.data.datasets import DATASETS
 from padgs.method import RenderConfig
 from padgs.model import PaDGSOptions
@@ -17,6 +18,7 @@ from padgs.train import TrainOptions
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
+SWEEPS = sorted(path.stem for path in (CONF.parent / "sweeps" / "sweep").glob("*.yaml"))
 
 
 def files(*groups: str) -> list[str]:
@@ -43,15 +45,86 @@ def test_every_choice_composes(choice):
     composed(choice)
 
 
-def test_sweeps_are_found_and_multiply_with_experiments():
-    assert [job.seed for job in jobs("+sweep=seeds")] == [0, 1, 2]
+def test_sweeps_multiply_with_experiments():
     both = jobs("+experiment=ablation", "+sweep=seeds")
     assert len({(job.variant, job.seed) for job in both}) == 12
 
 
+@pytest.mark.parametrize("name", SWEEPS)
+def test_every_sweep_varies_its_key_alone_and_says_how_to_run_it(name):
+    package, command, *_ = (CONF.parent / "sweeps" / "sweep" / f"{name}.yaml").read_text().splitlines()
+    assert (package, command) == ("# @package _global_", f"# padgs-run +sweep={name}")
+    found = jobs(f"+sweep={name}")
+    keys = {
+        "backends": {"render.backend"},
+        "lambda": {"train.lambda_l1"},
+        "offsets_and_features": {"method.offsets", "method.features"},
+        "projections": {"render.projection", "render.cubemap"},
+        "resolution": {"data.width"},
+        "seeds": {"seed"},
+        "tau": {"method.tau"},
+        "voxel_size": {"method.voxel_size"},
+    }[name]
+    differing = {key for job in found for key in different_keys(found[0].values(), job.values())}
+    assert differing == keys
+    assert all(job.labels.experiments == (name,) for job in found)
+    assert len(found) > 1 and len({str(job.values()) for job in found}) == len(found)
+
+
+def different_keys(first: dict, second: dict, where: str = "") -> set[str]:
+    """Dotted keys in which two configurations differ."""
+    found = set()
+    for key in first.keys() | second.keys():
+        mine, theirs = first.get(key), second.get(key)
+        if isinstance(mine, dict) and isinstance(theirs, dict):
+            found |= different_keys(mine, theirs, f"{where}{key}.")
+        elif mine != theirs:
+            found.add(f"{where}{key}")
+    return found
+
+
+def test_what_the_command_line_sweeps_multiplies_with_the_file_or_replaces_it():
+    with hydra_loader() as loader:
+        params = {"method.tau": "0.5,0.9", "+scene": "glob(synthetic_ro*)", "seed": "0,1,2"}
+        found = expand(params, ["++seed=7,8", "+sweep=tau"], loader)
+    assert found == [
+        [f"++method.tau={tau}", "+scene=synthetic_room", f"++seed={seed}", "+sweep=tau"]
+        for tau in (0.5, 0.9)
+        for seed in (7, 8)
+    ]
+
+
+def test_the_tables_of_the_paper_are_all_of_its_scenes_times_all_of_its_methods():
+    for name, known in (("table1_360roam", "roam360"), ("table2_ricoh360", "ricoh360")):
+        pairs = [dict(setting.split("=") for setting in job) for job in expanded(f"+experiment={name}")]
+        scenes = {f"{known}_{scene}" for scene in DATASETS[known].scenes}
+        assert {pair["+scene"] for pair in pairs} == scenes
+        assert len(pairs) == len(scenes) * len({pair["method"] for pair in pairs})
+        first, *_ = covering_jobs(f"+experiment={name}")
+        assert first.data.path == f"data/{known}/{DATASETS[known].scenes[0]}" and first.data.dataset == known
+        assert first.train.iterations == 30_000 and first.labels.experiments == (name,)
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_every_experiment_also_runs_on_a_bare_machine(name):
+    for job in covering_jobs(f"+experiment={name}", "scale=cpu"):
+        assert job.data.path is None and job.data.dataset is None
+        assert job.data.generator["width"] <= 512 and job.train.iterations <= 1500
+        assert job.labels.experiments == (f"{name}@cpu",)
+
+
+def test_one_scene_indoors_and_one_outdoors_stand_in_for_the_data_sets():
+    scenes = {
+        name: {job.data.generator["scene"] for job in covering_jobs(f"+experiment={name}", "scale=cpu")}
+        for name in ("table1_360roam", "ablation_bar", "table2_ricoh360", "ablation_cat_tower", "table4_efficiency")
+    }
+    room, outdoor = {"room"}, {"outdoor"}
+    assert list(scenes.values()) == [room, room, outdoor, outdoor, room | outdoor]
+
+
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_every_experiment_composes_and_says_how_to_run_it(name):
-    assert jobs(f"+experiment={name}")
+    assert covering_jobs(f"+experiment={name}")
     package, command, *_ = (CONF / "experiment" / f"{name}.yaml").read_text().splitlines()
     assert package == "# @package _global_"  # Hydra reads it only there
     assert re.match(rf"# padgs-run \+experiment={name}\b", command)

@@ -21,6 +21,7 @@ def result() -> Result:
         run="padgs-room-0123456789",
         status="ok",
         method="padgs",
+        preset="padgs",
         variant="full",
         dataset="synthetic",
         scene="room",
@@ -72,7 +73,7 @@ def test_an_edited_number_is_noticed(result, tmp_path):
 
 def test_another_schema_is_named(result, tmp_path):
     path = results.write(result, tmp_path)
-    path.write_text(path.read_text().replace('"schema": 1', '"schema": 2'))
+    path.write_text(path.read_text().replace('"schema": 2', '"schema": 1'))
     with pytest.raises(ResultError, match="another version"):
         results.read(path)
 

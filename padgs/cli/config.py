@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from baselines import METHODS
+from padgs.cli.labels import Labels
 from padgs.cli.typed import ConfigError, typed
 from padgs.data.options import DataOptions
 from padgs.method import Budget, RenderConfig
@@ -77,9 +78,15 @@ class RunConfig:
     run: RunOptions
     variant: str = ""  # name of this setting within an experiment, such as a row of the ablation
     seed: int = 0
+    labels: Labels = Labels()
+
+    @property
+    def preset(self) -> str:
+        """The name of the method's settings: of a file in conf/method."""
+        return self.labels.preset or self.method
 
     def values(self) -> dict[str, Any]:
-        """The whole configuration as plain values in the shape of the YAML files, defaults included."""
+        """The whole configuration as plain values in the shape of the YAML files, defaults included, without labels."""
         return {
             "data": asdict(self.data),
             "method": {"name": self.method, **asdict(self.options)},
@@ -96,7 +103,7 @@ GROUPS: dict[str, type] = {"data": DataConfig, "render": RenderConfig, "train": 
 OTHER_KEYS = ("method", "protocol", "variant", "seed")
 
 
-def config_from_values(values: Mapping[str, Any]) -> RunConfig:
+def config_from_values(values: Mapping[str, Any], labels: Labels = Labels()) -> RunConfig:  # noqa: B008 - frozen
     """The typed configuration of what Hydra composed.
 
     Raises:
@@ -121,7 +128,7 @@ def config_from_values(values: Mapping[str, Any]) -> RunConfig:
     top = asdict(typed(_Top, top))
     if not protocols:
         raise ConfigError(f"protocol is empty; name at least one of {', '.join(PROTOCOLS)}")
-    return RunConfig(method=name, options=typed_options, protocols=protocols, **groups, **top)
+    return RunConfig(method=name, options=typed_options, protocols=protocols, labels=labels, **groups, **top)
 
 
 def default_fields() -> dict[str, Any]:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import os
-import re
 import shlex
 import sys
 import tempfile
-from pathlib import Path
 from typing import Any
 
 import hydra
 from hydra.core.config_store import ConfigStore
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
@@ -20,19 +19,13 @@ from padgs.checkpoint import CheckpointError
 from padgs.cli import session
 from padgs.cli.config import config_from_values, default_fields, method_fields
 from padgs.cli.interrupt import Interrupted
+from padgs.cli.labels import labels
+from padgs.cli.overrides import lenient, root
 from padgs.cli.run_folder import RunFolderError
+from padgs.cli.scenes import scene_choices
 
 EXPECTED = (ValueError, OSError, CheckpointError, RunFolderError)  # say what to do; a traceback would only hide it
 INTERRUPTED = 130  # exit code of a command that Ctrl-C ended
-
-
-def root() -> Path:
-    """The folder that holds `conf/` and `sweeps/`: the package where it is installed, else the checkout.
-
-    Hydra resolves relative paths against the importing module, which a console script does not have.
-    """
-    package = Path(__file__).resolve().parent.parent
-    return package if (package / "conf").is_dir() else package.parent
 
 
 def register_fields() -> None:
@@ -41,22 +34,8 @@ def register_fields() -> None:
     store.store(name="fields", node=default_fields())
     for method in METHODS:
         store.store(group="fields/method", name=method, node=method_fields(method))
-
-
-def lenient(arguments: list[str]) -> list[str]:
-    """Let unknown keys pass Hydra, so that `config_from_values` refuses them and lists the known ones.
-
-    >>> lenient(["method=padgs", "train.iteration=5", "+experiment=smoke", "-m", "seed=1,2"])
-    ['method=padgs', '++train.iteration=5', '+experiment=smoke', '-m', '++seed=1,2']
-    """
-    groups = {path.name for path in (root() / "conf").iterdir() if path.is_dir()} | {"hydra"}
-
-    def forced(argument: str) -> str:
-        key = re.match(r"([A-Za-z_]\w*)(\.\w+)*=", argument)
-        is_value = key is not None and key[1] != "hydra" and (key[2] is not None or key[1] not in groups)
-        return f"++{argument}" if is_value else argument
-
-    return [forced(argument) for argument in arguments]
+    for name, scene in scene_choices().items():
+        store.store(group="scene", name=name, node=scene, package="_global_")
 
 
 def main() -> None:
@@ -73,7 +52,7 @@ def main() -> None:
         """One run; what is wrong with it is said here, so that it ends no other run of a multirun."""
         try:
             values: Any = OmegaConf.to_container(composed, resolve=True)
-            result = session.run(config_from_values(values), console)
+            result = session.run(config_from_values(values, labels(HydraConfig.get().runtime.choices)), console)
         except EXPECTED as error:
             if os.environ.get("HYDRA_FULL_ERROR"):
                 raise

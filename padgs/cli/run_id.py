@@ -24,14 +24,14 @@ def config_hash(values: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()
 
 
-def run_id(values: Mapping[str, Any], scene: str, fingerprint: str) -> str:
-    """Scene, method and variant for people, and a hash of configuration and data for the rest.
+def run_id(values: Mapping[str, Any], scene: str, fingerprint: str, preset: str = "") -> str:
+    """Scene, preset of the method and variant for people, and a hash of configuration and data for the rest.
 
     >>> values = {"data": {"path": "/x"}, "method": {"name": "padgs"}, "variant": "no m", "seed": 0}
     >>> run_id(values, "bar", "f00d")
     'bar_padgs_no-m_37d2ecb9bc'
     """
     digest = hashlib.sha256(f"{config_hash(values)}|{fingerprint}".encode()).hexdigest()
-    words = [scene, values["method"]["name"], values["variant"]]
+    words = [scene, preset or values["method"]["name"], values["variant"]]
     readable = [re.sub(r"[^A-Za-z0-9.-]+", "-", word).strip("-.") for word in words]
     return "_".join([*(word for word in readable if word), digest[:HASH_DIGITS]])

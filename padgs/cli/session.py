@@ -39,7 +39,7 @@ def run(config: RunConfig, console: Console) -> Result:
     clock.reset_peak_memory()
     scene = data.load(config.data.path, config.data.format, config.data)
     values = config.values()
-    folder = RunFolder(Path(config.run.folder) / run_id(values, scene.name, scene.fingerprint))
+    folder = RunFolder(Path(config.run.folder) / run_id(values, scene.name, scene.fingerprint, config.preset))
     _introduce(config, scene, folder, console)
     result = folder.result()
     if result is None:
@@ -51,6 +51,9 @@ def run(config: RunConfig, console: Console) -> Result:
     else:
         advice = "" if result.ok else f"; it failed, delete {folder.path} to try again"
         console.print(f"finished before, nothing to do{advice}", highlight=False, soft_wrap=True)
+    experiments = tuple(sorted({*result.experiments, *config.labels.experiments}))
+    if experiments != result.experiments:  # one run may serve several tables
+        result = folder.finish(replace(result, experiments=experiments))
     show_result(result, folder.path, console)
     return result
 
@@ -135,6 +138,7 @@ def _blank(config: RunConfig, scene: Scene, folder: RunFolder) -> Result:
         run=folder.path.name,
         status="ok",
         method=config.method,
+        preset=config.preset,
         variant=config.variant,
         dataset=config.data.dataset or ("" if config.data.path else "synthetic"),
         scene=scene.name,
@@ -149,12 +153,13 @@ def _blank(config: RunConfig, scene: Scene, folder: RunFolder) -> Result:
         fingerprint=scene.fingerprint,
         finished="",
         config=values,
+        experiments=config.labels.experiments,
     )
 
 
 def _introduce(config: RunConfig, scene: Scene, folder: RunFolder, console: Console) -> None:
     view = scene.train[0]
-    what = f"{config.method}{f' ({config.variant})' if config.variant else ''} on {scene.name}"
+    what = f"{config.preset}{f' ({config.variant})' if config.variant else ''} on {scene.name}"
     views = f"{len(scene.train)} training and {len(scene.test)} test views of {view.width}x{view.height}"
     console.print(
         f"[bold]{what}[/]: {views}, {len(scene.points)} points, {config.train.iterations} iterations",

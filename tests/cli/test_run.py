@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from padgs import checkpoint, results
-from padgs.cli.run import lenient
+from padgs.cli.overrides import lenient
 
 ROOT = Path(__file__).resolve().parents[2]
 TINY = [  # half a minute's worth of nothing: what is tested is the machinery around it

@@ -15,6 +15,7 @@ def result(
         run=f"bar_padgs_{variant}_{others.get('seed', 0)}",
         status="ok",
         method="padgs",
+        preset="padgs",
         variant=variant,
         dataset="roam360",
         scene="bar",

@@ -1,0 +1,62 @@
+"""Command lines on their way to Hydra: what it is told, and the jobs that a multirun consists of."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra.core.config_loader import ConfigLoader
+from hydra.core.override_parser.overrides_parser import OverridesParser
+
+
+def root() -> Path:
+    """The folder that holds `conf/` and `sweeps/`: the package where it is installed, else the checkout.
+
+    Hydra resolves relative paths against the importing module, which a console script does not have.
+    """
+    package = Path(__file__).resolve().parent.parent
+    return package if (package / "conf").is_dir() else package.parent
+
+
+def lenient(arguments: Sequence[str]) -> list[str]:
+    """Let unknown keys pass Hydra, so that `config_from_values` refuses them and lists the known ones.
+
+    `scale` is a group that experiments bring along; without an experiment it is added.
+
+    >>> lenient(["method=padgs", "train.iteration=5", "+experiment=smoke", "-m", "seed=1,2"])
+    ['method=padgs', '++train.iteration=5', '+experiment=smoke', '-m', '++seed=1,2']
+    >>> lenient(["scale=cpu"])
+    ['+scale=cpu']
+    """
+    groups = {path.name for path in (root() / "conf").iterdir() if path.is_dir()} | {"hydra"}
+    has_experiment = any(argument.startswith("+experiment=") for argument in arguments)
+
+    def forced(argument: str) -> str:
+        if argument.startswith("scale=") and not has_experiment:
+            return f"+{argument}"
+        key = re.match(r"([A-Za-z_]\w*)(\.\w+)*=", argument)
+        is_value = key is not None and key[1] != "hydra" and (key[2] is not None or key[1] not in groups)
+        return f"++{argument}" if is_value else argument
+
+    return [forced(argument) for argument in arguments]
+
+
+def expand(params: Mapping[str, Any], arguments: Sequence[str], loader: ConfigLoader) -> list[list[str]]:
+    """The overrides of every job: all combinations of what is swept.
+
+    Args:
+        params: `hydra.sweeper.params`, key -> values as they would stand on a command line.
+        arguments: of the command line; a key that is there replaces the same key of `params`.
+        loader: knows the choices of groups, for `glob(...)`.
+    """
+    swept = lenient([f"{key}={values}" for key, values in params.items() if values is not None])
+    choices: dict[str, list[str]] = {}
+    for override in OverridesParser.create(config_loader=loader).parse_overrides([*swept, *arguments]):
+        key = override.get_key_element()
+        values = override.sweep_string_iterator() if override.is_sweep_override() else [None]
+        texts = [override.get_value_element_as_str() if value is None else value for value in values]
+        choices[key.lstrip("+")] = [key if key.startswith("~") else f"{key}={text}" for text in texts]
+    return [list(job) for job in itertools.product(*choices.values())]
