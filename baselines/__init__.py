@@ -4,4 +4,6 @@ METHODS = {
     "padgs": "baselines.padgs:PaDGSMethod",
     "omnigs": "baselines.omnigs:OmniGSMethod",
     "spags": "baselines.spags:SPaGSMethod",
+    "cubemap_3dgs": "baselines.cubemap_3dgs:Cubemap3DGSMethod",
+    "crops_3dgs": "baselines.crops_3dgs:Crops3DGSMethod",
 }

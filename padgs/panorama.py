@@ -118,3 +118,24 @@ def projection_jacobian(points: Tensor, width: int, height: int, *, min_cos_lati
         (per_down * sin_latitude * east_z, per_down * cos_latitude, -per_down * sin_latitude * east_x), dim=-1
     )
     return torch.stack((row_u, row_v), dim=-2)
+
+
+def sample(image: Tensor, directions: Tensor) -> Tensor:
+    """Bilinear samples [..., C] float32 of a panorama [H, W, C], across the seam and the poles.
+
+    Args:
+        image: any dtype, values as they are.
+        directions: [..., 3] camera frame, any length but zero.
+    """
+    height, width = image.shape[:2]
+    u, v = (project(directions, width, height) - 0.5).unbind(-1)
+    column, row = u.floor().long(), v.floor().long()
+    across, down = (u - column)[..., None].float(), (v - row)[..., None].float()
+
+    def at(row: Tensor, column: Tensor) -> Tensor:
+        beyond = (row < 0) | (row >= height)  # a pole: the next row is the same one, half a turn further
+        column = torch.where(beyond, column + width // 2, column) % width
+        return image[row.clamp(0, height - 1), column].float()
+
+    above = at(row, column).lerp(at(row, column + 1), across)
+    return above.lerp(at(row + 1, column).lerp(at(row + 1, column + 1), across), down)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
+from padgs.camera import Panorama
 from padgs.clone_split import CloneSplit, CloneSplitOptions
 from padgs.method import RenderConfig, State
 from padgs.probes import render_probed
@@ -60,7 +63,7 @@ class TrainableSplats:
         rendering, probe = render_probed(
             gaussians,
             view,
-            self._render_options(),
+            self._render_options(view),
             signal=self.densifier.options.signal,
             backend=self._config.backend,
         )
@@ -87,7 +90,7 @@ class TrainableSplats:
     @torch.no_grad()
     def render(self, view: View) -> Rendering:
         """Render a view without gradients."""
-        return render(self.splats.gaussians(view), view, self._render_options(), backend=self._config.backend)
+        return render(self.splats.gaussians(view), view, self._render_options(view), backend=self._config.backend)
 
     def state(self) -> State:
         """Parameters, statistics, random state; not copies."""
@@ -115,8 +118,11 @@ class TrainableSplats:
         self.densifier.statistics = {n: t.to(device, copy=True) for n, t in _under("statistics/", state).items()}
         self.densifier.generator.set_state(state.tensors["random/pieces"])
 
-    def _render_options(self) -> RenderOptions:
-        return self._config.options(self.splats.unit)
+    def _render_options(self, view: View) -> RenderOptions:
+        options = self._config.options(self.splats.unit)
+        if options.cubemap and not isinstance(view.camera, Panorama):  # one face of a cube, or a crop: draw it as it is
+            return replace(options, cubemap=False, face_size=None)
+        return options
 
 
 def extent_of(scene: Scene) -> float:

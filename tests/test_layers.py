@@ -14,7 +14,7 @@ import pytest
 # From the ground up; a package stands for all its modules. A file imports from its own layer and those above it here.
 LAYERS = {
     "geometry": ("padgs.registry", "padgs.panorama", "padgs.distortion"),
-    "data types": ("padgs.camera", "padgs.scene", "padgs.gaussians"),
+    "data types": ("padgs.camera", "padgs.scene", "padgs.perspectives", "padgs.gaussians"),
     "rendering": ("padgs.render",),
     "models": (
         "padgs.method",

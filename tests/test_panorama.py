@@ -16,6 +16,7 @@ from padgs.panorama import (
     projection_jacobian,
     rays,
     row_latitudes,
+    sample,
     unproject,
 )
 
@@ -207,3 +208,24 @@ def test_jacobian_is_differentiable_also_on_the_axis():
     assert torch.isfinite(point.grad).all()
     others = torch.tensor([[0.3, -0.8, 0.5], [-1.0, 0.1, -2.0]], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda p: projection_jacobian(p, W, H), others)
+
+
+def test_samples_at_pixel_centres_are_the_pixels(generator):
+    image = torch.rand(16, 32, 2, generator=generator)
+    assert torch.allclose(sample(image, rays(32, 16, dtype=torch.float64)), image, atol=1e-6)
+
+
+def test_samples_are_continuous_across_the_seam(generator):
+    """A step of a fraction of a pixel changes little, on every row and where columns end."""
+    image = torch.rand(16, 32, 1, generator=generator)
+    turn = torch.linspace(0, 2 * math.pi, 10_000, dtype=torch.float64)
+    level = torch.stack((torch.sin(turn), torch.full_like(turn, 0.2), torch.cos(turn)), dim=-1)
+    assert sample(image, level).diff(dim=0).abs().max() < 0.01
+
+
+def test_a_row_beyond_a_pole_is_the_same_row_half_a_turn_further(generator):
+    """Between the first row's centres and the pole: halfway there, a quarter of what is across."""
+    image = torch.rand(16, 32, 1, generator=generator)
+    at = unproject(torch.tensor([[5.5, 0.25], [7.5, 15.75]], dtype=torch.float64), 32, 16)
+    expected = torch.stack((0.75 * image[0, 5] + 0.25 * image[0, 21], 0.75 * image[15, 7] + 0.25 * image[15, 23]))
+    assert torch.allclose(sample(image, at), expected, atol=1e-6)

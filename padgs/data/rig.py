@@ -20,7 +20,7 @@ from padgs.data.capture import Cloud, Frame, Tracks
 from padgs.data.colmap import pycolmap_module
 from padgs.data.images import decode
 from padgs.data.poses import rigid
-from padgs.panorama import direction, project
+from padgs.panorama import direction, project, sample
 
 LATITUDES = (-35.0, 0.0, 35.0)  # degrees, positive down
 VIEWS_PER_ROW = 4
@@ -60,15 +60,7 @@ def owned(index: int, rays: Tensor) -> Tensor:
 
 def resample(image: Tensor, rays: Tensor) -> Tensor:
     """Bilinear samples [..., C] of a panorama [H, W, C] uint8 in the given directions [..., 3]; rounded to uint8."""
-    height, width = image.shape[:2]
-    u, v = (project(rays, width, height) - 0.5).unbind(-1)
-    u0, v0 = u.floor(), v.floor()
-    fu, fv = (u - u0)[..., None].float(), (v - v0)[..., None].float()
-    left, right = u0.long() % width, (u0.long() + 1) % width
-    above, below = v0.long().clamp(0, height - 1), (v0.long() + 1).clamp(0, height - 1)
-    top = image[above, left].float().lerp(image[above, right].float(), fu)
-    bottom = image[below, left].float().lerp(image[below, right].float(), fu)
-    return top.lerp(bottom, fv).round().to(torch.uint8)
+    return sample(image, rays).round().to(torch.uint8)
 
 
 def render_views(

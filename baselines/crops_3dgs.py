@@ -1,0 +1,55 @@
+"""Ordinary 3DGS on perspective crops of the panoramas, all of one lens and so of one solid angle.
+
+Twelve crops look along the vertices of an icosahedron, the evenest twelve directions that there are; none looks along
+the panorama's axis. They overlap, so that no direction is seen at the border of crops alone.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from baselines.cubemap_3dgs import Cubemap3DGSMethod
+from padgs.camera import Panorama, Pinhole
+from padgs.perspectives import looking_at, square_lens
+from padgs.splat_method import SplatOptions
+
+GOLDEN = (1 + math.sqrt(5)) / 2
+ICOSAHEDRON = [
+    vertex for a in (1.0, -1.0) for b in (GOLDEN, -GOLDEN) for vertex in ((0.0, a, b), (a, b, 0.0), (b, 0.0, a))
+]
+# Twice the angle between a vertex and the middle of a face; crops that are any narrower leave holes there.
+NARROWEST = 2 * math.degrees(math.acos(math.sqrt((5 + 2 * math.sqrt(5)) / 15)))
+
+
+@dataclass(frozen=True)
+class Crops3DGSOptions(SplatOptions):
+    """The `method` group of the configuration."""
+
+    field_of_view: float = 75.0  # degrees across each square crop
+
+    def __post_init__(self) -> None:
+        """Reject crops that leave holes between them, or are no perspective images."""
+        super().__post_init__()
+        if not NARROWEST <= self.field_of_view < 180:
+            raise ValueError(
+                f"field_of_view is {self.field_of_view}; below {NARROWEST:.2f} degrees the crops do not cover the "
+                "sphere, and it must be less than 180"
+            )
+
+
+class Crops3DGSMethod(Cubemap3DGSMethod):
+    """See `padgs.method.Method`."""
+
+    Options = Crops3DGSOptions
+
+    def turns(self) -> Tensor:
+        """Rotations [12, 3, 3] from a panorama's camera frame to those of the crops."""
+        return looking_at(ICOSAHEDRON)
+
+    def lens(self, panorama: Panorama) -> Pinhole:
+        """The camera of the crops."""
+        assert isinstance(self._options, Crops3DGSOptions)
+        return square_lens(panorama, math.tan(math.radians(self._options.field_of_view / 2)))

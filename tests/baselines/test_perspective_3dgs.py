@@ -1,0 +1,87 @@
+"""3DGS on cube faces and on crops."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from composed import composed
+from tiny_scene import tiny_scene
+
+from baselines import METHODS
+from baselines.crops_3dgs import NARROWEST, Crops3DGSMethod, Crops3DGSOptions
+from baselines.cubemap_3dgs import Cubemap3DGSMethod
+from padgs.camera import Panorama, Pinhole
+from padgs.method import Budget
+from padgs.registry import lookup
+from padgs.train import TrainOptions
+
+PANORAMA = Panorama(256, 128)
+METHOD = {"cubemap_3dgs": Cubemap3DGSMethod, "crops_3dgs": Crops3DGSMethod}
+each_method = pytest.mark.parametrize("name", METHOD)
+
+
+def times_seen(method: Cubemap3DGSMethod) -> torch.Tensor:
+    """How many views hold each direction of a panorama, [H, W]."""
+    lens = method.lens(PANORAMA)
+    tangent = lens.width / 2 / lens.fx
+    x, y, z = torch.einsum("kij,hwj->khwi", method.turns(), PANORAMA.rays(dtype=torch.float64)).unbind(-1)
+    return ((z > 0) & (x.abs() <= tangent * z) & (y.abs() <= tangent * z)).sum(0)
+
+
+def solid_angle(lens: Pinhole) -> float:
+    """Of a square image: 4 asin(sin^2(half the field of view))."""
+    return 4 * math.asin(math.sin(math.atan(lens.width / 2 / lens.fx)) ** 2)
+
+
+@each_method
+def test_registered_and_configured_as_the_class_says(name, monkeypatch, root):
+    monkeypatch.setenv("PADGS_ROOT", str(root))
+    config, method = composed(f"method={name}"), METHOD[name]
+    assert lookup(METHODS, name, "method") is method
+    assert (config.method, config.options, config.render) == (name, method.Options(), method.RENDER)
+    assert config.train.weight == method.TRAIN.weight == "uniform"
+
+
+def test_cube_faces_show_every_direction_once():
+    assert (times_seen(Cubemap3DGSMethod()) == 1).all()
+    assert 6 * solid_angle(Cubemap3DGSMethod().lens(PANORAMA)) == pytest.approx(4 * math.pi)
+
+
+def test_crops_cover_the_sphere_with_equal_solid_angles():
+    """One lens, so one solid angle; no direction is missed, even by the narrowest crops that are allowed."""
+    seen, weight = times_seen(Crops3DGSMethod()), torch.cos(torch.linspace(-90, 90, 128).deg2rad())[:, None]
+    assert seen.min() == 1 and seen.max() <= 3
+    crop = solid_angle(Crops3DGSMethod().lens(PANORAMA))
+    assert crop == pytest.approx(1.5186, abs=1e-3)
+    assert (weight * seen).sum() / (weight * torch.ones_like(seen)).sum() == pytest.approx(
+        12 * crop / (4 * math.pi), rel=0.01
+    )
+    assert times_seen(Crops3DGSMethod(Crops3DGSOptions(field_of_view=NARROWEST))).min() == 1
+    with pytest.raises(ValueError, match="field_of_view is 70; below 74.75 degrees the crops do not cover the sphere"):
+        Crops3DGSOptions(field_of_view=70)
+
+
+def test_pixels_of_an_iteration_are_those_that_the_documentation_states():
+    for method, times in ((Cubemap3DGSMethod(), 4.93), (Crops3DGSMethod(), 8.38)):
+        lens = method.lens(Panorama(2048, 1024))
+        assert 2048 * 1024 / (lens.width * lens.height) == pytest.approx(times, rel=2e-3)
+
+
+@each_method
+def test_learns_whole_panoramas_from_their_parts(name):
+    scene = tiny_scene()
+    method = METHOD[name]()
+    records = list(method.fit(scene, Budget(150)))
+    view = scene.test[0]
+    error = (method.render(view).image.clamp(0, 1) - view.image()).square().mean()
+    assert records[-1].loss < records[0].loss
+    assert -10 * torch.log10(error) > 21
+
+
+@each_method
+def test_a_weight_of_latitudes_is_refused(name):
+    method = METHOD[name](train=TrainOptions(weight="solid_angle"))
+    with pytest.raises(ValueError, match="train.weight is solid_angle, but the rows of perspective views"):
+        next(method.fit(tiny_scene(), Budget(1)))
