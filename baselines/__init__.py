@@ -6,4 +6,5 @@ METHODS = {
     "spags": "baselines.spags:SPaGSMethod",
     "cubemap_3dgs": "baselines.cubemap_3dgs:Cubemap3DGSMethod",
     "crops_3dgs": "baselines.crops_3dgs:Crops3DGSMethod",
+    "egonerf": "baselines.egonerf:EgoNeRFMethod",
 }

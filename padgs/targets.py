@@ -43,16 +43,7 @@ class Targets(Sequence[Target]):
         Raises:
             ValueError: the view has no pixels, or they have another size than the view, or the mask leaves none.
         """
-        view = self._views[index]
-        image, mask = view.image(device=self._device), view.mask(device=self._device)
-        for what, tensor in (("image", image), ("mask", mask)):
-            if tensor is not None and tuple(tensor.shape[:2]) != (view.height, view.width):
-                size = f"{tensor.shape[1]}x{tensor.shape[0]}"
-                raise ValueError(f"{what} of view {view.name!r} is {size}; the view is {view.width}x{view.height}")
-        try:
-            weight = pixel_weight(self._weight, view.height, mask, device=self._device)
-        except ValueError as error:
-            raise ValueError(f"view {view.name!r}: {error}") from error
+        image, weight = image_and_weight(self._views[index], self._weight, self._device)
         return Target(image, weight, None if fits(image) else self._moments_of(index, image))
 
     def _moments_of(self, index: int, image: Tensor) -> TargetMoments:
@@ -64,3 +55,20 @@ class Targets(Sequence[Target]):
             self._bytes_left -= size
             self._moments[index] = moments
         return moments
+
+
+def image_and_weight(view: View, weight: str, device: torch.device | str = "cpu") -> tuple[Tensor, Tensor]:
+    """Image [H, W, 3] in [0, 1] of a view and the weight of its pixels, [H, W] or [H, 1].
+
+    Raises:
+        ValueError: the view has no pixels, or they have another size than the view, or the mask leaves none.
+    """
+    image, mask = view.image(device=device), view.mask(device=device)
+    for what, tensor in (("image", image), ("mask", mask)):
+        if tensor is not None and tuple(tensor.shape[:2]) != (view.height, view.width):
+            size = f"{tensor.shape[1]}x{tensor.shape[0]}"
+            raise ValueError(f"{what} of view {view.name!r} is {size}; the view is {view.width}x{view.height}")
+    try:
+        return image, pixel_weight(weight, view.height, mask, device=device)
+    except ValueError as error:
+        raise ValueError(f"view {view.name!r}: {error}") from error

@@ -25,6 +25,7 @@ LAYERS = {
         "padgs.model",
         "padgs.spherical_harmonics",
         "padgs.splats",
+        "padgs.egonerf",
     ),
     "learning": (
         "padgs.fused_loss",
@@ -41,6 +42,9 @@ LAYERS = {
         "padgs.anchor_training",
         "padgs.splat_training",
         "padgs.splat_method",
+        "padgs.ray_pixels",
+        "padgs.ray_training",
+        "padgs.egonerf_training",
     ),
     "measuring": (
         "padgs.metrics",

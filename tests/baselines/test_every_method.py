@@ -18,7 +18,15 @@ from padgs.scene import Scene
 
 WIDTH = 32
 STEPS = 20
-TINY: dict[str, tuple[str, ...]] = {}  # setting -> overrides that make it small enough for a test
+TINY_EGONERF = tuple(
+    f"method.{name}={value}"
+    for name, value in {
+        **{"radial_nodes": 16, "polar_nodes": 12, "azimuth_nodes": 36, "environment_height": 16, "hidden": 16},
+        **{"density_components": 4, "appearance_components": 4, "coarse_samples": 16, "fine_samples": 16, "rays": 128},
+    }.items()
+)
+# setting -> overrides that make it small enough for a test
+TINY: dict[str, tuple[str, ...]] = {"egonerf": TINY_EGONERF, "egonerf_small": TINY_EGONERF}
 SLOW: set[str] = set()  # settings that are not fast enough for every run of the tests
 SETTINGS = sorted(path.stem for path in (Path(__file__).resolve().parents[2] / "conf" / "method").glob("*.yaml"))
 EVERY = [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in SETTINGS]

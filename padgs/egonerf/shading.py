@@ -1,0 +1,59 @@
+"""Colour from the appearance grids: a linear basis for each chart, then a network that also sees the direction."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from padgs.egonerf.charts import YANG, YIN
+from padgs.egonerf.plane_lines import CHARTS, MODES
+
+
+class Shader(nn.Module):
+    """Products of planes and lines, and a viewing direction -> RGB in (0, 1)."""
+
+    def __init__(
+        self, components: int, features: int, hidden: int, feature_frequencies: int, direction_frequencies: int
+    ) -> None:
+        """Layers inputs-hidden-hidden-3 after a basis of `features`; frequencies are those of the encodings."""
+        super().__init__()
+        inputs = len(MODES) * components
+        bound = 1 / math.sqrt(inputs)
+        self.basis = nn.Parameter(torch.empty(CHARTS, features, inputs).uniform_(-bound, bound))
+        self.feature_frequencies, self.direction_frequencies = feature_frequencies, direction_frequencies
+        width = features * (1 + 2 * feature_frequencies) + 3 * (1 + 2 * direction_frequencies)
+        last = nn.Linear(hidden, 3)
+        nn.init.zeros_(last.bias)
+        self.network = nn.Sequential(
+            nn.Linear(width, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), last, nn.Sigmoid()
+        )
+
+    def forward(self, products: Sequence[Tensor], chart: Tensor, directions: Tensor) -> Tensor:
+        """Colours [N, 3].
+
+        Args:
+            products: [C, N] of each mode, see `plane_lines.products`.
+            chart: [N] of the places.
+            directions: [N, 3] unit, of the rays.
+        """
+        stacked = torch.cat(list(products))
+        features = torch.where(chart == YANG, self.basis[YANG] @ stacked, self.basis[YIN] @ stacked).T
+        encoded = (
+            encoding(features, self.feature_frequencies),
+            encoding(directions, self.direction_frequencies),
+        )
+        return self.network(torch.cat(encoded, dim=-1))
+
+
+def encoding(values: Tensor, frequencies: int) -> Tensor:
+    """values [N, D] with the sines and cosines of 1, 2, 4, ... times them, [N, D (1 + 2 frequencies)].
+
+    >>> encoding(torch.zeros(1, 1), 2).tolist()
+    [[0.0, 0.0, 0.0, 1.0, 1.0]]
+    """
+    factors = 2.0 ** torch.arange(frequencies, dtype=values.dtype, device=values.device)
+    angles = (values[..., None] * factors).flatten(-2)
+    return torch.cat((values, angles.sin(), angles.cos()), dim=-1)
