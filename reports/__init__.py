@@ -5,10 +5,14 @@ A table is a function `build(results, request) -> Table`, an entry of `TABLES`; 
 """
 
 TABLES = {
+    "table1": "reports.tables_of_methods:table1",
+    "table2": "reports.tables_of_methods:table2",
     "table3": "reports.table3:build",
+    "table4": "reports.tables_of_methods:table4",
     "runs": "reports.runs:build",
 }
 WRITERS = {  # file extension -> Table -> text
     "md": "reports.markdown:text",
     "tex": "reports.latex:text",
+    "csv": "reports.csv_text:text",
 }

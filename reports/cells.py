@@ -57,6 +57,21 @@ def over_seeds(results: Sequence[Result], number: Any) -> Cell:
     """Mean and standard deviation of `number(result)` over the runs that are ok; else why there is none."""
     failed = " ".join(dict.fromkeys(result.status for result in results if not result.ok))
     values = [value for result in results if result.ok and (value := number(result)) is not None]
+    return spread(values, failed)
+
+
+def over_scenes(scenes: Sequence[Sequence[Result]], number: Any) -> Cell:
+    """Mean over scenes of `number(result)`, with its spread over the seeds that every scene has.
+
+    Missing where a scene has no number at all: a mean over what happened to finish would compare unequal things.
+    """
+    values = [{r.seed: value for r in runs if r.ok and (value := number(r)) is not None} for runs in scenes]
+    seeds = sorted(set.intersection(*map(set, values))) if values else []
+    return spread([math.fsum(of[seed] for of in values) / len(values) for seed in seeds])
+
+
+def spread(values: Sequence[float], failed: str = "") -> Cell:
+    """Mean and sample standard deviation; missing for no values."""
     if not values:
         return Cell(status=failed)
     finite = all(math.isfinite(value) for value in values)

@@ -1,29 +1,29 @@
-"""Under what conditions the numbers of a block were made, in one sentence."""
+"""Under what conditions the numbers of a table were made, in a sentence for all blocks that share them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from padgs.results import Result
-from reports.request import CONDITIONS
+from reports.conditions import CONDITIONS, machine
 
 
-def conditions(title: str, results: Sequence[Result], protocol: str) -> str:
-    """Protocol with all its rules, resolution, iterations, seeds, code version and machine of some results."""
+def conditions(blocks: Mapping[str, Sequence[Result]], protocol: str) -> list[str]:
+    """Protocol with all its rules, resolution, iterations, seeds, code version and machine of the results of blocks."""
+    titles: dict[str, list[str]] = {}
+    for title, results in blocks.items():
+        titles.setdefault(_sentence(results, protocol), []).append(title)
+    return [f"{'; '.join(of)}: {sentence}" for sentence, of in titles.items()]
+
+
+def _sentence(results: Sequence[Result], protocol: str) -> str:
     if not results:
-        return f"{title}: not run."
+        return "not run."
     rules, sizes, iterations = (_listed(CONDITIONS[what](r, protocol) for r in results) for what in _SHOWN)
     seeds = _listed(str(seed) for seed in sorted({result.seed for result in results}))
     versions = _listed(result.code_version for result in results)
     machines = _listed(machine(result) for result in results)
-    return f"{title}: protocol {rules}, {sizes}, {iterations} iterations, seeds {seeds}, padgs {versions}, {machines}."
-
-
-def machine(result: Result) -> str:
-    """The hardware in a few words."""
-    known = result.machine
-    where = known.get("gpu") or f"{known.get('cores')} cores of {known.get('cpu')}"
-    return f"{where}, torch {known.get('torch')}"
+    return f"protocol {rules}, {sizes}, {iterations} iterations, seeds {seeds}, padgs {versions}, {machines}."
 
 
 _SHOWN = ("protocol", "resolution", "iterations")

@@ -1,43 +1,79 @@
-"""A table as LaTeX with booktabs: blocks under each other, best number of each column in bold."""
+"""A table as LaTeX with booktabs: blocks under each other, the best of each column in bold, the second underlined."""
 
 from __future__ import annotations
 
 from itertools import groupby
 
-from reports.table import Table, best_rows
+from reports.ranking import BEST, emphasis
+from reports.table import Block, Table
 
 SPECIAL = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
 SPECIAL |= {character: f"\\{character}" for character in "&%$#_{}"}
 SYMBOLS = {"↑": r"$\uparrow$", "↓": r"$\downarrow$", "Δ": r"$\Delta$", "±": r"$\pm$", "–": "--", "×": r"$\times$"}
 
 
+LINES_OF_A_PAGE = 55
+
+
 def text(table: Table) -> str:
-    """A `table` environment; needs the package booktabs."""
-    width = len(table.columns) + 1
-    lines = [
-        "% needs \\usepackage{booktabs}",
+    """A `table`, made as narrow as the line, or a `longtable` where a page is too short; needs the packages named."""
+    body = [line for block in table.blocks for line in _block(block, table)]
+    whole = _longtable if len(body) > LINES_OF_A_PAGE else _float
+    return "\n".join(whole(table, body)) + "\n"
+
+
+def _float(table: Table, body: list[str]) -> list[str]:
+    notes = " ".join(escaped(note) for note in table.notes)
+    return [
+        "% needs \\usepackage{booktabs, graphicx}",
         r"\begin{table}",
         r"  \centering",
-        f"  \\caption{{{escaped(table.title)}}}",
-        f"  \\label{{tab:{table.name}}}",
+        f"  {_caption(table)}",
+        r"  \resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%",
         f"  \\begin{{tabular}}{{l{'r' * len(table.columns)}}}",
         r"    \toprule",
         *_headings(table),
+        *body,
+        r"    \bottomrule",
+        r"  \end{tabular}}",
+        f"  \\par\\smallskip\\begin{{minipage}}{{\\linewidth}}\\footnotesize {notes}\\end{{minipage}}",
+        r"\end{table}",
     ]
-    for block in table.blocks:
-        best = [best_rows(block, index, table.columns) for index in range(len(table.columns))]
-        lines += [r"    \midrule", f"    \\multicolumn{{{width}}}{{l}}{{\\emph{{{escaped(block.title)}}}}} \\\\"]
-        for number, row in enumerate(block.rows):
-            cells = [escaped(row.title)]
-            for index, (cell, column) in enumerate(zip(row.cells, table.columns, strict=True)):
-                shown = _number(cell.text(column))
-                cells.append(f"\\textbf{{{shown}}}" if number in best[index] else shown)
-            lines.append(_line(cells))
-    lines += [r"    \bottomrule", r"  \end{tabular}"]
-    if table.notes:
-        notes = " ".join(escaped(note) for note in table.notes)
-        lines += [f"  \\par\\smallskip\\begin{{minipage}}{{\\linewidth}}\\footnotesize {notes}\\end{{minipage}}"]
-    return "\n".join([*lines, r"\end{table}"]) + "\n"
+
+
+def _longtable(table: Table, body: list[str]) -> list[str]:
+    return [
+        "% needs \\usepackage{booktabs, longtable}",
+        r"\begingroup\scriptsize\setlength{\tabcolsep}{2pt}",
+        f"\\begin{{longtable}}{{l{'r' * len(table.columns)}}}",
+        f"  {_caption(table)} \\\\",
+        r"    \toprule",
+        *_headings(table),
+        r"    \endhead",
+        *body,
+        r"    \bottomrule",
+        r"\end{longtable}",
+        *(f"\\noindent {escaped(note)}\\par" for note in table.notes),
+        r"\endgroup",
+    ]
+
+
+def _caption(table: Table) -> str:
+    return f"\\caption{{{escaped(table.title)}}}\\label{{tab:{table.name}}}"
+
+
+def _block(block: Block, table: Table) -> list[str]:
+    ranks = [emphasis(block, index, table.columns) for index in range(len(table.columns))]
+    title = f"\\multicolumn{{{len(table.columns) + 1}}}{{l}}{{\\emph{{{escaped(block.title)}}}}}"
+    lines = [r"    \midrule", _line([title])]
+    for number, row in enumerate(block.rows):
+        cells = [escaped(row.title)]
+        for index, (cell, column) in enumerate(zip(row.cells, table.columns, strict=True)):
+            shown, rank = _number(cell.text(column)), ranks[index].get(number)
+            command = None if rank is None else "textbf" if rank == BEST else "underline"
+            cells.append(shown if command is None else f"\\{command}{{{shown}}}")
+        lines.append(_line(cells))
+    return lines
 
 
 def escaped(words: str) -> str:
@@ -63,7 +99,9 @@ def _headings(table: Table) -> list[str]:
 
 
 def _number(shown: str) -> str:
-    return f"${shown[0]}${shown[1:]}" if shown[:1] in ("+", "-") else escaped(shown)
+    mean, plus_minus, spread = shown.partition(" ± ")
+    text = f"${mean[0]}${mean[1:]}" if mean[:1] in ("+", "-") else escaped(mean)
+    return f"{text}{{\\tiny\\,$\\pm$\\,{escaped(spread)}}}" if plus_minus else text
 
 
 def _line(cells: list[str]) -> str:

@@ -1,8 +1,9 @@
-"""A table as GitHub Markdown: one table per block, best number of each column in bold."""
+"""A table as GitHub Markdown: one table per block, the best number of each column in bold, the second underlined."""
 
 from __future__ import annotations
 
-from reports.table import Block, Table, best_rows
+from reports.ranking import BEST, emphasis
+from reports.table import Block, Table
 
 
 def text(table: Table) -> str:
@@ -16,7 +17,7 @@ def text(table: Table) -> str:
 
 
 def _block(table: Table, block: Block) -> str:
-    best = [best_rows(block, index, table.columns) for index in range(len(table.columns))]
+    ranks = [emphasis(block, index, table.columns) for index in range(len(table.columns))]
     lines = [
         _line([table.corner, *(column.heading for column in table.columns)]),
         _line(["---", *("---:" for _ in table.columns)]),
@@ -25,7 +26,8 @@ def _block(table: Table, block: Block) -> str:
         cells = []
         for index, (cell, column) in enumerate(zip(row.cells, table.columns, strict=True)):
             shown = _escaped(cell.text(column))
-            cells.append(f"**{shown}**" if number in best[index] else shown)
+            rank = ranks[index].get(number)
+            cells.append(shown if rank is None else f"**{shown}**" if rank == BEST else f"<ins>{shown}</ins>")
         lines.append(_line([_escaped(row.title), *cells]))
     return "\n".join(lines)
 

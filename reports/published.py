@@ -47,6 +47,12 @@ def load(path: Path | None = None) -> Mapping[Key, Published]:
         }
 
 
+def scenes(numbers: Mapping[Key, Published], dataset: str) -> list[str]:
+    """The scenes of a data set, as the paper calls it, in the paper's order."""
+    found = dict.fromkeys(key.scene for key in numbers if key.dataset == dataset and key.table < 3)
+    return [scene for scene in found if scene != "average"]
+
+
 def scene_title(dataset: str, scene: str) -> str:
     """What a scene is called in a table.
 

@@ -23,14 +23,15 @@ def build(results: Sequence[Result], request: Request) -> Table:
     chosen = [result for result in results if request.admits(result)]
     columns = {**_marks("paper", FLAT), **_marks("sphere", SPHERE), **COSTS}
     places = dict.fromkeys((r.dataset, r.scene, r.width, r.height, r.iterations) for r in chosen)
-    blocks, notes = [], []
+    blocks, runs_of = [], {}
     for place in places:
         dataset, scene, width, height, iterations = place
         title = f"{scene_title(dataset, scene)}, {width}x{height}, {iterations} iterations"
         own = [r for r in chosen if (r.dataset, r.scene, r.width, r.height, r.iterations) == place]
         rows = [Row(_title(r), tuple(over_seeds([r], number) for number in columns.values())) for r in own]
         blocks.append(Block(title, tuple(rows)))
-        notes += [conditions(f"{scene}, {protocol}", own, protocol) for protocol in ("paper", "sphere")]
+        runs_of[title] = own
+    notes = [note for protocol in ("paper", "sphere") for note in conditions(runs_of, protocol)]
     return Table("runs", "Runs", "Run", tuple(columns), tuple(blocks), tuple(notes))
 
 

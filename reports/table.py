@@ -84,17 +84,3 @@ def shown(value: float, column: Column) -> str:
     if not math.isfinite(value):
         return str(value)
     return f"{value:{'+' if column.signed else ''}.{column.decimals}f}"
-
-
-def best_rows(block: Block, column: int, columns: tuple[Column, ...]) -> set[int]:
-    """Indices of the rows with the best number of a column, as shown: what prints the same is equally good.
-
-    Empty where a direction is not given, or with fewer than two numbers to compare.
-    """
-    better = columns[column].higher_is_better
-    cells = [row.cells[column] for row in block.rows]
-    numbers = {i: float(shown(cell.value, columns[column])) for i, cell in enumerate(cells) if cell.value is not None}
-    if better is None or len(numbers) < 2:
-        return set()
-    best = max(numbers.values()) if better else min(numbers.values())
-    return {i for i, number in numbers.items() if number == best}

@@ -7,10 +7,13 @@ from collections.abc import Sequence
 from padgs.results import Result
 from reports import published
 from reports.cells import difference, measured, of_the_paper, one_setting
+from reports.conditions import refuse_mixture
 from reports.footnotes import conditions
 from reports.metrics import PAPER_METRICS, PROTOCOL_METRICS, column
 from reports.published import Key
-from reports.request import Request, refuse_mixture
+from reports.ranking import NOTE
+from reports.request import Request
+from reports.settings import chosen
 from reports.table import Block, Cell, Column, ReportError, Row, Table
 
 ROWS = {  # variant (conf/ablation) -> title
@@ -30,17 +33,18 @@ def build(results: Sequence[Result], request: Request) -> Table:
     """
     if request.protocol not in PROTOCOL_METRICS:
         raise ReportError(f"unknown protocol {request.protocol!r}; known: {', '.join(PROTOCOL_METRICS)}")
-    rows = [result for result in results if result.variant in ROWS and request.admits(result)]
+    rows = [result for result in chosen(results, "table3", request) if result.variant in ROWS]
     scenes = dict.fromkeys((*PAPER_SCENES, *((result.dataset, result.scene) for result in rows)))
     paper = published.load() if request.protocol == published.PROTOCOL else {}
-    blocks, notes = [], []
+    blocks, blocks_of = [], {}
     for dataset, scene in scenes:
         title = published.scene_title(dataset, scene)
         own = [result for result in rows if (result.dataset, result.scene) == (dataset, scene)]
         refuse_mixture(own, request, title)
         lines = [_row(variant, own, paper, request.protocol, dataset, scene, title) for variant in ROWS]
         blocks.append(Block(title, tuple(lines)))
-        notes.append(conditions(title, own, request.protocol))
+        blocks_of[title] = own
+    notes = [*conditions(blocks_of, request.protocol), NOTE]
     if request.protocol == published.PROTOCOL:
         notes.append("Columns 'paper': published numbers, from another machine; Δ = ours - paper.")
     title = "Ablation of PaD-GS: distortion-aware decoding (DAGD), opacity modulation (DAOM), solid-angle weight (M)"

@@ -1,4 +1,4 @@
-"""`padgs report`: read result files, make a table, write it down."""
+"""`padgs report`: read result files, make tables, write them down."""
 
 from __future__ import annotations
 
@@ -14,43 +14,58 @@ from reports import TABLES, WRITERS
 from reports.request import Request
 from reports.table import ReportError, Table
 
+ALL = "all"
+
 
 def report(
-    table: Annotated[str, typer.Argument(help="table3 or another table; `padgs report list` names all")],
-    runs: Annotated[str, typer.Option(help="folder of run folders")] = "runs",
-    out: Annotated[str, typer.Option(help="where the files go; RUNS/tables if not given")] = "",
+    what: Annotated[str, typer.Argument(help=f"{', '.join(TABLES)}, or {ALL}")],
+    runs: Annotated[str, typer.Argument(help="folder of run folders")] = "runs",
+    out: Annotated[str, typer.Option(help="where the files go; RUNS/reports if not given")] = "",
     protocol: Annotated[str, typer.Option(help="which scores: paper or sphere")] = "paper",
+    experiment: Annotated[str, typer.Option(help="only runs of this experiment or sweep, e.g. tau@cpu")] = "",
     where: Annotated[list[str] | None, typer.Option(help="only runs with KEY=VALUE; repeatable")] = None,
-    mix: Annotated[bool, typer.Option(help="let other rules, sizes and run lengths stand together")] = False,
+    mix: Annotated[bool, typer.Option(help="let other rules, sizes, run lengths and machines stand together")] = False,
     strict: Annotated[bool, typer.Option(help="exit code 1 if a result file cannot be used")] = False,
 ) -> None:
-    """Make a table from result files, as Markdown and LaTeX, and show it."""
-    if table == "list":
-        print("\n".join(TABLES))
-        return
+    """Make tables from result files, as Markdown, LaTeX and CSV."""
     folder = Path(runs)
     if not folder.is_dir():
-        raise _refused(f"there is no folder {folder}; name the folder of the runs with --runs")
+        raise _refused(f"there is no folder {folder}; give the folder of the runs after the name of the table")
     found, broken = results.read_all(folder)
     for error in broken:
         print(f"left out: {error}", file=sys.stderr)
     try:
-        request = Request(protocol, mix, dict(_pair(setting) for setting in where or []))
-        made: Table = lookup(TABLES, table, "table")(found, request)
+        request = Request(protocol, mix, experiment, dict(_pair(setting) for setting in where or []))
+        wanted = {name: lookup(TABLES, name, "report") for name in (TABLES if what == ALL else [what])}
     except ValueError as error:
-        raise _refused(str(error)) from error
-    target = Path(out) if out else folder / "tables"
-    texts = {extension: lookup(WRITERS, extension, "format")(made) for extension in WRITERS}
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-        for extension, text in texts.items():
-            results.replace_file(target / f"{made.name}.{extension}", text.encode())
-    except OSError as error:
-        raise _refused(f"cannot write to {target}: {error.strerror}; name another folder with --out") from error
-    print(texts["md"])
-    print(f"{len(found)} results; written: {', '.join(f'{target / made.name}.{e}' for e in texts)}", file=sys.stderr)
-    if strict and broken:
+        raise _refused(f"{error}, {ALL}") from error
+    refused = False
+    for build in wanted.values():
+        try:
+            made: Table = build(found, request)
+        except ReportError as error:
+            refused = True
+            print(f"error: {error}", file=sys.stderr)
+            continue
+        text = _write(made, Path(out) if out else folder / "reports")
+        if what != ALL:
+            print(text)
+    print(f"{len(found)} results, {len(broken)} left out", file=sys.stderr)
+    if refused or (strict and broken):
         raise typer.Exit(1)
+
+
+def _write(table: Table, folder: Path) -> str:
+    """The table in all formats; returns the Markdown."""
+    texts = {extension: lookup(WRITERS, extension, "format")(table) for extension in WRITERS}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for extension, text in texts.items():
+            results.replace_file(folder / f"{table.name}.{extension}", text.encode())
+    except OSError as error:
+        raise _refused(f"cannot write to {folder}: {error.strerror}; name another folder with --out") from error
+    print(f"written: {', '.join(f'{folder / table.name}.{extension}' for extension in texts)}", file=sys.stderr)
+    return texts["md"]
 
 
 def _pair(setting: str) -> tuple[str, str]:

@@ -2,15 +2,18 @@ import shutil
 import subprocess
 
 import pytest
-from made_up import failed, result
+from made_up import data_set, failed, result
 
 from reports import latex, table3
 from reports.request import Request
+from reports.tables_of_methods import table1, table2, table4
+
+ABLATION = [result("full"), failed("baseline", "oom")]
 
 
 @pytest.fixture
 def text() -> str:
-    return latex.text(table3.build([result("full"), failed("baseline", "oom")], Request()))
+    return latex.text(table3.build(ABLATION, Request()))
 
 
 def test_every_line_of_the_tabular_has_all_columns(text):
@@ -26,13 +29,24 @@ def test_what_latex_would_misread_is_escaped(text):
 
 
 def test_numbers_and_emphasis(text):
-    assert r"\textbf{0.808}" in text and "OOM" in text and "$+$0.10" in text
+    assert r"\textbf{0.808}" in text and r"\underline{0.804}" in text and "OOM" in text and "$+$0.10" in text
+
+
+def test_a_long_table_may_break_over_pages():
+    text = latex.text(table1(data_set("roam360"), Request()))
+    assert r"\begin{longtable}{lrrrrrrrrr}" in text and r"\endhead" in text and r"\begin{table}" not in text
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="no pdflatex here")
-def test_it_compiles(text, tmp_path):
-    document = rf"\documentclass{{article}}\usepackage{{booktabs}}\begin{{document}}{text}\end{{document}}"
-    (tmp_path / "table.tex").write_text(document)
-    command = ["pdflatex", "-halt-on-error", "table.tex"]
-    subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
+def test_they_compile(tmp_path):
+    results = [*data_set("roam360"), *data_set("ricoh360", seeds=2)]
+    tables = [build(results, Request()) for build in (table1, table2, table4)]
+    body = "\n".join(latex.text(table) for table in (*tables, table3.build(ABLATION, Request())))
+    packages = r"\usepackage{booktabs, graphicx, longtable}"
+    document = rf"\documentclass{{article}}{packages}\begin{{document}}{body}\end{{document}}"
+    (tmp_path / "tables.tex").write_text(document)
+    command = ["pdflatex", "-halt-on-error", "-interaction=nonstopmode", "tables.tex"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-2000:]
+    assert "Undefined control sequence" not in done.stdout

@@ -22,41 +22,41 @@ def report(*arguments):
 
 
 def test_it_writes_markdown_and_latex_and_shows_the_first(runs, tmp_path):
-    done = report("table3", "--runs", runs, "--out", tmp_path / "out")
+    done = report("table3", runs, "--out", tmp_path / "out")
     assert done.exit_code == 0
     written = {path.name: path.read_text() for path in (tmp_path / "out").iterdir()}
-    assert written.keys() == {"table3.md", "table3.tex"}
+    assert written.keys() == {"table3.md", "table3.tex", "table3.csv"}
     assert written["table3.md"] in done.output
 
 
 def test_the_same_results_give_the_same_bytes(runs, tmp_path):
     for name in ("one", "two"):
-        report("table3", "--runs", runs, "--out", tmp_path / name)
+        report("table3", runs, "--out", tmp_path / name)
     assert (tmp_path / "one" / "table3.tex").read_bytes() == (tmp_path / "two" / "table3.tex").read_bytes()
 
 
 def test_a_broken_file_is_named_and_left_out_and_strict_fails(runs):
     (runs / "full" / "result.json").write_text("{")
-    done = report("table3", "--runs", runs)
+    done = report("table3", runs)
     assert done.exit_code == 0 and "left out" in done.output and "full/result.json" in done.output
-    assert report("table3", "--runs", runs, "--strict").exit_code == 1
+    assert report("table3", runs, "--strict").exit_code == 1
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["table9"], "unknown table 'table9'; known: runs, table3"),
+        (["table9"], "unknown report 'table9'; known: runs, table1, table2, table3, table4, all"),
         (["table3", "--where", "x"], "--where x is not KEY=VALUE"),
         (["table3", "--protocol", "x"], "unknown protocol 'x'"),
     ],
 )
 def test_what_is_wrong_is_said(runs, arguments, message):
-    done = report(*arguments, "--runs", runs)
+    done = report(arguments[0], runs, *arguments[1:])
     assert done.exit_code == 1 and message in done.output
 
 
 def test_a_folder_that_is_not_there(tmp_path):
-    done = report("table3", "--runs", tmp_path / "none")
+    done = report("table3", tmp_path / "none")
     assert done.exit_code == 1 and "there is no folder" in done.output
 
 

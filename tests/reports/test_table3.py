@@ -37,8 +37,8 @@ def test_the_best_of_each_column_is_bold_by_its_own_direction():
 
 
 def test_what_prints_the_same_is_equally_good():
-    rows = lines([result("dagd", psnr=23.501), result("full", psnr=23.499)])
-    assert [row[4] for row in rows] == [MISSING, "**23.50**", MISSING, "**23.50**"]
+    rows = lines([result("baseline", psnr=23.0), result("dagd", psnr=23.501), result("full", psnr=23.499)])
+    assert [row[4] for row in rows] == ["<ins>23.00</ins>", "**23.50**", MISSING, "**23.50**"]
 
 
 def test_missing_and_failed_cells_say_so():

@@ -1,0 +1,51 @@
+"""Which scenes a table is about: those of a published data set, and others that stand in for them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from padgs.results import Result
+from reports import published
+
+OUTDOOR_WORDS = ("outdoor", "garden")  # what a scene outside the data sets is called if it belongs to Table 2
+
+
+@dataclass(frozen=True)
+class Place:
+    """A scene of a data set, as results name them."""
+
+    dataset: str
+    scene: str
+
+    @property
+    def published(self) -> bool:
+        """Whether the paper has numbers of it."""
+        return self.dataset in published.DATASETS
+
+    @property
+    def outdoor(self) -> bool:
+        """Whether it belongs beside the outdoor scenes of Ricoh360."""
+        return self.dataset == "ricoh360" or any(word in self.scene for word in OUTDOOR_WORDS)
+
+    @property
+    def title(self) -> str:
+        """What stands over its rows: nobody shall take a stand-in for a scene of the paper."""
+        if self.published:
+            return published.scene_title(self.dataset, self.scene)
+        if self.dataset == "synthetic":
+            return f"{self.scene} (built in, generated; no scene of the paper)"
+        return f"{self.scene} (a capture that is no scene of the paper)"
+
+
+def places(results: Iterable[Result]) -> list[Place]:
+    """The scenes of some results: those of the paper first, otherwise in the order of their names."""
+    found = {Place(result.dataset, result.scene) for result in results}
+    order = list(published.DATASETS)
+    known = {place: order.index(place.dataset) if place.published else len(order) for place in found}
+    return sorted(found, key=lambda place: (known[place], place.dataset, place.scene))
+
+
+def at(place: Place, results: Iterable[Result]) -> list[Result]:
+    """The results of one scene."""
+    return [result for result in results if (result.dataset, result.scene) == (place.dataset, place.scene)]
