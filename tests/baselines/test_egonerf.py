@@ -1,0 +1,136 @@
+from dataclasses import replace
+
+import pytest
+import torch
+from composed import composed
+from tiny_scene import tiny_scene
+
+from baselines.egonerf import EgoNeRFMethod, EgoNeRFMethodOptions
+from padgs.cli.session import build
+from padgs.data.synthetic import SyntheticOptions, generate
+from padgs.method import Budget, RenderConfig
+from padgs.scene import Scene, View
+from padgs.train import TrainOptions
+
+SMALL = EgoNeRFMethodOptions(
+    radial_nodes=16,
+    polar_nodes=12,
+    azimuth_nodes=36,
+    density_components=4,
+    appearance_components=8,
+    hidden=32,
+    coarse_samples=24,
+    fine_samples=24,
+    environment_height=16,
+    rays=256,
+)
+
+
+def method(train: TrainOptions = TrainOptions(weight="uniform"), **options) -> EgoNeRFMethod:  # noqa: B008
+    return EgoNeRFMethod(replace(SMALL, **options), RenderConfig(), train)
+
+
+def psnr(trained: EgoNeRFMethod, view: View) -> float:
+    error = trained.render(view).image.clamp(0, 1) - view.image()
+    return -10 * torch.log10(error.square().mean()).item()
+
+
+@pytest.fixture(autouse=True)
+def padgs_root(monkeypatch, root):
+    monkeypatch.setenv("PADGS_ROOT", str(root))
+
+
+@pytest.fixture
+def room(tmp_path, monkeypatch) -> Scene:
+    monkeypatch.setenv("PADGS_CACHE", str(tmp_path))
+    return generate(SyntheticOptions("room", 64, train_views=6, test_views=1, samples=1, points=500))
+
+
+def test_the_room_is_learned(room):
+    trained = method(coarse_samples=16, fine_samples=16)
+    records = trained.fit(room, Budget(120))
+    first = next(records)
+    start = psnr(trained, room.test[0])
+    losses = [record.loss for record in records]
+    assert sum(losses[-10:]) / 10 < 0.6 * first.loss
+    assert psnr(trained, room.test[0]) > start + 2  # measured: 10.9 to 14.1 dB
+
+
+def test_the_small_setting_has_less_than_a_million_parameters():
+    scene, small = tiny_scene(), build(composed("method=egonerf_small"))
+    next(small.fit(scene, Budget(1)))
+    assert small.size().parameters <= 1_000_000
+    assert small.size().bytes == 4 * small.size().parameters
+
+
+def test_the_units_of_the_world_do_not_matter_to_training():
+    def scaled(view: View, scale: float) -> View:
+        pose = view.cam_from_world.clone()
+        pose[:3, 3] *= scale
+        return replace(view, cam_from_world=pose)
+
+    scene = tiny_scene()
+    views = {part: tuple(scaled(view, 100.0) for view in getattr(scene, part)) for part in ("train", "test")}
+    other = replace(scene, points=scene.points * 100, **views)
+    losses = [[record.loss for record in method().fit(which, Budget(10))] for which in (scene, other)]
+    assert losses[0] == pytest.approx(losses[1], rel=1e-3)
+
+
+def test_masked_pixels_teach_nothing():
+    """What lies under the mask may be anything: the training is the same."""
+    scene = tiny_scene()
+    mask = torch.ones(16, 32)
+    mask[10:] = 0
+
+    def painted(view: View, value: int) -> View:
+        pixels = (view.image() * 255).round().to(torch.uint8)
+        pixels[10:] = value
+        return replace(view, load_pixels=lambda: pixels, load_mask=lambda: mask)
+
+    images = []
+    for value in (0, 200):
+        trained = method()
+        list(trained.fit(replace(scene, train=tuple(painted(view, value) for view in scene.train)), Budget(5)))
+        images.append(trained.render(scene.test[0]).image)
+    assert torch.equal(*images)
+
+
+def test_weights_of_rows_are_honoured():
+    losses = [
+        next(method(TrainOptions(weight=weight)).fit(tiny_scene(), Budget(1))).loss
+        for weight in ("uniform", "solid_angle")
+    ]
+    assert losses[0] != losses[1]
+
+
+@pytest.mark.parametrize(
+    "render, train, reason",
+    [
+        (
+            {"projection": "ray"},
+            {},
+            "draws no Gaussians, so render.projection=ray means nothing to it; leave it at erp",
+        ),
+        ({"backend": "cpu"}, {}, "no backend 'cpu'; it casts rays in torch, known: auto, torch"),
+        ({}, {"lambda_l1": 0.5}, "squared error, so train.lambda_l1=0.5 means nothing to it; leave it at 0.8"),
+        ({}, {"normalisation": "channel_sum"}, "train.normalisation=channel_sum means nothing"),
+    ],
+)
+def test_options_of_splatting_are_refused_and_not_ignored(render, train, reason):
+    with pytest.raises(ValueError, match=reason):
+        next(EgoNeRFMethod(SMALL, RenderConfig(**render), TrainOptions(**train)).fit(tiny_scene(), Budget(1)))
+
+
+@pytest.mark.parametrize("name, value", [("rays", 0), ("grid_rate", 0.0), ("density_variation", -1.0)])
+def test_training_options_without_a_meaning_are_named(name, value):
+    with pytest.raises(ValueError, match=f"{name} is {value}"):
+        method(**{name: value})
+
+
+def test_variation_smooths_the_planes():
+    scene, roughness = tiny_scene(), []
+    for weight in (0.0, 1e4):
+        trained = method(density_variation=weight, appearance_variation=0.0)
+        list(trained.fit(scene, Budget(20)))
+        roughness.append(trained._trained().density.variation().item())
+    assert roughness[1] < 0.5 * roughness[0]
