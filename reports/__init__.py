@@ -1,18 +1,16 @@
-"""Tables from result files. Nothing here trains, renders or imports torch; every number comes from a `result.json`
-or from the file of published numbers.
+"""Tables and charts from result files. Nothing here trains, renders or imports torch; every number comes from a
+`result.json`, from the log beside it, or from the file of published numbers.
 
-A table is a function `build(results, request) -> Table`, an entry of `TABLES`; writers turn any `Table` into text.
+A table is a function `build(results, request) -> Table`, an entry of `reports.gathered.TABLES`; writers turn any
+`Table` into text. What can be asked for is an entry of `REPORTS`: a function that yields files.
 """
 
-TABLES = {
-    "table1": "reports.tables_of_methods:table1",
-    "table2": "reports.tables_of_methods:table2",
-    "table3": "reports.table3:build",
-    "table4": "reports.tables_of_methods:table4",
-    "runs": "reports.runs:build",
-}
-WRITERS = {  # file extension -> Table -> text
-    "md": "reports.markdown:text",
-    "tex": "reports.latex:text",
-    "csv": "reports.csv_text:text",
+REPORTS = {
+    "table1": "reports.files:table1",
+    "table2": "reports.files:table2",
+    "table3": "reports.files:table3",
+    "table4": "reports.files:table4",
+    "runs": "reports.files:runs",
+    "sweep": "reports.files:sweep",
+    "chart": "reports.files:chart",
 }

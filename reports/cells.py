@@ -11,6 +11,9 @@ from padgs.results import Result
 from reports.published import Published
 from reports.table import Cell, ReportError
 
+# Keys that no trained number depends on, and the seed.
+NO_SETTING = ("seed", "run", "protocol", "data.path", "data.cache_bytes", "data.read_ahead", "data.device")
+
 
 def one_setting(results: Sequence[Result], where: str) -> list[Result]:
     """Results of one cell, sorted by seed.
@@ -38,7 +41,7 @@ def different_keys(first: Mapping[str, Any], second: Mapping[str, Any], where: s
     found = []
     for key in dict.fromkeys((*first, *second)):
         name = f"{where}{key}"
-        if name in ("seed", "run", "protocol", "data.path", "data.cache_bytes", "data.read_ahead", "data.device"):
+        if name in NO_SETTING:
             continue
         mine, theirs = first.get(key), second.get(key)
         if isinstance(mine, Mapping) and isinstance(theirs, Mapping):

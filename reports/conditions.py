@@ -66,4 +66,6 @@ CONDITIONS: Mapping[str, Condition] = {
     "data": lambda result, protocol: result.fingerprint[:10],
 }
 OF_A_DATA_SET = {what: of for what, of in CONDITIONS.items() if what != "data"}  # scenes may differ, rules may not
+OF_A_SWEEP = {"protocol": _rules, "machine": _machine_and_threads}  # all else shows as a changed key
+OF_A_CHART = {what: CONDITIONS[what] for what in ("protocol", "resolution", "data")} | {"machine": _machine_and_threads}
 OF_TIMES = {**CONDITIONS, "machine": _machine_and_threads}

@@ -42,9 +42,30 @@ def mark(protocol: str, metric: str) -> Callable[[Result], float | None]:
     return lambda result: result.scores[protocol].metrics.get(metric) if protocol in result.scores else None
 
 
+def quantity(name: str, protocol: str, results: Sequence[Result]) -> Measure:
+    """A metric that results have under a protocol, or a cost, by its name.
+
+    Raises:
+        ReportError: no such name; the message lists the known ones.
+    """
+    if name in QUANTITIES:
+        return QUANTITIES[name]
+    scored = [result.scores[protocol].metrics for result in results if protocol in result.scores]
+    known = dict.fromkeys(metric for metrics in scored for metric in metrics)
+    if name not in known:
+        names = ", ".join((*known, *QUANTITIES))
+        raise ReportError(f"unknown metric {name!r}; known under protocol {protocol}: {names}")
+    return Measure(column(name), mark(protocol, name))
+
+
+def train_seconds(result: Result) -> float | None:
+    """Training time in seconds."""
+    return result.timing.get("train_seconds")
+
+
 def hours(result: Result) -> float | None:
     """Training time in hours."""
-    seconds = result.timing.get("train_seconds")
+    seconds = train_seconds(result)
     return None if seconds is None else seconds / 3600
 
 
@@ -82,3 +103,11 @@ COSTS: Sequence[Measure] = (
     Measure(Column("model MB", 1, False), megabytes),
     Measure(Column("peak GB", 2, False), peak_gigabytes),
 )
+
+QUANTITIES = {  # what charts can show beside the metrics
+    "frame_ms": Measure(Column("ms per frame", 1, False), frame_ms),
+    "train_seconds": Measure(Column("training s", 0, False), train_seconds),
+    "gaussians": Measure(Column("Gaussians", 0), gaussians),
+    "megabytes": Measure(Column("model MB", 1, False), megabytes),
+    "peak_gigabytes": Measure(Column("peak GB", 2, False), peak_gigabytes),
+}

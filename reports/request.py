@@ -16,6 +16,7 @@ class Request:
 
     protocol: str = "paper"
     mix: bool = False  # let different rules, sizes and run lengths stand in one block
+    metrics: tuple[str, ...] = ()  # of the curves; empty for those of the protocol and the costs
     experiment: str = ""  # only runs of this experiment or sweep, by the name that results give it
     where: Mapping[str, str] = field(default_factory=dict)  # dotted configuration key -> the value wanted
 

@@ -1,8 +1,9 @@
-"""`padgs report`: read result files, make tables, write them down."""
+"""`padgs report`: read result files, make tables, charts and the page, write them down."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
@@ -10,62 +11,72 @@ import typer
 
 from padgs import results
 from padgs.registry import lookup
-from reports import TABLES, WRITERS
+from reports import REPORTS
 from reports.request import Request
-from reports.table import ReportError, Table
+from reports.table import ReportError
 
 ALL = "all"
 
 
 def report(
-    what: Annotated[str, typer.Argument(help=f"{', '.join(TABLES)}, or {ALL}")],
+    what: Annotated[str, typer.Argument(help=f"{', '.join(REPORTS)}, or {ALL}")],
     runs: Annotated[str, typer.Argument(help="folder of run folders")] = "runs",
     out: Annotated[str, typer.Option(help="where the files go; RUNS/reports if not given")] = "",
     protocol: Annotated[str, typer.Option(help="which scores: paper or sphere")] = "paper",
     experiment: Annotated[str, typer.Option(help="only runs of this experiment or sweep, e.g. tau@cpu")] = "",
+    metric: Annotated[list[str] | None, typer.Option(help="of the curves of sweeps, e.g. ws_psnr; repeatable")] = None,
     where: Annotated[list[str] | None, typer.Option(help="only runs with KEY=VALUE; repeatable")] = None,
     mix: Annotated[bool, typer.Option(help="let other rules, sizes, run lengths and machines stand together")] = False,
+    collect: Annotated[bool, typer.Option(help="copy the result files to OUT/runs, without pictures")] = False,
     strict: Annotated[bool, typer.Option(help="exit code 1 if a result file cannot be used")] = False,
 ) -> None:
-    """Make tables from result files, as Markdown, LaTeX and CSV."""
+    """Make tables (Markdown, LaTeX, CSV), charts (SVG, PNG, CSV) and a page (HTML) from result files."""
     folder = Path(runs)
     if not folder.is_dir():
-        raise _refused(f"there is no folder {folder}; give the folder of the runs after the name of the table")
+        raise _refused(f"there is no folder {folder}; give the folder of the runs after the name of the report")
     found, broken = results.read_all(folder)
     for error in broken:
         print(f"left out: {error}", file=sys.stderr)
+    from reports.gathered import Gathered
+
     try:
-        request = Request(protocol, mix, experiment, dict(_pair(setting) for setting in where or []))
-        wanted = {name: lookup(TABLES, name, "report") for name in (TABLES if what == ALL else [what])}
+        wanted = {name: lookup(REPORTS, name, "report") for name in (REPORTS if what == ALL else [what])}
+        settings = dict(_pair(setting) for setting in where or [])
+        gathered = Gathered(folder, found, Request(protocol, mix, tuple(metric or ()), experiment, settings))
+    except ReportError as error:
+        raise _refused(str(error)) from error
     except ValueError as error:
         raise _refused(f"{error}, {ALL}") from error
-    refused = False
-    for build in wanted.values():
+    target, refused = Path(out) if out else folder / "reports", 0
+    for name, files in wanted.items():
         try:
-            made: Table = build(found, request)
+            texts = _write(files(gathered), target)
         except ReportError as error:
-            refused = True
-            print(f"error: {error}", file=sys.stderr)
+            refused += 1
+            print(f"error: {name}: {error}", file=sys.stderr)
             continue
-        text = _write(made, Path(out) if out else folder / "reports")
-        if what != ALL:
-            print(text)
-    print(f"{len(found)} results, {len(broken)} left out", file=sys.stderr)
+        if what == name and not texts:
+            raise _refused(f"nothing to show for {name}; no run or experiment in {folder} is of that kind")
+        if what == name and f"{name}.md" in texts:
+            print(texts[f"{name}.md"].decode())
+    if collect:
+        from reports.collected import files
+
+        _write(files(folder, found), target / "runs")
+    print(f"{len(found)} results, {len(broken)} left out; see {target}", file=sys.stderr)
     if refused or (strict and broken):
         raise typer.Exit(1)
 
 
-def _write(table: Table, folder: Path) -> str:
-    """The table in all formats; returns the Markdown."""
-    texts = {extension: lookup(WRITERS, extension, "format")(table) for extension in WRITERS}
+def _write(files: Iterable[tuple[str, bytes]], folder: Path) -> dict[str, bytes]:
+    written = dict(files)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for extension, text in texts.items():
-            results.replace_file(folder / f"{table.name}.{extension}", text.encode())
+        for name, content in written.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            results.replace_file(folder / name, content)
     except OSError as error:
         raise _refused(f"cannot write to {folder}: {error.strerror}; name another folder with --out") from error
-    print(f"written: {', '.join(f'{folder / table.name}.{extension}' for extension in texts)}", file=sys.stderr)
-    return texts["md"]
+    return written
 
 
 def _pair(setting: str) -> tuple[str, str]:

@@ -1,8 +1,9 @@
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
-from made_up import result
+from made_up import compared, result, swept, write
 from typer.testing import CliRunner
 
 from padgs import results
@@ -45,9 +46,11 @@ def test_a_broken_file_is_named_and_left_out_and_strict_fails(runs):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["table9"], "unknown report 'table9'; known: runs, table1, table2, table3, table4, all"),
+        (["table9"], "unknown report 'table9'; known: chart, runs, sweep, table1, table2, table3, table4, all"),
         (["table3", "--where", "x"], "--where x is not KEY=VALUE"),
         (["table3", "--protocol", "x"], "unknown protocol 'x'"),
+        (["sweep", "--metric", "x"], "unknown metric 'x'; known under protocol paper: psnr, ssim"),
+        (["sweep"], "nothing to show for sweep"),
     ],
 )
 def test_what_is_wrong_is_said(runs, arguments, message):
@@ -61,10 +64,28 @@ def test_a_folder_that_is_not_there(tmp_path):
 
 
 def test_reports_need_no_torch(root):
-    code = "import sys, reports.table3, reports.runs, reports.latex, reports.markdown; sys.exit('torch' in sys.modules)"
+    code = "import sys, reports.files; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], cwd=root).returncode == 0
 
 
 def test_help_is_quick(root):
     code = "import sys, padgs.cli.app; sys.exit('torch' in sys.modules or 'hydra' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], cwd=root).returncode == 0
+
+
+def test_everything_at_once(tmp_path):
+    runs = write([*compared(["synthetic-room"], seeds=1), *swept(scenes=["synthetic-room"])], tmp_path / "runs")
+    done = report("all", runs, "--out", tmp_path / "out")
+    assert done.exit_code == 0, done.output
+    written = {path.name for path in (tmp_path / "out").iterdir()}
+    tables = {f"{name}.{e}" for name in ("table1", "table2", "table3", "table4", "runs") for e in ("md", "tex", "csv")}
+    charts = {f"{name}.{e}" for name in ("chart_synthetic-room", "sweep_tau_cpu") for e in ("svg", "png", "csv")}
+    assert written == tables | charts | {"time_synthetic-room.svg", "time_synthetic-room.png"}
+
+
+def test_what_is_refused_does_not_keep_the_rest_back(tmp_path):
+    first, *others = compared(["synthetic-room"], seeds=1)
+    write([replace(first, machine={"gpu": "H200"}), *others], tmp_path / "runs")
+    done = report("all", tmp_path / "runs", "--out", tmp_path / "out")
+    assert done.exit_code == 1 and "error: table4: " in done.output and "differ in machine" in done.output
+    assert (tmp_path / "out" / "table1.md").exists() and not (tmp_path / "out" / "table4.md").exists()

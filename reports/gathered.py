@@ -1,0 +1,64 @@
+"""All that a folder of runs gives: its tables and charts, each made once, whoever asks for it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from padgs.results import Result
+from reports import runs, sweep_chart, table3, tables_of_methods, trade_off_chart
+from reports.drawing import Chart
+from reports.quality_log import probes
+from reports.request import Request
+from reports.sweeps import Sweep, sweeps
+from reports.table import ReportError, Table
+from reports.trade_off import TradeOff, trade_offs
+
+TABLES: Mapping[str, Callable[[Sequence[Result], Request], Table]] = {
+    "table1": tables_of_methods.table1,
+    "table2": tables_of_methods.table2,
+    "table3": table3.build,
+    "table4": tables_of_methods.table4,
+    "runs": runs.build,
+}
+
+
+@dataclass(frozen=True)
+class Gathered:
+    """The results of a folder of run folders, and what is asked of them. Everything raises ReportError if refused."""
+
+    folder: Path
+    results: Sequence[Result]
+    request: Request
+
+    def table(self, name: str) -> Table:
+        """A table of `TABLES`."""
+        return self._tables.setdefault(name, TABLES[name](self.results, self.request))
+
+    @cached_property
+    def sweeps(self) -> list[tuple[Sweep, Chart]]:
+        """Each sweep and its picture."""
+        return [(sweep, sweep_chart.chart(sweep)) for sweep in sweeps(self.results, self.request)]
+
+    @cached_property
+    def trade_offs(self) -> list[tuple[TradeOff, list[Chart]]]:
+        """Speed against accuracy with its picture, and quality over training time where runs left a log."""
+        found = []
+        for made in trade_offs(self.results, self.request):
+            over_time = trade_off_chart.time_chart(made, probes(self.folder, made.runs))
+            found.append((made, [trade_off_chart.chart(made), *([over_time] if over_time else [])]))
+        return found
+
+    @cached_property
+    def _tables(self) -> dict[str, Table]:
+        return {}
+
+
+def attempt(make: Callable[[], object], refused: list[str]) -> None:
+    """Do what can be done, and keep the reason where it is refused."""
+    try:
+        make()
+    except ReportError as error:
+        refused.append(str(error))
