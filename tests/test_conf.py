@@ -57,7 +57,9 @@ def test_every_sweep_varies_its_key_alone_and_says_how_to_run_it(name):
     found = jobs(f"+sweep={name}")
     keys = {
         "backends": {"render.backend"},
+        "growth_threshold": {"method.gradient_threshold"},
         "lambda": {"train.lambda_l1"},
+        "omega_axis": {"method.omega_axis"},
         "offsets_and_features": {"method.offsets", "method.features"},
         "projections": {"render.projection", "render.cubemap"},
         "resolution": {"data.width"},
@@ -158,6 +160,39 @@ def test_the_ablation_is_the_four_rows_of_table_3(name):
         assert replace(job.train, weight="solid_angle") == full.train
     assert full.train.iterations == 30_000
     assert TrainOptions(weight=full.train.weight) == TrainOptions() and PaDGSOptions().tau == full.options.tau
+
+
+def test_every_rung_of_the_ladder_changes_one_thing():
+    rungs = jobs("+experiment=ladder")
+    first, *changes = [
+        different_keys(low.values(), high.values()) - {"variant"} for low, high in zip(rungs, rungs[1:], strict=False)
+    ]
+    assert {rungs[0].method, *(rung.method for rung in rungs[1:])} == {"omnigs", "padgs"} and rungs[
+        0
+    ].method == "omnigs"
+    assert all(key.startswith("method.") for key in first), "explicit Gaussians give way to anchors, all else stays"
+    assert changes == [
+        {"method.use_distance"},
+        {"method.use_distortion"},
+        {"method.tau"},
+        {"train.weight"},
+        {"train.normalisation"},
+    ]
+    assert [rung.options.inputs for rung in rungs[1:4]] == [35, 36, 37]
+    # The last is the paper's method: its threshold, three times ours, on a loss three times ours.
+    paper = composed("train.iterations=30000")
+    assert replace(rungs[-1].options, gradient_threshold=paper.options.gradient_threshold) == paper.options
+    assert rungs[-1].options.gradient_threshold == pytest.approx(3 * paper.options.gradient_threshold)
+    assert replace(rungs[-1].train, normalisation="mean") == paper.train
+
+
+@pytest.mark.parametrize("projection", ["tangent", "ray"])
+def test_padgs_on_another_projection_differs_in_nothing_else(projection):
+    other, paper = composed(f"method=padgs_{projection}"), composed()
+    differing = different_keys(paper.values(), other.values())
+    assert differing - {"render.low_pass_kind"} == {"render.projection"}
+    assert other.render.projection == projection
+    assert other.render.options(1.0).resolved_low_pass_kind == "angular"
 
 
 @pytest.mark.parametrize("name", ["roam360", "ricoh360"])

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 
 from padgs.clone_split import CloneSplitOptions
 from padgs.gaussians import Gaussians, rotation_matrices
 from padgs.method import RenderConfig
+from padgs.panorama import direction
 from padgs.probes import render_probed
 from padgs.render import RenderOptions, render
 from padgs.scene import View
@@ -75,6 +78,28 @@ def test_a_small_gaussian_is_pulled_alike_wherever_it_is(generator):
         signals.append(probe.grad.norm().item())
     assert signals[1] == pytest.approx(signals[0], rel=2e-3)
     assert signals[2] == pytest.approx(signals[0], rel=1e-6)
+
+
+@pytest.mark.parametrize("latitude", [15.0, 45.0, 70.0])
+@pytest.mark.parametrize("projection", ["tangent", "ray"])
+def test_the_signal_in_the_image_has_one_unit_in_every_projection(projection, latitude, generator):
+    """So one threshold of growth means the same: medians over many small Gaussians agree to some percent."""
+    count, width = 60, 256
+    longitude = math.pi * (2 * torch.rand(count, generator=generator, dtype=torch.float64) - 1)
+    means = 2 * direction(longitude, torch.full_like(longitude, math.radians(latitude)))
+    sizes = 2 * 2 * math.pi / width * (0.6 + 0.8 * torch.rand(count, 3, generator=generator, dtype=torch.float64))
+    quats = torch.randn(count, 4, generator=generator, dtype=torch.float64)
+    gaussians = Gaussians(means, quats, sizes, torch.full_like(longitude, 0.5), torch.rand(count, 3).double())
+    blobs = torch.rand(1, 3, 8, 16, generator=generator, dtype=torch.float64)
+    target = torch.nn.functional.interpolate(blobs, (width // 2, width), mode="bicubic")[0].permute(1, 2, 0)
+    signals = {}
+    for name, kind in (("erp", "pixels"), (projection, "angular")):
+        options = RenderOptions(projection=name, low_pass_kind=kind)
+        rendering, probe = render_probed(gaussians, view_at(None, width), options, signal="image", backend="torch")
+        ((rendering.image - target) ** 2).mean().backward()
+        assert probe.grad is not None
+        signals[name] = probe.grad.norm(dim=-1)
+    assert (signals[projection] / signals["erp"]).median().item() == pytest.approx(1, abs=0.15)
 
 
 @pytest.mark.parametrize(("signal", "axes"), [("image", 2), ("space", 3)])
