@@ -1,13 +1,17 @@
 from dataclasses import replace
+from time import process_time
 
 import pytest
 import torch
+from composed import composed
 from tiny_scene import tiny_scene
 from torch.nn.functional import normalize, softplus
 
 from padgs.camera import Pinhole, RayTable
+from padgs.cli.session import build
 from padgs.egonerf.model import EgoNeRF
 from padgs.egonerf.options import EgoNeRFOptions
+from padgs.method import Budget
 from padgs.scene import Scene, View
 
 SMALL = EgoNeRFOptions(
@@ -239,3 +243,20 @@ class Traced(torch.nn.Module):
 def test_options_that_make_no_model_are_named(changes, reason):
     with pytest.raises(ValueError, match=reason):
         replace(SMALL, **changes)
+
+
+@pytest.mark.slow
+def test_the_small_setting_keeps_its_promises_of_time(monkeypatch, root):
+    """500 steps of 1024 rays in 3 minutes and 256x128 in 20 s on 2 cores: twice that in processor time."""
+    monkeypatch.setenv("PADGS_ROOT", str(root))
+    scene, small = tiny_scene(), build(composed("method=egonerf_small"))
+    records = small.fit(scene, Budget(500))
+    for _ in range(5):
+        next(records)
+    start = process_time()
+    for _ in range(20):
+        next(records)
+    assert (process_time() - start) * 500 / 20 < 2 * 180  # measured: 135
+    start = process_time()
+    small.render(replace(scene.test[0], width=256, height=128))
+    assert process_time() - start < 2 * 20  # measured: 4.7
