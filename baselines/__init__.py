@@ -3,6 +3,8 @@
 METHODS = {
     "padgs": "baselines.padgs:PaDGSMethod",
     "omnigs": "baselines.omnigs:OmniGSMethod",
+    "odgs": "baselines.odgs:ODGSMethod",
+    "op43dgs": "baselines.op43dgs:OP43DGSMethod",
     "spags": "baselines.spags:SPaGSMethod",
     "cubemap_3dgs": "baselines.cubemap_3dgs:Cubemap3DGSMethod",
     "crops_3dgs": "baselines.crops_3dgs:Crops3DGSMethod",

@@ -34,12 +34,17 @@ class CloneSplitOptions:
     densify_every: int = 100
     signal: str = "image"  # what is compared with the threshold: a name of `padgs.probes.SIGNALS`
     gradient_threshold: float = 2e-4  # in the units of the signal's probe, for a loss that is a plain mean
+    polar_threshold: float | None = (
+        None  # at the poles, where it rises to with 1 - cos(latitude) (ODGS); None: the same
+    )
     percent_dense: float = 0.01  # largest scale that is cloned rather than split, in extents
     sample_clones: bool = False  # clones are placed at random inside the Gaussian, not exactly on it (GOF)
     min_opacity: float = 0.005  # fainter Gaussians are pruned
     opacity_decay: float = 0.0  # taken from all opacities in every round
     prune_by_extent: bool = False  # also prune scales above max_scale; empties scenes of tiny camera motion
     max_scale: float = 0.1  # in extents
+    prune_by_extent_from: int = 3000  # ... after this iteration
+    extent_margin: float = 0.0  # world units added to the extent that sizes are compared with (the released ODGS)
     reset_every: int = 3000  # iterations between opacity resets
     reset_opacity: float = 0.01  # no opacity is larger after a reset
     max_gaussians: int | None = 1_000_000  # with more candidates, those with the largest gradients multiply
@@ -70,6 +75,7 @@ class CloneSplitOptions:
             self,
             densify_from=scaled(self.densify_from, iterations),
             densify_until=scaled(self.densify_until, iterations),
+            prune_by_extent_from=scaled(self.prune_by_extent_from, iterations),
             densify_every=max(min(MIN_DENSIFY_EVERY, self.densify_every), every),
             reset_every=max(min(MIN_RESET_EVERY, self.reset_every), scaled(self.reset_every, iterations)),
         )
@@ -79,21 +85,32 @@ class CloneSplit:
     """Densification of one model.
 
     Attributes:
-        statistics: sums since the last round, one row per Gaussian: gradient [N] norms, seen [N] iterations.
+        statistics: sums since the last round, one row per Gaussian: gradient [N] norms, seen [N] iterations, and, for a
+            threshold that depends on it, polar [N]: 1 - cos(latitude).
         generator: source of the random positions of split Gaussians, on the CPU.
     """
 
     def __init__(self, splats: Splats, options: CloneSplitOptions, *, extent: float, seed: int = 0) -> None:
         """Start with empty statistics; `extent` is the length that sizes are compared with, in world units."""
-        self.splats, self.options, self.extent = splats, options, extent
+        self.splats, self.options, self.extent = splats, options, extent + options.extent_margin
         self.generator = torch.Generator().manual_seed(seed)
         self.statistics = self._empty()
 
-    def observe(self, gradient: Tensor, visible: Tensor, iteration: int) -> None:
-        """Add one view: gradient [N, 2 or 3] of the loss by the probe (`padgs.probes`), and visible [N] bool."""
+    def observe(self, gradient: Tensor, visible: Tensor, iteration: int, cos_latitudes: Tensor | None = None) -> None:
+        """Add one view.
+
+        Args:
+            gradient: [N, 2 or 3] of the loss by the probe (`padgs.probes`).
+            visible: [N] bool.
+            iteration: of the view.
+            cos_latitudes: [N] where the view has the Gaussians; needed with `polar_threshold` only.
+        """
         if iteration < self.options.densify_until:
             self.statistics["gradient"] += torch.where(visible, gradient.norm(dim=-1), 0.0)
             self.statistics["seen"] += visible
+            if self.options.polar_threshold is not None:
+                assert cos_latitudes is not None, "polar_threshold needs the latitudes"
+                self.statistics["polar"] += torch.where(visible, 1 - cos_latitudes, 0.0)
 
     @torch.no_grad()
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
@@ -106,7 +123,7 @@ class CloneSplit:
         if iteration > begin and iteration % options.densify_every == 0:
             cloned, split = self._multiply(optimizer)
             self._decay_opacities()
-            pruned = self._prune(optimizer)
+            pruned = self._prune(optimizer, iteration)
             self.statistics = self._empty()
             events.append(f"cloned {cloned}, split {split}, pruned {pruned} Gaussians")
         if iteration % options.reset_every == 0:
@@ -117,8 +134,12 @@ class CloneSplit:
     def _multiply(self, optimizer: torch.optim.Adam) -> tuple[int, int]:
         """Clone and split; returns how many of each. Each adds one Gaussian to the count, within `max_gaussians`."""
         rows = self.splats.rows()
-        mean_gradient = self.statistics["gradient"] / self.statistics["seen"].clamp(min=1)
-        chosen = mean_gradient >= self.options.gradient_threshold
+        seen = self.statistics["seen"].clamp(min=1)
+        mean_gradient = self.statistics["gradient"] / seen
+        threshold = self.options.gradient_threshold
+        if self.options.polar_threshold is not None:
+            threshold += (self.options.polar_threshold - threshold) * self.statistics["polar"] / seen
+        chosen = mean_gradient >= threshold
         if self.options.max_gaussians is not None:
             room = max(0, self.options.max_gaussians - len(chosen))
             if int(chosen.sum()) > room:
@@ -148,9 +169,9 @@ class CloneSplit:
             copies["means"] = copies["means"] + (rotation_matrices(copies["quats"]) @ steps[..., None])[..., 0]
         return copies
 
-    def _prune(self, optimizer: torch.optim.Adam) -> int:
+    def _prune(self, optimizer: torch.optim.Adam, iteration: int) -> int:
         keep = torch.sigmoid(self.splats.opacity_logits) >= self.options.min_opacity
-        if self.options.prune_by_extent:
+        if self.options.prune_by_extent and iteration > self.options.prune_by_extent_from:
             keep &= torch.exp(self.splats.log_scales).amax(-1) <= self.options.max_scale * self.extent
         keep_rows(self.splats.rows(), optimizer, keep)
         return int((~keep).sum())
@@ -173,4 +194,5 @@ class CloneSplit:
 
     def _empty(self) -> dict[str, Tensor]:
         zeros = self.splats.means.new_zeros(len(self.splats))
-        return {"gradient": zeros, "seen": zeros.clone()}
+        names = ("gradient", "seen") if self.options.polar_threshold is None else ("gradient", "seen", "polar")
+        return {name: zeros.clone() for name in names}

@@ -29,6 +29,7 @@ class RenderConfig:
     near_cull: str = "mean"
     low_pass: float = 0.3
     low_pass_kind: str = "auto"
+    pixel_bias: float = 0.0
     wrap: bool = True
     bounds: str = "exact"
     cubemap: bool = False  # through six perspective faces, for the projections pinhole, tangent and ray
@@ -51,6 +52,7 @@ class RenderConfig:
             near_cull=self.near_cull,
             low_pass=self.low_pass,
             low_pass_kind=self.low_pass_kind,
+            pixel_bias=self.pixel_bias,
             wrap=self.wrap,
             bounds=self.bounds,
             cubemap=self.cubemap,

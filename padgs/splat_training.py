@@ -9,6 +9,7 @@ import torch
 from padgs.camera import Panorama
 from padgs.clone_split import CloneSplit, CloneSplitOptions
 from padgs.method import RenderConfig, State
+from padgs.panorama import longitude_latitude
 from padgs.probes import render_probed
 from padgs.render import Rendering, RenderOptions, render
 from padgs.scene import Scene, View
@@ -42,6 +43,7 @@ class TrainableSplats:
         self.splats, self.iterations = splats, iterations
         self.densifier = CloneSplit(splats, options.for_run(iterations), extent=extent, seed=seed)
         self._config, self._extent, self._factor = config, extent, learning_rate_factor
+        self._drawn: View | None = None  # the view of the last drawing
 
     def groups(self) -> list[ParameterGroup]:
         """Learning rates of 3DGS; that of the means falls over the whole run and follows the size of the scene."""
@@ -59,6 +61,7 @@ class TrainableSplats:
 
     def draw(self, view: View) -> Drawing:
         """Render all Gaussians, differentiably."""
+        self._drawn = view
         gaussians = self.splats.gaussians(view)
         rendering, probe = render_probed(
             gaussians,
@@ -71,8 +74,10 @@ class TrainableSplats:
 
     def observe(self, drawing: Drawing, iteration: int) -> None:
         """Note how hard each Gaussian was pulled."""
-        assert drawing.probe.grad is not None, "observe is called after backward"
-        self.densifier.observe(drawing.probe.grad, drawing.rendering.visible, iteration)
+        assert drawing.probe.grad is not None and self._drawn is not None, "observe is called after draw and backward"
+        means, pose = self.splats.means, self._drawn.cam_from_world.to(self.splats.means)
+        _, latitudes = longitude_latitude(means @ pose[:3, :3].T + pose[:3, 3])
+        self.densifier.observe(drawing.probe.grad, drawing.rendering.visible, iteration, latitudes.cos())
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
         """Densify, and bring the next SH degree into use, where it is time to."""

@@ -2,9 +2,12 @@ import math
 
 import pytest
 import torch
+from tiny_scene import tiny_scene
 
 from padgs.clone_split import SHRINK, CloneSplit, CloneSplitOptions
 from padgs.gaussians import rotation_matrices
+from padgs.method import RenderConfig
+from padgs.splat_training import TrainableSplats
 from padgs.splats import Splats
 
 LARGE, SMALL = 0.5, 0.005  # scales above and below percent_dense x extent = 0.01
@@ -20,7 +23,7 @@ def densifier(scales: list[float], **options) -> tuple[CloneSplit, torch.optim.A
     sum(p.sum() for p in splats.parameters()).backward()
     optimizer.step()  # fills the moments, moves nothing
     optimizer.zero_grad()
-    settings = {"densify_from": 0, "densify_every": EVERY, "reset_every": 10**6} | options
+    settings = {"densify_from": 0, "densify_every": EVERY, "reset_every": 10**6, "prune_by_extent_from": 0} | options
     return CloneSplit(splats, CloneSplitOptions(**settings), extent=1.0), optimizer
 
 
@@ -48,6 +51,42 @@ def test_large_gaussians_are_replaced_by_two_smaller_ones():
     assert torch.equal(grown.splats.means[0], torch.ones(3)), "the one that was split is gone"
     assert torch.allclose(grown.splats.log_scales[1:].exp(), torch.full((2, 3), LARGE / 1.6))
     assert not torch.equal(grown.splats.means[1], grown.splats.means[2])
+
+
+def test_a_margin_on_the_extent_clones_what_would_be_split():
+    for margin, expected in ((0.0, "cloned 0, split 1"), (100.0, "cloned 1, split 0")):
+        grown, optimizer = densifier([LARGE, LARGE], extent_margin=margin)
+        pull(grown, [1e-3, 0.0])
+        assert grown.adapt(EVERY, optimizer)[0].startswith(expected)
+
+
+def test_the_threshold_may_rise_towards_the_poles():
+    """At 60 degrees half way up: with 2e-4 at the horizon and 6e-4 at the poles a pull of 4e-4 is just enough there."""
+    for latitude, multiplies in ((0.0, True), (59.0, True), (61.0, False), (90.0, False)):
+        grown, optimizer = densifier([SMALL], polar_threshold=6e-4)
+        cos = torch.tensor([math.cos(math.radians(latitude))])
+        for _ in range(3):
+            grown.observe(torch.tensor([[4e-4, 0.0]]), torch.tensor([True]), 1, cos)
+        grown.observe(torch.tensor([[1.0, 0.0]]), torch.tensor([False]), 1, torch.tensor([1.0]))  # not seen: no vote
+        assert grown.adapt(EVERY, optimizer)[0].startswith(f"cloned {int(multiplies)}")
+
+
+def test_the_latitude_is_that_in_the_view():
+    scene = tiny_scene()
+    splats = Splats(torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[-1.0] * 3]), torch.ones(1, 3))
+    above = torch.eye(4)
+    above[:3, 3] = torch.tensor([0.0, 2.0, 0.0])  # the camera is 2 above the origin (y is down): it looks down by 45
+    trained = TrainableSplats(splats, CloneSplitOptions(polar_threshold=1e-3), RenderConfig(), extent=1.0, iterations=9)
+    drawing = trained.draw(scene.train[0].at(above))
+    drawing.rendering.image.sum().backward()
+    trained.observe(drawing, 1)
+    assert trained.densifier.statistics["polar"].item() == pytest.approx(1 - math.sqrt(0.5), rel=1e-5)
+
+
+def test_pruning_by_extent_may_begin_later():
+    grown, optimizer = densifier([LARGE, SMALL], prune_by_extent=True, prune_by_extent_from=EVERY)
+    assert grown.adapt(EVERY, optimizer) == ("cloned 0, split 0, pruned 0 Gaussians",)
+    assert grown.adapt(2 * EVERY, optimizer) == ("cloned 0, split 0, pruned 1 Gaussians",)
 
 
 def test_pieces_are_samples_of_the_gaussian_they_replace():

@@ -58,6 +58,9 @@ def render(
     if background is None:
         background = means.new_zeros(3)
     check_inputs(gaussians, cam_from_world, view.camera, options, background, probe, check_values=check_values)
+    if options.pixel_bias:
+        bias = 2 * options.pixel_bias / means.new_tensor([view.camera.width, view.camera.height])
+        probe = bias.expand(len(means), 2) if probe is None else probe + bias
     rasterize = lookup(BACKENDS, resolve_backend(backend, means), "backend")
     if options.cubemap:
         rasterize = partial(rasterize_cubemap, rasterize)

@@ -46,6 +46,7 @@ class RenderOptions:
     near_cull: str = "mean"  # what must be farther than near: the mean, or (ray) all that is drawn of the Gaussian
     low_pass: float = 0.3  # variance of the low-pass filter in square pixels (at the centre of a perspective image)
     low_pass_kind: str = "auto"  # pixels, angular, solid or fixed; auto: the first one of the projection
+    pixel_bias: float = 0.0  # erp: pixels right and down of the truth that means are drawn; released ODGS: 0.5
     wrap: bool = True  # erp: continue footprints across the +-180 degree seam; tangent and ray know of no seam
     cubemap: bool = False  # draw a panorama through the six faces of a cube, each an ordinary perspective view
     face_size: int | None = None  # cubemap: pixels across the 90 degrees of a face; None: as fine as the panorama
@@ -75,6 +76,8 @@ class RenderOptions:
             raise ValueError(f"near is {self.near}; it must be a distance >= 0 in world units")
         if not self.low_pass >= 0:
             raise ValueError(f"low_pass is {self.low_pass}; it must be a variance >= 0 in square pixels")
+        if self.pixel_bias and self.projection != "erp":
+            raise ValueError(f"pixel_bias is a defect of projection 'erp', not of {self.projection!r}; set it to 0")
         if not self.max_instances >= 1:
             raise ValueError(f"max_instances is {self.max_instances}; it must be at least 1")
         if self.memory_cap is not None and not self.memory_cap >= 1:

@@ -3,6 +3,7 @@
 A new method needs no line here, unless its defaults are too large for a test (`TINY`) or it is slow (`SLOW`).
 """
 
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,9 @@ from padgs import checkpoint
 from padgs.cli.session import build
 from padgs.data.synthetic import SCENES, SyntheticOptions, generate
 from padgs.method import Budget, Method, Record, State
+from padgs.registry import lookup
 from padgs.scene import Scene
+from padgs.splat_method import SplatMethod
 
 WIDTH = 32
 STEPS = 20
@@ -68,6 +71,16 @@ def test_every_method_has_a_setting_of_its_name():
     assert METHODS.keys() <= set(SETTINGS)
     assert {composed(f"method={setting}").method for setting in SETTINGS} == METHODS.keys()
     assert TINY.keys() | SLOW <= set(SETTINGS)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_explicit_gaussians_are_drawn_and_trained_as_their_setting_says(name):
+    method = lookup(METHODS, name, "method")
+    if not issubclass(method, SplatMethod):
+        pytest.skip("it has no defaults of its own for these groups")
+    config = composed(f"method={name}")
+    assert config.render == method.RENDER
+    assert asdict(method.TRAIN).items() <= asdict(config.train).items()
 
 
 def test_every_method_has_a_section_in_the_docs(root):

@@ -154,8 +154,8 @@ def test_released_bugs_are_off_unless_asked_for(root, monkeypatch):
     monkeypatch.setenv("PADGS_ROOT", str(root))
     described, released = (composed(f"method={name}") for name in ("omnigs", "omnigs_release"))
     assert not any((described.options.released_start, described.options.released_reset))
-    assert described.render == OmniGSMethod.RENDER and released.render == composed("render=released").render
-    quirks = {"released_start": True, "released_reset": True, "max_gaussians": None}
+    assert described.render == RenderConfig() and released.render == composed("render=released").render
+    quirks = {"released_start": True, "released_reset": True, "prune_by_extent_from": 0, "max_gaussians": None}
     assert released.options == replace(described.options, **quirks)
     assert described.train == released.train and released.train.weight == "uniform"
 

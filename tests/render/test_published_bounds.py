@@ -25,12 +25,12 @@ DISTANCES = (1, 3, 10, 30, 100)
 PUBLISHED = (11, 34, 362, 1432, 3772)
 
 
-def shell(distance: float, count: int = 2000, sigma: float = 0.15) -> Gaussians:
+def shell(distance: float, count: int = 2000, sigma: float = 0.1) -> Gaussians:
     """Gaussians all around, of many sizes and shapes, which look the same from every distance; sigma in degrees."""
     generator = torch.Generator().manual_seed(0)
     normals = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
     size = torch.exp(
-        0.8 * torch.randn(count, 1, generator=generator) + 0.8 * torch.randn(count, 3, generator=generator)
+        0.6 * torch.randn(count, 1, generator=generator) + 1.2 * torch.randn(count, 3, generator=generator)
     )
     return Gaussians(
         means=distance * normals,

@@ -1,0 +1,16 @@
+"""OP43DGS ("optimal projection"): explicit 3D Gaussians, each drawn on the tangent plane of the sphere at its mean.
+
+With exact bounds, this is the method as it should be. conf/method/op43dgs_release.yaml has the bounds of its released
+code, which grow with the distance of a Gaussian in scene units, and the memory that it then runs out of.
+"""
+
+from __future__ import annotations
+
+from padgs.method import RenderConfig
+from padgs.splat_method import SplatMethod
+
+
+class OP43DGSMethod(SplatMethod):
+    """See `padgs.method.Method`."""
+
+    RENDER = RenderConfig(projection="tangent")

@@ -1,0 +1,88 @@
+"""ODGS: its way to a footprint leads where OmniGS is, and what is its own in growing and in its release."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from composed import composed
+from torch import Tensor
+
+from baselines.odgs import ODGSOptions
+from padgs.gaussians import Gaussians
+from padgs.panorama import direction, longitude_latitude, projection_jacobian
+from padgs.render import RenderOptions, render
+from padgs.scene import View
+
+
+def tangent_plane_jacobian(means: Tensor, width: int, height: int) -> Tensor:
+    """Jacobian of the pixel by the mean in the steps of ODGS; [N, 2, 3] pixels per unit of length.
+
+    Turn the mean onto the forward axis, where it is (0, 0, r); take the Jacobian of a pinhole of focal length 1 there;
+    scale its tangent plane to pixels by W / (2 pi cos(latitude)) and H / pi.
+    """
+    longitude, latitude = longitude_latitude(means)
+    zero, one = torch.zeros_like(longitude), torch.ones_like(longitude)
+    sin, cos = longitude.sin(), longitude.cos()
+    yaw = torch.stack((cos, zero, -sin, zero, one, zero, sin, zero, cos), dim=-1).unflatten(-1, (3, 3))
+    sin, cos = latitude.sin(), latitude.cos()
+    pitch = torch.stack((one, zero, zero, zero, cos, -sin, zero, sin, cos), dim=-1).unflatten(-1, (3, 3))
+    turned = (pitch @ yaw @ means[..., None])[..., 0]
+    x, y, z = turned.unbind(-1)
+    assert torch.allclose(turned, torch.stack((zero, zero, means.norm(dim=-1)), dim=-1), atol=1e-12)
+    pinhole = torch.stack((1 / z, zero, -x / z**2, zero, 1 / z, -y / z**2), dim=-1).unflatten(-1, (2, 3))
+    scale = torch.stack((width / (2 * math.pi * cos), height / math.pi * one), dim=-1)
+    return scale[..., None] * (pinhole @ pitch @ yaw)
+
+
+def test_the_tangent_plane_leads_to_the_jacobian_of_the_panorama(generator):
+    means = torch.randn(5000, 3, generator=generator, dtype=torch.float64)
+    means = means * torch.logspace(-2, 2, 5000, dtype=torch.float64)[:, None]
+    latitude = longitude_latitude(means)[1]
+    assert latitude.abs().max() > 1.5, "near the poles too"
+    expected = projection_jacobian(means, 2048, 1024)
+    difference = (tangent_plane_jacobian(means, 2048, 1024) - expected).abs().amax((1, 2))
+    assert (difference / expected.abs().amax((1, 2))).max() < 1e-9
+    assert difference[means.norm(dim=-1) > 1].max() < 1e-9
+
+
+@pytest.fixture
+def padgs_root(monkeypatch, root):
+    monkeypatch.setenv("PADGS_ROOT", str(root))
+
+
+def test_the_method_is_omnigs_with_half_the_threshold(padgs_root):
+    odgs, omnigs = composed("method=odgs"), composed("method=omnigs")
+    assert odgs.options == replace(ODGSOptions(**vars(omnigs.options)), gradient_threshold=1e-4)
+    assert (odgs.render, odgs.train) == (omnigs.render, omnigs.train)
+    assert omnigs.options.gradient_threshold == 2e-4
+
+
+def test_the_release_differs_by_its_quirks_only(padgs_root):
+    odgs, release = composed("method=odgs"), composed("method=odgs_release")
+    quirks = {"sh_degree": 0, "extent_margin": 100.0, "prune_by_extent": True, "max_gaussians": None}
+    assert release.options == replace(odgs.options, **quirks)
+    assert release.render == replace(composed("render=released").render, pixel_bias=0.5)
+    assert release.train == odgs.train
+
+
+def test_means_of_the_release_are_half_a_pixel_off():
+    width, height = 64, 32
+    pixels = torch.tensor([[10.5, 16.5], [40.5, 20.5], [50.5, 12.5]])
+    angles = (pixels / torch.tensor([width, height]) - 0.5) * torch.tensor([2 * math.pi, math.pi])
+    gaussians = Gaussians(
+        means=direction(*angles.unbind(-1)),
+        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(3, 1),
+        scales=torch.full((3, 3), 0.1),
+        opacities=torch.full((3,), 0.9),
+        colors=torch.eye(3),
+    )
+    view = View("v", torch.eye(4, dtype=torch.float64), width, height)
+    centred, moved = (render(gaussians, view, RenderOptions(pixel_bias=bias)).image for bias in (0.0, 1.0))
+    torch.testing.assert_close(moved, centred.roll((1, 1), (0, 1)), rtol=1e-4, atol=1e-5)
+    half = render(gaussians, view, RenderOptions(pixel_bias=0.5)).image
+    for number, (u, v) in enumerate(pixels.long().tolist()):
+        block = half[v : v + 2, u : u + 2, number]
+        torch.testing.assert_close(block, block[:1, :1].expand(2, 2), rtol=1e-3, atol=1e-4)  # centred between four
+    with pytest.raises(ValueError, match="pixel_bias is a defect of projection 'erp', not of 'ray'"):
+        RenderOptions("ray", pixel_bias=0.5)
