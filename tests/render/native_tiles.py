@@ -24,6 +24,9 @@ def pixel_boxes(gaussians: Gaussians, camera: Camera, options: RenderOptions, po
     return projected(gaussians, camera, options, pose).boxes.long()
 
 
+PATCH_WIDTH, PATCH_HEIGHT = 8, 2  # pixels, as in csrc/abi.h
+
+
 class NativeTiles:
     """The tile lists of one view, drawn in one strip."""
 
@@ -32,11 +35,12 @@ class NativeTiles:
         (strip,) = self.projected.strips()
         self.strip, self.count = strip, len(strip.instances)
         self.gaussian, self.slot, packed = strip.instances.long().unbind(1)
-        self.row, self.row_end, self.chunk, self.chunk_end = (packed >> shift & 255 for shift in (0, 8, 16, 24))
+        reach = torch.stack([packed >> shift & 255 for shift in (0, 8, 16, 24)])  # in patches
+        self.row, self.row_end = reach[:2] * PATCH_HEIGHT  # pixels from the tile's corner
+        self.column, self.column_end = reach[2:] * PATCH_WIDTH
         self.tile = torch.repeat_interleave(torch.arange(strip.tiles), strip.tile_start.diff())
         self.level = self.projected.level.long()  # [rows of tiles]
-        chunks = (camera.width + TILE - 1) // TILE
-        per_row = (chunks + (1 << self.level) - 1) >> self.level
+        per_row = -(-camera.width // (TILE << self.level))
         self.row_of_tile = torch.repeat_interleave(torch.arange(len(self.level)), per_row)
         column_of_tile = torch.arange(strip.tiles) - (per_row.cumsum(0) - per_row)[self.row_of_tile]
         self.first_column = column_of_tile * TILE << self.level[self.row_of_tile]  # [tiles] pixels
@@ -47,5 +51,5 @@ class NativeTiles:
         for i in (self.gaussian == gaussian).nonzero()[:, 0].tolist():
             x, y = int(self.first_column[self.tile[i]]), int(self.row_of_tile[self.tile[i]]) * TILE
             rows = slice(y + int(self.row[i]), y + int(self.row_end[i]))
-            times[rows, x + TILE * int(self.chunk[i]) : x + TILE * int(self.chunk_end[i])] += 1
+            times[rows, x + int(self.column[i]) : x + int(self.column_end[i])] += 1
         return times.flatten()

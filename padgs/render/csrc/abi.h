@@ -12,8 +12,9 @@
 
 namespace padgs {
 
-constexpr int kTile = 16;        // pixels: height of a tile, and width of a chunk; a chunk's row is one vector
-constexpr int kMaxLevel = 4;     // tiles are up to 2^kMaxLevel chunks wide, near the poles
+constexpr int kPatchWidth = 8, kPatchHeight = 2;  // pixels of a patch, which is one vector
+constexpr int kTile = 16;        // pixels: height of a tile, and its width times a power of two
+constexpr int kMaxLevel = 4;     // tiles are up to kTile 2^kMaxLevel pixels wide, near the poles
 constexpr int kMoments = 16;     // floats that backward blending leaves for each (Gaussian, tile) instance
 constexpr float kAlphaMin = 1.0f / 255.0f;
 constexpr float kAlphaMax = 0.99f;
@@ -54,7 +55,7 @@ struct PixelBox {
 };
 static_assert(sizeof(PixelBox) == 20, "padgs/render/cpu_backend.py allocates 5 integers per box");
 
-// Tiles: rows of 16 pixels; in a row of level l a tile is 2^l chunks wide.
+// Tiles: rows of 16 pixels; in a row of level l a tile is 16 2^l pixels wide.
 struct TileGrid {
   int32_t width, height;
   int32_t first_row, end_row;  // rows of tiles that are drawn
@@ -62,11 +63,11 @@ struct TileGrid {
   const int64_t *row_start;    // [drawn rows + 1] tiles before each drawn row
 };
 
-// One (Gaussian, tile) pair, with the part of the tile that the Gaussian can reach.
+// One (Gaussian, tile) pair, with the patches of the tile that the Gaussian can reach.
 struct Instance {
   int32_t gaussian;
-  uint32_t slot;                          // where its moments go
-  uint8_t row, row_end, chunk, chunk_end;  // chunk_end is exclusive; rows and chunks count from the tile's corner
+  uint32_t slot;                             // where its moments go
+  uint8_t row, row_end, column, column_end;  // of patches, from the tile's corner; ends are exclusive
 };
 static_assert(sizeof(Instance) == 12, "padgs/render/cpu_backend.py allocates 3 integers per instance");
 
@@ -82,7 +83,7 @@ struct Gradients {
   double *pose;                                        // [12] or null
 };
 
-// Directions of the pixels, for projective footprints. Rows are padded to whole chunks.
+// Directions of the pixels, for projective footprints. Rows are padded to whole tiles.
 struct Rays {
   const float *column_sine, *column_cosine;  // [padded W] of the longitude   } a panorama
   const float *row_sine, *row_cosine;        // [H] of the latitude           }

@@ -5,10 +5,19 @@
 #include <cstring>
 #include <vector>
 
+#if defined(_OPENMP)
+#include <omp.h>
+#endif
+
 #include "runs.h"
 
 namespace padgs {
 namespace {
+
+constexpr int kTileShift = 1;  // a tile of level l is 2^(l + kTileShift) patches wide
+static_assert(kTile == kPatchWidth << kTileShift, "chosen for patches half as wide as the narrowest tile");
+constexpr int64_t kAhead = 16;  // Gaussians to ask for in advance, where they are scattered in memory
+
 
 // Stable radix sort of the indices of visible Gaussians by depth; positive floats order as their bits do.
 std::vector<int32_t> depth_order(const Footprint *footprints, const PixelBox *boxes, int64_t count) {
@@ -39,27 +48,36 @@ std::vector<int32_t> depth_order(const Footprint *footprints, const PixelBox *bo
   return order;
 }
 
-// Calls visit(tile, instance part) for each drawn tile of the box, in a fixed order.
+// The patches that a Gaussian can reach: a pixel box in other units, as the passes over all instances read it.
+struct PatchBox {
+  int32_t gaussian;
+  uint16_t column, column_end, second_end, row, row_end;
+
+  PatchBox(const PixelBox &box, int32_t index)
+      : gaussian(index), column(uint16_t(box.column / kPatchWidth)), column_end(uint16_t(units(box.column_end, kPatchWidth))),
+        second_end(uint16_t(units(box.second_end, kPatchWidth))), row(uint16_t(box.row / kPatchHeight)),
+        row_end(uint16_t(units(box.row_end, kPatchHeight))) {}
+};
+
+constexpr int kPatchRows = kTile / kPatchHeight;  // of a tile
+
+// Calls visit(row, run) for each run of drawn tiles of a box, in a fixed order.
 template <typename Visit>
-void for_each_tile(const PixelBox &box, const TileGrid &grid, Visit visit) {
-  if (box.row == box.row_end) return;
-  const int end = std::min((box.row_end - 1) / kTile + 1, grid.end_row);
-  for (int row = std::max(box.row / kTile, grid.first_row); row < end; ++row) {
-    const int level = grid.level[row], y0 = row * kTile;
-    const int64_t base = grid.row_start[row - grid.first_row];
-    Instance part{};
-    part.row = uint8_t(std::max(box.row - y0, 0));
-    part.row_end = uint8_t(std::min(box.row_end - y0, kTile));
+inline void for_each_run(const PatchBox &box, const TileGrid &grid, Visit visit) {
+  const int end = std::min((box.row_end - 1) / kPatchRows + 1, grid.end_row);
+  for (int row = std::max(box.row / kPatchRows, grid.first_row); row < end; ++row) {
     Run runs[2];
-    const int count = runs_in_row(box, level, runs);
-    for (int r = 0; r < count; ++r)
-      for (int tile = runs[r].tile; tile < runs[r].tile_end; ++tile) {
-        const int first = tile << level;
-        part.chunk = uint8_t(std::max(runs[r].chunk - first, 0));
-        part.chunk_end = uint8_t(std::min(runs[r].chunk_end - first, 1 << level));
-        visit(base + tile, part);
-      }
+    const int count = runs_in_row(box.column, box.column_end, box.second_end, grid.level[row] + kTileShift, runs);
+    for (int r = 0; r < count; ++r) visit(row, runs[r]);
   }
+}
+
+int threads() {
+#ifdef _OPENMP
+  return omp_get_max_threads();
+#else
+  return 1;
+#endif
 }
 
 }  // namespace
@@ -69,13 +87,13 @@ using namespace padgs;
 
 // Widths of tiles by row, so that a tile covers about the same angle at every latitude: level = round(log2(1 / cos)).
 PADGS_API void padgs_tile_levels(const Camera *camera, int32_t *level) {
-  const int rows = int(chunks(camera->height));
+  const int rows = units(camera->height, kTile);
   for (int row = 0; row < rows; ++row) {
     level[row] = 0;
     if (camera->model != kPanoramaModel || camera->square) continue;
     const double latitude = ((row + 0.5) * kTile / camera->height - 0.5) * 3.14159265358979323846;
     const int wanted = int(std::lround(std::log2(1 / std::max(std::cos(latitude), 1e-3))));
-    while (level[row] < std::min(wanted, kMaxLevel) && (2 << level[row]) <= chunks(camera->width)) ++level[row];
+    while (level[row] < std::min(wanted, kMaxLevel) && (2 << level[row]) <= units(camera->width, kTile)) ++level[row];
   }
 }
 
@@ -90,15 +108,11 @@ PADGS_API int64_t padgs_depth_order(const Footprint *footprints, const PixelBox 
 PADGS_API void padgs_count_instances(const PixelBox *boxes, int64_t count, const int32_t *level, int32_t rows,
                                      int64_t *per_row) {
   std::fill_n(per_row, rows, int64_t(0));
-  for (int64_t i = 0; i < count; ++i) {
-    const PixelBox &box = boxes[i];
-    if (box.row == box.row_end) continue;
-    for (int row = box.row / kTile; row <= (box.row_end - 1) / kTile; ++row) {
-      Run runs[2];
-      const int pieces = runs_in_row(box, level[row], runs);
-      for (int r = 0; r < pieces; ++r) per_row[row] += runs[r].tile_end - runs[r].tile;
-    }
-  }
+  const TileGrid grid{0, 0, 0, rows, level, nullptr};
+  for (int64_t i = 0; i < count; ++i)
+    if (boxes[i].row < boxes[i].row_end)
+      for_each_run(PatchBox(boxes[i], int32_t(i)), grid,
+                   [&](int row, const Run &run) { per_row[row] += run.tile_end - run.tile; });
 }
 
 // Fills the lists of the grid's drawn tiles.
@@ -108,16 +122,25 @@ PADGS_API void padgs_bin(const PixelBox *boxes, int64_t count, const int32_t *or
                          const TileGrid *grid, int64_t *slot_start, int64_t *tile_start, Instance *instances) {
   const int64_t tiles = grid->row_start[grid->end_row - grid->first_row];
   std::fill_n(slot_start, count + 1, int64_t(0));
-  // Each block of Gaussians, in depth order, has its own histogram: blocks can be filled at the same time.
-  const int64_t block_size = std::max<int64_t>(4096, (visible + 63) / 64);
-  const int64_t blocks = (visible + block_size - 1) / block_size;
+  // Each thread takes a block of the Gaussians, in depth order, and has a histogram of its own. Counting sort is stable,
+  // so that the lists do not depend on how many blocks there are.
+  const int blocks = threads();
+  const auto start = [&](int64_t block) { return visible * block / blocks; };
   std::vector<int64_t> next(blocks * tiles, 0);
+  std::vector<std::vector<PatchBox>> sorted(blocks);
 #pragma omp parallel for schedule(static, 1)
-  for (int64_t block = 0; block < blocks; ++block) {
+  for (int block = 0; block < blocks; ++block) {
     int64_t *histogram = next.data() + block * tiles;
-    for (int64_t i = block * block_size; i < std::min(visible, (block + 1) * block_size); ++i) {
+    sorted[block].reserve(start(block + 1) - start(block));
+    for (int64_t i = start(block); i < start(block + 1); ++i) {
+      if (i + kAhead < visible) __builtin_prefetch(boxes + order[i + kAhead]);
+      sorted[block].emplace_back(boxes[order[i]], order[i]);
       int64_t own = 0;
-      for_each_tile(boxes[order[i]], *grid, [&](int64_t tile, const Instance &) { ++histogram[tile], ++own; });
+      for_each_run(sorted[block].back(), *grid, [&](int row, const Run &run) {
+        int64_t *tile = histogram + grid->row_start[row - grid->first_row];
+        for (int t = run.tile; t < run.tile_end; ++t) ++tile[t];
+        own += run.tile_end - run.tile;
+      });
       slot_start[order[i] + 1] = own;
     }
   }
@@ -125,7 +148,7 @@ PADGS_API void padgs_bin(const PixelBox *boxes, int64_t count, const int32_t *or
   int64_t total = 0;
   for (int64_t tile = 0; tile < tiles; ++tile) {
     tile_start[tile] = total;
-    for (int64_t block = 0; block < blocks; ++block) {
+    for (int block = 0; block < blocks; ++block) {
       const int64_t here = next[block * tiles + tile];
       next[block * tiles + tile] = total;
       total += here;
@@ -133,15 +156,25 @@ PADGS_API void padgs_bin(const PixelBox *boxes, int64_t count, const int32_t *or
   }
   tile_start[tiles] = total;
 #pragma omp parallel for schedule(static, 1)
-  for (int64_t block = 0; block < blocks; ++block) {
+  for (int block = 0; block < blocks; ++block) {
     int64_t *cursor = next.data() + block * tiles;
-    for (int64_t i = block * block_size; i < std::min(visible, (block + 1) * block_size); ++i) {
-      const int32_t index = order[i];
-      uint32_t slot = uint32_t(slot_start[index]);
-      for_each_tile(boxes[index], *grid, [&](int64_t tile, Instance part) {
-        part.gaussian = index;
-        part.slot = slot++;
-        instances[cursor[tile]++] = part;
+    const std::vector<PatchBox> &own = sorted[block];
+    for (size_t i = 0; i < own.size(); ++i) {
+      if (i + kAhead < own.size()) __builtin_prefetch(slot_start + own[i + kAhead].gaussian);
+      const PatchBox &box = own[i];
+      Instance part{box.gaussian, uint32_t(slot_start[box.gaussian]), 0, 0, 0, 0};
+      for_each_run(box, *grid, [&](int row, const Run &run) {
+        const int64_t base = grid->row_start[row - grid->first_row];
+        const int shift = grid->level[row] + kTileShift, top = row * kPatchRows;
+        part.row = uint8_t(std::max(box.row - top, 0));
+        part.row_end = uint8_t(std::min(box.row_end - top, kPatchRows));
+        for (int tile = run.tile; tile < run.tile_end; ++tile) {
+          const int first = tile << shift;
+          part.column = uint8_t(std::max(run.column - first, 0));
+          part.column_end = uint8_t(std::min(run.column_end - first, 1 << shift));
+          instances[cursor[base + tile]++] = part;
+          ++part.slot;
+        }
       });
     }
   }

@@ -1,7 +1,7 @@
 // Hybrid blending: each pixel keeps its K nearest fragments in order and blends the rest as one layer behind them. The
 // definition is padgs/render/hybrid.py. Nothing is sorted before; the tile lists may be in any order.
 //
-// A chunk of 16 x 16 pixels is finished before the next, so that its fragments stay in the cache. The backward pass
+// A column of patches, 8 x 16 pixels, is finished before the next, so that its fragments stay in the cache. The backward pass
 // collects the fragments again, turns every slot into what its derivative needs, and visits the list a second time.
 #include <cmath>
 #include <vector>
@@ -15,57 +15,64 @@ namespace padgs {
 namespace PADGS_ISA {
 namespace {
 
-// Sixteen rows of sixteen pixels.
-struct Chunk {
-  int index, x0, columns;
-  Mask inside;  // the image
-  Fragments *rows;
+constexpr int kPatchesInColumn = kTile / kPatchHeight;
 
-  Chunk(const BlendArguments &args, const Tile &tile, int i) : index(i), x0(tile.x0 + i * kTile) {
+// A column of patches of a tile, and their fragments.
+struct PatchColumn {
+  int index;
+  const Tile &tile;
+  const BlendArguments &args;
+  Fragments *fragments;  // [patch rows]
+
+  PatchColumn(const BlendArguments &args, const Tile &tile, int index) : index(index), tile(tile), args(args) {
     static thread_local std::vector<Slot> slots;
     static thread_local std::vector<Fragments> storage;
-    columns = std::min(kTile, args.grid.width - x0);
-    inside = less(iota(), splat(float(columns)));
     const int size = int(std::min<int64_t>(args.core_size, std::max<int64_t>(tile.end - tile.first, 1)));
-    if (slots.size() < size_t(kTile) * size) slots.resize(size_t(kTile) * size);
+    if (slots.size() < size_t(kPatchesInColumn) * size) slots.resize(size_t(kPatchesInColumn) * size);
     storage.clear();
-    for (int y = 0; y < kTile; ++y) storage.push_back({slots.data() + y * size, size, 0, Tail()});
-    rows = storage.data();
+    for (int row = 0; row < tile.patch_rows; ++row) storage.push_back({slots.data() + row * size, size, 0, Tail()});
+    fragments = storage.data();
   }
-  bool reached_by(const Instance &instance) const { return instance.chunk <= index && index < instance.chunk_end; }
-  int64_t pixel(const BlendArguments &args, const Tile &tile, int y) const {
-    return int64_t(tile.y0 + y) * args.grid.width + x0;
-  }
+  bool reached_by(const Instance &instance) const { return instance.column <= index && index < instance.column_end; }
+  int number(int row) const { return row * tile.patch_columns + index; }  // of a patch in the tile
+  Patch patch(int row) const { return Patch(tile, number(row), args.grid.width); }
 };
 
 // Where a Gaussian lies on the rays: for `ray` at its largest value there, |M^-1 mean| b / D; else at its mean.
 float ray_reach(const BlendArguments &args, const Footprint &f) {
   return args.projection == kRay ? 1.0f / std::sqrt(f.shape[9]) : 0.0f;
 }
-Vec distance(const ProjectiveRow &at, const Footprint &f, float reach) {
+Vec distance(const ProjectiveFootprint::At &at, const Footprint &f, float reach) {
   return reach > 0 ? at.b_by_d * reach : splat(f.depth);
 }
-Vec distance(const PlanarPixels::Row &, const Footprint &f, float) { return splat(f.depth); }
+Vec distance(const PlanarFootprint::At &, const Footprint &f, float) { return splat(f.depth); }
 
-// Brings all fragments of a chunk together; returns how many pairs were evaluated.
-template <class Pixels>
-int64_t collect(const BlendArguments &args, const Tile &tile, const Chunk &chunk) {
+template <class Seen>
+using Places = std::vector<typename Seen::Place>;
+
+// Brings all fragments of a column together; returns how many pairs were evaluated.
+template <class Seen>
+int64_t collect(const PatchColumn &column, const Places<Seen> &places) {
+  const BlendArguments &args = column.args;
+  const Tile &tile = column.tile;
+  Vec inside[kPatchesInColumn];
+  for (int row = 0; row < tile.patch_rows; ++row) inside[row] = column.patch(row).inside();
   int64_t evaluated = 0;
   for (int64_t i = tile.first; i < tile.end; ++i) {
     prefetch(args, i + kAhead, tile.end);
     const Instance instance = args.instances[i];
-    if (!chunk.reached_by(instance)) continue;
+    if (!column.reached_by(instance)) continue;
     const Footprint &f = args.footprints[instance.gaussian];
-    const Pixels pixels(f, args, chunk.x0);
+    const Seen g(f, args, tile);
     const float reach = ray_reach(args, f);
-    for (int y = instance.row; y < instance.row_end; ++y) {
-      const typename Pixels::Row at = pixels.row(args, tile.y0 + y);
-      const Mask reached = both(at.reached, chunk.inside);
+    for (int row = instance.row; row < instance.row_end; ++row) {
+      const typename Seen::At at = g.at(places[column.number(row)]);
+      const Mask reached = both(at.reached, less(zero(), inside[row]));
       if (!any(reached)) continue;
       const Vec alpha = keep(reached, minimum(exp2_fast(at.log2_alpha), splat(kAlphaMax)));
-      chunk.rows[y].add(args.footprints, instance.gaussian, distance(at, f, reach), alpha);
+      column.fragments[row].add(args.footprints, instance.gaussian, distance(at, f, reach), alpha);
     }
-    evaluated += kTile * (instance.row_end - instance.row);
+    evaluated += kLanes * (instance.row_end - instance.row);
   }
   return evaluated;
 }
@@ -82,14 +89,15 @@ Vec opacity_per_alpha(const Tail &tail) {
   return keep(some, (1.0f - tail.left) / select(some, tail.alpha, splat(1.0f)));
 }
 
-int64_t blend_row(const BlendArguments &args, const Tile &tile, const Chunk &chunk, int y) {
-  const Fragments &row = chunk.rows[y];
-  const Tail &tail = row.tail;
+int64_t blend_patch(const PatchColumn &column, int row) {
+  const BlendArguments &args = column.args;
+  const Fragments &fragments = column.fragments[row];
+  const Tail &tail = fragments.tail;
   Vec left = splat(1.0f), red = zero(), green = zero(), blue = zero(), depth = zero(), coverage = zero();
   int64_t contributing = 0;
-  for (int k = 0; k < row.filled; ++k) {
-    const Vec weight = row.core[k].alpha * left;
-    const Colors c = gather(args.footprints, row.core[k].gaussian);
+  for (int k = 0; k < fragments.filled; ++k) {
+    const Vec weight = fragments.core[k].alpha * left;
+    const Colors c = gather(args.footprints, fragments.core[k].gaussian);
     red += weight * c.red;
     green += weight * c.green;
     blue += weight * c.blue;
@@ -108,30 +116,28 @@ int64_t blend_row(const BlendArguments &args, const Tile &tile, const Chunk &chu
   store(lanes[2], blue + share * tail.blue + transmittance * args.background[2]);
   store(lanes[3], transmittance);
   store(lanes[4], select(less(zero(), coverage), (depth + share * tail.depth) / coverage, zero()));
-  const int64_t pixel = chunk.pixel(args, tile, y);
-  for (int x = 0; x < chunk.columns; ++x) {
-    for (int channel = 0; channel < 3; ++channel) args.image[3 * (pixel + x) + channel] = lanes[channel][x];
-    args.transmittance[pixel + x] = lanes[3][x];
-    args.depth[pixel + x] = lanes[4][x];
-  }
+  column.patch(row).each_pixel([&](int lane, int64_t pixel) {
+    for (int channel = 0; channel < 3; ++channel) args.image[3 * pixel + channel] = lanes[channel][lane];
+    args.transmittance[pixel] = lanes[3][lane];
+    args.depth[pixel] = lanes[4][lane];
+  });
   return contributing;
 }
 
-template <class Pixels>
-void forward_all(const BlendArguments &args) {
-  for_each_tile(args, [&](const Tile &tile, int64_t index) {
-    int64_t evaluated = 0, contributing = 0;
-    for (int i = 0; i < tile.chunks; ++i) {
-      const Chunk chunk(args, tile, i);
-      evaluated += collect<Pixels>(args, tile, chunk);
-      for (int y = 0; y < tile.rows; ++y) contributing += blend_row(args, tile, chunk, y);
-    }
-    args.pair_counts[2 * index] = evaluated;
-    args.pair_counts[2 * index + 1] = contributing;
-  });
+template <class Seen>
+void forward_tile(const BlendArguments &args, const Tile &tile, int64_t index) {
+  const Places<Seen> &places = places_of<Seen>(args, tile);
+  int64_t evaluated = 0, contributing = 0;
+  for (int i = 0; i < tile.patch_columns; ++i) {
+    const PatchColumn column(args, tile, i);
+    evaluated += collect<Seen>(column, places);
+    for (int row = 0; row < tile.patch_rows; ++row) contributing += blend_patch(column, row);
+  }
+  args.pair_counts[2 * index] = evaluated;
+  args.pair_counts[2 * index + 1] = contributing;
 }
 
-// Upstream gradients of a row of pixels, and what the derivatives of its tail fragments need. With s the signal of a
+// Upstream gradients of a patch, and what the derivatives of its tail fragments need. With s the signal of a
 // fragment (upstream gradient of its colour and depth times these), a fragment of weight alpha u has
 //   dL/dalpha = u (s - mean) - behind / (1 - alpha),
 // in the core u = what is in front leaves, mean = 0, behind = weighted signals behind it, background included;
@@ -140,32 +146,32 @@ struct Upstream {
   Vec red, green, blue, depth, offset;
   Vec unit, mean, behind;  // of the tail
   Vec furthest;            // distance at which the core ends
+  Vec inside;              // 1 inside the image, -1 outside
 
   Vec signal(Vec r, Vec g, Vec b, Vec d) const { return red * r + green * g + blue * b + depth * d + offset; }
 };
 
-// Loads a row and replaces distance and alpha of its slots by u and behind.
-Upstream differentiate_row(const BlendGradientArguments &args, const Tile &tile, const Chunk &chunk, int y) {
+// Loads a patch and replaces distance and alpha of its slots by u and behind.
+Upstream differentiate_patch(const BlendGradientArguments &args, const PatchColumn &column, int row) {
   const BlendArguments &forward = args.forward;
-  Fragments &row = chunk.rows[y];
-  const Tail &tail = row.tail;
+  Fragments &fragments = column.fragments[row];
+  const Tail &tail = fragments.tail;
   float grad[3][kLanes] = {}, through[kLanes] = {}, depth[kLanes] = {}, grad_depth[kLanes] = {};
-  const int64_t pixel = chunk.pixel(forward, tile, y);
-  for (int x = 0; x < chunk.columns; ++x) {
-    const int64_t p = pixel + x;
-    if (args.grad_transmittance) through[x] = args.grad_transmittance[p];
+  column.patch(row).each_pixel([&](int lane, int64_t pixel) {
+    if (args.grad_transmittance) through[lane] = args.grad_transmittance[pixel];
     for (int channel = 0; channel < 3; ++channel) {
-      grad[channel][x] = args.grad_image[3 * p + channel];
-      through[x] += grad[channel][x] * forward.background[channel];
+      grad[channel][lane] = args.grad_image[3 * pixel + channel];
+      through[lane] += grad[channel][lane] * forward.background[channel];
     }
-    if (args.grad_depth) depth[x] = forward.depth[p], grad_depth[x] = args.grad_depth[p];
-  }
+    if (args.grad_depth) depth[lane] = forward.depth[pixel], grad_depth[lane] = args.grad_depth[pixel];
+  });
   Upstream up;
-  up.furthest = row.filled == row.size ? row.core[row.size - 1].distance : splat(kEmpty);
+  up.inside = column.patch(row).inside();
+  up.furthest = fragments.filled == fragments.size ? fragments.core[fragments.size - 1].distance : splat(kEmpty);
   Vec left = splat(1.0f), coverage = zero();
-  for (int k = 0; k < row.filled; ++k) {
-    const Vec weight = row.core[k].alpha * left;
-    row.core[k].distance = left;
+  for (int k = 0; k < fragments.filled; ++k) {
+    const Vec weight = fragments.core[k].alpha * left;
+    fragments.core[k].distance = left;
     coverage += weight;
     left = left_behind(left, weight);
   }
@@ -180,8 +186,8 @@ Upstream differentiate_row(const BlendGradientArguments &args, const Tile &tile,
   up.mean = keep(some, up.signal(tail.red * each, tail.green * each, tail.blue * each, tail.depth * each));
   up.behind = left * tail.left * (load(through) - up.mean);
   Vec behind = up.unit * tail.alpha * up.mean + left * tail.left * load(through);
-  for (int k = row.filled - 1; k >= 0; --k) {
-    Slot &slot = row.core[k];
+  for (int k = fragments.filled - 1; k >= 0; --k) {
+    Slot &slot = fragments.core[k];
     const Colors c = gather(forward.footprints, slot.gaussian);
     const Vec here = slot.alpha * slot.distance * up.signal(c.red, c.green, c.blue, c.depth);
     slot.alpha = behind;
@@ -190,38 +196,40 @@ Upstream differentiate_row(const BlendGradientArguments &args, const Tile &tile,
   return up;
 }
 
-// The moments of every instance over the pixels of one chunk, added to those of the chunks before.
-template <class Pixels>
-void add_moments(const BlendGradientArguments &args, const Tile &tile, const Chunk &chunk, const Upstream *upstream) {
+// The moments of every instance over the patches of one column, added to those of the columns before.
+template <class Seen>
+void add_moments(const BlendGradientArguments &args, const PatchColumn &column, const Upstream *upstream,
+                 const Places<Seen> &places, Places<Seen> &ray_gradients) {
   const BlendArguments &forward = args.forward;
+  const Tile &tile = column.tile;
   for (int64_t i = tile.first; i < tile.end; ++i) {
     prefetch(forward, i + kAhead, tile.end);
     const Instance instance = forward.instances[i];
-    if (!chunk.reached_by(instance)) continue;
+    if (!column.reached_by(instance)) continue;
     const Footprint &f = forward.footprints[instance.gaussian];
-    const Pixels pixels(f, forward, chunk.x0);
+    const Seen g(f, forward, tile);
     const VecI gaussian = splat_int(instance.gaussian);
     const float reach = ray_reach(forward, f);
     const Vec f_red = splat(f.red), f_green = splat(f.green), f_blue = splat(f.blue), f_depth = splat(f.depth);
-    typename Pixels::ChunkMoments in_chunk;
+    typename Seen::Moments moments;
     Vec red = zero(), green = zero(), blue = zero(), depth = zero();
-    for (int y = instance.row; y < instance.row_end; ++y) {
-      const typename Pixels::Row at = pixels.row(forward, tile.y0 + y);
-      const Mask reached = both(at.reached, chunk.inside);
+    for (int row = instance.row; row < instance.row_end; ++row) {
+      const typename Seen::At at = g.at(places[column.number(row)]);
+      const Upstream &up = upstream[row];
+      const Mask reached = both(at.reached, less(zero(), up.inside));
       if (!any(reached)) continue;
       const Vec full = exp2_fast(at.log2_alpha);
       const Vec alpha = keep(reached, minimum(full, splat(kAlphaMax)));
-      const Upstream &up = upstream[y];
-      const Fragments &row = chunk.rows[y];
+      const Fragments &fragments = column.fragments[row];
       Vec unit = up.unit, mean = up.mean, behind = up.behind;
       // The margins are for rounding, which may differ from that of `collect`; what is not found is in the tail.
       const Mask near = at_least(up.furthest * 1.001f, distance(at, f, reach));
       Mask sought = both(near, at_least(alpha, splat(kCoreAlphaMin * 0.999f)));
-      for (int k = 0; k < row.filled && any(sought); ++k) {
-        const Mask found = both(sought, equal(row.core[k].gaussian, gaussian));
-        unit = select(found, row.core[k].distance, unit);
+      for (int k = 0; k < fragments.filled && any(sought); ++k) {
+        const Mask found = both(sought, equal(fragments.core[k].gaussian, gaussian));
+        unit = select(found, fragments.core[k].distance, unit);
         mean = select(found, zero(), mean);
-        behind = select(found, row.core[k].alpha, behind);
+        behind = select(found, fragments.core[k].alpha, behind);
         sought = without(sought, found);
       }
       const Vec weight = alpha * unit;
@@ -231,11 +239,10 @@ void add_moments(const BlendGradientArguments &args, const Tile &tile, const Chu
       green += weight * up.green;
       blue += weight * up.blue;
       depth += weight * up.depth;
-      in_chunk.add(at, m);
-      if (args.grad_rays) pixels.add_ray_gradient(f, at, m, args.grad_rays, forward.grid.width, tile.y0 + y);
+      moments.add(at, m);
+      if constexpr (Seen::kOfRays)
+        if (args.grad_rays) g.add_ray_gradient(at, m, ray_gradients[column.number(row)]);
     }
-    typename Pixels::Moments moments;
-    moments.add(pixels, in_chunk);
     Vec sums[kMoments];
     moments.finish(sums);
     sums[10] = red, sums[11] = green, sums[12] = blue, sums[13] = depth;
@@ -243,42 +250,40 @@ void add_moments(const BlendGradientArguments &args, const Tile &tile, const Chu
     float totals[kMoments];
     for (int k = 0; k < kMoments; k += 4) sum4(sums + k, totals + k);
     float *out = args.moments + int64_t(instance.slot) * kMoments;
-    const bool first = chunk.index == instance.chunk;
+    const bool first = column.index == instance.column;
     for (int k = 0; k < kMoments; ++k) out[k] = first ? totals[k] : out[k] + totals[k];
   }
 }
 
-template <class Pixels>
-void backward_all(const BlendGradientArguments &args) {
-  for_each_tile(args.forward, [&](const Tile &tile, int64_t) {
-    Upstream upstream[kTile];
-    for (int i = 0; i < tile.chunks; ++i) {
-      const Chunk chunk(args.forward, tile, i);
-      collect<Pixels>(args.forward, tile, chunk);
-      for (int y = 0; y < tile.rows; ++y) upstream[y] = differentiate_row(args, tile, chunk, y);
-      add_moments<Pixels>(args, tile, chunk, upstream);
-    }
-  });
+template <class Seen>
+void backward_tile(const BlendGradientArguments &args, const Tile &tile) {
+  const Places<Seen> &places = places_of<Seen>(args.forward, tile);
+  Places<Seen> ray_gradients;
+  if constexpr (Seen::kOfRays)
+    if (args.grad_rays) ray_gradients.resize(tile.patches());
+  Upstream upstream[kPatchesInColumn];
+  for (int i = 0; i < tile.patch_columns; ++i) {
+    const PatchColumn column(args.forward, tile, i);
+    collect<Seen>(column, places);
+    for (int row = 0; row < tile.patch_rows; ++row) upstream[row] = differentiate_patch(args, column, row);
+    add_moments<Seen>(args, column, upstream, places, ray_gradients);
+  }
+  if constexpr (Seen::kOfRays)
+    if (args.grad_rays) add_ray_gradients(args, tile, ray_gradients);
 }
 
 bool planar(const BlendArguments &args) { return args.projection == kErp || args.projection == kPinhole; }
 
 void hybrid_forward(const BlendArguments &args) {
-  if (planar(args))
-    forward_all<PlanarPixels>(args);
-  else if (args.rays.table)
-    forward_all<TablePixels>(args);
-  else
-    forward_all<PanoramaPixels>(args);
+  for_each_tile(args, [&](const Tile &tile, int64_t index) {
+    planar(args) ? forward_tile<PlanarFootprint>(args, tile, index) : forward_tile<ProjectiveFootprint>(args, tile, index);
+  });
 }
 
 void hybrid_backward(const BlendGradientArguments &args) {
-  if (planar(args.forward))
-    backward_all<PlanarPixels>(args);
-  else if (args.forward.rays.table)
-    backward_all<TablePixels>(args);
-  else
-    backward_all<PanoramaPixels>(args);
+  for_each_tile(args.forward, [&](const Tile &tile, int64_t) {
+    planar(args.forward) ? backward_tile<PlanarFootprint>(args, tile) : backward_tile<ProjectiveFootprint>(args, tile);
+  });
 }
 
 }  // namespace

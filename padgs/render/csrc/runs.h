@@ -6,25 +6,28 @@
 
 namespace padgs {
 
-PADGS_HD int chunks(int width) { return (width + kTile - 1) / kTile; }
+PADGS_HD int units(int pixels, int size) { return (pixels + size - 1) / size; }
+PADGS_HD int chunks(int width) { return units(width, kTile); }
 
-// A run of tiles in one row, and the chunks [first, end) of the image that the footprint reaches there.
+// A run of tiles in one row, and the columns [column, column_end) of the image that the footprint reaches there.
 struct Run {
-  int tile, tile_end, chunk, chunk_end;
+  int tile, tile_end, column, column_end;
 };
 
-// The tiles of one row of level `level` that a box touches: one run, or two across the seam; each tile once.
+// The tiles of one row that a box touches: one run, or two across the seam; each tile once. Columns are counted in any
+// unit of which a tile has 2^shift.
+PADGS_HD int runs_in_row(int column, int column_end, int second_end, int shift, Run *runs) {
+  runs[0] = {column >> shift, ((column_end - 1) >> shift) + 1, column, column_end};
+  if (second_end == 0) return 1;
+  runs[1] = {0, ((second_end - 1) >> shift) + 1, 0, second_end};
+  if (runs[1].tile_end <= runs[0].tile) return 2;
+  runs[0].tile = runs[0].column = 0;  // both pieces meet in a tile: take it, and with it the whole row, once
+  return 1;
+}
+
+// The same for a box of pixels and tiles of level `level`, in chunks of 16 pixels.
 PADGS_HD int runs_in_row(const PixelBox &box, int level, Run *runs) {
-  const int chunk = box.column / kTile, chunk_end = chunks(box.column_end);
-  runs[0] = {chunk >> level, ((chunk_end - 1) >> level) + 1, chunk, chunk_end};
-  if (box.second_end == 0) return 1;
-  const int second_end = chunks(box.second_end), second_tiles = ((second_end - 1) >> level) + 1;
-  if (second_tiles > runs[0].tile) {  // both pieces meet in a tile: take it, and with it the whole row, once
-    runs[0] = {0, runs[0].tile_end, 0, chunk_end};
-    return 1;
-  }
-  runs[1] = {0, second_tiles, 0, second_end};
-  return 2;
+  return runs_in_row(box.column / kTile, chunks(box.column_end), chunks(box.second_end), level, runs);
 }
 
 }  // namespace padgs

@@ -83,6 +83,12 @@ PADGS_INLINE Vec round_nearest(Vec a) { return vec(_mm512_roundscale_ps(raw(a), 
 PADGS_INLINE Vec round_down(Vec a) { return vec(_mm512_roundscale_ps(raw(a), 1)); }
 PADGS_INLINE Vec scale_by_power(Vec a, Vec n) { return vec(_mm512_scalef_ps(raw(a), raw(n))); }
 
+// 1 / a to one unit in the last place or so, without the slow division.
+PADGS_INLINE Vec reciprocal(Vec a) {
+  const Vec guess = vec(_mm512_rcp14_ps(raw(a)));
+  return guess + guess * (1.0f - a * guess);
+}
+
 #else
 
 struct Mask {
@@ -117,6 +123,7 @@ PADGS_INLINE VecI select_int(Mask m, VecI a, VecI b) {
   PADGS_EACH_PART r.p[i] = (a.p[i] & m.p[i]) | (b.p[i] & ~m.p[i]);
   return r;
 }
+PADGS_INLINE Vec reciprocal(Vec a) { return 1.0f / a; }
 PADGS_INLINE Vec minimum(Vec a, Vec b) { return select(less(a, b), a, b); }
 PADGS_INLINE Vec maximum(Vec a, Vec b) { return select(less(a, b), b, a); }
 // Adding and subtracting 1.5 * 2^23 rounds to the nearest integer; right for |a| < 2^22, which is all we have.

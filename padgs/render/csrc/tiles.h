@@ -1,27 +1,64 @@
-// The tiles of an image as blending visits them.
+// The tiles of an image as blending visits them, and their patches: 8 x 2 pixels, one for each vector lane.
 #pragma once
 
 #include <algorithm>
 
 #include "abi.h"
+#include "simd.h"
 
 namespace padgs {
 namespace PADGS_ISA {
 
+static_assert(kPatchWidth * kPatchHeight == kLanes, "a patch is a vector");
+
 // One tile's place in the image.
 struct Tile {
-  int x0, y0, chunks, columns, rows;
+  int x0, y0, columns, rows;        // pixels
+  int patch_columns, patch_rows;
   int64_t first, end;  // its instances
+
+  int patches() const { return patch_columns * patch_rows; }
 };
 
 inline Tile tile_at(const BlendArguments &args, int row, int64_t index) {
   const TileGrid &grid = args.grid;
   const int level = grid.level[row], y0 = row * kTile;
   const int x0 = int(index - grid.row_start[row - grid.first_row]) * (kTile << level);
-  const int columns = std::min(kTile << level, grid.width - x0);
-  return {x0, y0, (columns + kTile - 1) / kTile, columns, std::min(kTile, grid.height - y0), args.tile_start[index],
+  const int columns = std::min(kTile << level, grid.width - x0), rows = std::min(kTile, grid.height - y0);
+  return {x0,
+          y0,
+          columns,
+          rows,
+          (columns + kPatchWidth - 1) / kPatchWidth,
+          (rows + kPatchHeight - 1) / kPatchHeight,
+          args.tile_start[index],
           args.tile_start[index + 1]};
 }
+
+// One patch of a tile; patches are numbered row by row. What lies beyond the image is in no pixel.
+struct Patch {
+  int x0, y0, columns, rows;  // pixels inside the image
+  int width;                  // of the image
+
+  Patch(const Tile &tile, int index, int image_width)
+      : x0(tile.x0 + index % tile.patch_columns * kPatchWidth), y0(tile.y0 + index / tile.patch_columns * kPatchHeight),
+        columns(std::min(kPatchWidth, tile.x0 + tile.columns - x0)),
+        rows(std::min(kPatchHeight, tile.y0 + tile.rows - y0)), width(image_width) {}
+
+  // Calls visit(lane, pixel) for each pixel inside the image.
+  template <typename Visit>
+  void each_pixel(Visit visit) const {
+    for (int y = 0; y < rows; ++y)
+      for (int x = 0; x < columns; ++x) visit(y * kPatchWidth + x, int64_t(y0 + y) * width + x0 + x);
+  }
+  // 1 inside the image, -1 outside.
+  Vec inside() const {
+    float lanes[kLanes];
+    std::fill_n(lanes, kLanes, -1.0f);
+    each_pixel([&](int lane, int64_t) { lanes[lane] = 1; });
+    return load(lanes);
+  }
+};
 
 // Calls visit(tile, index) for every drawn tile, several at a time.
 template <typename Visit>
@@ -36,9 +73,10 @@ void for_each_tile(const BlendArguments &args, Visit visit) {
   }
 }
 
-// Footprints are scattered in memory; ask for those of the instances to come.
-constexpr int kAhead = 8;
-inline void prefetch(const BlendArguments &args, int64_t instance, int64_t end) {
+// Footprints are scattered in memory; ask for those of the instances to come. Inlined always, because GCC takes a function
+// that only prefetches for one without effect and drops its calls.
+constexpr int kAhead = 16;
+PADGS_INLINE void prefetch(const BlendArguments &args, int64_t instance, int64_t end) {
   if (instance < end) __builtin_prefetch(args.footprints + args.instances[instance].gaussian);
 }
 
