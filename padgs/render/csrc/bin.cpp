@@ -18,7 +18,6 @@ constexpr int kTileShift = 1;  // a tile of level l is 2^(l + kTileShift) patche
 static_assert(kTile == kPatchWidth << kTileShift, "chosen for patches half as wide as the narrowest tile");
 constexpr int64_t kAhead = 16;  // Gaussians to ask for in advance, where they are scattered in memory
 
-
 // Stable radix sort of the indices of visible Gaussians by depth; positive floats order as their bits do.
 std::vector<int32_t> depth_order(const Footprint *footprints, const PixelBox *boxes, int64_t count) {
   constexpr int kBits = 11, kBuckets = 1 << kBits, kPasses = 3;
