@@ -1,4 +1,4 @@
-"""Tables and charts from result files. Nothing here trains, renders or imports torch; every number comes from a
+"""Tables, charts and a page from result files. Nothing here trains, renders or imports torch; every number comes from a
 `result.json`, from the log beside it, or from the file of published numbers.
 
 A table is a function `build(results, request) -> Table`, an entry of `reports.gathered.TABLES`; writers turn any
@@ -13,4 +13,5 @@ REPORTS = {
     "runs": "reports.files:runs",
     "sweep": "reports.files:sweep",
     "chart": "reports.files:chart",
+    "html": "reports.files:html",
 }

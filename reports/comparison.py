@@ -109,7 +109,9 @@ def _columns(measure: Measure, beside_the_paper: bool) -> list[Column]:
     columns = [measure.column]
     if beside_the_paper and measure.published:
         decimals = min(measure.column.decimals, 2) if not measure.difference else measure.column.decimals
-        columns.append(Column("paper", decimals, measure.column.higher_is_better, group=measure.column.group))
+        columns.append(
+            Column("paper", decimals, measure.column.higher_is_better, group=measure.column.group, optional=True)
+        )
         if measure.difference:
-            columns.append(Column("Δ", measure.column.decimals, signed=True, group=measure.column.group))
+            columns.append(Column("Δ", measure.column.decimals, signed=True, group=measure.column.group, optional=True))
     return columns

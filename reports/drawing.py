@@ -5,12 +5,15 @@ from __future__ import annotations
 import html
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
 
 from reports import methods
 
+P = ParamSpec("P")
+T = TypeVar("T")
 # Okabe and Ito's colours, which colour-blind readers can tell apart; one for each method, in the order of the tables.
 COLORS = ("#E69F00", "#56B4E9", "#009E73", "#D55E00", "#0072B2", "#CC79A7", "#000000", "#8c6d31", "#7f7f7f")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*")
@@ -25,6 +28,8 @@ STYLE: dict[Any, Any] = {
     "grid.color": "#e3e3e3",
     "grid.linewidth": 0.6,
     "axes.axisbelow": True,
+    "legend.frameon": False,
+    "text.parse_math": False,  # a name with a $ in it is a name
 }
 DPI = 110
 
@@ -52,14 +57,25 @@ class Chart:
     png: bytes
 
 
+def styled(draw: Callable[P, T]) -> Callable[P, T]:
+    """Let a function that draws use `STYLE`, which matplotlib reads whenever something is added to a figure."""
+
+    @wraps(draw)
+    def in_style(*arguments: P.args, **named: P.kwargs) -> T:
+        from matplotlib import rc_context
+
+        with rc_context(STYLE):
+            return draw(*arguments, **named)
+
+    return in_style
+
+
 def figure(columns: int, rows: int, width: float = 3.0, height: float = 2.6) -> tuple[Any, Any]:
     """A figure with a grid of axes [rows, columns]; inches per panel."""
-    from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    with rc_context(STYLE):
-        made = Figure(figsize=(columns * width, rows * height), layout="constrained")
-        return made, made.subplots(rows, columns, squeeze=False)
+    made = Figure(figsize=(columns * width, rows * height), layout="constrained")
+    return made, made.subplots(rows, columns, squeeze=False)
 
 
 def dress(axis: Any, values: Sequence[float], log_from: float = math.inf) -> None:
@@ -81,13 +97,10 @@ def dress(axis: Any, values: Sequence[float], log_from: float = math.inf) -> Non
 
 def finish(made: Any, name: str, title: str, tips: Tips) -> Chart:
     """Title and files of a figure."""
-    from matplotlib import rc_context
-
-    with rc_context(STYLE):
-        made.suptitle(title, fontsize=10.5)
-        svg, png = io.StringIO(), io.BytesIO()
-        made.savefig(svg, format="svg", metadata={"Date": None, "Creator": None})
-        made.savefig(png, format="png", dpi=DPI, metadata={"Software": None})
+    made.suptitle(title, fontsize=10.5)
+    svg, png = io.StringIO(), io.BytesIO()
+    made.savefig(svg, format="svg", metadata={"Date": None, "Creator": None})
+    made.savefig(png, format="png", dpi=DPI, metadata={"Software": None})
     return Chart(name, title, _with_tips(svg.getvalue(), tips), png.getvalue())
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import partial
 
-from reports import csv_text, latex, markdown, sweeps, trade_off
+from reports import csv_text, latex, markdown, page, sweeps, trade_off
 from reports.drawing import Chart
 from reports.gathered import Gathered
 
@@ -37,6 +37,11 @@ def chart(gathered: Gathered) -> Iterator[File]:
         for drawn in charts:
             yield from _pictures(drawn)
         yield f"{made.name}.csv", trade_off.csv_text(made).encode()
+
+
+def html(gathered: Gathered) -> Iterator[File]:
+    """The page with everything."""
+    yield "report.html", page.text(gathered).encode()
 
 
 def _pictures(chart: Chart) -> Iterator[File]:

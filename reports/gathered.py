@@ -13,7 +13,7 @@ from reports.drawing import Chart
 from reports.quality_log import probes
 from reports.request import Request
 from reports.sweeps import Sweep, sweeps
-from reports.table import ReportError, Table
+from reports.table import Table
 from reports.trade_off import TradeOff, trade_offs
 
 TABLES: Mapping[str, Callable[[Sequence[Result], Request], Table]] = {
@@ -32,6 +32,7 @@ class Gathered:
     folder: Path
     results: Sequence[Result]
     request: Request
+    left_out: Sequence[str] = ()  # why which result files could not be used
 
     def table(self, name: str) -> Table:
         """A table of `TABLES`."""
@@ -54,11 +55,3 @@ class Gathered:
     @cached_property
     def _tables(self) -> dict[str, Table]:
         return {}
-
-
-def attempt(make: Callable[[], object], refused: list[str]) -> None:
-    """Do what can be done, and keep the reason where it is refused."""
-    try:
-        make()
-    except ReportError as error:
-        refused.append(str(error))

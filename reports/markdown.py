@@ -10,7 +10,8 @@ def text(table: Table) -> str:
     """The whole table with its title and footnotes."""
     parts = [f"## {table.title}"]
     for block in table.blocks:
-        parts.append(f"### {block.title}\n\n{_block(table, block)}")
+        alone = table.alone(block)
+        parts.append(f"### {block.title}\n\n{_block(alone, alone.blocks[0])}")
     if table.notes:
         parts.append("\n".join(f"- {_escaped(note)}" for note in table.notes))
     return "\n\n".join(parts) + "\n"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from reports.drawing import COLORS, MARKERS, Chart, Tips, dress, figure, finish
+from reports.drawing import COLORS, MARKERS, Chart, Tips, dress, figure, finish, styled
 from reports.measures import Measure
 from reports.sweeps import Line, Sweep, cell
 
@@ -13,6 +13,7 @@ LOGARITHMIC = 20  # from this ratio of the largest to the smallest value on
 PAPER_CHOICES = {"method.tau": 0.9, "train.lambda_l1": 0.8, "method.offsets": 10, "method.features": 32}
 
 
+@styled
 def chart(sweep: Sweep) -> Chart:
     """A panel for each quantity; the dotted line is the paper's choice."""
     rows = -(-len(sweep.measures) // COLUMNS)
@@ -26,7 +27,7 @@ def chart(sweep: Sweep) -> Chart:
         panel.set_axis_off()
     handles, labels = axes[0, 0].get_legend_handles_labels()
     if handles:
-        made.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
+        made.legend(handles, labels, loc="outside lower center", ncols=3)
     return finish(made, sweep.file_name, f"Sweep {sweep.name}: mean and standard deviation over seeds", tips)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 MISSING = "–"
 
@@ -21,6 +21,7 @@ class Column:
     higher_is_better: bool | None = None  # None: neither end is best
     signed: bool = False  # a difference: always with its sign
     group: str = ""  # heading over neighbouring columns
+    optional: bool = False  # left out of a block that has nothing in it, where blocks stand as tables of their own
 
     @property
     def heading(self) -> str:
@@ -77,6 +78,17 @@ class Table:
     columns: tuple[Column, ...]
     blocks: tuple[Block, ...]
     notes: tuple[str, ...] = field(default=())
+
+    def alone(self, block: Block) -> Table:
+        """One block as a table of its own, without the optional columns that it has nothing in."""
+        kept = [
+            index
+            for index, column in enumerate(self.columns)
+            if not column.optional or any(row.cells[index] != Cell() for row in block.rows)
+        ]
+        rows = tuple(Row(row.title, tuple(row.cells[index] for index in kept)) for row in block.rows)
+        columns = tuple(self.columns[index] for index in kept)
+        return replace(self, columns=columns, blocks=(Block(block.title, rows),))
 
 
 def shown(value: float, column: Column) -> str:

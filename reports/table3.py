@@ -57,8 +57,8 @@ def _columns(protocol: str) -> tuple[Column, ...]:
         ours = column(PROTOCOL_METRICS[protocol][name], group=name.upper())
         columns.append(ours)
         if protocol == published.PROTOCOL:
-            columns.append(Column("paper", ours.decimals, ours.higher_is_better, group=ours.group))
-            columns.append(Column("Δ", ours.decimals, signed=True, group=ours.group))
+            columns.append(Column("paper", ours.decimals, ours.higher_is_better, group=ours.group, optional=True))
+            columns.append(Column("Δ", ours.decimals, signed=True, group=ours.group, optional=True))
     return tuple(columns)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from reports import methods, published
-from reports.drawing import Chart, Tips, color_of, dress, figure, finish, marker_of
+from reports.drawing import Chart, Tips, color_of, dress, figure, finish, marker_of, styled
 from reports.measures import Measure
 from reports.published import Key
 from reports.quality_log import Probe
@@ -24,6 +24,7 @@ PUBLISHED = (  # metric and cost of the paper, how to read the cost
 PUBLISHED_COSTS = (("fps", "ms per frame ↓", lambda fps: 1000 / fps), ("train_hours", "training h ↓", lambda h: h))
 
 
+@styled
 def chart(trade_off: TradeOff) -> Chart:
     """Two rows of panels: measured quality against four costs, and the published numbers on axes of their own."""
     presets = methods.ordered(point.preset for point in trade_off.points)
@@ -36,17 +37,19 @@ def chart(trade_off: TradeOff) -> Chart:
         for index in range(len(PUBLISHED_COSTS)):
             _published(axes[row, len(COSTS) + index], trade_off.beside, row, index, presets, tips)
     handles, labels = axes[0, 0].get_legend_handles_labels()
-    made.legend(handles, labels, loc="outside lower center", ncols=6, frameon=False)
+    made.legend(handles, labels, loc="outside lower center", ncols=6)
     title = f"{trade_off.title}\nfilled: measured here, area = Gaussians, line = Pareto front; hollow: published"
     return finish(made, trade_off.name, f"{title}, {published.TITLES[trade_off.beside]}, one RTX 3090 Ti", tips)
 
 
+@styled
 def time_chart(trade_off: TradeOff, probes: Mapping[str, Sequence[Probe]]) -> Chart | None:
     """Held-out PSNR over training seconds, a line for each run; None where no run left a log."""
     made, axes = figure(1, 1, 6.0, 3.6)
     panel, tips = axes[0, 0], Tips()
     presets = methods.ordered(result.preset for result in trade_off.runs)
     drawn: dict[str, None] = {}
+    ends: list[float] = []
     by_scene = [
         [r for r in trade_off.runs if r.scene == scene] for scene in dict.fromkeys(r.scene for r in trade_off.runs)
     ]
@@ -60,13 +63,15 @@ def time_chart(trade_off: TradeOff, probes: Mapping[str, Sequence[Probe]]) -> Ch
             drawn[setting.title] = None
             xs, ys = [p.seconds for p in points], [p.psnr for p in points]
             panel.plot(xs, ys, color=color, linewidth=1.1, alpha=0.8, label=label)
+            ends.append(xs[-1])
             tip = tips.add(f"{setting.title}, {result.scene}, seed {result.seed}\n{ys[-1]:.2f} dB after {xs[-1]:.0f} s")
             panel.plot(xs[-1:], ys[-1:], marker, color=color, markersize=5, gid=tip)
     if not drawn:
         return None
+    dress(panel.xaxis, ends, log_from=8)
     panel.set_xlabel("training time in seconds, rendering of probes not counted")
     panel.set_ylabel("PSNR of a held-out view, dB")
-    panel.legend(fontsize=8, frameon=False)
+    panel.legend(fontsize=8)
     return finish(
         made, trade_off.name.replace("chart_", "time_", 1), f"{trade_off.title}\nquality over training time", tips
     )

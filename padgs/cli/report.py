@@ -42,7 +42,9 @@ def report(
     try:
         wanted = {name: lookup(REPORTS, name, "report") for name in (REPORTS if what == ALL else [what])}
         settings = dict(_pair(setting) for setting in where or [])
-        gathered = Gathered(folder, found, Request(protocol, mix, tuple(metric or ()), experiment, settings))
+        gathered = Gathered(
+            folder, found, Request(protocol, mix, tuple(metric or ()), experiment, settings), tuple(map(str, broken))
+        )
     except ReportError as error:
         raise _refused(str(error)) from error
     except ValueError as error:

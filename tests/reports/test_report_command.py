@@ -46,7 +46,7 @@ def test_a_broken_file_is_named_and_left_out_and_strict_fails(runs):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["table9"], "unknown report 'table9'; known: chart, runs, sweep, table1, table2, table3, table4, all"),
+        (["table9"], "unknown report 'table9'; known: chart, html, runs, sweep, table1, table2, table3, table4, all"),
         (["table3", "--where", "x"], "--where x is not KEY=VALUE"),
         (["table3", "--protocol", "x"], "unknown protocol 'x'"),
         (["sweep", "--metric", "x"], "unknown metric 'x'; known under protocol paper: psnr, ssim"),
@@ -80,7 +80,7 @@ def test_everything_at_once(tmp_path):
     written = {path.name for path in (tmp_path / "out").iterdir()}
     tables = {f"{name}.{e}" for name in ("table1", "table2", "table3", "table4", "runs") for e in ("md", "tex", "csv")}
     charts = {f"{name}.{e}" for name in ("chart_synthetic-room", "sweep_tau_cpu") for e in ("svg", "png", "csv")}
-    assert written == tables | charts | {"time_synthetic-room.svg", "time_synthetic-room.png"}
+    assert written == tables | charts | {"time_synthetic-room.svg", "time_synthetic-room.png", "report.html"}
 
 
 def test_what_is_refused_does_not_keep_the_rest_back(tmp_path):

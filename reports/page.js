@@ -1,0 +1,102 @@
+"use strict";
+// Sorting, tooltips, and the choice of pictures; the rest is done by the libraries above.
+
+for (const table of document.querySelectorAll("table.sortable")) new Tablesort(table);
+
+// SVG titles are slow to appear and cannot be styled: show them at once, beside the pointer.
+const tip = document.getElementById("tip");
+for (const mark of document.querySelectorAll(".tip")) {
+  const title = mark.querySelector("title");
+  mark.dataset.tip = title.textContent;
+  title.remove();
+  mark.addEventListener("pointerenter", () => { tip.textContent = mark.dataset.tip; tip.hidden = false; });
+  mark.addEventListener("pointerleave", () => { tip.hidden = true; });
+}
+document.addEventListener("pointermove", (event) => {
+  if (tip.hidden) return;
+  const left = Math.min(event.clientX + 14, innerWidth - tip.offsetWidth - 8);
+  tip.style.left = `${left}px`;
+  tip.style.top = `${Math.min(event.clientY + 14, innerHeight - tip.offsetHeight - 8)}px`;
+});
+
+const data = JSON.parse(document.getElementById("data").textContent);
+const urls = [];
+function url(number) { // a blob and not the text itself, so that a picture is decoded once and the viewer may load it
+  if (!urls[number]) {
+    const bytes = Uint8Array.from(atob(data.images[number]), (character) => character.charCodeAt(0));
+    urls[number] = URL.createObjectURL(new Blob([bytes], { type: "image/jpeg" }));
+  }
+  return urls[number];
+}
+
+if (data.scenes.length) {
+  const select = Object.fromEntries(["scene", "view", "method", "pair"].map((id) => [id, document.getElementById(id)]));
+  const slots = [...document.querySelectorAll("#slider figure")];
+  const panels = [...document.querySelectorAll(".panoramas figure")];
+  let viewers = [];
+
+  const fill = (list, titles) => {
+    const before = list.selectedOptions[0]?.textContent;
+    list.replaceChildren(...titles.map((title, index) => new Option(title, index)));
+    list.selectedIndex = Math.max(0, titles.findIndex((title) => name(title) === name(before ?? "")));
+  };
+  const name = (title) => title.replace(/ \([\d.]+ dB\)$/, ""); // the mark behind a method differs from view to view
+
+  const scene = () => data.scenes[select.scene.selectedIndex];
+  const view = () => scene().views[select.view.selectedIndex];
+  const method = () => view().methods[select.method.selectedIndex];
+
+  function compare() {
+    const shown = {
+      truth: [view().truth, "truth"],
+      render: [method().render, method().title],
+      error: [method().error, "error"],
+    };
+    select.pair.value.split("-").forEach((what, index) => {
+      slots[index].querySelector("img").src = url(shown[what][0]);
+      slots[index].querySelector("figcaption").textContent = shown[what][1];
+    });
+  }
+
+  function look() {
+    const [first] = viewers;
+    const direction = first ? { yaw: first.getYaw(), pitch: first.getPitch(), hfov: first.getHfov() } : { hfov: 100 };
+    viewers.forEach((viewer) => viewer.destroy());
+    panels[1].querySelector("figcaption").textContent = method().title;
+    viewers = [["panorama-truth", view().truth], ["panorama-render", method().render]].map(([id, number]) =>
+      pannellum.viewer(id, {
+        type: "equirectangular", panorama: url(number), autoLoad: true, showFullscreenCtrl: false,
+        keyboardZoom: false, ignoreGPanoXMP: true, ...direction,
+      }));
+    window.viewers = viewers;
+  }
+
+  // Whichever of the two is used leads; the other follows, inertia included.
+  let leader = 0;
+  panels.forEach((panel, index) => {
+    for (const event of ["pointerdown", "wheel", "keydown"]) {
+      panel.addEventListener(event, () => { leader = index; }, { capture: true, passive: true });
+    }
+  });
+  (function follow() {
+    requestAnimationFrame(follow);
+    if (viewers.length < 2 || !viewers.every((viewer) => viewer.isLoaded())) return;
+    const [led, other] = [viewers[leader], viewers[1 - leader]];
+    for (const angle of ["Yaw", "Pitch", "Hfov"]) {
+      if (Math.abs(led[`get${angle}`]() - other[`get${angle}`]()) > 1e-3) other[`set${angle}`](led[`get${angle}`](), false);
+    }
+  })();
+
+  const changed = {
+    scene: () => fill(select.view, scene().views.map((item) => item.title)),
+    view: () => fill(select.method, view().methods.map((item) => item.title)),
+    method: () => { compare(); look(); },
+  };
+  const steps = Object.keys(changed);
+  steps.forEach((step, index) => {
+    select[step].addEventListener("change", () => steps.slice(index).forEach((later) => changed[later]()));
+  });
+  select.pair.addEventListener("change", compare);
+  fill(select.scene, data.scenes.map((item) => item.title));
+  steps.forEach((step) => changed[step]());
+}
