@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -50,7 +51,8 @@ class RunOptions:
     """The `run` group: what a machine or a person decides and no number depends on; not part of the run id."""
 
     folder: str = "runs"  # of the run folders
-    threads: int | None = None  # null = all cores
+    jobs: int = 1  # runs at the same time on one machine: conf/launcher
+    threads: int | None = None  # of one run; null = cores / jobs
     log_every: int = 10  # iterations between lines of log.jsonl
     probe_every: int = 100  # iterations between renders of one test view, the held-out PSNR of the live line
     checkpoint_every: int | None = None  # iterations between checkpoints; null = only by time
@@ -59,10 +61,18 @@ class RunOptions:
 
     def __post_init__(self) -> None:
         """Reject intervals that never come round."""
-        for name in ("threads", "log_every", "probe_every", "checkpoint_every"):
+        for name in ("jobs", "threads", "log_every", "probe_every", "checkpoint_every"):
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ValueError(f"{name} is {value}; it must be at least 1")
+
+    @property
+    def threads_per_job(self) -> int | None:
+        """Threads of one run, such that all runs together use the cores of this process; None: as torch likes."""
+        if self.threads is not None or self.jobs == 1:
+            return self.threads
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        return max(1, cores // self.jobs)
 
 
 @dataclass(frozen=True)
@@ -78,7 +88,13 @@ class RunConfig:
     run: RunOptions
     variant: str = ""  # name of this setting within an experiment, such as a row of the ablation
     seed: int = 0
+    retry: str = "none"  # which finished runs are done again: a name of RETRIES
     labels: Labels = Labels()
+
+    def __post_init__(self) -> None:
+        """Reject an unknown kind of retry."""
+        if self.retry not in RETRIES:
+            raise ConfigError(f"unknown retry {self.retry!r}; known: {', '.join(RETRIES)}")
 
     @property
     def preset(self) -> str:
@@ -86,7 +102,7 @@ class RunConfig:
         return self.labels.preset or self.method
 
     def values(self) -> dict[str, Any]:
-        """The whole configuration as plain values in the shape of the YAML files, defaults included, without labels."""
+        """The configuration of a run as plain values in the shape of the YAML files, defaults included."""
         return {
             "data": asdict(self.data),
             "method": {"name": self.method, **asdict(self.options)},
@@ -100,7 +116,8 @@ class RunConfig:
 
 
 GROUPS: dict[str, type] = {"data": DataConfig, "render": RenderConfig, "train": TrainConfig, "run": RunOptions}
-OTHER_KEYS = ("method", "protocol", "variant", "seed")
+OTHER_KEYS = ("method", "protocol", "variant", "seed", "retry")
+RETRIES = ("none", "failed")
 
 
 def config_from_values(values: Mapping[str, Any], labels: Labels = Labels()) -> RunConfig:  # noqa: B008 - frozen
@@ -124,7 +141,7 @@ def config_from_values(values: Mapping[str, Any], labels: Labels = Labels()) -> 
         raise ConfigError(str(error)) from error
     groups = {key: typed(kind, values.get(key, {}), key) for key, kind in GROUPS.items()}
     typed_options = typed(options, method, "method")
-    top = {key: values[key] for key in ("variant", "seed") if key in values}
+    top = {key: values[key] for key in ("variant", "seed", "retry") if key in values}
     top = asdict(typed(_Top, top))
     if not protocols:
         raise ConfigError(f"protocol is empty; name at least one of {', '.join(PROTOCOLS)}")
@@ -145,3 +162,4 @@ def method_fields(name: str) -> dict[str, Any]:
 class _Top:
     variant: str = ""
     seed: int = 0
+    retry: str = "none"

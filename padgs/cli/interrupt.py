@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
+from collections.abc import Callable
 from types import FrameType
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)  # SIGTERM is what cluster schedulers send before they kill
@@ -16,10 +17,15 @@ class Interrupted(KeyboardInterrupt):
 class Interrupt:
     """While this context lasts, a signal only sets `requested`; its owner looks there when it is safe to stop."""
 
-    def __init__(self) -> None:
-        """Not requested yet."""
-        self.requested = False
+    def __init__(self, asked: Callable[[], bool] = lambda: False) -> None:
+        """Not requested yet; `asked` is another way to request it."""
+        self._signalled, self._asked = False, asked
         self._before: dict[int, object] = {}
+
+    @property
+    def requested(self) -> bool:
+        """Whether to stop."""
+        return self._signalled or self._asked()
 
     def __enter__(self) -> Interrupt:
         """Take over the signals; only the main thread can, elsewhere they keep their meaning."""
@@ -32,7 +38,7 @@ class Interrupt:
         self._restore()
 
     def _request(self, number: int, frame: FrameType | None) -> None:
-        self.requested = True
+        self._signalled = True
         self._restore()
 
     def _restore(self) -> None:

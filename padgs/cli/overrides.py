@@ -21,6 +21,16 @@ def root() -> Path:
     return package if (package / "conf").is_dir() else package.parent
 
 
+def options_first(arguments: Sequence[str]) -> list[str]:
+    """Options and their values before settings: Hydra's parser refuses settings on both sides of an option.
+
+    >>> options_first(["method=padgs", "-m", "seed=0,1", "--cfg", "job"])
+    ['-m', '--cfg', 'job', 'method=padgs', 'seed=0,1']
+    """
+    is_setting = [not text.startswith("-") and ("=" in text or text.startswith("~")) for text in arguments]
+    return [text for wanted in (False, True) for text, it in zip(arguments, is_setting, strict=True) if it == wanted]
+
+
 def lenient(arguments: Sequence[str]) -> list[str]:
     """Let unknown keys pass Hydra, so that `config_from_values` refuses them and lists the known ones.
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from PIL import Image
 from torch import Tensor
 
 from padgs import results
+from padgs.cli import run_lock
 from padgs.pictures import comparison
 from padgs.results import Result
 
@@ -57,6 +59,27 @@ class RunFolder:
             path = results.write(result, self.path)
         return results.read(path)
 
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Make the folder, and keep other processes out of it.
+
+        Raises:
+            RunBusy: another process works on this run.
+            RunFolderError: the folder cannot be written.
+        """
+        with ExitStack() as stack:
+            with self._writing():
+                self.path.mkdir(parents=True, exist_ok=True)
+                stack.enter_context(run_lock.held(self.path))
+            yield
+
+    def forget(self, result: Result) -> None:
+        """Let a failed run start again; where only time or memory ran out, from its checkpoint."""
+        with self._writing():
+            if result.status not in ("oom", "timeout"):
+                shutil.rmtree(self.checkpoint, ignore_errors=True)
+            (self.path / results.FILE_NAME).unlink()
+
     def log(self, line: Mapping[str, Any]) -> None:
         """Append a line to log.jsonl."""
         with self._writing(), self._log.open("a") as file:
@@ -87,7 +110,12 @@ class RunFolder:
         try:
             yield
         except OSError as error:
-            raise RunFolderError(
-                f"cannot write run folder {self.path}: {error.strerror or error}; "
-                "make room, mend the permissions, or set run.folder to another place"
-            ) from error
+            raise cannot_write(self.path, error) from error
+
+
+def cannot_write(path: Path, error: OSError) -> RunFolderError:
+    """The error to raise where a run folder, or what lies beside it, cannot be written."""
+    return RunFolderError(
+        f"cannot write run folder {path}: {error.strerror or error}; "
+        "make room, mend the permissions, or set run.folder to another place"
+    )

@@ -18,7 +18,7 @@ def scene_choices() -> dict[str, dict[str, Any]]:
     """
     built_in = {f"synthetic_{scene}": _node("synthetic", {"generator": {"scene": scene}}) for scene in SCENES}
     published = {
-        f"{name}_{scene}": _node(name, {"path": f"data/{name}/{scene}"})
+        f"{name}_{scene}": _node(name, {"path": f"data/{known.title.casefold()}/{scene}"})
         for name, known in DATASETS.items()
         for scene in known.scenes
     }

@@ -18,6 +18,7 @@ from padgs.cli.run_id import config_hash, run_id
 from padgs.cli.scoring import frame_times, same_rules, scores
 from padgs.cli.summary import show_result
 from padgs.cli.training import resume, train
+from padgs.cli.watch import Watch
 from padgs.guards import is_out_of_memory
 from padgs.method import Failure, Method
 from padgs.registry import lookup
@@ -25,47 +26,67 @@ from padgs.results import Result
 from padgs.scene import Scene
 
 
-def run(config: RunConfig, console: Console) -> Result:
+def run(config: RunConfig, console: Console, watch: Watch = Watch()) -> Result:  # noqa: B008 - has no state
     """Do what is missing of a run and show its result.
 
     Raises:
         DataError: the input cannot be used.
         ResultError, CheckpointError, RunFolderError: files of the run cannot be read or written.
+        RunBusy: another process works on this run.
         Interrupted: stopped from outside; starting again goes on.
     """
-    if config.run.threads is not None:
-        torch.set_num_threads(config.run.threads)
+    if config.run.threads_per_job is not None:
+        torch.set_num_threads(config.run.threads_per_job)
     torch.manual_seed(config.seed)
     clock.reset_peak_memory()
     scene = data.load(config.data.path, config.data.format, config.data)
-    values = config.values()
-    folder = RunFolder(Path(config.run.folder) / run_id(values, scene.name, scene.fingerprint, config.preset))
+    name = run_id(config.values(), scene.name, scene.fingerprint, config.preset)
+    folder = RunFolder(Path(config.run.folder) / name)
+    watch.started(folder.path, config.train.iterations)
     _introduce(config, scene, folder, console)
     result = folder.result()
-    if result is None:
-        folder.prepare(values)
-        result = _finish(config, scene, folder, console)
-    elif result.ok and not _is_scored(result, config):
-        console.print("finished before; only the new protocol is missing")
-        result = _score_again(result, config, scene, folder)
+    if result is None or _is_missing(result, config):
+        with folder.locked():
+            result = _complete(folder.result(), config, scene, folder, console, watch)
     else:
-        advice = "" if result.ok else f"; it failed, delete {folder.path} to try again"
+        advice = "" if result.ok else "; it failed, retry=failed starts it again"
         console.print(f"finished before, nothing to do{advice}", highlight=False, soft_wrap=True)
-    experiments = tuple(sorted({*result.experiments, *config.labels.experiments}))
-    if experiments != result.experiments:  # one run may serve several tables
-        result = folder.finish(replace(result, experiments=experiments))
     show_result(result, folder.path, console)
     return result
 
 
-def _finish(config: RunConfig, scene: Scene, folder: RunFolder, console: Console) -> Result:
+def _complete(
+    result: Result | None, config: RunConfig, scene: Scene, folder: RunFolder, console: Console, watch: Watch
+) -> Result:
+    """What is missing of a run whose folder is locked; `result` is what is there."""
+    if result is not None and not result.ok and config.retry == "failed":
+        folder.forget(result)
+        result = None
+    if result is None:
+        folder.prepare(config.values())
+        return _finish(config, scene, folder, console, watch)
+    if result.ok and not _is_scored(result, config):
+        console.print("finished before; only the new protocol is missing")
+        result = _score_again(result, config, scene, folder)
+    experiments = tuple(sorted({*result.experiments, *config.labels.experiments}))  # a run may serve several tables
+    return result if experiments == result.experiments else folder.finish(replace(result, experiments=experiments))
+
+
+def _is_missing(result: Result, config: RunConfig) -> bool:
+    """Whether there is anything left to do about a finished run."""
+    if not result.ok and config.retry == "failed":
+        return True
+    return result.ok and not _is_scored(result, config) or not {*config.labels.experiments} <= {*result.experiments}
+
+
+def _finish(config: RunConfig, scene: Scene, folder: RunFolder, console: Console, watch: Watch) -> Result:
     method = build(config)
     progress = resume(method, folder)
     if progress.iteration:
         console.print(f"resuming after iteration {progress.iteration}", highlight=False)
     result = _blank(config, scene, folder)
     try:
-        progress = train(method, scene, config, folder, progress, console)
+        progress = train(method, scene, config, folder, progress, console, watch)
         size = method.size()
         result = replace(
             result,

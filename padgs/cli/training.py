@@ -12,6 +12,7 @@ from padgs.cli.config import RunConfig
 from padgs.cli.interrupt import Interrupt, Interrupted
 from padgs.cli.live import LiveLine
 from padgs.cli.run_folder import RunFolder
+from padgs.cli.watch import Watch
 from padgs.method import Method, Record, State
 from padgs.metrics import psnr
 from padgs.scene import Scene, View
@@ -44,7 +45,13 @@ def resume(method: Method, folder: RunFolder) -> Progress:
 
 
 def train(
-    method: Method, scene: Scene, config: RunConfig, folder: RunFolder, progress: Progress, console: Console
+    method: Method,
+    scene: Scene,
+    config: RunConfig,
+    folder: RunFolder,
+    progress: Progress,
+    console: Console,
+    watch: Watch = Watch(),  # noqa: B008 - has no state
 ) -> Progress:
     """Train from `progress` to the end of the budget. The last checkpoint holds the trained method.
 
@@ -56,7 +63,7 @@ def train(
     options, saved = config.run, time.monotonic()
     held_out = scene.test[len(scene.test) // 2] if scene.test else None
     saved_iteration = progress.iteration
-    with Interrupt() as stop, LiveLine(console, config.train.iterations) as line:
+    with Interrupt(watch.stop_requested) as stop, LiveLine(console, config.train.iterations) as line:
         for record in method.fit(scene, config.train.budget):
             progress = Progress(record.iteration, record.seconds)
             last = record.iteration == config.train.iterations
@@ -65,11 +72,13 @@ def train(
             if record.iteration % options.log_every == 0 or last or probe or record.events:
                 folder.log(_line(record, quality))
             line.update(record, quality)
+            stopping = stop.requested
             due = options.checkpoint_every is not None and record.iteration % options.checkpoint_every == 0
-            if due or stop.requested or time.monotonic() - saved > options.checkpoint_seconds:
+            if due or stopping or time.monotonic() - saved > options.checkpoint_seconds:
                 save(method, progress, folder)
+                watch.saved(folder.path)
                 saved, saved_iteration = time.monotonic(), record.iteration
-            if stop.requested and not last:
+            if stopping and not last:
                 raise Interrupted(f"stopped after iteration {record.iteration}, the checkpoint is written")
         if saved_iteration != progress.iteration:
             save(method, progress, folder)

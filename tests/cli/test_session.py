@@ -16,7 +16,9 @@ from padgs import checkpoint, results
 from padgs.checkpoint import CheckpointError
 from padgs.cli import session, training
 from padgs.cli.interrupt import Interrupted
+from padgs.cli.labels import Labels
 from padgs.cli.run_folder import RunFolder, RunFolderError
+from padgs.cli.run_lock import RunBusy
 from padgs.method import Failure
 
 ITERATIONS = 12
@@ -55,6 +57,7 @@ def test_a_run_leaves_all_its_files_and_says_where(config):
     result, said = run(config)
     folder = folder_of(config).path
     assert sorted(p.name for p in folder.iterdir()) == [
+        ".lock",
         "checkpoint",
         "config.yaml",
         "log.jsonl",
@@ -175,7 +178,42 @@ def test_a_failed_run_has_a_result_with_its_status(config, monkeypatch, error, s
     assert (result.status, result.reason, result.scores) == (status, str(error), {})
     assert status in said and str(error) in said
     again, said = run(config)
-    assert again == result and "delete" in said
+    assert again == result and "retry=failed" in said
+
+
+@pytest.mark.parametrize(("status", "starts_at"), [("nan", 0), ("timeout", 5)])
+def test_a_failed_run_is_retried_only_if_asked(config, monkeypatch, status, starts_at):
+    config = replace(config, run=replace(config.run, checkpoint_every=5))
+
+    def fail():
+        raise Failure(status, "for the test")
+
+    with monkeypatch.context() as patch:
+        stop_at(7, patch, fail)
+        failed, _ = run(config)
+    assert failed.status == status and run(config)[0] == failed
+    retried, said = run(replace(config, retry="failed"))
+    assert retried.status == "ok"
+    assert ("resuming after iteration 5" in said) == (starts_at == 5)  # what went wrong must not be gone on from
+    assert run(replace(config, retry="failed"))[0] == retried
+
+
+def test_a_run_that_another_process_works_on_is_left_alone(config):
+    first, _ = run(config)
+    folder = folder_of(config)
+    (folder.path / "result.json").unlink()
+    with folder.locked(), pytest.raises(RunBusy, match=f"worked on by process {os.getpid()} on .* since"):
+        run(config)
+    assert run(config)[0].scores == first.scores
+
+
+def test_a_finished_run_learns_which_other_experiments_want_it(config, monkeypatch):
+    first, _ = run(replace(config, labels=Labels("padgs", ("table1",))))
+    monkeypatch.setattr(session, "train", lambda *_: pytest.fail("trained again"))
+    again, _ = run(replace(config, labels=Labels("padgs", ("table4",))))
+    assert again.experiments == ("table1", "table4") and first.experiments == ("table1",)
+    assert replace(again, experiments=first.experiments) == first
+    assert results.read(folder_of(config).path / "result.json") == again
 
 
 def test_an_error_of_ours_is_no_result(config, monkeypatch):

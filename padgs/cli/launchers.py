@@ -1,0 +1,69 @@
+"""Where Hydra's launchers need help: which package each comes in, and not giving up on many jobs because of one."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+PACKAGES = {  # choice of conf/launcher -> module of its plugin, extra of pyproject.toml
+    "local": ("hydra_plugins.hydra_joblib_launcher", "launchers"),
+    "slurm": ("hydra_plugins.hydra_submitit_launcher", "launchers"),
+    "submitit": ("hydra_plugins.hydra_submitit_launcher", "launchers"),
+    "ray": ("hydra_plugins.hydra_ray_launcher", "ray"),
+}
+
+
+def missing_plugin(arguments: Sequence[str]) -> str | None:
+    """What to install for the launcher that a command line asks for; None where nothing is missing.
+
+    >>> missing_plugin(["method=padgs", "seed=0,1"])
+    """
+    wanted = [argument.partition("=")[2] for argument in arguments if argument.startswith("launcher=")]
+    for name in wanted:
+        module, extra = PACKAGES.get(name, ("padgs", ""))
+        try:
+            found = importlib.util.find_spec(module) is not None
+        except ModuleNotFoundError:  # there are no plugins at all
+            found = False
+        if not found:
+            return f"launcher={name} needs {module.partition('.')[2]}: pip install 'padgs[{extra}]'"
+    return None
+
+
+@contextmanager
+def patient() -> Iterator[None]:
+    """While this lasts, submitit's launcher waits for all jobs, even if the process of one has died.
+
+    As it is, the first one to be found dead is raised, and the others run on unobserved.
+    """
+    try:
+        import submitit
+    except ImportError:
+        yield
+        return
+    executor = submitit.AutoExecutor
+
+    class PatientExecutor(executor):
+        def map_array(self, *arguments: Any) -> list[Any]:
+            return [_Patient(job) for job in super().map_array(*arguments)]
+
+    submitit.AutoExecutor = PatientExecutor
+    try:
+        yield
+    finally:
+        submitit.AutoExecutor = executor
+
+
+class _Patient:
+    """A job of submitit whose result may also be that there is none; the board says how it ended."""
+
+    def __init__(self, job: Any) -> None:
+        self._job = job
+
+    def results(self) -> list[Any]:
+        try:
+            return self._job.results()
+        except Exception:
+            return [None]
