@@ -13,9 +13,7 @@ from padgs.panorama import longitude_latitude, pixel_from_angles, projection_jac
 from padgs.render.contract import PUBLISHED_FOCAL, RenderOptions
 
 TILE = 16  # pixels
-INSTANCE_BYTES = (
-    24  # keys of 8 bytes and values of 4, each before and after sorting; without what the sort needs itself
-)
+INSTANCE_BYTES = 24  # a key of 8 bytes and a value of 4, before and after sorting; what the sort needs comes on top
 LEAST_COS_LATITUDE, LEAST_DIVISOR = 1e-4, 1e-20  # keep the directions of the poles finite
 
 

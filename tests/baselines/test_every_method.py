@@ -3,7 +3,9 @@
 A new method needs no line here, unless its defaults are too large for a test (`TINY`) or it is slow (`SLOW`).
 """
 
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -12,6 +14,7 @@ from composed import composed
 
 from baselines import METHODS
 from padgs import checkpoint
+from padgs.cli.config import RunConfig
 from padgs.cli.session import build
 from padgs.data.synthetic import SCENES, SyntheticOptions, generate
 from padgs.method import Budget, Method, Record, State
@@ -32,6 +35,7 @@ TINY_EGONERF = tuple(
 TINY: dict[str, tuple[str, ...]] = {"egonerf": TINY_EGONERF, "egonerf_small": TINY_EGONERF}
 SLOW: set[str] = set()  # settings that are not fast enough for every run of the tests
 SETTINGS = sorted(path.stem for path in (Path(__file__).resolve().parents[2] / "conf" / "method").glob("*.yaml"))
+EXPLICIT = [name for name in METHODS if issubclass(lookup(METHODS, name, "method"), SplatMethod)]
 EVERY = [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in SETTINGS]
 
 
@@ -41,18 +45,22 @@ def padgs_root(monkeypatch, root):
 
 
 @pytest.fixture(scope="module")
-def scenes(tmp_path_factory) -> dict[str, Scene]:
-    """All synthetic scenes, tiny."""
+def scenes(tmp_path_factory) -> Iterator[Callable[[str], Scene]]:
+    """The synthetic scenes by their names, tiny."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PADGS_CACHE", str(tmp_path_factory.mktemp("cache")))
-        return {
-            name: generate(SyntheticOptions(name, WIDTH, train_views=3, test_views=1, samples=1, points=200))
-            for name in SCENES
-        }
+        yield cache(
+            lambda name: generate(SyntheticOptions(name, WIDTH, train_views=3, test_views=1, samples=1, points=200))
+        )
+
+
+@cache
+def config_of(setting: str) -> RunConfig:
+    return composed(f"method={setting}", *TINY.get(setting, ()))
 
 
 def method_of(setting: str) -> Method:
-    return build(composed(f"method={setting}", *TINY.get(setting, ())))
+    return build(config_of(setting))
 
 
 def trained(setting: str, scene: Scene, steps: int = STEPS) -> tuple[Method, list[Record]]:
@@ -69,16 +77,13 @@ def assert_same_but_time(a: State, b: State) -> None:
 
 def test_every_method_has_a_setting_of_its_name():
     assert METHODS.keys() <= set(SETTINGS)
-    assert {composed(f"method={setting}").method for setting in SETTINGS} == METHODS.keys()
+    assert {config_of(setting).method for setting in SETTINGS} == METHODS.keys()
     assert TINY.keys() | SLOW <= set(SETTINGS)
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", EXPLICIT)
 def test_explicit_gaussians_are_drawn_and_trained_as_their_setting_says(name):
-    method = lookup(METHODS, name, "method")
-    if not issubclass(method, SplatMethod):
-        pytest.skip("it has no defaults of its own for these groups")
-    config = composed(f"method={name}")
+    method, config = lookup(METHODS, name, "method"), config_of(name)
     assert config.render == method.RENDER
     assert asdict(method.TRAIN).items() <= asdict(config.train).items()
 
@@ -91,14 +96,14 @@ def test_every_method_has_a_section_in_the_docs(root):
 
 @pytest.mark.parametrize("setting", EVERY)
 def test_twenty_steps_on_a_scene_leave_a_method_that_renders(setting, scenes):
-    survives(setting, scenes["room"])
+    survives(setting, scenes("room"))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("setting", SETTINGS)
 def test_every_synthetic_scene_is_survived(setting, scene, scenes):
-    survives(setting, scenes[scene])
+    survives(setting, scenes(scene))
 
 
 def survives(setting: str, scene: Scene) -> None:
@@ -117,7 +122,7 @@ def survives(setting: str, scene: Scene) -> None:
 
 @pytest.mark.parametrize("setting", EVERY)
 def test_killed_and_resumed_every_method_ends_bit_identically(setting, scenes, tmp_path):
-    scene, steps, stop = scenes["room"], 12, 7
+    scene, steps, stop = scenes("room"), 12, 7
     whole, _ = trained(setting, scene, steps)
     first = method_of(setting)
     records = first.fit(scene, Budget(steps))
@@ -137,7 +142,7 @@ def test_killed_and_resumed_every_method_ends_bit_identically(setting, scenes, t
 @pytest.mark.parametrize("setting", EVERY)
 def test_before_training_every_method_says_that_there_is_nothing(setting, scenes):
     method = method_of(setting)
-    for ask in (method.state, method.size, lambda: method.render(scenes["room"].test[0])):
+    for ask in (method.state, method.size, lambda: method.render(scenes("room").test[0])):
         with pytest.raises(RuntimeError, match="before fit or load_state|call fit or load_state first"):
             ask()
 
@@ -147,6 +152,6 @@ def test_the_same_seed_gives_the_same_images(setting, scenes):
     images = []
     for _ in range(2):
         torch.manual_seed(0)  # as the run does
-        method, _ = trained(setting, scenes["room"], 3)
-        images.append(method.render(scenes["room"].test[0]).image)
+        method, _ = trained(setting, scenes("room"), 3)
+        images.append(method.render(scenes("room").test[0]).image)
     assert torch.equal(*images)
