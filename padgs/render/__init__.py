@@ -21,6 +21,7 @@ from padgs.scene import View
 BACKENDS = {
     "torch": "padgs.render.torch_backend:rasterize",
     "cpu": "padgs.render.cpu_backend:rasterize",
+    "cuda": "padgs.render.cuda_backend:rasterize",
 }
 RELEASED = RenderOptions(near=0.2, wrap=False, bounds="square")  # the published rasterizer, near in scene units
 
@@ -46,8 +47,8 @@ def render(
         background: [3] RGB behind everything; black if not given.
         probe: [N, 2] zeros that move the projected means, in normalised image units (x and y each run over 2 across
             the image, as in 3DGS); its gradient after `backward` is the densification signal.
-        backend: a name of `BACKENDS`, or auto: cpu for float32 tensors on the CPU if the library is built, else torch
-            (and a warning, once, if that is because the library is missing).
+        backend: a name of `BACKENDS`, or auto: cpu or cuda for float32 tensors that are there, if the library for it is
+            built, else torch (and a warning, once, if that is because the library is missing).
         check_values: also check that all numbers are sane; a pass over the tensors, meant for tests and debugging.
 
     Raises:
@@ -71,21 +72,22 @@ def resolve_backend(backend: str, means: Tensor) -> str:
     """The backend that `auto` stands for, given the tensors to draw; other names are returned as they are."""
     if backend != "auto":
         return backend
-    from padgs.render import native
+    from padgs.render import cuda_native, native
 
-    if means.device.type != "cpu" or means.dtype != torch.float32:
+    library = {"cpu": native, "cuda": cuda_native}.get(means.device.type)
+    if library is None or means.dtype != torch.float32:
         return "torch"
-    if native.available():
-        return "cpu"
-    _say_that_native_is_missing()
+    if library.available():
+        return means.device.type
+    _say_that_native_is_missing(means.device.type)
     return "torch"
 
 
 @cache  # once in a process, whatever the filters of the warnings module say
-def _say_that_native_is_missing() -> None:
-    from padgs.render import native
+def _say_that_native_is_missing(backend: str) -> None:
+    from padgs.render import cuda_native, native
 
     try:
-        native.library()
+        {"cpu": native, "cuda": cuda_native}[backend].library()
     except OSError as error:
-        warnings.warn(f"rendering with backend torch, many times slower than cpu: {error}", stacklevel=4)
+        warnings.warn(f"rendering with backend torch, many times slower than {backend}: {error}", stacklevel=4)

@@ -16,6 +16,7 @@ from padgs.render.contract import RenderOptions
 from padgs.render.low_pass import low_pass_of
 from padgs.render.native import pointer
 
+CPU = torch.device("cpu")
 CHUNK = 16  # pixels; rows of ray tables are padded to whole chunks
 PROJECTIONS = ("erp", "pinhole", "tangent", "ray")  # numbered as in csrc/abi.h
 MODELS = (Panorama, Pinhole, RayTable)
@@ -46,7 +47,7 @@ def native_camera(cam_from_world: Tensor, camera: Camera, options: RenderOptions
     """
     if options.projection not in PROJECTIONS:
         raise ValueError(
-            f"backend cpu does not know projection {options.projection!r}; known: {', '.join(PROJECTIONS)}"
+            f"the native libraries do not know projection {options.projection!r}; known: {', '.join(PROJECTIONS)}"
         )
     low_pass = low_pass_of(options, camera)
     lens = (camera.fx, camera.fy, camera.cx, camera.cy) if isinstance(camera, Pinhole) else (0.0, 0.0, 0.0, 0.0)
@@ -67,23 +68,22 @@ def native_camera(cam_from_world: Tensor, camera: Camera, options: RenderOptions
     )
 
 
-def native_rays(camera: Camera) -> NativeRays:
-    """Directions of the pixels; computed once for cameras that are formulas."""
+def native_rays(camera: Camera, device: torch.device = CPU) -> NativeRays:
+    """Directions of the pixels; computed once, for each device, for cameras that are formulas."""
     if isinstance(camera, RayTable):
-        return NativeRays(table=_padded_table(camera.table.detach().to("cpu", torch.float32)))
-    return _formula_rays(camera)
+        return NativeRays(table=_padded_table(camera.table.detach().to(device, torch.float32)))
+    return _formula_rays(camera, device)
 
 
 @functools.lru_cache(maxsize=16)
-def _formula_rays(camera: Panorama | Pinhole) -> NativeRays:
+def _formula_rays(camera: Panorama | Pinhole, device: torch.device) -> NativeRays:
     if isinstance(camera, Pinhole):
-        return NativeRays(table=_padded_table(camera.rays()))
+        return NativeRays(table=_padded_table(camera.rays()).to(device))
     padded = -(-camera.width // CHUNK) * CHUNK
     longitude = ((torch.arange(padded, dtype=torch.float64) + 0.5) / camera.width - 0.5) * (2 * torch.pi)
     latitude = row_latitudes(camera.height, dtype=torch.float64)
-    return NativeRays(
-        *(angles.float() for angles in (longitude.sin(), longitude.cos(), latitude.sin(), latitude.cos()))
-    )
+    angles = (longitude.sin(), longitude.cos(), latitude.sin(), latitude.cos())
+    return NativeRays(*(values.to(device, torch.float32) for values in angles))
 
 
 def _padded_table(rays: Tensor) -> Tensor:

@@ -67,7 +67,7 @@ class Projected:
         self.per_row = torch.empty(rows, dtype=torch.int64)
         library.padgs_count_instances(pointer(self.boxes), count, pointer(self.level), rows, pointer(self.per_row))
         self.instances = int(self.per_row.sum())
-        self._cuts = _cuts(self.per_row.tolist(), max_instances)
+        self._cuts = strip_cuts(self.per_row.tolist(), max_instances)
         self._only: Strip | None = None
 
     def strips(self) -> Iterator[Strip]:
@@ -81,7 +81,7 @@ class Projected:
             yield Strip(self, first, end)
 
 
-def _cuts(per_row: list[int], max_instances: int) -> list[int]:
+def strip_cuts(per_row: list[int], max_instances: int) -> list[int]:
     """Where to cut so that no strip exceeds the limit, unless a single row of tiles does."""
     cuts, inside = [0], 0
     for row, instances in enumerate(per_row):

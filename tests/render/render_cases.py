@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import cuda_engine
 import pytest
 import torch
 from torch import Tensor
@@ -39,7 +40,7 @@ def engines() -> list:
     found = []
     for backend in BACKENDS:
         for dtype in (torch.float64, torch.float32) if backend == "torch" else (torch.float32,):
-            marks = [pytest.mark.cuda] if backend == "cuda" else []
+            marks = cuda_engine.marks() if backend == "cuda" else []
             if backend == "cpu":
                 marks.append(pytest.mark.skipif(not native.available(), reason="the native library is not built"))
             found.append(pytest.param(backend, dtype, id=f"{backend}-{str(dtype)[-2:]}", marks=marks))
@@ -47,6 +48,9 @@ def engines() -> list:
 
 
 each_engine = pytest.mark.parametrize(("backend", "dtype"), engines())
+each_hybrid_engine = pytest.mark.parametrize(  # cuda has no hybrid blending
+    ("backend", "dtype"), [engine for engine in engines() if engine.values[0] != "cuda"]
+)
 needs_native = pytest.mark.skipif(not native.available(), reason="the native library is not built")
 each_setup = pytest.mark.parametrize(("projection", "lens"), SETUPS, ids=["-".join(setup) for setup in SETUPS])
 each_panorama = pytest.mark.parametrize("projection", ("erp", "tangent", "ray"))

@@ -15,7 +15,7 @@ import torch
 from hybrid_reference import one_pixel
 from render_cases import (
     INPUTS,
-    each_engine,
+    each_hybrid_engine,
     gaussians_of,
     identity_pose,
     leaves,
@@ -81,7 +81,7 @@ def fragments(gaussians: Gaussians, camera: Camera, options: RenderOptions, pose
 
 @pytest.mark.parametrize("size", [1, 4, 16])
 @each_projection
-@each_engine
+@each_hybrid_engine
 def test_images_are_those_of_the_published_procedure(projection: str, size: int, backend: str, dtype: torch.dtype):
     generator = torch.Generator().manual_seed(100 * PROJECTIONS.index(projection) + size)
     camera, options, pose = camera_of(projection, 33, 17), options_of(projection, size), random_pose(generator, 0.2)
@@ -200,7 +200,7 @@ def overlapping(count: int, generator: torch.Generator) -> Gaussians:
 
 
 @each_projection
-@each_engine
+@each_hybrid_engine
 def test_a_large_core_is_exact_blending_in_the_order_of_the_rays(projection: str, backend: str, dtype: torch.dtype):
     generator = torch.Generator().manual_seed(11)
     camera, options = camera_of(projection, 128, 64), options_of(projection, 64)
@@ -232,7 +232,7 @@ def test_a_large_core_is_exact_blending_in_the_order_of_the_rays(projection: str
         torch.testing.assert_close(getattr(rendering, name)[agree], getattr(classic, name)[agree], rtol=1e-4, atol=1e-5)
 
 
-@each_engine
+@each_hybrid_engine
 def test_each_ray_has_its_own_order(backend: str, dtype: torch.dtype):
     """Two long Gaussians cross ahead, turned by 45 degrees to either side: each is in front on one side."""
     half_turn = math.pi / 8
@@ -255,7 +255,7 @@ def test_each_ray_has_its_own_order(backend: str, dtype: torch.dtype):
 
 @pytest.mark.parametrize("size", [1, 2])
 @each_projection
-@each_engine
+@each_hybrid_engine
 def test_of_equally_far_gaussians_the_first_is_in_front(projection: str, size: int, backend: str, dtype: torch.dtype):
     one = {"means": [0.1, 0.0, 2.0], "quats": [1.0, 0.2, 0.0, 0.1], "scales": [0.3, 0.2, 0.1]}
     twins = {name: torch.tensor([value, value]) for name, value in one.items()}
@@ -268,7 +268,7 @@ def test_of_equally_far_gaussians_the_first_is_in_front(projection: str, size: i
 
 
 @each_projection
-@each_engine
+@each_hybrid_engine
 def test_the_order_of_the_gaussians_does_not_matter(projection: str, backend: str, dtype: torch.dtype):
     generator = torch.Generator().manual_seed(12)
     gaussians, camera, options = mixture(8, generator), camera_of(projection, 48, 24), options_of(projection, 3)
@@ -361,7 +361,7 @@ def test_every_instruction_set_draws_the_same(tmp_path: Path, generator: torch.G
             assert row_error(result[name], reference[name]) < 1e-3, f"{name} with {isa}"
 
 
-@each_engine
+@each_hybrid_engine
 def test_nothing_to_draw_is_the_background(backend: str, dtype: torch.dtype):
     empty = Gaussians(*(torch.zeros(0, width) for width in (3, 4, 3)), torch.zeros(0), torch.zeros(0, 3)).to(dtype)
     behind = gaussians_of("ordinary", 3, torch.Generator().manual_seed(1)).to(dtype)

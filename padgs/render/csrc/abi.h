@@ -40,7 +40,7 @@ struct Camera {
 };
 
 // One projected Gaussian as the blender reads it: a cache line.
-struct Footprint {
+struct alignas(16) Footprint {
   float shape[11];  // planar: u, v, a, b, c;  projective: l0 (3), l1 (3), m (3), kappa, near_ratio
   float log2_opacity;
   float depth;

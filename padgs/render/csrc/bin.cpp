@@ -84,16 +84,8 @@ int threads() {
 
 using namespace padgs;
 
-// Widths of tiles by row, so that a tile covers about the same angle at every latitude: level = round(log2(1 / cos)).
 PADGS_API void padgs_tile_levels(const Camera *camera, int32_t *level) {
-  const int rows = units(camera->height, kTile);
-  for (int row = 0; row < rows; ++row) {
-    level[row] = 0;
-    if (camera->model != kPanoramaModel || camera->square) continue;
-    const double latitude = ((row + 0.5) * kTile / camera->height - 0.5) * 3.14159265358979323846;
-    const int wanted = int(std::lround(std::log2(1 / std::max(std::cos(latitude), 1e-3))));
-    while (level[row] < std::min(wanted, kMaxLevel) && (2 << level[row]) <= units(camera->width, kTile)) ++level[row];
-  }
+  for (int row = 0; row < chunks(camera->height); ++row) level[row] = tile_level(*camera, row);
 }
 
 // Depth order [visible] of the Gaussians; returns how many are visible.

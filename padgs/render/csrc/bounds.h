@@ -7,6 +7,8 @@
 // with the discriminant |M^T w|^2 - |M^T a x M^T b|^2, w = (n.b) a - (n.a) b, where nothing of order 1 cancels.
 #pragma once
 
+#include <initializer_list>
+
 #include "abi.h"
 #include "vector3.h"
 

@@ -1,6 +1,8 @@
 // Which tiles of a row a footprint touches: the same answer for counting, binning, and every backend.
 #pragma once
 
+#include <cmath>
+
 #include "abi.h"
 #include "scalar.h"
 
@@ -8,6 +10,17 @@ namespace padgs {
 
 PADGS_HD int units(int pixels, int size) { return (pixels + size - 1) / size; }
 PADGS_HD int chunks(int width) { return units(width, kTile); }
+
+// How wide the tiles of a row are, 2^level chunks, so that a tile covers about the same angle at every latitude:
+// level = round(log2(1 / cos)).
+inline int tile_level(const Camera &camera, int row) {
+  if (camera.model != kPanoramaModel || camera.square) return 0;
+  const double latitude = ((row + 0.5) * kTile / camera.height - 0.5) * 3.14159265358979323846;
+  const int wanted = int(std::lround(std::log2(1 / std::fmax(std::cos(latitude), 1e-3))));
+  int level = 0;
+  while (level < wanted && level < kMaxLevel && (2 << level) <= chunks(camera.width)) ++level;
+  return level;
+}
 
 // A run of tiles in one row, and the columns [column, column_end) of the image that the footprint reaches there.
 struct Run {

@@ -1,0 +1,91 @@
+// The C ABI of libpadgs_cuda, beside the structures that it shares with the CPU library. Every pointer is to memory of the
+// device, and was allocated by padgs/render/cuda_backend.py. Every function returns a cudaError_t, 0 where all is well.
+#pragma once
+
+#include "layout.h"
+
+namespace padgs {
+
+struct ProjectArguments {
+  Camera camera;      // its pose is not used
+  const float *pose;  // [12] or more, rows of [R | t]
+  Inputs in;
+  Footprint *footprints;     // [N]
+  PixelBox *boxes;           // [N]
+  uint32_t *depth_keys;      // [N] bits of the depth, all ones where nothing is drawn
+  int32_t *indices;          // [N] 0, 1, 2, ...
+  TileTable table;           // of all rows
+  unsigned long long *counts;  // [rows + 1] instances in each row of tiles, and Gaussians that are drawn; zero before
+};
+
+struct ProjectGradientArguments {
+  Camera camera;
+  const float *pose;
+  Inputs in;
+  const float *moments;  // [N, kMoments], sums over the instances of each Gaussian
+  Gradients out;         // pose: [blocks, 12] partial sums, see padgs_cuda_pose_blocks, or null
+};
+
+struct SortArguments {
+  void *scratch;  // padgs_cuda_scratch_bytes(count)
+  int64_t scratch_bytes, count;
+  uint32_t *keys, *sorted_keys;      // [count]
+  int32_t *values, *sorted_values;
+  int32_t bits;  // of the keys that differ
+};
+
+// Instances are numbered in depth order of their Gaussians: this number is their slot.
+struct BinArguments {
+  TileTable table;
+  const PixelBox *boxes;
+  const int32_t *order;  // [visible] front to back
+  int64_t visible;
+  uint32_t *tiles;       // [visible + 1] how many tiles each touches, and 0
+  uint32_t *slot_start;  // [visible + 1]
+  Reach *reaches;        // [I] by slot
+  SortArguments sort;    // of the I instances by tile; its values become the slots of the lists
+  int32_t *tile_start;   // [tiles + 1]
+};
+
+struct BlendInputs {
+  TileTable table;
+  int32_t projection, wrap;
+  Rays rays;
+  const Footprint *footprints;
+  const int32_t *tile_start, *slots;  // the lists: slots of each tile, front to back
+  const Reach *reaches;
+  const float *background;               // [3]
+  float *image, *transmittance, *depth;  // [H,W,3] [H,W] [H,W]
+  int32_t *last;                         // [H,W] 1 + position in the tile's list of the last contribution
+  int32_t *pair_counts;                  // [chunks, 2] evaluated and contributing pairs, or null
+};
+
+// Aligned, so that the GPU moves sixteen bytes at a time.
+struct alignas(16) Upstream {
+  float red, green, blue, depth;  // dL/d of what the weights multiply
+};
+struct alignas(8) PixelState {
+  float transmittance;  // in front of all that has been visited
+  float behind;         // sum of weight * (dL/dcolour . colour) behind it, background included
+};
+
+struct alignas(16) Moments {
+  float of[kMoments];
+};
+
+struct BlendGradientInputs {
+  BlendInputs forward;
+  const float *grad_image, *grad_transmittance, *grad_depth;  // [H,W,3] [H,W] or null, [H,W] or null
+  Upstream *upstream;      // [H,W]
+  PixelState *states;      // [states, 256]
+  int32_t *furthest;       // [chunks] largest `last` of the chunk's pixels
+  int64_t instances;
+  Moments *moments;        // [I] by slot
+  float *grad_rays;        // [H, 3, padded W] or null
+  const int32_t *order;    // [visible]
+  const uint32_t *slot_start;
+  int64_t visible;
+  float *totals;  // [N, kMoments], added to
+};
+
+}  // namespace padgs

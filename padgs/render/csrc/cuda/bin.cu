@@ -1,0 +1,65 @@
+// Tile lists: one stable sort of the instances by tile, of Gaussians that are in depth order already, so that every list
+// is front to back.
+#include "sort.cuh"
+
+namespace padgs {
+namespace {
+
+constexpr int kThreads = 128;
+constexpr int kWarps = kThreads / kWarp;
+
+__global__ void count_kernel(BinArguments args) {
+  const int64_t i = global_thread();
+  if (i <= args.visible) args.tiles[i] = i < args.visible ? tiles_of(args.boxes[args.order[i]], args.table) : 0;
+}
+
+// A warp lists the instances of 32 Gaussians, as many to each lane whatever their sizes, and writes them side by side.
+__global__ void emit_kernel(BinArguments args) {
+  __shared__ PixelBox boxes[kWarps][kWarp];
+  __shared__ int32_t gaussians[kWarps][kWarp];
+  __shared__ uint32_t starts[kWarps][kWarp];
+  const int warp = int(threadIdx.x) / kWarp, lane = lane_index();
+  const int64_t first = global_thread() - lane, i = first + lane;
+  if (i < args.visible) {
+    gaussians[warp][lane] = args.order[i];
+    boxes[warp][lane] = args.boxes[args.order[i]];
+  }
+  starts[warp][lane] = args.slot_start[i < args.visible ? i : args.visible];
+  __syncwarp();
+  if (first >= args.visible) return;
+  const uint32_t end = args.slot_start[first + kWarp < args.visible ? first + kWarp : args.visible];
+  for (uint32_t slot = starts[warp][0] + uint32_t(lane); slot < end; slot += kWarp) {
+    int owner = 0;  // the last that starts at or before this slot; those after it that start there too are empty
+    for (int step = kWarp / 2; step; step /= 2)
+      if (starts[warp][owner + step] <= slot) owner += step;
+    Reach reach;
+    const int tile = nth_tile(boxes[warp][owner], args.table, slot - starts[warp][owner], reach);
+    reach.gaussian = gaussians[warp][owner];
+    args.reaches[slot] = reach;
+    args.sort.keys[slot] = uint32_t(tile);
+    args.sort.values[slot] = int32_t(slot);
+  }
+}
+
+__global__ void tile_start_kernel(BinArguments args, int tiles) {
+  const int64_t tile = global_thread();
+  if (tile <= tiles) args.tile_start[tile] = int32_t(lower_bound(args.sort.sorted_keys, args.sort.count, uint32_t(tile)));
+}
+
+}  // namespace
+}  // namespace padgs
+
+using namespace padgs;
+
+// Launches with a table of the host's sizes: the number of tiles comes from the caller, who has the table's rows.
+PADGS_API int padgs_cuda_bin(const Queue *queue, const BinArguments *args, int32_t tiles) {
+  if (const int error = begin(*queue)) return error;
+  if (args->sort.count) {
+    launch(count_kernel, blocks_for(args->visible + 1, kThreads), kThreads, *queue, *args);
+    if (const int error = exclusive_sum(*queue, args->sort, args->tiles, args->slot_start, args->visible + 1)) return error;
+    launch(emit_kernel, blocks_for(args->visible, kThreads), kThreads, *queue, *args);
+    if (const int error = sort_pairs(*queue, args->sort)) return error;
+  }
+  launch(tile_start_kernel, blocks_for(int64_t(tiles) + 1, kThreads), kThreads, *queue, *args, tiles);
+  return finish();
+}

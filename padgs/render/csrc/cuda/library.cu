@@ -1,0 +1,57 @@
+// What the library says about itself.
+#include "arguments.h"
+#include "device.cuh"
+
+namespace padgs {
+namespace {
+
+__global__ void probe_kernel(int32_t *) {}
+
+}  // namespace
+}  // namespace padgs
+
+using namespace padgs;
+
+// Bytes of the structures that cross the border, in the order of STRUCTURES in cuda_native.py.
+PADGS_API int64_t padgs_cuda_structure_bytes(int32_t index) {
+  const size_t bytes[] = {sizeof(Queue), sizeof(ProjectArguments), sizeof(ProjectGradientArguments), sizeof(SortArguments),
+                          sizeof(BinArguments), sizeof(BlendInputs), sizeof(BlendGradientInputs)};
+  return index >= 0 && size_t(index) < sizeof(bytes) / sizeof(*bytes) ? int64_t(bytes[index]) : -1;
+}
+
+// The kind of device whose memory the library takes, as torch calls it.
+PADGS_API const char *padgs_cuda_device_type() {
+#if defined(PADGS_EMULATED)
+  return "cpu";
+#else
+  return "cuda";
+#endif
+}
+
+// Architectures that the library was compiled for, as "80 86 89 90".
+PADGS_API const char *padgs_cuda_architectures() {
+#if defined(PADGS_ARCHITECTURES)
+  return PADGS_ARCHITECTURES;
+#else
+  return "";
+#endif
+}
+
+PADGS_API void padgs_cuda_tile_levels(const Camera *camera, int32_t *level) {
+  for (int row = 0; row < chunks(camera->height); ++row) level[row] = tile_level(*camera, row);
+}
+
+// Whether the kernels can run on a device: 0, or an error such as that none was compiled for it.
+PADGS_API int padgs_cuda_check(const Queue *queue) {
+  if (const int error = begin(*queue)) return error;
+  launch(probe_kernel, 1, 32, *queue, (int32_t *)nullptr);
+  return finish();
+}
+
+PADGS_API const char *padgs_cuda_error(int code) {
+#if defined(PADGS_EMULATED)
+  return code ? "error" : "no error";
+#else
+  return cudaGetErrorString(cudaError_t(code));
+#endif
+}

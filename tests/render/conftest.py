@@ -1,0 +1,18 @@
+"""Which tests of the emulated GPU run by default."""
+
+import cuda_engine
+import pytest
+
+# The definition, the golden cases and bad input; the rest of what every engine is asked takes minutes at this pace.
+QUICK = {"test_contract", "test_cuda_backend", "test_cuda_tiles", "test_golden", "test_near_cull", "test_parity"}
+
+
+@pytest.hookimpl(tryfirst=True)  # before marks are looked at
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the others slow."""
+    for item in items:
+        engine = getattr(item, "callspec", None)
+        if engine is None or engine.params.get("backend") != "cuda" or cuda_engine.ON_GPU:
+            continue
+        if item.path.stem not in QUICK or "erp_many" in item.name:
+            item.add_marker(pytest.mark.slow)
