@@ -96,7 +96,7 @@ def perspective_views(panorama: View, turns: Tensor, lens: Pinhole) -> tuple[Vie
 def perspective_scene(scene: Scene, turns: Tensor, lens: Callable[[Panorama], Pinhole]) -> Scene:
     """The scene with each training panorama replaced by views cut out of it; test views remain panoramas.
 
-    Views that a mask hides altogether are left out.
+    Views that a mask hides altogether are left out (looked for on a grid of at most 64 x 64 directions).
     """
     views: list[View] = []
     for panorama in scene.train:
@@ -106,8 +106,14 @@ def perspective_scene(scene: Scene, turns: Tensor, lens: Callable[[Panorama], Pi
 
 
 def _shows_something(view: View) -> bool:
-    mask = view.mask()
-    return mask is None or bool((mask > 0).any())
+    if not isinstance(view.load_mask, _Mask):
+        return True
+    lens = view.load_mask.lens
+    shrink = min(1.0, 64 / max(lens.width, lens.height))
+    width, height = max(1, round(shrink * lens.width)), max(1, round(shrink * lens.height))
+    across, down = width / lens.width, height / lens.height
+    grid = Pinhole(width, height, across * lens.fx, down * lens.fy, across * lens.cx, down * lens.cy)
+    return bool((replace(view.load_mask, lens=grid)() > 0).any())
 
 
 def square_lens(panorama: Panorama, tangent: float) -> Pinhole:
