@@ -34,9 +34,7 @@ class CloneSplitOptions:
     densify_every: int = 100
     signal: str = "image"  # what is compared with the threshold: a name of `padgs.probes.SIGNALS`
     gradient_threshold: float = 2e-4  # in the units of the signal's probe, for a loss that is a plain mean
-    polar_threshold: float | None = (
-        None  # at the poles, where it rises to with 1 - cos(latitude) (ODGS); None: the same
-    )
+    polar_threshold: float | None = None  # what it grows to at the poles, with 1 - cos(latitude) (ODGS); None: nothing
     percent_dense: float = 0.01  # largest scale that is cloned rather than split, in extents
     sample_clones: bool = False  # clones are placed at random inside the Gaussian, not exactly on it (GOF)
     min_opacity: float = 0.005  # fainter Gaussians are pruned
