@@ -34,7 +34,7 @@ class Camera(ctypes.Structure):
         ("cam_from_world", ctypes.c_float * 12),
         *fields(ctypes.c_float, "near_radius", "low_pass"),
         *fields(ctypes.c_int32, "wrap", "square"),
-        *fields(ctypes.c_float, "fx", "fy", "cx", "cy", "widen"),
+        *fields(ctypes.c_float, "fx", "fy", "cx", "cy", "widen", "off_panorama"),
         *fields(ctypes.c_int32, "compensate", "cull_ellipsoids"),
     ]
 

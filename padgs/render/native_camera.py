@@ -17,6 +17,8 @@ from padgs.render.low_pass import low_pass_of
 from padgs.render.native import pointer
 
 CPU = torch.device("cpu")
+FAR_OFF = 0.3  # radians; with rays further off a panorama's its bounds would exclude little
+SLACK = 1e-5  # radians; rounding must never cost a contribution
 CHUNK = 16  # pixels; rows of ray tables are padded to whole chunks
 PROJECTIONS = ("erp", "pinhole", "tangent", "ray")  # numbered as in csrc/abi.h
 MODELS = (Panorama, Pinhole, RayTable)
@@ -49,7 +51,7 @@ def native_camera(cam_from_world: Tensor, camera: Camera, options: RenderOptions
         raise ValueError(
             f"the native libraries do not know projection {options.projection!r}; known: {', '.join(PROJECTIONS)}"
         )
-    low_pass = low_pass_of(options, camera)
+    low_pass, off_panorama = low_pass_of(options, camera), _off_panorama(camera)
     lens = (camera.fx, camera.fy, camera.cx, camera.cy) if isinstance(camera, Pinhole) else (0.0, 0.0, 0.0, 0.0)
     return native.Camera(
         camera.width,
@@ -59,13 +61,30 @@ def native_camera(cam_from_world: Tensor, camera: Camera, options: RenderOptions
         (ctypes.c_float * 12)(*cam_from_world[:3].detach().reshape(-1).tolist()),
         options.near,
         low_pass.own,
-        isinstance(camera, Panorama) and (options.wrap or options.projection != "erp"),
+        off_panorama >= 0 or (isinstance(camera, Panorama) and (options.wrap or options.projection != "erp")),
         options.bounds == "square",
         *lens,
         low_pass.widen,
+        off_panorama,
         low_pass.compensate,
         options.near_cull == "ellipsoid",
     )
+
+
+def _off_panorama(camera: Camera) -> float:
+    """The largest angle in radians between a ray of a table and the one of a panorama at the same pixel; -1 if it is
+    large: a table that is nearly a panorama has its bounds, any other may look anywhere."""
+    if not isinstance(camera, RayTable):
+        return -1.0
+    table = camera.table.detach().float()
+    chord = (table - _panorama_rays(camera.width, camera.height).to(table.device)).norm(dim=-1)
+    angle = 2 * torch.asin((chord.max() / 2).clamp(max=1)).item() + SLACK
+    return angle if angle < FAR_OFF else -1.0
+
+
+@functools.lru_cache(maxsize=4)
+def _panorama_rays(width: int, height: int) -> Tensor:
+    return Panorama(width, height).rays()
 
 
 def native_rays(camera: Camera, device: torch.device = CPU) -> NativeRays:

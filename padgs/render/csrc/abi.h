@@ -35,6 +35,7 @@ struct Camera {
   int32_t square;        // 1: published bounds, a square of 3 sigma of the longest axis rounded out to tiles
   float fx, fy, cx, cy;  // pinhole
   float widen;           // rad^2, times r^2 added to the 3D covariance
+  float off_panorama;    // of a table: radians that its rays are off a panorama's at most; < 0: they may look anywhere
   int32_t compensate;    // 1: widening lowers the opacity
   int32_t cull_ellipsoids;  // 1: ray: all that is drawn of a Gaussian must be beyond near_radius, not the mean alone
 };

@@ -79,6 +79,17 @@ PADGS_HD PixelRange sphere_range(const Cone &k, const SphereFrame<float> &f, flo
           top * per_radian_v + 0.5f * height - widen_v, bottom * per_radian_v + 0.5f * height + widen_v};
 }
 
+// The range of a panorama within `angle` of any direction of a range: a disc about latitude psi spans asin(sin(angle) /
+// cos(psi)) of longitude to each side, and all of it once it reaches a pole.
+PADGS_HD PixelRange widened_range(PixelRange r, float angle, float width, float height) {
+  const float per_radian_u = width / (2 * kPi), per_radian_v = height / kPi;
+  const float steepest = larger(magnitude(r.v0 - 0.5f * height), magnitude(r.v1 - 0.5f * height)) / per_radian_v;
+  r.v0 -= angle * per_radian_v + kSlackPixels, r.v1 += angle * per_radian_v + kSlackPixels;
+  if (steepest + angle >= 0.5f * kPi - 1e-3f) return {0, width, r.v0, r.v1};
+  const float aside = asinf(smaller(sinf(angle) / cosf(steepest), 1.0f)) * per_radian_u * kSlack + kSlackPixels;
+  return {r.u0 - aside, r.u1 + aside, r.v0, r.v1};
+}
+
 // Whether a cone lies strictly on the side of a plane through the camera that the plane's normal turns away from.
 PADGS_HD bool behind(const Cone &k, Vec3<float> plane) {
   const Vec3<float> p = transposed_times(k.spread, plane);

@@ -127,7 +127,7 @@ PADGS_HD PixelBox box_of(const Camera &camera, const float *shape, const float *
     const float half_u = b[0] * kSlack + kSlackPixels, half_v = b[1] * kSlack + kSlackPixels;
     return pixel_box(camera, {u - half_u, u + half_u, v - half_v, v + half_v});
   }
-  if (camera.model == kTableModel) return {0, camera.width, 0, 0, camera.height};  // it may look anywhere
+  if (camera.model == kTableModel && camera.off_panorama < 0) return {0, camera.width, 0, 0, camera.height};
   const Vec3<float> mean{b[0], b[1], b[2]};
   if (camera.square) {
     const ErpChart<float> chart(camera, mean);
@@ -137,6 +137,9 @@ PADGS_HD PixelBox box_of(const Camera &camera, const float *shape, const float *
   const Cone cone{{{b[3], b[4], b[5]}, {b[6], b[7], b[8]}, {b[9], b[10], b[11]}}, frame.normal};
   if (camera.model == kPanoramaModel)
     return pixel_box(camera, sphere_range(cone, frame, float(camera.width), float(camera.height)));
+  if (camera.model == kTableModel)
+    return pixel_box(camera, widened_range(sphere_range(cone, frame, float(camera.width), float(camera.height)),
+                                           camera.off_panorama, float(camera.width), float(camera.height)));
   return misses_pinhole(cone, camera) ? no_pixels() : pixel_box(camera, pinhole_range(cone, camera));
 }
 
