@@ -21,6 +21,7 @@ from padgs.data.store import ImageStore, StoredImage
 from padgs.data.synthetic import cache, camera, paths
 from padgs.data.synthetic.options import SCENES, SyntheticOptions
 from padgs.data.synthetic.points import sample_points
+from padgs.data.synthetic.stitching import draw_stitched
 from padgs.data.synthetic.truth import SyntheticTruth
 from padgs.scene import Scene, View
 
@@ -95,7 +96,11 @@ def _make(options: SyntheticOptions) -> cache.Stored:
     images = []
     for index, pose in enumerate(truth.poses):
         gain = 1.0 if index in held_out else float(2 ** exposure[index])
-        images.append(camera.draw(truth.world, pose, options.width, options.samples, options.seed, gain))
+        if index in held_out or not (options.lens_gap or options.lens_k1):
+            images.append(camera.draw(truth.world, pose, options.width, options.samples, options.seed, gain))
+        else:
+            gap = options.lens_gap * truth.median_depth
+            images.append(draw_stitched(truth.world, pose, gap, options, gain))
     train = [index for index in range(len(images)) if index not in held_out]
     points, colors = sample_points(
         truth.world, truth.poses[train], [images[index] for index in train], options, truth.random("points")

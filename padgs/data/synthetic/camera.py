@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -26,8 +27,19 @@ def directions(rows: Array, columns: Array, width: int, height: int) -> Array:
     return np.stack((flat * np.sin(longitude), np.sin(latitude), flat * np.cos(longitude)))
 
 
-def draw(world: World, cam_from_world: Array, width: int, samples: int, seed: int = 0, gain: float = 1.0) -> Array:
-    """The panorama [H, W, 3] uint8 that a camera at `cam_from_world` [4, 4] sees, with `samples` rays a pixel."""
+def draw(
+    world: World,
+    cam_from_world: Array,
+    width: int,
+    samples: int,
+    seed: int = 0,
+    gain: float = 1.0,
+    lens: Callable[[Array], Array] | None = None,
+) -> Array:
+    """The panorama [H, W, 3] uint8 that a camera at `cam_from_world` [4, 4] sees, with `samples` rays a pixel.
+
+    `lens` says where it looks instead of along the camera-frame directions [3, n] of an ideal panorama.
+    """
     height = width // 2
     image = np.empty((height, width, 3), np.uint8)
     jitter = _jitter(height, samples, seed)
@@ -41,7 +53,7 @@ def draw(world: World, cam_from_world: Array, width: int, samples: int, seed: in
         v = np.broadcast_to((rows[:, None] + jitter[rows, :, 1])[:, None, :], (len(rows), len(columns), samples))
         u = columns[None, :, None] + jitter[rows, :, 0][:, None, :]
         rays = directions(v.ravel().astype(np.float32), u.ravel().astype(np.float32), width, height)
-        color = world.color(origin, world_from_cam @ rays)
+        color = world.color(origin, world_from_cam @ (rays if lens is None else lens(rays)))
         mean = color.reshape(3, len(rows), len(columns), samples).mean(-1)
         image[np.ix_(rows, columns)] = np.clip(mean * (255 * gain) + 0.5, 0, 255).astype(np.uint8).transpose(1, 2, 0)
 

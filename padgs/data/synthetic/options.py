@@ -17,7 +17,8 @@ class SyntheticOptions:
     """What to generate. The defaults are the embedded scene of a run without arguments.
 
     Everything is built and drawn in metres; `world_scale` and `world_rotation` then move poses, points and depth, so
-    the images do not depend on them. Pose noise and exposure touch training views only: test views are the truth.
+    the images do not depend on them. Pose noise, exposure and the two lenses touch training views only: test views are
+    the truth.
     """
 
     scene: str = "room"
@@ -39,6 +40,9 @@ class SyntheticOptions:
     pose_noise_translation: float = 0.0  # standard deviation per axis, relative to the scene's median depth
     pose_noise_rotation: float = 0.0  # degrees, standard deviation of the angle
     exposure: float = 0.0  # training views are brightened by a factor 2^e, e uniform in [-exposure, exposure]
+    lens_gap: float = 0.0  # between the two lenses of the camera of training views, relative to the median depth
+    lens_k1: float = 0.0  # theta' = theta (1 + k1 theta^2) of both lenses, see padgs/lens.py
+    lens_blend: float = 5.0  # degrees on both sides of the plane between the lenses in which both are seen
     world_scale: float = 1.0  # world units per metre
     world_rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)  # degrees about world x, then y, then z
 
@@ -55,9 +59,13 @@ class SyntheticOptions:
         for field, least in (("train_views", 2), ("test_views", 0), ("points", 1), ("spokes", 1)):
             if getattr(self, field) < least:
                 raise DataError(f"{field} {getattr(self, field)} is less than {least}")
-        for field in ("point_noise", "pose_noise_translation", "pose_noise_rotation", "exposure", "tilt"):
+        for field in ("point_noise", "pose_noise_translation", "pose_noise_rotation", "exposure", "tilt", "lens_gap"):
             if not 0 <= getattr(self, field) < math.inf:
                 raise DataError(f"{field} {getattr(self, field)} is not a finite number >= 0")
+        if not 0 <= self.lens_blend < 90:
+            raise DataError(f"lens_blend {self.lens_blend} is not an angle in [0, 90) degrees")
+        if not -0.1 <= self.lens_k1 <= 0.1:  # up to the horizon of a lens, theta' must grow with theta
+            raise DataError(f"lens_k1 {self.lens_k1} is not in [-0.1, 0.1]")
         if not 0 <= self.outliers < 1:
             raise DataError(f"outliers {self.outliers} is not a share in [0, 1)")
         for field in ("texture_frequency", "world_scale"):

@@ -1,0 +1,79 @@
+"""A fisheye lens that sees half a sphere: how it bends rays about its axis, and where it meets its twin.
+
+Directions are unit vectors in the camera frame (x right, y down, z forward), angles are radians. The lens of the other
+side is the same with the opposite axis.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}  # of the first lens, in the camera frame
+
+
+def axis_direction(name: str) -> Tensor:
+    """The axis [3] float64 of the first lens.
+
+    Raises:
+        ValueError: not one of `AXES`.
+    """
+    if name not in AXES:
+        raise ValueError(f"unknown lens axis {name!r}; known: {', '.join(AXES)}")
+    return torch.tensor(AXES[name], dtype=torch.float64)
+
+
+def radial_map(theta: Tensor, coefficients: Tensor) -> Tensor:
+    """theta' = theta (1 + k1 theta^2 + k2 theta^4 + ...): the angle from the axis that is seen where theta should be.
+
+    >>> round(radial_map(torch.tensor(0.5), torch.tensor([0.1])).item(), 6)
+    0.5125
+    """
+    return theta + _excess(theta, coefficients)
+
+
+def bend(directions: Tensor, axis: Tensor, coefficients: Tensor) -> Tensor:
+    """Directions [..., 3] turned away from the axis [3] by the radial map; as they are where all coefficients are 0.
+
+    d' = d cos(e) + t sin(e) with e = theta' - theta and t = (d cos(theta) - a) / sin(theta), the unit vector in which
+    theta grows. On the axis e / sin(theta) goes to 0.
+    """
+    cosine = directions @ axis
+    sine = torch.linalg.cross(directions, axis.expand_as(directions)).norm(dim=-1).clamp(min=1e-6)
+    excess = _excess(torch.atan2(sine, cosine), coefficients)
+    away = (directions * cosine[..., None] - axis) / sine[..., None]
+    return directions * torch.cos(excess)[..., None] + away * torch.sin(excess)[..., None]
+
+
+def hemisphere_weight(directions: Tensor, axis: Tensor, blend: float) -> Tensor:
+    """How much of each direction [..., 3] the lens along the axis [3] shows, in [0, 1]; its twin shows the rest.
+
+    A smooth step from 0 to 1 over the band of `blend` radians on both sides of the plane between the lenses; a hard one
+    for blend = 0.
+    """
+    height = directions @ axis
+    if blend == 0:
+        return (height > 0).to(directions) + 0.5 * (height == 0).to(directions)
+    x = (torch.asin(height.clamp(-1, 1)) / (2 * blend) + 0.5).clamp(0, 1)
+    return x * x * (3 - 2 * x)
+
+
+def check_blend(degrees: float) -> float:
+    """A half width of the band in radians.
+
+    Raises:
+        ValueError: not in [0, 90) degrees.
+    """
+    if not 0 <= degrees < 90:
+        raise ValueError(f"the blend band of the lenses is {degrees} degrees to each side; it must be in [0, 90)")
+    return math.radians(degrees)
+
+
+def _excess(theta: Tensor, coefficients: Tensor) -> Tensor:
+    square = theta * theta
+    total = torch.zeros_like(theta)
+    for coefficient in reversed(coefficients.unbind()):  # Horner
+        total = (total + coefficient) * square
+    return theta * total
