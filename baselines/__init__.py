@@ -9,4 +9,6 @@ METHODS = {
     "cubemap_3dgs": "baselines.cubemap_3dgs:Cubemap3DGSMethod",
     "crops_3dgs": "baselines.crops_3dgs:Crops3DGSMethod",
     "egonerf": "baselines.egonerf:EgoNeRFMethod",
+    "sc_omnigs": "baselines.sc_omnigs:SCOmniGSMethod",
+    "seam360gs": "baselines.seam360gs:Seam360GSMethod",
 }

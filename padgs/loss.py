@@ -48,7 +48,7 @@ def photometric_loss(
     normalisation: str = "mean",
     moments: TargetMoments | None = None,
 ) -> Tensor:
-    """Eq. 16, a scalar; differentiable by `image`.
+    """Eq. 16, a scalar; differentiable by `image`, and by `target` where that asks for a gradient.
 
     Args:
         image: [H, W, 3], not clamped.
@@ -56,7 +56,7 @@ def photometric_loss(
         weight: [H, W], or [H, 1] where all pixels of a row weigh the same; >= 0, not 0 everywhere.
         lambda_l1: lambda of Eq. 16.
         normalisation: mean divides by 3 sum(W); channel_sum by sum(W), as the released code does (3 x the mean).
-        moments: `target_moments(target)`, if already known.
+        moments: `target_moments(target)`, if already known; they stop the gradient by the target.
 
     Raises:
         ValueError: unknown normalisation.
@@ -66,7 +66,11 @@ def photometric_loss(
     height, width, channels = image.shape
     total = weight.expand(height, width).sum() * (channels if normalisation == "mean" else 1)
     if fits(image):
-        return fused_photometric_loss(image, target, weight, lambda_l1, float(total))
+        loss = fused_photometric_loss(image, target.detach(), weight, lambda_l1, float(total))
+        if target.requires_grad:  # Eq. 16 is symmetric, so that is the derivative by the image with both exchanged
+            mirrored = fused_photometric_loss(target, image.detach(), weight, lambda_l1, float(total))
+            loss = loss + (mirrored - mirrored.detach())
+        return loss
     per_channel = lambda_l1 * (image - target).abs() + (1 - lambda_l1) * (1 - ssim_map(image, target, moments))
     return (weight[..., None] * per_channel).sum() / total
 

@@ -121,21 +121,35 @@ def projection_jacobian(points: Tensor, width: int, height: int, *, min_cos_lati
 
 
 def sample(image: Tensor, directions: Tensor) -> Tensor:
-    """Bilinear samples [..., C] float32 of a panorama [H, W, C], across the seam and the poles.
+    """Bilinear samples [..., C] of a panorama [H, W, C], across the seam and the poles, as `sample_pixels` takes them.
 
     Args:
         image: any dtype, values as they are.
         directions: [..., 3] camera frame, any length but zero.
     """
     height, width = image.shape[:2]
-    u, v = (project(directions, width, height) - 0.5).unbind(-1)
-    column, row = u.floor().long(), v.floor().long()
-    across, down = (u - column)[..., None].float(), (v - row)[..., None].float()
+    return sample_pixels(image, project(directions, width, height))
+
+
+def sample_pixels(image: Tensor, pixels: Tensor) -> Tensor:
+    """Bilinear samples [..., C] of a panorama [H, W, C] at pixel coordinates; at pixel centres its very values.
+
+    Differentiable by both. Samples have the dtype of the image, float32 where it holds integers.
+
+    Args:
+        image: any dtype, values as they are.
+        pixels: (u, v) [..., 2], continuous; u any number of turns around, v within the image.
+    """
+    height, width = image.shape[:2]
+    image = image if image.is_floating_point() else image.float()
+    u, v = (pixels - 0.5).unbind(-1)
+    column, row = u.detach().floor().long(), v.detach().floor().long()
+    across, down = (u - column)[..., None].to(image), (v - row)[..., None].to(image)
 
     def at(row: Tensor, column: Tensor) -> Tensor:
         beyond = (row < 0) | (row >= height)  # a pole: the next row is the same one, half a turn further
         column = torch.where(beyond, column + width // 2, column) % width
-        return image[row.clamp(0, height - 1), column].float()
+        return image[row.clamp(0, height - 1), column]
 
     above = at(row, column).lerp(at(row, column + 1), across)
     return above.lerp(at(row + 1, column).lerp(at(row + 1, column + 1), across), down)

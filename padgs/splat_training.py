@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from padgs.camera import Panorama
 from padgs.clone_split import CloneSplit, CloneSplitOptions
@@ -59,8 +60,8 @@ class TrainableSplats:
             ParameterGroup("sh_rest", (splats.sh_rest,), Constant(2.5e-3 / 20 * factor)),
         ]
 
-    def draw(self, view: View) -> Drawing:
-        """Render all Gaussians, differentiably."""
+    def draw(self, view: View, probe: Tensor | None = None) -> Drawing:
+        """Render all Gaussians, differentiably; `probe` is that of another drawing of the same Gaussians."""
         self._drawn = view
         gaussians = self.splats.gaussians(view)
         rendering, probe = render_probed(
@@ -68,6 +69,7 @@ class TrainableSplats:
             view,
             self._render_options(view),
             signal=self.densifier.options.signal,
+            probe=probe,
             backend=self._config.backend,
         )
         return Drawing(rendering, probe, gaussians, torch.arange(len(probe), device=probe.device))

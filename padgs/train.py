@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass, fields
 from typing import Protocol
 
 import torch
@@ -14,7 +15,7 @@ from padgs.loss import NORMALISATIONS, ROW_WEIGHTS, photometric_loss
 from padgs.method import Budget, Failure, State
 from padgs.render import Rendering
 from padgs.scene import Scene, View
-from padgs.targets import Targets
+from padgs.targets import Target, Targets
 from padgs.training_loop import Optimisable, TrainingLoop, model_state
 
 __all__ = ["Drawing", "TrainOptions", "Trainable", "Trainer", "model_state"]
@@ -28,6 +29,9 @@ class Drawing:
     probe: Tensor  # [N, 2] or [N, 3], see `padgs.probes`; its .grad is filled by backward
     gaussians: Gaussians  # the N that were drawn
     slots: Tensor  # [N] int64: the row of the model's statistics that each drawn Gaussian counts for
+    _: KW_ONLY
+    penalty: Tensor | None = None  # a scalar to be added to the loss
+    photo: Callable[[Target], Target] | None = None  # brings the training image to where it was drawn; differentiable
 
 
 class Trainable(Optimisable, Protocol):
@@ -103,6 +107,8 @@ class Trainer(TrainingLoop):
         drawing = self._trainee.draw(self._scene.train[index])
         if len(drawing.gaussians) == 0:
             raise Failure("collapsed", f"no Gaussian is left to draw at iteration {iteration}")
+        if drawing.photo is not None:
+            target = drawing.photo(target)
         image = drawing.rendering.image
         options = self._options
         loss = photometric_loss(
@@ -113,6 +119,8 @@ class Trainer(TrainingLoop):
             normalisation=options.normalisation,
             moments=target.moments,
         )
+        if drawing.penalty is not None:
+            loss = loss + drawing.penalty
         value = loss.item()
         if not math.isfinite(value):
             inputs = {field.name: getattr(drawing.gaussians, field.name) for field in fields(drawing.gaussians)}
@@ -122,7 +130,7 @@ class Trainer(TrainingLoop):
         with torch.no_grad():
             self._trainee.observe(drawing, iteration)
         drawn = len(drawing.gaussians)
-        del drawing, image, loss  # the graph must be gone before rows of its leaves come and go
+        del drawing, image, loss, target  # the graph must be gone before rows of its leaves come and go
         self._update()
         with torch.no_grad():
             events = self._trainee.adapt(iteration, self._optimizer)

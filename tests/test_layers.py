@@ -13,7 +13,7 @@ import pytest
 
 # From the ground up; a package stands for all its modules. A file imports from its own layer and those above it here.
 LAYERS = {
-    "geometry": ("padgs.registry", "padgs.panorama", "padgs.distortion"),
+    "geometry": ("padgs.registry", "padgs.panorama", "padgs.distortion", "padgs.lens"),
     "data types": ("padgs.camera", "padgs.scene", "padgs.perspectives", "padgs.gaussians"),
     "rendering": ("padgs.render",),
     "models": (
@@ -45,6 +45,10 @@ LAYERS = {
         "padgs.ray_pixels",
         "padgs.ray_training",
         "padgs.egonerf_training",
+        "padgs.calibrated_splats",
+        "padgs.pose_refinement",
+        "padgs.camera_map",
+        "padgs.dual_lens",
     ),
     "measuring": (
         "padgs.metrics",

@@ -121,3 +121,25 @@ def test_wrong_options_are_named():
         photometric_loss(image, image, torch.ones(8, 1), normalisation="sum")
     with pytest.raises(ValueError, match="no pixel is left"):
         pixel_weight("uniform", 8, torch.zeros(8, 16))
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_the_gradient_by_a_target_that_asks_for_one_is_that_of_differences(dtype, generator):
+    """Float32 takes the native loss, whose derivative by the target is that by the image with both exchanged."""
+    image = torch.rand(20, 24, 3, generator=generator, dtype=torch.float64).to(dtype).requires_grad_()
+    target = torch.rand(20, 24, 3, generator=generator, dtype=torch.float64).to(dtype).requires_grad_()
+    weight = solid_angle_weight(20, dtype=dtype)[:, None]
+    loss = photometric_loss(image, target, weight)
+    assert loss.item() == pytest.approx(photometric_loss(image.detach(), target.detach(), weight).item(), rel=1e-6)
+    by_image, by_target = torch.autograd.grad(loss, (image, target))
+    exact = [t.detach().double().requires_grad_() for t in (image, target)]
+    expected = torch.autograd.grad(photometric_loss(*exact, weight.double()), exact)
+    for gradient, truth in zip((by_image, by_target), expected, strict=True):
+        torch.testing.assert_close(gradient.double(), truth, rtol=1e-3, atol=1e-7)
+    step, place = 1e-6, (7, 11, 1)
+    sides = []
+    for sign in (1, -1):
+        moved = exact[1].detach().clone()
+        moved[place] += sign * step
+        sides.append(photometric_loss(exact[0].detach(), moved, weight.double()).item())
+    assert expected[1][place].item() == pytest.approx((sides[0] - sides[1]) / (2 * step), rel=1e-4)

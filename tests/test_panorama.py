@@ -17,6 +17,7 @@ from padgs.panorama import (
     rays,
     row_latitudes,
     sample,
+    sample_pixels,
     unproject,
 )
 
@@ -213,6 +214,17 @@ def test_jacobian_is_differentiable_also_on_the_axis():
 def test_samples_at_pixel_centres_are_the_pixels(generator):
     image = torch.rand(16, 32, 2, generator=generator)
     assert torch.allclose(sample(image, rays(32, 16, dtype=torch.float64)), image, atol=1e-6)
+
+
+def test_samples_at_pixel_coordinates_are_exact_wrap_and_have_gradients(generator):
+    image = torch.rand(4, 8, 2, generator=generator, dtype=torch.float64)
+    columns, rows = torch.meshgrid(torch.arange(8) + 0.5, torch.arange(4) + 0.5, indexing="xy")
+    centres = torch.stack((columns, rows), dim=-1).double()
+    assert torch.equal(sample_pixels(image, centres), image)
+    assert torch.equal(sample_pixels(image, centres + torch.tensor([16.0, 0.0])), image)
+    assert sample_pixels((image * 255).to(torch.uint8), centres).dtype == torch.float32
+    places = (centres + 0.3).requires_grad_()
+    assert torch.autograd.gradcheck(sample_pixels, (image.requires_grad_(), places))
 
 
 def test_samples_are_continuous_across_the_seam(generator):

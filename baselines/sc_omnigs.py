@@ -1,0 +1,183 @@
+"""SC-OmniGS: OmniGS that calibrates itself; poses and the panoramic camera are optimised with the Gaussians.
+
+No code of it is public. What is known and what is inferred here is told apart in docs/methods.md.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from padgs.calibrated_splats import CalibratedMethod, CalibratedSplats
+from padgs.camera_map import CameraMap
+from padgs.data.align import Difference, Similarity, align
+from padgs.loss import pixel_weight
+from padgs.method import Budget, Record, State
+from padgs.panorama import sample_pixels
+from padgs.pose_refinement import PoseRates, PoseRefinement
+from padgs.render import Rendering
+from padgs.scene import Scene, View
+from padgs.schedule import Constant, ParameterGroup
+from padgs.splat_method import SplatOptions
+from padgs.targets import Target
+from padgs.train import Drawing, TrainOptions
+
+
+@dataclass(frozen=True)
+class SCOmniGSOptions(SplatOptions):
+    """Those of OmniGS, and of the calibration."""
+
+    poses: PoseRates = PoseRates()
+    focal_rate: float = 1e-5  # learning rate of the focal-type coefficient
+    distortion_rate: float = 1e-5  # ... of the angular distortion map, radians
+    roughness_weight: float = 1e-2  # in the loss, of the map's total variation per radian
+    anisotropy_weight: float = 1e-3  # in the loss, of `anisotropy`
+    anisotropy_ratio: float = 10.0  # longest to shortest axis that a Gaussian may have unpunished
+
+
+class SelfCalibration(nn.Module):
+    """Poses of all training views and the one camera that took them; see `padgs.calibrated_splats.Calibration`."""
+
+    def __init__(self, poses: PoseRefinement, camera: CameraMap, options: SCOmniGSOptions, weight: str) -> None:
+        """Start from the given poses and an ideal camera; `weight` is a name of `padgs.loss.ROW_WEIGHTS`."""
+        super().__init__()
+        self.poses, self.camera = poses, camera
+        self._options, self._weight = options, weight
+
+    def groups(self, iterations: int) -> list[ParameterGroup]:
+        """Parameters of poses and camera."""
+        options, camera = self._options, self.camera
+        return [
+            *self.poses.groups(options.poses, iterations),
+            ParameterGroup("camera_focal", (camera.focal,), Constant(options.focal_rate)),
+            ParameterGroup("camera_offsets", (camera.offsets,), Constant(options.distortion_rate)),
+        ]
+
+    def draw(self, draw: Callable[..., Drawing], view: View) -> Drawing:
+        """The ideal panorama at the refined pose; the photograph is resampled to it."""
+        drawing, options = draw(self.poses.refined(view)), self._options
+        penalty = options.roughness_weight * self.camera.roughness()
+        penalty = penalty + options.anisotropy_weight * anisotropy(drawing.gaussians.scales, options.anisotropy_ratio)
+        return replace(drawing, penalty=penalty, photo=partial(self.photograph, view))
+
+    def summary(self) -> str:
+        """How far the poses have moved from the given ones, world units and degrees, once both are aligned."""
+        _, left = aligned(self.poses)
+        return (
+            f"poses moved by {left.distance.median():.3g} world units and {left.degrees.median():.3g} degrees (median)"
+        )
+
+    def values(self) -> dict[str, Any]:
+        """Names of the views, size of their images, unit of length."""
+        size = {"width": self.camera.width, "height": self.camera.height}
+        return {"views": self.poses.names, "unit": self.poses.unit, **size}
+
+    def counts(self) -> dict[str, int]:
+        """The poses."""
+        return {"poses": len(self.poses.names)}
+
+    def photograph(self, view: View, target: Target) -> Target:
+        """A training image, and the mask of its view, as an ideal camera would have taken them."""
+        pixels, mask = self.camera.source_pixels(), view.mask(device=target.image.device)
+        if mask is None:
+            return Target(sample_pixels(target.image, pixels), target.weight, moments=None)
+        mask = sample_pixels(mask[..., None], pixels.detach())[..., 0]
+        weight = pixel_weight(self._weight, view.height, mask, device=mask.device)
+        return Target(sample_pixels(target.image, pixels), weight, moments=None)
+
+
+class SCOmniGSMethod(CalibratedMethod):
+    """See `padgs.method.Method`.
+
+    Held-out views: their poses are given in the world of the given training poses, the model lives in that of the
+    refined ones. The similarity that maps the former cameras onto the latter takes each view across; no pixel of a
+    held-out view is used. What is rendered is the photograph, distortion included.
+    """
+
+    Options = SCOmniGSOptions
+    TRAIN = TrainOptions(weight="solid_angle")
+
+    _photography: tuple[Similarity, Tensor] | None = None  # what rendering a view of the given world takes
+
+    def fit(self, scene: Scene, budget: Budget) -> Iterator[Record]:
+        """Train, from the point cloud and poses of the scene or from a loaded state.
+
+        Raises:
+            ValueError: training views of several sizes (there is one camera), or all from one place (no scale).
+        """
+        for record in super().fit(scene, budget):
+            self._photography = None
+            yield record
+
+    def render(self, view: View) -> Rendering:
+        """Render a view of the given world, as its camera photographs it, without gradients.
+
+        Raises:
+            ValueError: a view of another size than the training views.
+        """
+        model = self._trained()
+        assert isinstance(model, CalibratedSplats) and isinstance(model.calibration, SelfCalibration)
+        poses, camera = model.calibration.poses, model.calibration.camera
+        if (view.width, view.height) != (camera.width, camera.height):
+            raise ValueError(
+                f"view {view.name!r} is {view.width}x{view.height}; the camera was calibrated at "
+                f"{camera.width}x{camera.height}"
+            )
+        if self._photography is None:
+            self._photography = aligned(poses)[0], camera.ideal_pixels()
+        similarity, pixels = self._photography
+        ideal = model.render(replace(view, cam_from_world=carried(view.cam_from_world, similarity)))
+        layers = torch.cat((ideal.image, ideal.transmittance[..., None], ideal.depth[..., None]), dim=-1)
+        image, transmittance, depth = sample_pixels(layers, pixels).split((3, 1, 1), dim=-1)
+        return replace(ideal, image=image, transmittance=transmittance[..., 0], depth=depth[..., 0])
+
+    def load_state(self, state: State) -> None:
+        """Become the method that `state` was taken of, ready to render and to go on."""
+        self._photography = None
+        super().load_state(state)
+
+    def _as_given(self, scene: Scene) -> SelfCalibration:
+        sizes = {(view.width, view.height) for view in scene.train}
+        if len(sizes) > 1:
+            raise ValueError(f"sc_omnigs calibrates one camera, but the training views have sizes {sorted(sizes)}")
+        poses = PoseRefinement.of(scene.train, unit=scene.unit)
+        align(poses.given, poses.given)  # refuses what could not be evaluated
+        return self._calibrating(poses, *sizes.pop())
+
+    def _as_stored(self, values: Mapping[str, Any]) -> SelfCalibration:
+        names = values["views"]
+        poses = PoseRefinement(names, torch.eye(4).repeat(len(names), 1, 1), unit=values["unit"])
+        return self._calibrating(poses, values["width"], values["height"])
+
+    def _calibrating(self, poses: PoseRefinement, width: int, height: int) -> SelfCalibration:
+        assert isinstance(self._options, SCOmniGSOptions)
+        return SelfCalibration(poses, CameraMap(width, height), self._options, self._train.weight)
+
+
+def aligned(poses: PoseRefinement) -> tuple[Similarity, Difference]:
+    """The similarity refined_from_given, and what it leaves of the corrections (world units, degrees)."""
+    return align(poses.poses(), poses.given)
+
+
+def carried(cam_from_world: Tensor, similarity: Similarity) -> Tensor:
+    """A pose [4, 4] float64 in the world that the similarity leads to."""
+    rotation = cam_from_world[:3, :3] @ similarity.rotation.mT
+    center = similarity(-cam_from_world[:3, :3].mT @ cam_from_world[:3, 3])
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ center
+    return pose
+
+
+def anisotropy(scales: Tensor, ratio: float) -> Tensor:
+    """Mean over Gaussians of ln(longest / shortest axis) as far as it exceeds ln(ratio), for scales [N, 3]; a scalar.
+
+    >>> round(anisotropy(torch.tensor([[1.0, 1.0, 20.0], [1.0, 1.0, 1.0]]), 10.0).item(), 4)  # ln(2) / 2
+    0.3466
+    """
+    return torch.relu(torch.log(scales.amax(-1) / scales.amin(-1)) - math.log(ratio)).mean()

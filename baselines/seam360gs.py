@@ -1,0 +1,52 @@
+"""Seam360GS: Gaussians seen through the two fisheye lenses that made the panorama, so that the seam is the camera's.
+
+No code of it is public. What is known and what is inferred here is told apart in docs/methods.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from padgs.calibrated_splats import CalibratedMethod
+from padgs.dual_lens import DualLens
+from padgs.method import RenderConfig
+from padgs.scene import Scene
+from padgs.splat_method import SplatOptions
+
+
+@dataclass(frozen=True)
+class Seam360GSOptions(SplatOptions):
+    """Those of explicit Gaussians, and of the lenses; the values of the latter are inferred."""
+
+    lens_axis: str = "z"  # x, y or z of the camera; the seam is the plane across it
+    lens_order: int = 2  # coefficients of each lens's radial map
+    lens_blend: float = 5.0  # degrees on both sides of the seam in which both lenses are seen
+    gap_rate: float = 1e-3  # learning rate of the gap at the start, scene units
+    coefficient_rate: float = 1e-3  # ... of the radial maps
+
+
+class Seam360GSMethod(CalibratedMethod):
+    """See `padgs.method.Method`. Trained through `DualLens`; `render` is the ideal camera, one centre and no seam.
+
+    Lenses see along rays of their own, which the projection erp cannot draw; it ends as rejected.
+    """
+
+    Options = Seam360GSOptions
+    RENDER = RenderConfig(projection="ray")
+
+    def _as_given(self, scene: Scene) -> DualLens:
+        return self._as_stored({"unit": scene.unit})
+
+    def _as_stored(self, values: Mapping[str, Any]) -> DualLens:
+        options = self._options
+        assert isinstance(options, Seam360GSOptions)
+        return DualLens(
+            axis=options.lens_axis,
+            order=options.lens_order,
+            blend=options.lens_blend,
+            unit=values["unit"],
+            gap_rate=options.gap_rate,
+            coefficient_rate=options.coefficient_rate,
+        )
