@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import io
 import math
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import wraps
@@ -98,6 +99,8 @@ def dress(axis: Any, values: Sequence[float], log_from: float = math.inf) -> Non
 def finish(made: Any, name: str, title: str, tips: Tips) -> Chart:
     """Title and files of a figure."""
     made.suptitle(title, fontsize=10.5)
+    made.draw_without_rendering()
+    made.set_layout_engine("none")  # the layout is found; each file would find it again
     svg, png = io.StringIO(), io.BytesIO()
     made.savefig(svg, format="svg", metadata={"Date": None, "Creator": None})
     made.savefig(png, format="png", dpi=DPI, metadata={"Software": None})
@@ -119,6 +122,7 @@ def marker_of(preset: str, presets: Sequence[str]) -> str:
 
 
 def _with_tips(svg: str, tips: Tips) -> str:
-    for name, text in tips.texts.items():
-        svg = svg.replace(f'<g id="{name}">', f'<g id="{name}" class="tip"><title>{html.escape(text)}</title>', 1)
-    return svg
+    def said(match: re.Match[str]) -> str:
+        return f'<g class="tip"><title>{html.escape(tips.texts[match[1]])}</title>'
+
+    return re.sub(r'<g id="(tip-\d+)">', said, svg)

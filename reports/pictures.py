@@ -19,9 +19,9 @@ from reports.settings import Setting, chosen, settings
 
 FOLDER = "renders"  # of a run: truth | render | error of each test view, side by side
 WIDTH = 1024  # pixels of an embedded panorama at most
-QUALITY = 85  # of JPEG
+QUALITY = 80  # of JPEG
 VIEWS = 3  # of a scene at most
-MOST_FILES = 90  # pictures opened for a page; a scene that no longer fits is left out and named
+MOST_FILES = 72  # pictures opened for a page; a scene that no longer fits is left out and named
 
 
 @dataclass
@@ -32,10 +32,10 @@ class Album:
     scenes: list[dict[str, Any]] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
 
-    def add(self, image: Image.Image) -> int:
-        """Keep an image and give its number."""
-        if image.width > WIDTH:
-            image = image.resize((WIDTH, round(WIDTH * image.height / image.width)), Image.Resampling.LANCZOS)
+    def add(self, image: Image.Image, width: int = WIDTH) -> int:
+        """Keep an image, reduced to so many pixels, and give its number."""
+        if image.width > width:
+            image = image.resize((width, round(width * image.height / image.width)), Image.Resampling.BOX)
         file = io.BytesIO()
         image.convert("RGB").save(file, "JPEG", quality=QUALITY)
         self.images.append(base64.b64encode(file.getvalue()).decode())
@@ -79,7 +79,7 @@ def _view(made: Album, folder: Path, runs: Sequence[Setting], name: str) -> dict
         truth, render, error = (picture.crop((i * width, 0, (i + 1) * width, height)) for i in range(3))
         if view["truth"] is None:
             view["truth"] = made.add(truth)
-        images = {"render": made.add(render), "error": made.add(error)}
+        images = {"render": made.add(render), "error": made.add(error, WIDTH // 2)}
         view["methods"].append({"title": f"{setting.title}{_mark(run, name)}", **images})
     return view
 

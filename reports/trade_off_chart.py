@@ -36,26 +36,30 @@ def chart(trade_off: TradeOff) -> Chart:
             _measured(axes[row, index], trade_off.points, cost, quality, presets, area, tips)
         for index in range(len(PUBLISHED_COSTS)):
             _published(axes[row, len(COSTS) + index], trade_off.beside, row, index, presets, tips)
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    made.legend(handles, labels, loc="outside lower center", ncols=6)
+    for preset in presets:
+        style = {"color": color_of(preset, presets), "marker": marker_of(preset, presets), "linestyle": "none"}
+        axes[0, 0].plot([], [], label=methods.title(preset), **style)
+    made.legend(loc="outside lower center", ncols=6)
     title = f"{trade_off.title}\nfilled: measured here, area = Gaussians, line = Pareto front; hollow: published"
     return finish(made, trade_off.name, f"{title}, {published.TITLES[trade_off.beside]}, one RTX 3090 Ti", tips)
 
 
 @styled
 def time_chart(trade_off: TradeOff, probes: Mapping[str, Sequence[Probe]]) -> Chart | None:
-    """Held-out PSNR over training seconds, a line for each run; None where no run left a log."""
+    """Held-out PSNR over training seconds; None where no run left a log.
+
+    A line for each run of one scene; of the scenes of a data set, whose lines would bury each other, the first seed.
+    """
     made, axes = figure(1, 1, 6.0, 3.6)
     panel, tips = axes[0, 0], Tips()
     presets = methods.ordered(result.preset for result in trade_off.runs)
     drawn: dict[str, None] = {}
     ends: list[float] = []
-    by_scene = [
-        [r for r in trade_off.runs if r.scene == scene] for scene in dict.fromkeys(r.scene for r in trade_off.runs)
-    ]
+    scenes = dict.fromkeys(result.scene for result in trade_off.runs)
+    by_scene = ([result for result in trade_off.runs if result.scene == scene] for scene in scenes)
     for setting in (setting for runs in by_scene for setting in settings(runs)):
         color, marker = color_of(setting.preset, presets), marker_of(setting.preset, presets)
-        for result in setting.runs:
+        for result in setting.runs[: 1 if len(scenes) > 1 else None]:
             points = probes.get(result.run, ())
             if not points:
                 continue
@@ -83,9 +87,7 @@ def _measured(
     there = []
     for point in points:
         x, y = point.numbers[cost.column.title], point.numbers[quality.column.title]
-        label = methods.title(point.preset)
         color, marker = color_of(point.preset, presets), marker_of(point.preset, presets)
-        panel.scatter([], [], s=AREA, color=color, marker=marker, label=label if _first_of(point, points) else None)
         if x.value is None or y.value is None or not math.isfinite(y.value):
             continue
         lines = [point.title, *(f"{t}: {c.value:,.4g}" for t, c in point.numbers.items() if c.value is not None)]
@@ -133,10 +135,6 @@ def _published(panel: Any, dataset: str, row: int, index: int, presets: list[str
     panel.set_facecolor("#fafafa")
     panel.set_xlabel(f"{cost_title} (published)")
     panel.set_ylabel(f"{title} (published)")
-
-
-def _first_of(point: Point, points: Sequence[Point]) -> bool:
-    return point is next(other for other in points if other.preset == point.preset)
 
 
 def _area(points: Sequence[Point]) -> Any:
