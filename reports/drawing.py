@@ -109,9 +109,9 @@ def finish(made: Any, name: str, title: str, tips: Tips) -> Chart:
 
 def color_of(preset: str, presets: Sequence[str]) -> str:
     """The colour of a preset's method: the paper's always have the same."""
-    known, method = list(methods.TITLES), preset.partition("_")[0]
-    others = [name for name in dict.fromkeys(p.partition("_")[0] for p in presets) if name not in known]
-    return COLORS[[*known, *others].index(method) % len(COLORS)]
+    known = list(methods.TITLES)
+    others = [name for name in dict.fromkeys(map(methods.method_of, presets)) if name not in known]
+    return COLORS[[*known, *others].index(methods.method_of(preset)) % len(COLORS)]
 
 
 def marker_of(preset: str, presets: Sequence[str]) -> str:

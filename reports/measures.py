@@ -96,7 +96,7 @@ def peak_gigabytes(result: Result) -> float | None:
 
 
 COSTS: Sequence[Measure] = (
-    Measure(Column("training h", 3, False, group="training h"), hours, "train_hours"),
+    Measure(Column("training h", 4, False, group="training h"), hours, "train_hours"),
     Measure(Column("FPS", 2, True, group="FPS"), fps, "fps"),
     Measure(Column("ms per frame", 1, False), frame_ms),
     Measure(Column("Gaussians", 0), gaussians),

@@ -11,7 +11,19 @@ TITLES = {
     "omnigs": "OmniGS",
     "spags": "SPaGS",
     "padgs": "PaD-GS",
+    "cubemap_3dgs": "3DGS on cube faces",
+    "crops_3dgs": "3DGS on crops",
 }
+
+
+def method_of(preset: str) -> str:
+    """The method of a preset: the known name that it begins with, else itself.
+
+    >>> method_of("odgs_release"), method_of("cubemap_3dgs"), method_of("my_own")
+    ('odgs', 'cubemap_3dgs', 'my_own')
+    """
+    known = [method for method in TITLES if preset == method or preset.startswith(f"{method}_")]
+    return known[0] if known else preset
 
 
 def title(preset: str) -> str:
@@ -20,9 +32,9 @@ def title(preset: str) -> str:
     >>> title("padgs"), title("odgs_release"), title("mine")
     ('PaD-GS', 'ODGS, release', 'mine')
     """
-    method, _, rest = preset.partition("_")
-    name = TITLES.get(method)
-    return preset if name is None else f"{name}, {rest.replace('_', ' ')}" if rest else name
+    method = method_of(preset)
+    rest = preset.removeprefix(method).strip("_").replace("_", " ")
+    return ", ".join(part for part in (TITLES.get(method, method), rest) if part)
 
 
 def ordered(presets: Iterable[str]) -> list[str]:
@@ -32,7 +44,7 @@ def ordered(presets: Iterable[str]) -> list[str]:
     ['odgs', 'odgs_release', 'padgs', 'mine']
     """
     ranks = {name: rank for rank, name in enumerate(TITLES)}
-    return sorted(set(presets), key=lambda preset: (ranks.get(preset.partition("_")[0], len(ranks)), preset))
+    return sorted(set(presets), key=lambda preset: (ranks.get(method_of(preset), len(ranks)), preset))
 
 
 def published_as(preset: str) -> str:

@@ -15,7 +15,7 @@ from reports.settings import settings
 from reports.trade_off import COSTS, Point, TradeOff, pareto
 
 AREA = 60.0  # points^2 of a marker with the median number of Gaussians
-SMALLEST, LARGEST = 25.0, 700.0
+SMALLEST, LARGEST = 32.0, 700.0
 WITHOUT_GAUSSIANS = 25.0
 PUBLISHED = (  # metric and cost of the paper, how to read the cost
     ("psnr", "PSNR ↑", True),
@@ -93,8 +93,8 @@ def _measured(
         lines = [point.title, *(f"{t}: {c.value:,.4g}" for t, c in point.numbers.items() if c.value is not None)]
         there.append((x.value, y.value))
         panel.errorbar([x.value], [y.value], xerr=x.std, yerr=y.std, color=color, linewidth=0.8, linestyle="none")
-        style = {"s": area(point), "color": color, "marker": marker, "alpha": 0.75, "edgecolors": "white"}
-        panel.scatter([x.value], [y.value], linewidths=0.5, gid=tips.add("\n".join(lines)), **style)
+        style = {"s": area(point), "color": color, "marker": marker, "alpha": 0.75}
+        panel.scatter([x.value], [y.value], linewidths=0.0, gid=tips.add("\n".join(lines)), **style)
     front = pareto(there, bool(quality.column.higher_is_better))
     panel.plot(
         *zip(*front, strict=True) if front else ((), ()),

@@ -27,7 +27,7 @@ def report(
     metric: Annotated[list[str] | None, typer.Option(help="of the curves of sweeps, e.g. ws_psnr; repeatable")] = None,
     where: Annotated[list[str] | None, typer.Option(help="only runs with KEY=VALUE; repeatable")] = None,
     mix: Annotated[bool, typer.Option(help="let other rules, sizes, run lengths and machines stand together")] = False,
-    collect: Annotated[bool, typer.Option(help="copy the result files to OUT/runs, without pictures")] = False,
+    collect: Annotated[bool, typer.Option(help="copy the result files to OUT/results, without pictures")] = False,
     strict: Annotated[bool, typer.Option(help="exit code 1 if a result file cannot be used")] = False,
 ) -> None:
     """Make tables (Markdown, LaTeX, CSV), charts (SVG, PNG, CSV) and a page (HTML) from result files."""
@@ -64,7 +64,7 @@ def report(
     if collect:
         from reports.collected import files
 
-        _write(files(folder, found), target / "runs")
+        _write(files(folder, found), target / "results")
     print(f"{len(found)} results, {len(broken)} left out; see {target}", file=sys.stderr)
     if refused or (strict and broken):
         raise typer.Exit(1)

@@ -15,7 +15,7 @@ def report(*arguments):
 def test_collected_results_give_the_same_reports_and_are_small(tmp_path):
     runs = write(compared(["synthetic-room"], seeds=1), tmp_path / "runs", pictures=True)
     report("table1", runs, "--out", tmp_path / "measured", "--collect")
-    collected = tmp_path / "measured" / "runs"
+    collected = tmp_path / "measured" / "results"
     assert results.read_all(collected)[0] == results.read_all(runs)[0]
     assert {path.name for path in collected.glob("*/*")} == {"result.json", "log.jsonl"}
     assert probes(collected, results.read_all(collected)[0]) == probes(runs, results.read_all(runs)[0])
