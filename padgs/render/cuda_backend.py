@@ -39,7 +39,7 @@ def rasterize(
         ValueError: tensors, or options, that the library cannot take.
         OSError: the library was not built.
         RuntimeError: the library was not compiled for this GPU.
-        torch.OutOfMemoryError: the GPU has too little memory; `options.max_instances` makes the strips smaller.
+        torch.cuda.OutOfMemoryError: the GPU has too little memory; `options.max_instances` makes the strips smaller.
     """
     check(gaussians.means, options)
     counters = Counters()

@@ -199,7 +199,7 @@ def call(name: str, where: Queue, *arguments: Any) -> None:
     """Call a function of the library that returns a cudaError_t; structures go by reference.
 
     Raises:
-        torch.OutOfMemoryError: the device has no memory left.
+        torch.cuda.OutOfMemoryError: the device has no memory left.
         RuntimeError: any other error of CUDA; those of kernels may be reported later than they happen.
     """
     references = (ctypes.byref(a) if isinstance(a, ctypes.Structure) else a for a in arguments)
@@ -211,4 +211,4 @@ def raise_for(code: int, name: str) -> None:
     if code == 0:
         return
     message = f"{name}: CUDA error {code}, {library().padgs_cuda_error(code).decode()}"
-    raise torch.OutOfMemoryError(message) if code == OUT_OF_MEMORY else RuntimeError(message)
+    raise torch.cuda.OutOfMemoryError(message) if code == OUT_OF_MEMORY else RuntimeError(message)

@@ -20,6 +20,7 @@ import torch
 from padgs.camera import RayTable
 from padgs.render import BACKENDS, Rendering, cuda_backend, cuda_native, native
 
+HERE = Path(__file__).parent
 SOURCES = Path(cuda_native.__file__).parent / "csrc" / "cuda"
 COMPILER = shutil.which("c++") or shutil.which("g++")
 ON_GPU = torch.cuda.is_available() and cuda_native.available()
@@ -29,16 +30,26 @@ real_library = cuda_native.library
 @functools.cache
 def emulated_library() -> ctypes.CDLL:
     """The kernels compiled for the host; seconds, once in a process."""
+    loaded = compiled("padgs_cuda", sorted(SOURCES.glob("*.cu")))
+    return native.declared(loaded, cuda_native.SIGNATURES, "padgs_cuda_structure_bytes", cuda_native.STRUCTURES)
+
+
+@functools.cache
+def layout_library() -> ctypes.CDLL:
+    """Functions of layout_check.cpp."""
+    return compiled("layout", [HERE / "layout_check.cpp"])
+
+
+def compiled(name: str, sources: list[Path]) -> ctypes.CDLL:
+    """A shared library of C++ sources, CUDA ones included, for as long as this process lives."""
     folder = Path(tempfile.mkdtemp(prefix="padgs-emulated-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    target = folder / "libpadgs_cuda.so"
+    target = folder / f"lib{name}.so"
     flags = ["-std=c++17", "-O2", "-fPIC", "-shared", "-Wall", "-Wextra", "-Werror", "-DPADGS_EMULATED"]
-    sources = [str(path) for path in sorted(SOURCES.glob("*.cu"))]
-    command = [str(COMPILER), *flags, f"-I{Path(__file__).parent}", "-x", "c++", *sources, "-o", str(target)]
+    command = [str(COMPILER), *flags, f"-I{HERE}", f"-I{SOURCES}", "-x", "c++", *map(str, sources), "-o", str(target)]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    loaded = ctypes.CDLL(str(target))
-    return native.declared(loaded, cuda_native.SIGNATURES, "padgs_cuda_structure_bytes", cuda_native.STRUCTURES)
+    return ctypes.CDLL(str(target))
 
 
 def rasterize_on_gpu(gaussians, cam_from_world, camera, options, background, probe=None) -> Rendering:
@@ -58,8 +69,9 @@ else:
     cuda_native.library = emulated_library
 
 
+needs_engine = pytest.mark.skipif(not ON_GPU and COMPILER is None, reason="no GPU, and no C++ compiler to emulate one")
+
+
 def marks() -> list:
     """What an engine of backend cuda is marked with."""
-    if ON_GPU:
-        return [pytest.mark.cuda]
-    return [pytest.mark.skipif(COMPILER is None, reason="no GPU, and no C++ compiler to emulate one")]
+    return [pytest.mark.cuda] if ON_GPU else [needs_engine]

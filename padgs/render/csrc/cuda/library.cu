@@ -50,7 +50,7 @@ PADGS_API int padgs_cuda_check(const Queue *queue) {
 
 PADGS_API const char *padgs_cuda_error(int code) {
 #if defined(PADGS_EMULATED)
-  return code ? "error" : "no error";
+  return code == 2 ? "out of memory" : code ? "error" : "no error";
 #else
   return cudaGetErrorString(cudaError_t(code));
 #endif
