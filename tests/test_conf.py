@@ -6,9 +6,11 @@ from pathlib import Path
 
 import pytest
 from composed import composed, covering_jobs, expanded, hydra_loader, jobs
+from hydra.errors import HydraException
 
 from baselines.padgs import preset
 from padgs.cli.config import RunOptions, TrainConfig
+from padgs.cli.launchers import missing_plugin
 from padgs.cli.overrides import expand
 from padgs.data.datasets import DATASETS
 from padgs.method import RenderConfig
@@ -40,7 +42,7 @@ def test_without_arguments_all_values_are_the_defaults_of_the_dataclasses():
     assert config.data.path is None and config.data.generator == {"scene": "room"}
 
 
-@pytest.mark.parametrize("choice", files("data", "method", "render", "train", "protocol"))
+@pytest.mark.parametrize("choice", files("data", "method", "render", "train", "protocol", "tracking"))
 def test_every_choice_composes(choice):
     composed(choice)
 
@@ -131,6 +133,19 @@ def test_every_experiment_composes_and_says_how_to_run_it(name):
     package, command, *_ = (CONF / "experiment" / f"{name}.yaml").read_text().splitlines()
     assert package == "# @package _global_"  # Hydra reads it only there
     assert re.match(rf"# padgs-run \+experiment={name}\b", command)
+
+
+@pytest.mark.parametrize("choice", ["+experiment=foo", "+sweep=foo", "+scene=foo", "launcher=foo", "tracking=foo"])
+def test_unknown_choices_are_answered_with_the_known_ones(choice):
+    with pytest.raises(HydraException, match="Available options in '"):
+        composed(choice)
+
+
+@pytest.mark.parametrize("name", ["none", "local", "slurm", "submitit", "ray"])
+def test_every_launcher_composes(name):
+    if missing_plugin([f"launcher={name}"]):
+        pytest.skip(f"the plugin of launcher {name} is not installed")
+    assert composed(f"launcher={name}").run.jobs >= 1
 
 
 def test_the_release_preset_is_the_one_in_the_code():

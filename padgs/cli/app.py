@@ -9,6 +9,7 @@ from padgs.cli.check import check
 from padgs.cli.convert import convert
 from padgs.cli.prepare import prepare
 from padgs.cli.report import report
+from padgs.cli.track import track
 
 app = typer.Typer(no_args_is_help=True, add_completion=False)
 
@@ -18,7 +19,7 @@ def commands() -> None:
     """Panoramic Gaussian splatting, measured fairly."""
 
 
-for command in (bench, check, convert, prepare, report):
+for command in (bench, check, convert, prepare, report, track):
     app.command()(command)
 
 

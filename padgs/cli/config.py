@@ -9,6 +9,7 @@ from typing import Any
 
 from baselines import METHODS
 from padgs.cli.labels import Labels
+from padgs.cli.tracking import TrackingOptions
 from padgs.cli.typed import ConfigError, typed
 from padgs.data.options import DataOptions
 from padgs.method import Budget, RenderConfig
@@ -86,6 +87,7 @@ class RunConfig:
     train: TrainConfig
     protocols: dict[str, Protocol]
     run: RunOptions
+    tracking: TrackingOptions = TrackingOptions()
     variant: str = ""  # name of this setting within an experiment, such as a row of the ablation
     seed: int = 0
     retry: str = "none"  # which finished runs are done again: a name of RETRIES
@@ -115,7 +117,13 @@ class RunConfig:
         }
 
 
-GROUPS: dict[str, type] = {"data": DataConfig, "render": RenderConfig, "train": TrainConfig, "run": RunOptions}
+GROUPS: dict[str, type] = {
+    "data": DataConfig,
+    "render": RenderConfig,
+    "train": TrainConfig,
+    "run": RunOptions,
+    "tracking": TrackingOptions,
+}
 OTHER_KEYS = ("method", "protocol", "variant", "seed", "retry")
 RETRIES = ("none", "failed")
 

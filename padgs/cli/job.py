@@ -6,6 +6,7 @@ import os
 import traceback
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from padgs.cli.interrupt import Interrupted
 from padgs.cli.labels import Labels, labels
 from padgs.cli.run_folder import RunFolderError
 from padgs.cli.run_lock import RunBusy
+from padgs.cli.tracking import TrackedRun, Tracker
 from padgs.cli.watch import Watch
 
 EXPECTED = (ValueError, OSError, CheckpointError, RunFolderError, RunBusy)  # a traceback would only hide what they say
@@ -72,7 +74,12 @@ def complain(message: str) -> None:
 
 def _only_job(values: dict[str, Any], names: Labels) -> str:
     try:
-        return session.run(config_from_values(values, names), Console()).status
+        config, console = config_from_values(values, names), Console()
+        say = partial(console.print, style="dim", markup=False, highlight=False, soft_wrap=True)
+        watch = TrackedRun(Tracker(config.tracking, Path(config.run.folder), " ".join(names.experiments), say))
+        result = session.run(config, console, watch)
+        watch.finished()
+        return result.status
     except EXPECTED as error:
         if os.environ.get("HYDRA_FULL_ERROR"):
             raise

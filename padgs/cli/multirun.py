@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import shutil
 import time
 from collections import Counter
@@ -18,10 +19,12 @@ from padgs.cli.board import CRASHED, ELSEWHERE, KILLED, OK, REFUSED, RUNNING, Bo
 from padgs.cli.finished import FinishedJobs
 from padgs.cli.interrupt import Interrupt, Interrupted
 from padgs.cli.job import complain, in_own_process
+from padgs.cli.labels import labels
 from padgs.cli.launchers import patient
 from padgs.cli.overview import Overview, iterations_done, shown
 from padgs.cli.run_folder import cannot_write
-from padgs.results import ResultError
+from padgs.cli.tracking import SECONDS_BETWEEN_LOOKS, Tracker, TrackingOptions
+from padgs.results import Result, ResultError
 
 ATTEMPTS = 2  # of a job whose process died: it may have been the fault of another one
 
@@ -49,7 +52,12 @@ class Multirun:
         self.states = {index: JobState() for index in range(len(self.jobs))}
         self._numbers = dict.fromkeys(self.states, -1)  # what the launcher calls a job; another one at each attempt
         self._said: set[str] = set()
-        self._began = time.monotonic()
+        names = " ".join(labels(config.hydra.runtime.choices).experiments)
+        digest = hashlib.sha256(repr(sorted(map(sorted, jobs))).encode()).hexdigest()[:8]
+        options = TrackingOptions(**config.tracking) if self.jobs else TrackingOptions("none")
+        self._tracker = Tracker(options, self.runs, names, self._say, f"{names or 'multirun'} {digest}")
+        self._tracked: set[int] = set()  # jobs of which mlflow knows the end
+        self._began = self._looked = time.monotonic()
 
     def run(self, launcher: Launcher, batch_size: int | None) -> None:
         """Launch what is missing.
@@ -87,6 +95,7 @@ class Multirun:
                 status = REFUSED if self._in_process else KILLED
                 self._end(index, replace(self.states[index], status=status, reason=str(error)))
             waiting += [index for index in left if index not in lost]
+            self._track()
             if self._in_process and waiting:
                 self._say(self.look().line())
 
@@ -103,10 +112,12 @@ class Multirun:
     def close(self) -> Overview:
         """Say how it ended; the board stays only where it can tell what went wrong."""
         for index, state in self.states.items():
-            if state.status == ELSEWHERE:
-                self._look_again(index, state)
+            if state.status == ELSEWHERE and (result := self._result(state)):  # by now it was finished there
+                self._end(index, replace(state, status=result.status))
         seen = self.look()
         self._say(seen.line())
+        self._track()
+        self._tracker.finish([result for state in self.states.values() if (result := self._result(state))])
         if any(status in results.STATUSES and status != OK for status in seen.counts):
             self._say("failed runs are kept as they are; retry=failed starts them again")
         if not self._in_process and {CRASHED, KILLED} & {*seen.counts}:
@@ -131,6 +142,17 @@ class Multirun:
     def _pass_on(self, stop: Interrupt) -> None:
         if stop.requested:
             self.board.request_stop()
+        elif time.monotonic() - self._looked >= SECONDS_BETWEEN_LOOKS:
+            self._track()
+
+    def _track(self) -> None:
+        """Have runs mirrored that are running or have ended since the last time."""
+        self._looked = time.monotonic()
+        for index, state in list(self.states.items()):
+            if index not in self._tracked and state.run and (self.runs / state.run / "config.yaml").exists():
+                self._tracker.update(self.runs / state.run)
+                if state.ended:
+                    self._tracked.add(index)
 
     def _follow(self, indices) -> None:
         """Read from the board what became of jobs."""
@@ -147,14 +169,12 @@ class Multirun:
         if state.finished and state.run:
             self._finished.add(self.jobs[index], state.run, state.status, state.data)
 
-    def _look_again(self, index: int, state: JobState) -> None:
-        """Another process worked on this run; by now it may have finished it."""
+    def _result(self, state: JobState) -> Result | None:
         path = self.runs / state.run / results.FILE_NAME
         try:
-            if path.exists():
-                self._end(index, replace(state, status=results.read(path).status))
+            return results.read(path) if state.run and path.exists() else None
         except ResultError:
-            return
+            return None
 
     def _say(self, text: str) -> None:
         self._console.print(text, markup=False, highlight=False, soft_wrap=True)

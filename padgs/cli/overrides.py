@@ -54,6 +54,24 @@ def lenient(arguments: Sequence[str]) -> list[str]:
     return [forced(argument) for argument in arguments]
 
 
+def conflict(arguments: Sequence[str]) -> str | None:
+    """What is wrong if a command line sets one key twice; None if it does not.
+
+    >>> conflict(["seed=1", "-m", "method=padgs", "++seed=2"])
+    'seed is set twice, by seed=1 and ++seed=2; keep one of them'
+    """
+    settings: dict[str, str] = {}
+    for argument in arguments:
+        key, equals, _ = argument.partition("=")
+        if not equals or key.startswith("-"):
+            continue
+        key = key.lstrip("+~")
+        if key in settings:
+            return f"{key} is set twice, by {settings[key]} and {argument}; keep one of them"
+        settings[key] = argument
+    return None
+
+
 def expand(params: Mapping[str, Any], arguments: Sequence[str], loader: ConfigLoader) -> list[list[str]]:
     """The overrides of every job: all combinations of what is swept.
 

@@ -17,7 +17,7 @@ from padgs.cli.board import FOLDER, OK
 from padgs.cli.config import default_fields, method_fields
 from padgs.cli.interrupt import Interrupted
 from padgs.cli.launchers import missing_plugin
-from padgs.cli.overrides import lenient, options_first, root
+from padgs.cli.overrides import conflict, lenient, options_first, root
 from padgs.cli.scenes import scene_choices
 
 INTERRUPTED = 130  # exit code of a command that Ctrl-C ended
@@ -38,7 +38,7 @@ def main() -> None:
     """Entry point of `padgs-run`; exit code 0, 1 if any run failed, 130 if stopped by Ctrl-C."""
     os.environ.setdefault("PADGS_ROOT", str(root()))
     arguments = sys.argv[1:]
-    if problem := missing_plugin(arguments):
+    if problem := conflict(arguments) or missing_plugin(arguments):
         job.complain(problem)
         sys.exit(1)
     register_fields()

@@ -1,0 +1,35 @@
+"""`padgs track`: mirror finished runs into mlflow, whoever ran them."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+
+def track(
+    runs: Annotated[str, typer.Argument(help="folder of run folders")] = "runs",
+    uri: Annotated[str, typer.Option(help="of a server or database; mlflow.db in RUNS if not given")] = "",
+) -> None:
+    """Mirror finished runs into mlflow: those of a cluster, or of a time when its server was away."""
+    from pathlib import Path
+
+    from rich.console import Console
+
+    from padgs import results
+    from padgs.cli.tracking import Tracker, TrackingOptions
+
+    console = Console(highlight=False, soft_wrap=True)
+    found, broken = results.read_all(Path(runs))
+    for error in broken:
+        console.print(f"left out: {error}", markup=False)
+    trackers: dict[str, Tracker] = {}
+    for result in found:
+        experiment = result.experiments[0] if result.experiments else ""
+        tracker = trackers.setdefault(
+            experiment, Tracker(TrackingOptions(uri=uri or None), Path(runs), experiment, console.print)
+        )
+        tracker.update(Path(runs) / result.run)
+        if not tracker.on:
+            raise typer.Exit(1)
+    console.print(f"{len(found)} runs mirrored in {len(trackers)} experiments")
