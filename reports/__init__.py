@@ -10,6 +10,7 @@ REPORTS = {
     "table2": "reports.files:table2",
     "table3": "reports.files:table3",
     "table4": "reports.files:table4",
+    "ladder": "reports.files:ladder",
     "runs": "reports.files:runs",
     "sweep": "reports.files:sweep",
     "chart": "reports.files:chart",

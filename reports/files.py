@@ -15,12 +15,12 @@ WRITERS = {"md": markdown.text, "tex": latex.text, "csv": csv_text.text}
 
 def _table(gathered: Gathered, name: str) -> Iterator[File]:
     table = gathered.table(name)
-    for extension, text in WRITERS.items():
+    for extension, text in WRITERS.items() if table.blocks else ():
         yield f"{name}.{extension}", text(table).encode()
 
 
-table1, table2, table3, table4, runs = (
-    partial(_table, name=name) for name in ("table1", "table2", "table3", "table4", "runs")
+table1, table2, table3, table4, ladder, runs = (
+    partial(_table, name=name) for name in ("table1", "table2", "table3", "table4", "ladder", "runs")
 )
 
 

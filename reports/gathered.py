@@ -8,10 +8,11 @@ from functools import cached_property
 from pathlib import Path
 
 from padgs.results import Result
-from reports import runs, sweep_chart, table3, tables_of_methods, trade_off_chart
+from reports import ladder, runs, sweep_chart, table3, tables_of_methods, trade_off_chart
 from reports.drawing import Chart
+from reports.measures import marks
 from reports.quality_log import probes
-from reports.request import Request
+from reports.request import Request, admitted
 from reports.sweeps import Sweep, sweeps
 from reports.table import Table
 from reports.trade_off import TradeOff, trade_offs
@@ -21,6 +22,7 @@ TABLES: Mapping[str, Callable[[Sequence[Result], Request], Table]] = {
     "table2": tables_of_methods.table2,
     "table3": table3.build,
     "table4": tables_of_methods.table4,
+    "ladder": ladder.build,
     "runs": runs.build,
 }
 
@@ -33,6 +35,11 @@ class Gathered:
     results: Sequence[Result]
     request: Request
     left_out: Sequence[str] = ()  # why which result files could not be used
+
+    def __post_init__(self) -> None:
+        """Refuse at once what no result or table knows."""
+        marks(self.request.protocol)
+        admitted(self.results, self.request)
 
     def table(self, name: str) -> Table:
         """A table of `TABLES`."""

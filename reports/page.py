@@ -28,7 +28,8 @@ def text(gathered: Gathered) -> str:
         loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     refused: list[str] = []
-    tables = [table for name in TABLES if (table := _attempt(lambda name=name: gathered.table(name), refused))]
+    made = [_attempt(lambda name=name: gathered.table(name), refused) for name in TABLES]
+    tables = [table for table in made if table is not None and table.blocks]
     trade_offs = _attempt(lambda: gathered.trade_offs, refused) or []
     sweeps = _attempt(lambda: gathered.sweeps, refused) or []
     pictures = album(gathered.folder, gathered.results, gathered.request)

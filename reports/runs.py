@@ -9,7 +9,7 @@ from reports.cells import over_seeds
 from reports.footnotes import conditions
 from reports.metrics import column
 from reports.published import scene_title
-from reports.request import Request
+from reports.request import Request, admitted
 from reports.table import Block, Column, Row, Table
 
 Number = Callable[[Result], "float | None"]
@@ -20,7 +20,7 @@ SPHERE = ("ws_psnr", "ws_ssim", "ws_lpips_alex", *(f"ws_psnr_{band}" for band in
 
 def build(results: Sequence[Result], request: Request) -> Table:
     """A block per scene and resolution, a row per run."""
-    chosen = [result for result in results if request.admits(result)]
+    chosen = admitted(results, request)
     columns = {**_marks("paper", FLAT), **_marks("sphere", SPHERE), **COSTS}
     places = dict.fromkeys((r.dataset, r.scene, r.width, r.height, r.iterations) for r in chosen)
     blocks, runs_of = [], {}

@@ -10,7 +10,7 @@ from typing import Any
 from padgs.results import Result
 from reports import methods
 from reports.cells import NO_SETTING, different_keys
-from reports.request import Request
+from reports.request import Request, admitted, value_of
 
 METHODS = ("table1_360roam", "table2_ricoh360", "all_methods")
 EXPERIMENTS = {  # report -> experiments (conf/experiment) that are run for it
@@ -18,6 +18,7 @@ EXPERIMENTS = {  # report -> experiments (conf/experiment) that are run for it
     "table2": METHODS,
     "table3": ("ablation", "ablation_bar", "ablation_cat_tower"),
     "table4": ("table4_efficiency", *METHODS),
+    "ladder": ("ladder",),
     "chart": ("pareto", "table4_efficiency", *METHODS),
 }
 
@@ -27,12 +28,21 @@ def chosen(results: Sequence[Result], report: str, request: Request) -> list[Res
 
     A folder may hold sweeps and trials beside the runs of a table; without the choice they would compete for its cells.
     """
-    admitted = [result for result in results if request.admits(result)]
+    asked_for = admitted(results, request)
     if request.experiment:
-        return admitted
+        return asked_for
     names = set(EXPERIMENTS.get(report, ()))
-    own = [result for result in admitted if {name.partition("@")[0] for name in result.experiments} & names]
-    return own or admitted
+    own = [result for result in asked_for if {name.partition("@")[0] for name in result.experiments} & names]
+    return own or asked_for
+
+
+def of_a_table(experiment: str) -> bool:
+    """Whether an experiment is run for a table or the chart, and is no sweep.
+
+    >>> of_a_table("table1_360roam@cpu"), of_a_table("tau@cpu")
+    (True, False)
+    """
+    return any(experiment.partition("@")[0] in names for names in EXPERIMENTS.values())
 
 
 @dataclass(frozen=True)
@@ -81,15 +91,7 @@ def _varied(groups: Sequence[Sequence[Result]]) -> list[str]:
 
 
 def _values(result: Result, keys: Sequence[str]) -> dict[str, Any]:
-    return {key: _value(result.config, key) for key in keys}
-
-
-def _value(config: Mapping[str, Any], key: str) -> Any:
-    """The value of a dotted key; None where another version of the code had no such key."""
-    value: Any = config
-    for part in key.split("."):
-        value = value.get(part) if isinstance(value, Mapping) else None
-    return value
+    return {key: value_of(result, key) for key in keys}
 
 
 def _without_seed(config: Mapping[str, Any]) -> str:

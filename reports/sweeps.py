@@ -14,9 +14,9 @@ from reports.cells import over_seeds
 from reports.conditions import OF_A_SWEEP, refuse_mixture
 from reports.footnotes import conditions
 from reports.measures import QUANTITIES, Measure, marks, quantity
-from reports.request import Request
+from reports.request import Request, admitted
 from reports.scenes import Place, at, places
-from reports.settings import Setting, settings, sort_key
+from reports.settings import Setting, of_a_table, settings, sort_key
 from reports.table import Cell
 
 COSTS_SHOWN = ("gaussians", "train_seconds", "frame_ms")
@@ -61,25 +61,24 @@ class Sweep:
 
 
 def sweeps(results: Sequence[Result], request: Request) -> list[Sweep]:
-    """Each experiment in which a preset was run on a scene in more than one setting.
+    """Each sweep in which a preset was run on a scene in more than one setting; an experiment of a table, if asked for.
 
     Raises:
         ReportError: a metric that nobody knows, or results that must not stand together.
     """
-    admitted = [result for result in results if request.admits(result)]
-    measures = _measures(request, admitted)
+    runs = admitted(results, request)
+    measures = _measures(request, runs)
     found = []
-    for name in sorted({name for result in admitted for name in result.experiments}):
-        if request.experiment and name != request.experiment:
-            continue
-        own = [result for result in admitted if name in result.experiments]
+    names = sorted({name for result in runs for name in result.experiments})
+    for name in [request.experiment] if request.experiment else [name for name in names if not of_a_table(name)]:
+        own = [result for result in runs if name in result.experiments]
         lines = [line for place in places(own) for line in _lines(place, at(place, own))]
         if not lines:
             continue
         drawn = {line.place: at(line.place, own) for line in lines}
-        for place, runs in drawn.items():
-            refuse_mixture(runs, request, f"{name}, {place.title}", OF_A_SWEEP)
-        notes = conditions({place.title: runs for place, runs in drawn.items()}, request.protocol)
+        for place, of in drawn.items():
+            refuse_mixture(of, request, f"{name}, {place.title}", OF_A_SWEEP)
+        notes = conditions({place.title: of for place, of in drawn.items()}, request.protocol)
         found.append(Sweep(name, tuple(lines), measures, tuple(notes)))
     return found
 

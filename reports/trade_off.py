@@ -100,6 +100,7 @@ def _trade_off(name: str, group: Sequence[Place], runs: Sequence[Result], reques
         for setting in settings(own):
             _, columns = found.setdefault(setting.title, (setting, [[] for _ in group]))
             columns[index] = list(setting.runs)
+    found = {title: (s, c) for title, (s, c) in found.items() if any(r.ok for runs in c for r in runs)}
     finished = [i for i in range(len(group)) if all(any(r.ok for r in c[i]) for _, c in found.values())]
     if len(group) == 1:
         finished = [0]  # who failed there has no point

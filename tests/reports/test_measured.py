@@ -28,6 +28,9 @@ def found(measured):
 @pytest.mark.parametrize("name", TABLES)
 def test_the_tables_come_out_again(measured, found, name):
     table = TABLES[name](found, Request())
+    if not table.blocks:
+        assert not (measured / f"{name}.md").exists()
+        return
     for extension, text in (("md", markdown.text), ("tex", latex.text), ("csv", csv_text.text)):
         assert (measured / f"{name}.{extension}").read_text() == text(table)
 

@@ -46,11 +46,16 @@ def test_a_broken_file_is_named_and_left_out_and_strict_fails(runs):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["table9"], "unknown report 'table9'; known: chart, html, runs, sweep, table1, table2, table3, table4, all"),
+        (
+            ["table9"],
+            "unknown report 'table9'; known: chart, html, ladder, runs, sweep, table1, table2, table3, table4, all",
+        ),
         (["table3", "--where", "x"], "--where x is not KEY=VALUE"),
         (["table3", "--protocol", "x"], "unknown protocol 'x'"),
         (["sweep", "--metric", "x"], "unknown metric 'x'; known under protocol paper: psnr, ssim"),
         (["sweep"], "nothing to show for sweep"),
+        (["runs", "--protocol", "x"], "unknown protocol 'x'; known: paper, sphere"),
+        (["html", "--experiment", "x"], "unknown experiment 'x'; known: none"),
     ],
 )
 def test_what_is_wrong_is_said(runs, arguments, message):
@@ -78,7 +83,11 @@ def test_everything_at_once(tmp_path):
     done = report("all", runs, "--out", tmp_path / "out")
     assert done.exit_code == 0, done.output
     written = {path.name for path in (tmp_path / "out").iterdir()}
-    tables = {f"{name}.{e}" for name in ("table1", "table2", "table3", "table4", "runs") for e in ("md", "tex", "csv")}
+    tables = {
+        f"{name}.{e}"
+        for name in ("table1", "table2", "table3", "table4", "ladder", "runs")
+        for e in ("md", "tex", "csv")
+    }
     charts = {f"{name}.{e}" for name in ("chart_synthetic-room", "sweep_tau_cpu") for e in ("svg", "png", "csv")}
     assert written == tables | charts | {"time_synthetic-room.svg", "time_synthetic-room.png", "report.html"}
 
@@ -89,3 +98,24 @@ def test_what_is_refused_does_not_keep_the_rest_back(tmp_path):
     done = report("all", tmp_path / "runs", "--out", tmp_path / "out")
     assert done.exit_code == 1 and "error: table4: " in done.output and "differ in machine" in done.output
     assert (tmp_path / "out" / "table1.md").exists() and not (tmp_path / "out" / "table4.md").exists()
+
+
+def test_edited_files_and_those_of_another_version_are_left_out_and_named(tmp_path):
+    write([*compared(["synthetic-room"], seeds=1)], tmp_path)
+    edited, old, cut, *_ = sorted(tmp_path.glob("*/result.json"))
+    edited.write_text(edited.read_text().replace('"ssim"', '"sism"'))
+    old.write_text(old.read_text().replace('"schema": ', '"schema": 90'))
+    cut.write_bytes(cut.read_bytes()[:500])
+    done = report("runs", tmp_path, "--out", tmp_path / "out", "--strict")
+    assert done.exit_code == 1 and "3 results, 3 left out" in done.output
+    for path, reason in ((edited, "was edited"), (old, "another version"), (cut, "is not JSON")):
+        assert any(path.parent.name in line and reason in line for line in done.output.splitlines())
+    page = report("html", tmp_path, "--out", tmp_path / "out")
+    assert page.exit_code == 0 and "was edited" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_where_leaves_out_methods_without_the_key(tmp_path):
+    other = replace(result(""), run="b", method="omnigs", preset="omnigs", config={"method": {"degree": 3}, "seed": 0})
+    write([replace(result(""), run="a"), other], tmp_path)
+    done = report("runs", tmp_path, "--where", "method.tau=0.9")
+    assert done.exit_code == 0 and "padgs" in done.output and "omnigs" not in done.output

@@ -91,3 +91,9 @@ def test_the_picture_has_words_that_can_be_read_and_markers_that_say_their_numbe
     chart = sweep_chart.chart(sweep)
     assert ">method.tau<" in chart.svg and "WS-PSNR" in chart.svg and chart.png.startswith(b"\x89PNG")
     assert "<title>synthetic-room, PaD-GS\n0.9: 24.70 ± 0.10 (n=3)</title>" in chart.svg
+
+
+def test_lengths_of_the_chart_are_a_sweep_only_if_asked_for():
+    lengths = [small(25.0, 1.0 + n, experiments=("pareto",), config={"train": {"iterations": n}}) for n in (1, 2)]
+    assert sweeps(lengths, Request()) == []
+    assert [sweep.key for sweep in sweeps(lengths, Request(experiment="pareto"))] == ["train.iterations"]

@@ -109,7 +109,7 @@ def test_two_settings_never_share_a_cell_and_where_chooses_between_them():
 
 def test_an_unknown_key_lists_its_neighbours():
     with pytest.raises(
-        ReportError, match="unknown key 'train.its'; known in train of run bar_padgs_full_0: iterations"
+        ReportError, match="unknown key 'train.its'; known in run bar_padgs_full_0: train.iterations, method.tau"
     ):
         table3.build(FOUR[3:], Request(where={"train.its": "3"}))
 

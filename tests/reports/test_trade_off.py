@@ -73,3 +73,9 @@ def test_quality_over_training_time_comes_from_the_logs(tmp_path):
     svg = trade_off_chart.time_chart(room, logs).svg
     assert "<title>PaD-GS, synthetic-room, seed 0\n25.47 dB after 200 s</title>" in svg  # 26 - 8 / 15 at the last probe
     assert trade_off_chart.time_chart(room, {}) is None
+
+
+def test_a_method_that_never_finishes_does_not_empty_the_chart():
+    runs = [replace(r, status="oom", scores={}) if r.method == "padgs" else r for r in data_set("roam360")]
+    (chart,) = trade_offs(runs, Request())
+    assert "mean over 11 scenes" in chart.title and [point.preset for point in chart.points] == ["omnigs"]
