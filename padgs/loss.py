@@ -66,9 +66,9 @@ def photometric_loss(
     height, width, channels = image.shape
     total = weight.expand(height, width).sum() * (channels if normalisation == "mean" else 1)
     if fits(image):
-        loss = fused_photometric_loss(image, target.detach(), weight, lambda_l1, float(total))
+        loss = fused_photometric_loss(image, target.detach(), weight, lambda_l1, total)
         if target.requires_grad:  # Eq. 16 is symmetric, so that is the derivative by the image with both exchanged
-            mirrored = fused_photometric_loss(target, image.detach(), weight, lambda_l1, float(total))
+            mirrored = fused_photometric_loss(target, image.detach(), weight, lambda_l1, total)
             loss = loss + (mirrored - mirrored.detach())
         return loss
     per_channel = lambda_l1 * (image - target).abs() + (1 - lambda_l1) * (1 - ssim_map(image, target, moments))

@@ -18,6 +18,7 @@ from padgs.render.native import (
     Inputs,
     Int32,
     Int64,
+    LossArguments,
     Pointer,
     Rays,
     declared,
@@ -112,6 +113,12 @@ class BlendGradientInputs(ctypes.Structure):
     ]
 
 
+class DeviceLossArguments(ctypes.Structure):
+    """`padgs::DeviceLossArguments`."""
+
+    _fields_ = [("loss", LossArguments), *fields(Pointer, "total", "block_sums")]
+
+
 STRUCTURES = (
     Queue,
     ProjectArguments,
@@ -120,6 +127,7 @@ STRUCTURES = (
     BinArguments,
     BlendInputs,
     BlendGradientInputs,
+    DeviceLossArguments,
 )
 SIGNATURES: dict[str, tuple[list, Any]] = {
     "padgs_cuda_structure_bytes": ([Int32], Int64),
@@ -136,6 +144,8 @@ SIGNATURES: dict[str, tuple[list, Any]] = {
     "padgs_cuda_blend": ([Pointer, Pointer], Int32),
     "padgs_cuda_blend_backward": ([Pointer, Pointer, Int32], Int32),
     "padgs_cuda_project_backward": ([Pointer, Pointer], Int32),
+    "padgs_cuda_loss_blocks": ([Int32, Int32], Int64),
+    "padgs_cuda_photometric_loss": ([Pointer, Pointer], Int32),
 }
 
 

@@ -4,7 +4,15 @@ import cuda_engine
 import pytest
 
 # The definition, the golden cases and bad input; the rest of what every engine is asked takes minutes at this pace.
-QUICK = {"test_contract", "test_cuda_backend", "test_cuda_tiles", "test_golden", "test_near_cull", "test_parity"}
+QUICK = {
+    "test_contract",
+    "test_cuda_backend",
+    "test_cuda_loss",
+    "test_cuda_tiles",
+    "test_golden",
+    "test_near_cull",
+    "test_parity",
+}
 
 
 @pytest.hookimpl(tryfirst=True)  # before marks are looked at

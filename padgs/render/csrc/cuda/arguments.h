@@ -88,4 +88,11 @@ struct BlendGradientInputs {
   float *totals;  // [N, kMoments], added to
 };
 
+// The loss over all pixels is the sum of block_sums / total. Its workspace holds dL by three window means, [3, H, W, 3].
+struct DeviceLossArguments {
+  LossArguments loss;   // its normalizer is not used
+  const float *total;   // [1]
+  float *block_sums;    // [padgs_cuda_loss_blocks]
+};
+
 }  // namespace padgs
