@@ -234,7 +234,7 @@ void add_moments(const BlendGradientArguments &args, const PatchColumn &column, 
       }
       const Vec weight = alpha * unit;
       const Vec signal = up.signal(f_red, f_green, f_blue, f_depth) - mean;
-      const Vec m = keep(less(full, splat(kAlphaMax)), weight * signal - behind * (alpha / (1.0f - alpha)));
+      const Vec m = keep(less(full, splat(kAlphaMax)), weight * signal - behind * (alpha * reciprocal(1.0f - alpha)));
       red += weight * up.red;
       green += weight * up.green;
       blue += weight * up.blue;

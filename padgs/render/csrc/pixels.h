@@ -86,20 +86,23 @@ struct ProjectiveFootprint {
   struct Place {  // directions of the pixels, or derivatives by them
     Vec x = zero(), y = zero(), z = zero();
     Place() = default;
-    // d = (cos(lat) sin(lon), sin(lat), cos(lat) cos(lon)) on a panorama.
     Place(const BlendArguments &args, const Patch &patch) {
-      float lanes[3][kLanes] = {};
-      patch.each_pixel([&](int lane, int64_t) {
-        const int column = patch.x0 + lane % kPatchWidth, row = patch.y0 + lane / kPatchWidth;
-        if (args.rays.table) {
-          const int64_t stride = padded(patch.width);
-          for (int axis = 0; axis < 3; ++axis) lanes[axis][lane] = args.rays.table[(3 * row + axis) * stride + column];
-        } else {
-          lanes[0][lane] = args.rays.row_cosine[row] * args.rays.column_sine[column];
-          lanes[1][lane] = args.rays.row_sine[row];
-          lanes[2][lane] = args.rays.row_cosine[row] * args.rays.column_cosine[column];
+      const Rays &rays = args.rays;
+      float lanes[3][kLanes];
+      for (int y = 0; y < kPatchHeight; ++y) {
+        const int row = std::min(patch.y0 + y, args.grid.height - 1);  // beyond the image any direction will do
+        for (int x = 0; x < kPatchWidth; ++x) {
+          const int lane = y * kPatchWidth + x, column = patch.x0 + x;
+          if (rays.table) {
+            for (int axis = 0; axis < 3; ++axis)
+              lanes[axis][lane] = rays.table[(3 * int64_t(row) + axis) * padded(patch.width) + column];
+          } else {  // (cos(lat) sin(lon), sin(lat), cos(lat) cos(lon)) on a panorama
+            lanes[0][lane] = rays.row_cosine[row] * rays.column_sine[column];
+            lanes[1][lane] = rays.row_sine[row];
+            lanes[2][lane] = rays.row_cosine[row] * rays.column_cosine[column];
+          }
         }
-      });
+      }
       x = load(lanes[0]), y = load(lanes[1]), z = load(lanes[2]);
     }
     static int64_t padded(int width) { return int64_t(width + kTile - 1) / kTile * kTile; }
@@ -120,7 +123,7 @@ struct ProjectiveFootprint {
     const Vec b = p.x * s[6] + p.y * s[7] + p.z * s[8];
     const Vec n = x * x + y * y;
     const Vec d = maximum(b * b + n * s[9], splat(1e-30f));  // rays across the tangent plane have none
-    const Vec inverse = 1.0f / d;
+    const Vec inverse = reciprocal(d);
     At at;
     at.q = n * inverse;
     at.b_by_d = b * inverse;
