@@ -24,7 +24,8 @@ EXPERIMENTS = {  # report -> experiments (conf/experiment) that are run for it
 
 
 def chosen(results: Sequence[Result], report: str, request: Request) -> list[Result]:
-    """The results for a report: those of the experiment asked for, else of the report's own, else all.
+    """The results for a report: those of the experiment asked for; else, scene by scene, those of the report's own
+    experiments, or those of none; all, if that leaves nothing.
 
     A folder may hold sweeps and trials beside the runs of a table; without the choice they would compete for its cells.
     """
@@ -33,7 +34,9 @@ def chosen(results: Sequence[Result], report: str, request: Request) -> list[Res
         return asked_for
     names = set(EXPERIMENTS.get(report, ()))
     own = [result for result in asked_for if {name.partition("@")[0] for name in result.experiments} & names]
-    return own or asked_for
+    scenes = {(result.dataset, result.scene) for result in own}
+    free = [r for r in asked_for if not r.experiments and (r.dataset, r.scene) not in scenes]
+    return [*own, *free] or asked_for
 
 
 def of_a_table(experiment: str) -> bool:

@@ -15,7 +15,7 @@ from reports.settings import settings
 from reports.trade_off import COSTS, Point, TradeOff, pareto
 
 AREA = 60.0  # points^2 of a marker with the median number of Gaussians
-SMALLEST, LARGEST = 32.0, 700.0
+SMALLEST, LARGEST = 45.0, 700.0
 WITHOUT_GAUSSIANS = 25.0
 PUBLISHED = (  # metric and cost of the paper, how to read the cost
     ("psnr", "PSNR ↑", True),

@@ -98,8 +98,15 @@ def test_only_runs_of_the_tables_own_experiments_compete_where_there_are_any():
         build([own, trial, other_tau], Request())
     assert block(markdown.text(table1([own, trial, other_tau], Request())), "360Roam, bar")[-1][4] == "23.50"
     with pytest.raises(ReportError, match="differ in iterations"):
-        table1([replace(own, experiments=()), trial], Request())
+        table1([replace(r, experiments=()) for r in (own, trial)], Request())
     assert block(markdown.text(table1([own, trial], Request(experiment="smoke"))), "360Roam, bar")[-1][4] == "9.00"
+
+
+def test_scenes_without_an_experiment_of_the_table_show_what_was_run_freely():
+    own = result("", experiments=("table1_360roam",))
+    room = [result("", dataset="", scene="room"), result("", dataset="", scene="room", psnr=9.0, experiments=("tau",))]
+    text = markdown.text(table1([own, *room], Request()))
+    assert block(text, "room (a capture")[0][2] == "23.50"
 
 
 def test_rows_of_an_ablation_are_not_methods():
