@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from rich.console import Console
 
 
 def bench(
@@ -15,6 +20,7 @@ def bench(
     repeats: Annotated[int, typer.Option(help="of each measurement; 0 for the usual number")] = 0,
     seed: Annotated[int, typer.Option(help="of the Gaussians")] = 0,
     isas: Annotated[bool, typer.Option(help="also on each instruction set")] = False,
+    device: Annotated[str, typer.Option(help="cpu, or cuda for the GPU: other stages, see padgs/bench/gpu.py")] = "cpu",
 ) -> None:
     """Measure training and rendering, stage by stage, against what this machine can do and what is asked."""
     import json
@@ -30,6 +36,9 @@ def bench(
 
     console = Console(highlight=False)
     folder = Path(out)
+    if device != "cpu":
+        _bench_gpu(console, folder, device, quick, full, repeats, seed)
+        return
     try:
         folder.mkdir(parents=True, exist_ok=True)  # before minutes of measuring, not after
         options = QUICK if quick else BenchOptions()
@@ -51,3 +60,33 @@ def bench(
         console.print(f"error: {error}", markup=False)
         raise typer.Exit(1) from error
     console.print(f"written: {folder / 'bench.json'}, {folder / 'bench.png'}", markup=False, soft_wrap=True)
+
+
+def _bench_gpu(console: Console, folder: Path, device: str, quick: bool, full: bool, repeats: int, seed: int) -> None:
+    import json
+
+    import torch
+
+    from padgs.bench.gpu import gpu_lines, measure_gpu
+    from padgs.results import replace_file
+
+    sizes = ("quick",) if quick else ("medium", "large") if full else ("medium",)
+    count = repeats or (3 if quick else 50)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with console.status("measuring") as status:
+            report = measure_gpu(
+                sizes,
+                torch.device(device),
+                repeats=count,
+                warm_up=min(10, count),
+                seed=seed,
+                progress=lambda what: status.update(f"measuring {what}"),
+            )
+        for line in gpu_lines(report):
+            console.print(line)
+        replace_file(folder / "bench_gpu.json", json.dumps(report, indent=1, allow_nan=False).encode())
+    except (OSError, RuntimeError, ValueError) as error:
+        console.print(f"error: {error}", markup=False)
+        raise typer.Exit(1) from error
+    console.print(f"written: {folder / 'bench_gpu.json'}", markup=False, soft_wrap=True)

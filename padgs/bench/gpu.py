@@ -1,0 +1,252 @@
+"""`padgs bench --device cuda`: frames and training iterations on a GPU, stage by stage, beside the published bounds.
+
+Seconds of the device between two events, after warm-up rounds; host time that the device waits for is in the whole, not
+in the stages. On the CPU, where tests run it, seconds of the wall clock.
+
+schema      version of this layout
+machine     `padgs.clock.machine` of the device; the compute capabilities of the library
+ceilings    copy (byte/s of torch's own copy, read and written) and fp32 (FLOP/s of a matrix product without TF32)
+sizes       name -> one workload of `padgs.bench.workload`:
+  ours, published   bounds that are exact, and squares of 3 sigma as published:
+    counters        what the renderer counted
+    frame           decode and draw, {"median", "p95", "min"} seconds
+    iteration       the same forward and backward with probe, loss, observation for densification and Adam
+    stages          calls of libpadgs_cuda in one iteration -> the same
+    peak_bytes      of torch's allocator, in one iteration
+  slower            median of the published bounds' frame and iteration over ours
+  targets           name -> {"value", "limit", "met"}; limits are for an H200 and the large size
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+from unittest import mock
+
+import torch
+
+from padgs import clock
+from padgs.bench.workload import OPTIONS, SIZES, Size, Workload, build
+from padgs.loss import photometric_loss
+from padgs.render import RenderOptions, cuda_native, render, resolve_backend
+from padgs.targets import Targets
+
+SCHEMA = 1
+PUBLISHED = dataclasses.replace(OPTIONS, bounds="square", wrap=False)
+LIMITS = {"frame_ms": 2.5, "iteration_ms": 6.0, "peak_gb": 6.0}  # at most; 1M Gaussians at 2048x1024 on an H200
+LEAST_SLOWER = 2.0
+
+
+class Stopwatch:
+    """Marks on the device's own time line."""
+
+    def __init__(self, device: torch.device) -> None:
+        """For one device."""
+        self.device = device
+
+    def mark(self) -> Any:
+        """Now, once the device gets here."""
+        if self.device.type != "cuda":
+            return time.perf_counter()
+        event = torch.cuda.Event(enable_timing=True)
+        event.record(torch.cuda.current_stream(self.device))
+        return event
+
+    def seconds(self, start: Any, end: Any) -> float:
+        """Between two marks that the device has reached."""
+        return end - start if self.device.type != "cuda" else start.elapsed_time(end) / 1000
+
+
+class Iteration:
+    """One training iteration as the trainer does it, all of it on the device."""
+
+    def __init__(self, work: Workload, options: RenderOptions, device: torch.device) -> None:
+        """Take the workload to the device."""
+        self.work, self.options, self.device = work, options, device
+        self.backend = resolve_backend("auto", work.model.positions)
+        groups = [{"params": list(group.parameters), "lr": 0.0} for group in work.groups()]
+        self.optimizer = torch.optim.Adam(groups, eps=1e-15, fused=True)
+        self.targets = Targets(work.scene.train, "solid_angle", device)
+        self.growth = work.watching_growth()
+        self.round = 0
+        self.counters: Mapping[str, int] = {}
+
+    def frame(self) -> None:
+        """Decode and draw."""
+        with torch.no_grad():
+            decoded = self.work.model.decode(self.work.view)
+            render(decoded.gaussians, self.work.view, self.options, backend=self.backend)
+
+    def train(self) -> None:
+        """Forward, backward, statistics, step; nothing is read back but the number of instances."""
+        target, view = self.targets[self.round % len(self.targets)], self.work.view
+        self.round += 1
+        decoded = self.work.model.decode(view)
+        probe = decoded.gaussians.means.new_zeros(len(decoded.slots), 2, requires_grad=True)
+        rendering = render(decoded.gaussians, view, self.options, probe=probe, backend=self.backend)
+        photometric_loss(rendering.image, target.image, target.weight).backward()
+        assert probe.grad is not None
+        with torch.no_grad():
+            self.growth.observe(decoded.raw_opacities, decoded.slots, probe.grad, rendering.visible, iteration=1)
+        self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+        self.counters = rendering.counters
+
+
+def measure_gpu(
+    sizes: tuple[str, ...],
+    device: torch.device,
+    *,
+    repeats: int = 50,
+    warm_up: int = 10,
+    seed: int = 0,
+    progress: Callable[[str], None] = lambda _: None,
+) -> dict[str, Any]:
+    """Measure; `progress` is told what is being measured. The layout of the result is described above.
+
+    Raises:
+        ValueError: an unknown size, or nothing to measure on.
+    """
+    unknown = [name for name in sizes if name not in SIZES]
+    if unknown or not sizes:
+        raise ValueError(f"unknown size {', '.join(unknown) or '(none)'}; known: {', '.join(SIZES)}")
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise ValueError("--device cuda, but torch finds no GPU with a driver here; see docs/cuda.md")
+    architectures = cuda_native.library().padgs_cuda_architectures().decode() if cuda_native.available() else None
+    progress("the device's ceilings")
+    report: dict[str, Any] = {
+        "schema": SCHEMA,
+        "machine": {**clock.machine(device), "compiled_for": architectures},
+        "options": {"sizes": list(sizes), "repeats": repeats, "warm_up": warm_up, "seed": seed},
+        "ceilings": measure_ceilings(device, megabytes=1024 if device.type == "cuda" else 8),
+        "sizes": {},
+    }
+    for name in sizes:
+        size = SIZES[name]
+        entry: dict[str, Any] = dict(dataclasses.asdict(size))
+        for label, options in {"ours": OPTIONS, "published": PUBLISHED}.items():
+            progress(f"{name}, {label} bounds")
+            work = _on_device(build(size, seed), device)
+            entry[label] = _measure(Iteration(work, options, device), repeats, warm_up)
+            del work
+        entry["slower"] = {
+            part: entry["published"][part]["median"] / entry["ours"][part]["median"] for part in ("frame", "iteration")
+        }
+        entry["targets"] = _targets(size, entry)
+        report["sizes"][name] = entry
+    return report
+
+
+def measure_ceilings(device: torch.device, megabytes: int) -> dict[str, float]:
+    """What torch itself gets out of the device."""
+    watch = Stopwatch(device)
+    source = torch.empty(megabytes << 18, device=device)
+    side = min(8192, 8 * megabytes)
+    matrix = torch.randn(side, side, device=device)
+    target, product = torch.empty_like(source), torch.empty_like(matrix)
+    copy = _timed(lambda: target.copy_(source), watch, 10, 3)["min"]
+    multiply = _timed(lambda: torch.mm(matrix, matrix, out=product), watch, 5, 2)["min"]
+    return {"copy": 2 * 4 * source.numel() / copy, "fp32": 2 * side**3 / multiply}
+
+
+def _on_device(work: Workload, device: torch.device) -> Workload:
+    work.model.to(device)
+    return work
+
+
+def _measure(iteration: Iteration, repeats: int, warm_up: int) -> dict[str, Any]:
+    watch = Stopwatch(iteration.device)
+    frame = _timed(iteration.frame, watch, repeats, warm_up)
+    clock.reset_peak_memory(iteration.device)
+    timing = _timed(iteration.train, watch, repeats, warm_up)
+    memory = clock.peak_memory(iteration.device)
+    return {
+        "backend": iteration.backend,
+        "frame": frame,
+        "iteration": timing,
+        "stages": _stages(iteration, watch, repeats),
+        "counters": dict(iteration.counters),
+        "peak_bytes": memory.get("device"),
+    }
+
+
+def _timed(work: Callable[[], object], watch: Stopwatch, repeats: int, warm_up: int) -> dict[str, float]:
+    for _ in range(warm_up):
+        work()
+    marks = []
+    for _ in range(repeats):
+        start = watch.mark()
+        work()
+        marks.append((start, watch.mark()))
+    clock.synchronise(watch.device)
+    return clock.summary([watch.seconds(*pair) for pair in marks])
+
+
+def _stages(iteration: Iteration, watch: Stopwatch, repeats: int) -> dict[str, dict[str, float]]:
+    rounds = []
+    for _ in range(repeats):
+        with _calls_watched(watch) as marks:
+            iteration.train()
+        clock.synchronise(watch.device)
+        spent: dict[str, float] = {}
+        for name, start, end in marks:
+            spent[name] = spent.get(name, 0.0) + watch.seconds(start, end)
+        rounds.append(spent)
+    names = sorted({name for spent in rounds for name in spent})
+    return {name: clock.summary([spent.get(name, 0.0) for spent in rounds]) for name in names}
+
+
+@contextmanager
+def _calls_watched(watch: Stopwatch) -> Iterator[list[tuple[str, Any, Any]]]:
+    marks: list[tuple[str, Any, Any]] = []
+    original = cuda_native.call
+
+    def call(name: str, *arguments: Any) -> None:
+        start = watch.mark()
+        original(name, *arguments)
+        marks.append((name.removeprefix("padgs_cuda_"), start, watch.mark()))
+
+    with mock.patch.object(cuda_native, "call", call):
+        yield marks
+
+
+def _targets(size: Size, entry: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    if size != SIZES["large"]:
+        return {}
+    ours = entry["ours"]
+    values = {
+        "frame_ms": 1e3 * ours["frame"]["median"],
+        "iteration_ms": 1e3 * ours["iteration"]["median"],
+        "peak_gb": None if ours["peak_bytes"] is None else ours["peak_bytes"] / 1e9,
+    }
+    targets: dict[str, dict[str, Any]] = {
+        name: {"value": value, "limit": LIMITS[name], "met": value is not None and value <= LIMITS[name]}
+        for name, value in values.items()
+    }
+    slower = min(entry["slower"].values())
+    targets["published_slower"] = {"value": slower, "limit": LEAST_SLOWER, "met": slower >= LEAST_SLOWER}
+    return targets
+
+
+def gpu_lines(report: dict[str, Any]) -> list[str]:
+    """The report for people."""
+    machine, ceilings = report["machine"], report["ceilings"]
+    found = [
+        f"{machine['gpu'] or machine['cpu']}: copies {ceilings['copy'] / 1e9:.0f} GB/s, multiplies "
+        f"{ceilings['fp32'] / 1e12:.2f} TFLOP/s in fp32"
+    ]
+    for name, size in report["sizes"].items():
+        found.append(f"{name}: {size['width']}x{size['height']}, about {size['gaussians']:,} Gaussians")
+        for label in ("ours", "published"):
+            part = size[label]
+            peak = "" if part["peak_bytes"] is None else f", {part['peak_bytes'] / 1e9:.2f} GB"
+            times = (f"{what} {1e3 * part[what]['median']:.2f} ms (p95 {1e3 * part[what]['p95']:.2f})"
+                     for what in ("frame", "iteration"))  # fmt: skip
+            found.append(f"  {label} bounds, backend {part['backend']}: {', '.join(times)}{peak}")
+        found += [f"    {stage}: {1e3 * timing['median']:.3f} ms" for stage, timing in size["ours"]["stages"].items()]
+        for target, verdict in size["targets"].items():
+            found.append(f"  {target}: {verdict['value']} (asked: {verdict['limit']}), met: {verdict['met']}")
+    return found

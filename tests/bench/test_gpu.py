@@ -1,0 +1,67 @@
+"""The GPU benchmark, run on the CPU: everything but the events."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from padgs.bench import gpu
+from padgs.bench.workload import SIZES
+from padgs.cli.app import app
+from padgs.render import cuda_native, native
+
+needs_native = pytest.mark.skipif(not native.available(), reason="the native library is not built")
+
+
+@pytest.fixture(scope="module")
+def report() -> dict:
+    return gpu.measure_gpu(("quick",), torch.device("cpu"), repeats=2, warm_up=1)
+
+
+@needs_native
+def test_the_report_says_what_was_measured(report: dict):
+    size = report["sizes"]["quick"]
+    for label in ("ours", "published"):
+        part = size[label]
+        assert part["backend"] == "cpu"
+        assert 0 < part["frame"]["median"] < part["iteration"]["median"]
+        assert part["counters"]["contributing"] > 0 and part["stages"] == {}  # no call went to libpadgs_cuda
+    assert size["published"]["counters"]["instances"] > size["ours"]["counters"]["instances"]
+    assert set(size["slower"]) == {"frame", "iteration"} and size["targets"] == {}
+    assert report["ceilings"]["copy"] > 0 and report["ceilings"]["fp32"] > 0
+    json.dumps(report, allow_nan=False)
+    text = "\n".join(gpu.gpu_lines(report))
+    assert "quick: 128x64, about 2,000 Gaussians" in text and "published bounds, backend cpu: frame " in text
+
+
+def test_targets_are_judged_for_the_size_that_they_are_stated_for():
+    def part(frame: float, iteration: float, peak: float) -> dict:
+        return {"frame": {"median": frame}, "iteration": {"median": iteration}, "peak_bytes": peak}
+
+    entry = {"ours": part(0.002, 0.007, 5e9), "slower": {"frame": 3.0, "iteration": 1.5}}
+    judged = gpu._targets(SIZES["large"], entry)
+    met = {name: verdict["met"] for name, verdict in judged.items()}
+    assert met == {"frame_ms": True, "iteration_ms": False, "peak_gb": True, "published_slower": False}
+    assert gpu._targets(SIZES["medium"], entry) == {}
+
+
+def test_calls_of_the_library_are_charged_to_stages(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(cuda_native, "call", lambda name, *_: None)
+    with gpu._calls_watched(gpu.Stopwatch(torch.device("cpu"))) as marks:
+        cuda_native.call("padgs_cuda_bin", None)
+    ((name, start, end),) = marks
+    assert name == "bin" and start <= end
+
+
+def test_unknown_sizes_list_the_known_ones():
+    with pytest.raises(ValueError, match="unknown size huge; known: quick, small, medium, large"):
+        gpu.measure_gpu(("huge",), torch.device("cpu"))
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_without_a_gpu_the_command_says_so(tmp_path):
+    result = CliRunner().invoke(app, ["bench", "--device", "cuda", "--quick", "--out", str(tmp_path / "bench")])
+    assert result.exit_code == 1 and "torch finds no GPU with a driver" in " ".join(result.output.split())
