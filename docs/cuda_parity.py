@@ -1,0 +1,62 @@
+"""The table of docs/cuda.md: how far backend cuda is from the definition in float64, by projection and region.
+
+    python docs/cuda_parity.py
+
+Runs on the GPU where there is one, else the same kernels on the CPU (tests/render/emulation.h), and says which.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import torch
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "render"))
+
+import cuda_engine
+from render_cases import SETUPS, gaussians_of, identity_pose, random_pose, row_error, stable_pixels
+from test_parity import random_weights, run
+
+from padgs.render import RenderOptions
+
+REGIONS = ("ordinary", "polar", "seam", "near")
+SIZE = (72, 36)
+COUNT = 60
+
+
+def main() -> None:
+    """Print the table as Markdown."""
+    where = torch.cuda.get_device_name() if cuda_engine.ON_GPU else "emulated on the CPU"
+    print(f"{COUNT} Gaussians, {SIZE[0]}x{SIZE[1]} pixels; {where}\n")
+    print("| projection, camera | region | image: max | mean | depth: max, relative | mean | gradients: max | mean |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
+    for projection, lens in SETUPS:
+        for region in REGIONS if lens == "panorama" else ("ordinary",):
+            numbers = " | ".join(f"{error:.1e}" for error in errors(projection, lens, region))
+            print(f"| {projection}, {lens} | {region} | {numbers} |")
+
+
+def errors(projection: str, lens: str, region: str) -> list[float]:
+    """Of the image, the depth (relative) and the gradients (rows of all inputs, relative): the largest and the mean."""
+    generator = torch.Generator().manual_seed(11)
+    gaussians = gaussians_of(region, COUNT, generator)
+    if region == "near" and projection == "ray":  # which draws nothing from inside
+        gaussians.scales.mul_(0.2)
+    pose = random_pose(generator) if region == "ordinary" and lens != "panorama" else identity_pose()
+    options = RenderOptions(projection)
+    stable = stable_pixels(gaussians, *SIZE, lens=lens, pose=pose, options=options)
+    weights = random_weights(SIZE, stable, generator)
+    runs = [
+        run(gaussians, SIZE, lens, options, weights, pose=pose, backend=backend, dtype=dtype)
+        for backend, dtype in (("torch", torch.float64), ("cuda", torch.float32))
+    ]
+    (truth, exact), (drawn, found) = runs
+    image = (drawn.image.double() - truth.image)[stable].abs()
+    depth = ((drawn.depth.double() - truth.depth).abs() / truth.depth.clamp(min=1e-9))[stable & (truth.depth > 0)]
+    gradients = torch.tensor([row_error(found[name], exact[name]) for name in exact if name != "rays"])
+    return [x for e in (image, depth, gradients) for x in (e.max().item(), e.mean().item())]
+
+
+if __name__ == "__main__":
+    main()
