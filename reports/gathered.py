@@ -43,7 +43,9 @@ class Gathered:
 
     def table(self, name: str) -> Table:
         """A table of `TABLES`."""
-        return self._tables.setdefault(name, TABLES[name](self.results, self.request))
+        if name not in self._tables:
+            self._tables[name] = TABLES[name](self.results, self.request)
+        return self._tables[name]
 
     @cached_property
     def sweeps(self) -> list[tuple[Sweep, Chart]]:

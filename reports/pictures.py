@@ -21,7 +21,7 @@ FOLDER = "renders"  # of a run: truth | render | error of each test view, side b
 WIDTH = 1024  # pixels of an embedded panorama at most
 QUALITY = 80  # of JPEG
 VIEWS = 3  # of a scene at most
-MOST_FILES = 72  # pictures opened for a page; a scene that no longer fits is left out and named
+MOST_FILES = 90  # pictures opened for a page; a scene that no longer fits is left out and named
 
 
 @dataclass
@@ -43,24 +43,21 @@ class Album:
 
 
 def album(folder: Path, results: Sequence[Result], request: Request) -> Album:
-    """The first seed of each setting of the methods, and the rows of ablations, on a few views of each scene."""
+    """Each setting of the methods, and the rows of ablations, on a few views of each scene; one seed is enough."""
+    own = [*chosen(results, "table1", request), *(r for r in chosen(results, "table3", request) if r.variant)]
+    seen = list({result.run: result for result in own if _files(folder, result)}.values())
+    groups = {place: settings(at(place, seen)) for place in places(seen)}
+    views = min(VIEWS, max(1, MOST_FILES // max(1, sum(map(len, groups.values())))))
     made, opened = Album(), 0
-    own = [*chosen(results, "chart", request), *(r for r in chosen(results, "table3", request) if r.variant)]
-    for place in places(own):
-        runs = [s for s in settings(_once(at(place, own))) if any(_files(folder, run) for run in s.runs)]
-        if not runs:
-            continue
-        names = _spread(_files(folder, runs[0].runs[0]) or _files(folder, runs[-1].runs[0]))
-        names = names[: max(1, (MOST_FILES - opened) // (len(runs) * max(1, len(names))) and len(names))]
-        if opened + len(runs) * len(names) > MOST_FILES:
-            names = names[:1]
-        if opened + len(runs) > MOST_FILES:
+    for place, runs in groups.items():
+        names = _spread(_files(folder, runs[0].runs[0]), views)
+        opened += len(runs) * len(names)
+        if opened > MOST_FILES:
             made.left_out.append(place.title)
             continue
-        opened += len(runs) * len(names)
-        views = [view for name in names if (view := _view(made, folder, runs, name))["methods"]]
-        if views:
-            made.scenes.append({"title": place.title, "views": views})
+        shown = [view for name in names if (view := _view(made, folder, runs, name))["methods"]]
+        if shown:
+            made.scenes.append({"title": place.title, "views": shown})
     return made
 
 
@@ -88,15 +85,15 @@ def _files(folder: Path, run: Result) -> list[str]:
     return sorted(path.name for path in (folder / run.run / FOLDER).glob("*.png"))
 
 
-def _spread(names: Sequence[str]) -> list[str]:
-    """The first, middle and last, so that a walk is seen from more than one place."""
-    if len(names) <= VIEWS:
+def _spread(names: Sequence[str], count: int) -> list[str]:
+    """So many of them from the first to the last, so that a walk is seen from more than one place.
+
+    >>> _spread("abcde", 3), _spread("abcde", 1), _spread("ab", 3)
+    (['a', 'c', 'e'], ['a'], ['a', 'b'])
+    """
+    if len(names) <= count:
         return list(names)
-    return [names[round(i * (len(names) - 1) / (VIEWS - 1))] for i in range(VIEWS)]
-
-
-def _once(results: Sequence[Result]) -> list[Result]:
-    return list({result.run: result for result in results if result.ok}.values())
+    return [names[round(i * (len(names) - 1) / max(1, count - 1))] for i in range(count)]
 
 
 def _mark(run: Result, name: str) -> str:

@@ -112,7 +112,7 @@ def _trade_off(name: str, group: Sequence[Place], runs: Sequence[Result], reques
             points.append(Point(title, setting.preset, numbers))
     what = group[0].title if len(group) == 1 else published.TITLES[name]
     if len(group) > 1 or group[0].published:
-        what += f", mean over {len(finished)} scenes: {', '.join(group[i].scene for i in finished)}"
+        what += f", mean over its scenes {', '.join(group[i].scene for i in finished)}"
     beside = group[0].dataset if group[0].published else "ricoh360" if group[0].outdoor else "roam360"
     shown = [result for i in finished for result in by_place[i]]
     notes = conditions({what: shown}, next(p for p, m in QUALITIES if column(m) == qualities[0].column))
