@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import wraps
+from textwrap import wrap
 from typing import Any, ParamSpec, TypeVar
 
 from reports import methods
@@ -33,6 +34,7 @@ STYLE: dict[Any, Any] = {
     "text.parse_math": False,  # a name with a $ in it is a name
 }
 DPI = 110
+LETTERS_PER_INCH = 12  # of a title
 
 
 @dataclass
@@ -98,7 +100,8 @@ def dress(axis: Any, values: Sequence[float], log_from: float = math.inf) -> Non
 
 def finish(made: Any, name: str, title: str, tips: Tips) -> Chart:
     """Title and files of a figure."""
-    made.suptitle(title, fontsize=10.5)
+    width = int(LETTERS_PER_INCH * made.get_figwidth())
+    made.suptitle("\n".join(part for line in title.split("\n") for part in wrap(line, width)), fontsize=10.5)
     made.draw_without_rendering()
     made.set_layout_engine("none")  # the layout is found; each file would find it again
     svg, png = io.StringIO(), io.BytesIO()

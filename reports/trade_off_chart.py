@@ -50,7 +50,7 @@ def time_chart(trade_off: TradeOff, probes: Mapping[str, Sequence[Probe]]) -> Ch
 
     A line for each run of one scene; of the scenes of a data set, whose lines would bury each other, the first seed.
     """
-    made, axes = figure(1, 1, 6.0, 3.6)
+    made, axes = figure(1, 1, 7.5, 3.6)
     panel, tips = axes[0, 0], Tips()
     presets = methods.ordered(result.preset for result in trade_off.runs)
     drawn: dict[str, None] = {}
@@ -75,7 +75,7 @@ def time_chart(trade_off: TradeOff, probes: Mapping[str, Sequence[Probe]]) -> Ch
     dress(panel.xaxis, ends, log_from=8)
     panel.set_xlabel("training time in seconds, rendering of probes not counted")
     panel.set_ylabel("PSNR of a held-out view, dB")
-    panel.legend(fontsize=8)
+    made.legend(loc="outside right center", fontsize=8)
     return finish(
         made, trade_off.name.replace("chart_", "time_", 1), f"{trade_off.title}\nquality over training time", tips
     )
@@ -90,7 +90,7 @@ def _measured(
         color, marker = color_of(point.preset, presets), marker_of(point.preset, presets)
         if x.value is None or y.value is None or not math.isfinite(y.value):
             continue
-        lines = [point.title, *(f"{t}: {c.value:,.4g}" for t, c in point.numbers.items() if c.value is not None)]
+        lines = [point.title, *(f"{t}: {_brief(c.value)}" for t, c in point.numbers.items() if c.value is not None)]
         there.append((x.value, y.value))
         panel.errorbar([x.value], [y.value], xerr=x.std, yerr=y.std, color=color, linewidth=0.8, linestyle="none")
         style = {"s": area(point), "color": color, "marker": marker, "alpha": 0.75}
@@ -135,6 +135,15 @@ def _published(panel: Any, dataset: str, row: int, index: int, presets: list[str
     panel.set_facecolor("#fafafa")
     panel.set_xlabel(f"{cost_title} (published)")
     panel.set_ylabel(f"{title} (published)")
+
+
+def _brief(value: float) -> str:
+    """Four digits, or all of those before the point.
+
+    >>> _brief(24.8512), _brief(123456.0)
+    ('24.85', '123,456')
+    """
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
 
 
 def _area(points: Sequence[Point]) -> Any:

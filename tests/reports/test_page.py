@@ -120,6 +120,7 @@ def test_in_a_browser(html, tmp_path):
         )
 
         browser.point("#charts .tip")
+        browser.wait("!document.getElementById('tip').hidden")
         assert "ms per frame" in browser.run("document.getElementById('tip').textContent")
 
         assert browser.complaints == []
