@@ -1,6 +1,5 @@
 """What Hydra makes of a command line, without running it."""
 
-import re
 from contextlib import contextmanager
 
 from hydra import compose, initialize_config_dir
@@ -25,17 +24,11 @@ def jobs(*overrides: str) -> list[RunConfig]:
         return [_config((*overrides, *job)) for job in _expanded(overrides, loader)]
 
 
-def covering_jobs(*overrides: str) -> list[RunConfig]:
-    """Some of the jobs of `padgs-run OVERRIDES`: all that is swept occurs, but few scenes."""
+def first_and_last_job(*overrides: str) -> list[RunConfig]:
+    """Two of the jobs of `padgs-run OVERRIDES`, as unlike each other as they come."""
     with hydra_loader() as loader:
-        seen: set[str] = set()
-        chosen = []
-        for job in _expanded(overrides, loader):
-            settings = {re.sub(r"(\+scene=[a-z]+360).*", r"\1", setting) for setting in job}
-            if not settings <= seen or not chosen:
-                seen |= settings
-                chosen.append(_config((*overrides, *job)))
-        return chosen
+        found = _expanded(overrides, loader)
+        return [_config((*overrides, *job)) for job in (found[0], found[-1])]
 
 
 def expanded(*overrides: str) -> list[list[str]]:

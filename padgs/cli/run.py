@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shlex
+import signal
 import sys
 from datetime import datetime
 
@@ -44,6 +45,7 @@ def main() -> None:
     register_fields()
     start = f"{datetime.now():%Y%m%d-%H%M%S}-{os.getpid()}"
     sys.argv[1:] = [*options_first(lenient(arguments)), f"hydra.sweep.dir=${{run.folder}}/{FOLDER}/{start}"]
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # what schedulers send is told apart from a crash
     try:
         hydra.main(version_base="1.3", config_path=str(root() / "conf"), config_name="config")(job.job)()
     except (Interrupted, KeyboardInterrupt) as stopped:

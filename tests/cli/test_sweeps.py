@@ -1,0 +1,117 @@
+"""Whole sweeps of tiny runs as processes: killed at random moments, and by different launchers."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from padgs import results
+
+ROOT = Path(__file__).resolve().parents[2]
+TINY = [
+    "protocol=paper",
+    "protocol.paper.lpips=none",
+    "data.generator.width=64",
+    "data.generator.train_views=4",
+    "data.generator.test_views=1",
+    "data.generator.samples=1",
+    "data.generator.points=400",
+    "train.iterations=40",
+    "run.checkpoint_every=5",
+    "run.threads=1",
+    "tracking=none",
+]
+SWEEP = ["-m", "method.tau=0.0,0.5,0.9,1.0", "seed=0,1,2"]
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory) -> Path:
+    """One folder of generated scenes for all processes."""
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture
+def start(tmp_path, cache):
+    """Start `padgs-run` in a process group of its own."""
+
+    def started(*arguments: str) -> subprocess.Popen:
+        environment = os.environ | {"PYTHONPATH": str(ROOT), "PADGS_CACHE": str(cache), "COLUMNS": "200"}
+        command = [sys.executable, "-W", "ignore", "-m", "padgs.cli.run", *TINY, *arguments]
+        pipe = subprocess.PIPE
+        return subprocess.Popen(
+            command, cwd=tmp_path, env=environment, stdout=pipe, stderr=pipe, text=True, start_new_session=True
+        )
+
+    return started
+
+
+def finish(process: subprocess.Popen) -> tuple[int, str, str]:
+    out, error = process.communicate(timeout=400)
+    return process.returncode, out, error
+
+
+def marks(folder: Path) -> dict[str, tuple]:
+    """Run -> all that must not depend on how it came about."""
+    found, broken = results.read_all(folder)
+    assert not broken
+    return {result.run: (result.status, result.scores, result.counts, result.iterations_done) for result in found}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", ["none", "local"])
+def test_a_sweep_that_was_killed_three_times_ends_as_if_nothing_had_been(start, tmp_path, launcher):
+    if launcher != "none":
+        pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    code, _, error = finish(start(*SWEEP, "run.folder=undisturbed"))
+    assert code == 0, error
+    expected = marks(tmp_path / "undisturbed")
+    assert len(expected) == 12
+    source = random.Random(time.time_ns())  # a random moment, as asked: any must do
+    for number in (signal.SIGKILL, signal.SIGINT, signal.SIGTERM):
+        process = start(*SWEEP, "run.folder=disturbed", f"launcher={launcher}")
+        known = len(list((tmp_path / "disturbed").glob("*/log.jsonl")))
+        deadline = time.monotonic() + 120
+        while process.poll() is None and len(list((tmp_path / "disturbed").glob("*/log.jsonl"))) <= known:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        time.sleep(source.uniform(0, 1.5))
+        if number == signal.SIGTERM:
+            process.terminate()  # the parent alone, as a scheduler does
+        else:
+            os.killpg(process.pid, number)  # all of them, as a terminal does
+        code, _, error = finish(process)
+        if number != signal.SIGKILL and code != 0:  # 0: the sweep was faster than the signal
+            assert code == 130 and "to go on: padgs-run" in error, error
+    code, out, error = finish(start(*SWEEP, "run.folder=disturbed", f"launcher={launcher}"))
+    assert code == 0, out + error
+    assert marks(tmp_path / "disturbed") == expected
+    code, out, _ = finish(start(*SWEEP, "run.folder=disturbed"))
+    assert code == 0 and out == "12 of 12 done (12 before)\n"
+
+
+@pytest.mark.slow
+def test_all_launchers_give_the_same_results(start, tmp_path):
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
+    found = []
+    for launcher in ("none", "local", "submitit"):
+        code, out, error = finish(start("-m", "seed=0,1,2,3", f"launcher={launcher}", f"run.folder={launcher}"))
+        assert code == 0 and out.endswith("4 of 4 done\n"), out + error
+        found.append(marks(tmp_path / launcher))
+    assert len(found[0]) == 4 and found[0] == found[1] == found[2]
+
+
+@pytest.mark.slow
+def test_two_processes_share_a_sweep_and_do_every_run_once(start, tmp_path):
+    processes = [start("-m", "seed=0,1,2,3,4,5") for _ in range(2)]
+    ends = [finish(process) for process in processes]
+    assert {code for code, _, _ in ends} <= {0, 1}  # 1: the other one was still at the last run
+    assert len(marks(tmp_path / "runs")) == 6
+    resumed = sum(out.count("resuming") for _, out, _ in ends)
+    trained = sum(out.count("trained 0:") - out.count("finished before, nothing") for _, out, _ in ends)
+    assert (resumed, trained) == (0, 6)
