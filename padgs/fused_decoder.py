@@ -9,15 +9,17 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from padgs.render import native
+from padgs.gpu_decoder import decode_on_gpu
+from padgs.render import cuda_native, native
 from padgs.render.native import pointer
 
 OUTPUTS = {"means": 3, "quats": 4, "scales": 3, "opacities": 0, "colors": 3}  # values per Gaussian, 0 = a scalar
 
 
 def fits(inputs: Tensor) -> bool:
-    """Whether the native decoder takes these inputs: float32, on the CPU, and the library is there."""
-    return inputs.dtype == torch.float32 and inputs.device.type == "cpu" and native.available()
+    """Whether a native decoder takes these inputs: float32, and the library of their device is there."""
+    library = {"cpu": native, "cuda": cuda_native}.get(inputs.device.type)
+    return library is not None and inputs.dtype == torch.float32 and library.available()
 
 
 def fused_decode(
@@ -34,6 +36,8 @@ def fused_decode(
     Arguments and results are those of `padgs.decoder.decode_gaussians`, with the twelve tensors of the weights in a
     row. Differentiable by weights, features, offsets and log-scales; the rest are constants.
     """
+    if features.device.type == "cuda":
+        return decode_on_gpu(weights, features, seen, positions, offsets, log_scales, attenuation)
     return _FusedDecode.apply(features, seen, positions, offsets, log_scales, attenuation, *weights)
 
 

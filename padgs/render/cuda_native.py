@@ -14,6 +14,8 @@ import torch
 
 from padgs.render.native import (
     Camera,
+    DecodeArguments,
+    DecodeGradientArguments,
     Gradients,
     Inputs,
     Int32,
@@ -119,6 +121,18 @@ class DeviceLossArguments(ctypes.Structure):
     _fields_ = [("loss", LossArguments), *fields(Pointer, "total", "block_sums")]
 
 
+class DeviceDecodeArguments(ctypes.Structure):
+    """`padgs::DeviceDecodeArguments`."""
+
+    _fields_ = [("decode", DecodeArguments), *fields(Pointer, "color_logits", "covariance_logits")]
+
+
+class DeviceDecodeGradientArguments(ctypes.Structure):
+    """`padgs::DeviceDecodeGradientArguments`."""
+
+    _fields_ = [("gradient", DecodeGradientArguments), *fields(Pointer, "opacity_out", "color_out", "covariance_out")]
+
+
 STRUCTURES = (
     Queue,
     ProjectArguments,
@@ -128,6 +142,8 @@ STRUCTURES = (
     BlendInputs,
     BlendGradientInputs,
     DeviceLossArguments,
+    DeviceDecodeArguments,
+    DeviceDecodeGradientArguments,
 )
 SIGNATURES: dict[str, tuple[list, Any]] = {
     "padgs_cuda_structure_bytes": ([Int32], Int64),
@@ -144,6 +160,8 @@ SIGNATURES: dict[str, tuple[list, Any]] = {
     "padgs_cuda_blend": ([Pointer, Pointer], Int32),
     "padgs_cuda_blend_backward": ([Pointer, Pointer, Int32], Int32),
     "padgs_cuda_project_backward": ([Pointer, Pointer], Int32),
+    "padgs_cuda_decode_place": ([Pointer, Pointer], Int32),
+    "padgs_cuda_decode_take_back": ([Pointer, Pointer], Int32),
     "padgs_cuda_loss_blocks": ([Int32, Int32], Int64),
     "padgs_cuda_photometric_loss": ([Pointer, Pointer], Int32),
 }

@@ -88,6 +88,16 @@ struct BlendGradientInputs {
   float *totals;  // [N, kMoments], added to
 };
 
+// Of the structures of decoding, the networks are not used: their outputs are here.
+struct DeviceDecodeArguments {
+  DecodeArguments decode;
+  const float *color_logits, *covariance_logits;  // [A, 3 K] [A, 7 K]
+};
+struct DeviceDecodeGradientArguments {
+  DecodeGradientArguments gradient;                     // features_out and weights_out are not used
+  float *opacity_out, *color_out, *covariance_out;  // [A, K] [A, 3 K] [A, 7 K]: dL by the networks' outputs
+};
+
 // The loss over all pixels is the sum of block_sums / total. Its workspace holds dL by three window means, [3, H, W, 3].
 struct DeviceLossArguments {
   LossArguments loss;   // its normalizer is not used
