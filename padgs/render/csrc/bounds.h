@@ -18,63 +18,78 @@ constexpr float kSlack = 1.0001f;  // rounding must never cost a contribution
 constexpr float kSlackPixels = 2e-3f;
 
 // Continuous pixel ranges of one footprint; u is not reduced modulo the width.
-struct PixelRange {
-  float u0, u1, v0, v1;
+template <class T>
+struct PixelRangeOf {
+  T u0, u1, v0, v1;
 };
+using PixelRange = PixelRangeOf<float>;
 
-struct Cone {
-  Mat3<float> spread;  // M
-  Vec3<float> normal;  // n
+template <class T>
+struct ConeOf {
+  Mat3<T> spread;  // M
+  Vec3<T> normal;  // n
 };
+using Cone = ConeOf<float>;
 
-PADGS_HD bool ratio_range(const Cone &k, Vec3<float> a, Vec3<float> b, float &low, float &high) {
-  const Vec3<float> p = transposed_times(k.spread, a), q = transposed_times(k.spread, b);
-  const float na = dot(k.normal, a), nb = dot(k.normal, b);
-  const float bb = dot(q, q) - nb * nb, ab = dot(p, q) - na * nb;
-  if (!(bb < 0)) return false;
-  const Vec3<float> w = scaled(nb, p) - scaled(na, q), minors = cross(p, q);
-  const float spread = root(larger(dot(w, w) - dot(minors, minors), 0.0f));
-  low = (ab + spread) / bb;
-  high = (ab - spread) / bb;
-  return true;
+// Extremes of (a.x) / (b.x); they mean something where the b^T K* b that it returns is negative.
+template <class T>
+PADGS_HD T ratio_range(const ConeOf<T> &k, Vec3<T> a, Vec3<T> b, T &low, T &high) {
+  const Vec3<T> p = transposed_times(k.spread, a), q = transposed_times(k.spread, b);
+  const T na = dot(k.normal, a), nb = dot(k.normal, b), zero = constant(0.0f, na);
+  const T bb = dot(q, q) - nb * nb, ab = dot(p, q) - na * nb, some = where(below(bb, zero), bb, constant(-1.0f, na));
+  const Vec3<T> w = scaled(nb, p) - scaled(na, q), minors = cross(p, q);
+  const T spread = root(larger(dot(w, w) - dot(minors, minors), zero));
+  low = (ab + spread) / some;
+  high = (ab - spread) / some;
+  return bb;
 }
 
-// The latitude-longitude box of a cone on a panorama. Longitude is exact, latitude conservative.
-PADGS_HD PixelRange sphere_range(const Cone &k, const SphereFrame<float> &f, float width, float height) {
-  const float c = f.cos_latitude, s = f.sin_latitude;
-  const Vec3<float> ahead{f.normal.x, 0, f.normal.z};
-  const float norm = root(dot(ahead, ahead));
-  const Vec3<float> h = norm > 0 ? scaled(1 / norm, ahead) : Vec3<float>{0, 0, 1};
+template <class T>
+PADGS_HD T arcsine(T x) {
+  const T one = constant(1.0f, x), inside = smaller(larger(x, -one), one);
+  return arctangent2(inside, root((one - inside) * (one + inside)));
+}
+
+// The latitude-longitude box of a cone on a panorama. Longitude is exact, latitude conservative. Without branches, so that
+// it serves many cones at a time.
+template <class T>
+PADGS_HD PixelRangeOf<T> sphere_range(const ConeOf<T> &k, const SphereFrame<T> &f, float width, float height) {
+  const T c = f.cos_latitude, s = f.sin_latitude, zero = constant(0.0f, c), one = constant(1.0f, c);
+  const Vec3<T> ahead{f.normal.x, zero, f.normal.z};
+  const T norm = root(dot(ahead, ahead)), inverse = one / where(below(zero, norm), norm, one);
+  const Vec3<T> h{ahead.x * inverse, zero, where(below(zero, norm), ahead.z * inverse, one)};
   // Longitude: the meridian plane at offset delta touches iff b_tt cot^2 - 2 b_rt cot + b_rr = 0.
-  const Vec3<float> along_t = transposed_times(k.spread, f.east), along_r = transposed_times(k.spread, h);
-  const Vec3<float> minors = cross(along_t, along_r);
-  const float b_tt = dot(along_t, along_t), b_rt = dot(along_r, along_t);  // n is orthogonal to east
-  const float disc = c * c * b_tt - dot(minors, minors);
-  const bool over_pole = !(disc > 1e-7f * b_rt * b_rt) || !(b_tt > 0) || norm == 0;
-  float west = -kPi, east = kPi;
-  if (!over_pole) {
-    east = arctangent2(1.0f, (b_rt + root(disc)) / b_tt);
-    west = arctangent2(1.0f, (b_rt - root(disc)) / b_tt) - kPi;
-  }
+  const Vec3<T> along_t = transposed_times(k.spread, f.east), along_r = transposed_times(k.spread, h);
+  const Vec3<T> minors = cross(along_t, along_r);
+  const T b_tt = dot(along_t, along_t), b_rt = dot(along_r, along_t);  // n is orthogonal to east
+  const T disc = c * c * b_tt - dot(minors, minors);
+  T over_pole = where(below(1e-7f * b_rt * b_rt, disc), zero, one);
+  over_pole = where(below(zero, b_tt), where(below(zero, norm), over_pole, one), one);
+  const T half_chord = root(larger(disc, zero)), across = where(below(zero, b_tt), b_tt, one);
+  const T half_turn = constant(kPi, c);
+  const T east = where(below(zero, over_pole), half_turn, arctangent2(one, (b_rt + half_chord) / across));
+  const T west = where(below(zero, over_pole), -half_turn, arctangent2(one, (b_rt - half_chord) / across) - kPi);
   // Latitude, over the tangent-plane box [x0, x1] x [y0, y1] of the cone.
-  float x0, x1, y0, y1, low = -1, high = 1;
-  if (ratio_range(k, f.east, f.normal, x0, x1) && ratio_range(k, f.down, f.normal, y0, y1)) {
-    const float reach = larger(magnitude(x0), magnitude(x1));
-    low = 1, high = -1;
-    for (const float y : {y0, y1}) {
-      const float rise = s + c * y, flat = rise / root(1 + y * y), bent = rise / root(1 + reach * reach + y * y);
-      low = smaller(low, rise > 0 ? bent : flat);
-      high = larger(high, rise > 0 ? flat : bent);
-    }
-    const bool passes = over_pole || c - s * (s > 0 ? y1 : y0) <= 0;
-    if (passes && s >= 0) high = 1;
-    if (passes && s <= 0) low = -1;
+  T x0, x1, y[2];
+  const T bounded_x = ratio_range(k, f.east, f.normal, x0, x1), bounded_y = ratio_range(k, f.down, f.normal, y[0], y[1]);
+  const T reach = larger(magnitude(x0), magnitude(x1));
+  T low = one, high = -one;
+  for (int i = 0; i < 2; ++i) {
+    const T rise = s + c * y[i], flat = rise / root(one + y[i] * y[i]), bent = rise / root(one + reach * reach + y[i] * y[i]);
+    low = smaller(low, where(below(zero, rise), bent, flat));
+    high = larger(high, where(below(zero, rise), flat, bent));
   }
-  const float longitude = arctangent2(f.normal.x, f.normal.z);
+  // The box of tangents holds the pole on the mean's side, and with it all rays around.
+  const T towards_pole = where(below(zero, s), y[1], y[0]);
+  const T passes = where(below(zero, c - s * towards_pole), over_pole, one);
+  high = where(below(s, zero), high, where(below(zero, passes), one, high));
+  low = where(below(zero, s), low, where(below(zero, passes), -one, low));
+  low = where(below(bounded_x, zero), where(below(bounded_y, zero), low, -one), -one);
+  high = where(below(bounded_x, zero), where(below(bounded_y, zero), high, one), one);
+  const T longitude = arctangent2(f.normal.x, f.normal.z);
   const float per_radian_u = width / (2 * kPi), per_radian_v = height / kPi;
-  const float widen_u = kSlackPixels + (kSlack - 1) * (east - west) * per_radian_u;
-  const float top = asinf(smaller(larger(low, -1.0f), 1.0f)), bottom = asinf(smaller(larger(high, -1.0f), 1.0f));
-  const float widen_v = kSlackPixels + (kSlack - 1) * (bottom - top) * per_radian_v;
+  const T widen_u = (east - west) * ((kSlack - 1) * per_radian_u) + kSlackPixels;
+  const T top = arcsine(low), bottom = arcsine(high), widen_v = (bottom - top) * ((kSlack - 1) * per_radian_v) + kSlackPixels;
   return {(longitude + west) * per_radian_u + 0.5f * width - widen_u, (longitude + east) * per_radian_u + 0.5f * width + widen_u,
           top * per_radian_v + 0.5f * height - widen_v, bottom * per_radian_v + 0.5f * height + widen_v};
 }
@@ -109,11 +124,11 @@ PADGS_HD bool misses_pinhole(const Cone &k, const Camera &camera) {
 PADGS_HD PixelRange pinhole_range(const Cone &k, const Camera &camera) {
   PixelRange range{0, float(camera.width), 0, float(camera.height)};
   float low, high;
-  if (ratio_range(k, {1, 0, 0}, {0, 0, 1}, low, high)) {
+  if (ratio_range<float>(k, {1, 0, 0}, {0, 0, 1}, low, high) < 0) {
     const float widen = kSlackPixels + (kSlack - 1) * (high - low) * camera.fx;
     range.u0 = camera.fx * low + camera.cx - widen, range.u1 = camera.fx * high + camera.cx + widen;
   }
-  if (ratio_range(k, {0, 1, 0}, {0, 0, 1}, low, high)) {
+  if (ratio_range<float>(k, {0, 1, 0}, {0, 0, 1}, low, high) < 0) {
     const float widen = kSlackPixels + (kSlack - 1) * (high - low) * camera.fy;
     range.v0 = camera.fy * low + camera.cy - widen, range.v1 = camera.fy * high + camera.cy + widen;
   }

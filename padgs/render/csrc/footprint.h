@@ -45,7 +45,7 @@ struct Projected {
   T shape[11];
   T log2_opacity, depth;
   T drawn;       // 1 or 0: solid, in front, within reach, and nothing overflowed on the way
-  T bounds[12];  // planar: half_u, half_v, uu, uv, vv, det;  projective: mean (3), cone (9)
+  T bounds[12];  // planar: half_u, half_v, uu, uv, vv, det;  projective: range on the panorama (4), or mean (3), cone (9)
 };
 
 template <class T>
@@ -79,12 +79,21 @@ PADGS_HD Projected<T> projected_planar(const Camera &camera, const Chart &chart,
   return p;
 }
 
+// Whether the pixels of a projective footprint follow from its range on a panorama.
+PADGS_HD bool by_range(const Camera &camera) { return camera.model != kPinholeModel && !camera.square; }
+
 template <class T>
-PADGS_HD Projected<T> projected_rays(const ProjectiveShape<T> &s, Vec3<T> mean, const Mat3<T> &k, T opacity, T depth, T in_front) {
+PADGS_HD Projected<T> projected_rays(const Camera &camera, const ProjectiveShape<T> &s, Vec3<T> mean, const Mat3<T> &k, T opacity, T depth, T in_front) {
+  const T zero = constant(0.0f, depth);
   Projected<T> p{{s.l0.x, s.l0.y, s.l0.z, s.l1.x, s.l1.y, s.l1.z, s.m.x, s.m.y, s.m.z, s.kappa, s.near_ratio},
                  log2_of_opacity(opacity), depth, in_front,
                  {mean.x, mean.y, mean.z, k.c0.x, k.c0.y, k.c0.z, k.c1.x, k.c1.y, k.c1.z, k.c2.x, k.c2.y, k.c2.z}};
   p.drawn = is_drawn(p, 12, opacity, in_front);
+  if (!by_range(camera)) return p;
+  const SphereFrame<T> frame = sphere_frame(mean);
+  const PixelRangeOf<T> range = sphere_range(ConeOf<T>{k, frame.normal}, frame, float(camera.width), float(camera.height));
+  const T bounds[12] = {range.u0, range.u1, range.v0, range.v1, zero, zero, zero, zero, zero, zero, zero, zero};
+  for (int i = 0; i < 12; ++i) p.bounds[i] = bounds[i];
   return p;
 }
 
@@ -107,7 +116,7 @@ PADGS_HD Projected<T> projected(const Camera &camera, const CameraGaussian<T> &p
     const T in_front = model.frame.r - camera.near_radius;
     Mat3<T> bounds = model.cone(k);
     if (camera.square) bounds.c2 = model.published_extent(camera, posed.mean);  // the cone leaves it empty
-    return projected_rays(model.shape(), posed.mean, bounds, g.opacity, model.frame.r, in_front);
+    return projected_rays(camera, model.shape(), posed.mean, bounds, g.opacity, model.frame.r, in_front);
   }
   const RayModel<T> model(g);  // not drawn from inside: rho^2 <= 2 ln(255 o)
   T in_front = smaller(model.frame.r - camera.near_radius, model.rho * model.rho - exact);
@@ -116,7 +125,7 @@ PADGS_HD Projected<T> projected(const Camera &camera, const CameraGaussian<T> &p
     const T reach = model.frame.r - root(larger(exact, constant(0.0f, exact)) * dot(along, along));
     in_front = smaller(in_front, reach - camera.near_radius);
   }
-  return projected_rays(model.shape(g, camera.near_radius), posed.mean, model.cone(g, k), g.opacity, model.frame.r, in_front);
+  return projected_rays(camera, model.shape(g, camera.near_radius), posed.mean, model.cone(g, k), g.opacity, model.frame.r, in_front);
 }
 
 // The box of a Gaussian that is drawn.
@@ -128,6 +137,11 @@ PADGS_HD PixelBox box_of(const Camera &camera, const float *shape, const float *
     return pixel_box(camera, {u - half_u, u + half_u, v - half_v, v + half_v});
   }
   if (camera.model == kTableModel && camera.off_panorama < 0) return {0, camera.width, 0, 0, camera.height};
+  if (by_range(camera)) {
+    const PixelRange range{b[0], b[1], b[2], b[3]};
+    if (camera.model == kPanoramaModel) return pixel_box(camera, range);
+    return pixel_box(camera, widened_range(range, camera.off_panorama, float(camera.width), float(camera.height)));
+  }
   const Vec3<float> mean{b[0], b[1], b[2]};
   if (camera.square) {
     const ErpChart<float> chart(camera, mean);
@@ -135,11 +149,6 @@ PADGS_HD PixelBox box_of(const Camera &camera, const float *shape, const float *
   }
   const SphereFrame<float> frame = sphere_frame(mean);
   const Cone cone{{{b[3], b[4], b[5]}, {b[6], b[7], b[8]}, {b[9], b[10], b[11]}}, frame.normal};
-  if (camera.model == kPanoramaModel)
-    return pixel_box(camera, sphere_range(cone, frame, float(camera.width), float(camera.height)));
-  if (camera.model == kTableModel)
-    return pixel_box(camera, widened_range(sphere_range(cone, frame, float(camera.width), float(camera.height)),
-                                           camera.off_panorama, float(camera.width), float(camera.height)));
   return misses_pinhole(cone, camera) ? no_pixels() : pixel_box(camera, pinhole_range(cone, camera));
 }
 
