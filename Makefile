@@ -4,7 +4,7 @@ BIN := .venv/bin
 SOURCES := pyproject.toml constraints.txt requirements-nodeps.txt CMakeLists.txt $(wildcard padgs/render/csrc/* padgs/render/csrc/cuda/*)
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: run test test-all lint bench cuda-compile
+.PHONY: run test test-all lint bench
 
 run: .venv/installed ## padgs-run, with ARGS="..." for it
 	$(BIN)/padgs-run $(ARGS)
@@ -20,12 +20,6 @@ lint: .venv/installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
-
-cuda-compile: ## do the GPU kernels compile? Needs nvcc, no GPU
-	@if command -v nvcc >/dev/null; then \
-	  mkdir -p build && echo "nvcc padgs/render/csrc/cuda/*.cu" && nvcc -std=c++17 -arch=sm_90 -Werror all-warnings \
-	    -Xcompiler -fPIC,-Wall -shared padgs/render/csrc/cuda/*.cu -o build/libpadgs_cuda_check.so; \
-	else echo "cuda-compile: skipped, no nvcc here"; fi
 
 bench: .venv/installed ## speed and memory, as ratios within one run
 	$(BIN)/padgs bench $(ARGS)
