@@ -26,10 +26,9 @@ def track(
     trackers: dict[str, Tracker] = {}
     for result in found:
         experiment = result.experiments[0] if result.experiments else ""
-        tracker = trackers.setdefault(
-            experiment, Tracker(TrackingOptions(uri=uri or None), Path(runs), experiment, console.print)
-        )
-        tracker.update(Path(runs) / result.run)
-        if not tracker.on:
+        if experiment not in trackers:
+            trackers[experiment] = Tracker(TrackingOptions(uri=uri or None), Path(runs), experiment, console.print)
+        trackers[experiment].update(Path(runs) / result.run)
+        if not trackers[experiment].on:
             raise typer.Exit(1)
-    console.print(f"{len(found)} runs mirrored in {len(trackers)} experiments")
+    console.print(f"mirrored: {len(found)} runs, as {', '.join(tracker.name for tracker in trackers.values())}")

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 KINDS = ("mlflow", "none")
 DEFAULT_EXPERIMENT = "padgs"  # of mlflow, for runs of no experiment of ours
+SERVERS = ("http", "databricks")  # how their URIs begin
 SECONDS_BETWEEN_LOOKS = 30.0  # at a run in progress
 # A server that does not answer must not hold up anything for minutes, as it does by default.
 # And nobody wants to know about the tables of a new database.
@@ -63,7 +64,7 @@ class Tracker:
             say: shows a line to the user; called at most once.
             multirun: name of the run of mlflow under which the runs stand; empty = none.
         """
-        self._options, self._runs, self._experiment = options, runs.absolute(), experiment or DEFAULT_EXPERIMENT
+        self._options, self._runs, self.name = options, runs.absolute(), experiment or DEFAULT_EXPERIMENT
         self._say, self._multirun = say, multirun
         self._mirror: Mirror | None = None
         self.on = options.kind != "none"
@@ -109,9 +110,10 @@ class Tracker:
 
         with FileLock(self._runs / ".mlflow.lock"):  # two processes that make one database destroy it
             client = MlflowClient(self.uri)
-            known = client.get_experiment_by_name(self._experiment)
-            place = None if self._options.uri else (self._runs / "mlflow-artifacts").as_uri()
-            identity = known.experiment_id if known else client.create_experiment(self._experiment, place)
+            known = client.get_experiment_by_name(self.name)
+            # A server has a place for artifacts; beside a database they would land wherever one happens to stand.
+            place = None if self.uri.startswith(SERVERS) else (self._runs / "mlflow-artifacts").as_uri()
+            identity = known.experiment_id if known else client.create_experiment(self.name, place)
             return Mirror(client, identity, self._multirun)
 
 

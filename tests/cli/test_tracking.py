@@ -2,8 +2,10 @@ import json
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 from padgs import results
+from padgs.cli.app import app
 from padgs.cli.mlflow_mirror import batches, log_lines
 from padgs.cli.tracking import TrackedRun, Tracker, TrackingOptions
 from padgs.results import Result, Scores
@@ -111,6 +113,25 @@ def test_a_database_that_is_lost_costs_a_line(tmp_path, said):
     tracker.update(run)
     tracker.update(run)
     assert len(said) == 1 and "padgs track" in said[0]
+
+
+@pytest.mark.slow
+@NEEDS_MLFLOW
+def test_runs_of_a_cluster_are_mirrored_later(tmp_path, monkeypatch):
+    mlflow = pytest.importorskip("mlflow")
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    make_run(tmp_path)
+    make_run(tmp_path, "room_padgs_2")
+    (tmp_path / "cut").mkdir()
+    (tmp_path / "cut" / "result.json").write_text("{")
+    done = CliRunner().invoke(app, ["track", str(tmp_path), "--uri", f"sqlite:///{tmp_path}/other.db"])
+    assert done.exit_code == 0 and "mirrored: 2 runs, as tau" in done.output and "left out: " in done.output
+    client = mlflow.MlflowClient(f"sqlite:///{tmp_path}/other.db")
+    assert len(client.search_runs([client.get_experiment_by_name("tau").experiment_id])) == 2
+    assert list(Path.cwd().iterdir()) == []
+    away = CliRunner().invoke(app, ["track", str(tmp_path), "--uri", "http://127.0.0.1:9"])
+    assert away.exit_code == 1 and "no longer mirrored" in away.output
 
 
 def test_a_run_in_progress_is_not_looked_at_all_the_time(tmp_path, monkeypatch):
