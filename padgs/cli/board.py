@@ -80,6 +80,7 @@ class Board:
         """Ask all jobs to write their checkpoints and stop, and those that wait not to start."""
         self.folder.mkdir(parents=True, exist_ok=True)
         (self.folder / "stop").touch()
+        self._stop = True
 
     def stop_requested(self) -> bool:
         """Whether that was asked; the file system is not asked more often than once a second."""

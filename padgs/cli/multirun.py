@@ -24,6 +24,7 @@ from padgs.cli.launchers import patient
 from padgs.cli.overview import Overview, iterations_done, shown
 from padgs.cli.run_folder import cannot_write
 from padgs.cli.tracking import SECONDS_BETWEEN_LOOKS, Tracker, TrackingOptions
+from padgs.cli.typed import typed
 from padgs.results import Result, ResultError
 
 ATTEMPTS = 2  # of a job whose process died: it may have been the fault of another one
@@ -54,7 +55,7 @@ class Multirun:
         self._said: set[str] = set()
         names = " ".join(labels(config.hydra.runtime.choices).experiments)
         digest = hashlib.sha256(repr(sorted(map(sorted, jobs))).encode()).hexdigest()[:8]
-        options = TrackingOptions(**config.tracking) if self.jobs else TrackingOptions("none")
+        options = typed(TrackingOptions, config.tracking if self.jobs else {"kind": "none"}, "tracking")
         self._tracker = Tracker(options, self.runs, names, self._say, f"{names or 'multirun'} {digest}")
         self._tracked: set[int] = set()  # jobs of which mlflow knows the end
         self._began = self._looked = time.monotonic()
@@ -93,7 +94,8 @@ class Multirun:
             lost = {index for index in left if self._in_process or attempts[index] >= ATTEMPTS}
             for index in lost:
                 status = REFUSED if self._in_process else KILLED
-                self._end(index, replace(self.states[index], status=status, reason=str(error)))
+                reason = f"a job did not say how it ended: {error or f'is there room in {self.runs}?'}"
+                self._end(index, replace(self.states[index], status=status, reason=reason))
             waiting += [index for index in left if index not in lost]
             self._track()
             if self._in_process and waiting:
@@ -135,6 +137,7 @@ class Multirun:
                 return None
             with Interrupt() as stop, patient(), shown(self.look, lambda: self._pass_on(stop), self._console):
                 launcher.launch(jobs, initial_job_idx=first_number)
+                self._pass_on(stop)
         except Exception as error:
             return error  # of the launcher or a worker process: jobs themselves raise nothing
         return None

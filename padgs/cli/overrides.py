@@ -55,19 +55,23 @@ def lenient(arguments: Sequence[str]) -> list[str]:
 
 
 def conflict(arguments: Sequence[str]) -> str | None:
-    """What is wrong if a command line sets one key twice; None if it does not.
+    """What is wrong with a command line that says two things at once; None if it does not.
 
     >>> conflict(["seed=1", "-m", "method=padgs", "++seed=2"])
     'seed is set twice, by seed=1 and ++seed=2; keep one of them'
+    >>> conflict(["+sweep=tau,seeds"])
+    '+sweep=tau,seeds: one sweep at a time, because each says itself what is swept'
     """
     settings: dict[str, str] = {}
     for argument in arguments:
-        key, equals, _ = argument.partition("=")
+        key, equals, value = argument.partition("=")
         if not equals or key.startswith("-"):
             continue
         key = key.lstrip("+~")
         if key in settings:
             return f"{key} is set twice, by {settings[key]} and {argument}; keep one of them"
+        if key in ("experiment", "sweep") and ("," in value or "(" in value):
+            return f"{argument}: one {key} at a time, because each says itself what is swept"
         settings[key] = argument
     return None
 

@@ -25,7 +25,7 @@ def track(
         console.print(f"left out: {error}", markup=False)
     trackers: dict[str, Tracker] = {}
     for result in found:
-        experiment = result.experiments[0] if result.experiments else ""
+        experiment = " ".join(result.experiments)
         if experiment not in trackers:
             trackers[experiment] = Tracker(TrackingOptions(uri=uri or None), Path(runs), experiment, console.print)
         trackers[experiment].update(Path(runs) / result.run)

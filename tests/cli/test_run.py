@@ -12,49 +12,13 @@ from pathlib import Path
 
 import pytest
 import torch
+from processes import SMALLEST, finish
 
 from padgs import checkpoint, results
 from padgs.cli.overrides import lenient
 
 ROOT = Path(__file__).resolve().parents[2]
-TINY = [  # half a minute's worth of nothing: what is tested is the machinery around it
-    "protocol=paper",
-    "protocol.paper.lpips=none",
-    "data.generator.width=64",
-    "data.generator.train_views=4",
-    "data.generator.test_views=1",
-    "data.generator.samples=1",
-    "data.generator.points=400",
-    "train.iterations=300",
-    "run.threads=1",
-    "run.checkpoint_every=10",
-    "run.probe_every=50",
-]
-
-
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory) -> Path:
-    """One folder of generated scenes for all processes."""
-    return tmp_path_factory.mktemp("cache")
-
-
-@pytest.fixture
-def start(tmp_path, cache):
-    """Start `padgs-run` in an empty folder."""
-
-    def started(*arguments: str) -> subprocess.Popen:
-        environment = os.environ | {"PYTHONPATH": str(ROOT), "PADGS_CACHE": str(cache), "COLUMNS": "200"}
-        environment.pop("PADGS_ROOT", None)
-        command = [sys.executable, "-W", "ignore::UserWarning", "-m", "padgs.cli.run", *arguments]
-        pipe = subprocess.PIPE
-        return subprocess.Popen(command, cwd=tmp_path, env=environment, stdout=pipe, stderr=pipe, text=True)
-
-    return started
-
-
-def finish(process: subprocess.Popen) -> tuple[int, str, str]:
-    out, error = process.communicate(timeout=240)
-    return process.returncode, out, error
+TINY = [*SMALLEST, "train.iterations=300", "run.checkpoint_every=10", "run.probe_every=50", "tracking=none"]
 
 
 def newest(folder: Path) -> bytes:

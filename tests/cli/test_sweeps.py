@@ -3,56 +3,16 @@
 import os
 import random
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
+from processes import SMALLEST, finish
 
 from padgs import results
 
-ROOT = Path(__file__).resolve().parents[2]
-TINY = [
-    "protocol=paper",
-    "protocol.paper.lpips=none",
-    "data.generator.width=64",
-    "data.generator.train_views=4",
-    "data.generator.test_views=1",
-    "data.generator.samples=1",
-    "data.generator.points=400",
-    "train.iterations=40",
-    "run.checkpoint_every=5",
-    "run.threads=1",
-    "tracking=none",
-]
+TINY = [*SMALLEST, "train.iterations=40", "run.checkpoint_every=5", "tracking=none"]
 SWEEP = ["-m", "method.tau=0.0,0.5,0.9,1.0", "seed=0,1,2"]
-
-
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory) -> Path:
-    """One folder of generated scenes for all processes."""
-    return tmp_path_factory.mktemp("cache")
-
-
-@pytest.fixture
-def start(tmp_path, cache):
-    """Start `padgs-run` in a process group of its own."""
-
-    def started(*arguments: str) -> subprocess.Popen:
-        environment = os.environ | {"PYTHONPATH": str(ROOT), "PADGS_CACHE": str(cache), "COLUMNS": "200"}
-        command = [sys.executable, "-W", "ignore", "-m", "padgs.cli.run", *TINY, *arguments]
-        pipe = subprocess.PIPE
-        return subprocess.Popen(
-            command, cwd=tmp_path, env=environment, stdout=pipe, stderr=pipe, text=True, start_new_session=True
-        )
-
-    return started
-
-
-def finish(process: subprocess.Popen) -> tuple[int, str, str]:
-    out, error = process.communicate(timeout=400)
-    return process.returncode, out, error
 
 
 def marks(folder: Path) -> dict[str, tuple]:
@@ -67,13 +27,13 @@ def marks(folder: Path) -> dict[str, tuple]:
 def test_a_sweep_that_was_killed_three_times_ends_as_if_nothing_had_been(start, tmp_path, launcher):
     if launcher != "none":
         pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    code, _, error = finish(start(*SWEEP, "run.folder=undisturbed"))
+    code, _, error = finish(start(*TINY, *SWEEP, "run.folder=undisturbed"))
     assert code == 0, error
     expected = marks(tmp_path / "undisturbed")
     assert len(expected) == 12
     source = random.Random(time.time_ns())  # a random moment, as asked: any must do
     for number in (signal.SIGKILL, signal.SIGINT, signal.SIGTERM):
-        process = start(*SWEEP, "run.folder=disturbed", f"launcher={launcher}")
+        process = start(*TINY, *SWEEP, "run.folder=disturbed", f"launcher={launcher}")
         known = len(list((tmp_path / "disturbed").glob("*/log.jsonl")))
         deadline = time.monotonic() + 120
         while process.poll() is None and len(list((tmp_path / "disturbed").glob("*/log.jsonl"))) <= known:
@@ -87,10 +47,10 @@ def test_a_sweep_that_was_killed_three_times_ends_as_if_nothing_had_been(start, 
         code, _, error = finish(process)
         if number != signal.SIGKILL and code != 0:  # 0: the sweep was faster than the signal
             assert code == 130 and "to go on: padgs-run" in error, error
-    code, out, error = finish(start(*SWEEP, "run.folder=disturbed", f"launcher={launcher}"))
+    code, out, error = finish(start(*TINY, *SWEEP, "run.folder=disturbed", f"launcher={launcher}"))
     assert code == 0, out + error
     assert marks(tmp_path / "disturbed") == expected
-    code, out, _ = finish(start(*SWEEP, "run.folder=disturbed"))
+    code, out, _ = finish(start(*TINY, *SWEEP, "run.folder=disturbed"))
     assert code == 0 and out == "12 of 12 done (12 before)\n"
 
 
@@ -100,7 +60,7 @@ def test_all_launchers_give_the_same_results(start, tmp_path):
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
     found = []
     for launcher in ("none", "local", "submitit"):
-        code, out, error = finish(start("-m", "seed=0,1,2,3", f"launcher={launcher}", f"run.folder={launcher}"))
+        code, out, error = finish(start(*TINY, "-m", "seed=0,1,2,3", f"launcher={launcher}", f"run.folder={launcher}"))
         assert code == 0 and out.endswith("4 of 4 done\n"), out + error
         found.append(marks(tmp_path / launcher))
     assert len(found[0]) == 4 and found[0] == found[1] == found[2]
@@ -108,7 +68,7 @@ def test_all_launchers_give_the_same_results(start, tmp_path):
 
 @pytest.mark.slow
 def test_two_processes_share_a_sweep_and_do_every_run_once(start, tmp_path):
-    processes = [start("-m", "seed=0,1,2,3,4,5") for _ in range(2)]
+    processes = [start(*TINY, "-m", "seed=0,1,2,3,4,5") for _ in range(2)]
     ends = [finish(process) for process in processes]
     assert {code for code, _, _ in ends} <= {0, 1}  # 1: the other one was still at the last run
     assert len(marks(tmp_path / "runs")) == 6
