@@ -81,7 +81,8 @@ def test_the_ablation_is_one_command_and_its_table_another(start, tmp_path, cach
     assert done.returncode == 0, done.stderr
     for result in found:
         assert f"{result.scores['paper'].metrics['psnr']:.2f}" in done.stdout
-    assert sorted(path.name for path in (tmp_path / "runs" / "tables").iterdir()) == ["table3.md", "table3.tex"]
+    written = {path.name for path in (tmp_path / "runs" / "reports").iterdir()}
+    assert written == {"table3.csv", "table3.md", "table3.tex"}
     assert {path.name for path in tmp_path.iterdir()} == {"runs"}, "Hydra left something behind"
 
 
