@@ -87,7 +87,8 @@ class EgoNeRFMethod:
         """Become the method that `state` was taken of, ready to render and to go on."""
         stored = model_state(state)
         centre = torch.tensor(stored.values["centre"], dtype=torch.float64)
-        self._model = EgoNeRF(self._options, centre, stored.values["unit"], stored.values["travel"])
+        model = EgoNeRF(self._options, centre, stored.values["unit"], stored.values["travel"])
+        self._model = model.to(next(iter(stored.tensors.values())).device)
         self._model.load_state_dict(stored.tensors)
         self._trainer, self._loaded = None, state
 

@@ -167,9 +167,10 @@ def aligned(poses: PoseRefinement) -> tuple[Similarity, Difference]:
 
 def carried(cam_from_world: Tensor, similarity: Similarity) -> Tensor:
     """A pose [4, 4] float64 in the world that the similarity leads to."""
+    cam_from_world = cam_from_world.to(similarity.rotation)
     rotation = cam_from_world[:3, :3] @ similarity.rotation.mT
     center = similarity(-cam_from_world[:3, :3].mT @ cam_from_world[:3, 3])
-    pose = torch.eye(4, dtype=torch.float64)
+    pose = torch.eye(4, dtype=torch.float64, device=rotation.device)
     pose[:3, :3], pose[:3, 3] = rotation, -rotation @ center
     return pose
 

@@ -23,6 +23,10 @@ PREFIX = "calibration/"  # of its tensors in a state
 class Calibration(Protocol):
     """A differentiable model of the cameras: an `nn.Module` that draws views through itself."""
 
+    def to(self, device: torch.device) -> Any:
+        """Move all of its tensors, in place."""
+        ...
+
     def groups(self, iterations: int) -> list[ParameterGroup]:
         """Its parameters and their learning rates in a run of `iterations`."""
         ...
@@ -123,6 +127,7 @@ class CalibratedMethod(SplatMethod, ABC):
 
     def _wrap(self, splats: Splats, extent: float, iterations: int) -> CalibratedSplats:
         assert self._calibration is not None
+        self._calibration.to(splats.means.device)
         return CalibratedSplats(
             splats,
             self._options,

@@ -12,6 +12,7 @@ import json
 from pathlib import Path
 
 import safetensors.torch
+import torch
 
 from padgs.method import State
 from padgs.results import replace_file
@@ -56,8 +57,8 @@ def save(state: State, folder: Path) -> None:
             stale.unlink(missing_ok=True)
 
 
-def load(folder: Path) -> State:
-    """Read a checkpoint that `save` wrote, whole or not at all. Tensors are on the CPU.
+def load(folder: Path, device: torch.device | str = "cpu") -> State:
+    """Read a checkpoint that `save` wrote, whole or not at all, all tensors on one device.
 
     Raises:
         CheckpointError: a file is missing, truncated, changed, or of another format.
@@ -73,7 +74,7 @@ def load(folder: Path) -> State:
     if hashlib.sha256(content).hexdigest() != manifest["sha256"]:
         raise CheckpointError(f"{path} was changed after it was written (SHA-256 differs); {WAY_OUT}")
     # Clones own aligned memory. Views into the file's bytes would not, and matrix products may round differently then.
-    tensors = {name: tensor.clone() for name, tensor in safetensors.torch.load(content).items()}
+    tensors = {name: tensor.to(device, copy=True) for name, tensor in safetensors.torch.load(content).items()}
     return State(tensors, manifest["values"])
 
 

@@ -168,7 +168,8 @@ class CloneSplit:
         return copies
 
     def _prune(self, optimizer: torch.optim.Adam, iteration: int) -> int:
-        keep = torch.sigmoid(self.splats.opacity_logits) >= self.options.min_opacity
+        # Not ">=": what is NaN stays, for the loop to find and name it.
+        keep = ~(torch.sigmoid(self.splats.opacity_logits) < self.options.min_opacity)
         if self.options.prune_by_extent and iteration > self.options.prune_by_extent_from:
             keep &= torch.exp(self.splats.log_scales).amax(-1) <= self.options.max_scale * self.extent
         keep_rows(self.splats.rows(), optimizer, keep)

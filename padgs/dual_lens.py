@@ -36,6 +36,8 @@ class DualLens(nn.Module):
         unit: the scene's unit of length in world units.
     """
 
+    axis: Tensor
+
     def __init__(
         self,
         *,
@@ -64,7 +66,8 @@ class DualLens(nn.Module):
             raise ValueError(f"the radial map has {order} coefficients; it must have at least 1")
         self.gap = nn.Parameter(torch.zeros(()))
         self.coefficients = nn.Parameter(torch.zeros(2, order))
-        self.axis, self.blend, self.unit = axis_direction(axis), check_blend(blend), unit
+        self.register_buffer("axis", axis_direction(axis), persistent=False)
+        self.blend, self.unit, self._axis_name = check_blend(blend), unit, axis
         self._rates = (gap_rate, coefficient_rate)
 
     def groups(self, iterations: int) -> list[ParameterGroup]:
@@ -84,13 +87,14 @@ class DualLens(nn.Module):
         if not isinstance(view.camera, Panorama):
             raise ValueError(f"view {view.name!r} is a {type(view.camera).__name__}; two lenses make a Panorama")
         focal = view.camera.focal
-        rays, weight = _sphere(view.camera, tuple(self.axis.tolist()), self.blend)
+        rays, weight = _sphere(view.camera, self._axis_name, self.blend, self.gap.device)
+        given = view.cam_from_world.to(self.gap.device)
         both = []
         for sign, seen, coefficients in zip((1.0, -1.0), (weight > 0, weight < 1), self.coefficients, strict=True):
             axis = sign * self.axis
-            shift = torch.zeros(4, 4, dtype=torch.float64)
+            shift = torch.zeros(4, 4, dtype=torch.float64, device=axis.device)
             shift[:3, 3] = axis
-            pose = view.cam_from_world - (0.5 * self.unit * self.gap) * shift  # the world moves the other way
+            pose = given - (0.5 * self.unit * self.gap) * shift  # the world moves the other way
             straight = rays.to(coefficients)
             # What the lens does not show stays straight: a polynomial runs off there, and bounds with it.
             table = torch.where(seen[..., None], bend(straight, axis.to(coefficients), coefficients), straight)
@@ -103,7 +107,7 @@ class DualLens(nn.Module):
         front = draw(first)
         back = draw(second, probe=front.probe)  # one probe: both lenses pull at the same Gaussians
         assert isinstance(view.camera, Panorama)
-        _, weight = _sphere(view.camera, tuple(self.axis.tolist()), self.blend)
+        _, weight = _sphere(view.camera, self._axis_name, self.blend, self.gap.device)
         return replace(front, rendering=stitched(front.rendering, back.rendering, weight))
 
     def counts(self) -> dict[str, int]:
@@ -133,7 +137,7 @@ def stitched(front: Rendering, back: Rendering, weight: Tensor) -> Rendering:
 
 
 @lru_cache(maxsize=4)
-def _sphere(camera: Panorama, axis: tuple[float, float, float], blend: float) -> tuple[Tensor, Tensor]:
+def _sphere(camera: Panorama, axis: str, blend: float, device: torch.device) -> tuple[Tensor, Tensor]:
     """Rays [H, W, 3] and weights [H, W] of the front lens, float64."""
-    rays = camera.rays(dtype=torch.float64)
-    return rays, hemisphere_weight(rays, torch.tensor(axis, dtype=torch.float64), blend)
+    rays = camera.rays(dtype=torch.float64, device=device)
+    return rays, hemisphere_weight(rays, axis_direction(axis).to(device), blend)

@@ -76,7 +76,7 @@ class Record:
     """One training iteration, as `Method.fit` yields it after the optimiser step."""
 
     iteration: int  # 1 for the first step
-    loss: float
+    loss: float | Tensor  # a scalar on the GPU where nobody has read it yet: `float` of it waits for the iteration
     seconds: float  # training time so far, evaluation and files excluded
     counts: dict[str, int] = field(default_factory=dict)  # anchors, gaussians drawn, ...
     events: tuple[str, ...] = ()  # what happened besides the step: "grew 120 anchors", ...

@@ -110,7 +110,8 @@ class PaDGS(nn.Module):
         self.features = nn.Parameter(positions.new_zeros(count, options.features))
         self.offsets = nn.Parameter(positions.new_zeros(count, options.offsets, 3))
         self.log_scales = nn.Parameter(log_scales)
-        self.decoder = Decoder(options.inputs, options.offsets, options.hidden, generator=generator)
+        decoder = Decoder(options.inputs, options.offsets, options.hidden, generator=generator)
+        self.decoder = decoder.to(positions.device)
 
     @classmethod
     def from_scene(cls, scene: Scene, options: PaDGSOptions = PaDGSOptions(), *, seed: int = 0) -> PaDGS:

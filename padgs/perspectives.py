@@ -26,7 +26,8 @@ class _Cut:
     lens: Pinhole
 
     def sampled(self, image: Tensor) -> Tensor:
-        return sample(image, self.lens.rays(dtype=torch.float64) @ self.turn)  # d_panorama = turn^T d_view
+        rays = self.lens.rays(dtype=torch.float64, device=image.device)
+        return sample(image, rays @ self.turn.to(image.device))  # d_panorama = turn^T d_view
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,8 @@ class _Pixels(_Cut):
 
     def __call__(self) -> Tensor:
         """Pixels [H, W, 3] uint8."""
-        image, mask = self.load(), self.panorama.mask()
+        image = self.load()
+        mask = self.panorama.mask(device=image.device)
         if mask is None:
             return self.sampled(image).round().to(torch.uint8)
         weighted = self.sampled(torch.cat((image * mask[..., None], mask[..., None]), dim=-1))

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from padgs.camera import Camera
 from padgs.scene import View
-from padgs.targets import image_and_weight
+from padgs.targets import image_of, weight_of
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class RayPixels:
         tables: dict[Camera, tuple[int, Tensor]] = {}  # where each camera's directions start among all, and they
         starts, total = [], 0
         for view in views:
-            image, of_pixel = image_and_weight(view, weight, device)
+            image, of_pixel = image_of(view, device), weight_of(view, weight, device)
             of_pixel = of_pixel.expand(view.height, view.width).reshape(-1)
             kept = of_pixel.nonzero().squeeze(-1)
             colors.append((image.reshape(-1, 3)[kept] * 255).round().to(torch.uint8))

@@ -72,15 +72,17 @@ class RayTrainer(TrainingLoop):
         self._pixels = RayPixels(views, weight, self._groups[0].parameters[0].device)
         self._generator = torch.Generator().manual_seed(seed)
 
-    def _step(self, iteration: int) -> tuple[float, dict[str, int], tuple[str, ...]]:
-        rays, value = self._pixels.draw(self._rays, self._generator), 0.0
+    def _step(self, iteration: int) -> tuple[float | Tensor, dict[str, int], tuple[str, ...]]:
+        rays = self._pixels.draw(self._rays, self._generator)
+        value = rays.weight.new_zeros((), dtype=torch.float64)
         total = 3 * rays.weight.sum()
         for part in torch.arange(self._rays, device=total.device).split(self._tracer.rays_at_once):
             image = self._tracer.colors(rays.origins[part], rays.directions[part], self._generator)
             error = (image - rays.color[part]).square() * rays.weight[part, None]
             loss = error.sum() / total
-            value += loss.item()
-            if not math.isfinite(value):
+            value += loss.detach()
+            read = self._read(value, iteration)
+            if isinstance(read, float) and not math.isfinite(read):
                 self._refuse_non_finite({**self._parameters(), "image": image, "loss": loss}, iteration)
             loss.backward()
         extra = self._tracer.regularisation(iteration)
@@ -88,7 +90,7 @@ class RayTrainer(TrainingLoop):
             extra.backward()
         self._check(iteration)
         self._update()
-        return value, {**self._tracer.counts(), "rays": self._rays}, ()
+        return self._read(value, iteration), {**self._tracer.counts(), "rays": self._rays}, ()
 
     def _order_state(self) -> State:
         return State({"random/rays": self._generator.get_state()}, {"pixels": len(self._pixels)})
@@ -99,4 +101,4 @@ class RayTrainer(TrainingLoop):
                 f"the state is of a run on {state.values['pixels']} pixels, but the training views have "
                 f"{len(self._pixels)}; resume with the data it was trained on"
             )
-        self._generator.set_state(state.tensors["random/rays"])
+        self._generator.set_state(state.tensors["random/rays"].cpu())

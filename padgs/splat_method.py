@@ -82,11 +82,11 @@ class SplatMethod:
 
     def load_state(self, state: State) -> None:
         """Become the method that `state` was taken of, ready to render and to go on."""
-        values = model_state(state).values
-        empty = torch.zeros(0, 3)
+        stored = model_state(state)
+        values, empty = stored.values, stored.tensors["splats/means"][:0]
         splats = Splats(empty, empty, empty, degree=self._options.sh_degree, unit=values["unit"])
         self._model = self._wrap(splats, values["extent"], values["iterations"])
-        self._model.load_state(model_state(state))
+        self._model.load_state(stored)
         self._trainer, self._loaded = None, state
 
     def size(self) -> Size:

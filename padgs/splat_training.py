@@ -123,7 +123,7 @@ class TrainableSplats:
         self.splats.active_degree = state.values["active_degree"]
         device = self.splats.means.device
         self.densifier.statistics = {n: t.to(device, copy=True) for n, t in _under("statistics/", state).items()}
-        self.densifier.generator.set_state(state.tensors["random/pieces"])
+        self.densifier.generator.set_state(state.tensors["random/pieces"].cpu())
 
     def _render_options(self, view: View) -> RenderOptions:
         options = self._config.options(self.splats.unit)

@@ -12,7 +12,7 @@ from padgs.fused_loss import fits
 from padgs.loss import TargetMoments, pixel_weight, target_moments
 from padgs.scene import View
 
-CACHE_BYTES = 1 << 29  # moments of views beyond this are computed again at every iteration
+CACHE_BYTES = 1 << 29  # weights and moments of views beyond this are computed again at every iteration
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,7 @@ class Targets(Sequence[Target]):
     def __init__(self, views: Sequence[View], weight: str, device: torch.device | str = "cpu") -> None:
         """Load nothing yet; `weight` is a name of `padgs.loss.ROW_WEIGHTS`."""
         self._views, self._weight, self._device = views, weight, device
+        self._weights: dict[int, Tensor] = {}
         self._moments: dict[int, TargetMoments] = {}
         self._bytes_left = CACHE_BYTES
 
@@ -43,32 +44,56 @@ class Targets(Sequence[Target]):
         Raises:
             ValueError: the view has no pixels, or they have another size than the view, or the mask leaves none.
         """
-        image, weight = image_and_weight(self._views[index], self._weight, self._device)
+        image = image_of(self._views[index], self._device)
+        weight = self._weights[index] if index in self._weights else self._weight_of(index)
         return Target(image, weight, None if fits(image) else self._moments_of(index, image))
+
+    def _weight_of(self, index: int) -> Tensor:
+        weight = weight_of(self._views[index], self._weight, self._device)
+        if self._keeps(weight.nbytes):
+            self._weights[index] = weight
+        return weight
 
     def _moments_of(self, index: int, image: Tensor) -> TargetMoments:
         if index in self._moments:
             return self._moments[index]
         moments = target_moments(image)
-        size = 2 * image.numel() * image.element_size()
-        if size <= self._bytes_left:
-            self._bytes_left -= size
+        if self._keeps(2 * image.nbytes):
             self._moments[index] = moments
         return moments
 
+    def _keeps(self, size: int) -> bool:
+        """Whether so many bytes more may be kept; they count from now on."""
+        kept = size <= self._bytes_left
+        self._bytes_left -= size if kept else 0
+        return kept
 
-def image_and_weight(view: View, weight: str, device: torch.device | str = "cpu") -> tuple[Tensor, Tensor]:
-    """Image [H, W, 3] in [0, 1] of a view and the weight of its pixels, [H, W] or [H, 1].
+
+def image_of(view: View, device: torch.device | str = "cpu") -> Tensor:
+    """Image [H, W, 3] in [0, 1] of a view.
 
     Raises:
-        ValueError: the view has no pixels, or they have another size than the view, or the mask leaves none.
+        ValueError: the view has no pixels, or they have another size than the view.
     """
-    image, mask = view.image(device=device), view.mask(device=device)
-    for what, tensor in (("image", image), ("mask", mask)):
-        if tensor is not None and tuple(tensor.shape[:2]) != (view.height, view.width):
-            size = f"{tensor.shape[1]}x{tensor.shape[0]}"
-            raise ValueError(f"{what} of view {view.name!r} is {size}; the view is {view.width}x{view.height}")
+    return _fitting(view, "image", view.image(device=device))
+
+
+def weight_of(view: View, weight: str, device: torch.device | str = "cpu") -> Tensor:
+    """Weight of the pixels of a view, [H, W], or [H, 1] without a mask; `weight` is a name of `ROW_WEIGHTS`.
+
+    Raises:
+        ValueError: the mask has another size than the view, or leaves no pixel.
+    """
+    mask = view.mask(device=device)
+    mask = None if mask is None else _fitting(view, "mask", mask)
     try:
-        return image, pixel_weight(weight, view.height, mask, device=device)
+        return pixel_weight(weight, view.height, mask, device=device)
     except ValueError as error:
         raise ValueError(f"view {view.name!r}: {error}") from error
+
+
+def _fitting(view: View, what: str, pixels: Tensor) -> Tensor:
+    height, width = pixels.shape[:2]
+    if (height, width) != (view.height, view.width):
+        raise ValueError(f"{what} of view {view.name!r} is {width}x{height}; the view is {view.width}x{view.height}")
+    return pixels

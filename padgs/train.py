@@ -99,13 +99,14 @@ class Trainer(TrainingLoop):
         self._order = torch.randperm(len(scene.train), generator=self._shuffler)  # of the views, this epoch
         self._position = 0  # in that order
 
-    def _step(self, iteration: int) -> tuple[float, dict[str, int], tuple[str, ...]]:
+    def _step(self, iteration: int) -> tuple[float | Tensor, dict[str, int], tuple[str, ...]]:
         """One iteration: draw, compare, differentiate, observe, update, adapt. Returns loss, counts and events."""
         index = self._next_view()
         self._scene.train[self._upcoming()].prefetch()
         target = self._targets[index]
         drawing = self._trainee.draw(self._scene.train[index])
         if len(drawing.gaussians) == 0:
+            self._refuse_non_finite(self._parameters(), iteration)  # a NaN shows nothing either
             raise Failure("collapsed", f"no Gaussian is left to draw at iteration {iteration}")
         if drawing.photo is not None:
             target = drawing.photo(target)
@@ -121,8 +122,8 @@ class Trainer(TrainingLoop):
         )
         if drawing.penalty is not None:
             loss = loss + drawing.penalty
-        value = loss.item()
-        if not math.isfinite(value):
+        value = self._read(loss, iteration)
+        if isinstance(value, float) and not math.isfinite(value):
             inputs = {field.name: getattr(drawing.gaussians, field.name) for field in fields(drawing.gaussians)}
             self._refuse_non_finite({**self._parameters(), **inputs, "image": image, "loss": loss}, iteration)
         loss.backward()
@@ -147,8 +148,8 @@ class Trainer(TrainingLoop):
                 f"the state is of a run with {views} training views, but scene {self._scene.name!r} has "
                 f"{len(self._scene.train)}; resume with the data it was trained on"
             )
-        self._shuffler.set_state(state.tensors["random/views"])
-        self._order = state.tensors["order"].clone()
+        self._shuffler.set_state(state.tensors["random/views"].cpu())
+        self._order = state.tensors["order"].to("cpu", copy=True)
         self._position = state.values["position"]
 
     def _next_view(self) -> int:

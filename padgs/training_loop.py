@@ -135,12 +135,14 @@ class TrainingLoop(ABC):
                 key.removeprefix(prefix): value for key, value in state.tensors.items() if key.startswith(prefix)
             }
             if moments:
-                self._optimizer.state[parameter] = {key: value.clone() for key, value in moments.items()}
-        torch.set_rng_state(state.tensors["random/torch"])
+                self._optimizer.state[parameter] = {
+                    key: value.to(parameter.device, copy=True) for key, value in moments.items()
+                }
+        torch.set_rng_state(state.tensors["random/torch"].cpu())
         self.iteration, self.seconds = state.values["iteration"], state.values["seconds"]
 
     @abstractmethod
-    def _step(self, iteration: int) -> tuple[float, dict[str, int], tuple[str, ...]]:
+    def _step(self, iteration: int) -> tuple[float | Tensor, dict[str, int], tuple[str, ...]]:
         """One iteration, `_update` included. Returns loss, counts and events of its record."""
 
     @abstractmethod
@@ -156,6 +158,12 @@ class TrainingLoop(ABC):
         if iteration % self._check_every == 0:
             gradients = {f"gradient of {name}": parameter.grad for name, parameter in self._parameters().items()}
             self._refuse_non_finite({**self._parameters(), **gradients}, iteration)
+
+    def _read(self, loss: Tensor, iteration: int) -> float | Tensor:
+        """The loss as a number. On a GPU, which the host would have to wait for, only where all is checked."""
+        if loss.device.type == "cpu" or iteration % self._check_every == 0:
+            return loss.item()
+        return loss.detach()
 
     def _update(self) -> None:
         """Step Adam. The graph must be gone by now, if rows of its leaves come and go afterwards."""

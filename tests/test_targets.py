@@ -32,7 +32,7 @@ def test_image_weight_and_moments():
 
 
 def test_moments_are_kept_only_while_there_is_room(monkeypatch):
-    monkeypatch.setattr(padgs.targets, "CACHE_BYTES", 2 * 96 * 4)
+    monkeypatch.setattr(padgs.targets, "CACHE_BYTES", 2 * 16 + 2 * 96 * 4)  # two weights, and moments
     targets = Targets([view(PIXELS), view(255 - PIXELS)], "uniform")
     assert targets[0].moments is targets[0].moments
     assert targets[1].moments is not targets[1].moments

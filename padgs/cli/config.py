@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from baselines import METHODS
+from padgs.cli.device import DEVICES
 from padgs.cli.labels import Labels
 from padgs.cli.tracking import TrackingOptions
 from padgs.cli.typed import ConfigError, typed
@@ -49,9 +50,10 @@ class TrainConfig(TrainOptions):
 
 @dataclass(frozen=True)
 class RunOptions:
-    """The `run` group: what a machine or a person decides and no number depends on; not part of the run id."""
+    """The `run` group: what a machine or a person decides and only rounding depends on; not part of the run id."""
 
     folder: str = "runs"  # of the run folders
+    device: str = "auto"  # auto | cpu | cuda; auto: a GPU where there is one that can draw what is asked for
     jobs: int = 1  # runs at the same time on one machine: conf/launcher
     threads: int | None = None  # of one run; null = cores / jobs
     log_every: int = 10  # iterations between lines of log.jsonl
@@ -61,7 +63,9 @@ class RunOptions:
     pictures: bool = True  # save truth | render | error of each test view
 
     def __post_init__(self) -> None:
-        """Reject intervals that never come round."""
+        """Reject an unknown device, and intervals that never come round."""
+        if self.device not in DEVICES:
+            raise ValueError(f"unknown run.device {self.device!r}; known: {', '.join(DEVICES)}")
         for name in ("jobs", "threads", "log_every", "probe_every", "checkpoint_every"):
             value = getattr(self, name)
             if value is not None and value < 1:

@@ -55,7 +55,7 @@ class LiveLine:
             self._console.print(line, highlight=False, soft_wrap=True)
 
     def _line(self, record: Record) -> str:
-        parts = [f"{record.iteration}/{self._iterations}", f"loss {record.loss:.4f}"]
+        parts = [f"{record.iteration}/{self._iterations}", f"loss {float(record.loss):.4f}"]
         if self._psnr is not None:
             parts.append(f"PSNR {self._psnr:.2f}")
         parts += [f"{name} {compact(count)}" for name, count in record.counts.items()]

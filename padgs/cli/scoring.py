@@ -23,7 +23,7 @@ def scores(
     found = {}
     for name, protocol in protocols.items():
         on_view = None if save_picture is None or found else _picture_saver(save_picture)
-        evaluation = evaluate(method.render, scene.test, protocol, on_view=on_view)
+        evaluation = evaluate(method.render, scene.test, protocol, device=scene.points.device, on_view=on_view)
         found[name] = Scores(evaluation.protocol, evaluation.mean, evaluation.views, evaluation.notes)
     return found
 
@@ -32,7 +32,8 @@ def frame_times(method: Method, scene: Scene) -> dict[str, float]:
     """Milliseconds per rendered test view, decoding included, after one view that does not count."""
     method.render(scene.test[0])
     views = islice(cycle(scene.test), max(FRAMES, len(scene.test)))
-    times = summary([timed(lambda view=view: method.render(view))[1] for view in views])
+    device = scene.points.device
+    times = summary([timed(lambda view=view: method.render(view), device)[1] for view in views])
     return {f"render_ms_{name}": 1000 * seconds for name, seconds in times.items()}
 
 

@@ -12,6 +12,7 @@ from rich.console import Console
 from baselines import METHODS
 from padgs import clock, data
 from padgs.cli.config import RunConfig
+from padgs.cli.device import chosen
 from padgs.cli.interrupt import Interrupted
 from padgs.cli.run_folder import RunFolder
 from padgs.cli.run_id import config_hash, run_id
@@ -38,8 +39,10 @@ def run(config: RunConfig, console: Console, watch: Watch = Watch()) -> Result: 
     if config.run.threads_per_job is not None:
         torch.set_num_threads(config.run.threads_per_job)
     torch.manual_seed(config.seed)
-    clock.reset_peak_memory()
-    scene = data.load(config.data.path, config.data.format, config.data)
+    device = chosen(config.run.device, config.render)
+    clock.reset_peak_memory(device)
+    options = replace(config.data, device=config.data.device or str(device))
+    scene = data.load(config.data.path, config.data.format, options).to(device)
     name = run_id(config.values(), scene.name, scene.fingerprint, config.preset)
     folder = RunFolder(Path(config.run.folder) / name)
     watch.started(folder.path, config.train.iterations)
@@ -81,7 +84,7 @@ def _is_missing(result: Result, config: RunConfig) -> bool:
 
 def _finish(config: RunConfig, scene: Scene, folder: RunFolder, console: Console, watch: Watch) -> Result:
     method = build(config)
-    progress = resume(method, folder)
+    progress = resume(method, folder, scene.points.device)
     if progress.iteration:
         console.print(f"resuming after iteration {progress.iteration}", highlight=False)
     result = _blank(config, scene, folder)
@@ -120,7 +123,7 @@ def build(config: RunConfig) -> Method:
 
 def _score_again(result: Result, config: RunConfig, scene: Scene, folder: RunFolder) -> Result:
     method = build(config)
-    resume(method, folder)
+    resume(method, folder, scene.points.device)
     missing = {
         name: protocol
         for name, protocol in config.protocols.items()
@@ -153,7 +156,7 @@ def _status(error: BaseException) -> str:
 
 def _blank(config: RunConfig, scene: Scene, folder: RunFolder) -> Result:
     view = (scene.test or scene.train)[0]
-    machine = clock.machine()
+    machine = clock.machine(scene.points.device)
     values = config.values()
     return Result(
         run=folder.path.name,

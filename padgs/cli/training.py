@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 
+import torch
 from rich.console import Console
 
 from padgs import checkpoint
@@ -28,8 +29,8 @@ class Progress:
     seconds: float = 0.0  # of training
 
 
-def resume(method: Method, folder: RunFolder) -> Progress:
-    """Put the method where the run's checkpoint was taken; the beginning, if there is none.
+def resume(method: Method, folder: RunFolder, device: torch.device | str = "cpu") -> Progress:
+    """Put the method where the run's checkpoint was taken, on this device; the beginning, if there is none.
 
     Raises:
         CheckpointError: there is one, but it is damaged.
@@ -37,7 +38,7 @@ def resume(method: Method, folder: RunFolder) -> Progress:
     if not checkpoint.exists(folder.checkpoint):
         folder.forget_after(0)
         return Progress()
-    state = checkpoint.load(folder.checkpoint)
+    state = checkpoint.load(folder.checkpoint, device)
     method.load_state(state)
     progress = Progress(**state.values[PROGRESS])
     folder.forget_after(progress.iteration)
@@ -103,7 +104,11 @@ def held_out_psnr(method: Method, view: View) -> float:
 
 
 def _line(record: Record, quality: float | None) -> dict[str, object]:
-    line: dict[str, object] = {"iteration": record.iteration, "loss": record.loss, "seconds": round(record.seconds, 4)}
+    line: dict[str, object] = {
+        "iteration": record.iteration,
+        "loss": float(record.loss),
+        "seconds": round(record.seconds, 4),
+    }
     line |= record.counts
     if quality is not None:
         line["psnr"] = quality

@@ -56,7 +56,7 @@ def align(first: Tensor, second: Tensor) -> tuple[Similarity, Difference]:
         raise ValueError(f"cannot align {len(first)} poses with {len(second)}; both must be the same two or more")
     rotations = first[:, :3, :3].mT @ second[:, :3, :3]  # first_from_second as each camera sees it
     u, _, vh = torch.linalg.svd(rotations.sum(0))
-    flip = torch.ones(3, dtype=u.dtype)
+    flip = torch.ones_like(u[0])
     flip[2] = torch.linalg.det(u @ vh)
     rotation = u * flip @ vh
     a, b = centers(first), centers(second)

@@ -24,7 +24,7 @@ class DataOptions:
     test_every: int = 8  # k of split=every
     cache_bytes: int = 1 << 30  # decoded images kept, all views together
     read_ahead: int = 2  # threads that decode images before they are asked for
-    device: str = "cpu"  # where decoded images are kept, as uint8
+    device: str | None = None  # where decoded images are kept, as uint8; null = where the run trains
     generator: Mapping[str, Any] = field(default_factory=dict)  # knobs of the synthetic scene
 
     def __post_init__(self) -> None:

@@ -37,10 +37,13 @@ class EgoNeRF(nn.Module):
         travel: how far cameras get from the centre, in units of the model; the grids reach `far` beyond it.
     """
 
+    centre: Tensor
+
     def __init__(self, options: EgoNeRFOptions, centre: Tensor, unit: float, travel: float) -> None:
         """Grids of noise; random numbers are torch's own."""
         super().__init__()
-        self.options, self.centre, self.unit, self.travel = options, centre.double().cpu(), unit, travel
+        self.options, self.unit, self.travel = options, unit, travel
+        self.register_buffer("centre", centre.double(), persistent=False)
         shape = {"radius": options.radial_nodes, "polar": options.polar_nodes, "azimuth": options.azimuth_nodes}
         self.density = PlaneLines(options.density_components, shape)
         self.appearance = PlaneLines(options.appearance_components, shape)
@@ -110,7 +113,7 @@ class EgoNeRF(nn.Module):
 
     def from_world(self, points: Tensor) -> Tensor:
         """Positions [..., 3] in units of the model of points in the world, on the model's device."""
-        return ((points.double().cpu() - self.centre) / self.unit).to(self.get_buffer("nodes"))
+        return ((points.to(self.centre) - self.centre) / self.unit).to(self.get_buffer("nodes"))
 
     @torch.no_grad()
     def _sample(self, origins: Tensor, directions: Tensor, generator: torch.Generator | None) -> Tensor:
@@ -123,7 +126,7 @@ class EgoNeRF(nn.Module):
             within = torch.rand(within.shape, generator=generator).to(coarse)
         at = self._at(origins, directions, first)
         weights, _ = visible_shares(self._optical_depths(self.density.coarse(), at, first))
-        second = refined(first, weights, (torch.arange(count).to(coarse) + within) / count)
+        second = refined(first, weights, (torch.arange(count, device=coarse.device).to(coarse) + within) / count)
         return torch.cat((first, second), dim=-1).sort(dim=-1).values
 
     def _at(self, origins: Tensor, directions: Tensor, distances: Tensor) -> GridPosition:

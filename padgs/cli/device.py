@@ -1,0 +1,28 @@
+"""Where a run trains, renders and is scored: everything follows the tensors of its scene and of its checkpoint."""
+
+from __future__ import annotations
+
+import torch
+
+from padgs.method import RenderConfig
+from padgs.render import cuda_native
+
+DEVICES = ("auto", "cpu", "cuda")
+
+
+def chosen(name: str, render: RenderConfig) -> torch.device:
+    """The device that `run.device` stands for; auto is a GPU where there is one that can draw this, else the CPU.
+
+    Raises:
+        ValueError: cuda where torch finds no GPU.
+    """
+    if name == "cuda" and not torch.cuda.is_available():
+        why = "torch finds no GPU with a working driver" if torch.version.cuda else "this torch is built without CUDA"
+        raise ValueError(f"run.device=cuda, but {why}; mend that, or set run.device=cpu or auto")
+    on_gpu = name == "cuda" or (name == "auto" and torch.cuda.is_available() and _draws(render))
+    return torch.device("cuda", torch.cuda.current_device()) if on_gpu else torch.device("cpu")
+
+
+def _draws(render: RenderConfig) -> bool:
+    """Whether a GPU draws this faster than the CPU does."""
+    return render.backend in ("auto", "cuda") and render.blending == "sorted" and cuda_native.available()

@@ -1,0 +1,114 @@
+"""Every kind of method trains, renders, is scored, stored and resumed where its scene is, on a GPU that is not there.
+
+Kernels compute on the CPU, and the renderer is backend torch: what is tested is that no tensor is on the wrong device,
+and that the host waits for nothing but the renderer's and the decoder's counts.
+"""
+
+import pytest
+import torch
+from composed import composed
+from pretended_gpu import GPU, pretended_gpu
+
+from padgs import checkpoint
+from padgs.cli import scoring
+from padgs.cli.scoring import frame_times, scores
+from padgs.cli.session import build
+from padgs.data.synthetic import SyntheticOptions, generate
+from padgs.method import Budget, Failure, State
+from padgs.scene import Scene
+
+STEPS, CHECK_EVERY = 8, 5
+SPLATS = tuple(f"method.{name}={value}" for name, value in {"densify_every": 2, "gradient_threshold": 1e-9}.items())
+ANCHORS = tuple(
+    f"method.{name}={value}"
+    for name, value in {
+        **{"scale_windows": "false", "statistics_from": 0, "grow_from": 1, "grow_until": 7, "grow_every": 2},
+        **{"gradient_threshold": 1e-9, "offset_rate": "[2,2]"},
+    }.items()
+)
+# setting -> overrides that make it small, and grow; how often the host waits in an iteration without growth or
+# checks: once for the pixels, which are not kept there, the rest is of backend torch, the decoder, and random rays
+METHODS = {
+    "padgs": (ANCHORS, 8),
+    "omnigs": (SPLATS, 6),
+    "sc_omnigs": (SPLATS, 6),
+    "seam360gs": (SPLATS, 7),
+    "cubemap_3dgs": (SPLATS, 6),
+    "egonerf_small": (
+        tuple(
+            f"method.{name}={value}"
+            for name, value in {
+                **{"radial_nodes": 16, "polar_nodes": 12, "azimuth_nodes": 36, "environment_height": 16, "rays": 64},
+                **{"coarse_samples": 8, "fine_samples": 8},
+            }.items()
+        ),
+        4,
+    ),
+}
+
+
+@pytest.fixture(autouse=True)
+def padgs_root(monkeypatch, root):
+    monkeypatch.setenv("PADGS_ROOT", str(root))
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Scene:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PADGS_CACHE", str(tmp_path_factory.mktemp("cache")))
+        return generate(SyntheticOptions("room", 32, train_views=3, test_views=1, samples=1, points=100))
+
+
+@pytest.mark.parametrize("setting", METHODS)
+def test_every_method_lives_where_its_scene_is(setting, scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(scoring, "FRAMES", 1)
+    overrides, waits_each = METHODS[setting]
+    config = composed(f"method={setting}", *overrides, f"train.check_every={CHECK_EVERY}", "render.backend=torch")
+    method, losses, waited, events = build(config), [], [], []
+    with pretended_gpu() as waits:
+        there = scene.to(GPU)
+        for record in method.fit(there, Budget(STEPS)):
+            waited.append(sum(waits.values()))
+            waits.clear()
+            losses.append(record.loss)
+            events += record.events
+        image = method.render(there.test[0]).image
+        marks = scores(method, there, config.protocols, None)
+        assert frame_times(method, there)["render_ms_min"] > 0
+        state = method.state()
+        checkpoint.save(state, tmp_path)
+        again = build(config)
+        again.load_state(checkpoint.load(tmp_path, GPU))
+        assert torch.equal(again.render(there.test[0]).image, image)
+        list(again.fit(there, Budget(STEPS + 1)))
+        assert again.state().tensors[of_model(state)].device == GPU
+
+    assert image.device == state.tensors[of_model(state)].device == GPU
+    assert [isinstance(loss, float) for loss in losses] == [n % CHECK_EVERY == 0 for n in range(1, STEPS + 1)]
+    assert any("grew" in event or "cloned" in event for event in events) == ("egonerf" not in setting)
+    assert min(waited) == waits_each, f"the host waits in every iteration: {waited}"
+
+    here = build(config)
+    here.load_state(checkpoint.load(tmp_path))
+    assert torch.allclose(here.render(scene.test[0]).image, image.held, atol=1e-5)
+    assert marks.keys() == scores(here, scene, config.protocols, None).keys()
+    list(here.fit(scene, Budget(STEPS + 1)))
+    fresh = [float(record.loss) for record in build(config).fit(scene, Budget(STEPS))]
+    assert [float(loss) for loss in losses] == pytest.approx(fresh, rel=1e-2)
+
+
+def test_a_nan_is_found_at_the_next_check(scene):
+    config = composed("method=omnigs", *SPLATS, f"train.check_every={CHECK_EVERY}", "render.backend=torch")
+    method = build(config)
+    with pretended_gpu():
+        records = method.fit(scene.to(GPU), Budget(STEPS))
+        next(records)
+        method._trained().splats.sh_dc.data[:] = float("nan")
+        with pytest.raises(Failure, match=f"is nan at iteration {CHECK_EVERY}") as failure:
+            list(records)
+    assert failure.value.status == "nan"
+
+
+def of_model(state: State) -> str:
+    """The name of one tensor of the model."""
+    return next(name for name in state.tensors if name.startswith("model/") and "random" not in name)

@@ -1,0 +1,43 @@
+import pytest
+import torch
+
+from padgs.cli.config import RunOptions
+from padgs.cli.device import chosen
+from padgs.method import RenderConfig
+from padgs.render import cuda_native
+
+GPU = torch.device("cuda", 0)
+
+
+@pytest.fixture
+def with_gpu(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+    monkeypatch.setattr(cuda_native, "available", lambda: True)
+
+
+def test_without_a_gpu_auto_is_the_cpu_and_cuda_is_refused(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert chosen("auto", RenderConfig()) == chosen("cpu", RenderConfig()) == torch.device("cpu")
+    with pytest.raises(ValueError, match="run.device=cuda, but .*set run.device=cpu or auto"):
+        chosen("cuda", RenderConfig())
+
+
+@pytest.mark.usefixtures("with_gpu")
+def test_with_a_gpu_auto_is_the_gpu_where_that_can_draw():
+    assert chosen("auto", RenderConfig()) == chosen("cuda", RenderConfig()) == GPU
+    assert chosen("cpu", RenderConfig()).type == "cpu"
+    for elsewhere in (RenderConfig(backend="cpu"), RenderConfig(backend="torch"), RenderConfig(blending="hybrid")):
+        assert chosen("auto", elsewhere).type == "cpu"
+        assert chosen("cuda", elsewhere) == GPU
+
+
+@pytest.mark.usefixtures("with_gpu")
+def test_without_the_library_auto_is_the_cpu(monkeypatch):
+    monkeypatch.setattr(cuda_native, "available", lambda: False)
+    assert chosen("auto", RenderConfig()).type == "cpu"
+
+
+def test_an_unknown_device_is_refused():
+    with pytest.raises(ValueError, match="unknown run.device 'gpu'; known: auto, cpu, cuda"):
+        RunOptions(device="gpu")
