@@ -141,7 +141,8 @@ class CloneSplit:
         if self.options.max_gaussians is not None:
             room = max(0, self.options.max_gaussians - len(chosen))
             if int(chosen.sum()) > room:
-                strongest = torch.argsort(mean_gradient, descending=True, stable=True)[:room]
+                candidates = torch.where(chosen, mean_gradient, -1.0)  # their thresholds may differ
+                strongest = torch.argsort(candidates, descending=True, stable=True)[:room]
                 chosen = torch.zeros_like(chosen).index_fill(0, strongest, True)
         small = torch.exp(self.splats.log_scales).amax(-1) <= self.options.percent_dense * self.extent
         clones = self._copies(chosen & small, 1, sampled=self.options.sample_clones)

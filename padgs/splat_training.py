@@ -77,9 +77,12 @@ class TrainableSplats:
     def observe(self, drawing: Drawing, iteration: int) -> None:
         """Note how hard each Gaussian was pulled."""
         assert drawing.probe.grad is not None and self._drawn is not None, "observe is called after draw and backward"
-        means, pose = self.splats.means, self._drawn.cam_from_world.to(self.splats.means)
-        _, latitudes = longitude_latitude(means @ pose[:3, :3].T + pose[:3, 3])
-        self.densifier.observe(drawing.probe.grad, drawing.rendering.visible, iteration, latitudes.cos())
+        cos_latitudes = None
+        if self.densifier.options.polar_threshold is not None:
+            means, pose = self.splats.means, self._drawn.cam_from_world.to(self.splats.means)
+            _, latitudes = longitude_latitude(means @ pose[:3, :3].T + pose[:3, 3])
+            cos_latitudes = latitudes.cos()
+        self.densifier.observe(drawing.probe.grad, drawing.rendering.visible, iteration, cos_latitudes)
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
         """Densify, and bring the next SH degree into use, where it is time to."""

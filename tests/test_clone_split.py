@@ -154,6 +154,16 @@ def test_the_cap_holds_and_the_hardest_pulled_come_first(scale):
     assert len(grown.splats) == 7
 
 
+def test_the_cap_leaves_out_what_is_below_its_own_threshold():
+    """The one at the pole is pulled hardest, but not hard enough there; the cap has room for one of the other two."""
+    grown, optimizer = densifier([SMALL] * 3, polar_threshold=1e-2, max_gaussians=4)
+    for _ in range(3):
+        gradient = torch.tensor([[5e-3, 0.0], [1e-3, 0.0], [2e-3, 0.0]])
+        grown.observe(gradient, torch.ones(3, dtype=torch.bool), 1, torch.tensor([0.0, 1.0, 1.0]))
+    assert grown.adapt(EVERY, optimizer)[0].startswith("cloned 1")
+    assert torch.equal(grown.splats.means[3], grown.splats.means[2])
+
+
 def test_opacity_reset_makes_all_nearly_transparent():
     grown, optimizer = densifier([SMALL, SMALL], densify_from=10**6, reset_every=30)
     grown.splats.opacity_logits.data = torch.logit(torch.tensor([0.007, 0.9]))
