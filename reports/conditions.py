@@ -67,5 +67,7 @@ CONDITIONS: Mapping[str, Condition] = {
 }
 OF_A_DATA_SET = {what: of for what, of in CONDITIONS.items() if what != "data"}  # scenes may differ, rules may not
 OF_A_SWEEP = {"protocol": _rules, "machine": _machine_and_threads}  # all else shows as a changed key
+OF_A_POINT = {"data": CONDITIONS["data"]}  # the folder of the data is no part of a setting
 OF_A_CHART = {what: CONDITIONS[what] for what in ("protocol", "resolution", "data")} | {"machine": _machine_and_threads}
+OF_A_MEAN = {**OF_A_DATA_SET, "machine": _machine_and_threads}  # of one setting over the scenes of a data set
 OF_TIMES = {**CONDITIONS, "machine": _machine_and_threads}

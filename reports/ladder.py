@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from padgs.results import Result
 from reports.cells import one_setting, over_seeds
-from reports.conditions import refuse_mixture
+from reports.conditions import OF_TIMES, refuse_mixture
 from reports.footnotes import conditions
 from reports.measures import QUANTITIES, marks
 from reports.ranking import NOTE
@@ -38,7 +38,7 @@ def build(results: Sequence[Result], request: Request) -> Table:
     found = {place: at(place, rungs) for place in places(rungs)}
     blocks = []
     for place, own in found.items():
-        refuse_mixture(own, request, place.title)
+        refuse_mixture(own, request, place.title, OF_TIMES)
         rows = []
         for variant, title in RUNGS.items():
             runs = one_setting([result for result in own if result.variant == variant], f"{place.title}, {title}")

@@ -13,6 +13,8 @@ TITLES = {
     "padgs": "PaD-GS",
     "cubemap_3dgs": "3DGS on cube faces",
     "crops_3dgs": "3DGS on crops",
+    "sc_omnigs": "SC-OmniGS",
+    "seam360gs": "Seam360GS",
 }
 
 

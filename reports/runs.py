@@ -1,8 +1,12 @@
-"""All runs, one line each: marks under both protocols, latitude bands, and what the model cost."""
+"""All runs, one line each: marks under both protocols, latitude bands, and what the model cost.
+
+No number stands out and no column has a better end: the lead of a single run may be its seed or its machine.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 from padgs.results import Result
 from reports.cells import over_seeds
@@ -36,7 +40,7 @@ def build(results: Sequence[Result], request: Request) -> Table:
 
 
 def _title(result: Result) -> str:
-    words = [result.method, result.variant, f"seed {result.seed}", result.run.rpartition("_")[2]]
+    words = [result.preset, result.variant, f"seed {result.seed}", result.run.rpartition("_")[2]]
     return ", ".join(word for word in words if word)
 
 
@@ -44,14 +48,14 @@ def _marks(protocol: str, metrics: Sequence[str]) -> dict[Column, Number]:
     def number(metric: str) -> Number:
         return lambda result: result.scores[protocol].metrics.get(metric) if protocol in result.scores else None
 
-    return {column(metric, group=protocol): number(metric) for metric in metrics}
+    return {replace(column(metric, group=protocol), higher_is_better=None): number(metric) for metric in metrics}
 
 
 COSTS: dict[Column, Number] = {
     Column("anchors", 0, group="cost"): lambda r: r.counts.get("anchors"),
     Column("Gaussians", 0, group="cost"): lambda r: r.counts.get("gaussians"),
-    Column("MB", 1, False, group="cost"): lambda r: r.model_bytes / 1e6,
-    Column("training s", 0, False, group="cost"): lambda r: r.timing.get("train_seconds"),
-    Column("ms per frame", 1, False, group="cost"): lambda r: r.timing.get("render_ms_median"),
-    Column("peak GB", 2, False, group="cost"): lambda r: r.peak_memory_bytes / 1e9,
+    Column("MB", 1, group="cost"): lambda r: r.model_bytes / 1e6,
+    Column("training s", 0, group="cost"): lambda r: r.timing.get("train_seconds"),
+    Column("ms per frame", 1, group="cost"): lambda r: r.timing.get("render_ms_median"),
+    Column("peak GB", 2, group="cost"): lambda r: r.peak_memory_bytes / 1e9,
 }

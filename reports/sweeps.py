@@ -11,7 +11,7 @@ from typing import Any
 from padgs.results import Result
 from reports import methods
 from reports.cells import over_seeds
-from reports.conditions import OF_A_SWEEP, refuse_mixture
+from reports.conditions import OF_A_POINT, OF_A_SWEEP, refuse_mixture
 from reports.footnotes import conditions
 from reports.measures import QUANTITIES, Measure, marks, quantity
 from reports.request import Request, admitted
@@ -78,6 +78,9 @@ def sweeps(results: Sequence[Result], request: Request) -> list[Sweep]:
         drawn = {line.place: at(line.place, own) for line in lines}
         for place, of in drawn.items():
             refuse_mixture(of, request, f"{name}, {place.title}", OF_A_SWEEP)
+        for line in lines:
+            for _, setting in line.points:
+                refuse_mixture(setting.runs, request, f"{name}, {line.place.title}, {setting.title}", OF_A_POINT)
         notes = conditions({place.title: of for place, of in drawn.items()}, request.protocol)
         found.append(Sweep(name, tuple(lines), measures, tuple(notes)))
     return found

@@ -5,12 +5,12 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from padgs.results import Result
 from reports import published
 from reports.cells import over_scenes
-from reports.conditions import OF_A_CHART, refuse_mixture
+from reports.conditions import OF_A_CHART, OF_A_MEAN, refuse_mixture
 from reports.footnotes import conditions
 from reports.measures import QUANTITIES, Measure, mark
 from reports.metrics import column
@@ -55,12 +55,16 @@ def trade_offs(results: Sequence[Result], request: Request) -> list[TradeOff]:
     runs = [result for result in chosen(results, "chart", request) if not result.variant]
     groups: dict[str, list[Place]] = {}
     for place in places(runs):
-        groups.setdefault(place.dataset if place.published else place.scene, []).append(place)
+        name = place.dataset if place.published else place.scene
+        if name in groups and not place.published:  # scenes of two data sets, or a scene called like a data set
+            name = f"{name}_{place.dataset or 'capture'}"
+        groups.setdefault(name, []).append(place)
     found = []
     for name, group in groups.items():
+        shown = replace(request, protocol=_protocol([result for place in group for result in at(place, runs)]))
         for place in group:
-            refuse_mixture(at(place, runs), request, place.title, OF_A_CHART)
-        made = _trade_off(name, group, runs, request)
+            refuse_mixture(at(place, runs), shown, place.title, OF_A_CHART)
+        made = _trade_off(name, group, runs, shown)
         if made.points:
             found.append(made)
     return found
@@ -94,12 +98,15 @@ def csv_text(chart: TradeOff) -> str:
 
 def _trade_off(name: str, group: Sequence[Place], runs: Sequence[Result], request: Request) -> TradeOff:
     by_place = [at(place, runs) for place in group]
-    qualities = _qualities([result for own in by_place for result in own])
+    qualities = _qualities(request.protocol)
     found: dict[str, tuple[Setting, list[list[Result]]]] = {}
     for index, own in enumerate(by_place):
         for setting in settings(own):
             _, columns = found.setdefault(setting.title, (setting, [[] for _ in group]))
             columns[index] = list(setting.runs)
+    for title, (_, columns) in found.items():
+        together = [result for runs_of_scene in columns for result in runs_of_scene]
+        refuse_mixture(together, request, f"{name}, {title}", OF_A_MEAN)
     found = {title: (s, c) for title, (s, c) in found.items() if any(r.ok for runs in c for r in runs)}
     finished = [i for i in range(len(group)) if all(any(r.ok for r in c[i]) for _, c in found.values())]
     if len(group) == 1:
@@ -115,13 +122,15 @@ def _trade_off(name: str, group: Sequence[Place], runs: Sequence[Result], reques
         what += f", mean over its scenes {', '.join(group[i].scene for i in finished)}"
     beside = group[0].dataset if group[0].published else "ricoh360" if group[0].outdoor else "roam360"
     shown = [result for i in finished for result in by_place[i]]
-    notes = conditions({what: shown}, next(p for p, m in QUALITIES if column(m) == qualities[0].column))
+    notes = conditions({what: shown}, request.protocol)
     return TradeOff(f"chart_{name}", what, qualities, tuple(points), beside, tuple(shown), tuple(notes))
 
 
-def _qualities(results: Sequence[Result]) -> tuple[Measure, ...]:
-    """WS-PSNR and weighted LPIPS; the flat ones where nothing was scored on the sphere."""
-    measures = [(Measure(column(metric), mark(protocol, metric)), protocol) for protocol, metric in QUALITIES]
-    there = [protocol for measure, protocol in measures if any(measure.number(r) is not None for r in results)]
-    protocol = there[0] if there else "sphere"
-    return tuple(measure for measure, of in measures if of == protocol)
+def _protocol(results: Sequence[Result]) -> str:
+    """The sphere's; that of the paper where nothing was scored on the sphere."""
+    there = [p for p, metric in QUALITIES if any(mark(p, metric)(result) is not None for result in results)]
+    return there[0] if there else "sphere"
+
+
+def _qualities(protocol: str) -> tuple[Measure, ...]:
+    return tuple(Measure(column(metric), mark(protocol, metric)) for of, metric in QUALITIES if of == protocol)

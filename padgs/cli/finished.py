@@ -44,7 +44,7 @@ class FinishedJobs:
     def status(self, overrides: Sequence[str]) -> str | None:
         """The status of a job's result; None where it must be looked at."""
         entry = self._known.get(key(overrides))
-        if entry is None or entry.get("written") != _written(self._runs / entry["run"]):
+        if entry is None or (written := _written(self._runs / entry["run"])) is None or entry["written"] != written:
             return None
         return entry["status"] if entry["data"] is None or entry["signature"] == signature(entry["data"]) else None
 

@@ -37,6 +37,11 @@ def test_a_result_that_is_gone_or_was_written_anew_is_looked_at(runs):
     assert FinishedJobs(runs).status(JOB) is None
 
 
+def test_a_job_whose_result_was_gone_when_it_was_noted_is_looked_at(runs):
+    FinishedJobs(runs).add(JOB, "nowhere", "ok", None)
+    assert FinishedJobs(runs).status(JOB) is None
+
+
 def test_data_that_changed_are_looked_at(runs, tmp_path):
     data = tmp_path / "data"
     data.mkdir()

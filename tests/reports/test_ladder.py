@@ -1,9 +1,11 @@
 from dataclasses import replace
 
+import pytest
 from made_up import result, small
 
 from reports import ladder, markdown
 from reports.request import Request
+from reports.table import ReportError
 
 
 def test_a_row_for_each_rung_with_what_it_costs():
@@ -17,3 +19,9 @@ def test_a_row_for_each_rung_with_what_it_costs():
 
 def test_without_a_ladder_there_is_no_block():
     assert ladder.build([result("full")], Request()).blocks == ()
+
+
+def test_times_of_two_machines_are_not_compared():
+    rungs = [replace(small(24 + i), variant=variant) for i, variant in enumerate(("a0_pano_3dgs", "a1_anchors"))]
+    with pytest.raises(ReportError, match="differ in machine"):
+        ladder.build([rungs[0], replace(rungs[1], machine={"gpu": "H200"})], Request())

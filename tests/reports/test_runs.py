@@ -17,3 +17,10 @@ def test_a_line_per_run_and_a_block_per_scene():
 def test_where_chooses():
     other = replace(result("dagd"), config={"method": {"tau": 0.5}})
     assert len(runs.build([result("full"), other], Request(where={"method.tau": "0.5"})).blocks[0].rows) == 1
+
+
+def test_presets_of_a_method_are_told_apart_and_nothing_stands_out():
+    release = result("", method="odgs", preset="odgs_release", psnr=24.0)
+    text = markdown.text(runs.build([result("", method="odgs"), release], Request()))
+    assert "| odgs, seed 0" in text and "| odgs\\_release, seed 0" in text
+    assert "**" not in text and "<ins>" not in text

@@ -97,3 +97,9 @@ def test_lengths_of_the_chart_are_a_sweep_only_if_asked_for():
     lengths = [small(25.0, 1.0 + n, experiments=("pareto",), config={"train": {"iterations": n}}) for n in (1, 2)]
     assert sweeps(lengths, Request()) == []
     assert [sweep.key for sweep in sweeps(lengths, Request(experiment="pareto"))] == ["train.iterations"]
+
+
+def test_runs_on_other_data_are_no_other_seed_of_a_point():
+    first, *others = swept("tau")
+    with pytest.raises(ReportError, match="tau@cpu, .*tau 0.0: results differ in data"):
+        sweeps([first, replace(first, fingerprint="other", run="other"), *others], Request())

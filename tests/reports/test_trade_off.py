@@ -79,3 +79,21 @@ def test_a_method_that_never_finishes_does_not_empty_the_chart():
     runs = [replace(r, status="oom", scores={}) if r.method == "padgs" else r for r in data_set("roam360")]
     (chart,) = trade_offs(runs, Request())
     assert "scenes bar, base" in chart.title and [point.preset for point in chart.points] == ["omnigs"]
+
+
+def test_lengths_are_not_mixed_in_a_mean_over_scenes():
+    runs = [replace(r, iterations=7000) if r.scene == "bar" else r for r in data_set("roam360")]
+    with pytest.raises(ReportError, match="roam360, OmniGS: results differ in iterations"):
+        trade_offs(runs, Request())
+
+
+def test_rules_of_the_protocol_that_is_shown_are_not_mixed():
+    first, *others = compared()
+    sphere = replace(first.scores["sphere"], protocol=first.scores["sphere"].protocol | {"bottom_crop": 0.1})
+    with pytest.raises(ReportError, match="differ in protocol"):
+        trade_offs([replace(first, scores=first.scores | {"sphere": sphere}), *others], Request())
+
+
+def test_scenes_of_two_data_sets_may_have_one_name():
+    charts = trade_offs([small(25.0, scene="room"), small(26.0, scene="room", dataset="")], Request())
+    assert [chart.name for chart in charts] == ["chart_room", "chart_room_synthetic"]
