@@ -25,6 +25,7 @@ from padgs.render import Rendering
 from padgs.scene import Scene, View
 from padgs.schedule import Constant, ParameterGroup
 from padgs.splat_method import SplatOptions
+from padgs.splat_training import stands_still
 from padgs.targets import Target
 from padgs.train import Drawing, TrainOptions
 
@@ -39,6 +40,15 @@ class SCOmniGSOptions(SplatOptions):
     roughness_weight: float = 1e-2  # in the loss, of the map's total variation per radian
     anisotropy_weight: float = 1e-3  # in the loss, of `anisotropy`
     anisotropy_ratio: float = 10.0  # longest to shortest axis that a Gaussian may have unpunished
+
+    def __post_init__(self) -> None:
+        """Reject values without a meaning."""
+        super().__post_init__()
+        for name in ("focal_rate", "distortion_rate", "roughness_weight", "anisotropy_weight"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 0, which switches it off")
+        if not self.anisotropy_ratio >= 1:
+            raise ValueError(f"anisotropy_ratio is {self.anisotropy_ratio}; longest to shortest is at least 1")
 
 
 class SelfCalibration(nn.Module):
@@ -146,8 +156,12 @@ class SCOmniGSMethod(CalibratedMethod):
         sizes = {(view.width, view.height) for view in scene.train}
         if len(sizes) > 1:
             raise ValueError(f"sc_omnigs calibrates one camera, but the training views have sizes {sorted(sizes)}")
+        if stands_still(scene):
+            raise ValueError(
+                f"the {len(scene.train)} training cameras of scene {scene.name!r} stand in one place, which has no "
+                "scale to carry held-out views by; sc_omnigs needs two places, omnigs does without"
+            )
         poses = PoseRefinement.of(scene.train, unit=scene.unit)
-        align(poses.given, poses.given)  # refuses what could not be evaluated
         return self._calibrating(poses, *sizes.pop())
 
     def _as_stored(self, values: Mapping[str, Any]) -> SelfCalibration:

@@ -26,6 +26,13 @@ class Seam360GSOptions(SplatOptions):
     gap_rate: float = 1e-3  # learning rate of the gap at the start, scene units
     coefficient_rate: float = 1e-3  # ... of the radial maps
 
+    def __post_init__(self) -> None:
+        """Reject rates that have no log-linear decay."""
+        super().__post_init__()
+        for name in ("gap_rate", "coefficient_rate"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} is {getattr(self, name)}; a learning rate must be > 0")
+
 
 class Seam360GSMethod(CalibratedMethod):
     """See `padgs.method.Method`. Trained through `DualLens`; `render` is the ideal camera, one centre and no seam.

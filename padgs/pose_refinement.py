@@ -7,7 +7,7 @@ wherever the origin of the world lies: x' = R(q) (R x + t) + unit * s.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor, nn
@@ -25,6 +25,12 @@ class PoseRates:
     rotation_end: float = 1.6e-4
     translation: float = 1e-2  # scene units
     translation_end: float = 6e-3
+
+    def __post_init__(self) -> None:
+        """Reject rates that have no log-linear decay."""
+        for field in fields(self):
+            if not getattr(self, field.name) > 0:
+                raise ValueError(f"poses.{field.name} is {getattr(self, field.name)}; a learning rate must be > 0")
 
 
 class PoseRefinement(nn.Module):

@@ -28,6 +28,12 @@ class SplatOptions(CloneSplitOptions):
     sh_degree: int = 3  # 0: colours do not depend on the direction
     learning_rate_factor: float = 1.0  # on all learning rates
 
+    def __post_init__(self) -> None:
+        """Reject what nothing can be learned with."""
+        super().__post_init__()
+        if not self.learning_rate_factor > 0:
+            raise ValueError(f"learning_rate_factor is {self.learning_rate_factor}; it must be > 0")
+
 
 class SplatMethod:
     """`padgs.method.Method`.

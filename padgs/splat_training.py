@@ -18,6 +18,7 @@ from padgs.schedule import Constant, LogLinear, ParameterGroup, scaled
 from padgs.splats import Splats
 from padgs.train import Drawing
 
+ONE_PLACE = 1e-6  # scene units; an extent up to here is rounding
 DEGREE_EVERY = 1000  # published iterations after which the next SH degree comes into use
 
 
@@ -137,7 +138,12 @@ class TrainableSplats:
 
 def extent_of(scene: Scene) -> float:
     """`Scene.extent`, or the scene's unit of length where all cameras stand in one place."""
-    return scene.extent if scene.extent > 1e-6 * scene.unit else scene.unit
+    return scene.unit if stands_still(scene) else scene.extent
+
+
+def stands_still(scene: Scene) -> bool:
+    """Whether all training cameras stand in one place, up to the rounding of their poses."""
+    return scene.extent <= ONE_PLACE * scene.unit
 
 
 def _under(prefix: str, state: State) -> dict[str, torch.Tensor]:

@@ -9,8 +9,10 @@ from baselines.omnigs import OmniGSMethod
 from baselines.sc_omnigs import SCOmniGSMethod, SCOmniGSOptions, aligned, carried
 from padgs.data.align import Similarity, align
 from padgs.data.synthetic import SyntheticOptions, SyntheticTruth, generate
+from padgs.gaussians import rotation_matrices
 from padgs.method import Budget, RenderConfig
 from padgs.metrics import psnr
+from padgs.pose_refinement import PoseRates
 from padgs.scene import Scene
 from padgs.splat_method import SplatOptions
 from padgs.targets import Targets
@@ -80,9 +82,15 @@ def test_a_held_out_view_is_carried_with_the_cameras():
 
 
 def test_a_scene_that_cannot_be_calibrated_is_refused(scene):
-    one_place = tuple(replace(view, cam_from_world=scene.train[0].cam_from_world) for view in scene.train)
-    with pytest.raises(ValueError, match="centres all coincide"):
-        next(SCOmniGSMethod(render=TORCH).fit(replace(scene, train=one_place), Budget(10)))
+    turned = []  # about one centre, which the poses then have up to rounding only
+    for angle, view in enumerate(scene.train):
+        pose = torch.eye(4, dtype=torch.float64)
+        quaternion = torch.tensor([1.0, 0.3 * angle, -0.2 * angle, 0.1], dtype=torch.float64)
+        pose[:3, :3] = rotation_matrices(quaternion)
+        pose[:3, 3] = -pose[:3, :3] @ torch.tensor([0.13, 0.07, -0.21], dtype=torch.float64)
+        turned.append(replace(view, cam_from_world=pose))
+    with pytest.raises(ValueError, match="the 5 training cameras of scene .* stand in one place, which has no scale"):
+        next(SCOmniGSMethod(render=TORCH).fit(replace(scene, train=tuple(turned)), Budget(10)))
     other = replace(scene.train[0], name="other", width=64, height=32)
     with pytest.raises(ValueError, match="calibrates one camera, but the training views have sizes"):
         next(SCOmniGSMethod(render=TORCH).fit(replace(scene, train=(*scene.train, other)), Budget(10)))
@@ -90,6 +98,17 @@ def test_a_scene_that_cannot_be_calibrated_is_refused(scene):
     next(method.fit(scene, Budget(10)))
     with pytest.raises(ValueError, match="is 64x32; the camera was calibrated at 32x16"):
         method.render(other)
+
+
+def test_options_without_a_meaning_are_refused():
+    with pytest.raises(ValueError, match=r"anisotropy_ratio is 0\.5"):
+        SCOmniGSOptions(anisotropy_ratio=0.5)
+    with pytest.raises(ValueError, match=r"distortion_rate is -1\.0"):
+        SCOmniGSOptions(distortion_rate=-1.0)
+    with pytest.raises(ValueError, match=r"poses\.rotation is 0\.0; a learning rate must be > 0"):
+        PoseRates(rotation=0.0)
+    with pytest.raises(ValueError, match=r"learning_rate_factor is 0\.0"):
+        SCOmniGSOptions(learning_rate_factor=0.0)
 
 
 def test_size_counts_poses_and_camera(scene):

@@ -44,6 +44,11 @@ def test_charts_cannot_draw_lenses(scene):
         next(Seam360GSMethod(render=RenderConfig(backend="torch")).fit(scene, Budget(10)))
 
 
+def test_a_rate_of_nothing_is_refused():
+    with pytest.raises(ValueError, match=r"gap_rate is 0\.0; a learning rate must be > 0"):
+        Seam360GSOptions(gap_rate=0.0)
+
+
 def test_size_counts_the_lenses(scene):
     method = Seam360GSMethod(Seam360GSOptions(lens_order=3), TORCH)
     next(method.fit(scene, Budget(10)))
