@@ -10,11 +10,11 @@ import torch
 from rich.console import Console
 
 from baselines import METHODS
-from padgs import clock, data
+from padgs import checkpoint, clock, data
 from padgs.cli.config import RunConfig
 from padgs.cli.device import chosen
 from padgs.cli.interrupt import Interrupted
-from padgs.cli.run_folder import RunFolder
+from padgs.cli.run_folder import RunFolder, RunFolderError
 from padgs.cli.run_id import config_hash, run_id
 from padgs.cli.scoring import frame_times, same_rules, scores
 from padgs.cli.summary import show_result
@@ -122,13 +122,18 @@ def build(config: RunConfig) -> Method:
 
 
 def _score_again(result: Result, config: RunConfig, scene: Scene, folder: RunFolder) -> Result:
-    method = build(config)
-    resume(method, folder, scene.points.device)
     missing = {
         name: protocol
         for name, protocol in config.protocols.items()
         if name not in result.scores or not same_rules(result.scores[name], protocol)
     }
+    if not checkpoint.exists(folder.checkpoint):  # an untrained method would be scored
+        raise RunFolderError(
+            f"{folder.path} has a result but no checkpoint any more, so it cannot be scored under other rules of "
+            f"{', '.join(missing)}; keep the old rules, or delete the folder to train again"
+        )
+    method = build(config)
+    resume(method, folder, scene.points.device)
     result = replace(result, scores={**result.scores, **scores(method, scene, missing, None)})
     return folder.finish(result)
 

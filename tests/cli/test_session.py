@@ -1,6 +1,7 @@
 import io
 import json
 import os
+import shutil
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -97,6 +98,17 @@ def test_another_protocol_scores_the_finished_run_without_training(config, monke
     assert both.scores["paper"] == first.scores["paper"]
     assert both.scores["sphere"].metrics["psnr"] == first.scores["paper"].metrics["psnr"]
     assert both.scores["sphere"].metrics["ws_psnr"] is not None
+
+
+def test_without_its_checkpoint_a_finished_run_is_not_scored_anew(config):
+    first, _ = run(config)
+    folder = folder_of(config)
+    log = (folder.path / "log.jsonl").read_bytes()
+    shutil.rmtree(folder.checkpoint)
+    sphere = composed("protocol=sphere", "protocol.sphere.lpips=none").protocols
+    with pytest.raises(RunFolderError, match="no checkpoint any more, .* other rules of sphere"):
+        run(replace(config, protocols={**config.protocols, **sphere}))
+    assert folder.result() == first and (folder.path / "log.jsonl").read_bytes() == log
 
 
 def stop_at(iteration: int, monkeypatch, how) -> None:
