@@ -17,8 +17,9 @@ from reports import methods
 P = ParamSpec("P")
 T = TypeVar("T")
 # Okabe and Ito's colours, which colour-blind readers can tell apart; one for each method, in the order of the tables.
-COLORS = ("#E69F00", "#56B4E9", "#009E73", "#D55E00", "#0072B2", "#CC79A7", "#000000", "#8c6d31", "#7f7f7f")
+COLORS = ("#E69F00", "#56B4E9", "#009E73", "#D55E00", "#0072B2", "#CC79A7", "#000000", "#8c6d31", "#7f7f7f", "#661100")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*")
+MARKER_STEP = 3  # from one preset of a method to the next; no divisor of their number
 STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",  # text stays text
     "svg.hashsalt": "padgs",  # the same numbers give the same file
@@ -119,9 +120,10 @@ def color_of(preset: str, presets: Sequence[str]) -> str:
 
 def marker_of(preset: str, presets: Sequence[str]) -> str:
     """The shape of a preset: presets of one method have its colour and differ in shape."""
-    known = list(methods.TITLES)
-    others = [name for name in dict.fromkeys(presets) if name not in known]
-    return MARKERS[[*known, *others].index(preset) % len(MARKERS)]
+    method = methods.method_of(preset)
+    known = [*methods.TITLES, *(name for name in map(methods.method_of, presets) if name not in methods.TITLES)]
+    own = [name for name in methods.ordered([preset, *presets]) if methods.method_of(name) == method]
+    return MARKERS[(known.index(method) + MARKER_STEP * own.index(preset)) % len(MARKERS)]
 
 
 def _with_tips(svg: str, tips: Tips) -> str:

@@ -6,6 +6,8 @@ import pytest
 from made_up import METHODS, compared, data_set, small, write
 
 from reports import trade_off_chart
+from reports.drawing import color_of, marker_of
+from reports.methods import TITLES, ordered
 from reports.quality_log import probes
 from reports.request import Request
 from reports.table import ReportError
@@ -97,3 +99,10 @@ def test_rules_of_the_protocol_that_is_shown_are_not_mixed():
 def test_scenes_of_two_data_sets_may_have_one_name():
     charts = trade_offs([small(25.0, scene="room"), small(26.0, scene="room", dataset="")], Request())
     assert [chart.name for chart in charts] == ["chart_room", "chart_room_synthetic"]
+
+
+def test_every_preset_has_a_colour_and_a_shape_of_its_own(root):
+    presets = ordered(path.stem for path in (root / "conf" / "method").glob("*.yaml"))
+    looks = {(color_of(preset, presets), marker_of(preset, presets)) for preset in presets}
+    assert len(looks) == len(presets) > 10
+    assert len({color_of(method, presets) for method in TITLES}) == len(TITLES)
