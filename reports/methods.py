@@ -11,8 +11,6 @@ TITLES = {
     "omnigs": "OmniGS",
     "spags": "SPaGS",
     "padgs": "PaD-GS",
-    "sc_omnigs": "SC-OmniGS",
-    "seam360gs": "Seam360GS",
     "cubemap_3dgs": "3DGS on cube faces",
     "crops_3dgs": "3DGS on crops",
     "sc_omnigs": "SC-OmniGS",
