@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypedDict, TypeVar
 
 import torch
 
@@ -84,11 +84,15 @@ def reset_peak_memory(device: Device = "cpu") -> None:
         return  # not Linux, or not allowed: the peak is that of the whole process
 
 
-def peak_memory(device: Device = "cpu") -> dict[str, int | None]:
-    """Peak memory in bytes since `reset_peak_memory` or the start: of the process, and of its tensors on the device.
+class Peak(TypedDict):
+    """Memory in bytes."""
 
-    {"host": bytes, "device": bytes, or None on the CPU}
-    """
+    host: int  # of the process
+    device: int | None  # of its tensors on the device; None on the CPU
+
+
+def peak_memory(device: Device = "cpu") -> Peak:
+    """The peaks since `reset_peak_memory` or the start."""
     on_device = torch.cuda.max_memory_allocated(device) if torch.device(device).type == "cuda" else None
     return {"host": _peak_resident(), "device": on_device}
 

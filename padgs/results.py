@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 SCHEMA = 2
+ADDED = {"peak_device_memory_bytes"}  # to the schema since: files without them are read, with the default
 FILE_NAME = "result.json"
 STATUSES = {
     "ok": "trained to the end and evaluated",
@@ -70,7 +71,8 @@ class Result:
     timing: dict[str, float] = field(default_factory=dict)  # train_seconds, render_ms_median, render_ms_p95, ...
     counts: dict[str, int] = field(default_factory=dict)  # anchors, gaussians, ...
     model_bytes: int = 0
-    peak_memory_bytes: int = 0
+    peak_memory_bytes: int = 0  # of the process, while training
+    peak_device_memory_bytes: int | None = None  # of torch's tensors on the GPU, while training; None on the CPU
     config: dict[str, Any] = field(default_factory=dict)  # the resolved configuration
     experiments: tuple[str, ...] = ()  # experiments and sweeps that it belongs to, sorted
 
@@ -116,11 +118,9 @@ def read(path: Path) -> Result:
         raise ResultError(f"{path} was written by another version (schema is not {SCHEMA}); run again with this one")
     digest = document.pop("sha256", None)
     known = {field.name for field in fields(Result)}
-    if document.keys() != known:
-        raise ResultError(
-            f"{path}: missing {sorted(known - document.keys())}, unknown {sorted(document.keys() - known)}; "
-            "delete it and run again"
-        )
+    missing, unknown = known - document.keys() - ADDED, document.keys() - known
+    if missing or unknown:
+        raise ResultError(f"{path}: missing {sorted(missing)}, unknown {sorted(unknown)}; delete it and run again")
     if digest != _digest(document):
         raise ResultError(f"{path} was edited after it was written (SHA-256 differs); delete it and run again")
     try:

@@ -91,8 +91,18 @@ def megabytes(result: Result) -> float | None:
 
 
 def peak_gigabytes(result: Result) -> float | None:
-    """Peak memory of training in GB (10^9 bytes)."""
+    """Peak memory of the process while training, in GB (10^9 bytes)."""
     return result.peak_memory_bytes / 1e9 if result.peak_memory_bytes else None
+
+
+def peak_gpu_gigabytes(result: Result) -> float | None:
+    """Peak memory of the tensors on the GPU while training, in GB; None for a run on the CPU."""
+    return None if result.peak_device_memory_bytes is None else result.peak_device_memory_bytes / 1e9
+
+
+def on_gpu(results: Sequence[Result]) -> bool:
+    """Whether the memory of a GPU is known of any of them; tables of the others have no column for it."""
+    return any(peak_gpu_gigabytes(result) is not None for result in results)
 
 
 COSTS: Sequence[Measure] = (
@@ -103,6 +113,7 @@ COSTS: Sequence[Measure] = (
     Measure(Column("model MB", 1, False), megabytes),
     Measure(Column("peak GB", 2, False), peak_gigabytes),
 )
+GPU_MEMORY = Measure(Column("peak GPU GB", 2, False), peak_gpu_gigabytes)
 
 QUANTITIES = {  # what charts can show beside the metrics
     "frame_ms": Measure(Column("ms per frame", 1, False), frame_ms),
@@ -110,4 +121,5 @@ QUANTITIES = {  # what charts can show beside the metrics
     "gaussians": Measure(Column("Gaussians", 0), gaussians),
     "megabytes": Measure(Column("model MB", 1, False), megabytes),
     "peak_gigabytes": Measure(Column("peak GB", 2, False), peak_gigabytes),
+    "peak_gpu_gigabytes": GPU_MEMORY,
 }

@@ -11,6 +11,7 @@ from dataclasses import replace
 from padgs.results import Result
 from reports.cells import over_seeds
 from reports.footnotes import conditions
+from reports.measures import on_gpu, peak_gpu_gigabytes
 from reports.metrics import column
 from reports.published import scene_title
 from reports.request import Request, admitted
@@ -25,7 +26,8 @@ SPHERE = ("ws_psnr", "ws_ssim", "ws_lpips_alex", *(f"ws_psnr_{band}" for band in
 def build(results: Sequence[Result], request: Request) -> Table:
     """A block per scene and resolution, a row per run."""
     chosen = admitted(results, request)
-    columns = {**_marks("paper", FLAT), **_marks("sphere", SPHERE), **COSTS}
+    costs = {**COSTS, **GPU_MEMORY} if on_gpu(chosen) else COSTS
+    columns = {**_marks("paper", FLAT), **_marks("sphere", SPHERE), **costs}
     places = dict.fromkeys((r.dataset, r.scene, r.width, r.height, r.iterations) for r in chosen)
     blocks, runs_of = [], {}
     for place in places:
@@ -59,3 +61,4 @@ COSTS: dict[Column, Number] = {
     Column("ms per frame", 1, group="cost"): lambda r: r.timing.get("render_ms_median"),
     Column("peak GB", 2, group="cost"): lambda r: r.peak_memory_bytes / 1e9,
 }
+GPU_MEMORY: dict[Column, Number] = {Column("peak GPU GB", 2, group="cost"): peak_gpu_gigabytes}

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from padgs.results import Result
 from reports.comparison import Comparison
 from reports.conditions import OF_TIMES
-from reports.measures import COSTS, marks
+from reports.measures import COSTS, GPU_MEMORY, marks, on_gpu
 from reports.ranking import NOTE
 from reports.request import Request
 from reports.scenes import Place
@@ -32,7 +32,10 @@ def table4(results: Sequence[Result], request: Request) -> Table:
     """Training time, rendering speed, size and memory."""
     marks(request.protocol)  # an unknown one is refused here too
     datasets = {"roam360": 4, "ricoh360": 4}
-    efficiency = Comparison("table4", "Efficiency", tuple(COSTS), datasets, _any, OF_TIMES, (NOTE, *_HOW_MEASURED))
+    costs, notes = tuple(COSTS), (NOTE, *_HOW_MEASURED)
+    if on_gpu(results):
+        costs, notes = (*costs, GPU_MEMORY), (*notes, "Memory of the GPU: peak of the tensors there while training.")
+    efficiency = Comparison("table4", "Efficiency", costs, datasets, _any, OF_TIMES, notes)
     return efficiency.build(results, request)
 
 

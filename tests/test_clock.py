@@ -69,6 +69,12 @@ def test_peak_memory_of_a_child_is_its_own():
     assert int(done.stdout) < clock.peak_memory()["host"] - block.numel() * 2
 
 
+def test_peak_memory_of_a_gpu_is_that_of_its_tensors(monkeypatch):
+    held = {torch.device("cuda", 1): 7}
+    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda device: held[device])
+    assert clock.peak_memory(torch.device("cuda", 1))["device"] == 7
+
+
 def test_the_machine_is_described_in_json():
     description = json.loads(json.dumps(clock.machine()))
     assert description["torch"] == torch.__version__

@@ -87,6 +87,17 @@ def test_missing_and_unknown_keys_are_listed(result, tmp_path):
         results.read(path)
 
 
+def test_a_file_from_before_the_memory_of_a_gpu_was_measured_is_read(result, tmp_path):
+    on_gpu = replace(result, peak_device_memory_bytes=3 * 10**9)
+    path = results.write(on_gpu, tmp_path)
+    assert results.read(path) == on_gpu
+    document = json.loads(path.read_text())
+    del document["peak_device_memory_bytes"], document["sha256"]
+    document["sha256"] = results._digest({key: value for key, value in document.items() if key != "schema"})
+    path.write_text(json.dumps(document))
+    assert results.read(path) == result
+
+
 def test_unknown_status_lists_the_known(result):
     with pytest.raises(ValueError, match="unknown status 'fine'; known: ok, oom, nan"):
         replace(result, status="fine")

@@ -169,7 +169,7 @@ def _measure(iteration: Iteration, repeats: int, warm_up: int) -> dict[str, Any]
         "iteration": timing,
         "stages": _stages(iteration, watch, repeats),
         "counters": dict(iteration.counters),
-        "peak_bytes": memory.get("device"),
+        "peak_bytes": memory["device"],
     }
 
 

@@ -126,6 +126,8 @@ def final_numbers(result: Result) -> dict[str, float]:
     }
     numbers |= {f"time/{key}": value for key, value in result.timing.items()}
     numbers |= {f"size/{key}": float(value) for key, value in result.counts.items()}
+    if result.peak_device_memory_bytes is not None:
+        numbers["peak_device_memory_bytes"] = result.peak_device_memory_bytes
     return numbers | {"size/model_bytes": float(result.model_bytes), "peak_memory_bytes": result.peak_memory_bytes}
 
 

@@ -96,7 +96,7 @@ def _finish(config: RunConfig, scene: Scene, folder: RunFolder, console: Console
             status="ok" if progress.iteration == config.train.iterations else "timeout",
             counts={**size.counts, "parameters": size.parameters},
             model_bytes=size.bytes,
-            peak_memory_bytes=_peak_memory(),  # of training; scoring has networks of its own
+            **_peak_memory(scene),  # of training; scoring has networks of its own
         )
         if scene.test:
             save_picture = folder.save_picture if config.run.pictures else None
@@ -107,7 +107,7 @@ def _finish(config: RunConfig, scene: Scene, folder: RunFolder, console: Console
     except KeyboardInterrupt as error:
         raise Interrupted("stopped at once, the last checkpoint stands") from error
     except (Failure, ValueError, MemoryError, RuntimeError) as error:
-        result = replace(result, status=_status(error), reason=str(error), scores={}, peak_memory_bytes=_peak_memory())
+        result = replace(result, status=_status(error), reason=str(error), scores={}, **_peak_memory(scene))
     result = replace(
         result,
         iterations_done=progress.iteration,
@@ -145,8 +145,9 @@ def _is_scored(result: Result, config: RunConfig) -> bool:
     )
 
 
-def _peak_memory() -> int:
-    return clock.peak_memory()["host"] or 0
+def _peak_memory(scene: Scene) -> dict[str, int | None]:
+    peak = clock.peak_memory(scene.points.device)
+    return {"peak_memory_bytes": peak["host"], "peak_device_memory_bytes": peak["device"]}
 
 
 def _status(error: BaseException) -> str:

@@ -31,6 +31,8 @@ def show_result(result: Result, folder: Path, console: Console) -> None:
     if "render_ms_median" in result.timing:
         costs.append(f"{result.timing['render_ms_median']:.1f} ms per frame")
     costs.append(f"peak memory {result.peak_memory_bytes / 1e9:.2f} GB")
+    if result.peak_device_memory_bytes is not None:
+        costs.append(f"{result.peak_device_memory_bytes / 1e9:.2f} GB on the GPU")
     console.print(", ".join(costs), highlight=False, soft_wrap=True)
     console.print(str(folder), style="bold", highlight=False, soft_wrap=True)
 

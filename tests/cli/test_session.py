@@ -69,10 +69,21 @@ def test_a_run_leaves_all_its_files_and_says_where(config):
     assert result.status == "ok" and result.iterations_done == ITERATIONS
     assert result.scores["paper"].metrics.keys() == {"psnr", "ssim"}
     assert result.counts["anchors"] > 0 and result.model_bytes > 0 and result.timing["train_seconds"] > 0
+    assert result.peak_memory_bytes > 0 and result.peak_device_memory_bytes is None and "on the GPU" not in said
     assert str(folder) in said and "PSNR" in said and "anchors" in said
     assert [p.name for p in (folder / "renders").iterdir()] == ["05.png"]
     with Image.open(folder / "renders" / "05.png") as picture:
         assert picture.size == (3 * WIDTH, HEIGHT)
+
+
+def test_the_memory_of_the_device_that_trains_is_in_the_result(config, monkeypatch):
+    asked = []
+    peak = {"host": 3 * 10**9, "device": 2 * 10**9}
+    monkeypatch.setattr(session.clock, "peak_memory", lambda device: asked.append(device) or peak)
+    result, said = run(config)
+    assert asked == [torch.device("cpu")]  # where the scene is
+    assert (result.peak_memory_bytes, result.peak_device_memory_bytes) == (3 * 10**9, 2 * 10**9)
+    assert "peak memory 3.00 GB, 2.00 GB on the GPU" in said
 
 
 def test_the_log_has_losses_and_the_held_out_view(config):

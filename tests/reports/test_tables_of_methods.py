@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 from made_up import data_set, failed, result
 
-from reports import csv_text, markdown
+from reports import csv_text, markdown, runs
 from reports.request import Request
 from reports.table import MISSING, ReportError, Table
 from reports.tables_of_methods import table1, table2, table4
@@ -118,6 +118,19 @@ def test_efficiency_beside_the_published_hours_and_frames():
     found = cells(table4(data_set("ricoh360"), Request()))
     values = {(group, column): float(found[title, "PaD-GS", group, column]["value"]) for group, column in COSTS}
     assert values == COSTS
+
+
+def test_memory_of_a_gpu_has_a_column_where_a_run_was_on_one():
+    title = "Ricoh360, average over its 12 scenes"
+    on_gpu = [replace(r, peak_device_memory_bytes=7_250_000_000) for r in data_set("ricoh360")]
+    for build in (table4, runs.build):
+        assert "peak GPU GB" not in markdown.text(build(data_set("ricoh360"), Request()))
+        assert "peak GPU GB" in markdown.text(build(on_gpu, Request())) and "7.25" in markdown.text(
+            build(on_gpu, Request())
+        )
+    found = block(markdown.text(table4(on_gpu, Request())), title)
+    assert [cell.strip("*") for cell in found[-1][-2:]] == ["2.50", "7.25"]
+    assert "Memory of the GPU: peak of the tensors there" in markdown.text(table4(on_gpu, Request()))
 
 
 def test_times_of_two_machines_are_not_compared_unless_told():
