@@ -23,6 +23,28 @@ def test_without_a_gpu_auto_is_the_cpu_and_cuda_is_refused(monkeypatch):
         chosen("cuda", RenderConfig())
 
 
+def test_without_a_gpu_its_backend_is_refused(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    for device in ("auto", "cpu"):
+        with pytest.raises(ValueError, match="render.backend=cuda, but .*set render.backend=auto, cpu or torch"):
+            chosen(device, RenderConfig(backend="cuda"))
+
+
+@pytest.mark.usefixtures("with_gpu")
+def test_the_backend_of_a_gpu_is_refused_on_the_cpu_and_where_it_is_not_built(monkeypatch):
+    monkeypatch.setattr(cuda_native, "library", lambda: None)
+    assert chosen("auto", RenderConfig(backend="cuda")) == chosen("cuda", RenderConfig(backend="cuda")) == GPU
+    with pytest.raises(ValueError, match="render.backend=cuda draws on a GPU only, .*set run.device=auto"):
+        chosen("cpu", RenderConfig(backend="cuda"))
+
+    def missing():
+        raise OSError("libpadgs_cuda.so not found")
+
+    monkeypatch.setattr(cuda_native, "library", missing)
+    with pytest.raises(OSError, match="libpadgs_cuda.so not found"):
+        chosen("auto", RenderConfig(backend="cuda"))
+
+
 @pytest.mark.usefixtures("with_gpu")
 def test_with_a_gpu_auto_is_the_gpu_where_that_can_draw():
     assert chosen("auto", RenderConfig()) == chosen("cuda", RenderConfig()) == GPU
