@@ -27,8 +27,14 @@ class Cubemap3DGSMethod(SplatMethod):
         """Train on what is cut out of the panoramas; an iteration is one such view.
 
         Raises:
-            ValueError: a training view is no panorama, or pixels shall be weighted by a latitude that they do not have.
+            ValueError: a training view is no panorama, or held-out panoramas could not be drawn, or pixels shall be
+                weighted by a latitude that they do not have.
         """
+        if self._render.projection == "pinhole" and not self._render.cubemap:
+            raise ValueError(
+                "projection pinhole cannot draw the held-out panoramas at once; set render.cubemap=true, or "
+                "render.projection=tangent or ray"
+            )
         if self._train.weight != "uniform":
             raise ValueError(
                 f"train.weight is {self._train.weight}, but the rows of perspective views have no latitude; set uniform"

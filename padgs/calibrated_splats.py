@@ -68,9 +68,9 @@ class CalibratedSplats(TrainableSplats):
         """Those of the splats and of the cameras."""
         return super().groups() + self.calibration.groups(self.iterations)
 
-    def draw(self, view: View, probe: Tensor | None = None) -> Drawing:
+    def draw(self, view: View) -> Drawing:
         """Render all Gaussians as the camera of the view takes them, differentiably."""
-        return self.calibration.draw(super().draw, view)
+        return self.calibration.draw(self._drawing, view)
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
         """As the splats do; the last event of a run says what was found of the cameras."""

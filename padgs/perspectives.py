@@ -1,7 +1,8 @@
 """Perspective views cut out of panoramas, for methods that know ordinary cameras only.
 
-Pixels are interpolated when they are asked for, from the panorama as its own loader gives it; nothing is stored. What
-the panorama's mask ignores colours no pixel of a view: colours are interpolated weighted by the mask.
+Pixels are interpolated when they are asked for, from the panorama as its own loader gives it, and kept where the
+panorama's are, within the same bytes (`padgs.data.store`); without such a store nothing is kept. What the panorama's
+mask ignores colours no pixel of a view: colours are interpolated weighted by the mask.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import torch
 from torch import Tensor
 
 from padgs.camera import Panorama, Pinhole
+from padgs.data.store import ImageStore, StoredImage
 from padgs.panorama import sample
 from padgs.scene import Scene, View
 
@@ -30,14 +32,22 @@ class _Cut:
         return sample(image, rays @ self.turn.to(image.device))  # d_panorama = turn^T d_view
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Pixels(_Cut):
     """Loads the colours of a view."""
 
     load: Callable[[], Tensor]
 
+    @property
+    def store(self) -> ImageStore | None:
+        return self.load.store if isinstance(self.load, StoredImage) else None
+
     def __call__(self) -> Tensor:
-        """Pixels [H, W, 3] uint8."""
+        """Pixels [H, W, 3] uint8; not to be written to."""
+        return self.decode() if self.store is None else self.store.get(self)
+
+    def decode(self) -> Tensor:
+        """Interpolate, past the cache."""
         image = self.load()
         mask = self.panorama.mask(device=image.device)
         if mask is None:
@@ -46,8 +56,9 @@ class _Pixels(_Cut):
         return (weighted[..., :3] / weighted[..., 3:].clamp(min=1e-6)).round().to(torch.uint8)
 
     def prefetch(self) -> None:
-        """Have the panorama loaded in the background, where its source can."""
-        self.panorama.prefetch()
+        """Have the panorama loaded in the background, where its source can, unless it is not needed any more."""
+        if self.store is None or self not in self.store:
+            self.panorama.prefetch()
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Sequence
 from typing import Protocol
 
@@ -69,7 +70,10 @@ class RayTrainer(TrainingLoop):
             raise ValueError("the scene has no training view; mend its split")
         super().__init__(model, budget, check_every=check_every, betas=betas, eps=eps)
         self._tracer, self._rays = model, rays
-        self._pixels = RayPixels(views, weight, self._groups[0].parameters[0].device)
+        device = self._groups[0].parameters[0].device
+        started = time.perf_counter()
+        self._pixels = RayPixels(views, weight, device)
+        self.seconds = time.perf_counter() - started  # reading images is training, as where they are read view by view
         self._generator = torch.Generator().manual_seed(seed)
 
     def _step(self, iteration: int) -> tuple[float | Tensor, dict[str, int], tuple[str, ...]]:

@@ -61,19 +61,9 @@ class TrainableSplats:
             ParameterGroup("sh_rest", (splats.sh_rest,), Constant(2.5e-3 / 20 * factor)),
         ]
 
-    def draw(self, view: View, probe: Tensor | None = None) -> Drawing:
-        """Render all Gaussians, differentiably; `probe` is that of another drawing of the same Gaussians."""
-        self._drawn = view
-        gaussians = self.splats.gaussians(view)
-        rendering, probe = render_probed(
-            gaussians,
-            view,
-            self._render_options(view),
-            signal=self.densifier.options.signal,
-            probe=probe,
-            backend=self._config.backend,
-        )
-        return Drawing(rendering, probe, gaussians, torch.arange(len(probe), device=probe.device))
+    def draw(self, view: View) -> Drawing:
+        """Render all Gaussians, differentiably."""
+        return self._drawing(view)
 
     def observe(self, drawing: Drawing, iteration: int) -> None:
         """Note how hard each Gaussian was pulled."""
@@ -128,6 +118,20 @@ class TrainableSplats:
         device = self.splats.means.device
         self.densifier.statistics = {n: t.to(device, copy=True) for n, t in _under("statistics/", state).items()}
         self.densifier.generator.set_state(state.tensors["random/pieces"].cpu())
+
+    def _drawing(self, view: View, probe: Tensor | None = None) -> Drawing:
+        """`draw`; `probe` is that of another drawing of the same Gaussians, for views that are made of several."""
+        self._drawn = view
+        gaussians = self.splats.gaussians(view)
+        rendering, probe = render_probed(
+            gaussians,
+            view,
+            self._render_options(view),
+            signal=self.densifier.options.signal,
+            probe=probe,
+            backend=self._config.backend,
+        )
+        return Drawing(rendering, probe, gaussians, torch.arange(len(probe), device=probe.device))
 
     def _render_options(self, view: View) -> RenderOptions:
         options = self._config.options(self.splats.unit)

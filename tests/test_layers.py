@@ -14,7 +14,7 @@ import pytest
 # From the ground up; a package stands for all its modules. A file imports from its own layer and those above it here.
 LAYERS = {
     "geometry": ("padgs.registry", "padgs.panorama", "padgs.distortion", "padgs.lens"),
-    "data types": ("padgs.camera", "padgs.scene", "padgs.perspectives", "padgs.gaussians"),
+    "data types": ("padgs.camera", "padgs.scene", "padgs.gaussians"),
     "rendering": ("padgs.render",),
     "models": (
         "padgs.method",
@@ -61,7 +61,7 @@ LAYERS = {
         "padgs.evaluate",
         "padgs.bench",
     ),
-    "data sources": ("padgs.data",),
+    "data sources": ("padgs.data", "padgs.perspectives"),
     "results": ("padgs.results", "padgs.checkpoint"),
     "methods": ("baselines",),
     "reporting": ("reports",),

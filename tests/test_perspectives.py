@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 
 from padgs.camera import Panorama, Pinhole
+from padgs.data.store import ImageStore, StoredImage
 from padgs.gaussians import Gaussians, rotation_matrices
 from padgs.panorama import rays, sample
 from padgs.perspectives import looking_at, perspective_scene, perspective_views, square_lens
@@ -74,6 +77,23 @@ def test_drawing_a_view_is_drawing_the_panorama_there(panorama: View, generator:
         expected = sample(whole, view.camera.rays(dtype=torch.float64) @ turn)
         drawn = render(gaussians, view, options).image
         assert (drawn - expected).abs().mean() < 1e-3
+
+
+def test_views_are_cut_once_where_the_panorama_comes_from_a_store(tmp_path: Path, panorama: View):
+    Image.fromarray(panorama.load_pixels().numpy()).save(tmp_path / "p.png")
+    size = 3 * WIDTH * HEIGHT
+    for limit, kept in ((10 * size, True), (size // 10, False)):
+        store = ImageStore(limit, threads=0)
+        stored = replace(panorama, load_pixels=StoredImage(tmp_path / "p.png", WIDTH, HEIGHT, store))
+        cut = perspective_views(stored, FACES, square_lens(panorama.camera, 1.0))
+        pixels = [view.load_pixels() for view in cut]
+        for view, before, free in zip(
+            cut, pixels, perspective_views(panorama, FACES, square_lens(panorama.camera, 1.0)), strict=True
+        ):
+            view.prefetch()
+            assert (view.load_pixels() is before) == kept, "kept, within the bytes that the panorama is kept in"
+            assert torch.equal(before, free.load_pixels()), "and the same pixels"
+        assert store.bytes <= store.limit_bytes
 
 
 def test_masks_are_cut_too_and_what_they_hide_colours_nothing(panorama: View):

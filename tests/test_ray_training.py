@@ -1,3 +1,6 @@
+import time
+from dataclasses import replace
+
 import pytest
 import torch
 from tiny_scene import tiny_scene
@@ -46,6 +49,18 @@ def test_the_mean_colour_is_learned():
     mean = torch.stack([view.image() for view in tiny_scene().train]).mean((0, 1, 2))
     assert torch.allclose(model.color.detach(), mean, atol=0.03)
     assert records[-1].loss < records[0].loss and records[0].counts == {"colors": 1, "rays": 200}
+
+
+def test_reading_the_images_is_training_time():
+    views = tiny_scene().train
+
+    def slow():
+        time.sleep(0.05)
+        return (views[0].image() * 255).round().to(torch.uint8)
+
+    first = replace(views[0], load_pixels=slow)
+    run = RayTrainer(Flat(), (first, *views[1:]), Budget(10), rays=200, seed=3)
+    assert run.seconds >= 0.05 and next(run.records()).seconds > run.seconds - 1e-9
 
 
 def test_the_loss_is_the_squared_error_that_counts():

@@ -10,12 +10,25 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from padgs.data.images import decode
 from padgs.data.resize import area_resize
+
+
+class Decodable(Protocol):
+    """What a store keeps the pixels of; compared and hashed as a key."""
+
+    def decode(self) -> Tensor:
+        """The pixels, past the cache."""
+        ...
+
+    def __hash__(self) -> int:
+        """Equal for equal images."""
+        ...
 
 
 class ImageStore:
@@ -26,12 +39,17 @@ class ImageStore:
         self.limit_bytes, self.threads, self.device = limit_bytes, threads, device
         self.bytes = 0  # kept now
         self.decoded = 0  # images decoded so far
-        self._kept: OrderedDict[StoredImage, Tensor] = OrderedDict()
-        self._pending: dict[StoredImage, Future[Tensor]] = {}
+        self._kept: OrderedDict[Decodable, Tensor] = OrderedDict()
+        self._pending: dict[Decodable, Future[Tensor]] = {}
         self._lock = Lock()
         self._pool: ThreadPoolExecutor | None = None
 
-    def get(self, image: StoredImage) -> Tensor:
+    def __contains__(self, image: Decodable) -> bool:
+        """Whether the pixels are kept now."""
+        with self._lock:
+            return image in self._kept
+
+    def get(self, image: Decodable) -> Tensor:
         """Pixels [H, W, C] uint8 of an image; shared, not to be written to."""
         with self._lock:
             if image in self._kept:
@@ -45,7 +63,7 @@ class ImageStore:
             self._fill(image, future)
         return future.result()
 
-    def prefetch(self, image: StoredImage) -> None:
+    def prefetch(self, image: Decodable) -> None:
         """Start decoding an image in the background, unless it is there, under way, or enough others are."""
         with self._lock:
             if image in self._kept or image in self._pending or len(self._pending) >= 2 * self.threads:
@@ -56,7 +74,7 @@ class ImageStore:
             self._pending[image] = future
             self._pool.submit(self._fill, image, future)
 
-    def _fill(self, image: StoredImage, future: Future[Tensor]) -> None:
+    def _fill(self, image: Decodable, future: Future[Tensor]) -> None:
         """Decode; an error reaches whoever asks for the image."""
         try:
             pixels = image.decode().to(self.device)

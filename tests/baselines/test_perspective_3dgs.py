@@ -13,7 +13,7 @@ from baselines import METHODS
 from baselines.crops_3dgs import NARROWEST, Crops3DGSMethod, Crops3DGSOptions
 from baselines.cubemap_3dgs import Cubemap3DGSMethod
 from padgs.camera import Panorama, Pinhole
-from padgs.method import Budget
+from padgs.method import Budget, RenderConfig
 from padgs.registry import lookup
 from padgs.train import TrainOptions
 
@@ -85,3 +85,9 @@ def test_a_weight_of_latitudes_is_refused(name):
     method = METHOD[name](train=TrainOptions(weight="solid_angle"))
     with pytest.raises(ValueError, match="train.weight is solid_angle, but the rows of perspective views"):
         next(method.fit(tiny_scene(), Budget(1)))
+
+
+@each_method
+def test_a_renderer_that_cannot_draw_held_out_panoramas_is_refused_before_training(name):
+    with pytest.raises(ValueError, match="pinhole cannot draw the held-out panoramas at once; set render.cubemap=true"):
+        next(METHOD[name](render=RenderConfig(projection="pinhole")).fit(tiny_scene(), Budget(10)))

@@ -59,6 +59,9 @@ def test_masks_are_undistorted_with_the_image(scene):
     assert (stretched.weight[10:] == 0).all(), "what shows row 10 and beyond"
     assert (stretched.weight[9] < 0.5 * target.weight[9]).all() and torch.equal(stretched.weight[:9], target.weight[:9])
     assert stretched.moments is None and stretched.image.requires_grad
+    spoiled = replace(target, image=torch.where(mask[..., None] > 0, target.image, 1e3))
+    seen = stretched.weight > 0
+    torch.testing.assert_close(calibration.photograph(views[0], spoiled).image[seen], stretched.image[seen])
 
 
 def test_a_held_out_view_is_carried_with_the_cameras():
