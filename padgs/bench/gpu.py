@@ -10,6 +10,7 @@ sizes       name -> one workload of `padgs.bench.workload`:
   ours, published   bounds that are exact, and squares of 3 sigma as published:
     counters        what the renderer counted
     frame           decode and draw, {"median", "p95", "min"} seconds
+    draw, graph     draw only, the same Gaussians each time: launch by launch, and as a CUDA graph (null without a GPU)
     iteration       the same forward and backward with probe, loss, observation for densification and Adam
     stages          calls of libpadgs_cuda in one iteration -> the same
     peak_bytes      of torch's allocator, in one iteration
@@ -32,6 +33,7 @@ from padgs import clock
 from padgs.bench.workload import OPTIONS, SIZES, Size, Workload, build
 from padgs.loss import photometric_loss
 from padgs.render import RenderOptions, cuda_native, render, resolve_backend
+from padgs.render.captured import CapturedRender
 from padgs.targets import Targets
 
 SCHEMA = 1
@@ -79,6 +81,17 @@ class Iteration:
         with torch.no_grad():
             decoded = self.work.model.decode(self.work.view)
             render(decoded.gaussians, self.work.view, self.options, backend=self.backend)
+
+    def drawing(self) -> tuple[Callable[[], object], Callable[[], object] | None]:
+        """Draw without decoding: launch by launch, and played back from a graph if the backend can."""
+        view = self.work.view.at(self.work.view.cam_from_world.to(self.device))
+        with torch.no_grad():
+            gaussians = self.work.model.decode(view).gaussians
+        graph = CapturedRender(lambda _: gaussians, view, self.options) if self.backend == "cuda" else None
+        return (
+            lambda: render(gaussians, view, self.options, backend=self.backend),
+            None if graph is None else lambda: graph(view.cam_from_world),
+        )
 
     def train(self) -> None:
         """Forward, backward, statistics, step; nothing is read back but the number of instances."""
@@ -160,12 +173,15 @@ def _on_device(work: Workload, device: torch.device) -> Workload:
 def _measure(iteration: Iteration, repeats: int, warm_up: int) -> dict[str, Any]:
     watch = Stopwatch(iteration.device)
     frame = _timed(iteration.frame, watch, repeats, warm_up)
+    draw, graph = (None if work is None else _timed(work, watch, repeats, warm_up) for work in iteration.drawing())
     clock.reset_peak_memory(iteration.device)
     timing = _timed(iteration.train, watch, repeats, warm_up)
     memory = clock.peak_memory(iteration.device)
     return {
         "backend": iteration.backend,
         "frame": frame,
+        "draw": draw,
+        "graph": graph,
         "iteration": timing,
         "stages": _stages(iteration, watch, repeats),
         "counters": dict(iteration.counters),
@@ -246,6 +262,8 @@ def gpu_lines(report: dict[str, Any]) -> list[str]:
             times = (f"{what} {1e3 * part[what]['median']:.2f} ms (p95 {1e3 * part[what]['p95']:.2f})"
                      for what in ("frame", "iteration"))  # fmt: skip
             found.append(f"  {label} bounds, backend {part['backend']}: {', '.join(times)}{peak}")
+            graph = "" if part["graph"] is None else f", as a CUDA graph {1e3 * part['graph']['median']:.2f} ms"
+            found.append(f"    drawn only: {1e3 * part['draw']['median']:.2f} ms{graph}")
         found += [f"    {stage}: {1e3 * timing['median']:.3f} ms" for stage, timing in size["ours"]["stages"].items()]
         for target, verdict in size["targets"].items():
             found.append(f"  {target}: {verdict['value']} (asked: {verdict['limit']}), met: {verdict['met']}")

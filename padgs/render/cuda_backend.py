@@ -18,7 +18,7 @@ from padgs.render import cuda_native, native
 from padgs.render.contract import Rendering, RenderOptions
 from padgs.render.cuda_tiles import Projected, Strip
 from padgs.render.native import pointer
-from padgs.render.native_camera import native_camera, native_rays
+from padgs.render.native_camera import NativeRays, native_camera, native_rays
 from padgs.render.published_bounds import check_memory
 from padgs.render.tiles import MOMENTS
 
@@ -130,16 +130,8 @@ class _Rasterize(torch.autograd.Function):
         projected = Projected(native_camera(IDENTITY, camera, options), pose, inputs, options.max_instances)
         check_memory(projected.instances, options)
         rays = native_rays(camera, device)
-        image = torch.empty(camera.height, camera.width, 3, device=device)
-        transmittance, depth = torch.empty(2, camera.height, camera.width, device=device)
-        last = torch.empty(camera.height, camera.width, dtype=torch.int32, device=device)
-        outputs = (image, transmittance, depth, last)
-        pairs = torch.zeros(2, dtype=torch.int64, device=device)
-        for strip in projected.strips():
-            pair_counts = torch.empty(strip.chunks, 2, dtype=torch.int32, device=device)
-            arguments = _blend_inputs(projected, strip, rays, background, outputs, pair_counts)
-            cuda_native.call("padgs_cuda_blend", projected.queue, arguments)
-            pairs += pair_counts.sum(0)
+        outputs = image, transmittance, depth, last = outputs_of(camera, device)
+        pairs = blend(projected, rays, background, outputs)
         visible = projected.boxes[:, 3] < projected.boxes[:, 4]
         counters.record(pairs, gaussians=count, visible=projected.visible, instances=projected.instances)
         ctx.mark_non_differentiable(visible)
@@ -181,6 +173,25 @@ class _Rasterize(torch.autograd.Function):
         if grad_rays is not None:
             grad_table = grad_rays[:, :, : image.shape[1]].permute(0, 2, 1)
         return *gradients, probe, grad_pose, grad_background, grad_table, None, None, None
+
+
+def outputs_of(camera: Camera, device: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Room for image [H, W, 3], transmittance and depth [H, W], and where each pixel's last contribution is, [H, W]."""
+    image = torch.empty(camera.height, camera.width, 3, device=device)
+    transmittance, depth = torch.empty(2, camera.height, camera.width, device=device)
+    last = torch.empty(camera.height, camera.width, dtype=torch.int32, device=device)
+    return image, transmittance, depth, last
+
+
+def blend(projected: Projected, rays: NativeRays, background: Tensor, outputs: tuple[Tensor, ...]) -> Tensor:
+    """Fill the outputs; returns how many pairs were evaluated, and how many contributed, [2] int64."""
+    pairs = torch.zeros(2, dtype=torch.int64, device=background.device)
+    for strip in projected.strips():
+        pair_counts = torch.empty(strip.chunks, 2, dtype=torch.int32, device=background.device)
+        arguments = _blend_inputs(projected, strip, rays, background, outputs, pair_counts)
+        cuda_native.call("padgs_cuda_blend", projected.queue, arguments)
+        pairs += pair_counts.sum(0)
+    return pairs
 
 
 def _moments(

@@ -1,6 +1,8 @@
 """Projected Gaussians and tile lists in the memory of a GPU, strip by strip; `padgs.render.tiles` is the CPU's.
 
 The host reads one thing back: how many instances each row of tiles has, before anything of their size is allocated.
+Where it must not wait (`padgs.render.captured`), there is room for a stated number of them instead: Gaussians that are
+not drawn are passed over rather than left out, and instances that do not exist have a key behind that of the last tile.
 """
 
 from __future__ import annotations
@@ -65,7 +67,7 @@ class Strip:
         self.first_row, self.end_row = first_row, end_row
         self.tiles = sum(rows.tiles[first_row:end_row])
         self.chunks = (end_row - first_row) * rows.columns
-        self.instances = sum(projected.per_row[first_row:end_row])
+        self.instances = projected.room if projected.room else sum(projected.per_row[first_row:end_row])
         if self.instances > MAX_INSTANCES:
             raise ValueError(
                 f"one row of tiles has {self.instances:,} (Gaussian, tile) instances; a list holds at most "
@@ -77,7 +79,11 @@ class Strip:
         self.slots = integers(self.instances)
         self.tile_start = integers(self.tiles + 1)
         self.table = projected.table(first_row, end_row)
-        counts, sort = integers(projected.visible + 1), Sorter(projected.queue, self.instances, device)
+        counts = integers(projected.visible + 1)
+        sort = Sorter(projected.queue, self.instances, device, summed=len(counts))
+        largest = self.tiles if projected.room else max(self.tiles - 1, 1)
+        if projected.room:
+            sort.keys.fill_(largest)
         arguments = cuda_native.BinArguments(
             self.table,
             pointer(projected.boxes),
@@ -86,21 +92,21 @@ class Strip:
             pointer(counts),
             pointer(self.slot_start),
             pointer(self.reaches),
-            sort.arguments(self.slots, bits=max(1, (self.tiles - 1).bit_length())),
+            sort.arguments(self.slots, bits=largest.bit_length()),
             pointer(self.tile_start),
         )
         cuda_native.call("padgs_cuda_bin", projected.queue, arguments, self.tiles)
 
 
 class Sorter:
-    """Keys, values and scratch for one stable sort; and for a sum over as many items."""
+    """Keys, values and scratch for one stable sort, and for a sum."""
 
-    def __init__(self, queue: Queue, count: int, device: torch.device) -> None:
-        """Allocate for `count` items."""
+    def __init__(self, queue: Queue, count: int, device: torch.device, *, summed: int = 0) -> None:
+        """Allocate for sorting `count` items and summing over `summed`."""
         self.queue, self.count = queue, count
         self.keys = torch.empty(count, dtype=torch.int32, device=device)
         self.sorted_keys, self.values = torch.empty_like(self.keys), torch.empty_like(self.keys)
-        scratch = cuda_native.library().padgs_cuda_scratch_bytes(ctypes.byref(queue), max(count, 1))
+        scratch = cuda_native.library().padgs_cuda_scratch_bytes(ctypes.byref(queue), max(count, summed, 1))
         self.scratch = torch.empty(max(scratch, 1), dtype=torch.uint8, device=device)
 
     def arguments(self, sorted_values: Tensor, bits: int) -> SortArguments:
@@ -112,14 +118,18 @@ class Sorter:
 class Projected:
     """All Gaussians as one view sees them, in depth order, and how they spread over the tiles."""
 
-    def __init__(self, camera: native.Camera, pose: Tensor, inputs: native.Inputs, max_instances: int) -> None:
-        """Project, sort, count; waits for the device once.
+    def __init__(
+        self, camera: native.Camera, pose: Tensor, inputs: native.Inputs, max_instances: int, *, room: int = 0
+    ) -> None:
+        """Project, sort, count; waits for the device once, unless it is told how much room there is.
 
         Args:
             camera: its own pose is not used.
             pose: [4, 4] on the device, contiguous.
             inputs: on the device.
             max_instances: of a strip.
+            room: for so many instances in a single strip, drawn without a look at how many there are: `counts` says on
+                the device. 0: as many as there are.
         """
         device, count = pose.device, inputs.count
         self.queue = cuda_native.queue(device)
@@ -128,20 +138,28 @@ class Projected:
         self.footprints = torch.empty(count, 16, device=device)
         self.boxes = torch.empty(count, 5, dtype=torch.int32, device=device)
         self.order = torch.empty(count, dtype=torch.int32, device=device)
+        self.per_row: list[int] = []
         self._state_start: Tensor | None = None
+        self._only: Strip | None = None
         sort = Sorter(self.queue, count, device)
-        counts = torch.zeros(len(self.rows.levels) + 1, dtype=torch.int64, device=device)
+        self.counts = torch.zeros(len(self.rows.levels) + 1, dtype=torch.int64, device=device)
         outputs = (self.footprints, self.boxes, sort.keys, sort.values)
         table = self.table(0, len(self.rows.levels))
         arguments = cuda_native.ProjectArguments(
-            camera, pointer(pose), inputs, *map(pointer, outputs), table, pointer(counts)
+            camera, pointer(pose), inputs, *map(pointer, outputs), table, pointer(self.counts)
         )
         cuda_native.call("padgs_cuda_project", self.queue, arguments)
         cuda_native.call("padgs_cuda_sort", self.queue, sort.arguments(self.order, bits=32))
-        *self.per_row, self.visible = counts.tolist()
-        self.instances = sum(self.per_row)
-        self._cuts = strip_cuts(self.per_row, min(max_instances, MAX_INSTANCES))
-        self._only: Strip | None = None
+        self.room, self.visible = room, count
+        self._cuts = [0, len(self.rows.levels)]
+        if not room:
+            *self.per_row, self.visible = self.counts.tolist()
+            self._cuts = strip_cuts(self.per_row, min(max_instances, MAX_INSTANCES))
+
+    @property
+    def instances(self) -> int:
+        """How many there are, of all rows; known where the device was waited for."""
+        return sum(self.per_row)
 
     def table(self, first_row: int, end_row: int) -> TileTable:
         """Some rows of tiles, for the library; with the places of pixel states once there are any."""

@@ -9,7 +9,7 @@ import torch
 from typer.testing import CliRunner
 
 from padgs.bench import gpu
-from padgs.bench.workload import SIZES
+from padgs.bench.workload import OPTIONS, SIZES, build
 from padgs.cli.app import app
 from padgs.render import cuda_native, native
 
@@ -28,6 +28,7 @@ def test_the_report_says_what_was_measured(report: dict):
         part = size[label]
         assert part["backend"] == "cpu"
         assert 0 < part["frame"]["median"] < part["iteration"]["median"]
+        assert part["draw"]["median"] > 0 and part["graph"] is None
         assert part["counters"]["contributing"] > 0 and part["stages"] == {}  # no call went to libpadgs_cuda
     assert size["published"]["counters"]["instances"] > size["ours"]["counters"]["instances"]
     assert set(size["slower"]) == {"frame", "iteration"} and size["targets"] == {}
@@ -35,6 +36,31 @@ def test_the_report_says_what_was_measured(report: dict):
     json.dumps(report, allow_nan=False)
     text = "\n".join(gpu.gpu_lines(report))
     assert "quick: 128x64, about 2,000 Gaussians" in text and "published bounds, backend cpu: frame " in text
+
+
+def test_on_a_gpu_the_same_gaussians_are_drawn_with_and_without_a_graph(monkeypatch: pytest.MonkeyPatch):
+    drawn = []
+
+    def captured(show, view, options):
+        return lambda pose: drawn.append((show(view), pose, options))
+
+    monkeypatch.setattr(gpu, "CapturedRender", captured)
+    monkeypatch.setattr(gpu, "render", lambda gaussians, view, options, **how: drawn.append((gaussians, view, how)))
+    iteration = gpu.Iteration(build(SIZES["quick"]), OPTIONS, torch.device("cpu"))
+    iteration.backend = "cuda"
+    for draw in iteration.drawing():
+        assert draw is not None
+        draw()
+    (usual, view, how), (recorded, pose, options) = drawn
+    assert recorded is usual and len(usual) > 0 and not usual.means.requires_grad
+    assert pose is view.cam_from_world and options is OPTIONS and how == {"backend": "cuda"}
+    part = {"backend": "cuda", "peak_bytes": None, "stages": {}} | {
+        what: {"median": ms / 1e3, "p95": 1.0}
+        for what, ms in {"frame": 5, "iteration": 9, "draw": 3, "graph": 2}.items()
+    }
+    size = {"width": 2, "height": 1, "gaussians": 3, "ours": part, "published": part, "targets": {}}
+    machine = {"machine": {"gpu": "G", "cpu": "C"}, "ceilings": {"copy": 1e9, "fp32": 1e12}}
+    assert "    drawn only: 3.00 ms, as a CUDA graph 2.00 ms" in gpu.gpu_lines({**machine, "sizes": {"quick": size}})
 
 
 def test_targets_are_judged_for_the_size_that_they_are_stated_for():
@@ -51,7 +77,7 @@ def test_targets_are_judged_for_the_size_that_they_are_stated_for():
 def test_calls_of_the_library_are_charged_to_stages(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(cuda_native, "call", lambda name, *_: None)
     with gpu._calls_watched(gpu.Stopwatch(torch.device("cpu"))) as marks:
-        cuda_native.call("padgs_cuda_bin", None)
+        cuda_native.call("padgs_cuda_bin", cuda_native.Queue())
     ((name, start, end),) = marks
     assert name == "bin" and start <= end
 

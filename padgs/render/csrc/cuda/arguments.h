@@ -39,11 +39,12 @@ struct BinArguments {
   TileTable table;
   const PixelBox *boxes;
   const int32_t *order;  // [visible] front to back
-  int64_t visible;
+  int64_t visible;       // or more: others that are in `order` touch no tile
   uint32_t *tiles;       // [visible + 1] how many tiles each touches, and 0
   uint32_t *slot_start;  // [visible + 1]
   Reach *reaches;        // [I] by slot
-  SortArguments sort;    // of the I instances by tile; its values become the slots of the lists
+  SortArguments sort;    // of the I instances by tile; its values become the slots of the lists. Where I is room for more than
+                         // there are, the keys behind the last are those from before the call: at least the number of tiles
   int32_t *tile_start;   // [tiles + 1]
 };
 

@@ -13,7 +13,8 @@ __global__ void count_kernel(BinArguments args) {
   if (i <= args.visible) args.tiles[i] = i < args.visible ? tiles_of(args.boxes[args.order[i]], args.table) : 0;
 }
 
-// A warp lists the instances of 32 Gaussians, as many to each lane whatever their sizes, and writes them side by side.
+// A warp lists the instances of 32 Gaussians, as many to each lane whatever their sizes, and writes them side by side; those
+// that there is no room for are left out.
 __global__ void emit_kernel(BinArguments args) {
   __shared__ PixelBox boxes[kWarps][kWarp];
   __shared__ int32_t gaussians[kWarps][kWarp];
@@ -27,7 +28,8 @@ __global__ void emit_kernel(BinArguments args) {
   starts[warp][lane] = args.slot_start[i < args.visible ? i : args.visible];
   __syncwarp();
   if (first >= args.visible) return;
-  const uint32_t end = args.slot_start[first + kWarp < args.visible ? first + kWarp : args.visible];
+  const int64_t listed = args.slot_start[first + kWarp < args.visible ? first + kWarp : args.visible];
+  const uint32_t end = uint32_t(listed < args.sort.count ? listed : args.sort.count);
   for (uint32_t slot = starts[warp][0] + uint32_t(lane); slot < end; slot += kWarp) {
     int owner = 0;  // the last that starts at or before this slot; those after it that start there too are empty
     for (int step = kWarp / 2; step; step /= 2)

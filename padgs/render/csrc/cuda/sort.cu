@@ -29,7 +29,7 @@ int exclusive_sum(const Queue &, const SortArguments &, const uint32_t *in, uint
   uint32_t total = 0;
   for (int64_t i = 0; i < count; ++i) {
     out[i] = total;
-    total += in[i];
+    total = SaturatingSum()(total, in[i]);
   }
   return 0;
 }
@@ -53,7 +53,8 @@ int64_t sort_bytes(int64_t count) {
 
 int64_t scan_bytes(int64_t count) {
   size_t bytes = 0;
-  cub::DeviceScan::ExclusiveSum(nullptr, bytes, (const uint32_t *)nullptr, (uint32_t *)nullptr, int32_t(count));
+  const uint32_t *in = nullptr;
+  cub::DeviceScan::ExclusiveScan(nullptr, bytes, in, (uint32_t *)nullptr, SaturatingSum(), 0u, int32_t(count));
   return int64_t(bytes);
 }
 
@@ -67,7 +68,8 @@ int sort_pairs(const Queue &queue, const SortArguments &args) {
 
 int exclusive_sum(const Queue &queue, const SortArguments &scratch, const uint32_t *in, uint32_t *out, int64_t count) {
   size_t bytes = size_t(scratch.scratch_bytes);
-  return int(cub::DeviceScan::ExclusiveSum(scratch.scratch, bytes, in, out, int32_t(count), cudaStream_t(queue.stream)));
+  return int(cub::DeviceScan::ExclusiveScan(scratch.scratch, bytes, in, out, SaturatingSum(), 0u, int32_t(count),
+                                            cudaStream_t(queue.stream)));
 }
 
 }  // namespace padgs
