@@ -10,6 +10,8 @@ REPORTS = {
     "table2": "reports.files:table2",
     "table3": "reports.files:table3",
     "table4": "reports.files:table4",
+    "methods": "reports.files:methods",
+    "equal_time": "reports.files:equal_time",
     "ladder": "reports.files:ladder",
     "runs": "reports.files:runs",
     "sweep": "reports.files:sweep",

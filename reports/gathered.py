@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 
 from padgs.results import Result
-from reports import ladder, runs, sweep_chart, table3, tables_of_methods, trade_off_chart
+from reports import ladder, runs, side_by_side, sweep_chart, table3, tables_of_methods, trade_off_chart
 from reports.drawing import Chart
 from reports.measures import marks
 from reports.quality_log import probes
@@ -22,6 +22,8 @@ TABLES: Mapping[str, Callable[[Sequence[Result], Request], Table]] = {
     "table2": tables_of_methods.table2,
     "table3": table3.build,
     "table4": tables_of_methods.table4,
+    "methods": side_by_side.methods,
+    "equal_time": side_by_side.equal_time,
     "ladder": ladder.build,
     "runs": runs.build,
 }

@@ -18,6 +18,8 @@ EXPERIMENTS = {  # report -> experiments (conf/experiment) that are run for it
     "table2": METHODS,
     "table3": ("ablation", "ablation_bar", "ablation_cat_tower"),
     "table4": ("table4_efficiency", *METHODS),
+    "methods": METHODS,
+    "equal_time": ("equal_time",),
     "ladder": ("ladder",),
     "chart": ("pareto", "table4_efficiency", *METHODS),
 }

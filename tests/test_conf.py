@@ -5,10 +5,11 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
-from composed import composed, expanded, first_and_last_job, hydra_loader, jobs
+from composed import composed, expanded, first_and_last_job, jobs
 from hydra.errors import HydraException
 
 from baselines.padgs import preset
+from padgs.cli.composition import composing
 from padgs.cli.config import RunOptions, TrainConfig
 from padgs.cli.launchers import missing_plugin
 from padgs.cli.overrides import expand
@@ -88,7 +89,7 @@ def different_keys(first: dict, second: dict, where: str = "") -> set[str]:
 
 
 def test_what_the_command_line_sweeps_multiplies_with_the_file_or_replaces_it():
-    with hydra_loader() as loader:
+    with composing() as loader:
         params = {"method.tau": "0.5,0.9", "+scene": "glob(synthetic_ro*)", "seed": "0,1,2"}
         found = expand(params, ["++seed=7,8", "+sweep=tau"], loader)
     assert found == [

@@ -7,6 +7,7 @@ import typer
 from padgs.cli.bench import bench
 from padgs.cli.check import check
 from padgs.cli.convert import convert
+from padgs.cli.equal_time import equal_time
 from padgs.cli.prepare import prepare
 from padgs.cli.report import report
 from padgs.cli.track import track
@@ -19,7 +20,7 @@ def commands() -> None:
     """Panoramic Gaussian splatting, measured fairly."""
 
 
-for command in (bench, check, convert, prepare, report, track):
+for command in (bench, check, convert, equal_time, prepare, report, track):
     app.command()(command)
 
 

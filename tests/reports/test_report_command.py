@@ -48,7 +48,8 @@ def test_a_broken_file_is_named_and_left_out_and_strict_fails(runs):
     [
         (
             ["table9"],
-            "unknown report 'table9'; known: chart, html, ladder, runs, sweep, table1, table2, table3, table4, all",
+            "unknown report 'table9'; known: chart, equal_time, html, ladder, methods, runs, sweep, table1, table2, "
+            "table3, table4, all",
         ),
         (["table3", "--where", "x"], "--where x is not KEY=VALUE"),
         (["table3", "--protocol", "x"], "unknown protocol 'x'"),
@@ -83,7 +84,8 @@ def test_everything_at_once(tmp_path):
     done = report("all", runs, "--out", tmp_path / "out")
     assert done.exit_code == 0, done.output
     written = {path.name for path in (tmp_path / "out").iterdir()}
-    tables = {f"{name}.{e}" for name in ("table1", "table2", "table3", "table4", "runs") for e in ("md", "tex", "csv")}
+    made = ("table1", "table2", "table3", "table4", "methods", "runs")
+    tables = {f"{name}.{extension}" for name in made for extension in ("md", "tex", "csv")}
     charts = {f"{name}.{e}" for name in ("chart_synthetic-room", "sweep_tau_cpu") for e in ("svg", "png", "csv")}
     assert written == tables | charts | {"time_synthetic-room.svg", "time_synthetic-room.png", "report.html"}
 

@@ -1,0 +1,106 @@
+"""`padgs equal-time`: how long each method has to be trained for all of them to take the same time."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from padgs import results
+from padgs.cli.typed import ConfigError
+from padgs.results import Result
+from reports.equal_time import EXPERIMENT, is_near, of_any_length
+from reports.measures import train_seconds
+from reports.request import Request
+from reports.settings import chosen
+from reports.table import ReportError
+
+
+def equal_time(
+    runs: Annotated[str, typer.Argument(help="folder of run folders, with a finished run of each method")],
+    seconds: Annotated[float, typer.Argument(help="of training, that every method shall take")],
+    settings: Annotated[list[str] | None, typer.Argument(help="settings for all commands, e.g. tracking=none")] = None,
+    experiment: Annotated[str, typer.Option(help="lengths are those of its runs, e.g. all_methods@cpu")] = "",
+) -> None:
+    """Print the commands that train every method of a folder for the same time; `| sh` runs them.
+
+    The number of iterations comes from the finished run of the same settings whose time was nearest. As models grow,
+    time is not proportional to iterations: repeat it until nothing is printed.
+    """
+    folder = Path(runs)
+    if not folder.is_dir():
+        raise _refused(f"there is no folder {folder}; give the folder of the runs")
+    if not seconds > 0:
+        raise _refused(f"seconds is {seconds:g}; it must be > 0")
+    found, broken = results.read_all(folder)
+    for error in broken:
+        print(f"left out: {error}", file=sys.stderr)
+    try:
+        methods = chosen(found, "methods", Request(experiment=experiment))
+    except ReportError as error:
+        raise _refused(str(error)) from error
+    known = {result.run: result for result in (*methods, *(r for r in found if EXPERIMENT in r.experiments))}
+    usable = [result for result in known.values() if result.ok and not result.variant and train_seconds(result)]
+    if not usable:
+        raise _refused(
+            f"no run in {folder} has ended well; run the methods first, "
+            "e.g. padgs-run +experiment=all_methods scale=cpu"
+        )
+    from hydra.errors import HydraException
+
+    from padgs.cli.composition import command, composing, settings_of
+
+    with composing():
+        for result in nearest(usable, seconds):
+            if EXPERIMENT in result.experiments and is_near(result, seconds):
+                continue
+            choices = (f"+experiment={EXPERIMENT}", f"method={result.preset}")
+            try:
+                given = settings_of(_values(result, folder, seconds), *choices)
+            except (ConfigError, HydraException) as error:
+                print(f"left out: {result.run}: {error}", file=sys.stderr)
+                continue
+            print(command([*given, *(settings or [])]))
+
+
+def nearest(runs: Iterable[Result], seconds: float) -> list[Result]:
+    """Of all runs that differ in their length only, the one whose training time is nearest to `seconds`, as a ratio."""
+    groups: dict[str, list[Result]] = {}
+    for result in runs:
+        config = {key: value for key, value in of_any_length(result).config.items() if key not in ("run", "protocol")}
+        groups.setdefault(json.dumps([result.preset, result.fingerprint, config], sort_keys=True), []).append(result)
+    return [min(group, key=lambda r: abs(math.log(_seconds(r) / seconds))) for group in groups.values()]
+
+
+def iterations(result: Result, seconds: float) -> int:
+    """Iterations that take `seconds` if each takes as long as in this run; those of the run itself if that is near."""
+    if is_near(result, seconds):
+        return result.iterations
+    return max(1, round(result.iterations * seconds / _seconds(result)))
+
+
+def _values(result: Result, folder: Path, seconds: float) -> dict[str, Any]:
+    """The configuration of the run that is asked for."""
+    config = result.config
+    return {
+        **config,
+        "data": {key: value for key, value in config["data"].items() if key != "device"},  # follows run.device
+        "train": {**config["train"], "iterations": iterations(result, seconds)},
+        "run": {**config["run"], "folder": str(folder)},
+    }
+
+
+def _seconds(result: Result) -> float:
+    seconds = train_seconds(result)
+    assert seconds is not None
+    return seconds
+
+
+def _refused(message: str) -> typer.Exit:
+    print(f"error: {message}", file=sys.stderr)
+    return typer.Exit(1)
