@@ -7,6 +7,7 @@
 #include <cmath>
 #include <vector>
 
+#include "batch.h"
 #include "kernels.h"
 #include "pixels.h"
 #include "tiles.h"
@@ -14,8 +15,6 @@
 namespace padgs {
 namespace PADGS_ISA {
 namespace {
-
-constexpr int kBatch = 256;  // instances; the number of one fits into a byte
 
 struct ForwardPatch {
   Vec transmittance;  // negative once the pixel has stopped
@@ -79,35 +78,21 @@ int64_t blend_patch(const Seen *batch, const uint8_t *list, int entries, int pos
 template <class Seen>
 void forward_tile(const BlendArguments &args, const Tile &tile, int64_t index) {
   static thread_local std::vector<ForwardPatch> storage;
-  static thread_local std::vector<uint8_t> lists;  // [patches, kBatch] which instances of the batch reach a patch
-  static thread_local std::vector<int> counts;     // [patches]
-  static thread_local std::vector<Seen> batch(kBatch);
   const int patches = tile.patches();
-  storage.resize(patches), lists.resize(size_t(patches) * kBatch), counts.resize(patches);
+  storage.resize(patches);
   ForwardPatch *states = storage.data();
+  Batch<Seen> &batch = batch_of_thread<Seen>();
   const std::vector<typename Seen::Place> &places = places_of<Seen>(args, tile);
   int alive = patches;
   for (int p = 0; p < patches; ++p) states[p] = {Patch(tile, p, args.grid.width).inside()};
   int64_t evaluated = 0, contributing = 0;
 
   for (int64_t start = tile.first; start < tile.end && alive; start += kBatch) {
-    const int size = int(std::min<int64_t>(kBatch, tile.end - start));
-    std::fill(counts.begin(), counts.end(), 0);
-    for (int i = 0; i < size; ++i) {
-      prefetch(args, start + i + kAhead, tile.end);
-      const Instance instance = args.instances[start + i];
-      batch[i] = Seen(args.footprints[instance.gaussian], args, tile);
-      for (int row = instance.row; row < instance.row_end; ++row)
-        for (int column = instance.column; column < instance.column_end; ++column) {
-          const int p = row * tile.patch_columns + column;
-          lists[size_t(p) * kBatch + counts[p]++] = uint8_t(i);
-        }
-    }
+    batch.load(args, tile, start);
     for (int p = 0; p < patches; ++p) {
-      if (!counts[p] || !states[p].alive) continue;
-      evaluated += kLanes * counts[p];
-      contributing += blend_patch(batch.data(), &lists[size_t(p) * kBatch], counts[p], int(start - tile.first), places[p],
-                                  states[p]);
+      if (!batch.count(p) || !states[p].alive) continue;
+      evaluated += kLanes * batch.count(p);
+      contributing += blend_patch(batch.seen(), batch.list(p), batch.count(p), int(start - tile.first), places[p], states[p]);
       alive -= !states[p].alive;
     }
   }
@@ -166,7 +151,7 @@ void backward_tile(const BlendGradientArguments &args, const Tile &tile) {
   for (int64_t i = tile.first + furthest; i < tile.end; ++i)
     std::fill_n(args.moments + int64_t(forward.instances[i].slot) * kMoments, kMoments, 0.0f);
   for (int64_t i = tile.first + furthest - 1; i >= tile.first; --i) {
-    if (i - kAhead >= tile.first) prefetch(forward, i - kAhead, tile.end);
+    prefetch(args, i - kAhead, tile.first, tile.end);
     const Instance instance = forward.instances[i];
     const Seen g(forward.footprints[instance.gaussian], forward, tile);
     const VecI position = splat_int(int32_t(i - tile.first) + 1);

@@ -1,8 +1,13 @@
 // The fragments of sixteen pixels for hybrid blending: the nearest few in order, and sums over all others.
+//
+// The core is a list of rows. Each instance that enters the core of any of the pixels appends a row, with holes at the other
+// pixels: transparent fragments as far away as what is in front of them. So the distances of every pixel ascend along the
+// rows, and as instances come nearly front to back, few fragments have to be moved to an earlier row.
 #pragma once
 
 #include <algorithm>
-#include <limits>
+#include <memory>
+#include <vector>
 
 #include "abi.h"
 #include "simd.h"
@@ -11,40 +16,29 @@ namespace padgs {
 namespace PADGS_ISA {
 
 constexpr float kCoreAlphaMin = 0.05f;  // fainter fragments go to the tail
-const float kEmpty = std::numeric_limits<float>::infinity();
+constexpr int32_t kMixed = -1;
 
-// One place in the core of each pixel. Empty: infinitely far, transparent, of Gaussian -1.
-struct Slot {
-  Vec distance, alpha;
-  VecI gaussian;
+struct Row {
+  Vec distance, alpha;  // alpha 0: a hole
+  int32_t entrant;      // of all its fragments; kMixed: they are in `entrants`
+  VecI entrants;
+
+  VecI each_entrant() const { return entrant == kMixed ? entrants : splat_int(entrant); }
 };
 
 struct Colors {
   Vec red, green, blue, depth;
 };
 
-// What sixteen Gaussians carry, one for each lane; any for -1.
-inline Colors gather(const Footprint *footprints, VecI gaussian) {
-  int32_t index[kLanes];
-  store_int(index, gaussian);
-  float lanes[4][kLanes];
-  for (int lane = 0; lane < kLanes; ++lane) {
-    const Footprint &f = footprints[std::max(index[lane], 0)];
-    lanes[0][lane] = f.red, lanes[1][lane] = f.green, lanes[2][lane] = f.blue, lanes[3][lane] = f.depth;
-  }
-  return {load(lanes[0]), load(lanes[1]), load(lanes[2]), load(lanes[3])};
-}
-
 // Sums over the fragments outside the core; they do not depend on any order but that of rounding.
 struct Tail {
-  Vec alpha = zero(), left = splat(1.0f), count = zero();  // sum of alpha, product of 1 - alpha, fragments
+  Vec alpha = zero(), left = splat(1.0f);                           // sum of alpha, product of 1 - alpha
   Vec red = zero(), green = zero(), blue = zero(), depth = zero();  // sums of alpha times them
 
   template <class C>
   void add(Vec a, const C &c) {
     alpha += a;
     left = left - left * a;
-    count += select(less(zero(), a), splat(1.0f), zero());
     red += a * c.red;
     green += a * c.green;
     blue += a * c.blue;
@@ -53,42 +47,80 @@ struct Tail {
 };
 
 struct Fragments {
-  Slot *core;      // [size]
-  int size;
-  int filled = 0;  // slots that are not empty in all lanes
   Tail tail;
+  Vec reached = zero(), entered = zero();  // fragments of each pixel: all, those in its rows
+  Vec last = splat(-1.0f);                 // distance in the last row
+  Row *rows = nullptr;
+  int32_t *entrants = nullptr;  // positions in the tile's list, ascending
+  int row_count = 0, entrant_count = 0;
 
-  // Takes one fragment of each lane, alpha = 0 where there is none.
-  void add(const Footprint *footprints, int32_t gaussian, Vec distance, Vec alpha) {
-    Mask entering = at_least(alpha, splat(kCoreAlphaMin));
-    if (filled == size) {
-      const Slot &last = core[size - 1];
-      entering = both(entering, less(distance, last.distance));
-      const Vec evicted = keep(entering, last.alpha);  // 0 where the slot was empty
-      if (any(less(zero(), evicted))) tail.add(evicted, gather(footprints, last.gaussian));
+  void clear() {
+    tail = Tail();
+    reached = entered = zero();
+    last = splat(-1.0f);
+    row_count = entrant_count = 0;
+  }
+  // Makes room for another `instances` of them.
+  void reserve(int instances) {
+    grow(row_storage_, rows, row_count, row_capacity_, row_count + instances + 1);
+    grow(entrant_storage_, entrants, entrant_count, entrant_capacity_, entrant_count + instances + 1);
+  }
+  // Leaves the nearest `core_size` fragments of each pixel in the rows, and no empty rows; the others join the tail.
+  template <class ColorsOf>
+  void close(int core_size, ColorsOf colors_of) {
+    const Vec size = splat(float(core_size));
+    if (!any(less(size, entered))) return;
+    Vec passed = zero();
+    int kept = 0;
+    for (int k = 0; k < row_count; ++k) {
+      Row &row = rows[k];
+      const Mask filled = less(zero(), row.alpha);
+      passed += keep(filled, splat(1.0f));
+      const Mask beyond = both(filled, less(size, passed));
+      if (any(beyond)) {
+        tail.add(keep(beyond, row.alpha), colors_of(row));
+        row.alpha = select(beyond, zero(), row.alpha);
+      }
+      if (any(less(zero(), row.alpha))) {
+        if (kept < k) rows[kept] = row;
+        ++kept;
+      }
     }
-    const Vec rest = select(entering, zero(), alpha);
-    if (any(less(zero(), rest))) tail.add(rest, footprints[gaussian]);
-    if (any(entering)) insert(entering, {distance, alpha, splat_int(gaussian)});
+    row_count = kept;
+    entered = minimum(entered, size);
   }
 
  private:
-  // From the back, as fragments mostly come front to back. Equal distances stay in the order of arrival.
-  void insert(Mask moving, const Slot &fragment) {
-    if (filled < size) core[filled++] = {splat(kEmpty), zero(), splat_int(-1)};
-    for (int k = filled - 1;; --k) {
-      Slot &here = core[k];
-      const Slot &front = core[k > 0 ? k - 1 : 0];
-      const Mask further = k > 0 ? both(moving, less(fragment.distance, front.distance)) : without(moving, moving);
-      here.distance = select(further, front.distance, select(moving, fragment.distance, here.distance));
-      here.alpha = select(further, front.alpha, select(moving, fragment.alpha, here.alpha));
-      here.gaussian = select_int(further, front.gaussian, select_int(moving, fragment.gaussian, here.gaussian));
-      if (!any(further)) break;
-      moving = further;
-    }
-    if (!any(less(core[filled - 1].distance, splat(kEmpty)))) --filled;
+  template <class T>
+  static void grow(std::unique_ptr<T[]> &storage, T *&data, int used, int &capacity, int needed) {
+    if (needed <= capacity) return;
+    std::unique_ptr<T[]> larger(new T[2 * needed]);
+    std::copy_n(data, used, larger.get());
+    storage.swap(larger);
+    data = storage.get();
+    capacity = 2 * needed;
   }
+  std::unique_ptr<Row[]> row_storage_;
+  std::unique_ptr<int32_t[]> entrant_storage_;
+  int row_capacity_ = 0, entrant_capacity_ = 0;
 };
+
+// Moves fragments of row `last`, in pixels `moving`, in front of all that are further away. Equal distances stay in the
+// order of arrival.
+inline void move_forward(Row *rows, int last, Mask moving, Vec distance, Vec alpha) {
+  const VecI entrant = splat_int(rows[last].entrant);
+  for (int k = last;; --k) {
+    Row &here = rows[k];
+    const Row &front = rows[k > 0 ? k - 1 : 0];
+    const Mask further = k > 0 ? both(moving, less(distance, front.distance)) : without(moving, moving);
+    here.distance = select(further, front.distance, select(moving, distance, here.distance));
+    here.alpha = select(further, front.alpha, select(moving, alpha, here.alpha));
+    here.entrants = select_int(further, front.each_entrant(), select_int(moving, entrant, here.each_entrant()));
+    here.entrant = kMixed;
+    if (!any(further)) break;
+    moving = further;
+  }
+}
 
 }  // namespace PADGS_ISA
 }  // namespace padgs

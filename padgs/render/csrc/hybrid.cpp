@@ -1,11 +1,12 @@
 // Hybrid blending: each pixel keeps its K nearest fragments in order and blends the rest as one layer behind them. The
-// definition is padgs/render/hybrid.py. Nothing is sorted before; the tile lists may be in any order.
+// definition is padgs/render/hybrid.py. The tile lists may be in any order; front to back is fast.
 //
-// A column of patches, 8 x 16 pixels, is finished before the next, so that its fragments stay in the cache. The backward pass
-// collects the fragments again, turns every slot into what its derivative needs, and visits the list a second time.
+// Both passes first collect the fragments of each patch. Backward turns the core into layers, one for each instance that
+// entered it, in the order of the list, and then visits the list a second time.
 #include <cmath>
 #include <vector>
 
+#include "batch.h"
 #include "fragments.h"
 #include "kernels.h"
 #include "pixels.h"
@@ -15,66 +16,99 @@ namespace padgs {
 namespace PADGS_ISA {
 namespace {
 
-constexpr int kPatchesInColumn = kTile / kPatchHeight;
-
-// A column of patches of a tile, and their fragments.
-struct PatchColumn {
-  int index;
-  const Tile &tile;
-  const BlendArguments &args;
-  Fragments *fragments;  // [patch rows]
-
-  PatchColumn(const BlendArguments &args, const Tile &tile, int index) : index(index), tile(tile), args(args) {
-    static thread_local std::vector<Slot> slots;
-    static thread_local std::vector<Fragments> storage;
-    const int size = int(std::min<int64_t>(args.core_size, std::max<int64_t>(tile.end - tile.first, 1)));
-    if (slots.size() < size_t(kPatchesInColumn) * size) slots.resize(size_t(kPatchesInColumn) * size);
-    storage.clear();
-    for (int row = 0; row < tile.patch_rows; ++row) storage.push_back({slots.data() + row * size, size, 0, Tail()});
-    fragments = storage.data();
-  }
-  bool reached_by(const Instance &instance) const { return instance.column <= index && index < instance.column_end; }
-  int number(int row) const { return row * tile.patch_columns + index; }  // of a patch in the tile
-  Patch patch(int row) const { return Patch(tile, number(row), args.grid.width); }
-};
-
 // Where a Gaussian lies on the rays: for `ray` at its largest value there, |M^-1 mean| b / D; else at its mean.
-float ray_reach(const BlendArguments &args, const Footprint &f) {
-  return args.projection == kRay ? 1.0f / std::sqrt(f.shape[9]) : 0.0f;
+float ray_reach(const BlendArguments &args, const ProjectiveFootprint &g) {
+  return args.projection == kRay ? 1.0f / std::sqrt(g.f.shape[9]) : 0.0f;
 }
-Vec distance(const ProjectiveFootprint::At &at, const Footprint &f, float reach) {
-  return reach > 0 ? at.b_by_d * reach : splat(f.depth);
+float ray_reach(const BlendArguments &, const PlanarFootprint &) { return 0.0f; }
+Vec distance(const ProjectiveFootprint::At &at, const ProjectiveFootprint &g, float reach) {
+  return reach > 0 ? at.b_by_d * reach : splat(g.depth);
 }
-Vec distance(const PlanarFootprint::At &, const Footprint &f, float) { return splat(f.depth); }
+Vec distance(const PlanarFootprint::At &, const PlanarFootprint &g, float) { return splat(g.depth); }
 
 template <class Seen>
 using Places = std::vector<typename Seen::Place>;
 
-// Brings all fragments of a column together; returns how many pairs were evaluated.
-template <class Seen>
-int64_t collect(const PatchColumn &column, const Places<Seen> &places) {
-  const BlendArguments &args = column.args;
-  const Tile &tile = column.tile;
-  Vec inside[kPatchesInColumn];
-  for (int row = 0; row < tile.patch_rows; ++row) inside[row] = column.patch(row).inside();
-  int64_t evaluated = 0;
-  for (int64_t i = tile.first; i < tile.end; ++i) {
-    prefetch(args, i + kAhead, tile.end);
-    const Instance instance = args.instances[i];
-    if (!column.reached_by(instance)) continue;
-    const Footprint &f = args.footprints[instance.gaussian];
-    const Seen g(f, args, tile);
-    const float reach = ray_reach(args, f);
-    for (int row = instance.row; row < instance.row_end; ++row) {
-      const typename Seen::At at = g.at(places[column.number(row)]);
-      const Mask reached = both(at.reached, less(zero(), inside[row]));
-      if (!any(reached)) continue;
-      const Vec alpha = keep(reached, minimum(exp2_fast(at.log2_alpha), splat(kAlphaMax)));
-      column.fragments[row].add(args.footprints, instance.gaussian, distance(at, f, reach), alpha);
-    }
-    evaluated += kLanes * (instance.row_end - instance.row);
+Colors colors_of(const BlendArguments &args, const Tile &tile, const Fragments &fragments, const Row &row) {
+  const auto footprint = [&](int32_t entrant) -> const Footprint & {
+    return args.footprints[args.instances[tile.first + fragments.entrants[entrant]].gaussian];
+  };
+  if (row.entrant != kMixed) {
+    const Footprint &f = footprint(row.entrant);
+    return {splat(f.red), splat(f.green), splat(f.blue), splat(f.depth)};
   }
-  return evaluated;
+  int32_t entrants[kLanes];
+  store_int(entrants, row.entrants);
+  float lanes[4][kLanes];
+  for (int lane = 0; lane < kLanes; ++lane) {
+    const Footprint &f = footprint(entrants[lane]);
+    lanes[0][lane] = f.red, lanes[1][lane] = f.green, lanes[2][lane] = f.blue, lanes[3][lane] = f.depth;
+  }
+  return {load(lanes[0]), load(lanes[1]), load(lanes[2]), load(lanes[3])};
+}
+
+// Adds the instances of a batch to the fragments of patch `p`; `position` is that of the batch in the tile's list.
+template <class Seen>
+void collect_patch(const Batch<Seen> &batch, const float *reach, int p, int position, const typename Seen::Place &place,
+                   Mask inside, Vec core_size, Fragments &fragments) {
+  const uint8_t *list = batch.list(p);
+  const int entries = batch.count(p);
+  fragments.reserve(entries);
+  Row *const rows = fragments.rows;
+  int32_t *const entrants = fragments.entrants;
+  int row = fragments.row_count, entrant = fragments.entrant_count;
+  Tail tail = fragments.tail;
+  Vec reached = fragments.reached, entered = fragments.entered, last = fragments.last;
+  for (int k = 0; k < entries; ++k) {
+    const Seen &g = batch.seen()[list[k]];
+    const typename Seen::At at = g.at(place);
+    const Mask drawn = both(at.reached, inside);
+    const Vec alpha = keep(drawn, minimum(exp2_fast(at.log2_alpha), splat(kAlphaMax)));
+    const Vec away = distance(at, g, reach[list[k]]);
+    const Mask nearer = less(away, last);
+    const Mask entering = both(at_least(alpha, splat(kCoreAlphaMin)), either(nearer, less(entered, core_size)));
+    const Vec in_core = keep(entering, alpha);
+    tail.add(alpha - in_core, g);
+    reached += keep(drawn, splat(1.0f));
+    entered += keep(entering, splat(1.0f));
+    last = select(entering, maximum(last, away), last);
+    // Written in any case, which is cheaper than to ask; the next overwrites it.
+    rows[row].distance = last;
+    rows[row].alpha = in_core;
+    rows[row].entrant = entrant;
+    entrants[entrant] = position + list[k];
+    const Mask early = both(entering, nearer);
+    if (any(early)) move_forward(rows, row, early, away, alpha);
+    row += any(entering), entrant += any(entering);
+  }
+  fragments.tail = tail;
+  fragments.reached = reached, fragments.entered = entered, fragments.last = last;
+  fragments.row_count = row, fragments.entrant_count = entrant;
+}
+
+// The fragments of all patches of a tile; this thread's, until it asks for the next. Counts the evaluated pairs.
+template <class Seen>
+std::vector<Fragments> &collect(const BlendArguments &args, const Tile &tile, const Places<Seen> &places, int64_t &evaluated) {
+  static thread_local std::vector<Fragments> storage;
+  const int patches = tile.patches();
+  if (int(storage.size()) < patches) storage.resize(patches);
+  for (int p = 0; p < patches; ++p) storage[p].clear();
+  Batch<Seen> &batch = batch_of_thread<Seen>();
+  float reach[kBatch];
+  const Vec core_size = splat(float(args.core_size));
+  for (int64_t start = tile.first; start < tile.end; start += kBatch) {
+    batch.load(args, tile, start);
+    for (int i = 0; i < batch.size(); ++i) reach[i] = ray_reach(args, batch.seen()[i]);
+    for (int p = 0; p < patches; ++p) {
+      if (!batch.count(p)) continue;
+      Fragments &fragments = storage[p];
+      const Mask inside = less(zero(), Patch(tile, p, args.grid.width).inside());
+      collect_patch<Seen>(batch, reach, p, int(start - tile.first), places[p], inside, core_size, fragments);
+      fragments.close(args.core_size, [&](const Row &row) { return colors_of(args, tile, fragments, row); });
+      evaluated += kLanes * batch.count(p);
+    }
+  }
+  return storage;
 }
 
 // What a core fragment leaves of `left`; nothing once that is below the threshold.
@@ -89,15 +123,14 @@ Vec opacity_per_alpha(const Tail &tail) {
   return keep(some, (1.0f - tail.left) / select(some, tail.alpha, splat(1.0f)));
 }
 
-int64_t blend_patch(const PatchColumn &column, int row) {
-  const BlendArguments &args = column.args;
-  const Fragments &fragments = column.fragments[row];
+int64_t blend_patch(const BlendArguments &args, const Tile &tile, const Patch &patch, const Fragments &fragments) {
   const Tail &tail = fragments.tail;
   Vec left = splat(1.0f), red = zero(), green = zero(), blue = zero(), depth = zero(), coverage = zero();
   int64_t contributing = 0;
-  for (int k = 0; k < fragments.filled; ++k) {
-    const Vec weight = fragments.core[k].alpha * left;
-    const Colors c = gather(args.footprints, fragments.core[k].gaussian);
+  for (int k = 0; k < fragments.row_count; ++k) {
+    const Row &row = fragments.rows[k];
+    const Vec weight = row.alpha * left;
+    const Colors c = colors_of(args, tile, fragments, row);
     red += weight * c.red;
     green += weight * c.green;
     blue += weight * c.blue;
@@ -109,14 +142,14 @@ int64_t blend_patch(const PatchColumn &column, int row) {
   const Vec share = left * opacity_per_alpha(tail);
   const Vec transmittance = left * tail.left;
   coverage += share * tail.alpha;
-  contributing += int64_t(sum(keep(less(zero(), left), tail.count)));
+  contributing += int64_t(sum(keep(less(zero(), left), fragments.reached - fragments.entered)));
   float lanes[5][kLanes];
   store(lanes[0], red + share * tail.red + transmittance * args.background[0]);
   store(lanes[1], green + share * tail.green + transmittance * args.background[1]);
   store(lanes[2], blue + share * tail.blue + transmittance * args.background[2]);
   store(lanes[3], transmittance);
   store(lanes[4], select(less(zero(), coverage), (depth + share * tail.depth) / coverage, zero()));
-  column.patch(row).each_pixel([&](int lane, int64_t pixel) {
+  patch.each_pixel([&](int lane, int64_t pixel) {
     for (int channel = 0; channel < 3; ++channel) args.image[3 * pixel + channel] = lanes[channel][lane];
     args.transmittance[pixel] = lanes[3][lane];
     args.depth[pixel] = lanes[4][lane];
@@ -126,13 +159,10 @@ int64_t blend_patch(const PatchColumn &column, int row) {
 
 template <class Seen>
 void forward_tile(const BlendArguments &args, const Tile &tile, int64_t index) {
-  const Places<Seen> &places = places_of<Seen>(args, tile);
   int64_t evaluated = 0, contributing = 0;
-  for (int i = 0; i < tile.patch_columns; ++i) {
-    const PatchColumn column(args, tile, i);
-    evaluated += collect<Seen>(column, places);
-    for (int row = 0; row < tile.patch_rows; ++row) contributing += blend_patch(column, row);
-  }
+  const std::vector<Fragments> &fragments = collect<Seen>(args, tile, places_of<Seen>(args, tile), evaluated);
+  for (int p = 0; p < tile.patches(); ++p)
+    contributing += blend_patch(args, tile, Patch(tile, p, args.grid.width), fragments[p]);
   args.pair_counts[2 * index] = evaluated;
   args.pair_counts[2 * index + 1] = contributing;
 }
@@ -145,19 +175,25 @@ void forward_tile(const BlendArguments &args, const Tile &tile, int64_t index) {
 struct Upstream {
   Vec red, green, blue, depth, offset;
   Vec unit, mean, behind;  // of the tail
-  Vec furthest;            // distance at which the core ends
   Vec inside;              // 1 inside the image, -1 outside
 
   Vec signal(Vec r, Vec g, Vec b, Vec d) const { return red * r + green * g + blue * b + depth * d + offset; }
 };
 
-// Loads a patch and replaces distance and alpha of its slots by u and behind.
-Upstream differentiate_patch(const BlendGradientArguments &args, const PatchColumn &column, int row) {
+// What the derivatives of an instance's core fragments need, in one patch.
+struct Layer {
+  Vec front, behind;  // u and `behind` as above; front < 0 where it is not in the core
+  int32_t position;   // of the instance in the tile's list
+};
+constexpr float kNotInCore = -1.0f;
+
+// Loads a patch, and appends its layers.
+Upstream differentiate_patch(const BlendGradientArguments &args, const Tile &tile, const Patch &patch, Fragments &fragments,
+                             Layer *layers) {
   const BlendArguments &forward = args.forward;
-  Fragments &fragments = column.fragments[row];
   const Tail &tail = fragments.tail;
   float grad[3][kLanes] = {}, through[kLanes] = {}, depth[kLanes] = {}, grad_depth[kLanes] = {};
-  column.patch(row).each_pixel([&](int lane, int64_t pixel) {
+  patch.each_pixel([&](int lane, int64_t pixel) {
     if (args.grad_transmittance) through[lane] = args.grad_transmittance[pixel];
     for (int channel = 0; channel < 3; ++channel) {
       grad[channel][lane] = args.grad_image[3 * pixel + channel];
@@ -166,12 +202,12 @@ Upstream differentiate_patch(const BlendGradientArguments &args, const PatchColu
     if (args.grad_depth) depth[lane] = forward.depth[pixel], grad_depth[lane] = args.grad_depth[pixel];
   });
   Upstream up;
-  up.inside = column.patch(row).inside();
-  up.furthest = fragments.filled == fragments.size ? fragments.core[fragments.size - 1].distance : splat(kEmpty);
+  up.inside = patch.inside();
   Vec left = splat(1.0f), coverage = zero();
-  for (int k = 0; k < fragments.filled; ++k) {
-    const Vec weight = fragments.core[k].alpha * left;
-    fragments.core[k].distance = left;
+  for (int k = 0; k < fragments.row_count; ++k) {
+    Row &row = fragments.rows[k];
+    const Vec weight = row.alpha * left;
+    row.distance = left;
     coverage += weight;
     left = left_behind(left, weight);
   }
@@ -185,88 +221,100 @@ Upstream differentiate_patch(const BlendGradientArguments &args, const PatchColu
   const Vec each = 1.0f / select(some, tail.alpha, splat(1.0f));
   up.mean = keep(some, up.signal(tail.red * each, tail.green * each, tail.blue * each, tail.depth * each));
   up.behind = left * tail.left * (load(through) - up.mean);
+  for (int e = 0; e < fragments.entrant_count; ++e) layers[e] = {splat(kNotInCore), zero(), fragments.entrants[e]};
   Vec behind = up.unit * tail.alpha * up.mean + left * tail.left * load(through);
-  for (int k = fragments.filled - 1; k >= 0; --k) {
-    Slot &slot = fragments.core[k];
-    const Colors c = gather(forward.footprints, slot.gaussian);
-    const Vec here = slot.alpha * slot.distance * up.signal(c.red, c.green, c.blue, c.depth);
-    slot.alpha = behind;
-    behind += here;
+  for (int k = fragments.row_count - 1; k >= 0; --k) {
+    const Row &row = fragments.rows[k];
+    const Vec u = row.distance;
+    const Mask filled = less(zero(), row.alpha);
+    if (row.entrant != kMixed) {
+      layers[row.entrant].front = select(filled, u, splat(kNotInCore));
+      layers[row.entrant].behind = behind;
+    } else {
+      float front_lanes[kLanes], behind_lanes[kLanes], alpha_lanes[kLanes];
+      int32_t entrants[kLanes];
+      store(front_lanes, u), store(behind_lanes, behind), store(alpha_lanes, row.alpha), store_int(entrants, row.entrants);
+      for (int lane = 0; lane < kLanes; ++lane) {
+        if (alpha_lanes[lane] <= 0) continue;
+        reinterpret_cast<float *>(&layers[entrants[lane]].front)[lane] = front_lanes[lane];
+        reinterpret_cast<float *>(&layers[entrants[lane]].behind)[lane] = behind_lanes[lane];
+      }
+    }
+    const Colors c = colors_of(forward, tile, fragments, row);
+    behind += row.alpha * u * up.signal(c.red, c.green, c.blue, c.depth);
   }
   return up;
 }
 
-// The moments of every instance over the patches of one column, added to those of the columns before.
 template <class Seen>
-void add_moments(const BlendGradientArguments &args, const PatchColumn &column, const Upstream *upstream,
-                 const Places<Seen> &places, Places<Seen> &ray_gradients) {
+void backward_tile(const BlendGradientArguments &args, const Tile &tile) {
   const BlendArguments &forward = args.forward;
-  const Tile &tile = column.tile;
+  const Places<Seen> &places = places_of<Seen>(forward, tile);
+  Places<Seen> ray_gradients;
+  if constexpr (Seen::kOfRays)
+    if (args.grad_rays) ray_gradients.resize(tile.patches());
+  int64_t evaluated = 0;
+  std::vector<Fragments> &fragments = collect<Seen>(forward, tile, places, evaluated);
+
+  static thread_local std::vector<Upstream> upstream;
+  static thread_local std::vector<Layer> layers;
+  static thread_local std::vector<const Layer *> next;  // [patches] the next instance of each patch that is in its core
+  const int patches = tile.patches();
+  size_t layer_count = 0;
+  for (int p = 0; p < patches; ++p) layer_count += fragments[p].entrant_count + 1;
+  if (layers.size() < layer_count) layers.resize(layer_count);
+  upstream.clear(), next.clear();
+  Layer *layer = layers.data();
+  for (int p = 0; p < patches; ++p) {
+    next.push_back(layer);
+    upstream.push_back(differentiate_patch(args, tile, Patch(tile, p, forward.grid.width), fragments[p], layer));
+    layer += fragments[p].entrant_count;
+    (layer++)->position = -1;
+  }
+
   for (int64_t i = tile.first; i < tile.end; ++i) {
-    prefetch(forward, i + kAhead, tile.end);
+    prefetch(args, i + kAhead, tile.first, tile.end);
     const Instance instance = forward.instances[i];
-    if (!column.reached_by(instance)) continue;
-    const Footprint &f = forward.footprints[instance.gaussian];
-    const Seen g(f, forward, tile);
-    const VecI gaussian = splat_int(instance.gaussian);
-    const float reach = ray_reach(forward, f);
-    const Vec f_red = splat(f.red), f_green = splat(f.green), f_blue = splat(f.blue), f_depth = splat(f.depth);
+    const Seen g(forward.footprints[instance.gaussian], forward, tile);
+    const Vec f_red = splat(g.red), f_green = splat(g.green), f_blue = splat(g.blue), f_depth = splat(g.depth);
     typename Seen::Moments moments;
     Vec red = zero(), green = zero(), blue = zero(), depth = zero();
-    for (int row = instance.row; row < instance.row_end; ++row) {
-      const typename Seen::At at = g.at(places[column.number(row)]);
-      const Upstream &up = upstream[row];
-      const Mask reached = both(at.reached, less(zero(), up.inside));
-      if (!any(reached)) continue;
-      const Vec full = exp2_fast(at.log2_alpha);
-      const Vec alpha = keep(reached, minimum(full, splat(kAlphaMax)));
-      const Fragments &fragments = column.fragments[row];
-      Vec unit = up.unit, mean = up.mean, behind = up.behind;
-      // The margins are for rounding, which may differ from that of `collect`; what is not found is in the tail.
-      const Mask near = at_least(up.furthest * 1.001f, distance(at, f, reach));
-      Mask sought = both(near, at_least(alpha, splat(kCoreAlphaMin * 0.999f)));
-      for (int k = 0; k < fragments.filled && any(sought); ++k) {
-        const Mask found = both(sought, equal(fragments.core[k].gaussian, gaussian));
-        unit = select(found, fragments.core[k].distance, unit);
-        mean = select(found, zero(), mean);
-        behind = select(found, fragments.core[k].alpha, behind);
-        sought = without(sought, found);
+    for (int row = instance.row; row < instance.row_end; ++row)
+      for (int column = instance.column; column < instance.column_end; ++column) {
+        const int p = row * tile.patch_columns + column;
+        const Upstream &up = upstream[p];
+        const Layer &core = *next[p];
+        const bool in_core = core.position == int32_t(i - tile.first);
+        next[p] += in_core;
+        const typename Seen::At at = g.at(places[p]);
+        const Mask reached = both(at.reached, less(zero(), up.inside));
+        if (!any(reached)) continue;
+        const Vec full = exp2_fast(at.log2_alpha);
+        const Vec alpha = keep(reached, minimum(full, splat(kAlphaMax)));
+        Vec unit = up.unit, mean = up.mean, behind = up.behind;
+        if (in_core) {
+          const Mask found = at_least(core.front, zero());
+          unit = select(found, core.front, unit);
+          mean = select(found, zero(), mean);
+          behind = select(found, core.behind, behind);
+        }
+        const Vec weight = alpha * unit;
+        const Vec signal = up.signal(f_red, f_green, f_blue, f_depth) - mean;
+        const Vec m = keep(less(full, splat(kAlphaMax)), weight * signal - behind * (alpha * reciprocal(1.0f - alpha)));
+        red += weight * up.red;
+        green += weight * up.green;
+        blue += weight * up.blue;
+        depth += weight * up.depth;
+        moments.add(at, m);
+        if constexpr (Seen::kOfRays)
+          if (args.grad_rays) g.add_ray_gradient(at, m, ray_gradients[p]);
       }
-      const Vec weight = alpha * unit;
-      const Vec signal = up.signal(f_red, f_green, f_blue, f_depth) - mean;
-      const Vec m = keep(less(full, splat(kAlphaMax)), weight * signal - behind * (alpha * reciprocal(1.0f - alpha)));
-      red += weight * up.red;
-      green += weight * up.green;
-      blue += weight * up.blue;
-      depth += weight * up.depth;
-      moments.add(at, m);
-      if constexpr (Seen::kOfRays)
-        if (args.grad_rays) g.add_ray_gradient(at, m, ray_gradients[column.number(row)]);
-    }
     Vec sums[kMoments];
     moments.finish(sums);
     sums[10] = red, sums[11] = green, sums[12] = blue, sums[13] = depth;
     sums[14] = sums[15] = zero();
-    float totals[kMoments];
-    for (int k = 0; k < kMoments; k += 4) sum4(sums + k, totals + k);
     float *out = args.moments + int64_t(instance.slot) * kMoments;
-    const bool first = column.index == instance.column;
-    for (int k = 0; k < kMoments; ++k) out[k] = first ? totals[k] : out[k] + totals[k];
-  }
-}
-
-template <class Seen>
-void backward_tile(const BlendGradientArguments &args, const Tile &tile) {
-  const Places<Seen> &places = places_of<Seen>(args.forward, tile);
-  Places<Seen> ray_gradients;
-  if constexpr (Seen::kOfRays)
-    if (args.grad_rays) ray_gradients.resize(tile.patches());
-  Upstream upstream[kPatchesInColumn];
-  for (int i = 0; i < tile.patch_columns; ++i) {
-    const PatchColumn column(args.forward, tile, i);
-    collect<Seen>(column, places);
-    for (int row = 0; row < tile.patch_rows; ++row) upstream[row] = differentiate_patch(args, column, row);
-    add_moments<Seen>(args, column, upstream, places, ray_gradients);
+    for (int k = 0; k < kMoments; k += 4) sum4(sums + k, out + k);
   }
   if constexpr (Seen::kOfRays)
     if (args.grad_rays) add_ray_gradients(args, tile, ray_gradients);

@@ -70,6 +70,7 @@ PADGS_INLINE Mask at_least(Vec a, Vec b) { return _mm512_cmp_ps_mask(raw(a), raw
 PADGS_INLINE Mask at_most(VecI a, VecI b) { return _mm512_cmple_epi32_mask((__m512i)a.p[0], (__m512i)b.p[0]); }
 PADGS_INLINE Mask equal(VecI a, VecI b) { return _mm512_cmpeq_epi32_mask((__m512i)a.p[0], (__m512i)b.p[0]); }
 PADGS_INLINE Mask both(Mask a, Mask b) { return a & b; }
+PADGS_INLINE Mask either(Mask a, Mask b) { return a | b; }
 PADGS_INLINE Mask without(Mask a, Mask b) { return a & ~b; }
 PADGS_INLINE bool any(Mask m) { return m != 0; }
 PADGS_INLINE int count(Mask m) { return __builtin_popcount(m); }
@@ -99,6 +100,7 @@ PADGS_INLINE Mask at_least(Vec a, Vec b) { Mask r; PADGS_EACH_PART r.p[i] = a.p[
 PADGS_INLINE Mask at_most(VecI a, VecI b) { Mask r; PADGS_EACH_PART r.p[i] = a.p[i] <= b.p[i]; return r; }
 PADGS_INLINE Mask equal(VecI a, VecI b) { Mask r; PADGS_EACH_PART r.p[i] = a.p[i] == b.p[i]; return r; }
 PADGS_INLINE Mask both(Mask a, Mask b) { Mask r; PADGS_EACH_PART r.p[i] = a.p[i] & b.p[i]; return r; }
+PADGS_INLINE Mask either(Mask a, Mask b) { Mask r; PADGS_EACH_PART r.p[i] = a.p[i] | b.p[i]; return r; }
 PADGS_INLINE Mask without(Mask a, Mask b) { Mask r; PADGS_EACH_PART r.p[i] = a.p[i] & ~b.p[i]; return r; }
 PADGS_INLINE uint32_t bits(Mask m) {
   uint32_t result = 0;
