@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -29,8 +29,8 @@ def equal_time(
 ) -> None:
     """Print the commands that train every method of a folder for the same time; `| sh` runs them.
 
-    The number of iterations comes from the finished run of the same settings whose time was nearest. As models grow,
-    time is not proportional to iterations: repeat it until nothing is printed.
+    The number of iterations comes from finished runs of the same settings, whatever their lengths. As models grow, time
+    is not proportional to iterations: repeat it until nothing is printed.
     """
     folder = Path(runs)
     if not folder.is_dir():
@@ -56,41 +56,56 @@ def equal_time(
     from padgs.cli.composition import command, composing, settings_of
 
     with composing():
-        for result in nearest(usable, seconds):
-            if EXPERIMENT in result.experiments and is_near(result, seconds):
+        for alike in lengths(usable):
+            nearest = min(alike, key=lambda result: _distance(result, seconds))
+            if EXPERIMENT in nearest.experiments and is_near(nearest, seconds):
                 continue
-            choices = (f"+experiment={EXPERIMENT}", f"method={result.preset}")
+            choices = (f"+experiment={EXPERIMENT}", f"method={nearest.preset}")
             try:
-                given = settings_of(_values(result, folder, seconds), *choices)
+                given = settings_of(_values(nearest, folder, iterations(alike, seconds)), *choices)
             except (ConfigError, HydraException) as error:
-                print(f"left out: {result.run}: {error}", file=sys.stderr)
+                print(f"left out: {nearest.run}: {error}", file=sys.stderr)
                 continue
             print(command([*given, *(settings or [])]))
 
 
-def nearest(runs: Iterable[Result], seconds: float) -> list[Result]:
-    """Of all runs that differ in their length only, the one whose training time is nearest to `seconds`, as a ratio."""
+def lengths(runs: Iterable[Result]) -> list[list[Result]]:
+    """The runs in groups that differ in their length only."""
     groups: dict[str, list[Result]] = {}
     for result in runs:
         config = {key: value for key, value in of_any_length(result).config.items() if key not in ("run", "protocol")}
         groups.setdefault(json.dumps([result.preset, result.fingerprint, config], sort_keys=True), []).append(result)
-    return [min(group, key=lambda r: abs(math.log(_seconds(r) / seconds))) for group in groups.values()]
+    return list(groups.values())
 
 
-def iterations(result: Result, seconds: float) -> int:
-    """Iterations that take `seconds` if each takes as long as in this run; those of the run itself if that is near."""
-    if is_near(result, seconds):
-        return result.iterations
-    return max(1, round(result.iterations * seconds / _seconds(result)))
+def iterations(runs: Sequence[Result], seconds: float) -> int:
+    """Iterations that take about `seconds`, by runs that differ in their length only.
+
+    Those of a run that took about as long; else between the next shorter and the next longer run, where time is taken
+    to grow as a power of the iterations; beyond all runs, in proportion to the nearest.
+    """
+    nearest = min(runs, key=lambda result: _distance(result, seconds))
+    if is_near(nearest, seconds):
+        return nearest.iterations
+    shorter = max((r for r in runs if _seconds(r) < seconds), key=_seconds, default=None)
+    longer = min((r for r in runs if _seconds(r) > seconds), key=_seconds, default=None)
+    if shorter is None or longer is None or shorter.iterations >= longer.iterations:
+        return max(1, round(nearest.iterations * seconds / _seconds(nearest)))
+    share = math.log(seconds / _seconds(shorter)) / math.log(_seconds(longer) / _seconds(shorter))
+    return max(1, round(shorter.iterations * (longer.iterations / shorter.iterations) ** share))
 
 
-def _values(result: Result, folder: Path, seconds: float) -> dict[str, Any]:
+def _distance(result: Result, seconds: float) -> float:
+    return abs(math.log(_seconds(result) / seconds))
+
+
+def _values(result: Result, folder: Path, length: int) -> dict[str, Any]:
     """The configuration of the run that is asked for."""
     config = result.config
     return {
         **config,
         "data": {key: value for key, value in config["data"].items() if key != "device"},  # follows run.device
-        "train": {**config["train"], "iterations": iterations(result, seconds)},
+        "train": {**config["train"], "iterations": length},
         "run": {**config["run"], "folder": str(folder)},
     }
 

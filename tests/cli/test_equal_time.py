@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from padgs import results
 from padgs.cli.app import app
 from padgs.cli.composition import composing, settings_of
-from padgs.cli.equal_time import iterations, nearest
+from padgs.cli.equal_time import iterations, lengths
 from padgs.results import Result
 
 LINES = (
@@ -98,16 +98,17 @@ def test_nothing_is_printed_once_all_are_there(tmp_path: Path):
     first = run(200.0, "method=spags", "train.iterations=500")
     second = run(52.0, "method=spags", "train.iterations=125", experiments=("equal_time",))
     assert printed(write([first, second], tmp_path), "50") == []
-    assert composed(*printed(tmp_path, "100")[0][1:]).train.iterations == 240
+    assert composed(*printed(tmp_path, "100")[0][1:]).train.iterations == 245
 
 
-def test_lengths_come_from_the_nearest_run_of_the_same_settings():
-    runs = [run(s, "method=omnigs", f"train.iterations={n}") for s, n in ((10, 100), (60, 400), (300, 900))]
+def test_lengths_come_from_the_nearest_runs_of_the_same_settings():
+    runs = [run(s, "method=omnigs", f"train.iterations={n}") for s, n in ((10, 100), (60, 400), (375, 900))]
     other = run(50.0, "method=omnigs", "train.iterations=7", "method.sh_degree=0")
-    assert {r.run for r in nearest([*runs, other], 100)} == {"omnigs_400", "omnigs_7"}
-    assert iterations(runs[1], 100) == round(400 * 100 / 60)
-    assert iterations(runs[1], 62) == 400, "the run itself, which then only gets another name"
-    assert iterations(runs[1], 0.01) == 1
+    assert lengths([*runs, other]) == [runs, [other]]
+    assert iterations(runs, 62) == 400, "the run itself, which then only gets another name"
+    assert iterations(runs, 150) == 600, "the geometric mean of 60 s and 375 s takes that of 400 and 900 iterations"
+    assert iterations(runs[:2], 150) == 1000 and iterations(runs[1:], 20) == 133, "beyond them in proportion"
+    assert iterations(runs, 0.01) == 1
 
 
 @pytest.mark.parametrize(
