@@ -1,7 +1,8 @@
 """The decoder: three small networks that turn an anchor as seen from a camera into K Gaussians (paper Eq. 13-14).
 
-`decode_gaussians` is a pure function of tensors. Where the native library can do it in one pass (float32 on the CPU)
-that is called; `define_gaussians` is the definition that it has to match.
+`decode_gaussians` is a pure function of tensors. Where a native library can do it (float32 on the CPU, any precision on
+a GPU) that is called; `define_gaussians` is the definition that it has to match. Precision is a matter of the networks'
+products alone: what becomes of their outputs is computed in the tensors' own type.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from torch import Tensor, nn
 
 from padgs.fused_decoder import fits, fused_decode
 from padgs.gaussians import Gaussians
+from padgs.precision import linear, reduced
 
 OPACITY_VALUES, COLOR_VALUES, COVARIANCE_VALUES = 1, 3, 7  # outputs of each head per Gaussian
 SORT_OUT_BELOW = 0.9  # share of anchors with a positive opacity
@@ -27,10 +29,10 @@ class Head(NamedTuple):
     w2: Tensor  # [O, H]
     b2: Tensor  # [O]
 
-    def __call__(self, inputs: Tensor) -> Tensor:
-        """Outputs [A, O] for inputs [A, I]."""
-        hidden = torch.relu(torch.addmm(self.b1, inputs, self.w1.T))
-        return torch.addmm(self.b2, hidden, self.w2.T)
+    def __call__(self, inputs: Tensor, dtype: torch.dtype | None = None) -> Tensor:
+        """Outputs [A, O] for inputs [A, I]; products in a reduced type, see `padgs.precision`."""
+        hidden = torch.relu(linear(inputs, self.w1, self.b1, dtype))
+        return linear(hidden, self.w2, self.b2, dtype)
 
 
 class DecoderWeights(NamedTuple):
@@ -52,7 +54,7 @@ class Attributes(NamedTuple):
     quats: Tensor  # [N, 4] wxyz, not normalised
 
 
-def decode(weights: DecoderWeights, inputs: Tensor) -> Attributes:
+def decode(weights: DecoderWeights, inputs: Tensor, dtype: torch.dtype | None = None) -> Attributes:
     """Decode anchors (Eq. 13): opacity by tanh, colour and shrinkage by sigmoid.
 
     Opacity comes first; the other two networks, nine tenths of the work, see only anchors with a positive one. The
@@ -62,8 +64,9 @@ def decode(weights: DecoderWeights, inputs: Tensor) -> Attributes:
     Args:
         weights: the three networks.
         inputs: [A, I], one row per anchor.
+        dtype: what the networks' products are taken in, see `padgs.precision`.
     """
-    raw_opacities = torch.tanh(weights.opacity(inputs))  # [A, K]
+    raw_opacities = torch.tanh(weights.opacity(inputs, dtype))  # [A, K]
     count, offsets = raw_opacities.shape
     selected = raw_opacities.detach() > 0
     alive = selected.any(-1).nonzero()[:, 0]  # [B]
@@ -73,8 +76,8 @@ def decode(weights: DecoderWeights, inputs: Tensor) -> Attributes:
         decoded_slots = selected[alive].view(-1).nonzero()[:, 0]  # [N] rows among the B K decoded Gaussians
     else:
         decoded_slots = slots
-    colors = weights.color(inputs).view(-1, COLOR_VALUES)
-    covariances = weights.covariance(inputs).view(-1, COVARIANCE_VALUES)
+    colors = weights.color(inputs, dtype).view(-1, COLOR_VALUES)
+    covariances = weights.covariance(inputs, dtype).view(-1, COVARIANCE_VALUES)
     shrinkage, quats = take_rows(covariances, decoded_slots).split((3, 4), dim=-1)
     return Attributes(
         raw_opacities,
@@ -94,6 +97,7 @@ def decode_gaussians(
     offsets: Tensor,
     log_scales: Tensor,
     attenuation: Tensor,
+    precision: str = "float32",
 ) -> tuple[Gaussians, Tensor, Tensor]:
     """The selected Gaussians of all anchors (Eq. 13-15); differentiable by weights, features, offsets and log-scales.
 
@@ -105,15 +109,21 @@ def decode_gaussians(
         offsets: [A, K, 3] in units of the anchor's scale.
         log_scales: [A, 6]; the first three scale the offsets, the last three the Gaussians.
         attenuation: [A], what Eq. 15 multiplies opacities by.
+        precision: of the networks' products, a name of `padgs.precision.PRECISIONS`. Others than float32 are made for
+            GPUs; on the CPU they are slower.
 
     Returns:
         N Gaussians in the order of their slots; slots [N] int64, anchor K + k; raw opacities [A, K] without gradient.
+
+    Raises:
+        ValueError: an unknown precision.
     """
-    if fits(features):
+    dtype, tensors = reduced(precision), (features, seen, positions, offsets, log_scales, attenuation)
+    if fits(features, dtype):
         flat = tuple(tensor for head in weights for tensor in head)
-        *values, slots, raw = fused_decode(flat, features, seen, positions, offsets, log_scales, attenuation)
+        *values, slots, raw = fused_decode(flat, *tensors, dtype)
         return Gaussians(*values), slots, raw
-    return define_gaussians(weights, features, seen, positions, offsets, log_scales, attenuation)
+    return define_gaussians(weights, *tensors, precision)
 
 
 def define_gaussians(
@@ -124,9 +134,10 @@ def define_gaussians(
     offsets: Tensor,
     log_scales: Tensor,
     attenuation: Tensor,
+    precision: str = "float32",
 ) -> tuple[Gaussians, Tensor, Tensor]:
-    """`decode_gaussians` in torch, for any dtype and device."""
-    said = decode(weights, torch.cat((features, seen), dim=-1))
+    """`decode_gaussians` in torch, for any dtype, precision and device."""
+    said = decode(weights, torch.cat((features, seen), dim=-1), reduced(precision))
     anchors = said.slots // offsets.shape[1]
     reach, size = take_rows(torch.exp(log_scales), anchors).split((3, 3), dim=-1)
     gaussians = Gaussians(

@@ -16,9 +16,10 @@ from padgs.render.native import pointer
 OUTPUTS = {"means": 3, "quats": 4, "scales": 3, "opacities": 0, "colors": 3}  # values per Gaussian, 0 = a scalar
 
 
-def fits(inputs: Tensor) -> bool:
-    """Whether a native decoder takes these inputs: float32, and the library of their device is there."""
-    library = {"cpu": native, "cuda": cuda_native}.get(inputs.device.type)
+def fits(inputs: Tensor, dtype: torch.dtype | None = None) -> bool:
+    """Whether a native decoder takes these inputs, with products in a reduced type: float32 tensors, and the library of
+    their device is there; the CPU's has no reduced types."""
+    library = {"cpu": None if dtype else native, "cuda": cuda_native}.get(inputs.device.type)
     return library is not None and inputs.dtype == torch.float32 and library.available()
 
 
@@ -30,14 +31,16 @@ def fused_decode(
     offsets: Tensor,
     log_scales: Tensor,
     attenuation: Tensor,
+    dtype: torch.dtype | None = None,
 ) -> tuple[Tensor, ...]:
     """Means, quaternions, scales, opacities, colours, slots and raw opacities of the selected Gaussians.
 
     Arguments and results are those of `padgs.decoder.decode_gaussians`, with the twelve tensors of the weights in a
-    row. Differentiable by weights, features, offsets and log-scales; the rest are constants.
+    row, and the reduced type of their products. Differentiable by weights, features, offsets and log-scales; the rest
+    are constants.
     """
     if features.device.type == "cuda":
-        return decode_on_gpu(weights, features, seen, positions, offsets, log_scales, attenuation)
+        return decode_on_gpu(weights, features, seen, positions, offsets, log_scales, attenuation, dtype=dtype)
     return _FusedDecode.apply(features, seen, positions, offsets, log_scales, attenuation, *weights)
 
 

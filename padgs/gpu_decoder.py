@@ -1,7 +1,8 @@
 """Decoding anchors into Gaussians on a GPU: matrix products by torch, all around them by csrc/cuda/decode.cu.
 
 `padgs.decoder` is the definition. The hidden layers of the three networks are one product; their values are kept for
-the way back, 4 bytes for each of the 96 units of an anchor. TF32 in the products is torch's own switch.
+the way back, 4 bytes for each of the 96 units of an anchor (2 in a reduced precision). TF32 in the products is torch's
+own switch.
 """
 
 from __future__ import annotations
@@ -12,28 +13,33 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from padgs.precision import OF_GRADIENTS
 from padgs.render import cuda_native, native
 from padgs.render.native import pointer
 
 SIZES = (3, 4, 3, 0, 3)  # values per Gaussian of means, quats, scales, opacities, colors; 0 = a scalar
 
 
-def decode_on_gpu(weights: tuple[Tensor, ...], *tensors: Tensor) -> tuple[Tensor, ...]:
+def decode_on_gpu(
+    weights: tuple[Tensor, ...], *tensors: Tensor, dtype: torch.dtype | None = None
+) -> tuple[Tensor, ...]:
     """`padgs.fused_decoder.fused_decode` where the GPU's library keeps its tensors; waits once, for a count."""
-    return _DecodeOnGPU.apply(*tensors, *weights)
+    return _DecodeOnGPU.apply(dtype, *tensors, *weights)
 
 
 class _DecodeOnGPU(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, features, seen, positions, offsets, log_scales, attenuation, *weights):
-        inputs = torch.cat((features.detach(), seen), dim=-1)
+    def forward(ctx: Any, dtype, features, seen, positions, offsets, log_scales, attenuation, *weights):
+        dtype = dtype or features.dtype
+        inputs = torch.cat((features.detach(), seen), dim=-1).to(dtype)
         constants = [t.detach().contiguous() for t in (positions, offsets, log_scales, attenuation)]
         weights = [w.detach() for w in weights]
-        w1, b1 = torch.cat(weights[0::4]), torch.cat(weights[1::4])
+        w1, b1 = torch.cat(weights[0::4]).to(dtype), torch.cat(weights[1::4]).to(dtype)
         hidden = torch.addmm(b1, inputs, w1.T).relu_()
         parts = hidden.split(len(weights[0]), dim=1)
         opacity, color, covariance = (
-            torch.addmm(b2, part, w2.T) for part, w2, b2 in zip(parts, weights[2::4], weights[3::4], strict=True)
+            torch.addmm(b2.to(dtype), part, w2.to(dtype).T).float()
+            for part, w2, b2 in zip(parts, weights[2::4], weights[3::4], strict=True)
         )
         raw = opacity.tanh_()
         starts = torch.zeros(len(raw) + 1, dtype=torch.int64, device=raw.device)
@@ -72,13 +78,17 @@ class _DecodeOnGPU(torch.autograd.Function):
         arguments = cuda_native.DeviceDecodeGradientArguments(gradient, *map(pointer, grad_logits))
         cuda_native.call("padgs_cuda_decode_take_back", cuda_native.queue(raw.device), arguments)
 
-        units = len(weights[0])
-        grad_hidden = torch.cat([grad @ w2 for grad, w2 in zip(grad_logits, weights[2::4], strict=True)], dim=1)
+        dtype = raw.dtype if inputs.dtype == raw.dtype else OF_GRADIENTS  # of the products
+        inputs, w1, units = inputs.to(dtype), w1.to(dtype), len(weights[0])
+        parts, logits = hidden.to(dtype).split(units, 1), [grad.to(dtype) for grad in grad_logits]
+        grad_hidden = torch.cat([grad @ w2.to(dtype) for grad, w2 in zip(logits, weights[2::4], strict=True)], dim=1)
         grad_hidden *= hidden > 0
-        first = zip((grad_hidden.T @ inputs).split(units), grad_hidden.sum(0).split(units), strict=True)
-        second = [(grad.T @ part, grad.sum(0)) for grad, part in zip(grad_logits, hidden.split(units, 1), strict=True)]
-        of_weights = [tensor for a, b in zip(first, second, strict=True) for tensor in (*a, *b)]
-        return grad_hidden @ w1[:, : ctx.features], None, None, grad_offsets, grad_log_scales, None, *of_weights
+        of_w1, of_b1 = (grad_hidden.T @ inputs).split(units), grad_hidden.sum(0, dtype=raw.dtype).split(units)
+        of_w2 = [grad.T @ part for grad, part in zip(logits, parts, strict=True)]
+        of_b2 = [grad.sum(0) for grad in grad_logits]
+        of_weights = [grad.to(raw.dtype) for head in zip(of_w1, of_b1, of_w2, of_b2, strict=True) for grad in head]
+        grad_features = (grad_hidden @ w1[:, : ctx.features]).to(raw.dtype)
+        return None, grad_features, None, None, grad_offsets, grad_log_scales, None, *of_weights
 
 
 def _arguments(constants, raw, starts, slots, outputs) -> native.DecodeArguments:

@@ -13,6 +13,7 @@ from padgs.anchors import anchors_from_points, automatic_voxel_size, initial_log
 from padgs.decoder import Decoder, decode_gaussians
 from padgs.gaussians import Gaussians
 from padgs.modulation import OMEGA_AXES, direction_distortion, modulate, polar_axis
+from padgs.precision import PRECISIONS
 from padgs.scene import Scene, View
 
 OMEGA_INPUTS = ("sin2", "cos")
@@ -28,6 +29,7 @@ class PaDGSOptions:
     features: int = 32  # C, learned values per anchor
     offsets: int = 10  # K, Gaussians per anchor
     hidden: int = 32  # width of the hidden layer of each network
+    precision: str = "float32"  # of the networks' products: float32, or bfloat16 or float16, which are for GPUs
     tau: float = 0.9  # Eq. 15; 0 turns opacity modulation off
     use_distance: bool = True  # distance camera - anchor as network input
     use_distortion: bool = True  # distortion degree as network input (DAGD)
@@ -43,6 +45,7 @@ class PaDGSOptions:
             ("omega_axis", OMEGA_AXES),
             ("omega_input", OMEGA_INPUTS),
             ("distance_unit", DISTANCE_UNITS),
+            ("precision", PRECISIONS),
         ):
             if getattr(self, name) not in known:
                 raise ValueError(f"unknown {name} {getattr(self, name)!r}; known: {', '.join(known)}")
@@ -197,5 +200,6 @@ class PaDGS(nn.Module):
             self.offsets,
             self.log_scales,
             attenuation,
+            options.precision,
         )
         return Decoded(*decoded)

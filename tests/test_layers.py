@@ -19,6 +19,7 @@ LAYERS = {
     "models": (
         "padgs.method",
         "padgs.anchors",
+        "padgs.precision",
         "padgs.gpu_decoder",
         "padgs.fused_decoder",
         "padgs.decoder",

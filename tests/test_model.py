@@ -101,6 +101,7 @@ def test_golden_image_and_gradients(golden, backend, dtype):
     gradients |= {f"{head}_{name}": w.grad for head in HEADS for name, w in getattr(model.decoder, head).items()}
     for name, gradient in gradients.items():
         expected, valid = golden[f"grad_{name}"], golden[f"valid_{name}"]
+        assert gradient is not None
         error = (gradient.flatten()[golden[f"grad_index_{name}"].long()] - expected).abs()[valid]
         assert valid.any() and error.max() <= 1e-3 * expected.abs().max(), name
 
@@ -186,10 +187,9 @@ def test_finite_on_the_poles_and_on_the_camera(overrides, position):
     model = one_anchor([float(x) for x in position], PaDGSOptions(**overrides))
     decoded = model.decode(view_from([0.0, 0.0, 0.0]))
     assert len(decoded.slots) > 0
-    sum(
-        getattr(decoded.gaussians, name).sum() for name in ("means", "quats", "scales", "opacities", "colors")
-    ).backward()
+    torch.cat([value.flatten() for value in vars(decoded.gaussians).values()]).sum().backward()
     for name, parameter in model.named_parameters():
+        assert parameter.grad is not None
         assert torch.isfinite(parameter).all() and torch.isfinite(parameter.grad).all(), name
 
 
@@ -215,6 +215,25 @@ def test_multiplying_the_world_by_100_changes_nothing():
 def test_same_seed_same_networks_and_another_seed_others():
     first, same, other = (PaDGS.from_scene(box_scene(), seed=seed).decoder.opacity["w1"] for seed in (1, 1, 2))
     assert torch.equal(first, same) and not torch.equal(first, other)
+
+
+@pytest.mark.parametrize("precision", ["bfloat16", "float16"])
+def test_a_reduced_precision_is_that_of_the_networks_and_all_learns_in_float32(precision):
+    exact, rounded = (
+        perturbed(PaDGS.from_scene(box_scene(count=40), PaDGSOptions(precision=name)))
+        for name in ("float32", precision)
+    )
+    view, limit = box_scene().train[1], 8 * torch.finfo(getattr(torch, precision)).eps
+    truth, decoded = exact.decode(view), rounded.decode(view)
+    error = (decoded.raw_opacities - truth.raw_opacities).abs().max()
+    assert 1e-5 < error < limit and len(decoded.slots) == pytest.approx(len(truth.slots), rel=limit)
+    for model, seen in ((exact, truth), (rounded, decoded)):
+        gaussians = seen.gaussians
+        (gaussians.means.sum() + gaussians.opacities.sum() + gaussians.colors.sum() + gaussians.scales.sum()).backward()
+        assert all(p.grad is not None and p.grad.dtype == p.dtype == torch.float32 for p in model.parameters())
+    for mine, theirs in zip(rounded.parameters(), exact.parameters(), strict=True):
+        assert mine.grad is not None and theirs.grad is not None
+        assert (mine.grad - theirs.grad).norm() < 0.1 * theirs.grad.norm()
 
 
 def test_gradients_match_finite_differences():
@@ -247,6 +266,7 @@ class _Decode(torch.nn.Module):
         ({"omega_axis": "up"}, "omega_axis 'up'; known: camera_y, world_z"),
         ({"omega_input": "sin"}, "known: sin2, cos"),
         ({"distance_unit": "metre"}, "known: scene, world"),
+        ({"precision": "half"}, "unknown precision 'half'; known: float32, bfloat16, float16"),
         ({"voxel_size": "small"}, "known: auto"),
         ({"tau": 1.5}, r"tau is 1.5; it must be in \[0, 1\]"),
         ({"offsets": 0}, "offsets is 0"),

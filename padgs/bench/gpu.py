@@ -10,6 +10,7 @@ sizes       name -> one workload of `padgs.bench.workload`:
   ours, published   bounds that are exact, and squares of 3 sigma as published:
     counters        what the renderer counted
     frame           decode and draw, {"median", "p95", "min"} seconds
+    decode          precision of the networks' products -> decode only, without gradients
     draw, graph     draw only, the same Gaussians each time: launch by launch, and as a CUDA graph (null without a GPU)
     iteration       the same forward and backward with probe, loss, observation for densification and Adam
     stages          calls of libpadgs_cuda in one iteration -> the same
@@ -32,6 +33,7 @@ import torch
 from padgs import clock
 from padgs.bench.workload import OPTIONS, SIZES, Size, Workload, build
 from padgs.loss import photometric_loss
+from padgs.precision import PRECISIONS
 from padgs.render import RenderOptions, cuda_native, render, resolve_backend
 from padgs.render.captured import CapturedRender
 from padgs.targets import Targets
@@ -81,6 +83,19 @@ class Iteration:
         with torch.no_grad():
             decoded = self.work.model.decode(self.work.view)
             render(decoded.gaussians, self.work.view, self.options, backend=self.backend)
+
+    def decoding(self, precision: str) -> Callable[[], object]:
+        """Decode without drawing."""
+        model = self.work.model
+
+        def work() -> None:
+            model.options = dataclasses.replace(usual, precision=precision)
+            with torch.no_grad():
+                model.decode(self.work.view)
+            model.options = usual
+
+        usual = model.options
+        return work
 
     def drawing(self) -> tuple[Callable[[], object], Callable[[], object] | None]:
         """Draw without decoding: launch by launch, and played back from a graph if the backend can."""
@@ -173,6 +188,7 @@ def _on_device(work: Workload, device: torch.device) -> Workload:
 def _measure(iteration: Iteration, repeats: int, warm_up: int) -> dict[str, Any]:
     watch = Stopwatch(iteration.device)
     frame = _timed(iteration.frame, watch, repeats, warm_up)
+    decode = {name: _timed(iteration.decoding(name), watch, repeats, warm_up) for name in PRECISIONS}
     draw, graph = (None if work is None else _timed(work, watch, repeats, warm_up) for work in iteration.drawing())
     clock.reset_peak_memory(iteration.device)
     timing = _timed(iteration.train, watch, repeats, warm_up)
@@ -180,6 +196,7 @@ def _measure(iteration: Iteration, repeats: int, warm_up: int) -> dict[str, Any]
     return {
         "backend": iteration.backend,
         "frame": frame,
+        "decode": decode,
         "draw": draw,
         "graph": graph,
         "iteration": timing,
@@ -263,6 +280,8 @@ def gpu_lines(report: dict[str, Any]) -> list[str]:
                      for what in ("frame", "iteration"))  # fmt: skip
             found.append(f"  {label} bounds, backend {part['backend']}: {', '.join(times)}{peak}")
             graph = "" if part["graph"] is None else f", as a CUDA graph {1e3 * part['graph']['median']:.2f} ms"
+            decoded = (f"{1e3 * timing['median']:.2f} ms in {name}" for name, timing in part["decode"].items())
+            found.append(f"    decoded only: {', '.join(decoded)}")
             found.append(f"    drawn only: {1e3 * part['draw']['median']:.2f} ms{graph}")
         found += [f"    {stage}: {1e3 * timing['median']:.3f} ms" for stage, timing in size["ours"]["stages"].items()]
         for target, verdict in size["targets"].items():

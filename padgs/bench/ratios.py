@@ -63,7 +63,7 @@ def ratios(work: Workload, brute_force: Workload, repeats: int) -> dict[str, dic
 @contextmanager
 def torch_decode() -> Iterator[None]:
     """Decode by `define_gaussians`, as where there is no native library."""
-    with mock.patch.object(padgs.decoder, "fits", lambda _: False):
+    with mock.patch.object(padgs.decoder, "fits", lambda *_: False):
         yield
 
 

@@ -29,6 +29,7 @@ def test_the_report_says_what_was_measured(report: dict):
         assert part["backend"] == "cpu"
         assert 0 < part["frame"]["median"] < part["iteration"]["median"]
         assert part["draw"]["median"] > 0 and part["graph"] is None
+        assert set(part["decode"]) == {"float32", "bfloat16", "float16"}
         assert part["counters"]["contributing"] > 0 and part["stages"] == {}  # no call went to libpadgs_cuda
     assert size["published"]["counters"]["instances"] > size["ours"]["counters"]["instances"]
     assert set(size["slower"]) == {"frame", "iteration"} and size["targets"] == {}
@@ -54,13 +55,23 @@ def test_on_a_gpu_the_same_gaussians_are_drawn_with_and_without_a_graph(monkeypa
     (usual, view, how), (recorded, pose, options) = drawn
     assert recorded is usual and len(usual) > 0 and not usual.means.requires_grad
     assert pose is view.cam_from_world and options is OPTIONS and how == {"backend": "cuda"}
-    part = {"backend": "cuda", "peak_bytes": None, "stages": {}} | {
+    part = {"backend": "cuda", "peak_bytes": None, "stages": {}, "decode": {"float32": {"median": 0.004}}} | {
         what: {"median": ms / 1e3, "p95": 1.0}
         for what, ms in {"frame": 5, "iteration": 9, "draw": 3, "graph": 2}.items()
     }
     size = {"width": 2, "height": 1, "gaussians": 3, "ours": part, "published": part, "targets": {}}
     machine = {"machine": {"gpu": "G", "cpu": "C"}, "ceilings": {"copy": 1e9, "fp32": 1e12}}
-    assert "    drawn only: 3.00 ms, as a CUDA graph 2.00 ms" in gpu.gpu_lines({**machine, "sizes": {"quick": size}})
+    lines = gpu.gpu_lines({**machine, "sizes": {"quick": size}})
+    assert (
+        "    drawn only: 3.00 ms, as a CUDA graph 2.00 ms" in lines and "    decoded only: 4.00 ms in float32" in lines
+    )
+
+
+def test_decoding_is_timed_in_a_precision_and_leaves_the_model_as_it_was(monkeypatch: pytest.MonkeyPatch):
+    iteration, seen = gpu.Iteration(build(SIZES["quick"]), OPTIONS, torch.device("cpu")), []
+    monkeypatch.setattr(iteration.work.model, "decode", lambda _: seen.append(iteration.work.model.options.precision))
+    iteration.decoding("float16")()
+    assert seen == ["float16"] and iteration.work.model.options.precision == "float32"
 
 
 def test_targets_are_judged_for_the_size_that_they_are_stated_for():

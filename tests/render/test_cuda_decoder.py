@@ -10,34 +10,36 @@ from torch import Tensor
 from padgs.decoder import Decoder, DecoderWeights, decode_gaussians, define_gaussians
 from padgs.gaussians import Gaussians
 from padgs.gpu_decoder import decode_on_gpu
+from padgs.precision import OF_GRADIENTS, reduced
 
 pytestmark = [*cuda_engine.marks()]
 DEVICE = "cuda" if cuda_engine.ON_GPU else "cpu"
 LEARNED = ("features", "offsets", "log_scales")
 
 
-def on_gpu(weights: DecoderWeights, **tensors: Tensor) -> tuple[Gaussians, Tensor, Tensor]:
+def on_gpu(weights: DecoderWeights, *tensors: Tensor, precision: str) -> tuple[Gaussians, Tensor, Tensor]:
     """What `decode_gaussians` does with tensors of a GPU."""
     if cuda_engine.ON_GPU:
-        return decode_gaussians(weights, **tensors)
-    *values, slots, raw = decode_on_gpu(tuple(tensor for head in weights for tensor in head), *tensors.values())
+        return decode_gaussians(weights, *tensors, precision=precision)
+    flat = tuple(tensor for head in weights for tensor in head)
+    *values, slots, raw = decode_on_gpu(flat, *tensors, dtype=reduced(precision))
     return Gaussians(*values), slots, raw
 
 
-def decoded(function, tensors: dict[str, Tensor], decoder: Decoder) -> tuple[Gaussians, Tensor, Tensor, dict]:
+def decoded(
+    function, tensors: dict[str, Tensor], decoder: Decoder, precision: str = "float32"
+) -> tuple[Gaussians, Tensor, Tensor, dict]:
     leaves = {name: tensor.clone().requires_grad_(name in LEARNED) for name, tensor in tensors.items()}
-    decoder.zero_grad()
-    gaussians, slots, raw = function(decoder.weights(), **leaves)
+    gaussians, slots, raw = function(decoder.weights(), *leaves.values(), precision=precision)
     generator = torch.Generator().manual_seed(0)
-    values = vars(gaussians).values()
-    sum((value * torch.randn(value.shape, generator=generator).to(value)).sum() for value in values).backward()
-    gradients = {name: leaves[name].grad for name in LEARNED}
-    return gaussians, slots, raw, gradients | {name: p.grad.clone() for name, p in decoder.named_parameters()}
+    values = list(vars(gaussians).values())
+    upstream = [torch.randn(value.shape, generator=generator).to(value) for value in values]
+    learned = {name: leaves[name] for name in LEARNED} | dict(decoder.named_parameters())
+    gradients = torch.autograd.grad(values, list(learned.values()), upstream)
+    return gaussians, slots, raw, dict(zip(learned, gradients, strict=True))
 
 
-@pytest.mark.parametrize("anchors", [1, 17, 300])
-@pytest.mark.parametrize(("offsets", "inputs", "hidden"), [(10, 37, 32), (1, 36, 16), (3, 37, 32)])
-def test_the_gpu_matches_the_definition(anchors: int, offsets: int, inputs: int, hidden: int, generator):
+def problem(anchors: int, offsets: int, inputs: int, hidden: int, generator) -> tuple[dict[str, Tensor], Decoder]:
     decoder = Decoder(inputs, offsets, hidden, generator=generator).to(DEVICE)
     with torch.no_grad():
         decoder.opacity["b2"] += 0.1
@@ -45,7 +47,13 @@ def test_the_gpu_matches_the_definition(anchors: int, offsets: int, inputs: int,
     tensors = {name: torch.randn(anchors, *shape, generator=generator) for name, shape in shapes.items()}
     tensors["log_scales"] = 0.3 * torch.randn(anchors, 6, generator=generator) - 1
     tensors["attenuation"] = 0.9 * torch.rand(anchors, generator=generator) + 0.1
-    tensors = {name: tensor.to(DEVICE) for name, tensor in tensors.items()}
+    return {name: tensor.to(DEVICE) for name, tensor in tensors.items()}, decoder
+
+
+@pytest.mark.parametrize("anchors", [1, 17, 300])
+@pytest.mark.parametrize(("offsets", "inputs", "hidden"), [(10, 37, 32), (1, 36, 16), (3, 37, 32)])
+def test_the_gpu_matches_the_definition(anchors: int, offsets: int, inputs: int, hidden: int, generator):
+    tensors, decoder = problem(anchors, offsets, inputs, hidden, generator)
     ours, slots, raw, gradients = decoded(on_gpu, tensors, decoder)
     truth, true_slots, true_raw, true_gradients = decoded(define_gaussians, tensors, decoder)
     assert torch.equal(slots, true_slots)
@@ -56,6 +64,29 @@ def test_the_gpu_matches_the_definition(anchors: int, offsets: int, inputs: int,
         limit = 2e-5 * expected.abs().max().clamp(min=1e-6)
         assert (gradients[name] - expected).abs().max() <= limit, name
         assert expected.any() or anchors == 1, name
+
+
+@pytest.mark.parametrize("precision", ["bfloat16", "float16"])
+def test_reduced_precisions_match_the_definition_and_stay_near_float32(precision: str, generator: torch.Generator):
+    tensors, decoder = problem(300, 10, 37, 32, generator)
+    with torch.no_grad():  # opacities away from the threshold, so that rounding selects nobody else
+        decoder.opacity["b2"] += 4
+    ours, slots, raw, gradients = decoded(on_gpu, tensors, decoder, precision)
+    assert all(value.dtype == torch.float32 for value in (raw, *vars(ours).values(), *gradients.values()))
+    u, u_of_gradients = (torch.finfo(dtype or torch.float32).eps / 2 for dtype in (reduced(precision), OF_GRADIENTS))
+    flips = (4 * u) ** 0.5  # of the norm: near enough to 0, a share of some u of the hidden units changes sides
+    for their_precision, limit, of_gradients in (
+        (precision, 8 * u, 8 * u_of_gradients),  # sums in another order may be rounded to the number beside
+        ("float32", 16 * u, 8 * u_of_gradients + flips),
+    ):
+        truth, true_slots, true_raw, true_gradients = decoded(define_gaussians, tensors, decoder, their_precision)
+        assert torch.equal(slots, true_slots) and (raw - true_raw).abs().max() < limit
+        for name, value in vars(truth).items():
+            assert (getattr(ours, name) - value).norm() < limit * value.norm(), name
+        for name, expected in true_gradients.items():
+            assert (gradients[name] - expected).norm() < of_gradients * expected.norm(), name
+    exact = on_gpu(decoder.weights(), *tensors.values(), precision="float32")[0]
+    assert torch.equal(ours.means, exact.means) and not torch.equal(ours.colors, exact.colors)
 
 
 def test_nothing_selected_is_no_gaussians(generator: torch.Generator):
@@ -71,5 +102,5 @@ def test_nothing_selected_is_no_gaussians(generator: torch.Generator):
         "attenuation": (),
     }
     tensors = {name: torch.zeros(9, *shape, device=DEVICE) for name, shape in shapes.items()}
-    gaussians, slots, raw = on_gpu(decoder.weights(), **tensors)
+    gaussians, slots, raw = on_gpu(decoder.weights(), *tensors.values(), precision="float32")
     assert len(gaussians) == len(slots) == 0 and (raw < 0).all()
