@@ -31,4 +31,4 @@ def chosen(name: str, render: RenderConfig) -> torch.device:
 
 def _draws(render: RenderConfig) -> bool:
     """Whether a GPU draws this faster than the CPU does."""
-    return render.backend in ("auto", "cuda") and render.blending == "sorted" and cuda_native.available()
+    return render.backend in ("auto", "cuda") and cuda_native.available()

@@ -83,7 +83,7 @@ class CapturedRender:
         self._replay: Callable[[], Frame] | None = None
         with torch.no_grad():
             means = (gaussians := show(view)).means
-            cuda_backend.check(means, options)
+            cuda_backend.check(means)
             self._background = means.new_zeros(3) if background is None else background
             self._view = view.at(view.cam_from_world.to(means.device, copy=True))
             pose = self._view.cam_from_world.to(means.dtype)
@@ -138,10 +138,10 @@ class CapturedRender:
     def _record(self) -> Frame:
         """All the work of a frame; nothing here waits for the device."""
         projected = self._projected(self._show(self._view), room=self.room)
-        outputs = image, transmittance, depth, _ = cuda_backend.outputs_of(self._view.camera, projected.order.device)
+        outputs = cuda_backend.Outputs.of(self._view.camera, self._options, projected.order.device)
         pairs = cuda_backend.blend(projected, self._rays, self._background, outputs)
         visible = projected.boxes[:, 3] < projected.boxes[:, 4]
-        return Frame(image, transmittance, depth, visible, pairs, projected)
+        return Frame(outputs.image, outputs.transmittance, outputs.depth, visible, pairs, projected)
 
 
 def captured(record: Callable[[], Frame], device: torch.device) -> Callable[[], Frame]:

@@ -5,7 +5,9 @@ The same results, bit by bit, from the same device and build: no float is added 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -41,7 +43,7 @@ def rasterize(
         RuntimeError: the library was not compiled for this GPU.
         torch.cuda.OutOfMemoryError: the GPU has too little memory; `options.max_instances` makes the strips smaller.
     """
-    check(gaussians.means, options)
+    check(gaussians.means)
     counters = Counters()
     image, transmittance, depth, visible = _Rasterize.apply(
         gaussians.means,
@@ -56,11 +58,12 @@ def rasterize(
         camera,
         options,
         counters,
+        torch.is_grad_enabled(),  # never inside
     )
     return Rendering(image, transmittance, depth, visible, counters)
 
 
-def check(means: Tensor, options: RenderOptions) -> None:
+def check(means: Tensor) -> None:
     """Refuse what the library cannot draw, and say what can.
 
     Raises:
@@ -72,8 +75,6 @@ def check(means: Tensor, options: RenderOptions) -> None:
             f"backend cuda takes float32 tensors on a GPU, got {means.dtype} on {means.device}{missing}; convert them, "
             "or use backend=auto"
         )
-    if options.blending != "sorted":
-        raise ValueError(f"backend cuda has no blending {options.blending!r}; use sorted, or backend=torch")
 
 
 class Counters(Mapping[str, int]):
@@ -105,6 +106,37 @@ class Counters(Mapping[str, int]):
         return 5
 
 
+@dataclass
+class Outputs:
+    """What blending writes, and needs again to go back."""
+
+    image: Tensor  # [H, W, 3]
+    transmittance: Tensor  # [H, W]
+    depth: Tensor  # [H, W]
+    last: Tensor | None  # [H, W] int32, sorted blending: where each pixel's last contribution is
+    core_size: int  # of hybrid blending, or 0
+    core: Tensor | None  # [H, W, core_size] int32, hybrid blending that is to be differentiated: see csrc/cuda/core.h
+    tails: Tensor | None  # [H, W, 6], as core
+
+    @staticmethod
+    def of(camera: Camera, options: RenderOptions, device: torch.device, *, differentiated: bool = False) -> Outputs:
+        """Room for one image."""
+        size, hybrid = (camera.height, camera.width), options.blending == "hybrid"
+        core_size = options.core_size if hybrid else 0
+        kept = hybrid and differentiated
+        transmittance, depth = torch.empty(2, *size, device=device)
+        integers = functools.partial(torch.empty, dtype=torch.int32, device=device)
+        return Outputs(
+            torch.empty(*size, 3, device=device),
+            transmittance,
+            depth,
+            None if hybrid else integers(size),
+            core_size,
+            integers((*size, core_size)) if kept else None,
+            torch.empty(*size, 6, device=device) if kept else None,
+        )
+
+
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -121,6 +153,7 @@ class _Rasterize(torch.autograd.Function):
         camera: Camera,
         options: RenderOptions,
         counters: Counters,
+        recorded: bool,
     ):
         device, count = means.device, len(means)
         tensors = [t.detach().contiguous() for t in (means, quats, scales, opacities, colors)]
@@ -130,21 +163,22 @@ class _Rasterize(torch.autograd.Function):
         projected = Projected(native_camera(IDENTITY, camera, options), pose, inputs, options.max_instances)
         check_memory(projected.instances, options)
         rays = native_rays(camera, device)
-        outputs = image, transmittance, depth, last = outputs_of(camera, device)
+        outputs = Outputs.of(camera, options, device, differentiated=recorded and any(ctx.needs_input_grad))
         pairs = blend(projected, rays, background, outputs)
         visible = projected.boxes[:, 3] < projected.boxes[:, 4]
         counters.record(pairs, gaussians=count, visible=projected.visible, instances=projected.instances)
         ctx.mark_non_differentiable(visible)
         ctx.set_materialize_grads(False)
-        ctx.save_for_backward(*tensors, cam_from_world, background, image, transmittance, depth)
-        ctx.last, ctx.probe, ctx.projected, ctx.rays = last, probe, projected, rays
-        return image, transmittance, depth, visible
+        ctx.save_for_backward(*tensors, cam_from_world, background, outputs.image, outputs.transmittance, outputs.depth)
+        ctx.probe, ctx.projected, ctx.rays = probe, projected, rays
+        ctx.kept = (outputs.last, outputs.core_size, outputs.core, outputs.tails)
+        return outputs.image, outputs.transmittance, outputs.depth, visible
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_image: Tensor | None, grad_transmittance, grad_depth, _):
         *tensors, cam_from_world, background, image, transmittance, depth = ctx.saved_tensors
-        projected, outputs = ctx.projected, (image, transmittance, depth, ctx.last)
+        projected, outputs = ctx.projected, Outputs(image, transmittance, depth, *ctx.kept)
         grad_image = torch.zeros_like(image) if grad_image is None else grad_image.contiguous()
         upstream = [grad_image, *(g if g is None else g.contiguous() for g in (grad_transmittance, grad_depth))]
         needs_pose, needs_background, needs_rays = ctx.needs_input_grad[6:9]
@@ -172,18 +206,10 @@ class _Rasterize(torch.autograd.Function):
             grad_background = (grad_image * transmittance[..., None]).sum((0, 1))
         if grad_rays is not None:
             grad_table = grad_rays[:, :, : image.shape[1]].permute(0, 2, 1)
-        return *gradients, probe, grad_pose, grad_background, grad_table, None, None, None
+        return *gradients, probe, grad_pose, grad_background, grad_table, None, None, None, None
 
 
-def outputs_of(camera: Camera, device: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Room for image [H, W, 3], transmittance and depth [H, W], and where each pixel's last contribution is, [H, W]."""
-    image = torch.empty(camera.height, camera.width, 3, device=device)
-    transmittance, depth = torch.empty(2, camera.height, camera.width, device=device)
-    last = torch.empty(camera.height, camera.width, dtype=torch.int32, device=device)
-    return image, transmittance, depth, last
-
-
-def blend(projected: Projected, rays: NativeRays, background: Tensor, outputs: tuple[Tensor, ...]) -> Tensor:
+def blend(projected: Projected, rays: NativeRays, background: Tensor, outputs: Outputs) -> Tensor:
     """Fill the outputs; returns how many pairs were evaluated, and how many contributed, [2] int64."""
     pairs = torch.zeros(2, dtype=torch.int64, device=background.device)
     for strip in projected.strips():
@@ -198,22 +224,24 @@ def _moments(
     projected: Projected,
     rays: Any,
     background: Tensor,
-    outputs: tuple[Tensor, ...],
+    outputs: Outputs,
     upstream: list[Tensor | None],
     grad_rays: Tensor | None,
 ) -> Tensor:
     """Moments [N, MOMENTS] of all Gaussians, from the gradients of image, transmittance and depth."""
-    device, (height, width) = background.device, outputs[1].shape
+    device, size, hybrid = background.device, outputs.depth.shape, outputs.core_size > 0
     totals = torch.zeros(len(projected.order), MOMENTS, device=device)
-    packed = torch.empty(height, width, 4, device=device)
+    packed = torch.empty(*size, 4, device=device)
+    core_gradients = torch.empty(*size, outputs.core_size, 2, device=device) if hybrid else None
+    tail_gradients = torch.empty(*size, 4, device=device) if hybrid else None
     for strip in projected.strips():
-        states = projected.states(strip)
-        furthest = torch.empty(strip.chunks, dtype=torch.int32, device=device)
+        states = None if hybrid else projected.states(strip)
+        furthest = None if hybrid else torch.empty(strip.chunks, dtype=torch.int32, device=device)
         moments = torch.empty(strip.instances, MOMENTS, device=device)
         arguments = cuda_native.BlendGradientInputs(
             _blend_inputs(projected, strip, rays, background, outputs, None),
             *map(pointer, upstream),
-            *map(pointer, (packed, states, furthest)),
+            *map(pointer, (packed, states, furthest, core_gradients, tail_gradients)),
             strip.instances,
             *map(pointer, (moments, grad_rays, projected.order, strip.slot_start)),
             projected.visible,
@@ -224,15 +252,17 @@ def _moments(
 
 
 def _blend_inputs(
-    projected: Projected, strip: Strip, rays: Any, background: Tensor, outputs: tuple[Tensor, ...], pair_counts
+    projected: Projected, strip: Strip, rays: Any, background: Tensor, outputs: Outputs, pair_counts
 ) -> cuda_native.BlendInputs:
     """Arguments of both directions; the tensors must outlive the call."""
     camera = projected.camera
     lists = (projected.footprints, strip.tile_start, strip.slots, strip.reaches, background)
+    written = (outputs.image, outputs.transmittance, outputs.depth, outputs.last, outputs.core, outputs.tails)
     return cuda_native.BlendInputs(
         strip.table,
         camera.projection,
         camera.wrap,
+        outputs.core_size,
         rays.native(),
-        *map(pointer, (*lists, *outputs, pair_counts)),
+        *map(pointer, (*lists, *written, pair_counts)),
     )

@@ -95,10 +95,10 @@ class BlendInputs(ctypes.Structure):
 
     _fields_ = [
         ("table", TileTable),
-        *fields(Int32, "projection", "wrap"),
+        *fields(Int32, "projection", "wrap", "core_size"),
         ("rays", Rays),
         *fields(Pointer, "footprints", "tile_start", "slots", "reaches", "background"),
-        *fields(Pointer, "image", "transmittance", "depth", "last", "pair_counts"),
+        *fields(Pointer, "image", "transmittance", "depth", "last", "core", "tails", "pair_counts"),
     ]
 
 
@@ -108,6 +108,7 @@ class BlendGradientInputs(ctypes.Structure):
     _fields_ = [
         ("forward", BlendInputs),
         *fields(Pointer, "grad_image", "grad_transmittance", "grad_depth", "upstream", "states", "furthest"),
+        *fields(Pointer, "core_gradients", "tail_gradients"),
         ("instances", Int64),
         *fields(Pointer, "moments", "grad_rays", "order", "slot_start"),
         ("visible", Int64),

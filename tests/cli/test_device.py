@@ -48,8 +48,9 @@ def test_the_backend_of_a_gpu_is_refused_on_the_cpu_and_where_it_is_not_built(mo
 @pytest.mark.usefixtures("with_gpu")
 def test_with_a_gpu_auto_is_the_gpu_where_that_can_draw():
     assert chosen("auto", RenderConfig()) == chosen("cuda", RenderConfig()) == GPU
+    assert chosen("auto", RenderConfig(projection="ray", blending="hybrid")) == GPU
     assert chosen("cpu", RenderConfig()).type == "cpu"
-    for elsewhere in (RenderConfig(backend="cpu"), RenderConfig(backend="torch"), RenderConfig(blending="hybrid")):
+    for elsewhere in (RenderConfig(backend="cpu"), RenderConfig(backend="torch")):
         assert chosen("auto", elsewhere).type == "cpu"
         assert chosen("cuda", elsewhere) == GPU
 

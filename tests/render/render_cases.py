@@ -48,9 +48,6 @@ def engines() -> list:
 
 
 each_engine = pytest.mark.parametrize(("backend", "dtype"), engines())
-each_hybrid_engine = pytest.mark.parametrize(  # cuda has no hybrid blending
-    ("backend", "dtype"), [engine for engine in engines() if engine.values[0] != "cuda"]
-)
 needs_native = pytest.mark.skipif(not native.available(), reason="the native library is not built")
 each_setup = pytest.mark.parametrize(("projection", "lens"), SETUPS, ids=["-".join(setup) for setup in SETUPS])
 each_panorama = pytest.mark.parametrize("projection", ("erp", "tangent", "ray"))

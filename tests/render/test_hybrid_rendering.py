@@ -15,7 +15,8 @@ import torch
 from hybrid_reference import one_pixel
 from render_cases import (
     INPUTS,
-    each_hybrid_engine,
+    each_engine,
+    engines,
     gaussians_of,
     identity_pose,
     leaves,
@@ -37,6 +38,10 @@ from padgs.scene import View
 PROJECTIONS = ("erp", "pinhole", "tangent", "ray")
 BACKGROUND = torch.tensor([0.3, 0.6, 0.9], dtype=torch.float64)
 each_projection = pytest.mark.parametrize("projection", PROJECTIONS)
+each_native_engine = pytest.mark.parametrize(
+    "backend",
+    [pytest.param(e.values[0], marks=e.marks, id=e.values[0]) for e in engines() if e.values[0] != "torch"],
+)
 
 
 def camera_of(projection: str, width: int, height: int) -> Camera:
@@ -81,7 +86,7 @@ def fragments(gaussians: Gaussians, camera: Camera, options: RenderOptions, pose
 
 @pytest.mark.parametrize("size", [1, 4, 16])
 @each_projection
-@each_hybrid_engine
+@each_engine
 def test_images_are_those_of_the_published_procedure(projection: str, size: int, backend: str, dtype: torch.dtype):
     generator = torch.Generator().manual_seed(100 * PROJECTIONS.index(projection) + size)
     camera, options, pose = camera_of(projection, 33, 17), options_of(projection, size), random_pose(generator, 0.2)
@@ -130,7 +135,9 @@ def run(
     return rendering, {name: leaf.grad for name, leaf in found.items()}
 
 
-def assert_native_is_the_definition(gaussians: Gaussians, camera: Camera, options: RenderOptions, generator) -> None:
+def assert_native_is_the_definition(
+    gaussians: Gaussians, camera: Camera, options: RenderOptions, generator: torch.Generator, backend: str
+) -> None:
     pose = identity_pose()
     *_, stable = fragments(gaussians, camera, options, pose)
     stable = stable.view(camera.height, camera.width)
@@ -138,7 +145,7 @@ def assert_native_is_the_definition(gaussians: Gaussians, camera: Camera, option
     weights = torch.randn(*stable.shape, 5, generator=generator, dtype=torch.float64) * stable[..., None]
     arguments = (gaussians, camera, options, pose, weights)
     expected, gradients = run(*arguments, "torch", torch.float64)
-    actual, found = run(*arguments, "cpu", torch.float32)
+    actual, found = run(*arguments, backend, torch.float32)
     assert torch.equal(actual.visible, expected.visible)
     torch.testing.assert_close(actual.image[stable].double(), expected.image[stable], atol=2e-5, rtol=0)
     torch.testing.assert_close(actual.transmittance[stable].double(), expected.transmittance[stable], atol=2e-5, rtol=0)
@@ -149,7 +156,7 @@ def assert_native_is_the_definition(gaussians: Gaussians, camera: Camera, option
         assert row_error(found[name].reshape(rows.shape), rows) < 2e-3, name
 
 
-@needs_native
+@each_native_engine
 @pytest.mark.parametrize("size", [1, 5, 16])
 @pytest.mark.parametrize(
     ("projection", "kind"),
@@ -158,7 +165,9 @@ def assert_native_is_the_definition(gaussians: Gaussians, camera: Camera, option
         *[("pinhole", kind) for kind in ("ordinary", "broad")],
     ],
 )
-def test_native_values_and_gradients_are_those_of_the_definition(projection: str, kind: str, size: int):
+def test_native_values_and_gradients_are_those_of_the_definition(
+    projection: str, kind: str, size: int, backend: str
+):
     generator = torch.Generator().manual_seed(7 + size)
     gaussians = gaussians_of("huge" if kind == "broad" else kind, 25, generator)
     gaussians.opacities[0] = 1.0  # reaches the maximum alpha, where the derivative is 0
@@ -166,23 +175,23 @@ def test_native_values_and_gradients_are_those_of_the_definition(projection: str
         gaussians = replace(gaussians, scales=0.0625 * gaussians.scales, opacities=0.5 * gaussians.opacities)
     for width, height in ((70, 44), (33, 17)):
         camera = camera_of(projection, width, height)
-        assert_native_is_the_definition(gaussians, camera, options_of(projection, size), generator)
+        assert_native_is_the_definition(gaussians, camera, options_of(projection, size), generator, backend)
 
 
-@needs_native
+@each_native_engine
 @pytest.mark.parametrize("projection", ["tangent", "ray"])
-def test_native_gradients_of_a_table_of_rays(projection: str, generator: torch.Generator):
+def test_native_gradients_of_a_table_of_rays(projection: str, backend: str, generator: torch.Generator):
     formula = Panorama(45, 23)
     camera = RayTable(formula.rays(dtype=torch.float64), formula.focal)
     gaussians = mixture(6, generator, ("ordinary", "polar", "seam"))
-    assert_native_is_the_definition(gaussians, camera, options_of(projection, 3), generator)
+    assert_native_is_the_definition(gaussians, camera, options_of(projection, 3), generator, backend)
 
 
-@needs_native
-def test_native_tiles_wider_than_a_chunk_agree(generator: torch.Generator):
+@each_native_engine
+def test_native_tiles_wider_than_a_chunk_agree(backend: str, generator: torch.Generator):
     gaussians = mixture(8, generator, ("polar", "pole", "seam"))  # tiles near the poles of 330 columns are wide
     for projection in ("erp", "ray"):
-        assert_native_is_the_definition(gaussians, Panorama(330, 165), options_of(projection, 4), generator)
+        assert_native_is_the_definition(gaussians, Panorama(330, 165), options_of(projection, 4), generator, backend)
 
 
 def overlapping(count: int, generator: torch.Generator) -> Gaussians:
@@ -200,7 +209,7 @@ def overlapping(count: int, generator: torch.Generator) -> Gaussians:
 
 
 @each_projection
-@each_hybrid_engine
+@each_engine
 def test_a_large_core_is_exact_blending_in_the_order_of_the_rays(projection: str, backend: str, dtype: torch.dtype):
     generator = torch.Generator().manual_seed(11)
     camera, options = camera_of(projection, 128, 64), options_of(projection, 64)
@@ -232,7 +241,7 @@ def test_a_large_core_is_exact_blending_in_the_order_of_the_rays(projection: str
         torch.testing.assert_close(getattr(rendering, name)[agree], getattr(classic, name)[agree], rtol=1e-4, atol=1e-5)
 
 
-@each_hybrid_engine
+@each_engine
 def test_each_ray_has_its_own_order(backend: str, dtype: torch.dtype):
     """Two long Gaussians cross ahead, turned by 45 degrees to either side: each is in front on one side."""
     half_turn = math.pi / 8
@@ -255,7 +264,7 @@ def test_each_ray_has_its_own_order(backend: str, dtype: torch.dtype):
 
 @pytest.mark.parametrize("size", [1, 2])
 @each_projection
-@each_hybrid_engine
+@each_engine
 def test_of_equally_far_gaussians_the_first_is_in_front(projection: str, size: int, backend: str, dtype: torch.dtype):
     one = {"means": [0.1, 0.0, 2.0], "quats": [1.0, 0.2, 0.0, 0.1], "scales": [0.3, 0.2, 0.1]}
     twins = {name: torch.tensor([value, value]) for name, value in one.items()}
@@ -268,7 +277,7 @@ def test_of_equally_far_gaussians_the_first_is_in_front(projection: str, size: i
 
 
 @each_projection
-@each_hybrid_engine
+@each_engine
 def test_the_order_of_the_gaussians_does_not_matter(projection: str, backend: str, dtype: torch.dtype):
     generator = torch.Generator().manual_seed(12)
     gaussians, camera, options = mixture(8, generator), camera_of(projection, 48, 24), options_of(projection, 3)
@@ -361,7 +370,7 @@ def test_every_instruction_set_draws_the_same(tmp_path: Path, generator: torch.G
             assert row_error(result[name], reference[name]) < 1e-3, f"{name} with {isa}"
 
 
-@each_hybrid_engine
+@each_engine
 def test_nothing_to_draw_is_the_background(backend: str, dtype: torch.dtype):
     empty = Gaussians(*(torch.zeros(0, width) for width in (3, 4, 3)), torch.zeros(0), torch.zeros(0, 3)).to(dtype)
     behind = gaussians_of("ordinary", 3, torch.Generator().manual_seed(1)).to(dtype)

@@ -19,6 +19,8 @@ constexpr int kMoments = 16;     // floats that backward blending leaves for eac
 constexpr float kAlphaMin = 1.0f / 255.0f;
 constexpr float kAlphaMax = 0.99f;
 constexpr float kTransmittanceMin = 1e-4f;
+constexpr float kCoreAlphaMin = 0.05f;  // hybrid: fainter fragments go to the tail
+constexpr int kMaxCoreSize = 256;       // hybrid
 constexpr float kNearest = 1e-15f, kFurthest = 1e15f;  // distances of means that are drawn; see contract.py
 
 enum Projection : int32_t { kErp = 0, kPinhole = 1, kTangent = 2, kRay = 3 };

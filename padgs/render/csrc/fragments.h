@@ -15,7 +15,6 @@
 namespace padgs {
 namespace PADGS_ISA {
 
-constexpr float kCoreAlphaMin = 0.05f;  // fainter fragments go to the tail
 constexpr int32_t kMixed = -1;
 
 struct Row {

@@ -2,6 +2,7 @@
 // device, and was allocated by padgs/render/cuda_backend.py. Every function returns a cudaError_t, 0 where all is well.
 #pragma once
 
+#include "core.h"
 #include "layout.h"
 
 namespace padgs {
@@ -51,13 +52,16 @@ struct BinArguments {
 struct BlendInputs {
   TileTable table;
   int32_t projection, wrap;
+  int32_t core_size;  // hybrid blending with so many fragments in order, or 0: sorted
   Rays rays;
   const Footprint *footprints;
   const int32_t *tile_start, *slots;  // the lists: slots of each tile, front to back
   const Reach *reaches;
   const float *background;               // [3]
   float *image, *transmittance, *depth;  // [H,W,3] [H,W] [H,W]
-  int32_t *last;                         // [H,W] 1 + position in the tile's list of the last contribution
+  int32_t *last;                         // [H,W] 1 + position in the tile's list of the last contribution; sorted only
+  int32_t *core;                         // [H,W,core_size] Gaussians in order, -1 behind the last } hybrid, where a gradient is
+  Tail *tails;                           // [H,W]                                                 } wanted; else null
   int32_t *pair_counts;                  // [chunks, 2] evaluated and contributing pairs, or null
 };
 
@@ -78,8 +82,10 @@ struct BlendGradientInputs {
   BlendInputs forward;
   const float *grad_image, *grad_transmittance, *grad_depth;  // [H,W,3] [H,W] or null, [H,W] or null
   Upstream *upstream;      // [H,W]
-  PixelState *states;      // [states, 256]
+  PixelState *states;      // [states, 256]; sorted only, as the next
   int32_t *furthest;       // [chunks] largest `last` of the chunk's pixels
+  CoreGradient *core_gradients;  // [H,W,core_size]; hybrid only, as the next
+  TailGradient *tail_gradients;  // [H,W]
   int64_t instances;
   Moments *moments;        // [I] by slot
   float *grad_rays;        // [H, 3, padded W] or null

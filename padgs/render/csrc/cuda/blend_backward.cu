@@ -1,4 +1,4 @@
-// Blending, backward, in two passes over the same lists, both back to front.
+// Sorted blending, backward, in two passes over the same lists, both back to front.
 //
 // The first has a thread for each pixel. It leaves, behind every bucket of 32 instances, how much light still passes and
 // what lies behind. The second has a thread for each instance: a warp takes a bucket and the pixels of a chunk pass
@@ -9,20 +9,15 @@
 namespace padgs {
 namespace {
 
-constexpr int kBucketThreads = 128;
 constexpr int kGaussiansPerBlock = 16;
 
 // dL/d of one pixel, as the definition of its outputs gives it; see also load_row in blend.cpp.
 __device__ PixelState load_pixel(const BlendGradientInputs &args, int64_t p, Upstream &upstream) {
-  const BlendInputs &forward = args.forward;
-  const float *grad = args.grad_image + 3 * p, *background = forward.background;
-  const float t = forward.transmittance[p];
-  upstream = {grad[0], grad[1], grad[2], 0.0f};
-  float grad_t = args.grad_transmittance ? args.grad_transmittance[p] : 0.0f;
-  grad_t += grad[0] * background[0] + grad[1] * background[1] + grad[2] * background[2];
+  const float t = args.forward.transmittance[p];
+  float grad_t = load_upstream(args, p, upstream);
   if (args.grad_depth && t < 1) {  // depth = sum(w r) / (1 - T)
     upstream.depth = args.grad_depth[p] / (1.0f - t);
-    grad_t += upstream.depth * forward.depth[p];
+    grad_t += upstream.depth * args.forward.depth[p];
   }
   return {t, t * grad_t};
 }
@@ -71,13 +66,12 @@ __global__ void __launch_bounds__(kBatch) states_kernel(BlendGradientInputs args
   for (int first = (furthest - 1) / kBatch * kBatch; first >= 0 && furthest > 0; first -= kBatch) {
     __syncthreads();
     const int at = first + thread;
-    batch.row_end[thread] = 0;
+    batch.reaches[thread] = Reach{};
     if (at < furthest) {
       const Reach reach = forward.reaches[forward.slots[begin + at]];
       if (reach.chunk <= chunk && chunk < reach.chunk_end) {
         batch.footprints[thread] = forward.footprints[reach.gaussian];
-        batch.row[thread] = reach.row;
-        batch.row_end[thread] = reach.row_end;
+        batch.reaches[thread] = reach;
       }
     }
     __syncthreads();
@@ -85,7 +79,7 @@ __global__ void __launch_bounds__(kBatch) states_kernel(BlendGradientInputs args
       if (k % kBucket == kBucket - 1 || first + k == furthest - 1)
         args.states[kChunkPixels * state_index(forward.table, forward.tile_start, place.chunk.row,
                                                bucket + (first + k) / kBucket, chunk) + thread] = state;
-      if (first + k >= last || y < batch.row[k] || y >= batch.row_end[k]) continue;
+      if (first + k >= last || y < batch.reaches[k].row || y >= batch.reaches[k].row_end) continue;
       const Footprint &f = batch.footprints[k];
       const typename Pixel::Pair pair = pixel.at(f);
       if (!pair.reached) continue;
@@ -94,12 +88,8 @@ __global__ void __launch_bounds__(kBatch) states_kernel(BlendGradientInputs args
       if constexpr (kWithRays) grad_ray = grad_ray + pixel.ray_gradient(f, pair, m);
     }
   }
-  if constexpr (kWithRays) {
-    if (!place.inside) return;
-    const int64_t stride = int64_t(chunks(forward.table.width)) * kTile;
-    float *out = args.grad_rays + 3 * stride * place.y + place.x;
-    out[0] = grad_ray.x, out[stride] = grad_ray.y, out[2 * stride] = grad_ray.z;
-  }
+  if constexpr (kWithRays)
+    if (place.inside) write_ray_gradient(args, place, grad_ray);
 }
 
 template <bool kPlanar>
@@ -107,35 +97,22 @@ __global__ void __launch_bounds__(kBucketThreads) buckets_kernel(BlendGradientIn
   typedef typename PixelOf<kPlanar>::Type Pixel;
   const BlendInputs &forward = args.forward;
   const TileTable &table = forward.table;
-  const int lane = lane_index();
-  const int64_t bucket = global_thread() / kWarp;
-  if (bucket >= buckets_at_most(args.instances, tiles)) return;  // whole warps
-  const int tile = tile_of_bucket(forward.tile_start, tiles, bucket);
-  const int begin = forward.tile_start[tile], count = forward.tile_start[tile + 1] - begin;
-  const int64_t from = (bucket - first_bucket(begin, tile)) * kBucket;
-  if (from >= count) return;
-  const int row = row_of_tile(table, tile), level = table.level[row];
-  const int at = int(from) + lane, y0 = row * kTile;
-  const bool mine = at < count;
-  int32_t slot = 0;
-  Reach reach{};
-  Footprint f{};
-  if (mine) {
-    slot = forward.slots[begin + at];
-    reach = forward.reaches[slot];
-    f = forward.footprints[reach.gaussian];
-  }
+  BucketLane own;
+  if (!take_bucket(forward, args.instances, tiles, own)) return;
+  const Reach &reach = own.reach;
+  const Footprint &f = own.footprint;
+  const int lane = lane_index(), row = own.row, level = own.level, column = own.column, y0 = row * kTile;
   Moments moments{};
   float *sums = moments.of;
 
-  const int column = (tile - tiles_before(table, row)) << level;  // of chunks
   for (int chunk = 0; chunk < 1 << level && column + chunk < chunks(table.width); ++chunk) {
     const int furthest = args.furthest[int64_t(row - table.first_row) * chunks(table.width) + column + chunk];
-    if (from >= furthest) continue;
-    const bool active = mine && reach.chunk <= chunk && chunk < reach.chunk_end && at < furthest;
-    const int top = -warp_max(active ? -int(reach.row) : -kTile), bottom = warp_max(active ? int(reach.row_end) : 0);
+    if (own.from >= furthest) continue;
+    const bool active = own.mine && reach.chunk <= chunk && chunk < reach.chunk_end && own.at < furthest;
+    int top, bottom;
+    rows_of_warp(active, reach, top, bottom);
     const int pixels = (bottom - top) * kTile;  // negative where no lane is active
-    const int64_t states = kChunkPixels * state_index(table, forward.tile_start, row, bucket, chunk) + top * kTile;
+    const int64_t states = kChunkPixels * state_index(table, forward.tile_start, row, own.bucket, chunk) + top * kTile;
     const int x0 = (column + chunk) * kTile;
     PixelState state{1.0f, 0.0f};
     for (int step = 0; step < pixels + kBucket - 1; ++step) {
@@ -147,7 +124,7 @@ __global__ void __launch_bounds__(kBucketThreads) buckets_kernel(BlendGradientIn
       const int x = x0 + k % kTile, row_in_tile = top + k / kTile, y = y0 + row_in_tile;
       if (!active || row_in_tile < reach.row || row_in_tile >= reach.row_end || x >= table.width) continue;
       const int64_t p = int64_t(y) * table.width + x;
-      if (at >= forward.last[p]) continue;
+      if (own.at >= forward.last[p]) continue;
       const Pixel pixel(forward.rays, forward.wrap, table.width, x, y);
       const typename Pixel::Pair pair = pixel.at(f);
       if (!pair.reached) continue;
@@ -160,7 +137,7 @@ __global__ void __launch_bounds__(kBucketThreads) buckets_kernel(BlendGradientIn
       sums[13] += weight * upstream.depth;
     }
   }
-  if (mine) args.moments[slot] = moments;
+  if (own.mine) args.moments[own.slot] = moments;
 }
 
 // Sixteen threads add up the moments of a Gaussian's instances, in the order of their slots.
@@ -173,6 +150,16 @@ __global__ void sum_kernel(BlendGradientInputs args) {
   args.totals[int64_t(args.order[i]) * kMoments + k] += sum;
 }
 
+void sorted_backward(const Queue &queue, const BlendGradientInputs &args, int tiles) {
+  const bool flat = planar(args.forward.projection);
+  const auto states = flat              ? states_kernel<true, false>
+                      : args.grad_rays ? states_kernel<false, true>
+                                        : states_kernel<false, false>;
+  launch(states, blocks_of(args.forward.table), kBatch, queue, args);
+  const int64_t threads = buckets_at_most(args.instances, tiles) * kWarp;
+  launch(flat ? buckets_kernel<true> : buckets_kernel<false>, blocks_for(threads, kBucketThreads), kBucketThreads, queue, args, tiles);
+}
+
 }  // namespace
 }  // namespace padgs
 
@@ -180,13 +167,10 @@ using namespace padgs;
 
 PADGS_API int padgs_cuda_blend_backward(const Queue *queue, const BlendGradientInputs *args, int32_t tiles) {
   if (const int error = begin(*queue)) return error;
-  const bool flat = planar(args->forward.projection);
-  const auto states = flat              ? states_kernel<true, false>
-                      : args->grad_rays ? states_kernel<false, true>
-                                        : states_kernel<false, false>;
-  launch(states, blocks_of(args->forward.table), kBatch, *queue, *args);
-  const int64_t threads = buckets_at_most(args->instances, tiles) * kWarp;
-  launch(flat ? buckets_kernel<true> : buckets_kernel<false>, blocks_for(threads, kBucketThreads), kBucketThreads, *queue, *args, int(tiles));
+  if (args->forward.core_size)
+    hybrid_backward(*queue, *args, tiles);
+  else
+    sorted_backward(*queue, *args, tiles);
   launch(sum_kernel, blocks_for(args->visible, kGaussiansPerBlock), kGaussiansPerBlock * kMoments, *queue, *args);
   return finish();
 }

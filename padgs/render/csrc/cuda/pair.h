@@ -13,6 +13,8 @@ struct PlanarPair {
   float t, dv, log2_alpha;
   bool reached;
 
+  PADGS_HD float distance(const Footprint &f, bool) const { return f.depth; }
+
   // Sums of M times 1, t, dv, t^2, t dv, dv^2 with t = a du + b dv; see planar.h.
   PADGS_HD void add(float m, float *sums) const {
     const float mt = m * t, mv = m * dv;
@@ -26,6 +28,9 @@ struct ProjectivePair {
   float q, cx, cy, log2_alpha;
   float b_by_d;
   bool reached;
+
+  // Where the Gaussian lies on the ray: for projection `ray` at its largest value there, |M^-1 mean| b / D; else at its mean.
+  PADGS_HD float distance(const Footprint &f, bool largest) const { return largest ? b_by_d / root(f.shape[9]) : f.depth; }
 
   PADGS_HD void add(float m, float *sums) const {
     const float w0 = m * q, w1 = m * cx, w2 = m * cy;
