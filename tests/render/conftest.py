@@ -10,6 +10,7 @@ QUICK = {
     "test_cuda_loss",
     "test_cuda_tiles",
     "test_golden",
+    "test_hybrid_rendering",
     "test_near_cull",
     "test_parity",
 }

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
+from itertools import pairwise
 from types import SimpleNamespace
 
 import cuda_engine
@@ -43,9 +45,11 @@ def crowd(count: int, generator: torch.Generator) -> Gaussians:
     return Gaussians(**{**vars(gaussians), "opacities": 0.1 * gaussians.opacities})
 
 
+@pytest.mark.parametrize("blending", ["sorted", "hybrid"])
 @pytest.mark.parametrize("projection", ["erp", "tangent", "ray"])
-def test_long_lists_are_drawn_like_short_ones(projection: str, generator: torch.Generator):
-    gaussians, options = crowd(1200, generator), RenderOptions(projection, low_pass_kind="angular")
+def test_long_lists_are_drawn_like_short_ones(projection: str, blending: str, generator: torch.Generator):
+    gaussians = crowd(1200, generator)
+    options = RenderOptions(projection, low_pass_kind="angular", blending=blending, core_size=4)
     expected, expected_gradients = drawn(gaussians, (72, 36), options, backend="cpu")
     actual, gradients = drawn(gaussians, (72, 36), options)
     assert actual.counters["instances"] > 8 * 256
@@ -58,10 +62,29 @@ def test_long_lists_are_drawn_like_short_ones(projection: str, generator: torch.
             assert (gradients[name] - gradient).norm() < 5e-3 * gradient.norm(), name
 
 
-def test_strips_are_parts_of_the_same_image(generator: torch.Generator):
-    gaussians = crowd(200, generator)
-    whole, whole_gradients = drawn(gaussians, (131, 77), RenderOptions())
-    parts, parts_gradients = drawn(gaussians, (131, 77), RenderOptions(max_instances=300))
+@pytest.mark.parametrize("projection", ["erp", "ray"])
+def test_cores_of_any_size(projection: str, generator: torch.Generator):
+    """On both sides of the sizes that kernels are compiled for; some pixels have more fragments than any."""
+    gaussians = gaussians_of("ordinary", 300, generator)
+    ahead = gaussians.means.abs() * torch.tensor([0.1, 0.1, 1.0]) + torch.tensor([0.0, 0.0, 2.0])
+    broad = {"scales": 0.4 + gaussians.scales, "opacities": torch.full((300,), 0.08, dtype=torch.float64)}
+    gaussians, images = Gaussians(**{**vars(gaussians), "means": ahead.float().double(), **broad}), []
+    for size in (1, 16, 17, 64, 65, 256):
+        options = RenderOptions(projection, blending="hybrid", core_size=size)
+        expected, expected_gradients = drawn(gaussians, (36, 18), options, backend="cpu")
+        actual, gradients = drawn(gaussians, (36, 18), options)
+        assert ((actual.image - expected.image).abs().amax(-1) > 2e-5).double().mean() < 0.05
+        for name, gradient in expected_gradients.items():
+            assert (gradients[name] - gradient).norm() < 5e-3 * gradient.norm(), name
+        images.append(actual.image.detach())
+    assert all((one - other).abs().max() > 1e-4 for one, other in pairwise(images))
+
+
+@pytest.mark.parametrize("blending", ["sorted", "hybrid"])
+def test_strips_are_parts_of_the_same_image(blending: str, generator: torch.Generator):
+    gaussians, options = crowd(200, generator), RenderOptions(blending=blending, core_size=3)
+    whole, whole_gradients = drawn(gaussians, (131, 77), options)
+    parts, parts_gradients = drawn(gaussians, (131, 77), replace(options, max_instances=300))
     for name in ("image", "transmittance", "depth", "visible"):
         assert torch.equal(getattr(parts, name), getattr(whole, name)), name
     assert dict(parts.counters) == dict(whole.counters)
@@ -70,12 +93,15 @@ def test_strips_are_parts_of_the_same_image(generator: torch.Generator):
 
 
 @pytest.mark.skipif(cuda_engine.ON_GPU, reason="about the order in which the emulation runs threads")
+@pytest.mark.parametrize("blending", ["sorted", "hybrid"])
 @pytest.mark.parametrize(("projection", "lens"), [("erp", "panorama"), ("ray", "panorama"), ("tangent", "fisheye")])
-def test_results_do_not_depend_on_which_thread_runs_first(projection, lens, generator, monkeypatch: pytest.MonkeyPatch):
-    gaussians = crowd(400, generator)
-    forwards = drawn(gaussians, (40, 20), RenderOptions(projection), lens=lens)
+def test_results_do_not_depend_on_which_thread_runs_first(
+    projection, lens, blending, generator, monkeypatch: pytest.MonkeyPatch
+):
+    gaussians, options = crowd(400, generator), RenderOptions(projection, blending=blending, core_size=3)
+    forwards = drawn(gaussians, (40, 20), options, lens=lens)
     monkeypatch.setenv("PADGS_EMULATION_REVERSED", "1")
-    backwards = drawn(gaussians, (40, 20), RenderOptions(projection), lens=lens)
+    backwards = drawn(gaussians, (40, 20), options, lens=lens)
     for name in ("image", "transmittance", "depth"):
         assert torch.equal(getattr(forwards[0], name), getattr(backwards[0], name)), name
     assert dict(forwards[0].counters) == dict(backwards[0].counters)
@@ -83,16 +109,18 @@ def test_results_do_not_depend_on_which_thread_runs_first(projection, lens, gene
         assert torch.equal(forwards[1][name], backwards[1][name]), name
 
 
-def test_results_repeat_bit_by_bit(generator: torch.Generator):
-    gaussians = crowd(400, generator)
-    first, second = (drawn(gaussians, (72, 36), RenderOptions("tangent")) for _ in range(2))
+@pytest.mark.parametrize("blending", ["sorted", "hybrid"])
+def test_results_repeat_bit_by_bit(blending: str, generator: torch.Generator):
+    gaussians, options = crowd(400, generator), RenderOptions("tangent", blending=blending)
+    first, second = (drawn(gaussians, (72, 36), options) for _ in range(2))
     assert torch.equal(first[0].image, second[0].image)
     assert all(torch.equal(first[1][name], second[1][name]) for name in first[1])
 
 
-def test_counters_are_those_of_the_cpu(generator: torch.Generator):
-    gaussians = gaussians_of("ordinary", 40, generator)
-    expected, actual = (drawn(gaussians, (72, 36), RenderOptions(), backend=name)[0] for name in ("cpu", "cuda"))
+@pytest.mark.parametrize("blending", ["sorted", "hybrid"])
+def test_counters_are_those_of_the_cpu(blending: str, generator: torch.Generator):
+    gaussians, options = gaussians_of("ordinary", 40, generator), RenderOptions(blending=blending, core_size=2)
+    expected, actual = (drawn(gaussians, (72, 36), options, backend=name)[0] for name in ("cpu", "cuda"))
     assert set(actual.counters) == set(expected.counters) and len(actual.counters) == 5
     for name in ("gaussians", "visible", "instances", "contributing"):
         assert actual.counters[name] == expected.counters[name]
@@ -101,10 +129,36 @@ def test_counters_are_those_of_the_cpu(generator: torch.Generator):
         actual.counters["pixels"]
 
 
-def test_hybrid_blending_is_refused(generator: torch.Generator):
-    gaussians = gaussians_of("ordinary", 5, generator).to(torch.float32)
-    with pytest.raises(ValueError, match="backend cuda has no blending 'hybrid'; use sorted, or backend=torch"):
-        render(gaussians, view_of(camera_of("panorama", 32, 16)), RenderOptions(blending="hybrid"), backend="cuda")
+def test_cores_are_kept_only_to_be_differentiated(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch):
+    kept = []
+    call = cuda_native.call
+
+    def spy(name: str, where, *arguments) -> None:
+        if name == "padgs_cuda_blend":
+            kept.append(arguments[0].core is not None and arguments[0].tails is not None)
+        call(name, where, *arguments)
+
+    monkeypatch.setattr(cuda_native, "call", spy)
+    inputs = leaves(gaussians_of("ordinary", 5, generator), torch.float32)
+    view, options = view_of(camera_of("panorama", 32, 16)), RenderOptions(blending="hybrid")
+    images = [render(inputs, view, options, backend="cuda").image]
+    with torch.no_grad():
+        images.append(render(inputs, view, options, backend="cuda").image)
+    constant = Gaussians(**{name: tensor.detach() for name, tensor in vars(inputs).items()})
+    images.append(render(constant, view, options, backend="cuda").image)
+    assert kept == [True, False, False]
+    assert torch.equal(images[0], images[1]) and torch.equal(images[0], images[2])
+
+
+@pytest.mark.parametrize("blending", ["sorted", "hybrid"])
+def test_going_back_twice_gives_the_same(blending: str, generator: torch.Generator):
+    inputs = leaves(gaussians_of("ordinary", 12, generator), torch.float32)
+    rendering = render(
+        inputs, view_of(camera_of("panorama", 40, 20)), RenderOptions(blending=blending), backend="cuda"
+    )
+    loss = rendering.image.square().sum() + rendering.depth.sum()
+    first, second = (torch.autograd.grad(loss, [*vars(inputs).values()], retain_graph=True) for _ in range(2))
+    assert all(torch.equal(*pair) and pair[0].any() for pair in zip(first, second, strict=True))
 
 
 def test_other_dtypes_and_places_are_refused(monkeypatch: pytest.MonkeyPatch):
