@@ -15,10 +15,12 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "render"))
 
 import cuda_engine
-from render_cases import SETUPS, gaussians_of, identity_pose, random_pose, row_error, stable_pixels
+from render_cases import SETUPS, camera_of, gaussians_of, identity_pose, random_pose, row_error, stable_pixels
+from test_hybrid_rendering import fragments
 from test_parity import random_weights, run
 
 from padgs.render import RenderOptions
+from padgs.render.contract import BLENDINGS
 
 REGIONS = ("ordinary", "polar", "seam", "near")
 SIZE = (72, 36)
@@ -29,23 +31,28 @@ def main() -> None:
     """Print the table as Markdown."""
     where = torch.cuda.get_device_name() if cuda_engine.ON_GPU else "emulated on the CPU"
     print(f"{COUNT} Gaussians, {SIZE[0]}x{SIZE[1]} pixels; {where}\n")
-    print("| projection, camera | region | image: max | mean | depth: max, relative | mean | gradients: max | mean |")
+    print("| projection, camera, blending | region | image: max | mean | depth: max, relative | mean | gradients: max | mean |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
-    for projection, lens in SETUPS:
-        for region in REGIONS if lens == "panorama" else ("ordinary",):
-            numbers = " | ".join(f"{error:.1e}" for error in errors(projection, lens, region))
-            print(f"| {projection}, {lens} | {region} | {numbers} |")
+    for blending in BLENDINGS:
+        for projection, lens in SETUPS:
+            everywhere = lens == "panorama" and (blending == "sorted" or projection == "ray")
+            for region in REGIONS if everywhere else ("ordinary",):
+                numbers = " | ".join(f"{error:.1e}" for error in errors(projection, lens, region, blending))
+                print(f"| {projection}, {lens}, {blending} | {region} | {numbers} |")
 
 
-def errors(projection: str, lens: str, region: str) -> list[float]:
+def errors(projection: str, lens: str, region: str, blending: str) -> list[float]:
     """Of the image, the depth (relative) and the gradients (rows of all inputs, relative): the largest and the mean."""
     generator = torch.Generator().manual_seed(11)
     gaussians = gaussians_of(region, COUNT, generator)
     if region == "near" and projection == "ray":  # which draws nothing from inside
         gaussians.scales.mul_(0.2)
     pose = random_pose(generator) if region == "ordinary" and lens != "panorama" else identity_pose()
-    options = RenderOptions(projection)
+    options = RenderOptions(projection, blending=blending, core_size=4)
     stable = stable_pixels(gaussians, *SIZE, lens=lens, pose=pose, options=options)
+    if blending == "hybrid":
+        *_, decided = fragments(gaussians, camera_of(lens, *SIZE), options, pose)
+        stable &= decided.view_as(stable)
     weights = random_weights(SIZE, stable, generator)
     runs = [
         run(gaussians, SIZE, lens, options, weights, pose=pose, backend=backend, dtype=dtype)
