@@ -7,7 +7,7 @@ schema      version of this layout
 machine     `padgs.clock.machine` of the device; the compute capabilities of the library
 ceilings    copy (byte/s of torch's own copy, read and written) and fp32 (FLOP/s of a matrix product without TF32)
 sizes       name -> one workload of `padgs.bench.workload`:
-  ours, published   bounds that are exact, and squares of 3 sigma as published:
+  ours, published, hybrid   bounds that are exact, squares of 3 sigma as published, and the exact with hybrid blending:
     counters        what the renderer counted
     frame           decode and draw, {"median", "p95", "min"} seconds
     decode          precision of the networks' products -> decode only, without gradients
@@ -39,7 +39,12 @@ from padgs.render.captured import CapturedRender
 from padgs.targets import Targets
 
 SCHEMA = 1
-PUBLISHED = dataclasses.replace(OPTIONS, bounds="square", wrap=False)
+MEASURED = {
+    "ours": OPTIONS,
+    "published": dataclasses.replace(OPTIONS, bounds="square", wrap=False),
+    "hybrid": dataclasses.replace(OPTIONS, blending="hybrid"),
+}
+TITLES = {"ours": "exact bounds", "published": "published bounds", "hybrid": "exact bounds, hybrid blending"}
 LIMITS = {"frame_ms": 2.5, "iteration_ms": 6.0, "peak_gb": 6.0}  # at most; 1M Gaussians at 2048x1024 on an H200
 LEAST_SLOWER = 2.0
 
@@ -155,8 +160,8 @@ def measure_gpu(
     for name in sizes:
         size = SIZES[name]
         entry: dict[str, Any] = dict(dataclasses.asdict(size))
-        for label, options in {"ours": OPTIONS, "published": PUBLISHED}.items():
-            progress(f"{name}, {label} bounds")
+        for label, options in MEASURED.items():
+            progress(f"{name}, {TITLES[label]}")
             work = _on_device(build(size, seed), device)
             entry[label] = _measure(Iteration(work, options, device), repeats, warm_up)
             del work
@@ -273,12 +278,12 @@ def gpu_lines(report: dict[str, Any]) -> list[str]:
     ]
     for name, size in report["sizes"].items():
         found.append(f"{name}: {size['width']}x{size['height']}, about {size['gaussians']:,} Gaussians")
-        for label in ("ours", "published"):
+        for label, title in TITLES.items():
             part = size[label]
             peak = "" if part["peak_bytes"] is None else f", {part['peak_bytes'] / 1e9:.2f} GB"
             times = (f"{what} {1e3 * part[what]['median']:.2f} ms (p95 {1e3 * part[what]['p95']:.2f})"
                      for what in ("frame", "iteration"))  # fmt: skip
-            found.append(f"  {label} bounds, backend {part['backend']}: {', '.join(times)}{peak}")
+            found.append(f"  {title}, backend {part['backend']}: {', '.join(times)}{peak}")
             graph = "" if part["graph"] is None else f", as a CUDA graph {1e3 * part['graph']['median']:.2f} ms"
             decoded = (f"{1e3 * timing['median']:.2f} ms in {name}" for name, timing in part["decode"].items())
             found.append(f"    decoded only: {', '.join(decoded)}")

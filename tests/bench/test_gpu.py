@@ -24,7 +24,7 @@ def report() -> dict:
 @needs_native
 def test_the_report_says_what_was_measured(report: dict):
     size = report["sizes"]["quick"]
-    for label in ("ours", "published"):
+    for label in ("ours", "published", "hybrid"):
         part = size[label]
         assert part["backend"] == "cpu"
         assert 0 < part["frame"]["median"] < part["iteration"]["median"]
