@@ -60,8 +60,8 @@ struct BlendInputs {
   const float *background;               // [3]
   float *image, *transmittance, *depth;  // [H,W,3] [H,W] [H,W]
   int32_t *last;                         // [H,W] 1 + position in the tile's list of the last contribution; sorted only
-  int32_t *core;                         // [H,W,core_size] Gaussians in order, -1 behind the last } hybrid, where a gradient is
-  Tail *tails;                           // [H,W]                                                 } wanted; else null
+  int32_t *core;  // [H,W,core_size] Gaussians in order, -1 behind the last; hybrid where a gradient is wanted, or null
+  Tail *tails;    // [H,W] as core
   int32_t *pair_counts;                  // [chunks, 2] evaluated and contributing pairs, or null
 };
 

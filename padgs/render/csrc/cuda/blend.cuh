@@ -50,9 +50,10 @@ __device__ inline int rank_in_block(bool chosen, int *counts, int &total) {
   return rank;
 }
 
-// Reads the instances from `first` on, and keeps those that reach the block's chunk; returns how many. The whole block takes
-// part, and nobody may read the batch before any more.
-__device__ inline int fill(Batch &batch, const BlendInputs &args, const ChunkPlace &place, int begin, int first, int end) {
+// Reads the instances from `first` on, and keeps those that reach the block's chunk; returns how many. The whole block
+// takes part, and nobody may read the batch before any more.
+__device__ inline int fill(Batch &batch, const BlendInputs &args, const ChunkPlace &place, int begin, int first,
+                           int end) {
   const int at = first + int(threadIdx.x);
   Reach reach{};
   bool chosen = at < end;
@@ -143,7 +144,8 @@ struct PixelOf<false> {
   typedef ProjectivePixel Type;
 };
 
-__device__ inline void write_ray_gradient(const BlendGradientInputs &args, const PixelPlace &place, Vec3<float> gradient) {
+__device__ inline void write_ray_gradient(const BlendGradientInputs &args, const PixelPlace &place,
+                                          Vec3<float> gradient) {
   const int64_t stride = int64_t(chunks(args.forward.table.width)) * kTile;
   float *out = args.grad_rays + 3 * stride * place.y + place.x;
   out[0] = gradient.x, out[stride] = gradient.y, out[2 * stride] = gradient.z;

@@ -1,5 +1,5 @@
-// The fragments of one pixel for hybrid blending: the nearest few in order, and sums over all others; fragments.h of the
-// CPU library has the same for sixteen pixels. The definition is padgs/render/hybrid.py.
+// The fragments of one pixel for hybrid blending: the nearest few in order, and sums over all others; fragments.h of
+// the CPU library has the same for sixteen pixels. The definition is padgs/render/hybrid.py.
 #pragma once
 
 #include "../abi.h"
@@ -60,8 +60,8 @@ PADGS_HD float left_behind(float left, float weight) {
   return next >= kTransmittanceMin ? next : 0.0f;
 }
 
-// What the derivatives of a pixel's fragments need. With s the signal of a fragment (upstream gradient of its colour and
-// depth times these), a fragment of weight alpha u has
+// What the derivatives of a pixel's fragments need. With s the signal of a fragment (upstream gradient of its colour
+// and depth times these), a fragment of weight alpha u has
 //   dL/dalpha = u (s - mean) - behind / (1 - alpha),
 // in the core u = what is in front leaves, mean = 0, behind = weighted signals behind it, background included;
 // in the tail u = T (1 - Q) / Z, mean = mean signal of the tail, behind = T Q (signal of the background - mean).

@@ -1,5 +1,5 @@
-// Hybrid blending, forward: a block draws one chunk of pixels from the list of its tile, a thread each. Every pixel keeps
-// its nearest fragments in its thread's own memory; the list may be in any order, and is read to its end.
+// Hybrid blending, forward: a block draws one chunk of pixels from the list of its tile, a thread each. Every pixel
+// keeps its nearest fragments in its thread's own memory. The order of the list only decides ties; it is read to its end.
 #include "blend.cuh"
 
 namespace padgs {

@@ -1,7 +1,7 @@
 // Hybrid blending, backward. The derivative of a fragment needs its pixel's core and the sums over its tail, which the
-// forward pass kept, but no other fragment: first a thread for each pixel turns the core into what derivatives need, then
-// a warp takes a bucket, a lane for each instance, and all lanes visit one pixel after the other. Every instance sums its
-// own moments in registers, as in sorted blending.
+// forward pass kept, but no other fragment: first a thread for each pixel turns the core into what derivatives need,
+// then a warp takes a bucket, a lane for each instance, and all lanes visit one pixel after the other. Every instance
+// sums its own moments in registers, as in sorted blending.
 #include "blend.cuh"
 
 namespace padgs {
@@ -125,8 +125,8 @@ __global__ void __launch_bounds__(kBatch) hybrid_rays_kernel(BlendGradientInputs
   const BlendInputs &forward = args.forward;
   const PixelPlace place = pixel_place(forward.table, blockIdx.x, int(threadIdx.x));
   const int begin = forward.tile_start[place.chunk.tile], end = forward.tile_start[place.chunk.tile + 1];
-  const int y = place.y - place.chunk.y0, width = forward.table.width;
-  const ProjectivePixel pixel(forward.rays, forward.wrap, width, place.inside ? place.x : 0, place.inside ? place.y : 0);
+  const int y = place.y - place.chunk.y0, row = place.inside ? place.y : 0, column = place.inside ? place.x : 0;
+  const ProjectivePixel pixel(forward.rays, forward.wrap, forward.table.width, column, row);
   const Upstream up = place.inside ? args.upstream[place.index] : Upstream{};
   Vec3<float> sum{0, 0, 0};
   for (int first = begin; first < end; first += kBatch) {

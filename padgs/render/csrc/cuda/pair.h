@@ -29,8 +29,11 @@ struct ProjectivePair {
   float b_by_d;
   bool reached;
 
-  // Where the Gaussian lies on the ray: for projection `ray` at its largest value there, |M^-1 mean| b / D; else at its mean.
-  PADGS_HD float distance(const Footprint &f, bool largest) const { return largest ? b_by_d / root(f.shape[9]) : f.depth; }
+  // Where the Gaussian lies on the ray: for projection `ray` at its largest value there, |M^-1 mean| b / D; else at its
+  // mean.
+  PADGS_HD float distance(const Footprint &f, bool largest) const {
+    return largest ? b_by_d / root(f.shape[9]) : f.depth;
+  }
 
   PADGS_HD void add(float m, float *sums) const {
     const float w0 = m * q, w1 = m * cx, w2 = m * cy;
