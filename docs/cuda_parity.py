@@ -31,7 +31,8 @@ def main() -> None:
     """Print the table as Markdown."""
     where = torch.cuda.get_device_name() if cuda_engine.ON_GPU else "emulated on the CPU"
     print(f"{COUNT} Gaussians, {SIZE[0]}x{SIZE[1]} pixels; {where}\n")
-    print("| projection, camera, blending | region | image: max | mean | depth: max, relative | mean | gradients: max | mean |")
+    errors_of = "image: max | mean | depth: max, relative | mean | gradients: max | mean"
+    print(f"| projection, camera, blending | region | {errors_of} |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
     for blending in BLENDINGS:
         for projection, lens in SETUPS:

@@ -59,7 +59,7 @@ def test_on_a_gpu_the_same_gaussians_are_drawn_with_and_without_a_graph(monkeypa
         what: {"median": ms / 1e3, "p95": 1.0}
         for what, ms in {"frame": 5, "iteration": 9, "draw": 3, "graph": 2}.items()
     }
-    size = {"width": 2, "height": 1, "gaussians": 3, "ours": part, "published": part, "targets": {}}
+    size = {"width": 2, "height": 1, "gaussians": 3, "targets": {}} | dict.fromkeys(gpu.MEASURED, part)
     machine = {"machine": {"gpu": "G", "cpu": "C"}, "ceilings": {"copy": 1e9, "fp32": 1e12}}
     lines = gpu.gpu_lines({**machine, "sizes": {"quick": size}})
     assert (

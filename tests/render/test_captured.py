@@ -66,8 +66,9 @@ def assert_same(actual: Rendering, expected: Rendering) -> None:
         (RenderOptions("tangent"), "panorama"),
         (RenderOptions("ray"), "fisheye"),
         (RenderOptions("pinhole"), "pinhole"),
+        (RenderOptions("ray", blending="hybrid", core_size=3), "panorama"),
     ],
-    ids=lambda value: getattr(value, "projection", value),
+    ids=lambda value: f"{value.projection}-{value.blending}" if isinstance(value, RenderOptions) else value,
 )
 def test_every_bit_is_that_of_an_ordinary_frame(options, lens, generator: torch.Generator, recorded: list[int]):
     gaussians, view = scene_of(generator), view_of(camera_of(lens, 72, 36), random_pose(generator, shift=0.1))

@@ -153,9 +153,7 @@ def test_cores_are_kept_only_to_be_differentiated(generator: torch.Generator, mo
 @pytest.mark.parametrize("blending", ["sorted", "hybrid"])
 def test_going_back_twice_gives_the_same(blending: str, generator: torch.Generator):
     inputs = leaves(gaussians_of("ordinary", 12, generator), torch.float32)
-    rendering = render(
-        inputs, view_of(camera_of("panorama", 40, 20)), RenderOptions(blending=blending), backend="cuda"
-    )
+    rendering = render(inputs, view_of(camera_of("panorama", 40, 20)), RenderOptions(blending=blending), backend="cuda")
     loss = rendering.image.square().sum() + rendering.depth.sum()
     first, second = (torch.autograd.grad(loss, [*vars(inputs).values()], retain_graph=True) for _ in range(2))
     assert all(torch.equal(*pair) and pair[0].any() for pair in zip(first, second, strict=True))

@@ -169,9 +169,7 @@ def assert_native_is_the_definition(
         *[("pinhole", kind) for kind in ("ordinary", "broad")],
     ],
 )
-def test_native_values_and_gradients_are_those_of_the_definition(
-    projection: str, kind: str, size: int, backend: str
-):
+def test_native_values_and_gradients_are_those_of_the_definition(projection: str, kind: str, size: int, backend: str):
     generator = torch.Generator().manual_seed(7 + size)
     gaussians = gaussians_of("huge" if kind == "broad" else kind, 25, generator)
     gaussians.opacities[0] = 1.0  # reaches the maximum alpha, where the derivative is 0
