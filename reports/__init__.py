@@ -13,6 +13,7 @@ REPORTS = {
     "methods": "reports.files:methods",
     "equal_time": "reports.files:equal_time",
     "ladder": "reports.files:ladder",
+    "quirks": "reports.files:quirks",
     "runs": "reports.files:runs",
     "sweep": "reports.files:sweep",
     "chart": "reports.files:chart",

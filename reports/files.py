@@ -19,9 +19,9 @@ def _table(gathered: Gathered, name: str) -> Iterator[File]:
         yield f"{name}.{extension}", text(table).encode()
 
 
-table1, table2, table3, table4, methods, equal_time, ladder, runs = (
+table1, table2, table3, table4, methods, equal_time, ladder, quirks, runs = (
     partial(_table, name=name)
-    for name in ("table1", "table2", "table3", "table4", "methods", "equal_time", "ladder", "runs")
+    for name in ("table1", "table2", "table3", "table4", "methods", "equal_time", "ladder", "quirks", "runs")
 )
 
 

@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 
 from padgs.results import Result
-from reports import ladder, runs, side_by_side, sweep_chart, table3, tables_of_methods, trade_off_chart
+from reports import ladder, quirks, runs, side_by_side, sweep_chart, table3, tables_of_methods, trade_off_chart
 from reports.drawing import Chart
 from reports.measures import marks
 from reports.quality_log import probes
@@ -25,6 +25,7 @@ TABLES: Mapping[str, Callable[[Sequence[Result], Request], Table]] = {
     "methods": side_by_side.methods,
     "equal_time": side_by_side.equal_time,
     "ladder": ladder.build,
+    "quirks": quirks.build,
     "runs": runs.build,
 }
 

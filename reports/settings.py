@@ -20,6 +20,7 @@ EXPERIMENTS = {  # report -> experiments (conf/experiment) that are run for it
     "table4": ("table4_efficiency", *METHODS),
     "methods": METHODS,
     "equal_time": ("equal_time",),
+    "quirks": ("quirks",),
     "ladder": ("ladder",),
     "chart": ("pareto", "table4_efficiency", *METHODS),
 }

@@ -203,6 +203,18 @@ def test_every_rung_of_the_ladder_changes_one_thing():
     assert replace(rungs[-1].train, normalisation="mean") == paper.train
 
 
+def test_every_quirk_is_a_part_of_its_release_and_changes_something():
+    found = {job.variant: job for job in jobs("+experiment=quirks")}
+    assert set(found) == {path.stem for path in (CONF / "quirk").glob("*.yaml")}
+    for name, job in found.items():
+        method = name.partition("_")[0]
+        described, released = found[method].values(), found[f"{method}_all"].values()
+        changed = different_keys(described, job.values()) - {"variant"}
+        assert bool(changed) == (name != method)
+        assert not changed & different_keys(job.values(), released), "and to what the release has"
+    assert found["odgs_all"].preset == "odgs_release"
+
+
 @pytest.mark.parametrize("projection", ["tangent", "ray"])
 def test_padgs_on_another_projection_differs_in_nothing_else(projection):
     other, paper = composed(f"method=padgs_{projection}"), composed()

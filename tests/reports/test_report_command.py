@@ -48,8 +48,8 @@ def test_a_broken_file_is_named_and_left_out_and_strict_fails(runs):
     [
         (
             ["table9"],
-            "unknown report 'table9'; known: chart, equal_time, html, ladder, methods, runs, sweep, table1, table2, "
-            "table3, table4, all",
+            "unknown report 'table9'; known: chart, equal_time, html, ladder, methods, quirks, runs, sweep, table1, "
+            "table2, table3, table4, all",
         ),
         (["table3", "--where", "x"], "--where x is not KEY=VALUE"),
         (["table3", "--protocol", "x"], "unknown protocol 'x'"),
