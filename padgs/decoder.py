@@ -15,7 +15,9 @@ from torch import Tensor, nn
 
 from padgs.fused_decoder import fits, fused_decode
 from padgs.gaussians import Gaussians
+from padgs.gpu_decoder import decode_on_gpu
 from padgs.precision import linear, reduced
+from padgs.render import cuda_native
 
 OPACITY_VALUES, COLOR_VALUES, COVARIANCE_VALUES = 1, 3, 7  # outputs of each head per Gaussian
 SORT_OUT_BELOW = 0.9  # share of anchors with a positive opacity
@@ -124,6 +126,35 @@ def decode_gaussians(
         *values, slots, raw = fused_decode(flat, *tensors, dtype)
         return Gaussians(*values), slots, raw
     return define_gaussians(weights, *tensors, precision)
+
+
+def decode_padded(
+    weights: DecoderWeights,
+    features: Tensor,
+    seen: Tensor,
+    positions: Tensor,
+    offsets: Tensor,
+    log_scales: Tensor,
+    attenuation: Tensor,
+    precision: str = "float32",
+) -> Gaussians:
+    """`decode_gaussians` for frames that a GPU draws without its host waiting (`padgs.render.captured`).
+
+    There are A K Gaussians however many are selected: those in order, and behind them zeros, which nobody draws.
+
+    Raises:
+        ValueError: tensors that are not float32 on a GPU, or an unknown precision.
+        OSError: the GPU's library was not built.
+    """
+    if features.dtype != torch.float32 or features.device.type != cuda_native.device_type():
+        raise ValueError(
+            f"only a GPU decodes without counting, and float32; got {features.dtype} on {features.device}. Convert "
+            "them, or use decode_gaussians"
+        )
+    flat = tuple(tensor for head in weights for tensor in head)
+    tensors = (features, seen, positions, offsets, log_scales, attenuation)
+    *values, _, _ = decode_on_gpu(flat, *tensors, dtype=reduced(precision), padded=True)
+    return Gaussians(*values)
 
 
 def define_gaussians(

@@ -21,15 +21,18 @@ SIZES = (3, 4, 3, 0, 3)  # values per Gaussian of means, quats, scales, opacitie
 
 
 def decode_on_gpu(
-    weights: tuple[Tensor, ...], *tensors: Tensor, dtype: torch.dtype | None = None
+    weights: tuple[Tensor, ...], *tensors: Tensor, dtype: torch.dtype | None = None, padded: bool = False
 ) -> tuple[Tensor, ...]:
-    """`padgs.fused_decoder.fused_decode` where the GPU's library keeps its tensors; waits once, for a count."""
-    return _DecodeOnGPU.apply(dtype, *tensors, *weights)
+    """`padgs.fused_decoder.fused_decode` where the GPU's library keeps its tensors; waits once, for a count.
+
+    Padded, it waits for nothing: behind the selected Gaussians come zeros, as many as there are others.
+    """
+    return _DecodeOnGPU.apply(dtype, padded, *tensors, *weights)
 
 
 class _DecodeOnGPU(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, dtype, features, seen, positions, offsets, log_scales, attenuation, *weights):
+    def forward(ctx: Any, dtype, padded, features, seen, positions, offsets, log_scales, attenuation, *weights):
         dtype = dtype or features.dtype
         inputs = torch.cat((features.detach(), seen), dim=-1).to(dtype)
         constants = [t.detach().contiguous() for t in (positions, offsets, log_scales, attenuation)]
@@ -44,9 +47,9 @@ class _DecodeOnGPU(torch.autograd.Function):
         raw = opacity.tanh_()
         starts = torch.zeros(len(raw) + 1, dtype=torch.int64, device=raw.device)
         torch.cumsum((raw > 0).sum(-1), 0, out=starts[1:])
-        count = int(starts[-1])
-        slots = starts.new_empty(count)
-        outputs = [raw.new_empty((count, size) if size else (count,)) for size in SIZES]
+        count, new = (raw.numel(), Tensor.new_zeros) if padded else (int(starts[-1]), Tensor.new_empty)
+        slots = new(starts, (count,))
+        outputs = [new(raw, (count, size) if size else (count,)) for size in SIZES]
         arguments = cuda_native.DeviceDecodeArguments(
             _arguments(constants, raw, starts, slots, outputs), pointer(color), pointer(covariance)
         )
@@ -88,7 +91,7 @@ class _DecodeOnGPU(torch.autograd.Function):
         of_b2 = [grad.sum(0) for grad in grad_logits]
         of_weights = [grad.to(raw.dtype) for head in zip(of_w1, of_b1, of_w2, of_b2, strict=True) for grad in head]
         grad_features = (grad_hidden @ w1[:, : ctx.features]).to(raw.dtype)
-        return None, grad_features, None, None, grad_offsets, grad_log_scales, None, *of_weights
+        return None, None, grad_features, None, None, grad_offsets, grad_log_scales, None, *of_weights
 
 
 def _arguments(constants, raw, starts, slots, outputs) -> native.DecodeArguments:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from padgs.anchors import anchors_from_points, automatic_voxel_size, initial_log_scales
-from padgs.decoder import Decoder, decode_gaussians
+from padgs.decoder import Decoder, decode_gaussians, decode_padded
 from padgs.gaussians import Gaussians
 from padgs.modulation import OMEGA_AXES, direction_distortion, modulate, polar_axis
 from padgs.precision import PRECISIONS
@@ -183,6 +183,18 @@ class PaDGS(nn.Module):
 
     def decode(self, view: View) -> Decoded:
         """The Gaussians that this view shows (Eq. 13-15)."""
+        return Decoded(*decode_gaussians(self.decoder.weights(), *self._as_seen(view), self.options.precision))
+
+    def show(self, view: View) -> Gaussians:
+        """The same for `padgs.render.captured`: A K Gaussians, of which those that are not selected are zeros.
+
+        Raises:
+            ValueError, OSError: as `padgs.decoder.decode_padded` does.
+        """
+        return decode_padded(self.decoder.weights(), *self._as_seen(view), self.options.precision)
+
+    def _as_seen(self, view: View) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """What is decoded: features, how the camera sees them, positions, offsets, log-scales, attenuation."""
         options = self.options
         direction, distance, omega = self.seen_from(view)
         seen = [direction]
@@ -192,14 +204,5 @@ class PaDGS(nn.Module):
             seen_omega = omega if options.omega_input == "sin2" else torch.sqrt((1 - omega).clamp(min=0))
             seen.append(seen_omega[:, None])
         attenuation = modulate(torch.ones_like(omega), omega, options.tau, options.max_modulated_omega)
-        decoded = decode_gaussians(
-            self.decoder.weights(),
-            self.features,
-            torch.cat(seen, dim=-1),
-            self.positions,
-            self.offsets,
-            self.log_scales,
-            attenuation,
-            options.precision,
-        )
-        return Decoded(*decoded)
+        constants = torch.cat(seen, dim=-1), self.positions
+        return self.features, *constants, self.offsets, self.log_scales, attenuation

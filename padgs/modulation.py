@@ -18,7 +18,9 @@ def polar_axis(name: str, cam_from_world: Tensor) -> Tensor:
     if name == "camera_y":
         return cam_from_world[1, :3]
     if name == "world_z":
-        return cam_from_world.new_tensor([0.0, 0.0, 1.0])
+        axis = cam_from_world.new_zeros(3)
+        axis[2].fill_(1)  # nothing is sent to a GPU
+        return axis
     raise ValueError(f"unknown omega_axis {name!r}; known: {', '.join(OMEGA_AXES)}")
 
 

@@ -11,7 +11,7 @@ sizes       name -> one workload of `padgs.bench.workload`:
     counters        what the renderer counted
     frame           decode and draw, {"median", "p95", "min"} seconds
     decode          precision of the networks' products -> decode only, without gradients
-    draw, graph     draw only, the same Gaussians each time: launch by launch, and as a CUDA graph (null without a GPU)
+    graph           frame as a CUDA graph: the host launches once and waits at its end; null without a GPU
     iteration       the same forward and backward with probe, loss, observation for densification and Adam
     stages          calls of libpadgs_cuda in one iteration -> the same
     peak_bytes      of torch's allocator, in one iteration
@@ -102,16 +102,13 @@ class Iteration:
         usual = model.options
         return work
 
-    def drawing(self) -> tuple[Callable[[], object], Callable[[], object] | None]:
-        """Draw without decoding: launch by launch, and played back from a graph if the backend can."""
-        view = self.work.view.at(self.work.view.cam_from_world.to(self.device))
-        with torch.no_grad():
-            gaussians = self.work.model.decode(view).gaussians
-        graph = CapturedRender(lambda _: gaussians, view, self.options) if self.backend == "cuda" else None
-        return (
-            lambda: render(gaussians, view, self.options, backend=self.backend),
-            None if graph is None else lambda: graph(view.cam_from_world),
-        )
+    def captured_frame(self) -> Callable[[], object] | None:
+        """The same, recorded and played back; None if the backend cannot."""
+        if self.backend != "cuda":
+            return None
+        pose = self.work.view.cam_from_world.to(self.device)
+        draw = CapturedRender(self.work.model.show, self.work.view, self.options)
+        return lambda: draw(pose)
 
     def train(self) -> None:
         """Forward, backward, statistics, step; nothing is read back but the number of instances."""
@@ -194,7 +191,9 @@ def _measure(iteration: Iteration, repeats: int, warm_up: int) -> dict[str, Any]
     watch = Stopwatch(iteration.device)
     frame = _timed(iteration.frame, watch, repeats, warm_up)
     decode = {name: _timed(iteration.decoding(name), watch, repeats, warm_up) for name in PRECISIONS}
-    draw, graph = (None if work is None else _timed(work, watch, repeats, warm_up) for work in iteration.drawing())
+    captured = iteration.captured_frame()
+    graph = None if captured is None else _timed(captured, watch, repeats, warm_up)
+    del captured  # and its memory
     clock.reset_peak_memory(iteration.device)
     timing = _timed(iteration.train, watch, repeats, warm_up)
     memory = clock.peak_memory(iteration.device)
@@ -202,7 +201,6 @@ def _measure(iteration: Iteration, repeats: int, warm_up: int) -> dict[str, Any]
         "backend": iteration.backend,
         "frame": frame,
         "decode": decode,
-        "draw": draw,
         "graph": graph,
         "iteration": timing,
         "stages": _stages(iteration, watch, repeats),
@@ -284,10 +282,10 @@ def gpu_lines(report: dict[str, Any]) -> list[str]:
             times = (f"{what} {1e3 * part[what]['median']:.2f} ms (p95 {1e3 * part[what]['p95']:.2f})"
                      for what in ("frame", "iteration"))  # fmt: skip
             found.append(f"  {title}, backend {part['backend']}: {', '.join(times)}{peak}")
-            graph = "" if part["graph"] is None else f", as a CUDA graph {1e3 * part['graph']['median']:.2f} ms"
+            if part["graph"] is not None:
+                found.append(f"    frame as a CUDA graph: {1e3 * part['graph']['median']:.2f} ms")
             decoded = (f"{1e3 * timing['median']:.2f} ms in {name}" for name, timing in part["decode"].items())
             found.append(f"    decoded only: {', '.join(decoded)}")
-            found.append(f"    drawn only: {1e3 * part['draw']['median']:.2f} ms{graph}")
         found += [f"    {stage}: {1e3 * timing['median']:.3f} ms" for stage, timing in size["ours"]["stages"].items()]
         for target, verdict in size["targets"].items():
             found.append(f"  {target}: {verdict['value']} (asked: {verdict['limit']}), met: {verdict['met']}")

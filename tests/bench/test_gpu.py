@@ -28,8 +28,7 @@ def test_the_report_says_what_was_measured(report: dict):
         part = size[label]
         assert part["backend"] == "cpu"
         assert 0 < part["frame"]["median"] < part["iteration"]["median"]
-        assert part["draw"]["median"] > 0 and part["graph"] is None
-        assert set(part["decode"]) == {"float32", "bfloat16", "float16"}
+        assert part["graph"] is None and set(part["decode"]) == {"float32", "bfloat16", "float16"}
         assert part["counters"]["contributing"] > 0 and part["stages"] == {}  # no call went to libpadgs_cuda
     assert size["published"]["counters"]["instances"] > size["ours"]["counters"]["instances"]
     assert set(size["slower"]) == {"frame", "iteration"} and size["targets"] == {}
@@ -39,32 +38,24 @@ def test_the_report_says_what_was_measured(report: dict):
     assert "quick: 128x64, about 2,000 Gaussians" in text and "published bounds, backend cpu: frame " in text
 
 
-def test_on_a_gpu_the_same_gaussians_are_drawn_with_and_without_a_graph(monkeypatch: pytest.MonkeyPatch):
-    drawn = []
-
-    def captured(show, view, options):
-        return lambda pose: drawn.append((show(view), pose, options))
-
-    monkeypatch.setattr(gpu, "CapturedRender", captured)
-    monkeypatch.setattr(gpu, "render", lambda gaussians, view, options, **how: drawn.append((gaussians, view, how)))
+def test_on_a_gpu_the_frame_is_also_played_back_from_a_graph(monkeypatch: pytest.MonkeyPatch):
+    made, poses = [], []
+    monkeypatch.setattr(gpu, "CapturedRender", lambda *how: made.append(how) or poses.append)
     iteration = gpu.Iteration(build(SIZES["quick"]), OPTIONS, torch.device("cpu"))
+    assert iteration.captured_frame() is None
     iteration.backend = "cuda"
-    for draw in iteration.drawing():
-        assert draw is not None
-        draw()
-    (usual, view, how), (recorded, pose, options) = drawn
-    assert recorded is usual and len(usual) > 0 and not usual.means.requires_grad
-    assert pose is view.cam_from_world and options is OPTIONS and how == {"backend": "cuda"}
+    draw = iteration.captured_frame()
+    assert draw is not None
+    draw()
+    assert made == [(iteration.work.model.show, iteration.work.view, OPTIONS)]
+    assert torch.equal(poses[0], iteration.work.view.cam_from_world)
     part = {"backend": "cuda", "peak_bytes": None, "stages": {}, "decode": {"float32": {"median": 0.004}}} | {
-        what: {"median": ms / 1e3, "p95": 1.0}
-        for what, ms in {"frame": 5, "iteration": 9, "draw": 3, "graph": 2}.items()
+        what: {"median": ms / 1e3, "p95": 1.0} for what, ms in {"frame": 5, "iteration": 9, "graph": 2}.items()
     }
-    size = {"width": 2, "height": 1, "gaussians": 3, "targets": {}} | dict.fromkeys(gpu.MEASURED, part)
+    size = {"width": 2, "height": 1, "gaussians": 3, **dict.fromkeys(gpu.TITLES, part), "targets": {}}
     machine = {"machine": {"gpu": "G", "cpu": "C"}, "ceilings": {"copy": 1e9, "fp32": 1e12}}
     lines = gpu.gpu_lines({**machine, "sizes": {"quick": size}})
-    assert (
-        "    drawn only: 3.00 ms, as a CUDA graph 2.00 ms" in lines and "    decoded only: 4.00 ms in float32" in lines
-    )
+    assert "    frame as a CUDA graph: 2.00 ms" in lines and "    decoded only: 4.00 ms in float32" in lines
 
 
 def test_decoding_is_timed_in_a_precision_and_leaves_the_model_as_it_was(monkeypatch: pytest.MonkeyPatch):

@@ -8,8 +8,10 @@ import cuda_engine
 import pytest
 import torch
 from render_cases import INPUTS, camera_of, mixture, random_pose, view_of
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from padgs.gaussians import Gaussians
+from padgs.model import PaDGS, PaDGSOptions
 from padgs.render import Rendering, RenderOptions, captured, cuda_backend, cuda_native
 from padgs.render.captured import CapturedRender
 from padgs.render.cuda_tiles import Projected, Strip, tile_rows
@@ -121,6 +123,65 @@ def test_what_a_view_shows_is_recorded_too_and_tensors_are_taken_by_reference(ge
     background += 1
     bright = draw(pose)
     assert (bright.image - bright.transmittance[..., None] >= 0).all() and bright.image.max() > 0.9
+
+
+@pytest.mark.usefixtures("dirty_memory")
+@pytest.mark.parametrize("omega_axis", ["camera_y", "world_z"])
+def test_anchors_are_decoded_within_the_recording(omega_axis: str, generator: torch.Generator, recorded: list[int]):
+    positions = 4 * torch.randn(30, 3, generator=generator)
+    options = PaDGSOptions(omega_axis=omega_axis)
+    model = PaDGS(positions, torch.full((30, 6), -1.0), options, voxel_size=0.1, generator=generator).to(DEVICE)
+    with torch.no_grad():
+        for parameter in (model.features, model.offsets):
+            parameter.copy_(torch.randn(parameter.shape, generator=generator))
+        view = view_of(camera_of("panorama", 72, 36))
+        draw = CapturedRender(model.show, view, room=10_000)
+        counts = set()
+        for _ in range(2):
+            pose = random_pose(generator, shift=1)
+            shown = model.show(view.at(pose))
+            selected = int((shown.opacities > 0).sum())
+            exact = Gaussians(**{name: getattr(shown, name)[:selected] for name in INPUTS})
+            actual, expected = draw(pose), ordinary(exact, view.at(pose), RenderOptions())
+            for name in ("image", "transmittance", "depth"):
+                assert torch.equal(getattr(actual, name), getattr(expected, name)), name
+            assert torch.equal(actual.visible[:selected], expected.visible) and not actual.visible[selected:].any()
+            counts.add(selected)
+    assert len(counts) == 2 and 0 < max(counts) < 300 and len(recorded) == 1
+
+
+class NothingIsRead(TorchDispatchMode):
+    """Refuses operations for which the host waits; so does a real recording."""
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        name = function._schema.name.split("::")[1]
+        assert name not in ("_local_scalar_dense", "nonzero", "masked_select", "equal", "lift_fresh"), name
+        return function(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize(
+    "options", [RenderOptions(), RenderOptions("ray", blending="hybrid")], ids=lambda o: o.blending
+)
+def test_a_recording_reads_nothing_back(options, generator: torch.Generator, monkeypatch: pytest.MonkeyPatch):
+    view = view_of(camera_of("fisheye" if options.projection == "ray" else "panorama", 40, 20))
+    model = PaDGS(
+        torch.randn(30, 3, generator=generator),
+        torch.full((30, 6), -1.0),
+        PaDGSOptions(omega_axis="world_z"),
+        voxel_size=0.1,
+        generator=generator,
+    ).to(DEVICE)
+    draw = CapturedRender(model.show, view, options)
+    draw(view.cam_from_world)  # what is kept for a camera is there
+
+    def refuse(_):
+        raise AssertionError("tolist")
+
+    with monkeypatch.context() as patch, NothingIsRead(), torch.no_grad():
+        patch.setattr(torch.Tensor, "tolist", refuse)
+        assert draw._record().image.shape == (20, 40, 3)
+    with pytest.raises(AssertionError), NothingIsRead():
+        torch.ones(1).sum().item()
 
 
 def test_nothing_to_draw_is_the_background(generator: torch.Generator):

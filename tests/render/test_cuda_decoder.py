@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from padgs.decoder import Decoder, DecoderWeights, decode_gaussians, define_gaussians
+from padgs.decoder import Decoder, DecoderWeights, decode_gaussians, decode_padded, define_gaussians
 from padgs.gaussians import Gaussians
 from padgs.gpu_decoder import decode_on_gpu
 from padgs.precision import OF_GRADIENTS, reduced
@@ -87,6 +87,22 @@ def test_reduced_precisions_match_the_definition_and_stay_near_float32(precision
             assert (gradients[name] - expected).norm() < of_gradients * expected.norm(), name
     exact = on_gpu(decoder.weights(), *tensors.values(), precision="float32")[0]
     assert torch.equal(ours.means, exact.means) and not torch.equal(ours.colors, exact.colors)
+
+
+def test_padded_decoding_is_the_same_with_zeros_behind(generator: torch.Generator):
+    tensors, decoder = problem(60, 10, 37, 32, generator)
+    exact = on_gpu(decoder.weights(), *tensors.values(), precision="float32")[0]
+    padded = decode_padded(decoder.weights(), *tensors.values(), precision="float32")
+    count = len(exact)
+    assert 0 < count < len(padded) == 600
+    for name, value in vars(exact).items():
+        assert torch.equal(getattr(padded, name)[:count], value) and not getattr(padded, name)[count:].any(), name
+
+
+def test_padded_decoding_elsewhere_is_refused(generator: torch.Generator):
+    tensors, decoder = problem(3, 10, 37, 32, generator)
+    with pytest.raises(ValueError, match="only a GPU decodes without counting, and float32; got torch.float64 on "):
+        decode_padded(decoder.weights(), *(tensor.double() for tensor in tensors.values()), precision="float32")
 
 
 def test_nothing_selected_is_no_gaussians(generator: torch.Generator):
