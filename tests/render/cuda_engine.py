@@ -46,6 +46,7 @@ def compiled(name: str, sources: list[Path]) -> ctypes.CDLL:
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     target = folder / f"lib{name}.so"
     flags = ["-std=c++17", "-O2", "-fPIC", "-shared", "-Wall", "-Wextra", "-Werror", "-DPADGS_EMULATED"]
+    flags += ["-fsanitize=bounds", "-fsanitize-undefined-trap-on-error"]  # of arrays: ends the process
     command = [str(COMPILER), *flags, f"-I{HERE}", f"-I{SOURCES}", "-x", "c++", *map(str, sources), "-o", str(target)]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
