@@ -62,7 +62,8 @@ class CapturedRender:
         Args:
             show: the Gaussians that a view shows, float32 tensors of a GPU. It is recorded too: it has to launch the
                 same work for every pose and read nothing back, and its Python is not run again. Tensors that it holds
-                are taken by reference: what is written into them is drawn from then on.
+                are taken by reference: what is written into them is drawn from then on. None may be replaced by
+                another, as growth and `PaDGS.load` do: a playback would read freed memory. Make a new `CapturedRender`.
             view: the camera, and the first pose.
             options: as in `padgs.render.render`, without cubemap and pixel bias.
             background: [3] RGB, by reference; black if not given.
@@ -85,7 +86,7 @@ class CapturedRender:
             means = (gaussians := show(view)).means
             cuda_backend.check(means)
             self._background = means.new_zeros(3) if background is None else background
-            self._view = view.at(view.cam_from_world.to(means.device, copy=True))
+            self._view = view.at(view.cam_from_world.to(means.device, copy=True).contiguous())
             pose = self._view.cam_from_world.to(means.dtype)
             check_inputs(gaussians, pose, view.camera, options, self._background, None, check_values=False)
             self._camera = native_camera(cuda_backend.IDENTITY, view.camera, options)
@@ -97,7 +98,7 @@ class CapturedRender:
         """Draw from a pose [4, 4]; waits for the end of the frame. The result is a copy that no other frame overwrites.
 
         Raises:
-            ValueError: not a pose.
+            ValueError: not of this shape.
             ValueError, MemoryError, torch.cuda.OutOfMemoryError: there cannot be as much room as the pose needs.
         """
         pose = self._view.cam_from_world
@@ -139,7 +140,8 @@ class CapturedRender:
         """All the work of a frame; nothing here waits for the device."""
         projected = self._projected(self._show(self._view), room=self.room)
         outputs = cuda_backend.Outputs.of(self._view.camera, self._options, projected.order.device)
-        pairs = cuda_backend.blend(projected, self._rays, self._background, outputs)
+        background = self._background.contiguous()  # which must outlive the call
+        pairs = cuda_backend.blend(projected, self._rays, background, outputs)
         visible = projected.boxes[:, 3] < projected.boxes[:, 4]
         return Frame(outputs.image, outputs.transmittance, outputs.depth, visible, pairs, projected)
 

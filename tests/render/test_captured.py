@@ -102,6 +102,14 @@ def test_too_little_room_is_noticed_and_made(missing: int | str, generator: torc
     assert len(recorded) < 3
 
 
+def test_poses_and_backgrounds_may_lie_in_memory_in_any_order(generator: torch.Generator):
+    gaussians, view = scene_of(generator), view_of(camera_of("panorama", 40, 20), random_pose(generator, shift=1))
+    transposed, background = view.at(view.cam_from_world.T.contiguous().T), torch.ones(1, device=DEVICE).expand(3)
+    draw = CapturedRender(lambda _: gaussians, transposed, background=background)
+    expected = CapturedRender(lambda _: gaussians, view, background=torch.ones(3, device=DEVICE))
+    assert_same(draw(transposed.cam_from_world), expected(view.cam_from_world))
+
+
 def test_the_room_is_for_the_first_pose_and_half_as_much_again(generator: torch.Generator):
     gaussians, view = scene_of(generator), view_of(camera_of("panorama", 72, 36))
     draw = CapturedRender(lambda _: gaussians, view)
