@@ -19,7 +19,7 @@ from padgs.panorama import sample
 from padgs.scene import Scene, View
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # a key of the store by identity: tensors are neither compared nor hashed by value
 class _Cut:
     """Where the pixels of one view lie in its panorama."""
 
@@ -61,7 +61,7 @@ class _Pixels(_Cut):
             self.panorama.prefetch()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Mask(_Cut):
     """Loads the mask of a view."""
 

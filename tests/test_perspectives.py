@@ -87,6 +87,7 @@ def test_views_are_cut_once_where_the_panorama_comes_from_a_store(tmp_path: Path
         stored = replace(panorama, load_pixels=StoredImage(tmp_path / "p.png", WIDTH, HEIGHT, store))
         cut = perspective_views(stored, FACES, square_lens(panorama.camera, 1.0))
         pixels = [view.load_pixels() for view in cut]
+        assert cut[0].load_pixels != replace(cut[0].load_pixels), "which are told apart by identity"
         for view, before, free in zip(
             cut, pixels, perspective_views(panorama, FACES, square_lens(panorama.camera, 1.0)), strict=True
         ):
