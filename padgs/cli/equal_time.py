@@ -35,8 +35,8 @@ def equal_time(
     folder = Path(runs)
     if not folder.is_dir():
         raise _refused(f"there is no folder {folder}; give the folder of the runs")
-    if not seconds > 0:
-        raise _refused(f"seconds is {seconds:g}; it must be > 0")
+    if not 0 < seconds < math.inf:
+        raise _refused(f"seconds is {seconds:g}; it must be > 0 and finite")
     found, broken = results.read_all(folder)
     for error in broken:
         print(f"left out: {error}", file=sys.stderr)

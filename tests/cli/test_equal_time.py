@@ -116,6 +116,7 @@ def test_lengths_come_from_the_nearest_runs_of_the_same_settings():
     [
         (["nowhere", "60"], "there is no folder nowhere"),
         (["{runs}", "0"], "seconds is 0; it must be > 0"),
+        (["{runs}", "inf"], "seconds is inf; it must be > 0 and finite"),
         (["{runs}", "60"], "has ended well; run the methods first"),
         (["{runs}", "60", "--experiment", "x"], "unknown experiment 'x'; known: none"),
     ],
