@@ -1,6 +1,8 @@
 """Matrix products of small networks in a reduced floating-point type: what tensor cores are for.
 
 Parameters and results stay float32; operands are rounded for the product, which is summed in float32 and rounded once.
+(On a GPU partial sums may be rounded too: `torch.backends.cuda.matmul.allow_bf16_reduced_precision_reduction`, on by
+default, and the same for float16.)
 Products of gradients are taken in bfloat16 whatever the type: those of a mean over pixels are smaller than float16's
 numbers begin.
 """
