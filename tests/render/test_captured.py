@@ -36,12 +36,15 @@ def recorded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 @pytest.fixture
-def dirty_memory():
+def dirty_memory(monkeypatch: pytest.MonkeyPatch):
     """Memory that nobody wrote to holds the largest numbers, so that whoever reads it is found out."""
+    monkeypatch.setenv("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # else products on a GPU warn, which is an error here
     torch.use_deterministic_algorithms(True, warn_only=True)
-    assert torch.empty(1, dtype=torch.int32, device=DEVICE).item() == 2**31 - 1
-    yield
-    torch.use_deterministic_algorithms(False)
+    try:
+        assert torch.empty(1, dtype=torch.int32, device=DEVICE).item() == 2**31 - 1
+        yield
+    finally:
+        torch.use_deterministic_algorithms(False)
 
 
 def scene_of(generator: torch.Generator, count: int = 40) -> Gaussians:
