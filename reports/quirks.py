@@ -34,7 +34,7 @@ COSTS = ("gaussians", "megabytes", "train_seconds", "frame_ms")
 
 
 def build(results: Sequence[Result], request: Request) -> Table:
-    """A block for each scene and method; rows: as described, with each quirk alone, with all of them; and the change.
+    """A block for each scene and method; rows: as described, with each quirk alone, as released; and the change.
 
     Raises:
         ReportError: results that must not stand together, or an unknown protocol.
