@@ -153,7 +153,7 @@ class _Rasterize(torch.autograd.Function):
         camera: Camera,
         options: RenderOptions,
         counters: Counters,
-        recorded: bool,
+        grad_enabled: bool,
     ):
         device, count = means.device, len(means)
         tensors = [t.detach().contiguous() for t in (means, quats, scales, opacities, colors)]
@@ -163,7 +163,7 @@ class _Rasterize(torch.autograd.Function):
         projected = Projected(native_camera(IDENTITY, camera, options), pose, inputs, options.max_instances)
         check_memory(projected.instances, options)
         rays = native_rays(camera, device)
-        outputs = Outputs.of(camera, options, device, differentiated=recorded and any(ctx.needs_input_grad))
+        outputs = Outputs.of(camera, options, device, differentiated=grad_enabled and any(ctx.needs_input_grad))
         pairs = blend(projected, rays, background, outputs)
         visible = projected.boxes[:, 3] < projected.boxes[:, 4]
         counters.record(pairs, gaussians=count, visible=projected.visible, instances=projected.instances)
