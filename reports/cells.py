@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 from padgs.results import Result
@@ -19,21 +20,29 @@ def one_setting(results: Sequence[Result], where: str) -> list[Result]:
     """Results of one cell, sorted by seed.
 
     Raises:
-        ReportError: they differ in more than the seed, so that their mean would mean nothing.
+        ReportError: they differ in more than the seed, so that their mean would mean nothing; or not even in that.
     """
     ordered = sorted(results, key=lambda result: result.seed)
-    for result in ordered[1:]:
-        differing = different_keys(ordered[0].config, result.config)
+    refuse_differences(ordered, where)
+    for before, result in pairwise(ordered):
+        if result.seed == before.seed:
+            raise ReportError(f"{where}: runs {before.run} and {result.run} are the same setting; delete one of them")
+    return ordered
+
+
+def refuse_differences(results: Sequence[Result], where: str) -> None:
+    """Results must differ in nothing but the seed, and what no number depends on.
+
+    Raises:
+        ReportError: they differ in more.
+    """
+    for result in results[1:]:
+        differing = different_keys(results[0].config, result.config)
         if differing:
             raise ReportError(
-                f"{where}: runs {ordered[0].run} and {result.run} differ in {', '.join(differing)}; "
+                f"{where}: runs {results[0].run} and {result.run} differ in {', '.join(differing)}; "
                 f"choose one with --where {differing[0]}=..."
             )
-        if result.seed == ordered[0].seed:
-            raise ReportError(
-                f"{where}: runs {ordered[0].run} and {result.run} are the same setting; delete one of them"
-            )
-    return ordered
 
 
 def different_keys(first: Mapping[str, Any], second: Mapping[str, Any], where: str = "") -> list[str]:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from padgs.results import Result
 from reports import methods as names
-from reports.cells import one_setting, over_seeds
+from reports.cells import one_setting, over_seeds, refuse_differences
 from reports.conditions import CONDITIONS, OF_TIMES, refuse_mixture
 from reports.equal_time import EXPERIMENT, common_seconds, nearest_to, of_any_length
 from reports.footnotes import conditions
@@ -61,6 +61,9 @@ def equal_time(results: Sequence[Result], request: Request) -> Table:
     for place in places(runs):
         own = at(place, runs)
         refuse_mixture(own, request, place.title, alike)
+        for preset in names.ordered(result.preset for result in own):
+            lengths = [of_any_length(r) for r in own if r.preset == preset]
+            refuse_differences(lengths, f"{place.title}, {names.title(preset)}")  # else the nearer of two settings would stand for both
         blocks[place] = [of_any_length(r) for r in nearest_to(common_seconds(own), own)]
     return _table("equal_time", "Every method after the same training time", blocks)
 

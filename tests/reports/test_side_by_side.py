@@ -62,8 +62,9 @@ def test_seeds_may_differ_in_length_but_in_nothing_else():
     runs = [trained("padgs", 100, 900, 25), trained("padgs", 102, 950, 27, seed=1)]
     assert value(equal_time(runs, Request()), "synthetic-room", "PaD-GS", "PSNR") == pytest.approx(26)
     other = replace(runs[1], config={**runs[1].config, "method": {"sh_degree": 0}})
-    with pytest.raises(ReportError, match="method.sh_degree"):
-        equal_time([runs[0], other], Request())
+    for seed in (0, 1):
+        with pytest.raises(ReportError, match="differ in method.sh_degree"):
+            equal_time([runs[0], replace(other, seed=seed)], Request())
 
 
 def test_a_method_that_failed_shows_its_status():
