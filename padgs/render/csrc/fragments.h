@@ -1,13 +1,14 @@
 // The fragments of sixteen pixels for hybrid blending: the nearest few in order, and sums over all others.
 //
-// The core is a list of rows. Each instance that enters the core of any of the pixels appends a row, with holes at the other
-// pixels: transparent fragments as far away as what is in front of them. So the distances of every pixel ascend along the
-// rows, and as instances come nearly front to back, few fragments have to be moved to an earlier row.
+// The core is a list of rows, each of one instance: those of its fragments that are in the core of their pixels, with holes at
+// the other pixels. A hole is a transparent fragment as far away as what is in front of it, so the distances of every pixel
+// ascend along the rows. As instances come nearly front to back, most rows are appended; fragments that are nearer than what
+// their pixel has already make rows further up.
 #pragma once
 
 #include <algorithm>
 #include <memory>
-#include <vector>
+#include <utility>
 
 #include "abi.h"
 #include "simd.h"
@@ -15,18 +16,10 @@
 namespace padgs {
 namespace PADGS_ISA {
 
-constexpr int32_t kMixed = -1;
-
 struct Row {
   Vec distance, alpha;  // alpha 0: a hole
-  int32_t entrant;      // of all its fragments; kMixed: they are in `entrants`
-  VecI entrants;
-
-  VecI each_entrant() const { return entrant == kMixed ? entrants : splat_int(entrant); }
-};
-
-struct Colors {
-  Vec red, green, blue, depth;
+  int32_t entrant;
+  int32_t front;  // the row in front of this one
 };
 
 // Sums over the fragments outside the core; they do not depend on any order but that of rounding.
@@ -45,79 +38,99 @@ struct Tail {
   }
 };
 
-struct Fragments {
+class Fragments {
+ public:
   Tail tail;
-  Vec reached = zero(), entered = zero();  // fragments of each pixel: all, those in its rows
-  Vec last = splat(-1.0f);                 // distance in the last row
-  Row *rows = nullptr;
+  Vec reached, entered;         // fragments of each pixel: all, those in its rows
+  Row *rows = nullptr;          // from 1 on; row 0 is in front of all, and empty
   int32_t *entrants = nullptr;  // positions in the tile's list, ascending
-  int row_count = 0, entrant_count = 0;
+  int row_count, entrant_count;
+  int last;       // of the rows, from front to back
+  bool in_order;  // the rows lie as they follow each other
 
   void clear() {
     tail = Tail();
     reached = entered = zero();
-    last = splat(-1.0f);
-    row_count = entrant_count = 0;
+    row_count = 1, entrant_count = last = 0, in_order = true;
+    rows = row_storage_.get();
+    reserve(0);
+    rows[0] = {splat(-1.0f), zero(), 0, 0};
   }
-  // Makes room for another `instances` of them.
-  void reserve(int instances) {
-    grow(row_storage_, rows, row_count, row_capacity_, row_count + instances + 1);
-    grow(entrant_storage_, entrants, entrant_count, entrant_capacity_, entrant_count + instances + 1);
+  // Makes room for `more` entrants, and for the rows of at least one.
+  void reserve(int more) {
+    const int offset = int(rows - row_storage_.get());
+    grow(row_storage_, row_capacity_, offset + row_count + kRowsOfOne);
+    rows = row_storage_.get() + offset;
+    grow(entrant_storage_, entrant_capacity_, entrant_count + more);
+    entrants = entrant_storage_.get();
   }
-  // Leaves the nearest `core_size` fragments of each pixel in the rows, and no empty rows; the others join the tail.
-  template <class ColorsOf>
-  void close(int core_size, ColorsOf colors_of) {
+  // While there are fewer rows there is room for those of another instance.
+  int row_limit() const { return row_capacity_ - int(rows - row_storage_.get()) - kRowsOfOne; }
+
+  // Brings the rows into order: 1 is the nearest. Only the `core_size` nearest fragments of each pixel stay in them; the
+  // others join the tail, and rows that have none left are dropped.
+  template <class FootprintOf>
+  void close(int core_size, FootprintOf footprint_of) {
+    if (in_order) return;  // and nothing came too late, or it would not be in the rows
+    in_order = true;
+    grow(spare_storage_, spare_capacity_, row_count);
     const Vec size = splat(float(core_size));
-    if (!any(less(size, entered))) return;
-    Vec passed = zero();
-    int kept = 0;
-    for (int k = 0; k < row_count; ++k) {
-      Row &row = rows[k];
-      const Mask filled = less(zero(), row.alpha);
-      passed += keep(filled, splat(1.0f));
-      const Mask beyond = both(filled, less(size, passed));
+    Vec place = entered;  // of each pixel's next fragment, counted from the front
+    Row *next = spare_storage_.get() + row_count;
+    for (int k = last; k > 0; k = rows[k].front) {
+      const Row &row = rows[k];
+      const Mask filled = less(zero(), row.alpha), beyond = both(filled, less(size, place));
+      place = place - keep(filled, splat(1.0f));
+      Vec alpha = row.alpha;
       if (any(beyond)) {
-        tail.add(keep(beyond, row.alpha), colors_of(row));
-        row.alpha = select(beyond, zero(), row.alpha);
+        tail.add(keep(beyond, alpha), footprint_of(row));
+        alpha = select(beyond, zero(), alpha);
+        if (!any(less(zero(), alpha))) continue;
       }
-      if (any(less(zero(), row.alpha))) {
-        if (kept < k) rows[kept] = row;
-        ++kept;
-      }
+      --next;
+      next->distance = row.distance, next->alpha = alpha, next->entrant = row.entrant;
     }
-    row_count = kept;
+    *--next = rows[0];
+    std::swap(row_storage_, spare_storage_), std::swap(row_capacity_, spare_capacity_);
+    row_count = int(row_storage_.get() + row_count - next);
+    rows = next;
+    for (int k = 1; k < row_count; ++k) rows[k].front = k - 1;
+    last = row_count - 1;
     entered = minimum(entered, size);
   }
 
  private:
+  static constexpr int kRowsOfOne = kLanes + 1;
   template <class T>
-  static void grow(std::unique_ptr<T[]> &storage, T *&data, int used, int &capacity, int needed) {
+  static void grow(std::unique_ptr<T[]> &storage, int &capacity, int needed) {
     if (needed <= capacity) return;
-    std::unique_ptr<T[]> larger(new T[2 * needed]);
-    std::copy_n(data, used, larger.get());
+    needed = std::max(needed, 2 * capacity);
+    std::unique_ptr<T[]> larger(new T[needed]);
+    std::copy_n(storage.get(), capacity, larger.get());
     storage.swap(larger);
-    data = storage.get();
-    capacity = 2 * needed;
+    capacity = needed;
   }
-  std::unique_ptr<Row[]> row_storage_;
+  std::unique_ptr<Row[]> row_storage_, spare_storage_;
   std::unique_ptr<int32_t[]> entrant_storage_;
-  int row_capacity_ = 0, entrant_capacity_ = 0;
+  int row_capacity_ = 0, spare_capacity_ = 0, entrant_capacity_ = 0;
 };
 
-// Moves fragments of row `last`, in pixels `moving`, in front of all that are further away. Equal distances stay in the
-// order of arrival.
-inline void move_forward(Row *rows, int last, Mask moving, Vec distance, Vec alpha) {
-  const VecI entrant = splat_int(rows[last].entrant);
-  for (int k = last;; --k) {
-    Row &here = rows[k];
-    const Row &front = rows[k > 0 ? k - 1 : 0];
-    const Mask further = k > 0 ? both(moving, less(distance, front.distance)) : without(moving, moving);
-    here.distance = select(further, front.distance, select(moving, distance, here.distance));
-    here.alpha = select(further, front.alpha, select(moving, alpha, here.alpha));
-    here.entrants = select_int(further, front.each_entrant(), select_int(moving, entrant, here.each_entrant()));
-    here.entrant = kMixed;
-    if (!any(further)) break;
+// Makes rows of fragments in pixels `moving`, each in front of all that are further away. All are nearer than the last row.
+// Equal distances stay in the order of arrival. Returns the number of rows.
+PADGS_INLINE int insert(Row *rows, int count, int last, Mask moving, Vec distance, Vec alpha, int32_t entrant) {
+  int behind = last;
+  for (;;) {
+    const int front = rows[behind].front;
+    const Vec nearest = rows[front].distance;
+    const Mask further = both(moving, less(distance, nearest)), here = without(moving, further);
+    // Written in any case, which is cheaper than to ask.
+    rows[count] = {select(here, distance, nearest), keep(here, alpha), entrant, front};
+    const int added = any(here);
+    rows[behind].front = front + (count - front) * added;
+    count += added;
+    if (!any(further)) return count;
     moving = further;
+    behind = front;
   }
 }
 

@@ -29,22 +29,8 @@ Vec distance(const PlanarFootprint::At &, const PlanarFootprint &g, float) { ret
 template <class Seen>
 using Places = std::vector<typename Seen::Place>;
 
-Colors colors_of(const BlendArguments &args, const Tile &tile, const Fragments &fragments, const Row &row) {
-  const auto footprint = [&](int32_t entrant) -> const Footprint & {
-    return args.footprints[args.instances[tile.first + fragments.entrants[entrant]].gaussian];
-  };
-  if (row.entrant != kMixed) {
-    const Footprint &f = footprint(row.entrant);
-    return {splat(f.red), splat(f.green), splat(f.blue), splat(f.depth)};
-  }
-  int32_t entrants[kLanes];
-  store_int(entrants, row.entrants);
-  float lanes[4][kLanes];
-  for (int lane = 0; lane < kLanes; ++lane) {
-    const Footprint &f = footprint(entrants[lane]);
-    lanes[0][lane] = f.red, lanes[1][lane] = f.green, lanes[2][lane] = f.blue, lanes[3][lane] = f.depth;
-  }
-  return {load(lanes[0]), load(lanes[1]), load(lanes[2]), load(lanes[3])};
+const Footprint &footprint_of(const BlendArguments &args, const Tile &tile, const Fragments &fragments, const Row &row) {
+  return args.footprints[args.instances[tile.first + fragments.entrants[row.entrant]].gaussian];
 }
 
 // Adds the instances of a batch to the fragments of patch `p`; `position` is that of the batch in the tile's list.
@@ -53,37 +39,42 @@ void collect_patch(const Batch<Seen> &batch, const float *reach, int p, int posi
                    Mask inside, Vec core_size, Fragments &fragments) {
   const uint8_t *list = batch.list(p);
   const int entries = batch.count(p);
-  fragments.reserve(entries);
-  Row *const rows = fragments.rows;
-  int32_t *const entrants = fragments.entrants;
-  int row = fragments.row_count, entrant = fragments.entrant_count;
   Tail tail = fragments.tail;
-  Vec reached = fragments.reached, entered = fragments.entered, last = fragments.last;
-  for (int k = 0; k < entries; ++k) {
-    const Seen &g = batch.seen()[list[k]];
-    const typename Seen::At at = g.at(place);
-    const Mask drawn = both(at.reached, inside);
-    const Vec alpha = keep(drawn, minimum(exp2_fast(at.log2_alpha), splat(kAlphaMax)));
-    const Vec away = distance(at, g, reach[list[k]]);
-    const Mask nearer = less(away, last);
-    const Mask entering = both(at_least(alpha, splat(kCoreAlphaMin)), either(nearer, less(entered, core_size)));
-    const Vec in_core = keep(entering, alpha);
-    tail.add(alpha - in_core, g);
-    reached += keep(drawn, splat(1.0f));
-    entered += keep(entering, splat(1.0f));
-    last = select(entering, maximum(last, away), last);
-    // Written in any case, which is cheaper than to ask; the next overwrites it.
-    rows[row].distance = last;
-    rows[row].alpha = in_core;
-    rows[row].entrant = entrant;
-    entrants[entrant] = position + list[k];
-    const Mask early = both(entering, nearer);
-    if (any(early)) move_forward(rows, row, early, away, alpha);
-    row += any(entering), entrant += any(entering);
+  Vec reached = fragments.reached, entered = fragments.entered;
+  for (int k = 0; k < entries;) {
+    fragments.reserve(entries - k + 1);
+    Row *const rows = fragments.rows;
+    int32_t *const entrants = fragments.entrants;
+    int count = fragments.row_count, last = fragments.last, entrant = fragments.entrant_count;
+    Vec furthest = rows[last].distance;
+    for (const int limit = fragments.row_limit(); k < entries && count <= limit; ++k) {
+      const Seen &g = batch.seen()[list[k]];
+      const typename Seen::At at = g.at(place);
+      const Mask drawn = both(at.reached, inside);
+      const Vec alpha = keep(drawn, minimum(exp2_fast(at.log2_alpha), splat(kAlphaMax)));
+      const Vec away = distance(at, g, reach[list[k]]);
+      const Mask nearer = less(away, furthest);
+      const Mask entering = both(at_least(alpha, splat(kCoreAlphaMin)), either(nearer, less(entered, core_size)));
+      tail.add(alpha - keep(entering, alpha), g);
+      reached += keep(drawn, splat(1.0f));
+      entered += keep(entering, splat(1.0f));
+      const Mask early = both(entering, nearer), late = without(entering, nearer);
+      if (any(early)) {
+        count = insert(rows, count, last, early, away, alpha, entrant);
+        fragments.in_order = false;
+      }
+      furthest = select(late, away, furthest);
+      // Written in any case, which is cheaper than to ask; the next overwrites it.
+      rows[count] = {furthest, keep(late, alpha), entrant, last};
+      entrants[entrant] = position + list[k];
+      const int added = any(late);  // no jump may depend on it: none could be predicted
+      last += (count - last) * added;
+      count += added, entrant += any(entering);
+    }
+    fragments.row_count = count, fragments.last = last, fragments.entrant_count = entrant;
   }
   fragments.tail = tail;
-  fragments.reached = reached, fragments.entered = entered, fragments.last = last;
-  fragments.row_count = row, fragments.entrant_count = entrant;
+  fragments.reached = reached, fragments.entered = entered;
 }
 
 // The fragments of all patches of a tile; this thread's, until it asks for the next. Counts the evaluated pairs.
@@ -104,7 +95,7 @@ std::vector<Fragments> &collect(const BlendArguments &args, const Tile &tile, co
       Fragments &fragments = storage[p];
       const Mask inside = less(zero(), Patch(tile, p, args.grid.width).inside());
       collect_patch<Seen>(batch, reach, p, int(start - tile.first), places[p], inside, core_size, fragments);
-      fragments.close(args.core_size, [&](const Row &row) { return colors_of(args, tile, fragments, row); });
+      fragments.close(args.core_size, [&](const Row &row) -> const Footprint & { return footprint_of(args, tile, fragments, row); });
       evaluated += kLanes * batch.count(p);
     }
   }
@@ -127,10 +118,10 @@ int64_t blend_patch(const BlendArguments &args, const Tile &tile, const Patch &p
   const Tail &tail = fragments.tail;
   Vec left = splat(1.0f), red = zero(), green = zero(), blue = zero(), depth = zero(), coverage = zero();
   int64_t contributing = 0;
-  for (int k = 0; k < fragments.row_count; ++k) {
+  for (int k = 1; k < fragments.row_count; ++k) {
     const Row &row = fragments.rows[k];
     const Vec weight = row.alpha * left;
-    const Colors c = colors_of(args, tile, fragments, row);
+    const Footprint &c = footprint_of(args, tile, fragments, row);
     red += weight * c.red;
     green += weight * c.green;
     blue += weight * c.blue;
@@ -175,9 +166,9 @@ void forward_tile(const BlendArguments &args, const Tile &tile, int64_t index) {
 struct Upstream {
   Vec red, green, blue, depth, offset;
   Vec unit, mean, behind;  // of the tail
-  Vec inside;              // 1 inside the image, -1 outside
 
-  Vec signal(Vec r, Vec g, Vec b, Vec d) const { return red * r + green * g + blue * b + depth * d + offset; }
+  template <class T>
+  Vec signal(T r, T g, T b, T d) const { return red * r + green * g + blue * b + depth * d + offset; }
 };
 
 // What the derivatives of an instance's core fragments need, in one patch.
@@ -202,9 +193,8 @@ Upstream differentiate_patch(const BlendGradientArguments &args, const Tile &til
     if (args.grad_depth) depth[lane] = forward.depth[pixel], grad_depth[lane] = args.grad_depth[pixel];
   });
   Upstream up;
-  up.inside = patch.inside();
   Vec left = splat(1.0f), coverage = zero();
-  for (int k = 0; k < fragments.row_count; ++k) {
+  for (int k = 1; k < fragments.row_count; ++k) {
     Row &row = fragments.rows[k];
     const Vec weight = row.alpha * left;
     row.distance = left;
@@ -223,36 +213,25 @@ Upstream differentiate_patch(const BlendGradientArguments &args, const Tile &til
   up.behind = left * tail.left * (load(through) - up.mean);
   for (int e = 0; e < fragments.entrant_count; ++e) layers[e] = {splat(kNotInCore), zero(), fragments.entrants[e]};
   Vec behind = up.unit * tail.alpha * up.mean + left * tail.left * load(through);
-  for (int k = fragments.row_count - 1; k >= 0; --k) {
+  for (int k = fragments.row_count - 1; k > 0; --k) {
     const Row &row = fragments.rows[k];
     const Vec u = row.distance;
     const Mask filled = less(zero(), row.alpha);
-    if (row.entrant != kMixed) {
-      layers[row.entrant].front = select(filled, u, splat(kNotInCore));
-      layers[row.entrant].behind = behind;
-    } else {
-      float front_lanes[kLanes], behind_lanes[kLanes], alpha_lanes[kLanes];
-      int32_t entrants[kLanes];
-      store(front_lanes, u), store(behind_lanes, behind), store(alpha_lanes, row.alpha), store_int(entrants, row.entrants);
-      for (int lane = 0; lane < kLanes; ++lane) {
-        if (alpha_lanes[lane] <= 0) continue;
-        reinterpret_cast<float *>(&layers[entrants[lane]].front)[lane] = front_lanes[lane];
-        reinterpret_cast<float *>(&layers[entrants[lane]].behind)[lane] = behind_lanes[lane];
-      }
-    }
-    const Colors c = colors_of(forward, tile, fragments, row);
+    Layer &layer = layers[row.entrant];
+    layer.front = select(filled, u, layer.front);
+    layer.behind = select(filled, behind, layer.behind);
+    const Footprint &c = footprint_of(forward, tile, fragments, row);
     behind += row.alpha * u * up.signal(c.red, c.green, c.blue, c.depth);
   }
   return up;
 }
 
-template <class Seen>
+template <class Seen, bool kWithDepth, bool kWithRays>
 void backward_tile(const BlendGradientArguments &args, const Tile &tile) {
   const BlendArguments &forward = args.forward;
   const Places<Seen> &places = places_of<Seen>(forward, tile);
   Places<Seen> ray_gradients;
-  if constexpr (Seen::kOfRays)
-    if (args.grad_rays) ray_gradients.resize(tile.patches());
+  if constexpr (kWithRays) ray_gradients.resize(tile.patches());
   int64_t evaluated = 0;
   std::vector<Fragments> &fragments = collect<Seen>(forward, tile, places, evaluated);
 
@@ -276,7 +255,6 @@ void backward_tile(const BlendGradientArguments &args, const Tile &tile) {
     prefetch(args, i + kAhead, tile.first, tile.end);
     const Instance instance = forward.instances[i];
     const Seen g(forward.footprints[instance.gaussian], forward, tile);
-    const Vec f_red = splat(g.red), f_green = splat(g.green), f_blue = splat(g.blue), f_depth = splat(g.depth);
     typename Seen::Moments moments;
     Vec red = zero(), green = zero(), blue = zero(), depth = zero();
     for (int row = instance.row; row < instance.row_end; ++row)
@@ -287,10 +265,9 @@ void backward_tile(const BlendGradientArguments &args, const Tile &tile) {
         const bool in_core = core.position == int32_t(i - tile.first);
         next[p] += in_core;
         const typename Seen::At at = g.at(places[p]);
-        const Mask reached = both(at.reached, less(zero(), up.inside));
-        if (!any(reached)) continue;
+        if (!any(at.reached)) continue;
         const Vec full = exp2_fast(at.log2_alpha);
-        const Vec alpha = keep(reached, minimum(full, splat(kAlphaMax)));
+        const Vec alpha = keep(at.reached, minimum(full, splat(kAlphaMax)));
         Vec unit = up.unit, mean = up.mean, behind = up.behind;
         if (in_core) {
           const Mask found = at_least(core.front, zero());
@@ -299,15 +276,15 @@ void backward_tile(const BlendGradientArguments &args, const Tile &tile) {
           behind = select(found, core.behind, behind);
         }
         const Vec weight = alpha * unit;
-        const Vec signal = up.signal(f_red, f_green, f_blue, f_depth) - mean;
+        Vec signal = up.red * g.red + up.green * g.green + up.blue * g.blue - mean;
+        if (kWithDepth) signal += up.depth * g.depth + up.offset;
         const Vec m = keep(less(full, splat(kAlphaMax)), weight * signal - behind * (alpha * reciprocal(1.0f - alpha)));
         red += weight * up.red;
         green += weight * up.green;
         blue += weight * up.blue;
-        depth += weight * up.depth;
+        if (kWithDepth) depth += weight * up.depth;
         moments.add(at, m);
-        if constexpr (Seen::kOfRays)
-          if (args.grad_rays) g.add_ray_gradient(at, m, ray_gradients[p]);
+        if constexpr (kWithRays) g.add_ray_gradient(at, m, ray_gradients[p]);
       }
     Vec sums[kMoments];
     moments.finish(sums);
@@ -316,8 +293,7 @@ void backward_tile(const BlendGradientArguments &args, const Tile &tile) {
     float *out = args.moments + int64_t(instance.slot) * kMoments;
     for (int k = 0; k < kMoments; k += 4) sum4(sums + k, out + k);
   }
-  if constexpr (Seen::kOfRays)
-    if (args.grad_rays) add_ray_gradients(args, tile, ray_gradients);
+  if constexpr (kWithRays) add_ray_gradients(args, tile, ray_gradients);
 }
 
 bool planar(const BlendArguments &args) { return args.projection == kErp || args.projection == kPinhole; }
@@ -330,7 +306,14 @@ void hybrid_forward(const BlendArguments &args) {
 
 void hybrid_backward(const BlendGradientArguments &args) {
   for_each_tile(args.forward, [&](const Tile &tile, int64_t) {
-    planar(args.forward) ? backward_tile<PlanarFootprint>(args, tile) : backward_tile<ProjectiveFootprint>(args, tile);
+    if (planar(args.forward))  // does not look at rays
+      args.grad_depth ? backward_tile<PlanarFootprint, true, false>(args, tile)
+                      : backward_tile<PlanarFootprint, false, false>(args, tile);
+    else if (args.grad_rays)
+      backward_tile<ProjectiveFootprint, true, true>(args, tile);
+    else
+      args.grad_depth ? backward_tile<ProjectiveFootprint, true, false>(args, tile)
+                      : backward_tile<ProjectiveFootprint, false, false>(args, tile);
   });
 }
 
