@@ -1,5 +1,5 @@
-// Some instances of a tile side by side, and for each patch which of them reach it: footprints lie scattered in memory, and
-// a patch that is finished before the next stays in registers.
+// Some instances of a tile side by side, and for each patch which of them reach it: footprints lie scattered in memory,
+// and a patch that is finished before the next stays in registers.
 #pragma once
 
 #include <algorithm>

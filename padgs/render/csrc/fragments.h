@@ -1,7 +1,7 @@
 // The fragments of sixteen pixels for hybrid blending: the nearest few in order, and sums over all others.
 //
-// The core is a list of rows, each of one instance: those of its fragments that are in the core of their pixels, with holes at
-// the other pixels. A hole is a transparent fragment as far away as what is in front of it, so the distances of every pixel
+// The core is a list of rows, each of one instance: those of its fragments that are in the core of their pixels, with holes
+// at the other pixels. A hole is a transparent fragment as far away as what is in front of it, so the distances of every pixel
 // ascend along the rows. As instances come nearly front to back, most rows are appended; fragments that are nearer than what
 // their pixel has already make rows further up.
 #pragma once
@@ -56,24 +56,22 @@ class Fragments {
     reserve(0);
     rows[0] = {splat(-1.0f), zero(), 0, 0};
   }
-  // Makes room for `more` entrants, and for the rows of at least one.
+  // Makes room for `more` instances; each makes a row for each pixel at most, and the last is written without being asked.
   void reserve(int more) {
     const int offset = int(rows - row_storage_.get());
-    grow(row_storage_, row_capacity_, offset + row_count + kRowsOfOne);
+    grow(row_storage_, row_capacity_, offset + row_count, kLanes * more + 1);
     rows = row_storage_.get() + offset;
-    grow(entrant_storage_, entrant_capacity_, entrant_count + more);
+    grow(entrant_storage_, entrant_capacity_, entrant_count, more + 1);
     entrants = entrant_storage_.get();
   }
-  // While there are fewer rows there is room for those of another instance.
-  int row_limit() const { return row_capacity_ - int(rows - row_storage_.get()) - kRowsOfOne; }
 
   // Brings the rows into order: 1 is the nearest. Only the `core_size` nearest fragments of each pixel stay in them; the
   // others join the tail, and rows that have none left are dropped.
   template <class FootprintOf>
   void close(int core_size, FootprintOf footprint_of) {
-    if (in_order) return;  // and nothing came too late, or it would not be in the rows
+    if (in_order) return;  // and none are too many: of what comes in order, nothing enters a full core
     in_order = true;
-    grow(spare_storage_, spare_capacity_, row_count);
+    grow(spare_storage_, spare_capacity_, 0, row_count);
     const Vec size = splat(float(core_size));
     Vec place = entered;  // of each pixel's next fragment, counted from the front
     Row *next = spare_storage_.get() + row_count;
@@ -100,15 +98,13 @@ class Fragments {
   }
 
  private:
-  static constexpr int kRowsOfOne = kLanes + 1;
   template <class T>
-  static void grow(std::unique_ptr<T[]> &storage, int &capacity, int needed) {
-    if (needed <= capacity) return;
-    needed = std::max(needed, 2 * capacity);
-    std::unique_ptr<T[]> larger(new T[needed]);
-    std::copy_n(storage.get(), capacity, larger.get());
+  static void grow(std::unique_ptr<T[]> &storage, int &capacity, int used, int more) {
+    if (used + more <= capacity) return;
+    std::unique_ptr<T[]> larger(new T[std::max(used + more, 2 * capacity)]);
+    std::copy_n(storage.get(), std::min(used, capacity), larger.get());
     storage.swap(larger);
-    capacity = needed;
+    capacity = std::max(used + more, 2 * capacity);
   }
   std::unique_ptr<Row[]> row_storage_, spare_storage_;
   std::unique_ptr<int32_t[]> entrant_storage_;

@@ -33,6 +33,8 @@ const Footprint &footprint_of(const BlendArguments &args, const Tile &tile, cons
   return args.footprints[args.instances[tile.first + fragments.entrants[row.entrant]].gaussian];
 }
 
+constexpr int kChunk = 16;  // instances that are evaluated, which needs no jumps, before any is given its place
+
 // Adds the instances of a batch to the fragments of patch `p`; `position` is that of the batch in the tile's list.
 template <class Seen>
 void collect_patch(const Batch<Seen> &batch, const float *reach, int p, int position, const typename Seen::Place &place,
@@ -41,22 +43,28 @@ void collect_patch(const Batch<Seen> &batch, const float *reach, int p, int posi
   const int entries = batch.count(p);
   Tail tail = fragments.tail;
   Vec reached = fragments.reached, entered = fragments.entered;
-  for (int k = 0; k < entries;) {
-    fragments.reserve(entries - k + 1);
+  Vec alphas[kChunk], aways[kChunk];
+  for (int start = 0; start < entries; start += kChunk) {
+    const int size = std::min(kChunk, entries - start);
+    for (int k = 0; k < size; ++k) {
+      const int i = list[start + k];
+      const Seen &g = batch.seen()[i];
+      const typename Seen::At at = g.at(place);
+      alphas[k] = keep(both(at.reached, inside), minimum(exp2_fast(at.log2_alpha), splat(kAlphaMax)));
+      aways[k] = distance(at, g, reach[i]);
+    }
+    fragments.reserve(kChunk);
     Row *const rows = fragments.rows;
     int32_t *const entrants = fragments.entrants;
     int count = fragments.row_count, last = fragments.last, entrant = fragments.entrant_count;
     Vec furthest = rows[last].distance;
-    for (const int limit = fragments.row_limit(); k < entries && count <= limit; ++k) {
-      const Seen &g = batch.seen()[list[k]];
-      const typename Seen::At at = g.at(place);
-      const Mask drawn = both(at.reached, inside);
-      const Vec alpha = keep(drawn, minimum(exp2_fast(at.log2_alpha), splat(kAlphaMax)));
-      const Vec away = distance(at, g, reach[list[k]]);
+    for (int k = 0; k < size; ++k) {
+      const int i = list[start + k];
+      const Vec alpha = alphas[k], away = aways[k];
       const Mask nearer = less(away, furthest);
       const Mask entering = both(at_least(alpha, splat(kCoreAlphaMin)), either(nearer, less(entered, core_size)));
-      tail.add(alpha - keep(entering, alpha), g);
-      reached += keep(drawn, splat(1.0f));
+      tail.add(alpha - keep(entering, alpha), batch.seen()[i]);
+      reached += keep(less(zero(), alpha), splat(1.0f));
       entered += keep(entering, splat(1.0f));
       const Mask early = both(entering, nearer), late = without(entering, nearer);
       if (any(early)) {
@@ -66,7 +74,7 @@ void collect_patch(const Batch<Seen> &batch, const float *reach, int p, int posi
       furthest = select(late, away, furthest);
       // Written in any case, which is cheaper than to ask; the next overwrites it.
       rows[count] = {furthest, keep(late, alpha), entrant, last};
-      entrants[entrant] = position + list[k];
+      entrants[entrant] = position + i;
       const int added = any(late);  // no jump may depend on it: none could be predicted
       last += (count - last) * added;
       count += added, entrant += any(entering);
@@ -95,7 +103,7 @@ std::vector<Fragments> &collect(const BlendArguments &args, const Tile &tile, co
       Fragments &fragments = storage[p];
       const Mask inside = less(zero(), Patch(tile, p, args.grid.width).inside());
       collect_patch<Seen>(batch, reach, p, int(start - tile.first), places[p], inside, core_size, fragments);
-      fragments.close(args.core_size, [&](const Row &row) -> const Footprint & { return footprint_of(args, tile, fragments, row); });
+      fragments.close(args.core_size, [&](const Row &row) { return footprint_of(args, tile, fragments, row); });
       evaluated += kLanes * batch.count(p);
     }
   }
