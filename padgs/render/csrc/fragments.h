@@ -1,9 +1,9 @@
 // The fragments of sixteen pixels for hybrid blending: the nearest few in order, and sums over all others.
 //
-// The core is a list of rows, each of one instance: those of its fragments that are in the core of their pixels, with holes
-// at the other pixels. A hole is a transparent fragment as far away as what is in front of it, so the distances of every pixel
-// ascend along the rows. As instances come nearly front to back, most rows are appended; fragments that are nearer than what
-// their pixel has already make rows further up.
+// The core is a list of rows, each of one instance: those of its fragments that are in the core of their pixels, with
+// holes at the other pixels. A hole is a transparent fragment as far away as what is in front of it, so the distances
+// of every pixel ascend along the rows. As instances come nearly front to back, most rows are appended; fragments that are
+// nearer than what their pixel has already make rows further up.
 #pragma once
 
 #include <algorithm>
@@ -56,7 +56,7 @@ class Fragments {
     reserve(0);
     rows[0] = {splat(-1.0f), zero(), 0, 0};
   }
-  // Makes room for `more` instances; each makes a row for each pixel at most, and the last is written without being asked.
+  // Makes room for `more` instances: a row for each pixel of each at most, and one that is written without being asked.
   void reserve(int more) {
     const int offset = int(rows - row_storage_.get());
     grow(row_storage_, row_capacity_, offset + row_count, kLanes * more + 1);
@@ -65,11 +65,11 @@ class Fragments {
     entrants = entrant_storage_.get();
   }
 
-  // Brings the rows into order: 1 is the nearest. Only the `core_size` nearest fragments of each pixel stay in them; the
-  // others join the tail, and rows that have none left are dropped.
+  // Brings the rows into order: 1 is the nearest. Only the `core_size` nearest fragments of each pixel stay in them;
+  // the others join the tail, and rows that have none left are dropped.
   template <class FootprintOf>
   void close(int core_size, FootprintOf footprint_of) {
-    if (in_order) return;  // and none are too many: of what comes in order, nothing enters a full core
+    if (in_order) return;  // and none is too many: of what comes in order, nothing enters a full core
     in_order = true;
     grow(spare_storage_, spare_capacity_, 0, row_count);
     const Vec size = splat(float(core_size));
@@ -111,8 +111,8 @@ class Fragments {
   int row_capacity_ = 0, spare_capacity_ = 0, entrant_capacity_ = 0;
 };
 
-// Makes rows of fragments in pixels `moving`, each in front of all that are further away. All are nearer than the last row.
-// Equal distances stay in the order of arrival. Returns the number of rows.
+// Makes rows of fragments in pixels `moving`, each in front of all that are further away; all are nearer than the last
+// row. Equal distances stay in the order of arrival. Returns the number of rows.
 PADGS_INLINE int insert(Row *rows, int count, int last, Mask moving, Vec distance, Vec alpha, int32_t entrant) {
   int behind = last;
   for (;;) {

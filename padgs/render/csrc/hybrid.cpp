@@ -1,8 +1,8 @@
 // Hybrid blending: each pixel keeps its K nearest fragments in order and blends the rest as one layer behind them. The
 // definition is padgs/render/hybrid.py. The tile lists may be in any order; front to back is fast.
 //
-// Both passes first collect the fragments of each patch. Backward turns the core into layers, one for each instance that
-// entered it, in the order of the list, and then visits the list a second time.
+// Both passes first collect the fragments of each patch. Backward turns the core into layers, one for each instance
+// that entered it, in the order of the list, and then visits the list a second time.
 #include <cmath>
 #include <vector>
 
@@ -87,7 +87,8 @@ void collect_patch(const Batch<Seen> &batch, const float *reach, int p, int posi
 
 // The fragments of all patches of a tile; this thread's, until it asks for the next. Counts the evaluated pairs.
 template <class Seen>
-std::vector<Fragments> &collect(const BlendArguments &args, const Tile &tile, const Places<Seen> &places, int64_t &evaluated) {
+std::vector<Fragments> &collect(const BlendArguments &args, const Tile &tile, const Places<Seen> &places,
+                                int64_t &evaluated) {
   static thread_local std::vector<Fragments> storage;
   const int patches = tile.patches();
   if (int(storage.size()) < patches) storage.resize(patches);
@@ -186,9 +187,9 @@ struct Layer {
 };
 constexpr float kNotInCore = -1.0f;
 
-// Loads a patch, and appends its layers.
-Upstream differentiate_patch(const BlendGradientArguments &args, const Tile &tile, const Patch &patch, Fragments &fragments,
-                             Layer *layers) {
+// Loads a patch, and writes its layers.
+Upstream differentiate_patch(const BlendGradientArguments &args, const Tile &tile, const Patch &patch,
+                             Fragments &fragments, Layer *layers) {
   const BlendArguments &forward = args.forward;
   const Tail &tail = fragments.tail;
   float grad[3][kLanes] = {}, through[kLanes] = {}, depth[kLanes] = {}, grad_depth[kLanes] = {};
