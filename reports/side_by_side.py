@@ -62,8 +62,9 @@ def equal_time(results: Sequence[Result], request: Request) -> Table:
         own = at(place, runs)
         refuse_mixture(own, request, place.title, alike)
         for preset in names.ordered(result.preset for result in own):
-            lengths = [of_any_length(r) for r in own if r.preset == preset]
-            refuse_differences(lengths, f"{place.title}, {names.title(preset)}")  # else the nearer of two settings would stand for both
+            own_runs = [of_any_length(r) for r in own if r.preset == preset]
+            # Else the nearer of two settings would stand for both.
+            refuse_differences(own_runs, f"{place.title}, {names.title(preset)}")
         blocks[place] = [of_any_length(r) for r in nearest_to(common_seconds(own), own)]
     return _table("equal_time", "Every method after the same training time", blocks)
 
