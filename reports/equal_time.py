@@ -29,7 +29,7 @@ def common_seconds(results: Sequence[Result]) -> float:
 
     Runs on the way to that time lie scattered.
     """
-    times = sorted(seconds for result in results if (seconds := train_seconds(result)))
+    times = sorted(seconds for result in results if result.ok and (seconds := train_seconds(result)))
     return max(times, key=lambda t: (sum(abs(other - t) <= TOLERANCE * t for other in times), -t), default=0.0)
 
 

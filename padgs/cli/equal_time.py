@@ -14,6 +14,7 @@ import typer
 from padgs import results
 from padgs.cli.typed import ConfigError
 from padgs.results import Result
+from reports.conditions import OF_TIMES, machine
 from reports.equal_time import EXPERIMENT, is_near, of_any_length
 from reports.measures import train_seconds
 from reports.request import Request
@@ -51,18 +52,24 @@ def equal_time(
             f"no run in {folder} has ended well; run the methods first, "
             "e.g. padgs-run +experiment=all_methods scale=cpu"
         )
+    machines = sorted({machine(result) for result in usable})
+    if len(machines) > 1:
+        raise _refused(
+            f"the runs in {folder} are of several machines ({'; '.join(machines)}), whose times say nothing about each "
+            "other; give a folder with the runs of one"
+        )
     from hydra.errors import HydraException
 
     from padgs.cli.composition import command, composing, settings_of
 
     with composing():
         for alike in lengths(usable):
-            nearest = min(alike, key=lambda result: _distance(result, seconds))
-            if EXPERIMENT in nearest.experiments and is_near(nearest, seconds):
-                continue
+            nearest, length = min(alike, key=lambda result: _distance(result, seconds)), iterations(alike, seconds)
+            if any(EXPERIMENT in result.experiments and result.iterations == length for result in alike):
+                continue  # near enough, or as near as a whole number of iterations comes
             choices = (f"+experiment={EXPERIMENT}", f"method={nearest.preset}")
             try:
-                given = settings_of(_values(nearest, folder, iterations(alike, seconds)), *choices)
+                given = settings_of(_values(nearest, folder, length), *choices)
             except (ConfigError, HydraException) as error:
                 print(f"left out: {nearest.run}: {error}", file=sys.stderr)
                 continue
@@ -70,11 +77,12 @@ def equal_time(
 
 
 def lengths(runs: Iterable[Result]) -> list[list[Result]]:
-    """The runs in groups that differ in their length only."""
+    """The runs in groups that differ in their length only; with as many threads each."""
     groups: dict[str, list[Result]] = {}
     for result in runs:
         config = {key: value for key, value in of_any_length(result).config.items() if key not in ("run", "protocol")}
-        groups.setdefault(json.dumps([result.preset, result.fingerprint, config], sort_keys=True), []).append(result)
+        key = [result.preset, result.fingerprint, OF_TIMES["machine"](result, ""), config]
+        groups.setdefault(json.dumps(key, sort_keys=True), []).append(result)
     return list(groups.values())
 
 

@@ -101,6 +101,13 @@ def test_nothing_is_printed_once_all_are_there(tmp_path: Path):
     assert composed(*printed(tmp_path, "100")[0][1:]).train.iterations == 245
 
 
+def test_times_of_other_machines_are_refused(tmp_path: Path):
+    here = run(200.0, "method=spags", "train.iterations=500")
+    there = replace(run(20.0, "method=omnigs", "train.iterations=500"), machine={"gpu": "H200", "torch": "2.11"})
+    done = CliRunner().invoke(app, ["equal-time", str(write([here, there], tmp_path)), "60"])
+    assert done.exit_code == 1 and "are of several machines" in done.stderr and "H200, torch 2.11" in done.stderr
+
+
 def test_lengths_come_from_the_nearest_runs_of_the_same_settings():
     runs = [run(s, "method=omnigs", f"train.iterations={n}") for s, n in ((10, 100), (60, 400), (375, 900))]
     other = run(50.0, "method=omnigs", "train.iterations=7", "method.sh_degree=0")
