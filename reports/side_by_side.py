@@ -8,7 +8,7 @@ from padgs.results import Result
 from reports import methods as names
 from reports.cells import one_setting, over_seeds, refuse_differences
 from reports.conditions import CONDITIONS, OF_TIMES, refuse_mixture
-from reports.equal_time import EXPERIMENT, common_seconds, nearest_to, of_any_length
+from reports.equal_time import EXPERIMENT, common_seconds, is_near, nearest_to, of_any_length
 from reports.footnotes import conditions
 from reports.measures import (
     GPU_MEMORY,
@@ -54,18 +54,23 @@ def methods(results: Sequence[Result], request: Request) -> Table:
 
 
 def equal_time(results: Sequence[Result], request: Request) -> Table:
-    """Every method after the same training time: of the runs of each, the one nearest to the time that most took."""
+    """Every method after the same training time: of the runs of each, the one nearest to the time that most took.
+
+    A run of the comparison after equal iterations counts where it happened to take as long.
+    """
     runs = [r for r in chosen(results, "equal_time", request) if EXPERIMENT in r.experiments and not r.variant]
+    others = [r for r in chosen(results, "methods", request) if r not in runs and not r.variant]
     alike = {what: of for what, of in OF_TIMES.items() if what != "iterations"}
     blocks = {}
     for place in places(runs):
-        own = at(place, runs)
+        seconds = common_seconds(at(place, runs))
+        own = [*at(place, runs), *(result for result in at(place, others) if is_near(result, seconds))]
         refuse_mixture(own, request, place.title, alike)
         for preset in names.ordered(result.preset for result in own):
             own_runs = [of_any_length(r) for r in own if r.preset == preset]
             # Else the nearer of two settings would stand for both.
             refuse_differences(own_runs, f"{place.title}, {names.title(preset)}")
-        blocks[place] = [of_any_length(r) for r in nearest_to(common_seconds(own), own)]
+        blocks[place] = [of_any_length(r) for r in nearest_to(seconds, own)]
     return _table("equal_time", "Every method after the same training time", blocks)
 
 

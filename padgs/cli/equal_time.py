@@ -65,7 +65,7 @@ def equal_time(
     with composing():
         for alike in lengths(usable):
             nearest, length = min(alike, key=lambda result: _distance(result, seconds)), iterations(alike, seconds)
-            if any(EXPERIMENT in result.experiments and result.iterations == length for result in alike):
+            if any(result.iterations == length for result in alike):
                 continue  # near enough, or as near as a whole number of iterations comes
             choices = (f"+experiment={EXPERIMENT}", f"method={nearest.preset}")
             try:
