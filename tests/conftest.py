@@ -1,5 +1,6 @@
 """Fixtures that every test may use. Data that is not part of the project is found beside the repository."""
 
+import signal
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,12 @@ settings.load_profile("padgs")
 
 ROOT = Path(__file__).resolve().parent.parent
 SHARED = ROOT.parent / "shared"
+
+
+@pytest.fixture(scope="session", autouse=True)
+def ctrl_c() -> None:
+    """Shells have what they start in the background ignore Ctrl-C, and tests of it would wait for it in vain."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
