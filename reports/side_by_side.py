@@ -8,7 +8,7 @@ from padgs.results import Result
 from reports import methods as names
 from reports.cells import one_setting, over_seeds, refuse_differences
 from reports.conditions import CONDITIONS, OF_TIMES, refuse_mixture
-from reports.equal_time import EXPERIMENT, common_seconds, is_near, nearest_to, of_any_length
+from reports.equal_time import EXPERIMENT, TOLERANCE, common_seconds, is_near, nearest_to, of_any_length
 from reports.footnotes import conditions
 from reports.measures import (
     GPU_MEMORY,
@@ -61,7 +61,7 @@ def equal_time(results: Sequence[Result], request: Request) -> Table:
     runs = [r for r in chosen(results, "equal_time", request) if EXPERIMENT in r.experiments and not r.variant]
     others = [r for r in chosen(results, "methods", request) if r not in runs and not r.variant]
     alike = {what: of for what, of in OF_TIMES.items() if what != "iterations"}
-    blocks = {}
+    blocks, notes = {}, []
     for place in places(runs):
         seconds = common_seconds(at(place, runs))
         own = [*at(place, runs), *(result for result in at(place, others) if is_near(result, seconds))]
@@ -71,10 +71,15 @@ def equal_time(results: Sequence[Result], request: Request) -> Table:
             # Else the nearer of two settings would stand for both.
             refuse_differences(own_runs, f"{place.title}, {names.title(preset)}")
         blocks[place] = [of_any_length(r) for r in nearest_to(seconds, own)]
-    return _table("equal_time", "Every method after the same training time", blocks)
+        off = names.ordered(r.preset for r in blocks[place] if r.ok and not is_near(r, seconds))
+        if off:
+            notes.append(
+                f"{place.title}: not within {TOLERANCE:.0%} of {seconds:.0f} s: {', '.join(map(names.title, off))}."
+            )
+    return _table("equal_time", "Every method after the same training time", blocks, notes)
 
 
-def _table(name: str, title: str, runs: dict[Place, list[Result]]) -> Table:
+def _table(name: str, title: str, runs: dict[Place, list[Result]], notes: Sequence[str] = ()) -> Table:
     measured = [result for own in runs.values() for result in own]
     measures = (*_marks(), *COSTS, *((GPU_MEMORY,) if on_gpu(measured) else ()))
     blocks = []
@@ -85,7 +90,7 @@ def _table(name: str, title: str, runs: dict[Place, list[Result]]) -> Table:
             rows.append(Row(names.title(preset), tuple(over_seeds(setting, m.number) for m in measures)))
         blocks.append(Block(place.title, tuple(rows)))
     by_title = {place.title: own for place, own in runs.items()}
-    notes = [note for protocol in MARKS for note in conditions(by_title, protocol)]
+    notes = [*notes, *(note for protocol in MARKS for note in conditions(by_title, protocol))]
     return Table(name, title, "Method", tuple(m.column for m in measures), tuple(blocks), (*notes, NOTE))
 
 

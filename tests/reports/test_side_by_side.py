@@ -72,6 +72,12 @@ def test_seeds_may_differ_in_length_but_in_nothing_else():
             equal_time([runs[0], replace(other, seed=seed)], Request())
 
 
+def test_what_is_not_near_the_common_time_is_named():
+    runs = [trained("padgs", 100, 900), trained("omnigs", 105, 900), trained("cubemap_3dgs", 300, 900)]
+    assert "not within 10% of 100 s: 3DGS on cube faces." in equal_time(runs, Request()).notes[0]
+    assert "not within" not in equal_time(runs[:2], Request()).notes[0]
+
+
 def test_a_method_that_failed_shows_its_status():
     late = replace(trained("odgs", 250, 900), status="timeout", scores={})
     table = equal_time([trained("padgs", 100, 900), late], Request())
