@@ -18,7 +18,7 @@ class SPaGSOptions(SplatOptions):
     """The published schedule; `opacity_decay` was read from a copy of the code and may belong to that copy alone."""
 
     densify_from: int = 200
-    signal: str = "space"
+    signal: str = "space_absolute"
     gradient_threshold: float = 5e-5
     sample_clones: bool = True
     reset_opacity: float = 0.1

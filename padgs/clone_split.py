@@ -32,7 +32,10 @@ class CloneSplitOptions:
     densify_from: int = 500  # Gaussians multiply and are pruned after this iteration
     densify_until: int = 15_000  # ... and before this one
     densify_every: int = 100
-    signal: str = "image"  # what is compared with the threshold: a name of `padgs.probes.SIGNALS`
+    signal: str = (
+        "image"  # what is compared with the threshold: a name of `padgs.probes.SIGNALS`; with space_absolute as
+    )
+    # many Gaussians as pass the threshold multiply for their absolute pull, the hardest pulled ones (GOF)
     gradient_threshold: float = 2e-4  # in the units of the signal's probe, for a loss that is a plain mean
     polar_threshold: float | None = None  # what it grows to at the poles, with 1 - cos(latitude) (ODGS); None: nothing
     percent_dense: float = 0.01  # largest scale that is cloned rather than split, in extents
@@ -83,8 +86,8 @@ class CloneSplit:
     """Densification of one model.
 
     Attributes:
-        statistics: sums since the last round, one row per Gaussian: gradient [N] norms, seen [N] iterations, and, for a
-            threshold that depends on it, polar [N]: 1 - cos(latitude).
+        statistics: sums since the last round, one row per Gaussian: gradient [N] norms, seen [N] iterations, for a
+            threshold that depends on it polar [N]: 1 - cos(latitude), and for signal space_absolute absolute [N] pulls.
         generator: source of the random positions of split Gaussians, on the CPU.
     """
 
@@ -98,12 +101,15 @@ class CloneSplit:
         """Add one view.
 
         Args:
-            gradient: [N, 2 or 3] of the loss by the probe (`padgs.probes`).
+            gradient: [N, 2, 3 or 4] of the loss by the probe (`padgs.probes`).
             visible: [N] bool.
             iteration: of the view.
             cos_latitudes: [N] where the view has the Gaussians; needed with `polar_threshold` only.
         """
         if iteration < self.options.densify_until:
+            if self.options.signal == "space_absolute":
+                gradient, absolute = gradient[:, :3], gradient[:, 3]
+                self.statistics["absolute"] += torch.where(visible, absolute, 0.0)
             self.statistics["gradient"] += torch.where(visible, gradient.norm(dim=-1), 0.0)
             self.statistics["seen"] += visible
             if self.options.polar_threshold is not None:
@@ -138,12 +144,13 @@ class CloneSplit:
         if self.options.polar_threshold is not None:
             threshold += (self.options.polar_threshold - threshold) * self.statistics["polar"] / seen
         chosen = mean_gradient >= threshold
+        if self.options.signal == "space_absolute":  # those above the quantile that leaves as many: 1 - (chosen / all)
+            chosen |= _largest(self.statistics["absolute"] / seen, int(chosen.sum()))
         if self.options.max_gaussians is not None:
             room = max(0, self.options.max_gaussians - len(chosen))
             if int(chosen.sum()) > room:
                 candidates = torch.where(chosen, mean_gradient, -1.0)  # their thresholds may differ
-                strongest = torch.argsort(candidates, descending=True, stable=True)[:room]
-                chosen = torch.zeros_like(chosen).index_fill(0, strongest, True)
+                chosen = _largest(candidates, room)
         small = torch.exp(self.splats.log_scales).amax(-1) <= self.options.percent_dense * self.extent
         clones = self._copies(chosen & small, 1, sampled=self.options.sample_clones)
         pieces = self._pieces(chosen & ~small)
@@ -194,5 +201,15 @@ class CloneSplit:
 
     def _empty(self) -> dict[str, Tensor]:
         zeros = self.splats.means.new_zeros(len(self.splats))
-        names = ("gradient", "seen") if self.options.polar_threshold is None else ("gradient", "seen", "polar")
+        names = ["gradient", "seen"]
+        if self.options.polar_threshold is not None:
+            names.append("polar")
+        if self.options.signal == "space_absolute":
+            names.append("absolute")
         return {name: zeros.clone() for name in names}
+
+
+def _largest(values: Tensor, count: int) -> Tensor:
+    """Where [N] the `count` largest values are; of equal ones the first."""
+    order = torch.argsort(values, descending=True, stable=True)[:count]
+    return torch.zeros_like(values, dtype=torch.bool).index_fill(0, order, True)

@@ -41,7 +41,16 @@ class TrainableSplats:
         learning_rate_factor: float = 1.0,
         seed: int = 0,
     ) -> None:
-        """Wrap splats; `extent` is `Scene.extent`, `options` are those of a published run (see `for_run`)."""
+        """Wrap splats; `extent` is `Scene.extent`, `options` are those of a published run (see `for_run`).
+
+        Raises:
+            ValueError: a signal that the projection does not have.
+        """
+        if options.signal == "space_absolute" and config.projection != "ray":
+            raise ValueError(
+                f"method.signal=space_absolute is made for render.projection=ray, not {config.projection}; "
+                "set method.signal=space"
+            )
         self.splats, self.iterations = splats, iterations
         self.densifier = CloneSplit(splats, options.for_run(iterations), extent=extent, seed=seed)
         self._config, self._extent, self._factor = config, extent, learning_rate_factor

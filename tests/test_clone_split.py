@@ -189,6 +189,20 @@ def test_clones_may_be_samples_of_their_gaussian():
     assert torch.equal(splats.log_scales[count:], splats.log_scales[:count])
 
 
+def test_as_many_multiply_for_their_absolute_pull_as_pass_the_threshold():
+    """GOF: above the quantile 1 - r, with r the share of those above the threshold."""
+    grown, optimizer = densifier([SMALL] * 6, signal="space_absolute", gradient_threshold=1e-4)
+    pulls = torch.tensor([2e-4, 3e-4, 0.0, 5e-5, 0.0, 0.0])
+    absolute = torch.tensor([1e-3, 0.0, 9e-3, 2e-3, 8e-3, 9.0])
+    visible = torch.tensor([True, True, True, True, True, False])
+    grown.observe(torch.cat((pulls[:, None] * torch.tensor([0.6, 0.0, 0.8]), absolute[:, None]), dim=-1), visible, 1)
+    quantile = torch.quantile(torch.where(visible, absolute, 0.0), 1 - 2 / 6)
+    assert torch.equal(visible & (absolute >= quantile), torch.tensor([False, False, True, False, True, False]))
+    assert grown.adapt(EVERY, optimizer) == ("cloned 4, split 0, pruned 0 Gaussians",)
+    assert grown.splats.means[6:, 0].tolist() == [0.0, 1.0, 2.0, 4.0]
+    assert not grown.statistics["absolute"].any() and len(grown.statistics["absolute"]) == 10
+
+
 def test_opacities_decay_in_every_round_and_the_faintest_go():
     grown, optimizer = densifier([SMALL] * 4, opacity_decay=0.001)
     opacities = torch.tensor([0.0055, 0.0065, 0.5, 0.0005])

@@ -102,24 +102,55 @@ def test_the_signal_in_the_image_has_one_unit_in_every_projection(projection, la
     assert (signals[projection] / signals["erp"]).median().item() == pytest.approx(1, abs=0.15)
 
 
-@pytest.mark.parametrize(("signal", "axes"), [("image", 2), ("space", 3)])
+def test_the_absolute_signal_is_half_the_distance_times_the_pulls_of_all_pixels(generator):
+    """Beside the signal in space, which is what it is without them."""
+    splats, view = colored_splats(30, generator), view_at(generator)
+    gaussians, weight = splats.gaussians(view), torch.randn(24, 48, 3, generator=generator).double()
+    probes = []
+    for signal in ("space", "space_absolute"):
+        rendering, probe = render_probed(gaussians, view, RAY, signal=signal, backend="torch")
+        (weight * rendering.image).sum().backward(retain_graph=True)
+        probes.append(probe.grad)
+    assert torch.equal(probes[0], probes[1][:, :3])
+
+    pulls = torch.zeros(30, dtype=torch.float64, requires_grad=True)
+    (weight * render(gaussians, view, RAY, absolute_probe=pulls).image).sum().backward()
+    distance = (gaussians.means.detach() @ view.cam_from_world[:3, :3].T + view.cam_from_world[:3, 3]).norm(dim=-1)
+    assert pulls.grad is not None and (pulls.grad > 0).sum() > 20
+    assert torch.allclose(probes[1][:, 3], 0.5 * distance * pulls.grad, rtol=1e-9, atol=1e-14)
+
+
+@pytest.mark.parametrize(("signal", "axes"), [("image", 2), ("space", 3), ("space_absolute", 4)])
 def test_the_densifier_is_given_the_signal_of_its_options(signal, axes, generator):
-    splats = colored_splats(10, generator)
-    trainee = TrainableSplats(
-        splats, CloneSplitOptions(signal=signal), RenderConfig(backend="torch"), extent=1.0, iterations=100
-    )
+    splats, render_config = colored_splats(10, generator), RenderConfig(backend="torch", projection="ray")
+    trainee = TrainableSplats(splats, CloneSplitOptions(signal=signal), render_config, extent=1.0, iterations=100)
     drawing = trainee.draw(view_at(generator))
     drawing.rendering.image.sum().backward()
     assert drawing.probe.grad is not None and drawing.probe.grad.shape == (10, axes)
     trainee.observe(drawing, 1)
-    norms = torch.where(drawing.rendering.visible, drawing.probe.grad.norm(dim=-1), 0.0)
+    norms = torch.where(drawing.rendering.visible, drawing.probe.grad[:, :3].norm(dim=-1), 0.0)
     assert torch.equal(trainee.densifier.statistics["gradient"], norms)
     assert norms.sum() > 0
+    if axes == 4:
+        assert torch.equal(trainee.densifier.statistics["absolute"], drawing.probe.grad[:, 3])
+
+
+def test_the_absolute_signal_wants_the_projection_that_has_it(generator):
+    with pytest.raises(
+        ValueError, match=r"space_absolute is made for render\.projection=ray, not erp; set .*signal=space"
+    ):
+        TrainableSplats(
+            colored_splats(1, generator),
+            CloneSplitOptions(signal="space_absolute"),
+            RenderConfig(),
+            extent=1.0,
+            iterations=100,
+        )
 
 
 def test_unknown_signals_are_named(generator):
-    with pytest.raises(ValueError, match="unknown signal 'pixels'; known: image, space"):
+    with pytest.raises(ValueError, match="unknown signal 'pixels'; known: image, space, space_absolute"):
         CloneSplitOptions(signal="pixels")
     view = view_at(generator)
-    with pytest.raises(ValueError, match="unknown signal 'pixels'; known: image, space"):
+    with pytest.raises(ValueError, match="unknown signal 'pixels'; known: image, space, space_absolute"):
         render_probed(colored_splats(1, generator).gaussians(view), view, RAY, signal="pixels")

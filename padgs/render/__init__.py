@@ -35,6 +35,7 @@ def render(
     *,
     background: Tensor | None = None,
     probe: Tensor | None = None,
+    absolute_probe: Tensor | None = None,
     backend: str = "auto",
     check_values: bool = False,
 ) -> Rendering:
@@ -47,6 +48,8 @@ def render(
         background: [3] RGB behind everything; black if not given.
         probe: [N, 2] zeros that move the projected means, in normalised image units (x and y each run over 2 across
             the image, as in 3DGS); its gradient after `backward` is the densification signal.
+        absolute_probe: [N] zeros that change nothing; projection ray. After `backward` its gradient is the sum over the
+            pixels of |dL/dmean| by way of each alone, which do not cancel (`padgs.render.absolute`).
         backend: a name of `BACKENDS`, or auto: cpu or cuda for float32 tensors that are there, if the library for it is
             built, else torch (and a warning, once, if that is because the library is missing).
         check_values: also check that all numbers are sane; a pass over the tensors, meant for tests and debugging.
@@ -58,11 +61,15 @@ def render(
     cam_from_world = view.cam_from_world.to(device=means.device, dtype=means.dtype)
     if background is None:
         background = means.new_zeros(3)
-    check_inputs(gaussians, cam_from_world, view.camera, options, background, probe, check_values=check_values)
+    check_inputs(
+        gaussians, cam_from_world, view.camera, options, background, probe, absolute_probe, check_values=check_values
+    )
     if options.pixel_bias:
         bias = 2 * options.pixel_bias / means.new_tensor([view.camera.width, view.camera.height])
         probe = bias.expand(len(means), 2) if probe is None else probe + bias
     rasterize = lookup(BACKENDS, resolve_backend(backend, means), "backend")
+    if absolute_probe is not None:
+        rasterize = partial(rasterize, absolute_probe=absolute_probe)
     if options.cubemap:
         rasterize = partial(rasterize_cubemap, rasterize)
     return rasterize(gaussians, cam_from_world, view.camera, options, background, probe)

@@ -124,13 +124,14 @@ def check_inputs(
     options: RenderOptions,
     background: Tensor,
     probe: Tensor | None,
+    absolute_probe: Tensor | None = None,
     *,
     check_values: bool,
 ) -> None:
     """Check what native code relies on and name the culprit.
 
     Args:
-        gaussians, cam_from_world, camera, options, background, probe: as in `torch_backend.rasterize`.
+        gaussians, cam_from_world, camera, options, background, probe, absolute_probe: as in `torch_backend.rasterize`.
         check_values: also look at every number (finite, positive scales, ...); costs a pass over the tensors.
 
     Raises:
@@ -148,6 +149,10 @@ def check_inputs(
     }
     if probe is not None:
         shapes["probe"] = (probe, (count, 2))
+    if absolute_probe is not None:
+        shapes["absolute_probe"] = (absolute_probe, (count,))
+        if options.projection != "ray":
+            raise ValueError(f"absolute_probe is made for projection 'ray', not {options.projection!r}; leave it out")
     dtype, device = gaussians.means.dtype, gaussians.means.device
     if dtype not in (torch.float32, torch.float64):
         raise ValueError(f"means has dtype {dtype}; renderers take torch.float32 or torch.float64")

@@ -21,7 +21,7 @@ from padgs.render.contract import Rendering, RenderOptions
 from padgs.render.native import pointer
 from padgs.render.native_camera import native_camera, native_rays
 from padgs.render.published_bounds import check_memory
-from padgs.render.tiles import MOMENTS, Projected
+from padgs.render.tiles import ABSOLUTE_MOMENT, MOMENTS, Projected
 
 
 def rasterize(
@@ -31,6 +31,7 @@ def rasterize(
     options: RenderOptions,
     background: Tensor,
     probe: Tensor | None = None,
+    absolute_probe: Tensor | None = None,
 ) -> Rendering:
     """Render with the native library; arguments are those of `torch_backend.rasterize`.
 
@@ -51,6 +52,7 @@ def rasterize(
         gaussians.opacities,
         gaussians.colors,
         probe,
+        absolute_probe,
         cam_from_world,
         background,
         camera.table if isinstance(camera, RayTable) else None,
@@ -86,6 +88,7 @@ class _Rasterize(torch.autograd.Function):
         opacities: Tensor,
         colors: Tensor,
         probe: Tensor | None,
+        _absolute_probe: Tensor | None,
         cam_from_world: Tensor,
         background: Tensor,
         _table: Tensor | None,
@@ -129,7 +132,7 @@ class _Rasterize(torch.autograd.Function):
         buffers, projected = _Buffers(image, transmittance, depth, ctx.last), ctx.projected
         grad_image = torch.zeros_like(image) if grad_image is None else grad_image.contiguous()
         upstream = [grad_image, *(g if g is None else g.contiguous() for g in (grad_transmittance, grad_depth))]
-        needs_pose, needs_background, needs_rays = ctx.needs_input_grad[6:9]
+        needs_absolute, needs_pose, needs_background, needs_rays = ctx.needs_input_grad[6:10]
         grad_rays = torch.zeros_like(ctx.rays.table) if needs_rays else None
         count = len(tensors[0])
         totals = torch.zeros(count, MOMENTS)
@@ -139,7 +142,7 @@ class _Rasterize(torch.autograd.Function):
             )
             moments = torch.empty(len(strip.instances), MOMENTS)
             arguments = native.BlendGradientArguments(
-                forward, *map(pointer, upstream), pointer(moments), pointer(grad_rays)
+                forward, *map(pointer, upstream), pointer(moments), pointer(grad_rays), needs_absolute
             )
             native.library().padgs_blend_backward(ctypes.byref(arguments))
             native.library().padgs_sum_moments(pointer(moments), pointer(strip.slot_start), count, pointer(totals))
@@ -161,7 +164,8 @@ class _Rasterize(torch.autograd.Function):
             grad_background = (grad_image * transmittance[..., None]).sum((0, 1))
         if grad_rays is not None:
             grad_table = grad_rays[:, :, : image.shape[1]].permute(0, 2, 1)
-        return *outputs, probe, grad_pose, grad_background, grad_table, None, None, None
+        absolute = totals[:, ABSOLUTE_MOMENT].clone() if needs_absolute else None
+        return *outputs, probe, absolute, grad_pose, grad_background, grad_table, None, None, None
 
 
 def _blend_arguments(

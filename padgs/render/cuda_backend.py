@@ -22,7 +22,7 @@ from padgs.render.cuda_tiles import Projected, Strip
 from padgs.render.native import pointer
 from padgs.render.native_camera import NativeRays, native_camera, native_rays
 from padgs.render.published_bounds import check_memory
-from padgs.render.tiles import MOMENTS
+from padgs.render.tiles import ABSOLUTE_MOMENT, MOMENTS
 
 IDENTITY = torch.eye(4)
 
@@ -34,6 +34,7 @@ def rasterize(
     options: RenderOptions,
     background: Tensor,
     probe: Tensor | None = None,
+    absolute_probe: Tensor | None = None,
 ) -> Rendering:
     """Render on the GPU that holds the tensors; arguments are those of `torch_backend.rasterize`.
 
@@ -52,6 +53,7 @@ def rasterize(
         gaussians.opacities,
         gaussians.colors,
         probe,
+        absolute_probe,
         cam_from_world,
         background,
         camera.table if isinstance(camera, RayTable) else None,
@@ -147,6 +149,7 @@ class _Rasterize(torch.autograd.Function):
         opacities: Tensor,
         colors: Tensor,
         probe: Tensor | None,
+        _absolute_probe: Tensor | None,
         cam_from_world: Tensor,
         background: Tensor,
         _table: Tensor | None,
@@ -181,9 +184,9 @@ class _Rasterize(torch.autograd.Function):
         projected, outputs = ctx.projected, Outputs(image, transmittance, depth, *ctx.kept)
         grad_image = torch.zeros_like(image) if grad_image is None else grad_image.contiguous()
         upstream = [grad_image, *(g if g is None else g.contiguous() for g in (grad_transmittance, grad_depth))]
-        needs_pose, needs_background, needs_rays = ctx.needs_input_grad[6:9]
+        needs_absolute, needs_pose, needs_background, needs_rays = ctx.needs_input_grad[6:10]
         grad_rays = torch.zeros_like(ctx.rays.table) if needs_rays else None
-        totals = _moments(projected, ctx.rays, background, outputs, upstream, grad_rays)
+        totals = _moments(projected, ctx.rays, background, outputs, upstream, grad_rays, absolute=needs_absolute)
 
         count, device = len(tensors[0]), image.device
         gradients = [torch.empty_like(t) for t in tensors]
@@ -206,7 +209,8 @@ class _Rasterize(torch.autograd.Function):
             grad_background = (grad_image * transmittance[..., None]).sum((0, 1))
         if grad_rays is not None:
             grad_table = grad_rays[:, :, : image.shape[1]].permute(0, 2, 1)
-        return *gradients, probe, grad_pose, grad_background, grad_table, None, None, None, None
+        absolute = totals[:, ABSOLUTE_MOMENT].clone() if needs_absolute else None
+        return *gradients, probe, absolute, grad_pose, grad_background, grad_table, None, None, None, None
 
 
 def blend(projected: Projected, rays: NativeRays, background: Tensor, outputs: Outputs) -> Tensor:
@@ -227,6 +231,8 @@ def _moments(
     outputs: Outputs,
     upstream: list[Tensor | None],
     grad_rays: Tensor | None,
+    *,
+    absolute: bool,
 ) -> Tensor:
     """Moments [N, MOMENTS] of all Gaussians, from the gradients of image, transmittance and depth."""
     device, size, hybrid = background.device, outputs.depth.shape, outputs.core_size > 0
@@ -246,6 +252,7 @@ def _moments(
             *map(pointer, (moments, grad_rays, projected.order, strip.slot_start)),
             projected.visible,
             pointer(totals),
+            absolute,
         )
         cuda_native.call("padgs_cuda_blend_backward", projected.queue, arguments, strip.tiles)
     return totals

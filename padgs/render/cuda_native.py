@@ -113,6 +113,7 @@ class BlendGradientInputs(ctypes.Structure):
         *fields(Pointer, "moments", "grad_rays", "order", "slot_start"),
         ("visible", Int64),
         ("totals", Pointer),
+        ("absolute", Int32),
     ]
 
 

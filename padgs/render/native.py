@@ -87,6 +87,7 @@ class BlendGradientArguments(ctypes.Structure):
     _fields_ = [
         ("forward", BlendArguments),
         *fields(Pointer, "grad_image", "grad_transmittance", "grad_depth", "moments", "grad_rays"),
+        ("absolute", ctypes.c_int32),
     ]
 
 

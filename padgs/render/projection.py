@@ -42,6 +42,10 @@ class Footprints(ABC):
         """Where the Gaussians [K] lie on the rays of the pixels [P]: [P, K] world units, no gradient; orders hybrid."""
         return self.depths.detach()[indices].expand(len(rows), -1)
 
+    def slope(self, indices: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+        """|dq/dmean| [P, K] per world unit, covariances held, no gradient; of `ray` footprints only."""
+        raise NotImplementedError(f"{type(self).__name__} do not say how q changes with their means")
+
 
 def project(
     gaussians: Gaussians,

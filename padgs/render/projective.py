@@ -63,6 +63,12 @@ class RayFootprints(Footprints):
         with torch.no_grad():
             return self._meeting(indices, rows, columns)[2]
 
+    def slope(self, indices: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+        """2 |M^-T (o - t w)|: the derivative by way of t vanishes, because there the ray meets the maximum."""
+        with torch.no_grad():
+            o, w, t = self._meeting(indices, rows, columns)
+            return 2 * torch.einsum("kic,pki->pkc", self.whitening[indices], o - t[..., None] * w).norm(dim=-1)
+
     def _meeting(self, indices: Tensor, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """o [K, 3], w [P, K, 3] and t [P, K]."""
         whitening = self.whitening[indices]

@@ -16,6 +16,7 @@ from padgs.render.native import pointer
 
 TILE = 16  # pixels
 MOMENTS = 16  # floats per instance, see csrc/abi.h
+ABSOLUTE_MOMENT = 14
 
 
 class Strip:

@@ -12,6 +12,7 @@ from torch.utils.checkpoint import checkpoint
 
 from padgs.camera import Camera
 from padgs.gaussians import Gaussians
+from padgs.render.absolute import with_absolute_pull
 from padgs.render.contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Rendering, RenderOptions
 from padgs.render.hybrid import hybrid_weights
 from padgs.render.projection import Footprints, project
@@ -27,11 +28,12 @@ def rasterize(
     options: RenderOptions,
     background: Tensor,
     probe: Tensor | None = None,
+    absolute_probe: Tensor | None = None,
 ) -> Rendering:
     """Render by brute force: every pixel against every visible Gaussian.
 
     Args:
-        gaussians, background, probe: as in `padgs.render.render`, checked.
+        gaussians, background, probe, absolute_probe: as in `padgs.render.render`, checked.
         cam_from_world: [4, 4] in the dtype and on the device of the means.
         camera: which direction each pixel looks.
         options: as in `padgs.render.render`.
@@ -46,7 +48,7 @@ def rasterize(
     parts = []
     for block in blocks:
         rows, columns = torch.div(block, camera.width, rounding_mode="floor"), block % camera.width
-        arguments = (footprints, gaussians.colors, background, order, rows, columns, options)
+        arguments = (footprints, gaussians.colors, background, order, rows, columns, options, absolute_probe)
         if len(blocks) > 1 and torch.is_grad_enabled():
             parts.append(checkpoint(_blend, *arguments, use_reentrant=False, preserve_rng_state=False))
         else:
@@ -76,9 +78,12 @@ def _blend(
     rows: Tensor,
     columns: Tensor,
     options: RenderOptions,
+    absolute_probe: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor, int]:
     """Colour [P, 3], transmittance [P] and depth [P] of some pixels, and how many pairs contribute (Eq. 4)."""
     q, inside = footprints.squared_distance(order, rows, columns)  # [P, K] each
+    if absolute_probe is not None:
+        q = with_absolute_pull(q, footprints.slope(order, rows, columns), absolute_probe[order])
     alpha = (footprints.opacities[order] * torch.exp(-0.5 * q)).clamp(max=ALPHA_MAX)
     alpha = torch.where(inside & (alpha.detach() >= ALPHA_MIN), alpha, torch.zeros_like(alpha))
     if options.blending == "hybrid":

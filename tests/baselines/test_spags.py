@@ -44,7 +44,7 @@ def test_is_registered_and_configured(monkeypatch, root):
 def test_the_published_schedule():
     options = SPaGSOptions()
     assert (options.densify_from, options.densify_until, options.densify_every) == (200, 15_000, 100)
-    assert (options.signal, options.gradient_threshold, options.min_opacity) == ("space", 5e-5, 0.005)
+    assert (options.signal, options.gradient_threshold, options.min_opacity) == ("space_absolute", 5e-5, 0.005)
     assert (options.reset_every, options.reset_opacity, options.opacity_decay) == (3000, 0.1, 0.001)
     assert not options.prune_by_extent and options.sh_degree == 3
 

@@ -5,6 +5,7 @@ import pytest
 
 # The definition, the golden cases and bad input; the rest of what every engine is asked takes minutes at this pace.
 QUICK = {
+    "test_absolute",
     "test_contract",
     "test_cuda_backend",
     "test_cuda_loss",

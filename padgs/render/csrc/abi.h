@@ -16,6 +16,7 @@ constexpr int kPatchWidth = 8, kPatchHeight = 2;  // pixels of a patch, which is
 constexpr int kTile = 16;        // pixels: height of a tile, and its width times a power of two
 constexpr int kMaxLevel = 4;     // tiles are up to kTile 2^kMaxLevel pixels wide, near the poles
 constexpr int kMoments = 16;     // floats that backward blending leaves for each (Gaussian, tile) instance
+constexpr int kAbsoluteMoment = 14;
 constexpr float kAlphaMin = 1.0f / 255.0f;
 constexpr float kAlphaMax = 0.99f;
 constexpr float kTransmittanceMin = 1e-4f;
@@ -112,6 +113,7 @@ struct BlendGradientArguments {
   const float *grad_image, *grad_transmittance, *grad_depth;  // [H,W,3] [H,W] or null, [H,W] or null
   float *moments;                                             // [I, kMoments] by slot
   float *grad_rays;                                           // [H, 3, padded W] or null
+  int32_t absolute;  // 1: also sum what each pixel alone pulls at the mean, into moment kAbsoluteMoment; `ray` only
 };
 
 // One network w2 relu(w1 x + b1) + b2; w1 [hidden, I], w2 [outputs, hidden].

@@ -235,7 +235,8 @@ Upstream differentiate_patch(const BlendGradientArguments &args, const Tile &til
   return up;
 }
 
-template <class Seen, bool kWithDepth, bool kWithRays>
+// kAbsolute: with `absolute`, see BlendGradientArguments.
+template <class Seen, bool kWithDepth, bool kWithRays, bool kAbsolute>
 void backward_tile(const BlendGradientArguments &args, const Tile &tile) {
   const BlendArguments &forward = args.forward;
   const Places<Seen> &places = places_of<Seen>(forward, tile);
@@ -265,7 +266,7 @@ void backward_tile(const BlendGradientArguments &args, const Tile &tile) {
     const Instance instance = forward.instances[i];
     const Seen g(forward.footprints[instance.gaussian], forward, tile);
     typename Seen::Moments moments;
-    Vec red = zero(), green = zero(), blue = zero(), depth = zero();
+    Vec red = zero(), green = zero(), blue = zero(), depth = zero(), absolute = zero();
     for (int row = instance.row; row < instance.row_end; ++row)
       for (int column = instance.column; column < instance.column_end; ++column) {
         const int p = row * tile.patch_columns + column;
@@ -293,12 +294,13 @@ void backward_tile(const BlendGradientArguments &args, const Tile &tile) {
         blue += weight * up.blue;
         if (kWithDepth) depth += weight * up.depth;
         moments.add(at, m);
+        if constexpr (kAbsolute) absolute += g.pull(at, m);
         if constexpr (kWithRays) g.add_ray_gradient(at, m, ray_gradients[p]);
       }
     Vec sums[kMoments];
     moments.finish(sums);
     sums[10] = red, sums[11] = green, sums[12] = blue, sums[13] = depth;
-    sums[14] = sums[15] = zero();
+    sums[kAbsoluteMoment] = absolute, sums[15] = zero();
     float *out = args.moments + int64_t(instance.slot) * kMoments;
     for (int k = 0; k < kMoments; k += 4) sum4(sums + k, out + k);
   }
@@ -316,13 +318,15 @@ void hybrid_forward(const BlendArguments &args) {
 void hybrid_backward(const BlendGradientArguments &args) {
   for_each_tile(args.forward, [&](const Tile &tile, int64_t) {
     if (planar(args.forward))  // does not look at rays
-      args.grad_depth ? backward_tile<PlanarFootprint, true, false>(args, tile)
-                      : backward_tile<PlanarFootprint, false, false>(args, tile);
+      args.grad_depth ? backward_tile<PlanarFootprint, true, false, false>(args, tile)
+                      : backward_tile<PlanarFootprint, false, false, false>(args, tile);
     else if (args.grad_rays)
-      backward_tile<ProjectiveFootprint, true, true>(args, tile);
+      backward_tile<ProjectiveFootprint, true, true, true>(args, tile);
+    else if (args.absolute)
+      backward_tile<ProjectiveFootprint, true, false, true>(args, tile);
     else
-      args.grad_depth ? backward_tile<ProjectiveFootprint, true, false>(args, tile)
-                      : backward_tile<ProjectiveFootprint, false, false>(args, tile);
+      args.grad_depth ? backward_tile<ProjectiveFootprint, true, false, false>(args, tile)
+                      : backward_tile<ProjectiveFootprint, false, false, false>(args, tile);
   });
 }
 

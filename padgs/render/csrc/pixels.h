@@ -8,7 +8,7 @@
 #include <vector>
 
 #include "abi.h"
-#include "simd.h"
+#include "simd_math.h"
 #include "tiles.h"
 
 namespace padgs {
@@ -133,13 +133,25 @@ struct ProjectiveFootprint {
     at.reached = both(at_least(at.log2_alpha, splat(kLog2AlphaMin)), both(less(zero(), b), less(d * s[10], b)));
     return at;
   }
-  // dq/dd = 2 (b / D) (c_x l0 + c_y l1 - q m), and M is worth -M/2 of dL/dq.
+  // e = c_x l0 + c_y l1 - q m, which the derivatives of one pixel are made of.
+  Place slope(const At &at) const {
+    const float *s = f.shape;
+    Place e;
+    e.x = at.cx * s[0] + at.cy * s[3] - at.q * s[6];
+    e.y = at.cx * s[1] + at.cy * s[4] - at.q * s[7];
+    e.z = at.cx * s[2] + at.cy * s[5] - at.q * s[8];
+    return e;
+  }
+  // dq/dd = 2 (b / D) e, and M is worth -M/2 of dL/dq.
   void add_ray_gradient(const At &at, Vec m, Place &grad) const {
     const Vec scale = -(m * at.b_by_d);
-    const float *s = f.shape;
-    grad.x += scale * (at.cx * s[0] + at.cy * s[3] - at.q * s[6]);
-    grad.y += scale * (at.cx * s[1] + at.cy * s[4] - at.q * s[7]);
-    grad.z += scale * (at.cx * s[2] + at.cy * s[5] - at.q * s[8]);
+    const Place e = slope(at);
+    grad.x += scale * e.x, grad.y += scale * e.y, grad.z += scale * e.z;
+  }
+  // |dL/dmean| of each pixel, the covariance held: |M h| with h = -sqrt(kappa) e (projective.h).
+  Vec pull(const At &at, Vec m) const {
+    const Place e = slope(at);
+    return magnitude(m) * root((e.x * e.x + e.y * e.y + e.z * e.z) * f.shape[9]);
   }
 
   struct Moments {

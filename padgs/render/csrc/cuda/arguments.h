@@ -93,6 +93,7 @@ struct BlendGradientInputs {
   const uint32_t *slot_start;
   int64_t visible;
   float *totals;  // [N, kMoments], added to
+  int32_t absolute;  // as in BlendGradientArguments
 };
 
 // Of the structures of decoding, the networks are not used: their outputs are here.

@@ -130,7 +130,9 @@ __global__ void __launch_bounds__(kBucketThreads) buckets_kernel(BlendGradientIn
       if (!pair.reached) continue;
       const Upstream upstream = args.upstream[p];
       float weight;
-      pair.add(step_back(f, pair.log2_alpha, upstream, state, weight), sums);
+      const float m = step_back(f, pair.log2_alpha, upstream, state, weight);
+      pair.add(m, sums);
+      if (args.absolute) sums[kAbsoluteMoment] += pair.pull(f, m);
       sums[10] += weight * upstream.red;
       sums[11] += weight * upstream.green;
       sums[12] += weight * upstream.blue;

@@ -108,7 +108,9 @@ __global__ void __launch_bounds__(kBucketThreads) hybrid_buckets_kernel(BlendGra
         const int64_t p = int64_t(y) * table.width + x;
         const Upstream up = args.upstream[p];
         float weight;
-        pair.add(differentiate(args, f, reach.gaussian, pair.log2_alpha, p, up, weight), sums);
+        const float m = differentiate(args, f, reach.gaussian, pair.log2_alpha, p, up, weight);
+        pair.add(m, sums);
+        if (args.absolute) sums[kAbsoluteMoment] += pair.pull(f, m);
         sums[10] += weight * up.red;
         sums[11] += weight * up.green;
         sums[12] += weight * up.blue;

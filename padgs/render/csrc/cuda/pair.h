@@ -14,6 +14,7 @@ struct PlanarPair {
   bool reached;
 
   PADGS_HD float distance(const Footprint &f, bool) const { return f.depth; }
+  PADGS_HD float pull(const Footprint &, float) const { return 0.0f; }  // is asked of `ray` only
 
   // Sums of M times 1, t, dv, t^2, t dv, dv^2 with t = a du + b dv; see planar.h.
   PADGS_HD void add(float m, float *sums) const {
@@ -33,6 +34,17 @@ struct ProjectivePair {
   // mean.
   PADGS_HD float distance(const Footprint &f, bool largest) const {
     return largest ? b_by_d / root(f.shape[9]) : f.depth;
+  }
+
+  // e = c_x l0 + c_y l1 - q m, which the derivatives of one pixel are made of.
+  PADGS_HD Vec3<float> slope(const Footprint &f) const {
+    const float *s = f.shape;
+    return scaled(cx, {s[0], s[1], s[2]}) + scaled(cy, {s[3], s[4], s[5]}) - scaled(q, {s[6], s[7], s[8]});
+  }
+  // |dL/dmean| of one pixel, the covariance held: |M h| with h = -sqrt(kappa) e (projective.h).
+  PADGS_HD float pull(const Footprint &f, float m) const {
+    const Vec3<float> e = slope(f);
+    return magnitude(m) * root(dot(e, e) * f.shape[9]);
   }
 
   PADGS_HD void add(float m, float *sums) const {
@@ -94,10 +106,9 @@ struct ProjectivePixel {
     return p;
   }
 
-  // dq/dd = 2 (b / D) (c_x l0 + c_y l1 - q m), and M is worth -M/2 of dL/dq.
+  // dq/dd = 2 (b / D) e, and M is worth -M/2 of dL/dq.
   PADGS_HD Vec3<float> ray_gradient(const Footprint &f, const ProjectivePair &p, float m) const {
-    const float *s = f.shape, scale = -(m * p.b_by_d);
-    return scaled(scale, scaled(p.cx, {s[0], s[1], s[2]}) + scaled(p.cy, {s[3], s[4], s[5]}) - scaled(p.q, {s[6], s[7], s[8]}));
+    return scaled(-(m * p.b_by_d), p.slope(f));
   }
 };
 
