@@ -37,7 +37,12 @@ def _size(name: str, *path: str) -> Callable[[dict[str, Any]], Any]:
     return read
 
 
+def _against_erp(projection: str) -> Callable[[dict[str, Any]], Any]:
+    return lambda report: report["ratios"][projection]["cpu"]
+
+
 FOUNDATION, RENDERER = "issue 2, speed and memory", "issue 3, speed and memory"
+METHODS = "issue 5, speed and memory"
 GOALS = (
     Goal("draw and back, 512x256, 100k", 60, "ms", FOUNDATION, _size("medium", "render"), MS),
     Goal("torch renderer / native", 30, "x", FOUNDATION, lambda r: r["ratios"]["torch_renderer"]["cpu"], at_least=True),
@@ -63,6 +68,9 @@ GOALS = (
     Goal("training iteration, 256x128, 20k", 11, "ms", RENDERER, _size("small", "iteration"), MS),
     Goal("frame, 2048x1024, 1M", 250, "ms", RENDERER, _size("large", "frame"), MS),
     Goal("memory of a frame, 2048x1024, 1M", 2, "GB", RENDERER, _size("large", "peak_bytes", "frame"), GIGA),
+    Goal("tangent / erp, draw and back", 1, "x", METHODS, _against_erp("tangent")),
+    Goal("ray / erp, draw and back", 1, "x", METHODS, _against_erp("ray")),
+    Goal("ray, hybrid / erp, draw and back", 1, "x", METHODS, _against_erp("hybrid")),
 )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from typing import Any
 from unittest import mock
 
@@ -18,6 +19,12 @@ from padgs.clock import measure
 from padgs.gaussians import Gaussians
 from padgs.render import Rendering, RenderOptions, render
 from padgs.targets import Targets
+
+PROJECTIONS = {
+    "tangent": RenderOptions(projection="tangent"),
+    "ray": RenderOptions(projection="ray"),
+    "hybrid": RenderOptions(projection="ray", blending="hybrid"),  # SPaGS
+}
 
 
 def ratios(work: Workload, brute_force: Workload, repeats: int) -> dict[str, dict[str, Any]]:
@@ -57,7 +64,26 @@ def ratios(work: Workload, brute_force: Workload, repeats: int) -> dict[str, dic
             _comparing(image, target),
             repeats,
         ),
+        "decode": _ratio(
+            "decode, draw with erp", "draw with erp", _decoding_and_drawing(work), _drawing(work, OPTIONS), repeats
+        ),
+        **{name: _against_erp(work, options, repeats) for name, options in PROJECTIONS.items()},
     }
+
+
+def _against_erp(work: Workload, options: RenderOptions, repeats: int) -> dict[str, Any]:
+    """The same Gaussians under another projection, forward and backward."""
+    hybrid = ", hybrid" if options.blending == "hybrid" else ""
+    options = replace(options, near=OPTIONS.near)
+    found = _ratio(
+        f"draw with {options.projection}{hybrid}",
+        "draw with erp",
+        _drawing(work, options),
+        _drawing(work, OPTIONS),
+        repeats,
+    )
+    counts = [_draw(_decoded(work), work, each).counters for each in (options, OPTIONS)]
+    return found | {count: counts[0][count] / counts[1][count] for count in ("instances", "evaluated")}
 
 
 @contextmanager
@@ -96,6 +122,16 @@ def _drawing(work: Workload, options: RenderOptions, backend: str = "cpu") -> Ca
     gaussians = _decoded(work)
     upstream = torch.randn(work.size.height, work.size.width, 3, generator=torch.Generator().manual_seed(2))
     return lambda: _draw(gaussians, work, options, backend).image.backward(upstream)
+
+
+def _decoding_and_drawing(work: Workload) -> Callable[[], None]:
+    upstream = torch.randn(work.size.height, work.size.width, 3, generator=torch.Generator().manual_seed(2))
+
+    def both_ways() -> None:
+        _draw(work.model.decode(work.view).gaussians, work, OPTIONS).image.backward(upstream)
+        work.model.zero_grad(set_to_none=True)
+
+    return both_ways
 
 
 def _decoding(work: Workload) -> Callable[[], None]:

@@ -21,7 +21,7 @@ def report() -> dict:
         },
         "decode_10k": timing(0.001, 0.002),
         "bounds": {"exact": {"mean": 5.6, "max": 9}},
-        "ratios": {"torch_renderer": {"cpu": 60.0}},
+        "ratios": {"torch_renderer": {"cpu": 60.0}, **{name: {"cpu": 1.5} for name in ("tangent", "ray", "hybrid")}},
     }
 
 
