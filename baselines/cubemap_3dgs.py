@@ -15,7 +15,7 @@ from padgs.method import Budget, Record, RenderConfig
 from padgs.perspectives import perspective_scene, square_lens
 from padgs.render.cubemap import FACES
 from padgs.scene import Scene
-from padgs.splat_method import SplatMethod
+from padgs.splat_method import SplatMethod, refuse_polar_threshold
 
 
 class Cubemap3DGSMethod(SplatMethod):
@@ -28,7 +28,7 @@ class Cubemap3DGSMethod(SplatMethod):
 
         Raises:
             ValueError: a training view is no panorama, or held-out panoramas could not be drawn, or pixels shall be
-                weighted by a latitude that they do not have.
+                weighted, or Gaussians chosen, by a latitude that they do not have.
         """
         if self._render.projection == "pinhole" and not self._render.cubemap:
             raise ValueError(
@@ -39,6 +39,7 @@ class Cubemap3DGSMethod(SplatMethod):
             raise ValueError(
                 f"train.weight is {self._train.weight}, but the rows of perspective views have no latitude; set uniform"
             )
+        refuse_polar_threshold(self._options, "perspective views have no poles")
         yield from super().fit(perspective_scene(scene, self.turns(), self.lens), budget)
 
     def turns(self) -> Tensor:

@@ -39,7 +39,7 @@ class EgoNeRFMethod:
         self,
         options: EgoNeRFMethodOptions = EgoNeRFMethodOptions(),
         render: RenderConfig = RenderConfig(),  # noqa: B008
-        train: TrainOptions = TrainOptions(),  # noqa: B008
+        train: TrainOptions = TrainOptions(weight="uniform"),  # noqa: B008
         seed: int = 0,
     ) -> None:
         """Prepare; the model comes with `fit` or `load_state`."""

@@ -18,10 +18,10 @@ from padgs.model import RELEASED_MODEL, PaDGS, PaDGSOptions
 from padgs.render import Rendering, render
 from padgs.scene import Scene, View
 from padgs.schedule import Constant, LogLinear, ParameterGroup
+from padgs.splat_training import extent_of
 from padgs.train import Trainer, TrainOptions, model_state
 
 OFFSET_RATE_UNITS = ("scene", "world")
-MIN_TRAVEL = 0.1  # scene units; cameras that hardly move, or a single one, must still be able to place Gaussians
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class LearningRates:
 
     def groups(self, model: PaDGS, scene: Scene, iterations: int) -> list[ParameterGroup]:
         """The parameters of a model with their rates in a run of `iterations` on a scene."""
-        travel = max(scene.extent, MIN_TRAVEL * scene.unit) / (scene.unit if self.offset_rate_unit == "scene" else 1.0)
+        travel = extent_of(scene) / (scene.unit if self.offset_rate_unit == "scene" else 1.0)
         first, last = self.offset_rate
         groups = [
             ParameterGroup("offsets", (model.offsets,), LogLinear(travel * first, travel * last, iterations)),

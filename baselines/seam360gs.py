@@ -13,7 +13,7 @@ from padgs.calibrated_splats import CalibratedMethod
 from padgs.dual_lens import DualLens
 from padgs.method import RenderConfig
 from padgs.scene import Scene
-from padgs.splat_method import SplatOptions
+from padgs.splat_method import SplatOptions, refuse_polar_threshold
 
 
 @dataclass(frozen=True)
@@ -44,6 +44,7 @@ class Seam360GSMethod(CalibratedMethod):
     RENDER = RenderConfig(projection="ray")
 
     def _as_given(self, scene: Scene) -> DualLens:
+        refuse_polar_threshold(self._options, "a view is made of two, each by a lens of its own")
         return self._as_stored({"unit": scene.unit})
 
     def _as_stored(self, values: Mapping[str, Any]) -> DualLens:

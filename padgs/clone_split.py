@@ -48,7 +48,7 @@ class CloneSplitOptions:
     extent_margin: float = 0.0  # world units added to the extent that sizes are compared with (the released ODGS)
     reset_every: int = 3000  # iterations between opacity resets
     reset_opacity: float = 0.01  # no opacity is larger after a reset
-    max_gaussians: int | None = 1_000_000  # with more candidates, those with the largest gradients multiply
+    max_gaussians: int | None = 10_000_000  # as many as PaD-GS may have; those with the largest gradients multiply
     released_start: bool = False  # bug of the released OmniGS: densify_from is read as 0
     released_reset: bool = False  # bug of the released OmniGS: resets clear Adam moments but keep the opacities
 
@@ -125,18 +125,24 @@ class CloneSplit:
         events = []
         begin = 0 if options.released_start else options.densify_from
         if iteration > begin and iteration % options.densify_every == 0:
-            cloned, split = self._multiply(optimizer)
+            cloned, split, left_out = self._multiply(optimizer)
             self._decay_opacities()
             pruned = self._prune(optimizer, iteration)
             self.statistics = self._empty()
             events.append(f"cloned {cloned}, split {split}, pruned {pruned} Gaussians")
+            if left_out:
+                total = cloned + split + left_out
+                events.append(f"max_gaussians {options.max_gaussians} left out {left_out} of {total} candidates")
         if iteration % options.reset_every == 0:
             self._reset_opacities(optimizer)
             events.append("reset opacities")
         return tuple(events)
 
-    def _multiply(self, optimizer: torch.optim.Adam) -> tuple[int, int]:
-        """Clone and split; returns how many of each. Each adds one Gaussian to the count, within `max_gaussians`."""
+    def _multiply(self, optimizer: torch.optim.Adam) -> tuple[int, int, int]:
+        """Clone and split; returns how many of each, and how many had to be left out.
+
+        Each adds one Gaussian to the count, within `max_gaussians`.
+        """
         rows = self.splats.rows()
         seen = self.statistics["seen"].clamp(min=1)
         mean_gradient = self.statistics["gradient"] / seen
@@ -146,9 +152,10 @@ class CloneSplit:
         chosen = mean_gradient >= threshold
         if self.options.signal == "space_absolute":  # those above the quantile that leaves as many: 1 - (chosen / all)
             chosen |= _largest(self.statistics["absolute"] / seen, int(chosen.sum()))
+        candidate_count = int(chosen.sum())
         if self.options.max_gaussians is not None:
             room = max(0, self.options.max_gaussians - len(chosen))
-            if int(chosen.sum()) > room:
+            if candidate_count > room:
                 candidates = torch.where(chosen, mean_gradient, -1.0)  # their thresholds may differ
                 chosen = _largest(candidates, room)
         small = torch.exp(self.splats.log_scales).amax(-1) <= self.options.percent_dense * self.extent
@@ -158,7 +165,8 @@ class CloneSplit:
         replaced = torch.zeros(len(self.splats), dtype=torch.bool, device=chosen.device)
         replaced[: len(chosen)] = chosen & ~small
         keep_rows(rows, optimizer, ~replaced)
-        return len(clones["means"]), len(pieces["means"]) // PIECES
+        cloned, split = len(clones["means"]), len(pieces["means"]) // PIECES
+        return cloned, split, candidate_count - cloned - split
 
     def _pieces(self, split: Tensor) -> dict[str, Tensor]:
         """What takes the place of the Gaussians marked in split [N]: smaller ones, at random places inside them."""

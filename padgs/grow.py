@@ -37,7 +37,7 @@ class GrowthOptions:
     prune_share: float = 0.8  # an anchor must have been decoded in more than this share of grow_every iterations
     min_opacity: float = 0.01  # anchors whose positive opacities sum to less, on average over views, are pruned
     log_scale_cap: float | None = None  # upper limit of Gaussians' log-scales, applied when pruning
-    max_anchors: int | None = 1_000_000  # where there are more candidates, those with the largest gradients are kept
+    max_anchors: int | None = 1_000_000  # of ten Gaussians each; those with the largest gradients grow
 
     def __post_init__(self) -> None:
         """Reject grids that are not multiples of a voxel, and limits without a meaning."""

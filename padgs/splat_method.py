@@ -26,13 +26,23 @@ class SplatOptions(CloneSplitOptions):
     """The `method` group of the configuration: the model, and its densification."""
 
     sh_degree: int = 3  # 0: colours do not depend on the direction
-    learning_rate_factor: float = 1.0  # on all learning rates
+    learning_rate_factor: float = 1.0  # on all learning rates of Gaussians; cameras have their own
 
     def __post_init__(self) -> None:
         """Reject what nothing can be learned with."""
         super().__post_init__()
         if not self.learning_rate_factor > 0:
             raise ValueError(f"learning_rate_factor is {self.learning_rate_factor}; it must be > 0")
+
+
+def refuse_polar_threshold(options: SplatOptions, why: str) -> None:
+    """For methods whose training views are not the panorama that the latitudes of a threshold are of.
+
+    Raises:
+        ValueError: there is such a threshold.
+    """
+    if options.polar_threshold is not None:
+        raise ValueError(f"method.polar_threshold is {options.polar_threshold}, but {why}; set it to null")
 
 
 class SplatMethod:

@@ -18,6 +18,7 @@ from padgs.schedule import Constant, LogLinear, ParameterGroup, scaled
 from padgs.splats import Splats
 from padgs.train import Drawing
 
+MIN_EXTENT = 0.1  # scene units
 ONE_PLACE = 1e-6  # scene units; an extent up to here is rounding
 DEGREE_EVERY = 1000  # published iterations after which the next SH degree comes into use
 
@@ -150,8 +151,8 @@ class TrainableSplats:
 
 
 def extent_of(scene: Scene) -> float:
-    """`Scene.extent`, or the scene's unit of length where all cameras stand in one place."""
-    return scene.unit if stands_still(scene) else scene.extent
+    """`Scene.extent`, world units, but for cameras that hardly move: they must be able to place Gaussians, too."""
+    return max(scene.extent, MIN_EXTENT * scene.unit)
 
 
 def stands_still(scene: Scene) -> bool:

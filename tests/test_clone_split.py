@@ -143,7 +143,7 @@ def test_large_gaussians_are_pruned_only_on_request(prune, left):
 def test_the_cap_holds_and_the_hardest_pulled_come_first(scale):
     grown, optimizer = densifier([scale] * 5, max_gaussians=7)
     pull(grown, [1e-3, 5e-3, 2e-3, 4e-3, 3e-3])
-    grown.adapt(EVERY, optimizer)
+    assert grown.adapt(EVERY, optimizer)[1:] == ("max_gaussians 7 left out 3 of 5 candidates",)
     assert len(grown.splats) == 7
     unchanged = {0.0, 2.0, 4.0}
     assert unchanged <= set(grown.splats.means[:, 0].tolist())

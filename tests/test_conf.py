@@ -62,6 +62,7 @@ def test_every_sweep_varies_its_key_alone_and_says_how_to_run_it(name):
         "backends": {"render.backend"},
         "growth_threshold": {"method.gradient_threshold"},
         "lambda": {"train.lambda_l1"},
+        "offset_rate": {"method.offset_rate"},
         "omega_axis": {"method.omega_axis"},
         "offsets_and_features": {"method.offsets", "method.features"},
         "projections": {"render.projection", "render.cubemap"},

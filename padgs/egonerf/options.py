@@ -21,12 +21,13 @@ class EgoNeRFOptions:
     feature_frequencies: int = 2
     direction_frequencies: int = 2
     density_shift: float = -10.0  # density = softplus(feature + shift)
-    distance_scale: float = 25.0  # optical depth = density x scale x length
+    distance_scale: float = 125.0  # optical depth = density x scale x length; ours, see the lengths
     coarse_samples: int = 128  # of each ray
     fine_samples: int = 128
     min_weight: float = 0.0  # ours: samples that contribute less are not shaded, their share is black
     length_unit: str = "scene"  # ours: Scene.unit, so the world's units do not matter | world: as published
-    near: float = 0.02  # ours, as are the next two: published 0.1, 300 and 0.05 world units, here divided by 5
+    # Ours: published 0.1, 300 and 0.05 world units, here divided by 5, and scale 25, times 5.
+    near: float = 0.02
     far: float = 60.0
     first_radius: float = 0.01  # of the radial nodes, and the shortest interval between nodes or between first samples
     environment: bool = True  # whether a picture of the sphere lies behind everything; else it is black

@@ -72,6 +72,10 @@ class RenderOptions:
             raise ValueError(f"core_size is {self.core_size}; it must be from 1 to {MAX_CORE_SIZE} fragments a pixel")
         if self.bounds == "square" and self.wrap:
             raise ValueError("bounds=square are the published bounds, which end at the seam; set wrap=false with them")
+        if not self.wrap and self.bounds == "exact" and self.projection in ("tangent", "ray"):
+            raise ValueError(
+                f"projection {self.projection!r} knows of no seam that wrap=false could cut; set wrap=true"
+            )
         if not self.near >= 0:
             raise ValueError(f"near is {self.near}; it must be a distance >= 0 in world units")
         if not self.low_pass >= 0:
@@ -96,6 +100,10 @@ class RenderOptions:
         if self.cubemap and self.projection == "erp":
             raise ValueError(
                 "projection 'erp' draws whole panoramas; the faces of a cubemap take pinhole, tangent or ray"
+            )
+        if self.face_size is not None and not self.cubemap:
+            raise ValueError(
+                f"face_size is {self.face_size}, but only a cubemap has faces; set cubemap=true, or leave it"
             )
         if self.face_size is not None and not self.face_size >= 2:
             raise ValueError(f"face_size is {self.face_size}; a face must be at least 2 pixels wide, or None")

@@ -5,11 +5,12 @@ from dataclasses import fields, replace
 import pytest
 import torch
 
-from baselines.padgs import MIN_TRAVEL, PRESETS, LearningRates, PaDGSMethod, PaDGSMethodOptions, preset
+from baselines.padgs import PRESETS, LearningRates, PaDGSMethod, PaDGSMethodOptions, preset
 from padgs.method import Budget, RenderConfig
 from padgs.model import PaDGS
 from padgs.panorama import rays
 from padgs.scene import Scene, View
+from padgs.splat_training import MIN_EXTENT
 from padgs.train import TrainOptions
 
 WIDTH, HEIGHT = 48, 24
@@ -160,7 +161,7 @@ def test_a_single_camera_can_still_place_gaussians():
     world = scene()
     alone = replace(world, train=world.train[:1])
     groups = LearningRates().groups(PaDGS.from_scene(alone), alone, 100)
-    assert groups[0].learning_rate(0) == pytest.approx(0.01 * MIN_TRAVEL)
+    assert groups[0].learning_rate(0) == pytest.approx(0.01 * MIN_EXTENT)
 
 
 @pytest.mark.parametrize(

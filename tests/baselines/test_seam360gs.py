@@ -44,6 +44,12 @@ def test_charts_cannot_draw_lenses(scene):
         next(Seam360GSMethod(render=RenderConfig(backend="torch")).fit(scene, Budget(10)))
 
 
+def test_a_threshold_that_follows_the_latitude_is_refused(scene):
+    method = Seam360GSMethod(Seam360GSOptions(polar_threshold=1e-3), TORCH)
+    with pytest.raises(ValueError, match=r"polar_threshold is 0\.001, but a view is made of two.*; set it to null"):
+        next(method.fit(scene, Budget(10)))
+
+
 def test_a_rate_of_nothing_is_refused():
     with pytest.raises(ValueError, match=r"gap_rate is 0\.0; a learning rate must be > 0"):
         Seam360GSOptions(gap_rate=0.0)

@@ -69,6 +69,24 @@ def test_the_defaults_have_the_published_number_of_parameters():
     assert 46e6 < sum(p.numel() for p in model.parameters()) < 47.5e6
 
 
+def test_the_default_is_the_published_model_of_a_scene_whose_unit_is_five(generator):
+    """Lengths are published in units of the data; the optical depth of a length is the same, too."""
+    world = tiny_scene()
+    world = moved(world, 5 / world.unit)
+    assert world.unit == pytest.approx(5)
+    lengths = ("length_unit", "near", "far", "first_radius", "distance_scale")
+    sizes = {name: value for name, value in vars(SMALL).items() if name not in lengths}
+    ours = EgoNeRFOptions(**sizes)
+    published = dict(zip(lengths, ("world", 0.1, 300.0, 0.05, 25.0), strict=True))
+    assert (ours.length_unit, ours.distance_scale) == ("scene", 125.0)
+    origins, directions = rays(50, generator)
+    seen = [dense(ours, world).trace(origins, directions)]  # positions inside are in the model's unit
+    seen.append(dense(EgoNeRFOptions(**sizes, **published), world).trace(5 * origins, directions))
+    assert 0.05 < seen[0].transmittance.mean() < 0.95
+    assert torch.allclose(seen[0].transmittance, seen[1].transmittance, rtol=1e-3, atol=1e-5)
+    assert torch.allclose(seen[0].color, seen[1].color, atol=1e-4)
+
+
 def test_a_field_of_constant_density_absorbs_as_the_formula_says(generator):
     """All factors zero: density = softplus(shift) everywhere, from the first sample on."""
     model = dense(replace(SMALL, density_shift=-3.0, environment=False))

@@ -131,6 +131,9 @@ def test_unknown_projections_list_the_known_ones(backend: str, dtype: torch.dtyp
         ({"low_pass": -0.1}, "low_pass is -0.1; it must be a variance >= 0"),
         ({"max_instances": 0}, "max_instances is 0; it must be at least 1"),
         ({"memory_cap": 1000}, "memory_cap is for the published rasterizers .bounds=square."),
+        ({"projection": "ray", "wrap": False}, "projection 'ray' knows of no seam that wrap=false could cut; set wrap"),
+        ({"projection": "tangent", "wrap": False}, "projection 'tangent' knows of no seam"),
+        ({"projection": "ray", "face_size": 64}, "face_size is 64, but only a cubemap has faces; set cubemap=true"),
         ({"memory_cap": 0, "bounds": "square", "wrap": False}, "memory_cap is 0; it must be at least 1 byte"),
     ],
 )

@@ -149,6 +149,13 @@ def test_scenes_of_a_data_set_scored_by_other_rules_are_not_averaged():
         table1(runs, Request())
 
 
+def test_footnotes_say_who_is_published_with_more_iterations():
+    note = "EgoNeRF is published with 100000 iterations"
+    assert note in markdown.text(table1([result("", method="egonerf", preset="egonerf_small")], Request()))
+    assert note not in markdown.text(table1([result("", method="egonerf", iterations=100_000)], Request()))
+    assert note not in markdown.text(table1([result("")], Request()))
+
+
 def test_footnotes_say_how_and_where():
     text = markdown.text(table4(data_set("roam360"), Request()))
     for words in ("paper, LPIPS-vgg fed", "2048x1024", "30000 iterations", "0.1.0 abc", "2 cores of A & B", "RTX 3090"):
