@@ -8,6 +8,8 @@ from tiny_scene import tiny_scene
 from baselines.egonerf import EgoNeRFMethod, EgoNeRFMethodOptions
 from padgs.cli.session import build
 from padgs.data.synthetic import SyntheticOptions, generate
+from padgs.egonerf.model import EgoNeRF
+from padgs.egonerf_training import TrainableEgoNeRF
 from padgs.method import Budget, RenderConfig
 from padgs.scene import Scene, View
 from padgs.train import TrainOptions
@@ -134,3 +136,46 @@ def test_variation_smooths_the_planes():
         list(trained.fit(scene, Budget(20)))
         roughness.append(trained._trained().density.variation().item())
     assert roughness[1] < 0.5 * roughness[0]
+
+
+def test_published_learning_rates():
+    model = EgoNeRF.from_scene(tiny_scene(), SMALL)
+    groups = {group.name: group for group in TrainableEgoNeRF(model, SMALL, 100_000).groups()}
+    starts = {"density": 0.02, "appearance": 0.02, "shader": 1e-3, "environment": 5e-3}
+    assert groups.keys() == starts.keys()
+    for name, start in starts.items():
+        rate = groups[name].learning_rate
+        assert rate(0) == pytest.approx(start), name
+        assert rate(50_000) == pytest.approx(start * 0.1**0.5), name
+        assert rate(100_000) == pytest.approx(0.1 * start), name
+        assert set(groups[name].parameters) == set(getattr(model, name).parameters()), name
+
+
+def test_adam_gets_the_published_betas_and_rates_that_fall_to_a_tenth():
+    trained = method()
+    records, rates = trained.fit(tiny_scene(), Budget(4)), []
+    for _ in records:
+        (*groups, environment) = trained._trainer._optimizer.param_groups
+        assert {group["betas"] for group in (*groups, environment)} == {(0.9, 0.99)}
+        rates.append((groups[0]["lr"], environment["lr"]))
+    expected = [0.1 ** (iteration / 4) for iteration in range(1, 5)]
+    assert [rate / 0.02 for rate, _ in rates] == pytest.approx(expected)
+    assert [rate / 5e-3 for _, rate in rates] == pytest.approx(expected)
+
+
+def test_published_weights_of_the_variation_fall_like_the_rates():
+    model = EgoNeRF.from_scene(tiny_scene(), SMALL)
+    with torch.no_grad():
+        for plane in model.appearance.planes:
+            plane.mul_(3)  # at first both vary alike, and could be mistaken for one another
+    density, appearance = model.density.variation().item(), model.appearance.variation().item()
+    trainable = TrainableEgoNeRF(model, SMALL, 100_000)
+    for iteration, share in ((0, 1.0), (50_000, 0.1**0.5), (100_000, 0.1)):
+        expected = 1e-2 * share * (0.1 * density + 0.01 * appearance)
+        assert trainable.regularisation(iteration).item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_the_setting_trains_as_published():
+    options = composed("method=egonerf").options
+    assert (options.rays, options.grid_rate, options.network_rate, options.environment_rate) == (4096, 0.02, 1e-3, 5e-3)
+    assert (options.rate_decay, options.density_variation, options.appearance_variation) == (0.1, 0.1, 0.01)

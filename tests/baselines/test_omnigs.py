@@ -13,14 +13,13 @@ from padgs.registry import lookup
 from padgs.render import native
 from padgs.scene import Scene, View
 from padgs.splat_method import SplatOptions
-from padgs.train import TrainOptions
 
 ITERATIONS = 120  # densifies at 50, and goes through all degrees
 
 
 def method(seed: int = 0, backend: str = "torch", **options) -> OmniGSMethod:
     options = {"densify_until": 20_000, "max_gaussians": 60} | options
-    return OmniGSMethod(SplatOptions(**options), RenderConfig(backend=backend), TrainOptions(), seed)
+    return OmniGSMethod(SplatOptions(**options), RenderConfig(backend=backend), seed=seed)
 
 
 def psnr(trained: OmniGSMethod, view: View) -> float:

@@ -1,13 +1,18 @@
+from dataclasses import replace
+
 import pytest
 import torch
-from tiny_scene import tiny_scene
+from tiny_scene import tiny_scene, truth
 
 from baselines.seam360gs import Seam360GSMethod, Seam360GSOptions
 from padgs.data.synthetic import SyntheticOptions, SyntheticTruth, generate
+from padgs.dual_lens import DualLens
 from padgs.method import Budget, RenderConfig
 from padgs.metrics import seam, ws_psnr
+from padgs.render import RenderOptions, render
 from padgs.scene import Scene, View
 from padgs.splat_method import SplatMethod, SplatOptions
+from padgs.train import Drawing
 
 TORCH = RenderConfig(projection="ray", backend="torch")
 
@@ -28,15 +33,61 @@ def test_an_ideal_camera_starts_as_one(scene):
     assert first == pytest.approx(plain, rel=1e-5)
 
 
-def test_lenses_learn_and_the_test_camera_is_ideal(scene):
-    method = Seam360GSMethod(render=TORCH)
-    *_, last = method.fit(scene, Budget(20))
+def photographed(gap: float, bending: tuple[float, float]) -> Scene:
+    """The tiny scene with its exact centres and colours as points, through two lenses."""
+    scene, seen = tiny_scene(), truth()
+    scene = replace(scene, points=seen.means, point_colors=(255 * seen.colors).round().to(torch.uint8))
+    lenses = DualLens(order=1, unit=scene.unit)
+    with torch.no_grad():
+        lenses.gap.fill_(gap)
+        lenses.coefficients[:, 0] = torch.tensor(bending)
+
+    def draw(view: View, probe: torch.Tensor | None = None) -> Drawing:
+        rendering = render(seen, view, RenderOptions("ray"), backend="torch")
+        return Drawing(rendering, torch.zeros(0), seen, torch.zeros(0))
+
+    @torch.no_grad()
+    def taken(view: View) -> View:
+        pixels = (255 * lenses.draw(draw, view).rendering.image.clamp(0, 1)).round().to(torch.uint8)
+        return replace(view, load_pixels=lambda: pixels)
+
+    return replace(scene, train=tuple(map(taken, scene.train)))
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_lenses_are_found_and_the_test_camera_is_ideal(sign):
+    """With Gaussians that are right from the start and learn next to nothing, all that is wrong is the camera."""
+    gap, bending = sign * 0.06, (sign * 0.02, sign * -0.03)
+    scene = photographed(gap, bending)
+    options = Seam360GSOptions(lens_order=1, gap_rate=5e-3, coefficient_rate=5e-3, learning_rate_factor=1e-3)
+    method = Seam360GSMethod(options)
+    records = method.fit(scene, Budget(60))
+    next(records)
+    with torch.no_grad():
+        method._trained().splats.log_scales.copy_(truth().scales.log())
+        method._trained().splats.opacity_logits.copy_(torch.logit(truth().opacities))
+    *_, last = records
     lenses = lenses_of(method)
-    assert lenses.gap != 0 and (lenses.coefficients != 0).all() and "lens gap" in last.events[-1]
+    assert lenses.gap.item() == pytest.approx(gap, rel=0.3)  # measured: 13 %
+    assert lenses.coefficients[:, 0].tolist() == pytest.approx(bending, rel=0.3)  # measured: 12 %
+    assert "lens gap" in last.events[-1]
     image = method.render(scene.test[0]).image
     with torch.no_grad():
         lenses.gap.fill_(1.0)
     assert torch.equal(method.render(scene.test[0]).image, image)
+
+
+def test_learning_rates_of_the_lenses_fall_to_a_tenth(scene):
+    method, steps = Seam360GSMethod(render=TORCH), 400
+    next(method.fit(scene, Budget(steps)))
+    groups = {group.name: group for group in method._trained().groups()}
+    for name, parameter in (("lens_gap", lenses_of(method).gap), ("lens_coefficients", lenses_of(method).coefficients)):
+        rate = groups[name].learning_rate
+        assert rate(0) == pytest.approx(1e-3), name
+        assert rate(steps // 2) == pytest.approx(1e-3 * 0.1**0.5), name
+        assert rate(steps) == pytest.approx(1e-4), name
+        (held,) = groups[name].parameters
+        assert held is parameter, name
 
 
 def test_charts_cannot_draw_lenses(scene):

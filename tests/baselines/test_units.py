@@ -1,0 +1,49 @@
+"""Explicit Gaussians, and cameras that learn with them, do not care about the units of the world."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from tiny_scene import tiny_scene
+
+from baselines import METHODS
+from padgs.method import Budget
+from padgs.registry import lookup
+from padgs.scene import Scene, View
+from padgs.splat_method import SplatMethod
+
+LARGER = 64.0  # a power of two: lengths are multiplied exactly, and what differs is the rounding of logarithms
+STEPS = 20
+EXPLICIT = [name for name in METHODS if issubclass(lookup(METHODS, name, "method"), SplatMethod)]
+
+
+def scaled(scene: Scene, scale: float) -> Scene:
+    def view_of(view: View) -> View:
+        pose = view.cam_from_world.clone()
+        pose[:3, 3] *= scale
+        return replace(view, cam_from_world=pose)
+
+    train, test = (tuple(map(view_of, views)) for views in (scene.train, scene.test))
+    return replace(scene, train=train, test=test, points=scale * scene.points)
+
+
+def trained(name: str, scene: Scene) -> tuple[torch.Tensor, torch.Tensor, list[float]]:
+    """How far the means were moved [N, 3], an image of a held-out view, and all losses."""
+    method = lookup(METHODS, name, "method")()
+    losses = [float(record.loss) for record in method.fit(scene, Budget(STEPS))]
+    image = method.render(scene.test[0]).image
+    return method._trained().splats.means.detach() - scene.points, image, losses
+
+
+@pytest.mark.parametrize("name", EXPLICIT)
+def test_a_world_64_times_as_large_is_learned_the_same(name):
+    scene = tiny_scene()
+    (moves, image, losses), (far, larger_image, larger_losses) = (
+        trained(name, scaled(scene, factor)) for factor in (1.0, LARGER)
+    )
+    assert moves.norm(dim=-1).mean() > 1e-5 * scene.unit, "measured: 5e-5"
+    assert (far / LARGER - moves).norm() < 1e-2 * moves.norm()  # measured: 1e-4
+    assert larger_losses == pytest.approx(losses, rel=6e-5)  # measured: 1.5e-5
+    # A response around 1/255 is drawn or is not, as rounding has it.
+    difference = (larger_image - image).abs()
+    assert difference.mean() < 3e-5 and difference.max() < 1 / 255
