@@ -27,11 +27,7 @@ class Batch {
       prefetch(args, start + i + kAhead, tile.end);
       const Instance instance = args.instances[start + i];
       seen[i] = Seen(args.footprints[instance.gaussian], args, tile);
-      for (int row = instance.row; row < instance.row_end; ++row)
-        for (int column = instance.column; column < instance.column_end; ++column) {
-          const int p = row * tile.patch_columns + column;
-          lists[size_t(p) * kBatch + counts[p]++] = uint8_t(i);
-        }
+      for_each_patch(tile, instance, [&](int p) { lists[size_t(p) * kBatch + counts[p]++] = uint8_t(i); });
     }
   }
   int size() const { return size_; }

@@ -1,7 +1,7 @@
 // Blending: one thread owns one tile at a time, one vector lane is one pixel of a patch. Paper Eq. 4-5.
 //
 // Forward takes a tile's instances in batches, front to back: it notes which patches each reaches, then finishes one patch
-// after the other, whose pixels stay in registers. Backward goes back to front, one instance after the other: it sums
+// after the other, whose pixels stay in registers. Backward goes back to front, a few instances at a time: for each it sums
 // moments of M = dL/d(ln alpha) over the patches, which planar.h and projective.h turn into derivatives.
 #include <algorithm>
 #include <cmath>
@@ -134,14 +134,36 @@ int load_patch(const BlendGradientArguments &args, const Patch &patch, BackwardP
   return furthest;
 }
 
+// Backward looks at a few instances before it sums their moments: evaluating needs no jumps and waits for nothing, and by
+// then it is known which patches an instance draws in, which could not be predicted.
+constexpr int kEntrants = 8, kHits = 12;
+constexpr int kMostPatches = (kTile << kMaxLevel) / kPatchWidth * (kTile / kPatchHeight);
+
+// A patch that an instance draws in.
+template <class Seen>
+struct Hit {
+  typename Seen::Factors factors;
+  Vec alpha, b_by_d;  // not limited, 0 where nothing is drawn; with rays only
+  int patch;
+};
+
+struct Entrant {
+  int32_t gaussian;
+  uint32_t slot;
+  int end;  // of its hits; they begin where those of the last one end
+};
+
 // kAbsolute: with `absolute`, see BlendGradientArguments.
 template <class Seen, bool kWithDepth, bool kWithRays, bool kAbsolute>
 void backward_tile(const BlendGradientArguments &args, const Tile &tile) {
   const BlendArguments &forward = args.forward;
   static thread_local std::vector<BackwardPatch> storage;
+  static thread_local std::vector<Hit<Seen>> hit_storage(kHits + kMostPatches);
   const int patches = tile.patches();
   storage.resize(patches);
   BackwardPatch *states = storage.data();
+  Hit<Seen> *hits = hit_storage.data();
+  Entrant entrants[kEntrants];
   const std::vector<typename Seen::Place> &places = places_of<Seen>(forward, tile);
   std::vector<typename Seen::Place> ray_gradients;
   if constexpr (kWithRays) ray_gradients.resize(patches);
@@ -151,22 +173,34 @@ void backward_tile(const BlendGradientArguments &args, const Tile &tile) {
 
   for (int64_t i = tile.first + furthest; i < tile.end; ++i)
     std::fill_n(args.moments + int64_t(forward.instances[i].slot) * kMoments, kMoments, 0.0f);
-  for (int64_t i = tile.first + furthest - 1; i >= tile.first; --i) {
-    prefetch(args, i - kAhead, tile.first, tile.end);
-    const Instance instance = forward.instances[i];
-    const Seen g(forward.footprints[instance.gaussian], forward, tile);
-    const VecI position = splat_int(int32_t(i - tile.first) + 1);
-    typename Seen::Moments moments;
-    Vec red = zero(), green = zero(), blue = zero(), depth = zero(), absolute = zero();
-    for (int row = instance.row; row < instance.row_end; ++row)
-      for (int column = instance.column; column < instance.column_end; ++column) {
-        const int p = row * tile.patch_columns + column;
-        BackwardPatch &state = states[p];
+  for (int64_t i = tile.first + furthest - 1; i >= tile.first;) {
+    int count = 0, found = 0;
+    for (; i >= tile.first && count < kEntrants && found < kHits; --i, ++count) {
+      prefetch(args, i - kAhead, tile.first, tile.end);
+      const Instance instance = forward.instances[i];
+      const Seen g(forward.footprints[instance.gaussian], forward, tile);
+      const VecI position = splat_int(int32_t(i - tile.first) + 1);
+      for_each_patch(tile, instance, [&](int p) {
         const typename Seen::At at = g.at(places[p]);
-        const Mask drawn = both(at.reached, at_most(position, state.last));
-        if (!any(drawn)) continue;
-        const Vec full = exp2_fast(at.log2_alpha);
-        const Vec alpha = keep(drawn, minimum(full, splat(kAlphaMax)));
+        const Mask drawn = both(at.reached, at_most(position, states[p].last));
+        Hit<Seen> &hit = hits[found];  // the next overwrites it where nothing is drawn
+        hit.factors = at.factors;
+        if constexpr (kWithRays) hit.b_by_d = at.b_by_d;
+        hit.alpha = keep(drawn, exp2_fast(at.log2_alpha));
+        hit.patch = p;
+        found += any(drawn);
+      });
+      entrants[count] = {instance.gaussian, instance.slot, found};
+    }
+    const Hit<Seen> *hit = hits;
+    for (int e = 0; e < count; ++e) {
+      const Footprint &g = forward.footprints[entrants[e].gaussian];
+      const Seen seen(g, forward, tile);
+      typename Seen::Moments moments;
+      Vec red = zero(), green = zero(), blue = zero(), depth = zero(), absolute = zero();
+      for (const Hit<Seen> *end = hits + entrants[e].end; hit < end; ++hit) {
+        BackwardPatch &state = states[hit->patch];
+        const Vec alpha = minimum(hit->alpha, splat(kAlphaMax));
         const Vec inverse = reciprocal(1.0f - alpha);
         state.transmittance = state.transmittance * inverse;
         const Vec weight = alpha * state.transmittance;
@@ -174,22 +208,23 @@ void backward_tile(const BlendGradientArguments &args, const Tile &tile) {
         if (kWithDepth) signal += state.grad_depth * g.depth;
         signal = signal * weight;
         // alpha dL/dalpha = T alpha (c . G) - (what is behind) alpha / (1 - alpha), and 0 where alpha is limited.
-        const Vec m = keep(less(full, splat(kAlphaMax)), signal - state.behind * (inverse * alpha));
+        const Vec m = keep(less(hit->alpha, splat(kAlphaMax)), signal - state.behind * (inverse * alpha));
         state.behind += signal;
         red += weight * state.grad_red;
         green += weight * state.grad_green;
         blue += weight * state.grad_blue;
         if (kWithDepth) depth += weight * state.grad_depth;
-        moments.add(at, m);
-        if constexpr (kAbsolute) absolute += g.pull(at, m);
-        if constexpr (kWithRays) g.add_ray_gradient(at, m, ray_gradients[p]);
+        moments.add(hit->factors, m);
+        if constexpr (kAbsolute) absolute += seen.pull(hit->factors, m);
+        if constexpr (kWithRays) seen.add_ray_gradient(hit->factors, hit->b_by_d, m, ray_gradients[hit->patch]);
       }
-    float *out = args.moments + int64_t(instance.slot) * kMoments;
-    Vec sums[kMoments];
-    moments.finish(sums);
-    sums[10] = red, sums[11] = green, sums[12] = blue, sums[13] = depth;
-    sums[kAbsoluteMoment] = absolute, sums[15] = zero();
-    for (int k = 0; k < kMoments; k += 4) sum4(sums + k, out + k);
+      float *out = args.moments + int64_t(entrants[e].slot) * kMoments;
+      Vec sums[kMoments];
+      moments.finish(sums);
+      sums[10] = red, sums[11] = green, sums[12] = blue, sums[13] = depth;
+      sums[kAbsoluteMoment] = absolute, sums[15] = zero();
+      for (int k = 0; k < kMoments; k += 8) sum8(sums + k, out + k);
+    }
   }
   if constexpr (kWithRays) add_ray_gradients(args, tile, ray_gradients);
 }

@@ -293,16 +293,16 @@ void backward_tile(const BlendGradientArguments &args, const Tile &tile) {
         green += weight * up.green;
         blue += weight * up.blue;
         if (kWithDepth) depth += weight * up.depth;
-        moments.add(at, m);
-        if constexpr (kAbsolute) absolute += g.pull(at, m);
-        if constexpr (kWithRays) g.add_ray_gradient(at, m, ray_gradients[p]);
+        moments.add(at.factors, m);
+        if constexpr (kAbsolute) absolute += g.pull(at.factors, m);
+        if constexpr (kWithRays) g.add_ray_gradient(at.factors, at.b_by_d, m, ray_gradients[p]);
       }
     Vec sums[kMoments];
     moments.finish(sums);
     sums[10] = red, sums[11] = green, sums[12] = blue, sums[13] = depth;
     sums[kAbsoluteMoment] = absolute, sums[15] = zero();
     float *out = args.moments + int64_t(instance.slot) * kMoments;
-    for (int k = 0; k < kMoments; k += 4) sum4(sums + k, out + k);
+    for (int k = 0; k < kMoments; k += 8) sum8(sums + k, out + k);
   }
   if constexpr (kWithRays) add_ray_gradients(args, tile, ray_gradients);
 }

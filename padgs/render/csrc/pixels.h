@@ -33,9 +33,13 @@ struct PlanarFootprint {
     Place(const BlendArguments &, const Patch &patch)
         : x(load(kLaneX) + (float(patch.x0) + 0.5f)), y(load(kLaneY) + (float(patch.y0) + 0.5f)) {}
   };
+  struct Factors {
+    Vec t, dv;
+  };
   struct At {
     Mask reached;
-    Vec log2_alpha, t, dv;
+    Vec log2_alpha;
+    Factors factors;
   };
 
   PlanarFootprint() = default;
@@ -49,14 +53,13 @@ struct PlanarFootprint {
     const float limit = 0.99f * (0.5f * width - half), reach = a * c * limit;
     if (limit <= 0 || (log2_opacity - kLog2AlphaMin) * (b * b + c * c) >= reach * reach) turns = 1 / width;
   }
-  At at(const Place &place) const {
+  PADGS_ALWAYS_INLINE At at(const Place &place) const {
     Vec du = place.x - u;
     if (turns != 0) du = du - round_down(du * turns + 0.5f) * width;
     At at;
-    at.dv = place.y - v;
-    at.t = du * a + at.dv * b;
-    const Vec cross = at.dv * c;
-    at.log2_alpha = (log2_opacity - cross * cross) - at.t * at.t;
+    const Vec dv = place.y - v, t = du * a + dv * b, cross = dv * c;
+    at.factors = {t, dv};
+    at.log2_alpha = (log2_opacity - cross * cross) - t * t;
     at.reached = at_least(at.log2_alpha, splat(kLog2AlphaMin));
     return at;
   }
@@ -65,7 +68,7 @@ struct PlanarFootprint {
   // those of du nearly cancel in every derivative.
   struct Moments {
     Vec one = zero(), t = zero(), v = zero(), tt = zero(), tv = zero(), vv = zero();
-    void add(const At &at, Vec m) {
+    PADGS_ALWAYS_INLINE void add(const Factors &at, Vec m) {
       const Vec mt = m * at.t, mv = m * at.dv;
       one += m, t += mt, v += mv;
       tt += mt * at.t, tv += mt * at.dv, vv += mv * at.dv;
@@ -107,17 +110,20 @@ struct ProjectiveFootprint {
     }
     static int64_t padded(int width) { return int64_t(width + kTile - 1) / kTile * kTile; }
   };
+  struct Factors {
+    Vec q, cx, cy;  // (q, x b / D, y b / D)
+  };
   struct At {
     Mask reached;
     Vec log2_alpha;
-    Vec q, cx, cy;  // (q, x b / D, y b / D)
-    Vec b_by_d;     // b / D
+    Factors factors;
+    Vec b_by_d;  // b / D
   };
 
   ProjectiveFootprint() = default;
   ProjectiveFootprint(const Footprint &footprint, const BlendArguments &, const Tile &)
       : f(footprint), red(f.red), green(f.green), blue(f.blue), depth(f.depth) {}
-  At at(const Place &p) const {
+  PADGS_ALWAYS_INLINE At at(const Place &p) const {
     const float *s = f.shape;
     const Vec x = p.x * s[0] + p.y * s[1] + p.z * s[2], y = p.x * s[3] + p.y * s[4] + p.z * s[5];
     const Vec b = p.x * s[6] + p.y * s[7] + p.z * s[8];
@@ -125,16 +131,14 @@ struct ProjectiveFootprint {
     const Vec d = maximum(b * b + n * s[9], splat(1e-30f));  // rays across the tangent plane have none
     const Vec inverse = reciprocal(d);
     At at;
-    at.q = n * inverse;
     at.b_by_d = b * inverse;
-    at.cx = x * at.b_by_d;
-    at.cy = y * at.b_by_d;
-    at.log2_alpha = f.log2_opacity - at.q * kHalfLog2;
+    at.factors = {n * inverse, x * at.b_by_d, y * at.b_by_d};
+    at.log2_alpha = f.log2_opacity - at.factors.q * kHalfLog2;
     at.reached = both(at_least(at.log2_alpha, splat(kLog2AlphaMin)), both(less(zero(), b), less(d * s[10], b)));
     return at;
   }
   // e = c_x l0 + c_y l1 - q m, which the derivatives of one pixel are made of.
-  Place slope(const At &at) const {
+  PADGS_ALWAYS_INLINE Place slope(const Factors &at) const {
     const float *s = f.shape;
     Place e;
     e.x = at.cx * s[0] + at.cy * s[3] - at.q * s[6];
@@ -143,13 +147,13 @@ struct ProjectiveFootprint {
     return e;
   }
   // dq/dd = 2 (b / D) e, and M is worth -M/2 of dL/dq.
-  void add_ray_gradient(const At &at, Vec m, Place &grad) const {
-    const Vec scale = -(m * at.b_by_d);
+  PADGS_ALWAYS_INLINE void add_ray_gradient(const Factors &at, Vec b_by_d, Vec m, Place &grad) const {
+    const Vec scale = -(m * b_by_d);
     const Place e = slope(at);
     grad.x += scale * e.x, grad.y += scale * e.y, grad.z += scale * e.z;
   }
   // |dL/dmean| of each pixel, the covariance held: |M h| with h = -sqrt(kappa) e (projective.h).
-  Vec pull(const At &at, Vec m) const {
+  PADGS_ALWAYS_INLINE Vec pull(const Factors &at, Vec m) const {
     const Place e = slope(at);
     return magnitude(m) * root((e.x * e.x + e.y * e.y + e.z * e.z) * f.shape[9]);
   }
@@ -157,7 +161,7 @@ struct ProjectiveFootprint {
   struct Moments {
     Vec m = zero(), c0 = zero(), c1 = zero(), c2 = zero();
     Vec c00 = zero(), c01 = zero(), c02 = zero(), c11 = zero(), c12 = zero(), c22 = zero();
-    void add(const At &at, Vec weight) {
+    PADGS_ALWAYS_INLINE void add(const Factors &at, Vec weight) {
       const Vec w0 = weight * at.q, w1 = weight * at.cx, w2 = weight * at.cy;
       m += weight;
       c0 += w0, c1 += w1, c2 += w2;

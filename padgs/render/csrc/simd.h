@@ -26,7 +26,8 @@ constexpr int kParts = 64 / kPartBytes;
 typedef float Part __attribute__((vector_size(kPartBytes)));
 typedef int32_t PartI __attribute__((vector_size(kPartBytes)));
 
-#define PADGS_INLINE static inline __attribute__((always_inline))
+#define PADGS_ALWAYS_INLINE inline __attribute__((always_inline))
+#define PADGS_INLINE static PADGS_ALWAYS_INLINE
 #define PADGS_EACH_PART for (int i = 0; i < kParts; ++i)
 
 struct Vec {
@@ -146,23 +147,34 @@ PADGS_INLINE Vec scale_by_power(Vec a, Vec n) {
 
 PADGS_INLINE Vec keep(Mask m, Vec a) { return select(m, a, zero()); }
 
-// Four registers of 16 bytes that add up to a vector's, and sums of all lanes in a fixed order.
-typedef float Quarter __attribute__((vector_size(16)));
-PADGS_INLINE Quarter folded(Vec v) {
+// The sum of all lanes, in a fixed order.
+PADGS_INLINE float sum(Vec v) {
+  typedef float Quarter __attribute__((vector_size(16)));
   Quarter q[4];
   std::memcpy(q, &v, sizeof q);
-  return (q[0] + q[2]) + (q[1] + q[3]);
-}
-PADGS_INLINE float sum(Vec v) {
-  const Quarter s = folded(v);
+  const Quarter s = (q[0] + q[2]) + (q[1] + q[3]);
   return (s[0] + s[2]) + (s[1] + s[3]);
 }
-// The sums of four vectors at once.
-PADGS_INLINE void sum4(const Vec *v, float *out) {
-  const Quarter a = folded(v[0]), b = folded(v[1]), c = folded(v[2]), d = folded(v[3]);
-  const Quarter ab = __builtin_shufflevector(a, b, 0, 4, 1, 5) + __builtin_shufflevector(a, b, 2, 6, 3, 7);
-  const Quarter cd = __builtin_shufflevector(c, d, 0, 4, 1, 5) + __builtin_shufflevector(c, d, 2, 6, 3, 7);
-  const Quarter total = __builtin_shufflevector(ab, cd, 0, 1, 4, 5) + __builtin_shufflevector(ab, cd, 2, 3, 6, 7);
+
+// The sums of eight vectors at once.
+typedef float Half __attribute__((vector_size(32)));
+PADGS_INLINE void sum8(const Vec *v, float *out) {
+  Half h[8];  // halves of each, added up
+  for (int k = 0; k < 8; ++k) {
+    Half both[2];
+    std::memcpy(both, v + k, sizeof both);
+    h[k] = both[0] + both[1];
+  }
+  Half quads[4];  // four lanes of v[k], and four of v[k + 4]
+  for (int k = 0; k < 4; ++k)
+    quads[k] = __builtin_shufflevector(h[k], h[k + 4], 0, 1, 2, 3, 12, 13, 14, 15) +
+               __builtin_shufflevector(h[k], h[k + 4], 4, 5, 6, 7, 8, 9, 10, 11);
+  Half pairs[2];
+  for (int k = 0; k < 2; ++k)
+    pairs[k] = __builtin_shufflevector(quads[2 * k], quads[2 * k + 1], 0, 8, 1, 9, 4, 12, 5, 13) +
+               __builtin_shufflevector(quads[2 * k], quads[2 * k + 1], 2, 10, 3, 11, 6, 14, 7, 15);
+  const Half total = __builtin_shufflevector(pairs[0], pairs[1], 0, 1, 8, 9, 4, 5, 12, 13) +
+                     __builtin_shufflevector(pairs[0], pairs[1], 2, 3, 10, 11, 6, 7, 14, 15);
   std::memcpy(out, &total, sizeof total);
 }
 

@@ -60,6 +60,21 @@ struct Patch {
   }
 };
 
+// Calls visit(p) for each patch of a tile that an instance can reach, row by row. In one loop: where those of rows end,
+// nobody can predict.
+template <typename Visit>
+PADGS_INLINE void for_each_patch(const Tile &tile, const Instance &instance, Visit visit) {
+  const int columns = instance.column_end - instance.column, to_next_row = tile.patch_columns - columns + 1;
+  const int end = (instance.row_end - 1) * tile.patch_columns + instance.column_end;
+  int left = columns;  // in this row
+  for (int p = instance.row * tile.patch_columns + instance.column; p < end;) {
+    visit(p);
+    --left;
+    p += left ? 1 : to_next_row;
+    left = left ? left : columns;
+  }
+}
+
 // Calls visit(tile, index) for every drawn tile, several at a time.
 template <typename Visit>
 void for_each_tile(const BlendArguments &args, Visit visit) {
