@@ -267,36 +267,34 @@ void backward_tile(const BlendGradientArguments &args, const Tile &tile) {
     const Seen g(forward.footprints[instance.gaussian], forward, tile);
     typename Seen::Moments moments;
     Vec red = zero(), green = zero(), blue = zero(), depth = zero(), absolute = zero();
-    for (int row = instance.row; row < instance.row_end; ++row)
-      for (int column = instance.column; column < instance.column_end; ++column) {
-        const int p = row * tile.patch_columns + column;
-        const Upstream &up = upstream[p];
-        const Layer &core = *next[p];
-        const bool in_core = core.position == int32_t(i - tile.first);
-        next[p] += in_core;
-        const typename Seen::At at = g.at(places[p]);
-        if (!any(at.reached)) continue;
-        const Vec full = exp2_fast(at.log2_alpha);
-        const Vec alpha = keep(at.reached, minimum(full, splat(kAlphaMax)));
-        Vec unit = up.unit, mean = up.mean, behind = up.behind;
-        if (in_core) {
-          const Mask found = at_least(core.front, zero());
-          unit = select(found, core.front, unit);
-          mean = select(found, zero(), mean);
-          behind = select(found, core.behind, behind);
-        }
-        const Vec weight = alpha * unit;
-        Vec signal = up.red * g.red + up.green * g.green + up.blue * g.blue - mean;
-        if (kWithDepth) signal += up.depth * g.depth + up.offset;
-        const Vec m = keep(less(full, splat(kAlphaMax)), weight * signal - behind * (alpha * reciprocal(1.0f - alpha)));
-        red += weight * up.red;
-        green += weight * up.green;
-        blue += weight * up.blue;
-        if (kWithDepth) depth += weight * up.depth;
-        moments.add(at.factors, m);
-        if constexpr (kAbsolute) absolute += g.pull(at.factors, m);
-        if constexpr (kWithRays) g.add_ray_gradient(at.factors, at.b_by_d, m, ray_gradients[p]);
+    for_each_patch(tile, instance, [&](int p) {
+      const Upstream &up = upstream[p];
+      const Layer &core = *next[p];
+      const bool in_core = core.position == int32_t(i - tile.first);
+      next[p] += in_core;
+      const typename Seen::At at = g.at(places[p]);
+      if (!any(at.reached)) return;
+      const Vec full = exp2_fast(at.log2_alpha);
+      const Vec alpha = keep(at.reached, minimum(full, splat(kAlphaMax)));
+      Vec unit = up.unit, mean = up.mean, behind = up.behind;
+      if (in_core) {
+        const Mask found = at_least(core.front, zero());
+        unit = select(found, core.front, unit);
+        mean = select(found, zero(), mean);
+        behind = select(found, core.behind, behind);
       }
+      const Vec weight = alpha * unit;
+      Vec signal = up.red * g.red + up.green * g.green + up.blue * g.blue - mean;
+      if (kWithDepth) signal += up.depth * g.depth + up.offset;
+      const Vec m = keep(less(full, splat(kAlphaMax)), weight * signal - behind * (alpha * reciprocal(1.0f - alpha)));
+      red += weight * up.red;
+      green += weight * up.green;
+      blue += weight * up.blue;
+      if (kWithDepth) depth += weight * up.depth;
+      moments.add(at.factors, m);
+      if constexpr (kAbsolute) absolute += g.pull(at.factors, m);
+      if constexpr (kWithRays) g.add_ray_gradient(at.factors, at.b_by_d, m, ray_gradients[p]);
+    });
     Vec sums[kMoments];
     moments.finish(sums);
     sums[10] = red, sums[11] = green, sums[12] = blue, sums[13] = depth;
