@@ -32,10 +32,9 @@ class CloneSplitOptions:
     densify_from: int = 500  # Gaussians multiply and are pruned after this iteration
     densify_until: int = 15_000  # ... and before this one
     densify_every: int = 100
-    signal: str = (
-        "image"  # what is compared with the threshold: a name of `padgs.probes.SIGNALS`; with space_absolute as
-    )
-    # many Gaussians as pass the threshold multiply for their absolute pull, the hardest pulled ones (GOF)
+    # What is compared with the threshold: a name of `padgs.probes.SIGNALS`. With space_absolute as many Gaussians as
+    # pass it multiply for their absolute pull, those that are pulled hardest (GOF).
+    signal: str = "image"
     gradient_threshold: float = 2e-4  # in the units of the signal's probe, for a loss that is a plain mean
     polar_threshold: float | None = None  # what it grows to at the poles, with 1 - cos(latitude) (ODGS); None: nothing
     percent_dense: float = 0.01  # largest scale that is cloned rather than split, in extents

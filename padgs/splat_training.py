@@ -42,7 +42,7 @@ class TrainableSplats:
         learning_rate_factor: float = 1.0,
         seed: int = 0,
     ) -> None:
-        """Wrap splats; `extent` is `Scene.extent`, `options` are those of a published run (see `for_run`).
+        """Wrap splats; `extent` is `extent_of` the scene, `options` are those of a published run (see `for_run`).
 
         Raises:
             ValueError: a signal that the projection does not have.

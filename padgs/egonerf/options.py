@@ -26,7 +26,7 @@ class EgoNeRFOptions:
     fine_samples: int = 128
     min_weight: float = 0.0  # ours: samples that contribute less are not shaded, their share is black
     length_unit: str = "scene"  # ours: Scene.unit, so the world's units do not matter | world: as published
-    # Ours: published 0.1, 300 and 0.05 world units, here divided by 5, and scale 25, times 5.
+    # Ours: published 0.1, 300 and 0.05 world units, here divided by 5, and distance_scale 25, here times 5.
     near: float = 0.02
     far: float = 60.0
     first_radius: float = 0.01  # of the radial nodes, and the shortest interval between nodes or between first samples
