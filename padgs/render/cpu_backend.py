@@ -21,7 +21,7 @@ from padgs.render.contract import Rendering, RenderOptions
 from padgs.render.native import pointer
 from padgs.render.native_camera import native_camera, native_rays
 from padgs.render.published_bounds import check_memory
-from padgs.render.tiles import ABSOLUTE_MOMENT, MOMENTS, Projected
+from padgs.render.tiles import ABSOLUTE_MOMENT, MOMENTS, Projected, Strip
 
 
 def rasterize(
@@ -59,6 +59,7 @@ def rasterize(
         camera,
         options,
         counters,
+        torch.is_grad_enabled(),  # never inside
     )
     return Rendering(image, transmittance, depth, visible, counters)
 
@@ -78,6 +79,19 @@ class _Buffers:
         return _Buffers(torch.empty(height, width, 3), flat, torch.empty_like(flat), flat.to(torch.int32))
 
 
+@dataclass
+class _Cores:
+    """What hybrid blending of a strip leaves to its backward pass, see csrc/kept_cores.h."""
+
+    words: Tensor  # [most that could be needed] int32; the system lends memory for those that are used
+    start: Tensor  # [tiles + 1] int64
+
+    @staticmethod
+    def of(strip: Strip, options: RenderOptions) -> _Cores:
+        words = native.library().padgs_core_words(ctypes.byref(strip.grid), options.core_size)
+        return _Cores(torch.empty(words, dtype=torch.int32), torch.zeros(strip.tiles + 1, dtype=torch.int64))
+
+
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -95,6 +109,7 @@ class _Rasterize(torch.autograd.Function):
         camera: Camera,
         options: RenderOptions,
         counters: dict[str, int],
+        grad_enabled: bool,
     ):
         tensors = [t.detach().contiguous() for t in (means, quats, scales, opacities, colors)]
         probe = None if probe is None else probe.detach().contiguous()
@@ -105,9 +120,14 @@ class _Rasterize(torch.autograd.Function):
         rays, background = native_rays(camera), background.detach().contiguous()
         buffers = _Buffers.of_size(camera.width, camera.height)
         pairs = torch.zeros(2, dtype=torch.int64)
+        kept = options.blending == "hybrid" and grad_enabled and any(ctx.needs_input_grad)
+        ctx.cores = []  # of each strip
         for strip in projected.strips():
             pair_counts = torch.empty(strip.tiles, 2, dtype=torch.int64)
-            arguments = _blend_arguments(native_cam, options, projected, strip, rays, background, buffers, pair_counts)
+            ctx.cores.append(_Cores.of(strip, options) if kept else None)
+            arguments = _blend_arguments(
+                native_cam, options, projected, strip, rays, background, buffers, ctx.cores[-1], pair_counts
+            )
             native.library().padgs_blend_forward(ctypes.byref(arguments))
             pairs += pair_counts.sum(0)
         visible = projected.boxes[:, 3] < projected.boxes[:, 4]
@@ -136,9 +156,9 @@ class _Rasterize(torch.autograd.Function):
         grad_rays = torch.zeros_like(ctx.rays.table) if needs_rays else None
         count = len(tensors[0])
         totals = torch.zeros(count, MOMENTS)
-        for strip in projected.strips():
+        for strip, cores in zip(projected.strips(), ctx.cores, strict=True):
             forward = _blend_arguments(
-                ctx.native_cam, ctx.options, projected, strip, ctx.rays, background, buffers, None
+                ctx.native_cam, ctx.options, projected, strip, ctx.rays, background, buffers, cores
             )
             moments = torch.empty(len(strip.instances), MOMENTS)
             arguments = native.BlendGradientArguments(
@@ -165,16 +185,17 @@ class _Rasterize(torch.autograd.Function):
         if grad_rays is not None:
             grad_table = grad_rays[:, :, : image.shape[1]].permute(0, 2, 1)
         absolute = totals[:, ABSOLUTE_MOMENT].clone() if needs_absolute else None
-        return *outputs, probe, absolute, grad_pose, grad_background, grad_table, None, None, None
+        return *outputs, probe, absolute, grad_pose, grad_background, grad_table, None, None, None, None
 
 
 def _blend_arguments(
-    camera, options, projected, strip, rays, background, buffers, pair_counts
+    camera, options, projected, strip, rays, background, buffers, cores: _Cores | None, pair_counts=None
 ) -> native.BlendArguments:
     """Arguments of both blending passes; the tensors must outlive the call."""
     lists = (projected.footprints, strip.tile_start, strip.instances, background)
     outputs = (buffers.image, buffers.transmittance, buffers.depth, buffers.last, pair_counts)
+    kept = (cores.words, cores.start) if cores else (None, None)
     core_size = options.core_size if options.blending == "hybrid" else 0
     return native.BlendArguments(
-        strip.grid, camera.projection, camera.wrap, core_size, rays.native(), *map(pointer, (*lists, *outputs))
+        strip.grid, camera.projection, camera.wrap, core_size, rays.native(), *map(pointer, (*lists, *outputs, *kept))
     )

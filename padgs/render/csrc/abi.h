@@ -106,6 +106,9 @@ struct BlendArguments {
   float *image, *transmittance, *depth;  // [H,W,3] [H,W] [H,W]
   int32_t *last;                         // [H,W] 1 + position in the tile's list of the last contribution; sorted only
   int64_t *pair_counts;                  // [tiles, 2] evaluated and contributing pairs
+  // Hybrid, of what forward leaves to backward (kept_cores.h); null where no gradient is wanted.
+  int32_t *cores;       // padgs_core_words(...) words, of which only so many are touched as are needed
+  int64_t *core_start;  // [tiles + 1] where each tile's begin, and how many words are in use: 0 before forward
 };
 
 struct BlendGradientArguments {

@@ -10,7 +10,7 @@ namespace padgs {
   namespace isa {                             \
   extern const ProjectKernels project_kernels; \
   extern const BlendKernels blend_kernels;    \
-  extern const BlendKernels hybrid_kernels;   \
+  extern const HybridKernels hybrid_kernels;  \
   extern const LossKernels loss_kernels;      \
   extern const DecodeKernels decode_kernels;  \
   extern const CeilingKernels ceiling_kernels; \
@@ -24,7 +24,8 @@ PADGS_DECLARE(avx512)
 struct Kernels {
   const char *name;
   const ProjectKernels &project;
-  const BlendKernels &blend, &hybrid;
+  const BlendKernels &blend;
+  const HybridKernels &hybrid;
   const LossKernels &loss;
   const DecodeKernels &decode;
   const CeilingKernels &ceilings;
@@ -76,12 +77,19 @@ PADGS_API void padgs_project_backward(const Camera *camera, const Inputs *in, co
   kernels().project.backward(*camera, *in, moments, *out);
 }
 
-PADGS_API void padgs_blend_forward(const BlendArguments *args) {
-  (args->core_size ? kernels().hybrid : kernels().blend).forward(*args);
+static const BlendKernels &blending(int32_t core_size) {
+  if (core_size) return kernels().hybrid;
+  return kernels().blend;
 }
 
+PADGS_API void padgs_blend_forward(const BlendArguments *args) { blending(args->core_size).forward(*args); }
+
 PADGS_API void padgs_blend_backward(const BlendGradientArguments *args) {
-  (args->forward.core_size ? kernels().hybrid : kernels().blend).backward(*args);
+  blending(args->forward.core_size).backward(*args);
+}
+
+PADGS_API int64_t padgs_core_words(const TileGrid *grid, int32_t core_size) {
+  return kernels().hybrid.core_words(*grid, core_size);
 }
 
 PADGS_API double padgs_photometric_loss(const LossArguments *args) { return kernels().loss.photometric(*args); }

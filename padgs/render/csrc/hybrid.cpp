@@ -1,13 +1,14 @@
 // Hybrid blending: each pixel keeps its K nearest fragments in order and blends the rest as one layer behind them. The
 // definition is padgs/render/hybrid.py. The tile lists may be in any order; front to back is fast.
 //
-// Both passes first collect the fragments of each patch. Backward turns the core into layers, one for each instance
-// that entered it, in the order of the list, and then visits the list a second time.
+// Forward collects the fragments of each patch, and keeps who is in the core. Backward turns the core into layers, one
+// for each instance that is in it, in the order of the list, and then visits the list.
 #include <cmath>
 #include <vector>
 
 #include "batch.h"
 #include "fragments.h"
+#include "kept_cores.h"
 #include "kernels.h"
 #include "pixels.h"
 #include "tiles.h"
@@ -157,10 +158,22 @@ int64_t blend_patch(const BlendArguments &args, const Tile &tile, const Patch &p
   return contributing;
 }
 
+// Keeps the cores of a tile, whose words go to the next free place.
+void keep_tile(const BlendArguments &args, const Tile &tile, int64_t index, const std::vector<Fragments> &fragments) {
+  static thread_local std::vector<int32_t> words;
+  words.clear();
+  for (int p = 0; p < tile.patches(); ++p) keep_patch(fragments[p], words);
+  int64_t &used = args.core_start[args.grid.row_start[args.grid.end_row - args.grid.first_row]];
+  const int64_t start = __atomic_fetch_add(&used, int64_t(words.size()), __ATOMIC_RELAXED);
+  std::copy(words.begin(), words.end(), args.cores + start);
+  args.core_start[index] = start;
+}
+
 template <class Seen>
 void forward_tile(const BlendArguments &args, const Tile &tile, int64_t index) {
   int64_t evaluated = 0, contributing = 0;
   const std::vector<Fragments> &fragments = collect<Seen>(args, tile, places_of<Seen>(args, tile), evaluated);
+  if (args.cores) keep_tile(args, tile, index, fragments);
   for (int p = 0; p < tile.patches(); ++p)
     contributing += blend_patch(args, tile, Patch(tile, p, args.grid.width), fragments[p]);
   args.pair_counts[2 * index] = evaluated;
@@ -188,10 +201,16 @@ struct Layer {
 constexpr float kNotInCore = -1.0f;
 
 // Loads a patch, and writes its layers.
+template <class Seen>
 Upstream differentiate_patch(const BlendGradientArguments &args, const Tile &tile, const Patch &patch,
-                             Fragments &fragments, Layer *layers) {
+                             const typename Seen::Place &place, const KeptPatch &kept, Layer *layers) {
+  struct Fragment {
+    Vec alpha, front;
+    const Footprint *footprint;
+  };
+  static thread_local std::vector<Fragment> core;
   const BlendArguments &forward = args.forward;
-  const Tail &tail = fragments.tail;
+  const Tail &tail = kept.tail;
   float grad[3][kLanes] = {}, through[kLanes] = {}, depth[kLanes] = {}, grad_depth[kLanes] = {};
   patch.each_pixel([&](int lane, int64_t pixel) {
     if (args.grad_transmittance) through[lane] = args.grad_transmittance[pixel];
@@ -203,10 +222,14 @@ Upstream differentiate_patch(const BlendGradientArguments &args, const Tile &til
   });
   Upstream up;
   Vec left = splat(1.0f), coverage = zero();
-  for (int k = 1; k < fragments.row_count; ++k) {
-    Row &row = fragments.rows[k];
-    const Vec weight = row.alpha * left;
-    row.distance = left;
+  core.resize(kept.rows);
+  for (int k = 0; k < kept.rows; ++k) {
+    const int32_t position = kept.positions[kept.row[k].entrant];
+    const Footprint &footprint = forward.footprints[forward.instances[tile.first + position].gaussian];
+    const typename Seen::At at = Seen(footprint, forward, tile).at(place);
+    const Vec alpha = keep(lanes_of(kept.row[k].lanes), minimum(exp2_fast(at.log2_alpha), splat(kAlphaMax)));
+    const Vec weight = alpha * left;
+    core[k] = {alpha, left, &footprint};
     coverage += weight;
     left = left_behind(left, weight);
   }
@@ -220,44 +243,48 @@ Upstream differentiate_patch(const BlendGradientArguments &args, const Tile &til
   const Vec each = 1.0f / select(some, tail.alpha, splat(1.0f));
   up.mean = keep(some, up.signal(tail.red * each, tail.green * each, tail.blue * each, tail.depth * each));
   up.behind = left * tail.left * (load(through) - up.mean);
-  for (int e = 0; e < fragments.entrant_count; ++e) layers[e] = {splat(kNotInCore), zero(), fragments.entrants[e]};
+  for (int e = 0; e < kept.entrants; ++e) layers[e] = {splat(kNotInCore), zero(), kept.positions[e]};
   Vec behind = up.unit * tail.alpha * up.mean + left * tail.left * load(through);
-  for (int k = fragments.row_count - 1; k > 0; --k) {
-    const Row &row = fragments.rows[k];
-    const Vec u = row.distance;
-    const Mask filled = less(zero(), row.alpha);
-    Layer &layer = layers[row.entrant];
-    layer.front = select(filled, u, layer.front);
+  for (int k = kept.rows - 1; k >= 0; --k) {
+    const Fragment &fragment = core[k];
+    const Mask filled = lanes_of(kept.row[k].lanes);
+    Layer &layer = layers[kept.row[k].entrant];
+    layer.front = select(filled, fragment.front, layer.front);
     layer.behind = select(filled, behind, layer.behind);
-    const Footprint &c = footprint_of(forward, tile, fragments, row);
-    behind += row.alpha * u * up.signal(c.red, c.green, c.blue, c.depth);
+    const Footprint &c = *fragment.footprint;
+    behind += fragment.alpha * fragment.front * up.signal(c.red, c.green, c.blue, c.depth);
   }
   return up;
 }
 
 // kAbsolute: with `absolute`, see BlendGradientArguments.
 template <class Seen, bool kWithDepth, bool kWithRays, bool kAbsolute>
-void backward_tile(const BlendGradientArguments &args, const Tile &tile) {
+void backward_tile(const BlendGradientArguments &args, const Tile &tile, int64_t index) {
   const BlendArguments &forward = args.forward;
   const Places<Seen> &places = places_of<Seen>(forward, tile);
   Places<Seen> ray_gradients;
   if constexpr (kWithRays) ray_gradients.resize(tile.patches());
-  int64_t evaluated = 0;
-  std::vector<Fragments> &fragments = collect<Seen>(forward, tile, places, evaluated);
 
   static thread_local std::vector<Upstream> upstream;
   static thread_local std::vector<Layer> layers;
   static thread_local std::vector<const Layer *> next;  // [patches] the next instance of each patch that is in its core
+  static thread_local std::vector<KeptPatch> kept;
   const int patches = tile.patches();
+  const int32_t *words = forward.cores + forward.core_start[index];
   size_t layer_count = 0;
-  for (int p = 0; p < patches; ++p) layer_count += fragments[p].entrant_count + 1;
+  kept.clear();
+  for (int p = 0; p < patches; ++p) {
+    kept.emplace_back(words);
+    layer_count += kept.back().entrants + 1;
+  }
   if (layers.size() < layer_count) layers.resize(layer_count);
   upstream.clear(), next.clear();
   Layer *layer = layers.data();
   for (int p = 0; p < patches; ++p) {
     next.push_back(layer);
-    upstream.push_back(differentiate_patch(args, tile, Patch(tile, p, forward.grid.width), fragments[p], layer));
-    layer += fragments[p].entrant_count;
+    upstream.push_back(
+        differentiate_patch<Seen>(args, tile, Patch(tile, p, forward.grid.width), places[p], kept[p], layer));
+    layer += kept[p].entrants;
     (layer++)->position = -1;
   }
 
@@ -314,24 +341,24 @@ void hybrid_forward(const BlendArguments &args) {
 }
 
 void hybrid_backward(const BlendGradientArguments &args) {
-  for_each_tile(args.forward, [&](const Tile &tile, int64_t) {
+  for_each_tile(args.forward, [&](const Tile &tile, int64_t index) {
     if (planar(args.forward))  // does not look at rays
-      args.grad_depth ? backward_tile<PlanarFootprint, true, false, false>(args, tile)
-                      : backward_tile<PlanarFootprint, false, false, false>(args, tile);
+      args.grad_depth ? backward_tile<PlanarFootprint, true, false, false>(args, tile, index)
+                      : backward_tile<PlanarFootprint, false, false, false>(args, tile, index);
     else if (args.grad_rays)
-      backward_tile<ProjectiveFootprint, true, true, true>(args, tile);
+      backward_tile<ProjectiveFootprint, true, true, true>(args, tile, index);
     else if (args.absolute)
-      backward_tile<ProjectiveFootprint, true, false, true>(args, tile);
+      backward_tile<ProjectiveFootprint, true, false, true>(args, tile, index);
     else
-      args.grad_depth ? backward_tile<ProjectiveFootprint, true, false, false>(args, tile)
-                      : backward_tile<ProjectiveFootprint, false, false, false>(args, tile);
+      args.grad_depth ? backward_tile<ProjectiveFootprint, true, false, false>(args, tile, index)
+                      : backward_tile<ProjectiveFootprint, false, false, false>(args, tile, index);
   });
 }
 
 }  // namespace
 
-extern const BlendKernels hybrid_kernels;
-const BlendKernels hybrid_kernels = {hybrid_forward, hybrid_backward};
+extern const HybridKernels hybrid_kernels;
+const HybridKernels hybrid_kernels = {{hybrid_forward, hybrid_backward}, core_words};
 
 }  // namespace PADGS_ISA
 }  // namespace padgs

@@ -15,6 +15,10 @@ struct BlendKernels {
   void (*backward)(const BlendGradientArguments &);
 };
 
+struct HybridKernels : BlendKernels {
+  int64_t (*core_words)(const TileGrid &, int core_size);  // the most that forward can leave to backward
+};
+
 struct LossKernels {
   double (*photometric)(const LossArguments &);
   int64_t (*workspace)(int32_t height, int32_t width);

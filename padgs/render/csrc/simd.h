@@ -73,6 +73,8 @@ PADGS_INLINE Mask equal(VecI a, VecI b) { return _mm512_cmpeq_epi32_mask((__m512
 PADGS_INLINE Mask both(Mask a, Mask b) { return a & b; }
 PADGS_INLINE Mask either(Mask a, Mask b) { return a | b; }
 PADGS_INLINE Mask without(Mask a, Mask b) { return a & ~b; }
+PADGS_INLINE uint32_t bits(Mask m) { return m; }
+PADGS_INLINE Mask lanes_of(uint32_t bits) { return Mask(bits); }
 PADGS_INLINE bool any(Mask m) { return m != 0; }
 PADGS_INLINE int count(Mask m) { return __builtin_popcount(m); }
 PADGS_INLINE Vec select(Mask m, Vec a, Vec b) { return vec(_mm512_mask_blend_ps(m, raw(b), raw(a))); }
@@ -113,6 +115,14 @@ PADGS_INLINE uint32_t bits(Mask m) {
   for (int lane = 0; lane < kLanes; ++lane) result |= uint32_t(m.p[lane / 4][lane % 4] != 0) << lane;
 #endif
   return result;
+}
+alignas(64) static const int32_t kLaneBits[kLanes] = {1 << 0, 1 << 1, 1 << 2,  1 << 3,  1 << 4,  1 << 5,  1 << 6,  1 << 7,
+                                                      1 << 8, 1 << 9, 1 << 10, 1 << 11, 1 << 12, 1 << 13, 1 << 14, 1 << 15};
+PADGS_INLINE Mask lanes_of(uint32_t bits) {
+  const VecI lane = load_int(kLaneBits);
+  Mask r;
+  PADGS_EACH_PART r.p[i] = (lane.p[i] & int32_t(bits)) != 0;
+  return r;
 }
 PADGS_INLINE bool any(Mask m) { return bits(m) != 0; }
 PADGS_INLINE int count(Mask m) { return __builtin_popcount(bits(m)); }
