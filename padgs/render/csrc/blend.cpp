@@ -8,6 +8,7 @@
 #include <vector>
 
 #include "batch.h"
+#include "hits.h"
 #include "kernels.h"
 #include "pixels.h"
 #include "tiles.h"
@@ -134,23 +135,12 @@ int load_patch(const BlendGradientArguments &args, const Patch &patch, BackwardP
   return furthest;
 }
 
-// Backward looks at a few instances before it sums their moments: evaluating needs no jumps and waits for nothing, and by
-// then it is known which patches an instance draws in, which could not be predicted.
-constexpr int kEntrants = 8, kHits = 12;
-constexpr int kMostPatches = (kTile << kMaxLevel) / kPatchWidth * (kTile / kPatchHeight);
-
 // A patch that an instance draws in.
 template <class Seen>
 struct Hit {
   typename Seen::Factors factors;
   Vec alpha, b_by_d;  // not limited, 0 where nothing is drawn; with rays only
   int patch;
-};
-
-struct Entrant {
-  int32_t gaussian;
-  uint32_t slot;
-  int end;  // of its hits; they begin where those of the last one end
 };
 
 // kAbsolute: with `absolute`, see BlendGradientArguments.

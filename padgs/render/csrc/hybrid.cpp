@@ -8,6 +8,7 @@
 
 #include "batch.h"
 #include "fragments.h"
+#include "hits.h"
 #include "kept_cores.h"
 #include "kernels.h"
 #include "pixels.h"
@@ -223,9 +224,12 @@ Upstream differentiate_patch(const BlendGradientArguments &args, const Tile &til
   Upstream up;
   Vec left = splat(1.0f), coverage = zero();
   core.resize(kept.rows);
+  const auto footprint_at = [&](int k) {
+    return forward.footprints + forward.instances[tile.first + kept.positions[kept.row[k].entrant]].gaussian;
+  };
   for (int k = 0; k < kept.rows; ++k) {
-    const int32_t position = kept.positions[kept.row[k].entrant];
-    const Footprint &footprint = forward.footprints[forward.instances[tile.first + position].gaussian];
+    if (k + kAhead < kept.rows) __builtin_prefetch(footprint_at(k + kAhead));
+    const Footprint &footprint = *footprint_at(k);
     const typename Seen::At at = Seen(footprint, forward, tile).at(place);
     const Vec alpha = keep(lanes_of(kept.row[k].lanes), minimum(exp2_fast(at.log2_alpha), splat(kAlphaMax)));
     const Vec weight = alpha * left;
@@ -256,6 +260,15 @@ Upstream differentiate_patch(const BlendGradientArguments &args, const Tile &til
   }
   return up;
 }
+
+// A patch that an instance draws in.
+template <class Seen>
+struct Hit {
+  typename Seen::Factors factors;
+  Vec alpha, b_by_d;   // not limited, 0 where nothing is drawn; with rays only
+  const Layer *layer;  // of its core fragments
+  int patch;
+};
 
 // kAbsolute: with `absolute`, see BlendGradientArguments.
 template <class Seen, bool kWithDepth, bool kWithRays, bool kAbsolute>
@@ -288,46 +301,62 @@ void backward_tile(const BlendGradientArguments &args, const Tile &tile, int64_t
     (layer++)->position = -1;
   }
 
-  for (int64_t i = tile.first; i < tile.end; ++i) {
-    prefetch(args, i + kAhead, tile.first, tile.end);
-    const Instance instance = forward.instances[i];
-    const Seen g(forward.footprints[instance.gaussian], forward, tile);
-    typename Seen::Moments moments;
-    Vec red = zero(), green = zero(), blue = zero(), depth = zero(), absolute = zero();
-    for_each_patch(tile, instance, [&](int p) {
-      const Upstream &up = upstream[p];
-      const Layer &core = *next[p];
-      const bool in_core = core.position == int32_t(i - tile.first);
-      next[p] += in_core;
-      const typename Seen::At at = g.at(places[p]);
-      if (!any(at.reached)) return;
-      const Vec full = exp2_fast(at.log2_alpha);
-      const Vec alpha = keep(at.reached, minimum(full, splat(kAlphaMax)));
-      Vec unit = up.unit, mean = up.mean, behind = up.behind;
-      if (in_core) {
-        const Mask found = at_least(core.front, zero());
-        unit = select(found, core.front, unit);
-        mean = select(found, zero(), mean);
-        behind = select(found, core.behind, behind);
+  static thread_local std::vector<Hit<Seen>> hit_storage(kHits + kMostPatches);
+  Hit<Seen> *hits = hit_storage.data();
+  Entrant entrants[kEntrants];
+  const Layer none = {splat(kNotInCore), zero(), -1};
+  for (int64_t i = tile.first; i < tile.end;) {
+    int count = 0, found = 0;
+    for (; i < tile.end && count < kEntrants && found < kHits; ++i, ++count) {
+      prefetch(args, i + kAhead, tile.first, tile.end);
+      const Instance instance = forward.instances[i];
+      const Seen g(forward.footprints[instance.gaussian], forward, tile);
+      for_each_patch(tile, instance, [&](int p) {
+        const Layer *core = next[p];
+        const bool in_core = core->position == int32_t(i - tile.first);
+        next[p] += in_core;
+        const typename Seen::At at = g.at(places[p]);
+        Hit<Seen> &hit = hits[found];  // the next overwrites it where nothing is drawn
+        hit.factors = at.factors;
+        if constexpr (kWithRays) hit.b_by_d = at.b_by_d;
+        hit.alpha = keep(at.reached, exp2_fast(at.log2_alpha));
+        hit.layer = in_core ? core : &none;
+        hit.patch = p;
+        found += any(at.reached);
+      });
+      entrants[count] = {instance.gaussian, instance.slot, found};
+    }
+    const Hit<Seen> *hit = hits;
+    for (int e = 0; e < count; ++e) {
+      const Seen g(forward.footprints[entrants[e].gaussian], forward, tile);
+      typename Seen::Moments moments;
+      Vec red = zero(), green = zero(), blue = zero(), depth = zero(), absolute = zero();
+      for (const Hit<Seen> *end = hits + entrants[e].end; hit < end; ++hit) {
+        const Upstream &up = upstream[hit->patch];
+        const Vec alpha = minimum(hit->alpha, splat(kAlphaMax));
+        const Mask in_core = at_least(hit->layer->front, zero());
+        const Vec unit = select(in_core, hit->layer->front, up.unit);
+        const Vec mean = select(in_core, zero(), up.mean);
+        const Vec behind = select(in_core, hit->layer->behind, up.behind);
+        const Vec weight = alpha * unit;
+        Vec signal = up.red * g.red + up.green * g.green + up.blue * g.blue - mean;
+        if (kWithDepth) signal += up.depth * g.depth + up.offset;
+        const Vec m = keep(less(hit->alpha, splat(kAlphaMax)), weight * signal - behind * (alpha * reciprocal(1.0f - alpha)));
+        red += weight * up.red;
+        green += weight * up.green;
+        blue += weight * up.blue;
+        if (kWithDepth) depth += weight * up.depth;
+        moments.add(hit->factors, m);
+        if constexpr (kAbsolute) absolute += g.pull(hit->factors, m);
+        if constexpr (kWithRays) g.add_ray_gradient(hit->factors, hit->b_by_d, m, ray_gradients[hit->patch]);
       }
-      const Vec weight = alpha * unit;
-      Vec signal = up.red * g.red + up.green * g.green + up.blue * g.blue - mean;
-      if (kWithDepth) signal += up.depth * g.depth + up.offset;
-      const Vec m = keep(less(full, splat(kAlphaMax)), weight * signal - behind * (alpha * reciprocal(1.0f - alpha)));
-      red += weight * up.red;
-      green += weight * up.green;
-      blue += weight * up.blue;
-      if (kWithDepth) depth += weight * up.depth;
-      moments.add(at.factors, m);
-      if constexpr (kAbsolute) absolute += g.pull(at.factors, m);
-      if constexpr (kWithRays) g.add_ray_gradient(at.factors, at.b_by_d, m, ray_gradients[p]);
-    });
-    Vec sums[kMoments];
-    moments.finish(sums);
-    sums[10] = red, sums[11] = green, sums[12] = blue, sums[13] = depth;
-    sums[kAbsoluteMoment] = absolute, sums[15] = zero();
-    float *out = args.moments + int64_t(instance.slot) * kMoments;
-    for (int k = 0; k < kMoments; k += 8) sum8(sums + k, out + k);
+      float *out = args.moments + int64_t(entrants[e].slot) * kMoments;
+      Vec sums[kMoments];
+      moments.finish(sums);
+      sums[10] = red, sums[11] = green, sums[12] = blue, sums[13] = depth;
+      sums[kAbsoluteMoment] = absolute, sums[15] = zero();
+      for (int k = 0; k < kMoments; k += 8) sum8(sums + k, out + k);
+    }
   }
   if constexpr (kWithRays) add_ray_gradients(args, tile, ray_gradients);
 }

@@ -62,7 +62,7 @@ struct KeptPatch {
 
   // Reads the record at `words`, and moves on to the next.
   explicit KeptPatch(const int32_t *&words) {
-    std::memcpy(&tail, words, sizeof tail);
+    std::memcpy(static_cast<void *>(&tail), words, sizeof tail);
     rows = words[kTailWords], entrants = words[kTailWords + 1];
     positions = words + kHeaderWords;
     row = reinterpret_cast<const KeptRow *>(positions + entrants);
