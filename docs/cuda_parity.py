@@ -15,7 +15,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "render"))
 
 import cuda_engine
-from render_cases import SETUPS, camera_of, gaussians_of, identity_pose, random_pose, row_error, stable_pixels
+from render_cases import SETUPS, blended, camera_of, gaussians_of, identity_pose, random_pose, row_error, stable_pixels
 from test_hybrid_rendering import fragments
 from test_parity import random_weights, run
 
@@ -49,7 +49,7 @@ def errors(projection: str, lens: str, region: str, blending: str) -> list[float
     if region == "near" and projection == "ray":  # which draws nothing from inside
         gaussians.scales.mul_(0.2)
     pose = random_pose(generator) if region == "ordinary" and lens != "panorama" else identity_pose()
-    options = RenderOptions(projection, blending=blending, core_size=4)
+    options = RenderOptions(projection, **blended(blending, 4))
     stable = stable_pixels(gaussians, *SIZE, lens=lens, pose=pose, options=options)
     if blending == "hybrid":
         *_, decided = fragments(gaussians, camera_of(lens, *SIZE), options, pose)

@@ -25,7 +25,7 @@ TRANSMITTANCE_MIN = 1e-4
 NEAREST, FURTHEST = 1e-15, 1e15
 PUBLISHED_FOCAL = 512  # pixels per radian on the tangent planes of the released OP43DGS, whatever the image
 CORE_ALPHA_MIN = 0.05  # hybrid: fainter fragments go to the tail
-MAX_CORE_SIZE = 256
+CORE_SIZE, MAX_CORE_SIZE = 16, 256
 BLENDINGS = ("sorted", "hybrid")
 BOUNDS = ("exact", "square")
 NEAR_CULLS = ("mean", "ellipsoid")
@@ -52,7 +52,7 @@ class RenderOptions:
     face_size: int | None = None  # cubemap: pixels across the 90 degrees of a face; None: as fine as the panorama
     bounds: str = "exact"  # exact: every pixel with alpha >= 1/255; square: as published, see `published_bounds`
     blending: str = "sorted"  # sorted: by distance of the means; hybrid: by distance on each ray, the rest unordered
-    core_size: int = 16  # hybrid: how many fragments of a pixel are kept in order
+    core_size: int = CORE_SIZE  # hybrid: how many fragments of a pixel are kept in order
     max_instances: int = 1 << 26  # (Gaussian, tile) pairs in memory at once; beyond it the image is drawn in strips
     memory_cap: int | None = None  # square: bytes of the published lists of all pairs; more than that is a MemoryError
 
@@ -70,6 +70,11 @@ class RenderOptions:
             raise ValueError(f"unknown blending {self.blending!r}; known: {', '.join(BLENDINGS)}")
         if not 1 <= self.core_size <= MAX_CORE_SIZE:
             raise ValueError(f"core_size is {self.core_size}; it must be from 1 to {MAX_CORE_SIZE} fragments a pixel")
+        if self.core_size != CORE_SIZE and self.blending != "hybrid":
+            raise ValueError(
+                f"core_size is {self.core_size}, but blending={self.blending} keeps no core; set blending=hybrid, "
+                "or leave it"
+            )
         if self.bounds == "square" and self.wrap:
             raise ValueError("bounds=square are the published bounds, which end at the seam; set wrap=false with them")
         if not self.wrap and self.bounds == "exact" and self.projection in ("tangent", "ray"):

@@ -216,3 +216,8 @@ def row_error(actual: Tensor, expected: Tensor) -> float:
     if largest == 0:
         return actual.abs().max().item()
     return ((actual - expected).abs().amax(-1) / (norms + 1e-3 * largest)).max().item()
+
+
+def blended(blending: str, core_size: int) -> dict:
+    """Options of either blending, with a core of that size where there is one."""
+    return {"blending": blending} | ({"core_size": core_size} if blending == "hybrid" else {})

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import cuda_engine
 import pytest
 import torch
-from render_cases import INPUTS, camera_of, gaussians_of, leaves, mixture, random_pose, row_error, view_of
+from render_cases import INPUTS, blended, camera_of, gaussians_of, leaves, mixture, random_pose, row_error, view_of
 from torch import Tensor
 
 from padgs import render as package
@@ -49,7 +49,7 @@ def crowd(count: int, generator: torch.Generator) -> Gaussians:
 @pytest.mark.parametrize("projection", ["erp", "tangent", "ray"])
 def test_long_lists_are_drawn_like_short_ones(projection: str, blending: str, generator: torch.Generator):
     gaussians = crowd(1200, generator)
-    options = RenderOptions(projection, low_pass_kind="angular", blending=blending, core_size=4)
+    options = RenderOptions(projection, low_pass_kind="angular", **blended(blending, 4))
     expected, expected_gradients = drawn(gaussians, (72, 36), options, backend="cpu")
     actual, gradients = drawn(gaussians, (72, 36), options)
     assert actual.counters["instances"] > 8 * 256
@@ -82,7 +82,7 @@ def test_cores_of_any_size(projection: str, generator: torch.Generator):
 
 @pytest.mark.parametrize("blending", ["sorted", "hybrid"])
 def test_strips_are_parts_of_the_same_image(blending: str, generator: torch.Generator):
-    gaussians, options = crowd(200, generator), RenderOptions(blending=blending, core_size=3)
+    gaussians, options = crowd(200, generator), RenderOptions(**blended(blending, 3))
     whole, whole_gradients = drawn(gaussians, (131, 77), options)
     parts, parts_gradients = drawn(gaussians, (131, 77), replace(options, max_instances=300))
     for name in ("image", "transmittance", "depth", "visible"):
@@ -98,7 +98,7 @@ def test_strips_are_parts_of_the_same_image(blending: str, generator: torch.Gene
 def test_results_do_not_depend_on_which_thread_runs_first(
     projection, lens, blending, generator, monkeypatch: pytest.MonkeyPatch
 ):
-    gaussians, options = crowd(400, generator), RenderOptions(projection, blending=blending, core_size=3)
+    gaussians, options = crowd(400, generator), RenderOptions(projection, **blended(blending, 3))
     forwards = drawn(gaussians, (40, 20), options, lens=lens)
     monkeypatch.setenv("PADGS_EMULATION_REVERSED", "1")
     backwards = drawn(gaussians, (40, 20), options, lens=lens)
@@ -119,7 +119,7 @@ def test_results_repeat_bit_by_bit(blending: str, generator: torch.Generator):
 
 @pytest.mark.parametrize("blending", ["sorted", "hybrid"])
 def test_counters_are_those_of_the_cpu(blending: str, generator: torch.Generator):
-    gaussians, options = gaussians_of("ordinary", 40, generator), RenderOptions(blending=blending, core_size=2)
+    gaussians, options = gaussians_of("ordinary", 40, generator), RenderOptions(**blended(blending, 2))
     expected, actual = (drawn(gaussians, (72, 36), options, backend=name)[0] for name in ("cpu", "cuda"))
     assert set(actual.counters) == set(expected.counters) and len(actual.counters) == 5
     for name in ("gaussians", "visible", "instances", "contributing"):

@@ -31,7 +31,8 @@ Vec distance(const PlanarFootprint::At &, const PlanarFootprint &g, float) { ret
 template <class Seen>
 using Places = std::vector<typename Seen::Place>;
 
-const Footprint &footprint_of(const BlendArguments &args, const Tile &tile, const Fragments &fragments, const Row &row) {
+const Footprint &footprint_of(const BlendArguments &args, const Tile &tile, const Fragments &fragments,
+                              const Row &row) {
   return args.footprints[args.instances[tile.first + fragments.entrants[row.entrant]].gaussian];
 }
 
@@ -341,7 +342,8 @@ void backward_tile(const BlendGradientArguments &args, const Tile &tile, int64_t
         const Vec weight = alpha * unit;
         Vec signal = up.red * g.red + up.green * g.green + up.blue * g.blue - mean;
         if (kWithDepth) signal += up.depth * g.depth + up.offset;
-        const Vec m = keep(less(hit->alpha, splat(kAlphaMax)), weight * signal - behind * (alpha * reciprocal(1.0f - alpha)));
+        const Vec hidden = behind * (alpha * reciprocal(1.0f - alpha));
+        const Vec m = keep(less(hit->alpha, splat(kAlphaMax)), weight * signal - hidden);
         red += weight * up.red;
         green += weight * up.green;
         blue += weight * up.blue;
@@ -365,7 +367,10 @@ bool planar(const BlendArguments &args) { return args.projection == kErp || args
 
 void hybrid_forward(const BlendArguments &args) {
   for_each_tile(args, [&](const Tile &tile, int64_t index) {
-    planar(args) ? forward_tile<PlanarFootprint>(args, tile, index) : forward_tile<ProjectiveFootprint>(args, tile, index);
+    if (planar(args))
+      forward_tile<PlanarFootprint>(args, tile, index);
+    else
+      forward_tile<ProjectiveFootprint>(args, tile, index);
   });
 }
 

@@ -1,4 +1,4 @@
-// What hybrid forward blending leaves to backward: who is in the cores of a patch's pixels, and its sums over the tails.
+// What forward hybrid blending leaves to backward: who is in the core of each pixel, and the sums over its tail.
 //
 // A record of 32-bit words for each patch of a tile, one after the other: tail sums, numbers of rows and entrants,
 // positions of the entrants in the tile's list, rows from front to back. Alphas are cheaper to evaluate than to keep.

@@ -116,8 +116,8 @@ PADGS_INLINE uint32_t bits(Mask m) {
 #endif
   return result;
 }
-alignas(64) static const int32_t kLaneBits[kLanes] = {1 << 0, 1 << 1, 1 << 2,  1 << 3,  1 << 4,  1 << 5,  1 << 6,  1 << 7,
-                                                      1 << 8, 1 << 9, 1 << 10, 1 << 11, 1 << 12, 1 << 13, 1 << 14, 1 << 15};
+alignas(64) static const int32_t kLaneBits[kLanes] = {1,   2,   4,    8,    16,   32,   64,    128,
+                                                      256, 512, 1024, 2048, 4096, 8192, 16384, 32768};
 PADGS_INLINE Mask lanes_of(uint32_t bits) {
   const VecI lane = load_int(kLaneBits);
   Mask r;
