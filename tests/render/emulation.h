@@ -1,7 +1,7 @@
-// CUDA on one CPU thread, as far as the kernels of padgs use it: the threads of a block take turns, each on a stack of its
-// own, and give way where they wait for one another. A wait that hardware would not survive ends the process with a word:
-// lanes of a warp that disagree on what they wait for, or a full warp's exchange that some lane has left.
-// With PADGS_EMULATION_REVERSED in the environment the turns go backwards; results that change hide a race.
+// CUDA on one CPU thread, as far as the kernels of padgs use it: the threads of a block take turns, each on a stack
+// of its own, and give way where they wait for one another. A wait that hardware would not survive ends the process
+// with a word: lanes of a warp that disagree on what they wait for, or a full warp's exchange that some lane has
+// left. With PADGS_EMULATION_REVERSED in the environment the turns go backwards; results that change hide a race.
 #pragma once
 
 #include <setjmp.h>

@@ -13,7 +13,8 @@ extern "C" void check_buckets(const int32_t *tile_start, int32_t tiles, int64_t 
 }
 
 // Row and places of states of one bucket [1 + 2^level].
-extern "C" int32_t check_states(const TileTable *table, const int32_t *tile_start, int32_t tile, int64_t bucket, int64_t *places) {
+extern "C" int32_t check_states(const TileTable *table, const int32_t *tile_start, int32_t tile, int64_t bucket,
+                                int64_t *places) {
   const int row = row_of_tile(*table, tile);
   for (int chunk = 0; chunk < 1 << table->level[row]; ++chunk)
     places[chunk] = state_index(*table, tile_start, row, bucket, chunk);
@@ -27,4 +28,6 @@ extern "C" int64_t check_blocks(const TileTable *table, ChunkPlace *places) {
   return blocks;
 }
 
-extern "C" int64_t check_lower_bound(const uint32_t *keys, int64_t count, uint32_t key) { return lower_bound(keys, count, key); }
+extern "C" int64_t check_lower_bound(const uint32_t *keys, int64_t count, uint32_t key) {
+  return lower_bound(keys, count, key);
+}

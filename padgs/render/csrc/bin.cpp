@@ -53,7 +53,9 @@ struct PatchBox {
   uint16_t column, column_end, second_end, row, row_end;
 
   PatchBox(const PixelBox &box, int32_t index)
-      : gaussian(index), column(uint16_t(box.column / kPatchWidth)), column_end(uint16_t(units(box.column_end, kPatchWidth))),
+      : gaussian(index),
+        column(uint16_t(box.column / kPatchWidth)),
+        column_end(uint16_t(units(box.column_end, kPatchWidth))),
         second_end(uint16_t(units(box.second_end, kPatchWidth))), row(uint16_t(box.row / kPatchHeight)),
         row_end(uint16_t(units(box.row_end, kPatchHeight))) {}
 };
@@ -113,8 +115,8 @@ PADGS_API void padgs_bin(const PixelBox *boxes, int64_t count, const int32_t *or
                          const TileGrid *grid, int64_t *slot_start, int64_t *tile_start, Instance *instances) {
   const int64_t tiles = grid->row_start[grid->end_row - grid->first_row];
   std::fill_n(slot_start, count + 1, int64_t(0));
-  // Each thread takes a block of the Gaussians, in depth order, and has a histogram of its own. Counting sort is stable,
-  // so that the lists do not depend on how many blocks there are.
+  // Each thread takes a block of the Gaussians, in depth order, and has a histogram of its own. Counting sort is
+  // stable, so that the lists do not depend on how many blocks there are.
   const int blocks = threads();
   const auto start = [&](int64_t block) { return visible * block / blocks; };
   std::vector<int64_t> next(blocks * tiles, 0);

@@ -1,8 +1,8 @@
 // Blending: one thread owns one tile at a time, one vector lane is one pixel of a patch. Paper Eq. 4-5.
 //
-// Forward takes a tile's instances in batches, front to back: it notes which patches each reaches, then finishes one patch
-// after the other, whose pixels stay in registers. Backward goes back to front, a few instances at a time: for each it sums
-// moments of M = dL/d(ln alpha) over the patches, which planar.h and projective.h turn into derivatives.
+// Forward takes a tile's instances in batches, front to back: it notes which patches each reaches, then finishes one
+// patch after the other, whose pixels stay in registers. Backward goes back to front, a few instances at a time: for
+// each it sums moments of M = dL/d(ln alpha) over the patches, which planar.h and projective.h turn into derivatives.
 #include <algorithm>
 #include <cmath>
 #include <vector>
@@ -20,7 +20,7 @@ namespace {
 struct ForwardPatch {
   Vec transmittance;  // negative once the pixel has stopped
   Vec red = zero(), green = zero(), blue = zero(), depth = zero();
-  Vec coverage = zero();  // sum of weights: 1 - transmittance without the difference, which leaves few digits of a faint pixel
+  Vec coverage = zero();  // sum of weights; 1 - transmittance would leave few digits of a faint pixel
   VecI last = zero_int();
   bool alive = true;
 };
@@ -43,10 +43,11 @@ void store_patch(const BlendArguments &args, const Patch &patch, const ForwardPa
   });
 }
 
-// Blends `entries` instances of a batch, those of `list`, into one patch; `position` is that of the batch in the tile's list.
+// Blends `entries` instances of a batch, those of `list`, into one patch; `position` is that of the batch in the
+// tile's list.
 template <class Seen>
-int64_t blend_patch(const Seen *batch, const uint8_t *list, int entries, int position, const typename Seen::Place &place,
-                    ForwardPatch &out) {
+int64_t blend_patch(const Seen *batch, const uint8_t *list, int entries, int position,
+                    const typename Seen::Place &place, ForwardPatch &out) {
   ForwardPatch s = out;
   int64_t contributing = 0;
   for (int k = 0; k < entries; ++k) {
@@ -93,7 +94,8 @@ void forward_tile(const BlendArguments &args, const Tile &tile, int64_t index) {
     for (int p = 0; p < patches; ++p) {
       if (!batch.count(p) || !states[p].alive) continue;
       evaluated += kLanes * batch.count(p);
-      contributing += blend_patch(batch.seen(), batch.list(p), batch.count(p), int(start - tile.first), places[p], states[p]);
+      contributing +=
+          blend_patch(batch.seen(), batch.list(p), batch.count(p), int(start - tile.first), places[p], states[p]);
       alive -= !states[p].alive;
     }
   }

@@ -1,9 +1,9 @@
 // Which pixels a footprint can reach with alpha >= 1/255. May be too large, never too small.
 //
-// On the sphere the reached rays form a cone, described by its dual K* = M M^T - n n^T with n the direction of the mean:
-// the plane through the camera with normal w touches it iff w^T K* w = 0. M and n stay apart: the square of a small M
-// would drown in the rounding of n n^T. Extremes of (a.x) / (b.x) over the cone are the roots t of
-//   (b^T K* b) t^2 - 2 (a^T K* b) t + a^T K* a = 0,   valid iff b^T K* b < 0 (the cone lies in front of the plane b.x = 0),
+// On the sphere the reached rays form a cone, described by its dual K* = M M^T - n n^T with n the direction of the
+// mean: the plane through the camera with normal w touches it iff w^T K* w = 0. M and n stay apart: the square of a
+// small M would drown in the rounding of n n^T. Extremes of (a.x) / (b.x) over the cone are the roots t of
+//   (b^T K* b) t^2 - 2 (a^T K* b) t + a^T K* a = 0,   valid iff b^T K* b < 0 (the cone is before the plane b.x = 0),
 // with the discriminant |M^T w|^2 - |M^T a x M^T b|^2, w = (n.b) a - (n.a) b, where nothing of order 1 cancels.
 #pragma once
 
@@ -50,8 +50,8 @@ PADGS_HD T arcsine(T x) {
   return arctangent2(inside, root((one - inside) * (one + inside)));
 }
 
-// The latitude-longitude box of a cone on a panorama. Longitude is exact, latitude conservative. Without branches, so that
-// it serves many cones at a time.
+// The latitude-longitude box of a cone on a panorama. Longitude is exact, latitude conservative. Without branches, so
+// that it serves many cones at a time.
 template <class T>
 PADGS_HD PixelRangeOf<T> sphere_range(const ConeOf<T> &k, const SphereFrame<T> &f, float width, float height) {
   const T c = f.cos_latitude, s = f.sin_latitude, zero = constant(0.0f, c), one = constant(1.0f, c);
@@ -71,11 +71,13 @@ PADGS_HD PixelRangeOf<T> sphere_range(const ConeOf<T> &k, const SphereFrame<T> &
   const T west = where(below(zero, over_pole), -half_turn, arctangent2(one, (b_rt - half_chord) / across) - kPi);
   // Latitude, over the tangent-plane box [x0, x1] x [y0, y1] of the cone.
   T x0, x1, y[2];
-  const T bounded_x = ratio_range(k, f.east, f.normal, x0, x1), bounded_y = ratio_range(k, f.down, f.normal, y[0], y[1]);
+  const T bounded_x = ratio_range(k, f.east, f.normal, x0, x1);
+  const T bounded_y = ratio_range(k, f.down, f.normal, y[0], y[1]);
   const T reach = larger(magnitude(x0), magnitude(x1));
   T low = one, high = -one;
   for (int i = 0; i < 2; ++i) {
-    const T rise = s + c * y[i], flat = rise / root(one + y[i] * y[i]), bent = rise / root(one + reach * reach + y[i] * y[i]);
+    const T rise = s + c * y[i], square = y[i] * y[i];
+    const T flat = rise / root(one + square), bent = rise / root(one + reach * reach + square);
     low = smaller(low, where(below(zero, rise), bent, flat));
     high = larger(high, where(below(zero, rise), flat, bent));
   }
@@ -89,8 +91,10 @@ PADGS_HD PixelRangeOf<T> sphere_range(const ConeOf<T> &k, const SphereFrame<T> &
   const T longitude = arctangent2(f.normal.x, f.normal.z);
   const float per_radian_u = width / (2 * kPi), per_radian_v = height / kPi;
   const T widen_u = (east - west) * ((kSlack - 1) * per_radian_u) + kSlackPixels;
-  const T top = arcsine(low), bottom = arcsine(high), widen_v = (bottom - top) * ((kSlack - 1) * per_radian_v) + kSlackPixels;
-  return {(longitude + west) * per_radian_u + 0.5f * width - widen_u, (longitude + east) * per_radian_u + 0.5f * width + widen_u,
+  const T top = arcsine(low), bottom = arcsine(high);
+  const T widen_v = (bottom - top) * ((kSlack - 1) * per_radian_v) + kSlackPixels;
+  return {(longitude + west) * per_radian_u + 0.5f * width - widen_u,
+          (longitude + east) * per_radian_u + 0.5f * width + widen_u,
           top * per_radian_v + 0.5f * height - widen_v, bottom * per_radian_v + 0.5f * height + widen_v};
 }
 
@@ -112,8 +116,8 @@ PADGS_HD bool behind(const Cone &k, Vec3<float> plane) {
   return n < 0 && dot(p, p) * kSlack < n * n;
 }
 
-// Whether a cone misses a pinhole image: it lies behind the camera, or beside one of the four sides of the image. Most of
-// what is neither before nor behind the camera does, and would else be given the whole image below.
+// Whether a cone misses a pinhole image: it lies behind the camera, or beside one of the four sides of the image.
+// Most of what is neither before nor behind the camera does, and would else be given the whole image below.
 PADGS_HD bool misses_pinhole(const Cone &k, const Camera &camera) {
   const float right = float(camera.width) - camera.cx, bottom = float(camera.height) - camera.cy;
   return behind(k, {0, 0, 1}) || behind(k, {camera.fx, 0, camera.cx}) || behind(k, {-camera.fx, 0, right}) ||

@@ -44,7 +44,8 @@ PADGS_HD int square_edge(float p, int pixels) {
 PADGS_HD PixelBox square_box(const Camera &camera, float u, float v, float middle, float determinant) {
   const float longest = middle + root(larger(middle * middle - determinant, 0.1f));
   const float radius = ceilf(3.0f * root(longest));
-  const PixelBox box{square_edge(u - 0.5f - radius, camera.width), square_edge(u - 0.5f + radius + kTile - 1, camera.width),
+  const PixelBox box{square_edge(u - 0.5f - radius, camera.width),
+                     square_edge(u - 0.5f + radius + kTile - 1, camera.width),
                      0, square_edge(v - 0.5f - radius, camera.height),
                      square_edge(v - 0.5f + radius + kTile - 1, camera.height)};
   return box.column < box.column_end && box.row < box.row_end ? box : no_pixels();

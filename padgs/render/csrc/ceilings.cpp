@@ -1,5 +1,5 @@
-// What this machine can do at most, for padgs bench to measure everything else by: arithmetic without memory, and memory
-// without arithmetic, on all threads. Both return the work they did; the caller reads the clocks.
+// What this machine can do at most, for padgs bench to measure everything else by: arithmetic without memory, and
+// memory without arithmetic, on all threads. Both return the work they did; the caller reads the clocks.
 #include "kernels.h"
 #include "simd.h"
 

@@ -1,8 +1,8 @@
 // Anchors to Gaussians and back in one pass each (paper Eq. 13-15): three small networks, selection, placement.
 //
-// Lanes are sixteen anchors. Nothing of the networks' insides is kept between the passes: computing the hidden layers again
-// costs less than reading them. Sums over anchors (the gradients of the weights) are formed for blocks of a fixed number
-// of anchors and added in order, so that they do not depend on the number of threads.
+// Lanes are sixteen anchors. Nothing of the networks' insides is kept between the passes: computing the hidden layers
+// again costs less than reading them. Sums over anchors (the gradients of the weights) are formed for blocks of a
+// fixed number of anchors and added in order, so that they do not depend on the number of threads.
 #include <algorithm>
 #include <cmath>
 #include <vector>
@@ -233,7 +233,8 @@ class BlockBackward {
       std::fill(grad_inputs_[g].begin(), grad_inputs_[g].end(), zero());
       float all_reaches[6 * kLanes];
       reaches(forward_, group.first, all_reaches);
-      for (int lane = 0; lane < group.lanes; ++lane) anchor(group.first + lane, grads_[g].data() + lane, all_reaches + lane);
+      for (int lane = 0; lane < group.lanes; ++lane)
+        anchor(group.first + lane, grads_[g].data() + lane, all_reaches + lane);
     }
     head(opacity_, 0, k);
     head(color_, k, 3 * k);

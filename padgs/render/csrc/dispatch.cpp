@@ -32,7 +32,8 @@ struct Kernels {
 };
 
 #define PADGS_KERNELS(isa)                                                                                  \
-  {#isa, isa::project_kernels, isa::blend_kernels, isa::hybrid_kernels, isa::loss_kernels, isa::decode_kernels, isa::ceiling_kernels}
+  {#isa,              isa::project_kernels, isa::blend_kernels,  isa::hybrid_kernels,                       \
+   isa::loss_kernels, isa::decode_kernels,  isa::ceiling_kernels}
 
 static Kernels choose() {
 #if PADGS_ISA_COUNT > 1
@@ -58,8 +59,8 @@ static const Kernels &kernels() {
 
 using namespace padgs;
 
-// Bytes of the structures of abi.h that cross the border, in the order of STRUCTURES in native.py, which refuses to talk
-// to a library that was built from other sources.
+// Bytes of the structures of abi.h that cross the border, in the order of STRUCTURES in native.py, which refuses to
+// talk to a library that was built from other sources.
 PADGS_API int64_t padgs_structure_bytes(int32_t index) {
   const size_t bytes[] = {sizeof(Camera), sizeof(Inputs), sizeof(Gradients), sizeof(BlendGradientArguments),
                           sizeof(DecodeGradientArguments), sizeof(LossArguments)};
@@ -73,7 +74,8 @@ PADGS_API void padgs_project(const Camera *camera, const Inputs *in, Footprint *
 }
 
 // Gradients of every input from the moments [N, kMoments], already summed over the instances of each Gaussian.
-PADGS_API void padgs_project_backward(const Camera *camera, const Inputs *in, const float *moments, const Gradients *out) {
+PADGS_API void padgs_project_backward(const Camera *camera, const Inputs *in, const float *moments,
+                                      const Gradients *out) {
   kernels().project.backward(*camera, *in, moments, *out);
 }
 

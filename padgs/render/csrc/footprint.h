@@ -45,7 +45,8 @@ struct Projected {
   T shape[11];
   T log2_opacity, depth;
   T drawn;       // 1 or 0: solid, in front, within reach, and nothing overflowed on the way
-  T bounds[12];  // planar: half_u, half_v, uu, uv, vv, det;  projective: range on the panorama (4), or mean (3), cone (9)
+  // Planar: half_u, half_v, uu, uv, vv, det; projective: range on the panorama (4), or mean (3) and cone (9).
+  T bounds[12];
 };
 
 template <class T>
@@ -62,13 +63,15 @@ PADGS_HD T is_drawn(const Projected<T> &p, int bounds, T opacity, T in_front) {
   for (int k = 0; k < bounds; ++k) total = total + magnitude(p.bounds[k]);
   const T zero = constant(0.0f, opacity), one = constant(1.0f, opacity), largest = constant(3e38f, opacity);
   const T finite = where(below(total, largest), one, zero);  // and not NaN: those are not below anything
-  const T ahead = where(below(zero, in_front), finite, zero), solid = where(below(opacity, one * kAlphaMin), zero, ahead);
+  const T ahead = where(below(zero, in_front), finite, zero);
+  const T solid = where(below(opacity, one * kAlphaMin), zero, ahead);
   const T far_enough = where(below(p.depth, one * kNearest), zero, solid);
   return where(below(one * kFurthest, p.depth), zero, where(below(opacity, largest), far_enough, zero));
 }
 
 template <class T, class Chart>
-PADGS_HD Projected<T> projected_planar(const Camera &camera, const Chart &chart, const CameraGaussian<T> &g, Probe<T> probe) {
+PADGS_HD Projected<T> projected_planar(const Camera &camera, const Chart &chart, const CameraGaussian<T> &g,
+                                       Probe<T> probe) {
   const Covariance2D<T> s = project_covariance(g.spread(), chart.jacobian_u, chart.jacobian_v, camera.low_pass);
   const T u = chart.u + probe.u * (0.5f * float(camera.width)), v = chart.v + probe.v * (0.5f * float(camera.height));
   const T log2_opacity = log2_of_opacity(g.opacity), zero = constant(0.0f, u);
@@ -83,7 +86,8 @@ PADGS_HD Projected<T> projected_planar(const Camera &camera, const Chart &chart,
 PADGS_HD bool by_range(const Camera &camera) { return camera.model != kPinholeModel && !camera.square; }
 
 template <class T>
-PADGS_HD Projected<T> projected_rays(const Camera &camera, const ProjectiveShape<T> &s, Vec3<T> mean, const Mat3<T> &k, T opacity, T depth, T in_front) {
+PADGS_HD Projected<T> projected_rays(const Camera &camera, const ProjectiveShape<T> &s, Vec3<T> mean, const Mat3<T> &k,
+                                     T opacity, T depth, T in_front) {
   const T zero = constant(0.0f, depth);
   Projected<T> p{{s.l0.x, s.l0.y, s.l0.z, s.l1.x, s.l1.y, s.l1.z, s.m.x, s.m.y, s.m.z, s.kappa, s.near_ratio},
                  log2_of_opacity(opacity), depth, in_front,
@@ -91,7 +95,8 @@ PADGS_HD Projected<T> projected_rays(const Camera &camera, const ProjectiveShape
   p.drawn = is_drawn(p, 12, opacity, in_front);
   if (!by_range(camera)) return p;
   const SphereFrame<T> frame = sphere_frame(mean);
-  const PixelRangeOf<T> range = sphere_range(ConeOf<T>{k, frame.normal}, frame, float(camera.width), float(camera.height));
+  const PixelRangeOf<T> range =
+      sphere_range(ConeOf<T>{k, frame.normal}, frame, float(camera.width), float(camera.height));
   const T bounds[12] = {range.u0, range.u1, range.v0, range.v1, zero, zero, zero, zero, zero, zero, zero, zero};
   for (int i = 0; i < 12; ++i) p.bounds[i] = bounds[i];
   return p;
@@ -125,7 +130,8 @@ PADGS_HD Projected<T> projected(const Camera &camera, const CameraGaussian<T> &p
     const T reach = model.frame.r - root(larger(exact, constant(0.0f, exact)) * dot(along, along));
     in_front = smaller(in_front, reach - camera.near_radius);
   }
-  return projected_rays(camera, model.shape(g, camera.near_radius), posed.mean, model.cone(g, k), g.opacity, model.frame.r, in_front);
+  return projected_rays(camera, model.shape(g, camera.near_radius), posed.mean, model.cone(g, k), g.opacity,
+                        model.frame.r, in_front);
 }
 
 // The box of a Gaussian that is drawn.
@@ -163,7 +169,8 @@ struct InputGradient {
 };
 
 template <class T, class Chart>
-PADGS_HD void planar_backward(const Camera &camera, const Chart &chart, const CameraGaussian<T> &g, const T *m, InputGradient<T> &out) {
+PADGS_HD void planar_backward(const Camera &camera, const Chart &chart, const CameraGaussian<T> &g, const T *m,
+                              InputGradient<T> &out) {
   const Covariance2D<T> s = project_covariance(g.spread(), chart.jacobian_u, chart.jacobian_v, camera.low_pass);
   PlanarGradient<T> f = planar_gradient(s, m);
   f.depth = m[13];
@@ -178,7 +185,8 @@ PADGS_HD void projective_backward(const Camera &camera, const CameraGaussian<T> 
   out.camera = camera.projection == kTangent ? TangentModel<T>(g, camera.low_pass).vjp(g, moments, m[13])
                                              : RayModel<T>(g).vjp(g, moments, m[13]);
   const SphereFrame<T> f = sphere_frame(g.mean);  // the probe moves along it, which changes no radius: no widening
-  out.probe = {dot(out.camera.mean, f.east) * f.r * f.cos_latitude * kPi, dot(out.camera.mean, f.down) * f.r * (0.5f * kPi)};
+  out.probe = {dot(out.camera.mean, f.east) * f.r * f.cos_latitude * kPi,
+               dot(out.camera.mean, f.down) * f.r * (0.5f * kPi)};
 }
 
 template <class T>
@@ -205,7 +213,8 @@ PADGS_HD InputGradient<T> gradient_of(const Camera &camera, const PosedGaussian<
   c.scale = kept(on, c.scale);
   c.orientation = {kept(on, c.orientation.c0), kept(on, c.orientation.c1), kept(on, c.orientation.c2)};
   out.mean = transposed_times(posed.camera, c.mean);
-  const Mat3<T> turned{transposed_times(posed.camera, c.orientation.c0), transposed_times(posed.camera, c.orientation.c1),
+  const Mat3<T> turned{transposed_times(posed.camera, c.orientation.c0),
+                       transposed_times(posed.camera, c.orientation.c1),
                        transposed_times(posed.camera, c.orientation.c2)};
   const Quaternion<T> q = rotation_vjp(posed.unit, posed.norm, turned);
   out.quat = {kept(on, q.w), kept(on, q.x), kept(on, q.y), kept(on, q.z)};
@@ -214,7 +223,8 @@ PADGS_HD InputGradient<T> gradient_of(const Camera &camera, const PosedGaussian<
   return out;
 }
 
-// dL/d[R | t], by rows: mean_cam = R mean + t and orientation = R R_q, so dL/dR = grad_mean mean^T + grad_orientation R_q^T.
+// dL/d[R | t], by rows: mean_cam = R mean + t and orientation = R R_q, so
+// dL/dR = grad_mean mean^T + grad_orientation R_q^T.
 template <class T>
 PADGS_HD void pose_gradient(const PosedGaussian<T> &posed, const CameraGaussianGradient<T> &g, T *pose) {
   const Mat3<T> local = rotation(posed.unit);

@@ -2,8 +2,8 @@
 //
 // The core is a list of rows, each of one instance: those of its fragments that are in the core of their pixels, with
 // holes at the other pixels. A hole is a transparent fragment as far away as what is in front of it, so the distances
-// of every pixel ascend along the rows. As instances come nearly front to back, most rows are appended; fragments that are
-// nearer than what their pixel has already make rows further up.
+// of every pixel ascend along the rows. As instances come nearly front to back, most rows are appended; fragments
+// that are nearer than what their pixel has already make rows further up.
 #pragma once
 
 #include <algorithm>

@@ -1,8 +1,8 @@
 // The photometric loss (Eq. 16) and its derivative by the image in one call: L1 and SSIM under a weight map.
 //
-// Rows hold their channels interleaved, as images do: a neighbour in x is 3 floats away, so blurring needs no other layout.
-// Four sweeps over the rows: blur along x, blur along y and compare, and the same two for the derivatives, because the
-// window is symmetric and so is its zero padding. With S the SSIM and m_i, s_ii, s_it its window means,
+// Rows hold their channels interleaved, as images do: a neighbour in x is 3 floats away, so blurring needs no other
+// layout. Four sweeps over the rows: blur along x, blur along y and compare, and the same two for the derivatives,
+// because the window is symmetric and so is its zero padding. With S the SSIM and m_i, s_ii, s_it its window means,
 //   dL/dx = blur(dL/dm_i) + 2 x blur(dL/ds_ii) + t blur(dL/ds_it) + the L1 part.
 #include <algorithm>
 #include <cmath>
@@ -73,9 +73,14 @@ struct RowSums {
 class Sweeps {
  public:
   explicit Sweeps(const LossArguments &args)
-      : args_(args), length_(args.width * kChannels), memory_(args.workspace), inputs_(memory_, 2, args.height, length_),
-        weights_(memory_, 1, args.height, length_), products_(memory_, 3, args.height, length_),
-        blurred_(memory_, 5, args.height, length_), partials_(memory_, 3, args.height, length_) {}
+      : args_(args),
+        length_(args.width * kChannels),
+        memory_(args.workspace),
+        inputs_(memory_, 2, args.height, length_),
+        weights_(memory_, 1, args.height, length_),
+        products_(memory_, 3, args.height, length_),
+        blurred_(memory_, 5, args.height, length_),
+        partials_(memory_, 3, args.height, length_) {}
 
   // Copies a row into padded storage and blurs image, target and their products along x.
   void blur_inputs(int y) {

@@ -1,6 +1,6 @@
-// The low-pass filters that widen a Gaussian in 3D, before it is projected: Sigma' = Sigma + widen r^2 I, a constant angle
-// to the camera. With compensation the opacity shrinks by sqrt(det Sigma / det Sigma'), so that the Gaussian's mass stays.
-// (Filters in pixels, and the tangent plane's own, belong to the footprints.)
+// The low-pass filters that widen a Gaussian in 3D, before it is projected: Sigma' = Sigma + widen r^2 I, a constant
+// angle to the camera. With compensation the opacity shrinks by sqrt(det Sigma / det Sigma'), so that the Gaussian's
+// mass stays. (Filters in pixels, and the tangent plane's own, belong to the footprints.)
 #pragma once
 
 #include "abi.h"

@@ -7,7 +7,7 @@
 
 namespace padgs {
 
-constexpr float kMinCosLatitude = 1e-4f;  // nearer to the axis an erp footprint is undefined: held constant, no gradient
+constexpr float kMinCosLatitude = 1e-4f;  // nearer to the axis erp footprints are undefined: held constant, no gradient
 constexpr float kHalfLog2E = 0.72134752044448170f;
 constexpr float kSlopeLimit = 1.3f;  // pinhole: slopes in the Jacobian are limited to this times the half field of view
 
@@ -26,7 +26,8 @@ struct Covariance2D {
   T uu, uv, vv, determinant;
 };
 template <class T>
-PADGS_HD Covariance2D<T> project_covariance(const Mat3<T> &spread, Vec3<T> jacobian_u, Vec3<T> jacobian_v, float low_pass) {
+PADGS_HD Covariance2D<T> project_covariance(const Mat3<T> &spread, Vec3<T> jacobian_u, Vec3<T> jacobian_v,
+                                            float low_pass) {
   Covariance2D<T> s;
   s.row_u = transposed_times(spread, jacobian_u);
   s.row_v = transposed_times(spread, jacobian_v);
@@ -157,7 +158,8 @@ PADGS_HD PlanarGradient<T> planar_gradient(const Covariance2D<T> &s, const T *m)
 
 // Back through chart and covariance to the Gaussian in the camera frame.
 template <class T, class Chart>
-PADGS_HD CameraGaussianGradient<T> planar_vjp(const CameraGaussian<T> &g, const Chart &chart, const PlanarGradient<T> &f) {
+PADGS_HD CameraGaussianGradient<T> planar_vjp(const CameraGaussian<T> &g, const Chart &chart,
+                                              const PlanarGradient<T> &f) {
   CameraGaussianGradient<T> out;
   const Vec3<T> ju = chart.jacobian_u, jv = chart.jacobian_v;
   spread_vjp(g,

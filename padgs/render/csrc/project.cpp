@@ -44,7 +44,8 @@ PosedGaussian<Vec> load_posed(const Camera &camera, const Inputs &in, int64_t fi
   load_items<1>(in.opacities, first, in.count, o);
   if (in.probe) load_items<2>(in.probe, first, in.count, p);
   probe = {p[0], p[1]};
-  PosedGaussian<Vec> posed(camera.cam_from_world, {m[0], m[1], m[2]}, {q[0], q[1], q[2], q[3]}, {s[0], s[1], s[2]}, o[0]);
+  PosedGaussian<Vec> posed(camera.cam_from_world, {m[0], m[1], m[2]}, {q[0], q[1], q[2], q[3]}, {s[0], s[1], s[2]},
+                           o[0]);
   if (in.probe && !planar(camera.projection)) posed.gaussian.mean = probed_mean(posed.gaussian.mean, probe);
   return posed;
 }

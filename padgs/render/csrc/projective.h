@@ -63,23 +63,26 @@ struct TangentModel {
     return {scaled(h * c11, frame.east) + scaled(h * c21, frame.down), scaled(h * c22, frame.down), {zero, zero, zero}};
   }
 
-  // What the released OP43DGS takes the radius of its bounds from: half a trace and a determinant, in square pixels. The
-  // trace is that of the footprint in the panorama, by a Jacobian whose lower row is divided by sqrt(x^2 + z^2 r^2) where
-  // r^2 sqrt(x^2 + z^2) belongs; the determinant is that of S at 512 pixels per radian. Grows with the distance.
+  // What the released OP43DGS takes the radius of its bounds from: half a trace and a determinant, in square pixels.
+  // The trace is that of the footprint in the panorama, by a Jacobian whose lower row is divided by
+  // sqrt(x^2 + z^2 r^2) where r^2 sqrt(x^2 + z^2) belongs; the determinant is that of S at 512 pixels per radian.
+  // Grows with the distance.
   PADGS_HD Vec3<T> published_extent(const Camera &camera, Vec3<T> mean) const {
     const ErpChart<T> chart(camera, mean);
     const T x2 = mean.x * mean.x, z2 = mean.z * mean.z, r2 = frame.r * frame.r;
     const T wrong = r2 * root(x2 + z2) / larger(root(x2 + z2 * r2), constant(1e-20f, r2));
     const T u = chart.per_east * frame.r, v = chart.per_down * frame.r * wrong;  // pixels per radian
     const T across = kPublishedFocal * kPublishedFocal * c11 * c22;
-    const T half_trace = 0.5f * (u * u * dot(e, e) + v * v * dot(d, d)) + camera.low_pass * kPublishedFocal * kPublishedFocal;
+    const T half_trace =
+        0.5f * (u * u * dot(e, e) + v * v * dot(d, d)) + camera.low_pass * kPublishedFocal * kPublishedFocal;
     return {half_trace, across * across, constant(0.0f, r2)};
   }
 
   // With y = C^-1 tau, g = S^-1 tau = C^-T y, Y = sum M y y^T:
   //   dL/dP = C^-T Y (C^-1 P), in this order, because S^-1 itself holds no digits where S is long and oblique,
   //   dL/dA = E^T dL/dP / r,  dL/dmu = [E^T (sum M (I + tau tau^T) g - dL/dP n) - tr(P^T dL/dP) n] / r
-  PADGS_HD CameraGaussianGradient<T> vjp(const CameraGaussian<T> &g, const ProjectiveMoments<T> &m, T grad_depth) const {
+  PADGS_HD CameraGaussianGradient<T> vjp(const CameraGaussian<T> &g, const ProjectiveMoments<T> &m,
+                                         T grad_depth) const {
     const T i11 = 1.0f / c11, i22 = 1.0f / c22, i21 = -(c21 * i11 * i22);  // C^-1
     const Vec3<T> q1 = scaled(i11, e), q2 = scaled(i21, e) + scaled(i22, d);
     const Vec3<T> z1 = scaled(m.c11, q1) + scaled(m.c12, q2), z2 = scaled(m.c12, q1) + scaled(m.c22, q2);
@@ -143,7 +146,8 @@ struct RayModel {
 
   // The closest point of a ray to the mean, in whitened space, is off by e = [o_hat u1 u2] (c0 / rho, -c1, -c2); with
   // h = M^-T e:  dL/dmu = -sum M h,  dL/dSigma = sum M h h^T / 2.
-  PADGS_HD CameraGaussianGradient<T> vjp(const CameraGaussian<T> &g, const ProjectiveMoments<T> &m, T grad_depth) const {
+  PADGS_HD CameraGaussianGradient<T> vjp(const CameraGaussian<T> &g, const ProjectiveMoments<T> &m,
+                                         T grad_depth) const {
     const T inverse_rho = 1.0f / rho;
     const Mat3<T> basis{scaled(inverse_rho, o_hat), scaled(constant(-1.0f, rho), u1), scaled(constant(-1.0f, rho), u2)};
     const Vec3<T> e = times(basis, Vec3<T>{m.c0, m.c1, m.c2});
@@ -160,8 +164,9 @@ struct RayModel {
     const Vec3<T> s = g.scale;
     const T ix = 1.0f / s.x, iy = 1.0f / s.y, iz = 1.0f / s.z;
     // G = R^T (dL/dSigma) R in the Gaussian's own axes.
-    const T gxx = 0.5f * ix * ix * entry(b0, h0), gyy = 0.5f * iy * iy * entry(b1, h1), gzz = 0.5f * iz * iz * entry(b2, h2);
-    const T gxy = 0.5f * ix * iy * entry(b0, h1), gxz = 0.5f * ix * iz * entry(b0, h2), gyz = 0.5f * iy * iz * entry(b1, h2);
+    const T gxx = 0.5f * ix * ix * entry(b0, h0), gxy = 0.5f * ix * iy * entry(b0, h1);
+    const T gyy = 0.5f * iy * iy * entry(b1, h1), gxz = 0.5f * ix * iz * entry(b0, h2);
+    const T gzz = 0.5f * iz * iz * entry(b2, h2), gyz = 0.5f * iy * iz * entry(b1, h2);
     CameraGaussianGradient<T> out;
     out.log_opacity = m.one;
     out.scale = {2.0f * s.x * gxx, 2.0f * s.y * gyy, 2.0f * s.z * gzz};

@@ -1,5 +1,5 @@
-// The elementary functions that the geometry is written in, for one float. simd_math.h has them for sixteen, so that one
-// template serves a CPU lane, a CUDA thread and a test.
+// The elementary functions that the geometry is written in, for one float. simd_math.h has them for sixteen, so that
+// one template serves a CPU lane, a CUDA thread and a test.
 #pragma once
 
 #include <cmath>

@@ -88,8 +88,8 @@ void for_each_tile(const BlendArguments &args, Visit visit) {
   }
 }
 
-// Footprints are scattered in memory; ask for those of the instances to come. Inlined always, because GCC takes a function
-// that only prefetches for one without effect and drops its calls.
+// Footprints are scattered in memory; ask for those of the instances to come. Inlined always, because GCC takes a
+// function that only prefetches for one without effect and drops its calls.
 constexpr int kAhead = 16;
 PADGS_INLINE void prefetch(const BlendArguments &args, int64_t instance, int64_t end) {
   if (instance < end) __builtin_prefetch(args.footprints + args.instances[instance].gaussian);

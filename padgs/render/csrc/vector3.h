@@ -28,7 +28,9 @@ struct Mat3 {
   Vec3<T> c0, c1, c2;
 };
 template <class T>
-PADGS_HD Vec3<T> times(const Mat3<T> &m, Vec3<T> v) { return scaled(v.x, m.c0) + scaled(v.y, m.c1) + scaled(v.z, m.c2); }
+PADGS_HD Vec3<T> times(const Mat3<T> &m, Vec3<T> v) {
+  return scaled(v.x, m.c0) + scaled(v.y, m.c1) + scaled(v.z, m.c2);
+}
 template <class T>
 PADGS_HD Vec3<T> transposed_times(const Mat3<T> &m, Vec3<T> v) { return {dot(m.c0, v), dot(m.c1, v), dot(m.c2, v)}; }
 template <class T>

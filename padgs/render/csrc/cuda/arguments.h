@@ -1,5 +1,6 @@
-// The C ABI of libpadgs_cuda, beside the structures that it shares with the CPU library. Every pointer is to memory of the
-// device, and was allocated by padgs/render/cuda_backend.py. Every function returns a cudaError_t, 0 where all is well.
+// The C ABI of libpadgs_cuda, beside the structures that it shares with the CPU library. Every pointer is to memory
+// of the device, and was allocated by padgs/render/cuda_backend.py. Every function returns a cudaError_t, 0 where all
+// is well.
 #pragma once
 
 #include "core.h"
@@ -44,8 +45,9 @@ struct BinArguments {
   uint32_t *tiles;       // [visible + 1] how many tiles each touches, and 0
   uint32_t *slot_start;  // [visible + 1]
   Reach *reaches;        // [I] by slot
-  SortArguments sort;    // of the I instances by tile; its values become the slots of the lists. Where I is room for more than
-                         // there are, the keys behind the last are those from before the call: at least the number of tiles
+  // Of the I instances by tile; its values become the slots of the lists. Where I is room for more than there are, the
+  // keys behind the last are those from before the call: at least the number of tiles.
+  SortArguments sort;
   int32_t *tile_start;   // [tiles + 1]
 };
 
@@ -106,7 +108,8 @@ struct DeviceDecodeGradientArguments {
   float *opacity_out, *color_out, *covariance_out;  // [A, K] [A, 3 K] [A, 7 K]: dL by the networks' outputs
 };
 
-// The loss over all pixels is the sum of block_sums / total. Its workspace holds dL by three window means, [3, H, W, 3].
+// The loss over all pixels is the sum of block_sums / total. Its workspace holds dL by three window means,
+// [3, H, W, 3].
 struct DeviceLossArguments {
   LossArguments loss;   // its normalizer is not used
   const float *total;   // [1]

@@ -1,5 +1,5 @@
-// Tile lists: one stable sort of the instances by tile, of Gaussians that are in depth order already, so that every list
-// is front to back.
+// Tile lists: one stable sort of the instances by tile, of Gaussians that are in depth order already, so that every
+// list is front to back.
 #include "sort.cuh"
 
 namespace padgs {
@@ -13,8 +13,8 @@ __global__ void count_kernel(BinArguments args) {
   if (i <= args.visible) args.tiles[i] = i < args.visible ? tiles_of(args.boxes[args.order[i]], args.table) : 0;
 }
 
-// A warp lists the instances of 32 Gaussians, as many to each lane whatever their sizes, and writes them side by side; those
-// that there is no room for are left out.
+// A warp lists the instances of 32 Gaussians, as many to each lane whatever their sizes, and writes them side by
+// side; those that there is no room for are left out.
 __global__ void emit_kernel(BinArguments args) {
   __shared__ PixelBox boxes[kWarps][kWarp];
   __shared__ int32_t gaussians[kWarps][kWarp];
@@ -45,7 +45,8 @@ __global__ void emit_kernel(BinArguments args) {
 
 __global__ void tile_start_kernel(BinArguments args, int tiles) {
   const int64_t tile = global_thread();
-  if (tile <= tiles) args.tile_start[tile] = int32_t(lower_bound(args.sort.sorted_keys, args.sort.count, uint32_t(tile)));
+  if (tile <= tiles)
+    args.tile_start[tile] = int32_t(lower_bound(args.sort.sorted_keys, args.sort.count, uint32_t(tile)));
 }
 
 }  // namespace
@@ -58,7 +59,8 @@ PADGS_API int padgs_cuda_bin(const Queue *queue, const BinArguments *args, int32
   if (const int error = begin(*queue)) return error;
   if (args->sort.count) {
     launch(count_kernel, blocks_for(args->visible + 1, kThreads), kThreads, *queue, *args);
-    if (const int error = exclusive_sum(*queue, args->sort, args->tiles, args->slot_start, args->visible + 1)) return error;
+    if (const int error = exclusive_sum(*queue, args->sort, args->tiles, args->slot_start, args->visible + 1))
+      return error;
     launch(emit_kernel, blocks_for(args->visible, kThreads), kThreads, *queue, *args);
     if (const int error = sort_pairs(*queue, args->sort)) return error;
   }

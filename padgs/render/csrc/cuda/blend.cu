@@ -14,7 +14,7 @@ __global__ void __launch_bounds__(kBatch) blend_kernel(BlendInputs args) {
   const Pixel pixel(args.rays, args.wrap, args.table.width, place.inside ? place.x : 0, place.inside ? place.y : 0);
   bool running = place.inside;
   float transmittance = 1, red = 0, green = 0, blue = 0, depth = 0;
-  float coverage = 0;  // sum of weights: 1 - transmittance without the difference, which leaves few digits of a faint pixel
+  float coverage = 0;  // sum of weights; 1 - transmittance would leave few digits of a faint pixel
   int last = 0, evaluated = 0, contributing = 0;
 
   for (int first = begin; first < end; first += kBatch) {
@@ -66,6 +66,7 @@ PADGS_API int padgs_cuda_blend(const Queue *queue, const BlendInputs *args) {
   if (args->core_size)
     hybrid_forward(*queue, *args);
   else
-    launch(planar(args->projection) ? blend_kernel<true> : blend_kernel<false>, blocks_of(args->table), kBatch, *queue, *args);
+    launch(planar(args->projection) ? blend_kernel<true> : blend_kernel<false>, blocks_of(args->table), kBatch, *queue,
+           *args);
   return finish();
 }

@@ -1,9 +1,10 @@
 // Sorted blending, backward, in two passes over the same lists, both back to front.
 //
-// The first has a thread for each pixel. It leaves, behind every bucket of 32 instances, how much light still passes and
-// what lies behind. The second has a thread for each instance: a warp takes a bucket and the pixels of a chunk pass
-// through it, entering at the last lane and handed on from lane to lane, so that every instance sums its own moments in
-// registers. No sum crosses threads, no float is added atomically: the results do not depend on scheduling.
+// The first has a thread for each pixel. It leaves, behind every bucket of 32 instances, how much light still passes
+// and what lies behind. The second has a thread for each instance: a warp takes a bucket and the pixels of a chunk
+// pass through it, entering at the last lane and handed on from lane to lane, so that every instance sums its own
+// moments in registers. No sum crosses threads, no float is added atomically: the results do not depend on
+// scheduling.
 #include "blend.cuh"
 
 namespace padgs {
@@ -44,7 +45,8 @@ __global__ void __launch_bounds__(kBatch) states_kernel(BlendGradientInputs args
   const int thread = int(threadIdx.x);
   const PixelPlace place = pixel_place(forward.table, blockIdx.x, thread);
   const int begin = forward.tile_start[place.chunk.tile], y = place.y - place.chunk.y0, chunk = place.chunk.chunk;
-  const Pixel pixel(forward.rays, forward.wrap, forward.table.width, place.inside ? place.x : 0, place.inside ? place.y : 0);
+  const Pixel pixel(forward.rays, forward.wrap, forward.table.width, place.inside ? place.x : 0,
+                    place.inside ? place.y : 0);
   Upstream upstream{};
   PixelState state{1.0f, 0.0f};
   int last = 0;
@@ -159,7 +161,8 @@ void sorted_backward(const Queue &queue, const BlendGradientInputs &args, int ti
                                         : states_kernel<false, false>;
   launch(states, blocks_of(args.forward.table), kBatch, queue, args);
   const int64_t threads = buckets_at_most(args.instances, tiles) * kWarp;
-  launch(flat ? buckets_kernel<true> : buckets_kernel<false>, blocks_for(threads, kBucketThreads), kBucketThreads, queue, args, tiles);
+  launch(flat ? buckets_kernel<true> : buckets_kernel<false>, blocks_for(threads, kBucketThreads), kBucketThreads,
+         queue, args, tiles);
 }
 
 }  // namespace

@@ -1,5 +1,6 @@
-// Anchors to Gaussians (paper Eq. 13-15), around the matrix products of the networks, which cuBLAS does better: select and
-// place forward; from the gradients of the Gaussians to those of the networks' outputs, offsets and scales backward.
+// Anchors to Gaussians (paper Eq. 13-15), around the matrix products of the networks, which cuBLAS does better:
+// select and place forward; from the gradients of the Gaussians to those of the networks' outputs, offsets and scales
+// backward.
 #include "arguments.h"
 #include "device.cuh"
 

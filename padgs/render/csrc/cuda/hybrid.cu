@@ -1,5 +1,6 @@
 // Hybrid blending, forward: a block draws one chunk of pixels from the list of its tile, a thread each. Every pixel
-// keeps its nearest fragments in its thread's own memory. The order of the list only decides ties; it is read to its end.
+// keeps its nearest fragments in its thread's own memory. The order of the list only decides ties; it is read to the
+// end.
 #include "blend.cuh"
 
 namespace padgs {

@@ -26,7 +26,9 @@ struct Reach {
 };
 static_assert(sizeof(Reach) == 8, "padgs/render/cuda_backend.py allocates 2 integers per instance");
 
-PADGS_HD int tiles_before(const TileTable &table, int row) { return table.row_start[row] - table.row_start[table.first_row]; }
+PADGS_HD int tiles_before(const TileTable &table, int row) {
+  return table.row_start[row] - table.row_start[table.first_row];
+}
 PADGS_HD int tiles_drawn(const TileTable &table) { return tiles_before(table, table.end_row); }
 
 // How many drawn tiles a box touches.
@@ -76,7 +78,12 @@ PADGS_HD int64_t chunks_drawn(const TileTable &table) {
 PADGS_HD ChunkPlace chunk_place(const TileTable &table, int64_t block) {
   const int across = chunks(table.width), row = table.first_row + int(block / across), column = int(block % across);
   const int level = table.level[row];
-  return {row, level, tiles_before(table, row) + (column >> level), column & ((1 << level) - 1), column * kTile, row * kTile};
+  return {row,
+          level,
+          tiles_before(table, row) + (column >> level),
+          column & ((1 << level) - 1),
+          column * kTile,
+          row * kTile};
 }
 
 // Buckets of a tile's list, numbered without gaps within a tile and at most one gap between tiles: no sum over tiles is
@@ -108,8 +115,8 @@ PADGS_HD int row_of_tile(const TileTable &table, int tile) {
   return low;
 }
 
-// Where the states of a chunk's 256 pixels behind one bucket are kept, in units of 256. A row of level l has 2^l for each
-// of its buckets.
+// Where the states of a chunk's 256 pixels behind one bucket are kept, in units of 256. A row of level l has 2^l for
+// each of its buckets.
 PADGS_HD int64_t state_index(const TileTable &table, const int32_t *tile_start, int row, int64_t bucket, int chunk) {
   const int first = tiles_before(table, row);
   const int64_t in_row = bucket - first_bucket(tile_start[first], first);

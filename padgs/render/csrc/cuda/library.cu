@@ -14,9 +14,16 @@ using namespace padgs;
 
 // Bytes of the structures that cross the border, in the order of STRUCTURES in cuda_native.py.
 PADGS_API int64_t padgs_cuda_structure_bytes(int32_t index) {
-  const size_t bytes[] = {sizeof(Queue), sizeof(ProjectArguments), sizeof(ProjectGradientArguments), sizeof(SortArguments),
-                          sizeof(BinArguments), sizeof(BlendInputs), sizeof(BlendGradientInputs), sizeof(DeviceLossArguments),
-                          sizeof(DeviceDecodeArguments), sizeof(DeviceDecodeGradientArguments)};
+  const size_t bytes[] = {sizeof(Queue),
+                          sizeof(ProjectArguments),
+                          sizeof(ProjectGradientArguments),
+                          sizeof(SortArguments),
+                          sizeof(BinArguments),
+                          sizeof(BlendInputs),
+                          sizeof(BlendGradientInputs),
+                          sizeof(DeviceLossArguments),
+                          sizeof(DeviceDecodeArguments),
+                          sizeof(DeviceDecodeGradientArguments)};
   return index >= 0 && size_t(index) < sizeof(bytes) / sizeof(*bytes) ? int64_t(bytes[index]) : -1;
 }
 

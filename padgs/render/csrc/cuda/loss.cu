@@ -1,5 +1,6 @@
-// The photometric loss (Eq. 16) and its derivative by the image: L1 and SSIM under a weight map. Two passes, each of which
-// blurs a block of pixels and what surrounds it in shared memory; loss.cpp of the CPU library says why two are enough.
+// The photometric loss (Eq. 16) and its derivative by the image: L1 and SSIM under a weight map. Two passes, each of
+// which blurs a block of pixels and what surrounds it in shared memory; loss.cpp of the CPU library says why two are
+// enough.
 #include "arguments.h"
 #include "device.cuh"
 
@@ -13,7 +14,8 @@ constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;
 
 // exp(-k^2 / (2 sigma^2)) by distance from the centre, normalised.
 __device__ float tap(int distance) {
-  const float taps[kHalf + 1] = {0.26601172486f, 0.21300553771f, 0.10936068951f, 0.03600077213f, 0.00759875814f, 0.00102838008f};
+  const float taps[kHalf + 1] = {0.26601172486f, 0.21300553771f, 0.10936068951f,
+                                 0.03600077213f, 0.00759875814f, 0.00102838008f};
   return taps[distance];
 }
 __device__ int distance(int k) { return k < 0 ? -k : k; }

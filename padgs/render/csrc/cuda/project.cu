@@ -9,7 +9,8 @@ namespace {
 constexpr int kThreads = 128;
 constexpr int kHistogram = 1024;  // rows of tiles that a block counts in shared memory: images of up to 16384 rows
 
-__device__ PosedGaussian<float> load_posed(const Camera &camera, const float *pose, const Inputs &in, int64_t i, Probe<float> &probe) {
+__device__ PosedGaussian<float> load_posed(const Camera &camera, const float *pose, const Inputs &in, int64_t i,
+                                           Probe<float> &probe) {
   const float *m = in.means + 3 * i, *q = in.quats + 4 * i, *s = in.scales + 3 * i;
   PosedGaussian<float> posed(pose, {m[0], m[1], m[2]}, {q[0], q[1], q[2], q[3]}, {s[0], s[1], s[2]}, in.opacities[i]);
   probe = {0.0f, 0.0f};

@@ -47,7 +47,8 @@ int64_t sort_bytes(int64_t count) {
   size_t bytes = 0;
   const uint32_t *keys = nullptr;
   const int32_t *values = nullptr;
-  cub::DeviceRadixSort::SortPairs(nullptr, bytes, keys, (uint32_t *)nullptr, values, (int32_t *)nullptr, int32_t(count));
+  cub::DeviceRadixSort::SortPairs(nullptr, bytes, keys, (uint32_t *)nullptr, values, (int32_t *)nullptr,
+                                  int32_t(count));
   return int64_t(bytes);
 }
 

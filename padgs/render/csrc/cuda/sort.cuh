@@ -9,7 +9,8 @@ namespace padgs {
 constexpr uint32_t kMostInstances = 0x7fffffffu;
 
 struct SaturatingSum {
-  PADGS_HD uint32_t operator()(uint32_t a, uint32_t b) const {  // of two that are not more than kMostInstances themselves
+  // Of two that are not more than kMostInstances themselves.
+  PADGS_HD uint32_t operator()(uint32_t a, uint32_t b) const {
     return a + b < kMostInstances ? a + b : kMostInstances;
   }
 };
