@@ -28,6 +28,11 @@ class EgoNeRFMethodOptions(EgoNeRFOptions, EgoNeRFTraining):
         """Check both parts."""
         EgoNeRFOptions.__post_init__(self)
         EgoNeRFTraining.__post_init__(self)
+        if self.environment_pretraining and not self.environment:
+            raise ValueError(
+                f"environment_pretraining is {self.environment_pretraining}, but environment is false; "
+                "change one of them"
+            )
 
 
 class EgoNeRFMethod:

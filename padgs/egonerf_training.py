@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -22,6 +23,8 @@ class EgoNeRFTraining:
     grid_rate: float = 0.02  # learning rates of Adam at the start
     network_rate: float = 1e-3  # bases and network
     environment_rate: float = 5e-3
+    environment_pretraining: int = 0  # iterations that teach it alone, first in the run; outdoor OmniBlender: 10 000
+    pretraining_rate: float = 0.02  # of the environment then; no rate falls before they are over
     rate_decay: float = 0.1  # all rates, and the weights of the variation, fall exponentially to this share
     density_variation: float = 0.1  # weight of the total variation of the density planes; 0 for none
     appearance_variation: float = 0.01
@@ -30,7 +33,9 @@ class EgoNeRFTraining:
         """Reject what nothing can be learned with."""
         if self.rays < 1:
             raise ValueError(f"rays is {self.rays}; it must be at least 1")
-        for name in ("grid_rate", "network_rate", "environment_rate", "rate_decay"):
+        if self.environment_pretraining < 0:
+            raise ValueError(f"environment_pretraining is {self.environment_pretraining}; it must be at least 0")
+        for name in ("grid_rate", "network_rate", "environment_rate", "pretraining_rate", "rate_decay"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be > 0")
         for name in ("density_variation", "appearance_variation"):
@@ -42,8 +47,18 @@ class TrainableEgoNeRF:
     """An EgoNeRF with the schedule of a run, as `padgs.ray_training.RayTrainer` wants it."""
 
     def __init__(self, model: EgoNeRF, options: EgoNeRFTraining, iterations: int) -> None:
-        """Tie together a model and its learning rates in a run of `iterations`."""
+        """Tie together a model and its learning rates in a run of `iterations`.
+
+        Raises:
+            ValueError: pretraining leaves no iteration for the rest.
+        """
         self.model, self._options, self._iterations = model, options, iterations
+        alone = options.environment_pretraining
+        if alone >= iterations:
+            raise ValueError(
+                f"environment_pretraining is {alone} of {iterations} iterations, which leaves none for the grids; "
+                "train longer, or lower it"
+            )
 
     @property
     def rays_at_once(self) -> int:
@@ -59,17 +74,25 @@ class TrainableEgoNeRF:
             ParameterGroup("shader", tuple(model.shader.parameters()), self._decaying(options.network_rate)),
         ]
         if model.environment is not None:
-            rate = self._decaying(options.environment_rate)
+            together = self._decaying(options.environment_rate)
+
+            def rate(iteration: int) -> float:
+                return options.pretraining_rate if self._pretrains(iteration) else together(iteration)
+
             groups.append(ParameterGroup("environment", tuple(model.environment.parameters()), rate))
         return groups
 
-    def colors(self, origins: Tensor, directions: Tensor, generator: torch.Generator) -> Tensor:
-        """Colours [B, 3] of rays in the world, with jittered samples."""
+    def colors(self, origins: Tensor, directions: Tensor, generator: torch.Generator, iteration: int) -> Tensor:
+        """Colours [B, 3] of rays in the world, with jittered samples; of the environment while it learns alone."""
+        if self.model.environment is not None and self._pretrains(iteration):
+            return self.model.environment(directions)
         return self.model.trace(self.model.from_world(origins), directions, generator).color
 
     def regularisation(self, iteration: int) -> Tensor | None:
         """Total variation of the planes, its weight falling like the learning rates."""
         options = self._options
+        if self._pretrains(iteration):
+            return None
         if options.density_variation == 0 and options.appearance_variation == 0:
             return None
         weighted = (
@@ -92,5 +115,11 @@ class TrainableEgoNeRF:
         """Take the parameters of a model of the same size and place."""
         self.model.load_state_dict(state.tensors)
 
-    def _decaying(self, rate: float) -> LogLinear:
-        return LogLinear(rate, rate * self._options.rate_decay, self._iterations)
+    def _pretrains(self, iteration: int) -> bool:
+        return 0 < iteration <= self._options.environment_pretraining
+
+    def _decaying(self, rate: float) -> Callable[[int], float]:
+        """Learning rate by iteration, from `rate` on once all learn."""
+        alone = self._options.environment_pretraining
+        fall = LogLinear(rate, rate * self._options.rate_decay, self._iterations - alone)
+        return lambda iteration: fall(iteration - alone)

@@ -24,7 +24,7 @@ class RayTrainable(Optimisable, Protocol):
         """How many rays may be traced before memory has to be given back; gradients add up over such passes."""
         ...
 
-    def colors(self, origins: Tensor, directions: Tensor, generator: torch.Generator) -> Tensor:
+    def colors(self, origins: Tensor, directions: Tensor, generator: torch.Generator, iteration: int) -> Tensor:
         """Colours [B, 3], differentiable, of rays from [B, 3] float64 in unit directions [B, 3], both world."""
         ...
 
@@ -81,7 +81,7 @@ class RayTrainer(TrainingLoop):
         value = rays.weight.new_zeros((), dtype=torch.float64)
         total = 3 * rays.weight.sum()
         for part in torch.arange(self._rays, device=total.device).split(self._tracer.rays_at_once):
-            image = self._tracer.colors(rays.origins[part], rays.directions[part], self._generator)
+            image = self._tracer.colors(rays.origins[part], rays.directions[part], self._generator, iteration)
             error = (image - rays.color[part]).square() * rays.weight[part, None]
             loss = error.sum() / total
             value += loss.detach()

@@ -22,7 +22,7 @@ class Flat:
     def groups(self) -> list[ParameterGroup]:
         return [ParameterGroup("color", (self.color,), Constant(1e-2))]
 
-    def colors(self, origins: Tensor, directions: Tensor, generator: torch.Generator) -> Tensor:
+    def colors(self, origins: Tensor, directions: Tensor, generator: torch.Generator, iteration: int) -> Tensor:
         self.passes.append(len(origins))
         return self.color.expand(len(origins), 3)
 
@@ -112,7 +112,7 @@ def test_a_state_of_other_data_is_refused():
 
 def test_what_is_not_finite_is_named():
     class Broken(Flat):
-        def colors(self, origins: Tensor, directions: Tensor, generator: torch.Generator) -> Tensor:
+        def colors(self, origins: Tensor, directions: Tensor, generator: torch.Generator, iteration: int) -> Tensor:
             return super().colors(origins, directions, generator) / torch.zeros(())
 
     with pytest.raises(Failure, match=r"image\[0, 0\] is inf at iteration 1") as caught:

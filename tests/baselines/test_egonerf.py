@@ -163,6 +163,45 @@ def test_adam_gets_the_published_betas_and_rates_that_fall_to_a_tenth():
     assert [rate / 5e-3 for _, rate in rates] == pytest.approx(expected)
 
 
+def test_the_environment_can_learn_alone_first():
+    """As published for outdoor OmniBlender: at a rate of its own, while nothing else moves and no rate falls."""
+    trained = method(environment_pretraining=3)
+    records, moved, rates = trained.fit(tiny_scene(), Budget(7)), [], []
+    before = {name: value.clone() for name, value in EgoNeRF.from_scene(tiny_scene(), SMALL).named_parameters()}
+    for _ in records:
+        now = dict(trained._trained().named_parameters())
+        moved.append({name for name, value in now.items() if not torch.equal(value, before[name])})
+        rates.append([group["lr"] for group in trained._trainer._optimizer.param_groups][::3])  # density, environment
+        before = {name: value.clone() for name, value in now.items()}
+    assert moved[:3] == 3 * [{"environment.emission"}]
+    assert all(names == before.keys() for names in moved[3:])
+    assert [environment for _, environment in rates[:3]] == 3 * [0.02]
+    expected = [0.1 ** (iteration / 4) for iteration in range(1, 5)]
+    assert [density / 0.02 for density, _ in rates[3:]] == pytest.approx(expected)
+    assert [environment / 5e-3 for _, environment in rates[3:]] == pytest.approx(expected)
+
+
+def test_alone_the_environment_becomes_the_mean_panorama(room):
+    trained = method(environment_pretraining=200, environment_height=8)
+    records = trained.fit(room, Budget(201))
+    losses = [next(records).loss for _ in range(200)]
+    assert sum(losses[-10:]) < 0.7 * sum(losses[:10])
+    views = torch.cat([view.image().view(-1, 3) for view in room.train])
+    directions = torch.cat([(view.camera.rays().reshape(-1, 3) @ view.cam_from_world[:3, :3]) for view in room.train])
+    up = directions[:, 2] > 0.7  # a patch of sky that all views see
+    learned = trained._trained().environment(directions[up].float()).mean(0)
+    assert torch.allclose(learned, views[up].mean(0), atol=0.05)
+
+
+def test_pretraining_needs_an_environment_and_leaves_iterations():
+    with pytest.raises(ValueError, match="environment_pretraining is 5 of 5 iterations, which leaves none for the g"):
+        list(method(environment_pretraining=5).fit(tiny_scene(), Budget(5)))
+    with pytest.raises(ValueError, match="environment_pretraining is 2, but environment is false"):
+        method(environment_pretraining=2, environment=False)
+    with pytest.raises(ValueError, match="environment_pretraining is -1; it must be at least 0"):
+        method(environment_pretraining=-1)
+
+
 def test_published_weights_of_the_variation_fall_like_the_rates():
     model = EgoNeRF.from_scene(tiny_scene(), SMALL)
     with torch.no_grad():
@@ -179,3 +218,4 @@ def test_the_setting_trains_as_published():
     options = composed("method=egonerf").options
     assert (options.rays, options.grid_rate, options.network_rate, options.environment_rate) == (4096, 0.02, 1e-3, 5e-3)
     assert (options.rate_decay, options.density_variation, options.appearance_variation) == (0.1, 0.1, 0.01)
+    assert (options.environment_pretraining, options.pretraining_rate) == (0, 0.02)
