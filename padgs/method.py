@@ -13,6 +13,7 @@ from typing import Any, Protocol
 from torch import Tensor
 
 from padgs.render import Rendering, RenderOptions
+from padgs.render.contract import CORE_SIZE
 from padgs.scene import Scene, View
 
 NEAR_UNITS = ("scene", "world")
@@ -35,7 +36,7 @@ class RenderConfig:
     cubemap: bool = False  # through six perspective faces, for the projections pinhole, tangent and ray
     face_size: int | None = None  # pixels; None: as fine as the panorama
     blending: str = "sorted"
-    core_size: int = 16  # of blending hybrid
+    core_size: int = CORE_SIZE  # of blending hybrid
     memory_cap: int | None = None  # bytes; with bounds square, where the published code would run out of memory
 
     def __post_init__(self) -> None:

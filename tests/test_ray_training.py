@@ -113,7 +113,7 @@ def test_a_state_of_other_data_is_refused():
 def test_what_is_not_finite_is_named():
     class Broken(Flat):
         def colors(self, origins: Tensor, directions: Tensor, generator: torch.Generator, iteration: int) -> Tensor:
-            return super().colors(origins, directions, generator) / torch.zeros(())
+            return super().colors(origins, directions, generator, iteration) / torch.zeros(())
 
     with pytest.raises(Failure, match=r"image\[0, 0\] is inf at iteration 1") as caught:
         list(trainer(Broken(), 5).records())

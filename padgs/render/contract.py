@@ -73,7 +73,7 @@ class RenderOptions:
         if self.core_size != CORE_SIZE and self.blending != "hybrid":
             raise ValueError(
                 f"core_size is {self.core_size}, but blending={self.blending} keeps no core; set blending=hybrid, "
-                "or leave it"
+                f"or leave it at {CORE_SIZE}"
             )
         if self.bounds == "square" and self.wrap:
             raise ValueError("bounds=square are the published bounds, which end at the seam; set wrap=false with them")

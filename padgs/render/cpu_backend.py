@@ -87,9 +87,12 @@ class _Cores:
     start: Tensor  # [tiles + 1] int64
 
     @staticmethod
-    def of(strip: Strip, options: RenderOptions) -> _Cores:
-        words = native.library().padgs_core_words(ctypes.byref(strip.grid), options.core_size)
+    def of(strip: Strip, arguments: native.BlendArguments) -> _Cores:
+        words = native.library().padgs_core_words(ctypes.byref(arguments))
         return _Cores(torch.empty(words, dtype=torch.int32), torch.zeros(strip.tiles + 1, dtype=torch.int64))
+
+    def join(self, arguments: native.BlendArguments) -> None:
+        arguments.cores, arguments.core_start = pointer(self.words), pointer(self.start)
 
 
 class _Rasterize(torch.autograd.Function):
@@ -121,13 +124,13 @@ class _Rasterize(torch.autograd.Function):
         buffers = _Buffers.of_size(camera.width, camera.height)
         pairs = torch.zeros(2, dtype=torch.int64)
         kept = options.blending == "hybrid" and grad_enabled and any(ctx.needs_input_grad)
-        ctx.cores = []  # of each strip
+        ctx.cores = []  # of each strip where they are kept
         for strip in projected.strips():
             pair_counts = torch.empty(strip.tiles, 2, dtype=torch.int64)
-            ctx.cores.append(_Cores.of(strip, options) if kept else None)
-            arguments = _blend_arguments(
-                native_cam, options, projected, strip, rays, background, buffers, ctx.cores[-1], pair_counts
-            )
+            arguments = _blend_arguments(native_cam, options, projected, strip, rays, background, buffers, pair_counts)
+            if kept:
+                ctx.cores.append(_Cores.of(strip, arguments))
+                ctx.cores[-1].join(arguments)
             native.library().padgs_blend_forward(ctypes.byref(arguments))
             pairs += pair_counts.sum(0)
         visible = projected.boxes[:, 3] < projected.boxes[:, 4]
@@ -156,10 +159,12 @@ class _Rasterize(torch.autograd.Function):
         grad_rays = torch.zeros_like(ctx.rays.table) if needs_rays else None
         count = len(tensors[0])
         totals = torch.zeros(count, MOMENTS)
-        for strip, cores in zip(projected.strips(), ctx.cores, strict=True):
+        for number, strip in enumerate(projected.strips()):
             forward = _blend_arguments(
-                ctx.native_cam, ctx.options, projected, strip, ctx.rays, background, buffers, cores
+                ctx.native_cam, ctx.options, projected, strip, ctx.rays, background, buffers, None
             )
+            if ctx.cores:
+                ctx.cores[number].join(forward)
             moments = torch.empty(len(strip.instances), MOMENTS)
             arguments = native.BlendGradientArguments(
                 forward, *map(pointer, upstream), pointer(moments), pointer(grad_rays), needs_absolute
@@ -189,13 +194,12 @@ class _Rasterize(torch.autograd.Function):
 
 
 def _blend_arguments(
-    camera, options, projected, strip, rays, background, buffers, cores: _Cores | None, pair_counts=None
+    camera, options, projected, strip, rays, background, buffers, pair_counts
 ) -> native.BlendArguments:
     """Arguments of both blending passes; the tensors must outlive the call."""
     lists = (projected.footprints, strip.tile_start, strip.instances, background)
     outputs = (buffers.image, buffers.transmittance, buffers.depth, buffers.last, pair_counts)
-    kept = (cores.words, cores.start) if cores else (None, None)
     core_size = options.core_size if options.blending == "hybrid" else 0
     return native.BlendArguments(
-        strip.grid, camera.projection, camera.wrap, core_size, rays.native(), *map(pointer, (*lists, *outputs, *kept))
+        strip.grid, camera.projection, camera.wrap, core_size, rays.native(), *map(pointer, (*lists, *outputs))
     )

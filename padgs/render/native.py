@@ -144,7 +144,7 @@ SIGNATURES = {
     "padgs_count_instances": ([Pointer, Int64, Pointer, Int32, Pointer], None),
     "padgs_bin": ([Pointer, Int64, Pointer, Int64, *[Pointer] * 4], None),
     "padgs_sum_moments": ([Pointer, Pointer, Int64, Pointer], None),
-    "padgs_core_words": ([Pointer, Int32], Int64),
+    "padgs_core_words": ([Pointer], Int64),
     "padgs_blend_forward": ([Pointer], None),
     "padgs_blend_backward": ([Pointer], None),
     "padgs_decode_select": ([Pointer], None),

@@ -134,7 +134,7 @@ def test_unknown_projections_list_the_known_ones(backend: str, dtype: torch.dtyp
         ({"projection": "ray", "wrap": False}, "projection 'ray' knows of no seam that wrap=false could cut; set wrap"),
         ({"projection": "tangent", "wrap": False}, "projection 'tangent' knows of no seam"),
         ({"projection": "ray", "face_size": 64}, "face_size is 64, but only a cubemap has faces; set cubemap=true"),
-        ({"core_size": 8}, "core_size is 8, but blending=sorted keeps no core; set blending=hybrid, or leave it"),
+        ({"core_size": 8}, "core_size is 8, but blending=sorted keeps no core; set blending=hybrid, or leave it at 16"),
         ({"memory_cap": 0, "bounds": "square", "wrap": False}, "memory_cap is 0; it must be at least 1 byte"),
     ],
 )

@@ -90,9 +90,8 @@ PADGS_API void padgs_blend_backward(const BlendGradientArguments *args) {
   blending(args->forward.core_size).backward(*args);
 }
 
-PADGS_API int64_t padgs_core_words(const TileGrid *grid, int32_t core_size) {
-  return kernels().hybrid.core_words(*grid, core_size);
-}
+// For `cores` of the same arguments, where no outputs are needed yet.
+PADGS_API int64_t padgs_core_words(const BlendArguments *args) { return kernels().hybrid.core_words(*args); }
 
 PADGS_API double padgs_photometric_loss(const LossArguments *args) { return kernels().loss.photometric(*args); }
 

@@ -226,13 +226,13 @@ Upstream differentiate_patch(const BlendGradientArguments &args, const Tile &til
   Vec left = splat(1.0f), coverage = zero();
   core.resize(kept.rows);
   const auto footprint_at = [&](int k) {
-    return forward.footprints + forward.instances[tile.first + kept.positions[kept.row[k].entrant]].gaussian;
+    return forward.footprints + forward.instances[tile.first + kept.positions[entrant_of(kept.row[k])]].gaussian;
   };
   for (int k = 0; k < kept.rows; ++k) {
     if (k + kAhead < kept.rows) __builtin_prefetch(footprint_at(k + kAhead));
     const Footprint &footprint = *footprint_at(k);
     const typename Seen::At at = Seen(footprint, forward, tile).at(place);
-    const Vec alpha = keep(lanes_of(kept.row[k].lanes), minimum(exp2_fast(at.log2_alpha), splat(kAlphaMax)));
+    const Vec alpha = keep(lanes_of(lanes_bits_of(kept.row[k])), minimum(exp2_fast(at.log2_alpha), splat(kAlphaMax)));
     const Vec weight = alpha * left;
     core[k] = {alpha, left, &footprint};
     coverage += weight;
@@ -252,8 +252,8 @@ Upstream differentiate_patch(const BlendGradientArguments &args, const Tile &til
   Vec behind = up.unit * tail.alpha * up.mean + left * tail.left * load(through);
   for (int k = kept.rows - 1; k >= 0; --k) {
     const Fragment &fragment = core[k];
-    const Mask filled = lanes_of(kept.row[k].lanes);
-    Layer &layer = layers[kept.row[k].entrant];
+    const Mask filled = lanes_of(lanes_bits_of(kept.row[k]));
+    Layer &layer = layers[entrant_of(kept.row[k])];
     layer.front = select(filled, fragment.front, layer.front);
     layer.behind = select(filled, behind, layer.behind);
     const Footprint &c = *fragment.footprint;

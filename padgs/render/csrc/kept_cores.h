@@ -4,28 +4,38 @@
 // positions of the entrants in the tile's list, rows from front to back. Alphas are cheaper to evaluate than to keep.
 #pragma once
 
+#include <algorithm>
 #include <cstring>
 #include <vector>
 
 #include "fragments.h"
+#include "tiles.h"
 
 namespace padgs {
 namespace PADGS_ISA {
 
-// A row of the core (fragments.h) without its alphas.
-struct KeptRow {
-  uint16_t entrant;
-  uint16_t lanes;  // a bit for each pixel that has a fragment in it
-};
 constexpr int kTailWords = 6 * kLanes, kHeaderWords = kTailWords + 2;
 static_assert(sizeof(Tail) == kTailWords * sizeof(float), "a tail is its sums");
+
+// A row of the core (fragments.h) without its alphas: the entrant, and a bit for each pixel that has a fragment in it.
+inline int32_t kept_row(int entrant, uint32_t lanes) { return int32_t(uint32_t(entrant) << kLanes | lanes); }
+inline int entrant_of(int32_t row) { return int(uint32_t(row) >> kLanes); }
+inline uint32_t lanes_bits_of(int32_t row) { return uint32_t(row) & ((1u << kLanes) - 1); }
 static_assert(kLanes * kMaxCoreSize <= 1 << 16, "entrants are numbered by 16 bits; each has a row of its own");
 
-// The most that the records of an image can need: as if every fragment in the core of a pixel were of another instance.
-inline int64_t core_words(const TileGrid &grid, int core_size) {
-  const int64_t columns = (grid.width + kPatchWidth - 1) / kPatchWidth;
-  const int64_t rows = int64_t(grid.end_row - grid.first_row) * (kTile / kPatchHeight);
-  return columns * rows * (kHeaderWords + 2 * kLanes * int64_t(core_size));
+// The most words that the records of the drawn tiles can need: every fragment in a core may be in a row of its own, and
+// no instance is in more rows than a patch has pixels.
+inline int64_t core_words(const BlendArguments &args) {
+  int64_t words = 0;
+  for (int row = args.grid.first_row; row < args.grid.end_row; ++row) {
+    const int64_t *start = args.grid.row_start + (row - args.grid.first_row);
+    for (int64_t index = start[0]; index < start[1]; ++index) {
+      const Tile tile = tile_at(args, row, index);
+      const int64_t instances = tile.end - tile.first, most = int64_t(kLanes) * args.core_size;
+      words += tile.patches() * (kHeaderWords + std::min(most, instances) + std::min(most, kLanes * instances));
+    }
+  }
+  return words;
 }
 
 // Adds the record of a patch. Entrants that others have pushed out of all cores are not in it.
@@ -47,8 +57,7 @@ inline void keep_patch(const Fragments &fragments, std::vector<int32_t> &words) 
   header[kTailWords] = rows, header[kTailWords + 1] = entrants;
   for (int k = 0; k < rows; ++k) {
     const Row &row = fragments.rows[k + 1];
-    const KeptRow kept = {uint16_t(numbers[row.entrant]), uint16_t(bits(less(zero(), row.alpha)))};
-    std::memcpy(positions + entrants + k, &kept, sizeof kept);
+    positions[entrants + k] = kept_row(numbers[row.entrant], bits(less(zero(), row.alpha)));
   }
   words.resize(start + kHeaderWords + entrants + rows);
 }
@@ -58,15 +67,15 @@ struct KeptPatch {
   Tail tail;
   int rows, entrants;
   const int32_t *positions;  // of the entrants, ascending
-  const KeptRow *row;        // from front to back
+  const int32_t *row;        // from front to back; see kept_row
 
   // Reads the record at `words`, and moves on to the next.
   explicit KeptPatch(const int32_t *&words) {
     std::memcpy(static_cast<void *>(&tail), words, sizeof tail);
     rows = words[kTailWords], entrants = words[kTailWords + 1];
     positions = words + kHeaderWords;
-    row = reinterpret_cast<const KeptRow *>(positions + entrants);
-    words = positions + entrants + rows;
+    row = positions + entrants;
+    words = row + rows;
   }
 };
 

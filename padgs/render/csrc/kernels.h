@@ -16,7 +16,7 @@ struct BlendKernels {
 };
 
 struct HybridKernels : BlendKernels {
-  int64_t (*core_words)(const TileGrid &, int core_size);  // the most that forward can leave to backward
+  int64_t (*core_words)(const BlendArguments &);  // the most that forward can leave to backward
 };
 
 struct LossKernels {
