@@ -67,9 +67,10 @@ def _block(block: Block, table: Table) -> list[str]:
     title = f"\\multicolumn{{{len(table.columns) + 1}}}{{l}}{{\\emph{{{escaped(block.title)}}}}}"
     lines = [r"    \midrule", _line([title])]
     for number, row in enumerate(block.rows):
-        cells = [escaped(row.title)]
-        for index, (cell, column) in enumerate(zip(row.cells, table.columns, strict=True)):
-            shown, rank = _number(cell.text(column)), ranks[index].get(number)
+        title, *texts = row.texts(table.columns)
+        cells = [escaped(title)]
+        for words, ranked in zip(texts, ranks, strict=True):
+            shown, rank = _number(words), ranked.get(number)
             command = None if rank is None else "textbf" if rank == BEST else "underline"
             cells.append(shown if command is None else f"\\{command}{{{shown}}}")
         lines.append(_line(cells))

@@ -24,13 +24,14 @@ def _block(table: Table, block: Block) -> str:
         _line(["---", *("---:" for _ in table.columns)]),
     ]
     for number, row in enumerate(block.rows):
-        cells = []
-        for index, (cell, column) in enumerate(zip(row.cells, table.columns, strict=True)):
-            shown = _escaped(cell.text(column))
-            rank = ranks[index].get(number)
-            cells.append(shown if rank is None else f"**{shown}**" if rank == BEST else f"<ins>{shown}</ins>")
-        lines.append(_line([_escaped(row.title), *cells]))
+        title, *shown = map(_escaped, row.texts(table.columns))
+        marked = [_marked(words, rank.get(number)) for words, rank in zip(shown, ranks, strict=True)]
+        lines.append(_line([title, *marked]))
     return "\n".join(lines)
+
+
+def _marked(words: str, rank: str | None) -> str:
+    return words if rank is None else f"**{words}**" if rank == BEST else f"<ins>{words}</ins>"
 
 
 def _line(cells: list[str]) -> str:

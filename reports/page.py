@@ -93,16 +93,15 @@ def _block(table: Table) -> dict[str, Any]:
 
 def _rows(table: Table, block: Block) -> list[dict[str, Any]]:
     ranks = [emphasis(block, index, table.columns) for index in range(len(table.columns))]
-    return [
-        {
-            "title": row.title,
-            "cells": [
-                {"text": cell.text(column), "sort": _sort(cell), "mark": _mark(rank.get(number))}
-                for cell, column, rank in zip(row.cells, table.columns, ranks, strict=True)
-            ],
-        }
-        for number, row in enumerate(block.rows)
-    ]
+    rows = []
+    for number, row in enumerate(block.rows):
+        title, *texts = row.texts(table.columns)
+        cells = [
+            {"text": words, "sort": _sort(cell), "mark": _mark(rank.get(number))}
+            for words, cell, rank in zip(texts, row.cells, ranks, strict=True)
+        ]
+        rows.append({"title": title, "cells": cells})
+    return rows
 
 
 def _sort(cell: Cell) -> str:

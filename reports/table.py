@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 MISSING = "–"
@@ -38,8 +39,8 @@ class Cell:
     count: int = 1
     status: str = ""  # of failed runs: oom, nan, ...
 
-    def text(self, column: Column) -> str:
-        """What stands in the cell, without emphasis.
+    def text(self, column: Column, *, counted: bool = True) -> str:
+        """What stands in the cell, without emphasis; `counted`: with the number of seeds.
 
         >>> Cell(26.018, 0.04, 5).text(Column("PSNR", 2)), Cell(status="oom").text(Column("PSNR", 2))
         ('26.02 ± 0.04 (n=5)', 'OOM')
@@ -48,7 +49,7 @@ class Cell:
             return self.status.upper() or MISSING
         text = shown(self.value, column)
         if self.std is not None:
-            text += f" ± {self.std:.{column.decimals}f} (n={self.count})"
+            text += f" ± {self.std:.{column.decimals}f}" + (f" (n={self.count})" if counted else "")
         return text + (f" [{self.status.upper()}]" if self.status else "")
 
 
@@ -58,6 +59,17 @@ class Row:
 
     title: str
     cells: tuple[Cell, ...]
+
+    def texts(self, columns: Sequence[Column]) -> list[str]:
+        """The title and the cells as they stand; the number of seeds is said once where all spreads are over as many.
+
+        >>> Row("PaD-GS", (Cell(26.018, 0.04, 5), Cell(0.8, 0.01, 5))).texts([Column("PSNR", 2), Column("SSIM", 3)])
+        ['PaD-GS (n=5)', '26.02 ± 0.04', '0.800 ± 0.010']
+        """
+        counts = {cell.count for cell in self.cells if cell.std is not None}
+        title = f"{self.title} (n={min(counts)})" if len(counts) == 1 else self.title
+        cells = zip(self.cells, columns, strict=True)
+        return [title, *(cell.text(column, counted=len(counts) > 1) for cell, column in cells)]
 
 
 @dataclass(frozen=True)

@@ -54,7 +54,14 @@ def test_without_any_result_the_published_numbers_remain():
 
 def test_seeds_are_averaged_with_their_spread():
     rows = lines([result("full", psnr=23.0, seed=0), result("full", psnr=24.0, seed=1)])
-    assert rows[3][4] == "23.50 ± 0.71 (n=2)"
+    assert rows[3][0].endswith(" (n=2)") and rows[3][4] == "23.50 ± 0.71"
+
+
+def test_numbers_of_seeds_that_differ_stand_in_the_cells():
+    kept = [result("full", psnr=psnr, seed=seed) for seed, psnr in enumerate((23.0, 24.0, 25.0))]
+    kept[2].scores["paper"].metrics.pop("ssim")
+    row = lines(kept)[3]
+    assert "n=" not in row[0] and row[4] == "24.00 ± 1.00 (n=3)" and row[1].endswith("(n=2)")
 
 
 def test_a_seed_that_failed_is_not_hidden():
