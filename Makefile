@@ -1,7 +1,7 @@
 # Everything runs in .venv, which is made on first use; delete it to start over.
 PYTHON ?= python3
 BIN := .venv/bin
-SOURCES := pyproject.toml constraints.txt requirements-nodeps.txt CMakeLists.txt $(wildcard padgs/render/csrc/* padgs/render/csrc/cuda/*)
+SOURCES := pyproject.toml constraints.txt requirements-nodeps.txt CMakeLists.txt $(wildcard padgs/native/csrc/* padgs/native/csrc/*/*)
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
 .PHONY: run test test-all lint bench

@@ -1,7 +1,7 @@
-"""The methods that are compared, one file each; `padgs.method.Method` is what they have in common."""
+"""The methods that are compared, one file each; `padgs.learning.method.Method` is what they have in common."""
 
 METHODS = {
-    "padgs": "baselines.padgs:PaDGSMethod",
+    "padgs": "padgs.anchors.method:PaDGSMethod",
     "omnigs": "baselines.omnigs:OmniGSMethod",
     "odgs": "baselines.odgs:ODGSMethod",
     "op43dgs": "baselines.op43dgs:OP43DGSMethod",

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from baselines.cubemap_3dgs import Cubemap3DGSMethod
-from padgs.camera import Panorama, Pinhole
-from padgs.perspectives import looking_at, square_lens
-from padgs.splat_method import SplatOptions
+from padgs.data.perspectives import looking_at, square_lens
+from padgs.sphere.camera import Panorama, Pinhole
+from padgs.splats.method import SplatOptions
 
 GOLDEN = (1 + math.sqrt(5)) / 2
 ICOSAHEDRON = [
@@ -41,7 +41,7 @@ class Crops3DGSOptions(SplatOptions):
 
 
 class Crops3DGSMethod(Cubemap3DGSMethod):
-    """See `padgs.method.Method`."""
+    """See `padgs.learning.method.Method`."""
 
     Options = Crops3DGSOptions
 

@@ -10,16 +10,16 @@ from collections.abc import Iterator
 
 from torch import Tensor
 
-from padgs.camera import Panorama, Pinhole
-from padgs.method import Budget, Record, RenderConfig
-from padgs.perspectives import perspective_scene, square_lens
+from padgs.data.perspectives import perspective_scene, square_lens
+from padgs.learning.method import Budget, Record, RenderConfig
 from padgs.render.cubemap import FACES
 from padgs.scene import Scene
-from padgs.splat_method import SplatMethod, refuse_polar_threshold
+from padgs.sphere.camera import Panorama, Pinhole
+from padgs.splats.method import SplatMethod, refuse_polar_threshold
 
 
 class Cubemap3DGSMethod(SplatMethod):
-    """See `padgs.method.Method`."""
+    """See `padgs.learning.method.Method`."""
 
     RENDER = RenderConfig(projection="pinhole", cubemap=True)
 

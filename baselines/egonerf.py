@@ -9,13 +9,13 @@ import torch
 
 from padgs.egonerf.model import EgoNeRF
 from padgs.egonerf.options import EgoNeRFOptions
-from padgs.egonerf_training import EgoNeRFTraining, TrainableEgoNeRF
-from padgs.method import Budget, Record, RenderConfig, Size, State
-from padgs.ray_training import RayTrainer
+from padgs.egonerf.trainee import EgoNeRFTraining, TrainableEgoNeRF
+from padgs.learning.loop import model_state
+from padgs.learning.method import Budget, Record, RenderConfig, Size, State
+from padgs.learning.rays import RayTrainer
+from padgs.learning.views import TrainOptions
 from padgs.render import Rendering
 from padgs.scene import Scene, View
-from padgs.train import TrainOptions
-from padgs.training_loop import model_state
 
 BACKENDS = ("auto", "torch")
 
@@ -36,7 +36,7 @@ class EgoNeRFMethodOptions(EgoNeRFOptions, EgoNeRFTraining):
 
 
 class EgoNeRFMethod:
-    """See `padgs.method.Method`."""
+    """See `padgs.learning.method.Method`."""
 
     Options = EgoNeRFMethodOptions
 

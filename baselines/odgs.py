@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from padgs.splat_method import SplatMethod, SplatOptions
+from padgs.splats.method import SplatMethod, SplatOptions
 
 
 @dataclass(frozen=True)
@@ -20,6 +20,6 @@ class ODGSOptions(SplatOptions):
 
 
 class ODGSMethod(SplatMethod):
-    """See `padgs.method.Method`."""
+    """See `padgs.learning.method.Method`."""
 
     Options = ODGSOptions

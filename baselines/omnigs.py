@@ -6,8 +6,8 @@ conf/method/omnigs_release.yaml switches on what its released code does otherwis
 
 from __future__ import annotations
 
-from padgs.splat_method import SplatMethod
+from padgs.splats.method import SplatMethod
 
 
 class OmniGSMethod(SplatMethod):
-    """See `padgs.method.Method`."""
+    """See `padgs.learning.method.Method`."""

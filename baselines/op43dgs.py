@@ -6,11 +6,11 @@ code, which grow with the distance of a Gaussian in scene units, and the memory 
 
 from __future__ import annotations
 
-from padgs.method import RenderConfig
-from padgs.splat_method import SplatMethod
+from padgs.learning.method import RenderConfig
+from padgs.splats.method import SplatMethod
 
 
 class OP43DGSMethod(SplatMethod):
-    """See `padgs.method.Method`."""
+    """See `padgs.learning.method.Method`."""
 
     RENDER = RenderConfig(projection="tangent")

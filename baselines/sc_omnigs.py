@@ -14,20 +14,20 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from padgs.calibrated_splats import CalibratedMethod, CalibratedSplats
-from padgs.camera_map import CameraMap
-from padgs.data.align import Difference, Similarity, align
-from padgs.loss import pixel_weight
-from padgs.method import Budget, Record, State
-from padgs.panorama import sample_pixels
-from padgs.pose_refinement import PoseRates, PoseRefinement
+from padgs.calibration.align import Difference, Similarity, align
+from padgs.calibration.camera_map import CameraMap
+from padgs.calibration.poses import PoseRates, PoseRefinement
+from padgs.calibration.splats import CalibratedMethod, CalibratedSplats
+from padgs.learning.loss import pixel_weight
+from padgs.learning.method import Budget, Record, State
+from padgs.learning.schedule import Constant, ParameterGroup
+from padgs.learning.targets import Target
+from padgs.learning.views import Drawing, TrainOptions
 from padgs.render import Rendering
 from padgs.scene import Scene, View
-from padgs.schedule import Constant, ParameterGroup
-from padgs.splat_method import SplatOptions
-from padgs.splat_training import stands_still
-from padgs.targets import Target
-from padgs.train import Drawing, TrainOptions
+from padgs.sphere.panorama import sample_pixels
+from padgs.splats.method import SplatOptions
+from padgs.splats.trainee import stands_still
 
 
 @dataclass(frozen=True)
@@ -52,10 +52,10 @@ class SCOmniGSOptions(SplatOptions):
 
 
 class SelfCalibration(nn.Module):
-    """Poses of all training views and the one camera that took them; see `padgs.calibrated_splats.Calibration`."""
+    """Poses of all training views and the one camera that took them; see `padgs.calibration.splats.Calibration`."""
 
     def __init__(self, poses: PoseRefinement, camera: CameraMap, options: SCOmniGSOptions, weight: str) -> None:
-        """Start from the given poses and an ideal camera; `weight` is a name of `padgs.loss.ROW_WEIGHTS`."""
+        """Start from the given poses and an ideal camera; `weight` is a name of `padgs.learning.loss.ROW_WEIGHTS`."""
         super().__init__()
         self.poses, self.camera = poses, camera
         self._options, self._weight = options, weight
@@ -107,7 +107,7 @@ class SelfCalibration(nn.Module):
 
 
 class SCOmniGSMethod(CalibratedMethod):
-    """See `padgs.method.Method`.
+    """See `padgs.learning.method.Method`.
 
     Held-out views: their poses are given in the world of the given training poses, the model lives in that of the
     refined ones. The similarity that maps the former cameras onto the latter takes each view across; no pixel of a

@@ -9,11 +9,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from padgs.calibrated_splats import CalibratedMethod
-from padgs.dual_lens import DualLens
-from padgs.method import RenderConfig
+from padgs.calibration.dual_lens import DualLens
+from padgs.calibration.splats import CalibratedMethod
+from padgs.learning.method import RenderConfig
 from padgs.scene import Scene
-from padgs.splat_method import SplatOptions, refuse_polar_threshold
+from padgs.splats.method import SplatOptions, refuse_polar_threshold
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,8 @@ class Seam360GSOptions(SplatOptions):
 
 
 class Seam360GSMethod(CalibratedMethod):
-    """See `padgs.method.Method`. Trained through `DualLens`; `render` is the ideal camera, one centre and no seam.
+    """See `padgs.learning.method.Method`. Trained through `DualLens`; `render` is the ideal camera, one centre and no
+    seam.
 
     Lenses see along rays of their own, which the projection erp cannot draw; it ends as rejected.
     """

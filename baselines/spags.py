@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from padgs.method import RenderConfig
-from padgs.splat_method import SplatMethod, SplatOptions
+from padgs.learning.method import RenderConfig
+from padgs.splats.method import SplatMethod, SplatOptions
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class SPaGSOptions(SplatOptions):
 
 
 class SPaGSMethod(SplatMethod):
-    """See `padgs.method.Method`."""
+    """See `padgs.learning.method.Method`."""
 
     Options = SPaGSOptions
     RENDER = RenderConfig(projection="ray", near_cull="ellipsoid", low_pass=0.2, blending="hybrid", core_size=16)

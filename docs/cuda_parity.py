@@ -2,7 +2,7 @@
 
     python docs/cuda_parity.py
 
-Runs on the GPU where there is one, else the same kernels on the CPU (tests/render/emulation.h), and says which.
+Runs on the GPU where there is one, else the same kernels on the CPU (tests/render/cuda/emulation.h), and says which.
 """
 
 from __future__ import annotations
@@ -12,7 +12,9 @@ from pathlib import Path
 
 import torch
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "render"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests/render"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests/render/cuda"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests/render/backends"))
 
 import cuda_engine
 from render_cases import SETUPS, blended, camera_of, gaussians_of, identity_pose, random_pose, row_error, stable_pixels

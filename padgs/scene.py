@@ -12,7 +12,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from padgs.camera import Camera, Panorama
+from padgs.sphere.camera import Camera, Panorama
 
 
 @dataclass(frozen=True)

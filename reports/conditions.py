@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from padgs.results import Result
 from reports.request import Request
-from reports.table import ReportError
+from reports.tables.table import ReportError
 
 Condition = Callable[[Result, str], "str | None"]  # of a result and a protocol; None contradicts nothing
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import partial
 
-from reports import csv_text, latex, markdown, page, sweeps, trade_off
-from reports.drawing import Chart
+from reports.charts import sweeps, trade_off
+from reports.charts.drawing import Chart
 from reports.gathered import Gathered
+from reports.page import page
+from reports.writers import csv_text, latex, markdown
 
 File = tuple[str, bytes]  # name, content
 WRITERS = {"md": markdown.text, "tex": latex.text, "csv": csv_text.text}

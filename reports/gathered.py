@@ -8,14 +8,15 @@ from functools import cached_property
 from pathlib import Path
 
 from padgs.results import Result
-from reports import ladder, quirks, runs, side_by_side, sweep_chart, table3, tables_of_methods, trade_off_chart
-from reports.drawing import Chart
+from reports.charts import sweep_chart, trade_off_chart
+from reports.charts.drawing import Chart
+from reports.charts.sweeps import Sweep, sweeps
+from reports.charts.trade_off import TradeOff, trade_offs
 from reports.measures import marks
 from reports.quality_log import probes
 from reports.request import Request, admitted
-from reports.sweeps import Sweep, sweeps
-from reports.table import Table
-from reports.trade_off import TradeOff, trade_offs
+from reports.tables import ladder, quirks, runs, side_by_side, table3, tables_of_methods
+from reports.tables.table import Table
 
 TABLES: Mapping[str, Callable[[Sequence[Result], Request], Table]] = {
     "table1": tables_of_methods.table1,

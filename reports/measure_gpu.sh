@@ -22,7 +22,7 @@ $python -m pytest -q -m cuda tests/render --junitxml="$build/tests.xml" || echo 
 sanitizer=not-run
 if command -v compute-sanitizer >/dev/null; then
   if timeout 300 compute-sanitizer --tool memcheck --error-exitcode 99 \
-    $python -m pytest -q -x -m cuda tests/render/test_cuda_backend.py tests/render/test_cuda_loss.py >"$build/sanitizer.log" 2>&1
+    $python -m pytest -q -x -m cuda tests/render/cuda/test_cuda_backend.py tests/render/cuda/test_cuda_loss.py >"$build/sanitizer.log" 2>&1
   then sanitizer=passed; else sanitizer="failed ($?)"; fi
   tail -n 3 "$build/sanitizer.log"
 fi

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from padgs.results import Result
 from reports import published
 from reports.metrics import PAPER_METRICS, PROTOCOL_METRICS, column
-from reports.table import Column, ReportError
+from reports.tables.table import Column, ReportError
 
 
 @dataclass(frozen=True)

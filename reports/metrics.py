@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from reports.table import Column
+from reports.tables.table import Column
 
 PAPER_METRICS = ("ssim", "psnr", "lpips")  # the order of the paper's tables
 PROTOCOL_METRICS = {  # protocol -> the metric that stands for each of PAPER_METRICS

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from padgs.results import Result
-from reports.table import ReportError
+from reports.tables.table import ReportError
 
 
 @dataclass(frozen=True)

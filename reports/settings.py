@@ -9,8 +9,8 @@ from typing import Any
 
 from padgs.results import Result
 from reports import methods
-from reports.cells import NO_SETTING, different_keys
 from reports.request import Request, admitted, value_of
+from reports.tables.cells import NO_SETTING, different_keys
 
 METHODS = ("table1_360roam", "table2_ricoh360", "all_methods")
 EXPERIMENTS = {  # report -> experiments (conf/experiment) that are run for it

@@ -2,9 +2,9 @@
 
 from hydra import compose
 
-from padgs.cli.composition import composing, configuration
-from padgs.cli.config import RunConfig
-from padgs.cli.overrides import expand, lenient
+from padgs.multirun.composition import composing, configuration
+from padgs.multirun.overrides import expand, lenient
+from padgs.runs.config import RunConfig
 
 
 def composed(*overrides: str) -> RunConfig:

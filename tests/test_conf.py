@@ -8,16 +8,16 @@ import pytest
 from composed import composed, expanded, first_and_last_job, jobs
 from hydra.errors import HydraException
 
-from baselines.padgs import preset
-from padgs.cli.composition import composing
-from padgs.cli.config import RunOptions, TrainConfig
-from padgs.cli.launchers import missing_plugin
-from padgs.cli.overrides import expand
+from padgs.anchors.method import preset
+from padgs.anchors.model import PaDGSOptions
 from padgs.data.datasets import DATASETS
-from padgs.method import RenderConfig
-from padgs.model import PaDGSOptions
-from padgs.protocols import PROTOCOLS, ROAM_360_BOTTOM_CROP
-from padgs.train import TrainOptions
+from padgs.learning.method import RenderConfig
+from padgs.learning.views import TrainOptions
+from padgs.multirun.composition import composing
+from padgs.multirun.launchers import missing_plugin
+from padgs.multirun.overrides import expand
+from padgs.runs.config import RunOptions, TrainConfig
+from padgs.scoring.protocols import PROTOCOLS, ROAM_360_BOTTOM_CROP
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))

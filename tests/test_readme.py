@@ -12,7 +12,7 @@ from composed import first_and_last_job
 from typer.main import get_command
 
 from padgs.cli.app import app
-from padgs.cli.launchers import missing_plugin
+from padgs.multirun.launchers import missing_plugin
 
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text()

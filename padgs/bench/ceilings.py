@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import torch
 
-from padgs.render import native
-from padgs.render.native import pointer
+from padgs.native import library as native
+from padgs.native.library import pointer
 
 FMA_ROUNDS = 1_000_000  # about 3 to 8 ms on each thread
 TRIAD_FLOATS = 1 << 23  # per array; the two are 64 MiB, more than caches hold

@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from padgs.anchors.model import PaDGSOptions
 from padgs.bench.ceilings import Ceiling
-from padgs.model import PaDGSOptions
 
 EXP_LANES = 8  # lane instructions of the exponential's polynomial
 BLEND_LANES, BLEND_BACKWARD_LANES = 20 + EXP_LANES, 55 + EXP_LANES  # per evaluated pair

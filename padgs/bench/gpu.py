@@ -31,12 +31,13 @@ from unittest import mock
 import torch
 
 from padgs import clock
+from padgs.anchors.precision import PRECISIONS
 from padgs.bench.workload import OPTIONS, SIZES, Size, Workload, build
-from padgs.loss import photometric_loss
-from padgs.precision import PRECISIONS
-from padgs.render import RenderOptions, cuda_native, render, resolve_backend
-from padgs.render.captured import CapturedRender
-from padgs.targets import Targets
+from padgs.learning.loss import photometric_loss
+from padgs.learning.targets import Targets
+from padgs.native import cuda as cuda_native
+from padgs.render import RenderOptions, render, resolve_backend
+from padgs.render.backends.captured import CapturedRender
 
 SCHEMA = 1
 MEASURED = {

@@ -13,7 +13,7 @@ import torch
 
 from padgs.bench.ratios import render_both_ways
 from padgs.bench.workload import Size, build
-from padgs.render import native
+from padgs.native import library as native
 
 ISAS = ("baseline", "avx2", "avx512")
 

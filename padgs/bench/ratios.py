@@ -11,14 +11,14 @@ from unittest import mock
 import torch
 from torch import Tensor
 
-import padgs.decoder
-import padgs.loss
+import padgs.anchors.decoder
+import padgs.learning.loss
 from padgs.bench.tile_counts import BOUNDS
 from padgs.bench.workload import OPTIONS, Workload
 from padgs.clock import measure
 from padgs.gaussians import Gaussians
+from padgs.learning.targets import Targets
 from padgs.render import Rendering, RenderOptions, render
-from padgs.targets import Targets
 
 PROJECTIONS = {
     "tangent": RenderOptions(projection="tangent"),
@@ -89,7 +89,7 @@ def _against_erp(work: Workload, options: RenderOptions, repeats: int) -> dict[s
 @contextmanager
 def torch_decode() -> Iterator[None]:
     """Decode by `define_gaussians`, as where there is no native library."""
-    with mock.patch.object(padgs.decoder, "fits", lambda *_: False):
+    with mock.patch.object(padgs.anchors.decoder, "fits", lambda *_: False):
         yield
 
 
@@ -97,7 +97,7 @@ def torch_decode() -> Iterator[None]:
 def torch_loss() -> Iterator[None]:
     """Compare in torch, as where there is no native library."""
     with ExitStack() as stack:
-        for module in ("padgs.loss", "padgs.targets"):
+        for module in ("padgs.learning.loss", "padgs.learning.targets"):
             stack.enter_context(mock.patch(f"{module}.fits", lambda _: False))
         yield
 
@@ -146,7 +146,9 @@ def _decoding(work: Workload) -> Callable[[], None]:
 
 def _comparing(image: Tensor, target) -> Callable[[], None]:
     leaf = image.clone().requires_grad_()
-    return lambda: padgs.loss.photometric_loss(leaf, target.image, target.weight, moments=target.moments).backward()
+    return lambda: padgs.learning.loss.photometric_loss(
+        leaf, target.image, target.weight, moments=target.moments
+    ).backward()
 
 
 def _in(circumstances: Callable, work: Callable[[], None]) -> Callable[[], None]:

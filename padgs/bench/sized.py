@@ -9,16 +9,16 @@ from typing import Any
 import torch
 
 from padgs import clock
-from padgs.anchor_training import TrainablePaDGS
+from padgs.anchors.model import PaDGSOptions
+from padgs.anchors.trainee import TrainablePaDGS
 from padgs.bench.ceilings import Ceiling
 from padgs.bench.cost import add_floors, costs
 from padgs.bench.ratios import render_both_ways
 from padgs.bench.stages import STAGES, Iteration, StageClock, amortised
 from padgs.bench.workload import NEVER, OPTIONS, Size, Workload, build, sigma_quantiles
-from padgs.method import Budget, Record
-from padgs.model import PaDGSOptions
+from padgs.learning.method import Budget, Record
+from padgs.learning.views import Trainer
 from padgs.render import render
-from padgs.train import Trainer
 
 MANY = 500_000  # Gaussians from which a few repeats must do
 FEW_REPEATS = 3

@@ -15,14 +15,14 @@ from unittest import mock
 
 import torch
 
+from padgs.anchors.growth import Growth, GrowthOptions
+from padgs.anchors.model import Decoded
 from padgs.bench.workload import OPTIONS, Workload
 from padgs.clock import summary
-from padgs.grow import Growth, GrowthOptions
-from padgs.loss import photometric_loss
-from padgs.model import Decoded
-from padgs.render import native as native_library
+from padgs.learning.loss import photometric_loss
+from padgs.learning.targets import Targets
+from padgs.native import library as native_library
 from padgs.render import render
-from padgs.targets import Targets
 
 STAGES = {
     "target": "read the panorama, as floats",
@@ -130,7 +130,7 @@ class _WatchedLibrary:
 
 
 class Iteration:
-    """The training iteration of `padgs.train.Trainer`, with a stage around each of its steps."""
+    """The training iteration of `padgs.learning.views.Trainer`, with a stage around each of its steps."""
 
     def __init__(self, work: Workload) -> None:
         """Prepare as the trainer does."""

@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 
 from padgs.gaussians import Gaussians
-from padgs.render import RenderOptions, native
-from padgs.render.native import pointer
-from padgs.render.native_camera import native_camera
+from padgs.native import library as native
+from padgs.native.library import pointer
+from padgs.render import RenderOptions
+from padgs.render.backends.native_camera import native_camera
 from padgs.render.tiles import Projected
 from padgs.scene import View
 

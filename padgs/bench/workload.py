@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from padgs.grow import Growth, GrowthOptions
-from padgs.model import PaDGS
+from padgs.anchors.growth import Growth, GrowthOptions
+from padgs.anchors.model import PaDGS
+from padgs.learning.schedule import Constant, ParameterGroup
 from padgs.render import RenderOptions
 from padgs.scene import Scene, View
-from padgs.schedule import Constant, ParameterGroup
 
 NEAREST, FURTHEST = 1.0, 4.0  # distances of anchors, world units, uniform
 SIGMA = 0.7  # median size of a Gaussian's axis, in pixels of the equator

@@ -1,7 +1,1 @@
-"""Entry points: `padgs-run` and `padgs`."""
-
-import os
-
-# Threads that wait for the next parallel piece of work must sleep, not spin: on a machine with other work on it,
-# spinning made training 20 times slower. Has to be said before torch loads its OpenMP runtime.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+"""`padgs`: one file a command."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from padgs.data.check import Report
+    from padgs.data.check.report import Report
 
 
 def check(
@@ -23,7 +23,7 @@ def check(
 
     from rich.console import Console
 
-    from padgs.data.check import check as look_through
+    from padgs.data.check.report import check as look_through
     from padgs.data.errors import DataError
     from padgs.data.options import DataOptions
 

@@ -22,8 +22,8 @@ def convert(
 
     from rich.console import Console
 
-    from padgs.data.convert import convert as write
     from padgs.data.errors import DataError
+    from padgs.data.formats.convert import convert as write
     from padgs.data.options import DataOptions
 
     console = Console(highlight=False, soft_wrap=True)

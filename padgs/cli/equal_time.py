@@ -12,14 +12,14 @@ from typing import Annotated, Any
 import typer
 
 from padgs import results
-from padgs.cli.typed import ConfigError
 from padgs.results import Result
+from padgs.runs.typed import ConfigError
 from reports.conditions import OF_TIMES, machine
-from reports.equal_time import EXPERIMENT, is_near, of_any_length
 from reports.measures import train_seconds
 from reports.request import Request
 from reports.settings import chosen
-from reports.table import ReportError
+from reports.tables.equal_time import EXPERIMENT, is_near, of_any_length
+from reports.tables.table import ReportError
 
 
 def equal_time(
@@ -60,7 +60,7 @@ def equal_time(
         )
     from hydra.errors import HydraException
 
-    from padgs.cli.composition import command, composing, settings_of
+    from padgs.multirun.composition import command, composing, settings_of
 
     with composing():
         for alike in lengths(usable):

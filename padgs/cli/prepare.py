@@ -41,10 +41,10 @@ def prepare(
     from rich.console import Console
 
     from padgs.cli.check import lines
-    from padgs.data.check import check
+    from padgs.data.check.report import check
     from padgs.data.errors import DataError
-    from padgs.data.prepare import PrepareOptions
-    from padgs.data.prepare import prepare as find_poses
+    from padgs.data.prepare.pipeline import PrepareOptions
+    from padgs.data.prepare.pipeline import prepare as find_poses
 
     console = Console(highlight=False, soft_wrap=True)
     target = Path(destination)

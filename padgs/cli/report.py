@@ -13,7 +13,7 @@ from padgs import results
 from padgs.registry import lookup
 from reports import REPORTS
 from reports.request import Request
-from reports.table import ReportError
+from reports.tables.table import ReportError
 
 ALL = "all"
 

@@ -10,22 +10,22 @@ from pathlib import Path
 
 from padgs.data.capture import Capture
 from padgs.data.datasets import DATASETS, lookup_dataset, refuse_missing
-from padgs.data.detect import detect
 from padgs.data.errors import DataError
+from padgs.data.formats.detect import detect
 from padgs.data.options import DataOptions
 from padgs.registry import lookup
 from padgs.scene import Scene
 
 # Each is `load(path, options) -> Scene`. All but synthetic read files; their modules also have `read`, to a Capture.
 LOADERS = {
-    "colmap": "padgs.data.colmap:load",
-    "transforms": "padgs.data.transforms:load",
-    "openmvg": "padgs.data.openmvg:load",
-    "opensfm": "padgs.data.opensfm:load",
-    "roam360": "padgs.data.roam360:load",
-    "ricoh360": "padgs.data.ricoh360:load",
-    "omniblender": "padgs.data.omniblender:load",
-    "released": "padgs.data.released:load",
+    "colmap": "padgs.data.formats.colmap:load",
+    "transforms": "padgs.data.formats.transforms:load",
+    "openmvg": "padgs.data.formats.openmvg:load",
+    "opensfm": "padgs.data.formats.opensfm:load",
+    "roam360": "padgs.data.formats.roam360:load",
+    "ricoh360": "padgs.data.formats.ricoh360:load",
+    "omniblender": "padgs.data.formats.omniblender:load",
+    "released": "padgs.data.formats.released:load",
     "synthetic": "padgs.data.synthetic:load",
 }
 

@@ -1,7 +1,7 @@
 """What a file format says, before any pixel is read: frames with poses, points, split lists.
 
 Every file format has one reader, `read(path, options) -> Capture`; `padgs.data.assemble` makes the scene of it, and
-`padgs.data.convert` writes it in another format.
+`padgs.data.formats.convert` writes it in another format.
 """
 
 from __future__ import annotations

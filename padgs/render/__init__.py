@@ -19,9 +19,9 @@ from padgs.render.cubemap import rasterize_cubemap
 from padgs.scene import View
 
 BACKENDS = {
-    "torch": "padgs.render.torch_backend:rasterize",
-    "cpu": "padgs.render.cpu_backend:rasterize",
-    "cuda": "padgs.render.cuda_backend:rasterize",
+    "torch": "padgs.render.backends.torch:rasterize",
+    "cpu": "padgs.render.backends.cpu:rasterize",
+    "cuda": "padgs.render.backends.cuda:rasterize",
 }
 RELEASED = RenderOptions(near=0.2, wrap=False, bounds="square")  # the published rasterizer, near in scene units
 
@@ -79,7 +79,8 @@ def resolve_backend(backend: str, means: Tensor) -> str:
     """The backend that `auto` stands for, given the tensors to draw; other names are returned as they are."""
     if backend != "auto":
         return backend
-    from padgs.render import cuda_native, native
+    from padgs.native import cuda as cuda_native
+    from padgs.native import library as native
 
     library = {"cpu": native, "cuda": cuda_native}.get(means.device.type)
     if library is None or means.dtype != torch.float32:
@@ -92,7 +93,8 @@ def resolve_backend(backend: str, means: Tensor) -> str:
 
 @cache  # once in a process, whatever the filters of the warnings module say
 def _say_that_native_is_missing(backend: str) -> None:
-    from padgs.render import cuda_native, native
+    from padgs.native import cuda as cuda_native
+    from padgs.native import library as native
 
     try:
         {"cpu": native, "cuda": cuda_native}[backend].library()

@@ -16,8 +16,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from padgs.camera import Camera, Panorama, Pinhole, RayTable
 from padgs.gaussians import Gaussians
+from padgs.sphere.camera import Camera, Panorama, Pinhole, RayTable
 
 ALPHA_MIN = 1 / 255
 ALPHA_MAX = 0.99

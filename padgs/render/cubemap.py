@@ -17,12 +17,12 @@ from math import ceil, pi
 import torch
 from torch import Tensor
 
-from padgs.camera import Camera, Panorama, Pinhole
 from padgs.gaussians import Gaussians
-from padgs.panorama import rays
 from padgs.render.contract import Rendering, RenderOptions
 from padgs.render.projection import camera_frame
 from padgs.render.projective import shift_of_probe
+from padgs.sphere.camera import Camera, Panorama, Pinhole
+from padgs.sphere.panorama import rays
 
 # face_from_camera: turned and looked through, each face is a camera like any other (x right, y down, z forward).
 FACES = torch.tensor(

@@ -17,9 +17,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from padgs.camera import Camera
 from padgs.gaussians import Gaussians
 from padgs.render.contract import PUBLISHED_FOCAL, RenderOptions
+from padgs.sphere.camera import Camera
 
 
 @dataclass(frozen=True)

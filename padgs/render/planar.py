@@ -10,13 +10,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from padgs.camera import Panorama, Pinhole
 from padgs.gaussians import Gaussians
-from padgs.panorama import longitude_latitude, pixel_from_angles, projection_jacobian
 from padgs.render.contract import ALPHA_MIN, RenderOptions
 from padgs.render.low_pass import low_pass_of, widened
 from padgs.render.projection import Footprints, camera_frame
 from padgs.render.published_bounds import square_boxes
+from padgs.sphere.camera import Panorama, Pinhole
+from padgs.sphere.panorama import longitude_latitude, pixel_from_angles, projection_jacobian
 
 MIN_COS_LATITUDE = 1e-4  # an erp footprint nearer to the axis than 0.006 degrees is undefined; see design.md section 3
 SLOPE_LIMIT = 1.3  # pinhole: slopes in the Jacobian are limited to this times the half field of view

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from padgs.camera import Camera
 from padgs.gaussians import Gaussians, rotation_matrices
 from padgs.registry import lookup
 from padgs.render.contract import FURTHEST, NEAREST, RenderOptions
+from padgs.sphere.camera import Camera
 
 PROJECTIONS = {
     "erp": "padgs.render.planar:project_erp",

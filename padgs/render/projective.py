@@ -13,12 +13,12 @@ from math import pi
 import torch
 from torch import Tensor
 
-from padgs.camera import Camera, Panorama
 from padgs.gaussians import Gaussians
 from padgs.render.contract import ALPHA_MIN, RenderOptions
 from padgs.render.low_pass import low_pass_of, widened
 from padgs.render.projection import Footprints, camera_frame
 from padgs.render.published_bounds import is_on_image, tangent_boxes
+from padgs.sphere.camera import Camera, Panorama
 
 
 @dataclass(frozen=True)

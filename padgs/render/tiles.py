@@ -1,4 +1,4 @@
-"""Projected Gaussians and the tile lists of an image, strip by strip (csrc/bin.cpp).
+"""Projected Gaussians and the tile lists of an image, strip by strip (csrc/cpu/bin.cpp).
 
 How many (Gaussian, tile) instances a row of tiles has is known before anything of that size is allocated. Where all of
 them together exceed the limit, the image is drawn in strips of tile rows instead of failing.
@@ -11,8 +11,8 @@ from collections.abc import Iterator
 
 import torch
 
-from padgs.render import native
-from padgs.render.native import pointer
+from padgs.native import library as native
+from padgs.native.library import pointer
 
 TILE = 16  # pixels
 MOMENTS = 16  # floats per instance, see csrc/abi.h

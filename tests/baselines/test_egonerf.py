@@ -6,13 +6,13 @@ from composed import composed
 from tiny_scene import tiny_scene
 
 from baselines.egonerf import EgoNeRFMethod, EgoNeRFMethodOptions
-from padgs.cli.session import build
 from padgs.data.synthetic import SyntheticOptions, generate
 from padgs.egonerf.model import EgoNeRF
-from padgs.egonerf_training import TrainableEgoNeRF
-from padgs.method import Budget, RenderConfig
+from padgs.egonerf.trainee import TrainableEgoNeRF
+from padgs.learning.method import Budget, RenderConfig
+from padgs.learning.views import TrainOptions
+from padgs.runs.session import build
 from padgs.scene import Scene, View
-from padgs.train import TrainOptions
 
 SMALL = EgoNeRFMethodOptions(
     radial_nodes=16,

@@ -13,14 +13,14 @@ import torch
 from composed import composed
 
 from baselines import METHODS
-from padgs import checkpoint
-from padgs.cli.config import RunConfig
-from padgs.cli.session import build
 from padgs.data.synthetic import SCENES, SyntheticOptions, generate
-from padgs.method import Budget, Method, Record, State
+from padgs.learning.method import Budget, Method, Record, State
 from padgs.registry import lookup
+from padgs.runs import checkpoint
+from padgs.runs.config import RunConfig
+from padgs.runs.session import build
 from padgs.scene import Scene
-from padgs.splat_method import SplatMethod
+from padgs.splats.method import SplatMethod
 
 WIDTH = 32
 STEPS = 20

@@ -7,12 +7,12 @@ from tiny_scene import tiny_scene
 
 from baselines import METHODS
 from baselines.omnigs import OmniGSMethod
-from padgs import checkpoint
-from padgs.method import Budget, Failure, RenderConfig, State
+from padgs.learning.method import Budget, Failure, RenderConfig, State
+from padgs.native import library as native
 from padgs.registry import lookup
-from padgs.render import native
+from padgs.runs import checkpoint
 from padgs.scene import Scene, View
-from padgs.splat_method import SplatOptions
+from padgs.splats.method import SplatOptions
 
 ITERATIONS = 120  # densifies at 50, and goes through all degrees
 

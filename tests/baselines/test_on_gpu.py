@@ -9,12 +9,11 @@ import torch
 from composed import composed
 from pretended_gpu import GPU, pretended_gpu
 
-from padgs import checkpoint
-from padgs.cli import scoring
-from padgs.cli.scoring import frame_times, scores
-from padgs.cli.session import build
 from padgs.data.synthetic import SyntheticOptions, generate
-from padgs.method import Budget, Failure, State
+from padgs.learning.method import Budget, Failure, State
+from padgs.runs import checkpoint, scoring
+from padgs.runs.scoring import frame_times, scores
+from padgs.runs.session import build
 from padgs.scene import Scene
 
 STEPS, CHECK_EVERY = 8, 5

@@ -12,10 +12,10 @@ from tiny_scene import tiny_scene
 from baselines import METHODS
 from baselines.crops_3dgs import NARROWEST, Crops3DGSMethod, Crops3DGSOptions
 from baselines.cubemap_3dgs import Cubemap3DGSMethod
-from padgs.camera import Panorama, Pinhole
-from padgs.method import Budget, RenderConfig
+from padgs.learning.method import Budget, RenderConfig
+from padgs.learning.views import TrainOptions
 from padgs.registry import lookup
-from padgs.train import TrainOptions
+from padgs.sphere.camera import Panorama, Pinhole
 
 PANORAMA = Panorama(256, 128)
 METHOD = {"cubemap_3dgs": Cubemap3DGSMethod, "crops_3dgs": Crops3DGSMethod}

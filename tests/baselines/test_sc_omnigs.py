@@ -7,16 +7,16 @@ from tiny_scene import HEIGHT, WIDTH, tiny_scene
 
 from baselines.omnigs import OmniGSMethod
 from baselines.sc_omnigs import SCOmniGSMethod, SCOmniGSOptions, aligned, carried
-from padgs.data.align import Similarity, align
+from padgs.calibration.align import Similarity, align
+from padgs.calibration.poses import PoseRates
 from padgs.data.synthetic import SyntheticOptions, SyntheticTruth, generate
 from padgs.gaussians import rotation_matrices
-from padgs.method import Budget, RenderConfig
-from padgs.metrics import psnr
-from padgs.pose_refinement import PoseRates
+from padgs.learning.method import Budget, RenderConfig
+from padgs.learning.targets import Targets
+from padgs.learning.views import TrainOptions
 from padgs.scene import Scene
-from padgs.splat_method import SplatOptions
-from padgs.targets import Targets
-from padgs.train import TrainOptions
+from padgs.scoring.metrics import psnr
+from padgs.splats.method import SplatOptions
 
 TORCH = RenderConfig(backend="torch")
 

@@ -5,14 +5,14 @@ import torch
 from tiny_scene import tiny_scene, truth
 
 from baselines.seam360gs import Seam360GSMethod, Seam360GSOptions
+from padgs.calibration.dual_lens import DualLens
 from padgs.data.synthetic import SyntheticOptions, SyntheticTruth, generate
-from padgs.dual_lens import DualLens
-from padgs.method import Budget, RenderConfig
-from padgs.metrics import seam, ws_psnr
+from padgs.learning.method import Budget, RenderConfig
+from padgs.learning.views import Drawing
 from padgs.render import RenderOptions, render
 from padgs.scene import Scene, View
-from padgs.splat_method import SplatMethod, SplatOptions
-from padgs.train import Drawing
+from padgs.scoring.metrics import seam, ws_psnr
+from padgs.splats.method import SplatMethod, SplatOptions
 
 TORCH = RenderConfig(projection="ray", backend="torch")
 

@@ -11,15 +11,16 @@ from tiny_scene import tiny_scene
 
 from baselines import METHODS
 from baselines.spags import SPaGSMethod, SPaGSOptions
-from padgs.camera import Panorama
 from padgs.gaussians import Gaussians, rotation_matrices
-from padgs.method import Budget, RenderConfig
+from padgs.learning.method import Budget, RenderConfig
+from padgs.native import library as native
 from padgs.registry import lookup
-from padgs.render import RenderOptions, native
+from padgs.render import RenderOptions
+from padgs.render.backends.native_camera import native_camera
 from padgs.render.low_pass import low_pass_of, widened
-from padgs.render.native_camera import native_camera
 from padgs.render.tiles import Projected
 from padgs.scene import Scene
+from padgs.sphere.camera import Panorama
 
 WIDTH, HEIGHT = 2048, 1024
 OPTIONS = SPaGSMethod.RENDER.options(scene_unit=1.0)

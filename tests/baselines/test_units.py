@@ -7,10 +7,10 @@ import torch
 from tiny_scene import tiny_scene
 
 from baselines import METHODS
-from padgs.method import Budget
+from padgs.learning.method import Budget
 from padgs.registry import lookup
 from padgs.scene import Scene, View
-from padgs.splat_method import SplatMethod
+from padgs.splats.method import SplatMethod
 
 LARGER = 64.0  # a power of two: lengths are multiplied exactly, and what differs is the rounding of logarithms
 STEPS = 20

@@ -2,9 +2,9 @@
 
 import pytest
 
+from padgs.anchors.model import PaDGSOptions
 from padgs.bench.ceilings import Ceiling
 from padgs.bench.cost import Cost, add_floors, costs
-from padgs.model import PaDGSOptions
 
 CEILINGS = {"fma": Ceiling(200.0, 100.0, 0.0), "triad": Ceiling(20.0, 10.0, 0.0)}
 

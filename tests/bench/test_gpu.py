@@ -11,7 +11,8 @@ from typer.testing import CliRunner
 from padgs.bench import gpu
 from padgs.bench.workload import OPTIONS, SIZES, build
 from padgs.cli.app import app
-from padgs.render import cuda_native, native
+from padgs.native import cuda as cuda_native
+from padgs.native import library as native
 
 needs_native = pytest.mark.skipif(not native.available(), reason="the native library is not built")
 

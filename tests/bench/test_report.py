@@ -13,7 +13,7 @@ from padgs.bench.report import QUICK, BenchOptions
 from padgs.bench.stages import STAGES
 from padgs.bench.workload import SIGMA, SIZES, Size, build
 from padgs.cli.app import app
-from padgs.render import native
+from padgs.native import library as native
 
 needs_library = pytest.mark.skipif(not native.available(), reason="the native library is not built")
 

@@ -6,7 +6,7 @@ import pytest
 
 from padgs.bench import stages
 from padgs.bench.stages import STAGES, StageClock, amortised, native_calls_watched
-from padgs.render import native
+from padgs.native import library as native
 
 
 @pytest.fixture

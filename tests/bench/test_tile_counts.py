@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from padgs.bench.tile_counts import BANDS, BOUNDS, spheres, tiles_by_latitude, tiles_per_gaussian
-from padgs.render import native
+from padgs.native import library as native
 
 pytestmark = pytest.mark.skipif(not native.available(), reason="the native library is not built")
 WIDTH, HEIGHT, TILE = 512, 256, 16

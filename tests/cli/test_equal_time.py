@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 
 from padgs import results
 from padgs.cli.app import app
-from padgs.cli.composition import composing, settings_of
 from padgs.cli.equal_time import iterations, lengths
+from padgs.multirun.composition import composing, settings_of
 from padgs.results import Result
 
 LINES = (

@@ -11,10 +11,10 @@ import math
 import torch
 from torch import Tensor
 
-from padgs.camera import Camera, Panorama, Pinhole, RayTable
 from padgs.gaussians import Gaussians, rotation_matrices
 from padgs.render import RenderOptions
 from padgs.render.contract import ALPHA_MIN
+from padgs.sphere.camera import Camera, Panorama, Pinhole, RayTable
 
 MARGIN = 1e-3  # relative; closer than this to flipping, rounding may decide
 

@@ -10,15 +10,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from padgs.camera import Camera, Panorama, Pinhole, RayTable
 from padgs.gaussians import Gaussians, rotation_matrices
-from padgs.panorama import direction
-from padgs.render import BACKENDS, Rendering, RenderOptions, native, render
+from padgs.native import library as native
+from padgs.render import BACKENDS, Rendering, RenderOptions, render
 from padgs.render.contract import ALPHA_MIN
 from padgs.render.planar import PlanarFootprints
 from padgs.render.projection import project
 from padgs.render.projective import RayFootprints
 from padgs.scene import View
+from padgs.sphere.camera import Camera, Panorama, Pinhole, RayTable
+from padgs.sphere.panorama import direction
 
 INPUTS = ("means", "quats", "scales", "opacities", "colors")
 KINDS = ("ordinary", "polar", "pole", "seam", "near", "huge", "needle")

@@ -9,10 +9,10 @@ import torch
 from render_cases import blended, each_engine, gaussians_of, identity_pose, mixture, row_error
 from torch import Tensor
 
-from padgs.camera import Panorama, RayTable
 from padgs.gaussians import Gaussians
 from padgs.render import RenderOptions, render
 from padgs.scene import View
+from padgs.sphere.camera import Panorama, RayTable
 
 BLENDINGS = ("sorted", "hybrid")
 each_blending = pytest.mark.parametrize("blending", BLENDINGS)

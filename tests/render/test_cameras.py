@@ -19,10 +19,10 @@ from render_cases import (
 )
 from torch import Tensor
 
-from padgs.camera import Camera, Panorama, Pinhole, RayTable
 from padgs.gaussians import Gaussians
-from padgs.panorama import project as pixel_of
 from padgs.render import RenderOptions, render
+from padgs.sphere.camera import Camera, Panorama, Pinhole, RayTable
+from padgs.sphere.panorama import project as pixel_of
 
 each_free = pytest.mark.parametrize("projection", ("tangent", "ray"))  # free of charts: any camera will do
 

@@ -18,10 +18,10 @@ from render_cases import (
     view_of,
 )
 
-from padgs.camera import Panorama, Pinhole, RayTable
 from padgs.gaussians import Gaussians
 from padgs.render import RenderOptions, render
 from padgs.scene import View
+from padgs.sphere.camera import Panorama, Pinhole, RayTable
 
 VIEW = View("v", identity_pose(), 32, 16)
 

@@ -20,13 +20,13 @@ from render_cases import (
     row_error,
 )
 
-from padgs.camera import Panorama, Pinhole
 from padgs.gaussians import Gaussians
-from padgs.method import RenderConfig
-from padgs.panorama import rays
+from padgs.learning.method import RenderConfig
 from padgs.render import Rendering, RenderOptions, render
 from padgs.render.cubemap import FACES, _corners, face_camera, panorama_from_faces
 from padgs.scene import View
+from padgs.sphere.camera import Panorama, Pinhole
+from padgs.sphere.panorama import rays
 
 PROJECTIONS = ("pinhole", "tangent", "ray")
 SIZES = ((64, 32), (70, 44), (33, 17), (8, 4), (2, 1))

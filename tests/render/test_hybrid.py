@@ -7,7 +7,7 @@ import torch
 from hybrid_reference import one_pixel
 from torch import Tensor
 
-from padgs.method import RenderConfig
+from padgs.learning.method import RenderConfig
 from padgs.render import RenderOptions
 from padgs.render.hybrid import hybrid_weights
 

@@ -28,13 +28,13 @@ from render_cases import (
 )
 from torch import Tensor
 
-from padgs.camera import Camera, Panorama, Pinhole, RayTable
 from padgs.gaussians import Gaussians, rotation_matrices
-from padgs.panorama import direction
 from padgs.render import Rendering, RenderOptions, render
 from padgs.render.planar import PlanarFootprints
 from padgs.render.projection import project
 from padgs.scene import View
+from padgs.sphere.camera import Camera, Panorama, Pinhole, RayTable
+from padgs.sphere.panorama import direction
 
 PROJECTIONS = ("erp", "pinhole", "tangent", "ray")
 BACKGROUND = torch.tensor([0.3, 0.6, 0.9], dtype=torch.float64)
@@ -349,7 +349,8 @@ def test_strips_change_nothing(generator: torch.Generator):
 DRAW = """
 import sys, torch
 from padgs.gaussians import Gaussians
-from padgs.render import RenderOptions, native, render
+from padgs.render import RenderOptions, render
+from padgs.native import library as native
 from padgs.scene import View
 inputs = {k: v.requires_grad_() for k, v in torch.load(sys.argv[1]).items()}
 options = RenderOptions(projection="ray", blending="hybrid", core_size=3)

@@ -10,15 +10,16 @@ import pytest
 import torch
 from render_cases import INPUTS, identity_pose, leaves, mixture, needs_native, random_pose, row_error
 
-from padgs.camera import Camera, Panorama, Pinhole
 from padgs.gaussians import Gaussians
-from padgs.method import RenderConfig
-from padgs.panorama import direction
-from padgs.render import RenderOptions, native, render
+from padgs.learning.method import RenderConfig
+from padgs.native import library as native
+from padgs.render import RenderOptions, render
 from padgs.render.contract import ALPHA_MIN, LOW_PASS_KINDS, PUBLISHED_FOCAL
 from padgs.render.planar import PlanarFootprints
 from padgs.render.projection import PROJECTIONS, project
 from padgs.scene import View
+from padgs.sphere.camera import Camera, Panorama, Pinhole
+from padgs.sphere.panorama import direction
 
 COMBINATIONS = [(projection, kind) for projection, kinds in LOW_PASS_KINDS.items() for kind in kinds]
 each_combination = pytest.mark.parametrize(("projection", "kind"), COMBINATIONS)

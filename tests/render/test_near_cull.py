@@ -9,12 +9,12 @@ import pytest
 import torch
 from render_cases import each_engine, gaussians_of, identity_pose
 
-from padgs.camera import Panorama
 from padgs.gaussians import Gaussians, rotation_matrices
-from padgs.panorama import direction
 from padgs.render import RenderOptions, render
 from padgs.render.projection import project
 from padgs.scene import View
+from padgs.sphere.camera import Panorama
+from padgs.sphere.panorama import direction
 
 VIEW = View("v", identity_pose(), 64, 32, lens=Panorama(64, 32))
 NEAR = 0.1

@@ -3,9 +3,10 @@
 import pytest
 
 from padgs import results
-from reports import csv_text, latex, markdown, sweeps, trade_off
+from reports.charts import sweeps, trade_off
 from reports.gathered import TABLES
 from reports.request import Request
+from reports.writers import csv_text, latex, markdown
 
 RUNS = "results"  # of reports/measured; made by `padgs report all ... --out reports/measured --collect`
 

@@ -1,0 +1,103 @@
+"""Decoding anchors into Gaussians on a GPU: matrix products by torch, all around them by csrc/cuda/decode.cu.
+
+`padgs.anchors.decoder` is the definition. The hidden layers of the three networks are one product; their values are
+kept for the way back, 4 bytes for each of the 96 units of an anchor (2 in a reduced precision). TF32 in the products is
+torch's own switch.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from padgs.anchors.precision import OF_GRADIENTS
+from padgs.native import cuda as cuda_native
+from padgs.native import library as native
+from padgs.native.library import pointer
+
+SIZES = (3, 4, 3, 0, 3)  # values per Gaussian of means, quats, scales, opacities, colors; 0 = a scalar
+
+
+def decode_on_gpu(
+    weights: tuple[Tensor, ...], *tensors: Tensor, dtype: torch.dtype | None = None, padded: bool = False
+) -> tuple[Tensor, ...]:
+    """`padgs.anchors.native_decoder.fused_decode` where the GPU's library keeps its tensors; waits once, for a count.
+
+    Padded, it waits for nothing: behind the selected Gaussians come zeros, as many as there are others.
+    """
+    return _DecodeOnGPU.apply(dtype, padded, *tensors, *weights)
+
+
+class _DecodeOnGPU(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, dtype, padded, features, seen, positions, offsets, log_scales, attenuation, *weights):
+        dtype = dtype or features.dtype
+        inputs = torch.cat((features.detach(), seen), dim=-1).to(dtype)
+        constants = [t.detach().contiguous() for t in (positions, offsets, log_scales, attenuation)]
+        weights = [w.detach() for w in weights]
+        w1, b1 = torch.cat(weights[0::4]).to(dtype), torch.cat(weights[1::4]).to(dtype)
+        hidden = torch.addmm(b1, inputs, w1.T).relu_()
+        parts = hidden.split(len(weights[0]), dim=1)
+        opacity, color, covariance = (
+            torch.addmm(b2.to(dtype), part, w2.to(dtype).T).float()
+            for part, w2, b2 in zip(parts, weights[2::4], weights[3::4], strict=True)
+        )
+        raw = opacity.tanh_()
+        starts = torch.zeros(len(raw) + 1, dtype=torch.int64, device=raw.device)
+        torch.cumsum((raw > 0).sum(-1), 0, out=starts[1:])
+        count, new = (raw.numel(), Tensor.new_zeros) if padded else (int(starts[-1]), Tensor.new_empty)
+        slots = new(starts, (count,))
+        outputs = [new(raw, (count, size) if size else (count,)) for size in SIZES]
+        arguments = cuda_native.DeviceDecodeArguments(
+            _arguments(constants, raw, starts, slots, outputs), pointer(color), pointer(covariance)
+        )
+        cuda_native.call("padgs_cuda_decode_place", cuda_native.queue(raw.device), arguments)
+        ctx.save_for_backward(inputs, w1, hidden, *weights, *constants, raw, starts, slots, *outputs)
+        ctx.features = features.shape[1]
+        ctx.mark_non_differentiable(slots, raw)
+        return *outputs, slots, raw
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor):
+        inputs, w1, hidden, *saved = ctx.saved_tensors
+        weights, constants, (raw, starts, slots), outputs = saved[:12], saved[12:16], saved[16:19], saved[19:]
+        upstream = [grad.contiguous() for grad in grads[: len(SIZES)]]
+        offsets, log_scales = constants[1:3]
+        grad_offsets, grad_log_scales = torch.empty_like(offsets), torch.empty_like(log_scales)
+        anchors, per_anchor = raw.shape
+        grad_logits = [raw.new_empty(anchors, values * per_anchor) for values in (1, 3, 7)]
+        gradient = native.DecodeGradientArguments(
+            _arguments(constants, raw, starts, slots, outputs),
+            *map(pointer, upstream),
+            ctx.features,
+            None,
+            pointer(grad_offsets),
+            pointer(grad_log_scales),
+            None,
+        )
+        arguments = cuda_native.DeviceDecodeGradientArguments(gradient, *map(pointer, grad_logits))
+        cuda_native.call("padgs_cuda_decode_take_back", cuda_native.queue(raw.device), arguments)
+
+        dtype = raw.dtype if inputs.dtype == raw.dtype else OF_GRADIENTS  # of the products
+        inputs, w1, units = inputs.to(dtype), w1.to(dtype), len(weights[0])
+        parts, logits = hidden.to(dtype).split(units, 1), [grad.to(dtype) for grad in grad_logits]
+        grad_hidden = torch.cat([grad @ w2.to(dtype) for grad, w2 in zip(logits, weights[2::4], strict=True)], dim=1)
+        grad_hidden *= hidden > 0
+        of_w1, of_b1 = (grad_hidden.T @ inputs).split(units), grad_hidden.sum(0, dtype=raw.dtype).split(units)
+        of_w2 = [grad.T @ part for grad, part in zip(logits, parts, strict=True)]
+        of_b2 = [grad.sum(0) for grad in grad_logits]
+        of_weights = [grad.to(raw.dtype) for head in zip(of_w1, of_b1, of_w2, of_b2, strict=True) for grad in head]
+        grad_features = (grad_hidden @ w1[:, : ctx.features]).to(raw.dtype)
+        return None, None, grad_features, None, None, grad_offsets, grad_log_scales, None, *of_weights
+
+
+def _arguments(constants, raw, starts, slots, outputs) -> native.DecodeArguments:
+    """Without the networks, which the kernels do not see."""
+    nobody = native.HeadWeights(None, None, None, None)
+    positions, offsets, log_scales, attenuation = constants
+    buffers = (positions, offsets, log_scales, attenuation, raw, starts, slots, *outputs)
+    return native.DecodeArguments(*raw.shape, 0, 0, nobody, nobody, nobody, None, *map(pointer, buffers))

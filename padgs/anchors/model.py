@@ -1,0 +1,208 @@
+"""PaD-GS: anchors, and the Gaussians that they become as seen from a camera (paper Eq. 13-15)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from padgs.anchors.decoder import Decoder, decode_gaussians, decode_padded
+from padgs.anchors.grid import anchors_from_points, automatic_voxel_size, initial_log_scales
+from padgs.anchors.modulation import OMEGA_AXES, direction_distortion, modulate, polar_axis
+from padgs.anchors.precision import PRECISIONS
+from padgs.gaussians import Gaussians
+from padgs.scene import Scene, View
+
+OMEGA_INPUTS = ("sin2", "cos")
+DISTANCE_UNITS = ("scene", "world")
+PUBLISHED_VOXEL_SIZES = {"360roam": 0.001, "ricoh360": 0.005}  # units of those data sets' own reconstructions
+TINY = 1e-6  # scene units; keeps directions finite for a camera exactly on an anchor
+
+
+@dataclass(frozen=True)
+class PaDGSOptions:
+    """The model. The defaults are the paper as written; `RELEASED_MODEL` is where the released code differs."""
+
+    features: int = 32  # C, learned values per anchor
+    offsets: int = 10  # K, Gaussians per anchor
+    hidden: int = 32  # width of the hidden layer of each network
+    precision: str = "float32"  # of the networks' products: float32, or bfloat16 or float16, which are for GPUs
+    tau: float = 0.9  # Eq. 15; 0 turns opacity modulation off
+    use_distance: bool = True  # distance camera - anchor as network input
+    use_distortion: bool = True  # distortion degree as network input (DAGD)
+    omega_axis: str = "camera_y"  # the latitude's axis: camera_y | world_z
+    omega_input: str = "sin2"  # what the networks see: sin2 = Omega | cos = sqrt(1 - Omega)
+    max_modulated_omega: float = 1.0  # limit of Omega in Eq. 15
+    distance_unit: str = "scene"  # distances as input are in Scene.unit, or in units of the world
+    voxel_size: float | str = "auto"  # world units, or auto: see `automatic_voxel_size`
+
+    def __post_init__(self) -> None:
+        """Reject what the model cannot be built with."""
+        for name, known in (
+            ("omega_axis", OMEGA_AXES),
+            ("omega_input", OMEGA_INPUTS),
+            ("distance_unit", DISTANCE_UNITS),
+            ("precision", PRECISIONS),
+        ):
+            if getattr(self, name) not in known:
+                raise ValueError(f"unknown {name} {getattr(self, name)!r}; known: {', '.join(known)}")
+        for name in ("features", "offsets", "hidden"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
+        if not 0 <= self.tau <= 1:
+            raise ValueError(f"tau is {self.tau}; it must be in [0, 1], or opacities turn negative at the poles")
+        if isinstance(self.voxel_size, str) and self.voxel_size != "auto":
+            raise ValueError(f"unknown voxel_size {self.voxel_size!r}; known: auto, or a length in world units")
+
+    @property
+    def inputs(self) -> int:
+        """Number of network inputs: features, direction 3, distance, distortion; 37 in the paper."""
+        return self.features + 3 + self.use_distance + self.use_distortion
+
+
+RELEASED_MODEL: dict[str, Any] = {
+    "omega_axis": "world_z",
+    "omega_input": "cos",
+    "max_modulated_omega": 1 - 1e-4,
+    "distance_unit": "world",
+}
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """What the model shows to one camera: N selected of the A K Gaussians."""
+
+    gaussians: Gaussians  # N, opacities modulated
+    slots: Tensor  # [N] int64 ascending, anchor K + k
+    raw_opacities: Tensor  # [A, K] in (-1, 1), before selection and modulation
+
+
+class PaDGS(nn.Module):
+    """Anchors with K Gaussians each. Positions are a buffer: they are never learned and carry no gradient.
+
+    Attributes:
+        positions: [A, 3] world.
+        features: [A, C].
+        offsets: [A, K, 3] in units of the anchor's scale.
+        log_scales: [A, 6]; the first three scale the offsets, the last three the Gaussians; world units.
+        decoder: the networks.
+        voxel_size: spacing of the grid that anchors live on, world units.
+        unit: what distances are divided by before the networks see them, world units.
+    """
+
+    positions: Tensor
+
+    def __init__(
+        self,
+        positions: Tensor,
+        log_scales: Tensor,
+        options: PaDGSOptions = PaDGSOptions(),
+        *,
+        voxel_size: float,
+        unit: float = 1.0,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        """A model with all Gaussians on their anchors [A, 3], log-scales [A, 6], and random networks."""
+        super().__init__()
+        count = len(positions)
+        self.options, self.voxel_size, self.unit = options, voxel_size, unit
+        self.register_buffer("positions", positions)
+        self.features = nn.Parameter(positions.new_zeros(count, options.features))
+        self.offsets = nn.Parameter(positions.new_zeros(count, options.offsets, 3))
+        self.log_scales = nn.Parameter(log_scales)
+        decoder = Decoder(options.inputs, options.offsets, options.hidden, generator=generator)
+        self.decoder = decoder.to(positions.device)
+
+    @classmethod
+    def from_scene(cls, scene: Scene, options: PaDGSOptions = PaDGSOptions(), *, seed: int = 0) -> PaDGS:
+        """The untrained model of a scene: its point cloud on a grid.
+
+        Raises:
+            ValueError: the point cloud is empty or not finite.
+        """
+        voxel_size = automatic_voxel_size(scene) if options.voxel_size == "auto" else float(options.voxel_size)
+        positions = anchors_from_points(scene.points, voxel_size)
+        return cls(
+            positions,
+            initial_log_scales(positions, voxel_size),
+            options,
+            voxel_size=voxel_size,
+            unit=scene.unit if options.distance_unit == "scene" else 1.0,
+            generator=torch.Generator().manual_seed(seed),
+        )
+
+    def __len__(self) -> int:
+        """Number of anchors."""
+        return len(self.positions)
+
+    def rows(self) -> dict[str, nn.Parameter]:
+        """The parameters that have one row per anchor."""
+        return {"offsets": self.offsets, "features": self.features, "log_scales": self.log_scales}
+
+    def load(self, tensors: Mapping[str, Tensor]) -> None:
+        """Take over what `state_dict` of another model gave; the number of anchors may differ, all else may not.
+
+        The parameters stay the same objects, so an optimiser that holds them goes on doing so.
+
+        Raises:
+            ValueError: a tensor is missing, or has another shape than the options of this model make it.
+        """
+        own = self.state_dict()
+        count = len(tensors["positions"]) if "positions" in tensors else 0
+        for name, mine in own.items():
+            shape = [count, *mine.shape[1:]] if name in (*self.rows(), "positions") else list(mine.shape)
+            given = list(tensors[name].shape) if name in tensors else None
+            if given != shape:
+                raise ValueError(f"{name} of the stored model has shape {given}; with these options it is {shape}")
+        for name, parameter in self.named_parameters():
+            parameter.data = tensors[name].to(parameter).clone()
+            parameter.grad = None
+        self.positions = tensors["positions"].to(self.positions).clone()
+
+    @torch.no_grad()
+    def centers(self) -> Tensor:
+        """Means [A K, 3] of all Gaussians in the world frame, selected or not, without gradient (Eq. 14)."""
+        reach = torch.exp(self.log_scales[:, None, :3])
+        return (self.positions[:, None] + reach * self.offsets).view(-1, 3)
+
+    @torch.no_grad()
+    def seen_from(self, view: View) -> tuple[Tensor, Tensor, Tensor]:
+        """Anchors as a camera sees them; constants of the view, so without gradient.
+
+        Returns:
+            direction [A, 3] camera -> anchor in the world frame; distance [A] in `unit`; distortion degree Omega [A].
+        """
+        ray = self.positions - view.center.to(self.positions)
+        distance = torch.sqrt((ray * ray).sum(-1) + (TINY * self.unit) ** 2)
+        direction = ray / distance[:, None]
+        axis = polar_axis(self.options.omega_axis, view.cam_from_world.to(self.positions))
+        return direction, distance / self.unit, direction_distortion(direction, axis)
+
+    def decode(self, view: View) -> Decoded:
+        """The Gaussians that this view shows (Eq. 13-15)."""
+        return Decoded(*decode_gaussians(self.decoder.weights(), *self._as_seen(view), self.options.precision))
+
+    def show(self, view: View) -> Gaussians:
+        """The same for `padgs.render.backends.captured`: A K Gaussians, of which those that are not selected are zeros.
+
+        Raises:
+            ValueError, OSError: as `padgs.anchors.decoder.decode_padded` does.
+        """
+        return decode_padded(self.decoder.weights(), *self._as_seen(view), self.options.precision)
+
+    def _as_seen(self, view: View) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """What is decoded: features, how the camera sees them, positions, offsets, log-scales, attenuation."""
+        options = self.options
+        direction, distance, omega = self.seen_from(view)
+        seen = [direction]
+        if options.use_distance:
+            seen.append(distance[:, None])
+        if options.use_distortion:
+            seen_omega = omega if options.omega_input == "sin2" else torch.sqrt((1 - omega).clamp(min=0))
+            seen.append(seen_omega[:, None])
+        attenuation = modulate(torch.ones_like(omega), omega, options.tau, options.max_modulated_omega)
+        constants = torch.cat(seen, dim=-1), self.positions
+        return self.features, *constants, self.offsets, self.log_scales, attenuation

@@ -1,0 +1,140 @@
+"""Explicit Gaussians whose cameras learn too: the splats of 3DGS and a `Calibration`, as one `Trainable`."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from padgs.learning.method import Budget, Record, Size, State
+from padgs.learning.schedule import ParameterGroup
+from padgs.learning.views import Drawing, model_state
+from padgs.scene import Scene, View
+from padgs.splats.method import SplatMethod
+from padgs.splats.model import Splats
+from padgs.splats.trainee import TrainableSplats
+
+PREFIX = "calibration/"  # of its tensors in a state
+
+
+class Calibration(Protocol):
+    """A differentiable model of the cameras: an `nn.Module` that draws views through itself."""
+
+    def to(self, device: torch.device) -> Any:
+        """Move all of its tensors, in place."""
+        ...
+
+    def groups(self, iterations: int) -> list[ParameterGroup]:
+        """Its parameters and their learning rates in a run of `iterations`."""
+        ...
+
+    def draw(self, draw: Callable[..., Drawing], view: View) -> Drawing:
+        """Draw a training view as its camera takes it; `draw(view, probe=None)` draws as an ideal camera does."""
+        ...
+
+    def summary(self) -> str:
+        """What was found, for people."""
+        ...
+
+    def counts(self) -> dict[str, int]:
+        """What it consists of: poses, lenses, ..."""
+        ...
+
+    def values(self) -> dict[str, Any]:
+        """What building it again takes besides the options, as JSON can hold it."""
+        ...
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Its tensors by name."""
+        ...
+
+    def load_state_dict(self, state_dict: dict[str, Tensor]) -> Any:
+        """Take over tensors; the parameters stay the same objects."""
+        ...
+
+
+class CalibratedSplats(TrainableSplats):
+    """`TrainableSplats` that draws training views through a calibration; `render` stays that of an ideal camera."""
+
+    def __init__(self, *args: Any, calibration: Calibration, **kwargs: Any) -> None:
+        """Arguments as for `TrainableSplats`, and the calibration that is optimised along with the splats."""
+        super().__init__(*args, **kwargs)
+        self.calibration = calibration
+
+    def groups(self) -> list[ParameterGroup]:
+        """Those of the splats and of the cameras."""
+        return super().groups() + self.calibration.groups(self.iterations)
+
+    def draw(self, view: View) -> Drawing:
+        """Render all Gaussians as the camera of the view takes them, differentiably."""
+        return self.calibration.draw(self._drawing, view)
+
+    def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
+        """As the splats do; the last event of a run says what was found of the cameras."""
+        events = super().adapt(iteration, optimizer)
+        return (*events, self.calibration.summary()) if iteration == self.iterations else events
+
+    def state(self) -> State:
+        """That of the splats, and the calibration."""
+        state = super().state()
+        tensors = {PREFIX + name: tensor for name, tensor in self.calibration.state_dict().items()}
+        return State(state.tensors | tensors, state.values | {"calibration": self.calibration.values()})
+
+    def load_state(self, state: State) -> None:
+        """Become the model that `state` was taken of."""
+        super().load_state(state)
+        tensors = {n.removeprefix(PREFIX): t for n, t in state.tensors.items() if n.startswith(PREFIX)}
+        self.calibration.load_state_dict(tensors)
+
+
+class CalibratedMethod(SplatMethod, ABC):
+    """A method whose model is `CalibratedSplats`; a subclass says which calibration."""
+
+    _calibration: Calibration | None = None
+
+    def fit(self, scene: Scene, budget: Budget) -> Iterator[Record]:
+        """Train, from the point cloud of the scene and the cameras as given, or from a loaded state."""
+        if self._loaded is None:
+            self._calibration = self._as_given(scene)
+        yield from super().fit(scene, budget)
+
+    def load_state(self, state: State) -> None:
+        """Become the method that `state` was taken of, ready to render and to go on."""
+        self._calibration = self._as_stored(model_state(state).values["calibration"])
+        super().load_state(state)
+
+    def size(self) -> Size:
+        """Counts and bytes of the model, calibration included."""
+        size = super().size()
+        assert self._calibration is not None
+        parameters = [p for group in self._calibration.groups(1) for p in group.parameters]
+        return Size(
+            counts={**size.counts, **self._calibration.counts()},
+            parameters=size.parameters + sum(p.numel() for p in parameters),
+            bytes=size.bytes + sum(p.numel() * p.element_size() for p in parameters),
+        )
+
+    @abstractmethod
+    def _as_given(self, scene: Scene) -> Calibration:
+        """The calibration that training starts with."""
+
+    @abstractmethod
+    def _as_stored(self, values: Mapping[str, Any]) -> Calibration:
+        """A calibration of the shape that `Calibration.values` tells; its tensors are loaded afterwards."""
+
+    def _wrap(self, splats: Splats, extent: float, iterations: int) -> CalibratedSplats:
+        assert self._calibration is not None
+        self._calibration.to(splats.means.device)
+        return CalibratedSplats(
+            splats,
+            self._options,
+            self._render,
+            extent=extent,
+            iterations=iterations,
+            learning_rate_factor=self._options.learning_rate_factor,
+            seed=self._seed,
+            calibration=self._calibration,
+        )

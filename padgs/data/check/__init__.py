@@ -1,0 +1,1 @@
+"""Is a data set fit for training, and if not, why?"""

@@ -1,0 +1,166 @@
+"""Do points and panoramas agree, and if not, under which other reading of the poses would they?
+
+A wrong axis convention rarely fails: it trains, badly. Two witnesses are asked. Observations (structure from motion's
+own pixels) say it exactly. Otherwise colours: points projected into the panoramas must meet their own colours; their
+correlation is high only if axes, handedness and direction of the poses are right, hidden points notwithstanding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import permutations, product
+
+import torch
+from torch import Tensor
+
+from padgs.data.capture import Tracks
+from padgs.sphere.panorama import project
+
+POINTS = 3000  # a sample is enough to tell conventions apart
+VIEWS = 8
+
+
+@dataclass(frozen=True)
+class Convention:
+    """Another way to read the poses: what to do about it, and the poses it gives."""
+
+    words: str
+    convert: Callable[[Tensor], Tensor]  # cam_from_world [F, 4, 4] -> the same
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How well the points fit under a convention."""
+
+    convention: Convention
+    score: float  # correlation of colours, or minus the median error in pixels
+
+
+def colour_fit(
+    poses: Tensor, images: Tensor, points: Tensor, colors: Tensor, conventions: Sequence[Convention]
+) -> list[Fit]:
+    """Correlation of point and pixel colours under each convention; 1 = the same, about 0 = unrelated.
+
+    Args:
+        poses: [F, 4, 4] cam_from_world.
+        images: [F, H, W, 3] uint8, panoramas reduced to a few hundred pixels width.
+        points: [P, 3] world.
+        colors: [P, 3] uint8.
+        conventions: to be tried.
+    """
+    step = max(1, len(points) // POINTS)
+    points, colors = points[::step].double(), colors[::step].float()
+    height, width = images.shape[1:3]
+    frame = torch.arange(len(images))[:, None]
+    fits = []
+    for convention in conventions:
+        pose = convention.convert(poses.double())
+        seen = (points @ pose[:, :3, :3].mT + pose[:, None, :3, 3]).float()
+        column, row = project(seen, width, height).long().unbind(-1)
+        found = images[frame, row.clamp(0, height - 1), column % width].float()
+        fits.append(Fit(convention, _correlation(found, colors.expand_as(found)).mean().item()))
+    return fits
+
+
+def track_fit(
+    poses: Tensor, points: Tensor, tracks: Tracks, width: int, height: int, conventions: Sequence[Convention]
+) -> list[Fit]:
+    """Minus the median reprojection error of the observations under each convention, in pixels of width x height."""
+    step = max(1, len(tracks.frame) // POINTS)
+    frame, point, pixels = tracks.frame[::step], tracks.point[::step], tracks.pixels[::step]
+    some = points[point].double()
+    fits = []
+    for convention in conventions:
+        pose = convention.convert(poses.double())[frame]
+        error = reprojection_error((pose[:, :3, :3] @ some[..., None])[..., 0] + pose[:, :3, 3], pixels, width, height)
+        fits.append(Fit(convention, -error.median().item()))
+    return fits
+
+
+def reprojection_error(points: Tensor, pixels: Tensor, width: int, height: int) -> Tensor:
+    """Distance in pixels [T] between where camera-frame points [T, 3] fall and where they were seen [T, 2].
+
+    Taken on the image, so that it says what structure from motion says, but the short way round across the seam, and
+    along a row by the cosine of the latitude, so that it means the same angle everywhere.
+    """
+    difference = project(points, width, height) - pixels
+    along = (difference[:, 0] + width / 2) % width - width / 2
+    along = along * torch.cos((pixels[:, 1] / height - 0.5) * torch.pi)
+    return torch.hypot(along, difference[:, 1])
+
+
+def known_conventions() -> list[Convention]:
+    """As stated first, then every reading that files of other programs have been seen to need."""
+    return list(_conventions())
+
+
+def _conventions() -> Iterator[Convention]:
+    yield Convention("the poses are right as they are", lambda poses: poses)
+    readings: dict[str, Callable[[Tensor], Tensor]] = {
+        "": lambda poses: poses,
+        "the poses are world from camera: invert them": torch.linalg.inv,
+        "the rotations are transposed: transpose them and keep the centres": _transposed,
+        "what stands for the translation is the centre: use t = -R t": _from_center,
+        "what stands for the centre is the translation: use C = -R^T C": _to_center,
+    }
+    axes = list(_signed_axes())
+    for reading, convert in readings.items():
+        for words, matrix in axes:
+            if not reading and words is None:
+                continue
+            text = "; ".join(part for part in (reading, words) if part)
+            yield Convention(text, lambda poses, convert=convert, matrix=matrix: matrix @ convert(poses))
+    for words, matrix in axes:
+        if words is None:
+            continue
+        text = f"poses and points stand in different worlds: rotate the points, {words.removeprefix('camera axes: ')}"
+        yield Convention(text, lambda poses, matrix=matrix: poses @ matrix)
+
+
+def _signed_axes() -> Iterator[tuple[str | None, Tensor]]:
+    """The 48 ways to name and point three axes, as [4, 4], with words; None for the identity."""
+    for order in permutations(range(3)):
+        for signs in product((1.0, -1.0), repeat=3):
+            matrix = torch.zeros(4, 4, dtype=torch.float64)
+            matrix[3, 3] = 1
+            for row, (column, sign) in enumerate(zip(order, signs, strict=True)):
+                matrix[row, column] = sign
+            yield _axis_words(matrix), matrix
+
+
+def _axis_words(matrix: Tensor) -> str | None:
+    rows = matrix[:3, :3].tolist()
+    if rows == torch.eye(3).tolist():
+        return None
+    names = [f"{'-' if min(row) < 0 else ''}{'xyz'[[abs(value) for value in row].index(1)]}" for row in rows]
+    words = f"camera axes: take ({', '.join(names)}) for (x, y, z)"
+    if names == ["x", "-y", "-z"]:
+        words += ", as from OpenGL, Blender or nerfstudio"
+    return words + (", which mirrors" if torch.linalg.det(matrix) < 0 else "")
+
+
+def _transposed(poses: Tensor) -> Tensor:
+    turned = poses[:, :3, :3].mT
+    centers = -turned @ poses[:, :3, 3:]
+    return _with(poses, turned, -turned @ centers)
+
+
+def _from_center(poses: Tensor) -> Tensor:
+    return _with(poses, poses[:, :3, :3], -poses[:, :3, :3] @ poses[:, :3, 3:])
+
+
+def _to_center(poses: Tensor) -> Tensor:
+    return _with(poses, poses[:, :3, :3], -poses[:, :3, :3].mT @ poses[:, :3, 3:])
+
+
+def _with(poses: Tensor, rotation: Tensor, translation: Tensor) -> Tensor:
+    out = poses.clone()
+    out[:, :3, :3], out[:, :3, 3:] = rotation, translation
+    return out
+
+
+def _correlation(a: Tensor, b: Tensor) -> Tensor:
+    """Pearson's over P of two [F, P, 3]; [F, 3]."""
+    a, b = a - a.mean(1, keepdim=True), b - b.mean(1, keepdim=True)
+    return (a * b).sum(1) / (a.norm(dim=1) * b.norm(dim=1)).clamp(min=1e-6)

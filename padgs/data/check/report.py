@@ -1,0 +1,237 @@
+"""Looks a data set through and says what it holds and what is wrong with it, all at once instead of one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+import padgs.data
+from padgs.data.assemble import assemble
+from padgs.data.capture import Capture
+from padgs.data.check.conventions import VIEWS, colour_fit, known_conventions, reprojection_error, track_fit
+from padgs.data.check.overlay import draw_overlay
+from padgs.data.errors import DataError, listed
+from padgs.data.images import decode, inspect
+from padgs.data.options import DataOptions
+from padgs.data.resize import area_resize
+from padgs.data.trajectory import Gravity, centers, gravity, median_depth, path_length
+from padgs.scene import Scene, View
+
+SMALL = 256  # width at which colours are compared
+REPROJECTION_LIMIT = 1 / 500  # of the width, on the median: 4 pixels of 2048
+BETTER = 0.1  # by how much the correlation under another convention must exceed the stated one's
+FITS = 0.3  # correlation from which points and pictures can be said to agree
+SAME_PLACE = 0.01  # of the median depth: a test view as near as this to a training view tests memory
+FAR_AWAY = 1e5  # coordinates larger than this many median depths lose digits in float32
+
+
+@dataclass
+class Report:
+    """What `padgs check` says. Lengths are in world units, pixels are those of the model's cameras."""
+
+    path: Path
+    format: str = ""
+    train: int = 0
+    test: int = 0
+    unused: int = 0
+    points: int = 0
+    coloured: bool = False
+    resolution: str = ""
+    gravity: Gravity | None = None
+    path_length: float = 0.0
+    median_depth: float = 0.0
+    observations: int = 0
+    reprojection_median: float | None = None  # pixels
+    reprojection_95: float | None = None  # pixels
+    colour_correlation: float | None = None  # of the points with the pictures, as stated
+    masked: dict[str, float] = field(default_factory=dict)  # view -> share of its pixels (by weight) that is ignored
+    notes: list[str] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+    suggestion: str | None = None  # how to read the poses so that the points fit
+    overlay: Path | None = None
+
+
+def check(
+    path: Path,
+    *,
+    format: str = "auto",
+    options: DataOptions = DataOptions(),  # noqa: B008 - frozen dataclass
+    overlay: Path | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Report:
+    """Check a data set; whatever is wrong ends up in `Report.problems`, nothing is raised for it.
+
+    Args:
+        path: folder or file, as for `padgs.data.load`.
+        format: a name of LOADERS, or auto.
+        options: the `data` group of the configuration.
+        overlay: where the picture of points on a panorama goes; none if not given.
+        progress: called with (images decoded, images in all).
+    """
+    report = Report(Path(path))
+    try:
+        capture = padgs.data.read(path, format, options)
+    except DataError as error:
+        report.problems.append(str(error))
+        return report
+    report.format = capture.format
+    _check_images(capture, report, progress)
+    scene = _assemble(capture, options, report)
+    if scene is None:
+        return report
+    poses = torch.stack([view.cam_from_world for view in (*scene.train, *scene.test)])
+    report.train, report.test = len(scene.train), len(scene.test)
+    report.unused = len(capture.frames) - report.train - report.test
+    report.points, report.coloured = len(scene.points), capture.cloud is not None and capture.cloud.colors is not None
+    sizes = sorted({(view.width, view.height) for view in (*scene.train, *scene.test)})
+    report.resolution = listed(f"{width}x{height}" for width, height in sizes)
+    report.notes += scene.notes
+    report.gravity = gravity(poses)
+    ordered = sorted(capture.frames, key=lambda frame: frame.name)
+    report.path_length = path_length(torch.stack([frame.cam_from_world for frame in ordered]))
+    report.median_depth = median_depth(poses, scene.points)
+    report.masked = {view.name: 1 - mask.mean().item() for view in _views(scene) if (mask := view.mask()) is not None}
+    _check_leaks(scene, capture, report)
+    _check_digits(scene, poses, report)
+    _check_fit(capture, scene, report)
+    if overlay is not None:
+        try:
+            draw_overlay((scene.test or scene.train)[0], scene.points, overlay)
+            report.overlay = overlay
+        except DataError as error:
+            report.problems.append(str(error))
+    return report
+
+
+def _views(scene: Scene) -> tuple[View, ...]:
+    return (*scene.train, *scene.test)
+
+
+def _check_images(capture: Capture, report: Report, progress: Callable[[int, int], None]) -> None:
+    """Decode everything once; a damaged file must show now, not in the middle of a training."""
+    for done, frame in enumerate(capture.frames):
+        if frame.image.is_file():  # absent ones are reported together
+            try:
+                inspect(frame.image)
+                decode(frame.image)
+            except DataError as error:
+                report.problems.append(str(error))
+        progress(done + 1, len(capture.frames))
+
+
+def _assemble(capture: Capture, options: DataOptions, report: Report) -> Scene | None:
+    """The scene, or what keeps it from being one: each part is tried by itself, so that all problems are told."""
+    try:
+        return assemble(capture, options)
+    except DataError as error:
+        if str(error) not in report.problems:
+            report.problems.append(str(error))
+    easier = (
+        {"mask": "none"},
+        {"split": "all"},
+        {"points": "random"},
+        {"mask": "none", "split": "all"},
+        {"mask": "none", "split": "all", "points": "random"},
+    )
+    for change in easier:
+        try:
+            return assemble(capture, replace(options, **change))
+        except DataError as error:
+            if str(error) not in report.problems:
+                report.problems.append(str(error))
+    return None
+
+
+def _check_leaks(scene: Scene, capture: Capture, report: Report) -> None:
+    """Test views that training has seen."""
+    files = {frame.name.rpartition(".")[0]: frame.image for frame in capture.frames}
+    digests = {inspect(files[view.name]).digest: view.name for view in scene.train}
+    for view in scene.test:
+        twin = digests.get(inspect(files[view.name]).digest)
+        if twin is not None:
+            report.problems.append(
+                f"the test view {view.name} is the same image as the training view {twin}; remove one of them"
+            )
+    if not scene.test:
+        return
+    train = centers(torch.stack([view.cam_from_world for view in scene.train]))
+    test = centers(torch.stack([view.cam_from_world for view in scene.test]))
+    near = torch.cdist(test, train).min(1).values < SAME_PLACE * report.median_depth
+    if near.any():
+        names = [view.name for view, is_near in zip(scene.test, near.tolist(), strict=True) if is_near]
+        report.notes.append(
+            f"{len(names)} test views stand within {SAME_PLACE:.0%} of the median depth of a training view "
+            f"({listed(names)}); they test memory more than synthesis"
+        )
+
+
+def _check_digits(scene: Scene, poses: Tensor, report: Report) -> None:
+    largest = torch.cat((centers(poses), scene.points.double())).abs().median().item()
+    if report.median_depth > 0 and largest > FAR_AWAY * report.median_depth:
+        report.problems.append(
+            f"coordinates are {largest:.3g} while things are {report.median_depth:.3g} away; 32-bit numbers cannot "
+            "hold both: shift the world to the cameras"
+        )
+    if report.path_length == 0 and len(poses) > 1:
+        report.problems.append("all cameras stand at one place; there is nothing to learn depth from")
+
+
+def _check_fit(capture: Capture, scene: Scene, report: Report) -> None:
+    """Reprojection of observations, else colours; and whether another convention does better."""
+    conventions = known_conventions()
+    fits = []
+    tracks = None if capture.tracks is None or capture.cloud is None else capture.tracks()
+    sizes = {(frame.width, frame.height) for frame in capture.frames}
+    width, height = next(iter(sizes))
+    if tracks is not None and len(tracks.frame) and len(sizes) == 1 and width is not None and height is not None:
+        assert capture.cloud is not None
+        poses = torch.stack([frame.cam_from_world for frame in capture.frames])
+        pose, points = poses[tracks.frame], capture.cloud.points[tracks.point]
+        seen = (pose[:, :3, :3] @ points[..., None])[..., 0] + pose[:, :3, 3]
+        error = reprojection_error(seen, tracks.pixels, width, height)
+        report.observations = len(error)
+        report.reprojection_median = error.median().item()
+        report.reprojection_95 = error.sort().values[int(0.95 * (len(error) - 1))].item()
+        limit = REPROJECTION_LIMIT * width
+        if report.reprojection_median > limit:
+            report.problems.append(
+                f"points are {report.reprojection_median:.1f} pixels (median) from where they were seen; up to "
+                f"{limit:.1f} would be fine at this size"
+            )
+            fits = track_fit(poses, capture.cloud.points, tracks, width, height, conventions)
+            best = max(fits, key=lambda fit: fit.score)
+            if -best.score <= limit:
+                report.suggestion = best.convention.words
+    if not report.coloured or any("random ones" in note for note in scene.notes):
+        return
+    step = max(1, len(_views(scene)) // VIEWS)
+    views = [view for view in _views(scene)[::step] if view.load_pixels is not None][:VIEWS]
+    poses = torch.stack([view.cam_from_world for view in views])
+    fits = colour_fit(poses, _small(views), scene.points, scene.point_colors, conventions)
+    stated, best = fits[0], max(fits, key=lambda fit: fit.score)
+    report.colour_correlation = stated.score
+    if best.score > max(FITS, stated.score + BETTER) and report.suggestion is None:
+        report.problems.append(
+            f"points and panoramas do not agree: their colours correlate by {stated.score:.2f} as the poses are stated "
+            f"and by {best.score:.2f} if read otherwise"
+        )
+        report.suggestion = best.convention.words
+    elif stated.score < FITS and report.suggestion is None:
+        report.notes.append(
+            f"the colours of points and panoramas correlate by only {stated.score:.2f}, and by no more in any other "
+            "known convention; look at the overlay"
+        )
+
+
+def _small(views: list[View]) -> Tensor:
+    """The panoramas [F, H, W, 3] uint8, all reduced to one width of a few hundred pixels."""
+    width = min(SMALL, *(view.width for view in views))
+    images = []
+    for view in views:
+        assert view.load_pixels is not None
+        images.append(torch.from_numpy(area_resize(view.load_pixels().cpu().numpy(), width, width // 2)))
+    return torch.stack(images)

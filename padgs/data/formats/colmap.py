@@ -1,0 +1,175 @@
+"""COLMAP models, text or binary, with or without rigs, of the camera EQUIRECTANGULAR (in forks: SPHERICAL).
+
+COLMAP's panoramic camera is this project's (padgs.sphere.panorama), so poses are taken as they are.
+"""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import torch
+
+from padgs.data.assemble import assemble, image_folder
+from padgs.data.capture import Capture, Cloud, Frame, Tracks
+from padgs.data.errors import DataError, listed
+from padgs.data.formats.colmap_binary import check_whole
+from padgs.data.formats.poses import cam_from_world
+from padgs.data.options import DataOptions
+from padgs.data.splits import check_inside
+from padgs.scene import Scene
+
+FILES = ("cameras", "images", "points3D")
+_ALIAS = re.compile(r"^(\s*\d+\s+)SPHERICAL\s+(\d+)\s+(\d+).*$", re.MULTILINE)
+
+
+def load(path: Path, options: DataOptions) -> Scene:
+    """The scene of a COLMAP model and its images."""
+    return assemble(read(path, options), options)
+
+
+def find_model(path: Path) -> Path | None:
+    """The folder with the model's files, in a data set's folder or itself; the largest of several parts."""
+    for folder in (path / "sparse_equirectangular", path / "sparse", path / "colmap" / "sparse", path):
+        parts = [folder, *sorted(part for part in folder.glob("*") if part.is_dir())] if folder != path else [folder]
+        found = [part for part in parts if _suffix(part)]
+        if found:
+            return max(found, key=lambda part: (part / f"images{_suffix(part)}").stat().st_size)
+    return None
+
+
+def read(path: Path, options: DataOptions, model: Path | None = None) -> Capture:
+    """Read a COLMAP model.
+
+    Args:
+        path: the data set's folder.
+        options: only `images` is used.
+        model: the folder with the model's files, where it is not in a usual place.
+
+    Raises:
+        DataError: files missing or damaged, a camera that is not panoramic, no pose.
+    """
+    model = model or find_model(path)
+    if model is None:
+        raise DataError(f"{path} holds no COLMAP model (cameras, images and points3D as .bin or .txt in sparse/0)")
+    suffix = _suffix(model)
+    absent = [f"{name}{suffix}" for name in FILES if not (model / f"{name}{suffix}").is_file()]
+    if absent:
+        raise DataError(f"the COLMAP model {model} lacks {listed(absent)}; export the whole model")
+    folder = image_folder(path, options.images)
+    reconstruction = _open(model, str(suffix))
+    images = [image for _, image in sorted(reconstruction.images.items()) if image.has_pose]
+    notes = _part_notes(path, model)
+    names = _names(model) if suffix == ".txt" else {}
+    without = [image.name for image in reconstruction.images.values() if not image.has_pose]
+    if without:
+        notes.append(f"{len(without)} images of the model are not registered: {listed(sorted(without))}")
+    frames = tuple(_frame(image, names.get(image.image_id) or str(image.name), folder, model) for image in images)
+    point_ids = sorted(reconstruction.points3D.keys())
+    points = [reconstruction.points3D[point_id] for point_id in point_ids]
+    cloud = Cloud(
+        torch.from_numpy(np.array([point.xyz for point in points], np.float64).reshape(-1, 3)),
+        torch.from_numpy(np.array([point.color for point in points], np.uint8).reshape(-1, 3)),
+    )
+    return Capture(
+        format="colmap",
+        folder=path,
+        image_folder=folder,
+        frames=frames,
+        cloud=cloud,
+        tracks=lambda: _tracks(images, point_ids),
+        notes=tuple(notes),
+    )
+
+
+def pycolmap_module() -> ModuleType:
+    """The module pycolmap, imported such that Pillow can still write PNG files afterwards."""
+    import zlib  # noqa: F401 - before pycolmap, whose own deflate symbols would otherwise replace the system's
+
+    import pycolmap
+
+    return pycolmap
+
+
+def _suffix(folder: Path) -> str | None:
+    return next((end for end in (".bin", ".txt") if (folder / f"images{end}").is_file()), None)
+
+
+def _part_notes(path: Path, model: Path) -> list[str]:
+    others = [part.name for part in sorted(model.parent.glob("*")) if part != model and part.is_dir() and _suffix(part)]
+    if model == path or not others:
+        return []
+    return [f"the model has several parts; {model.name} is the largest and is used, not {listed(others)}"]
+
+
+def _open(model: Path, suffix: str) -> Any:
+    pycolmap = pycolmap_module()
+    if suffix == ".bin":
+        check_whole(model)
+    reconstruction = pycolmap.Reconstruction()
+    try:
+        if suffix == ".bin":
+            reconstruction.read_binary(str(model))
+        elif _ALIAS.search(cameras := (model / "cameras.txt").read_text(encoding="utf-8", errors="replace")):
+            with tempfile.TemporaryDirectory() as folder:
+                for file in model.glob("*.txt"):
+                    (Path(folder) / file.name).symlink_to(file.absolute())
+                (Path(folder) / "cameras.txt").unlink()
+                (Path(folder) / "cameras.txt").write_text(_ALIAS.sub(r"\1EQUIRECTANGULAR \2 \3 \2 \3", cameras))
+                reconstruction.read_text(folder)
+        else:
+            reconstruction.read_text(str(model))
+    except (ValueError, IndexError, RuntimeError, OSError) as error:
+        raise DataError(f"pycolmap cannot read the COLMAP model {model}: {error}; export the model again") from error
+    return reconstruction
+
+
+def _names(model: Path) -> dict[int, str]:
+    """Image id -> name. pycolmap ends the names of text models at the first space."""
+    lines = iter((model / "images.txt").read_text(encoding="utf-8", errors="surrogateescape").splitlines())
+    names = {}
+    for line in lines:
+        fields = line.split(None, 9)
+        if fields and not line.startswith("#") and len(fields) == 10 and fields[0].isdecimal():
+            names[int(fields[0])] = fields[9].rstrip()
+            next(lines, None)  # its observations
+    return names
+
+
+def _frame(image: Any, name: str, folder: Path, model: Path) -> Frame:
+    camera = image.camera
+    if camera.model_name != "EQUIRECTANGULAR":
+        raise DataError(
+            f"{name} has a {camera.model_name} camera ({model}); only panoramas (EQUIRECTANGULAR) can be used: "
+            "reconstruct from the panoramas themselves (`padgs prepare`), or give the sparse_equirectangular model"
+        )
+    pose = torch.from_numpy(np.asarray(image.cam_from_world().matrix(), np.float64))
+    return Frame(
+        name=check_inside(name, str(model)),
+        image=folder / name,
+        cam_from_world=cam_from_world(pose[:, :3], pose[:, 3], f"{name} in {model}"),
+        width=camera.width,
+        height=camera.height,
+    )
+
+
+def _tracks(images: list[Any], point_ids: Sequence[int]) -> Tracks:
+    index = {point_id: i for i, point_id in enumerate(point_ids)}
+    frame: list[int] = []
+    point: list[int] = []
+    pixels: list[Any] = []
+    for i, image in enumerate(images):
+        for seen in image.get_observation_points2D():
+            frame.append(i)
+            point.append(index[seen.point3D_id])
+            pixels.append(seen.xy)
+    return Tracks(
+        torch.tensor(frame, dtype=torch.int64),
+        torch.tensor(point, dtype=torch.int64),
+        torch.from_numpy(np.array(pixels, np.float64).reshape(-1, 2)),
+    )

@@ -1,0 +1,146 @@
+"""From any format to any other: read, check everything, write beside, then move into place at once."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+
+import torch
+from PIL import Image
+
+import padgs.data
+from padgs.data.assemble import assemble, view_name
+from padgs.data.capture import Capture, Cloud, Frame, Tracks
+from padgs.data.errors import DataError
+from padgs.data.formats.writers import WRITERS, Content
+from padgs.data.options import DataOptions
+from padgs.scene import Scene, View
+
+IMAGE_FOLDERS = {"ricoh360": "imgs"}  # "images" otherwise
+PNG_ONLY = ("ricoh360",)  # EgoNeRF appends .png to the names in its lists
+
+
+def convert(
+    source: Path,
+    destination: Path,
+    to: str,
+    *,
+    format: str = "auto",
+    options: DataOptions = DataOptions(),  # noqa: B008 - frozen dataclass
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Scene:
+    """Write a data set in another format.
+
+    Images are copied byte for byte, unless they are reduced (`options.width`) or the format wants PNG. The split is
+    written as decided; masks are written as mask.png or masks/, and the row rule of 360Roam becomes such a mask.
+
+    Args:
+        source: a data set in any known format.
+        destination: a folder that does not exist yet, or is empty.
+        to: a name of `padgs.data.formats.writers.WRITERS`.
+        format: that of the source, or auto.
+        options: as for `padgs.data.load`.
+        progress: called with (images written, images in all).
+
+    Returns:
+        The scene as it was read from the source.
+
+    Raises:
+        DataError: a source that `load` would refuse, or a destination that cannot be written. Nothing is left there.
+        ValueError: unknown format.
+    """
+    if to not in WRITERS:
+        raise ValueError(f"unknown format {to!r}; known: {', '.join(WRITERS)}")
+    if destination.exists() and (not destination.is_dir() or any(destination.iterdir())):
+        raise DataError(f"{destination} exists; nothing is overwritten: remove it or choose another place")
+    capture = padgs.data.read(source, format, options)
+    scene = assemble(capture, options)
+    partial = destination.with_name(f".{destination.name}.partial-{os.getpid()}")
+    try:
+        partial.mkdir(parents=True)
+        content = _write_images(capture, scene, partial, to, progress)
+        if options.points != "auto":
+            content = replace(content, cloud=Cloud(scene.points.double(), scene.point_colors), tracks=None)
+        _write_masks((*scene.train, *scene.test), partial)
+        WRITERS[to](content, partial)
+        if destination.exists():
+            destination.rmdir()
+        partial.rename(destination)
+    except OSError as error:
+        raise DataError(f"cannot write {destination} ({error.strerror or error}); nothing was left there") from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return scene
+
+
+def _write_images(
+    capture: Capture, scene: Scene, folder: Path, to: str, progress: Callable[[int, int], None]
+) -> Content:
+    """Copy or re-encode the images, and say what is to be written about them."""
+    views = {view.name: view for view in (*scene.train, *scene.test)}
+    target = folder / IMAGE_FOLDERS.get(to, "images")
+    frames: list[Frame] = []
+    renamed: dict[str, str] = {}  # view name -> new frame name
+    kept = [i for i, frame in enumerate(capture.frames) if view_name(frame.name) in views]
+    for done, i in enumerate(kept):
+        frame = capture.frames[i]
+        view = views[view_name(frame.name)]
+        with Image.open(frame.image) as image:
+            reduced = image.width != view.width
+        encode = reduced or (to in PNG_ONLY and frame.image.suffix.lower() != ".png")
+        name = str(PurePosixPath(frame.name).with_suffix(".png")) if encode else frame.name
+        (target / name).parent.mkdir(parents=True, exist_ok=True)
+        if encode:
+            assert view.load_pixels is not None
+            Image.fromarray(view.load_pixels().cpu().numpy()).save(target / name)
+        else:
+            shutil.copyfile(frame.image, target / name)
+        frames.append(replace(frame, name=name, width=view.width, height=view.height, mask=None))
+        renamed[view.name] = name
+        progress(done + 1, len(kept))
+    split = {"train": scene.train, "test": scene.test} if scene.test else {}
+    return Content(
+        frames=tuple(frames),
+        cloud=capture.cloud,
+        tracks=_kept_tracks(capture, kept, frames),
+        split={side: tuple(renamed[view.name] for view in part) for side, part in split.items()},
+    )
+
+
+def _kept_tracks(capture: Capture, kept: list[int], frames: list[Frame]) -> Tracks | None:
+    """The observations in the frames that are written, in pixels of the written images."""
+    if capture.tracks is None or any(frame.width is None for frame in capture.frames):
+        return None
+    tracks = capture.tracks()
+    position = torch.full((len(capture.frames),), -1)
+    position[kept] = torch.arange(len(kept))
+    scale = torch.ones(len(capture.frames), dtype=torch.float64)
+    for i, frame in zip(kept, frames, strict=True):
+        before = capture.frames[i].width
+        assert before is not None and frame.width is not None
+        scale[i] = frame.width / before
+    rows = position[tracks.frame] >= 0
+    pixels = tracks.pixels[rows] * scale[tracks.frame[rows], None]
+    return Tracks(position[tracks.frame[rows]], tracks.point[rows], pixels)
+
+
+def _write_masks(views: tuple[View, ...], folder: Path) -> None:
+    """mask.png if all views have the same weights, else one file per masked view."""
+    masks = {view.name: view.mask() for view in views}
+    present = {name: mask for name, mask in masks.items() if mask is not None}
+    if not present:
+        return
+    first = next(iter(present.values()))
+    if len(present) == len(masks) and all(torch.equal(mask, first) for mask in present.values()):
+        _save_mask(first, folder / "mask.png")
+        return
+    for name, mask in present.items():
+        (folder / "masks" / name).parent.mkdir(parents=True, exist_ok=True)
+        _save_mask(mask, folder / "masks" / f"{name}.png")
+
+
+def _save_mask(mask: torch.Tensor, path: Path) -> None:
+    Image.fromarray((mask * 255).round().to(torch.uint8).cpu().numpy()).save(path)

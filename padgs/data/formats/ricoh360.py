@@ -1,0 +1,86 @@
+"""Ricoh360 scenes as published with EgoNeRF: imgs/, train.txt, test.txt, and COLMAP's text files in output_dir/colmap.
+
+The text files come from OpenMVG and their camera is none of COLMAP's, so they are read here. Names in them may carry
+another extension than the images; they are joined without it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path, PurePosixPath
+
+import torch
+
+from padgs.data.assemble import assemble, image_folder, image_names
+from padgs.data.capture import Capture, Cloud, Frame
+from padgs.data.cloud import existing_ply
+from padgs.data.errors import DataError
+from padgs.data.formats.poses import cam_from_world, rotation_from_quaternion
+from padgs.data.options import DataOptions
+from padgs.data.splits import check_inside
+from padgs.scene import Scene
+
+MODEL = "output_dir/colmap"
+
+
+def load(path: Path, options: DataOptions) -> Scene:
+    """The scene in a folder of Ricoh360."""
+    return assemble(read(path, options), options)
+
+
+def read(path: Path, options: DataOptions) -> Capture:
+    """Read poses and points."""
+    images = image_folder(path, options.images, ("imgs", "images"))
+    files = {str(PurePosixPath(name).with_suffix("")): name for name in image_names(images)}
+    files.pop("mask", None)
+    file = path / MODEL / "images.txt"
+    frames = []
+    for line in _pose_lines(file):
+        fields = line.split(None, 9)
+        if len(fields) < 10:
+            raise DataError(f"{file}: the line {line[:60]!r} has {len(fields)} fields; an image has 10")
+        name = check_inside(fields[9].strip(), str(file))
+        name = files.get(str(PurePosixPath(name).with_suffix("")), name)
+        where = f"{name} in {file}"
+        try:
+            values = torch.tensor([float(field) for field in fields[1:8]], dtype=torch.float64)
+        except ValueError as error:
+            raise DataError(f"{where}: the pose is not numbers ({error})") from error
+        pose = cam_from_world(rotation_from_quaternion(values[:4], where), values[4:], where)
+        frames.append(Frame(name, images / name, pose))
+    cloud = existing_ply(path, ("openMVG/scene.ply", "scene.ply", "pcd.ply"))
+    points = path / MODEL / "points3D.txt"
+    if cloud is None and points.is_file():
+        cloud = _cloud(points)
+    mask = "imgs/mask.png" if (path / "imgs" / "mask.png").is_file() else "auto"
+    return Capture("ricoh360", path, images, tuple(frames), cloud, mask=mask)
+
+
+def _pose_lines(file: Path) -> list[str]:
+    """The first line of each pair; the second one, the observations, may be empty."""
+    lines = iter(_lines(file))
+    poses = []
+    for line in lines:
+        if line.strip() and not line.startswith("#"):
+            poses.append(line)
+            next(lines, None)
+    return poses
+
+
+def _cloud(file: Path) -> Cloud | None:
+    rows = [line.split()[1:7] for line in _lines(file) if line.strip() and not line.startswith("#")]
+    if not rows:
+        return None
+    try:
+        values = torch.tensor([[float(field) for field in row] for row in rows], dtype=torch.float64)
+    except ValueError as error:
+        raise DataError(f"{file}: a point is not 'id x y z red green blue error' ({error})") from error
+    if values.shape[1] < 6:
+        raise DataError(f"{file}: a point has {values.shape[1] + 1} fields; it must have id x y z red green blue")
+    return Cloud(values[:, :3], values[:, 3:].clamp(0, 255).to(torch.uint8))
+
+
+def _lines(file: Path) -> list[str]:
+    try:
+        return file.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{file} cannot be read as text ({error})") from error

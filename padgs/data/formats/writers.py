@@ -1,0 +1,252 @@
+"""How each format is written: the files beside the images. The readers are the modules of the same names."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from padgs.data.capture import Cloud, Frame, Tracks
+from padgs.data.errors import DataError
+from padgs.data.formats.colmap import pycolmap_module
+from padgs.data.formats.poses import OPENCV_FROM_OPENGL, quaternion_from_rotation, vector_from_rotation
+from padgs.data.ply import write_ply
+from padgs.data.splits import LISTS
+
+
+@dataclass(frozen=True)
+class Content:
+    """What is to be written. Frame sizes are those of the image files; names are those in the image folder."""
+
+    frames: tuple[Frame, ...]
+    cloud: Cloud | None
+    tracks: Tracks | None
+    split: Mapping[str, tuple[str, ...]]  # "train", "test" -> names; empty where nothing is held out
+
+
+def write_colmap(content: Content, folder: Path) -> None:
+    """sparse/0 in binary, with rigs and frames, and the lists."""
+    pycolmap = pycolmap_module()
+    if content.cloud is None:
+        raise DataError(
+            "there is no point cloud, and a COLMAP model needs one; set data.points to a PLY file or random"
+        )
+    tracks, model = content.tracks, pycolmap.Reconstruction()
+    seen: list[list[int]] = [[] for _ in content.frames]  # rows of tracks, by frame
+    if tracks is not None:
+        for row, frame in enumerate(tracks.frame.tolist()):
+            seen[frame].append(row)
+    elements: dict[int, list[Any]] = {}
+    cameras: dict[tuple[int, int], int] = {}
+    for i, frame in enumerate(content.frames):
+        width, height = _size(frame)
+        if (width, height) not in cameras:
+            cameras[width, height] = len(cameras) + 1
+            model.add_camera_with_trivial_rig(
+                pycolmap.Camera(
+                    camera_id=cameras[width, height],
+                    model="EQUIRECTANGULAR",
+                    width=width,
+                    height=height,
+                    params=[width, height],
+                )
+            )
+        pixels = torch.zeros(0, 2) if tracks is None else tracks.pixels[seen[i]]
+        image = pycolmap.Image(
+            name=frame.name, keypoints=pixels.double().numpy(), camera_id=cameras[width, height], image_id=i + 1
+        )
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(frame.cam_from_world[:3].numpy()))
+        for index, row in enumerate(seen[i]):
+            assert tracks is not None
+            elements.setdefault(int(tracks.point[row]), []).append(pycolmap.TrackElement(i + 1, index))
+    colors = _colors(content.cloud)
+    for k, point in enumerate(content.cloud.points.numpy()):
+        model.add_point3D(point[:, None], pycolmap.Track(elements.get(k, [])), colors[k][:, None])
+    (folder / "sparse" / "0").mkdir(parents=True)
+    model.write_binary(str(folder / "sparse" / "0"))
+    _write_lists(content, folder)
+
+
+def write_transforms(content: Content, folder: Path) -> None:
+    """`transforms.json` and sparse_pc.ply."""
+    frames = []
+    for frame in content.frames:
+        width, height = _size(frame)
+        pose = _opengl_pose(frame)
+        frames.append({"file_path": f"images/{frame.name}", "w": width, "h": height, "transform_matrix": pose})
+    meta: dict[str, Any] = {"camera_model": "EQUIRECTANGULAR", "frames": frames}
+    if content.cloud is not None:
+        write_ply(folder / "sparse_pc.ply", content.cloud)
+        meta["ply_file_path"] = "sparse_pc.ply"
+    if content.split:
+        for side in ("train", "test"):
+            meta[f"{side}_filenames"] = [f"images/{name}" for name in content.split[side]]
+        meta["val_filenames"] = []
+    _write_json(folder / "transforms.json", meta)
+
+
+def write_openmvg(content: Content, folder: Path) -> None:
+    """`sfm_data.json`, colorized.ply for the colours, and the lists."""
+    views, extrinsics = _mvg_views(content)
+    width, height = _size(content.frames[0])
+    cereal = {"polymorphic_id": 2147483649, "polymorphic_name": "spherical"}
+    intrinsic = {"id": 2147483649, "data": {"value0": {"width": width, "height": height}}}
+    structure: list[dict[str, Any]] = []
+    if content.cloud is not None:
+        for key, point in enumerate(content.cloud.points.tolist()):
+            structure.append({"key": key, "value": {"X": point, "observations": []}})
+        if content.cloud.colors is not None:
+            write_ply(folder / "colorized.ply", content.cloud)
+    if content.tracks is not None:
+        tracks = content.tracks
+        rows = zip(tracks.frame.tolist(), tracks.point.tolist(), tracks.pixels.tolist(), strict=True)
+        for feature, (frame, point, pixel) in enumerate(rows):
+            seen = {"key": frame, "value": {"id_feat": feature, "x": pixel}}
+            structure[point]["value"]["observations"].append(seen)
+    data = {
+        "sfm_data_version": "0.3",
+        "root_path": "images",
+        "views": views,
+        "intrinsics": [{"key": 0, "value": {**cereal, "ptr_wrapper": intrinsic}}],
+        "extrinsics": extrinsics,
+        "structure": structure,
+        "control_points": [],
+    }
+    _write_json(folder / "sfm_data.json", data)
+    _write_lists(content, folder)
+
+
+def write_opensfm(content: Content, folder: Path) -> None:
+    """`reconstruction.json` with one reconstruction, and the lists."""
+    cameras, shots = {}, {}
+    for frame in content.frames:
+        width, height = _size(frame)
+        camera = f"panorama {width} {height} spherical"
+        cameras[camera] = {"projection_type": "spherical", "width": width, "height": height}
+        shots[frame.name] = {
+            "rotation": vector_from_rotation(frame.cam_from_world[:3, :3]).tolist(),
+            "translation": frame.cam_from_world[:3, 3].tolist(),
+            "camera": camera,
+        }
+    points = {}
+    if content.cloud is not None:
+        rows = zip(content.cloud.points.tolist(), _colors(content.cloud).tolist(), strict=True)
+        points = {str(k): {"coordinates": point, "color": color} for k, (point, color) in enumerate(rows)}
+    _write_json(folder / "reconstruction.json", [{"cameras": cameras, "shots": shots, "points": points}])
+    _write_lists(content, folder)
+
+
+def write_roam360(content: Content, folder: Path) -> None:
+    """`pose_c2w.json` and scene.ply. The format has no place for views in neither list."""
+    if not content.split:
+        raise DataError("360Roam's format states a split, and there is none; set data.split to every or files")
+    frames = {frame.name: frame for frame in content.frames}
+    poses = {
+        side: [
+            {"rgb_file": name, "transform_matrix": torch.linalg.inv(frames[name].cam_from_world).tolist()}
+            for name in content.split[side]
+        ]
+        for side in ("train", "test")
+    }
+    _write_json(folder / "pose_c2w.json", poses)
+    if content.cloud is not None:
+        write_ply(folder / "scene.ply", content.cloud)
+
+
+def write_ricoh360(content: Content, folder: Path) -> None:
+    """COLMAP text files in output_dir/colmap, and the lists (without extensions)."""
+    model = folder / "output_dir" / "colmap"
+    model.mkdir(parents=True)
+    width, height = _size(content.frames[0])
+    header = "# written by padgs\n# in the layout of\n# EgoNeRF's Ricoh360\n#\n"
+    (model / "cameras.txt").write_text(f"{header}0 SPHERICAL {width} {height}\n", encoding="utf-8")
+    with (model / "images.txt").open("w", encoding="utf-8") as file:
+        file.write(header)
+        for i, frame in enumerate(content.frames):
+            quaternion = quaternion_from_rotation(frame.cam_from_world[:3, :3])
+            pose = " ".join(repr(x) for x in [*quaternion.tolist(), *frame.cam_from_world[:3, 3].tolist()])
+            file.write(f"{i} {pose} 0 {frame.name}\n\n")
+    with (model / "points3D.txt").open("w", encoding="utf-8") as file:
+        file.write(header)
+        if content.cloud is not None:
+            colors = _colors(content.cloud).tolist()
+            for k, (point, color) in enumerate(zip(content.cloud.points.tolist(), colors, strict=True)):
+                file.write(" ".join([str(k), *map(repr, point), *map(str, color), "0"]) + "\n")
+    _write_lists(content, folder, extensions=False)
+
+
+def write_omniblender(content: Content, folder: Path) -> None:
+    """`transform.json`, the lists, and pcd.ply, which EgoNeRF's own scenes lack."""
+    width, height = _size(content.frames[0])
+    frames = [{"file_path": frame.name, "transform_matrix": _opengl_pose(frame)} for frame in content.frames]
+    meta = {"indoor": False, "width": width, "height": height, "frames": frames}
+    _write_json(folder / "transform.json", meta)
+    if content.cloud is not None:
+        write_ply(folder / "pcd.ply", content.cloud)
+    _write_lists(content, folder, extensions=False)
+
+
+def write_released(content: Content, folder: Path) -> None:
+    """data_views.json, data_extrinsics.json, pcd.ply and the lists (of stems): what the released programs read."""
+    views, extrinsics = _mvg_views(content)
+    _write_json(folder / "data_views.json", {"views": views})
+    _write_json(folder / "data_extrinsics.json", {"extrinsics": extrinsics})
+    if content.cloud is not None:
+        write_ply(folder / "pcd.ply", content.cloud)
+    _write_lists(content, folder, extensions=False)
+
+
+WRITERS: dict[str, Callable[[Content, Path], None]] = {
+    "colmap": write_colmap,
+    "transforms": write_transforms,
+    "openmvg": write_openmvg,
+    "opensfm": write_opensfm,
+    "roam360": write_roam360,
+    "ricoh360": write_ricoh360,
+    "omniblender": write_omniblender,
+    "released": write_released,
+}
+
+
+def _mvg_views(content: Content) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    views, extrinsics = [], []
+    for i, frame in enumerate(content.frames):
+        width, height = _size(frame)
+        data = {"local_path": "", "filename": frame.name, "width": width, "height": height}
+        data |= {"id_view": i, "id_intrinsic": 0, "id_pose": i}
+        wrapper = {"id": 2147483650 + i, "data": data}
+        views.append({"key": i, "value": {"polymorphic_id": 1073741824, "ptr_wrapper": wrapper}})
+        rotation, translation = frame.cam_from_world[:3, :3], frame.cam_from_world[:3, 3]
+        center = -rotation.T @ translation
+        extrinsics.append({"key": i, "value": {"rotation": rotation.tolist(), "center": center.tolist()}})
+    return views, extrinsics
+
+
+def _opengl_pose(frame: Frame) -> list[list[float]]:
+    pose = torch.linalg.inv(frame.cam_from_world)
+    pose[:3, :3] = pose[:3, :3] @ OPENCV_FROM_OPENGL
+    return pose.tolist()
+
+
+def _size(frame: Frame) -> tuple[int, int]:
+    assert frame.width is not None and frame.height is not None
+    return frame.width, frame.height
+
+
+def _colors(cloud: Cloud) -> Any:
+    colors = torch.full((len(cloud.points), 3), 128, dtype=torch.uint8) if cloud.colors is None else cloud.colors
+    return colors.numpy()
+
+
+def _write_json(path: Path, value: Any) -> None:
+    path.write_text(json.dumps(value, ensure_ascii=False, allow_nan=False), encoding="utf-8")
+
+
+def _write_lists(content: Content, folder: Path, extensions: bool = True) -> None:
+    for side, names in content.split.items():
+        lines = [name if extensions else name.rpartition(".")[0] for name in names]
+        (folder / LISTS[side]).write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")

@@ -1,0 +1,374 @@
+"""From panoramas without poses, or a 360-degree video, to a data set that is ready for training.
+
+Works beside its destination, in a hidden folder that outlives an interruption: the same call goes on where it stopped.
+The destination appears at the end, complete, or not at all.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from padgs.data.capture import Cloud, Frame, Tracks
+from padgs.data.errors import DataError, listed
+from padgs.data.formats import colmap
+from padgs.data.formats.writers import Content, write_colmap
+from padgs.data.options import DataOptions
+from padgs.data.prepare import rig, sfm
+from padgs.data.prepare.pairs import PAIRS, image_pairs
+from padgs.data.prepare.sources import Source, find_source
+from padgs.data.prepare.video import extract_frames, is_video
+from padgs.data.trajectory import gravity
+
+STEPS = ("frames", "images", "views", "features", "matches", "poses", "result")
+LEVEL_AGREEMENT = 0.9  # length of the mean of the cameras' up directions from which they have a common one
+_REMEDIES = "take them closer together, hide what moves with the camera in a mask (--mask), or try --accurate"
+
+Progress = Callable[[str, int, int], None]  # (one of STEPS, done, in all)
+
+
+@dataclass(frozen=True)
+class PrepareOptions:
+    """What the user may decide."""
+
+    accurate: bool = False  # features in undistorted views: slower, better near the poles
+    pairs: str = "auto"  # auto | exhaustive | sequential (names in the order they were taken)
+    mask: str = "auto"  # auto (mask.png or masks/ with the images) | none | rows:959/1024 | a file or folder
+    level: bool = True  # turn the world so that the cameras' common up is +z
+    per_second: float = 2.0  # frames kept of a video
+    seed: int = 0
+    threads: int = 0  # 0 = one per processor, at most 8; each takes about 0.6 GB at 2048 x 1024
+
+    def __post_init__(self) -> None:
+        """Reject what cannot be followed."""
+        if self.pairs not in PAIRS:
+            raise DataError(f"unknown pairs {self.pairs!r}; known: {', '.join(PAIRS)}")
+        if not 0 < self.per_second <= 1000:
+            raise DataError(f"per_second is {self.per_second}; it must be above 0")
+        if self.threads < 0:
+            raise DataError(f"threads is {self.threads}; give 1 or more, or 0 for all processors")
+
+
+@dataclass
+class Prepared:
+    """What came out; also in prepare.json at the destination."""
+
+    folder: Path
+    registered: tuple[str, ...]
+    unregistered: tuple[str, ...]  # images that could not be placed; they are not at the destination
+    points: int
+    observations: int
+    seconds: dict[str, float] = field(default_factory=dict)  # per step, of this call
+    notes: tuple[str, ...] = ()
+
+
+def prepare(
+    source: Path,
+    destination: Path,
+    options: PrepareOptions = PrepareOptions(),
+    progress: Progress = lambda step, done, total: None,
+) -> Prepared:
+    """Find poses and points for panoramas by structure from motion.
+
+    Args:
+        source: a folder of 2:1 panoramas (subfolders included), or a stitched 360-degree video.
+        destination: a folder that does not exist yet, or is empty. It gets images/, sparse/0 (COLMAP, camera
+            EQUIRECTANGULAR), masks if there are any, and prepare.json.
+        options: see PrepareOptions. The same options, input and machine give the same result.
+        progress: called with (step, done, in all).
+
+    Raises:
+        DataError: input that cannot be used, no two images that can be placed, or a full disk. What was found so far
+            stays in the hidden folder beside the destination; nothing is at the destination.
+    """
+    if destination.exists() and (not destination.is_dir() or any(destination.iterdir())):
+        raise DataError(f"{destination} exists; nothing is overwritten: remove it or choose another place")
+    work = destination.absolute().with_name(f".{destination.name}.prepare")
+    try:
+        return _Job(source, destination.absolute(), work, options, progress).run()
+    except OSError as error:
+        raise DataError(
+            f"cannot prepare {destination} ({error.strerror or error}); the same command goes on where this stopped"
+        ) from error
+    finally:
+        if work.is_dir() and not any(work.glob("*.done")) and not (work / "database.db").exists():
+            shutil.rmtree(work, ignore_errors=True)  # nothing in it that would be worth going on from
+
+
+class _Job:
+    """One preparation in its working folder."""
+
+    def __init__(
+        self, source: Path, destination: Path, work: Path, options: PrepareOptions, progress: Progress
+    ) -> None:
+        self.destination, self.work, self.options, self.progress = destination, work, options, progress
+        self.threads = options.threads or min(8, os.cpu_count() or 1)
+        self.seconds: dict[str, float] = {}
+        if is_video(source):
+            self._open("video", _file_digest(source))
+            with self._step("frames"):
+                self._extract_frames(source)
+            source = self.work / "frames"
+        with self._step("images"):
+            self.source: Source = find_source(source, options.mask)
+        of_video = ("video.sha256", "frames", "frames.done") if source.parent == self.work else ()
+        self._open("images", self.source.fingerprint, keep=of_video)
+        # pycolmap's list of pairs knows no spaces, so it gets names of ours.
+        self.files = {f"{index:06d}{Path(name).suffix}": name for index, name in enumerate(self.source.images)}
+        self.views = rig.VIEWS_PER_ROW * len(rig.LATITUDES) if options.accurate else 1
+
+    def run(self) -> Prepared:
+        """All steps; those that are done already are skipped."""
+        database, images, masks = self.work / "database.db", self.work / "images", self.work / "masks"
+        with sfm.log_to(self.work / "log.txt"):
+            with self._step("views"):
+                self._link_images(images, masks)
+                if self.options.accurate:
+                    self._once("views", self._render_views)
+                    images, masks = self.work / "views", self.work / "view_masks"
+            with self._step("features"):
+                self._once("features", partial(self._find_features, database, images, masks))
+            with self._step("matches"):
+                self._once("matches", partial(self._match, database))
+            with self._step("poses"):
+                self._once("poses", partial(self._place, database, images))
+            with self._step("result"):
+                return self._write()
+
+    # Steps, in order.
+
+    def _extract_frames(self, video: Path) -> None:
+        def extract() -> None:
+            (self.work / "frames").mkdir(exist_ok=True)
+            extract_frames(video, self.work / "frames", self.options.per_second, partial(self.progress, "frames"))
+
+        self._once("frames", extract)
+
+    def _link_images(self, images: Path, masks: Path) -> None:
+        images.mkdir(exist_ok=True)
+        for short, name in self.files.items():
+            if not (images / short).is_symlink():
+                (images / short).symlink_to(self.source.images[name].path.absolute())
+        if self.source.masks:
+            masks.mkdir(exist_ok=True)
+            for short, name in self.files.items():
+                mask = self.source.masks.get(name)
+                image = self.source.images[name]
+                use = np.ones((image.height, image.width), bool) if mask is None else mask().numpy() >= 0.5
+                Image.fromarray(use * np.uint8(255)).save(masks / f"{short}.png", compress_level=1)
+
+    def _render_views(self) -> None:
+        sizes = {(image.width, image.height) for image in self.source.images.values()}
+        if len(sizes) > 1:
+            raise DataError(
+                f"the panoramas have {len(sizes)} sizes ({listed(f'{w}x{h}' for w, h in sorted(sizes))}); --accurate "
+                "needs one: resize them, or do without it"
+            )
+        rig.render_views(
+            {short: self.source.images[name].path for short, name in self.files.items()},
+            {short: self.work / "masks" / f"{short}.png" for short in self.files} if self.source.masks else {},
+            self.work / "views",
+            self.work / "view_masks",
+            partial(self.progress, "views"),
+        )
+
+    def _find_features(self, database: Path, images: Path, masks: Path) -> None:
+        sfm.extract_features(
+            database, images, self._groups(), masks if masks.is_dir() else None, self.threads, self._tell("features")
+        )
+        if self.options.accurate:
+            sfm.make_rig(database, rig.rig_config())
+
+    def _groups(self) -> list[sfm.Group]:
+        """Images that share a camera: panoramas of one size, or one view of all panoramas."""
+        if self.options.accurate:
+            size = rig.view_size(next(iter(self.source.images.values())).width)
+            return [
+                sfm.Group(tuple(rig.view_name(view, short) for short in self.files), size, size, size / 2)
+                for view in range(self.views)
+            ]
+        by_size: dict[tuple[int, int], list[str]] = {}
+        for short, name in self.files.items():
+            image = self.source.images[name]
+            by_size.setdefault((image.width, image.height), []).append(short)
+        return [sfm.Group(tuple(names), *size) for size, names in by_size.items()]
+
+    def _match(self, database: Path) -> None:
+        pairs = [[pair] for pair in image_pairs(list(self.files), self.options.pairs)]
+        if self.options.accurate:
+            both = list(product(range(self.views), repeat=2))
+            pairs = [[(rig.view_name(i, a), rig.view_name(j, b)) for i, j in both] for [(a, b)] in pairs]
+        sfm.match(database, pairs, self.options.accurate, self.threads, self.options.seed, self._tell("matches"))
+
+    def _place(self, database: Path, images: Path) -> None:
+        parts = self.work / "parts"
+        shutil.rmtree(parts, ignore_errors=True)
+        parts.mkdir()
+        found = sfm.reconstruct(
+            database, images, parts, self.threads, self.options.seed, self.views, self._tell("poses")
+        )
+        if not found:
+            raise DataError(f"no two of the {len(self.files)} panoramas could be placed together; {_REMEDIES}")
+
+    def _write(self) -> Prepared:
+        self.progress("result", 0, 1)
+        model, others = self._largest_part()
+        sfm.refine(model, self.threads)
+        frames, cloud, tracks = self._panoramas(model)
+        notes = list(self.source.notes)
+        if self.options.level:
+            frames, cloud, note = _levelled(frames, cloud)
+            notes.append(note)
+        registered = tuple(frame.name for frame in frames)
+        unregistered = tuple(name for name in self.files.values() if name not in set(registered))
+        if unregistered:
+            notes.append(
+                f"{len(unregistered)} of {len(self.files)} panoramas could not be placed: {listed(unregistered)}; "
+                f"{_REMEDIES}"
+            )
+        if others:
+            notes.append(f"{len(others)} smaller part(s) of {listed(others)} panoramas have no connection to the rest")
+        result = Prepared(
+            self.destination, registered, unregistered, len(cloud.points), len(tracks.frame), self.seconds, tuple(notes)
+        )
+        partial_folder = self.work / "out"
+        shutil.rmtree(partial_folder, ignore_errors=True)
+        partial_folder.mkdir()
+        self._copy_images(frames, partial_folder)
+        write_colmap(Content(frames, cloud, tracks, {}), partial_folder)
+        stated = {**asdict(result), "folder": ".", "options": asdict(self.options)}
+        (partial_folder / "prepare.json").write_text(json.dumps(stated, indent=2, ensure_ascii=False), encoding="utf-8")
+        if self.destination.exists():
+            self.destination.rmdir()
+        partial_folder.rename(self.destination)
+        shutil.rmtree(self.work, ignore_errors=True)
+        self.progress("result", 1, 1)
+        return result
+
+    def _largest_part(self) -> tuple[Any, list[int]]:
+        """The part with most panoramas, and the sizes of the others."""
+        pycolmap = colmap.pycolmap_module()
+        parts = [pycolmap.Reconstruction(str(path)) for path in sorted((self.work / "parts").iterdir())]
+        parts.sort(key=lambda part: -part.num_reg_frames())
+        return parts[0], [part.num_reg_frames() for part in parts[1:]]
+
+    def _panoramas(self, model: Any) -> tuple[tuple[Frame, ...], Cloud, Tracks]:
+        """Frames under their own names, points and observations."""
+        if self.options.accurate:
+            paths = {short: self.source.images[name].path for short, name in self.files.items()}
+            frames, cloud, tracks = rig.panoramas(model, paths, next(iter(self.source.images.values())).width)
+        else:
+            refined = self.work / "refined"
+            refined.mkdir(exist_ok=True)
+            model.write_binary(str(refined))
+            capture = colmap.read(self.work, DataOptions(images="images"), refined)
+            assert capture.cloud is not None and capture.tracks is not None
+            frames, cloud, tracks = capture.frames, capture.cloud, capture.tracks()
+        renamed = tuple(
+            replace(frame, name=self.files[frame.name], image=self.source.images[self.files[frame.name]].path)
+            for frame in frames
+        )
+        return renamed, cloud, tracks
+
+    def _copy_images(self, frames: tuple[Frame, ...], folder: Path) -> None:
+        masks = {frame.name: self.source.masks[frame.name]() for frame in frames if frame.name in self.source.masks}
+        first = next(iter(masks.values()), None)
+        shared = first is not None and len(masks) == len(frames) and all(m.equal(first) for m in masks.values())
+        for frame in frames:
+            target = folder / "images" / frame.name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(frame.image, target)
+            if frame.name in masks and not shared:
+                _save_mask(masks[frame.name], folder / "masks" / f"{Path(frame.name).with_suffix('.png')}")
+        if shared:
+            _save_mask(masks[frames[0].name], folder / "mask.png")
+
+    # Bookkeeping.
+
+    def _open(self, of: str, fingerprint: str, keep: tuple[str, ...] = ()) -> None:
+        """Keep the working folder of the same input and options; start over, but for `keep`, with any other."""
+        wanted = {key: value for key, value in asdict(self.options).items() if key != "threads"}
+        stated = hashlib.sha256(json.dumps([fingerprint, wanted], sort_keys=True).encode()).hexdigest()
+        marker = self.work / f"{of}.sha256"
+        if not (marker.is_file() and marker.read_text() == stated):
+            for path in self.work.iterdir() if self.work.is_dir() else ():
+                if path.name not in keep:
+                    shutil.rmtree(path) if path.is_dir() else path.unlink()
+        self.work.mkdir(parents=True, exist_ok=True)
+        marker.write_text(stated)
+
+    @contextmanager
+    def _step(self, name: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self.seconds[name] = round(time.perf_counter() - start, 2)
+
+    def _once(self, step: str, action: Callable[[], None]) -> None:
+        """Do a step unless it has been done in the working folder."""
+        marker = self.work / f"{step}.done"
+        if not marker.exists():
+            action()
+            marker.touch()
+
+    def _tell(self, step: str) -> Callable[[int, int], None]:
+        return partial(self.progress, step)
+
+
+def _levelled(frames: tuple[Frame, ...], cloud: Cloud) -> tuple[tuple[Frame, ...], Cloud, str]:
+    """The same in a world whose +z is the cameras' common up, if they have one, and a note."""
+    found = gravity(torch.stack([frame.cam_from_world for frame in frames]))
+    if found.agreement < LEVEL_AGREEMENT:
+        return frames, cloud, "the cameras have no common up; the world stays as structure from motion left it"
+    new_from_old = rotation_between(torch.tensor(found.up, dtype=torch.float64))
+    turn = torch.eye(4, dtype=torch.float64)
+    turn[:3, :3] = new_from_old.mT
+    frames = tuple(replace(frame, cam_from_world=frame.cam_from_world @ turn) for frame in frames)
+    cloud = Cloud(cloud.points @ new_from_old.mT, cloud.colors)
+    return frames, cloud, "the world's +z is the common up of the cameras; its scale is arbitrary"
+
+
+def rotation_between(up: Tensor) -> Tensor:
+    """The smallest rotation [3, 3] that takes a unit vector [3] to +z.
+
+    >>> rotation_between(torch.tensor([0.0, -1.0, 0.0]))
+    tensor([[ 1.,  0.,  0.],
+            [ 0.,  0.,  1.],
+            [ 0., -1.,  0.]])
+    """
+    x, y, z = up.tolist()
+    if z < -1 + 1e-9:
+        return torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=up.dtype))
+    k = 1 / (1 + z)
+    rows = ((1 - k * x * x, -k * x * y, -x), (-k * x * y, 1 - k * y * y, -y), (x, y, z))
+    return torch.tensor(rows, dtype=up.dtype) + 0.0
+
+
+def _save_mask(mask: Tensor, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray((mask * 255).round().to(torch.uint8).numpy()).save(path)
+
+
+def _file_digest(path: Path) -> str:
+    digest = hashlib.sha256()
+    try:
+        with open(path, "rb") as file:
+            while block := file.read(1 << 20):
+                digest.update(block)
+    except OSError as error:
+        raise DataError(f"{path} cannot be read ({error.strerror}); check its name and permissions") from error
+    return digest.hexdigest()

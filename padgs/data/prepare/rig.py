@@ -1,0 +1,173 @@
+"""A panorama as a rig of twelve perspective views: structure from motion with features where they are undistorted.
+
+Three rows of four 90-degree views at latitudes -35, 0 and 35 degrees; every direction belongs to the view whose centre
+is nearest, so that no feature is found twice. The views' focal length has the panorama's resolution at its horizon.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from padgs.data.capture import Cloud, Frame, Tracks
+from padgs.data.formats.colmap import pycolmap_module
+from padgs.data.formats.poses import rigid
+from padgs.data.images import decode
+from padgs.sphere.panorama import direction, project, sample
+
+LATITUDES = (-35.0, 0.0, 35.0)  # degrees, positive down
+VIEWS_PER_ROW = 4
+
+
+def cam_from_pano() -> Tensor:
+    """Rotations [12, 3, 3] from the panorama's frame to those of its views; rows are right, down, forward."""
+    rotations = []
+    for row, latitude in enumerate(LATITUDES):
+        for column in range(VIEWS_PER_ROW):
+            # Every other row is turned by half a view, which evens out the overlap.
+            longitude = torch.tensor(math.radians(90 * column + 45 * (row % 2)), dtype=torch.float64)
+            angle = torch.tensor(math.radians(latitude), dtype=torch.float64)
+            forward = direction(longitude, angle)
+            down = direction(longitude, angle + math.pi / 2)
+            rotations.append(torch.stack((torch.linalg.cross(down, forward), down, forward)))
+    return torch.stack(rotations)
+
+
+def view_size(pano_width: int) -> int:
+    """Side in pixels of a view: 90 degrees at the panorama's resolution at its horizon, W / pi, even."""
+    return 2 * round(pano_width / math.pi / 2)
+
+
+def view_rays(size: int) -> Tensor:
+    """Directions [size, size, 3] through the pixel centres of a view, in its own frame, not normalised."""
+    offset = (torch.arange(size, dtype=torch.float64) + 0.5) / (size / 2) - 1
+    return torch.stack(
+        (offset.expand(size, size), offset[:, None].expand(size, size), torch.ones(size, size).double()), dim=-1
+    )
+
+
+def owned(index: int, rays: Tensor) -> Tensor:
+    """Whether directions [..., 3] in the panorama's frame belong to view `index`: bool [...]."""
+    return (rays @ cam_from_pano()[:, 2].mT).argmax(-1) == index
+
+
+def resample(image: Tensor, rays: Tensor) -> Tensor:
+    """Bilinear samples [..., C] of a panorama [H, W, C] uint8 in the given directions [..., 3]; rounded to uint8."""
+    return sample(image, rays).round().to(torch.uint8)
+
+
+def render_views(
+    images: dict[str, Path],
+    masks: dict[str, Path],
+    folder: Path,
+    mask_folder: Path,
+    progress: Callable[[int, int], None],
+) -> None:
+    """Write the twelve views of every panorama, and their masks, as <view>/<name>.png.
+
+    Args:
+        images: name -> panorama; all of one size.
+        masks: name -> mask [H, W], 255 = use; names without one are used wholly.
+        folder: where the views go.
+        mask_folder: where their masks go, named as COLMAP wants them: <view>/<name>.png.png.
+        progress: called with (panoramas done, in all).
+    """
+    rotations = cam_from_pano()
+    for done, (name, path) in enumerate(sorted(images.items())):
+        image = torch.from_numpy(decode(path))
+        mask = torch.from_numpy(decode(masks[name], "L")) if name in masks else None
+        rays = view_rays(view_size(image.shape[1]))
+        for index, rotation in enumerate(rotations):
+            pano_rays = rays @ rotation  # transposed: from the view's frame to the panorama's
+            use = owned(index, pano_rays)
+            if mask is not None:
+                use &= resample(mask, pano_rays)[..., 0] >= 128
+            _save(resample(image, pano_rays).numpy(), folder / view_name(index, name))
+            _save((use.numpy() * np.uint8(255)), mask_folder / f"{view_name(index, name)}.png")
+        progress(done + 1, len(images))
+
+
+def view_name(index: int, name: str) -> str:
+    """File of a view of the panorama `name`, relative to the folder of views."""
+    return f"{index:02d}/{name}.png"
+
+
+def split_name(view: str) -> tuple[int, str]:
+    """The inverse of `view_name`.
+
+    >>> split_name("03/kitchen.jpg.png")
+    (3, 'kitchen.jpg')
+    """
+    return int(view[:2]), view[3:].removesuffix(".png")
+
+
+def rig_config() -> Any:
+    """The rig for pycolmap: the first view is its reference, all share one centre."""
+    pycolmap = pycolmap_module()
+    rotations = cam_from_pano()
+    cameras = []
+    for index, rotation in enumerate(rotations):
+        from_first = np.eye(3, 4)
+        from_first[:, :3] = (rotation @ rotations[0].mT).numpy()
+        cameras.append(
+            pycolmap.RigConfigCamera(
+                ref_sensor=index == 0,
+                image_prefix=f"{index:02d}/",
+                cam_from_rig=None if index == 0 else pycolmap.Rigid3d(from_first),
+            )
+        )
+    return pycolmap.RigConfig(cameras=cameras)
+
+
+def panoramas(model: Any, images: dict[str, Path], width: int) -> tuple[tuple[Frame, ...], Cloud, Tracks]:
+    """Frames, points and observations of the panoramas behind a reconstruction of their views.
+
+    Args:
+        model: pycolmap.Reconstruction of the rig.
+        images: name -> panorama.
+        width: of the panoramas, in pixels.
+    """
+    rotations = cam_from_pano()
+    point_ids = sorted(model.points3D.keys())
+    row_of = {point_id: row for row, point_id in enumerate(point_ids)}
+    poses: dict[str, Tensor] = {}
+    seen: dict[str, list[tuple[Tensor, Tensor]]] = {}  # name -> (point rows, pixels) of its views
+    for image in model.images.values():
+        if not image.has_pose:
+            continue
+        view, name = split_name(image.name)
+        matrix = torch.from_numpy(np.array(image.cam_from_world().matrix()))
+        poses.setdefault(name, rigid(rotations[view].mT @ matrix[:, :3], rotations[view].mT @ matrix[:, 3]))
+        with_point = [point for point in image.points2D if point.has_point3D()]
+        if with_point:
+            pixels = torch.from_numpy(np.array([point.xy for point in with_point]))
+            half = view_size(width) / 2
+            rays = torch.cat((pixels / half - 1, torch.ones(len(pixels), 1, dtype=torch.float64)), dim=1)
+            rows = torch.tensor([row_of[point.point3D_id] for point in with_point])
+            seen.setdefault(name, []).append((rows, project(rays @ rotations[view], width, width // 2)))
+    names: Sequence[str] = sorted(poses)
+    frames = tuple(Frame(name, images[name], poses[name], width, width // 2) for name in names)
+    parts = [(index, rows, pixels) for index, name in enumerate(names) for rows, pixels in seen.get(name, [])]
+    tracks = Tracks(
+        frame=torch.cat([torch.full((len(rows),), index) for index, rows, _ in parts]),
+        point=torch.cat([rows for _, rows, _ in parts]),
+        pixels=torch.cat([pixels for _, _, pixels in parts]),
+    )
+    points = [model.points3D[point_id] for point_id in point_ids]
+    cloud = Cloud(
+        torch.from_numpy(np.array([point.xyz for point in points])),
+        torch.from_numpy(np.array([point.color for point in points], np.uint8)),
+    )
+    return frames, cloud, tracks
+
+
+def _save(pixels: np.ndarray, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(pixels).save(path, compress_level=1)

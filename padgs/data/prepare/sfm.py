@@ -1,0 +1,251 @@
+"""Structure from motion with pycolmap, step by step: features, matches, poses, and a last robust refinement.
+
+Features and matches go through the database in batches: that gives progress, and what is in the database is not done
+again. pycolmap logs to the process's standard error and heeds none of its own switches; `log_to` redirects that.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from padgs.data.formats.colmap import pycolmap_module
+
+Progress = Callable[[int, int], None]  # (done, in all)
+
+# Tuned on real indoor and garden panoramas: more features than COLMAP's defaults, because at 2048 x 1024 those leave
+# textureless rooms with a thousand.
+PEAK_THRESHOLD = 0.004
+MAX_FEATURES = 12_000
+LOSS_SCALE = 1.0  # pixels, of the Cauchy loss in the last refinement
+MAX_ERROR = 4.0  # pixels: points with larger reprojection errors are dropped, as the mapper does
+MIN_ANGLE = 1.5  # degrees between the rays to a point
+_PAIRS_PER_BATCH = 64  # of images, however many panoramas that is
+
+
+@dataclass(frozen=True)
+class Group:
+    """Images that share a camera."""
+
+    names: tuple[str, ...]  # relative to the image folder
+    width: int
+    height: int
+    focal: float | None = None  # pixels, of a pinhole camera that looks through its middle; None = equirectangular
+
+
+def extract_features(
+    database: Path, folder: Path, groups: Sequence[Group], masks: Path | None, threads: int, progress: Progress
+) -> int:
+    """Find features in all images; those that are in the database already are left alone.
+
+    Args:
+        database: created if absent.
+        folder: of the images.
+        groups: the images.
+        masks: a folder with <image name>.png for every image, 0 = ignore; or None.
+        threads: processor threads.
+        progress: called with (images done, in all).
+
+    Returns:
+        Number of features, all images together.
+    """
+    pycolmap = pycolmap_module()
+    cameras = _register(database, groups)
+    extraction = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=threads)
+    extraction.sift.peak_threshold, extraction.sift.max_num_features = PEAK_THRESHOLD, MAX_FEATURES
+    total, done = sum(len(group.names) for group in groups), 0
+    for group, camera_id in zip(groups, cameras, strict=True):
+        reader = pycolmap.ImageReaderOptions(existing_camera_id=camera_id)
+        if masks is not None:
+            reader.mask_path = masks
+        for batch in _batches(group.names, 2 * threads):
+            pycolmap.extract_features(
+                database,
+                folder,
+                image_names=list(batch),
+                camera_mode=pycolmap.CameraMode.SINGLE,
+                reader_options=reader,
+                extraction_options=extraction,
+            )
+            done += len(batch)
+            progress(done, total)
+    with pycolmap.Database.open(database) as found:
+        return int(found.num_keypoints())
+
+
+def _register(database: Path, groups: Sequence[Group]) -> list[int]:
+    """Enter cameras and images that are not there yet; returns the camera of each group.
+
+    pycolmap would enter images itself, but in the order in which its threads finish; results would depend on that.
+    """
+    pycolmap = pycolmap_module()
+    cameras = []
+    with pycolmap.Database.open(database) as entries:
+        known = {image.name: image for image in entries.read_all_images()}
+        for group in groups:
+            if group.names[0] in known:
+                camera_id = known[group.names[0]].camera_id
+                rig_id = entries.read_rig_with_sensor(entries.read_camera(camera_id).sensor_id).rig_id
+            else:
+                camera_id = entries.write_camera(_camera(group))
+                rig = pycolmap.Rig()
+                rig.add_ref_sensor(entries.read_camera(camera_id).sensor_id)
+                rig_id = entries.write_rig(rig)
+            for name in group.names:
+                if name not in known:
+                    image_id = entries.write_image(pycolmap.Image(name=name, camera_id=camera_id))
+                    frame = pycolmap.Frame()
+                    frame.rig_id = rig_id
+                    frame.add_data_id(entries.read_image(image_id).data_id)
+                    entries.write_frame(frame)
+            cameras.append(camera_id)
+    return cameras
+
+
+def _camera(group: Group) -> Any:
+    pycolmap = pycolmap_module()
+    if group.focal is None:
+        model, params = "EQUIRECTANGULAR", [group.width, group.height]
+    else:
+        model, params = "SIMPLE_PINHOLE", [group.focal, group.width / 2, group.height / 2]
+    camera = pycolmap.Camera(model=model, width=group.width, height=group.height, params=params)
+    camera.has_prior_focal_length = True
+    return camera
+
+
+def make_rig(database: Path, config: Any) -> None:
+    """Tell the database which images were taken at once, from one place."""
+    pycolmap = pycolmap_module()
+    with pycolmap.Database.open(database) as found:
+        pycolmap.apply_rig_config([config], found)
+
+
+def match(
+    database: Path, pairs: Sequence[Sequence[tuple[str, str]]], rig: bool, threads: int, seed: int, progress: Progress
+) -> int:
+    """Match and verify pairs of images; those that have been matched before are left alone.
+
+    Args:
+        database: with features.
+        pairs: groups of pairs that belong together; for a rig, all pairs of views of two panoramas.
+        rig: verify the views of two panoramas together.
+        threads: processor threads.
+        seed: of the random samples in the verification.
+        progress: called with (groups done, in all).
+
+    Returns:
+        Number of image pairs that show the same things.
+    """
+    pycolmap = pycolmap_module()
+    matching = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=threads)
+    matching.rig_verification = matching.skip_image_pairs_in_same_frame = rig
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = seed
+    file = database.with_name("pairs.txt")
+    done = 0
+    for batch in _batches(pairs, max(1, _PAIRS_PER_BATCH // len(pairs[0]))):
+        file.write_text("".join(f"{a} {b}\n" for group in batch for a, b in group), encoding="utf-8")
+        pycolmap.match_image_pairs(
+            database,
+            matching_options=matching,
+            pairing_options=pycolmap.ImportedPairingOptions(match_list_path=file),
+            verification_options=verification,
+        )
+        done += len(batch)
+        progress(done, len(pairs))
+    file.unlink(missing_ok=True)
+    with pycolmap.Database.open(database) as found:
+        return int(found.num_verified_image_pairs())
+
+
+def reconstruct(
+    database: Path, folder: Path, parts: Path, threads: int, seed: int, images_per_pose: int, progress: Progress
+) -> list[Any]:
+    """Poses and points, largest part first. Parts are what could not be connected.
+
+    Args:
+        database: with matches.
+        folder: of the images, for the colours of the points.
+        parts: folder that pycolmap writes to.
+        threads: processor threads.
+        seed: of all random choices.
+        images_per_pose: views in a rig, else 1.
+        progress: called with (panoramas placed, in all).
+
+    Returns:
+        pycolmap.Reconstruction objects, none if no two images could be placed.
+    """
+    pycolmap = pycolmap_module()
+    pycolmap.set_random_seed(seed)
+    with pycolmap.Database.open(database) as found:
+        total = found.num_images() // images_per_pose
+    options = pycolmap.IncrementalPipelineOptions(num_threads=threads, random_seed=seed, min_model_size=2)
+    # What a camera that looks all around moves towards is not special: moving forward is as good as any way.
+    options.mapper.init_max_forward_motion = 1.0
+    options.ba_refine_focal_length = options.ba_refine_principal_point = options.ba_refine_extra_params = False
+    options.ba_refine_sensor_from_rig = False
+    placed = 0
+
+    def placed_one() -> None:
+        nonlocal placed
+        placed += 1
+        progress(min(placed, total), total)
+
+    def placed_two() -> None:
+        nonlocal placed
+        placed = 2
+        progress(placed, total)
+
+    found_parts = pycolmap.incremental_mapping(
+        database,
+        folder,
+        parts,
+        options,
+        initial_image_pair_callback=placed_two,
+        next_image_callback=placed_one,
+    )
+    return sorted(found_parts.values(), key=lambda part: -part.num_reg_frames())
+
+
+def refine(model: Any, threads: int) -> None:
+    """Adjust all poses and points together once more, robustly, and drop points that still do not fit.
+
+    The mapper adjusts with squared errors; a Cauchy loss takes the weight from the wrong matches among them, which
+    halves the largest errors of rotation on real panoramas.
+    """
+    pycolmap = pycolmap_module()
+    options = pycolmap.BundleAdjustmentOptions(print_summary=False)
+    options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = False
+    options.refine_sensor_from_rig = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = LOSS_SCALE
+    options.ceres.solver_options.function_tolerance = 1e-10
+    options.ceres.solver_options.num_threads = threads
+    pycolmap.bundle_adjustment(model, options)
+    pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR, MIN_ANGLE)
+    model.update_point_3d_errors()
+
+
+@contextmanager
+def log_to(path: Path) -> Iterator[None]:
+    """While this lasts, standard error of the whole process (Python's and pycolmap's) is appended to a file."""
+    sys.stderr.flush()
+    kept = os.dup(2)
+    try:
+        with open(path, "ab") as file:
+            os.dup2(file.fileno(), 2)
+        yield
+    finally:
+        sys.stderr.flush()
+        os.dup2(kept, 2)
+        os.close(kept)
+
+
+def _batches(items: Sequence[Any], size: int) -> Iterator[Sequence[Any]]:
+    for start in range(0, len(items), size):
+        yield items[start : start + size]

@@ -1,0 +1,125 @@
+"""EgoNeRF as the training loop sees it: a model, its learning rates and its regularisation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from padgs.egonerf.model import EgoNeRF
+from padgs.learning.method import State
+from padgs.learning.schedule import LogLinear, ParameterGroup
+
+VARIATION_FACTOR = 1e-2  # published, on both weights
+
+
+@dataclass(frozen=True)
+class EgoNeRFTraining:
+    """What is published for Ricoh360."""
+
+    rays: int = 4096  # of an iteration
+    grid_rate: float = 0.02  # learning rates of Adam at the start
+    network_rate: float = 1e-3  # bases and network
+    environment_rate: float = 5e-3
+    environment_pretraining: int = 0  # iterations that teach it alone, first in the run; outdoor OmniBlender: 10 000
+    pretraining_rate: float = 0.02  # of the environment then; no rate falls before they are over
+    rate_decay: float = 0.1  # all rates, and the weights of the variation, fall exponentially to this share
+    density_variation: float = 0.1  # weight of the total variation of the density planes; 0 for none
+    appearance_variation: float = 0.01
+
+    def __post_init__(self) -> None:
+        """Reject what nothing can be learned with."""
+        if self.rays < 1:
+            raise ValueError(f"rays is {self.rays}; it must be at least 1")
+        if self.environment_pretraining < 0:
+            raise ValueError(f"environment_pretraining is {self.environment_pretraining}; it must be at least 0")
+        for name in ("grid_rate", "network_rate", "environment_rate", "pretraining_rate", "rate_decay"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be > 0")
+        for name in ("density_variation", "appearance_variation"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be >= 0")
+
+
+class TrainableEgoNeRF:
+    """An EgoNeRF with the schedule of a run, as `padgs.learning.rays.RayTrainer` wants it."""
+
+    def __init__(self, model: EgoNeRF, options: EgoNeRFTraining, iterations: int) -> None:
+        """Tie together a model and its learning rates in a run of `iterations`.
+
+        Raises:
+            ValueError: pretraining leaves no iteration for the rest.
+        """
+        self.model, self._options, self._iterations = model, options, iterations
+        alone = options.environment_pretraining
+        if alone >= iterations:
+            raise ValueError(
+                f"environment_pretraining is {alone} of {iterations} iterations, which leaves none for the grids; "
+                "train longer, or lower it"
+            )
+
+    @property
+    def rays_at_once(self) -> int:
+        """Rays of a pass."""
+        return self.model.options.rays_at_once
+
+    def groups(self) -> list[ParameterGroup]:
+        """All parameters, by what they belong to."""
+        model, options = self.model, self._options
+        groups = [
+            ParameterGroup("density", tuple(model.density.parameters()), self._decaying(options.grid_rate)),
+            ParameterGroup("appearance", tuple(model.appearance.parameters()), self._decaying(options.grid_rate)),
+            ParameterGroup("shader", tuple(model.shader.parameters()), self._decaying(options.network_rate)),
+        ]
+        if model.environment is not None:
+            together = self._decaying(options.environment_rate)
+
+            def rate(iteration: int) -> float:
+                return options.pretraining_rate if self._pretrains(iteration) else together(iteration)
+
+            groups.append(ParameterGroup("environment", tuple(model.environment.parameters()), rate))
+        return groups
+
+    def colors(self, origins: Tensor, directions: Tensor, generator: torch.Generator, iteration: int) -> Tensor:
+        """Colours [B, 3] of rays in the world, with jittered samples; of the environment while it learns alone."""
+        if self.model.environment is not None and self._pretrains(iteration):
+            return self.model.environment(directions)
+        return self.model.trace(self.model.from_world(origins), directions, generator).color
+
+    def regularisation(self, iteration: int) -> Tensor | None:
+        """Total variation of the planes, its weight falling like the learning rates."""
+        options = self._options
+        if self._pretrains(iteration):
+            return None
+        if options.density_variation == 0 and options.appearance_variation == 0:
+            return None
+        weighted = (
+            options.density_variation * self.model.density.variation()
+            + options.appearance_variation * self.model.appearance.variation()
+        )
+        return VARIATION_FACTOR * self._decaying(1.0)(iteration) * weighted
+
+    def counts(self) -> dict[str, int]:
+        """Number of parameters."""
+        return {"parameters": sum(p.numel() for p in self.model.parameters())}
+
+    def state(self) -> State:
+        """The parameters, and where the model is; not copies."""
+        model = self.model
+        values = {"unit": model.unit, "travel": model.travel, "centre": model.centre.tolist()}
+        return State(dict(model.state_dict()), values)
+
+    def load_state(self, state: State) -> None:
+        """Take the parameters of a model of the same size and place."""
+        self.model.load_state_dict(state.tensors)
+
+    def _pretrains(self, iteration: int) -> bool:
+        return 0 < iteration <= self._options.environment_pretraining
+
+    def _decaying(self, rate: float) -> Callable[[int], float]:
+        """Learning rate by iteration, from `rate` on once all learn."""
+        alone = self._options.environment_pretraining
+        fall = LogLinear(rate, rate * self._options.rate_decay, self._iterations - alone)
+        return lambda iteration: fall(iteration - alone)

@@ -1,0 +1,107 @@
+"""Eq. 16 and its derivative in one native call (csrc/cpu/loss.cpp, csrc/cuda/loss.cu).
+
+`padgs.learning.loss.photometric_loss` is the definition.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from padgs.native import cuda as cuda_native
+from padgs.native import library as native
+from padgs.native.library import pointer
+
+
+def fits(image: Tensor) -> bool:
+    """Whether a native loss takes this image: float32, three channels, and the library of its device is there."""
+    library = {"cpu": native, "cuda": cuda_native}.get(image.device.type)
+    return library is not None and image.dtype == torch.float32 and image.shape[-1] == 3 and library.available()
+
+
+def fused_photometric_loss(image: Tensor, target: Tensor, weight: Tensor, lambda_l1: float, total: Tensor) -> Tensor:
+    """Eq. 16 over float32 tensors on one device, a scalar; differentiable by `image`.
+
+    Args:
+        image, target: [H, W, 3].
+        weight: [H, W] or [H, 1].
+        lambda_l1: lambda of Eq. 16.
+        total: what the weighted sum over pixels and channels is divided by, a scalar.
+    """
+    if image.device.type == "cuda":
+        return loss_on_gpu(image, target, weight, lambda_l1, total)
+    return _FusedLoss.apply(image, target, weight, lambda_l1, total)
+
+
+class _FusedLoss(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, target: Tensor, weight: Tensor, lambda_l1: float, total: Tensor) -> Tensor:
+        height, width, _ = image.shape
+        image, target = image.contiguous(), target.contiguous()
+        weight = weight.to(torch.float32).expand(height, width)
+        gradient = torch.empty_like(image) if ctx.needs_input_grad[0] else None
+        arguments = native.LossArguments(
+            width,
+            height,
+            pointer(image),
+            pointer(target),
+            weight.data_ptr(),
+            *weight.stride(),
+            lambda_l1,
+            1 / float(total),
+            pointer(_workspace(height, width)),
+            pointer(gradient),
+        )
+        loss = native.library().padgs_photometric_loss(ctypes.byref(arguments))
+        ctx.gradient = gradient
+        return image.new_tensor(loss)
+
+    @staticmethod
+    def backward(ctx: Any, grad_loss: Tensor):
+        return ctx.gradient * grad_loss, None, None, None, None
+
+
+@functools.lru_cache(maxsize=2)
+def _workspace(height: int, width: int) -> Tensor:
+    # Kept between iterations: fresh memory costs more in page faults than the loss does in arithmetic.
+    return torch.zeros(native.library().padgs_loss_workspace(height, width))
+
+
+def loss_on_gpu(image: Tensor, target: Tensor, weight: Tensor, lambda_l1: float, total: Tensor) -> Tensor:
+    """`fused_photometric_loss` where the GPU's library keeps its tensors; the host waits for nothing."""
+    return _LossOnGPU.apply(image, target, weight, lambda_l1, total)
+
+
+class _LossOnGPU(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, target: Tensor, weight: Tensor, lambda_l1: float, total: Tensor) -> Tensor:
+        height, width, _ = image.shape
+        image, target = image.contiguous(), target.contiguous()
+        weight, total = weight.to(torch.float32).expand(height, width), total.to(torch.float32)
+        gradient = torch.empty_like(image) if ctx.needs_input_grad[0] else None
+        partials = None if gradient is None else image.new_empty(3, height, width, 3)
+        sums = image.new_empty(cuda_native.library().padgs_cuda_loss_blocks(height, width))
+        loss = native.LossArguments(
+            width,
+            height,
+            pointer(image),
+            pointer(target),
+            weight.data_ptr(),
+            *weight.stride(),
+            lambda_l1,
+            0.0,
+            pointer(partials),
+            pointer(gradient),
+        )
+        arguments = cuda_native.DeviceLossArguments(loss, pointer(total), pointer(sums))
+        cuda_native.call("padgs_cuda_photometric_loss", cuda_native.queue(image.device), arguments)
+        ctx.gradient = gradient
+        return (sums.sum(dtype=torch.float64) / total).to(torch.float32)
+
+    @staticmethod
+    def backward(ctx: Any, grad_loss: Tensor):
+        return ctx.gradient * grad_loss, None, None, None, None

@@ -1,0 +1,1 @@
+"""What Hydra is told, and many runs at once: sweeps, jobs, and looking on."""

@@ -1,0 +1,101 @@
+"""Which jobs are known to be finished, so that skipping hundreds of them takes no composing and no loading of scenes.
+
+`<run.folder>/.multirun/finished.jsonl` has a line for each job that ended with a result. A job is recognised by its
+command-line settings, the configuration files and the program's own sources; its run by the time of its `result.json`,
+and its data by names, sizes and times of all files. Where anything differs, the job is composed and looked at as usual.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from padgs import results
+from padgs.multirun.board import FOLDER
+from padgs.multirun.overrides import root
+
+FILE_NAME = "finished.jsonl"
+NOT_PART = ("run.", "launcher", "tracking", "retry", "hydra.")  # settings that decide nothing about results
+
+
+class FinishedJobs:
+    """The list of one run folder."""
+
+    def __init__(self, runs: Path) -> None:
+        """Read it; a damaged line only costs time."""
+        self._runs, self._path = runs, runs / FOLDER / FILE_NAME
+        self._known: dict[str, dict[str, Any]] = {}
+        try:
+            lines = self._path.read_text().splitlines()
+        except OSError:
+            lines = []
+        for line in lines:
+            try:
+                entry = json.loads(line)
+                self._known[entry["job"]] = entry
+            except (ValueError, KeyError, TypeError):
+                continue
+
+    def status(self, overrides: Sequence[str]) -> str | None:
+        """The status of a job's result; None where it must be looked at."""
+        entry = self._known.get(key(overrides))
+        if entry is None or (written := _written(self._runs / entry["run"])) is None or entry["written"] != written:
+            return None
+        return entry["status"] if entry["data"] is None or entry["signature"] == signature(entry["data"]) else None
+
+    def add(self, overrides: Sequence[str], run: str, status: str, data: str | None) -> None:
+        """Remember a job that has ended with a result; a disk that is full loses only this."""
+        entry = {"job": key(overrides), "run": run, "status": status, "written": _written(self._runs / run)}
+        entry |= {"data": data, "signature": None if data is None else signature(data)}
+        self._known[entry["job"]] = entry
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            with self._path.open("a") as file:
+                file.write(json.dumps(entry) + "\n")
+        except OSError:
+            return
+
+
+def key(overrides: Sequence[str]) -> str:
+    """What a job is recognised by."""
+    kept = sorted(text for text in overrides if not text.lstrip("+~").startswith(NOT_PART))
+    return hashlib.sha256(json.dumps([*kept, os.getcwd(), _sources()]).encode()).hexdigest()
+
+
+@cache
+def signature(folder: str) -> str:
+    """Names, sizes and times of all files below a folder."""
+    digest = hashlib.sha256()
+    for parent, folders, files in os.walk(folder):
+        folders.sort()
+        for name in sorted(files):
+            path = os.path.join(parent, name)
+            try:
+                status = os.stat(path)
+            except OSError:
+                continue
+            digest.update(f"{path}|{status.st_size}|{status.st_mtime_ns}\n".encode())
+    return digest.hexdigest()
+
+
+@cache
+def _sources() -> str:
+    digest = hashlib.sha256()
+    package = Path(__file__).resolve().parent.parent
+    for folder in (package, package.parent / "baselines", root() / "conf", root() / "sweeps"):
+        for path in sorted(folder.rglob("*")):
+            if path.suffix in (".py", ".yaml"):
+                digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def _written(run: Path) -> int | None:
+    try:
+        return (run / results.FILE_NAME).stat().st_mtime_ns
+    except OSError:
+        return None

@@ -1,0 +1,59 @@
+"""`padgs-run`: one run, or a multirun of many, composed by Hydra from `conf/`."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import signal
+import sys
+from datetime import datetime
+
+import hydra
+from hydra.core.config_store import ConfigStore
+from rich.console import Console
+
+from baselines import METHODS
+from padgs.multirun import job, sweeper
+from padgs.multirun.board import FOLDER, OK
+from padgs.multirun.launchers import missing_plugin
+from padgs.multirun.overrides import conflict, lenient, options_first, root
+from padgs.multirun.scenes import scene_choices
+from padgs.runs.config import default_fields, method_fields
+from padgs.runs.interrupt import Interrupted
+
+INTERRUPTED = 130  # exit code of a command that Ctrl-C ended
+
+
+def register_fields() -> None:
+    """Tell Hydra the keys and defaults of the dataclasses, so that files and commands only name what differs."""
+    store = ConfigStore.instance()
+    store.store(name="fields", node=default_fields())
+    for method in METHODS:
+        store.store(group="fields/method", name=method, node=method_fields(method))
+    for name, scene in scene_choices().items():
+        store.store(group="scene", name=name, node=scene, package="_global_")
+    sweeper.register()
+
+
+def main() -> None:
+    """Entry point of `padgs-run`; exit code 0, 1 if any run failed, 130 if stopped by Ctrl-C."""
+    os.environ.setdefault("PADGS_ROOT", str(root()))
+    arguments = sys.argv[1:]
+    if problem := conflict(arguments) or missing_plugin(arguments):
+        job.complain(problem)
+        sys.exit(1)
+    register_fields()
+    start = f"{datetime.now():%Y%m%d-%H%M%S}-{os.getpid()}"
+    sys.argv[1:] = [*options_first(lenient(arguments)), f"hydra.sweep.dir=${{run.folder}}/{FOLDER}/{start}"]
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # what schedulers send is told apart from a crash
+    try:
+        hydra.main(version_base="1.3", config_path=str(root() / "conf"), config_name="config")(job.job)()
+    except (Interrupted, KeyboardInterrupt) as stopped:
+        advice = f"{str(stopped) or 'stopped'}; to go on: {shlex.join(['padgs-run', *arguments])}"
+        Console(stderr=True).print(advice, markup=False, highlight=False, soft_wrap=True)
+        sys.exit(INTERRUPTED)
+    sys.exit(0 if {*job.ENDS, *sweeper.ENDS} <= {OK} else 1)
+
+
+if __name__ == "__main__":
+    main()

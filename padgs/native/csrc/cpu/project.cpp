@@ -1,0 +1,130 @@
+// Projection of all Gaussians, forward and backward: sixteen at a time, no shared state.
+#include <algorithm>
+#include <cstddef>
+#include <cstring>
+#include <vector>
+
+#include "kernels.h"
+#include "simd_math.h"
+
+#include "../mathematics/footprint.h"
+
+namespace padgs {
+namespace PADGS_ISA {
+namespace {
+
+constexpr int64_t kBlock = 1024;  // Gaussians per partial sum of the pose gradient; fixed, so that sums are too
+
+// Sixteen items of an array of N x width floats, one vector per component. Lanes past the end repeat the last item.
+template <int kWidth>
+void load_items(const float *array, int64_t first, int64_t count, Vec *out) {
+  float lanes[kWidth][kLanes];
+  for (int lane = 0; lane < kLanes; ++lane) {
+    const float *item = array + std::min(first + lane, count - 1) * kWidth;
+    for (int k = 0; k < kWidth; ++k) lanes[k][lane] = item[k];
+  }
+  for (int k = 0; k < kWidth; ++k) out[k] = load(lanes[k]);
+}
+
+template <int kWidth>
+void store_items(float *array, int64_t first, int64_t count, const Vec *in) {
+  float lanes[kWidth][kLanes];
+  for (int k = 0; k < kWidth; ++k) store(lanes[k], in[k]);
+  const int end = int(std::min<int64_t>(kLanes, count - first));
+  for (int lane = 0; lane < end; ++lane)
+    for (int k = 0; k < kWidth; ++k) array[(first + lane) * kWidth + k] = lanes[k][lane];
+}
+
+// Sixteen Gaussians in the camera frame; a probe has moved those of projective footprints.
+PosedGaussian<Vec> load_posed(const Camera &camera, const Inputs &in, int64_t first, Probe<Vec> &probe) {
+  Vec m[3], q[4], s[3], o[1], p[2] = {zero(), zero()};
+  load_items<3>(in.means, first, in.count, m);
+  load_items<4>(in.quats, first, in.count, q);
+  load_items<3>(in.scales, first, in.count, s);
+  load_items<1>(in.opacities, first, in.count, o);
+  if (in.probe) load_items<2>(in.probe, first, in.count, p);
+  probe = {p[0], p[1]};
+  PosedGaussian<Vec> posed(camera.cam_from_world, {m[0], m[1], m[2]}, {q[0], q[1], q[2], q[3]}, {s[0], s[1], s[2]},
+                           o[0]);
+  if (in.probe && !planar(camera.projection)) posed.gaussian.mean = probed_mean(posed.gaussian.mean, probe);
+  return posed;
+}
+
+void forward_batch(const Camera &camera, const Inputs &in, int64_t first, Footprint *footprints, PixelBox *boxes) {
+  Probe<Vec> probe;
+  const PosedGaussian<Vec> posed = load_posed(camera, in, first, probe);
+  const Projected<Vec> all = projected(camera, posed.gaussian, probe);
+  constexpr int kOwn = 13;  // values of a footprint besides its colour
+  static_assert(sizeof all == (kOwn + 13) * sizeof(Vec) && offsetof(Footprint, red) == kOwn * sizeof(float));
+  float footprint[kOwn][kLanes], drawn[kLanes], bounds[12][kLanes];
+  std::memcpy(footprint, &all, sizeof footprint);
+  store(drawn, all.drawn);
+  std::memcpy(bounds, all.bounds, sizeof bounds);
+  const int reads = planar(camera.projection) ? 6 : 12;
+  const int end = int(std::min<int64_t>(kLanes, in.count - first));
+  for (int lane = 0; lane < end; ++lane) {
+    float own[kOwn], bound[12];
+    for (int k = 0; k < kOwn; ++k) own[k] = footprint[k][lane];
+    Footprint &f = footprints[first + lane];
+    std::memcpy(&f, own, sizeof own);
+    std::memcpy(&f.red, in.colors + 3 * (first + lane), 3 * sizeof(float));
+    boxes[first + lane] = no_pixels();
+    if (!(drawn[lane] > 0)) continue;
+    for (int k = 0; k < reads; ++k) bound[k] = bounds[k][lane];
+    boxes[first + lane] = box_of(camera, own, bound);
+  }
+}
+
+// Gradients of sixteen Gaussians from their moments. Where all moments are 0, so are the gradients.
+void backward_batch(const Camera &camera, const Inputs &in, const float *moments, int64_t first, const Gradients &out,
+                    double *pose) {
+  Probe<Vec> probe;
+  const PosedGaussian<Vec> posed = load_posed(camera, in, first, probe);
+  Vec m[kMoments], active = zero();
+  load_items<kMoments>(moments, first, in.count, m);
+  for (int k = 0; k < kMoments; ++k) active += magnitude(m[k]);
+  const int end = int(std::min<int64_t>(kLanes, in.count - first));
+  const Vec on = select(less(zero(), active), select(less(iota(), splat(float(end))), splat(1.0f), zero()), zero());
+  const InputGradient<Vec> g = gradient_of(camera, posed, m, on);
+  const Vec means[3] = {g.mean.x, g.mean.y, g.mean.z}, quats[4] = {g.quat.w, g.quat.x, g.quat.y, g.quat.z};
+  const Vec scales[3] = {g.camera.scale.x, g.camera.scale.y, g.camera.scale.z}, opacities[1] = {g.opacity};
+  const Vec colors[3] = {m[10], m[11], m[12]}, probes[2] = {g.probe.u, g.probe.v};
+  store_items<3>(out.means, first, in.count, means);
+  store_items<4>(out.quats, first, in.count, quats);
+  store_items<3>(out.scales, first, in.count, scales);
+  store_items<1>(out.opacities, first, in.count, opacities);
+  store_items<3>(out.colors, first, in.count, colors);
+  if (out.probe) store_items<2>(out.probe, first, in.count, probes);
+  if (!pose) return;
+  Vec entries[12];
+  pose_gradient(posed, g.camera, entries);
+  for (int k = 0; k < 12; ++k) pose[k] += sum(entries[k]);
+}
+
+void forward(const Camera &camera, const Inputs &in, Footprint *footprints, PixelBox *boxes) {
+#pragma omp parallel for schedule(static)
+  for (int64_t first = 0; first < in.count; first += kLanes) forward_batch(camera, in, first, footprints, boxes);
+}
+
+void backward(const Camera &camera, const Inputs &in, const float *moments, const Gradients &out) {
+  const int64_t blocks = (in.count + kBlock - 1) / kBlock;
+  std::vector<double> poses(out.pose ? 12 * blocks : 0, 0.0);
+#pragma omp parallel for schedule(static)
+  for (int64_t block = 0; block < blocks; ++block) {
+    double *pose = out.pose ? poses.data() + 12 * block : nullptr;
+    for (int64_t first = block * kBlock; first < std::min(in.count, (block + 1) * kBlock); first += kLanes)
+      backward_batch(camera, in, moments, first, out, pose);
+  }
+  if (!out.pose) return;
+  std::fill_n(out.pose, 12, 0.0);
+  for (int64_t block = 0; block < blocks; ++block)
+    for (int k = 0; k < 12; ++k) out.pose[k] += poses[12 * block + k];
+}
+
+}  // namespace
+
+extern const ProjectKernels project_kernels;
+const ProjectKernels project_kernels = {forward, backward};
+
+}  // namespace PADGS_ISA
+}  // namespace padgs

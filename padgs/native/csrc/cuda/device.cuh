@@ -1,0 +1,66 @@
+// What the kernels need of CUDA, so that the same sources also compile for the host: with PADGS_EMULATED every block's
+// threads run in turns on one CPU thread (tests/render/cuda/emulation.h), which is how machines without a GPU test them.
+#pragma once
+
+#include <cstdint>
+
+#if defined(PADGS_EMULATED)
+#include "emulation.h"
+#else
+#include <cuda_runtime.h>
+#endif
+
+namespace padgs {
+
+constexpr int kWarp = 32;
+constexpr unsigned kAllLanes = 0xffffffffu;
+
+// Where work goes.
+struct Queue {
+  int32_t device;
+  void *stream;
+};
+
+#if defined(PADGS_EMULATED)
+
+template <class... P, class... A>
+void launch(void (*kernel)(P...), int64_t blocks, int threads, const Queue &, A... arguments) {
+  emulate(unsigned(blocks), unsigned(threads), [=] { kernel(arguments...); });
+}
+inline int begin(const Queue &) { return 0; }
+inline int finish() { return 0; }
+inline float quick_inverse(float x) { return 1.0f / x; }
+
+#else
+
+template <class... P, class... A>
+void launch(void (*kernel)(P...), int64_t blocks, int threads, const Queue &queue, A... arguments) {
+  if (blocks > 0) kernel<<<unsigned(blocks), threads, 0, cudaStream_t(queue.stream)>>>(arguments...);
+}
+// This library has a CUDA runtime of its own, which knows nothing of the device that torch chose.
+inline int begin(const Queue &queue) { return int(cudaSetDevice(queue.device)); }
+inline int finish() { return int(cudaGetLastError()); }
+__device__ inline float quick_inverse(float x) { return __fdividef(1.0f, x); }
+
+#endif
+
+inline int64_t blocks_for(int64_t items, int per_block) { return (items + per_block - 1) / per_block; }
+
+__device__ inline int64_t global_thread() { return int64_t(blockIdx.x) * blockDim.x + threadIdx.x; }
+__device__ inline int lane_index() { return int(threadIdx.x) % kWarp; }
+
+// Over a whole warp, all of whose lanes must take part; in a fixed order, so that sums of floats are reproducible.
+template <class T>
+__device__ T warp_sum(T value) {
+  for (int step = kWarp / 2; step; step /= 2) value += __shfl_xor_sync(kAllLanes, value, step);
+  return value;
+}
+__device__ inline int warp_max(int value) {
+  for (int step = kWarp / 2; step; step /= 2) {
+    const int other = __shfl_xor_sync(kAllLanes, value, step);
+    value = other > value ? other : value;
+  }
+  return value;
+}
+
+}  // namespace padgs

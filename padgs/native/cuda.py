@@ -1,0 +1,244 @@
+"""Finds, loads and calls libpadgs_cuda; importing this module loads nothing. Mirrors `csrc/cuda/arguments.h`.
+
+The library holds kernels and a CUDA runtime of its own. Pointers to memory of the device and a stream go in; nothing is
+allocated and nothing waits.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from typing import Any
+
+import torch
+
+from padgs.native.library import (
+    Camera,
+    DecodeArguments,
+    DecodeGradientArguments,
+    Gradients,
+    Inputs,
+    Int32,
+    Int64,
+    LossArguments,
+    Pointer,
+    Rays,
+    declared,
+    fields,
+    opened,
+)
+
+OUT_OF_MEMORY = 2  # cudaErrorMemoryAllocation
+NOT_COMPILED_FOR = (98, 209, 222)  # no such kernel, no image for this device, PTX newer than the driver
+
+
+class Queue(ctypes.Structure):
+    """`padgs::Queue`."""
+
+    _fields_ = [("device", Int32), ("stream", Pointer)]
+
+
+class TileTable(ctypes.Structure):
+    """`padgs::TileTable`."""
+
+    _fields_ = [
+        *fields(Int32, "width", "height", "first_row", "end_row"),
+        *fields(Pointer, "level", "row_start", "state_start"),
+    ]
+
+
+class ProjectArguments(ctypes.Structure):
+    """`padgs::ProjectArguments`."""
+
+    _fields_ = [
+        ("camera", Camera),
+        ("pose", Pointer),
+        ("inputs", Inputs),
+        *fields(Pointer, "footprints", "boxes", "depth_keys", "indices"),
+        ("table", TileTable),
+        ("counts", Pointer),
+    ]
+
+
+class ProjectGradientArguments(ctypes.Structure):
+    """`padgs::ProjectGradientArguments`."""
+
+    _fields_ = [("camera", Camera), ("pose", Pointer), ("inputs", Inputs), ("moments", Pointer), ("out", Gradients)]
+
+
+class SortArguments(ctypes.Structure):
+    """`padgs::SortArguments`."""
+
+    _fields_ = [
+        ("scratch", Pointer),
+        *fields(Int64, "scratch_bytes", "count"),
+        *fields(Pointer, "keys", "sorted_keys", "values", "sorted_values"),
+        ("bits", Int32),
+    ]
+
+
+class BinArguments(ctypes.Structure):
+    """`padgs::BinArguments`."""
+
+    _fields_ = [
+        ("table", TileTable),
+        *fields(Pointer, "boxes", "order"),
+        ("visible", Int64),
+        *fields(Pointer, "tiles", "slot_start", "reaches"),
+        ("sort", SortArguments),
+        ("tile_start", Pointer),
+    ]
+
+
+class BlendInputs(ctypes.Structure):
+    """`padgs::BlendInputs`."""
+
+    _fields_ = [
+        ("table", TileTable),
+        *fields(Int32, "projection", "wrap", "core_size"),
+        ("rays", Rays),
+        *fields(Pointer, "footprints", "tile_start", "slots", "reaches", "background"),
+        *fields(Pointer, "image", "transmittance", "depth", "last", "core", "tails", "pair_counts"),
+    ]
+
+
+class BlendGradientInputs(ctypes.Structure):
+    """`padgs::BlendGradientInputs`."""
+
+    _fields_ = [
+        ("forward", BlendInputs),
+        *fields(Pointer, "grad_image", "grad_transmittance", "grad_depth", "upstream", "states", "furthest"),
+        *fields(Pointer, "core_gradients", "tail_gradients"),
+        ("instances", Int64),
+        *fields(Pointer, "moments", "grad_rays", "order", "slot_start"),
+        ("visible", Int64),
+        ("totals", Pointer),
+        ("absolute", Int32),
+    ]
+
+
+class DeviceLossArguments(ctypes.Structure):
+    """`padgs::DeviceLossArguments`."""
+
+    _fields_ = [("loss", LossArguments), *fields(Pointer, "total", "block_sums")]
+
+
+class DeviceDecodeArguments(ctypes.Structure):
+    """`padgs::DeviceDecodeArguments`."""
+
+    _fields_ = [("decode", DecodeArguments), *fields(Pointer, "color_logits", "covariance_logits")]
+
+
+class DeviceDecodeGradientArguments(ctypes.Structure):
+    """`padgs::DeviceDecodeGradientArguments`."""
+
+    _fields_ = [("gradient", DecodeGradientArguments), *fields(Pointer, "opacity_out", "color_out", "covariance_out")]
+
+
+STRUCTURES = (
+    Queue,
+    ProjectArguments,
+    ProjectGradientArguments,
+    SortArguments,
+    BinArguments,
+    BlendInputs,
+    BlendGradientInputs,
+    DeviceLossArguments,
+    DeviceDecodeArguments,
+    DeviceDecodeGradientArguments,
+)
+SIGNATURES: dict[str, tuple[list, Any]] = {
+    "padgs_cuda_structure_bytes": ([Int32], Int64),
+    "padgs_cuda_device_type": ([], ctypes.c_char_p),
+    "padgs_cuda_architectures": ([], ctypes.c_char_p),
+    "padgs_cuda_check": ([Pointer], Int32),
+    "padgs_cuda_error": ([Int32], ctypes.c_char_p),
+    "padgs_cuda_tile_levels": ([Pointer, Pointer], None),
+    "padgs_cuda_scratch_bytes": ([Pointer, Int64], Int64),
+    "padgs_cuda_pose_blocks": ([Int64], Int64),
+    "padgs_cuda_project": ([Pointer, Pointer], Int32),
+    "padgs_cuda_sort": ([Pointer, Pointer], Int32),
+    "padgs_cuda_bin": ([Pointer, Pointer, Int32], Int32),
+    "padgs_cuda_blend": ([Pointer, Pointer], Int32),
+    "padgs_cuda_blend_backward": ([Pointer, Pointer, Int32], Int32),
+    "padgs_cuda_project_backward": ([Pointer, Pointer], Int32),
+    "padgs_cuda_decode_place": ([Pointer, Pointer], Int32),
+    "padgs_cuda_decode_take_back": ([Pointer, Pointer], Int32),
+    "padgs_cuda_loss_blocks": ([Int32, Int32], Int64),
+    "padgs_cuda_photometric_loss": ([Pointer, Pointer], Int32),
+}
+
+
+@functools.cache
+def library() -> ctypes.CDLL:
+    """The loaded library.
+
+    Raises:
+        OSError: it was not built (no nvcc when padgs was installed), does not load, or was built from other sources.
+    """
+    return declared(opened("padgs_cuda", "nvcc"), SIGNATURES, "padgs_cuda_structure_bytes", STRUCTURES)
+
+
+@functools.cache
+def available() -> bool:
+    """Whether the library is built and loads; a GPU that can run it is another question."""
+    try:
+        library()
+    except OSError:
+        return False
+    return True
+
+
+def device_type() -> str:
+    """Where the library wants its tensors, in torch's words: cuda."""
+    return library().padgs_cuda_device_type().decode()
+
+
+def queue(device: torch.device) -> Queue:
+    """The stream of a device that torch works on at present, after a look whether the kernels can run there.
+
+    Raises:
+        RuntimeError: the library was not compiled for this device, or the device does not answer.
+    """
+    if device.type != "cuda":
+        return Queue(0, None)
+    index = torch.cuda.current_device() if device.index is None else device.index
+    check_device(index)
+    return Queue(index, torch.cuda.current_stream(index).cuda_stream)
+
+
+@functools.cache
+def check_device(index: int) -> None:
+    """Launch an empty kernel, once for each device.
+
+    Raises:
+        RuntimeError: as `queue` does.
+    """
+    code = library().padgs_cuda_check(ctypes.byref(Queue(index, None)))
+    if code in NOT_COMPILED_FOR:
+        major, minor = torch.cuda.get_device_capability(index)
+        raise RuntimeError(
+            f"libpadgs_cuda is compiled for compute capabilities {library().padgs_cuda_architectures().decode()}; "
+            f"{torch.cuda.get_device_name(index)} has {major}{minor}. Install padgs with "
+            f"-C cmake.define.PADGS_CUDA_ARCHITECTURES={major}{minor}, or render with backend=torch"
+        )
+    raise_for(code, "padgs_cuda_check")
+
+
+def call(name: str, where: Queue, *arguments: Any) -> None:
+    """Call a function of the library that returns a cudaError_t; structures go by reference.
+
+    Raises:
+        torch.cuda.OutOfMemoryError: the device has no memory left.
+        RuntimeError: any other error of CUDA; those of kernels may be reported later than they happen.
+    """
+    references = (ctypes.byref(a) if isinstance(a, ctypes.Structure) else a for a in arguments)
+    raise_for(getattr(library(), name)(ctypes.byref(where), *references), name)
+
+
+def raise_for(code: int, name: str) -> None:
+    """Raise what an error code stands for; 0 stands for nothing."""
+    if code == 0:
+        return
+    message = f"{name}: CUDA error {code}, {library().padgs_cuda_error(code).decode()}"
+    raise torch.cuda.OutOfMemoryError(message) if code == OUT_OF_MEMORY else RuntimeError(message)

@@ -1,0 +1,188 @@
+"""Projected Gaussians and tile lists in the memory of a GPU, strip by strip; `padgs.render.tiles` is the CPU's.
+
+The host reads one thing back: how many instances each row of tiles has, before anything of their size is allocated.
+Where it must not wait (`padgs.render.backends.captured`), there is room for a stated number of them instead: Gaussians
+that are not drawn are passed over rather than left out, and instances that do not exist have a key behind that of the
+last tile.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from padgs.native import cuda as cuda_native
+from padgs.native import library as native
+from padgs.native.cuda import Queue, SortArguments, TileTable
+from padgs.native.library import pointer
+from padgs.render.tiles import TILE, strip_cuts
+
+BUCKET = 32  # instances of one list that a warp differentiates together, see csrc/cuda/layout.h
+CHUNK_PIXELS = TILE * TILE
+MAX_INSTANCES = (1 << 31) - 1  # of one strip: positions in its lists are 32-bit integers
+
+
+class TileRows:
+    """Widths of the tiles of an image, by row of tiles: on the host, and as the kernels read them."""
+
+    def __init__(self, level: list[int], width: int, device: torch.device) -> None:
+        """From the level of each row: its tiles are 16 * 2^level pixels wide."""
+        columns = -(-width // TILE)
+        self.levels = level
+        self.tiles = [-(-columns // (1 << one)) for one in level]
+        self.columns = columns
+        self.level = torch.tensor(level, dtype=torch.int32).to(device)
+        starts = torch.tensor([0, *self.tiles]).cumsum(0)
+        self.row_start = starts.to(device, torch.int32)
+
+    def state_starts(self, instances: list[int]) -> list[int]:
+        """Blocks of 256 pixel states before each row, and all of them: 2^level for each bucket that a row may have.
+
+        Args:
+            instances: of each row of tiles.
+        """
+        starts = [0]
+        for level, tiles, count in zip(self.levels, self.tiles, instances, strict=True):
+            starts.append(starts[-1] + ((count // BUCKET + 1 + tiles) << level))
+        return starts
+
+
+@functools.lru_cache(maxsize=16)
+def tile_rows(width: int, height: int, model: int, square: int, device: torch.device) -> TileRows:
+    """The rows of tiles of a camera; computed once for each device."""
+    level = torch.empty(-(-height // TILE), dtype=torch.int32)
+    camera = native.Camera(width=width, height=height, model=model, square=square)
+    cuda_native.library().padgs_cuda_tile_levels(ctypes.byref(camera), pointer(level))
+    return TileRows(level.tolist(), width, device)
+
+
+class Strip:
+    """The lists of some rows of tiles."""
+
+    def __init__(self, projected: Projected, first_row: int, end_row: int) -> None:
+        """Fill the lists of tile rows [first_row, end_row)."""
+        device, rows = projected.order.device, projected.rows
+        self.first_row, self.end_row = first_row, end_row
+        self.tiles = sum(rows.tiles[first_row:end_row])
+        self.chunks = (end_row - first_row) * rows.columns
+        self.instances = projected.room if projected.room else sum(projected.per_row[first_row:end_row])
+        if self.instances > MAX_INSTANCES:
+            raise ValueError(
+                f"one row of tiles has {self.instances:,} (Gaussian, tile) instances; a list holds at most "
+                f"{MAX_INSTANCES:,}. Draw fewer or smaller Gaussians, or with backend=cpu"
+            )
+        integers = functools.partial(torch.empty, dtype=torch.int32, device=device)
+        self.slot_start = integers(projected.visible + 1)
+        self.reaches = integers(self.instances, 2)
+        self.slots = integers(self.instances)
+        self.tile_start = integers(self.tiles + 1)
+        self.table = projected.table(first_row, end_row)
+        counts = integers(projected.visible + 1)
+        sort = Sorter(projected.queue, self.instances, device, summed=len(counts))
+        largest = self.tiles if projected.room else max(self.tiles - 1, 1)
+        if projected.room:
+            sort.keys.fill_(largest)
+        arguments = cuda_native.BinArguments(
+            self.table,
+            pointer(projected.boxes),
+            pointer(projected.order),
+            projected.visible,
+            pointer(counts),
+            pointer(self.slot_start),
+            pointer(self.reaches),
+            sort.arguments(self.slots, bits=largest.bit_length()),
+            pointer(self.tile_start),
+        )
+        cuda_native.call("padgs_cuda_bin", projected.queue, arguments, self.tiles)
+
+
+class Sorter:
+    """Keys, values and scratch for one stable sort, and for a sum."""
+
+    def __init__(self, queue: Queue, count: int, device: torch.device, *, summed: int = 0) -> None:
+        """Allocate for sorting `count` items and summing over `summed`."""
+        self.queue, self.count = queue, count
+        self.keys = torch.empty(count, dtype=torch.int32, device=device)
+        self.sorted_keys, self.values = torch.empty_like(self.keys), torch.empty_like(self.keys)
+        scratch = cuda_native.library().padgs_cuda_scratch_bytes(ctypes.byref(queue), max(count, summed, 1))
+        self.scratch = torch.empty(max(scratch, 1), dtype=torch.uint8, device=device)
+
+    def arguments(self, sorted_values: Tensor, bits: int) -> SortArguments:
+        """For the library; the tensors must outlive the call."""
+        buffers = (self.keys, self.sorted_keys, self.values, sorted_values)
+        return SortArguments(pointer(self.scratch), len(self.scratch), self.count, *map(pointer, buffers), bits)
+
+
+class Projected:
+    """All Gaussians as one view sees them, in depth order, and how they spread over the tiles."""
+
+    def __init__(
+        self, camera: native.Camera, pose: Tensor, inputs: native.Inputs, max_instances: int, *, room: int = 0
+    ) -> None:
+        """Project, sort, count; waits for the device once, unless it is told how much room there is.
+
+        Args:
+            camera: its own pose is not used.
+            pose: [4, 4] on the device, contiguous.
+            inputs: on the device.
+            max_instances: of a strip.
+            room: for so many instances in a single strip, drawn without a look at how many there are: `counts` says on
+                the device. 0: as many as there are.
+        """
+        device, count = pose.device, inputs.count
+        self.queue = cuda_native.queue(device)
+        self.camera = camera
+        self.rows = tile_rows(camera.width, camera.height, camera.model, camera.square, device)
+        self.footprints = torch.empty(count, 16, device=device)
+        self.boxes = torch.empty(count, 5, dtype=torch.int32, device=device)
+        self.order = torch.empty(count, dtype=torch.int32, device=device)
+        self.per_row: list[int] = []
+        self._state_start: Tensor | None = None
+        self._only: Strip | None = None
+        sort = Sorter(self.queue, count, device)
+        self.counts = torch.zeros(len(self.rows.levels) + 1, dtype=torch.int64, device=device)
+        outputs = (self.footprints, self.boxes, sort.keys, sort.values)
+        table = self.table(0, len(self.rows.levels))
+        arguments = cuda_native.ProjectArguments(
+            camera, pointer(pose), inputs, *map(pointer, outputs), table, pointer(self.counts)
+        )
+        cuda_native.call("padgs_cuda_project", self.queue, arguments)
+        cuda_native.call("padgs_cuda_sort", self.queue, sort.arguments(self.order, bits=32))
+        self.room, self.visible = room, count
+        self._cuts = [0, len(self.rows.levels)]
+        if not room:
+            *self.per_row, self.visible = self.counts.tolist()
+            self._cuts = strip_cuts(self.per_row, min(max_instances, MAX_INSTANCES))
+
+    @property
+    def instances(self) -> int:
+        """How many there are, of all rows; known where the device was waited for."""
+        return sum(self.per_row)
+
+    def table(self, first_row: int, end_row: int) -> TileTable:
+        """Some rows of tiles, for the library; with the places of pixel states once there are any."""
+        rows = (self.rows.level, self.rows.row_start, self._state_start)
+        return TileTable(self.camera.width, self.camera.height, first_row, end_row, *map(pointer, rows))
+
+    def strips(self) -> Iterator[Strip]:
+        """The strips of the image from top to bottom; a single one is kept for the backward pass, more are not."""
+        if len(self._cuts) == 2:
+            if self._only is None:
+                self._only = Strip(self, *self._cuts)
+            yield self._only
+            return
+        for first, end in zip(self._cuts, self._cuts[1:], strict=False):
+            yield Strip(self, first, end)
+
+    def states(self, strip: Strip) -> Tensor:
+        """Room for the states of a strip's pixels behind each of its buckets, [states, 256, 2]; sets their places."""
+        starts = self.rows.state_starts(self.per_row)
+        if self._state_start is None:
+            self._state_start = torch.tensor(starts).to(self.order.device)
+        strip.table = self.table(strip.first_row, strip.end_row)
+        total = starts[strip.end_row] - starts[strip.first_row]
+        return torch.empty(total, CHUNK_PIXELS, 2, device=self.order.device)

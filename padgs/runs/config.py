@@ -1,0 +1,177 @@
+"""The configuration of a run. Its keys are the fields of dataclasses; the files in `conf/` only override defaults."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from baselines import METHODS
+from padgs.data.options import DataOptions
+from padgs.learning.method import Budget, RenderConfig
+from padgs.learning.schedule import PUBLISHED_ITERATIONS
+from padgs.learning.views import TrainOptions
+from padgs.registry import lookup
+from padgs.runs.device import DEVICES
+from padgs.runs.labels import Labels
+from padgs.runs.typed import ConfigError, typed
+from padgs.scoring.protocols import PROTOCOLS, Protocol, protocol_from_options
+from padgs.tracking.tracking import TrackingOptions
+
+
+@dataclass(frozen=True)
+class DataConfig(DataOptions):
+    """The `data` group: where a scene comes from."""
+
+    format: str = "synthetic"  # a name of padgs.data.LOADERS
+    path: str | None = None  # folder of the scene; null for a scene that is generated
+    voxel_size: float | str = "auto"  # of the anchors of methods that have them, where the paper states it
+
+
+@dataclass(frozen=True)
+class TrainConfig(TrainOptions):
+    """The `train` group: how a method is trained, and for how long."""
+
+    iterations: int = PUBLISHED_ITERATIONS
+    max_seconds: float | None = None  # of training; where they end it, the run has status timeout
+
+    def __post_init__(self) -> None:
+        """Reject an empty budget."""
+        super().__post_init__()
+        if self.iterations < 1:
+            raise ValueError(f"iterations is {self.iterations}; it must be at least 1")
+
+    @property
+    def budget(self) -> Budget:
+        """How long the method may train."""
+        return Budget(self.iterations, self.max_seconds)
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """The `run` group: what a machine or a person decides and only rounding depends on; not part of the run id."""
+
+    folder: str = "runs"  # of the run folders
+    device: str = "auto"  # auto | cpu | cuda; auto: a GPU where there is one that can draw what is asked for
+    jobs: int = 1  # runs at the same time on one machine: conf/launcher
+    threads: int | None = None  # of one run; null = cores / jobs
+    log_every: int = 10  # iterations between lines of log.jsonl
+    probe_every: int = 100  # iterations between renders of one test view, the held-out PSNR of the live line
+    checkpoint_every: int | None = None  # iterations between checkpoints; null = only by time
+    checkpoint_seconds: float = 60.0  # between checkpoints, if not sooner by iterations
+    pictures: bool = True  # save truth | render | error of each test view
+
+    def __post_init__(self) -> None:
+        """Reject an unknown device, and intervals that never come round."""
+        if self.device not in DEVICES:
+            raise ValueError(f"unknown run.device {self.device!r}; known: {', '.join(DEVICES)}")
+        for name in ("jobs", "threads", "log_every", "probe_every", "checkpoint_every"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"{name} is {value}; it must be at least 1")
+
+    @property
+    def threads_per_job(self) -> int | None:
+        """Threads of one run, such that all runs together use the cores of this process; None: as torch likes."""
+        if self.threads is not None or self.jobs == 1:
+            return self.threads
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        return max(1, cores // self.jobs)
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """One run, ready to start."""
+
+    data: DataConfig
+    method: str  # a name of baselines.METHODS
+    options: Any  # of the method
+    render: RenderConfig
+    train: TrainConfig
+    protocols: dict[str, Protocol]
+    run: RunOptions
+    tracking: TrackingOptions = TrackingOptions()
+    variant: str = ""  # name of this setting within an experiment, such as a row of the ablation
+    seed: int = 0
+    retry: str = "none"  # which finished runs are done again: a name of RETRIES
+    labels: Labels = Labels()
+
+    def __post_init__(self) -> None:
+        """Reject an unknown kind of retry."""
+        if self.retry not in RETRIES:
+            raise ConfigError(f"unknown retry {self.retry!r}; known: {', '.join(RETRIES)}")
+
+    @property
+    def preset(self) -> str:
+        """The name of the method's settings: of a file in conf/method."""
+        return self.labels.preset or self.method
+
+    def values(self) -> dict[str, Any]:
+        """The configuration of a run as plain values in the shape of the YAML files, defaults included."""
+        return {
+            "data": asdict(self.data),
+            "method": {"name": self.method, **asdict(self.options)},
+            "render": asdict(self.render),
+            "train": asdict(self.train),
+            "protocol": {name: asdict(protocol) for name, protocol in self.protocols.items()},
+            "run": asdict(self.run),
+            "variant": self.variant,
+            "seed": self.seed,
+        }
+
+
+GROUPS: dict[str, type] = {
+    "data": DataConfig,
+    "render": RenderConfig,
+    "train": TrainConfig,
+    "run": RunOptions,
+    "tracking": TrackingOptions,
+}
+OTHER_KEYS = ("method", "protocol", "variant", "seed", "retry")
+RETRIES = ("none", "failed")
+
+
+def config_from_values(values: Mapping[str, Any], labels: Labels = Labels()) -> RunConfig:  # noqa: B008 - frozen
+    """The typed configuration of what Hydra composed.
+
+    Raises:
+        ConfigError: an unknown key or name (the known ones are listed), or a value of the wrong type.
+    """
+    unknown = [key for key in values if key not in (*GROUPS, *OTHER_KEYS)]
+    if unknown:
+        raise ConfigError(f"unknown key {unknown[0]}; known: {', '.join((*GROUPS, *OTHER_KEYS))}")
+    method = dict(values.get("method", {}))
+    name = method.pop("name", "padgs")
+    try:
+        options = lookup(METHODS, name, "method").Options
+        protocols = {
+            key: protocol_from_options(key, **{k: v for k, v in rules.items() if k != "name"})
+            for key, rules in values.get("protocol", {}).items()
+        }
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+    groups = {key: typed(kind, values.get(key, {}), key) for key, kind in GROUPS.items()}
+    typed_options = typed(options, method, "method")
+    top = {key: values[key] for key in ("variant", "seed", "retry") if key in values}
+    top = asdict(typed(_Top, top))
+    if not protocols:
+        raise ConfigError(f"protocol is empty; name at least one of {', '.join(PROTOCOLS)}")
+    return RunConfig(method=name, options=typed_options, protocols=protocols, labels=labels, **groups, **top)
+
+
+def default_fields() -> dict[str, Any]:
+    """All keys of the configuration with their defaults, except `method`, whose keys depend on its name."""
+    return {**{key: asdict(kind()) for key, kind in GROUPS.items()}, **asdict(_Top())}
+
+
+def method_fields(name: str) -> dict[str, Any]:
+    """The keys of `method` with their defaults for one method."""
+    return {"name": name, **asdict(lookup(METHODS, name, "method").Options())}
+
+
+@dataclass(frozen=True)
+class _Top:
+    variant: str = ""
+    seed: int = 0
+    retry: str = "none"

@@ -1,0 +1,121 @@
+"""The folder of one run: config.yaml, log.jsonl, checkpoint/, renders/, and at the very end result.json."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+from PIL import Image
+from torch import Tensor
+
+from padgs import results
+from padgs.results import Result
+from padgs.runs import lock as run_lock
+from padgs.scoring.pictures import comparison
+
+
+class RunFolderError(RuntimeError):
+    """The run folder cannot be written; the message names the file, the reason and the way out."""
+
+
+class RunFolder:
+    """Reads and writes the files of one run."""
+
+    def __init__(self, path: Path) -> None:
+        """Nothing is touched before it is needed."""
+        self.path = path
+        self.checkpoint = path / "checkpoint"
+        self.renders = path / "renders"
+        self._log = path / "log.jsonl"
+
+    def prepare(self, values: Mapping[str, Any]) -> None:
+        """Make the folder and write config.yaml.
+
+        Raises:
+            RunFolderError: it cannot be written.
+        """
+        with self._writing():
+            self.renders.mkdir(parents=True, exist_ok=True)
+            results.replace_file(self.path / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(dict(values))).encode())
+
+    def result(self) -> Result | None:
+        """The result, if the run is done.
+
+        Raises:
+            ResultError: there is one, but it cannot be used.
+        """
+        path = self.path / results.FILE_NAME
+        return results.read(path) if path.exists() else None
+
+    def finish(self, result: Result) -> Result:
+        """Write result.json; from then on the run is done. Returns what the file says, as any later reader sees it."""
+        with self._writing():
+            path = results.write(result, self.path)
+        return results.read(path)
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Make the folder, and keep other processes out of it.
+
+        Raises:
+            RunBusy: another process works on this run.
+            RunFolderError: the folder cannot be written.
+        """
+        with ExitStack() as stack:
+            with self._writing():
+                self.path.mkdir(parents=True, exist_ok=True)
+                stack.enter_context(run_lock.held(self.path))
+            yield
+
+    def forget(self, result: Result) -> None:
+        """Let a failed run start again; where only time or memory ran out, from its checkpoint."""
+        with self._writing():
+            if result.status not in ("oom", "timeout"):
+                shutil.rmtree(self.checkpoint, ignore_errors=True)
+            (self.path / results.FILE_NAME).unlink()
+
+    def log(self, line: Mapping[str, Any]) -> None:
+        """Append a line to log.jsonl."""
+        with self._writing(), self._log.open("a") as file:
+            file.write(json.dumps(line) + "\n")
+
+    def forget_after(self, iteration: int) -> None:
+        """Drop what the log says about later iterations, and a line that a kill has cut; they will come again."""
+        if not self._log.exists():
+            return
+        kept = []
+        for line in self._log.read_text().splitlines():
+            try:
+                if json.loads(line)["iteration"] <= iteration:
+                    kept.append(line + "\n")
+            except (ValueError, KeyError, TypeError):
+                continue
+        with self._writing():
+            results.replace_file(self._log, "".join(kept).encode())
+
+    def save_picture(self, name: str, truth: Tensor, image: Tensor) -> None:
+        """Save truth | render | error of the view `name`; images [H, W, 3]."""
+        path = self.renders / f"{re.sub(r'[^A-Za-z0-9._-]+', '-', name)}.png"
+        with self._writing():
+            Image.fromarray(comparison(truth, image)).save(path)
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise cannot_write(self.path, error) from error
+
+
+def cannot_write(path: Path, error: OSError) -> RunFolderError:
+    """The error to raise where a run folder, or what lies beside it, cannot be written."""
+    return RunFolderError(
+        f"cannot write run folder {path}: {error.strerror or error}; "
+        "make room, mend the permissions, or set run.folder to another place"
+    )

@@ -1,0 +1,88 @@
+"""What a person sees of a run in progress: one live line in a terminal, a plain line now and then elsewhere."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+
+from rich.console import Console
+from rich.live import Live
+from rich.text import Text
+
+from padgs.learning.method import Record
+
+REDRAWS_PER_SECOND = 5
+SECONDS_BETWEEN_LINES = 10.0  # where there is no terminal
+RECENT = 64  # records that the speed is taken from
+
+
+class LiveLine:
+    """Iteration, loss, held-out PSNR, counts, iterations per second and the time that is left."""
+
+    def __init__(self, console: Console, iterations: int) -> None:
+        """A line about a run of so many iterations."""
+        self._console, self._iterations = console, iterations
+        self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
+        self._times: deque[tuple[int, float]] = deque(maxlen=RECENT)
+        self._shown = -float("inf")
+        self._psnr: float | None = None
+
+    def __enter__(self) -> LiveLine:
+        """Start to show."""
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Leave the last line standing."""
+        if self._live is not None:
+            self._live.stop()
+
+    def update(self, record: Record, psnr: float | None) -> None:
+        """Take in a record and, where it was measured, the PSNR of the held-out view."""
+        now = time.monotonic()
+        self._times.append((record.iteration, now))
+        self._psnr = self._psnr if psnr is None else psnr
+        last = record.iteration == self._iterations
+        interval = 1 / REDRAWS_PER_SECOND if self._live is not None else SECONDS_BETWEEN_LINES
+        if now - self._shown < interval and not last:
+            return
+        self._shown = now
+        line = self._line(record)
+        if self._live is not None:
+            self._live.update(Text(line, no_wrap=True, overflow="ellipsis"), refresh=True)
+        else:
+            self._console.print(line, highlight=False, soft_wrap=True)
+
+    def _line(self, record: Record) -> str:
+        parts = [f"{record.iteration}/{self._iterations}", f"loss {float(record.loss):.4f}"]
+        if self._psnr is not None:
+            parts.append(f"PSNR {self._psnr:.2f}")
+        parts += [f"{name} {compact(count)}" for name, count in record.counts.items()]
+        (first, start), (latest, end) = self._times[0], self._times[-1]
+        if latest > first:
+            speed = (latest - first) / max(end - start, 1e-9)
+            parts += [f"{speed:.1f} it/s", f"ETA {clock((self._iterations - latest) / speed)}"]
+        return "  ".join(parts)
+
+
+def compact(count: int) -> str:
+    """A count in few characters.
+
+    >>> [compact(n) for n in (987, 12_345, 123_456, 2_345_678)]
+    ['987', '12.3k', '123k', '2.35M']
+    """
+    if count < 1000:
+        return str(count)
+    return f"{count / 1000:.3g}k" if count < 999_500 else f"{count / 1e6:.3g}M"
+
+
+def clock(seconds: float) -> str:
+    """A duration as people write it.
+
+    >>> [clock(s) for s in (7, 72, 3723)]
+    ['0:07', '1:12', '1:02:03']
+    """
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"

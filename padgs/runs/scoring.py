@@ -1,0 +1,48 @@
+"""Score a trained method on the test views, and time it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict
+from itertools import cycle, islice
+
+from padgs.clock import summary, timed
+from padgs.learning.method import Method
+from padgs.results import Scores
+from padgs.scene import Scene
+from padgs.scoring.evaluate import evaluate
+from padgs.scoring.protocols import Protocol
+
+FRAMES = 10  # timed at least, and each test view once
+
+
+def scores(
+    method: Method, scene: Scene, protocols: dict[str, Protocol], save_picture: Callable | None
+) -> dict[str, Scores]:
+    """The marks of the test views under each protocol; pictures are saved once."""
+    found = {}
+    for name, protocol in protocols.items():
+        on_view = None if save_picture is None or found else _picture_saver(save_picture)
+        evaluation = evaluate(method.render, scene.test, protocol, device=scene.points.device, on_view=on_view)
+        found[name] = Scores(evaluation.protocol, evaluation.mean, evaluation.views, evaluation.notes)
+    return found
+
+
+def frame_times(method: Method, scene: Scene) -> dict[str, float]:
+    """Milliseconds per rendered test view, decoding included, after one view that does not count."""
+    method.render(scene.test[0])
+    views = islice(cycle(scene.test), max(FRAMES, len(scene.test)))
+    device = scene.points.device
+    times = summary([timed(lambda view=view: method.render(view), device)[1] for view in views])
+    return {f"render_ms_{name}": 1000 * seconds for name, seconds in times.items()}
+
+
+def same_rules(scores: Scores, protocol: Protocol) -> bool:
+    """Whether marks were given under exactly these rules."""
+    rules = {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(protocol).items()}
+    stored = {key: list(value) if isinstance(value, tuple) else value for key, value in scores.protocol.items()}
+    return rules == stored
+
+
+def _picture_saver(save_picture: Callable) -> Callable:
+    return lambda view, truth, image: save_picture(view.name, truth, image)

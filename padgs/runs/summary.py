@@ -1,0 +1,59 @@
+"""The small table at the end of a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from padgs.results import Result
+from padgs.runs.live import clock, compact
+
+MISSING = "–"
+
+
+def show_result(result: Result, folder: Path, console: Console) -> None:
+    """Print the marks of a run, what it cost, and where its files are."""
+    if not result.ok:
+        console.print(
+            f"[bold red]{result.status}[/]: {result.reason or 'stopped early'}", highlight=False, soft_wrap=True
+        )
+    if result.scores:
+        console.print(marks(result))
+    for note in dict.fromkeys(note for scores in result.scores.values() for note in scores.notes):
+        console.print(note, style="yellow", highlight=False, soft_wrap=True)
+    costs = [f"{compact(count)} {name}" for name, count in result.counts.items()]
+    costs.append(f"{result.model_bytes / 1e6:.1f} MB")
+    if "train_seconds" in result.timing:
+        costs.append(f"trained {clock(result.timing['train_seconds'])}")
+    if "render_ms_median" in result.timing:
+        costs.append(f"{result.timing['render_ms_median']:.1f} ms per frame")
+    costs.append(f"peak memory {result.peak_memory_bytes / 1e9:.2f} GB")
+    if result.peak_device_memory_bytes is not None:
+        costs.append(f"{result.peak_device_memory_bytes / 1e9:.2f} GB on the GPU")
+    console.print(", ".join(costs), highlight=False, soft_wrap=True)
+    console.print(str(folder), style="bold", highlight=False, soft_wrap=True)
+
+
+def marks(result: Result) -> Table:
+    """One row per metric, one column per protocol."""
+    table = Table("metric", box=SIMPLE_HEAD)
+    for protocol in result.scores:
+        table.add_column(protocol, justify="right")
+    for metric in dict.fromkeys(name for scores in result.scores.values() for name in scores.metrics):
+        values = [scores.metrics.get(metric) for scores in result.scores.values()]
+        table.add_row(metric, *(number(metric, value) for value in values))
+    return table
+
+
+def number(metric: str, value: float | None) -> str:
+    """A mark as tables show it: decibels with two decimals, all else with three.
+
+    >>> number("ws_psnr", 24.256), number("ssim", 0.5), number("lpips_vgg", None)
+    ('24.26', '0.500', '–')
+    """
+    if value is None:
+        return MISSING
+    return f"{value:.2f}" if "psnr" in metric else f"{value:.3f}"

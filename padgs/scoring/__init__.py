@@ -1,0 +1,1 @@
+"""How renders are compared with photographs: metrics, protocols, evaluation."""

@@ -1,0 +1,1 @@
+"""Explicit Gaussians with spherical harmonics: the 3DGS family."""

@@ -1,0 +1,135 @@
+"""Explicit 3D Gaussians with spherical harmonics: the model of 3DGS and OmniGS, and the ablation's baseline."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import torch
+from scipy.spatial import KDTree
+from torch import Tensor, nn
+
+from padgs.gaussians import Gaussians
+from padgs.scene import Scene, View
+from padgs.sphere import harmonics as spherical_harmonics
+
+INITIAL_OPACITY = 0.1
+NEIGHBOURS = 3  # distances that set a Gaussian's initial size
+SMALLEST_SCALE = 1e-4  # initial scale of coinciding points, in scene units
+TINY = 1e-6  # scene units; keeps directions finite for a camera exactly on a Gaussian
+
+
+class Splats(nn.Module):
+    """N Gaussians, stored as they are learned: log-scales, opacity logits, SH coefficients.
+
+    Attributes:
+        means: [N, 3] world.
+        quats: [N, 4] wxyz, not normalised.
+        log_scales: [N, 3] of world units.
+        opacity_logits: [N].
+        sh_dc: [N, 3] colour coefficient of degree 0.
+        sh_rest: [N, (degree + 1)^2 - 1, 3] of the higher degrees.
+        active_degree: degree in use; the higher coefficients wait, and get no gradient.
+        unit: the scene's unit of length in world units.
+    """
+
+    def __init__(
+        self, means: Tensor, log_scales: Tensor, colors: Tensor, *, degree: int = 3, unit: float = 1.0
+    ) -> None:
+        """Round Gaussians of one colour: means [N, 3], log-scales [N, 3], RGB in [0, 1] [N, 3].
+
+        Raises:
+            ValueError: the degree is not 0, 1, 2 or 3.
+        """
+        super().__init__()
+        if not 0 <= degree <= spherical_harmonics.MAX_DEGREE:
+            raise ValueError(f"sh_degree is {degree}; it must be 0 to {spherical_harmonics.MAX_DEGREE}")
+        count = len(means)
+        self.degree, self.active_degree, self.unit = degree, 0, unit
+        self.means = nn.Parameter(means.clone())
+        self.quats = nn.Parameter(means.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1))
+        self.log_scales = nn.Parameter(log_scales.clone())
+        self.opacity_logits = nn.Parameter(means.new_full((count,), math.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY))))
+        self.sh_dc = nn.Parameter(spherical_harmonics.dc_from_colors(colors))
+        self.sh_rest = nn.Parameter(means.new_zeros(count, (degree + 1) ** 2 - 1, 3))
+
+    @classmethod
+    def from_scene(
+        cls, scene: Scene, *, degree: int = 3, max_gaussians: int | None = None, generator: torch.Generator
+    ) -> Splats:
+        """One Gaussian per point of the cloud; a random choice of points where there are more than `max_gaussians`.
+
+        Raises:
+            ValueError: the point cloud is empty or not finite.
+        """
+        points, colors = scene.points.float(), scene.point_colors.float() / 255
+        if len(points) == 0:
+            raise ValueError("the point cloud is empty; Gaussians start from points, so the scene needs at least one")
+        if not torch.isfinite(points).all():
+            bad = int((~torch.isfinite(points).all(-1)).nonzero()[0])
+            raise ValueError(f"point {bad} of the cloud is {points[bad].tolist()}; remove points that are not finite")
+        if max_gaussians is not None and len(points) > max_gaussians:
+            chosen = torch.randperm(len(points), generator=generator)[:max_gaussians].sort().values
+            points, colors = points[chosen], colors[chosen]
+        scales = initial_scales(points, scene.unit)
+        return cls(points, torch.log(scales)[:, None].repeat(1, 3), colors, degree=degree, unit=scene.unit)
+
+    def __len__(self) -> int:
+        """Number of Gaussians."""
+        return len(self.means)
+
+    def rows(self) -> dict[str, nn.Parameter]:
+        """All parameters; each has one row per Gaussian."""
+        return dict(self.named_parameters())
+
+    def load(self, tensors: Mapping[str, Tensor]) -> None:
+        """Take over what `state_dict` of another model gave; the number of Gaussians may differ.
+
+        The parameters stay the same objects, so an optimiser that holds them goes on doing so.
+
+        Raises:
+            ValueError: a tensor is missing or has another shape than the SH degree of this model makes it.
+        """
+        count = len(tensors["means"]) if "means" in tensors else 0
+        for name, parameter in self.named_parameters():
+            shape = [count, *parameter.shape[1:]]
+            given = list(tensors[name].shape) if name in tensors else None
+            if given != shape:
+                raise ValueError(f"{name} of the stored model has shape {given}; with these options it is {shape}")
+        for name, parameter in self.named_parameters():
+            parameter.data = tensors[name].to(parameter).clone()
+            parameter.grad = None
+
+    def gaussians(self, view: View) -> Gaussians:
+        """The Gaussians with the colours that this view sees."""
+        return Gaussians(
+            means=self.means,
+            quats=self.quats,
+            scales=torch.exp(self.log_scales),
+            opacities=torch.sigmoid(self.opacity_logits),
+            colors=self._colors(view),
+        )
+
+    def _colors(self, view: View) -> Tensor:
+        """Max(0, 1/2 + SH), [N, 3], seen along camera -> Gaussian in the world frame."""
+        colors = 0.5 + spherical_harmonics.DC * self.sh_dc
+        if self.active_degree > 0:
+            rays = self.means - view.center.to(self.means)
+            directions = rays / torch.sqrt((rays * rays).sum(-1, keepdim=True) + (TINY * self.unit) ** 2)
+            values = spherical_harmonics.basis(directions, self.active_degree)[:, 1:]  # [N, K]
+            colors = colors + torch.einsum("nk,nkc->nc", values, self.sh_rest[:, : values.shape[1]])
+        return colors.clamp(min=0)
+
+
+def initial_scales(points: Tensor, unit: float) -> Tensor:
+    """Root mean square distance [N] of each point [N, 3] to its three nearest others, at least `SMALLEST_SCALE` units.
+
+    A lone point gets a tenth of a unit.
+    """
+    neighbours = min(NEIGHBOURS, len(points) - 1)
+    if neighbours < 1:
+        return points.new_full((len(points),), 0.1 * unit)
+    xyz = points.double().cpu().numpy()
+    distances, _ = KDTree(xyz).query(xyz, k=neighbours + 1)  # the first is the point itself, or one that coincides
+    mean_square = torch.from_numpy(distances[:, 1:]).square().mean(-1)
+    return mean_square.sqrt().clamp(min=SMALLEST_SCALE * unit).to(points)

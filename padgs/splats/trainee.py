@@ -1,0 +1,164 @@
+"""Training explicit Gaussians: splats, their learning rates, and their densification, as one `Trainable`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from padgs.learning.method import RenderConfig, State
+from padgs.learning.schedule import Constant, LogLinear, ParameterGroup, scaled
+from padgs.learning.views import Drawing
+from padgs.render import Rendering, RenderOptions, render
+from padgs.scene import Scene, View
+from padgs.sphere.camera import Panorama
+from padgs.sphere.panorama import longitude_latitude
+from padgs.splats.clone_split import CloneSplit, CloneSplitOptions
+from padgs.splats.model import Splats
+from padgs.splats.probes import render_probed
+
+MIN_EXTENT = 0.1  # scene units
+ONE_PLACE = 1e-6  # scene units; an extent up to here is rounding
+DEGREE_EVERY = 1000  # published iterations after which the next SH degree comes into use
+
+
+class TrainableSplats:
+    """Splats with the schedule of 3DGS for a run of `iterations`.
+
+    Attributes:
+        splats: the model.
+        densifier: its growth.
+    """
+
+    def __init__(
+        self,
+        splats: Splats,
+        options: CloneSplitOptions,
+        config: RenderConfig,
+        *,
+        extent: float,
+        iterations: int,
+        learning_rate_factor: float = 1.0,
+        seed: int = 0,
+    ) -> None:
+        """Wrap splats; `extent` is `extent_of` the scene, `options` are those of a published run (see `for_run`).
+
+        Raises:
+            ValueError: a signal that the projection does not have.
+        """
+        if options.signal == "space_absolute" and config.projection != "ray":
+            raise ValueError(
+                f"method.signal=space_absolute is made for render.projection=ray, not {config.projection}; "
+                "set method.signal=space"
+            )
+        self.splats, self.iterations = splats, iterations
+        self.densifier = CloneSplit(splats, options.for_run(iterations), extent=extent, seed=seed)
+        self._config, self._extent, self._factor = config, extent, learning_rate_factor
+        self._drawn: View | None = None  # the view of the last drawing
+
+    def groups(self) -> list[ParameterGroup]:
+        """Learning rates of 3DGS; that of the means falls over the whole run and follows the size of the scene."""
+        splats, factor = self.splats, self._factor
+        rate = factor * self._extent
+        means = LogLinear(1.6e-4 * rate, 1.6e-6 * rate, self.iterations)
+        return [
+            ParameterGroup("means", (splats.means,), means),
+            ParameterGroup("quats", (splats.quats,), Constant(1e-3 * factor)),
+            ParameterGroup("log_scales", (splats.log_scales,), Constant(5e-3 * factor)),
+            ParameterGroup("opacity_logits", (splats.opacity_logits,), Constant(5e-2 * factor)),
+            ParameterGroup("sh_dc", (splats.sh_dc,), Constant(2.5e-3 * factor)),
+            ParameterGroup("sh_rest", (splats.sh_rest,), Constant(2.5e-3 / 20 * factor)),
+        ]
+
+    def draw(self, view: View) -> Drawing:
+        """Render all Gaussians, differentiably."""
+        return self._drawing(view)
+
+    def observe(self, drawing: Drawing, iteration: int) -> None:
+        """Note how hard each Gaussian was pulled."""
+        assert drawing.probe.grad is not None and self._drawn is not None, "observe is called after draw and backward"
+        cos_latitudes = None
+        if self.densifier.options.polar_threshold is not None:
+            means, pose = self.splats.means, self._drawn.cam_from_world.to(self.splats.means)
+            _, latitudes = longitude_latitude(means @ pose[:3, :3].T + pose[:3, 3])
+            cos_latitudes = latitudes.cos()
+        self.densifier.observe(drawing.probe.grad, drawing.rendering.visible, iteration, cos_latitudes)
+
+    def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
+        """Densify, and bring the next SH degree into use, where it is time to."""
+        events = self.densifier.adapt(iteration, optimizer)
+        degree = min(self.splats.degree, (iteration + 1) // scaled(DEGREE_EVERY, self.iterations))
+        if degree > self.splats.active_degree:
+            self.splats.active_degree = degree
+            events += (f"spherical harmonics of degree {degree}",)
+        return events
+
+    def counts(self) -> dict[str, int]:
+        """Number of Gaussians."""
+        return {"gaussians": len(self.splats)}
+
+    @torch.no_grad()
+    def render(self, view: View) -> Rendering:
+        """Render a view without gradients."""
+        return render(self.splats.gaussians(view), view, self._render_options(view), backend=self._config.backend)
+
+    def state(self) -> State:
+        """Parameters, statistics, random state; not copies."""
+        tensors = {f"splats/{name}": tensor for name, tensor in self.splats.state_dict().items()}
+        tensors |= {f"statistics/{name}": tensor for name, tensor in self.densifier.statistics.items()}
+        tensors["random/pieces"] = self.densifier.generator.get_state()
+        values = {
+            "active_degree": self.splats.active_degree,
+            "degree": self.splats.degree,
+            "unit": self.splats.unit,
+            "extent": self._extent,
+            "iterations": self.iterations,
+        }
+        return State(tensors, values)
+
+    def load_state(self, state: State) -> None:
+        """Become the model that `state` was taken of.
+
+        Raises:
+            ValueError: the state is of a model with other options.
+        """
+        self.splats.load(_under("splats/", state))
+        self.splats.active_degree = state.values["active_degree"]
+        device = self.splats.means.device
+        self.densifier.statistics = {n: t.to(device, copy=True) for n, t in _under("statistics/", state).items()}
+        self.densifier.generator.set_state(state.tensors["random/pieces"].cpu())
+
+    def _drawing(self, view: View, probe: Tensor | None = None) -> Drawing:
+        """`draw`; `probe` is that of another drawing of the same Gaussians, for views that are made of several."""
+        self._drawn = view
+        gaussians = self.splats.gaussians(view)
+        rendering, probe = render_probed(
+            gaussians,
+            view,
+            self._render_options(view),
+            signal=self.densifier.options.signal,
+            probe=probe,
+            backend=self._config.backend,
+        )
+        return Drawing(rendering, probe, gaussians, torch.arange(len(probe), device=probe.device))
+
+    def _render_options(self, view: View) -> RenderOptions:
+        options = self._config.options(self.splats.unit)
+        if options.cubemap and not isinstance(view.camera, Panorama):  # one face of a cube, or a crop: draw it as it is
+            return replace(options, cubemap=False, face_size=None)
+        return options
+
+
+def extent_of(scene: Scene) -> float:
+    """`Scene.extent`, world units, but for cameras that hardly move: they must be able to place Gaussians, too."""
+    return max(scene.extent, MIN_EXTENT * scene.unit)
+
+
+def stands_still(scene: Scene) -> bool:
+    """Whether all training cameras stand in one place, up to the rounding of their poses."""
+    return scene.extent <= ONE_PLACE * scene.unit
+
+
+def _under(prefix: str, state: State) -> dict[str, torch.Tensor]:
+    return {name.removeprefix(prefix): tensor for name, tensor in state.tensors.items() if name.startswith(prefix)}

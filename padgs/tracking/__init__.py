@@ -1,0 +1,1 @@
+"""Runs mirrored into mlflow."""

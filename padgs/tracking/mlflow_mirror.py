@@ -1,0 +1,153 @@
+"""What stands in mlflow about a run folder: settings, progress in batches, marks, pictures and tables."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from padgs import results
+from padgs.results import Result
+from reports.request import Request
+from reports.tables import runs
+from reports.writers import csv_text, markdown
+
+RUN, PARENT, MULTIRUN, LOGGED = "padgs.run", "mlflow.parentRunId", "padgs.multirun", "padgs.logged_iteration"  # tags
+MOST_PARAMS, MOST_METRICS = 100, 1000  # in one batch, as mlflow's servers allow
+LONGEST_VALUE = 500  # characters
+
+
+class Mirror:
+    """Writes run folders into one experiment."""
+
+    def __init__(self, client: Any, experiment: str, multirun: str = "") -> None:
+        """Find or make the run that stands for a multirun.
+
+        Args:
+            client: an MlflowClient.
+            experiment: id of an experiment.
+            multirun: name of the run under which the others stand; empty = none.
+        """
+        self._client, self._experiment = client, experiment
+        self._parent = (self._find(MULTIRUN, multirun) or self._create(MULTIRUN, multirun)) if multirun else ""
+
+    def update(self, run: Path) -> None:
+        """Bring mlflow up to date about a run, finished or in progress."""
+        identity = self._find(RUN, run.name)
+        if identity is None:
+            identity = self._create(RUN, run.name, {PARENT: self._parent} if self._parent else {})
+            self._log_settings(identity, OmegaConf.to_container(OmegaConf.load(run / "config.yaml")))
+        self._log_progress(identity, run)
+        if (run / results.FILE_NAME).exists():
+            self._log_result(identity, run, results.read(run / results.FILE_NAME))
+        else:
+            self._client.update_run(identity, status="RUNNING")
+
+    def finish(self, found: Sequence[Result]) -> None:
+        """End the run that stands for a multirun, with a table of all its results."""
+        if self._parent:
+            self._log_table(self._parent, found)
+            self._client.set_terminated(self._parent, "FINISHED" if all(result.ok for result in found) else "FAILED")
+
+    def _find(self, tag: str, value: str) -> str | None:
+        found = self._client.search_runs([self._experiment], f"tags.`{tag}` = '{value}'", max_results=1)
+        return found[0].info.run_id if found else None
+
+    def _create(self, tag: str, name: str, more: Mapping[str, str] | None = None) -> str:
+        tags = {tag: name, **(more or {})}
+        return self._client.create_run(self._experiment, run_name=name, tags=tags).info.run_id
+
+    def _log_settings(self, identity: str, config: Any) -> None:
+        from mlflow.entities import Param
+
+        params = [Param(key, str(value)[:LONGEST_VALUE]) for key, value in flat(config)]
+        for batch in batches(params, MOST_PARAMS):
+            self._client.log_batch(identity, params=batch)
+
+    def _log_progress(self, identity: str, run: Path) -> None:
+        """What log.jsonl says and mlflow does not know; a run that went back to a checkpoint says nothing twice."""
+        from mlflow.entities import Metric, RunTag
+
+        known = int(self._client.get_run(identity).data.tags.get(LOGGED, 0))
+        now, metrics, last = int(1000 * time.time()), [], known
+        for line in log_lines(run):
+            if line["iteration"] > known:
+                last = line["iteration"]
+                numbers = {key: value for key, value in line.items() if isinstance(value, (int, float))}
+                metrics += [Metric(f"train/{key}", float(value), now, last) for key, value in numbers.items()]
+        for batch in batches(metrics, MOST_METRICS):
+            self._client.log_batch(identity, metrics=batch)
+        if last > known:
+            self._client.log_batch(identity, tags=[RunTag(LOGGED, str(last))])
+
+    def _log_result(self, identity: str, run: Path, result: Result) -> None:
+        from mlflow.entities import Metric, RunTag
+
+        words = {"status": result.status, "preset": result.preset, "scene": result.scene, "variant": result.variant}
+        words |= {"experiments": " ".join(result.experiments), "reason": result.reason}
+        now = int(1000 * time.time())
+        metrics = [Metric(key, value, now, result.iterations_done) for key, value in final_numbers(result).items()]
+        tags = [RunTag(f"padgs.{key}", value[:LONGEST_VALUE]) for key, value in words.items()]
+        self._client.log_batch(identity, metrics=metrics, tags=tags)
+        self._client.log_artifacts(identity, str(run / "renders"), "renders")
+        self._client.log_artifact(identity, str(run / results.FILE_NAME))
+        self._log_table(identity, [result])
+        self._client.set_terminated(identity, "FINISHED" if result.ok else "FAILED")
+
+    def _log_table(self, identity: str, found: Sequence[Result]) -> None:
+        table = runs.build(found, Request(mix=True))
+        self._client.log_text(identity, markdown.text(table), "tables/runs.md")
+        self._client.log_text(identity, csv_text.text(table), "tables/runs.csv")
+
+
+def flat(values: Mapping[str, Any], where: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted keys and values of a configuration.
+
+    >>> list(flat({"a": {"b": 1}, "c": [2]}))
+    [('a.b', 1), ('c', [2])]
+    """
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            yield from flat(value, f"{where}{key}.")
+        else:
+            yield f"{where}{key}", value
+
+
+def final_numbers(result: Result) -> dict[str, float]:
+    """Marks under each protocol, times and sizes; what is missing is left out."""
+    numbers = {
+        f"{name}/{metric}": value
+        for name, scores in result.scores.items()
+        for metric, value in scores.metrics.items()
+        if value is not None
+    }
+    numbers |= {f"time/{key}": value for key, value in result.timing.items()}
+    numbers |= {f"size/{key}": float(value) for key, value in result.counts.items()}
+    if result.peak_device_memory_bytes is not None:
+        numbers["peak_device_memory_bytes"] = result.peak_device_memory_bytes
+    return numbers | {"size/model_bytes": float(result.model_bytes), "peak_memory_bytes": result.peak_memory_bytes}
+
+
+def log_lines(run: Path) -> Iterator[dict[str, Any]]:
+    """The whole lines of a run's log.jsonl."""
+    try:
+        lines = (run / "log.jsonl").read_text().splitlines()
+    except OSError:
+        return
+    for line in lines:
+        try:
+            entry = json.loads(line)
+            entry["iteration"] = int(entry["iteration"])
+        except (ValueError, KeyError, TypeError):
+            continue  # being written
+        yield entry
+
+
+def batches(items: Sequence[Any], size: int) -> Iterator[Sequence[Any]]:
+    """Consecutive parts of at most `size` items."""
+    for start in range(0, len(items), size):
+        yield items[start : start + size]

@@ -1,0 +1,1 @@
+"""Curves and points, and how they are drawn."""

@@ -1,0 +1,126 @@
+"""One page with everything, in one file that needs no network: tables that sort, charts, pictures and a 360° viewer."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+from reports.gathered import TABLES, Gathered
+from reports.page.pictures import album
+from reports.tables.footnotes import machine
+from reports.tables.ranking import BEST, emphasis
+from reports.tables.table import Block, Cell, ReportError, Table
+
+HERE = Path(__file__).resolve().parent
+SCRIPTS = ("pannellum.js", "tablesort.min.js", "tablesort.number.min.js", "img-comparison-slider.js")
+STYLES = ("pannellum.css", "img-comparison-slider.css")
+LOWEST = "-1e99"  # where a cell without a number is sorted
+
+
+def text(gathered: Gathered) -> str:
+    """The page as HTML."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    environment = Environment(
+        loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    refused: list[str] = []
+    made = [_attempt(lambda name=name: gathered.table(name), refused) for name in TABLES]
+    tables = [table for table in made if table is not None and table.blocks]
+    trade_offs = _attempt(lambda: gathered.trade_offs, refused) or []
+    sweeps = _attempt(lambda: gathered.sweeps, refused) or []
+    pictures = album(gathered.folder, gathered.results, gathered.request)
+    return environment.get_template("page.html.j2").render(
+        facts=_facts(gathered),
+        problems=[*gathered.left_out, *refused],
+        tables=[_table(table) for table in tables],
+        charts=[(chart.title, _inline(chart.svg), made.notes) for made, charts in trade_offs for chart in charts],
+        sweeps=[(chart.title, _inline(chart.svg), made.notes) for made, chart in sweeps],
+        pictures=pictures,
+        data=_script(json.dumps({"images": pictures.images, "scenes": pictures.scenes})),
+        styles="\n".join([*(_vendored(name) for name in STYLES), (HERE / "page.css").read_text()]),
+        scripts=[*(_vendored(name) for name in SCRIPTS), (HERE / "page.js").read_text()],
+        notice=_vendored("NOTICE.md"),
+    )
+
+
+def _attempt(make: Callable[[], Any], refused: list[str]) -> Any:
+    """What can be made; else None, with the reason kept for the page."""
+    try:
+        return make()
+    except ReportError as error:
+        refused.append(str(error))
+        return None
+
+
+def _facts(gathered: Gathered) -> list[tuple[str, str]]:
+    results = gathered.results
+    lists: Sequence[tuple[str, Callable[[Any], str]]] = (
+        ("Scenes", lambda result: result.scene),
+        ("Methods", lambda result: result.preset),
+        ("Code", lambda result: result.code_version),
+        ("Machines", machine),
+    )
+    failed = sum(not result.ok for result in results)
+    facts = [("Runs", f"{len(results)}, of which {failed} failed")]
+    facts += [(name, ", ".join(sorted({of(result) for result in results}))) for name, of in lists]
+    return [*facts, ("Last run", max((result.finished for result in results), default="none"))]
+
+
+def _table(table: Table) -> dict[str, Any]:
+    return {
+        "name": table.name,
+        "title": table.title,
+        "corner": table.corner,
+        "blocks": [_block(table.alone(block)) for block in table.blocks],
+        "notes": table.notes,
+    }
+
+
+def _block(table: Table) -> dict[str, Any]:
+    (block,) = table.blocks
+    groups = [(group, len(list(columns))) for group, columns in groupby(table.columns, lambda column: column.group)]
+    return {
+        "title": block.title,
+        "groups": groups if any(size > 1 for _, size in groups) else [],
+        "headings": [column.heading for column in table.columns],
+        "rows": _rows(table, block),
+    }
+
+
+def _rows(table: Table, block: Block) -> list[dict[str, Any]]:
+    ranks = [emphasis(block, index, table.columns) for index in range(len(table.columns))]
+    rows = []
+    for number, row in enumerate(block.rows):
+        title, *texts = row.texts(table.columns)
+        cells = [
+            {"text": words, "sort": _sort(cell), "mark": _mark(rank.get(number))}
+            for words, cell, rank in zip(texts, row.cells, ranks, strict=True)
+        ]
+        rows.append({"title": title, "cells": cells})
+    return rows
+
+
+def _sort(cell: Cell) -> str:
+    return LOWEST if cell.value is None else f"{cell.value:.9f}"
+
+
+def _mark(rank: str | None) -> str:
+    return "" if rank is None else "best" if rank == BEST else "second"
+
+
+def _inline(svg: str) -> str:
+    """A picture without the lines that only a file of its own needs."""
+    return svg[svg.index("<svg") :]
+
+
+def _script(text: str) -> str:
+    """JSON that cannot end the script element around it."""
+    return text.replace("<", "\\u003c")
+
+
+def _vendored(name: str) -> str:
+    return (HERE / "vendor" / name).read_text()

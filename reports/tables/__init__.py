@@ -1,0 +1,1 @@
+"""Tables as data: which results stand in which cell."""

@@ -1,0 +1,192 @@
+"""`padgs check` on every fixture, on real input, and on broken copies: each is caught, and by name."""
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fixtures import WRITERS, World, write_colmap_text, write_transforms
+from PIL import Image
+from typer import Typer
+from typer.testing import CliRunner
+
+from padgs.cli import check as check_command
+from padgs.cli import convert as convert_command
+from padgs.data import load
+from padgs.data.check.report import check
+
+app = Typer()
+app.command()(check_command.check)
+app.command()(convert_command.convert)
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_sound_data_sets_pass(name: str, world: World, tmp_path: Path) -> None:
+    WRITERS[name](world, tmp_path / "scene")
+    report = check(tmp_path / "scene", overlay=tmp_path / "look.png")
+    assert report.problems == [] and report.suggestion is None
+    assert (report.format, report.train, report.test, report.unused) == (name, 4, 2, 0)
+    assert report.resolution == "64x32"
+    if name not in ("openmvg", "omniblender"):  # no colours, no points
+        assert report.colour_correlation is not None and report.colour_correlation > 0.9
+    if name in ("colmap", "openmvg"):
+        assert report.reprojection_95 is not None and report.reprojection_95 < 1e-9
+    with Image.open(tmp_path / "look.png") as picture:
+        assert picture.size == (64, 32)
+
+
+@pytest.mark.parametrize(
+    ("name", "up", "off_axis", "tilt", "reprojection"),
+    [("flat", "-y", 34.7, 0.3, 0.20), ("garden", "-y", 34.9, 2.1, 0.26), ("room", "+z", 0.0, 0.0, None)],
+)
+def test_real_input(name: str, up: str, off_axis: float, tilt: float, reprojection: float | None, shared: Path) -> None:
+    report = check(shared / "data" / name)
+    assert report.problems == [] and report.suggestion is None and report.gravity is not None
+    assert report.gravity.axis == up
+    assert (report.gravity.off_axis, report.gravity.tilt) == pytest.approx((off_axis, tilt), abs=0.06)
+    assert report.reprojection_median == (None if reprojection is None else pytest.approx(reprojection, abs=0.01))
+    assert report.colour_correlation is not None and report.colour_correlation > 0.6
+
+
+def _edit(folder: Path, file: str, change: Callable[[str], str]) -> None:
+    path = folder / file
+    path.write_text(change(path.read_text()))
+
+
+def _save(folder: Path, name: str, pixels: np.ndarray) -> None:
+    Image.fromarray(pixels).save(folder / name)
+
+
+WIDE = np.zeros((32, 60, 3), np.uint8)
+BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
+    "image missing": (lambda f: (f / "images/pano_02.png").unlink(), "1 of 6 poses have no image in .*: pano_02.png"),
+    "image cut": (
+        lambda f: (f / "images/pano_02.png").write_bytes(b"\x89PNG\r\n\x1a\n"),
+        "pano_02.png is not an image",
+    ),
+    "not 2:1": (lambda f: _save(f, "images/pano_03.png", WIDE), "pano_03.png is 60x32, which is not 2:1"),
+    "mask of another size": (lambda f: _save(f, "mask.png", WIDE[:30]), "mask.png is 60x30 but pano_00.png is 64x32"),
+    "mask hides all": (lambda f: _save(f, "mask.png", np.zeros((32, 64), np.uint8)), "mask.png hides every pixel"),
+    "list names absent": (lambda f: _edit(f, "test.txt", lambda t: t + "nobody\n"), "names images .*there: nobody"),
+    "lists overlap": (lambda f: shutil.copy(f / "train.txt", f / "test.txt"), "train and test list overlap: pano_00"),
+    "list escapes": (lambda f: _edit(f, "train.txt", lambda t: t + "../../x\n"), "'../../x'; names must be relative"),
+    "same image twice": (
+        lambda f: shutil.copy(f / "images/pano_00.png", f / "images/pano_01.png"),
+        "the test view pano_01 is the same image as the training view pano_00",
+    ),
+    "empty cloud": (lambda f: (f / "sparse/0/points3D.txt").write_text("\n"), "holds no points; training starts"),
+    "other camera": (
+        lambda f: _edit(f, "sparse/0/cameras.txt", lambda t: re.sub("1 EQ.*", "1 PINHOLE 64 32 9 9 32 16", t)),
+        "has a PINHOLE camera",
+    ),
+    "binary garbage": (lambda f: (f / "sparse/0/images.bin").write_bytes(b"\x07" * 99), "lacks cameras.bin"),
+    "world far away": (lambda f: _far(f), "coordinates are 1e.07 while things are .* shift the world to the cameras"),
+    "other axes": (lambda f: _turn(f), "colours correlate by -?0.* and by 0.9. if read otherwise"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_broken_copies_are_caught(case: str, world: World, tmp_path: Path) -> None:
+    spoil, message = BROKEN[case]
+    write_colmap_text(world, tmp_path)
+    spoil(tmp_path)
+    report = check(tmp_path)
+    assert any(re.search(message, problem) for problem in report.problems), report.problems
+    assert all("Traceback" not in problem for problem in report.problems)
+
+
+def test_all_problems_are_told_at_once(world: World, tmp_path: Path) -> None:
+    write_colmap_text(world, tmp_path)
+    for case in ("image cut", "not 2:1", "lists overlap", "mask hides all"):
+        BROKEN[case][0](tmp_path)
+    problems = "\n".join(check(tmp_path).problems)
+    assert "pano_02.png is not an image" in problems and "pano_03.png is 60x32" in problems
+    for name in ("pano_02", "pano_03"):
+        _save(tmp_path, f"images/{name}.png", world.images[2])
+    problems = "\n".join(check(tmp_path).problems)
+    assert "overlap" in problems and "hides every pixel" in problems
+
+
+def test_a_wrong_convention_in_a_transforms_file(world: World, tmp_path: Path) -> None:
+    """Poses written for a camera with y down and z forward, into a format whose cameras have y up and z backward."""
+    write_transforms(world, tmp_path)
+    meta = json.loads((tmp_path / "transforms.json").read_text())
+    for i, frame in enumerate(meta["frames"]):
+        frame["transform_matrix"] = world.world_from_cam(i).tolist()
+    (tmp_path / "transforms.json").write_text(json.dumps(meta))
+    report = check(tmp_path)
+    assert report.suggestion is not None and "take (x, -y, -z) for (x, y, z), as from OpenGL" in report.suggestion
+    assert report.colour_correlation is not None and report.colour_correlation < 0.5
+
+
+def test_the_command(world: World, tmp_path: Path) -> None:
+    folder = tmp_path / "ma scène"
+    write_colmap_text(world, folder)
+    run = CliRunner().invoke
+    good = run(app, ["check", str(folder), "--overlay", str(tmp_path / "look.png")])
+    assert good.exit_code == 0 and "ready for training" in good.output and "4 train, 2 test" in good.output
+    assert (tmp_path / "look.png").is_file()
+    (folder / "images/pano_02.png").unlink()
+    bad = run(app, ["check", str(folder), "--overlay", ""])
+    assert (
+        bad.exit_code == 1 and "PROBLEM" in bad.output and "pano_02.png" in bad.output and "1 problem(s)" in bad.output
+    )
+    assert run(app, ["check", str(tmp_path / "absent"), "--overlay", ""]).exit_code == 1
+    assert "unknown data.split 'x'" in run(app, ["check", str(folder), "--split", "x"]).output
+
+
+def test_the_convert_command(world: World, tmp_path: Path) -> None:
+    write_colmap_text(world, tmp_path / "a")
+    run = CliRunner().invoke
+    good = run(app, ["convert", str(tmp_path / "a"), str(tmp_path / "b"), "--to", "transforms", "--width", "32"])
+    assert good.exit_code == 0 and "4 train and 2 test views, 400 points, as transforms" in good.output
+    assert load(tmp_path / "b").train[0].width == 32
+    again = run(app, ["convert", str(tmp_path / "a"), str(tmp_path / "b"), "--to", "colmap"])
+    assert again.exit_code == 1 and "nothing is overwritten" in again.output
+    assert (
+        "unknown format 'obj'" in run(app, ["convert", str(tmp_path / "a"), str(tmp_path / "c"), "--to", "obj"]).output
+    )
+
+
+def _far(folder: Path) -> None:
+    """The whole world, 10 000 km from its origin, as in projected map coordinates."""
+    shift = np.array([1e7, 1e7, 1e7])
+
+    def poses(text: str) -> str:
+        lines = []
+        for line in text.splitlines():
+            if line.endswith(".png"):
+                fields = line.split()
+                w, x, y, z = map(float, fields[1:5])
+                rotation = np.array(
+                    [
+                        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+                    ]
+                )
+                moved = np.array(list(map(float, fields[5:8]))) - rotation @ shift
+                line = " ".join([*fields[:5], *(repr(float(value)) for value in moved), *fields[8:]])
+            lines.append(line)
+        return "\n".join(lines) + "\n"
+
+    def points(text: str) -> str:
+        rows = [line.split() for line in text.splitlines() if not line.startswith("#")]
+        moved = [[row[0], *(repr(float(x) + 1e7) for x in row[1:4]), *row[4:]] for row in rows]
+        return "\n".join(" ".join(row) for row in moved) + "\n"
+
+    _edit(folder, "sparse/0/images.txt", poses)
+    _edit(folder, "sparse/0/points3D.txt", points)
+
+
+def _turn(folder: Path) -> None:
+    """Points in a z-up world, poses in a y-down one."""
+
+    def turned(text: str) -> str:
+        rows = [line.split() for line in text.splitlines() if not line.startswith("#")]
+        return "\n".join(" ".join([row[0], row[1], row[3], repr(-float(row[2])), *row[4:]]) for row in rows) + "\n"
+
+    _edit(folder, "sparse/0/points3D.txt", turned)

@@ -1,0 +1,140 @@
+"""Write, read, compare: every format into every other, and nothing half-written."""
+
+import errno
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from fixtures import WRITERS, World, write_cloud
+from PIL import Image
+
+from padgs.data import DataError, DataOptions, load, read
+from padgs.data.formats import writers
+from padgs.data.formats.convert import convert
+from padgs.scene import Scene
+
+
+@pytest.mark.parametrize("to", WRITERS)
+@pytest.mark.parametrize("source", WRITERS)
+def test_round_trip(source: str, to: str, world: World, tmp_path: Path) -> None:
+    """Source by hand -> `to` by padgs -> read by padgs, against the truth."""
+    WRITERS[source](world, tmp_path / "in")
+    if source == "omniblender":  # has none of its own
+        write_cloud(world, tmp_path / "in" / "pcd.ply")
+    convert(tmp_path / "in", tmp_path / "out put", to)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["in", "out put"]
+    scene, truth = load(tmp_path / "out put"), load(tmp_path / "in")
+    assert scene.notes[0].startswith(f"format: {to}")
+    _same(scene, truth, world, pixels=not (source == "roam360" and to == "ricoh360"))
+
+
+def test_nothing_is_lost_in_a_chain_through_all(world: World, tmp_path: Path) -> None:
+    WRITERS["colmap"](world, tmp_path / "0")
+    mask = np.full((32, 64), 255, np.uint8)
+    mask[20:] = 0
+    Image.fromarray(mask).save(tmp_path / "0" / "mask.png")
+    truth = load(tmp_path / "0")
+    names = [name for name in WRITERS if name != "roam360"] + ["colmap"]
+    for i, to in enumerate(names):
+        convert(tmp_path / str(i), tmp_path / str(i + 1), to)
+    scene = load(tmp_path / str(len(names)))
+    _same(scene, truth, world)
+    assert torch.equal(scene.train[0].mask(), truth.train[0].mask())  # type: ignore[arg-type]
+
+
+def test_tracks_survive(world: World, tmp_path: Path) -> None:
+    WRITERS["colmap"](world, tmp_path / "a")
+    convert(tmp_path / "a", tmp_path / "b", "openmvg", options=DataOptions(width=32))
+    (tmp_path / "b" / "colorized.ply").unlink()  # its points are in another order for all that openmvg promises
+    convert(tmp_path / "b", tmp_path / "c", "colmap")
+    before, after = read(tmp_path / "a").tracks, read(tmp_path / "c").tracks
+    assert before is not None and after is not None
+    first, last = before(), after()
+    keys = [tracks.frame * 1000 + tracks.point for tracks in (first, last)]
+    pixels = [tracks.pixels[key.argsort()] for tracks, key in zip((first, last), keys, strict=True)]
+    torch.testing.assert_close(pixels[0], 2 * pixels[1], atol=1e-9, rtol=0)
+
+
+def test_masks_per_image_and_the_rule_of_360roam(world: World, tmp_path: Path) -> None:
+    WRITERS["roam360"](world, tmp_path / "a")
+    convert(tmp_path / "a", tmp_path / "b", "transforms")
+    assert (tmp_path / "b" / "mask.png").is_file()
+    mask, rule = load(tmp_path / "b").train[0].mask(), load(tmp_path / "a").train[0].mask()
+    torch.testing.assert_close(mask, rule, atol=0.5 / 255, rtol=0)
+    WRITERS["colmap"](world, tmp_path / "c")
+    (tmp_path / "c" / "masks").mkdir()
+    Image.new("L", (64, 32), 100).save(tmp_path / "c" / "masks" / "pano_02.png")
+    convert(tmp_path / "c", tmp_path / "d", "released")
+    found = {view.name: view.mask() for view in load(tmp_path / "d").train}
+    assert [name for name, mask in found.items() if mask is not None] == ["pano_02"]
+
+
+def test_reducing(world: World, tmp_path: Path) -> None:
+    WRITERS["colmap"](world, tmp_path / "a")
+    convert(tmp_path / "a", tmp_path / "b", "colmap", options=DataOptions(width=32))
+    small, reduced = load(tmp_path / "b"), load(tmp_path / "a", width=32)
+    assert torch.equal(small.test[1].image(), reduced.test[1].image())
+    assert read(tmp_path / "b").frames[0].width == 32
+
+
+def test_nested_images(world: World, tmp_path: Path) -> None:
+    WRITERS["transforms"](world, tmp_path / "a")
+    text = (tmp_path / "a" / "transforms.json").read_text()
+    for name, folder in (("pano_00", "eins"), ("pano_01", "zwei ü")):
+        (tmp_path / "a" / "images" / folder).mkdir()
+        (tmp_path / "a" / "images" / f"{name}.png").rename(tmp_path / "a" / "images" / folder / f"{name}.png")
+        text = text.replace(f"images/{name}.png", f"images/{folder}/{name}.png")
+    (tmp_path / "a" / "transforms.json").write_text(text)
+    convert(tmp_path / "a", tmp_path / "b", "colmap")
+    convert(tmp_path / "b", tmp_path / "c", "ricoh360")
+    names = {view.name for view in (lambda scene: (*scene.train, *scene.test))(load(tmp_path / "c"))}
+    assert {"eins/pano_00", "zwei ü/pano_01"} <= {name.removeprefix("images/") for name in names}
+
+
+def test_a_full_disk_leaves_nothing(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    WRITERS["colmap"](world, tmp_path / "in")
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setitem(writers.WRITERS, "released", full)
+    with pytest.raises(DataError, match=r"cannot write .*out \(No space left on device\); nothing was left there"):
+        convert(tmp_path / "in", tmp_path / "out", "released")
+    assert [path.name for path in tmp_path.iterdir()] == ["in"]
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(shutil, "copyfile", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        convert(tmp_path / "in", tmp_path / "out", "colmap")
+    assert [path.name for path in tmp_path.iterdir()] == ["in"]
+
+
+def test_what_convert_refuses(world: World, tmp_path: Path) -> None:
+    WRITERS["omniblender"](world, tmp_path / "in")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "file").touch()
+    with pytest.raises(DataError, match="full exists; nothing is overwritten"):
+        convert(tmp_path / "in", tmp_path / "full", "colmap")
+    with pytest.raises(ValueError, match="unknown format 'ply'; known: colmap, transforms"):
+        convert(tmp_path / "in", tmp_path / "out", "ply")
+    with pytest.raises(DataError, match="there is no point cloud, and a COLMAP model needs one"):
+        convert(tmp_path / "in", tmp_path / "out", "colmap")
+    (tmp_path / "in" / "images" / "pano_03.png").write_bytes(b"no image")
+    with pytest.raises(DataError, match="pano_03.png is not an image"):
+        convert(tmp_path / "in", tmp_path / "out", "transforms")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["full", "in"]
+
+
+def _same(scene: Scene, truth: Scene, world: World, pixels: bool = True) -> None:
+    assert [view.name for view in scene.train] == list(world.train)
+    assert [view.name for view in scene.test] == list(world.test)
+    for view, expected in zip((*scene.train, *scene.test), (*truth.train, *truth.test), strict=True):
+        torch.testing.assert_close(view.cam_from_world, expected.cam_from_world, atol=1e-12, rtol=0)
+        if pixels:
+            assert torch.equal(view.load_pixels(), expected.load_pixels())  # type: ignore[misc]
+    assert torch.equal(scene.points, truth.points)
+    assert torch.equal(scene.point_colors, truth.point_colors)

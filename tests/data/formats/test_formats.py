@@ -1,0 +1,230 @@
+"""Every format, from files written by hand: exact poses, points, colours, split, and images that agree with them."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from fixtures import WRITERS, World, paint, write_transforms
+
+from padgs.data import DataError, load, read
+from padgs.scene import Scene
+from padgs.sphere.panorama import rays
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_the_scene_is_exact(name: str, world: World, tmp_path: Path) -> None:
+    folder = tmp_path / "ein Ordner ünd mehr"
+    WRITERS[name](world, folder)
+    scene = load(folder)
+    assert scene.notes[0].startswith(f"format: {name}, because there is ")
+    assert [view.name for view in scene.train] == list(world.train)
+    assert [view.name for view in scene.test] == list(world.test)
+    for view in (*scene.train, *scene.test):
+        i = world.names.index(view.name)
+        rotation, center = torch.from_numpy(world.rotations[i]), torch.from_numpy(world.centers[i])
+        torch.testing.assert_close(view.cam_from_world[:3, :3], rotation, atol=1e-12, rtol=0)
+        torch.testing.assert_close(view.center, center, atol=1e-12, rtol=0)
+        if name != "roam360":  # JPEG
+            assert torch.equal(view.load_pixels(), torch.from_numpy(world.images[i]))
+    if name == "omniblender":
+        assert any("100000 random ones" in note for note in scene.notes)
+        return
+    torch.testing.assert_close(scene.points, torch.from_numpy(world.points).float())
+    if name == "openmvg":
+        assert "points: they have no colours; grey is taken" in scene.notes
+    else:
+        assert torch.equal(scene.point_colors, torch.from_numpy(world.colors))
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_what_a_view_shows_is_what_is_there(name: str, world: World, tmp_path: Path) -> None:
+    """Points along the rays of padgs, from the poses as loaded, have the colours of the pixels."""
+    WRITERS[name](world, tmp_path / "scene")
+    view = load(tmp_path / "scene").train[1]
+    directions = rays(view.width, view.height, dtype=torch.float64) @ view.cam_from_world[:3, :3]
+    half, center = torch.tensor([2.0, 1.2, 1.6], dtype=torch.float64), view.center
+    distance = ((directions.sign() * half - center) / directions).min(-1, keepdim=True).values
+    colors = torch.from_numpy(paint((center + distance * directions).numpy()))
+    difference = (colors.float() - view.load_pixels().float()).abs()
+    assert difference.median() <= (2 if name == "roam360" else 0)
+
+
+def test_tracks_of_openmvg_reproject(world: World, tmp_path: Path) -> None:
+    WRITERS["openmvg"](world, tmp_path / "scene")
+    capture = read(tmp_path / "scene")
+    assert capture.tracks is not None and len(capture.tracks().pixels) == 2 * len(world.points)
+
+
+def test_360roam_is_masked_and_reduced(world: World, tmp_path: Path) -> None:
+    WRITERS["roam360"](world, tmp_path / "bar")
+    scene = load(tmp_path / "bar")
+    mask = scene.test[0].mask()
+    assert mask is not None and mask[:29].eq(1).all() and mask[30:].eq(0).all()
+    assert mask[29, 0].item() == pytest.approx(959 / 1024 * 32 - 29)
+    from PIL import Image
+
+    for path in (tmp_path / "bar" / "images").iterdir():
+        Image.new("RGB", (4096, 2048)).save(path)
+    assert load(tmp_path / "bar").train[0].width == 2048
+    assert load(tmp_path / "bar", width=512).train[0].width == 512
+
+
+def test_ricoh360_uses_its_mask_and_not_as_a_view(world: World, tmp_path: Path) -> None:
+    WRITERS["ricoh360"](world, tmp_path / "bricks")
+    scene = load(tmp_path / "bricks")
+    assert "mask" not in [view.name for view in (*scene.train, *scene.test)]
+    assert scene.train[0].mask().eq(1).all()  # type: ignore[union-attr]
+
+
+def test_a_pair_of_transforms(world: World, tmp_path: Path) -> None:
+    """transforms_train.json and transforms_test.json, file names without extension, as Blender's exporters write."""
+    whole = _written(world, tmp_path)
+    for side, names in (("train", world.train), ("test", world.test)):
+        frames = [frame for frame in whole["frames"] if Path(frame["file_path"]).stem in names]
+        frames = [{**frame, "file_path": "./" + frame["file_path"].removesuffix(".png")} for frame in frames]
+        part = {"camera_model": "EQUIRECTANGULAR", "frames": frames}
+        (tmp_path / "scene" / f"transforms_{side}.json").write_text(json.dumps(part))
+    (tmp_path / "scene" / "transforms.json").unlink()
+    scene = load(tmp_path / "scene")
+    assert [view.name for view in scene.test] == list(world.test) and len(scene.points) == len(world.points)
+
+
+def test_masks_that_transforms_names(world: World, tmp_path: Path) -> None:
+    from PIL import Image
+
+    def name_masks(meta: dict[str, Any]) -> None:
+        for frame in meta["frames"][:2]:
+            frame["mask_path"] = "masks/" + Path(frame["file_path"]).name
+
+    _written(world, tmp_path, name_masks)
+    (tmp_path / "scene" / "masks").mkdir()
+    for name in world.names[:2]:
+        Image.new("L", (64, 32), 255).save(tmp_path / "scene" / "masks" / f"{name}.png")
+    views: dict[str, Any] = {view.name: view for view in _all(load(tmp_path / "scene"))}
+    assert [views[name].mask() is not None for name in world.names] == [True, True, False, False, False, False]
+
+
+def test_several_formats_in_one_folder(world: World, tmp_path: Path) -> None:
+    WRITERS["colmap"](world, tmp_path / "scene")
+    _written(world, tmp_path / "other")
+    (tmp_path / "scene" / "transforms.json").write_text((tmp_path / "other" / "scene" / "transforms.json").read_text())
+    (tmp_path / "scene" / "sparse_pc.ply").write_bytes((tmp_path / "other" / "scene" / "sparse_pc.ply").read_bytes())
+    note = load(tmp_path / "scene").notes[0]
+    assert note.startswith("format: colmap") and "also there, not used: transforms.json" in note
+    assert load(tmp_path / "scene", "transforms").train[0].name == "pano_00"
+    assert load(tmp_path / "scene" / "transforms.json").notes[0].startswith("format: transforms")
+
+
+Change = Callable[[dict[str, Any]], object]
+BROKEN: dict[str, tuple[Change, str]] = {
+    "camera": (
+        lambda m: m.update(camera_model="OPENCV_FISHEYE"),
+        "'OPENCV_FISHEYE'; only EQUIRECTANGULAR",
+    ),
+    "no camera": (lambda m: m.pop("camera_model"), "camera_model None"),
+    "no frames": (lambda m: m.pop("frames"), "lacks the field 'frames'; it has camera_model, w, h"),
+    "no pose": (
+        lambda m: m["frames"][0].pop("transform_matrix"),
+        "pano_00.png .* lacks the field 'transform_matrix'",
+    ),
+    "nan": (lambda m: m["frames"][1]["transform_matrix"][0].__setitem__(3, float("nan")), "pano_01.png .*contains nan"),
+    "scaled": (lambda m: _scale(m["frames"][2], 2), "pano_02.png .* a rotation times 2; scale belongs"),
+    "sheared": (lambda m: m["frames"][2]["transform_matrix"][0].__setitem__(0, 3.0), "is not a rotation: R R"),
+    "mirrored": (lambda m: _mirror(m["frames"][3]), "pano_03.png .*left-handed .*negate the column"),
+    "transposed": (lambda m: _transpose(m["frames"][4]), "pano_04.png .*the pose is transposed, its last row"),
+    "last row": (lambda m: m["frames"][4]["transform_matrix"][3].__setitem__(3, 2), "must be 0 0 0 1"),
+    "words": (lambda m: m["frames"][0].update(transform_matrix="identity"), "not an array of numbers"),
+    "ragged": (lambda m: m["frames"][0]["transform_matrix"][1].pop(), "not an array of numbers"),
+    "outside": (
+        lambda m: m["frames"][0].update(file_path="../../secret.png"),
+        "names '../../secret.png'; names",
+    ),
+    "outside cloud": (lambda m: m.update(ply_file_path="/etc/passwd"), "names '/etc/passwd'; names must be relative"),
+    "no cloud": (lambda m: m.update(ply_file_path="absent.ply"), "the point cloud .*absent.ply does not exist"),
+    "absent test view": (lambda m: m["test_filenames"].append("images/x.png"), "the test list names images .*: x.png"),
+    "overlap": (lambda m: m["test_filenames"].append(m["train_filenames"][0]), "overlap: pano_00.png"),
+    "size": (lambda m: m.update(h=33), "the camera of pano_00.png is 64x33; a full panorama is 2:1"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_broken_transforms(case: str, world: World, tmp_path: Path) -> None:
+    change, message = BROKEN[case]
+    _written(world, tmp_path, change)
+    with pytest.raises(DataError, match=message):
+        load(tmp_path / "scene")
+
+
+@pytest.mark.parametrize(
+    ("name", "file"),
+    [
+        ("transforms", "transforms.json"),
+        ("openmvg", "sfm_data.json"),
+        ("opensfm", "reconstruction.json"),
+        ("roam360", "pose_c2w.json"),
+        ("omniblender", "transform.json"),
+        ("released", "data_extrinsics.json"),
+    ],
+)
+def test_files_that_are_not_json(name: str, file: str, world: World, tmp_path: Path) -> None:
+    WRITERS[name](world, tmp_path / "scene")
+    path = tmp_path / "scene" / file
+    path.write_text(path.read_text()[:-40])
+    with pytest.raises(DataError, match=rf"{file} is not valid JSON \(.* line \d+"):
+        load(tmp_path / "scene")
+    path.write_text("{}" if name != "opensfm" else "[]")
+    with pytest.raises(DataError, match=rf"{file} (lacks the field|must hold)"):
+        load(tmp_path / "scene")
+
+
+@pytest.mark.parametrize(
+    ("name", "file", "old", "new", "message"),
+    [
+        ("openmvg", "sfm_data.json", "spherical", "pinhole_radial_k3", "a 'pinhole_radial_k3' camera; only spherical"),
+        ("opensfm", "reconstruction.json", '"spherical"', '"perspective"', "a 'perspective' camera; only spherical"),
+        ("released", "data_views.json", "pano_00.png", "../pano_00.png", "names '../pano_00.png'"),
+        ("roam360", "pose_c2w.json", '"pano_01.jpg"', '"pano_00.jpg"', "pano_00.jpg is both a train and a test view"),
+    ],
+)
+def test_other_formats_name_what_is_wrong(
+    name: str, file: str, old: str, new: str, message: str, world: World, tmp_path: Path
+) -> None:
+    WRITERS[name](world, tmp_path / "scene")
+    path = tmp_path / "scene" / file
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(DataError, match=message):
+        load(tmp_path / "scene")
+
+
+def _written(
+    world: World, folder: Path, change: Callable[[dict[str, Any]], object] = lambda meta: None
+) -> dict[str, Any]:
+    write_transforms(world, folder / "scene")
+    path = folder / "scene" / "transforms.json"
+    meta = json.loads(path.read_text())
+    change(meta)
+    path.write_text(json.dumps(meta))
+    return meta
+
+
+def _all(scene: Scene) -> tuple[Any, ...]:
+    return (*scene.train, *scene.test)
+
+
+def _scale(frame: dict[str, Any], factor: float) -> None:
+    matrix = frame["transform_matrix"]
+    for row in matrix[:3]:
+        row[:3] = [factor * value for value in row[:3]]
+
+
+def _mirror(frame: dict[str, Any]) -> None:
+    for row in frame["transform_matrix"][:3]:
+        row[0] = -row[0]
+
+
+def _transpose(frame: dict[str, Any]) -> None:
+    frame["transform_matrix"] = [list(column) for column in zip(*frame["transform_matrix"], strict=True)]

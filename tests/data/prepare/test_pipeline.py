@@ -1,0 +1,204 @@
+"""Structure from motion, against exact poses and against models of real panoramas; interruption, masks, bad input."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import padgs.data
+from padgs.calibration.align import align
+from padgs.data import DataError
+from padgs.data.check.report import check
+from padgs.data.prepare.pipeline import PrepareOptions, prepare, rotation_between
+from padgs.data.synthetic import SyntheticOptions, generate
+from padgs.data.trajectory import gravity, path_length
+
+VIEWS = 6
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """A walk of some metres through the synthetic room, and its panoramas in a folder with a space in its name."""
+    folder = tmp_path_factory.mktemp("room é 1")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PADGS_CACHE", str(tmp_path_factory.mktemp("cache")))
+        options = SyntheticOptions(path="line", width=512, train_views=VIEWS, test_views=0, samples=4, points=10)
+        scene = generate(options)
+        for view in scene.train:
+            Image.fromarray(view.load_pixels().numpy()).save(folder / f"pano {view.name}.png")
+    return scene, folder
+
+
+@pytest.fixture(scope="module")
+def prepared(scene, tmp_path_factory):
+    """The result of an uninterrupted call, and what was told on the way."""
+    out, told = tmp_path_factory.mktemp("out") / "done", []
+    result = prepare(scene[1], out, PrepareOptions(threads=2), lambda *step: told.append(step))
+    return result, out, told
+
+
+def differences(folder, reference):
+    """(distance [F], degrees [F], path length) of a prepared folder against name -> pose."""
+    frames = padgs.data.read(folder).frames
+    found = torch.stack([frame.cam_from_world for frame in frames])
+    exact = torch.stack([reference[frame.name] for frame in frames])
+    _, left = align(exact, found)
+    return left.distance, left.degrees, path_length(exact)
+
+
+def test_exact_poses_are_found(scene, prepared):
+    result, out, _ = prepared
+    reference = {f"pano {view.name}.png": view.cam_from_world for view in scene[0].train}
+    assert result.registered == tuple(sorted(reference))
+    assert result.unregistered == ()
+    distance, degrees, length = differences(out, reference)
+    assert length > 2
+    assert distance.max() < 1e-3 * length  # 0.1 % of the path
+    assert distance.max() < 4e-3  # metres
+    assert degrees.max() < 0.08
+
+
+def test_the_result_is_level_complete_and_ready(prepared):
+    result, out, _ = prepared
+    assert sorted(path.name for path in out.iterdir()) == ["images", "prepare.json", "sparse"]
+    assert sorted(path.name for path in out.parent.iterdir()) == ["done"]  # no working folder left
+    poses = torch.stack([frame.cam_from_world for frame in padgs.data.read(out).frames])
+    assert gravity(poses).axis == "+z"
+    assert gravity(poses).off_axis < 0.01
+    stated = json.loads((out / "prepare.json").read_text(encoding="utf-8"))
+    assert stated["points"] == result.points > 300
+    assert check(out).problems == []
+
+
+def test_progress_counts_up_to_all(prepared):
+    _, _, told = prepared
+    last = {step: (done, total) for step, done, total in told}
+    pairs = VIEWS * (VIEWS - 1) // 2
+    assert last == {"features": (VIEWS,) * 2, "matches": (pairs,) * 2, "poses": (VIEWS,) * 2, "result": (1, 1)}
+
+
+def test_an_interrupted_call_goes_on_and_ends_the_same(scene, prepared, tmp_path):
+    out = tmp_path / "done"
+
+    def interrupt(step, done, total):
+        if step == "matches":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        prepare(scene[1], out, PrepareOptions(threads=2), interrupt)
+    assert not out.exists()
+    told = []
+    prepare(scene[1], out, PrepareOptions(threads=2), lambda *step: told.append(step[0]))
+    assert "features" not in told
+    for path in (prepared[1] / "sparse" / "0").iterdir():
+        assert (out / "sparse" / "0" / path.name).read_bytes() == path.read_bytes(), path.name
+
+
+def test_other_input_starts_over(scene, tmp_path):
+    """A working folder belongs to its images and options; here it is of other images."""
+    out, work = tmp_path / "done", tmp_path / ".done.prepare"
+
+    def interrupt(step, done, total):
+        raise KeyboardInterrupt
+
+    some = tmp_path / "some"
+    some.mkdir()
+    for index in range(2):
+        shutil.copy(scene[1] / f"pano 00{index}.png", some)
+    for options in (PrepareOptions(threads=1), PrepareOptions(threads=1, seed=1)):
+        with pytest.raises(KeyboardInterrupt):
+            prepare(some, out, options, interrupt)
+        assert not (work / "stale").exists()
+        (work / "stale").touch()
+    with pytest.raises(KeyboardInterrupt):
+        prepare(some, out, PrepareOptions(threads=1, seed=1), interrupt)
+    assert (work / "stale").exists()  # the same input and options: kept
+
+
+def test_masked_pixels_have_no_features_and_the_mask_comes_along(scene, tmp_path):
+    source = tmp_path / "in"
+    shutil.copytree(scene[1], source, ignore=lambda folder, names: [n for n in names if not n.startswith("pano")])
+    mask = np.full((256, 512), 255, np.uint8)
+    mask[160:] = 0
+    Image.fromarray(mask).save(source / "mask.png")
+    result = prepare(source, tmp_path / "out", PrepareOptions(threads=2, level=False))
+    assert "mask: mask.png for every view" in result.notes
+    rows = padgs.data.read(tmp_path / "out").tracks().pixels[:, 1]
+    assert len(rows) > 300
+    assert rows.max() < 161
+    assert np.array_equal(np.asarray(Image.open(tmp_path / "out" / "mask.png")), mask)
+
+
+def test_unrelated_images_are_reported(scene, tmp_path):
+    source = tmp_path / "in"
+    source.mkdir()
+    for index in range(3):
+        shutil.copy(scene[1] / f"pano 00{index}.png", source)
+    noise = np.random.default_rng(0).integers(0, 256, (256, 512, 3), np.uint8)
+    Image.fromarray(noise).save(source / "other.png")
+    result = prepare(source, tmp_path / "out", PrepareOptions(threads=2))
+    assert result.unregistered == ("other.png",)
+    assert any("1 of 4 panoramas could not be placed: other.png" in note for note in result.notes)
+    assert not (tmp_path / "out" / "images" / "other.png").exists()
+
+
+def test_nothing_to_place(tmp_path):
+    source = tmp_path / "in"
+    source.mkdir()
+    for index in range(2):
+        noise = np.random.default_rng(index).integers(0, 256, (64, 128, 3), np.uint8)
+        Image.fromarray(noise).save(source / f"{index}.png")
+    with pytest.raises(DataError, match="no two of the 2 panoramas could be placed together"):
+        prepare(source, tmp_path / "out", PrepareOptions(threads=1))
+    assert not (tmp_path / "out").exists()
+
+
+def test_bad_input_is_refused(scene, tmp_path):
+    with pytest.raises(DataError, match="unknown pairs 'some'; known: auto, exhaustive, sequential"):
+        PrepareOptions(pairs="some")
+    with pytest.raises(DataError, match="per_second"):
+        PrepareOptions(per_second=0.0)
+    (tmp_path / "there").mkdir()
+    (tmp_path / "there" / "file").touch()
+    with pytest.raises(DataError, match="nothing is overwritten"):
+        prepare(scene[1], tmp_path / "there")
+    with pytest.raises(DataError, match="is not a folder"):
+        prepare(tmp_path / "absent", tmp_path / "out")
+    with pytest.raises(DataError, match="cannot be read"):
+        prepare(tmp_path / "absent.mp4", tmp_path / "out")
+    assert [path.name for path in tmp_path.iterdir()] == ["there"]
+
+
+def test_rotation_between_is_the_smallest_turn_to_z():
+    for vector in ((0.0, 0.0, 1.0), (0.0, 0.0, -1.0), (0.6, 0.0, 0.8), (-0.48, 0.64, -0.6)):
+        up = torch.tensor(vector, dtype=torch.float64)
+        rotation = rotation_between(up)
+        torch.testing.assert_close(rotation @ up, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+        torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3, dtype=torch.float64))
+        assert torch.linalg.det(rotation).item() == pytest.approx(1.0)
+        assert (rotation.trace().item() - 1) / 2 == pytest.approx(vector[2], abs=1e-9)  # cosine of its angle
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "accurate"), [("flat", False), ("garden", False), ("garden", True)])
+def test_models_of_real_panoramas_are_reproduced(shared, tmp_path, name, accurate):
+    given = shared / "data" / name
+    prepare(given / "images", tmp_path / "out", PrepareOptions(accurate=accurate))  # finds mask.png beside images/
+    frames = padgs.data.read(given).frames
+    distance, degrees, length = differences(tmp_path / "out", {f.name: f.cam_from_world for f in frames})
+    assert len(distance) == len(frames)
+    assert distance.max() < 1e-3 * length
+    assert degrees.max() < 0.05
+
+
+@pytest.mark.slow
+def test_the_accurate_mode_finds_exact_poses_too(scene, tmp_path):
+    prepare(scene[1], tmp_path / "out", PrepareOptions(accurate=True))
+    reference = {f"pano {view.name}.png": view.cam_from_world for view in scene[0].train}
+    distance, degrees, _ = differences(tmp_path / "out", reference)
+    assert len(distance) == VIEWS
+    assert distance.max() < 4e-3
+    assert degrees.max() < 0.08

@@ -1,0 +1,87 @@
+"""The perspective views of a panorama: geometry that can be predicted, pixels that can be computed."""
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from padgs.data.prepare import rig
+from padgs.sphere.panorama import direction, project, rays
+
+
+def test_views_are_rotations_that_look_where_they_should():
+    rotations = rig.cam_from_pano()
+    assert rotations.shape == (12, 3, 3)
+    torch.testing.assert_close(rotations @ rotations.mT, torch.eye(3, dtype=torch.float64).expand(12, 3, 3))
+    torch.testing.assert_close(torch.linalg.det(rotations), torch.ones(12, dtype=torch.float64))
+    # The first view of the upper row looks ahead and 35 degrees up (-y); its right is the panorama's right.
+    ahead_up = direction(torch.tensor(0.0), torch.tensor(-35.0).deg2rad()).double()
+    torch.testing.assert_close(rotations[0] @ ahead_up, torch.tensor([0.0, 0.0, 1.0]).double(), atol=1e-6, rtol=0)
+    torch.testing.assert_close(rotations[0, 0], torch.tensor([1.0, 0.0, 0.0]).double())
+    assert (rotations[:, 1, 1] > 0).all()  # no view hangs upside down
+
+
+def test_every_direction_has_one_owner_which_sees_it():
+    every = rays(256, 128, dtype=torch.float64)
+    owners = torch.stack([rig.owned(index, every) for index in range(12)])
+    assert (owners.sum(0) == 1).all()
+    rotations = rig.cam_from_pano()
+    seen = torch.zeros(128, 256, dtype=torch.bool)
+    for index in range(12):
+        x, y, z = (every @ rotations[index].mT).unbind(-1)
+        seen |= owners[index] & (z > 0) & (x.abs() <= z) & (y.abs() <= z)
+    latitude = (torch.arange(128) + 0.5) / 128 * 180 - 90
+    assert seen[latitude.abs() < 70].all()
+
+
+def test_a_view_shows_what_is_in_its_directions():
+    """The panorama's colour is a smooth function of direction; so must be the view's, seam and poles included."""
+
+    def color(directions):
+        unit = directions / directions.norm(dim=-1, keepdim=True)
+        return ((unit + 1) * 100).round().to(torch.uint8)
+
+    image = color(rays(512, 256, dtype=torch.float64))
+    for rotation in rig.cam_from_pano():
+        pano_rays = rig.view_rays(rig.view_size(512)) @ rotation
+        difference = (rig.resample(image, pano_rays).int() - color(pano_rays).int()).abs()
+        assert difference.max() <= 2
+
+
+def test_resampling_at_pixel_centres_changes_nothing():
+    generator = torch.Generator().manual_seed(0)
+    image = torch.randint(0, 256, (16, 32, 3), dtype=torch.uint8, generator=generator)
+    assert torch.equal(rig.resample(image, rays(32, 16, dtype=torch.float64)), image)
+
+
+def test_views_keep_the_resolution_of_the_horizon():
+    size = rig.view_size(2048)
+    assert size == 652
+    center = rig.view_rays(size)[size // 2, size // 2 - 1 : size // 2 + 1]
+    pixels = project(center, 2048, 1024)
+    assert (pixels[1, 0] - pixels[0, 0]).item() == pytest.approx(1.0, abs=0.01)
+
+
+def test_files_and_masks_of_views(tmp_path):
+    image = np.full((32, 64, 3), 90, np.uint8)
+    mask = np.full((32, 64), 255, np.uint8)
+    mask[:16] = 0  # only what is below the horizon
+    Image.fromarray(image).save(tmp_path / "a.png")
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    told = []
+    rig.render_views(
+        {"a.png": tmp_path / "a.png"},
+        {"a.png": tmp_path / "mask.png"},
+        tmp_path / "views",
+        tmp_path / "masks",
+        lambda *step: told.append(step),
+    )
+    assert told == [(1, 1)]
+    used = {}
+    for index in range(12):
+        name = rig.view_name(index, "a.png")
+        assert rig.split_name(name) == (index, "a.png")
+        assert np.asarray(Image.open(tmp_path / "views" / name)).shape == (20, 20, 3)
+        used[index] = (np.asarray(Image.open(tmp_path / "masks" / f"{name}.png")) > 0).mean()
+    assert max(used[index] for index in range(4)) == 0  # the upper row lies above the horizon
+    assert min(used[index] for index in range(8, 12)) > 0.3

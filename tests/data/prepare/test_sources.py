@@ -1,0 +1,64 @@
+"""What `prepare` starts from."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from padgs.data import DataError
+from padgs.data.prepare.sources import find_source
+
+
+def save(path, value=100, size=(16, 32)):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    shape = (*size, 3) if path.name != "mask.png" and "masks" not in path.parts else size
+    Image.fromarray(np.full(shape, value, np.uint8)).save(path)
+
+
+def test_images_masks_and_notes(tmp_path):
+    for name in ("b.png", "a.png", "up stairs/ç.png"):
+        save(tmp_path / "images" / name)
+    mask = np.full((16, 32), 255, np.uint8)
+    mask[12:] = 0
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    source = find_source(tmp_path, "auto")
+    assert list(source.images) == ["a.png", "b.png", "up stairs/ç.png"]
+    assert source.notes == ("mask: mask.png for every view",)
+    assert source.masks["a.png"]().mean() == pytest.approx(0.75)
+    inner = find_source(tmp_path / "images", "auto")  # the same, asked for by the image folder
+    assert inner.fingerprint == source.fingerprint
+    bare = find_source(tmp_path, "none")
+    assert bare.masks == {}
+    assert bare.fingerprint != source.fingerprint
+    assert find_source(tmp_path, "rows:3/4").masks["b.png"]().mean() == pytest.approx(0.75)
+
+
+def test_a_mask_among_the_images_is_not_an_image(tmp_path):
+    save(tmp_path / "a.png")
+    save(tmp_path / "b.png")
+    save(tmp_path / "masks" / "a.png", 255)
+    source = find_source(tmp_path, "auto")
+    assert list(source.images) == ["a.png", "b.png"]
+    assert list(source.masks) == ["a.png"]
+
+
+def test_a_mask_file_is_looked_for_where_one_stands(tmp_path, monkeypatch):
+    save(tmp_path / "in" / "a.png")
+    save(tmp_path / "in" / "b.png")
+    Image.fromarray(np.full((16, 32), 255, np.uint8)).save(tmp_path / "tripod.png")
+    monkeypatch.chdir(tmp_path)
+    assert set(find_source(tmp_path / "in", "tripod.png").masks) == {"a.png", "b.png"}
+
+
+def test_bad_input_is_refused(tmp_path):
+    with pytest.raises(DataError, match="is not a folder; give a folder of panoramas, or a video"):
+        find_source(tmp_path / "nothing", "auto")
+    save(tmp_path / "a.png")
+    with pytest.raises(DataError, match="holds 1 images; structure from motion needs at least two"):
+        find_source(tmp_path, "auto")
+    save(tmp_path / "A.png")
+    with pytest.raises(DataError, match=r"'A.png' and 'a.png' would share one name"):
+        find_source(tmp_path, "auto")
+    (tmp_path / "A.png").unlink()
+    save(tmp_path / "b.png", size=(16, 31))
+    with pytest.raises(DataError, match=r"b.png is 31x16, which is not 2:1"):
+        find_source(tmp_path, "auto")

@@ -1,0 +1,64 @@
+"""Frames of a video. The decoding itself needs PyAV, an extra."""
+
+import builtins
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from padgs.data import DataError
+from padgs.data.prepare.video import extract_frames, is_video, sharpness
+
+
+def test_videos_are_known_by_name(tmp_path):
+    assert is_video(tmp_path / "Tour.MP4")
+    assert not is_video(tmp_path / "tour.jpg")
+
+
+def test_blur_lowers_sharpness():
+    rng = np.random.default_rng(0)
+    noise = rng.integers(0, 256, (64, 128, 3), np.uint8)
+    blurred = ((noise + np.roll(noise, 2, 0) + np.roll(noise, 2, 1).astype(int)) // 3).astype(np.uint8)
+    assert sharpness(noise) > 1.3 * sharpness(blurred) > sharpness(np.full_like(noise, 9))
+
+
+def test_without_the_extra_the_error_says_so(tmp_path, monkeypatch):
+    real = builtins.__import__
+
+    def refuse(name, *args, **kwargs):
+        if name.startswith("imageio"):
+            raise ImportError(name)
+        return real(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", refuse)
+    with pytest.raises(DataError, match=r"needs imageio and PyAV: pip install 'padgs\[video\]'"):
+        extract_frames(tmp_path / "a.mp4", tmp_path, 2.0)
+
+
+def test_the_sharpest_frame_of_each_interval_is_kept(tmp_path):
+    av = pytest.importorskip("av", reason="PyAV, the extra `video`, is not installed")
+    pattern = np.kron(np.indices((16, 32)).sum(0) % 2, np.ones((4, 4)))[..., None] * np.ones(3)
+    path = tmp_path / "a b.mp4"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4", rate=10)
+        stream.width, stream.height, stream.pix_fmt, stream.bit_rate = 128, 64, "yuv420p", 4_000_000
+        for index in range(20):  # two seconds; contrast is highest in frames 3 and 16, brightness tells them apart
+            contrast = 100 if index in (3, 16) else 20
+            pixels = (40 + 5 * index + contrast * pattern).clip(0, 255).astype(np.uint8)
+            for packet in stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")):
+                container.mux(packet)
+        for packet in stream.encode():
+            container.mux(packet)
+    told = []
+    assert extract_frames(path, tmp_path, 1.0, lambda *step: told.append(step)) == 2
+    assert told[-1][0] == 20
+    for name, index in (("frame_00001.jpg", 3), ("frame_00002.jpg", 16)):
+        darkest = np.asarray(Image.open(tmp_path / name)).min()
+        assert abs(int(darkest) - (40 + 5 * index)) < 12
+
+
+def test_not_a_video(tmp_path):
+    pytest.importorskip("av", reason="PyAV, the extra `video`, is not installed")
+    (tmp_path / "a.mp4").write_bytes(b"no video")
+    with pytest.raises(DataError, match="cannot be decoded"):
+        extract_frames(tmp_path / "a.mp4", tmp_path, 2.0)

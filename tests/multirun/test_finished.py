@@ -1,0 +1,65 @@
+import json
+
+import pytest
+
+from padgs.multirun import finished
+from padgs.multirun.finished import FinishedJobs
+
+JOB = ["method=padgs", "++seed=1"]
+
+
+@pytest.fixture
+def runs(tmp_path):
+    """A folder of runs with one finished run of one job."""
+    folder = tmp_path / "runs"
+    (folder / "room_padgs_1").mkdir(parents=True)
+    (folder / "room_padgs_1" / "result.json").write_text("{}")
+    FinishedJobs(folder).add(JOB, "room_padgs_1", "ok", None)
+    return folder
+
+
+def test_a_finished_job_is_known_at_the_next_start(runs):
+    assert FinishedJobs(runs).status(JOB) == "ok"
+    assert FinishedJobs(runs).status(["method=padgs", "++seed=2"]) is None
+
+
+def test_what_decides_nothing_about_results_is_ignored(runs):
+    for extra in ("++run.threads=2", "launcher=local", "tracking=none", "++retry=failed", "hydra.verbose=true"):
+        assert FinishedJobs(runs).status([extra, *reversed(JOB)]) == "ok"
+
+
+def test_a_result_that_is_gone_or_was_written_anew_is_looked_at(runs):
+    path = runs / "room_padgs_1" / "result.json"
+    content = path.read_text()
+    path.unlink()
+    assert FinishedJobs(runs).status(JOB) is None
+    path.write_text(content)
+    assert FinishedJobs(runs).status(JOB) is None
+
+
+def test_a_job_whose_result_was_gone_when_it_was_noted_is_looked_at(runs):
+    FinishedJobs(runs).add(JOB, "nowhere", "ok", None)
+    assert FinishedJobs(runs).status(JOB) is None
+
+
+def test_data_that_changed_are_looked_at(runs, tmp_path):
+    data = tmp_path / "data"
+    data.mkdir()
+    (data / "0.png").write_bytes(b"1")
+    FinishedJobs(runs).add(JOB, "room_padgs_1", "ok", str(data))
+    finished.signature.cache_clear()
+    assert FinishedJobs(runs).status(JOB) == "ok"
+    (data / "0.png").write_bytes(b"22")
+    finished.signature.cache_clear()
+    assert FinishedJobs(runs).status(JOB) is None
+
+
+def test_other_sources_are_looked_at(runs, monkeypatch):
+    monkeypatch.setattr(finished, "_sources", lambda: "other")
+    assert FinishedJobs(runs).status(JOB) is None
+
+
+def test_a_cut_line_costs_only_its_own_job(runs):
+    path = runs / ".multirun" / "finished.jsonl"
+    path.write_text('{"job": "cut\n' + path.read_text() + json.dumps(["no", "entry"]))
+    assert FinishedJobs(runs).status(JOB) == "ok"

@@ -1,0 +1,122 @@
+"""`padgs-run` as a process: exit codes, messages, and runs that are killed."""
+
+import os
+import random
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from processes import SMALLEST, finish
+
+from padgs import results
+from padgs.multirun.overrides import lenient
+from padgs.runs import checkpoint
+
+ROOT = Path(__file__).resolve().parents[2]
+TINY = [*SMALLEST, "train.iterations=300", "run.checkpoint_every=10", "run.probe_every=50", "tracking=none"]
+
+
+def newest(folder: Path) -> bytes:
+    """What the checkpoint of the only run in a folder says."""
+    return next((path.read_bytes() for path in folder.glob("*/checkpoint/state.json")), b"")
+
+
+def wait_for_new_checkpoint(folder: Path, before: bytes, process: subprocess.Popen) -> None:
+    deadline = time.monotonic() + 120
+    while process.poll() is None and newest(folder) == before:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def same_end(one: Path, other: Path) -> None:
+    """Marks and checkpoint of the only run in each folder are equal, bit by bit."""
+    (mine,), (theirs,) = results.read_all(one)[0], results.read_all(other)[0]
+    assert mine.status == "ok"
+    assert (mine.run, mine.scores, mine.counts) == (theirs.run, theirs.scores, theirs.counts)
+    first, second = (checkpoint.load(folder / mine.run / "checkpoint") for folder in (one, other))
+    assert first.tensors.keys() == second.tensors.keys()
+    assert all(torch.equal(first.tensors[name], second.tensors[name]) for name in first.tensors)
+    lines = [(folder / mine.run / "log.jsonl").read_text() for folder in (one, other)]
+    without_times = [re.sub(r'"seconds": [0-9.]+', "", text) for text in lines]
+    assert without_times[0] == without_times[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["padgs", "omnigs"])
+def test_killed_and_interrupted_runs_end_bit_identically(start, tmp_path, method):
+    arguments = [*TINY, f"method={method}"]
+    code, _, error = finish(start(*arguments, "run.folder=undisturbed"))
+    assert code == 0, error
+    source = random.Random(time.time_ns())  # a random moment, as asked: any must do
+    for number in (signal.SIGKILL, signal.SIGINT, signal.SIGTERM):
+        before = newest(tmp_path / "disturbed")
+        process = start(*arguments, "run.folder=disturbed")
+        wait_for_new_checkpoint(tmp_path / "disturbed", before, process)
+        time.sleep(source.uniform(0, 0.1))
+        process.send_signal(number)
+        code, _, error = finish(process)
+        if number != signal.SIGKILL and code != 0:  # 0: the run was faster than the signal
+            assert code == 130 and "to go on: padgs-run" in error, error
+    code, out, error = finish(start(*arguments, "run.folder=disturbed"))
+    assert code == 0, error
+    same_end(tmp_path / "disturbed", tmp_path / "undisturbed")
+
+
+@pytest.mark.slow
+def test_the_ablation_is_one_command_and_its_table_another(start, tmp_path, cache):
+    quick = [argument for argument in TINY if not argument.startswith("train.iterations")]
+    code, out, error = finish(start("+experiment=ablation", *quick, "train.iterations=30"))
+    assert code == 0, error
+    found, broken = results.read_all(tmp_path / "runs")
+    assert {result.variant for result in found} == {"baseline", "dagd", "dagd_daom_no_m", "full"} and not broken
+    report = [sys.executable, "-m", "padgs.cli.app", "report", "table3"]
+    done = subprocess.run(
+        report, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    for result in found:
+        assert f"{result.scores['paper'].metrics['psnr']:.2f}" in done.stdout
+    written = {path.name for path in (tmp_path / "runs" / "reports").iterdir()}
+    assert written == {"table3.csv", "table3.md", "table3.tex"}
+    assert {path.name for path in tmp_path.iterdir()} == {"runs"}, "Hydra left something behind"
+
+
+def test_a_missing_data_set_says_where_to_get_it_and_where_to_put_it(start, tmp_path):
+    code, _, error = finish(start("+experiment=ablation_bar"))
+    assert code == 1
+    assert "huajianup.github.io" in error and str(tmp_path / "data/360roam/bar") in error
+    assert error.count("error:") == 1 and "Traceback" not in error
+
+
+def test_a_folder_that_cannot_be_written_is_a_clear_error(start, tmp_path):
+    (tmp_path / "runs").write_text("a file where the folder should be")
+    for arguments in ([], ["+sweep=seeds"]):
+        code, _, error = finish(start(*TINY, *arguments))
+        assert code == 1 and "cannot write run folder runs/" in error and "Traceback" not in error
+
+
+@pytest.mark.parametrize(
+    ("argument", "message"),
+    [
+        ("train.iteration=5", "unknown key train.iteration; known: train.lambda_l1"),
+        ("sede=5", "unknown key sede; known: data, render"),
+        ("method=foo", "Available options in 'method'"),
+        ("+experiment=foo", "Available options in 'experiment'"),
+        ("data.path=/no/such/folder", "/no/such/folder"),
+    ],
+)
+def test_what_is_unknown_is_named_with_what_is_known(start, argument, message):
+    code, _, error = finish(start(argument))
+    assert code == 1 and message in error and "Traceback" not in error
+
+
+def test_only_values_are_forced_past_hydra():
+    line = shlex.split("method=omnigs +experiment=x ++a.b=1 ~c hydra.mode=RUN -m seed=1 train.max_seconds=3")
+    forced = shlex.split("method=omnigs +experiment=x ++a.b=1 ~c hydra.mode=RUN -m ++seed=1 ++train.max_seconds=3")
+    assert lenient(line) == forced

@@ -1,0 +1,59 @@
+"""What forward hybrid blending keeps of the cores for its backward pass."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from render_cases import gaussians_of, identity_pose, leaves, needs_native
+from test_hybrid_rendering import each_native_engine, options_of
+
+from padgs.gaussians import Gaussians
+from padgs.render import RenderOptions, render
+from padgs.render.backends import cpu as cpu_backend
+from padgs.scene import View
+
+
+@each_native_engine
+def test_going_back_twice_gives_the_same(backend: str, generator: torch.Generator):
+    inputs = leaves(gaussians_of("ordinary", 12, generator), torch.float32)
+    rendering = render(inputs, View("v", identity_pose(), 40, 20), options_of("ray", 3), backend=backend)
+    loss = rendering.image.square().sum() + rendering.depth.sum()
+    first, second = (torch.autograd.grad(loss, [*vars(inputs).values()], retain_graph=True) for _ in range(2))
+    assert all(torch.equal(*pair) and pair[0].any() for pair in zip(first, second, strict=True))
+
+
+@pytest.fixture
+def kept(monkeypatch: pytest.MonkeyPatch) -> list:
+    """What forward passes of the CPU keep for backward."""
+    found, of = [], cpu_backend._Cores.of
+    monkeypatch.setattr(cpu_backend._Cores, "of", lambda *arguments: found.append(of(*arguments)) or found[-1])
+    return found
+
+
+@needs_native
+@pytest.mark.parametrize("size", [1, 3, 16, 256])
+def test_what_is_kept_for_backward_fits_where_it_goes(size: int, kept: list, generator: torch.Generator):
+    """Solid dots of about a pixel: in the core of each pixel are other Gaussians than in those beside it."""
+    count, view = 20_000, View("v", identity_pose(), 60, 30)
+    gaussians = gaussians_of("ordinary", count, generator)
+    dots = replace(gaussians, scales=torch.full((count, 3), 0.1), opacities=torch.full((count,), 0.9))
+    inputs = leaves(dots, torch.float32)
+    for few in (5, count):
+        part = Gaussians(*(value[:few] for value in vars(inputs).values()))
+        render(part, view, options_of("ray", size, low_pass=0.0), backend="cpu").image.sum().backward()
+        used, room = int(kept[-1].start[-1]), len(kept[-1].words)
+        patches = 8 * 15
+        assert 98 * patches < used <= room <= patches * (98 + min(17 * few, 32 * size))
+        assert few < count or used > patches * (98 + 12)  # in words: a third of the room where the core is one
+
+
+@needs_native
+def test_nothing_is_kept_where_no_gradient_is_wanted(kept: list, generator: torch.Generator):
+    gaussians, view = gaussians_of("ordinary", 12, generator).to(torch.float32), View("v", identity_pose(), 40, 20)
+    render(gaussians, view, options_of("ray", 3), backend="cpu")
+    with torch.no_grad():
+        render(leaves(gaussians, torch.float32), view, options_of("ray", 3), backend="cpu")
+    render(leaves(gaussians, torch.float32), view, RenderOptions("ray"), backend="cpu")
+    assert not kept

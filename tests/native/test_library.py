@@ -1,0 +1,99 @@
+"""The native library: chosen at run time, loaded when first asked for, missed once and politely."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from render_cases import gaussians_of, identity_pose, needs_native
+
+from padgs import render as package
+from padgs.gaussians import Gaussians
+from padgs.native import library as native
+from padgs.render import render
+from padgs.scene import View
+
+ROOT = Path(__file__).resolve().parents[2]
+VIEW = View("v", identity_pose(), 72, 36)
+
+
+def in_a_new_process(code: str, *arguments: str, **environment: str) -> str:
+    search_path = os.pathsep.join(filter(None, (str(ROOT), str(Path(__file__).parent), os.environ.get("PYTHONPATH"))))
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments],
+        env={**os.environ, "PYTHONPATH": search_path, **environment},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="needs /proc to see what is loaded")
+def test_importing_loads_no_library():
+    code = """
+import sys, padgs.render
+print("padgs.native.library" in sys.modules, "padgs_cpu" in open("/proc/self/maps").read())
+"""
+    assert in_a_new_process(code).split() == ["False", "False"]
+
+
+@pytest.fixture
+def missing_library(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
+    """As on a machine where nothing was compiled."""
+    caches = (native.library, native.available, package._say_that_native_is_missing)
+    monkeypatch.setenv("PADGS_LIBRARY_DIR", str(tmp_path))
+    monkeypatch.setattr(native, "_package_folders", lambda: [str(tmp_path / "padgs" / "render")])
+    for cached in caches:
+        cached.cache_clear()
+    yield
+    for cached in caches:
+        cached.cache_clear()
+
+
+@pytest.fixture
+def gaussians(generator: torch.Generator) -> Gaussians:
+    return gaussians_of("ordinary", 5, generator).to(torch.float32)
+
+
+def test_without_the_library_auto_means_torch_and_says_so_once(missing_library: None, gaussians: Gaussians):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        images = [render(gaussians, VIEW).image for _ in range(3)]
+    assert len(caught) == 1
+    message = str(caught[0].message)
+    assert "backend torch" in message and "C++ compiler" in message and "padgs_cpu" in message
+    assert caught[0].filename == __file__  # the warning points at who called render
+    assert torch.equal(images[0], render(gaussians, VIEW, backend="torch").image)
+
+
+def test_without_the_library_nothing_is_said_where_it_could_not_be_used(missing_library: None, gaussians: Gaussians):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        render(gaussians.to(torch.float64), VIEW)
+        render(gaussians, VIEW, backend="torch")
+
+
+def test_without_the_library_asking_for_it_says_the_way_out(
+    missing_library: None, gaussians: Gaussians, tmp_path: Path
+):
+    with pytest.raises(
+        OSError, match="padgs_cpu.* not found in .*C\\+\\+ compiler.* or render with backend=torch"
+    ) as error:
+        render(gaussians, VIEW, backend="cpu")
+    assert str(tmp_path) in str(error.value)
+
+
+@needs_native
+def test_auto_is_cpu_for_float32_and_torch_for_float64(gaussians: Gaussians):
+    assert package.resolve_backend("auto", gaussians.means) == "cpu"
+    assert package.resolve_backend("auto", gaussians.means.double()) == "torch"
+    assert package.resolve_backend("auto", gaussians.means.to("meta")) == "torch"
+    assert package.resolve_backend("torch", gaussians.means) == "torch"

@@ -1,0 +1,155 @@
+"""Native results are bit-equal for any number of threads (T0, N9), and nearly so on any instruction set."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from render_cases import camera_of, leaves, mixture, needs_native, random_pose, view_of
+from torch import Tensor
+
+from padgs.anchors.decoder import Decoder, decode_gaussians
+from padgs.learning.loss import photometric_loss
+from padgs.native import library as native
+from padgs.render import RenderOptions, render
+from padgs.sphere.camera import RayTable
+
+pytestmark = needs_native
+RENDERINGS = {
+    "erp": ("erp", "panorama", {}),
+    "erp in strips": ("erp", "panorama", {"max_instances": 2000}),
+    "tangent": ("tangent", "panorama", {}),
+    "ray": ("ray", "panorama", {"near": 0.05}),
+    "pinhole": ("pinhole", "pinhole", {}),
+    "ray in a pinhole": ("ray", "pinhole", {}),
+    "tangent along a table": ("tangent", "fisheye", {}),
+    "ray along a table": ("ray", "fisheye", {}),
+}
+
+
+def drawn(name: str, count: int = 250, size: tuple[int, int] = (250, 125)) -> dict[str, Tensor]:
+    """Outputs and gradients of one rendering, by name."""
+    projection, lens, settings = RENDERINGS[name]
+    generator = torch.Generator().manual_seed(99)
+    gaussians = mixture(count, generator, ("ordinary", "polar", "seam", "needle"))
+    leaf = dict(vars(leaves(gaussians, torch.float32)))
+    inputs, camera = type(gaussians)(**leaf), camera_of(lens, *size)
+    leaf["pose"] = random_pose(generator, shift=0.1).float().requires_grad_()
+    leaf["background"] = torch.full((3,), 0.5, requires_grad=True)
+    leaf["probe"] = torch.zeros(len(gaussians), 2, requires_grad=True)
+    if isinstance(camera, RayTable):
+        leaf["rays"] = camera.table.float().requires_grad_()
+        camera = RayTable(leaf["rays"], camera.focal)
+    view, options = view_of(camera, leaf["pose"]), RenderOptions(projection, **settings)
+    extra = {"background": leaf["background"], "probe": leaf["probe"], "backend": "cpu"}
+    rendering = render(inputs, view, options, **extra)
+    outputs = {key: getattr(rendering, key) for key in ("image", "transmittance", "depth")}
+    loss = sum((value * torch.randn(value.shape, generator=generator)).sum() for value in outputs.values())
+    gradients = torch.autograd.grad(loss, list(leaf.values()))
+    counters = torch.tensor([rendering.counters[key] for key in sorted(rendering.counters)])
+    return {**outputs, "counters": counters, **{f"by {key}": g for key, g in zip(leaf, gradients, strict=True)}}
+
+
+def decoded(anchors: int = 3000) -> dict[str, Tensor]:
+    """Gaussians of a decoder and the gradients of everything that it learns, by name."""
+    generator = torch.Generator().manual_seed(98)
+
+    def randn(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    weights = Decoder(36, 10, generator=generator).weights()
+    leaf = {"features": randn(anchors, 32), "offsets": randn(anchors, 10, 3), "log_scales": 0.3 * randn(anchors, 6)}
+    leaf = {key: value.requires_grad_() for key, value in leaf.items()}
+    gaussians, slots, raw = decode_gaussians(
+        weights, leaf["features"], randn(anchors, 4), randn(anchors, 3), leaf["offsets"], leaf["log_scales"],
+        torch.rand(anchors, generator=generator),
+    )  # fmt: skip
+    loss = sum((value * randn(*value.shape)).sum() for value in vars(gaussians).values())
+    flat = [*leaf.values(), *(tensor for head in weights for tensor in head)]
+    gradients = torch.autograd.grad(loss, flat)
+    return {**vars(gaussians), "slots": slots, "raw": raw, **{f"by {i}": g for i, g in enumerate(gradients)}}
+
+
+def compared(size: tuple[int, int] = (203, 101)) -> dict[str, Tensor]:
+    """The photometric loss of two images and its gradient."""
+    generator = torch.Generator().manual_seed(97)
+    image, target = torch.rand(2, *size, 3, generator=generator)
+    image.requires_grad_()
+    loss = photometric_loss(image, target, torch.rand(size, generator=generator))
+    return {"loss": loss.detach(), "by image": torch.autograd.grad(loss, image)[0]}
+
+
+EVERYTHING = {**{name: (drawn, name) for name in RENDERINGS}, "decode": (decoded,), "loss": (compared,)}
+
+
+@pytest.fixture
+def restored_threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("name", EVERYTHING)
+def test_n9_results_are_bit_equal_for_any_number_of_threads(name: str, restored_threads: None):
+    function, *arguments = EVERYTHING[name]
+    results = []
+    for threads in (1, 2, 3):
+        torch.set_num_threads(threads)
+        results.append(function(*arguments))
+    for threads, result in zip((2, 3), results[1:], strict=True):
+        for key, expected in results[0].items():
+            assert torch.equal(result[key], expected), f"{key} with {threads} threads"
+
+
+def small_results() -> dict[str, dict[str, Tensor]]:
+    """So few pairs that in none of them rounding decides about the cut."""
+    results = {name: drawn(name, 6, (72, 36)) for name in RENDERINGS}
+    return {**results, "decode": decoded(), "loss": compared()}
+
+
+IN_ANOTHER_PROCESS = """
+import sys, torch, test_determinism
+from padgs.native import library as native
+torch.save(test_determinism.small_results(), sys.argv[1])
+print(native.library().padgs_isa().decode(), end="")
+"""
+
+
+def on_instruction_set(isa: str, file: Path) -> tuple[str, dict[str, dict[str, Tensor]]]:
+    """All results with PADGS_ISA set, and the instruction set that was really used."""
+    folder = Path(__file__).parent
+    places = (folder.parents[2], folder.parent, folder, os.environ.get("PYTHONPATH"))
+    search_path = os.pathsep.join(str(place) for place in places if place)
+    done = subprocess.run(
+        [sys.executable, "-c", IN_ANOTHER_PROCESS, str(file)],
+        env={**os.environ, "PYTHONPATH": search_path, "PADGS_ISA": isa},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout, torch.load(file)
+
+
+def test_every_instruction_set_computes_the_same(tmp_path: Path):
+    here, best = small_results(), native.library().padgs_isa().decode()
+    others = {}
+    for isa in {"baseline", "avx2", "avx512"} - {best}:
+        used, result = on_instruction_set(isa, tmp_path / f"{isa}.pt")
+        if used != best:  # it is, where the machine does not have what was asked for
+            assert used == isa
+            others[isa] = result
+    if not others and best == "baseline":
+        pytest.skip("this machine has only the baseline instruction set")
+    assert "baseline" in (best, *others), "PADGS_ISA=baseline is not obeyed"
+    for isa, result in others.items():
+        for name, expected in here.items():
+            for key, truth in expected.items():
+                actual, truth = result[name][key].double(), truth.double()
+                assert actual.shape == truth.shape, f"{name}: {key} with {isa}"
+                assert (actual - truth).abs().max() <= 1e-4 * truth.abs().max(), f"{name}: {key} with {isa}"

@@ -1,0 +1,142 @@
+"""Tile lists hold every pixel once, in order of depth, wide tiles near the poles; strips change nothing."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from definition import MARGIN, alphas
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from native_tiles import NativeTiles, projected
+from render_cases import (
+    INPUTS,
+    KINDS,
+    ODD_SIZES,
+    SETUPS,
+    camera_of,
+    each_setup,
+    gaussians_of,
+    identity_pose,
+    leaves,
+    mixture,
+    needs_native,
+    random_pose,
+    view_of,
+)
+
+from padgs.render import RELEASED, RenderOptions, render
+from padgs.render.contract import ALPHA_MIN
+from padgs.render.tiles import TILE
+from padgs.sphere.camera import Panorama
+
+few = settings(max_examples=10, deadline=None, derandomize=True, database=None)
+SIZES = st.sampled_from([*ODD_SIZES, (200, 90), (256, 128), (1, 1), (90, 200)])
+OUTPUTS = ("image", "transmittance", "depth")
+
+
+@each_setup
+@needs_native
+@few
+@given(kind=st.sampled_from(KINDS), seed=st.integers(0, 2**31), size=SIZES, wrap=st.booleans())
+def test_tiles_hold_every_pixel_and_each_tile_once(kind, seed, size, wrap, projection: str, lens: str):
+    gaussians = gaussians_of(kind, 12, torch.Generator().manual_seed(seed))
+    camera, options = camera_of(lens, *size), RenderOptions(projection, wrap=wrap or projection != "erp")
+    tiles = NativeTiles(gaussians, camera, options, identity_pose())
+    accepted = alphas(gaussians, camera, options) >= ALPHA_MIN * (1 + MARGIN)
+    for index in range(len(gaussians)):
+        times = tiles.times_listed(index, camera)
+        assert (times[accepted[index]] == 1).all() and times.max() <= 1
+    pairs = torch.stack((tiles.gaussian, tiles.tile), dim=1)
+    assert len(pairs.unique(dim=0)) == tiles.count, "a Gaussian is twice in the same tile"
+    radius = gaussians.means.float().norm(dim=-1)[tiles.gaussian]
+    same_tile = tiles.tile.diff() == 0
+    assert (radius.diff()[same_tile] >= -1e-6 * radius[:-1][same_tile]).all(), "not front to back"
+    # Slots: consecutive for each Gaussian, each used once.
+    assert torch.equal(tiles.slot.sort().values, torch.arange(tiles.count))
+    owner = torch.repeat_interleave(torch.arange(len(gaussians)), tiles.strip.slot_start.diff())
+    assert torch.equal(owner[tiles.slot], tiles.gaussian)
+
+
+@needs_native
+@pytest.mark.parametrize(("width", "height"), [(2048, 1024), (1000, 500), (72, 36), (300, 600), (16, 400)])
+def test_tiles_cover_the_same_angle_in_every_row(width: int, height: int):
+    gaussians = gaussians_of("ordinary", 1, torch.Generator().manual_seed(1))
+    level = projected(gaussians, Panorama(width, height), RenderOptions("ray"), identity_pose()).level
+    for row, found in enumerate(level.tolist()):
+        latitude = ((row + 0.5) * TILE / height - 0.5) * math.pi
+        wanted = round(math.log2(1 / max(math.cos(latitude), 1e-3)))
+        assert 0 <= found <= 4 and (found == min(wanted, 4) or (TILE << found + 1) > -(-width // TILE) * TILE)
+    for projection, lens in (("pinhole", "pinhole"), ("ray", "pinhole"), ("ray", "fisheye")):
+        camera = camera_of(lens, width, height)
+        assert not projected(gaussians, camera, RenderOptions(projection), identity_pose()).level.any()
+
+
+@needs_native
+def test_tiles_are_few():
+    """Bounds follow the opacity and both axes, and tiles widen toward the poles: far fewer instances than published."""
+    gaussians = mixture(200, torch.Generator().manual_seed(5), ("ordinary", "polar"))
+    published = NativeTiles(gaussians, Panorama(512, 256), RELEASED, identity_pose()).count
+    for projection in ("erp", "tangent", "ray"):
+        ours = NativeTiles(gaussians, Panorama(512, 256), RenderOptions(projection), identity_pose())
+        assert ours.count < 0.45 * published
+
+
+@needs_native
+def test_the_tiles_of_a_small_gaussian_are_as_many_at_every_latitude():
+    """Near the poles it spans many columns; wide tiles keep the count below twice that of the horizon."""
+    counts = []
+    for latitude in (0, 45, 70, 80, 85):
+        generator = torch.Generator().manual_seed(3)
+        gaussians = gaussians_of("ordinary", 300, generator)
+        angle = math.radians(latitude) * torch.ones(300, dtype=torch.float64)
+        longitude = 2 * math.pi * torch.rand(300, generator=generator, dtype=torch.float64)
+        flat = torch.cos(angle)
+        means = torch.stack((flat * torch.sin(longitude), torch.sin(angle), flat * torch.cos(longitude)), dim=-1)
+        scales = torch.full((300, 3), math.radians(0.7))  # four pixels at this size
+        moved = type(gaussians)(means, gaussians.quats, scales, gaussians.opacities, gaussians.colors)
+        tiles = NativeTiles(moved, Panorama(2048, 1024), RenderOptions("ray"), identity_pose())
+        counts.append(tiles.count / 300)
+    assert max(counts) < 2 * counts[0] and counts[0] < 7, counts
+
+
+@pytest.mark.parametrize(
+    ("projection", "lens", "wrap"), [*((*setup, True) for setup in SETUPS), ("erp", "panorama", False)]
+)
+@needs_native
+def test_strips_draw_and_differentiate_the_same(projection: str, lens: str, wrap: bool):
+    generator = torch.Generator().manual_seed(12)
+    gaussians = mixture(20, generator, ("ordinary", "polar", "seam", "needle"))
+    pose = random_pose(generator, shift=0.1)
+    weights = [torch.randn(90, 200, generator=generator) for _ in OUTPUTS]
+    results = []
+    for limit in (1 << 26, 200, 1):
+        inputs, moved = leaves(gaussians, torch.float32), pose.float().requires_grad_()
+        view = view_of(camera_of(lens, 200, 90), moved)
+        options = RenderOptions(projection, wrap=wrap, max_instances=limit)
+        rendering = render(inputs, view, options, backend="cpu")
+        outputs = [rendering.image.sum(-1), rendering.transmittance, rendering.depth]
+        loss = sum((output * weight).sum() for output, weight in zip(outputs, weights, strict=True))
+        results.append((rendering, torch.autograd.grad(loss, [*vars(inputs).values(), moved])))
+    (whole, gradients), *others = results
+    assert whole.counters["instances"] > 250
+    for rendering, strip_gradients in others:
+        assert rendering.counters == whole.counters
+        for name in OUTPUTS:
+            assert torch.equal(getattr(rendering, name), getattr(whole, name)), name
+        for name, actual, expected in zip((*INPUTS, "pose"), strip_gradients, gradients, strict=True):
+            assert torch.equal(actual, expected), name
+
+
+@needs_native
+def test_no_strip_holds_more_instances_than_allowed():
+    gaussians = mixture(100, torch.Generator().manual_seed(13), ("ordinary", "polar"))
+    for limit in (1, 100, 400, 1000):
+        lists = projected(gaussians, Panorama(256, 128), RenderOptions("ray", max_instances=limit), identity_pose())
+        strips = list(lists.strips())
+        assert sum(len(strip.instances) for strip in strips) == lists.instances > 1000
+        assert [strip.grid.first_row for strip in strips] == [0, *(strip.grid.end_row for strip in strips[:-1])]
+        assert strips[-1].grid.end_row == len(lists.per_row)
+        for strip in strips:
+            assert len(strip.instances) <= limit or strip.grid.end_row == strip.grid.first_row + 1

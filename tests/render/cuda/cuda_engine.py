@@ -1,0 +1,81 @@
+"""What tests mean by backend cuda: the GPU where there is one, else the same kernels on the CPU (emulation.h).
+
+Importing this module arranges it for the whole process. On a GPU, tensors of a test stay on the CPU and take a trip.
+"""
+
+from __future__ import annotations
+
+import atexit
+import ctypes
+import functools
+import shutil
+import subprocess
+import tempfile
+from dataclasses import fields, replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from padgs.native import cuda as cuda_native
+from padgs.native import library as native
+from padgs.render import BACKENDS, Rendering
+from padgs.render.backends import cuda as cuda_backend
+from padgs.sphere.camera import RayTable
+
+HERE = Path(__file__).parent
+SOURCES = Path(cuda_native.__file__).parent / "csrc" / "cuda"
+COMPILER = shutil.which("c++") or shutil.which("g++")
+ON_GPU = torch.cuda.is_available() and cuda_native.available()
+real_library = cuda_native.library
+
+
+@functools.cache
+def emulated_library() -> ctypes.CDLL:
+    """The kernels compiled for the host; seconds, once in a process."""
+    loaded = compiled("padgs_cuda", sorted(SOURCES.glob("*.cu")))
+    return native.declared(loaded, cuda_native.SIGNATURES, "padgs_cuda_structure_bytes", cuda_native.STRUCTURES)
+
+
+@functools.cache
+def layout_library() -> ctypes.CDLL:
+    """Functions of layout_check.cpp."""
+    return compiled("layout", [HERE / "layout_check.cpp"])
+
+
+def compiled(name: str, sources: list[Path]) -> ctypes.CDLL:
+    """A shared library of C++ sources, CUDA ones included, for as long as this process lives."""
+    folder = Path(tempfile.mkdtemp(prefix="padgs-emulated-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    target = folder / f"lib{name}.so"
+    flags = ["-std=c++17", "-O2", "-fPIC", "-shared", "-Wall", "-Wextra", "-Werror", "-DPADGS_EMULATED"]
+    flags += ["-fsanitize=bounds", "-fsanitize-undefined-trap-on-error"]  # of arrays: ends the process
+    command = [str(COMPILER), *flags, f"-I{HERE}", f"-I{SOURCES}", "-x", "c++", *map(str, sources), "-o", str(target)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return ctypes.CDLL(str(target))
+
+
+def rasterize_on_gpu(gaussians, cam_from_world, camera, options, background, probe=None) -> Rendering:
+    """`cuda_backend.rasterize` for tensors on the CPU; gradients find their way back."""
+    gaussians = type(gaussians)(**{field.name: getattr(gaussians, field.name).cuda() for field in fields(gaussians)})
+    if isinstance(camera, RayTable):
+        camera = RayTable(camera.table.cuda(), camera.focal)
+    probe = None if probe is None else probe.cuda()
+    drawn = cuda_backend.rasterize(gaussians, cam_from_world.cuda(), camera, options, background.cuda(), probe)
+    tensors = {name: getattr(drawn, name).cpu() for name in ("image", "transmittance", "depth", "visible")}
+    return replace(drawn, **tensors)
+
+
+if ON_GPU:
+    BACKENDS["cuda"] = "cuda_engine:rasterize_on_gpu"
+else:
+    cuda_native.library = emulated_library
+
+
+needs_engine = pytest.mark.skipif(not ON_GPU and COMPILER is None, reason="no GPU, and no C++ compiler to emulate one")
+
+
+def marks() -> list:
+    """What an engine of backend cuda is marked with."""
+    return [pytest.mark.cuda] if ON_GPU else [needs_engine]

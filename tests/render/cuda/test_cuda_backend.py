@@ -1,0 +1,232 @@
+"""The GPU backend where it differs from the others: strips, long lists, scheduling, errors. On the GPU or emulated."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from itertools import pairwise
+from types import SimpleNamespace
+
+import cuda_engine
+import pytest
+import torch
+from render_cases import INPUTS, blended, camera_of, gaussians_of, leaves, mixture, random_pose, row_error, view_of
+from torch import Tensor
+
+from padgs import render as package
+from padgs.gaussians import Gaussians
+from padgs.learning.failure import is_out_of_memory
+from padgs.native import cuda as cuda_native
+from padgs.native import library as native
+from padgs.render import Rendering, RenderOptions, render
+from padgs.render.backends import cuda as cuda_backend
+from padgs.render.backends import cuda_tiles
+
+pytestmark = [*cuda_engine.marks()]
+
+
+def drawn(
+    gaussians: Gaussians,
+    size: tuple[int, int],
+    options: RenderOptions,
+    *,
+    backend: str = "cuda",
+    lens: str = "panorama",
+) -> tuple[Rendering, dict[str, Tensor]]:
+    """A rendering in a random pose, and gradients of a random weighting of all its outputs."""
+    generator = torch.Generator().manual_seed(5)
+    inputs = leaves(gaussians, torch.float32)
+    pose = random_pose(generator, shift=0.1).float().requires_grad_()
+    rendering = render(inputs, view_of(camera_of(lens, *size), pose), options, backend=backend)
+    outputs = (rendering.image, rendering.transmittance, rendering.depth)
+    sum((out * torch.randn(out.shape, generator=generator)).sum() for out in outputs).backward()
+    return rendering, {**{name: getattr(inputs, name).grad for name in INPUTS}, "pose": pose.grad}
+
+
+def crowd(count: int, generator: torch.Generator) -> Gaussians:
+    """So many faint Gaussians that lists are longer than the batches and buckets that kernels take them in."""
+    gaussians = mixture(count // 4, generator, ("ordinary", "polar", "pole", "seam"))
+    return Gaussians(**{**vars(gaussians), "opacities": 0.1 * gaussians.opacities})
+
+
+@pytest.mark.parametrize("blending", ["sorted", "hybrid"])
+@pytest.mark.parametrize("projection", ["erp", "tangent", "ray"])
+def test_long_lists_are_drawn_like_short_ones(projection: str, blending: str, generator: torch.Generator):
+    gaussians = crowd(1200, generator)
+    options = RenderOptions(projection, low_pass_kind="angular", **blended(blending, 4))
+    expected, expected_gradients = drawn(gaussians, (72, 36), options, backend="cpu")
+    actual, gradients = drawn(gaussians, (72, 36), options)
+    assert actual.counters["instances"] > 8 * 256
+    flipped = 2e-3  # an alpha that rounding moves across 1/255 changes a pixel by so much
+    assert ((actual.image - expected.image).abs().amax(-1) > 2e-5).double().mean() < 0.02
+    assert (actual.image - expected.image).abs().max() < flipped
+    for name, gradient in expected_gradients.items():
+        if name != "pose":
+            assert row_error(gradients[name], gradient) < 0.05, name
+            assert (gradients[name] - gradient).norm() < 5e-3 * gradient.norm(), name
+
+
+@pytest.mark.parametrize("projection", ["erp", "ray"])
+def test_cores_of_any_size(projection: str, generator: torch.Generator):
+    """On both sides of the sizes that kernels are compiled for; some pixels have more fragments than any."""
+    gaussians = gaussians_of("ordinary", 300, generator)
+    ahead = gaussians.means.abs() * torch.tensor([0.1, 0.1, 1.0]) + torch.tensor([0.0, 0.0, 2.0])
+    broad = {"scales": 0.4 + gaussians.scales, "opacities": torch.full((300,), 0.08, dtype=torch.float64)}
+    gaussians, images = Gaussians(**{**vars(gaussians), "means": ahead.float().double(), **broad}), []
+    for size in (1, 16, 17, 64, 65, 256):
+        options = RenderOptions(projection, blending="hybrid", core_size=size)
+        expected, expected_gradients = drawn(gaussians, (36, 18), options, backend="cpu")
+        actual, gradients = drawn(gaussians, (36, 18), options)
+        assert ((actual.image - expected.image).abs().amax(-1) > 2e-5).double().mean() < 0.05
+        for name, gradient in expected_gradients.items():
+            assert (gradients[name] - gradient).norm() < 5e-3 * gradient.norm(), name
+        images.append(actual.image.detach())
+    assert all((one - other).abs().max() > 1e-4 for one, other in pairwise(images))
+
+
+@pytest.mark.parametrize("blending", ["sorted", "hybrid"])
+def test_strips_are_parts_of_the_same_image(blending: str, generator: torch.Generator):
+    gaussians, options = crowd(200, generator), RenderOptions(**blended(blending, 3))
+    whole, whole_gradients = drawn(gaussians, (131, 77), options)
+    parts, parts_gradients = drawn(gaussians, (131, 77), replace(options, max_instances=300))
+    for name in ("image", "transmittance", "depth", "visible"):
+        assert torch.equal(getattr(parts, name), getattr(whole, name)), name
+    assert dict(parts.counters) == dict(whole.counters)
+    for name, gradient in whole_gradients.items():
+        torch.testing.assert_close(parts_gradients[name], gradient, rtol=1e-4, atol=1e-4 * gradient.abs().max().item())
+
+
+@pytest.mark.skipif(cuda_engine.ON_GPU, reason="about the order in which the emulation runs threads")
+@pytest.mark.parametrize("blending", ["sorted", "hybrid"])
+@pytest.mark.parametrize(("projection", "lens"), [("erp", "panorama"), ("ray", "panorama"), ("tangent", "fisheye")])
+def test_results_do_not_depend_on_which_thread_runs_first(
+    projection, lens, blending, generator, monkeypatch: pytest.MonkeyPatch
+):
+    gaussians, options = crowd(400, generator), RenderOptions(projection, **blended(blending, 3))
+    forwards = drawn(gaussians, (40, 20), options, lens=lens)
+    monkeypatch.setenv("PADGS_EMULATION_REVERSED", "1")
+    backwards = drawn(gaussians, (40, 20), options, lens=lens)
+    for name in ("image", "transmittance", "depth"):
+        assert torch.equal(getattr(forwards[0], name), getattr(backwards[0], name)), name
+    assert dict(forwards[0].counters) == dict(backwards[0].counters)
+    for name in forwards[1]:
+        assert torch.equal(forwards[1][name], backwards[1][name]), name
+
+
+@pytest.mark.parametrize("blending", ["sorted", "hybrid"])
+def test_results_repeat_bit_by_bit(blending: str, generator: torch.Generator):
+    gaussians, options = crowd(400, generator), RenderOptions("tangent", blending=blending)
+    first, second = (drawn(gaussians, (72, 36), options) for _ in range(2))
+    assert torch.equal(first[0].image, second[0].image)
+    assert all(torch.equal(first[1][name], second[1][name]) for name in first[1])
+
+
+@pytest.mark.parametrize("blending", ["sorted", "hybrid"])
+def test_counters_are_those_of_the_cpu(blending: str, generator: torch.Generator):
+    gaussians, options = gaussians_of("ordinary", 40, generator), RenderOptions(**blended(blending, 2))
+    expected, actual = (drawn(gaussians, (72, 36), options, backend=name)[0] for name in ("cpu", "cuda"))
+    assert set(actual.counters) == set(expected.counters) and len(actual.counters) == 5
+    for name in ("gaussians", "visible", "instances", "contributing"):
+        assert actual.counters[name] == expected.counters[name]
+    assert 0 < actual.counters["contributing"] <= actual.counters["evaluated"]
+    with pytest.raises(KeyError):
+        actual.counters["pixels"]
+
+
+def test_cores_are_kept_only_to_be_differentiated(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch):
+    kept = []
+    call = cuda_native.call
+
+    def spy(name: str, where, *arguments) -> None:
+        if name == "padgs_cuda_blend":
+            kept.append(arguments[0].core is not None and arguments[0].tails is not None)
+        call(name, where, *arguments)
+
+    monkeypatch.setattr(cuda_native, "call", spy)
+    inputs = leaves(gaussians_of("ordinary", 5, generator), torch.float32)
+    view, options = view_of(camera_of("panorama", 32, 16)), RenderOptions(blending="hybrid")
+    images = [render(inputs, view, options, backend="cuda").image]
+    with torch.no_grad():
+        images.append(render(inputs, view, options, backend="cuda").image)
+    constant = Gaussians(**{name: tensor.detach() for name, tensor in vars(inputs).items()})
+    images.append(render(constant, view, options, backend="cuda").image)
+    assert kept == [True, False, False]
+    assert torch.equal(images[0], images[1]) and torch.equal(images[0], images[2])
+
+
+@pytest.mark.parametrize("blending", ["sorted", "hybrid"])
+def test_going_back_twice_gives_the_same(blending: str, generator: torch.Generator):
+    inputs = leaves(gaussians_of("ordinary", 12, generator), torch.float32)
+    rendering = render(inputs, view_of(camera_of("panorama", 40, 20)), RenderOptions(blending=blending), backend="cuda")
+    loss = rendering.image.square().sum() + rendering.depth.sum()
+    first, second = (torch.autograd.grad(loss, [*vars(inputs).values()], retain_graph=True) for _ in range(2))
+    assert all(torch.equal(*pair) and pair[0].any() for pair in zip(first, second, strict=True))
+
+
+def test_other_dtypes_and_places_are_refused(monkeypatch: pytest.MonkeyPatch):
+    with pytest.raises(ValueError, match="backend cuda takes float32 tensors on a GPU, got torch.float64 on "):
+        cuda_backend.check(torch.zeros(1, 3, dtype=torch.float64))
+    monkeypatch.setattr(cuda_native, "device_type", lambda: "cuda")
+    where = "" if torch.cuda.is_available() else r" \(torch finds no GPU with a driver here\)"
+    with pytest.raises(ValueError, match=f"got torch.float32 on cpu{where}; convert them, or use backend=auto"):
+        cuda_backend.check(torch.zeros(1, 3))
+
+
+def test_more_instances_than_a_list_can_hold_are_refused(generator, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(cuda_tiles, "MAX_INSTANCES", 10)
+    message = r"one row of tiles has \d+ \(Gaussian, tile\) instances; a list holds at most 10. Draw fewer"
+    with pytest.raises(ValueError, match=message):
+        drawn(crowd(200, generator), (72, 36), RenderOptions())
+
+
+def test_errors_of_cuda_keep_their_names():
+    cuda_native.raise_for(0, "padgs_cuda_sort")
+    with pytest.raises(RuntimeError, match="padgs_cuda_sort: CUDA error 700, ") as error:
+        cuda_native.raise_for(700, "padgs_cuda_sort")
+    assert not is_out_of_memory(error.value)
+    with pytest.raises(torch.cuda.OutOfMemoryError, match="padgs_cuda_sort: CUDA error 2, ") as error:
+        cuda_native.raise_for(2, "padgs_cuda_sort")
+    assert is_out_of_memory(error.value)
+
+
+def test_a_gpu_that_nothing_was_compiled_for_is_named(monkeypatch: pytest.MonkeyPatch):
+    fake = SimpleNamespace(padgs_cuda_check=lambda _: 209, padgs_cuda_architectures=lambda: b"80 90")
+    monkeypatch.setattr(cuda_native, "library", lambda: fake)
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda _: (7, 5))
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda _: "Tesla T4")
+    with pytest.raises(
+        RuntimeError, match="compiled for compute capabilities 80 90; Tesla T4 has 75. .*ARCHITECTURES=75"
+    ):
+        cuda_native.check_device.__wrapped__(0)
+
+
+def test_without_the_library_auto_means_torch_and_says_so(tmp_path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("PADGS_LIBRARY_DIR", str(tmp_path))
+    monkeypatch.setattr(native, "_package_folders", lambda: [str(tmp_path)])
+    monkeypatch.setattr(cuda_native, "library", cuda_engine.real_library.__wrapped__)
+    cuda_native.available.cache_clear()
+    package._say_that_native_is_missing.cache_clear()
+    means = SimpleNamespace(device=torch.device("cuda"), dtype=torch.float32)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert package.resolve_backend("auto", means) == "torch"
+    assert "slower than cuda: libpadgs_cuda.so not found in" in str(caught[0].message) and "nvcc" in str(
+        caught[0].message
+    )
+    monkeypatch.setattr(cuda_native, "available", lambda: True)
+    assert package.resolve_backend("auto", means) == "cuda"
+    assert package.resolve_backend("auto", SimpleNamespace(device=torch.device("cuda"), dtype=torch.float64)) == "torch"
+
+
+def test_nothing_is_drawn_outside_the_gradients_that_are_asked_for(generator: torch.Generator):
+    """Without a pose or a table that wants one, the same gradients."""
+    gaussians = gaussians_of("ordinary", 12, generator)
+    everything = drawn(gaussians, (40, 20), RenderOptions("ray"))[1]
+    inputs = Gaussians(**{name: getattr(gaussians, name).float() for name in INPUTS})
+    inputs.means.requires_grad_()
+    again = torch.Generator().manual_seed(5)
+    pose = random_pose(again, shift=0.1).float()
+    rendering = render(inputs, view_of(camera_of("panorama", 40, 20), pose), RenderOptions("ray"), backend="cuda")
+    outputs = (rendering.image, rendering.transmittance, rendering.depth)
+    sum((out * torch.randn(out.shape, generator=again)).sum() for out in outputs).backward()
+    assert torch.equal(inputs.means.grad, everything["means"])

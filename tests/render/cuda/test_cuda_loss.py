@@ -1,0 +1,47 @@
+"""The GPU's photometric loss against its definition in float64; on the GPU or emulated."""
+
+from __future__ import annotations
+
+import cuda_engine
+import pytest
+import torch
+
+from padgs.learning.loss import photometric_loss, pixel_weight
+from padgs.learning.native_loss import loss_on_gpu
+
+pytestmark = [*cuda_engine.marks()]
+DEVICE = "cuda" if cuda_engine.ON_GPU else "cpu"
+
+
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (5, 7), (17, 33), (24, 48), (50, 70)])
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("lambda_l1", [0.8, 0.0, 1.0])
+def test_the_gpu_matches_the_definition(height: int, width: int, masked: bool, lambda_l1: float, generator):
+    image = torch.rand(height, width, 3, generator=generator)
+    target = (image + 0.1 * torch.randn(height, width, 3, generator=generator)).clamp(0, 1)
+    if height > 1:
+        target[0, 0] = image[0, 0]  # where the absolute value has no derivative
+    mask = (torch.rand(height, width, generator=generator) > 0.4).float() if masked else None
+    if mask is not None:
+        mask[0, 0] = 1.0
+    weight = pixel_weight("solid_angle", height, mask)
+    exact = image.double().requires_grad_()
+    expected = photometric_loss(exact, target.double(), weight.double(), lambda_l1=lambda_l1)
+    expected.backward()
+
+    leaf = image.to(DEVICE).requires_grad_()
+    total = 3 * weight.expand(height, width).sum().to(DEVICE)
+    value = loss_on_gpu(leaf, target.to(DEVICE), weight.to(DEVICE), lambda_l1, total)
+    (2 * value).backward()
+    assert exact.grad is not None and leaf.grad is not None
+    assert value.item() == pytest.approx(expected.item(), abs=2e-6)
+    assert (leaf.grad.cpu().double() / 2 - exact.grad).abs().max() <= 2e-5 * exact.grad.abs().max()
+
+
+def test_without_a_gradient_none_is_computed(generator: torch.Generator):
+    image, target = torch.rand(2, 20, 30, 3, generator=generator).to(DEVICE)
+    weight = torch.ones(20, 1, device=DEVICE)
+    total = torch.tensor(1800.0, device=DEVICE)
+    leaf = image.clone().requires_grad_()
+    values = [loss_on_gpu(x, target, weight, 0.8, total) for x in (image, leaf)]
+    assert torch.equal(values[0], values[1]) and not values[0].requires_grad

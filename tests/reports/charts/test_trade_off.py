@@ -1,0 +1,108 @@
+import csv
+import io
+from dataclasses import replace
+
+import pytest
+from made_up import METHODS, compared, data_set, small, write
+
+from reports.charts import trade_off_chart
+from reports.charts.drawing import color_of, marker_of
+from reports.charts.trade_off import csv_text, pareto, trade_offs
+from reports.methods import TITLES, ordered
+from reports.quality_log import probes
+from reports.request import Request
+from reports.tables.table import ReportError
+
+
+def numbers(chart) -> dict[tuple[str, str], float]:
+    lines = csv.DictReader(io.StringIO(csv_text(chart)))
+    return {(line["setting"], line["quantity"]): float(line["mean"]) for line in lines}
+
+
+def test_a_point_for_each_method_and_setting():
+    config = {"train": {"iterations": 3000}, "method": {"tau": 0.9}}
+    longer = [small(28.0, 3.0, experiments=("pareto@cpu",), iterations=3000, config=config)]
+    room = next(
+        chart for chart in trade_offs([*compared(), *longer], Request()) if chart.name == "chart_synthetic-room"
+    )
+    found = numbers(room)
+    assert found["ODGS", "WS-PSNR"] == pytest.approx(22 + 1.6 + 0.05 - 0.4)
+    assert found["ODGS", "ms per frame"] == pytest.approx(40 * 1.1)
+    assert {title for title, _ in found if title.startswith("PaD-GS")} == {
+        "PaD-GS, iterations 1500",
+        "PaD-GS, iterations 3000",
+    }
+
+
+def test_who_failed_has_no_point():
+    outdoor = next(chart for chart in trade_offs(compared(), Request()) if "outdoor" in chart.name)
+    assert {point.preset for point in outdoor.points} == set(METHODS) - {"op43dgs"}
+
+
+def test_a_data_set_is_averaged_over_the_scenes_that_all_finished():
+    runs = [
+        replace(r, status="oom", scores={}) if (r.scene, r.method) == ("bar", "padgs") else r
+        for r in data_set("roam360")
+    ]
+    (chart,) = trade_offs(runs, Request())
+    assert "mean over its scenes base, cafe" in chart.title and chart.beside == "roam360"
+    assert numbers(chart)["OmniGS", "PSNR"] == pytest.approx(20 + 5.5)  # scenes 1..10
+
+
+def test_times_of_two_machines_do_not_share_a_chart():
+    first, *others = compared()
+    with pytest.raises(ReportError, match="differ in machine"):
+        trade_offs([replace(first, machine={"gpu": "H200"}), *others], Request())
+
+
+def test_no_point_of_the_front_is_beaten():
+    points = [(1.0, 20.0), (1.0, 21.0), (2.0, 20.5), (3.0, 24.0), (4.0, 24.0)]
+    assert pareto(points, higher_is_better=True) == [(1.0, 21.0), (3.0, 24.0)]
+    assert pareto(points, higher_is_better=False) == [(1.0, 20.0)]
+
+
+def test_published_numbers_stand_on_axes_of_their_own():
+    room = next(chart for chart in trade_offs(compared(), Request()) if "room" in chart.name)
+    svg = trade_off_chart.chart(room).svg
+    assert "PSNR ↑ (published)" in svg and "WS-PSNR ↑" in svg
+    assert "<title>PaD-GS, published\nPSNR ↑: 26.02\nms per frame ↓: 33.5</title>" in svg
+
+
+def test_quality_over_training_time_comes_from_the_logs(tmp_path):
+    runs = compared(seeds=1)
+    logs = probes(write(runs, tmp_path), runs)
+    room = next(chart for chart in trade_offs(runs, Request()) if "room" in chart.name)
+    svg = trade_off_chart.time_chart(room, logs).svg
+    assert "<title>PaD-GS, synthetic-room, seed 0\n25.47 dB after 200 s</title>" in svg  # 26 - 8 / 15 at the last probe
+    assert trade_off_chart.time_chart(room, {}) is None
+
+
+def test_a_method_that_never_finishes_does_not_empty_the_chart():
+    runs = [replace(r, status="oom", scores={}) if r.method == "padgs" else r for r in data_set("roam360")]
+    (chart,) = trade_offs(runs, Request())
+    assert "scenes bar, base" in chart.title and [point.preset for point in chart.points] == ["omnigs"]
+
+
+def test_lengths_are_not_mixed_in_a_mean_over_scenes():
+    runs = [replace(r, iterations=7000) if r.scene == "bar" else r for r in data_set("roam360")]
+    with pytest.raises(ReportError, match="roam360, OmniGS: results differ in iterations"):
+        trade_offs(runs, Request())
+
+
+def test_rules_of_the_protocol_that_is_shown_are_not_mixed():
+    first, *others = compared()
+    sphere = replace(first.scores["sphere"], protocol=first.scores["sphere"].protocol | {"bottom_crop": 0.1})
+    with pytest.raises(ReportError, match="differ in protocol"):
+        trade_offs([replace(first, scores=first.scores | {"sphere": sphere}), *others], Request())
+
+
+def test_scenes_of_two_data_sets_may_have_one_name():
+    charts = trade_offs([small(25.0, scene="room"), small(26.0, scene="room", dataset="")], Request())
+    assert [chart.name for chart in charts] == ["chart_room", "chart_room_synthetic"]
+
+
+def test_every_preset_has_a_colour_and_a_shape_of_its_own(root):
+    presets = ordered(path.stem for path in (root / "conf" / "method").glob("*.yaml"))
+    looks = {(color_of(preset, presets), marker_of(preset, presets)) for preset in presets}
+    assert len(looks) == len(presets) > 10
+    assert len({color_of(method, presets) for method in TITLES}) == len(TITLES)

@@ -1,0 +1,129 @@
+import re
+import time
+from dataclasses import replace
+
+import pytest
+from chromium import PROGRAM, Browser
+from made_up import compared, data_set, failed, small, swept, write
+
+from reports.gathered import Gathered
+from reports.page import page, pictures
+from reports.request import Request
+
+
+def gathered(folder, results, **others) -> Gathered:
+    return Gathered(folder, results, Request(), **others)
+
+
+@pytest.fixture(scope="module")
+def folder_and_results(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("page") / "runs"
+    results = [*compared(["synthetic-room"], seeds=1), *swept(scenes=["synthetic-room"], seeds=2)]
+    return write(results, folder, pictures=True), results
+
+
+@pytest.fixture(scope="module")
+def html(folder_and_results) -> str:
+    return page.text(gathered(*folder_and_results, left_out=("runs/x/result.json was edited",)))
+
+
+def test_it_needs_nothing_from_outside(html):
+    loading = r"""(?:src|href|xlink:href)=["'](?!#|data:)([^"']*)|url\((?!['"]?(?:#|data:))([^)]*)\)|@import"""
+    body = re.sub(r"<script>.*?</script>", "", html, flags=re.DOTALL)
+    assert [found for found in re.findall(loading, body) if any(found)] == []
+    assert "connect-src blob: data:" in html and "MIT" in html and "Matthew Petroff" in html
+
+
+def test_it_has_the_tables_the_charts_and_what_was_left_out(html):
+    for words in ("Table 4", "26.02", "Sweep tau@cpu", "synthetic-room (built in", "runs/x/result.json was edited"):
+        assert words in html
+    assert html.count('<figure class="chart"') == 3 and html.count('class="tip"><title>') > 50
+
+
+def test_what_names_contain_is_text_and_not_markup(tmp_path):
+    evil = small(25.0, scene="</script><b-x>$a_b", method="<i-x>")
+    html = page.text(gathered(tmp_path, [evil]))
+    assert "<b-x>" not in html and "<i-x>" not in html and "&lt;b-x&gt;$a_b" in html
+
+
+def test_a_folder_without_pictures_gives_a_page_without_them(tmp_path):
+    html = page.text(gathered(tmp_path, [failed("", "oom")]))
+    assert 'id="slider"' not in html and "OOM" in html
+
+
+def test_a_refused_table_is_named_and_the_others_are_there(tmp_path):
+    first, *others = data_set("roam360")
+    html = page.text(gathered(tmp_path, [replace(first, machine={"gpu": "H200"}), *others]))
+    assert "differ in machine" in html and 'id="table1"' in html and 'id="table4"' not in html
+
+
+def test_pictures_are_bounded(folder_and_results, monkeypatch, tmp_path):
+    folder, results = folder_and_results
+    made = pictures.album(folder, results, Request())
+    (scene,) = made.scenes
+    assert [view["title"] for view in scene["views"]] == ["view0", "view1"]
+    assert [method["title"] for method in scene["views"][0]["methods"]][-1] == "PaD-GS (26.00 dB)"
+    assert len(made.images) == 2 * (1 + 2 * 6) and max(map(len, made.images)) < 10_000
+    monkeypatch.setattr(pictures, "MOST_FILES", 6)
+    assert [len(scene["views"]) for scene in pictures.album(folder, results, Request()).scenes] == [1]
+    monkeypatch.setattr(pictures, "MOST_FILES", 5)
+    assert pictures.album(folder, results, Request()).left_out == [
+        "synthetic-room (built in, generated; no scene of the paper)"
+    ]
+
+
+def test_a_picture_that_was_cut_is_left_out(tmp_path):
+    runs = compared(["synthetic-room"], seeds=1)[:2]
+    folder = write(runs, tmp_path, pictures=True)
+    broken = folder / runs[0].run / "renders" / "view0.png"
+    broken.write_bytes(broken.read_bytes()[:300])
+    first, second = pictures.album(folder, runs, Request()).scenes[0]["views"]
+    assert (len(first["methods"]), len(second["methods"])) == (1, 2)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(PROGRAM is None, reason="no Chromium here")
+def test_in_a_browser(html, tmp_path):
+    (tmp_path / "report.html").write_text(html)
+    browser = Browser(tmp_path / "profile")
+    try:
+        browser.open(tmp_path / "report.html")
+        browser.wait("viewers.length === 2 && viewers.every(viewer => viewer.isLoaded())")
+
+        first_cells = "[...document.querySelectorAll('#table1 tbody')].at(-1).querySelectorAll('td:first-child')"
+        rows = f"[...{first_cells}].map(cell => cell.textContent)"
+        assert browser.run(rows)[0] == "EgoNeRF"
+        browser.run("[...document.querySelectorAll('#table1 table')].at(-1).id = 'last'")
+        orders = []
+        for _ in range(2):
+            browser.click("#last thead tr:last-child th:nth-child(3)")
+            orders.append(browser.run(rows))
+        assert {order[0] for order in orders} == {"EgoNeRF", "PaD-GS"} and orders[0] == orders[1][::-1]
+
+        before = browser.run("document.getElementById('slider').value")
+        browser.drag("#slider", 200, 0)
+        assert browser.run("document.getElementById('slider').value") > before + 5
+
+        yaws = "viewers.map(viewer => viewer.getYaw())"
+        assert browser.run(yaws) == [0, 0]
+        browser.drag("#panorama-render", -150, 0)
+        browser.wait(f"{yaws}.every(yaw => yaw > 5)")
+        time.sleep(1.5)  # inertia
+        truth, render = browser.run(yaws)
+        assert truth == pytest.approx(render, abs=0.5)
+
+        browser.run("document.getElementById('method').selectedIndex = 5")
+        browser.run("document.getElementById('method').dispatchEvent(new Event('change'))")
+        browser.wait("viewers.every(viewer => viewer.isLoaded())")
+        assert (
+            browser.run("document.querySelector('#slider [slot=second] figcaption').textContent") == "PaD-GS (26.00 dB)"
+        )
+
+        browser.point("#charts .tip")
+        browser.wait("!document.getElementById('tip').hidden")
+        assert "ms per frame" in browser.run("document.getElementById('tip').textContent")
+
+        assert browser.complaints == []
+        assert {url.partition(":")[0] for url in browser.requests} <= {"file", "blob", "data"}
+    finally:
+        browser.close()

@@ -1,0 +1,91 @@
+"""Tables of all methods, after equal iterations and after equal time."""
+
+from dataclasses import replace
+
+import pytest
+from made_up import compared, failed, small
+
+from reports.request import Request
+from reports.tables.equal_time import EXPERIMENT, common_seconds, is_near, nearest_to
+from reports.tables.side_by_side import equal_time, methods
+from reports.tables.table import ReportError, Table
+
+
+def columns(table: Table) -> list[str]:
+    return [column.title for column in table.columns]
+
+
+def value(table: Table, block: str, row: str, column: str) -> float | None:
+    rows = next(b.rows for b in table.blocks if b.title.startswith(block))
+    return next(r for r in rows if r.title == row).cells[columns(table).index(column)].value
+
+
+def trained(method: str, seconds: float, iterations: int, psnr: float = 25.0, **others):
+    config = {"train": {"iterations": iterations}, "method": {"sh_degree": 3}, "seed": 0}
+    own = {"method": method, "iterations": iterations, "iterations_done": iterations, "config": config}
+    made = small(psnr, seconds / 100, experiments=(EXPERIMENT,), **own, **others)
+    return replace(made, run=f"{made.run}_{iterations}")
+
+
+def test_every_method_with_all_that_is_measured():
+    table = methods(compared(seeds=2), Request())
+    assert [block.title.split()[0] for block in table.blocks] == ["synthetic-outdoor", "synthetic-room"]
+    assert {"PSNR", "SSIM", "WS-PSNR", "WS-PSNR pole", "seam", "training s", "ms per frame", "MB"} <= {*columns(table)}
+    assert value(table, "synthetic-room", "OmniGS", "PSNR") == pytest.approx(22 + 0.8 * 3 + 0.05), "mean of two seeds"
+    outdoor = next(b for b in table.blocks if "outdoor" in b.title)
+    assert next(r for r in outdoor.rows if r.title == "OP43DGS").cells[0].status == "oom"
+
+
+def test_runs_of_different_lengths_do_not_stand_together():
+    with pytest.raises(ReportError, match="differ in iterations"):
+        methods([small(25), small(26, method="omnigs", iterations=3000)], Request())
+
+
+def test_of_each_method_the_run_nearest_to_the_common_time_counts():
+    on_the_way = [trained("padgs", 40, 500, 20), trained("omnigs", 30, 500, 21), trained("spags", 300, 500, 22)]
+    there = [trained("padgs", 103, 1300, 26), trained("omnigs", 98, 1600, 27), trained("spags", 108, 170, 21)]
+    others = [
+        small(30, cost, method=method, experiments=("all_methods",))
+        for cost, method in ((1.05, "odgs"), (9, "op43dgs"))
+    ]
+    table = equal_time([*on_the_way, *there, *others], Request())
+    rows = [row.title for row in table.blocks[0].rows]
+    assert rows == ["ODGS", "OmniGS", "SPaGS", "PaD-GS"], "of another experiment what happened to take as long"
+    for method, *expected in (("PaD-GS", 103, 1300, 26), ("OmniGS", 98, 1600, 27), ("SPaGS", 108, 170, 21)):
+        found = [value(table, "synthetic-room", method, name) for name in ("training s", "iterations", "PSNR")]
+        assert found == pytest.approx(expected)
+
+
+def test_times_of_different_machines_do_not_stand_together():
+    runs = [trained("padgs", 100, 900), trained("omnigs", 100, 900, machine={"cores": 64, "cpu": "B", "torch": "2"})]
+    with pytest.raises(ReportError, match="differ in machine"):
+        equal_time(runs, Request())
+    assert equal_time(runs, Request(mix=True)).blocks
+
+
+def test_seeds_may_differ_in_length_but_in_nothing_else():
+    runs = [trained("padgs", 100, 900, 25), trained("padgs", 102, 950, 27, seed=1)]
+    assert value(equal_time(runs, Request()), "synthetic-room", "PaD-GS", "PSNR") == pytest.approx(26)
+    other = replace(runs[1], config={**runs[1].config, "method": {"sh_degree": 0}})
+    for seed in (0, 1):
+        with pytest.raises(ReportError, match="differ in method.sh_degree"):
+            equal_time([runs[0], replace(other, seed=seed)], Request())
+
+
+def test_what_is_not_near_the_common_time_is_named():
+    runs = [trained("padgs", 100, 900), trained("omnigs", 105, 900), trained("cubemap_3dgs", 300, 900)]
+    assert "not within 10% of 100 s: 3DGS on cube faces." in equal_time(runs, Request()).notes[0]
+    assert "not within" not in equal_time(runs[:2], Request()).notes[0]
+
+
+def test_a_method_that_failed_shows_its_status():
+    late = replace(trained("odgs", 250, 900), status="timeout", scores={})
+    table = equal_time([trained("padgs", 100, 900), late], Request())
+    assert next(r for r in table.blocks[0].rows if r.title == "ODGS").cells[0].status == "timeout"
+
+
+def test_the_common_time_is_that_of_the_most_runs():
+    runs = [trained("padgs", seconds, 10 + seconds) for seconds in (20, 35, 61, 60, 57, 90)]
+    assert 57 <= round(common_seconds(runs)) <= 61 and common_seconds([]) == 0
+    assert is_near(runs[2], 60) and not is_near(runs[5], 60) and not is_near(failed("", "oom"), 60)
+    assert [r.timing["train_seconds"] for r in nearest_to(59.5, runs)] == [60.0]

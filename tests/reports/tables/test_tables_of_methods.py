@@ -1,0 +1,163 @@
+import csv
+import io
+from dataclasses import replace
+
+import pytest
+from made_up import data_set, failed, result
+
+from reports.request import Request
+from reports.tables import runs
+from reports.tables.table import MISSING, ReportError, Table
+from reports.tables.tables_of_methods import table1, table2, table4
+from reports.writers import csv_text, markdown
+
+COSTS = {  # what data_set has, and the paper: group, column -> value
+    ("training h", "training"): 1.0,
+    ("training h", "paper"): 1.66,
+    ("FPS", "FPS"): 25.0,
+    ("FPS", "paper"): 23.12,
+    ("", "ms"): 40.0,
+    ("", "Gaussians"): 100_000,
+    ("", "model"): 24.0,
+    ("", "peak"): 2.5,
+}
+
+
+def cells(table: Table) -> dict[tuple[str, str, str, str], dict[str, str]]:
+    """(block, row, group, column) -> the line of the CSV."""
+    lines = csv.DictReader(io.StringIO(csv_text.text(table)))
+    return {(line["block"], line["row"], line["group"], line["column"].partition(" ")[0]): line for line in lines}
+
+
+def block(text: str, title: str) -> list[list[str]]:
+    body = text.split(f"### {title}")[1].split("\n\n### ")[0]
+    lines = [line for line in body.splitlines() if line.startswith("|")][2:]
+    return [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
+
+
+def test_published_numbers_stand_beside_ours_with_the_difference():
+    text = markdown.text(table1([result("", psnr=23.5, ssim=0.81, lpips=0.229)], Request()))
+    padgs = block(text, "360Roam, bar")[-1]
+    assert padgs[:4] == ["PaD-GS", "0.810", "**0.808**", "+0.002"] and padgs[4:7] == ["23.50", "**23.40**", "+0.10"]
+    omnigs = next(row for row in block(text, "360Roam, bar") if row[0] == "OmniGS")
+    assert omnigs[:4] == ["OmniGS", MISSING, "<ins>0.783</ins>", MISSING]
+
+
+def test_a_failure_of_ours_and_of_the_paper_says_so():
+    bricks = failed("", "oom", dataset="ricoh360", scene="bricks")
+    rows = {row[0]: row for row in block(markdown.text(table2([bricks], Request())), "Ricoh360, bricks")}
+    assert rows["PaD-GS"][1] == "OOM" and rows["OP43DGS"][2] == "OOM"
+
+
+def test_the_average_of_all_scenes_is_theirs():
+    title = "360Roam, average over its 11 scenes"
+    average = cells(table1(data_set("roam360", seeds=2), Request()))
+    ours = average[title, "OmniGS", "PSNR", "PSNR"]
+    assert float(ours["value"]) == pytest.approx(20 + 5 + 0.05) and ours["n"] == "2"  # scenes 0..10, seeds 0, 1
+    assert float(ours["std"]) == pytest.approx(0.1 / 2**0.5)
+    assert average[title, "OmniGS", "PSNR", "paper"]["value"] == "24.84"
+    assert float(average[title, "OmniGS", "PSNR", "Δ"]["value"]) == pytest.approx(25.05 - 24.84)
+
+
+def test_the_average_of_an_incomplete_column_is_missing():
+    all_but_one = [r for r in data_set("roam360") if (r.scene, r.method) != ("lab", "omnigs")]
+    table = table1(all_but_one, Request())
+    rows = {row[0]: row for row in block(markdown.text(table), "360Roam, average")}
+    assert rows["OmniGS"][4] == MISSING and rows["PaD-GS"][4] == "25.50"
+    broken = [r if r.scene != "lab" else replace(r, status="oom", scores={}) for r in data_set("roam360")]
+    found = cells(table1(broken, Request()))
+    assert {found["360Roam, average over its 11 scenes", m, "PSNR", "PSNR"]["value"] for m in ("OmniGS", "PaD-GS")} == {
+        ""
+    }
+    op43dgs = next(r for r in block(markdown.text(table2([], Request())), "Ricoh360, average") if r[0] == "OP43DGS")
+    assert set(op43dgs[1:]) == {MISSING}
+
+
+def test_stand_ins_have_blocks_of_their_own_and_say_what_they_are():
+    room = result("", dataset="synthetic", scene="synthetic-room")
+    outdoor = replace(room, scene="synthetic-outdoor")
+    capture = replace(room, dataset="", scene="flat")
+    indoor, outdoors = (markdown.text(build([room, outdoor, capture], Request())) for build in (table1, table2))
+    assert "### synthetic-room (built in, generated; no scene of the paper)" in indoor
+    assert "### flat (a capture that is no scene of the paper)" in indoor
+    assert "synthetic-outdoor" in outdoors and "flat" not in outdoors and "synthetic-outdoor" not in indoor
+    assert "360Roam, not run: bar, base" in indoor
+
+
+def test_presets_of_a_method_are_rows_of_their_own():
+    runs = [result("", method="odgs", preset=preset) for preset in ("odgs", "odgs_release", "odgs_fast")]
+    rows = {row[0]: row for row in block(markdown.text(table1(runs, Request())), "360Roam, bar")}
+    assert rows["ODGS"][5].strip("*") == rows["ODGS, release"][5].strip("*") == "20.17"
+    assert rows["ODGS, fast"][5] == MISSING
+
+
+def test_only_runs_of_the_tables_own_experiments_compete_where_there_are_any():
+    own = result("", experiments=("table1_360roam@cpu", "tau@cpu"))
+    trial = result("", psnr=9.0, experiments=("smoke",), iterations=7)
+    other_tau = result("", psnr=8.0, experiments=("tau@cpu",), config={"method": {"tau": 0.5}})
+    for build in (table1, table4):
+        build([own, trial, other_tau], Request())
+    assert block(markdown.text(table1([own, trial, other_tau], Request())), "360Roam, bar")[-1][4] == "23.50"
+    with pytest.raises(ReportError, match="differ in iterations"):
+        table1([replace(r, experiments=()) for r in (own, trial)], Request())
+    assert block(markdown.text(table1([own, trial], Request(experiment="smoke"))), "360Roam, bar")[-1][4] == "9.00"
+
+
+def test_scenes_without_an_experiment_of_the_table_show_what_was_run_freely():
+    own = result("", experiments=("table1_360roam",))
+    room = [result("", dataset="", scene="room"), result("", dataset="", scene="room", psnr=9.0, experiments=("tau",))]
+    text = markdown.text(table1([own, *room], Request()))
+    assert block(text, "room (a capture")[0][2] == "23.50"
+
+
+def test_rows_of_an_ablation_are_not_methods():
+    assert "23.50" not in markdown.text(table1([result("full")], Request()))
+
+
+def test_efficiency_beside_the_published_hours_and_frames():
+    title = "Ricoh360, average over its 12 scenes"
+    found = cells(table4(data_set("ricoh360"), Request()))
+    values = {(group, column): float(found[title, "PaD-GS", group, column]["value"]) for group, column in COSTS}
+    assert values == COSTS
+
+
+def test_memory_of_a_gpu_has_a_column_where_a_run_was_on_one():
+    title = "Ricoh360, average over its 12 scenes"
+    on_gpu = [replace(r, peak_device_memory_bytes=7_250_000_000) for r in data_set("ricoh360")]
+    for build in (table4, runs.build):
+        assert "peak GPU GB" not in markdown.text(build(data_set("ricoh360"), Request()))
+        assert "peak GPU GB" in markdown.text(build(on_gpu, Request())) and "7.25" in markdown.text(
+            build(on_gpu, Request())
+        )
+    found = block(markdown.text(table4(on_gpu, Request())), title)
+    assert [cell.strip("*") for cell in found[-1][-2:]] == ["2.50", "7.25"]
+    assert "Memory of the GPU: peak of the tensors there" in markdown.text(table4(on_gpu, Request()))
+
+
+def test_times_of_two_machines_are_not_compared_unless_told():
+    here = data_set("roam360", methods=("padgs",))
+    there = [replace(r, method="omnigs", preset="omnigs", machine={**r.machine, "cores": 64}) for r in here]
+    table1([*here, *there], Request())
+    with pytest.raises(ReportError, match="differ in machine .*64 cores.*--mix"):
+        table4([*here, *there], Request())
+    table4([*here, *there], Request(mix=True))
+
+
+def test_scenes_of_a_data_set_scored_by_other_rules_are_not_averaged():
+    runs = data_set("roam360")
+    runs[3:] = [replace(r, width=512, height=256) for r in runs[3:]]
+    with pytest.raises(ReportError, match="differ in resolution"):
+        table1(runs, Request())
+
+
+def test_footnotes_say_who_is_published_with_more_iterations():
+    note = "EgoNeRF is published with 100000 iterations"
+    assert note in markdown.text(table1([result("", method="egonerf", preset="egonerf_small")], Request()))
+    assert note not in markdown.text(table1([result("", method="egonerf", iterations=100_000)], Request()))
+    assert note not in markdown.text(table1([result("")], Request()))
+
+
+def test_footnotes_say_how_and_where():
+    text = markdown.text(table4(data_set("roam360"), Request()))
+    for words in ("paper, LPIPS-vgg fed", "2048x1024", "30000 iterations", "0.1.0 abc", "2 cores of A & B", "RTX 3090"):
+        assert words in text

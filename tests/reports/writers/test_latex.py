@@ -1,0 +1,53 @@
+import shutil
+import subprocess
+
+import pytest
+from made_up import data_set, failed, result
+
+from reports.request import Request
+from reports.tables import table3
+from reports.tables.tables_of_methods import table1, table2, table4
+from reports.writers import latex
+
+ABLATION = [result("full"), failed("baseline", "oom")]
+
+
+@pytest.fixture
+def text() -> str:
+    return latex.text(table3.build(ABLATION, Request()))
+
+
+def test_every_line_of_the_tabular_has_all_columns(text):
+    body = text.split(r"\begin{tabular}{lrrrrrrrrr}")[1].split(r"\end{tabular}")[0]
+    rows = [line for line in body.splitlines() if line.strip().endswith(r"\\") and "multicolumn" not in line]
+    assert len(rows) == 1 + 4 + 4
+    assert all(row.replace(r"\&", "").count("&") == 9 for row in rows)
+
+
+def test_what_latex_would_misread_is_escaped(text):
+    assert r"A \& B\_1" in text and r"cat\_tower" in text
+    assert not {"±", "Δ", "↑", "–"} & set(text)
+
+
+def test_numbers_and_emphasis(text):
+    assert r"\textbf{0.808}" in text and r"\underline{0.804}" in text and "OOM" in text and "$+$0.10" in text
+
+
+def test_a_long_table_may_break_over_pages():
+    text = latex.text(table1(data_set("roam360"), Request()))
+    assert r"\begin{longtable}{lrrrrrrrrr}" in text and r"\endhead" in text and r"\begin{table}" not in text
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="no pdflatex here")
+def test_they_compile(tmp_path):
+    results = [*data_set("roam360"), *data_set("ricoh360", seeds=2)]
+    tables = [build(results, Request()) for build in (table1, table2, table4)]
+    body = "\n".join(latex.text(table) for table in (*tables, table3.build(ABLATION, Request())))
+    packages = r"\usepackage{booktabs, graphicx, longtable}"
+    document = rf"\documentclass{{article}}{packages}\begin{{document}}{body}\end{{document}}"
+    (tmp_path / "tables.tex").write_text(document)
+    command = ["pdflatex", "-halt-on-error", "-interaction=nonstopmode", "tables.tex"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-2000:]
+    assert "Undefined control sequence" not in done.stdout

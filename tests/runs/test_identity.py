@@ -1,0 +1,59 @@
+from dataclasses import replace
+
+import pytest
+from composed import composed
+
+from padgs.runs.identity import config_hash, run_id
+
+
+@pytest.fixture(autouse=True)
+def padgs_root(monkeypatch, root):
+    monkeypatch.setenv("PADGS_ROOT", str(root))
+
+
+def name(*overrides: str, scene: str = "room", fingerprint: str = "f00d") -> str:
+    return run_id(composed(*overrides).values(), scene, fingerprint)
+
+
+def test_it_reads_like_what_it_is():
+    assert name("+ablation=dagd").startswith("room_padgs_dagd_")
+    assert name().startswith("room_padgs_")
+    assert "/" not in name(scene="../house 3/ü")
+
+
+@pytest.mark.parametrize(
+    "same",
+    ["run.threads=1", "run.folder=elsewhere", "data.path=/mnt/x", "data.cache_bytes=1", "protocol=paper", "seed=0"],
+)
+def test_paths_machine_and_scoring_are_no_part_of_it(same):
+    assert name(same) == name()
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        "seed=1",
+        "method=omnigs",
+        "method.tau=0.5",
+        "train.iterations=7",
+        "render.wrap=false",
+        "data.width=64",
+        "variant=a",
+    ],
+)
+def test_whatever_changes_numbers_changes_it(other):
+    assert name(other) != name()
+
+
+def test_other_data_is_another_run():
+    assert name(fingerprint="f00d") != name(fingerprint="beef")
+
+
+def test_spelling_of_numbers_does_not_matter():
+    assert name("method.tau=1") == name("method.tau=1.0")
+    assert name("train.iterations=2000") == name("train.iterations=2e3")
+
+
+def test_the_hash_of_a_configuration_survives_its_file():
+    config = composed("method.tau=0.5")
+    assert config_hash(config.values()) == config_hash(replace(config).values())

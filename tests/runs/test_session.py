@@ -1,0 +1,269 @@
+import io
+import json
+import os
+import shutil
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from composed import composed
+from PIL import Image
+from rich.console import Console
+from tiny_scene import HEIGHT, WIDTH, tiny_scene
+
+from padgs import results
+from padgs.learning.method import Failure
+from padgs.runs import checkpoint, session, training
+from padgs.runs.checkpoint import CheckpointError
+from padgs.runs.folder import RunFolder, RunFolderError
+from padgs.runs.interrupt import Interrupted
+from padgs.runs.labels import Labels
+from padgs.runs.lock import RunBusy
+
+ITERATIONS = 12
+
+
+@pytest.fixture(autouse=True)
+def tiny(monkeypatch, root):
+    monkeypatch.setenv("PADGS_ROOT", str(root))
+    monkeypatch.setattr(session.data, "load", lambda path, format, options: tiny_scene())
+
+
+@pytest.fixture
+def config(tmp_path):
+    return composed(
+        f"run.folder={tmp_path}/runs",
+        f"train.iterations={ITERATIONS}",
+        "run.log_every=2",
+        "run.probe_every=5",
+        "protocol=paper",
+        "protocol.paper.lpips=none",
+        "render.backend=torch",
+    )
+
+
+def run(config) -> tuple[results.Result, str]:
+    out = io.StringIO()
+    return session.run(config, Console(file=out, width=200)), out.getvalue()
+
+
+def folder_of(config) -> RunFolder:
+    (path,) = Path(config.run.folder).iterdir()
+    return RunFolder(path)
+
+
+def test_a_run_leaves_all_its_files_and_says_where(config):
+    result, said = run(config)
+    folder = folder_of(config).path
+    assert sorted(p.name for p in folder.iterdir()) == [
+        ".lock",
+        "checkpoint",
+        "config.yaml",
+        "log.jsonl",
+        "renders",
+        "result.json",
+    ]
+    assert results.read(folder / "result.json") == result
+    assert result.status == "ok" and result.iterations_done == ITERATIONS
+    assert result.scores["paper"].metrics.keys() == {"psnr", "ssim"}
+    assert result.counts["anchors"] > 0 and result.model_bytes > 0 and result.timing["train_seconds"] > 0
+    assert result.peak_memory_bytes > 0 and result.peak_device_memory_bytes is None and "on the GPU" not in said
+    assert str(folder) in said and "PSNR" in said and "anchors" in said
+    assert [p.name for p in (folder / "renders").iterdir()] == ["05.png"]
+    with Image.open(folder / "renders" / "05.png") as picture:
+        assert picture.size == (3 * WIDTH, HEIGHT)
+
+
+def test_the_memory_of_the_device_that_trains_is_in_the_result(config, monkeypatch):
+    asked = []
+    peak = {"host": 3 * 10**9, "device": 2 * 10**9}
+    monkeypatch.setattr(session.clock, "peak_memory", lambda device: asked.append(device) or peak)
+    result, said = run(config)
+    assert asked == [torch.device("cpu")]  # where the scene is
+    assert (result.peak_memory_bytes, result.peak_device_memory_bytes) == (3 * 10**9, 2 * 10**9)
+    assert "peak memory 3.00 GB, 2.00 GB on the GPU" in said
+
+
+def test_the_log_has_losses_and_the_held_out_view(config):
+    run(config)
+    lines = [json.loads(line) for line in (folder_of(config).path / "log.jsonl").read_text().splitlines()]
+    assert [line["iteration"] for line in lines] == [2, 4, 5, 6, 8, 10, 12]
+    assert [line["iteration"] for line in lines if "psnr" in line] == [5, 10, 12]
+
+
+def test_a_finished_run_is_shown_and_not_repeated(config, monkeypatch):
+    first, _ = run(config)
+    monkeypatch.setattr(session, "train", lambda *_: pytest.fail("trained again"))
+    again, said = run(config)
+    assert again == first
+    assert "finished before" in said and f"{first.scores['paper'].metrics['psnr']:.2f}" in said
+
+
+def test_another_protocol_scores_the_finished_run_without_training(config, monkeypatch):
+    first, _ = run(config)
+    monkeypatch.setattr(session, "train", lambda *_: pytest.fail("trained again"))
+    sphere = composed("protocol=sphere", "protocol.sphere.lpips=none").protocols
+    both, _ = run(replace(config, protocols={**config.protocols, **sphere}))
+    assert both.scores["paper"] == first.scores["paper"]
+    assert both.scores["sphere"].metrics["psnr"] == first.scores["paper"].metrics["psnr"]
+    assert both.scores["sphere"].metrics["ws_psnr"] is not None
+
+
+def test_without_its_checkpoint_a_finished_run_is_not_scored_anew(config):
+    first, _ = run(config)
+    folder = folder_of(config)
+    log = (folder.path / "log.jsonl").read_bytes()
+    shutil.rmtree(folder.checkpoint)
+    sphere = composed("protocol=sphere", "protocol.sphere.lpips=none").protocols
+    with pytest.raises(RunFolderError, match="no checkpoint any more, .* other rules of sphere"):
+        run(replace(config, protocols={**config.protocols, **sphere}))
+    assert folder.result() == first and (folder.path / "log.jsonl").read_bytes() == log
+
+
+def stop_at(iteration: int, monkeypatch, how) -> None:
+    """Do `how` right after an iteration was shown."""
+    update = training.LiveLine.update
+
+    def stopping(self, record, psnr):
+        update(self, record, psnr)
+        if record.iteration == iteration:
+            how()
+
+    monkeypatch.setattr(training.LiveLine, "update", stopping)
+
+
+def test_ctrl_c_finishes_the_step_and_the_next_start_ends_bit_identically(config, monkeypatch, tmp_path):
+    undisturbed, _ = run(replace(config, run=replace(config.run, folder=str(tmp_path / "undisturbed"))))
+    with monkeypatch.context() as patch:
+        stop_at(7, patch, lambda: os.kill(os.getpid(), signal.SIGINT))
+        with pytest.raises(Interrupted, match="stopped after iteration 7"):
+            run(config)
+    assert checkpoint.load(folder_of(config).checkpoint).values["progress"]["iteration"] == 7
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    resumed, said = run(config)
+    assert "resuming after iteration 7" in said
+    assert resumed.scores == undisturbed.scores
+    same_checkpoint(config, replace(config, run=replace(config.run, folder=str(tmp_path / "undisturbed"))))
+
+
+def same_checkpoint(one, other) -> None:
+    mine, theirs = (checkpoint.load(folder_of(config).checkpoint) for config in (one, other))
+    assert mine.tensors.keys() == theirs.tensors.keys()
+    assert all(torch.equal(mine.tensors[name], theirs.tensors[name]) for name in mine.tensors)
+
+
+def test_a_crash_between_checkpoints_loses_only_what_came_after(config, monkeypatch, tmp_path):
+    config = replace(config, run=replace(config.run, checkpoint_every=5, log_every=1))
+
+    def crash():
+        raise ZeroDivisionError
+
+    with monkeypatch.context() as patch:
+        stop_at(9, patch, crash)
+        with pytest.raises(ZeroDivisionError):
+            run(config)
+    _, said = run(config)
+    assert "resuming after iteration 5" in said
+    lines = (folder_of(config).path / "log.jsonl").read_text().splitlines()
+    assert [json.loads(line)["iteration"] for line in lines] == list(range(1, ITERATIONS + 1))
+
+
+def test_a_damaged_checkpoint_is_named_and_nothing_is_started(config, monkeypatch):
+    with monkeypatch.context() as patch:
+        stop_at(7, patch, lambda: os.kill(os.getpid(), signal.SIGINT))
+        with pytest.raises(Interrupted):
+            run(config)
+    (tensors,) = folder_of(config).checkpoint.glob("*.safetensors")
+    tensors.write_bytes(tensors.read_bytes()[:-1])
+    monkeypatch.setattr(session, "train", lambda *_: pytest.fail("trained"))
+    with pytest.raises(CheckpointError, match=tensors.name):
+        run(config)
+    assert not (folder_of(config).path / "result.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [
+        (Failure("nan", "loss is nan at iteration 3"), "nan"),
+        (MemoryError("no more"), "oom"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory"), "oom"),
+        (ValueError("the point cloud is empty"), "rejected"),
+    ],
+)
+def test_a_failed_run_has_a_result_with_its_status(config, monkeypatch, error, status):
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr(session, "train", fail)
+    result, said = run(config)
+    assert (result.status, result.reason, result.scores) == (status, str(error), {})
+    assert status in said and str(error) in said
+    again, said = run(config)
+    assert again == result and "retry=failed" in said
+
+
+@pytest.mark.parametrize(("status", "starts_at"), [("nan", 0), ("timeout", 5)])
+def test_a_failed_run_is_retried_only_if_asked(config, monkeypatch, status, starts_at):
+    config = replace(config, run=replace(config.run, checkpoint_every=5))
+
+    def fail():
+        raise Failure(status, "for the test")
+
+    with monkeypatch.context() as patch:
+        stop_at(7, patch, fail)
+        failed, _ = run(config)
+    assert failed.status == status and run(config)[0] == failed
+    retried, said = run(replace(config, retry="failed"))
+    assert retried.status == "ok"
+    assert ("resuming after iteration 5" in said) == (starts_at == 5)  # what went wrong must not be gone on from
+    assert run(replace(config, retry="failed"))[0] == retried
+
+
+def test_a_run_that_another_process_works_on_is_left_alone(config):
+    first, _ = run(config)
+    folder = folder_of(config)
+    (folder.path / "result.json").unlink()
+    with folder.locked(), pytest.raises(RunBusy, match=f"worked on by process {os.getpid()} on .* since"):
+        run(config)
+    assert run(config)[0].scores == first.scores
+
+
+def test_a_finished_run_learns_which_other_experiments_want_it(config, monkeypatch):
+    first, _ = run(replace(config, labels=Labels("padgs", ("table1",))))
+    monkeypatch.setattr(session, "train", lambda *_: pytest.fail("trained again"))
+    again, _ = run(replace(config, labels=Labels("padgs", ("table4",))))
+    assert again.experiments == ("table1", "table4") and first.experiments == ("table1",)
+    assert replace(again, experiments=first.experiments) == first
+    assert results.read(folder_of(config).path / "result.json") == again
+
+
+def test_an_error_of_ours_is_no_result(config, monkeypatch):
+    def fail(*_):
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr(session, "train", fail)
+    with pytest.raises(RuntimeError, match="a bug"):
+        run(config)
+    assert not (folder_of(config).path / "result.json").exists()
+
+
+def test_time_running_out_is_a_status_and_the_model_is_scored(config):
+    result, _ = run(replace(config, train=replace(config.train, max_seconds=1e-9)))
+    assert result.status == "timeout" and result.iterations_done < ITERATIONS
+    assert result.scores["paper"].metrics["psnr"] is not None
+
+
+def test_a_run_folder_that_cannot_be_made_is_a_clear_error(config, tmp_path):
+    (tmp_path / "file").write_text("")
+    blocked = replace(config, run=replace(config.run, folder=str(tmp_path / "file")))
+    with pytest.raises(RunFolderError, match="cannot write run folder .*set run.folder"):
+        run(blocked)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full to stand in for a full disk")
+def test_a_full_disk_while_logging_is_a_clear_error(config, monkeypatch):
+    stop_at(1, monkeypatch, lambda: (folder_of(config).path / "log.jsonl").symlink_to("/dev/full"))
+    with pytest.raises(RunFolderError, match="No space left on device; make room"):
+        run(config)
