@@ -16,8 +16,7 @@ from padgs.bench.cost import add_floors, costs
 from padgs.bench.ratios import render_both_ways
 from padgs.bench.stages import STAGES, Iteration, StageClock, amortised
 from padgs.bench.workload import NEVER, OPTIONS, Size, Workload, build, sigma_quantiles
-from padgs.learning.method import Budget, Record
-from padgs.learning.views import Trainer
+from padgs.learning.loop import Budget, Record, Trainer
 from padgs.render import render
 
 MANY = 500_000  # Gaussians from which a few repeats must do

@@ -9,10 +9,10 @@ from typing import Any
 
 from baselines import METHODS
 from padgs.data.options import DataOptions
-from padgs.learning.method import Budget, RenderConfig
+from padgs.learning.loop import Budget, TrainOptions
 from padgs.learning.schedule import PUBLISHED_ITERATIONS
-from padgs.learning.views import TrainOptions
 from padgs.registry import lookup
+from padgs.render.config import RenderConfig
 from padgs.runs.device import DEVICES
 from padgs.runs.labels import Labels
 from padgs.runs.typed import ConfigError, typed

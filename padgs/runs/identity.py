@@ -10,6 +10,7 @@ from typing import Any
 
 NOT_PART = ("run", "protocol")  # what a machine decides; how the trained model is scored afterwards
 NOT_PART_OF_DATA = ("path", "cache_bytes", "read_ahead", "device")  # the fingerprint says what was read
+NOT_PART_OF_RENDER = ("max_instances",)  # memory
 HASH_DIGITS = 10
 
 
@@ -21,6 +22,7 @@ def config_hash(values: Mapping[str, Any]) -> str:
     """
     kept = {key: value for key, value in values.items() if key not in NOT_PART}
     kept["data"] = {key: value for key, value in kept["data"].items() if key not in NOT_PART_OF_DATA}
+    kept["render"] = {key: value for key, value in kept.get("render", {}).items() if key not in NOT_PART_OF_RENDER}
     return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()
 
 

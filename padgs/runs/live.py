@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from padgs.learning.method import Record
+from padgs.learning.loop import Record
 
 REDRAWS_PER_SECOND = 5
 SECONDS_BETWEEN_LINES = 10.0  # where there is no terminal

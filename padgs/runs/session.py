@@ -11,8 +11,8 @@ from rich.console import Console
 
 from baselines import METHODS
 from padgs import clock, data
-from padgs.learning.failure import is_out_of_memory
-from padgs.learning.method import Failure, Method
+from padgs.learning.failure import Failure, is_out_of_memory
+from padgs.learning.method import Method
 from padgs.registry import lookup
 from padgs.results import Result
 from padgs.runs import checkpoint

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 import torch
 from rich.console import Console
 
-from padgs.learning.method import Method, Record, State
+from padgs.learning.loop import Record
+from padgs.learning.method import Method
+from padgs.learning.trainee import State
 from padgs.runs import checkpoint
 from padgs.runs.config import RunConfig
 from padgs.runs.folder import RunFolder

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from padgs.clock import timed
-from padgs.learning.method import Failure
+from padgs.learning.failure import Failure
 from padgs.render import Rendering
 from padgs.scene import View
 from padgs.scoring.lpips import lpips, weighted_lpips

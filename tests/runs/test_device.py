@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from padgs.learning.method import RenderConfig
 from padgs.native import cuda as cuda_native
+from padgs.render.config import RenderConfig
 from padgs.runs.config import RunOptions
 from padgs.runs.device import chosen
 

@@ -14,7 +14,7 @@ from rich.console import Console
 from tiny_scene import HEIGHT, WIDTH, tiny_scene
 
 from padgs import results
-from padgs.learning.method import Failure
+from padgs.learning.failure import Failure
 from padgs.runs import checkpoint, session, training
 from padgs.runs.checkpoint import CheckpointError
 from padgs.runs.folder import RunFolder, RunFolderError

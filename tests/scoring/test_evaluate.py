@@ -5,7 +5,7 @@ import pytest
 import torch
 from PIL import Image
 
-from padgs.learning.method import Failure
+from padgs.learning.failure import Failure
 from padgs.render import Rendering
 from padgs.scene import View
 from padgs.scoring import evaluate as module

@@ -8,9 +8,10 @@ from tiny_scene import tiny_scene
 from torch import Tensor, nn
 
 from padgs.gaussians import Gaussians
-from padgs.learning.method import Budget, Failure, State
+from padgs.learning.failure import Failure
+from padgs.learning.loop import Budget, Trainer, TrainOptions
 from padgs.learning.schedule import Constant, LogLinear, ParameterGroup
-from padgs.learning.views import Drawing, Trainer, TrainOptions
+from padgs.learning.trainee import Drawing, State
 from padgs.render import Rendering
 from padgs.scene import View
 
@@ -161,11 +162,6 @@ def test_state_of_another_scene_is_refused():
     other = Trainer(Flat(), replace(scene, train=scene.train[:3]), Budget(5))
     with pytest.raises(ValueError, match="a run with 5 training views, but scene 'tiny' has 3"):
         other.load_state(state)
-
-
-def test_scene_without_training_views_is_refused():
-    with pytest.raises(ValueError, match="scene 'tiny' has no training view"):
-        Trainer(Flat(), replace(tiny_scene(), train=()), Budget(5))
 
 
 class Poisoned(Flat):

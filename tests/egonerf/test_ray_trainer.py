@@ -6,9 +6,11 @@ import torch
 from tiny_scene import tiny_scene
 from torch import Tensor, nn
 
-from padgs.learning.method import Budget, Failure, State
-from padgs.learning.rays import RayTrainer
+from padgs.egonerf.ray_trainer import RayTrainer
+from padgs.learning.failure import Failure
+from padgs.learning.loop import Budget, TrainOptions
 from padgs.learning.schedule import Constant, ParameterGroup
+from padgs.learning.trainee import State
 
 
 class Flat:
@@ -40,7 +42,8 @@ class Flat:
 
 
 def trainer(model: Flat, iterations: int = 400, **options) -> RayTrainer:
-    return RayTrainer(model, tiny_scene().train, Budget(iterations), **{"rays": 200, "seed": 3, **options})
+    weight = TrainOptions(weight=options.pop("weight", "uniform"))
+    return RayTrainer(model, tiny_scene(), Budget(iterations), weight, seed=3, rays=200)
 
 
 def test_the_mean_colour_is_learned():
@@ -59,7 +62,7 @@ def test_reading_the_images_is_training_time():
         return (views[0].image() * 255).round().to(torch.uint8)
 
     first = replace(views[0], load_pixels=slow)
-    run = RayTrainer(Flat(), (first, *views[1:]), Budget(10), rays=200, seed=3)
+    run = RayTrainer(Flat(), replace(tiny_scene(), train=(first, *views[1:])), Budget(10), seed=3, rays=200)
     reading = run.seconds
     assert reading >= 0.05 and next(run.records()).seconds > reading
 
@@ -67,7 +70,7 @@ def test_reading_the_images_is_training_time():
 def test_the_loss_is_the_squared_error_that_counts():
     model = Flat()
     run = trainer(model, weight="solid_angle")
-    rays = run._pixels.draw(200, torch.Generator().manual_seed(3))
+    rays = trainer(model, weight="solid_angle")._pixels.draw(200)
     error = ((0.2 - rays.color).square().mean(-1) * rays.weight).sum() / rays.weight.sum()
     assert next(run.records()).loss == pytest.approx(error.item(), rel=1e-5)
 
@@ -105,7 +108,7 @@ def test_resuming_changes_nothing(stop):
 
 def test_a_state_of_other_data_is_refused():
     state = trainer(Flat(), 5).state()
-    other = RayTrainer(Flat(), tiny_scene().train[:2], Budget(5), rays=10)
+    other = RayTrainer(Flat(), replace(tiny_scene(), train=tiny_scene().train[:2]), Budget(5), rays=10)
     with pytest.raises(ValueError, match="a run on 2560 pixels, but the training views have 1024"):
         other.load_state(state)
 
@@ -118,8 +121,3 @@ def test_what_is_not_finite_is_named():
     with pytest.raises(Failure, match=r"image\[0, 0\] is inf at iteration 1") as caught:
         list(trainer(Broken(), 5).records())
     assert caught.value.status == "nan"
-
-
-def test_a_scene_without_training_views_is_refused():
-    with pytest.raises(ValueError, match="no training view"):
-        RayTrainer(Flat(), (), Budget(5), rays=10)

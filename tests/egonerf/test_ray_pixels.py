@@ -4,7 +4,7 @@ import pytest
 import torch
 from tiny_scene import tiny_scene
 
-from padgs.learning.ray_pixels import RayPixels
+from padgs.egonerf.ray_pixels import RayPixels
 from padgs.scene import View
 from padgs.sphere.camera import Pinhole
 
@@ -38,8 +38,8 @@ def test_every_pixel_is_the_ray_of_its_own_view(views):
     assert len(pixels) == start
 
 
-def test_pixels_are_drawn_uniformly_over_all_views(views, generator):
-    rays = RayPixels(views).draw(50_000, generator)
+def test_pixels_are_drawn_uniformly_over_all_views(views):
+    rays = RayPixels(views).draw(50_000)
     in_photo = (rays.origins == views[2].center).all(-1).double().mean().item()
     assert in_photo == pytest.approx(48 / (48 + 2 * 512), abs=0.004)
     up = (rays.directions[:, 1] < -0.9).double().mean().item()
@@ -47,18 +47,18 @@ def test_pixels_are_drawn_uniformly_over_all_views(views, generator):
     assert torch.equal(rays.weight, torch.ones(50_000))
 
 
-def test_masked_pixels_are_never_drawn_and_others_weigh_as_the_mask_says(views, generator):
+def test_masked_pixels_are_never_drawn_and_others_weigh_as_the_mask_says(views):
     mask = torch.ones(16, 32)
     mask[:8], mask[8] = 0, 0.25
     pixels = RayPixels([masked(views[0], mask)])
     assert len(pixels) == 8 * 32
-    rays = pixels.draw(5000, generator)
+    rays = pixels.draw(5000)
     assert (rays.directions[:, 1] > 0).all(), "the upper half is masked"
     assert set(rays.weight.tolist()) == {0.25, 1.0}
 
 
-def test_rows_may_weigh_by_solid_angle(views, generator):
-    rays = RayPixels([views[0]], "solid_angle").draw(1000, generator)
+def test_rows_may_weigh_by_solid_angle(views):
+    rays = RayPixels([views[0]], "solid_angle").draw(1000)
     assert torch.allclose(rays.weight, rays.directions[:, [0, 2]].norm(dim=-1), atol=1e-5)
 
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from padgs.learning.targets import image_of, weight_of
+from padgs.learning.trainee import State
 from padgs.scene import View
 from padgs.sphere.camera import Camera
 
@@ -24,9 +25,15 @@ class Rays:
 
 
 class RayPixels:
-    """The pixels of some views that their masks let through; 7 bytes for each, 11 where their weights differ."""
+    """The pixels of some views that their masks let through; 7 bytes for each, 11 where their weights differ.
 
-    def __init__(self, views: Sequence[View], weight: str = "uniform", device: torch.device | str = "cpu") -> None:
+    Attributes:
+        generator: decides which are drawn, and what else is random about an iteration.
+    """
+
+    def __init__(
+        self, views: Sequence[View], weight: str = "uniform", device: torch.device | str = "cpu", seed: int = 0
+    ) -> None:
         """Load every view once; `weight` is a name of `padgs.learning.loss.ROW_WEIGHTS`.
 
         Raises:
@@ -52,15 +59,16 @@ class RayPixels:
         self._starts = torch.tensor(starts, device=device)
         self._ends = torch.tensor([len(place) for place in places], device=device).cumsum(0)
         self._centers = torch.stack([view.center.double() for view in views]).to(device)
+        self.generator = torch.Generator().manual_seed(seed)
         self._rotations = torch.stack([view.cam_from_world[:3, :3] for view in views]).to(self._directions)
 
     def __len__(self) -> int:
         """Number of pixels that can be drawn."""
         return len(self._colors)
 
-    def draw(self, count: int, generator: torch.Generator) -> Rays:
+    def draw(self, count: int) -> Rays:
         """`count` rays through the centres of random pixels, each equally likely, with replacement."""
-        return self.at(torch.randint(len(self), (count,), generator=generator).to(self._colors.device))
+        return self.at(torch.randint(len(self), (count,), generator=self.generator).to(self._colors.device))
 
     def at(self, indices: Tensor) -> Rays:
         """The rays through pixels [B], counted view by view and row by row."""
@@ -69,3 +77,20 @@ class RayPixels:
         directions = torch.einsum("bc,bcw->bw", in_camera, self._rotations[view])
         weight = torch.ones_like(directions[:, 0]) if self._weights is None else self._weights[indices]
         return Rays(self._centers[view], directions, self._colors[indices].to(directions) / 255, weight)
+
+    def state(self) -> State:
+        """What decides the rays to come."""
+        return State({"random/rays": self.generator.get_state()}, {"pixels": len(self)})
+
+    def load(self, state: State) -> None:
+        """Take that back out of a whole state.
+
+        Raises:
+            ValueError: it is of a run on other pixels.
+        """
+        if state.values["pixels"] != len(self):
+            raise ValueError(
+                f"the state is of a run on {state.values['pixels']} pixels, but the training views have {len(self)}; "
+                "resume with the data it was trained on"
+            )
+        self.generator.set_state(state.tensors["random/rays"].cpu())
