@@ -59,9 +59,9 @@ def test_a_point_on_the_chart_becomes_a_circle_of_pixels_or_of_angle(latitude: f
     for kind in ("pixels", "angular"):
         footprints = project(point, identity_pose(), camera, options_of("erp", kind))
         assert isinstance(footprints, PlanarFootprints)
-        a, b, c = footprints.conics[0].tolist()
+        a, b, c = footprints.whitening[0].tolist()
         assert abs(b) < 1e-9
-        widths[kind] = 1 / a, 1 / c
+        widths[kind] = 1 / a**2, 1 / c**2
         assert torch.equal(footprints.opacities, point.opacities)
     assert widths["pixels"] == pytest.approx((VARIANCE, VARIANCE))
     assert widths["angular"] == pytest.approx((VARIANCE / math.cos(latitude) ** 2, VARIANCE))
