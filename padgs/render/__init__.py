@@ -79,10 +79,9 @@ def resolve_backend(backend: str, means: Tensor) -> str:
     """The backend that `auto` stands for, given the tensors to draw; other names are returned as they are."""
     if backend != "auto":
         return backend
-    from padgs.native import cuda as cuda_native
-    from padgs.native import library as native
+    from padgs.native import LIBRARIES
 
-    library = {"cpu": native, "cuda": cuda_native}.get(means.device.type)
+    library = LIBRARIES.get(means.device.type)
     if library is None or means.dtype != torch.float32:
         return "torch"
     if library.available():
@@ -93,10 +92,9 @@ def resolve_backend(backend: str, means: Tensor) -> str:
 
 @cache  # once in a process, whatever the filters of the warnings module say
 def _say_that_native_is_missing(backend: str) -> None:
-    from padgs.native import cuda as cuda_native
-    from padgs.native import library as native
+    from padgs.native import LIBRARIES
 
     try:
-        {"cpu": native, "cuda": cuda_native}[backend].library()
+        LIBRARIES[backend].library()
     except OSError as error:
         warnings.warn(f"rendering with backend torch, many times slower than {backend}: {error}", stacklevel=4)

@@ -8,7 +8,7 @@ from tiny_scene import tiny_scene
 from baselines import METHODS
 from baselines.omnigs import OmniGSMethod
 from padgs.learning.method import Budget, Failure, RenderConfig, State
-from padgs.native import library as native
+from padgs.native import cpu
 from padgs.registry import lookup
 from padgs.runs import checkpoint
 from padgs.scene import Scene, View
@@ -91,7 +91,7 @@ def test_killed_and_resumed_is_bit_identical(scene, finished, tmp_path, stop):
     assert_same_but_time(second.state(), finished)
 
 
-@pytest.mark.skipif(not native.available(), reason="the native library is not built")
+@pytest.mark.skipif(not cpu.available(), reason="the native library is not built")
 def test_killed_and_resumed_is_bit_identical_on_the_native_backend(scene):
     whole, first, second = (method(backend="cpu") for _ in range(3))
     for _ in whole.fit(scene, Budget(ITERATIONS)):

@@ -12,7 +12,8 @@ from render_cases import INPUTS, identity_pose, leaves, mixture, needs_native, r
 
 from padgs.gaussians import Gaussians
 from padgs.learning.method import RenderConfig
-from padgs.native import library as native
+from padgs.native import cpu
+from padgs.native.abi import NativeCamera
 from padgs.render import RenderOptions, render
 from padgs.render.contract import ALPHA_MIN, LOW_PASS_KINDS, PUBLISHED_FOCAL
 from padgs.render.planar import PlanarFootprints
@@ -225,8 +226,8 @@ def test_it_is_a_setting_of_a_run():
 @needs_native
 def test_a_library_of_another_version_is_refused(monkeypatch):
     class Grown(ctypes.Structure):
-        _fields_ = [*native.Camera._fields_, ("more", ctypes.c_int32)]
+        _fields_ = [*NativeCamera._fields_, ("more", ctypes.c_int32)]
 
-    monkeypatch.setattr(native, "STRUCTURES", (Grown, *native.STRUCTURES[1:]))
+    monkeypatch.setattr(cpu, "STRUCTURES", (Grown, *cpu.STRUCTURES[1:]))
     with pytest.raises(OSError, match="libpadgs_cpu.* is of another version, with another Grown; build it again"):
-        native.library.__wrapped__()
+        cpu.library.__wrapped__()

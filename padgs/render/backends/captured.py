@@ -15,10 +15,9 @@ import torch
 from torch import Tensor
 
 from padgs.gaussians import Gaussians
-from padgs.native import library as native
-from padgs.native.library import pointer
+from padgs.native.abi import Inputs, pointer
 from padgs.render.backends import cuda as cuda_backend
-from padgs.render.backends.cuda_tiles import MAX_INSTANCES, Projected
+from padgs.render.backends.cuda_tiles import MAX_INSTANCES, DeviceProjected
 from padgs.render.backends.native_camera import native_camera, native_rays
 from padgs.render.contract import Rendering, RenderOptions, check_inputs
 from padgs.render.published_bounds import check_memory
@@ -36,7 +35,7 @@ class Frame:
     depth: Tensor  # [H, W]
     visible: Tensor  # [N]
     pairs: Tensor  # [2]
-    projected: Projected  # kernels of the graph point to its tensors
+    projected: DeviceProjected  # kernels of the graph point to its tensors
 
 
 class CapturedRender:
@@ -130,12 +129,12 @@ class CapturedRender:
             )
         return min(self._most, int(HEADROOM * instances) + 1)
 
-    def _projected(self, gaussians: Gaussians, *, room: int) -> Projected:
+    def _projected(self, gaussians: Gaussians, *, room: int) -> DeviceProjected:
         named = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors)
         tensors = [tensor.contiguous() for tensor in named]  # which must outlive the call
         pose = self._view.cam_from_world.to(torch.float32)
-        inputs = native.Inputs(len(gaussians), *map(pointer, tensors), None)
-        return Projected(self._camera, pose, inputs, self._options.max_instances, room=room)
+        inputs = Inputs(len(gaussians), *map(pointer, tensors), None)
+        return DeviceProjected(self._camera, pose, inputs, self._options.max_instances, room=room)
 
     def _record(self) -> Frame:
         """All the work of a frame; nothing here waits for the device."""

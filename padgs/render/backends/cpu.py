@@ -15,8 +15,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from padgs.gaussians import Gaussians
-from padgs.native import library as native
-from padgs.native.library import pointer
+from padgs.native import cpu
+from padgs.native.abi import BlendArguments, BlendGradientArguments, Gradients, Inputs, pointer
 from padgs.render.backends.native_camera import native_camera, native_rays
 from padgs.render.contract import Rendering, RenderOptions
 from padgs.render.published_bounds import check_memory
@@ -87,11 +87,11 @@ class _Cores:
     start: Tensor  # [tiles + 1] int64
 
     @staticmethod
-    def of(strip: Strip, arguments: native.BlendArguments) -> _Cores:
-        words = native.library().padgs_core_words(ctypes.byref(arguments))
+    def of(strip: Strip, arguments: BlendArguments) -> _Cores:
+        words = cpu.library().padgs_core_words(ctypes.byref(arguments))
         return _Cores(torch.empty(words, dtype=torch.int32), torch.zeros(strip.tiles + 1, dtype=torch.int64))
 
-    def join(self, arguments: native.BlendArguments) -> None:
+    def join(self, arguments: BlendArguments) -> None:
         arguments.cores, arguments.core_start = pointer(self.words), pointer(self.start)
 
 
@@ -116,7 +116,7 @@ class _Rasterize(torch.autograd.Function):
     ):
         tensors = [t.detach().contiguous() for t in (means, quats, scales, opacities, colors)]
         probe = None if probe is None else probe.detach().contiguous()
-        inputs = native.Inputs(len(means), *map(pointer, tensors), pointer(probe))
+        inputs = Inputs(len(means), *map(pointer, tensors), pointer(probe))
         native_cam = native_camera(cam_from_world, camera, options)
         projected = Projected(native_cam, inputs, options.max_instances)
         check_memory(projected.instances, options)
@@ -131,7 +131,7 @@ class _Rasterize(torch.autograd.Function):
             if kept:
                 ctx.cores.append(_Cores.of(strip, arguments))
                 ctx.cores[-1].join(arguments)
-            native.library().padgs_blend_forward(ctypes.byref(arguments))
+            cpu.library().padgs_blend_forward(ctypes.byref(arguments))
             pairs += pair_counts.sum(0)
         visible = projected.boxes[:, 3] < projected.boxes[:, 4]
         counters.update(
@@ -166,20 +166,20 @@ class _Rasterize(torch.autograd.Function):
             if ctx.cores:
                 ctx.cores[number].join(forward)
             moments = torch.empty(len(strip.instances), MOMENTS)
-            arguments = native.BlendGradientArguments(
+            arguments = BlendGradientArguments(
                 forward, *map(pointer, upstream), pointer(moments), pointer(grad_rays), needs_absolute
             )
-            native.library().padgs_blend_backward(ctypes.byref(arguments))
-            native.library().padgs_sum_moments(pointer(moments), pointer(strip.slot_start), count, pointer(totals))
+            cpu.library().padgs_blend_backward(ctypes.byref(arguments))
+            cpu.library().padgs_sum_moments(pointer(moments), pointer(strip.slot_start), count, pointer(totals))
         outputs = [torch.empty_like(t) for t in tensors]
         probe = None if ctx.probe is None else torch.empty_like(ctx.probe)
         pose = torch.zeros(12, dtype=torch.float64) if needs_pose else None
-        inputs = native.Inputs(count, *map(pointer, tensors), pointer(ctx.probe))
-        native.library().padgs_project_backward(
+        inputs = Inputs(count, *map(pointer, tensors), pointer(ctx.probe))
+        cpu.library().padgs_project_backward(
             ctypes.byref(ctx.native_cam),
             ctypes.byref(inputs),
             pointer(totals),
-            ctypes.byref(native.Gradients(*map(pointer, outputs), pointer(probe), pointer(pose))),
+            ctypes.byref(Gradients(*map(pointer, outputs), pointer(probe), pointer(pose))),
         )
         grad_pose = grad_background = grad_table = None
         if pose is not None:
@@ -193,13 +193,11 @@ class _Rasterize(torch.autograd.Function):
         return *outputs, probe, absolute, grad_pose, grad_background, grad_table, None, None, None, None
 
 
-def _blend_arguments(
-    camera, options, projected, strip, rays, background, buffers, pair_counts
-) -> native.BlendArguments:
+def _blend_arguments(camera, options, projected, strip, rays, background, buffers, pair_counts) -> BlendArguments:
     """Arguments of both blending passes; the tensors must outlive the call."""
     lists = (projected.footprints, strip.tile_start, strip.instances, background)
     outputs = (buffers.image, buffers.transmittance, buffers.depth, buffers.last, pair_counts)
     core_size = options.core_size if options.blending == "hybrid" else 0
-    return native.BlendArguments(
+    return BlendArguments(
         strip.grid, camera.projection, camera.wrap, core_size, rays.native(), *map(pointer, (*lists, *outputs))
     )

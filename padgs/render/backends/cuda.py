@@ -15,10 +15,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from padgs.gaussians import Gaussians
-from padgs.native import cuda as cuda_native
-from padgs.native import library as native
-from padgs.native.library import pointer
-from padgs.render.backends.cuda_tiles import Projected, Strip
+from padgs.native import cuda
+from padgs.native.abi import Gradients, Inputs, pointer
+from padgs.render.backends.cuda_tiles import DeviceProjected, DeviceStrip
 from padgs.render.backends.native_camera import NativeRays, native_camera, native_rays
 from padgs.render.contract import Rendering, RenderOptions
 from padgs.render.published_bounds import check_memory
@@ -72,7 +71,7 @@ def check(means: Tensor) -> None:
     Raises:
         ValueError, OSError: as `rasterize` does.
     """
-    if means.dtype != torch.float32 or means.device.type != cuda_native.device_type():
+    if means.dtype != torch.float32 or means.device.type != cuda.device_type():
         missing = "" if torch.cuda.is_available() else " (torch finds no GPU with a driver here)"
         raise ValueError(
             f"backend cuda takes float32 tensors on a GPU, got {means.dtype} on {means.device}{missing}; convert them, "
@@ -163,8 +162,8 @@ class _Rasterize(torch.autograd.Function):
         tensors = [t.detach().contiguous() for t in (means, quats, scales, opacities, colors)]
         probe = None if probe is None else probe.detach().contiguous()
         pose, background = cam_from_world.detach().contiguous(), background.detach().contiguous()
-        inputs = native.Inputs(count, *map(pointer, tensors), pointer(probe))
-        projected = Projected(native_camera(IDENTITY, camera, options), pose, inputs, options.max_instances)
+        inputs = Inputs(count, *map(pointer, tensors), pointer(probe))
+        projected = DeviceProjected(native_camera(IDENTITY, camera, options), pose, inputs, options.max_instances)
         check_memory(projected.instances, options)
         rays = native_rays(camera, device)
         outputs = Outputs.of(camera, options, device, differentiated=grad_enabled and any(ctx.needs_input_grad))
@@ -192,16 +191,16 @@ class _Rasterize(torch.autograd.Function):
         count, device = len(tensors[0]), image.device
         gradients = [torch.empty_like(t) for t in tensors]
         probe = None if ctx.probe is None else torch.empty_like(ctx.probe)
-        blocks = cuda_native.library().padgs_cuda_pose_blocks(count)
+        blocks = cuda.library().padgs_cuda_pose_blocks(count)
         poses = torch.empty(blocks, 12, dtype=torch.float64, device=device) if needs_pose else None
-        arguments = cuda_native.ProjectGradientArguments(
+        arguments = cuda.ProjectGradientArguments(
             projected.camera,
             pointer(cam_from_world.contiguous()),
-            native.Inputs(count, *map(pointer, tensors), pointer(ctx.probe)),
+            Inputs(count, *map(pointer, tensors), pointer(ctx.probe)),
             pointer(totals),
-            native.Gradients(*map(pointer, gradients), pointer(probe), pointer(poses)),
+            Gradients(*map(pointer, gradients), pointer(probe), pointer(poses)),
         )
-        cuda_native.call("padgs_cuda_project_backward", projected.queue, arguments)
+        cuda.call("padgs_cuda_project_backward", projected.queue, arguments)
         grad_pose = grad_background = grad_table = None
         if poses is not None:
             grad_pose = torch.zeros_like(cam_from_world)
@@ -214,19 +213,19 @@ class _Rasterize(torch.autograd.Function):
         return *gradients, probe, absolute, grad_pose, grad_background, grad_table, None, None, None, None
 
 
-def blend(projected: Projected, rays: NativeRays, background: Tensor, outputs: Outputs) -> Tensor:
+def blend(projected: DeviceProjected, rays: NativeRays, background: Tensor, outputs: Outputs) -> Tensor:
     """Fill the outputs; returns how many pairs were evaluated, and how many contributed, [2] int64."""
     pairs = torch.zeros(2, dtype=torch.int64, device=background.device)
     for strip in projected.strips():
         pair_counts = torch.empty(strip.chunks, 2, dtype=torch.int32, device=background.device)
         arguments = _blend_inputs(projected, strip, rays, background, outputs, pair_counts)
-        cuda_native.call("padgs_cuda_blend", projected.queue, arguments)
+        cuda.call("padgs_cuda_blend", projected.queue, arguments)
         pairs += pair_counts.sum(0)
     return pairs
 
 
 def _moments(
-    projected: Projected,
+    projected: DeviceProjected,
     rays: Any,
     background: Tensor,
     outputs: Outputs,
@@ -245,7 +244,7 @@ def _moments(
         states = None if hybrid else projected.states(strip)
         furthest = None if hybrid else torch.empty(strip.chunks, dtype=torch.int32, device=device)
         moments = torch.empty(strip.instances, MOMENTS, device=device)
-        arguments = cuda_native.BlendGradientInputs(
+        arguments = cuda.BlendGradientInputs(
             _blend_inputs(projected, strip, rays, background, outputs, None),
             *map(pointer, upstream),
             *map(pointer, (packed, states, furthest, core_gradients, tail_gradients)),
@@ -255,18 +254,18 @@ def _moments(
             pointer(totals),
             absolute,
         )
-        cuda_native.call("padgs_cuda_blend_backward", projected.queue, arguments, strip.tiles)
+        cuda.call("padgs_cuda_blend_backward", projected.queue, arguments, strip.tiles)
     return totals
 
 
 def _blend_inputs(
-    projected: Projected, strip: Strip, rays: Any, background: Tensor, outputs: Outputs, pair_counts
-) -> cuda_native.BlendInputs:
+    projected: DeviceProjected, strip: DeviceStrip, rays: Any, background: Tensor, outputs: Outputs, pair_counts
+) -> cuda.BlendInputs:
     """Arguments of both directions; the tensors must outlive the call."""
     camera = projected.camera
     lists = (projected.footprints, strip.tile_start, strip.slots, strip.reaches, background)
     written = (outputs.image, outputs.transmittance, outputs.depth, outputs.last, outputs.core, outputs.tails)
-    return cuda_native.BlendInputs(
+    return cuda.BlendInputs(
         strip.table,
         camera.projection,
         camera.wrap,

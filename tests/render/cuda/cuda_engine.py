@@ -17,24 +17,23 @@ from pathlib import Path
 import pytest
 import torch
 
-from padgs.native import cuda as cuda_native
-from padgs.native import library as native
+from padgs.native import cuda, loading
 from padgs.render import BACKENDS, Rendering
 from padgs.render.backends import cuda as cuda_backend
 from padgs.sphere.camera import RayTable
 
 HERE = Path(__file__).parent
-SOURCES = Path(cuda_native.__file__).parent / "csrc" / "cuda"
+SOURCES = Path(cuda.__file__).parent / "csrc" / "cuda"
 COMPILER = shutil.which("c++") or shutil.which("g++")
-ON_GPU = torch.cuda.is_available() and cuda_native.available()
-real_library = cuda_native.library
+ON_GPU = torch.cuda.is_available() and cuda.available()
+real_library = cuda.library
 
 
 @functools.cache
 def emulated_library() -> ctypes.CDLL:
     """The kernels compiled for the host; seconds, once in a process."""
     loaded = compiled("padgs_cuda", sorted(SOURCES.glob("*.cu")))
-    return native.declared(loaded, cuda_native.SIGNATURES, "padgs_cuda_structure_bytes", cuda_native.STRUCTURES)
+    return loading.declared(loaded, cuda.SIGNATURES, "padgs_cuda_structure_bytes", cuda.STRUCTURES)
 
 
 @functools.cache
@@ -70,7 +69,7 @@ def rasterize_on_gpu(gaussians, cam_from_world, camera, options, background, pro
 if ON_GPU:
     BACKENDS["cuda"] = "cuda_engine:rasterize_on_gpu"
 else:
-    cuda_native.library = emulated_library
+    cuda.library = emulated_library
 
 
 needs_engine = pytest.mark.skipif(not ON_GPU and COMPILER is None, reason="no GPU, and no C++ compiler to emulate one")
