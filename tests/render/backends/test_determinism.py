@@ -123,7 +123,7 @@ print(cpu.library().padgs_isa().decode(), end="")
 def on_instruction_set(isa: str, file: Path) -> tuple[str, dict[str, dict[str, Tensor]]]:
     """All results with PADGS_ISA set, and the instruction set that was really used."""
     folder = Path(__file__).parent
-    places = (folder.parents[2], folder.parent, folder, os.environ.get("PYTHONPATH"))
+    places = (folder.parents[2], folder.parent, folder.parent / "cuda", folder, os.environ.get("PYTHONPATH"))
     search_path = os.pathsep.join(str(place) for place in places if place)
     done = subprocess.run(
         [sys.executable, "-c", IN_ANOTHER_PROCESS, str(file)],
