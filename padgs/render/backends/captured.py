@@ -19,7 +19,7 @@ from padgs.native.abi import Inputs, pointer
 from padgs.render.backends import cuda as cuda_backend
 from padgs.render.backends.cuda_tiles import MAX_INSTANCES, DeviceProjected
 from padgs.render.backends.native_camera import native_camera, native_rays
-from padgs.render.contract import Rendering, RenderOptions, check_inputs
+from padgs.render.contract import Rendering, RenderOptions, Request, check_inputs
 from padgs.render.published_bounds import check_memory
 from padgs.scene import View
 
@@ -88,7 +88,7 @@ class CapturedRender:
             self._background = means.new_zeros(3) if background is None else background
             self._view = view.at(view.cam_from_world.to(means.device, copy=True).contiguous())
             pose = self._view.cam_from_world.to(means.dtype)
-            check_inputs(gaussians, pose, view.camera, options, self._background, None, check_values=False)
+            check_inputs(Request(gaussians, pose, view.camera, options, self._background), check_values=False)
             self._camera = native_camera(cuda_backend.IDENTITY, view.camera, options)
             self._rays = native_rays(view.camera, means.device)
             self.room = room or self._room_for(self._projected(gaussians, room=0).instances)
@@ -114,9 +114,8 @@ class CapturedRender:
                 break
             self.room = self._room_for(sum(per_row))
             self._replay = frame = None  # gives their memory back before more is taken
-        counters = cuda_backend.Counters()
-        gaussians = len(frame.visible)
-        counters.record(frame.pairs.clone(), gaussians=gaussians, visible=visible, instances=sum(per_row))
+        known = {"gaussians": len(frame.visible), "visible": visible, "instances": sum(per_row)}
+        counters = cuda_backend.Counters(frame.pairs.clone(), **known)
         image, transmittance, depth = frame.image.clone(), frame.transmittance.clone(), frame.depth.clone()
         return Rendering(image, transmittance, depth, frame.visible.clone(), counters)
 

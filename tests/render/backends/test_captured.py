@@ -19,6 +19,7 @@ from padgs.render.backends import cuda as cuda_backend
 from padgs.render.backends.captured import CapturedRender
 from padgs.render.backends.cuda_tiles import DeviceProjected, DeviceStrip, tile_rows
 from padgs.render.backends.native_camera import native_camera
+from padgs.render.contract import Request
 from padgs.scene import View
 
 pytestmark = [*cuda_engine.marks()]
@@ -57,7 +58,7 @@ def scene_of(generator: torch.Generator, count: int = 40) -> Gaussians:
 def ordinary(gaussians: Gaussians, view: View, options: RenderOptions) -> Rendering:
     background = torch.zeros(3, device=DEVICE)
     pose = view.cam_from_world.to(DEVICE, torch.float32)
-    return cuda_backend.rasterize(gaussians, pose, view.camera, options, background)
+    return cuda_backend.rasterize(Request(gaussians, pose, view.camera, options, background))
 
 
 def assert_same(actual: Rendering, expected: Rendering) -> None:

@@ -11,15 +11,17 @@ import functools
 import shutil
 import subprocess
 import tempfile
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
+from padgs.gaussians import Gaussians
 from padgs.native import cuda, loading
 from padgs.render import BACKENDS, Rendering
 from padgs.render.backends import cuda as cuda_backend
+from padgs.render.contract import Request
 from padgs.sphere.camera import RayTable
 
 HERE = Path(__file__).parent
@@ -55,13 +57,14 @@ def compiled(name: str, sources: list[Path]) -> ctypes.CDLL:
     return ctypes.CDLL(str(target))
 
 
-def rasterize_on_gpu(gaussians, cam_from_world, camera, options, background, probe=None) -> Rendering:
+def rasterize_on_gpu(request: Request) -> Rendering:
     """`cuda_backend.rasterize` for tensors on the CPU; gradients find their way back."""
-    gaussians = type(gaussians)(**{field.name: getattr(gaussians, field.name).cuda() for field in fields(gaussians)})
+    tensors = {name: value.cuda() for name, value in vars(request).items() if isinstance(value, torch.Tensor)}
+    gaussians = Gaussians(**{name: value.cuda() for name, value in vars(request.gaussians).items()})
+    camera = request.camera
     if isinstance(camera, RayTable):
         camera = RayTable(camera.table.cuda(), camera.focal)
-    probe = None if probe is None else probe.cuda()
-    drawn = cuda_backend.rasterize(gaussians, cam_from_world.cuda(), camera, options, background.cuda(), probe)
+    drawn = cuda_backend.rasterize(replace(request, gaussians=gaussians, camera=camera, **tensors))
     tensors = {name: getattr(drawn, name).cpu() for name in ("image", "transmittance", "depth", "visible")}
     return replace(drawn, **tensors)
 
