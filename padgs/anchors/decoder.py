@@ -17,7 +17,7 @@ from padgs.anchors.gpu_decoder import decode_on_gpu
 from padgs.anchors.native_decoder import fits, fused_decode
 from padgs.anchors.precision import linear, reduced
 from padgs.gaussians import Gaussians
-from padgs.native import cuda as cuda_native
+from padgs.native import cuda
 
 OPACITY_VALUES, COLOR_VALUES, COVARIANCE_VALUES = 1, 3, 7  # outputs of each head per Gaussian
 SORT_OUT_BELOW = 0.9  # share of anchors with a positive opacity
@@ -146,7 +146,7 @@ def decode_padded(
         ValueError: tensors that are not float32 on a GPU, or an unknown precision.
         OSError: the GPU's library was not built.
     """
-    if features.dtype != torch.float32 or features.device.type != cuda_native.device_type():
+    if features.dtype != torch.float32 or features.device.type != cuda.device_type():
         raise ValueError(
             f"only a GPU decodes without counting, and float32; got {features.dtype} on {features.device}. Convert "
             "them, or use decode_gaussians"

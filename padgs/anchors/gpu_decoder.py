@@ -14,9 +14,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from padgs.anchors.precision import OF_GRADIENTS
-from padgs.native import cuda as cuda_native
-from padgs.native import library as native
-from padgs.native.library import pointer
+from padgs.native import cuda
+from padgs.native.abi import DecodeArguments, DecodeGradientArguments, HeadWeights, pointer
 
 SIZES = (3, 4, 3, 0, 3)  # values per Gaussian of means, quats, scales, opacities, colors; 0 = a scalar
 
@@ -51,10 +50,10 @@ class _DecodeOnGPU(torch.autograd.Function):
         count, new = (raw.numel(), Tensor.new_zeros) if padded else (int(starts[-1]), Tensor.new_empty)
         slots = new(starts, (count,))
         outputs = [new(raw, (count, size) if size else (count,)) for size in SIZES]
-        arguments = cuda_native.DeviceDecodeArguments(
+        arguments = cuda.DeviceDecodeArguments(
             _arguments(constants, raw, starts, slots, outputs), pointer(color), pointer(covariance)
         )
-        cuda_native.call("padgs_cuda_decode_place", cuda_native.queue(raw.device), arguments)
+        cuda.call("padgs_cuda_decode_place", cuda.queue(raw.device), arguments)
         ctx.save_for_backward(inputs, w1, hidden, *weights, *constants, raw, starts, slots, *outputs)
         ctx.features = features.shape[1]
         ctx.mark_non_differentiable(slots, raw)
@@ -70,7 +69,7 @@ class _DecodeOnGPU(torch.autograd.Function):
         grad_offsets, grad_log_scales = torch.empty_like(offsets), torch.empty_like(log_scales)
         anchors, per_anchor = raw.shape
         grad_logits = [raw.new_empty(anchors, values * per_anchor) for values in (1, 3, 7)]
-        gradient = native.DecodeGradientArguments(
+        gradient = DecodeGradientArguments(
             _arguments(constants, raw, starts, slots, outputs),
             *map(pointer, upstream),
             ctx.features,
@@ -79,8 +78,8 @@ class _DecodeOnGPU(torch.autograd.Function):
             pointer(grad_log_scales),
             None,
         )
-        arguments = cuda_native.DeviceDecodeGradientArguments(gradient, *map(pointer, grad_logits))
-        cuda_native.call("padgs_cuda_decode_take_back", cuda_native.queue(raw.device), arguments)
+        arguments = cuda.DeviceDecodeGradientArguments(gradient, *map(pointer, grad_logits))
+        cuda.call("padgs_cuda_decode_take_back", cuda.queue(raw.device), arguments)
 
         dtype = raw.dtype if inputs.dtype == raw.dtype else OF_GRADIENTS  # of the products
         inputs, w1, units = inputs.to(dtype), w1.to(dtype), len(weights[0])
@@ -95,9 +94,9 @@ class _DecodeOnGPU(torch.autograd.Function):
         return None, None, grad_features, None, None, grad_offsets, grad_log_scales, None, *of_weights
 
 
-def _arguments(constants, raw, starts, slots, outputs) -> native.DecodeArguments:
+def _arguments(constants, raw, starts, slots, outputs) -> DecodeArguments:
     """Without the networks, which the kernels do not see."""
-    nobody = native.HeadWeights(None, None, None, None)
+    nobody = HeadWeights(None, None, None, None)
     positions, offsets, log_scales, attenuation = constants
     buffers = (positions, offsets, log_scales, attenuation, raw, starts, slots, *outputs)
-    return native.DecodeArguments(*raw.shape, 0, 0, nobody, nobody, nobody, None, *map(pointer, buffers))
+    return DecodeArguments(*raw.shape, 0, 0, nobody, nobody, nobody, None, *map(pointer, buffers))

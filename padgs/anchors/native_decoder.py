@@ -13,9 +13,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from padgs.anchors.gpu_decoder import decode_on_gpu
-from padgs.native import cuda as cuda_native
-from padgs.native import library as native
-from padgs.native.library import pointer
+from padgs.native import cpu, cuda
+from padgs.native.abi import DecodeArguments, DecodeGradientArguments, HeadWeights, pointer
 
 OUTPUTS = {"means": 3, "quats": 4, "scales": 3, "opacities": 0, "colors": 3}  # values per Gaussian, 0 = a scalar
 
@@ -23,7 +22,7 @@ OUTPUTS = {"means": 3, "quats": 4, "scales": 3, "opacities": 0, "colors": 3}  # 
 def fits(inputs: Tensor, dtype: torch.dtype | None = None) -> bool:
     """Whether a native decoder takes these inputs, with products in a reduced type: float32 tensors, and the library of
     their device is there; the CPU's has no reduced types."""
-    library = {"cpu": None if dtype else native, "cuda": cuda_native}.get(inputs.device.type)
+    library = {"cpu": None if dtype else cpu, "cuda": cuda}.get(inputs.device.type)
     return library is not None and inputs.dtype == torch.float32 and library.available()
 
 
@@ -58,12 +57,12 @@ class _FusedDecode(torch.autograd.Function):
         raw = torch.empty(anchors, per_anchor)
         slot_start = torch.empty(anchors + 1, dtype=torch.int64)
         arguments = _arguments(weights, constants, raw, slot_start)
-        native.library().padgs_decode_select(ctypes.byref(arguments))
+        cpu.library().padgs_decode_select(ctypes.byref(arguments))
         count = int(slot_start[-1])
         slots = torch.empty(count, dtype=torch.int64)
         outputs = [torch.empty((count, size) if size else count) for size in OUTPUTS.values()]
         arguments = _arguments(weights, constants, raw, slot_start, slots, outputs)
-        native.library().padgs_decode_place(ctypes.byref(arguments))
+        cpu.library().padgs_decode_place(ctypes.byref(arguments))
         ctx.save_for_backward(*weights, *constants, raw, slot_start, slots, *outputs)
         ctx.features = features.shape[1]
         ctx.mark_non_differentiable(slots, raw)
@@ -80,13 +79,13 @@ class _FusedDecode(torch.autograd.Function):
         grad_offsets, grad_log_scales = torch.empty_like(offsets), torch.empty_like(log_scales)
         grad_weights = torch.empty(sum(w.numel() for w in weights))
         forward = _arguments(weights, constants, raw, slot_start, slots, outputs)
-        arguments = native.DecodeGradientArguments(
+        arguments = DecodeGradientArguments(
             forward,
             *map(pointer, upstream),
             ctx.features,
             *map(pointer, (grad_features, grad_offsets, grad_log_scales, grad_weights)),
         )
-        native.library().padgs_decode_backward(ctypes.byref(arguments))
+        cpu.library().padgs_decode_backward(ctypes.byref(arguments))
         parts = grad_weights.split([w.numel() for w in weights])
         return (
             grad_features,
@@ -102,8 +101,8 @@ class _FusedDecode(torch.autograd.Function):
 def _arguments(weights, constants, raw, slot_start, slots=None, outputs=None):
     outputs = [None] * len(OUTPUTS) if outputs is None else outputs
     inputs, positions, offsets, log_scales, attenuation = constants
-    heads = [native.HeadWeights(*map(pointer, weights[i : i + 4])) for i in (0, 4, 8)]
-    return native.DecodeArguments(
+    heads = [HeadWeights(*map(pointer, weights[i : i + 4])) for i in (0, 4, 8)]
+    return DecodeArguments(
         *offsets.shape[:2],
         inputs.shape[1],
         len(weights[0]),

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import torch
 
-from padgs.native import library as native
-from padgs.native.library import pointer
+from padgs.native import cpu
+from padgs.native.abi import pointer
 
 FMA_ROUNDS = 1_000_000  # about 3 to 8 ms on each thread
 TRIAD_FLOATS = 1 << 23  # per array; the two are 64 MiB, more than caches hold
@@ -31,7 +31,7 @@ def measure_ceilings(seconds: float = 0.3) -> dict[str, Ceiling]:
     Args:
         seconds: wall time that each of the two is repeated for; five times at least.
     """
-    library = native.library()
+    library = cpu.library()
     arrays = torch.zeros(2, TRIAD_FLOATS)
     return {
         "fma": _best(lambda: library.padgs_measure_fma(FMA_ROUNDS), seconds),

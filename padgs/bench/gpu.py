@@ -35,7 +35,7 @@ from padgs.anchors.precision import PRECISIONS
 from padgs.bench.workload import OPTIONS, SIZES, Size, Workload, build
 from padgs.learning.loss import photometric_loss
 from padgs.learning.targets import Targets
-from padgs.native import cuda as cuda_native
+from padgs.native import cuda
 from padgs.render import RenderOptions, render, resolve_backend
 from padgs.render.backends.captured import CapturedRender
 
@@ -146,7 +146,7 @@ def measure_gpu(
         raise ValueError(f"unknown size {', '.join(unknown) or '(none)'}; known: {', '.join(SIZES)}")
     if device.type == "cuda" and not torch.cuda.is_available():
         raise ValueError("--device cuda, but torch finds no GPU with a driver here; see docs/cuda.md")
-    architectures = cuda_native.library().padgs_cuda_architectures().decode() if cuda_native.available() else None
+    architectures = cuda.library().padgs_cuda_architectures().decode() if cuda.available() else None
     progress("the device's ceilings")
     report: dict[str, Any] = {
         "schema": SCHEMA,
@@ -239,14 +239,14 @@ def _stages(iteration: Iteration, watch: Stopwatch, repeats: int) -> dict[str, d
 @contextmanager
 def _calls_watched(watch: Stopwatch) -> Iterator[list[tuple[str, Any, Any]]]:
     marks: list[tuple[str, Any, Any]] = []
-    original = cuda_native.call
+    original = cuda.call
 
     def call(name: str, *arguments: Any) -> None:
         start = watch.mark()
         original(name, *arguments)
         marks.append((name.removeprefix("padgs_cuda_"), start, watch.mark()))
 
-    with mock.patch.object(cuda_native, "call", call):
+    with mock.patch.object(cuda, "call", call):
         yield marks
 
 

@@ -13,7 +13,7 @@ import torch
 
 from padgs.bench.ratios import render_both_ways
 from padgs.bench.workload import Size, build
-from padgs.native import library as native
+from padgs.native import cpu
 
 ISAS = ("baseline", "avx2", "avx512")
 
@@ -40,7 +40,7 @@ def by_instruction_set(size: Size, repeats: int, seed: int) -> dict[str, dict[st
 def _main(job: dict[str, Any]) -> None:
     torch.set_num_threads(job["threads"])
     timing = render_both_ways(build(Size(**job["size"]), job["seed"]), job["repeats"])
-    print(json.dumps({"isa": native.library().padgs_isa().decode(), **timing}))
+    print(json.dumps({"isa": cpu.library().padgs_isa().decode(), **timing}))
 
 
 if __name__ == "__main__":

@@ -41,7 +41,7 @@ from padgs.bench import goals, isas, ratios, tile_counts
 from padgs.bench.ceilings import Ceiling, measure_ceilings
 from padgs.bench.sized import add_size_floors, measure_size
 from padgs.bench.workload import SIZES, Size, build
-from padgs.native import library as native
+from padgs.native import cpu
 
 SCHEMA = 1
 NOISE_LIMIT = 0.25
@@ -79,7 +79,7 @@ def measure_all(options: BenchOptions, progress: Callable[[str], None] = lambda 
     Raises:
         OSError: the native library is not there.
     """
-    native.library()
+    cpu.library()
     threads_before = torch.get_num_threads()
     torch.set_num_threads(options.threads or clock.machine()["cores"])
     try:
@@ -90,7 +90,7 @@ def measure_all(options: BenchOptions, progress: Callable[[str], None] = lambda 
 
 def _measure_all(options: BenchOptions, progress: Callable[[str], None]) -> dict[str, Any]:
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
-    isa = native.library().padgs_isa().decode()
+    isa = cpu.library().padgs_isa().decode()
     progress("the machine's ceilings")
     before = measure_ceilings(options.ceiling_seconds)
     sizes = {}

@@ -21,7 +21,7 @@ from padgs.bench.workload import OPTIONS, Workload
 from padgs.clock import summary
 from padgs.learning.loss import photometric_loss
 from padgs.learning.targets import Targets
-from padgs.native import library as native_library
+from padgs.native import cpu
 from padgs.render import render
 
 STAGES = {
@@ -108,8 +108,8 @@ class StageClock:
 @contextmanager
 def native_calls_watched(clock: StageClock) -> Iterator[None]:
     """Charge every native call to its stage, wherever it is made from."""
-    watched = _WatchedLibrary(native_library.library(), clock)
-    with mock.patch.object(native_library, "library", lambda: watched):
+    watched = _WatchedLibrary(cpu.library(), clock)
+    with mock.patch.object(cpu, "library", lambda: watched):
         yield
 
 

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from padgs.gaussians import Gaussians
-from padgs.native import library as native
-from padgs.native.library import pointer
+from padgs.native.abi import Inputs, pointer
 from padgs.render import RenderOptions
 from padgs.render.backends.native_camera import native_camera
 from padgs.render.tiles import Projected
@@ -62,7 +61,7 @@ def tiles_per_gaussian(gaussians: Gaussians, width: int, height: int, options: R
         tensor.contiguous()
         for tensor in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors)
     ]
-    inputs = native.Inputs(len(gaussians), *map(pointer, tensors), None)
+    inputs = Inputs(len(gaussians), *map(pointer, tensors), None)
     projected = Projected(native_camera(torch.eye(4), camera, options), inputs, max_instances=1 << 40)
     (strip,) = projected.strips()
     return strip.slot_start.diff()

@@ -12,14 +12,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from padgs.native import cuda as cuda_native
-from padgs.native import library as native
-from padgs.native.library import pointer
+from padgs.native import LIBRARIES, cpu, cuda
+from padgs.native.abi import LossArguments, pointer
 
 
 def fits(image: Tensor) -> bool:
     """Whether a native loss takes this image: float32, three channels, and the library of its device is there."""
-    library = {"cpu": native, "cuda": cuda_native}.get(image.device.type)
+    library = LIBRARIES.get(image.device.type)
     return library is not None and image.dtype == torch.float32 and image.shape[-1] == 3 and library.available()
 
 
@@ -44,7 +43,7 @@ class _FusedLoss(torch.autograd.Function):
         image, target = image.contiguous(), target.contiguous()
         weight = weight.to(torch.float32).expand(height, width)
         gradient = torch.empty_like(image) if ctx.needs_input_grad[0] else None
-        arguments = native.LossArguments(
+        arguments = LossArguments(
             width,
             height,
             pointer(image),
@@ -56,7 +55,7 @@ class _FusedLoss(torch.autograd.Function):
             pointer(_workspace(height, width)),
             pointer(gradient),
         )
-        loss = native.library().padgs_photometric_loss(ctypes.byref(arguments))
+        loss = cpu.library().padgs_photometric_loss(ctypes.byref(arguments))
         ctx.gradient = gradient
         return image.new_tensor(loss)
 
@@ -68,7 +67,7 @@ class _FusedLoss(torch.autograd.Function):
 @functools.lru_cache(maxsize=2)
 def _workspace(height: int, width: int) -> Tensor:
     # Kept between iterations: fresh memory costs more in page faults than the loss does in arithmetic.
-    return torch.zeros(native.library().padgs_loss_workspace(height, width))
+    return torch.zeros(cpu.library().padgs_loss_workspace(height, width))
 
 
 def loss_on_gpu(image: Tensor, target: Tensor, weight: Tensor, lambda_l1: float, total: Tensor) -> Tensor:
@@ -84,8 +83,8 @@ class _LossOnGPU(torch.autograd.Function):
         weight, total = weight.to(torch.float32).expand(height, width), total.to(torch.float32)
         gradient = torch.empty_like(image) if ctx.needs_input_grad[0] else None
         partials = None if gradient is None else image.new_empty(3, height, width, 3)
-        sums = image.new_empty(cuda_native.library().padgs_cuda_loss_blocks(height, width))
-        loss = native.LossArguments(
+        sums = image.new_empty(cuda.library().padgs_cuda_loss_blocks(height, width))
+        loss = LossArguments(
             width,
             height,
             pointer(image),
@@ -97,8 +96,8 @@ class _LossOnGPU(torch.autograd.Function):
             pointer(partials),
             pointer(gradient),
         )
-        arguments = cuda_native.DeviceLossArguments(loss, pointer(total), pointer(sums))
-        cuda_native.call("padgs_cuda_photometric_loss", cuda_native.queue(image.device), arguments)
+        arguments = cuda.DeviceLossArguments(loss, pointer(total), pointer(sums))
+        cuda.call("padgs_cuda_photometric_loss", cuda.queue(image.device), arguments)
         ctx.gradient = gradient
         return (sums.sum(dtype=torch.float64) / total).to(torch.float32)
 

@@ -1,1 +1,5 @@
-"""The compiled libraries, their sources (csrc/), and how they are found and loaded. Importing this loads nothing."""
+"""The compiled code and how it is called: drawing, decoding, the loss, and the ceilings of a machine."""
+
+from padgs.native import cpu, cuda
+
+LIBRARIES = {"cpu": cpu, "cuda": cuda}  # by the type of the devices whose tensors they take

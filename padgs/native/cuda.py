@@ -1,4 +1,4 @@
-"""Finds, loads and calls libpadgs_cuda; importing this module loads nothing. Mirrors `csrc/cuda/arguments.h`.
+"""libpadgs_cuda and how to call it, with the structures of `csrc/cuda/arguments.h`; importing this loads nothing.
 
 The library holds kernels and a CUDA runtime of its own. Pointers to memory of the device and a stream go in; nothing is
 allocated and nothing waits.
@@ -12,8 +12,7 @@ from typing import Any
 
 import torch
 
-from padgs.native.library import (
-    Camera,
+from padgs.native.abi import (
     DecodeArguments,
     DecodeGradientArguments,
     Gradients,
@@ -21,12 +20,12 @@ from padgs.native.library import (
     Int32,
     Int64,
     LossArguments,
+    NativeCamera,
     Pointer,
-    Rays,
-    declared,
+    RayPointers,
     fields,
-    opened,
 )
+from padgs.native.loading import declared, opened
 
 OUT_OF_MEMORY = 2  # cudaErrorMemoryAllocation
 NOT_COMPILED_FOR = (98, 209, 222)  # no such kernel, no image for this device, PTX newer than the driver
@@ -51,7 +50,7 @@ class ProjectArguments(ctypes.Structure):
     """`padgs::ProjectArguments`."""
 
     _fields_ = [
-        ("camera", Camera),
+        ("camera", NativeCamera),
         ("pose", Pointer),
         ("inputs", Inputs),
         *fields(Pointer, "footprints", "boxes", "depth_keys", "indices"),
@@ -63,7 +62,13 @@ class ProjectArguments(ctypes.Structure):
 class ProjectGradientArguments(ctypes.Structure):
     """`padgs::ProjectGradientArguments`."""
 
-    _fields_ = [("camera", Camera), ("pose", Pointer), ("inputs", Inputs), ("moments", Pointer), ("out", Gradients)]
+    _fields_ = [
+        ("camera", NativeCamera),
+        ("pose", Pointer),
+        ("inputs", Inputs),
+        ("moments", Pointer),
+        ("out", Gradients),
+    ]
 
 
 class SortArguments(ctypes.Structure):
@@ -96,7 +101,7 @@ class BlendInputs(ctypes.Structure):
     _fields_ = [
         ("table", TileTable),
         *fields(Int32, "projection", "wrap", "core_size"),
-        ("rays", Rays),
+        ("rays", RayPointers),
         *fields(Pointer, "footprints", "tile_start", "slots", "reaches", "background"),
         *fields(Pointer, "image", "transmittance", "depth", "last", "core", "tails", "pair_counts"),
     ]

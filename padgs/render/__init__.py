@@ -1,20 +1,20 @@
 """Rendering: one function, several backends. `render(gaussians, view)` is all that models and methods call.
 
-Backends are entries of `BACKENDS`; each is a function with the signature of `torch_backend.rasterize`. The torch one
-is the definition.
+Backends are entries of `BACKENDS`; each is a `padgs.render.contract.Backend`. The torch one is the definition.
 """
 
 from __future__ import annotations
 
 import warnings
-from functools import cache, partial
+from dataclasses import replace
+from functools import cache
 
 import torch
 from torch import Tensor
 
 from padgs.gaussians import Gaussians
 from padgs.registry import lookup
-from padgs.render.contract import Rendering, RenderOptions, check_inputs
+from padgs.render.contract import Backend, Rendering, RenderOptions, Request, check_inputs
 from padgs.render.cubemap import rasterize_cubemap
 from padgs.scene import View
 
@@ -61,28 +61,22 @@ def render(
     cam_from_world = view.cam_from_world.to(device=means.device, dtype=means.dtype)
     if background is None:
         background = means.new_zeros(3)
-    check_inputs(
-        gaussians, cam_from_world, view.camera, options, background, probe, absolute_probe, check_values=check_values
-    )
+    request = Request(gaussians, cam_from_world, view.camera, options, background, probe, absolute_probe)
+    check_inputs(request, check_values=check_values)
     if options.pixel_bias:
         bias = 2 * options.pixel_bias / means.new_tensor([view.camera.width, view.camera.height])
-        probe = bias.expand(len(means), 2) if probe is None else probe + bias
-    rasterize = lookup(BACKENDS, resolve_backend(backend, means), "backend")
-    if absolute_probe is not None:
-        rasterize = partial(rasterize, absolute_probe=absolute_probe)
-    if options.cubemap:
-        rasterize = partial(rasterize_cubemap, rasterize)
-    return rasterize(gaussians, cam_from_world, view.camera, options, background, probe)
+        request = replace(request, probe=bias.expand(len(means), 2) if probe is None else probe + bias)
+    rasterize: Backend = lookup(BACKENDS, resolve_backend(backend, means), "backend")
+    return rasterize_cubemap(rasterize, request) if options.cubemap else rasterize(request)
 
 
 def resolve_backend(backend: str, means: Tensor) -> str:
     """The backend that `auto` stands for, given the tensors to draw; other names are returned as they are."""
     if backend != "auto":
         return backend
-    from padgs.native import cuda as cuda_native
-    from padgs.native import library as native
+    from padgs.native import LIBRARIES
 
-    library = {"cpu": native, "cuda": cuda_native}.get(means.device.type)
+    library = LIBRARIES.get(means.device.type)
     if library is None or means.dtype != torch.float32:
         return "torch"
     if library.available():
@@ -93,10 +87,9 @@ def resolve_backend(backend: str, means: Tensor) -> str:
 
 @cache  # once in a process, whatever the filters of the warnings module say
 def _say_that_native_is_missing(backend: str) -> None:
-    from padgs.native import cuda as cuda_native
-    from padgs.native import library as native
+    from padgs.native import LIBRARIES
 
     try:
-        {"cpu": native, "cuda": cuda_native}[backend].library()
+        LIBRARIES[backend].library()
     except OSError as error:
         warnings.warn(f"rendering with backend torch, many times slower than {backend}: {error}", stacklevel=4)

@@ -10,7 +10,7 @@ That is blending "sorted"; "hybrid" shares all but the order and the stop, see `
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import torch
@@ -120,6 +120,19 @@ class RenderOptions:
 
 
 @dataclass(frozen=True)
+class Request:
+    """What a backend is asked for."""
+
+    gaussians: Gaussians  # N, in the world frame
+    cam_from_world: Tensor  # [4, 4] in the dtype and on the device of the means
+    camera: Camera  # which direction each pixel looks
+    options: RenderOptions
+    background: Tensor  # [3]
+    probe: Tensor | None = None  # [N, 2], and the next [N]: see `padgs.render.render`
+    absolute_probe: Tensor | None = None
+
+
+@dataclass(frozen=True)
 class Rendering:
     """What a backend returns. Differentiable by image, transmittance and depth."""
 
@@ -130,26 +143,20 @@ class Rendering:
     counters: Mapping[str, int] = field(default_factory=dict)  # gaussians, visible, instances, evaluated pairs, ...
 
 
-def check_inputs(
-    gaussians: Gaussians,
-    cam_from_world: Tensor,
-    camera: Camera,
-    options: RenderOptions,
-    background: Tensor,
-    probe: Tensor | None,
-    absolute_probe: Tensor | None = None,
-    *,
-    check_values: bool,
-) -> None:
+Backend = Callable[[Request], Rendering]  # every entry of `padgs.render.BACKENDS`
+
+
+def check_inputs(request: Request, *, check_values: bool) -> None:
     """Check what native code relies on and name the culprit.
 
     Args:
-        gaussians, cam_from_world, camera, options, background, probe, absolute_probe: as in `torch_backend.rasterize`.
+        request: of a user, who may have got anything wrong.
         check_values: also look at every number (finite, positive scales, ...); costs a pass over the tensors.
 
     Raises:
         ValueError: a shape, dtype, device or value breaks the contract.
     """
+    gaussians, options = request.gaussians, request.options
     count = gaussians.means.shape[0] if gaussians.means.ndim else 0
     shapes = {
         "means": (gaussians.means, (count, 3)),
@@ -157,13 +164,13 @@ def check_inputs(
         "scales": (gaussians.scales, (count, 3)),
         "opacities": (gaussians.opacities, (count,)),
         "colors": (gaussians.colors, (count, 3)),
-        "cam_from_world": (cam_from_world, (4, 4)),
-        "background": (background, (3,)),
+        "cam_from_world": (request.cam_from_world, (4, 4)),
+        "background": (request.background, (3,)),
     }
-    if probe is not None:
-        shapes["probe"] = (probe, (count, 2))
-    if absolute_probe is not None:
-        shapes["absolute_probe"] = (absolute_probe, (count,))
+    if request.probe is not None:
+        shapes["probe"] = (request.probe, (count, 2))
+    if request.absolute_probe is not None:
+        shapes["absolute_probe"] = (request.absolute_probe, (count,))
         if options.projection != "ray":
             raise ValueError(f"absolute_probe is made for projection 'ray', not {options.projection!r}; leave it out")
     dtype, device = gaussians.means.dtype, gaussians.means.device
@@ -176,10 +183,10 @@ def check_inputs(
             raise ValueError(f"{name} has dtype {tensor.dtype} but means has {dtype}; convert one of them")
         if tensor.device != device:
             raise ValueError(f"{name} is on {tensor.device} but means is on {device}; move one of them")
-    _check_camera(camera, options)
+    _check_camera(request.camera, options)
     if check_values:
-        _check_values(gaussians, cam_from_world, {name: tensor for name, (tensor, _) in shapes.items()})
-        _check_rays(camera)
+        _check_values(gaussians, request.cam_from_world, {name: tensor for name, (tensor, _) in shapes.items()})
+        _check_rays(request.camera)
 
 
 def _check_camera(camera: Camera, options: RenderOptions) -> None:

@@ -9,7 +9,6 @@ baselines, which no resampling removes.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 from math import ceil, pi
@@ -17,11 +16,10 @@ from math import ceil, pi
 import torch
 from torch import Tensor
 
-from padgs.gaussians import Gaussians
-from padgs.render.contract import Rendering, RenderOptions
+from padgs.render.contract import Backend, Rendering, Request
 from padgs.render.projection import camera_frame
 from padgs.render.projective import shift_of_probe
-from padgs.sphere.camera import Camera, Panorama, Pinhole
+from padgs.sphere.camera import Panorama, Pinhole
 from padgs.sphere.panorama import rays
 
 # face_from_camera: turned and looked through, each face is a camera like any other (x right, y down, z forward).
@@ -55,30 +53,19 @@ def face_camera(panorama: Panorama, face_size: int | None = None) -> Pinhole:
     return Pinhole(size, size, focal, focal, size / 2, size / 2)
 
 
-def rasterize_cubemap(
-    rasterize: Callable[..., Rendering],
-    gaussians: Gaussians,
-    cam_from_world: Tensor,
-    camera: Camera,
-    options: RenderOptions,
-    background: Tensor,
-    probe: Tensor | None = None,
-) -> Rendering:
-    """A backend that draws panoramas with another one's perspective views.
-
-    Args:
-        rasterize: the other backend.
-        gaussians, cam_from_world, camera, options, background, probe: as in `torch_backend.rasterize`.
-    """
+def rasterize_cubemap(rasterize: Backend, request: Request) -> Rendering:
+    """Draw a panorama with a backend's perspective views."""
+    gaussians, cam_from_world, camera = request.gaussians, request.cam_from_world, request.camera
     assert isinstance(camera, Panorama), type(camera)  # `check_inputs` has seen to it
-    if probe is not None:  # it is given in units of the panorama, so it moves the means, once for all faces
-        means, _ = camera_frame(gaussians, cam_from_world)
-        gaussians = replace(gaussians, means=gaussians.means + shift_of_probe(means, probe) @ cam_from_world[:3, :3])
-    lens = face_camera(camera, options.face_size)
+    if request.probe is not None:  # it is given in units of the panorama, so it moves the means, once for all faces
+        shift = shift_of_probe(camera_frame(gaussians, cam_from_world)[0], request.probe)
+        gaussians = replace(gaussians, means=gaussians.means + shift @ cam_from_world[:3, :3])
+    lens = face_camera(camera, request.options.face_size)
     turns = torch.eye(4, dtype=cam_from_world.dtype, device=cam_from_world.device).repeat(6, 1, 1)
     turns[:, :3, :3] = FACES
-    each = replace(options, cubemap=False, face_size=None)
-    faces = [rasterize(gaussians, turn @ cam_from_world, lens, each, background) for turn in turns]
+    options = replace(request.options, cubemap=False, face_size=None)
+    each = replace(request, gaussians=gaussians, camera=lens, options=options, probe=None)
+    faces = [rasterize(replace(each, cam_from_world=turn @ cam_from_world)) for turn in turns]
     return panorama_from_faces(faces, camera, lens)
 
 

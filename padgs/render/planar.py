@@ -28,20 +28,23 @@ class PlanarFootprints(Footprints):
 
     boxes: Tensor  # [N, 4]; columns not reduced mod W
     centers: Tensor  # [N, 2] (u, v)
-    conics: Tensor  # [N, 3] (A, B, C) of the inverse covariance [[A, B], [B, C]]
+    whitening: Tensor  # [N, 3] (a, b, c) of the Cholesky factor K = [[a, b], [0, c]] of the inverse S^-1 = K^T K
     turn: float  # pixels after which columns repeat (the width, with wrap), or infinity
 
     def squared_distance(self, indices: Tensor, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
-        """q = delta^T S^-1 delta, delta from the nearest copy of the centre across the seam."""
-        centers, conics, boxes = self.centers[indices], self.conics[indices], self.boxes[indices]
+        """q = |K delta|^2, delta from the nearest copy of the centre across the seam.
+
+        Written out, as A du^2 + 2 B du dv + C dv^2, it would cancel far from the centre of a long oblique footprint.
+        """
+        centers, boxes = self.centers[indices], self.boxes[indices]
         dv = rows[:, None] + 0.5 - centers[:, 1]
         du = columns[:, None] + 0.5 - centers[:, 0]
         columns = columns[:, None].to(centers)
         if self.turn < torch.inf:  # into [-W/2, W/2)
             turns = torch.floor(du.detach() / self.turn + 0.5)
             du, columns = du - turns * self.turn, columns - turns * self.turn
-        a, b, c = conics.unbind(-1)
-        q = a * du * du + 2 * b * du * dv + c * dv * dv
+        a, b, c = self.whitening[indices].unbind(-1)
+        q = (a * du + b * dv) ** 2 + (c * dv) ** 2
         rows = rows[:, None]
         inside = (columns >= boxes[:, 0]) & (columns < boxes[:, 1]) & (rows >= boxes[:, 2]) & (rows < boxes[:, 3])
         return q, inside
@@ -110,7 +113,8 @@ def _footprints(
     low_pass = low_pass_of(options, camera).own
     determinant = (minors**2).sum(-1) + low_pass * (var_u + var_v) + low_pass**2
     var_u, var_v = var_u + low_pass, var_v + low_pass
-    conics = torch.stack((var_v, -cov_uv, var_u), dim=-1) / determinant[:, None]
+    a = torch.sqrt(var_v / determinant)
+    whitening = torch.stack((a, -a * (cov_uv / var_v), torch.rsqrt(var_v)), dim=-1)
     covariance = torch.stack((var_u, cov_uv, var_v), dim=-1).detach()
     opacities = gaussians.opacities.detach()
     if options.bounds == "square":
@@ -125,7 +129,7 @@ def _footprints(
     sound = torch.isfinite(determinant.detach()) & (determinant.detach() > 0)  # else float overflows or nothing spreads
     visible = in_front & (opacities >= ALPHA_MIN) & on_image & sound
     turn = float(camera.width) if wrap else torch.inf
-    return PlanarFootprints(gaussians.opacities, means.norm(dim=-1), visible, boxes, centers, conics, turn)
+    return PlanarFootprints(gaussians.opacities, means.norm(dim=-1), visible, boxes, centers, whitening, turn)
 
 
 def _exact_boxes(centers: Tensor, covariance: Tensor, opacities: Tensor) -> Tensor:

@@ -54,7 +54,7 @@ def project(
     options: RenderOptions,
     probe: Tensor | None = None,
 ) -> Footprints:
-    """Footprints under `options.projection`; arguments as in `torch_backend.rasterize`."""
+    """Footprints under `options.projection`; arguments as in `padgs.render.contract.Request`."""
     footprints_of = lookup(PROJECTIONS, options.projection, "projection")
     with torch.no_grad():
         first = footprints_of(gaussians, cam_from_world, camera, options, probe)

@@ -11,8 +11,8 @@ from collections.abc import Iterator
 
 import torch
 
-from padgs.native import library as native
-from padgs.native.library import pointer
+from padgs.native import cpu
+from padgs.native.abi import Inputs, NativeCamera, TileGrid, pointer
 
 TILE = 16  # pixels
 MOMENTS = 16  # floats per instance, see csrc/abi.h
@@ -30,13 +30,13 @@ class Strip:
         self._row_start = torch.cat((torch.zeros(1, dtype=torch.int64), per_row.cumsum(0)))
         self._level = projected.level
         self.tiles = int(self._row_start[-1])
-        self.grid = native.TileGrid(
+        self.grid = TileGrid(
             camera.width, camera.height, first_row, end_row, pointer(self._level), pointer(self._row_start)
         )
         self.slot_start = torch.empty(count + 1, dtype=torch.int64)
         self.tile_start = torch.empty(self.tiles + 1, dtype=torch.int64)
         self.instances = torch.empty(int(projected.per_row[first_row:end_row].sum()), 3, dtype=torch.int32)
-        native.library().padgs_bin(
+        cpu.library().padgs_bin(
             pointer(projected.boxes),
             count,
             pointer(projected.order),
@@ -51,9 +51,9 @@ class Strip:
 class Projected:
     """All Gaussians as one view sees them, in depth order, and how they spread over the tiles."""
 
-    def __init__(self, camera: native.Camera, inputs: native.Inputs, max_instances: int) -> None:
+    def __init__(self, camera: NativeCamera, inputs: Inputs, max_instances: int) -> None:
         """Project, sort, count."""
-        library, count = native.library(), inputs.count
+        library, count = cpu.library(), inputs.count
         rows = -(-camera.height // TILE)
         self.camera = camera
         self.footprints = torch.empty(count, 16)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from padgs.native import cuda as cuda_native
+from padgs.native import cuda
 from padgs.render.config import RenderConfig
 
 DEVICES = ("auto", "cpu", "cuda")
@@ -24,11 +24,11 @@ def chosen(name: str, render: RenderConfig) -> torch.device:
     if render.backend == "cuda":
         if name == "cpu":
             raise ValueError("render.backend=cuda draws on a GPU only, not with run.device=cpu; set run.device=auto")
-        cuda_native.library()
+        cuda.library()
     on_gpu = name == "cuda" or (name == "auto" and torch.cuda.is_available() and _draws(render))
     return torch.device("cuda", torch.cuda.current_device()) if on_gpu else torch.device("cpu")
 
 
 def _draws(render: RenderConfig) -> bool:
     """Whether a GPU draws this faster than the CPU does."""
-    return render.backend in ("auto", "cuda") and cuda_native.available()
+    return render.backend in ("auto", "cuda") and cuda.available()

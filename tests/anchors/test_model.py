@@ -9,7 +9,7 @@ import torch
 
 from padgs.anchors.model import Decoded, PaDGS, PaDGSOptions
 from padgs.learning.loss import photometric_loss, pixel_weight
-from padgs.native import library as native
+from padgs.native import cpu
 from padgs.render import BACKENDS, RenderOptions, render
 from padgs.scene import Scene, View
 
@@ -90,7 +90,7 @@ def backend_cases():
 
 @pytest.mark.parametrize(("backend", "dtype"), list(backend_cases()))
 def test_golden_image_and_gradients(golden, backend, dtype):
-    if backend == "cpu" and not native.available():
+    if backend == "cpu" and not cpu.available():
         pytest.skip("the native CPU library is not built")
     if backend == "cuda" and "cuda_engine" not in sys.modules:
         pytest.skip("tests/render, which arranges for backend cuda, is not part of this run")

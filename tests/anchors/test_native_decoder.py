@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from padgs.anchors.decoder import Decoder, decode_gaussians, define_gaussians
-from padgs.native import library as native
+from padgs.native import cpu
 
-pytestmark = pytest.mark.skipif(not native.available(), reason="the native library is not built")
+pytestmark = pytest.mark.skipif(not cpu.available(), reason="the native library is not built")
 OUTPUTS = ("means", "quats", "scales", "opacities", "colors")
 
 

@@ -171,9 +171,7 @@ def test_the_environment_can_learn_alone_first():
     for _ in records:
         now = dict(trained.trainee.model.named_parameters())
         moved.append({name for name, value in now.items() if not torch.equal(value, before[name])})
-        rates.append(
-            [group["lr"] for group in trained._trainer._optimiser.adam.param_groups][::3]
-        )
+        rates.append([group["lr"] for group in trained._trainer._optimiser.adam.param_groups][::3])
         before = {name: value.clone() for name, value in now.items()}
     assert moved[:3] == 3 * [{"environment.emission"}]
     assert all(names == before.keys() for names in moved[3:])

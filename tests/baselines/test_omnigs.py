@@ -10,7 +10,7 @@ from baselines.omnigs import OmniGSMethod
 from padgs.learning.failure import Failure
 from padgs.learning.loop import Budget
 from padgs.learning.trainee import State
-from padgs.native import library as native
+from padgs.native import cpu
 from padgs.registry import lookup
 from padgs.render.config import RenderConfig
 from padgs.runs import checkpoint
@@ -94,7 +94,7 @@ def test_killed_and_resumed_is_bit_identical(scene, finished, tmp_path, stop):
     assert_same_but_time(second.state(), finished)
 
 
-@pytest.mark.skipif(not native.available(), reason="the native library is not built")
+@pytest.mark.skipif(not cpu.available(), reason="the native library is not built")
 def test_killed_and_resumed_is_bit_identical_on_the_native_backend(scene):
     whole, first, second = (method(backend="cpu") for _ in range(3))
     for _ in whole.fit(scene, Budget(ITERATIONS)):

@@ -13,7 +13,8 @@ from baselines import METHODS
 from baselines.spags import SPaGSMethod, SPaGSOptions
 from padgs.gaussians import Gaussians, rotation_matrices
 from padgs.learning.loop import Budget
-from padgs.native import library as native
+from padgs.native import cpu
+from padgs.native.abi import Inputs, pointer
 from padgs.registry import lookup
 from padgs.render import RenderOptions
 from padgs.render.backends.native_camera import native_camera
@@ -128,10 +129,10 @@ def tangent_corner_width(means, spread):
 
 
 def native_boxes(gaussians):
-    if not native.available():
+    if not cpu.available():
         pytest.skip("the native library is not built")
     inputs = [getattr(gaussians, n).float().contiguous() for n in ("means", "quats", "scales", "opacities", "colors")]
-    structure = native.Inputs(len(gaussians), *map(native.pointer, inputs), None)
+    structure = Inputs(len(gaussians), *map(pointer, inputs), None)
     options = RenderOptions(projection="ray", low_pass=0.0)
     return Projected(native_camera(torch.eye(4), Panorama(WIDTH, HEIGHT), options), structure, 1 << 26).boxes.double()
 

@@ -11,10 +11,9 @@ from typer.testing import CliRunner
 from padgs.bench import gpu
 from padgs.bench.workload import OPTIONS, SIZES, build
 from padgs.cli.app import app
-from padgs.native import cuda as cuda_native
-from padgs.native import library as native
+from padgs.native import cpu, cuda
 
-needs_native = pytest.mark.skipif(not native.available(), reason="the native library is not built")
+needs_native = pytest.mark.skipif(not cpu.available(), reason="the native library is not built")
 
 
 @pytest.fixture(scope="module")
@@ -78,9 +77,9 @@ def test_targets_are_judged_for_the_size_that_they_are_stated_for():
 
 
 def test_calls_of_the_library_are_charged_to_stages(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(cuda_native, "call", lambda name, *_: None)
+    monkeypatch.setattr(cuda, "call", lambda name, *_: None)
     with gpu._calls_watched(gpu.Stopwatch(torch.device("cpu"))) as marks:
-        cuda_native.call("padgs_cuda_bin", cuda_native.Queue())
+        cuda.call("padgs_cuda_bin", cuda.Queue())
     ((name, start, end),) = marks
     assert name == "bin" and start <= end
 

@@ -13,15 +13,15 @@ from padgs.bench.report import QUICK, BenchOptions
 from padgs.bench.stages import STAGES
 from padgs.bench.workload import SIGMA, SIZES, Size, build
 from padgs.cli.app import app
-from padgs.native import library as native
+from padgs.native import cpu
 
-needs_library = pytest.mark.skipif(not native.available(), reason="the native library is not built")
+needs_library = pytest.mark.skipif(not cpu.available(), reason="the native library is not built")
 
 
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory):
     """The files of `padgs bench --quick`, and what it printed."""
-    if not native.available():
+    if not cpu.available():
         pytest.skip("the native library is not built")
     folder, threads = tmp_path_factory.mktemp("bench"), torch.get_num_threads()
     done = CliRunner().invoke(app, ["bench", "--quick", "--out", str(folder)], env={"COLUMNS": "160"})
@@ -130,7 +130,7 @@ def test_each_instruction_set_that_there_is_gets_its_time():
     from padgs.bench.isas import by_instruction_set
 
     found = by_instruction_set(Size(64, 32, 200), repeats=1, seed=0)
-    assert "baseline" in found and native.library().padgs_isa().decode() in found
+    assert "baseline" in found and cpu.library().padgs_isa().decode() in found
     assert all(timing["cpu"]["min"] > 0 for timing in found.values())
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from padgs.bench import stages
 from padgs.bench.stages import STAGES, StageClock, amortised, native_calls_watched
-from padgs.native import library as native
+from padgs.native import cpu
 
 
 @pytest.fixture
@@ -63,22 +63,22 @@ def test_a_stage_that_fails_is_left(tick):
 
 def test_native_calls_are_charged_to_their_stages(tick, monkeypatch):
     library = SimpleNamespace(padgs_bin=lambda x: (tick(3), x)[1], padgs_isa=lambda: b"none")
-    monkeypatch.setattr(native, "library", lambda: library)
+    monkeypatch.setattr(cpu, "library", lambda: library)
     clock = StageClock()
     with native_calls_watched(clock), clock.stage("render_rest"):
-        assert native.library().padgs_bin(7) == 7
-        assert native.library().padgs_isa() == b"none"
+        assert cpu.library().padgs_bin(7) == 7
+        assert cpu.library().padgs_isa() == b"none"
     clock.finish_round()
     assert clock.rounds == [{"render_rest": (0, 0), "sort": (3, 6)}]
-    assert native.library() is library
+    assert cpu.library() is library
 
 
 def test_watched_calls_exist_and_belong_to_a_stage():
-    if not native.available():
+    if not cpu.available():
         pytest.skip("the native library is not built")
     for name, stage in stages.NATIVE_CALLS.items():
         assert stage in STAGES
-        assert hasattr(native.library(), name)
+        assert hasattr(cpu.library(), name)
 
 
 def test_growing_is_charged_once_in_a_hundred_iterations():

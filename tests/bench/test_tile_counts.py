@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from padgs.bench.tile_counts import BANDS, BOUNDS, spheres, tiles_by_latitude, tiles_per_gaussian
-from padgs.native import library as native
+from padgs.native import cpu
 
-pytestmark = pytest.mark.skipif(not native.available(), reason="the native library is not built")
+pytestmark = pytest.mark.skipif(not cpu.available(), reason="the native library is not built")
 WIDTH, HEIGHT, TILE = 512, 256, 16
 
 

@@ -5,9 +5,9 @@ import torch
 
 from padgs.learning import loss
 from padgs.learning.loss import photometric_loss, pixel_weight
-from padgs.native import library as native
+from padgs.native import cpu
 
-pytestmark = pytest.mark.skipif(not native.available(), reason="the native library is not built")
+pytestmark = pytest.mark.skipif(not cpu.available(), reason="the native library is not built")
 
 
 def pair(height, width):

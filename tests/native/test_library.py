@@ -15,7 +15,7 @@ from render_cases import gaussians_of, identity_pose, needs_native
 
 from padgs import render as package
 from padgs.gaussians import Gaussians
-from padgs.native import library as native
+from padgs.native import cpu, loading
 from padgs.render import render
 from padgs.scene import View
 
@@ -40,7 +40,7 @@ def in_a_new_process(code: str, *arguments: str, **environment: str) -> str:
 def test_importing_loads_no_library():
     code = """
 import sys, padgs.render
-print("padgs.native.library" in sys.modules, "padgs_cpu" in open("/proc/self/maps").read())
+print("padgs.native" in sys.modules, "padgs_cpu" in open("/proc/self/maps").read())
 """
     assert in_a_new_process(code).split() == ["False", "False"]
 
@@ -48,9 +48,9 @@ print("padgs.native.library" in sys.modules, "padgs_cpu" in open("/proc/self/map
 @pytest.fixture
 def missing_library(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
     """As on a machine where nothing was compiled."""
-    caches = (native.library, native.available, package._say_that_native_is_missing)
+    caches = (cpu.library, cpu.available, package._say_that_native_is_missing)
     monkeypatch.setenv("PADGS_LIBRARY_DIR", str(tmp_path))
-    monkeypatch.setattr(native, "_package_folders", lambda: [str(tmp_path / "padgs" / "render")])
+    monkeypatch.setattr(loading, "_package_folders", lambda: [str(tmp_path / "padgs" / "render")])
     for cached in caches:
         cached.cache_clear()
     yield

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from padgs.gaussians import Gaussians, rotation_matrices
-from padgs.native import library as native
+from padgs.native import cpu
 from padgs.render import BACKENDS, Rendering, RenderOptions, render
 from padgs.render.contract import ALPHA_MIN
 from padgs.render.planar import PlanarFootprints
@@ -43,13 +43,13 @@ def engines() -> list:
         for dtype in (torch.float64, torch.float32) if backend == "torch" else (torch.float32,):
             marks = cuda_engine.marks() if backend == "cuda" else []
             if backend == "cpu":
-                marks.append(pytest.mark.skipif(not native.available(), reason="the native library is not built"))
+                marks.append(pytest.mark.skipif(not cpu.available(), reason="the native library is not built"))
             found.append(pytest.param(backend, dtype, id=f"{backend}-{str(dtype)[-2:]}", marks=marks))
     return found
 
 
 each_engine = pytest.mark.parametrize(("backend", "dtype"), engines())
-needs_native = pytest.mark.skipif(not native.available(), reason="the native library is not built")
+needs_native = pytest.mark.skipif(not cpu.available(), reason="the native library is not built")
 each_setup = pytest.mark.parametrize(("projection", "lens"), SETUPS, ids=["-".join(setup) for setup in SETUPS])
 each_panorama = pytest.mark.parametrize("projection", ("erp", "tangent", "ray"))
 

@@ -350,14 +350,14 @@ DRAW = """
 import sys, torch
 from padgs.gaussians import Gaussians
 from padgs.render import RenderOptions, render
-from padgs.native import library as native
+from padgs.native import cpu
 from padgs.scene import View
 inputs = {k: v.requires_grad_() for k, v in torch.load(sys.argv[1]).items()}
 options = RenderOptions(projection="ray", blending="hybrid", core_size=3)
 r = render(Gaussians(**inputs), View("v", torch.eye(4), 72, 36), options, backend="cpu")
 (r.image.square().sum() + r.depth.sum()).backward()
 torch.save({"image": r.image.detach(), **{k: v.grad for k, v in inputs.items()}}, sys.argv[2])
-print(native.library().padgs_isa().decode(), end="")
+print(cpu.library().padgs_isa().decode(), end="")
 """
 
 

@@ -11,7 +11,8 @@ import torch
 from render_cases import INPUTS, identity_pose, leaves, mixture, needs_native, random_pose, row_error
 
 from padgs.gaussians import Gaussians
-from padgs.native import library as native
+from padgs.native import cpu
+from padgs.native.abi import NativeCamera
 from padgs.render import RenderOptions, render
 from padgs.render.config import RenderConfig
 from padgs.render.contract import ALPHA_MIN, LOW_PASS_KINDS, PUBLISHED_FOCAL
@@ -59,9 +60,9 @@ def test_a_point_on_the_chart_becomes_a_circle_of_pixels_or_of_angle(latitude: f
     for kind in ("pixels", "angular"):
         footprints = project(point, identity_pose(), camera, options_of("erp", kind))
         assert isinstance(footprints, PlanarFootprints)
-        a, b, c = footprints.conics[0].tolist()
+        a, b, c = footprints.whitening[0].tolist()
         assert abs(b) < 1e-9
-        widths[kind] = 1 / a, 1 / c
+        widths[kind] = 1 / a**2, 1 / c**2
         assert torch.equal(footprints.opacities, point.opacities)
     assert widths["pixels"] == pytest.approx((VARIANCE, VARIANCE))
     assert widths["angular"] == pytest.approx((VARIANCE / math.cos(latitude) ** 2, VARIANCE))
@@ -225,8 +226,8 @@ def test_it_is_a_setting_of_a_run():
 @needs_native
 def test_a_library_of_another_version_is_refused(monkeypatch):
     class Grown(ctypes.Structure):
-        _fields_ = [*native.Camera._fields_, ("more", ctypes.c_int32)]
+        _fields_ = [*NativeCamera._fields_, ("more", ctypes.c_int32)]
 
-    monkeypatch.setattr(native, "STRUCTURES", (Grown, *native.STRUCTURES[1:]))
+    monkeypatch.setattr(cpu, "STRUCTURES", (Grown, *cpu.STRUCTURES[1:]))
     with pytest.raises(OSError, match="libpadgs_cpu.* is of another version, with another Grown; build it again"):
-        native.library.__wrapped__()
+        cpu.library.__wrapped__()

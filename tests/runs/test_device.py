@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from padgs.native import cuda as cuda_native
+from padgs.native import cuda
 from padgs.render.config import RenderConfig
 from padgs.runs.config import RunOptions
 from padgs.runs.device import chosen
@@ -13,7 +13,7 @@ GPU = torch.device("cuda", 0)
 def with_gpu(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
-    monkeypatch.setattr(cuda_native, "available", lambda: True)
+    monkeypatch.setattr(cuda, "available", lambda: True)
 
 
 def test_without_a_gpu_auto_is_the_cpu_and_cuda_is_refused(monkeypatch):
@@ -32,7 +32,7 @@ def test_without_a_gpu_its_backend_is_refused(monkeypatch):
 
 @pytest.mark.usefixtures("with_gpu")
 def test_the_backend_of_a_gpu_is_refused_on_the_cpu_and_where_it_is_not_built(monkeypatch):
-    monkeypatch.setattr(cuda_native, "library", lambda: None)
+    monkeypatch.setattr(cuda, "library", lambda: None)
     assert chosen("auto", RenderConfig(backend="cuda")) == chosen("cuda", RenderConfig(backend="cuda")) == GPU
     with pytest.raises(ValueError, match="render.backend=cuda draws on a GPU only, .*set run.device=auto"):
         chosen("cpu", RenderConfig(backend="cuda"))
@@ -40,7 +40,7 @@ def test_the_backend_of_a_gpu_is_refused_on_the_cpu_and_where_it_is_not_built(mo
     def missing():
         raise OSError("libpadgs_cuda.so not found")
 
-    monkeypatch.setattr(cuda_native, "library", missing)
+    monkeypatch.setattr(cuda, "library", missing)
     with pytest.raises(OSError, match="libpadgs_cuda.so not found"):
         chosen("auto", RenderConfig(backend="cuda"))
 
@@ -57,7 +57,7 @@ def test_with_a_gpu_auto_is_the_gpu_where_that_can_draw():
 
 @pytest.mark.usefixtures("with_gpu")
 def test_without_the_library_auto_is_the_cpu(monkeypatch):
-    monkeypatch.setattr(cuda_native, "available", lambda: False)
+    monkeypatch.setattr(cuda, "available", lambda: False)
     assert chosen("auto", RenderConfig()).type == "cpu"
 
 

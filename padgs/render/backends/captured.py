@@ -15,12 +15,11 @@ import torch
 from torch import Tensor
 
 from padgs.gaussians import Gaussians
-from padgs.native import library as native
-from padgs.native.library import pointer
+from padgs.native.abi import Inputs, pointer
 from padgs.render.backends import cuda as cuda_backend
-from padgs.render.backends.cuda_tiles import MAX_INSTANCES, Projected
+from padgs.render.backends.cuda_tiles import MAX_INSTANCES, DeviceProjected
 from padgs.render.backends.native_camera import native_camera, native_rays
-from padgs.render.contract import Rendering, RenderOptions, check_inputs
+from padgs.render.contract import Rendering, RenderOptions, Request, check_inputs
 from padgs.render.published_bounds import check_memory
 from padgs.scene import View
 
@@ -36,7 +35,7 @@ class Frame:
     depth: Tensor  # [H, W]
     visible: Tensor  # [N]
     pairs: Tensor  # [2]
-    projected: Projected  # kernels of the graph point to its tensors
+    projected: DeviceProjected  # kernels of the graph point to its tensors
 
 
 class CapturedRender:
@@ -89,7 +88,7 @@ class CapturedRender:
             self._background = means.new_zeros(3) if background is None else background
             self._view = view.at(view.cam_from_world.to(means.device, copy=True).contiguous())
             pose = self._view.cam_from_world.to(means.dtype)
-            check_inputs(gaussians, pose, view.camera, options, self._background, None, check_values=False)
+            check_inputs(Request(gaussians, pose, view.camera, options, self._background), check_values=False)
             self._camera = native_camera(cuda_backend.IDENTITY, view.camera, options)
             self._rays = native_rays(view.camera, means.device)
             self.room = room or self._room_for(self._projected(gaussians, room=0).instances)
@@ -115,9 +114,8 @@ class CapturedRender:
                 break
             self.room = self._room_for(sum(per_row))
             self._replay = frame = None  # gives their memory back before more is taken
-        counters = cuda_backend.Counters()
-        gaussians = len(frame.visible)
-        counters.record(frame.pairs.clone(), gaussians=gaussians, visible=visible, instances=sum(per_row))
+        known = {"gaussians": len(frame.visible), "visible": visible, "instances": sum(per_row)}
+        counters = cuda_backend.Counters(frame.pairs.clone(), **known)
         image, transmittance, depth = frame.image.clone(), frame.transmittance.clone(), frame.depth.clone()
         return Rendering(image, transmittance, depth, frame.visible.clone(), counters)
 
@@ -130,12 +128,12 @@ class CapturedRender:
             )
         return min(self._most, int(HEADROOM * instances) + 1)
 
-    def _projected(self, gaussians: Gaussians, *, room: int) -> Projected:
+    def _projected(self, gaussians: Gaussians, *, room: int) -> DeviceProjected:
         named = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors)
         tensors = [tensor.contiguous() for tensor in named]  # which must outlive the call
         pose = self._view.cam_from_world.to(torch.float32)
-        inputs = native.Inputs(len(gaussians), *map(pointer, tensors), None)
-        return Projected(self._camera, pose, inputs, self._options.max_instances, room=room)
+        inputs = Inputs(len(gaussians), *map(pointer, tensors), None)
+        return DeviceProjected(self._camera, pose, inputs, self._options.max_instances, room=room)
 
     def _record(self) -> Frame:
         """All the work of a frame; nothing here waits for the device."""

@@ -1,4 +1,4 @@
-"""Projected Gaussians and tile lists in the memory of a GPU, strip by strip; `padgs.render.tiles` is the CPU's.
+"""DeviceProjected Gaussians and tile lists in the memory of a GPU, strip by strip; `padgs.render.tiles` is the CPU's.
 
 The host reads one thing back: how many instances each row of tiles has, before anything of their size is allocated.
 Where it must not wait (`padgs.render.backends.captured`), there is room for a stated number of them instead: Gaussians
@@ -15,10 +15,9 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from padgs.native import cuda as cuda_native
-from padgs.native import library as native
+from padgs.native import cuda
+from padgs.native.abi import Inputs, NativeCamera, pointer
 from padgs.native.cuda import Queue, SortArguments, TileTable
-from padgs.native.library import pointer
 from padgs.render.tiles import TILE, strip_cuts
 
 BUCKET = 32  # instances of one list that a warp differentiates together, see csrc/cuda/layout.h
@@ -55,15 +54,15 @@ class TileRows:
 def tile_rows(width: int, height: int, model: int, square: int, device: torch.device) -> TileRows:
     """The rows of tiles of a camera; computed once for each device."""
     level = torch.empty(-(-height // TILE), dtype=torch.int32)
-    camera = native.Camera(width=width, height=height, model=model, square=square)
-    cuda_native.library().padgs_cuda_tile_levels(ctypes.byref(camera), pointer(level))
+    camera = NativeCamera(width=width, height=height, model=model, square=square)
+    cuda.library().padgs_cuda_tile_levels(ctypes.byref(camera), pointer(level))
     return TileRows(level.tolist(), width, device)
 
 
-class Strip:
+class DeviceStrip:
     """The lists of some rows of tiles."""
 
-    def __init__(self, projected: Projected, first_row: int, end_row: int) -> None:
+    def __init__(self, projected: DeviceProjected, first_row: int, end_row: int) -> None:
         """Fill the lists of tile rows [first_row, end_row)."""
         device, rows = projected.order.device, projected.rows
         self.first_row, self.end_row = first_row, end_row
@@ -86,7 +85,7 @@ class Strip:
         largest = self.tiles if projected.room else max(self.tiles - 1, 1)
         if projected.room:
             sort.keys.fill_(largest)
-        arguments = cuda_native.BinArguments(
+        arguments = cuda.BinArguments(
             self.table,
             pointer(projected.boxes),
             pointer(projected.order),
@@ -97,7 +96,7 @@ class Strip:
             sort.arguments(self.slots, bits=largest.bit_length()),
             pointer(self.tile_start),
         )
-        cuda_native.call("padgs_cuda_bin", projected.queue, arguments, self.tiles)
+        cuda.call("padgs_cuda_bin", projected.queue, arguments, self.tiles)
 
 
 class Sorter:
@@ -108,7 +107,7 @@ class Sorter:
         self.queue, self.count = queue, count
         self.keys = torch.empty(count, dtype=torch.int32, device=device)
         self.sorted_keys, self.values = torch.empty_like(self.keys), torch.empty_like(self.keys)
-        scratch = cuda_native.library().padgs_cuda_scratch_bytes(ctypes.byref(queue), max(count, summed, 1))
+        scratch = cuda.library().padgs_cuda_scratch_bytes(ctypes.byref(queue), max(count, summed, 1))
         self.scratch = torch.empty(max(scratch, 1), dtype=torch.uint8, device=device)
 
     def arguments(self, sorted_values: Tensor, bits: int) -> SortArguments:
@@ -117,11 +116,11 @@ class Sorter:
         return SortArguments(pointer(self.scratch), len(self.scratch), self.count, *map(pointer, buffers), bits)
 
 
-class Projected:
+class DeviceProjected:
     """All Gaussians as one view sees them, in depth order, and how they spread over the tiles."""
 
     def __init__(
-        self, camera: native.Camera, pose: Tensor, inputs: native.Inputs, max_instances: int, *, room: int = 0
+        self, camera: NativeCamera, pose: Tensor, inputs: Inputs, max_instances: int, *, room: int = 0
     ) -> None:
         """Project, sort, count; waits for the device once, unless it is told how much room there is.
 
@@ -134,7 +133,7 @@ class Projected:
                 the device. 0: as many as there are.
         """
         device, count = pose.device, inputs.count
-        self.queue = cuda_native.queue(device)
+        self.queue = cuda.queue(device)
         self.camera = camera
         self.rows = tile_rows(camera.width, camera.height, camera.model, camera.square, device)
         self.footprints = torch.empty(count, 16, device=device)
@@ -142,16 +141,16 @@ class Projected:
         self.order = torch.empty(count, dtype=torch.int32, device=device)
         self.per_row: list[int] = []
         self._state_start: Tensor | None = None
-        self._only: Strip | None = None
+        self._only: DeviceStrip | None = None
         sort = Sorter(self.queue, count, device)
         self.counts = torch.zeros(len(self.rows.levels) + 1, dtype=torch.int64, device=device)
         outputs = (self.footprints, self.boxes, sort.keys, sort.values)
         table = self.table(0, len(self.rows.levels))
-        arguments = cuda_native.ProjectArguments(
+        arguments = cuda.ProjectArguments(
             camera, pointer(pose), inputs, *map(pointer, outputs), table, pointer(self.counts)
         )
-        cuda_native.call("padgs_cuda_project", self.queue, arguments)
-        cuda_native.call("padgs_cuda_sort", self.queue, sort.arguments(self.order, bits=32))
+        cuda.call("padgs_cuda_project", self.queue, arguments)
+        cuda.call("padgs_cuda_sort", self.queue, sort.arguments(self.order, bits=32))
         self.room, self.visible = room, count
         self._cuts = [0, len(self.rows.levels)]
         if not room:
@@ -168,17 +167,17 @@ class Projected:
         rows = (self.rows.level, self.rows.row_start, self._state_start)
         return TileTable(self.camera.width, self.camera.height, first_row, end_row, *map(pointer, rows))
 
-    def strips(self) -> Iterator[Strip]:
+    def strips(self) -> Iterator[DeviceStrip]:
         """The strips of the image from top to bottom; a single one is kept for the backward pass, more are not."""
         if len(self._cuts) == 2:
             if self._only is None:
-                self._only = Strip(self, *self._cuts)
+                self._only = DeviceStrip(self, *self._cuts)
             yield self._only
             return
         for first, end in zip(self._cuts, self._cuts[1:], strict=False):
-            yield Strip(self, first, end)
+            yield DeviceStrip(self, first, end)
 
-    def states(self, strip: Strip) -> Tensor:
+    def states(self, strip: DeviceStrip) -> Tensor:
         """Room for the states of a strip's pixels behind each of its buckets, [states, 256, 2]; sets their places."""
         starts = self.rows.state_starts(self.per_row)
         if self._state_start is None:

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from padgs.native import library as native
-from padgs.native.library import pointer
+from padgs.native.abi import NativeCamera, RayPointers, pointer
 from padgs.render.contract import RenderOptions
 from padgs.render.low_pass import low_pass_of
 from padgs.sphere.camera import Camera, Panorama, Pinhole, RayTable
@@ -26,7 +25,7 @@ MODELS = (Panorama, Pinhole, RayTable)
 
 @dataclass(frozen=True)
 class NativeRays:
-    """The tensors behind a `native.Rays`, which only points to them."""
+    """The tensors behind a `RayPointers`, which only points to them."""
 
     column_sine: Tensor | None = None  # [padded W]
     column_cosine: Tensor | None = None
@@ -34,14 +33,14 @@ class NativeRays:
     row_cosine: Tensor | None = None
     table: Tensor | None = None  # [H, 3, padded W]
 
-    def native(self) -> native.Rays:
+    def native(self) -> RayPointers:
         """Pointers to the tensors; they must outlive it."""
-        return native.Rays(
+        return RayPointers(
             *map(pointer, (self.column_sine, self.column_cosine, self.row_sine, self.row_cosine, self.table))
         )
 
 
-def native_camera(cam_from_world: Tensor, camera: Camera, options: RenderOptions) -> native.Camera:
+def native_camera(cam_from_world: Tensor, camera: Camera, options: RenderOptions) -> NativeCamera:
     """Pose, camera and options in one structure.
 
     Raises:
@@ -53,7 +52,7 @@ def native_camera(cam_from_world: Tensor, camera: Camera, options: RenderOptions
         )
     low_pass, off_panorama = low_pass_of(options, camera), _off_panorama(camera)
     lens = (camera.fx, camera.fy, camera.cx, camera.cy) if isinstance(camera, Pinhole) else (0.0, 0.0, 0.0, 0.0)
-    return native.Camera(
+    return NativeCamera(
         camera.width,
         camera.height,
         PROJECTIONS.index(options.projection),

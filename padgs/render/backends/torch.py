@@ -10,35 +10,19 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from padgs.gaussians import Gaussians
 from padgs.render.absolute import with_absolute_pull
-from padgs.render.contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Rendering, RenderOptions
+from padgs.render.contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Rendering, RenderOptions, Request
 from padgs.render.hybrid import hybrid_weights
 from padgs.render.projection import Footprints, project
 from padgs.render.published_bounds import check_memory, instances
-from padgs.sphere.camera import Camera
 
 PAIRS_PER_BLOCK = 1 << 21  # (pixel, Gaussian) pairs held at once
 
 
-def rasterize(
-    gaussians: Gaussians,
-    cam_from_world: Tensor,
-    camera: Camera,
-    options: RenderOptions,
-    background: Tensor,
-    probe: Tensor | None = None,
-    absolute_probe: Tensor | None = None,
-) -> Rendering:
-    """Render by brute force: every pixel against every visible Gaussian.
-
-    Args:
-        gaussians, background, probe, absolute_probe: as in `padgs.render.render`, checked.
-        cam_from_world: [4, 4] in the dtype and on the device of the means.
-        camera: which direction each pixel looks.
-        options: as in `padgs.render.render`.
-    """
-    footprints = project(gaussians, cam_from_world, camera, options, probe)
+def rasterize(request: Request) -> Rendering:
+    """Render by brute force: every pixel against every visible Gaussian."""
+    gaussians, camera, options, background = request.gaussians, request.camera, request.options, request.background
+    footprints = project(gaussians, request.cam_from_world, camera, options, request.probe)
     order = torch.argsort(footprints.depths.detach(), stable=True)
     order = order[footprints.visible[order]]
     if options.memory_cap is not None and footprints.boxes is not None:
@@ -48,7 +32,7 @@ def rasterize(
     parts = []
     for block in blocks:
         rows, columns = torch.div(block, camera.width, rounding_mode="floor"), block % camera.width
-        arguments = (footprints, gaussians.colors, background, order, rows, columns, options, absolute_probe)
+        arguments = (footprints, gaussians.colors, background, order, rows, columns, options, request.absolute_probe)
         if len(blocks) > 1 and torch.is_grad_enabled():
             parts.append(checkpoint(_blend, *arguments, use_reentrant=False, preserve_rng_state=False))
         else:

@@ -12,13 +12,14 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from padgs.anchors.model import PaDGS, PaDGSOptions
 from padgs.gaussians import Gaussians
-from padgs.native import cuda as cuda_native
+from padgs.native import cuda
 from padgs.render import Rendering, RenderOptions
 from padgs.render.backends import captured
 from padgs.render.backends import cuda as cuda_backend
 from padgs.render.backends.captured import CapturedRender
-from padgs.render.backends.cuda_tiles import Projected, Strip, tile_rows
+from padgs.render.backends.cuda_tiles import DeviceProjected, DeviceStrip, tile_rows
 from padgs.render.backends.native_camera import native_camera
+from padgs.render.contract import Request
 from padgs.scene import View
 
 pytestmark = [*cuda_engine.marks()]
@@ -57,7 +58,7 @@ def scene_of(generator: torch.Generator, count: int = 40) -> Gaussians:
 def ordinary(gaussians: Gaussians, view: View, options: RenderOptions) -> Rendering:
     background = torch.zeros(3, device=DEVICE)
     pose = view.cam_from_world.to(DEVICE, torch.float32)
-    return cuda_backend.rasterize(gaussians, pose, view.camera, options, background)
+    return cuda_backend.rasterize(Request(gaussians, pose, view.camera, options, background))
 
 
 def assert_same(actual: Rendering, expected: Rendering) -> None:
@@ -234,13 +235,13 @@ def test_what_cannot_be_recorded_is_refused(generator: torch.Generator):
 def test_more_instances_than_32_bits_count_leave_the_first_ones_in_place():
     """Slots of Gaussians far back must not begin again at 0, where they would be written over the first."""
     side, count, room = 8192, 16_400, 100
-    view = Projected.__new__(Projected)
+    view = DeviceProjected.__new__(DeviceProjected)
     view.camera = native_camera(cuda_backend.IDENTITY, camera_of("pinhole", side, side), RenderOptions("pinhole"))
     view.rows = tile_rows(side, side, view.camera.model, view.camera.square, DEVICE)
-    view.queue, view.room, view.visible, view._state_start = cuda_native.queue(DEVICE), room, count, None
+    view.queue, view.room, view.visible, view._state_start = cuda.queue(DEVICE), room, count, None
     view.boxes = torch.tensor([0, side, 0, 0, side], dtype=torch.int32, device=DEVICE).repeat(count, 1)
     view.order = torch.arange(count, dtype=torch.int32, device=DEVICE)
-    strip = Strip(view, 0, len(view.rows.levels))
+    strip = DeviceStrip(view, 0, len(view.rows.levels))
     assert count * strip.tiles > 2**32
     wanted = (strip.tiles * torch.arange(count + 1)).clamp(max=2**31 - 1)
     assert torch.equal(strip.slot_start.cpu().long(), wanted)

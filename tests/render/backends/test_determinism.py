@@ -15,7 +15,7 @@ from torch import Tensor
 
 from padgs.anchors.decoder import Decoder, decode_gaussians
 from padgs.learning.loss import photometric_loss
-from padgs.native import library as native
+from padgs.native import cpu
 from padgs.render import RenderOptions, render
 from padgs.sphere.camera import RayTable
 
@@ -114,9 +114,9 @@ def small_results() -> dict[str, dict[str, Tensor]]:
 
 IN_ANOTHER_PROCESS = """
 import sys, torch, test_determinism
-from padgs.native import library as native
+from padgs.native import cpu
 torch.save(test_determinism.small_results(), sys.argv[1])
-print(native.library().padgs_isa().decode(), end="")
+print(cpu.library().padgs_isa().decode(), end="")
 """
 
 
@@ -137,7 +137,7 @@ def on_instruction_set(isa: str, file: Path) -> tuple[str, dict[str, dict[str, T
 
 
 def test_every_instruction_set_computes_the_same(tmp_path: Path):
-    here, best = small_results(), native.library().padgs_isa().decode()
+    here, best = small_results(), cpu.library().padgs_isa().decode()
     others = {}
     for isa in {"baseline", "avx2", "avx512"} - {best}:
         used, result = on_instruction_set(isa, tmp_path / f"{isa}.pt")

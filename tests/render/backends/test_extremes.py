@@ -8,6 +8,7 @@ import pytest
 import torch
 from render_cases import (
     INPUTS,
+    SETUPS,
     camera_of,
     chosen,
     draw,
@@ -19,6 +20,7 @@ from render_cases import (
     leaves,
     view_of,
 )
+from test_parity import ENGINES_IN_FLOAT32, assert_same
 
 from padgs.gaussians import Gaussians
 from padgs.render import RenderOptions, render
@@ -90,3 +92,21 @@ def test_n2_a_non_finite_gaussian_is_rejected_or_not_drawn(name: str, bad: float
         rendering.image.sum().backward()
         assert torch.isfinite(broken.colors.grad).all() and torch.isfinite(broken.means.grad).all()
     assert torch.isfinite(rendering.image).all()
+
+
+@pytest.mark.parametrize(("projection", "lens"), [setup for setup in SETUPS if setup[0] in ("erp", "pinhole")])
+@pytest.mark.parametrize(("backend", "dtype"), ENGINES_IN_FLOAT32)
+def test_long_oblique_needles_are_drawn_in_float32_as_in_float64(projection, lens, backend, dtype):
+    """Hundreds of pixels long, thinner than one: du^2, du dv and dv^2 are large there, and their sum is not."""
+    generator = torch.Generator().manual_seed(3)
+    half = torch.deg2rad(torch.tensor([[45.0], [-30.0], [20.0]], dtype=torch.float64)) / 2
+    gaussians = Gaussians(
+        means=torch.tensor([[0.0, 0.0, 1.0], [0.1, 0.05, 1.25], [-0.2, 0.1, 1.5]], dtype=torch.float64),
+        quats=half.cos() * torch.tensor([1.0, 0, 0, 0]) + half.sin() * torch.tensor([0, 0, 0, 1.0]),
+        scales=torch.tensor([[0.3, 1e-4, 1e-4]], dtype=torch.float64).expand(3, 3),
+        opacities=torch.tensor([0.9, 0.5, 0.7], dtype=torch.float64),
+        colors=torch.tensor([[0.3, 0.5, 0.7], [0.9, 0.2, 0.1], [0.2, 0.8, 0.4]], dtype=torch.float64),
+    )
+    gaussians = gaussians.to(torch.float32).to(torch.float64)
+    options, pose = RenderOptions(projection), torch.eye(4, dtype=torch.float64)
+    assert_same(gaussians, (2048, 1024), lens, options, generator, pose=pose, backend=backend, dtype=dtype, slack=6)

@@ -7,7 +7,7 @@ from render_cases import INPUTS
 from torch import Tensor
 
 from padgs.gaussians import Gaussians
-from padgs.native import library as native
+from padgs.native.abi import Inputs, pointer
 from padgs.render import RenderOptions
 from padgs.render.backends.native_camera import native_camera
 from padgs.render.tiles import TILE, Projected
@@ -16,7 +16,7 @@ from padgs.sphere.camera import Camera
 
 def projected(gaussians: Gaussians, camera: Camera, options: RenderOptions, pose: Tensor) -> Projected:
     inputs = [getattr(gaussians, name).float().contiguous() for name in INPUTS]
-    structure = native.Inputs(len(gaussians), *map(native.pointer, inputs), None)
+    structure = Inputs(len(gaussians), *map(pointer, inputs), None)
     return Projected(native_camera(pose, camera, options), structure, options.max_instances)
 
 

@@ -11,30 +11,31 @@ import functools
 import shutil
 import subprocess
 import tempfile
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
-from padgs.native import cuda as cuda_native
-from padgs.native import library as native
+from padgs.gaussians import Gaussians
+from padgs.native import cuda, loading
 from padgs.render import BACKENDS, Rendering
 from padgs.render.backends import cuda as cuda_backend
+from padgs.render.contract import Request
 from padgs.sphere.camera import RayTable
 
 HERE = Path(__file__).parent
-SOURCES = Path(cuda_native.__file__).parent / "csrc" / "cuda"
+SOURCES = Path(cuda.__file__).parent / "csrc" / "cuda"
 COMPILER = shutil.which("c++") or shutil.which("g++")
-ON_GPU = torch.cuda.is_available() and cuda_native.available()
-real_library = cuda_native.library
+ON_GPU = torch.cuda.is_available() and cuda.available()
+real_library = cuda.library
 
 
 @functools.cache
 def emulated_library() -> ctypes.CDLL:
     """The kernels compiled for the host; seconds, once in a process."""
     loaded = compiled("padgs_cuda", sorted(SOURCES.glob("*.cu")))
-    return native.declared(loaded, cuda_native.SIGNATURES, "padgs_cuda_structure_bytes", cuda_native.STRUCTURES)
+    return loading.declared(loaded, cuda.SIGNATURES, "padgs_cuda_structure_bytes", cuda.STRUCTURES)
 
 
 @functools.cache
@@ -56,13 +57,14 @@ def compiled(name: str, sources: list[Path]) -> ctypes.CDLL:
     return ctypes.CDLL(str(target))
 
 
-def rasterize_on_gpu(gaussians, cam_from_world, camera, options, background, probe=None) -> Rendering:
+def rasterize_on_gpu(request: Request) -> Rendering:
     """`cuda_backend.rasterize` for tensors on the CPU; gradients find their way back."""
-    gaussians = type(gaussians)(**{field.name: getattr(gaussians, field.name).cuda() for field in fields(gaussians)})
+    tensors = {name: value.cuda() for name, value in vars(request).items() if isinstance(value, torch.Tensor)}
+    gaussians = Gaussians(**{name: value.cuda() for name, value in vars(request.gaussians).items()})
+    camera = request.camera
     if isinstance(camera, RayTable):
         camera = RayTable(camera.table.cuda(), camera.focal)
-    probe = None if probe is None else probe.cuda()
-    drawn = cuda_backend.rasterize(gaussians, cam_from_world.cuda(), camera, options, background.cuda(), probe)
+    drawn = cuda_backend.rasterize(replace(request, gaussians=gaussians, camera=camera, **tensors))
     tensors = {name: getattr(drawn, name).cpu() for name in ("image", "transmittance", "depth", "visible")}
     return replace(drawn, **tensors)
 
@@ -70,7 +72,7 @@ def rasterize_on_gpu(gaussians, cam_from_world, camera, options, background, pro
 if ON_GPU:
     BACKENDS["cuda"] = "cuda_engine:rasterize_on_gpu"
 else:
-    cuda_native.library = emulated_library
+    cuda.library = emulated_library
 
 
 needs_engine = pytest.mark.skipif(not ON_GPU and COMPILER is None, reason="no GPU, and no C++ compiler to emulate one")

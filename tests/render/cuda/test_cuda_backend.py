@@ -16,8 +16,7 @@ from torch import Tensor
 from padgs import render as package
 from padgs.gaussians import Gaussians
 from padgs.learning.failure import is_out_of_memory
-from padgs.native import cuda as cuda_native
-from padgs.native import library as native
+from padgs.native import cuda, loading
 from padgs.render import Rendering, RenderOptions, render
 from padgs.render.backends import cuda as cuda_backend
 from padgs.render.backends import cuda_tiles
@@ -135,14 +134,14 @@ def test_counters_are_those_of_the_cpu(blending: str, generator: torch.Generator
 
 def test_cores_are_kept_only_to_be_differentiated(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch):
     kept = []
-    call = cuda_native.call
+    call = cuda.call
 
     def spy(name: str, where, *arguments) -> None:
         if name == "padgs_cuda_blend":
             kept.append(arguments[0].core is not None and arguments[0].tails is not None)
         call(name, where, *arguments)
 
-    monkeypatch.setattr(cuda_native, "call", spy)
+    monkeypatch.setattr(cuda, "call", spy)
     inputs = leaves(gaussians_of("ordinary", 5, generator), torch.float32)
     view, options = view_of(camera_of("panorama", 32, 16)), RenderOptions(blending="hybrid")
     images = [render(inputs, view, options, backend="cuda").image]
@@ -166,7 +165,7 @@ def test_going_back_twice_gives_the_same(blending: str, generator: torch.Generat
 def test_other_dtypes_and_places_are_refused(monkeypatch: pytest.MonkeyPatch):
     with pytest.raises(ValueError, match="backend cuda takes float32 tensors on a GPU, got torch.float64 on "):
         cuda_backend.check(torch.zeros(1, 3, dtype=torch.float64))
-    monkeypatch.setattr(cuda_native, "device_type", lambda: "cuda")
+    monkeypatch.setattr(cuda, "device_type", lambda: "cuda")
     where = "" if torch.cuda.is_available() else r" \(torch finds no GPU with a driver here\)"
     with pytest.raises(ValueError, match=f"got torch.float32 on cpu{where}; convert them, or use backend=auto"):
         cuda_backend.check(torch.zeros(1, 3))
@@ -180,31 +179,31 @@ def test_more_instances_than_a_list_can_hold_are_refused(generator, monkeypatch:
 
 
 def test_errors_of_cuda_keep_their_names():
-    cuda_native.raise_for(0, "padgs_cuda_sort")
+    cuda.raise_for(0, "padgs_cuda_sort")
     with pytest.raises(RuntimeError, match="padgs_cuda_sort: CUDA error 700, ") as error:
-        cuda_native.raise_for(700, "padgs_cuda_sort")
+        cuda.raise_for(700, "padgs_cuda_sort")
     assert not is_out_of_memory(error.value)
     with pytest.raises(torch.cuda.OutOfMemoryError, match="padgs_cuda_sort: CUDA error 2, ") as error:
-        cuda_native.raise_for(2, "padgs_cuda_sort")
+        cuda.raise_for(2, "padgs_cuda_sort")
     assert is_out_of_memory(error.value)
 
 
 def test_a_gpu_that_nothing_was_compiled_for_is_named(monkeypatch: pytest.MonkeyPatch):
     fake = SimpleNamespace(padgs_cuda_check=lambda _: 209, padgs_cuda_architectures=lambda: b"80 90")
-    monkeypatch.setattr(cuda_native, "library", lambda: fake)
+    monkeypatch.setattr(cuda, "library", lambda: fake)
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda _: (7, 5))
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda _: "Tesla T4")
     with pytest.raises(
         RuntimeError, match="compiled for compute capabilities 80 90; Tesla T4 has 75. .*ARCHITECTURES=75"
     ):
-        cuda_native.check_device.__wrapped__(0)
+        cuda.check_device.__wrapped__(0)
 
 
 def test_without_the_library_auto_means_torch_and_says_so(tmp_path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("PADGS_LIBRARY_DIR", str(tmp_path))
-    monkeypatch.setattr(native, "_package_folders", lambda: [str(tmp_path)])
-    monkeypatch.setattr(cuda_native, "library", cuda_engine.real_library.__wrapped__)
-    cuda_native.available.cache_clear()
+    monkeypatch.setattr(loading, "_package_folders", lambda: [str(tmp_path)])
+    monkeypatch.setattr(cuda, "library", cuda_engine.real_library.__wrapped__)
+    cuda.available.cache_clear()
     package._say_that_native_is_missing.cache_clear()
     means = SimpleNamespace(device=torch.device("cuda"), dtype=torch.float32)
     with warnings.catch_warnings(record=True) as caught:
@@ -213,7 +212,7 @@ def test_without_the_library_auto_means_torch_and_says_so(tmp_path, monkeypatch:
     assert "slower than cuda: libpadgs_cuda.so not found in" in str(caught[0].message) and "nvcc" in str(
         caught[0].message
     )
-    monkeypatch.setattr(cuda_native, "available", lambda: True)
+    monkeypatch.setattr(cuda, "available", lambda: True)
     assert package.resolve_backend("auto", means) == "cuda"
     assert package.resolve_backend("auto", SimpleNamespace(device=torch.device("cuda"), dtype=torch.float64)) == "torch"
 

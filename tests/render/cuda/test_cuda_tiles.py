@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from render_cases import INPUTS, camera_of, identity_pose, mixture, random_pose
 from torch import Tensor
 
-from padgs.native import cuda as cuda_native
-from padgs.native import library as native
+from padgs.native import cuda
+from padgs.native.abi import Inputs, Pointer, pointer
 from padgs.render import RenderOptions
-from padgs.render.backends.cuda_tiles import BUCKET, Projected, TileRows
+from padgs.render.backends.cuda_tiles import BUCKET, DeviceProjected, TileRows
 from padgs.render.backends.native_camera import native_camera
 from padgs.render.tiles import TILE
 
@@ -28,12 +28,12 @@ CPU = torch.device("cpu")
 
 def projected(
     size: tuple[int, int], options: RenderOptions, lens: str, generator: torch.Generator, pose: Tensor
-) -> Projected:
+) -> DeviceProjected:
     gaussians = mixture(12, generator)
     inputs = [getattr(gaussians, name).float() for name in INPUTS]
-    structure = native.Inputs(len(gaussians), *map(native.pointer, inputs), None)
+    structure = Inputs(len(gaussians), *map(pointer, inputs), None)
     camera = native_camera(identity_pose(), camera_of(lens, *size), options)
-    return Projected(camera, pose.float(), structure, options.max_instances)
+    return DeviceProjected(camera, pose.float(), structure, options.max_instances)
 
 
 def pixels_of(box: list[int], size: tuple[int, int]) -> set[tuple[int, int]]:
@@ -112,14 +112,12 @@ def test_every_bucket_has_room_of_its_own_for_its_pixels(rows, data):
     flat = torch.tensor([0, *(count for counts in per_tile[first:end] for count in counts)]).cumsum(0)
     tile_start, tiles = flat.to(torch.int32), len(flat) - 1
     tensors = (table.level, table.row_start, starts)
-    native_table = cuda_native.TileTable(width, len(rows) * TILE, first, end, *map(native.pointer, tensors))
+    native_table = cuda.TileTable(width, len(rows) * TILE, first, end, *map(pointer, tensors))
 
     library = cuda_engine.layout_library()
     buckets = int(tile_start[-1]) // BUCKET + tiles
     tile_of = torch.empty(buckets, dtype=torch.int32)
-    library.check_buckets(
-        native.Pointer(tile_start.data_ptr()), tiles, ctypes.c_int64(buckets), native.Pointer(tile_of.data_ptr())
-    )
+    library.check_buckets(Pointer(tile_start.data_ptr()), tiles, ctypes.c_int64(buckets), Pointer(tile_of.data_ptr()))
     wanted = [t for t in range(tiles) for _ in range(-(-int(tile_start[t + 1] - tile_start[t]) // BUCKET))]
     assert [t for t in tile_of.tolist() if t >= 0] == wanted
 
@@ -130,8 +128,8 @@ def test_every_bucket_has_room_of_its_own_for_its_pixels(rows, data):
             continue
         places = torch.empty(16, dtype=torch.int64)
         row = library.check_states(
-            ctypes.byref(native_table), native.Pointer(tile_start.data_ptr()), tile, ctypes.c_int64(bucket),
-            native.Pointer(places.data_ptr()),
+            ctypes.byref(native_table), Pointer(tile_start.data_ptr()), tile, ctypes.c_int64(bucket),
+            Pointer(places.data_ptr()),
         )  # fmt: skip
         assert row == row_of_tile[tile]
         taken += places[: 1 << table.levels[row]].tolist()
@@ -141,12 +139,12 @@ def test_every_bucket_has_room_of_its_own_for_its_pixels(rows, data):
 
 def test_blocks_draw_every_chunk_once():
     table = TileRows([2, 1, 0], 5 * TILE - 3, CPU)  # five chunks across
-    native_table = cuda_native.TileTable(5 * TILE - 3, 40, 1, 3, *map(native.pointer, (table.level, table.row_start)))
+    native_table = cuda.TileTable(5 * TILE - 3, 40, 1, 3, *map(pointer, (table.level, table.row_start)))
     library = cuda_engine.layout_library()
     library.check_blocks.restype = ctypes.c_int64
     blocks = library.check_blocks(ctypes.byref(native_table), None)
     places = torch.empty(blocks, 6, dtype=torch.int32)
-    library.check_blocks(ctypes.byref(native_table), native.Pointer(places.data_ptr()))
+    library.check_blocks(ctypes.byref(native_table), Pointer(places.data_ptr()))
     row, level, tile, chunk, x0, y0 = places.unbind(1)
     assert row.tolist() == [1] * 5 + [2] * 5 and level.tolist() == [1] * 5 + [0] * 5
     assert tile.tolist() == [0, 0, 1, 1, 2, 3, 4, 5, 6, 7]
@@ -159,5 +157,5 @@ def test_lists_begin_at_the_first_key_that_is_not_less(keys: list[int], key: int
     library = cuda_engine.layout_library()
     library.check_lower_bound.restype = ctypes.c_int64
     values = torch.tensor(keys, dtype=torch.int32)
-    found = library.check_lower_bound(native.Pointer(values.data_ptr()), ctypes.c_int64(len(keys)), key)
+    found = library.check_lower_bound(Pointer(values.data_ptr()), ctypes.c_int64(len(keys)), key)
     assert found == sum(k < key for k in keys)

@@ -1,0 +1,63 @@
+"""libpadgs_cpu: tiles, SIMD, OpenMP (`csrc/cpu`); importing this module loads nothing."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+
+from padgs.native.abi import (
+    BlendGradientArguments,
+    DecodeGradientArguments,
+    Gradients,
+    Inputs,
+    Int32,
+    Int64,
+    LossArguments,
+    NativeCamera,
+    Pointer,
+)
+from padgs.native.loading import declared, opened
+
+STRUCTURES = (NativeCamera, Inputs, Gradients, BlendGradientArguments, DecodeGradientArguments, LossArguments)
+SIGNATURES = {
+    "padgs_isa": ([], ctypes.c_char_p),
+    "padgs_structure_bytes": ([Int32], Int64),
+    "padgs_project": ([Pointer] * 4, None),
+    "padgs_project_backward": ([Pointer] * 4, None),
+    "padgs_tile_levels": ([Pointer] * 2, None),
+    "padgs_depth_order": ([Pointer, Pointer, Int64, Pointer], Int64),
+    "padgs_count_instances": ([Pointer, Int64, Pointer, Int32, Pointer], None),
+    "padgs_bin": ([Pointer, Int64, Pointer, Int64, *[Pointer] * 4], None),
+    "padgs_sum_moments": ([Pointer, Pointer, Int64, Pointer], None),
+    "padgs_core_words": ([Pointer], Int64),
+    "padgs_blend_forward": ([Pointer], None),
+    "padgs_blend_backward": ([Pointer], None),
+    "padgs_decode_select": ([Pointer], None),
+    "padgs_decode_place": ([Pointer], None),
+    "padgs_decode_backward": ([Pointer], None),
+    "padgs_photometric_loss": ([Pointer], ctypes.c_double),
+    "padgs_loss_workspace": ([Int32, Int32], Int64),
+    "padgs_measure_fma": ([Int64], ctypes.c_double),
+    "padgs_measure_triad": ([Pointer, Pointer, Int64], ctypes.c_double),
+}
+
+
+@functools.cache
+def library() -> ctypes.CDLL:
+    """The loaded CPU library.
+
+    Raises:
+        OSError: it was not built (no compiler at install time), does not load, or was built from other sources; the
+            message says where it was sought.
+    """
+    return declared(opened("padgs_cpu", "a C++ compiler"), SIGNATURES, "padgs_structure_bytes", STRUCTURES)
+
+
+@functools.cache
+def available() -> bool:
+    """Whether the native CPU library is built and loads."""
+    try:
+        library()
+    except OSError:
+        return False
+    return True
