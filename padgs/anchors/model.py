@@ -174,7 +174,7 @@ class PaDGS(nn.Module):
 
     def decode(self, view: View) -> Decoded:
         """The Gaussians that this view shows (Eq. 13-15)."""
-        return Decoded(*decode_gaussians(self.decoder.weights(), *self._as_seen(view), self.options.precision))
+        return Decoded(*decode_gaussians(self.decoder.weights(), *self.as_seen(view), self.options.precision))
 
     def show(self, view: View) -> Gaussians:
         """The same for `padgs.render.backends.captured`: A K Gaussians, of which those that are not selected are zeros.
@@ -182,9 +182,9 @@ class PaDGS(nn.Module):
         Raises:
             ValueError, OSError: as `padgs.anchors.decoder.decode_padded` does.
         """
-        return decode_padded(self.decoder.weights(), *self._as_seen(view), self.options.precision)
+        return decode_padded(self.decoder.weights(), *self.as_seen(view), self.options.precision)
 
-    def _as_seen(self, view: View) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    def as_seen(self, view: View) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
         """What is decoded: features, how the camera sees them, positions, offsets, log-scales, attenuation."""
         options = self.options
         direction, distance, omega = self.seen_from(view)
