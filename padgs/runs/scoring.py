@@ -23,8 +23,7 @@ def scores(
     found = {}
     for name, protocol in protocols.items():
         on_view = None if save_picture is None or found else _picture_saver(save_picture)
-        evaluation = evaluate(method.render, scene.test, protocol, device=scene.points.device, on_view=on_view)
-        found[name] = Scores(evaluation.protocol, evaluation.mean, evaluation.views, evaluation.notes)
+        found[name] = evaluate(method.render, scene.test, protocol, on_view=on_view)
     return found
 
 
