@@ -17,7 +17,7 @@ from padgs.runs.device import DEVICES
 from padgs.runs.labels import Labels
 from padgs.runs.typed import ConfigError, typed
 from padgs.scoring.protocols import PROTOCOLS, Protocol, protocol_from_options
-from padgs.tracking.tracking import TrackingOptions
+from padgs.tracking.tracker import TrackingOptions
 
 
 @dataclass(frozen=True)
