@@ -43,9 +43,9 @@ class Session:
         torch.manual_seed(config.seed)
         device = chosen(config.run.device, config.render)
         clock.reset_peak_memory(device)
-        options = replace(config.data, device=config.data.device or str(device))
+        images_on = str(device) if config.run.images_on == "device" else config.run.images_on
         self.config, self.console, self.watch = config, console, watch
-        self.scene = data.load(config.data.path, config.data.format, options).to(device)
+        self.scene = data.load(config.data.path, config.data.format, config.data.options(images_on)).to(device)
         name = run_id(config.values(), self.scene.name, self.scene.fingerprint, config.preset)
         self.folder = RunFolder(Path(config.run.folder) / name)
 
