@@ -10,6 +10,7 @@ import hashlib
 import json
 import math
 import os
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
@@ -18,17 +19,19 @@ from typing import Any
 SCHEMA = 2
 ADDED = {"peak_device_memory_bytes"}  # to the schema since: files without them are read, with the default
 FILE_NAME = "result.json"
+LOG_NAME = "log.jsonl"
 STATUSES = {
     "ok": "trained to the end and evaluated",
     "oom": "an allocation failed, or memory would have passed the declared limit",
     "nan": "a loss, gradient or parameter was not finite",
-    "diverged": "the loss rose well above its best and stayed there",
     "collapsed": "next to nothing was left to draw",
-    "exploded": "sizes or counts left all bounds",
-    "degenerate": "the loss fell although the geometry was wrong",
     "timeout": "the time limit came before the last iteration",
     "rejected": "the input was refused with a clear error",
 }
+# Keys of a configuration that no trained number depends on but by rounding: of the machine, and the others. What was
+# read is said by the fingerprint of the data; scoring comes after training. `data.device` is in files of old runs only.
+OF_THE_MACHINE = ("run", "render.max_instances", "data.cache_bytes", "data.read_ahead", "data.device")
+DECIDE_NOTHING = (*OF_THE_MACHINE, "data.path", "protocol")
 
 
 class ResultError(ValueError):
@@ -139,6 +142,42 @@ def read_all(folder: Path) -> tuple[list[Result], list[ResultError]]:
         except ResultError as error:
             errors.append(error)
     return results, errors
+
+
+def log_lines(run_folder: Path, tail: int | None = None) -> Iterator[dict[str, Any]]:
+    """The whole lines of a run's log, each with its `iteration`; a line that is being written, or was cut, is left out.
+
+    Args:
+        run_folder: of one run; a log that is missing has no lines.
+        tail: read so many bytes at the end of the log only.
+    """
+    try:
+        with (run_folder / LOG_NAME).open("rb") as file:
+            if tail is not None:
+                file.seek(max(0, file.seek(0, os.SEEK_END) - tail))
+            lines = file.read().splitlines()
+    except OSError:
+        return
+    for line in lines:
+        try:
+            entry = json.loads(line)
+            entry["iteration"] = int(entry["iteration"])
+        except (ValueError, KeyError, TypeError):
+            continue
+        yield entry
+
+
+def decisive(config: Mapping[str, Any], where: str = "") -> dict[str, Any]:
+    """A configuration without the keys that decide nothing.
+
+    >>> decisive({"seed": 0, "run": {"threads": 2}, "data": {"path": "/x", "width": 64}})
+    {'seed': 0, 'data': {'width': 64}}
+    """
+    return {
+        key: decisive(value, f"{where}{key}.") if isinstance(value, Mapping) else value
+        for key, value in config.items()
+        if f"{where}{key}" not in DECIDE_NOTHING
+    }
 
 
 def replace_file(path: Path, content: bytes) -> None:

@@ -80,7 +80,7 @@ def lengths(runs: Iterable[Result]) -> list[list[Result]]:
     """The runs in groups that differ in their length only; with as many threads each."""
     groups: dict[str, list[Result]] = {}
     for result in runs:
-        config = {key: value for key, value in of_any_length(result).config.items() if key not in ("run", "protocol")}
+        config = results.decisive(of_any_length(result).config)
         key = [result.preset, result.fingerprint, OF_TIMES["machine"](result, ""), config]
         groups.setdefault(json.dumps(key, sort_keys=True), []).append(result)
     return list(groups.values())

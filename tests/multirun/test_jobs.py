@@ -11,7 +11,7 @@ from rich.console import Console
 
 from padgs.multirun import overview
 from padgs.multirun.board import Board, JobState
-from padgs.multirun.multirun import Multirun
+from padgs.multirun.jobs import Multirun
 from padgs.runs.interrupt import Interrupted
 
 IN_PROCESS = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"

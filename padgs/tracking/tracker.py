@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,6 @@ from typing import TYPE_CHECKING
 from filelock import FileLock
 
 from padgs.results import Result
-from padgs.tracking.watch import Watch
 
 if TYPE_CHECKING:
     from padgs.tracking.mlflow_mirror import Mirror
@@ -115,27 +113,3 @@ class Tracker:
             place = None if self.uri.startswith(SERVERS) else (self._runs / "mlflow-artifacts").as_uri()
             identity = known.experiment_id if known else client.create_experiment(self.name, place)
             return Mirror(client, identity, self._multirun)
-
-
-class TrackedRun(Watch):
-    """Mirrors the only run of a process, now and then."""
-
-    def __init__(self, tracker: Tracker) -> None:
-        """With this tracker."""
-        self._tracker, self._looked = tracker, time.monotonic()
-        self._folder: Path | None = None
-
-    def started(self, folder: Path, iterations: int) -> None:
-        """The run is known."""
-        self._folder = folder
-
-    def saved(self, folder: Path) -> None:
-        """The log is up to date."""
-        if time.monotonic() - self._looked >= SECONDS_BETWEEN_LOOKS:
-            self._tracker.update(folder)
-            self._looked = time.monotonic()
-
-    def finished(self) -> None:
-        """The result was written."""
-        if self._folder is not None:
-            self._tracker.update(self._folder)

@@ -25,7 +25,7 @@ from padgs.runs.folder import cannot_write
 from padgs.runs.interrupt import Interrupt, Interrupted
 from padgs.runs.labels import labels
 from padgs.runs.typed import typed
-from padgs.tracking.tracking import SECONDS_BETWEEN_LOOKS, Tracker, TrackingOptions
+from padgs.tracking.tracker import SECONDS_BETWEEN_LOOKS, Tracker, TrackingOptions
 
 ATTEMPTS = 2  # of a job whose process died: it may have been the fault of another one
 
