@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 from padgs.results import Result
 from reports.charts import sweep_chart, trade_off_chart
@@ -13,8 +12,8 @@ from reports.charts.drawing import Chart
 from reports.charts.sweeps import Sweep, sweeps
 from reports.charts.trade_off import TradeOff, trade_offs
 from reports.measures import marks
-from reports.quality_log import probes
 from reports.request import Request, admitted
+from reports.store import Run
 from reports.tables import ladder, quirks, runs, side_by_side, table3, tables_of_methods
 from reports.tables.table import Table
 
@@ -33,10 +32,9 @@ TABLES: Mapping[str, Callable[[Sequence[Result], Request], Table]] = {
 
 @dataclass(frozen=True)
 class Gathered:
-    """The results of a folder of run folders, and what is asked of them. Everything raises ReportError if refused."""
+    """Finished runs, and what is asked of them. Everything raises ReportError if refused."""
 
-    folder: Path
-    results: Sequence[Result]
+    runs: Sequence[Run]
     request: Request
     left_out: Sequence[str] = ()  # why which result files could not be used
 
@@ -44,6 +42,11 @@ class Gathered:
         """Refuse at once what no result or table knows."""
         marks(self.request.protocol)
         admitted(self.results, self.request)
+
+    @cached_property
+    def results(self) -> list[Result]:
+        """What the runs have to say for themselves."""
+        return [run.result for run in self.runs]
 
     def table(self, name: str) -> Table:
         """A table of `TABLES`."""
@@ -59,9 +62,9 @@ class Gathered:
     @cached_property
     def trade_offs(self) -> list[tuple[TradeOff, list[Chart]]]:
         """Speed against accuracy with its picture, and quality over training time where runs left a log."""
-        found = []
+        found, logs = [], {run.result.run: run.log for run in self.runs}
         for made in trade_offs(self.results, self.request):
-            over_time = trade_off_chart.time_chart(made, probes(self.folder, made.runs))
+            over_time = trade_off_chart.time_chart(made, logs)
             found.append((made, [trade_off_chart.chart(made), *([over_time] if over_time else [])]))
         return found
 

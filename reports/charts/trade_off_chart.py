@@ -11,7 +11,6 @@ from reports.charts.drawing import Chart, Tips, color_of, dress, figure, finish,
 from reports.charts.trade_off import COSTS, Point, TradeOff, pareto
 from reports.measures import Measure
 from reports.published import Key
-from reports.quality_log import Probe
 from reports.settings import settings
 
 AREA = 60.0  # points^2 of a marker with the median number of Gaussians
@@ -45,7 +44,7 @@ def chart(trade_off: TradeOff) -> Chart:
 
 
 @styled
-def time_chart(trade_off: TradeOff, probes: Mapping[str, Sequence[Probe]]) -> Chart | None:
+def time_chart(trade_off: TradeOff, logs: Mapping[str, Mapping[str, Sequence[float]]]) -> Chart | None:
     """Held-out PSNR over training seconds; None where no run left a log.
 
     A line for each run of one scene; of the scenes of a data set, whose lines would bury each other, the first seed.
@@ -60,12 +59,12 @@ def time_chart(trade_off: TradeOff, probes: Mapping[str, Sequence[Probe]]) -> Ch
     for setting in (setting for runs in by_scene for setting in settings(runs)):
         color, marker = color_of(setting.preset, presets), marker_of(setting.preset, presets)
         for result in setting.runs[: 1 if len(scenes) > 1 else None]:
-            points = probes.get(result.run, ())
-            if not points:
+            log = logs.get(result.run, {})
+            if not log.get("psnr"):
                 continue
             label = None if setting.title in drawn else setting.title
             drawn[setting.title] = None
-            xs, ys = [p.seconds for p in points], [p.psnr for p in points]
+            xs, ys = log["seconds"], log["psnr"]
             panel.plot(xs, ys, color=color, linewidth=1.1, alpha=0.8, label=label)
             ends.append(xs[-1])
             tip = tips.add(f"{setting.title}, {result.scene}, seed {result.seed}\n{ys[-1]:.2f} dB after {xs[-1]:.0f} s")

@@ -32,7 +32,7 @@ def text(gathered: Gathered) -> str:
     tables = [table for table in made if table is not None and table.blocks]
     trade_offs = _attempt(lambda: gathered.trade_offs, refused) or []
     sweeps = _attempt(lambda: gathered.sweeps, refused) or []
-    pictures = album(gathered.folder, gathered.results, gathered.request)
+    pictures = album(gathered.runs, gathered.request)
     return environment.get_template("page.html.j2").render(
         facts=_facts(gathered),
         problems=[*gathered.left_out, *refused],

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import base64
 import io
-import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from PIL import Image
 
-from padgs.results import Result
+from padgs.results import Result, picture_name
 from reports.request import Request
 from reports.scenes import at, places
 from reports.settings import Setting, chosen, settings
+from reports.store import Run
 
-FOLDER = "renders"  # of a run: truth | render | error of each test view, side by side
 WIDTH = 1024  # pixels of an embedded panorama at most
 QUALITY = 80  # of JPEG
 VIEWS = 3  # of a scene at most
@@ -42,33 +41,35 @@ class Album:
         return len(self.images) - 1
 
 
-def album(folder: Path, results: Sequence[Result], request: Request) -> Album:
+def album(runs: Sequence[Run], request: Request) -> Album:
     """Each setting of the methods, and the rows of ablations, on a few views of each scene; one seed is enough."""
+    results = [run.result for run in runs]
+    folders = {run.result.run: run.pictures for run in runs if run.pictures is not None}
     own = [*chosen(results, "table1", request), *(r for r in chosen(results, "table3", request) if r.variant)]
-    seen = list({result.run: result for result in own if _files(folder, result)}.values())
+    seen = list({result.run: result for result in own if _files(folders, result)}.values())
     groups = {place: settings(at(place, seen)) for place in places(seen)}
     views = min(VIEWS, max(1, MOST_FILES // max(1, sum(map(len, groups.values())))))
     made, opened = Album(), 0
-    for place, runs in groups.items():
-        names = _spread(_files(folder, runs[0].runs[0]), views)
-        opened += len(runs) * len(names)
+    for place, shown_settings in groups.items():
+        names = _spread(_files(folders, shown_settings[0].runs[0]), views)
+        opened += len(shown_settings) * len(names)
         if opened > MOST_FILES:
             made.left_out.append(place.title)
             continue
-        shown = [view for name in names if (view := _view(made, folder, runs, name))["methods"]]
+        shown = [view for name in names if (view := _view(made, folders, shown_settings, name))["methods"]]
         if shown:
             made.scenes.append({"title": place.title, "views": shown})
     return made
 
 
-def _view(made: Album, folder: Path, runs: Sequence[Setting], name: str) -> dict[str, Any]:
+def _view(made: Album, folders: Mapping[str, Path], runs: Sequence[Setting], name: str) -> dict[str, Any]:
     view: dict[str, Any] = {"title": Path(name).stem, "truth": None, "methods": []}
     for setting in runs:
-        run = next((run for run in setting.runs if (folder / run.run / FOLDER / name).is_file()), None)
+        run = next((run for run in setting.runs if name in _files(folders, run)), None)
         if run is None:
             continue
         try:
-            with Image.open(folder / run.run / FOLDER / name) as picture:
+            with Image.open(folders[run.run] / name) as picture:
                 picture.load()
         except OSError:
             continue  # a picture that a kill has cut: the numbers do not depend on it
@@ -81,8 +82,8 @@ def _view(made: Album, folder: Path, runs: Sequence[Setting], name: str) -> dict
     return view
 
 
-def _files(folder: Path, run: Result) -> list[str]:
-    return sorted(path.name for path in (folder / run.run / FOLDER).glob("*.png"))
+def _files(folders: Mapping[str, Path], run: Result) -> list[str]:
+    return sorted(path.name for path in folders[run.run].glob("*.png")) if run.run in folders else []
 
 
 def _spread(names: Sequence[str], count: int) -> list[str]:
@@ -101,6 +102,6 @@ def _mark(run: Result, name: str) -> str:
     for scores in run.scores.values():
         for view, numbers in scores.views.items():
             value = numbers.get("psnr")
-            if re.sub(r"[^A-Za-z0-9._-]+", "-", view) == Path(name).stem and value is not None:
+            if picture_name(view) == name and value is not None:
                 return f" ({value:.2f} dB)"
     return ""

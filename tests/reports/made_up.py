@@ -10,6 +10,7 @@ from PIL import Image
 from padgs import results
 from padgs.results import Result, Scores
 from reports import published
+from reports.store import LOGGED, Run
 
 RULES = {"name": "paper", "lpips": "vgg", "lpips_inputs": "01", "bottom_crop": 0.0}
 
@@ -172,3 +173,8 @@ def picture(one: Result, run: Path, width: int = 128) -> None:
         render = np.roll(truth, 2, 1) * 0.95
         three = np.concatenate([truth, render, np.abs(truth - render)], 1)
         Image.fromarray((255 * three).astype("uint8")).save(run / "renders" / f"view{view}.png")
+
+
+def runs_of(results_: list[Result]) -> list[Run]:
+    """Runs that left nothing but their results."""
+    return [Run(one, dict.fromkeys(LOGGED, ()), {}) for one in results_]

@@ -7,7 +7,7 @@ from typer.testing import CliRunner
 from padgs import results
 from padgs.cli.app import app
 from padgs.results import Result, Scores
-from padgs.tracking.mlflow_mirror import batches, log_lines
+from padgs.tracking.mlflow_mirror import batches
 from padgs.tracking.tracking import TrackedRun, Tracker, TrackingOptions
 
 NEEDS_MLFLOW = pytest.mark.filterwarnings("ignore")  # what it warns of is not ours
@@ -142,12 +142,6 @@ def test_a_run_in_progress_is_not_looked_at_all_the_time(tmp_path, monkeypatch):
     assert looks == []
     watch.finished()
     assert looks == [tmp_path]
-
-
-def test_lines_that_are_being_written_are_left_for_later(tmp_path):
-    assert list(log_lines(tmp_path)) == []
-    (tmp_path / "log.jsonl").write_text('{"iteration": 1}\n{"loss": 2}\n{"iteration": 2, "lo')
-    assert list(log_lines(tmp_path)) == [{"iteration": 1}]
 
 
 def test_batches_hold_everything_once():

@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 from made_up import METHODS, compared, data_set, small, write
 
+from reports import store
 from reports.charts import trade_off_chart
 from reports.charts.drawing import color_of, marker_of
 from reports.charts.trade_off import csv_text, pareto, trade_offs
 from reports.methods import TITLES, ordered
-from reports.quality_log import probes
 from reports.request import Request
 from reports.tables.table import ReportError
 
@@ -70,7 +70,7 @@ def test_published_numbers_stand_on_axes_of_their_own():
 
 def test_quality_over_training_time_comes_from_the_logs(tmp_path):
     runs = compared(seeds=1)
-    logs = probes(write(runs, tmp_path), runs)
+    logs = {run.result.run: run.log for run in store.read(write(runs, tmp_path))[0]}
     room = next(chart for chart in trade_offs(runs, Request()) if "room" in chart.name)
     svg = trade_off_chart.time_chart(room, logs).svg
     assert "<title>PaD-GS, synthetic-room, seed 0\n25.47 dB after 200 s</title>" in svg  # 26 - 8 / 15 at the last probe
