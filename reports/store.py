@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from padgs.results import Result, ResultError
 
 FILE_NAME = "results.jsonl"
 LOGGED = ("iteration", "seconds", "psnr")  # seconds of training so far; dB
+NO_LOG: Mapping[str, Sequence[float]] = {name: () for name in LOGGED}
 
 
 @dataclass(frozen=True)
@@ -25,8 +26,8 @@ class Run:
     """A finished run, and what it left beside its result."""
 
     result: Result
-    log: Mapping[str, Sequence[float]]  # name of `LOGGED` -> its values, as many for each
-    document: Mapping[str, Any]  # content of the result file
+    log: Mapping[str, Sequence[float]] = field(default_factory=lambda: NO_LOG)  # name of `LOGGED` -> its values
+    document: Mapping[str, Any] | None = None  # content of the result file
     pictures: Path | None = None  # folder of truth | render | error of each test view; None in a store
 
 
@@ -63,8 +64,9 @@ def add(runs: Iterable[Run], store: Path) -> list[Run]:
         raise damaged[0]
     by_name = {run.result.run: run for run in (*there, *runs)}
     together = [by_name[name] for name in sorted(by_name)]
-    lines = (json.dumps({**run.document, "log": run.log}, separators=(",", ":"), allow_nan=False) for run in together)
-    results.replace_file(store, "".join(f"{line}\n" for line in lines).encode())
+    lines = ({**(run.document or results.encoded(run.result)), "log": run.log} for run in together)
+    texts = (json.dumps(line, separators=(",", ":"), allow_nan=False) for line in lines)
+    results.replace_file(store, "".join(f"{text}\n" for text in texts).encode())
     return together
 
 

@@ -10,9 +10,7 @@ from typing import Annotated
 import typer
 
 from padgs import results
-from padgs.registry import lookup
 from reports import REPORTS, store
-from reports.request import Request
 from reports.tables.table import ReportError
 
 ALL = "all"
@@ -33,33 +31,31 @@ def report(
     strict: Annotated[bool, typer.Option(help="exit code 1 if a result file cannot be used")] = False,
 ) -> None:
     """Make tables (Markdown, LaTeX, CSV), charts (SVG, PNG, CSV) and a page (HTML) from result files."""
+    if what not in (*REPORTS, ALL):
+        raise _refused(f"unknown report {what!r}; known: {', '.join(sorted(REPORTS))}, {ALL}")
     source = Path(runs)
     if not source.exists():
         raise _refused(f"there is no folder {source}; give the folder of the runs after the name of the report")
     target = Path(out) if out else (source if source.is_dir() else source.parent) / "reports"
+    from reports.files import files  # pandas, which other commands need not wait for
+    from reports.frame import frame
+    from reports.gathered import Gathered
+    from reports.request import Request
+
     try:
+        request = Request(protocol, mix, tuple(metric or ()), experiment, dict(map(_pair, where or [])))
         found, broken = store.read(source)
         if collect:
             found = _collected(found, target / store.FILE_NAME)
-    except results.ResultError as error:
+        for error in broken:
+            print(f"left out: {error}", file=sys.stderr)
+        gathered = Gathered(frame(found), request, tuple(map(str, broken)))
+    except (ReportError, results.ResultError) as error:
         raise _refused(str(error)) from error
-    for error in broken:
-        print(f"left out: {error}", file=sys.stderr)
-    from reports.gathered import Gathered
-
-    try:
-        wanted = {name: lookup(REPORTS, name, "report") for name in (REPORTS if what == ALL else [what])}
-        settings = dict(_pair(setting) for setting in where or [])
-        request = Request(protocol, mix, tuple(metric or ()), experiment, settings)
-        gathered = Gathered(found, request, tuple(map(str, broken)))
-    except ReportError as error:
-        raise _refused(str(error)) from error
-    except ValueError as error:
-        raise _refused(f"{error}, {ALL}") from error
     refused = 0
-    for name, files in wanted.items():
+    for name in REPORTS if what == ALL else [what]:
         try:
-            texts = _write(files(gathered), target)
+            texts = _write(files(gathered.report(name)), target)
         except ReportError as error:
             refused += 1
             print(f"error: {name}: {error}", file=sys.stderr)

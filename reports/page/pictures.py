@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 from PIL import Image
 
-from padgs.results import Result, picture_name
-from reports.request import Request
-from reports.scenes import at, places
-from reports.settings import Setting, chosen, settings
-from reports.store import Run
+from reports.frame import by_place
+from reports.gathered import Gathered
+from reports.settings import Setting, settings
 
 WIDTH = 1024  # pixels of an embedded panorama at most
 QUALITY = 80  # of JPEG
@@ -41,35 +40,35 @@ class Album:
         return len(self.images) - 1
 
 
-def album(runs: Sequence[Run], request: Request) -> Album:
+def album(gathered: Gathered) -> Album:
     """Each setting of the methods, and the rows of ablations, on a few views of each scene; one seed is enough."""
-    results = [run.result for run in runs]
-    folders = {run.result.run: run.pictures for run in runs if run.pictures is not None}
-    own = [*chosen(results, "table1", request), *(r for r in chosen(results, "table3", request) if r.variant)]
-    seen = list({result.run: result for result in own if _files(folders, result)}.values())
-    groups = {place: settings(at(place, seen)) for place in places(seen)}
+    methods, parts = gathered.chosen("table1"), gathered.chosen("table3")
+    own = pd.concat([methods, parts.loc[parts["variant"] != ""]]).drop_duplicates("run")
+    own = own.loc[own["pictures"].map(_files).map(len) > 0]
+    groups = {place: settings(runs) for place, runs in by_place(own).items()}
     views = min(VIEWS, max(1, MOST_FILES // max(1, sum(map(len, groups.values())))))
     made, opened = Album(), 0
-    for place, shown_settings in groups.items():
-        names = _spread(_files(folders, shown_settings[0].runs[0]), views)
-        opened += len(shown_settings) * len(names)
+    for place, shown in groups.items():
+        names = _spread(_files(shown[0].runs["pictures"].iloc[0]), views)
+        opened += len(shown) * len(names)
         if opened > MOST_FILES:
             made.left_out.append(place.title)
             continue
-        shown = [view for name in names if (view := _view(made, folders, shown_settings, name))["methods"]]
-        if shown:
-            made.scenes.append({"title": place.title, "views": shown})
+        pictured = [view for name in names if (view := _view(made, shown, name))["methods"]]
+        if pictured:
+            made.scenes.append({"title": place.title, "views": pictured})
     return made
 
 
-def _view(made: Album, folders: Mapping[str, Path], runs: Sequence[Setting], name: str) -> dict[str, Any]:
+def _view(made: Album, shown: Sequence[Setting], name: str) -> dict[str, Any]:
     view: dict[str, Any] = {"title": Path(name).stem, "truth": None, "methods": []}
-    for setting in runs:
-        run = next((run for run in setting.runs if name in _files(folders, run)), None)
-        if run is None:
+    for setting in shown:
+        runs = setting.runs.loc[[(folder / name).is_file() for folder in setting.runs["pictures"]]]
+        if runs.empty:
             continue
+        run = runs.iloc[0]
         try:
-            with Image.open(folders[run.run] / name) as picture:
+            with Image.open(run["pictures"] / name) as picture:
                 picture.load()
         except OSError:
             continue  # a picture that a kill has cut: the numbers do not depend on it
@@ -78,12 +77,14 @@ def _view(made: Album, folders: Mapping[str, Path], runs: Sequence[Setting], nam
         if view["truth"] is None:
             view["truth"] = made.add(truth)
         images = {"render": made.add(render), "error": made.add(error, WIDTH // 2)}
-        view["methods"].append({"title": f"{setting.title}{_mark(run, name)}", **images})
+        psnr = run["view_psnr"].get(name)
+        mark = "" if psnr is None else f" ({psnr:.2f} dB)"
+        view["methods"].append({"title": f"{setting.title}{mark}", **images})
     return view
 
 
-def _files(folders: Mapping[str, Path], run: Result) -> list[str]:
-    return sorted(path.name for path in folders[run.run].glob("*.png")) if run.run in folders else []
+def _files(folder: Path | None) -> list[str]:
+    return [] if folder is None else sorted(path.name for path in folder.glob("*.png"))
 
 
 def _spread(names: Sequence[str], count: int) -> list[str]:
@@ -95,13 +96,3 @@ def _spread(names: Sequence[str], count: int) -> list[str]:
     if len(names) <= count:
         return list(names)
     return [names[round(i * (len(names) - 1) / max(1, count - 1))] for i in range(count)]
-
-
-def _mark(run: Result, name: str) -> str:
-    """The PSNR of the view, after the name of the method."""
-    for scores in run.scores.values():
-        for view, numbers in scores.views.items():
-            value = numbers.get("psnr")
-            if picture_name(view) == name and value is not None:
-                return f" ({value:.2f} dB)"
-    return ""

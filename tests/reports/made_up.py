@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -10,7 +11,10 @@ from PIL import Image
 from padgs import results
 from padgs.results import Result, Scores
 from reports import published
-from reports.store import LOGGED, Run
+from reports.frame import frame
+from reports.gathered import Gathered
+from reports.request import Request
+from reports.store import Run
 
 RULES = {"name": "paper", "lpips": "vgg", "lpips_inputs": "01", "bottom_crop": 0.0}
 
@@ -175,6 +179,6 @@ def picture(one: Result, run: Path, width: int = 128) -> None:
         Image.fromarray((255 * three).astype("uint8")).save(run / "renders" / f"view{view}.png")
 
 
-def runs_of(results_: list[Result]) -> list[Run]:
-    """Runs that left nothing but their results."""
-    return [Run(one, dict.fromkeys(LOGGED, ()), {}) for one in results_]
+def gathered(results_: list[Result], **asked: Any) -> Gathered:
+    """What a report is made from, of runs that left nothing but their results."""
+    return Gathered(frame(map(Run, results_)), Request(**asked))
