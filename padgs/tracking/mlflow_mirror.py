@@ -11,8 +11,11 @@ from omegaconf import OmegaConf
 
 from padgs import results
 from padgs.results import Result
+from reports.frame import frame
+from reports.gathered import Gathered
 from reports.request import Request
-from reports.tables import runs
+from reports.store import Run
+from reports.tables.runs import runs
 from reports.writers import csv_text, markdown
 
 RUN, PARENT, MULTIRUN, LOGGED = "padgs.run", "mlflow.parentRunId", "padgs.multirun", "padgs.logged_iteration"  # tags
@@ -98,7 +101,7 @@ class Mirror:
         self._client.set_terminated(identity, "FINISHED" if result.ok else "FAILED")
 
     def _log_table(self, identity: str, found: Sequence[Result]) -> None:
-        table = runs.build(found, Request(mix=True))
+        table = runs(Gathered(frame(map(Run, found)), Request(mix=True)))
         self._client.log_text(identity, markdown.text(table), "tables/runs.md")
         self._client.log_text(identity, csv_text.text(table), "tables/runs.csv")
 
