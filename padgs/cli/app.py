@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import typer
 
+import padgs
 from padgs.cli.bench import bench
 from padgs.cli.check import check
 from padgs.cli.convert import convert
@@ -15,8 +18,17 @@ from padgs.cli.track import track
 app = typer.Typer(no_args_is_help=True, add_completion=False)
 
 
+def show_version(asked: bool) -> None:
+    """Print the version and stop, if that is asked."""
+    if asked:
+        typer.echo(f"padgs {padgs.__version__}")
+        raise typer.Exit
+
+
 @app.callback()
-def commands() -> None:
+def commands(
+    version: Annotated[bool, typer.Option("--version", callback=show_version, is_eager=True, help="and stop")] = False,
+) -> None:
     """Panoramic Gaussian splatting, measured fairly."""
 
 

@@ -33,7 +33,7 @@ __all__ = ["DATASETS", "LOADERS", "DataError", "DataOptions", "load", "read"]
 
 
 def load(
-    path: str | Path | None,
+    path: str | Path | None = None,
     format: str = "auto",
     options: DataOptions = DataOptions(),  # noqa: B008 - frozen dataclass
     **fields: object,
@@ -41,7 +41,7 @@ def load(
     """The scene in a folder.
 
     Args:
-        path: the data set's folder, or the file that describes it; the synthetic loader needs none.
+        path: the data set's folder, or the file that describes it; without one, the built-in room is made.
         format: a name of `LOADERS`, or auto.
         options: the `data` group of the configuration.
         fields: single options by name, over `options`.

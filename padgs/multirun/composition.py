@@ -14,10 +14,12 @@ from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf, open_dict
 
+from padgs.learning.method import Method
 from padgs.multirun.overrides import lenient, root
 from padgs.multirun.run import register_fields
 from padgs.runs.config import RunConfig, config_from_values
 from padgs.runs.labels import labels
+from padgs.runs.session import build
 
 _PLAIN = re.compile(r"[\w./@:-]+")  # values that Hydra's grammar takes without quotes
 
@@ -45,6 +47,21 @@ def configuration(settings: Sequence[str]) -> RunConfig:
     values = OmegaConf.to_container(config, resolve=True)
     assert isinstance(values, dict)
     return config_from_values({str(key): value for key, value in values.items()}, labels(choices))
+
+
+def make_method(name: str = "padgs", *settings: str) -> Method:
+    """An untrained method, as `padgs-run method=NAME SETTINGS` would train it.
+
+    Args:
+        name: a choice of `method`: any that the README lists.
+        settings: as on the command line, of its options, rendering, loss or seed: "method.sh_degree=1", "seed=2".
+
+    Raises:
+        ConfigError: an unknown key, or a value that it cannot have.
+        HydraException: there is no such method.
+    """
+    with composing():
+        return build(configuration([f"method={name}", *settings]))
 
 
 def settings_of(values: Mapping[str, Any], *choices: str) -> list[str]:

@@ -1,0 +1,141 @@
+"""A run opened from Python: its method, scene and scores, and pictures as arrays; finished or not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from omegaconf import OmegaConf
+from scipy.spatial.transform import Rotation, Slerp
+
+from padgs import data
+from padgs.learning.method import Method
+from padgs.results import Result, Scores
+from padgs.runs import checkpoint
+from padgs.runs.config import RunConfig, config_from_values
+from padgs.runs.device import chosen
+from padgs.runs.folder import RunFolder, RunFolderError
+from padgs.runs.session import build
+from padgs.scene import Scene, View
+from padgs.scoring.evaluate import evaluate
+from padgs.scoring.protocols import PROTOCOLS
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What a method shows of a view, as float32 arrays."""
+
+    image: np.ndarray  # [H, W, 3] colours in [0, 1]
+    depth: np.ndarray  # [H, W] world units from the camera, the mean by contribution; 0 where there is nothing
+    alpha: np.ndarray  # [H, W] in [0, 1], 1 where nothing of the background is seen
+
+
+def draw(method: Method, view: View) -> Picture:
+    """What a trained method shows of a view.
+
+    Raises:
+        RuntimeError: the method has no model yet.
+    """
+    rendering = method.render(view)
+    image, depth = rendering.image.clamp(0, 1), rendering.depth
+    return Picture(*(tensor.float().cpu().numpy() for tensor in (image, depth, 1 - rendering.transmittance)))
+
+
+class OpenedRun:
+    """What `load_run` returns.
+
+    Attributes:
+        folder: of the run.
+        config: its configuration.
+        method: as its last checkpoint left it.
+        result: what `result.json` says; None where the run is not finished.
+    """
+
+    def __init__(self, folder: Path, config: RunConfig, method: Method, result: Result | None) -> None:
+        self.folder, self.config, self.method, self.result = folder, config, method, result
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The scene that it was trained on, loaded when first asked for.
+
+        Raises:
+            DataError: it is not where it was; `load_run(folder, data=...)` says where it is now.
+        """
+        device = chosen(self.config.run.device, self.config.render)
+        options = self.config.data.options(str(device))
+        return data.load(self.config.data.path, self.config.data.format, options).to(device)
+
+    @property
+    def scores(self) -> dict[str, Scores]:
+        """Protocol -> the marks of the test views, as `result.json` has them; empty where the run is not finished."""
+        return self.result.scores if self.result is not None else {}
+
+    def render(self, view: View) -> Picture:
+        """What it shows of a view: one of its scene, or the same camera elsewhere, `view.at(cam_from_world)`."""
+        return draw(self.method, view)
+
+    def score(self, protocol: str) -> Scores:
+        """The marks of the test views now, under a protocol of the run or a known one.
+
+        Raises:
+            ValueError: unknown protocol, or there are no test views.
+        """
+        rules = {**PROTOCOLS, **self.config.protocols}
+        if protocol not in rules:
+            raise ValueError(f"unknown protocol {protocol!r}; known: {', '.join(rules)}")
+        return evaluate(self.method.render, self.scene.test, rules[protocol])
+
+    def path(self, frames: int) -> list[View]:
+        """Views along a path through the training cameras in their order, `frames` of them, evenly spaced in number.
+
+        Raises:
+            ValueError: fewer than two training views or frames.
+        """
+        views = self.scene.train
+        if len(views) < 2 or frames < 2:
+            raise ValueError(f"a path of {frames} frames through {len(views)} views; it takes at least two of both")
+        poses = torch.stack([view.cam_from_world for view in views]).cpu().numpy()
+        times = np.linspace(0, len(views) - 1, frames)
+        turns = Slerp(np.arange(len(views)), Rotation.from_matrix(poses[:, :3, :3]))(times).as_matrix()
+        centers = np.stack([view.center.cpu().numpy() for view in views])
+        at = np.stack([np.interp(times, np.arange(len(views)), axis) for axis in centers.T], axis=-1)
+        found = []
+        for number, (turn, center) in enumerate(zip(turns, at, strict=True)):
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = turn, -turn @ center
+            view = views[0].at(torch.from_numpy(pose).to(views[0].cam_from_world))
+            found.append(replace(view, name=f"frame-{number:05d}"))
+        return found
+
+
+def load_run(folder: str | Path, *, data: str | Path | None = None, device: str = "auto") -> OpenedRun:
+    """Open the folder of a run.
+
+    Args:
+        folder: with `config.yaml` and `checkpoint/`, as `padgs-run` writes them.
+        data: where the data set is now, if not where it was.
+        device: auto, cpu or cuda.
+
+    Raises:
+        RunFolderError: it is no such folder, or has no checkpoint.
+        CheckpointError, ResultError, ConfigError: one of its files is damaged, or of another version.
+    """
+    files = RunFolder(Path(folder))
+    settings = files.path / "config.yaml"
+    if not settings.is_file() or not checkpoint.exists(files.checkpoint):
+        raise RunFolderError(
+            f"{folder} has no {'checkpoint' if settings.is_file() else settings.name}; give the folder of one run, as "
+            "padgs-run names it at its end"
+        )
+    values: Any = OmegaConf.to_container(OmegaConf.load(settings))
+    values["data"].pop("device", None)  # of runs until run.device decided alone
+    values["data"]["path"] = values["data"]["path"] if data is None else str(data)
+    values["run"]["device"] = device
+    config = config_from_values(values)
+    method = build(config)
+    method.load_state(checkpoint.load(files.checkpoint, chosen(device, config.render)))
+    return OpenedRun(files.path, config, method, files.result())

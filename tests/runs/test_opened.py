@@ -1,0 +1,89 @@
+"""Runs opened from Python: what they show, how they score, and what is wrong with folders that are none."""
+
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from rich.console import Console
+
+import padgs
+from padgs.multirun.composition import composing, configuration
+from padgs.results import read
+from padgs.runs.folder import RunFolderError
+from padgs.runs.session import Session
+
+SETTINGS = [
+    "method=omnigs",
+    "train.iterations=30",
+    "data.generator.width=32",
+    "data.generator.train_views=3",
+    "data.generator.test_views=2",
+    "data.generator.samples=1",
+    "data.generator.points=200",
+    "protocol=sphere",
+    "protocol.sphere.lpips=none",
+    "run.device=cpu",
+    "tracking=none",
+]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PADGS_CACHE", str(tmp_path_factory.mktemp("cache")))
+        runs = tmp_path_factory.mktemp("runs")
+        with composing():
+            config = configuration([*SETTINGS, f"run.folder={runs}"])
+        Session(config, Console(quiet=True)).run()
+        yield next(path.parent for path in runs.glob("*/result.json"))
+
+
+def test_an_opened_run_shows_and_scores_what_was_trained(folder):
+    run = padgs.load_run(folder, device="cpu")
+    assert run.result == read(folder / "result.json") and run.scores == run.result.scores
+    again = run.score("sphere")
+    assert again.metrics == pytest.approx(run.scores["sphere"].metrics, nan_ok=True)
+    view = run.scene.test[0]
+    picture = run.render(view)
+    assert [part.dtype for part in (picture.image, picture.depth, picture.alpha)] == [np.float32] * 3
+    assert picture.image.shape == (16, 32, 3) and picture.depth.shape == picture.alpha.shape == (16, 32)
+    for part in (picture.image, picture.alpha):
+        assert part.min() >= 0 and part.max() <= 1
+    assert picture.depth[picture.alpha > 0.5].min() > 0
+    truth = view.image().numpy()
+    assert np.square(picture.image - truth).mean() < np.square(truth - truth.mean()).mean(), "better than grey"
+
+
+def test_a_path_goes_through_the_training_cameras(folder):
+    run = padgs.load_run(folder, device="cpu")
+    views = run.path(5)  # three cameras, and one between each two
+    for view, camera in zip(views[::2], run.scene.train, strict=True):
+        assert torch.allclose(view.cam_from_world, camera.cam_from_world, atol=1e-9)
+    middle = (run.scene.train[0].center + run.scene.train[1].center) / 2
+    assert torch.allclose(views[1].center, middle, atol=1e-9)
+    turn = views[1].cam_from_world[:3, :3]
+    assert torch.allclose(turn @ turn.T, torch.eye(3, dtype=torch.float64), atol=1e-9)
+    assert run.render(views[1]).image.shape == (16, 32, 3)
+    with pytest.raises(ValueError, match="a path of 1 frames through 3 views"):
+        run.path(1)
+
+
+def test_a_run_that_is_not_finished_opens_too_and_an_old_key_is_passed_over(folder, tmp_path):
+    copy = shutil.copytree(folder, tmp_path / "run")
+    (copy / "result.json").unlink()
+    settings = copy / "config.yaml"
+    settings.write_text(settings.read_text().replace("data:\n", "data:\n  device: cpu\n", 1))
+    run = padgs.load_run(copy)
+    assert run.result is None and run.scores == {}
+    assert run.method.size().counts["gaussians"] > 0
+
+
+def test_what_is_no_run_is_refused_with_a_way_out(folder, tmp_path):
+    with pytest.raises(RunFolderError, match="has no config.yaml; give the folder of one run"):
+        padgs.load_run(tmp_path)
+    shutil.copy(folder / "config.yaml", tmp_path)
+    with pytest.raises(RunFolderError, match="has no checkpoint"):
+        padgs.load_run(tmp_path)
+    with pytest.raises(ValueError, match="unknown protocol 'papre'; known: paper, sphere"):
+        padgs.load_run(folder).score("papre")
