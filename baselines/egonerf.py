@@ -39,6 +39,8 @@ class EgoNeRFMethod:
     """See `padgs.learning.method.Method`."""
 
     Options = EgoNeRFMethodOptions
+    RENDER = RenderConfig()
+    TRAIN = TrainOptions(weight="uniform")
 
     def __init__(
         self,

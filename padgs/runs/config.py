@@ -110,7 +110,7 @@ class RunConfig:
 
     @property
     def preset(self) -> str:
-        """The name of the method's settings: of a file in conf/method."""
+        """The name of the method's settings: its own, or that of a file in conf/method."""
         return self.labels.preset or self.method
 
     def values(self) -> dict[str, Any]:
