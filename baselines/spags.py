@@ -2,7 +2,7 @@
 
 What is its own: projection `ray` with the 3D filter (variance 0.2 (r / f)^2), hybrid transparency, a Gaussian that
 reaches the near sphere is not drawn at all, and a densification signal that knows no image plane. All but the last is
-how it renders (conf/method/spags.yaml); spags_sorted blends in the order of the means instead.
+how it renders (`RENDER`); spags_sorted blends in the order of the means instead.
 """
 
 from __future__ import annotations

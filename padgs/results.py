@@ -59,7 +59,7 @@ class Result:
     run: str  # run id = name of the run folder
     status: str  # key of STATUSES
     method: str  # name in `baselines.METHODS`
-    preset: str  # name of the file in conf/method that the run was started with
+    preset: str  # what `method=` was when the run was started: a method, or a file in conf/method
     variant: str  # row of an ablation; empty for none
     dataset: str  # synthetic, a name of padgs.data.DATASETS, or empty for a capture of one's own
     scene: str

@@ -8,14 +8,17 @@ import pytest
 from composed import composed, expanded, first_and_last_job, jobs
 from hydra.errors import HydraException
 
+from baselines import METHODS
 from padgs.anchors.growth import PUBLISHED_THRESHOLD
 from padgs.anchors.method import PaDGSMethodOptions
 from padgs.anchors.model import PaDGSOptions
 from padgs.data.datasets import DATASETS
 from padgs.learning.loop import TrainOptions
+from padgs.multirun.choices import method_choices
 from padgs.multirun.composition import composing
 from padgs.multirun.launchers import missing_plugin
 from padgs.multirun.overrides import expand
+from padgs.registry import lookup
 from padgs.render.config import RenderConfig
 from padgs.runs.config import RunOptions, TrainConfig
 from padgs.scoring.protocols import PROTOCOLS, ROAM_360_BOTTOM_CROP
@@ -27,6 +30,10 @@ SWEEPS = sorted(path.stem for path in (CONF.parent / "sweeps" / "sweep").glob("*
 
 def files(*groups: str) -> list[str]:
     return sorted(f"{group}={path.stem}" for group in groups for path in (CONF / group).glob("*.yaml"))
+
+
+def registered() -> list[str]:
+    return [f"{group}={name}" for name in METHODS for group, _ in method_choices(name)]
 
 
 @pytest.fixture(autouse=True)
@@ -44,7 +51,7 @@ def test_without_arguments_all_values_are_the_defaults_of_the_dataclasses():
     assert config.data.path is None and config.data.generator == {"scene": "room"}
 
 
-@pytest.mark.parametrize("choice", files("data", "method", "render", "train", "protocol", "tracking"))
+@pytest.mark.parametrize("choice", [*files("data", "method", "render", "train", "protocol", "tracking"), *registered()])
 def test_every_choice_composes(choice):
     composed(choice)
 
@@ -168,9 +175,17 @@ def test_the_release_of_padgs_differs_from_the_paper_where_its_code_does():
     assert (released.train.weight, released.train.normalisation) == ("end_rows", "channel_sum")
 
 
+@pytest.mark.parametrize("name", sorted(METHODS.keys() - {"padgs"}))
+def test_every_method_is_drawn_and_trained_as_its_class_says(name):
+    method, config = lookup(METHODS, name, "method"), composed(f"method={name}")
+    assert (config.options, config.render) == (method.Options(), method.RENDER)
+    assert asdict(method.TRAIN).items() <= asdict(config.train).items()
+
+
 def test_a_choice_on_the_command_line_beats_what_the_method_brings():
     config = composed("method=omnigs", "train=default")
     assert config.train.weight == "solid_angle"
+    assert composed("method=op43dgs", "render=default").render == RenderConfig()
 
 
 @pytest.mark.parametrize("name", ["ablation", "ablation_bar", "ablation_cat_tower"])

@@ -27,7 +27,6 @@ class DataSettings:
     generator: Mapping[str, Any] = field(default_factory=dict)  # knobs of the synthetic scene
 
     def __post_init__(self) -> None:
-        """Reject values that no loader could follow."""
         if self.split not in SPLITS:
             raise DataError(f"unknown data.split {self.split!r}; known: {', '.join(SPLITS)}")
         if self.test_every < 2:

@@ -45,7 +45,6 @@ class ImageStore:
         self._pool: ThreadPoolExecutor | None = None
 
     def __contains__(self, image: Decodable) -> bool:
-        """Whether the pixels are kept now."""
         with self._lock:
             return image in self._kept
 

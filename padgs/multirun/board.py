@@ -98,7 +98,6 @@ class BoardEntry(Watch):
     """Writes what a job does on the board of its multirun."""
 
     def __init__(self, board: Board, number: int) -> None:
-        """Of the job with this number."""
         self.data: str | None = None  # folder of the data set
         self._board, self._number, self._state = board, number, JobState(RUNNING)
         self._board.write(number, self._state)

@@ -15,8 +15,8 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf, open_dict
 
 from padgs.learning.method import Method
+from padgs.multirun.choices import register_choices
 from padgs.multirun.overrides import lenient, root
-from padgs.multirun.run import register_fields
 from padgs.runs.config import RunConfig, config_from_values
 from padgs.runs.labels import labels
 from padgs.runs.session import build
@@ -28,7 +28,7 @@ _PLAIN = re.compile(r"[\w./@:-]+")  # values that Hydra's grammar takes without 
 def composing() -> Iterator[ConfigLoader]:
     """Within it `configuration` can be called; yields what knows the choices of groups."""
     os.environ.setdefault("PADGS_ROOT", str(root()))
-    register_fields()
+    register_choices()
     with initialize_config_dir(str(root() / "conf"), version_base="1.3"):
         yield GlobalHydra.instance().config_loader()
 

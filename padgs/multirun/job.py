@@ -91,7 +91,6 @@ class TrackedRun(Watch):
     """Mirrors the only run of a process, now and then."""
 
     def __init__(self, tracker: Tracker) -> None:
-        """With this tracker."""
         self._tracker, self._looked = tracker, time.monotonic()
         self._folder: Path | None = None
 

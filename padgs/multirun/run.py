@@ -9,30 +9,16 @@ import sys
 from datetime import datetime
 
 import hydra
-from hydra.core.config_store import ConfigStore
 from rich.console import Console
 
-from baselines import METHODS
 from padgs.multirun import job, sweeper
 from padgs.multirun.board import FOLDER, OK
+from padgs.multirun.choices import register_choices
 from padgs.multirun.launchers import missing_plugin
 from padgs.multirun.overrides import conflict, lenient, options_first, root
-from padgs.multirun.scenes import scene_choices
-from padgs.runs.config import default_fields, method_fields
 from padgs.runs.interrupt import Interrupted
 
 INTERRUPTED = 130  # exit code of a command that Ctrl-C ended
-
-
-def register_fields() -> None:
-    """Tell Hydra the keys and defaults of the dataclasses, so that files and commands only name what differs."""
-    store = ConfigStore.instance()
-    store.store(name="fields", node=default_fields())
-    for method in METHODS:
-        store.store(group="fields/method", name=method, node=method_fields(method))
-    for name, scene in scene_choices().items():
-        store.store(group="scene", name=name, node=scene, package="_global_")
-    sweeper.register()
 
 
 def main() -> None:
@@ -42,7 +28,8 @@ def main() -> None:
     if problem := conflict(arguments) or missing_plugin(arguments):
         job.complain(problem)
         sys.exit(1)
-    register_fields()
+    register_choices()
+    sweeper.register()
     start = f"{datetime.now():%Y%m%d-%H%M%S}-{os.getpid()}"
     sys.argv[1:] = [*options_first(lenient(arguments)), f"hydra.sweep.dir=${{run.folder}}/{FOLDER}/{start}"]
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # what schedulers send is told apart from a crash

@@ -41,7 +41,6 @@ class TrainConfig(TrainOptions):
     max_seconds: float | None = None  # of training; where they end it, the run has status timeout
 
     def __post_init__(self) -> None:
-        """Reject an empty budget."""
         super().__post_init__()
         if self.iterations < 1:
             raise ValueError(f"iterations is {self.iterations}; it must be at least 1")
@@ -68,7 +67,6 @@ class RunOptions:
     pictures: bool = True  # save truth | render | error of each test view
 
     def __post_init__(self) -> None:
-        """Reject unknown places, and intervals that never come round."""
         for name, known in (("device", DEVICES), ("images_on", IMAGES_ON)):
             if getattr(self, name) not in known:
                 raise ValueError(f"unknown run.{name} {getattr(self, name)!r}; known: {', '.join(known)}")
@@ -104,13 +102,12 @@ class RunConfig:
     labels: Labels = Labels()
 
     def __post_init__(self) -> None:
-        """Reject an unknown kind of retry."""
         if self.retry not in RETRIES:
             raise ConfigError(f"unknown retry {self.retry!r}; known: {', '.join(RETRIES)}")
 
     @property
     def preset(self) -> str:
-        """The name of the method's settings: of a file in conf/method."""
+        """The name of the method's settings: its own, or that of a file in conf/method."""
         return self.labels.preset or self.method
 
     def values(self) -> dict[str, Any]:

@@ -34,7 +34,6 @@ class Interrupt:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Give the signals back."""
         self._restore()
 
     def _request(self, number: int, frame: FrameType | None) -> None:

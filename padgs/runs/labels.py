@@ -12,7 +12,7 @@ FULL = "full"  # the scale that is not mentioned
 class Labels:
     """Who asked for a run, and by which names; not part of the hash of its configuration."""
 
-    preset: str = ""  # choice in conf/method; empty = the method's own name
+    preset: str = ""  # choice of `method`; empty = the method's own name
     experiments: tuple[str, ...] = ()  # experiment and sweep, with "@scale" where it is not full; sorted
 
 

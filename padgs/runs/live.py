@@ -57,7 +57,6 @@ class LiveLine(Display):
     """Of one run: iteration, loss, held-out PSNR, counts, iterations per second and the time that is left."""
 
     def __init__(self, console: Console, iterations: int) -> None:
-        """A line about a run of so many iterations."""
         super().__init__(console, redraw=1 / REDRAWS_PER_SECOND, line=SECONDS_BETWEEN_LINES)
         self._iterations = iterations
         self._times: deque[tuple[int, float]] = deque(maxlen=RECENT)

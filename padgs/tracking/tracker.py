@@ -42,7 +42,6 @@ class TrackingOptions:
     telemetry: bool = False  # whether mlflow may report its use to its makers
 
     def __post_init__(self) -> None:
-        """Reject an unknown kind."""
         if self.kind not in KINDS:
             raise ValueError(f"unknown tracking.kind {self.kind!r}; known: {', '.join(KINDS)}")
 

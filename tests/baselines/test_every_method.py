@@ -1,4 +1,4 @@
-"""What every method promises, whatever it is: each file of conf/method is trained for a few steps here.
+"""What every method promises, whatever it is: each, and each preset in conf/method, is trained for a few steps here.
 
 A new method needs no line here, unless its defaults are too large for a test (`TINY`) or it is slow (`SLOW`).
 """
@@ -36,7 +36,8 @@ TINY_EGONERF = tuple(
 # setting -> overrides that make it small enough for a test
 TINY: dict[str, tuple[str, ...]] = {"egonerf": TINY_EGONERF, "egonerf_small": TINY_EGONERF}
 SLOW: set[str] = set()  # settings that are not fast enough for every run of the tests
-SETTINGS = sorted(path.stem for path in (Path(__file__).resolve().parents[2] / "conf" / "method").glob("*.yaml"))
+CONF = Path(__file__).resolve().parents[2] / "conf"
+SETTINGS = sorted({*METHODS, *(path.stem for path in (CONF / "method").glob("*.yaml"))})
 EXPLICIT = [name for name in METHODS if issubclass(lookup(METHODS, name, "method"), SplatMethod)]
 EVERY = [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in SETTINGS]
 

@@ -1,3 +1,4 @@
+import inspect
 import io
 import json
 import os
@@ -25,6 +26,7 @@ from padgs.runs.lock import RunBusy
 from padgs.runs.session import Session
 
 ITERATIONS = 12
+PACKAGE = Path(session.__file__).parents[1]
 
 
 @pytest.fixture(autouse=True)
@@ -216,11 +218,23 @@ def test_a_failed_run_is_retried_only_if_asked(config, monkeypatch, status, star
     with monkeypatch.context() as patch:
         stop_at(7, patch, fail)
         failed, _ = run(config)
-    assert failed.status == status and run(config)[0] == failed
+    assert failed.status == status and failed.iterations_done == 7 and run(config)[0] == failed
     retried, said = run(replace(config, retry="failed"))
     assert retried.status == "ok"
     assert ("resuming after iteration 5" in said) == (starts_at == 5)  # what went wrong must not be gone on from
     assert run(replace(config, retry="failed"))[0] == retried
+
+
+def test_two_frames_lie_between_a_job_and_its_method(config, monkeypatch):
+    frames = []
+
+    def fit(self, scene, budget):
+        frames.extend(frame.function for frame in inspect.stack() if Path(frame.filename).is_relative_to(PACKAGE))
+        raise Failure("nan", "for the test")
+
+    monkeypatch.setattr(PaDGSMethod, "fit", fit)
+    run(config)
+    assert frames == ["train", "run"]
 
 
 def test_a_run_that_another_process_works_on_is_left_alone(config):

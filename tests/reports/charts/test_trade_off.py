@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 from made_up import METHODS, compared, data_set, gathered, small, write
 
+import baselines
 from reports import store
 from reports.charts import trade_off_chart
 from reports.charts.drawing import color_of, marker_of
@@ -105,7 +106,7 @@ def test_scenes_of_two_data_sets_may_have_one_name():
 
 
 def test_every_preset_has_a_colour_and_a_shape_of_its_own(root):
-    presets = ordered(path.stem for path in (root / "conf" / "method").glob("*.yaml"))
+    presets = ordered({*baselines.METHODS, *(path.stem for path in (root / "conf" / "method").glob("*.yaml"))})
     looks = {(color_of(preset, presets), marker_of(preset, presets)) for preset in presets}
     assert len(looks) == len(presets) > 10
     assert len({color_of(method, presets) for method in TITLES}) == len(TITLES)

@@ -1,0 +1,72 @@
+"""Choices of groups that no file in `conf/` holds: every method and every scene that the program knows by name."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict
+from typing import Any
+
+from hydra.core.config_store import ConfigStore
+
+from baselines import METHODS
+from padgs.data.datasets import DATASETS
+from padgs.data.synthetic.options import SCENES
+from padgs.learning.loop import TrainOptions
+from padgs.multirun.overrides import root
+from padgs.registry import lookup
+from padgs.render.config import RenderConfig
+from padgs.runs.config import default_fields, method_fields
+
+
+def register_choices() -> None:
+    """Tell Hydra the keys and defaults of the dataclasses, so that files and commands only name what differs."""
+    store = ConfigStore.instance()
+    store.store(name="fields", node=default_fields())
+    for method in METHODS:
+        store.store(group="fields/method", name=method, node=method_fields(method))
+        for group, node in method_choices(method):
+            store.store(group=group, name=method, node=node, package="_global_")
+    for name, scene in scene_choices().items():
+        store.store(group="scene", name=name, node=scene, package="_global_")
+
+
+def method_choices(name: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Group and node of `method=NAME`, and of what it brings: how it is drawn and trained, where that is its own.
+
+    Those are choices as well, so that render=... and train=... on a command line replace them. Nothing of a method that
+    has a file in conf/method, which says more.
+
+    >>> list(method_choices("op43dgs"))[0]
+    ('render', {'render': {'projection': 'tangent'}})
+    """
+    if (root() / "conf" / "method" / f"{name}.yaml").exists():
+        return
+    kind = lookup(METHODS, name, "method")
+    defaults: list[Any] = [f"/fields/method/{name}@method"]
+    for group, own, usual in (("render", kind.RENDER, RenderConfig()), ("train", kind.TRAIN, TrainOptions())):
+        changes = {key: value for key, value in asdict(own).items() if value != getattr(usual, key)}
+        if changes:
+            yield group, {group: changes}
+            defaults.append({f"override /{group}": name})
+    yield "method", {"defaults": defaults}
+
+
+def scene_choices() -> dict[str, dict[str, Any]]:
+    """Choice of `+scene=` -> what it sets; named <data set>_<scene>, so that a sweep can say `+scene=glob(roam360_*)`.
+
+    >>> scene_choices()["ricoh360_cat_tower"]
+    {'defaults': [{'override /data': 'ricoh360'}], 'data': {'path': 'data/ricoh360/cat_tower'}}
+    >>> scene_choices()["synthetic_outdoor"]
+    {'defaults': [{'override /data': 'synthetic'}], 'data': {'generator': {'scene': 'outdoor'}}}
+    """
+    built_in = {f"synthetic_{scene}": _scene("synthetic", {"generator": {"scene": scene}}) for scene in SCENES}
+    published = {
+        f"{name}_{scene}": _scene(name, {"path": f"data/{known.title.casefold()}/{scene}"})
+        for name, known in DATASETS.items()
+        for scene in known.scenes
+    }
+    return {**built_in, **published}
+
+
+def _scene(data: str, values: dict[str, Any]) -> dict[str, Any]:
+    return {"defaults": [{"override /data": data}], "data": values}
