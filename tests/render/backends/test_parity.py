@@ -125,7 +125,7 @@ def test_n9_every_engine_agrees_with_the_definition(projection, lens, configurat
         gaussians = Gaussians(**{**vars(gaussians), "scales": 0.2 * gaussians.scales})
     if kind == "needle" and projection == "ray":  # which fades what is thinner than a pixel
         gaussians = Gaussians(**{**vars(gaussians), "scales": gaussians.scales.clamp(min=0.03)})
-    slack = 6 if kind == "needle" else 1  # their covariances alone cost four digits of seven
+    slack = 8 if kind == "needle" else 1  # their covariances alone cost four digits of seven
     assert_same(gaussians, size, lens, options, generator, pose=pose, backend=backend, dtype=dtype, slack=slack)
 
 
