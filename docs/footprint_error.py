@@ -19,7 +19,7 @@ from padgs.render.footprint_error import LATITUDES, SIGMAS, footprint_error
 
 FOLDER = Path(__file__).resolve().parent
 PROJECTIONS = ("erp", "tangent", "cubemap")
-# The same quantity by another program (the project's reference text on projections, section 3.8), in percent.
+# The same quantity by another program, in percent.
 REFERENCE = {
     "erp": {
         0.5: {0: 0, 45: 0.4, 70: 1.0, 85: 3.9, 89: 19.2},

@@ -38,7 +38,7 @@ def test_all_faces_of_a_cube_are_alike():
         assert above == pytest.approx(below, rel=0.03)
 
 
-# Computed by another program: baselines-and-projections.md, section 3.8.
+# Computed by another program.
 @pytest.mark.parametrize(
     ("projection", "sigma", "latitude", "percent"),
     [

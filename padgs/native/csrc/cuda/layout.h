@@ -24,7 +24,7 @@ struct Reach {
   int32_t gaussian;
   uint8_t row, row_end, chunk, chunk_end;  // from the tile's corner; chunk_end is exclusive
 };
-static_assert(sizeof(Reach) == 8, "padgs/render/backends/cuda.py allocates 2 integers per instance");
+static_assert(sizeof(Reach) == 8, "padgs/render/backends/cuda_tiles.py allocates 2 integers per instance");
 
 PADGS_HD int tiles_before(const TileTable &table, int row) {
   return table.row_start[row] - table.row_start[table.first_row];
