@@ -29,7 +29,6 @@ static_assert(sizeof(Reach) == 8, "padgs/render/backends/cuda_tiles.py allocates
 PADGS_HD int tiles_before(const TileTable &table, int row) {
   return table.row_start[row] - table.row_start[table.first_row];
 }
-PADGS_HD int tiles_drawn(const TileTable &table) { return tiles_before(table, table.end_row); }
 
 // How many drawn tiles a box touches.
 PADGS_HD uint32_t tiles_of(const PixelBox &box, const TileTable &table) {
