@@ -51,5 +51,4 @@ class Crops3DGSMethod(Cubemap3DGSMethod):
 
     def lens(self, panorama: Panorama) -> Pinhole:
         """The camera of the crops."""
-        assert isinstance(self._options, Crops3DGSOptions)
-        return square_lens(panorama, math.tan(math.radians(self._options.field_of_view / 2)))
+        return square_lens(panorama, math.tan(math.radians(self.options.field_of_view / 2)))

@@ -6,7 +6,7 @@ code, which grow with the distance of a Gaussian in scene units, and the memory 
 
 from __future__ import annotations
 
-from padgs.learning.method import RenderConfig
+from padgs.render.config import RenderConfig
 from padgs.splats.method import SplatMethod
 
 

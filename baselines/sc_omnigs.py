@@ -6,7 +6,7 @@ No code of it is public. What is known and what is inferred here is told apart i
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -17,17 +17,16 @@ from torch import Tensor, nn
 from padgs.calibration.align import Difference, Similarity, align
 from padgs.calibration.camera_map import CameraMap
 from padgs.calibration.poses import PoseRates, PoseRefinement
-from padgs.calibration.splats import CalibratedMethod, CalibratedSplats
+from padgs.calibration.splats import CalibratedMethod
+from padgs.learning.loop import TrainOptions
 from padgs.learning.loss import pixel_weight
-from padgs.learning.method import Budget, Record, State
 from padgs.learning.schedule import Constant, ParameterGroup
 from padgs.learning.targets import Target
-from padgs.learning.views import Drawing, TrainOptions
+from padgs.learning.trainee import Drawing, State
 from padgs.render import Rendering
 from padgs.scene import Scene, View
 from padgs.sphere.panorama import sample_pixels
 from padgs.splats.method import SplatOptions
-from padgs.splats.trainee import stands_still
 
 
 @dataclass(frozen=True)
@@ -117,17 +116,7 @@ class SCOmniGSMethod(CalibratedMethod):
     Options = SCOmniGSOptions
     TRAIN = TrainOptions(weight="solid_angle")
 
-    _photography: tuple[Similarity, Tensor] | None = None  # what rendering a view of the given world takes
-
-    def fit(self, scene: Scene, budget: Budget) -> Iterator[Record]:
-        """Train, from the point cloud and poses of the scene or from a loaded state.
-
-        Raises:
-            ValueError: training views of several sizes (there is one camera), or all from one place (no scale).
-        """
-        for record in super().fit(scene, budget):
-            self._photography = None
-            yield record
+    _photography: tuple[int, Similarity, Tensor] | None = None  # what rendering a given view takes, at an iteration
 
     def render(self, view: View) -> Rendering:
         """Render a view of the given world, as its camera photographs it, without gradients.
@@ -135,18 +124,18 @@ class SCOmniGSMethod(CalibratedMethod):
         Raises:
             ValueError: a view of another size than the training views.
         """
-        model = self._trained()
-        assert isinstance(model, CalibratedSplats) and isinstance(model.calibration, SelfCalibration)
-        poses, camera = model.calibration.poses, model.calibration.camera
+        trainee, calibration = self.trainee, self.trainee.calibration
+        poses, camera = calibration.poses, calibration.camera
         if (view.width, view.height) != (camera.width, camera.height):
             raise ValueError(
                 f"view {view.name!r} is {view.width}x{view.height}; the camera was calibrated at "
                 f"{camera.width}x{camera.height}"
             )
-        if self._photography is None:
-            self._photography = aligned(poses)[0], camera.ideal_pixels()
-        similarity, pixels = self._photography
-        ideal = model.render(replace(view, cam_from_world=carried(view.cam_from_world, similarity)))
+        iteration = -1 if self._trainer is None else self._trainer.iteration
+        if self._photography is None or self._photography[0] != iteration:
+            self._photography = iteration, aligned(poses)[0], camera.ideal_pixels()
+        _, similarity, pixels = self._photography
+        ideal = trainee.render(replace(view, cam_from_world=carried(view.cam_from_world, similarity)))
         layers = torch.cat((ideal.image, ideal.transmittance[..., None], ideal.depth[..., None]), dim=-1)
         image, transmittance, depth = sample_pixels(layers, pixels).split((3, 1, 1), dim=-1)
         return replace(ideal, image=image, transmittance=transmittance[..., 0], depth=depth[..., 0])
@@ -160,7 +149,7 @@ class SCOmniGSMethod(CalibratedMethod):
         sizes = {(view.width, view.height) for view in scene.train}
         if len(sizes) > 1:
             raise ValueError(f"sc_omnigs calibrates one camera, but the training views have sizes {sorted(sizes)}")
-        if stands_still(scene):
+        if scene.stands_still:
             raise ValueError(
                 f"the {len(scene.train)} training cameras of scene {scene.name!r} stand in one place, which has no "
                 "scale to carry held-out views by; sc_omnigs needs two places, omnigs does without"
@@ -174,8 +163,7 @@ class SCOmniGSMethod(CalibratedMethod):
         return self._calibrating(poses, values["width"], values["height"])
 
     def _calibrating(self, poses: PoseRefinement, width: int, height: int) -> SelfCalibration:
-        assert isinstance(self._options, SCOmniGSOptions)
-        return SelfCalibration(poses, CameraMap(width, height), self._options, self._train.weight)
+        return SelfCalibration(poses, CameraMap(width, height), self.options, self.train_options.weight)
 
 
 def aligned(poses: PoseRefinement) -> tuple[Similarity, Difference]:

@@ -11,7 +11,7 @@ from typing import Any
 
 from padgs.calibration.dual_lens import DualLens
 from padgs.calibration.splats import CalibratedMethod
-from padgs.learning.method import RenderConfig
+from padgs.render.config import RenderConfig
 from padgs.scene import Scene
 from padgs.splats.method import SplatOptions, refuse_polar_threshold
 
@@ -35,8 +35,7 @@ class Seam360GSOptions(SplatOptions):
 
 
 class Seam360GSMethod(CalibratedMethod):
-    """See `padgs.learning.method.Method`. Trained through `DualLens`; `render` is the ideal camera, one centre and no
-    seam.
+    """See `padgs.learning.method.Method`. Trained through `DualLens`; `render` is the ideal camera, without a seam.
 
     Lenses see along rays of their own, which the projection erp cannot draw; it ends as rejected.
     """
@@ -45,12 +44,11 @@ class Seam360GSMethod(CalibratedMethod):
     RENDER = RenderConfig(projection="ray")
 
     def _as_given(self, scene: Scene) -> DualLens:
-        refuse_polar_threshold(self._options, "a view is made of two, each by a lens of its own")
+        refuse_polar_threshold(self.options, "a view is made of two, each by a lens of its own")
         return self._as_stored({"unit": scene.unit})
 
     def _as_stored(self, values: Mapping[str, Any]) -> DualLens:
-        options = self._options
-        assert isinstance(options, Seam360GSOptions)
+        options = self.options
         return DualLens(
             axis=options.lens_axis,
             order=options.lens_order,

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from padgs.learning.method import RenderConfig
+from padgs.render.config import RenderConfig
 from padgs.splats.method import SplatMethod, SplatOptions
 
 

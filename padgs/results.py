@@ -1,7 +1,8 @@
 """What a run has to say for itself, and its file `result.json`. Standard library only, so that reports need no torch.
 
 The file is written last and atomically: where it exists, the run is done. A run that failed has a result too, with its
-status instead of scores; it appears in the tables as such.
+status instead of scores; it appears in the tables as such. What else readers of a run folder must know without torch
+stands here as well: its log, the names of its pictures, and which end of a metric is the better one.
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ import hashlib
 import json
 import math
 import os
+import re
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
@@ -18,17 +21,21 @@ from typing import Any
 SCHEMA = 2
 ADDED = {"peak_device_memory_bytes"}  # to the schema since: files without them are read, with the default
 FILE_NAME = "result.json"
+LOG_NAME = "log.jsonl"
+PICTURES = "renders"  # folder of truth | render | error of each test view, in one picture
 STATUSES = {
     "ok": "trained to the end and evaluated",
     "oom": "an allocation failed, or memory would have passed the declared limit",
     "nan": "a loss, gradient or parameter was not finite",
-    "diverged": "the loss rose well above its best and stayed there",
     "collapsed": "next to nothing was left to draw",
-    "exploded": "sizes or counts left all bounds",
-    "degenerate": "the loss fell although the geometry was wrong",
     "timeout": "the time limit came before the last iteration",
     "rejected": "the input was refused with a clear error",
 }
+# Keys of a configuration that no trained number depends on but by rounding: of the machine, and the others. What was
+# read is said by the fingerprint of the data; scoring comes after training. `data.device` is in files of old runs only.
+OF_THE_MACHINE = ("run", "render.max_instances", "data.cache_bytes", "data.read_ahead", "data.device")
+DECIDE_NOTHING = (*OF_THE_MACHINE, "data.path", "protocol")
+HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "lpips": False, "seam": False}  # of every metric with the word in it
 
 
 class ResultError(ValueError):
@@ -93,10 +100,8 @@ def write(result: Result, folder: Path) -> Path:
     Raises:
         OSError: the disk is full, the folder is read-only, ...; no file is left behind, an older one stays.
     """
-    content = _encode(asdict(result))
-    document = {"schema": SCHEMA, "sha256": _digest(content), **content}
     path = folder / FILE_NAME
-    replace_file(path, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
+    replace_file(path, (json.dumps(encoded(result), indent=1, allow_nan=False) + "\n").encode())
     return path
 
 
@@ -106,27 +111,62 @@ def read(path: Path) -> Result:
     Raises:
         ResultError: it is missing, truncated, of another version, or was edited.
     """
+    return decoded(parsed(file_content(path), str(path)), str(path))
+
+
+def file_content(path: Path) -> bytes:
+    """What the file holds.
+
+    Raises:
+        ResultError: it cannot be read.
+    """
     try:
-        document = json.loads(path.read_bytes())
+        return path.read_bytes()
     except OSError as error:
         raise ResultError(f"cannot read {path}: {error.strerror}") from error
+
+
+def encoded(result: Result) -> dict[str, Any]:
+    """What a file holds of a result: its fields, after the version of the schema and a digest of all."""
+    content = _encode(asdict(result))
+    return {"schema": SCHEMA, "sha256": _digest(content), **content}
+
+
+def parsed(content: bytes, where: str) -> dict[str, Any]:
+    """What `encoded` made, from its JSON; `where` names it in errors.
+
+    Raises:
+        ResultError: it is truncated, or something else.
+    """
+    try:
+        document = json.loads(content)
     except ValueError as error:
-        raise ResultError(f"{path} is not JSON ({error}); delete it and run again") from error
+        raise ResultError(f"{where} is not JSON ({error}); delete it and run again") from error
     if not isinstance(document, dict) or "schema" not in document:
-        raise ResultError(f"{path} is not a result file (no schema); delete it and run again")
+        raise ResultError(f"{where} is not a result file (no schema); delete it and run again")
+    return document
+
+
+def decoded(document: Mapping[str, Any], where: str) -> Result:
+    """The result that `encoded` made a document of; `where` names it in errors.
+
+    Raises:
+        ResultError: it is of another version, or was edited.
+    """
+    document = dict(document)
     if document.pop("schema") != SCHEMA:
-        raise ResultError(f"{path} was written by another version (schema is not {SCHEMA}); run again with this one")
+        raise ResultError(f"{where} was written by another version (schema is not {SCHEMA}); run again with this one")
     digest = document.pop("sha256", None)
     known = {field.name for field in fields(Result)}
     missing, unknown = known - document.keys() - ADDED, document.keys() - known
     if missing or unknown:
-        raise ResultError(f"{path}: missing {sorted(missing)}, unknown {sorted(unknown)}; delete it and run again")
+        raise ResultError(f"{where}: missing {sorted(missing)}, unknown {sorted(unknown)}; delete it and run again")
     if digest != _digest(document):
-        raise ResultError(f"{path} was edited after it was written (SHA-256 differs); delete it and run again")
+        raise ResultError(f"{where} was edited after it was written (SHA-256 differs); delete it and run again")
     try:
         return Result(**document | {key: _DECODERS[key](document[key]) for key in _DECODERS})
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ResultError(f"{path}: {error}; delete it and run again") from error
+        raise ResultError(f"{where}: {error}; delete it and run again") from error
 
 
 def read_all(folder: Path) -> tuple[list[Result], list[ResultError]]:
@@ -139,6 +179,60 @@ def read_all(folder: Path) -> tuple[list[Result], list[ResultError]]:
         except ResultError as error:
             errors.append(error)
     return results, errors
+
+
+def log_lines(run_folder: Path, tail: int | None = None) -> Iterator[dict[str, Any]]:
+    """The whole lines of a run's log, each with its `iteration`; a line that is being written, or was cut, is left out.
+
+    Args:
+        run_folder: of one run; a log that is missing has no lines.
+        tail: read so many bytes at the end of the log only.
+    """
+    try:
+        with (run_folder / LOG_NAME).open("rb") as file:
+            if tail is not None:
+                file.seek(max(0, file.seek(0, os.SEEK_END) - tail))
+            lines = file.read().splitlines()
+    except OSError:
+        return
+    for line in lines:
+        try:
+            entry = json.loads(line)
+            entry["iteration"] = int(entry["iteration"])
+        except (ValueError, KeyError, TypeError):
+            continue
+        yield entry
+
+
+def decisive(config: Mapping[str, Any], where: str = "") -> dict[str, Any]:
+    """A configuration without the keys that decide nothing.
+
+    >>> decisive({"seed": 0, "run": {"threads": 2}, "data": {"path": "/x", "width": 64}})
+    {'seed': 0, 'data': {'width': 64}}
+    """
+    return {
+        key: decisive(value, f"{where}{key}.") if isinstance(value, Mapping) else value
+        for key, value in config.items()
+        if f"{where}{key}" not in DECIDE_NOTHING
+    }
+
+
+def picture_name(view: str) -> str:
+    """The name of the file with the picture of a test view, among the `renders` of a run.
+
+    >>> picture_name("left/R001 a")
+    'left-R001-a.png'
+    """
+    return re.sub(r"[^A-Za-z0-9._-]+", "-", view) + ".png"
+
+
+def higher_is_better(metric: str) -> bool | None:
+    """Which end of a metric is the better one, by the word of `HIGHER_IS_BETTER` in its name; None for others.
+
+    >>> higher_is_better("ws_psnr_pole"), higher_is_better("lpips_vgg_01"), higher_is_better("latitude")
+    (True, False, None)
+    """
+    return next((HIGHER_IS_BETTER[word] for word in metric.split("_") if word in HIGHER_IS_BETTER), None)
 
 
 def replace_file(path: Path, content: bytes) -> None:

@@ -14,6 +14,9 @@ from torch import Tensor
 
 from padgs.sphere.camera import Camera, Panorama
 
+MIN_EXTENT = 0.1  # units of the scene
+ONE_PLACE = 1e-6  # units of the scene; a reach up to here is rounding
+
 
 @dataclass(frozen=True)
 class View:
@@ -92,7 +95,19 @@ class Scene:
 
     @cached_property
     def extent(self) -> float:
-        """1.1 x the largest distance of a training camera from their mean, in world units (as 3DGS defines it)."""
+        """What learning rates of positions follow, world units: 1.1 x the largest distance of a training camera from
+        their mean, as 3DGS defines it, but at least `MIN_EXTENT` units: cameras that hardly move must be able to place
+        Gaussians, too.
+        """
+        return max(self._reach, MIN_EXTENT * self.unit)
+
+    @property
+    def stands_still(self) -> bool:
+        """Whether all training cameras stand in one place, up to the rounding of their poses."""
+        return self._reach <= ONE_PLACE * self.unit
+
+    @cached_property
+    def _reach(self) -> float:
         centers = torch.stack([view.center for view in self.train])
         return 1.1 * (centers - centers.mean(0)).norm(dim=-1).max().item()
 

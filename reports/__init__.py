@@ -1,21 +1,37 @@
-"""Tables, charts and a page from result files. Nothing here trains, renders or imports torch; every number comes from a
-`result.json`, from the log beside it, or from the file of published numbers.
+"""Tables, charts and a page from finished runs. Nothing here trains, renders or imports torch; every number comes from
+a `result.json`, from the log beside it, or from the file of published numbers.
 
-A table is a function `build(results, request) -> Table`, an entry of `reports.gathered.TABLES`; writers turn any
-`Table` into text. What can be asked for is an entry of `REPORTS`: a function that yields files.
+`frame` puts all runs into one data frame, a row a run. A report is a function of `Gathered`, that frame and what is
+asked of it, and gives a `Table`, a list of `Chart`s or a page; `files` writes any of them down.
 """
 
-REPORTS = {
-    "table1": "reports.files:table1",
-    "table2": "reports.files:table2",
-    "table3": "reports.files:table3",
-    "table4": "reports.files:table4",
-    "methods": "reports.files:methods",
-    "equal_time": "reports.files:equal_time",
-    "ladder": "reports.files:ladder",
-    "quirks": "reports.files:quirks",
-    "runs": "reports.files:runs",
-    "sweep": "reports.files:sweep",
-    "chart": "reports.files:chart",
-    "html": "reports.files:html",
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Report:
+    """What can be asked for."""
+
+    function: str  # "package.module:function", imported when it is wanted
+    experiments: tuple[str, ...] = ()  # of conf/experiment that are run for it; none for sweeps and lists of all runs
+
+
+METHODS = ("table1_360roam", "table2_ricoh360", "all_methods")
+
+REPORTS: Mapping[str, Report] = {
+    "table1": Report("reports.tables.tables_of_methods:table1", METHODS),
+    "table2": Report("reports.tables.tables_of_methods:table2", METHODS),
+    "table3": Report("reports.tables.variants:table3", ("ablation", "ablation_bar", "ablation_cat_tower")),
+    "table4": Report("reports.tables.tables_of_methods:table4", ("table4_efficiency", *METHODS)),
+    "methods": Report("reports.tables.side_by_side:methods", METHODS),
+    "equal_time": Report("reports.tables.side_by_side:equal_time", ("equal_time",)),
+    "ladder": Report("reports.tables.variants:ladder", ("ladder",)),
+    "quirks": Report("reports.tables.variants:quirks", ("quirks",)),
+    "runs": Report("reports.tables.runs:runs"),
+    "chart": Report("reports.charts.trade_off_chart:charts", ("pareto", "table4_efficiency", *METHODS)),
+    "sweep": Report("reports.charts.sweep_chart:charts"),
+    "html": Report("reports.page.page:html"),
 }

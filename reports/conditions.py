@@ -1,73 +1,70 @@
-"""What results of one block must have in common, so that their numbers may be compared."""
+"""Under what conditions numbers were made: what runs of one block must share, and what stands under a table."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 
-from padgs.results import Result
+import pandas as pd
+from pandas import DataFrame
+
+from reports.methods import title
 from reports.request import Request
 from reports.tables.table import ReportError
 
-Condition = Callable[[Result, str], "str | None"]  # of a result and a protocol; None contradicts nothing
+CONDITIONS = ("protocol", "resolution", "iterations", "data")  # columns of the frame; the protocol's are its rules
+OF_A_DATA_SET = ("protocol", "resolution", "iterations")  # scenes may differ, rules may not
+OF_A_SWEEP = ("protocol", "machine")  # all else shows as a changed key
+OF_A_POINT = ("data",)  # the folder of the data is no part of a setting
+OF_A_CHART = ("protocol", "resolution", "data", "machine")
+OF_A_MEAN = (*OF_A_DATA_SET, "machine")  # of one setting over the scenes of a data set
+OF_TIMES = (*CONDITIONS, "machine")
+OF_EQUAL_TIMES = ("protocol", "resolution", "data", "machine")
+PUBLISHED_LENGTHS = {"egonerf": 100_000}  # iterations; of the others 30 000, which tables of the paper have
 
-INPUT_RANGES = {"01": "[0, 1]", "11": "[-1, 1]"}
 
-
-def refuse_mixture(
-    results: Sequence[Result], request: Request, where: str, conditions: Mapping[str, Condition] | None = None
-) -> None:
-    """Results of one block must have been made and scored alike.
+def refuse_mixture(runs: DataFrame, request: Request, where: str, conditions: Iterable[str] = CONDITIONS) -> None:
+    """Runs of one block must have been made and scored alike.
 
     Raises:
         ReportError: they were not, and the request does not say that this is meant.
     """
-    if request.mix:
-        return
-    for what, of in (CONDITIONS if conditions is None else conditions).items():
-        found: dict[str, str] = {}
-        for result in results:
-            value = of(result, request.protocol)
-            if value is not None:
-                found.setdefault(value, result.run)
-        if len(found) > 1:
-            examples = "; ".join(f"{value} in {run}" for value, run in found.items())
+    for what in () if request.mix else conditions:
+        values = _values(runs, what, request.protocol).drop_duplicates()
+        if len(values) > 1:
+            examples = "; ".join(
+                f"{value} in {run}" for value, run in zip(values, runs["run"][values.index], strict=True)
+            )
             raise ReportError(
                 f"{where}: results differ in {what} ({examples}); choose with --where, or say --mix if this is meant"
             )
 
 
-def _rules(result: Result, protocol: str) -> str | None:
-    scores = result.scores.get(protocol)
-    rules = scores.protocol if scores else result.config.get("protocol", {}).get(protocol)
-    if rules is None:
-        return None  # a run that was never scored under this protocol contradicts nothing
-    words = [protocol, f"LPIPS-{rules.get('lpips')} fed {INPUT_RANGES.get(rules.get('lpips_inputs', ''))}"]
-    if rules.get("bottom_crop"):
-        words.append(f"without the last {100 * rules['bottom_crop']:.1f} % of the rows")
-    return ", ".join(words)
+def footnotes(blocks: Mapping[str, DataFrame], protocol: str) -> list[str]:
+    """Protocol with all its rules, resolution, iterations, seeds, code version and machine of the runs of blocks, in a
+    sentence for all blocks that share them.
+    """
+    titles: dict[str, list[str]] = {}
+    for block, runs in blocks.items():
+        titles.setdefault(_sentence(runs, protocol), []).append(block)
+    notes = [f"{'; '.join(of)}: {sentence}" for sentence, of in titles.items()]
+    for method, length in PUBLISHED_LENGTHS.items():
+        if any(((runs["method"] == method) & (runs["iterations"] < length)).any() for runs in blocks.values()):
+            notes.append(f"{title(method)} is published with {length} iterations.")
+    return notes
 
 
-def machine(result: Result) -> str:
-    """The hardware in a few words, with the version of torch."""
-    known = result.machine
-    where = known.get("gpu") or f"{known.get('cores')} cores of {known.get('cpu')}"
-    return f"{where}, torch {known.get('torch')}"
+def _sentence(runs: DataFrame, protocol: str) -> str:
+    if runs.empty:
+        return "not run."
+    columns = {what: _values(runs, what, protocol) for what in (*OF_A_DATA_SET, "seed", "code_version", "hardware")}
+    columns["seed"] = columns["seed"].sort_values()
+    rules, sizes, lengths, seeds, versions, machines = (
+        " / ".join(map(str, values.unique())) or "none" for values in columns.values()
+    )
+    return f"protocol {rules}, {sizes}, {lengths} iterations, seeds {seeds}, padgs {versions}, {machines}."
 
 
-def _machine_and_threads(result: Result, protocol: str) -> str | None:
-    threads = result.machine.get("threads")
-    return machine(result) + (f", {threads} threads" if threads else "")
-
-
-CONDITIONS: Mapping[str, Condition] = {
-    "protocol": _rules,
-    "resolution": lambda result, protocol: f"{result.width}x{result.height}",
-    "iterations": lambda result, protocol: str(result.iterations),
-    "data": lambda result, protocol: result.fingerprint[:10],
-}
-OF_A_DATA_SET = {what: of for what, of in CONDITIONS.items() if what != "data"}  # scenes may differ, rules may not
-OF_A_SWEEP = {"protocol": _rules, "machine": _machine_and_threads}  # all else shows as a changed key
-OF_A_POINT = {"data": CONDITIONS["data"]}  # the folder of the data is no part of a setting
-OF_A_CHART = {what: CONDITIONS[what] for what in ("protocol", "resolution", "data")} | {"machine": _machine_and_threads}
-OF_A_MEAN = {**OF_A_DATA_SET, "machine": _machine_and_threads}  # of one setting over the scenes of a data set
-OF_TIMES = {**CONDITIONS, "machine": _machine_and_threads}
+def _values(runs: DataFrame, what: str, protocol: str) -> pd.Series:
+    """A condition of each run; one that was never scored under a protocol contradicts none of its rules."""
+    column = f"{protocol} rules" if what == "protocol" else what
+    return runs[column].dropna() if column in runs else pd.Series(dtype=object)

@@ -1,70 +1,70 @@
-"""All that a folder of runs gives: its tables and charts, each made once, whoever asks for it."""
+"""Finished runs and what is asked of them; each report of them is made once, whoever asks for it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from pathlib import Path
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from importlib import import_module
+from typing import Any
 
-from padgs.results import Result
-from reports.charts import sweep_chart, trade_off_chart
-from reports.charts.drawing import Chart
-from reports.charts.sweeps import Sweep, sweeps
-from reports.charts.trade_off import TradeOff, trade_offs
+from pandas import DataFrame
+
+from reports import REPORTS
 from reports.measures import marks
-from reports.quality_log import probes
 from reports.request import Request, admitted
-from reports.tables import ladder, quirks, runs, side_by_side, table3, tables_of_methods
-from reports.tables.table import Table
-
-TABLES: Mapping[str, Callable[[Sequence[Result], Request], Table]] = {
-    "table1": tables_of_methods.table1,
-    "table2": tables_of_methods.table2,
-    "table3": table3.build,
-    "table4": tables_of_methods.table4,
-    "methods": side_by_side.methods,
-    "equal_time": side_by_side.equal_time,
-    "ladder": ladder.build,
-    "quirks": quirks.build,
-    "runs": runs.build,
-}
 
 
 @dataclass(frozen=True)
 class Gathered:
-    """The results of a folder of run folders, and what is asked of them. Everything raises ReportError if refused."""
+    """All that a report is made from. Everything raises ReportError if refused."""
 
-    folder: Path
-    results: Sequence[Result]
-    request: Request
+    runs: DataFrame  # as `frame` makes it
+    request: Request = Request()
     left_out: Sequence[str] = ()  # why which result files could not be used
+    _made: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Refuse at once what no result or table knows."""
         marks(self.request.protocol)
-        admitted(self.results, self.request)
+        admitted(self.runs, self.request)
 
-    def table(self, name: str) -> Table:
-        """A table of `TABLES`."""
-        if name not in self._tables:
-            self._tables[name] = TABLES[name](self.results, self.request)
-        return self._tables[name]
+    @property
+    def asked_for(self) -> DataFrame:
+        """The runs that the request lets in."""
+        return admitted(self.runs, self.request)
 
-    @cached_property
-    def sweeps(self) -> list[tuple[Sweep, Chart]]:
-        """Each sweep and its picture."""
-        return [(sweep, sweep_chart.chart(sweep)) for sweep in sweeps(self.results, self.request)]
+    def report(self, name: str) -> Any:
+        """What the function of an entry of `REPORTS` makes of this."""
+        if name not in self._made:
+            module, _, function = REPORTS[name].function.partition(":")
+            self._made[name] = getattr(import_module(module), function)(self)
+        return self._made[name]
 
-    @cached_property
-    def trade_offs(self) -> list[tuple[TradeOff, list[Chart]]]:
-        """Speed against accuracy with its picture, and quality over training time where runs left a log."""
-        found = []
-        for made in trade_offs(self.results, self.request):
-            over_time = trade_off_chart.time_chart(made, probes(self.folder, made.runs))
-            found.append((made, [trade_off_chart.chart(made), *([over_time] if over_time else [])]))
-        return found
+    def chosen(self, name: str) -> DataFrame:
+        """The runs for a report: those of the experiment asked for; else, scene by scene, those of the report's own
+        experiments, or those of none; all, if that leaves nothing.
 
-    @cached_property
-    def _tables(self) -> dict[str, Table]:
-        return {}
+        A folder may hold sweeps and trials beside the runs of a table; without the choice they would compete for its
+        cells.
+        """
+        runs, names = self.asked_for, set(REPORTS[name].experiments)
+        if self.request.experiment:
+            return runs
+        experiments = runs["experiments"]
+        own = runs.loc[experiments.map(lambda of: not names.isdisjoint(map(_experiment, of))).astype(bool)]
+        free = runs.loc[(experiments.map(len) == 0) & ~runs["place"].isin(own["place"])]
+        return runs.loc[[*own.index, *free.index]] if len(own) + len(free) else runs
+
+
+def of_a_table(experiment: str) -> bool:
+    """Whether an experiment is run for a table or the chart, and is no sweep.
+
+    >>> of_a_table("table1_360roam@cpu"), of_a_table("tau@cpu")
+    (True, False)
+    """
+    return any(_experiment(experiment) in report.experiments for report in REPORTS.values())
+
+
+def _experiment(name: str) -> str:
+    """The experiment without the scale that it was run at: tau@cpu is tau."""
+    return name.partition("@")[0]

@@ -1,24 +1,75 @@
-"""What is compared between methods: a number of each result, how it is read, and what the paper calls it."""
+"""What is compared between methods: a number of each run, how it is read, and what the paper calls it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
-from padgs.results import Result
+from pandas import DataFrame
+
+from padgs.results import higher_is_better
 from reports import published
-from reports.metrics import PAPER_METRICS, PROTOCOL_METRICS, column
 from reports.tables.table import Column, ReportError
+
+PAPER_METRICS = ("ssim", "psnr", "lpips")  # the order of the paper's tables
+PROTOCOL_METRICS = {  # protocol -> the metric that stands for each of PAPER_METRICS
+    "paper": {"ssim": "ssim", "psnr": "psnr", "lpips": "lpips_vgg_01"},
+    "sphere": {"ssim": "ws_ssim", "psnr": "ws_psnr", "lpips": "ws_lpips_alex"},
+}
+TITLES = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "ws": "WS", "vgg": "VGG", "alex": "Alex", "01": "[0, 1]"}
 
 
 @dataclass(frozen=True)
 class Measure:
-    """A number of a result; `published` is the metric of `baselines/published.csv` that it may stand beside."""
+    """A number of a run; `published` is the metric of `baselines/published.csv` that it may stand beside."""
 
+    name: str  # of its column in the frame
     column: Column
-    number: Callable[[Result], float | None]
     published: str | None = None
     difference: bool = False  # whether ours minus the paper's means anything
+
+
+COSTS = {
+    measure.name: measure
+    for measure in (
+        Measure("iterations_done", Column("iterations", 0)),
+        Measure("train_hours", Column("training h", 4, False, group="training h"), "train_hours"),
+        Measure("train_seconds", Column("training s", 0, False)),
+        Measure("fps", Column("FPS", 2, True, group="FPS"), "fps"),
+        Measure("frame_ms", Column("ms per frame", 1, False)),
+        Measure("anchors", Column("anchors", 0)),
+        Measure("gaussians", Column("Gaussians", 0)),
+        Measure("megabytes", Column("model MB", 1, False)),
+        Measure("peak_gigabytes", Column("peak GB", 2, False)),
+        Measure("peak_gpu_gigabytes", Column("peak GPU GB", 2, False)),
+    )
+}
+
+
+def costs(*names: str, **how: Any) -> tuple[Measure, ...]:
+    """Some of `COSTS`; `how` says what is different about their columns."""
+    return tuple(replace(COSTS[name], column=replace(COSTS[name].column, **how)) for name in names)
+
+
+def gpu_memory(runs: DataFrame, **how: Any) -> tuple[Measure, ...]:
+    """The memory of the GPU, if it is known of any of the runs; tables of the others have no column for it."""
+    return costs("peak_gpu_gigabytes", **how) if runs["peak_gpu_gigabytes"].notna().any() else ()
+
+
+def alone(measure: Measure) -> Measure:
+    """The measure with nothing of the paper beside it."""
+    return replace(measure, published=None, difference=False)
+
+
+def mark(protocol: str, metric: str, group: str = "") -> Measure:
+    """A metric under a protocol.
+
+    >>> mark("sphere", "ws_psnr_pole").column.heading, mark("paper", "lpips_vgg_01").column.heading
+    ('WS-PSNR pole ↑', 'LPIPS VGG [0, 1] ↓')
+    """
+    title = " ".join(TITLES.get(word, word) for word in metric.split("_")).replace("WS ", "WS-")
+    column = Column(title, 2 if "psnr" in metric else 3, higher_is_better(metric), group=group)
+    return Measure(f"{protocol}/{metric}", column)
 
 
 def marks(protocol: str) -> tuple[Measure, ...]:
@@ -29,97 +80,20 @@ def marks(protocol: str) -> tuple[Measure, ...]:
     """
     if protocol not in PROTOCOL_METRICS:
         raise ReportError(f"unknown protocol {protocol!r}; known: {', '.join(PROTOCOL_METRICS)}")
-    paper = protocol == published.PROTOCOL
-    names = PROTOCOL_METRICS[protocol]
-    return tuple(
-        Measure(column(names[name], name.upper()), mark(protocol, names[name]), name if paper else None, paper)
-        for name in PAPER_METRICS
-    )
+    ours = {name: mark(protocol, PROTOCOL_METRICS[protocol][name], name.upper()) for name in PAPER_METRICS}
+    if protocol != published.PROTOCOL:
+        return tuple(ours.values())
+    return tuple(replace(measure, published=name, difference=True) for name, measure in ours.items())
 
 
-def mark(protocol: str, metric: str) -> Callable[[Result], float | None]:
-    """The mark of a result under a protocol; None where it was not scored so."""
-    return lambda result: result.scores[protocol].metrics.get(metric) if protocol in result.scores else None
-
-
-def quantity(name: str, protocol: str, results: Sequence[Result]) -> Measure:
-    """A metric that results have under a protocol, or a cost, by its name.
+def quantity(name: str, protocol: str, runs: DataFrame) -> Measure:
+    """A metric that runs have under a protocol, or a cost, by its name.
 
     Raises:
         ReportError: no such name; the message lists the known ones.
     """
-    if name in QUANTITIES:
-        return QUANTITIES[name]
-    scored = [result.scores[protocol].metrics for result in results if protocol in result.scores]
-    known = dict.fromkeys(metric for metrics in scored for metric in metrics)
-    if name not in known:
-        names = ", ".join((*known, *QUANTITIES))
+    known = [column.removeprefix(f"{protocol}/") for column in runs if column.startswith(f"{protocol}/")]
+    if name not in (*known, *COSTS):
+        names = ", ".join((*known, *COSTS))
         raise ReportError(f"unknown metric {name!r}; known under protocol {protocol}: {names}")
-    return Measure(column(name), mark(protocol, name))
-
-
-def train_seconds(result: Result) -> float | None:
-    """Training time in seconds."""
-    return result.timing.get("train_seconds")
-
-
-def hours(result: Result) -> float | None:
-    """Training time in hours."""
-    seconds = train_seconds(result)
-    return None if seconds is None else seconds / 3600
-
-
-def frame_ms(result: Result) -> float | None:
-    """Median time of a rendered test view in milliseconds, decoding included."""
-    return result.timing.get("render_ms_median")
-
-
-def fps(result: Result) -> float | None:
-    """Frames per second at that time."""
-    milliseconds = frame_ms(result)
-    return 1000 / milliseconds if milliseconds else None
-
-
-def gaussians(result: Result) -> float | None:
-    """Gaussians of the trained model; None for a method without any."""
-    return result.counts.get("gaussians")
-
-
-def megabytes(result: Result) -> float | None:
-    """Size of the trained model in MB (10^6 bytes)."""
-    return result.model_bytes / 1e6 if result.model_bytes else None
-
-
-def peak_gigabytes(result: Result) -> float | None:
-    """Peak memory of the process while training, in GB (10^9 bytes)."""
-    return result.peak_memory_bytes / 1e9 if result.peak_memory_bytes else None
-
-
-def peak_gpu_gigabytes(result: Result) -> float | None:
-    """Peak memory of the tensors on the GPU while training, in GB; None for a run on the CPU."""
-    return None if result.peak_device_memory_bytes is None else result.peak_device_memory_bytes / 1e9
-
-
-def on_gpu(results: Sequence[Result]) -> bool:
-    """Whether the memory of a GPU is known of any of them; tables of the others have no column for it."""
-    return any(peak_gpu_gigabytes(result) is not None for result in results)
-
-
-COSTS: Sequence[Measure] = (
-    Measure(Column("training h", 4, False, group="training h"), hours, "train_hours"),
-    Measure(Column("FPS", 2, True, group="FPS"), fps, "fps"),
-    Measure(Column("ms per frame", 1, False), frame_ms),
-    Measure(Column("Gaussians", 0), gaussians),
-    Measure(Column("model MB", 1, False), megabytes),
-    Measure(Column("peak GB", 2, False), peak_gigabytes),
-)
-GPU_MEMORY = Measure(Column("peak GPU GB", 2, False), peak_gpu_gigabytes)
-
-QUANTITIES = {  # what charts can show beside the metrics
-    "frame_ms": Measure(Column("ms per frame", 1, False), frame_ms),
-    "train_seconds": Measure(Column("training s", 0, False), train_seconds),
-    "gaussians": Measure(Column("Gaussians", 0), gaussians),
-    "megabytes": Measure(Column("model MB", 1, False), megabytes),
-    "peak_gigabytes": Measure(Column("peak GB", 2, False), peak_gigabytes),
-    "peak_gpu_gigabytes": GPU_MEMORY,
-}
+    return COSTS[name] if name in COSTS else mark(protocol, name)

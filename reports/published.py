@@ -47,6 +47,12 @@ def load(path: Path | None = None) -> Mapping[Key, Published]:
         }
 
 
+def row(numbers: Mapping[Key, Published], table: int, dataset: str, scene: str, method: str) -> dict[str, Published]:
+    """Metric -> number, of a method on a scene of a data set, as we call it; empty where the paper has none."""
+    where = (table, DATASETS.get(dataset), scene, method)
+    return {k.metric: n for k, n in numbers.items() if (k.table, k.dataset, k.scene, k.method) == where}
+
+
 def scenes(numbers: Mapping[Key, Published], dataset: str) -> list[str]:
     """The scenes of a data set, as the paper calls it, in the paper's order."""
     found = dict.fromkeys(key.scene for key in numbers if key.dataset == dataset and key.table < 3)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
-from padgs.results import Result
 from reports import published
 
 OUTDOOR_WORDS = ("outdoor", "garden")  # what a scene outside the data sets is called if it belongs to Table 2
@@ -37,15 +35,8 @@ class Place:
             return f"{self.scene} (built in, generated; no scene of the paper)"
         return f"{self.scene} (a capture that is no scene of the paper)"
 
-
-def places(results: Iterable[Result]) -> list[Place]:
-    """The scenes of some results: those of the paper first, otherwise in the order of their names."""
-    found = {Place(result.dataset, result.scene) for result in results}
-    order = list(published.DATASETS)
-    known = {place: order.index(place.dataset) if place.published else len(order) for place in found}
-    return sorted(found, key=lambda place: (known[place], place.dataset, place.scene))
-
-
-def at(place: Place, results: Iterable[Result]) -> list[Result]:
-    """The results of one scene."""
-    return [result for result in results if (result.dataset, result.scene) == (place.dataset, place.scene)]
+    @property
+    def rank(self) -> tuple[int, str, str]:
+        """Scenes of the paper stand first, otherwise in the order of their names."""
+        order = list(published.DATASETS)
+        return (order.index(self.dataset) if self.published else len(order), self.dataset, self.scene)

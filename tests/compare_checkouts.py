@@ -32,13 +32,8 @@ NOT_COMPARED = ("seconds",)  # keys of what a checkpoint and a log hold
 
 def train(checkout: Path, method: str, runs: Path) -> subprocess.CompletedProcess:
     """`padgs-run` of a checkout, from the checkout, so that its own files are found."""
-    command = [
-        checkout / ".venv/bin/padgs-run",
-        f"method={method}",
-        *SETTINGS,
-        *MORE.get(method, []),
-        f"run.folder={runs}",
-    ]
+    settings = {setting.partition("=")[0]: setting for setting in (*SETTINGS, *MORE.get(method, []))}
+    command = [checkout / ".venv/bin/padgs-run", f"method={method}", *settings.values(), f"run.folder={runs}"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     return subprocess.run(list(map(str, command)), cwd=checkout, env=environment, capture_output=True, text=True)
 

@@ -6,14 +6,13 @@ Statistics are collected over many views (`observe`) and acted upon every `grow_
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from padgs.anchors.grid import cells_from_points, occupied, points_from_cells, unique_cells
 from padgs.anchors.model import PaDGS
-from padgs.learning.method import Failure
+from padgs.learning.failure import Failure
 from padgs.learning.rows import append_rows, keep_rows
 from padgs.learning.schedule import scaled
 
@@ -72,13 +71,6 @@ class GrowthOptions:
     def threshold(self, level: int) -> float:
         """Mean gradient from which a Gaussian is a candidate at a level, in the units of a render's probe."""
         return self.gradient_threshold * (self.refinement // 2) ** level
-
-
-RELEASED_GROWTH: dict[str, Any] = {
-    "gradient_threshold": PUBLISHED_THRESHOLD,
-    "log_scale_cap": 0.05,
-    "max_anchors": None,
-}
 
 
 @dataclass(frozen=True)

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from padgs.anchors.decoder import Decoder, decode_gaussians, decode_padded
 from padgs.anchors.grid import anchors_from_points, automatic_voxel_size, initial_log_scales
-from padgs.anchors.modulation import OMEGA_AXES, direction_distortion, modulate, polar_axis
 from padgs.anchors.precision import PRECISIONS
 from padgs.gaussians import Gaussians
 from padgs.scene import Scene, View
+from padgs.sphere.distortion import OMEGA_AXES, distortion, opacity_factor, polar_axis
 
 OMEGA_INPUTS = ("sin2", "cos")
 DISTANCE_UNITS = ("scene", "world")
@@ -24,7 +23,7 @@ TINY = 1e-6  # scene units; keeps directions finite for a camera exactly on an a
 
 @dataclass(frozen=True)
 class PaDGSOptions:
-    """The model. The defaults are the paper as written; `RELEASED_MODEL` is where the released code differs."""
+    """The model. The defaults are the paper as written; conf/method/padgs_release.yaml is its released code."""
 
     features: int = 32  # C, learned values per anchor
     offsets: int = 10  # K, Gaussians per anchor
@@ -61,14 +60,6 @@ class PaDGSOptions:
     def inputs(self) -> int:
         """Number of network inputs: features, direction 3, distance, distortion; 37 in the paper."""
         return self.features + 3 + self.use_distance + self.use_distortion
-
-
-RELEASED_MODEL: dict[str, Any] = {
-    "omega_axis": "world_z",
-    "omega_input": "cos",
-    "max_modulated_omega": 1 - 1e-4,
-    "distance_unit": "world",
-}
 
 
 @dataclass(frozen=True)
@@ -179,11 +170,11 @@ class PaDGS(nn.Module):
         distance = torch.sqrt((ray * ray).sum(-1) + (TINY * self.unit) ** 2)
         direction = ray / distance[:, None]
         axis = polar_axis(self.options.omega_axis, view.cam_from_world.to(self.positions))
-        return direction, distance / self.unit, direction_distortion(direction, axis)
+        return direction, distance / self.unit, distortion(direction, axis)
 
     def decode(self, view: View) -> Decoded:
         """The Gaussians that this view shows (Eq. 13-15)."""
-        return Decoded(*decode_gaussians(self.decoder.weights(), *self._as_seen(view), self.options.precision))
+        return Decoded(*decode_gaussians(self.decoder.weights(), *self.as_seen(view), self.options.precision))
 
     def show(self, view: View) -> Gaussians:
         """The same for `padgs.render.backends.captured`: A K Gaussians, of which those that are not selected are zeros.
@@ -191,9 +182,9 @@ class PaDGS(nn.Module):
         Raises:
             ValueError, OSError: as `padgs.anchors.decoder.decode_padded` does.
         """
-        return decode_padded(self.decoder.weights(), *self._as_seen(view), self.options.precision)
+        return decode_padded(self.decoder.weights(), *self.as_seen(view), self.options.precision)
 
-    def _as_seen(self, view: View) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    def as_seen(self, view: View) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
         """What is decoded: features, how the camera sees them, positions, offsets, log-scales, attenuation."""
         options = self.options
         direction, distance, omega = self.seen_from(view)
@@ -203,6 +194,6 @@ class PaDGS(nn.Module):
         if options.use_distortion:
             seen_omega = omega if options.omega_input == "sin2" else torch.sqrt((1 - omega).clamp(min=0))
             seen.append(seen_omega[:, None])
-        attenuation = modulate(torch.ones_like(omega), omega, options.tau, options.max_modulated_omega)
+        attenuation = opacity_factor(omega, options.tau, options.max_modulated_omega)
         constants = torch.cat(seen, dim=-1), self.positions
         return self.features, *constants, self.offsets, self.log_scales, attenuation

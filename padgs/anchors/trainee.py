@@ -1,4 +1,4 @@
-"""PaD-GS as the training loop sees it: a model, its growth and its learning rates."""
+"""PaD-GS in training: a model, its growth and its learning rates."""
 
 from __future__ import annotations
 
@@ -7,13 +7,46 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from padgs.anchors.growth import Growth
+from padgs.anchors.growth import Growth, GrowthOptions
 from padgs.anchors.model import PaDGS
-from padgs.learning.method import State
-from padgs.learning.schedule import ParameterGroup
-from padgs.learning.views import Drawing
-from padgs.render import RenderOptions, render
+from padgs.learning.schedule import Constant, LogLinear, ParameterGroup
+from padgs.learning.trainee import Drawing, Size, State
+from padgs.render import Rendering, RenderOptions, render
 from padgs.scene import View
+
+OFFSET_RATE_UNITS = ("scene", "world")
+
+
+@dataclass(frozen=True)
+class LearningRates:
+    """Learning rates of Adam; pairs are the first and the last of a log-linear decay over the run."""
+
+    offset_rate: tuple[float, float] = (0.01, 0.0001)  # times the extent of the cameras in `offset_rate_unit`
+    offset_rate_unit: str = "scene"  # scene: Scene.unit, so the world's units do not matter | world: as published
+    feature_rate: float = 0.0075
+    log_scale_rate: float = 0.007
+    opacity_rate: tuple[float, float] = (0.002, 2e-5)  # the three networks
+    color_rate: tuple[float, float] = (0.008, 5e-5)
+    covariance_rate: tuple[float, float] = (0.004, 0.004)
+
+    def __post_init__(self) -> None:
+        if self.offset_rate_unit not in OFFSET_RATE_UNITS:
+            known = ", ".join(OFFSET_RATE_UNITS)
+            raise ValueError(f"unknown offset_rate_unit {self.offset_rate_unit!r}; known: {known}")
+
+    def groups(self, model: PaDGS, extent: float, iterations: int) -> list[ParameterGroup]:
+        """The parameters of a model with their rates in a run of `iterations`; `extent` in `offset_rate_unit`."""
+        first, last = self.offset_rate
+        groups = [
+            ParameterGroup("offsets", (model.offsets,), LogLinear(extent * first, extent * last, iterations)),
+            ParameterGroup("features", (model.features,), Constant(self.feature_rate)),
+            ParameterGroup("log_scales", (model.log_scales,), Constant(self.log_scale_rate)),
+        ]
+        for head in ("opacity", "color", "covariance"):
+            weights = tuple(getattr(model.decoder, head).values())
+            first, last = getattr(self, f"{head}_rate")
+            groups.append(ParameterGroup(head, weights, LogLinear(first, last, iterations)))
+        return groups
 
 
 @dataclass(frozen=True)
@@ -23,19 +56,43 @@ class AnchorDrawing(Drawing):
     raw_opacities: Tensor  # [A, K]
 
 
-class TrainablePaDGS:
-    """A PaD-GS model with its growth, as `padgs.learning.views.Trainer` wants it."""
+class AnchorTrainee:
+    """A PaD-GS model with its growth; a `padgs.learning.trainee.Trainee`.
+
+    Attributes:
+        model, growth: what is trained, and what densifies it.
+    """
 
     def __init__(
-        self, model: PaDGS, growth: Growth, groups: list[ParameterGroup], options: RenderOptions, backend: str
+        self,
+        model: PaDGS,
+        options: RenderOptions,
+        backend: str = "auto",
+        *,
+        growth: GrowthOptions = GrowthOptions(),  # noqa: B008 - frozen
+        rates: LearningRates = LearningRates(),
+        extent: float,
+        iterations: int,
+        seed: int = 0,
     ) -> None:
-        """Tie together a model, its growth and its learning rates."""
-        self.model, self.growth = model, growth
-        self._groups, self._options, self._backend = groups, options, backend
+        """Wrap a model.
+
+        Args:
+            model: what is trained.
+            options, backend: how it is drawn.
+            growth: as it is in this run, see `GrowthOptions.for_run`.
+            rates: learning rates.
+            extent: of the cameras, in `rates.offset_rate_unit`.
+            iterations: of the run.
+            seed: of the random choices of growth.
+        """
+        self.model, self.growth = model, Growth(model, growth, seed=seed)
+        self._options, self._backend = options, backend
+        self._rates, self._extent, self._iterations = rates, extent, iterations
 
     def groups(self) -> list[ParameterGroup]:
         """All learnable parameters; positions of anchors are none."""
-        return self._groups
+        return self._rates.groups(self.model, self._extent, self._iterations)
 
     def draw(self, view: View) -> AnchorDrawing:
         """Decode the anchors for the view and render them, differentiably."""
@@ -54,9 +111,23 @@ class TrainablePaDGS:
         """Grow and prune anchors."""
         return self.growth.adapt(iteration, optimizer)
 
+    @torch.no_grad()
+    def render(self, view: View) -> Rendering:
+        """Render a view without gradients."""
+        return render(self.model.decode(view).gaussians, view, self._options, backend=self._backend)
+
     def counts(self) -> dict[str, int]:
         """Number of anchors."""
         return {"anchors": len(self.model)}
+
+    def size(self) -> Size:
+        """Anchors, the Gaussians that they can show, and the bytes of the stored model."""
+        model = self.model
+        return Size(
+            counts={"anchors": len(model), "gaussians": len(model) * model.options.offsets},
+            parameters=sum(p.numel() for p in model.parameters()),
+            bytes=sum(t.numel() * t.element_size() for t in model.state_dict().values()),
+        )
 
     def state(self) -> State:
         """Model, growth statistics and random state."""

@@ -12,7 +12,7 @@ sizes       name -> one workload of `padgs.bench.workload`:
     frame           decode and draw, {"median", "p95", "min"} seconds
     decode          precision of the networks' products -> decode only, without gradients
     graph           frame as a CUDA graph: the host launches once and waits at its end; null without a GPU
-    iteration       the same forward and backward with probe, loss, observation for densification and Adam
+    iteration       one iteration of `padgs.learning.loop.Trainer`
     stages          calls of libpadgs_cuda in one iteration -> the same
     peak_bytes      of torch's allocator, in one iteration
   slower            median of the published bounds' frame and iteration over ours
@@ -23,20 +23,19 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
-from unittest import mock
 
 import torch
 
 from padgs import clock
 from padgs.anchors.precision import PRECISIONS
 from padgs.bench.workload import OPTIONS, SIZES, Size, Workload, build
-from padgs.learning.loss import photometric_loss
-from padgs.learning.targets import Targets
 from padgs.native import cuda
-from padgs.render import RenderOptions, render, resolve_backend
+from padgs.native.abi import Pointer
+from padgs.native.watch import watched
+from padgs.render import Rendering, RenderOptions, render, resolve_backend
 from padgs.render.backends.captured import CapturedRender
 
 SCHEMA = 1
@@ -45,6 +44,7 @@ MEASURED = {
     "published": dataclasses.replace(OPTIONS, bounds="square", wrap=False),
     "hybrid": dataclasses.replace(OPTIONS, blending="hybrid"),
 }
+QUEUED = {name for name, (arguments, _) in cuda.SIGNATURES.items() if arguments[:2] == [Pointer, Pointer]}
 TITLES = {"ours": "exact bounds", "published": "published bounds", "hybrid": "exact bounds, hybrid blending"}
 LIMITS = {"frame_ms": 2.5, "iteration_ms": 6.0, "peak_gb": 6.0}  # at most; 1M Gaussians at 2048x1024 on an H200
 LEAST_SLOWER = 2.0
@@ -70,25 +70,20 @@ class Stopwatch:
         return end - start if self.device.type != "cuda" else start.elapsed_time(end) / 1000
 
 
-class Iteration:
-    """One training iteration as the trainer does it, all of it on the device."""
+class OnDevice:
+    """A workload that is drawn and trained on a device."""
 
     def __init__(self, work: Workload, options: RenderOptions, device: torch.device) -> None:
         """Take the workload to the device."""
         self.work, self.options, self.device = work, options, device
         self.backend = resolve_backend("auto", work.model.positions)
-        groups = [{"params": list(group.parameters), "lr": 0.0} for group in work.groups()]
-        self.optimizer = torch.optim.Adam(groups, eps=1e-15, fused=True)
-        self.targets = Targets(work.scene.train, "solid_angle", device)
-        self.growth = work.watching_growth()
-        self.round = 0
-        self.counters: Mapping[str, int] = {}
+        self._records = work.trainer(options).records()
 
-    def frame(self) -> None:
+    def frame(self) -> Rendering:
         """Decode and draw."""
         with torch.no_grad():
             decoded = self.work.model.decode(self.work.view)
-            render(decoded.gaussians, self.work.view, self.options, backend=self.backend)
+            return render(decoded.gaussians, self.work.view, self.options, backend=self.backend)
 
     def decoding(self, precision: str) -> Callable[[], object]:
         """Decode without drawing."""
@@ -112,19 +107,8 @@ class Iteration:
         return lambda: draw(pose)
 
     def train(self) -> None:
-        """Forward, backward, statistics, step; nothing is read back but the number of instances."""
-        target, view = self.targets[self.round % len(self.targets)], self.work.view
-        self.round += 1
-        decoded = self.work.model.decode(view)
-        probe = decoded.gaussians.means.new_zeros(len(decoded.slots), 2, requires_grad=True)
-        rendering = render(decoded.gaussians, view, self.options, probe=probe, backend=self.backend)
-        photometric_loss(rendering.image, target.image, target.weight).backward()
-        assert probe.grad is not None
-        with torch.no_grad():
-            self.growth.observe(decoded.raw_opacities, decoded.slots, probe.grad, rendering.visible, iteration=1)
-        self.optimizer.step()
-        self.optimizer.zero_grad(set_to_none=True)
-        self.counters = rendering.counters
+        """One iteration of the trainer."""
+        next(self._records)
 
 
 def measure_gpu(
@@ -161,7 +145,7 @@ def measure_gpu(
         for label, options in MEASURED.items():
             progress(f"{name}, {TITLES[label]}")
             work = _on_device(build(size, seed), device)
-            entry[label] = _measure(Iteration(work, options, device), repeats, warm_up)
+            entry[label] = _measure(OnDevice(work, options, device), repeats, warm_up)
             del work
         entry["slower"] = {
             part: entry["published"][part]["median"] / entry["ours"][part]["median"] for part in ("frame", "iteration")
@@ -188,7 +172,7 @@ def _on_device(work: Workload, device: torch.device) -> Workload:
     return work
 
 
-def _measure(iteration: Iteration, repeats: int, warm_up: int) -> dict[str, Any]:
+def _measure(iteration: OnDevice, repeats: int, warm_up: int) -> dict[str, Any]:
     watch = Stopwatch(iteration.device)
     frame = _timed(iteration.frame, watch, repeats, warm_up)
     decode = {name: _timed(iteration.decoding(name), watch, repeats, warm_up) for name in PRECISIONS}
@@ -205,7 +189,7 @@ def _measure(iteration: Iteration, repeats: int, warm_up: int) -> dict[str, Any]
         "graph": graph,
         "iteration": timing,
         "stages": _stages(iteration, watch, repeats),
-        "counters": dict(iteration.counters),
+        "counters": dict(iteration.frame().counters),
         "peak_bytes": memory["device"],
     }
 
@@ -222,7 +206,7 @@ def _timed(work: Callable[[], object], watch: Stopwatch, repeats: int, warm_up: 
     return clock.summary([watch.seconds(*pair) for pair in marks])
 
 
-def _stages(iteration: Iteration, watch: Stopwatch, repeats: int) -> dict[str, dict[str, float]]:
+def _stages(iteration: OnDevice, watch: Stopwatch, repeats: int) -> dict[str, dict[str, float]]:
     rounds = []
     for _ in range(repeats):
         with _calls_watched(watch) as marks:
@@ -238,15 +222,17 @@ def _stages(iteration: Iteration, watch: Stopwatch, repeats: int) -> dict[str, d
 
 @contextmanager
 def _calls_watched(watch: Stopwatch) -> Iterator[list[tuple[str, Any, Any]]]:
+    """Marks around every call that puts work into the device's queue."""
     marks: list[tuple[str, Any, Any]] = []
-    original = cuda.call
 
-    def call(name: str, *arguments: Any) -> None:
+    @contextmanager
+    def stage(name: str) -> Iterator[None]:
         start = watch.mark()
-        original(name, *arguments)
-        marks.append((name.removeprefix("padgs_cuda_"), start, watch.mark()))
+        yield
+        if name in QUEUED:
+            marks.append((name.removeprefix("padgs_cuda_"), start, watch.mark()))
 
-    with mock.patch.object(cuda, "call", call):
+    with watched(stage):
         yield marks
 
 

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
-from unittest import mock
 
 import torch
 from torch import Tensor
 
-import padgs.anchors.decoder
-import padgs.learning.loss
+from padgs.anchors.decoder import decode_gaussians, define_gaussians
 from padgs.bench.tile_counts import BOUNDS
 from padgs.bench.workload import OPTIONS, Workload
 from padgs.clock import measure
 from padgs.gaussians import Gaussians
-from padgs.learning.targets import Targets
+from padgs.learning.loop import TrainOptions
+from padgs.learning.loss import define_loss, photometric_loss, target_moments
+from padgs.learning.targets import Target, Targets
 from padgs.render import Rendering, RenderOptions, render
 
+LAMBDA_L1 = TrainOptions().lambda_l1
 PROJECTIONS = {
     "tangent": RenderOptions(projection="tangent"),
     "ray": RenderOptions(projection="ray"),
@@ -48,22 +48,14 @@ def ratios(work: Workload, brute_force: Workload, repeats: int) -> dict[str, dic
         "torch renderer", "native renderer", _drawing(brute_force, OPTIONS, "torch"), _drawing(brute_force, OPTIONS), 1
     )
     slow_renderer["size"] = [brute_force.size.width, brute_force.size.height, brute_force.size.gaussians]
-    with torch_loss():
-        slow_target = Targets(work.scene.train[:1], "solid_angle")[0]  # with the moments that only this loss needs
     image = torch.rand(work.size.height, work.size.width, 3, generator=torch.Generator().manual_seed(1))
     return {
         "torch_renderer": slow_renderer,
         "published_bounds": published,
         "torch_decode": _ratio(
-            "torch decoder", "native decoder", _in(torch_decode, _decoding(work)), _decoding(work), repeats
+            "torch decoder", "native decoder", _decoding(work, define_gaussians), _decoding(work), repeats
         ),
-        "torch_loss": _ratio(
-            "torch loss",
-            "native loss",
-            _in(torch_loss, _comparing(image, slow_target)),
-            _comparing(image, target),
-            repeats,
-        ),
+        "torch_loss": _ratio("torch loss", "native loss", _defining(image, target), _comparing(image, target), repeats),
         "decode": _ratio(
             "decode, draw with erp", "draw with erp", _decoding_and_drawing(work), _drawing(work, OPTIONS), repeats
         ),
@@ -84,22 +76,6 @@ def _against_erp(work: Workload, options: RenderOptions, repeats: int) -> dict[s
     )
     counts = [_draw(_decoded(work), work, each).counters for each in (options, OPTIONS)]
     return found | {count: counts[0][count] / counts[1][count] for count in ("instances", "evaluated")}
-
-
-@contextmanager
-def torch_decode() -> Iterator[None]:
-    """Decode by `define_gaussians`, as where there is no native library."""
-    with mock.patch.object(padgs.anchors.decoder, "fits", lambda *_: False):
-        yield
-
-
-@contextmanager
-def torch_loss() -> Iterator[None]:
-    """Compare in torch, as where there is no native library."""
-    with ExitStack() as stack:
-        for module in ("padgs.learning.loss", "padgs.learning.targets"):
-            stack.enter_context(mock.patch(f"{module}.fits", lambda _: False))
-        yield
 
 
 def render_both_ways(work: Workload, repeats: int) -> dict[str, Any]:
@@ -134,9 +110,9 @@ def _decoding_and_drawing(work: Workload) -> Callable[[], None]:
     return both_ways
 
 
-def _decoding(work: Workload) -> Callable[[], None]:
+def _decoding(work: Workload, decode: Callable = decode_gaussians) -> Callable[[], None]:
     def both_ways() -> None:
-        found = work.model.decode(work.view).gaussians
+        found = decode(work.model.decoder.weights(), *work.model.as_seen(work.view))[0]
         leaves = (found.means, found.quats, found.scales, found.opacities, found.colors)
         torch.autograd.backward(leaves, tuple(map(torch.ones_like, leaves)))
         work.model.zero_grad(set_to_none=True)
@@ -144,19 +120,16 @@ def _decoding(work: Workload) -> Callable[[], None]:
     return both_ways
 
 
-def _comparing(image: Tensor, target) -> Callable[[], None]:
+def _comparing(image: Tensor, target: Target) -> Callable[[], None]:
     leaf = image.clone().requires_grad_()
-    return lambda: padgs.learning.loss.photometric_loss(
-        leaf, target.image, target.weight, moments=target.moments
-    ).backward()
+    return lambda: photometric_loss(leaf, target.image, target.weight).backward()
 
 
-def _in(circumstances: Callable, work: Callable[[], None]) -> Callable[[], None]:
-    def there() -> None:
-        with circumstances():
-            work()
-
-    return there
+def _defining(image: Tensor, target: Target) -> Callable[[], None]:
+    """`_comparing` in torch, with what training keeps of the target where it has no native loss."""
+    leaf, moments = image.clone().requires_grad_(), target_moments(target.image)
+    total = 3 * target.weight.expand(image.shape[:2]).sum()
+    return lambda: define_loss(leaf, target.image, target.weight, LAMBDA_L1, total, moments).backward()
 
 
 def _ratio(slow_name: str, fast_name: str, slow: Callable, fast: Callable, repeats: int) -> dict[str, Any]:

@@ -13,7 +13,7 @@ sizes          name -> one workload:
   stages       stage of `padgs.bench.stages.STAGES` -> {wall, cpu: {median, p95, min}} per iteration; where there
                is a cost model also operations, bytes, floor (CPU seconds), bound, fraction (floor / least CPU)
   stage_sum    the iteration that the stages are parts of, without adapt
-  iteration    `padgs.learning.views.Trainer`, undisturbed;  iteration_1_thread: the same on one thread
+  iteration    `padgs.learning.loop.Trainer`, undisturbed;  iteration_1_thread: the same on one thread
   adapt_event  growing and pruning once; the stage adapt is its share of one iteration
   frame        decode and draw without gradients
   render       draw fixed Gaussians and go back to their gradients

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import torch
 
 from padgs import clock
 from padgs.anchors.model import PaDGSOptions
-from padgs.anchors.trainee import TrainablePaDGS
 from padgs.bench.ceilings import Ceiling
 from padgs.bench.cost import add_floors, costs
 from padgs.bench.ratios import render_both_ways
-from padgs.bench.stages import STAGES, Iteration, StageClock, amortised
-from padgs.bench.workload import NEVER, OPTIONS, Size, Workload, build, sigma_quantiles
-from padgs.learning.method import Budget, Record
-from padgs.learning.views import Trainer
-from padgs.render import render
+from padgs.bench.stages import STAGES, amortised, growing, measured
+from padgs.bench.workload import OPTIONS, Size, Workload, build, sigma_quantiles
+from padgs.render import Rendering, render
 
 MANY = 500_000  # Gaussians from which a few repeats must do
 FEW_REPEATS = 3
@@ -38,21 +35,24 @@ def measure_size(
     frame = clock.measure(lambda: _frame(work), repeats=repeats)
     peak["frame"] = clock.peak_memory()["host"]
     progress("whole iterations")
-    records = _training(work)
+    records = work.trainer().records()
     iteration = clock.measure(lambda: next(records), repeats=repeats, warm_up=WARM_UP)
     peak["training"] = clock.peak_memory()["host"]
     progress("whole iterations on one thread")
     iteration_1_thread = _on_one_thread(lambda: clock.measure(lambda: next(records), repeats=repeats, warm_up=1))
     progress("stages")
-    stages, total, event, counters = _stages(work, repeats)
+    clock_of_stages = measured(work, repeats, WARM_UP)
+    event = growing(work, ADAPT_EVENTS)
+    stages = {**clock_of_stages.stages(), "adapt": amortised(event)}
+    counters = dict(_frame(work).counters)
     progress("drawing alone")
     drawing = render_both_ways(work, repeats)
     pairs = counters["evaluated"]
     return {
         **dataclasses.asdict(size),
         "counters": {**_counts(work), **_shares(counters, size), "sigma": sigma_quantiles(work)},
-        "stages": stages,
-        "stage_sum": total,
+        "stages": {name: stages[name] for name in STAGES},
+        "stage_sum": clock_of_stages.total(),
         "iteration": iteration,
         "iteration_1_thread": iteration_1_thread,
         "adapt_event": event,
@@ -78,14 +78,9 @@ def add_size_floors(size: dict[str, Any], ceilings: dict[str, Ceiling]) -> None:
     size["floor"] = sum(timing.get("floor", 0.0) for timing in size["stages"].values())
 
 
-def _frame(work: Workload) -> None:
+def _frame(work: Workload) -> Rendering:
     with torch.no_grad():
-        render(work.model.decode(work.view).gaussians, work.view, OPTIONS, backend="cpu")
-
-
-def _training(work: Workload) -> Iterator[Record]:
-    trainee = TrainablePaDGS(work.model, work.watching_growth(), work.groups(), OPTIONS, "cpu")
-    return Trainer(trainee, work.scene, Budget(NEVER)).records()
+        return render(work.model.decode(work.view).gaussians, work.view, OPTIONS, backend="cpu")
 
 
 def _on_one_thread(work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
@@ -95,19 +90,6 @@ def _on_one_thread(work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         return work()
     finally:
         torch.set_num_threads(threads)
-
-
-def _stages(work: Workload, repeats: int) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any], dict[str, int]]:
-    iteration, cold, measured, adapting = Iteration(work), StageClock(), StageClock(), StageClock()
-    for _ in range(WARM_UP):
-        iteration.run(cold)
-    for _ in range(repeats):
-        iteration.run(measured)
-    for _ in range(ADAPT_EVENTS):
-        iteration.adapt(adapting)
-    event = adapting.stages()["adapt"]
-    stages = {**measured.stages(), "adapt": amortised(event)}
-    return {name: stages[name] for name in STAGES}, measured.total(), event, iteration.counters
 
 
 def _counts(work: Workload) -> dict[str, int]:

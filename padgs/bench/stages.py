@@ -1,7 +1,7 @@
 """One training iteration, taken apart: who had the processor when.
 
-Stages nest, and a stage is charged only while no inner one runs, so together they are the whole iteration. The parts of
-the renderer are told apart by watching the native calls that it makes; what it does around them is a stage of its own.
+Stages nest, and a stage is charged only while no inner one runs, so together they are the whole iteration. The outer
+ones are those of `padgs.learning.loop`; native calls are told apart within them.
 """
 
 from __future__ import annotations
@@ -9,33 +9,26 @@ from __future__ import annotations
 import copy
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
-from unittest import mock
 
-import torch
-
-from padgs.anchors.growth import Growth, GrowthOptions
-from padgs.anchors.model import Decoded
-from padgs.bench.workload import OPTIONS, Workload
+from padgs.anchors.growth import GrowthOptions
+from padgs.bench.workload import Workload
 from padgs.clock import summary
-from padgs.learning.loss import photometric_loss
-from padgs.learning.targets import Targets
-from padgs.native import cpu
-from padgs.render import render
+from padgs.native.watch import watched
 
 STAGES = {
     "target": "read the panorama, as floats",
-    "decode": "anchors to Gaussians",
+    "decode": "anchors to Gaussians, natively",
     "project": "Gaussians to footprints and their bounds",
     "sort": "depth order, counting and binning of tile instances",
     "blend": "footprints to pixels",
-    "render_rest": "renderer around its native calls: allocation, checks",
+    "draw": "drawing around its native calls: allocation, checks",
     "loss": "L1 and SSIM, with their gradient",
     "blend_backward": "pixels to moments of the footprints, and their sums",
     "project_backward": "moments to gradients of the Gaussians",
     "decode_backward": "gradients of anchors and networks",
-    "backward_rest": "autograd around the native calls",
+    "backward": "autograd around the native calls",
     "observe": "densification statistics",
     "optimiser": "Adam",
     "adapt": "growing and pruning, its share of one iteration",
@@ -104,91 +97,31 @@ class StageClock:
             self._spent[self._running[-1]] = (wall + now[0] - self._since[0], cpu + now[1] - self._since[1])
         self._since = now
 
-
-@contextmanager
-def native_calls_watched(clock: StageClock) -> Iterator[None]:
-    """Charge every native call to its stage, wherever it is made from."""
-    watched = _WatchedLibrary(cpu.library(), clock)
-    with mock.patch.object(cpu, "library", lambda: watched):
-        yield
+    def native_call(self, name: str) -> AbstractContextManager[object]:
+        """A stage for `padgs.native.watch.watched`."""
+        return self.stage(NATIVE_CALLS[name]) if name in NATIVE_CALLS else nullcontext()
 
 
-class _WatchedLibrary:
-    def __init__(self, library: Any, clock: StageClock) -> None:
-        self._library, self._clock = library, clock
-
-    def __getattr__(self, name: str) -> Any:
-        function = getattr(self._library, name)
-        if name not in NATIVE_CALLS:
-            return function
-
-        def call(*arguments):
-            with self._clock.stage(NATIVE_CALLS[name]):
-                return function(*arguments)
-
-        return call
+def measured(work: Workload, rounds: int, warm_up: int) -> StageClock:
+    """Rounds of the trainer, one iteration each."""
+    clock = StageClock()
+    records = work.trainer(stage=clock.stage).records()
+    with watched(clock.native_call):
+        for _ in range(warm_up + rounds):
+            with clock.stage("rest"):
+                next(records)
+            clock.finish_round()
+    del clock.rounds[:warm_up]
+    return clock
 
 
-class Iteration:
-    """The training iteration of `padgs.learning.views.Trainer`, with a stage around each of its steps."""
-
-    def __init__(self, work: Workload) -> None:
-        """Prepare as the trainer does."""
-        self.work = work
-        groups = work.groups()
-        self.optimizer = torch.optim.Adam(
-            [{"params": list(group.parameters), "lr": 0.0} for group in groups], eps=1e-15, fused=True
-        )
-        self.targets = Targets(work.scene.train, "solid_angle")
-        self.growth = work.watching_growth()
-        self.counters: dict[str, int] = {}
-
-    def run(self, clock: StageClock) -> None:
-        """One round."""
-        with clock.stage("rest"), native_calls_watched(clock):
-            with clock.stage("target"):
-                target = self.targets[len(clock.rounds) % len(self.targets)]
-            decoded, probe, visible = self._backward(clock, target)
-            with clock.stage("observe"), torch.no_grad():
-                self._observe(self.growth, decoded, probe, visible)
-            with clock.stage("optimiser"):
-                self.optimizer.step()
-                self.optimizer.zero_grad(set_to_none=True)
+def growing(work: Workload, rounds: int) -> dict[str, Any]:
+    """What growing and pruning once takes, each time in the first iteration of a copy."""
+    clock = StageClock()
+    for _ in range(rounds):
+        next(copy.deepcopy(work).trainer(grows=True, stage=clock.stage).records())
         clock.finish_round()
-
-    def adapt(self, clock: StageClock) -> tuple[str, ...]:
-        """Grow and prune once, on a copy; charges the share of one of the iterations between two such events."""
-        twin = Iteration(copy.deepcopy(self.work))
-        growth = twin.work.acting_growth()
-        decoded, probe, visible = twin._backward(StageClock(), twin.targets[0])
-        with torch.no_grad():
-            twin._observe(growth, decoded, probe, visible)
-            del decoded, probe, visible
-            twin.optimizer.step()
-            with clock.stage("adapt"):
-                events = growth.adapt(1, twin.optimizer)
-        clock.finish_round()
-        return events
-
-    def _backward(self, clock: StageClock, target):
-        view = self.work.view
-        with clock.stage("decode"):
-            decoded = self.work.model.decode(view)
-        with clock.stage("render_rest"):
-            probe = decoded.gaussians.means.new_zeros(len(decoded.slots), 2, requires_grad=True)
-            rendering = render(decoded.gaussians, view, OPTIONS, probe=probe, backend="cpu")
-        with clock.stage("loss"):
-            loss = photometric_loss(rendering.image, target.image, target.weight)
-            loss.item()
-        with clock.stage("backward_rest"):
-            loss.backward()
-        self.counters = dict(rendering.counters)
-        return decoded, probe, rendering.visible
-
-    @staticmethod
-    def _observe(growth: Growth, decoded: Decoded, probe: torch.Tensor, visible: torch.Tensor) -> None:
-        assert probe.grad is not None
-        growth.observe(decoded.raw_opacities, decoded.slots, probe.grad, visible, iteration=1)
+    return clock.stages()["adapt"]
 
 
 def amortised(adapt: dict[str, Any]) -> dict[str, Any]:

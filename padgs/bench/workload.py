@@ -8,14 +8,16 @@ opacity of 0.15; these Gaussians, 100 k at 512x256, have 40, 3.8, 2.0 and 0.15.
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from padgs.anchors.growth import Growth, GrowthOptions
+from padgs.anchors.growth import GrowthOptions
 from padgs.anchors.model import PaDGS
-from padgs.learning.schedule import Constant, ParameterGroup
+from padgs.anchors.trainee import AnchorTrainee, LearningRates
+from padgs.learning.loop import Budget, Stage, Trainer
 from padgs.render import RenderOptions
 from padgs.scene import Scene, View
 
@@ -27,6 +29,8 @@ OFFSET = 4.0  # distance between an anchor and its Gaussians, pixels of the equa
 RAW_DEVIATIONS = {"opacity": 0.35, "color": 1.0, "covariance": 1.0}  # of the networks' outputs before tanh or sigmoid
 OPTIONS = RenderOptions(near=0.01)
 NEVER = 1 << 40  # iterations
+LEAST = (1e-30, 1e-30)  # a learning rate that changes no float32, for schedules that have no 0
+STILL = LearningRates(LEAST, "scene", 0.0, 0.0, opacity_rate=LEAST, color_rate=LEAST, covariance_rate=LEAST)
 
 
 @dataclass(frozen=True)
@@ -60,21 +64,18 @@ class Workload:
         """The first view."""
         return self.scene.train[0]
 
-    def groups(self) -> list[ParameterGroup]:
-        """All parameters at a learning rate of 0: the optimiser does its work, and every iteration has the same."""
-        rows = [ParameterGroup(name, (parameter,), Constant(0.0)) for name, parameter in self.model.rows().items()]
-        heads = ("opacity", "color", "covariance")
-        return rows + [
-            ParameterGroup(head, tuple(getattr(self.model.decoder, head).values()), Constant(0.0)) for head in heads
-        ]
+    def trainer(self, options: RenderOptions = OPTIONS, *, grows: bool = False, stage: Stage = nullcontext) -> Trainer:
+        """The real one. Nothing learns, so that all iterations have the same work; the optimiser does all of its own.
 
-    def watching_growth(self) -> Growth:
-        """Densification that collects statistics at every iteration, and never acts on them."""
-        return Growth(self.model, GrowthOptions(statistics_from=0, grow_from=NEVER, grow_until=NEVER))
-
-    def acting_growth(self) -> Growth:
-        """Densification that acts on the statistics of one iteration."""
-        return Growth(self.model, GrowthOptions(statistics_from=0, grow_from=0, grow_until=NEVER, grow_every=1))
+        Args:
+            options: how the model is drawn.
+            grows: act on the statistics of every iteration; else they are collected and never acted on.
+            stage: see `Trainer`.
+        """
+        grow_from = 0 if grows else NEVER
+        growth = GrowthOptions(statistics_from=0, grow_from=grow_from, grow_until=NEVER, grow_every=1 if grows else 100)
+        trainee = AnchorTrainee(self.model, options, growth=growth, rates=STILL, extent=1.0, iterations=NEVER)
+        return Trainer(trainee, self.scene, Budget(NEVER), stage=stage)
 
 
 def build(size: Size, seed: int = 0) -> Workload:

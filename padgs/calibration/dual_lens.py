@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from padgs.learning.schedule import LogLinear, ParameterGroup
-from padgs.learning.views import Drawing
+from padgs.learning.trainee import Drawing
 from padgs.render import Rendering
 from padgs.scene import View
 from padgs.sphere.camera import Panorama, RayTable

@@ -1,21 +1,21 @@
-"""Explicit Gaussians whose cameras learn too: the splats of 3DGS and a `Calibration`, as one `Trainable`."""
+"""Explicit Gaussians whose cameras learn too: the splats of 3DGS and a `Calibration`, as a trainee."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from abc import abstractmethod
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
-from padgs.learning.method import Budget, Record, Size, State
+from padgs.learning.loop import model_state
 from padgs.learning.schedule import ParameterGroup
-from padgs.learning.views import Drawing, model_state
+from padgs.learning.trainee import Drawing, Size, State
 from padgs.scene import Scene, View
 from padgs.splats.method import SplatMethod
 from padgs.splats.model import Splats
-from padgs.splats.trainee import TrainableSplats
+from padgs.splats.trainee import SplatTrainee
 
 PREFIX = "calibration/"  # of its tensors in a state
 
@@ -56,11 +56,11 @@ class Calibration(Protocol):
         ...
 
 
-class CalibratedSplats(TrainableSplats):
-    """`TrainableSplats` that draws training views through a calibration; `render` stays that of an ideal camera."""
+class CalibratedTrainee(SplatTrainee):
+    """Splats that are drawn through a calibration in training; `render` stays that of an ideal camera."""
 
     def __init__(self, *args: Any, calibration: Calibration, **kwargs: Any) -> None:
-        """Arguments as for `TrainableSplats`, and the calibration that is optimised along with the splats."""
+        """Arguments as for `SplatTrainee`, and the calibration that is optimised along with the splats."""
         super().__init__(*args, **kwargs)
         self.calibration = calibration
 
@@ -70,12 +70,22 @@ class CalibratedSplats(TrainableSplats):
 
     def draw(self, view: View) -> Drawing:
         """Render all Gaussians as the camera of the view takes them, differentiably."""
-        return self.calibration.draw(self._drawing, view)
+        return self.calibration.draw(super().draw, view)
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
         """As the splats do; the last event of a run says what was found of the cameras."""
         events = super().adapt(iteration, optimizer)
         return (*events, self.calibration.summary()) if iteration == self.iterations else events
+
+    def size(self) -> Size:
+        """Counts and bytes of the model, calibration included."""
+        size = super().size()
+        parameters = [p for group in self.calibration.groups(1) for p in group.parameters]
+        return Size(
+            counts={**size.counts, **self.calibration.counts()},
+            parameters=size.parameters + sum(p.numel() for p in parameters),
+            bytes=size.bytes + sum(p.numel() * p.element_size() for p in parameters),
+        )
 
     def state(self) -> State:
         """That of the splats, and the calibration."""
@@ -86,36 +96,13 @@ class CalibratedSplats(TrainableSplats):
     def load_state(self, state: State) -> None:
         """Become the model that `state` was taken of."""
         super().load_state(state)
-        tensors = {n.removeprefix(PREFIX): t for n, t in state.tensors.items() if n.startswith(PREFIX)}
-        self.calibration.load_state_dict(tensors)
+        self.calibration.load_state_dict(state.under(PREFIX))
 
 
-class CalibratedMethod(SplatMethod, ABC):
-    """A method whose model is `CalibratedSplats`; a subclass says which calibration."""
+class CalibratedMethod(SplatMethod):
+    """A method whose cameras learn, too; a subclass says which calibration they have."""
 
-    _calibration: Calibration | None = None
-
-    def fit(self, scene: Scene, budget: Budget) -> Iterator[Record]:
-        """Train, from the point cloud of the scene and the cameras as given, or from a loaded state."""
-        if self._loaded is None:
-            self._calibration = self._as_given(scene)
-        yield from super().fit(scene, budget)
-
-    def load_state(self, state: State) -> None:
-        """Become the method that `state` was taken of, ready to render and to go on."""
-        self._calibration = self._as_stored(model_state(state).values["calibration"])
-        super().load_state(state)
-
-    def size(self) -> Size:
-        """Counts and bytes of the model, calibration included."""
-        size = super().size()
-        assert self._calibration is not None
-        parameters = [p for group in self._calibration.groups(1) for p in group.parameters]
-        return Size(
-            counts={**size.counts, **self._calibration.counts()},
-            parameters=size.parameters + sum(p.numel() for p in parameters),
-            bytes=size.bytes + sum(p.numel() * p.element_size() for p in parameters),
-        )
+    _calibration: Calibration  # what the next trainee is made with
 
     @abstractmethod
     def _as_given(self, scene: Scene) -> Calibration:
@@ -125,16 +112,23 @@ class CalibratedMethod(SplatMethod, ABC):
     def _as_stored(self, values: Mapping[str, Any]) -> Calibration:
         """A calibration of the shape that `Calibration.values` tells; its tensors are loaded afterwards."""
 
-    def _wrap(self, splats: Splats, extent: float, iterations: int) -> CalibratedSplats:
-        assert self._calibration is not None
+    def _start(self, scene: Scene, iterations: int) -> SplatTrainee:
+        self._calibration = self._as_given(scene)
+        return super()._start(scene, iterations)
+
+    def _blank(self, state: State) -> SplatTrainee:
+        self._calibration = self._as_stored(model_state(state).values["calibration"])
+        return super()._blank(state)
+
+    def _trainee_of(self, splats: Splats, extent: float, iterations: int) -> CalibratedTrainee:
         self._calibration.to(splats.means.device)
-        return CalibratedSplats(
+        return CalibratedTrainee(
             splats,
-            self._options,
-            self._render,
+            self.options,
+            self.render_config,
             extent=extent,
             iterations=iterations,
-            learning_rate_factor=self._options.learning_rate_factor,
-            seed=self._seed,
+            learning_rate_factor=self.options.learning_rate_factor,
+            seed=self.seed,
             calibration=self._calibration,
         )

@@ -14,11 +14,11 @@ import typer
 from padgs import results
 from padgs.results import Result
 from padgs.runs.typed import ConfigError
-from reports.conditions import OF_TIMES, machine
-from reports.measures import train_seconds
+from reports.frame import frame, hardware, machine
+from reports.gathered import Gathered
 from reports.request import Request
-from reports.settings import chosen
-from reports.tables.equal_time import EXPERIMENT, is_near, of_any_length
+from reports.store import Run
+from reports.tables.equal_time import EXPERIMENT, is_near
 from reports.tables.table import ReportError
 
 
@@ -42,17 +42,21 @@ def equal_time(
     for error in broken:
         print(f"left out: {error}", file=sys.stderr)
     try:
-        methods = chosen(found, "methods", Request(experiment=experiment))
+        methods = Gathered(frame(map(Run, found)), Request(experiment=experiment)).chosen("methods")
     except ReportError as error:
         raise _refused(str(error)) from error
-    known = {result.run: result for result in (*methods, *(r for r in found if EXPERIMENT in r.experiments))}
-    usable = [result for result in known.values() if result.ok and not result.variant and train_seconds(result)]
+    known = {
+        result.run: result for result in found if result.run in set(methods["run"]) or EXPERIMENT in result.experiments
+    }
+    usable = [
+        result for result in known.values() if result.ok and not result.variant and result.timing.get("train_seconds")
+    ]
     if not usable:
         raise _refused(
             f"no run in {folder} has ended well; run the methods first, "
             "e.g. padgs-run +experiment=all_methods scale=cpu"
         )
-    machines = sorted({machine(result) for result in usable})
+    machines = sorted({hardware(result) for result in usable})
     if len(machines) > 1:
         raise _refused(
             f"the runs in {folder} are of several machines ({'; '.join(machines)}), whose times say nothing about each "
@@ -80,8 +84,9 @@ def lengths(runs: Iterable[Result]) -> list[list[Result]]:
     """The runs in groups that differ in their length only; with as many threads each."""
     groups: dict[str, list[Result]] = {}
     for result in runs:
-        config = {key: value for key, value in of_any_length(result).config.items() if key not in ("run", "protocol")}
-        key = [result.preset, result.fingerprint, OF_TIMES["machine"](result, ""), config]
+        config = results.decisive(result.config)
+        config["train"] = {key: value for key, value in config["train"].items() if key != "iterations"}
+        key = [result.preset, result.fingerprint, machine(result), config]
         groups.setdefault(json.dumps(key, sort_keys=True), []).append(result)
     return list(groups.values())
 
@@ -93,7 +98,7 @@ def iterations(runs: Sequence[Result], seconds: float) -> int:
     to grow as a power of the iterations; beyond all runs, in proportion to the nearest.
     """
     nearest = min(runs, key=lambda result: _distance(result, seconds))
-    if is_near(nearest, seconds):
+    if is_near(_seconds(nearest), seconds):
         return nearest.iterations
     shorter = max((r for r in runs if _seconds(r) < seconds), key=_seconds, default=None)
     longer = min((r for r in runs if _seconds(r) > seconds), key=_seconds, default=None)
@@ -119,9 +124,7 @@ def _values(result: Result, folder: Path, length: int) -> dict[str, Any]:
 
 
 def _seconds(result: Result) -> float:
-    seconds = train_seconds(result)
-    assert seconds is not None
-    return seconds
+    return result.timing["train_seconds"]
 
 
 def _refused(message: str) -> typer.Exit:

@@ -1,18 +1,16 @@
-"""`padgs report`: read result files, make tables, charts and the page, write them down."""
+"""`padgs report`: read finished runs, make tables, charts and the page, write them down."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from padgs import results
-from padgs.registry import lookup
-from reports import REPORTS
-from reports.request import Request
+from reports import REPORTS, store
 from reports.tables.table import ReportError
 
 ALL = "all"
@@ -20,54 +18,64 @@ ALL = "all"
 
 def report(
     what: Annotated[str, typer.Argument(help=f"{', '.join(REPORTS)}, or {ALL}")],
-    runs: Annotated[str, typer.Argument(help="folder of run folders")] = "runs",
-    out: Annotated[str, typer.Option(help="where the files go; RUNS/reports if not given")] = "",
+    runs: Annotated[str, typer.Argument(help="folder of run folders, or a results.jsonl")] = "runs",
+    out: Annotated[str, typer.Option(help="where the files go; reports in or beside RUNS if not given")] = "",
     protocol: Annotated[str, typer.Option(help="which scores: paper or sphere")] = "paper",
     experiment: Annotated[str, typer.Option(help="only runs of this experiment or sweep, e.g. tau@cpu")] = "",
     metric: Annotated[list[str] | None, typer.Option(help="of the curves of sweeps, e.g. ws_psnr; repeatable")] = None,
     where: Annotated[list[str] | None, typer.Option(help="only runs with KEY=VALUE; repeatable")] = None,
     mix: Annotated[bool, typer.Option(help="let other rules, sizes, run lengths and machines stand together")] = False,
-    collect: Annotated[bool, typer.Option(help="copy the result files to OUT/results, without pictures")] = False,
+    collect: Annotated[
+        bool, typer.Option(help="add the runs to OUT/results.jsonl first, and report on all in it")
+    ] = False,
     strict: Annotated[bool, typer.Option(help="exit code 1 if a result file cannot be used")] = False,
 ) -> None:
     """Make tables (Markdown, LaTeX, CSV), charts (SVG, PNG, CSV) and a page (HTML) from result files."""
-    folder = Path(runs)
-    if not folder.is_dir():
-        raise _refused(f"there is no folder {folder}; give the folder of the runs after the name of the report")
-    found, broken = results.read_all(folder)
-    for error in broken:
-        print(f"left out: {error}", file=sys.stderr)
+    if what not in (*REPORTS, ALL):
+        raise _refused(f"unknown report {what!r}; known: {', '.join(sorted(REPORTS))}, {ALL}")
+    source = Path(runs)
+    if not source.exists():
+        raise _refused(f"there is no folder {source}; give the folder of the runs after the name of the report")
+    target = Path(out) if out else (source if source.is_dir() else source.parent) / "reports"
+    from reports.files import files  # pandas, which other commands need not wait for
+    from reports.frame import frame
     from reports.gathered import Gathered
+    from reports.request import Request
 
     try:
-        wanted = {name: lookup(REPORTS, name, "report") for name in (REPORTS if what == ALL else [what])}
-        settings = dict(_pair(setting) for setting in where or [])
-        gathered = Gathered(
-            folder, found, Request(protocol, mix, tuple(metric or ()), experiment, settings), tuple(map(str, broken))
-        )
-    except ReportError as error:
+        request = Request(protocol, mix, tuple(metric or ()), experiment, dict(map(_pair, where or [])))
+        found, broken = store.read(source)
+        if collect:
+            found = _collected(found, target / store.FILE_NAME)
+        for error in broken:
+            print(f"left out: {error}", file=sys.stderr)
+        gathered = Gathered(frame(found), request, tuple(map(str, broken)))
+    except (ReportError, results.ResultError) as error:
         raise _refused(str(error)) from error
-    except ValueError as error:
-        raise _refused(f"{error}, {ALL}") from error
-    target, refused = Path(out) if out else folder / "reports", 0
-    for name, files in wanted.items():
+    refused = 0
+    for name in REPORTS if what == ALL else [what]:
         try:
-            texts = _write(files(gathered), target)
+            texts = _write(files(gathered.report(name)), target)
         except ReportError as error:
             refused += 1
             print(f"error: {name}: {error}", file=sys.stderr)
             continue
         if what == name and not texts:
-            raise _refused(f"nothing to show for {name}; no run or experiment in {folder} is of that kind")
+            raise _refused(f"nothing to show for {name}; no run or experiment in {source} is of that kind")
         if what == name and f"{name}.md" in texts:
             print(texts[f"{name}.md"].decode())
-    if collect:
-        from reports.collected import files
-
-        _write(files(folder, found), target / "results")
     print(f"{len(found)} results, {len(broken)} left out; see {target}", file=sys.stderr)
     if refused or (strict and broken):
         raise typer.Exit(1)
+
+
+def _collected(runs: Sequence[store.Run], path: Path) -> list[store.Run]:
+    """The runs, and those that the store holds besides; pictures are there of the former only."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return store.add(runs, path)
+    except OSError as error:
+        raise _refused(f"cannot write {path}: {error.strerror}; name another folder with --out") from error
 
 
 def _write(files: Iterable[tuple[str, bytes]], folder: Path) -> dict[str, bytes]:

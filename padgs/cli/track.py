@@ -17,7 +17,7 @@ def track(
     from rich.console import Console
 
     from padgs import results
-    from padgs.tracking.tracking import Tracker, TrackingOptions
+    from padgs.tracking.tracker import Tracker, TrackingOptions
 
     console = Console(highlight=False, soft_wrap=True)
     found, broken = results.read_all(Path(runs))

@@ -44,7 +44,7 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
         names, capture.folder, mode=options.split, every=options.test_every, stated=capture.split, unposed=unposed
     )
     points, colors, cloud_notes = starting_cloud(capture, options.points)
-    store = ImageStore(options.cache_bytes, options.read_ahead, options.device or "cpu")
+    store = ImageStore(options.cache_bytes, options.read_ahead, options.device)
     masks, mask_digests, mask_notes = find_masks(capture, options.mask, images, sizes, store)
     views = [
         View(

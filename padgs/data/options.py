@@ -1,4 +1,4 @@
-"""What the user may decide about a data source: the `data` group of the configuration, field by field."""
+"""What is decided about a data source: by the user in the `data` group of the configuration, and by the run."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ SPLITS = ("auto", "files", "every", "all")
 
 
 @dataclass(frozen=True)
-class DataOptions:
-    """How to turn files into a scene. The defaults suit a folder about which nothing else is known."""
+class DataSettings:
+    """What the user decides. The defaults suit a folder about which nothing else is known."""
 
     dataset: str | None = None  # a name of DATASETS: its mask, size and where to get it
     width: int | None = None  # panoramas are reduced to this width (area filter); None = as stored
@@ -24,7 +24,6 @@ class DataOptions:
     test_every: int = 8  # k of split=every
     cache_bytes: int = 1 << 30  # decoded images kept, all views together
     read_ahead: int = 2  # threads that decode images before they are asked for
-    device: str | None = None  # where decoded images are kept, as uint8; null = where the run trains
     generator: Mapping[str, Any] = field(default_factory=dict)  # knobs of the synthetic scene
 
     def __post_init__(self) -> None:
@@ -41,3 +40,10 @@ class DataOptions:
             )
         if self.cache_bytes < 0 or self.read_ahead < 0:
             raise DataError("data.cache_bytes and data.read_ahead must not be negative; 0 switches them off")
+
+
+@dataclass(frozen=True)
+class DataOptions(DataSettings):
+    """How to turn files into a scene."""
+
+    device: str = "cpu"  # where decoded images are kept, as uint8

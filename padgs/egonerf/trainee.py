@@ -9,8 +9,10 @@ import torch
 from torch import Tensor
 
 from padgs.egonerf.model import EgoNeRF
-from padgs.learning.method import State
 from padgs.learning.schedule import LogLinear, ParameterGroup
+from padgs.learning.trainee import Size, State
+from padgs.render import Rendering
+from padgs.scene import View
 
 VARIATION_FACTOR = 1e-2  # published, on both weights
 
@@ -43,8 +45,8 @@ class EgoNeRFTraining:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be >= 0")
 
 
-class TrainableEgoNeRF:
-    """An EgoNeRF with the schedule of a run, as `padgs.learning.rays.RayTrainer` wants it."""
+class EgoNeRFTrainee:
+    """An EgoNeRF with the schedule of a run, as `padgs.egonerf.ray_trainer` wants it."""
 
     def __init__(self, model: EgoNeRF, options: EgoNeRFTraining, iterations: int) -> None:
         """Tie together a model and its learning rates in a run of `iterations`.
@@ -104,6 +106,19 @@ class TrainableEgoNeRF:
     def counts(self) -> dict[str, int]:
         """Number of parameters."""
         return {"parameters": sum(p.numel() for p in self.model.parameters())}
+
+    def render(self, view: View) -> Rendering:
+        """Render a view without gradients."""
+        return self.model.render(view)
+
+    def size(self) -> Size:
+        """Parameters and their bytes."""
+        parameters = list(self.model.parameters())
+        return Size(
+            counts={},
+            parameters=sum(p.numel() for p in parameters),
+            bytes=sum(p.numel() * p.element_size() for p in parameters),
+        )
 
     def state(self) -> State:
         """The parameters, and where the model is; not copies."""

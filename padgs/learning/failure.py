@@ -1,4 +1,4 @@
-"""Recognising the ways in which training breaks."""
+"""The ways in which training breaks, and how they are recognised."""
 
 from __future__ import annotations
 
@@ -8,6 +8,14 @@ import torch
 from torch import Tensor
 
 OUT_OF_MEMORY_MESSAGES = ("can't allocate memory", "not enough memory", "out of memory", "bad_alloc")
+
+
+class Failure(RuntimeError):
+    """Training cannot go on; `status` is one of `padgs.results.STATUSES` and enters the tables as such."""
+
+    def __init__(self, status: str, reason: str) -> None:
+        super().__init__(reason)
+        self.status = status
 
 
 def first_non_finite(tensors: Mapping[str, Tensor | None]) -> str | None:

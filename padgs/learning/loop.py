@@ -1,84 +1,99 @@
-"""The loop that every method trains in: iterations, time, Adam and its schedules, failures, and resuming.
+"""The training loop: from a photograph to a step of the optimiser, again and again.
 
-What one iteration is, and in which order the data comes, is said by its subclasses.
+One iteration draws one training view, compares it with its photograph, goes back to the gradients, lets the trainee
+note where they are large, steps Adam, and lets the trainee grow or prune. Knows no files.
 """
 
 from __future__ import annotations
 
+import math
 import time
-from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
-from typing import Protocol
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field, fields
+from typing import Any, ClassVar
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from padgs.learning.failure import first_non_finite, is_out_of_memory
-from padgs.learning.method import Budget, Failure, Record, State
-from padgs.learning.schedule import ParameterGroup
+from padgs.learning.failure import Failure, is_out_of_memory
+from padgs.learning.loss import NORMALISATIONS, ROW_WEIGHTS, photometric_loss
+from padgs.learning.optimiser import Optimiser
+from padgs.learning.order import Order, ViewOrder
+from padgs.learning.targets import Targets
+from padgs.learning.trainee import State, Trainee
+from padgs.scene import Scene
 
 MODEL = "model/"  # prefix of the model's own tensors in a state
+Stage = Callable[[str], AbstractContextManager[object]]  # entered with the name of each part of an iteration
 
 
-class Optimisable(Protocol):
-    """A model with parameters to learn.
+@dataclass(frozen=True)
+class Budget:
+    """How long a method may train."""
 
-    `load_state` must make the model what `state` was taken of, sizes included, and may replace the data of parameters
-    but not the parameters returned by `groups`.
-    """
-
-    def groups(self) -> list[ParameterGroup]:
-        """All learnable parameters, each in exactly one group."""
-        ...
-
-    def counts(self) -> dict[str, int]:
-        """What the model consists of now: anchors, gaussians, ..."""
-        ...
-
-    def state(self) -> State:
-        """Parameters, statistics and random state, without the optimiser."""
-        ...
-
-    def load_state(self, state: State) -> None:
-        """Become the model that `state` was taken of."""
-        ...
+    iterations: int
+    max_seconds: float | None = None  # training time, evaluation excluded
 
 
-class TrainingLoop(ABC):
-    """A generator of records. Knows no files.
+@dataclass(frozen=True)
+class Record:
+    """One training iteration, after the optimiser step."""
+
+    iteration: int  # 1 for the first step
+    loss: float | Tensor  # a scalar on the GPU where nobody has read it yet: `float` of it waits for the iteration
+    seconds: float  # training time so far, evaluation and files excluded
+    counts: dict[str, int] = field(default_factory=dict)  # anchors, gaussians drawn, ...
+    events: tuple[str, ...] = ()  # what happened besides the step: "grew 120 anchors", ...
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    """The `train` group of the configuration, without the run length (`Budget`)."""
+
+    lambda_l1: float = 0.8  # lambda of Eq. 16
+    weight: str = "solid_angle"  # M of Eq. 17, see `padgs.learning.loss.ROW_WEIGHTS`
+    normalisation: str = "mean"  # channel_sum: 3 x the mean, as the released code does
+    check_every: int = 50  # iterations between checks of all gradients and parameters; the loss is checked at each
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.lambda_l1 <= 1:
+            raise ValueError(f"lambda_l1 is {self.lambda_l1}; it must be in [0, 1]")
+        if self.weight not in ROW_WEIGHTS:
+            raise ValueError(f"unknown weight {self.weight!r}; known: {', '.join(ROW_WEIGHTS)}")
+        if self.normalisation not in NORMALISATIONS:
+            raise ValueError(f"unknown normalisation {self.normalisation!r}; known: {', '.join(NORMALISATIONS)}")
+        if self.check_every < 1:
+            raise ValueError(f"check_every is {self.check_every}; it must be at least 1")
+
+
+class Trainer:
+    """Optimises a trainee on the training views of a scene, one random view per iteration.
 
     Between two records `state` holds all that continuing bit-identically needs (on the CPU); `load_state` goes back
     there. A resumed run goes on counting its training time.
     """
 
+    ADAM: ClassVar[dict[str, Any]] = {"betas": (0.9, 0.999), "eps": 1e-15}  # of 3DGS: single Gaussians pull tiny
+
     def __init__(
         self,
-        model: Optimisable,
+        trainee: Trainee,
+        scene: Scene,
         budget: Budget,
+        options: TrainOptions = TrainOptions(),
+        seed: int = 0,
         *,
-        check_every: int,
-        betas: tuple[float, float] = (0.9, 0.999),
-        eps: float = 1e-15,
+        stage: Stage = nullcontext,
     ) -> None:
-        """Prepare; nothing is drawn yet.
-
-        Args:
-            model: what is optimised.
-            budget: for how long.
-            check_every: iterations between checks of all gradients and parameters for values that are not finite.
-            betas, eps: of Adam. The default eps is that of 3DGS, where gradients of single Gaussians are tiny.
-        """
+        """Prepare; nothing is drawn yet. `stage` is for whoever wants to know what an iteration spends its time on."""
         self.iteration = 0
         self.seconds = 0.0
-        self._model, self._budget, self._check_every = model, budget, check_every
-        self._groups = model.groups()
-        # fused is 2 to 3 times faster on CPUs.
-        self._optimizer = torch.optim.Adam(
-            [{"params": list(group.parameters), "name": group.name} for group in self._groups],
-            betas=betas,
-            eps=eps,
-            fused=True,
-        )
+        self._trainee, self._scene, self._budget, self._options, self._stage = trainee, scene, budget, options, stage
+        self._optimiser = Optimiser(trainee.groups(), options.check_every, **self.ADAM)
+        self._targets = Targets(scene.train, options.weight, self._optimiser.device)
+        self._views = ViewOrder(scene, seed)
+        self._order: Order = self._views
 
     def records(self) -> Iterator[Record]:
         """Train to the end of the budget, yielding a record after each iteration.
@@ -92,10 +107,7 @@ class TrainingLoop(ABC):
         """
         limit = self._budget.max_seconds
         while self.iteration < self._budget.iterations and (limit is None or self.seconds < limit):
-            started = time.perf_counter()
-            iteration = self.iteration + 1
-            for group, settings in zip(self._groups, self._optimizer.param_groups, strict=True):
-                settings["lr"] = group.learning_rate(iteration)
+            started, iteration = time.perf_counter(), self.iteration + 1
             try:
                 loss, counts, events = self._step(iteration)
             except (MemoryError, RuntimeError) as error:
@@ -103,91 +115,81 @@ class TrainingLoop(ABC):
                     raise
                 raise Failure("oom", f"out of memory at iteration {iteration}: {error}") from error
             if iteration == self._budget.iterations:
-                self._refuse_non_finite(self._parameters(), iteration)
+                self._optimiser.refuse_non_finite(self._optimiser.parameters(), iteration)
             self.iteration = iteration
             self.seconds += time.perf_counter() - started
             yield Record(iteration, loss, self.seconds, counts, events)
 
+    def _step(self, iteration: int) -> tuple[float | Tensor, dict[str, int], tuple[str, ...]]:
+        """One iteration. Returns loss, counts and events of its record."""
+        trainee, optimiser, stage, options = self._trainee, self._optimiser, self._stage, self._options
+        with stage("target"):
+            index = self._views.next()
+            self._scene.train[self._views.upcoming()].prefetch()
+            target = self._targets[index]
+        with stage("draw"):
+            drawing = trainee.draw(self._scene.train[index])
+            image = drawing.rendering.image
+        if len(drawing.gaussians) == 0:
+            optimiser.refuse_non_finite(optimiser.parameters(), iteration)  # a NaN shows nothing either
+            raise Failure("collapsed", f"no Gaussian is left to draw at iteration {iteration}")
+        with stage("loss"):
+            if drawing.photo is not None:
+                target = drawing.photo(target)
+            loss = photometric_loss(
+                image,
+                target.image,
+                target.weight,
+                options.lambda_l1,
+                normalisation=options.normalisation,
+                moments=target.moments,
+            )
+            if drawing.penalty is not None:
+                loss = loss + drawing.penalty
+            value = self._read(loss, iteration)
+        if isinstance(value, float) and not math.isfinite(value):
+            inputs = {field.name: getattr(drawing.gaussians, field.name) for field in fields(drawing.gaussians)}
+            optimiser.refuse_non_finite({**optimiser.parameters(), **inputs, "image": image, "loss": loss}, iteration)
+        with stage("backward"):
+            loss.backward()
+        optimiser.check(iteration)
+        with stage("observe"), torch.no_grad():
+            trainee.observe(drawing, iteration)
+        drawn = len(drawing.gaussians)
+        del drawing, image, loss, target  # the graph must be gone before rows of its leaves come and go
+        with stage("optimiser"):
+            optimiser.step(iteration)
+        with stage("adapt"), torch.no_grad():
+            events = trainee.adapt(iteration, optimiser.adam)
+        return value, {**trainee.counts(), "drawn": drawn}, events
+
+    def _read(self, loss: Tensor, iteration: int) -> float | Tensor:
+        """The loss as a number. On a GPU, which the host would have to wait for, only where all is checked."""
+        if loss.device.type == "cpu" or self._optimiser.is_checked(iteration):
+            return loss.item()
+        return loss.detach()
+
     def state(self) -> State:
         """Copies of model, optimiser, statistics, random state and data order; to be taken between two records."""
-        model, order = self._model.state(), self._order_state()
+        model, order = self._trainee.state(), self._order.state()
         tensors = {f"{MODEL}{name}": tensor for name, tensor in model.tensors.items()}
-        for name, parameter in self._parameters().items():
-            for key, value in self._optimizer.state.get(parameter, {}).items():
-                tensors[f"adam/{name}/{key}"] = value
-        tensors["random/torch"] = torch.get_rng_state()
-        tensors |= order.tensors
+        tensors |= self._optimiser.tensors() | {"random/torch": torch.get_rng_state()} | order.tensors
         values = {"model": model.values, "iteration": self.iteration, "seconds": self.seconds, **order.values}
         return State({name: tensor.detach().clone() for name, tensor in tensors.items()}, values)
 
     def load_state(self, state: State) -> None:
-        """Go on where `state` was taken; model, scene, budget and options must be those of that run.
+        """Go on where `state` was taken; trainee, scene, budget and options must be those of that run.
 
         Raises:
             ValueError: the state is of a run on other data.
         """
-        self._load_order(state)
-        self._model.load_state(model_state(state))
-        self._optimizer.state.clear()
-        for name, parameter in self._parameters().items():
-            prefix = f"adam/{name}/"
-            moments = {
-                key.removeprefix(prefix): value for key, value in state.tensors.items() if key.startswith(prefix)
-            }
-            if moments:
-                self._optimizer.state[parameter] = {
-                    key: value.to(parameter.device, copy=True) for key, value in moments.items()
-                }
+        self._order.load(state)
+        self._trainee.load_state(model_state(state))
+        self._optimiser.load(state)
         torch.set_rng_state(state.tensors["random/torch"].cpu())
         self.iteration, self.seconds = state.values["iteration"], state.values["seconds"]
 
-    @abstractmethod
-    def _step(self, iteration: int) -> tuple[float | Tensor, dict[str, int], tuple[str, ...]]:
-        """One iteration, `_update` included. Returns loss, counts and events of its record."""
-
-    @abstractmethod
-    def _order_state(self) -> State:
-        """What decides which data the next iterations see. Not copies."""
-
-    @abstractmethod
-    def _load_order(self, state: State) -> None:
-        """Take back what `_order_state` returned, out of the whole state; raise ValueError if the data are others."""
-
-    def _check(self, iteration: int) -> None:
-        """Look at all parameters and gradients where it is time to; called after `backward`."""
-        if iteration % self._check_every == 0:
-            gradients = {f"gradient of {name}": parameter.grad for name, parameter in self._parameters().items()}
-            self._refuse_non_finite({**self._parameters(), **gradients}, iteration)
-
-    def _read(self, loss: Tensor, iteration: int) -> float | Tensor:
-        """The loss as a number. On a GPU, which the host would have to wait for, only where all is checked."""
-        if loss.device.type == "cpu" or iteration % self._check_every == 0:
-            return loss.item()
-        return loss.detach()
-
-    def _update(self) -> None:
-        """Step Adam. The graph must be gone by now, if rows of its leaves come and go afterwards."""
-        self._optimizer.step()
-        self._optimizer.zero_grad(set_to_none=True)
-
-    def _parameters(self) -> dict[str, nn.Parameter]:
-        """All parameters by a name for messages and checkpoints."""
-        return {
-            group.name if len(group.parameters) == 1 else f"{group.name}[{number}]": parameter
-            for group in self._groups
-            for number, parameter in enumerate(group.parameters)
-        }
-
-    def _refuse_non_finite(self, tensors: Mapping[str, Tensor | None], iteration: int) -> None:
-        bad = first_non_finite(tensors)
-        if bad is not None:
-            every = self._check_every
-            raise Failure(
-                "nan", f"{bad} at iteration {iteration} (all parameters are checked every {every} iterations)"
-            )
-
 
 def model_state(state: State) -> State:
-    """The model's own part of what `TrainingLoop.state` returned, for models that are only looked at."""
-    tensors = {name.removeprefix(MODEL): t for name, t in state.tensors.items() if name.startswith(MODEL)}
-    return State(tensors, state.values["model"])
+    """The model's own part of what `Trainer.state` returned, for models that are only looked at."""
+    return State(state.under(MODEL), state.values["model"])

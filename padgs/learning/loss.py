@@ -71,6 +71,13 @@ def photometric_loss(
             mirrored = fused_photometric_loss(target, image.detach(), weight, lambda_l1, total)
             loss = loss + (mirrored - mirrored.detach())
         return loss
+    return define_loss(image, target, weight, lambda_l1, total, moments)
+
+
+def define_loss(
+    image: Tensor, target: Tensor, weight: Tensor, lambda_l1: float, total: Tensor, moments: TargetMoments | None = None
+) -> Tensor:
+    """`photometric_loss` in torch, for any dtype and device; `total` is what the weighted sum is divided by."""
     per_channel = lambda_l1 * (image - target).abs() + (1 - lambda_l1) * (1 - ssim_map(image, target, moments))
     return (weight[..., None] * per_channel).sum() / total
 

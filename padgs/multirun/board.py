@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TextIO
 
 from padgs.results import replace_file
+from padgs.runs.watch import Watch
 
 FOLDER = ".multirun"  # in run.folder
 WAITING, RUNNING, OK = "waiting", "running", "ok"
@@ -91,3 +92,28 @@ class Board:
 
     def _path(self, job: int) -> Path:
         return self.folder / f"{job:05d}.json"
+
+
+class BoardEntry(Watch):
+    """Writes what a job does on the board of its multirun."""
+
+    def __init__(self, board: Board, number: int) -> None:
+        """Of the job with this number."""
+        self.data: str | None = None  # folder of the data set
+        self._board, self._number, self._state = board, number, JobState(RUNNING)
+        self._board.write(number, self._state)
+
+    def started(self, folder: Path, iterations: int) -> None:
+        """The run is known."""
+        self._state = replace(self._state, run=folder.name, iterations=iterations, data=self.data)
+        self._board.write(self._number, self._state)
+
+    def stop_requested(self) -> bool:
+        """Whether the multirun is to stop."""
+        return self._board.stop_requested()
+
+    def end(self, status: str, reason: str = "") -> str:
+        """The job has ended; returns the status."""
+        self._state = replace(self._state, status=status, reason=reason)
+        self._board.write(self._number, self._state)
+        return status

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
@@ -20,7 +21,9 @@ from padgs.multirun.board import FOLDER
 from padgs.multirun.overrides import root
 
 FILE_NAME = "finished.jsonl"
-NOT_PART = ("run.", "launcher", "tracking", "retry", "hydra.")  # settings that decide nothing about results
+# Settings that a job is not recognised by. The rules of scoring decide nothing about training, but whether it is done;
+# and where the data lie says whose files are looked at.
+NOT_PART = (*results.OF_THE_MACHINE, "launcher", "tracking", "retry", "hydra")
 
 
 class FinishedJobs:
@@ -63,7 +66,7 @@ class FinishedJobs:
 
 def key(overrides: Sequence[str]) -> str:
     """What a job is recognised by."""
-    kept = sorted(text for text in overrides if not text.lstrip("+~").startswith(NOT_PART))
+    kept = sorted(text for text in overrides if not re.match(rf"[+~]*({'|'.join(map(re.escape, NOT_PART))})[.=]", text))
     return hashlib.sha256(json.dumps([*kept, os.getcwd(), _sources()]).encode()).hexdigest()
 
 

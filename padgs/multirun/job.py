@@ -1,48 +1,58 @@
-"""One job of Hydra: a run of its own, or one of a multirun, in this process or in another one."""
+"""One job of Hydra: the only run of a process, or one of a multirun, in the process that launched it or another one."""
 
 from __future__ import annotations
 
 import os
+import time
 import traceback
 from contextlib import ExitStack
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from hydra.conf import HydraConf
 from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
-from padgs.multirun.board import CRASHED, ELSEWHERE, REFUSED, RUNNING, STOPPED, Board, JobState
-from padgs.runs import session
+from padgs.multirun.board import CRASHED, ELSEWHERE, REFUSED, STOPPED, Board, BoardEntry
 from padgs.runs.checkpoint import CheckpointError
-from padgs.runs.config import config_from_values
+from padgs.runs.config import RunConfig, config_from_values
 from padgs.runs.folder import RunFolderError
 from padgs.runs.interrupt import Interrupted
-from padgs.runs.labels import Labels, labels
+from padgs.runs.labels import labels
 from padgs.runs.lock import RunBusy
-from padgs.tracking.tracking import TrackedRun, Tracker
-from padgs.tracking.watch import Watch
+from padgs.runs.session import Session
+from padgs.runs.watch import Watch
+from padgs.tracking.tracker import SECONDS_BETWEEN_LOOKS, Tracker
 
 EXPECTED = (ValueError, OSError, CheckpointError, RunFolderError, RunBusy)  # a traceback would only hide what they say
 ENDS: list[str] = []  # how the job ended that was this process's only one; Hydra's main returns nothing
 
 
-def job(composed: DictConfig) -> str:
-    """Run what Hydra composed; part of a multirun raises nothing but an interruption, so that the others go on.
+def only_job(composed: DictConfig) -> None:
+    """Run what Hydra composed; how it ended, a status of `padgs.results` or refused, is added to `ENDS`."""
+    try:
+        config, console = _typed(composed), Console()
+        say = partial(console.print, style="dim", markup=False, highlight=False, soft_wrap=True)
+        watch = TrackedRun(Tracker(config.tracking, Path(config.run.folder), " ".join(config.labels.experiments), say))
+        result = Session(config, console, watch).run()
+        watch.finished()
+        ENDS.append(result.status)
+    except EXPECTED as error:
+        if os.environ.get("HYDRA_FULL_ERROR"):
+            raise
+        complain(str(error))
+        ENDS.append(REFUSED)
+
+
+def job_of_many(composed: DictConfig) -> str:
+    """The same within a multirun; raises nothing but an interruption, so that the other jobs go on.
 
     Returns:
         How it ended: a status of `padgs.results`, or one of `padgs.multirun.board`.
     """
     hydra = HydraConfig.get()
-    values: Any = OmegaConf.to_container(composed, resolve=True)
-    names = labels(hydra.runtime.choices)
-    if hydra.mode != RunMode.MULTIRUN:
-        ENDS.append(_only_job(values, names))
-        return ENDS[-1]
     board = Board(Path(hydra.sweep.dir))
     with ExitStack() as stack:
         alone = in_own_process(hydra)
@@ -51,9 +61,9 @@ def job(composed: DictConfig) -> str:
         try:
             if entry.stop_requested():
                 raise Interrupted("not started")
-            config = config_from_values(values, names)
+            config = _typed(composed)
             entry.data = None if config.data.path is None else str(Path(config.data.path).absolute())
-            result = session.run(config, console, entry)
+            result = Session(config, console, entry).run()
             return entry.end(result.status, result.reason)
         except KeyboardInterrupt as error:
             entry.end(STOPPED, str(error))
@@ -72,46 +82,35 @@ def complain(message: str) -> None:
     Console(stderr=True).print(f"error: {message}", style="red", markup=False, highlight=False, soft_wrap=True)
 
 
-def _only_job(values: dict[str, Any], names: Labels) -> str:
-    try:
-        config, console = config_from_values(values, names), Console()
-        say = partial(console.print, style="dim", markup=False, highlight=False, soft_wrap=True)
-        watch = TrackedRun(Tracker(config.tracking, Path(config.run.folder), " ".join(names.experiments), say))
-        result = session.run(config, console, watch)
-        watch.finished()
-        return result.status
-    except EXPECTED as error:
-        if os.environ.get("HYDRA_FULL_ERROR"):
-            raise
-        complain(str(error))
-        return REFUSED
-
-
 def in_own_process(hydra: DictConfig | HydraConf) -> bool:
     """Whether jobs run in other processes than the one that launches them."""
     return not str(hydra.launcher._target_).endswith("BasicLauncher")
 
 
-class BoardEntry(Watch):
-    """Writes what a job does on the board of its multirun."""
+class TrackedRun(Watch):
+    """Mirrors the only run of a process, now and then."""
 
-    def __init__(self, board: Board, number: int) -> None:
-        """Of the job with this number."""
-        self.data: str | None = None  # folder of the data set
-        self._board, self._number, self._state = board, number, JobState(RUNNING)
-        self._board.write(number, self._state)
+    def __init__(self, tracker: Tracker) -> None:
+        """With this tracker."""
+        self._tracker, self._looked = tracker, time.monotonic()
+        self._folder: Path | None = None
 
     def started(self, folder: Path, iterations: int) -> None:
         """The run is known."""
-        self._state = replace(self._state, run=folder.name, iterations=iterations, data=self.data)
-        self._board.write(self._number, self._state)
+        self._folder = folder
 
-    def stop_requested(self) -> bool:
-        """Whether the multirun is to stop."""
-        return self._board.stop_requested()
+    def saved(self, folder: Path) -> None:
+        """The log is up to date."""
+        if time.monotonic() - self._looked >= SECONDS_BETWEEN_LOOKS:
+            self._tracker.update(folder)
+            self._looked = time.monotonic()
 
-    def end(self, status: str, reason: str = "") -> str:
-        """The job has ended; returns the status."""
-        self._state = replace(self._state, status=status, reason=reason)
-        self._board.write(self._number, self._state)
-        return status
+    def finished(self) -> None:
+        """The result was written."""
+        if self._folder is not None:
+            self._tracker.update(self._folder)
+
+
+def _typed(composed: DictConfig) -> RunConfig:
+    values: Any = OmegaConf.to_container(composed, resolve=True)
+    return config_from_values(values, labels(HydraConfig.get().runtime.choices))

@@ -36,7 +36,9 @@ def missing_plugin(arguments: Sequence[str]) -> str | None:
 def patient() -> Iterator[None]:
     """While this lasts, submitit's launcher waits for all jobs, even if the process of one has died.
 
-    As it is, the first one to be found dead is raised, and the others run on unobserved.
+    As it is, the first one to be found dead is raised, and the others run on unobserved. Hydra's launcher asks for this
+    very class by its name and keeps the jobs that it submits to itself, and what submitit itself can be extended by are
+    entry points of installed packages, so for the time being another class has that name.
     """
     try:
         import submitit

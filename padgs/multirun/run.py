@@ -47,7 +47,7 @@ def main() -> None:
     sys.argv[1:] = [*options_first(lenient(arguments)), f"hydra.sweep.dir=${{run.folder}}/{FOLDER}/{start}"]
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # what schedulers send is told apart from a crash
     try:
-        hydra.main(version_base="1.3", config_path=str(root() / "conf"), config_name="config")(job.job)()
+        hydra.main(version_base="1.3", config_path=str(root() / "conf"), config_name="config")(job.only_job)()
     except (Interrupted, KeyboardInterrupt) as stopped:
         advice = f"{str(stopped) or 'stopped'}; to go on: {shlex.join(['padgs-run', *arguments])}"
         Console(stderr=True).print(advice, markup=False, highlight=False, soft_wrap=True)

@@ -10,13 +10,14 @@ from __future__ import annotations
 from collections import Counter
 from typing import Any
 
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.plugins import Plugins
+from hydra.plugins.sweeper import Sweeper
 from omegaconf import DictConfig
 from rich.console import Console
 
-from padgs.multirun.multirun import Multirun
+from padgs.multirun.job import job_of_many
+from padgs.multirun.jobs import Multirun
 from padgs.multirun.overrides import expand
 
 ENDS: Counter[str] = Counter()  # how the runs of the last multirun ended; Hydra's main returns nothing
@@ -25,24 +26,24 @@ ENDS: Counter[str] = Counter()  # how the runs of the last multirun ended; Hydra
 def register() -> None:
     """Have Hydra sweep this way.
 
-    It takes sweepers only from packages called `hydra_plugins`, so ours is its basic one with another method.
+    Ours is its basic sweeper with another method. A class of our own would have to stand in an installed package
+    `hydra_plugins`, even if it is given to `Plugins.register`, and every program here that uses Hydra would import it.
     """
-    name = f"{BasicSweeper.__module__}.{BasicSweeper.__name__}"
-    basic: Any = Plugins.instance().class_name_to_class[name]  # not the one above: finding plugins defines them anew
-    basic.sweep = sweep
+    (basic,) = (kind for kind in Plugins.instance().discover(Sweeper) if kind.__name__ == "BasicSweeper")
+    basic.sweep = sweep  # type: ignore[attr-defined]
 
 
-def sweep(self: BasicSweeper, arguments: list[str]) -> None:
+def sweep(self: Any, arguments: list[str]) -> None:
     """Do what is missing of a multirun: all combinations of what is swept, each of them once.
 
     Args:
-        self: has been set up by Hydra.
+        self: a basic sweeper that has been set up by Hydra, with a launcher that was given the job of a single run.
         arguments: the settings of the command line.
 
     Raises:
         Interrupted: stopped from outside; the same command goes on.
     """
-    assert self.config is not None and self.launcher is not None and self.hydra_context is not None
+    self.launcher.setup(hydra_context=self.hydra_context, task_function=job_of_many, config=self.config)
     loader = self.hydra_context.config_loader
     multirun = Multirun(self.config, expand(self.params, arguments, loader), Console())
     _refuse_unknown_choices(multirun.jobs, self.config, loader)

@@ -17,6 +17,7 @@ from padgs.native.abi import (
     Pointer,
 )
 from padgs.native.loading import declared, opened
+from padgs.native.watch import Watchable
 
 STRUCTURES = (NativeCamera, Inputs, Gradients, BlendGradientArguments, DecodeGradientArguments, LossArguments)
 SIGNATURES = {
@@ -43,7 +44,7 @@ SIGNATURES = {
 
 
 @functools.cache
-def library() -> ctypes.CDLL:
+def library() -> Watchable:
     """The loaded CPU library.
 
     Raises:

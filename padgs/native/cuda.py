@@ -26,6 +26,7 @@ from padgs.native.abi import (
     fields,
 )
 from padgs.native.loading import declared, opened
+from padgs.native.watch import Watchable
 
 OUT_OF_MEMORY = 2  # cudaErrorMemoryAllocation
 NOT_COMPILED_FOR = (98, 209, 222)  # no such kernel, no image for this device, PTX newer than the driver
@@ -175,7 +176,7 @@ SIGNATURES: dict[str, tuple[list, Any]] = {
 
 
 @functools.cache
-def library() -> ctypes.CDLL:
+def library() -> Watchable:
     """The loaded library.
 
     Raises:

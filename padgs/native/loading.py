@@ -12,6 +12,8 @@ from typing import Any
 
 import torch  # noqa: F401 - first: the library then shares torch's OpenMP threads and thread count
 
+from padgs.native.watch import Watchable
+
 
 def opened(stem: str, needs: str) -> ctypes.CDLL:
     """The library lib`stem` of this package, or of the folder PADGS_LIBRARY_DIR while someone works on the kernels.
@@ -40,7 +42,7 @@ def _package_folders() -> list[str]:
 
 def declared(
     loaded: ctypes.CDLL, signatures: Mapping[str, tuple[list, Any]], bytes_of: str, structures: Sequence[type]
-) -> ctypes.CDLL:
+) -> Watchable:
     """The library with the types of its functions set, if it is one of ours and of this version.
 
     Raises:
@@ -54,4 +56,4 @@ def declared(
     for index, structure in enumerate(structures):  # what is laid out differently would be read as nonsense
         if getattr(loaded, bytes_of)(index) != ctypes.sizeof(structure):
             raise OSError(f"{loaded._name} is of another version, with another {structure.__name__}; build it again")
-    return loaded
+    return Watchable(loaded)

@@ -14,7 +14,7 @@ from pathlib import Path
 import safetensors.torch
 import torch
 
-from padgs.learning.method import State
+from padgs.learning.trainee import State
 from padgs.results import replace_file
 
 FORMAT = 1

@@ -4,29 +4,33 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from baselines import METHODS
-from padgs.data.options import DataOptions
-from padgs.learning.method import Budget, RenderConfig
+from padgs.data.options import DataOptions, DataSettings
+from padgs.learning.loop import Budget, TrainOptions
 from padgs.learning.schedule import PUBLISHED_ITERATIONS
-from padgs.learning.views import TrainOptions
 from padgs.registry import lookup
+from padgs.render.config import RenderConfig
 from padgs.runs.device import DEVICES
 from padgs.runs.labels import Labels
 from padgs.runs.typed import ConfigError, typed
 from padgs.scoring.protocols import PROTOCOLS, Protocol, protocol_from_options
-from padgs.tracking.tracking import TrackingOptions
+from padgs.tracking.tracker import TrackingOptions
 
 
 @dataclass(frozen=True)
-class DataConfig(DataOptions):
+class DataConfig(DataSettings):
     """The `data` group: where a scene comes from."""
 
     format: str = "synthetic"  # a name of padgs.data.LOADERS
     path: str | None = None  # folder of the scene; null for a scene that is generated
     voxel_size: float | str = "auto"  # of the anchors of methods that have them, where the paper states it
+
+    def options(self, device: str) -> DataOptions:
+        """What the loader is told, with the device that keeps decoded images."""
+        return DataOptions(**{field.name: getattr(self, field.name) for field in fields(DataSettings)}, device=device)
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,7 @@ class RunOptions:
 
     folder: str = "runs"  # of the run folders
     device: str = "auto"  # auto | cpu | cuda; auto: a GPU where there is one that can draw what is asked for
+    images_on: str = "device"  # device | cpu: where decoded panoramas are kept, as uint8 within data.cache_bytes
     jobs: int = 1  # runs at the same time on one machine: conf/launcher
     threads: int | None = None  # of one run; null = cores / jobs
     log_every: int = 10  # iterations between lines of log.jsonl
@@ -63,9 +68,10 @@ class RunOptions:
     pictures: bool = True  # save truth | render | error of each test view
 
     def __post_init__(self) -> None:
-        """Reject an unknown device, and intervals that never come round."""
-        if self.device not in DEVICES:
-            raise ValueError(f"unknown run.device {self.device!r}; known: {', '.join(DEVICES)}")
+        """Reject unknown places, and intervals that never come round."""
+        for name, known in (("device", DEVICES), ("images_on", IMAGES_ON)):
+            if getattr(self, name) not in known:
+                raise ValueError(f"unknown run.{name} {getattr(self, name)!r}; known: {', '.join(known)}")
         for name in ("jobs", "threads", "log_every", "probe_every", "checkpoint_every"):
             value = getattr(self, name)
             if value is not None and value < 1:
@@ -130,6 +136,7 @@ GROUPS: dict[str, type] = {
 }
 OTHER_KEYS = ("method", "protocol", "variant", "seed", "retry")
 RETRIES = ("none", "failed")
+IMAGES_ON = ("device", "cpu")
 
 
 def config_from_values(values: Mapping[str, Any], labels: Labels = Labels()) -> RunConfig:  # noqa: B008 - frozen
@@ -141,6 +148,11 @@ def config_from_values(values: Mapping[str, Any], labels: Labels = Labels()) -> 
     unknown = [key for key in values if key not in (*GROUPS, *OTHER_KEYS)]
     if unknown:
         raise ConfigError(f"unknown key {unknown[0]}; known: {', '.join((*GROUPS, *OTHER_KEYS))}")
+    if "device" in values.get("data", {}):  # a key until run.device decided alone
+        raise ConfigError(
+            "data.device is no key any more: run.device says where a run trains and keeps its panoramas; "
+            "run.images_on=cpu keeps them in main memory while it trains on a GPU"
+        )
     method = dict(values.get("method", {}))
     name = method.pop("name", "padgs")
     try:

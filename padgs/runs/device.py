@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from padgs.learning.method import RenderConfig
 from padgs.native import cuda
+from padgs.render.config import RenderConfig
 
 DEVICES = ("auto", "cpu", "cuda")
 

@@ -7,21 +7,38 @@ import re
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 from omegaconf import OmegaConf
 from PIL import Image
 from torch import Tensor
 
 from padgs import results
+from padgs.learning.loop import Record
+from padgs.learning.method import Method
+from padgs.learning.trainee import State
 from padgs.results import Result
+from padgs.runs import checkpoint
 from padgs.runs import lock as run_lock
 from padgs.scoring.pictures import comparison
 
 
 class RunFolderError(RuntimeError):
     """The run folder cannot be written; the message names the file, the reason and the way out."""
+
+
+PROGRESS = "progress"  # where a checkpoint says how far the run was
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far training went."""
+
+    iteration: int = 0
+    seconds: float = 0.0  # of training
 
 
 class RunFolder:
@@ -32,7 +49,7 @@ class RunFolder:
         self.path = path
         self.checkpoint = path / "checkpoint"
         self.renders = path / "renders"
-        self._log = path / "log.jsonl"
+        self._log = path / results.LOG_NAME
 
     def prepare(self, values: Mapping[str, Any]) -> None:
         """Make the folder and write config.yaml.
@@ -80,24 +97,48 @@ class RunFolder:
                 shutil.rmtree(self.checkpoint, ignore_errors=True)
             (self.path / results.FILE_NAME).unlink()
 
-    def log(self, line: Mapping[str, Any]) -> None:
-        """Append a line to log.jsonl."""
+    def log(self, record: Record, psnr: float | None) -> None:
+        """Append a line to log.jsonl; `psnr` of the held-out view, where it was measured."""
+        line: dict[str, Any] = {
+            "iteration": record.iteration,
+            "loss": float(record.loss),
+            "seconds": round(record.seconds, 4),
+            **record.counts,
+        }
+        if psnr is not None:
+            line["psnr"] = psnr
+        if record.events:
+            line["events"] = list(record.events)
         with self._writing(), self._log.open("a") as file:
             file.write(json.dumps(line) + "\n")
 
-    def forget_after(self, iteration: int) -> None:
-        """Drop what the log says about later iterations, and a line that a kill has cut; they will come again."""
-        if not self._log.exists():
-            return
-        kept = []
-        for line in self._log.read_text().splitlines():
-            try:
-                if json.loads(line)["iteration"] <= iteration:
-                    kept.append(line + "\n")
-            except (ValueError, KeyError, TypeError):
-                continue
-        with self._writing():
-            results.replace_file(self._log, "".join(kept).encode())
+    def save(self, method: Method, progress: Progress) -> None:
+        """Write the checkpoint.
+
+        Raises:
+            CheckpointError: it cannot be written; the previous one stands.
+        """
+        state = method.state()
+        checkpoint.save(State(state.tensors, {**state.values, PROGRESS: asdict(progress)}), self.checkpoint)
+
+    def resume(self, method: Method, device: torch.device | str = "cpu") -> Progress:
+        """Put a method where the checkpoint was taken, on this device; the beginning, if there is none.
+
+        What the log says about later iterations is dropped, they will come again; so is a line that a kill has cut.
+
+        Raises:
+            CheckpointError: there is one, but it is damaged.
+        """
+        progress = Progress()
+        if checkpoint.exists(self.checkpoint):
+            state = checkpoint.load(self.checkpoint, device)
+            method.load_state(state)
+            progress = Progress(**state.values[PROGRESS])
+        if self._log.exists():
+            kept = [line for line in results.log_lines(self.path) if line["iteration"] <= progress.iteration]
+            with self._writing():
+                results.replace_file(self._log, "".join(json.dumps(line) + "\n" for line in kept).encode())
+        return progress
 
     def save_picture(self, name: str, truth: Tensor, image: Tensor) -> None:
         """Save truth | render | error of the view `name`; images [H, W, 3]."""

@@ -8,20 +8,18 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-NOT_PART = ("run", "protocol")  # what a machine decides; how the trained model is scored afterwards
-NOT_PART_OF_DATA = ("path", "cache_bytes", "read_ahead", "device")  # the fingerprint says what was read
+from padgs.results import decisive
+
 HASH_DIGITS = 10
 
 
 def config_hash(values: Mapping[str, Any]) -> str:
-    """SHA-256 of a resolved configuration without paths, machine matters and evaluation.
+    """SHA-256 of the keys of a resolved configuration that decide something.
 
     Args:
         values: as `RunConfig.values` gives it, typed, so that 1 and 1.0 of a float field are the same.
     """
-    kept = {key: value for key, value in values.items() if key not in NOT_PART}
-    kept["data"] = {key: value for key, value in kept["data"].items() if key not in NOT_PART_OF_DATA}
-    return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(decisive(values), sort_keys=True).encode()).hexdigest()
 
 
 def run_id(values: Mapping[str, Any], scene: str, fingerprint: str, preset: str = "") -> str:

@@ -1,58 +1,74 @@
-"""What a person sees of a run in progress: one live line in a terminal, a plain line now and then elsewhere."""
+"""What a person sees of work in progress: a picture that changes in a terminal, a plain line now and then elsewhere."""
 
 from __future__ import annotations
 
 import time
 from collections import deque
+from typing import TypeVar
 
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.live import Live
 from rich.text import Text
 
-from padgs.learning.method import Record
+from padgs.learning.loop import Record
 
 REDRAWS_PER_SECOND = 5
 SECONDS_BETWEEN_LINES = 10.0  # where there is no terminal
 RECENT = 64  # records that the speed is taken from
 
+D = TypeVar("D", bound="Display")
 
-class LiveLine:
-    """Iteration, loss, held-out PSNR, counts, iterations per second and the time that is left."""
 
-    def __init__(self, console: Console, iterations: int) -> None:
-        """A line about a run of so many iterations."""
-        self._console, self._iterations = console, iterations
+class Display:
+    """A place on the console for what changes; the last picture stays."""
+
+    def __init__(self, console: Console, *, redraw: float, line: float) -> None:
+        """Show something new after `redraw` seconds in a terminal, after `line` seconds elsewhere."""
+        self._console = console
         self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
-        self._times: deque[tuple[int, float]] = deque(maxlen=RECENT)
-        self._shown = -float("inf")
-        self._psnr: float | None = None
+        self._interval = line if self._live is None else redraw
+        self._shown = 0.0
 
-    def __enter__(self) -> LiveLine:
-        """Start to show."""
+    def __enter__(self: D) -> D:
+        self._shown = time.monotonic()
         if self._live is not None:
             self._live.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Leave the last line standing."""
         if self._live is not None:
             self._live.stop()
 
-    def update(self, record: Record, psnr: float | None) -> None:
-        """Take in a record and, where it was measured, the PSNR of the held-out view."""
-        now = time.monotonic()
-        self._times.append((record.iteration, now))
-        self._psnr = self._psnr if psnr is None else psnr
-        last = record.iteration == self._iterations
-        interval = 1 / REDRAWS_PER_SECOND if self._live is not None else SECONDS_BETWEEN_LINES
-        if now - self._shown < interval and not last:
-            return
-        self._shown = now
-        line = self._line(record)
+    @property
+    def is_due(self) -> bool:
+        """Whether what is shown is old."""
+        return time.monotonic() - self._shown >= self._interval
+
+    def show(self, line: str, picture: RenderableType | None = None) -> None:
+        """Show a line, or in a terminal what says more."""
+        self._shown = time.monotonic()
         if self._live is not None:
-            self._live.update(Text(line, no_wrap=True, overflow="ellipsis"), refresh=True)
+            self._live.update(picture or Text(line, no_wrap=True, overflow="ellipsis"), refresh=True)
         else:
             self._console.print(line, highlight=False, soft_wrap=True)
+
+
+class LiveLine(Display):
+    """Of one run: iteration, loss, held-out PSNR, counts, iterations per second and the time that is left."""
+
+    def __init__(self, console: Console, iterations: int) -> None:
+        """A line about a run of so many iterations."""
+        super().__init__(console, redraw=1 / REDRAWS_PER_SECOND, line=SECONDS_BETWEEN_LINES)
+        self._iterations = iterations
+        self._times: deque[tuple[int, float]] = deque(maxlen=RECENT)
+        self._psnr: float | None = None
+
+    def update(self, record: Record, psnr: float | None) -> None:
+        """Take in a record and, where it was measured, the PSNR of the held-out view."""
+        self._times.append((record.iteration, time.monotonic()))
+        self._psnr = self._psnr if psnr is None else psnr
+        if self.is_due or len(self._times) == 1 or record.iteration == self._iterations:
+            self.show(self._line(record))
 
     def _line(self, record: Record) -> str:
         parts = [f"{record.iteration}/{self._iterations}", f"loss {float(record.loss):.4f}"]

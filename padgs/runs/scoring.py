@@ -9,8 +9,9 @@ from itertools import cycle, islice
 from padgs.clock import summary, timed
 from padgs.learning.method import Method
 from padgs.results import Scores
-from padgs.scene import Scene
+from padgs.scene import Scene, View
 from padgs.scoring.evaluate import evaluate
+from padgs.scoring.metrics import psnr
 from padgs.scoring.protocols import Protocol
 
 FRAMES = 10  # timed at least, and each test view once
@@ -23,9 +24,18 @@ def scores(
     found = {}
     for name, protocol in protocols.items():
         on_view = None if save_picture is None or found else _picture_saver(save_picture)
-        evaluation = evaluate(method.render, scene.test, protocol, device=scene.points.device, on_view=on_view)
-        found[name] = Scores(evaluation.protocol, evaluation.mean, evaluation.views, evaluation.notes)
+        found[name] = evaluate(method.render, scene.test, protocol, on_view=on_view)
     return found
+
+
+def held_out_psnr(method: Method, view: View) -> float:
+    """PSNR in dB of one test view, all of its pixels that its mask lets through."""
+    image = method.render(view).image.clamp(0, 1)
+    return psnr(
+        image,
+        view.image(dtype=image.dtype, device=image.device),
+        view.mask(dtype=image.dtype, device=image.device),
+    ).item()
 
 
 def frame_times(method: Method, scene: Scene) -> dict[str, float]:

@@ -2,201 +2,195 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
+from typing import Any
 
 import torch
 from rich.console import Console
 
 from baselines import METHODS
 from padgs import clock, data
-from padgs.learning.failure import is_out_of_memory
-from padgs.learning.method import Failure, Method
+from padgs.learning.failure import Failure
+from padgs.learning.loop import Record
+from padgs.learning.method import Method
 from padgs.registry import lookup
 from padgs.results import Result
-from padgs.runs import checkpoint
+from padgs.runs import checkpoint, outcome
 from padgs.runs.config import RunConfig
 from padgs.runs.device import chosen
-from padgs.runs.folder import RunFolder, RunFolderError
-from padgs.runs.identity import config_hash, run_id
-from padgs.runs.interrupt import Interrupted
-from padgs.runs.scoring import frame_times, same_rules, scores
-from padgs.runs.summary import show_result
-from padgs.runs.training import resume, train
-from padgs.scene import Scene
-from padgs.tracking.watch import Watch
+from padgs.runs.folder import Progress, RunFolder, RunFolderError
+from padgs.runs.identity import run_id
+from padgs.runs.interrupt import Interrupt, Interrupted
+from padgs.runs.live import LiveLine
+from padgs.runs.scoring import frame_times, held_out_psnr, same_rules, scores
+from padgs.runs.summary import introduce, show_result
+from padgs.runs.watch import Watch
+from padgs.scoring.protocols import Protocol
 
 
-def run(config: RunConfig, console: Console, watch: Watch = Watch()) -> Result:  # noqa: B008 - has no state
-    """Do what is missing of a run and show its result.
+class Session:
+    """A run with its configuration, scene and folder, the console it speaks to, and whoever watches it."""
 
-    Raises:
-        DataError: the input cannot be used.
-        ResultError, CheckpointError, RunFolderError: files of the run cannot be read or written.
-        RunBusy: another process works on this run.
-        Interrupted: stopped from outside; starting again goes on.
-    """
-    if config.run.threads_per_job is not None:
-        torch.set_num_threads(config.run.threads_per_job)
-    torch.manual_seed(config.seed)
-    device = chosen(config.run.device, config.render)
-    clock.reset_peak_memory(device)
-    options = replace(config.data, device=config.data.device or str(device))
-    scene = data.load(config.data.path, config.data.format, options).to(device)
-    name = run_id(config.values(), scene.name, scene.fingerprint, config.preset)
-    folder = RunFolder(Path(config.run.folder) / name)
-    watch.started(folder.path, config.train.iterations)
-    _introduce(config, scene, folder, console)
-    result = folder.result()
-    if result is None or _is_missing(result, config):
-        with folder.locked():
-            result = _complete(folder.result(), config, scene, folder, console, watch)
-    else:
-        advice = "" if result.ok else "; it failed, retry=failed starts it again"
-        console.print(f"finished before, nothing to do{advice}", highlight=False, soft_wrap=True)
-    show_result(result, folder.path, console)
-    return result
+    def __init__(self, config: RunConfig, console: Console, watch: Watch = Watch()) -> None:  # noqa: B008 - no state
+        """Load the scene; nothing is written before `run`.
 
+        Raises:
+            DataError: the input cannot be used.
+        """
+        if config.run.threads_per_job is not None:
+            torch.set_num_threads(config.run.threads_per_job)
+        torch.manual_seed(config.seed)
+        device = chosen(config.run.device, config.render)
+        clock.reset_peak_memory(device)
+        images_on = str(device) if config.run.images_on == "device" else config.run.images_on
+        self.config, self.console, self.watch = config, console, watch
+        self.scene = data.load(config.data.path, config.data.format, config.data.options(images_on)).to(device)
+        name = run_id(config.values(), self.scene.name, self.scene.fingerprint, config.preset)
+        self.folder = RunFolder(Path(config.run.folder) / name)
 
-def _complete(
-    result: Result | None, config: RunConfig, scene: Scene, folder: RunFolder, console: Console, watch: Watch
-) -> Result:
-    """What is missing of a run whose folder is locked; `result` is what is there."""
-    if result is not None and not result.ok and config.retry == "failed":
-        folder.forget(result)
-        result = None
-    if result is None:
+    def run(self) -> Result:
+        """Do what is missing of the run and show its result.
+
+        Raises:
+            ResultError, CheckpointError, RunFolderError: files of the run cannot be read or written.
+            RunBusy: another process works on this run.
+            Interrupted: stopped from outside; starting again goes on.
+        """
+        self.watch.started(self.folder.path, self.config.train.iterations)
+        introduce(self.config, self.scene, self.folder.path, self.console)
+        result = self.folder.result()
+        if result is None or self._is_missing(result):
+            with self.folder.locked():
+                result = self.folder.result()  # by now another process may have finished it
+                if result is not None and self._is_retried(result):
+                    self.folder.forget(result)
+                    result = None
+                result = self.train() if result is None else self._completed(result)
+        else:
+            advice = "" if result.ok else "; it failed, retry=failed starts it again"
+            self._say(f"finished before, nothing to do{advice}")
+        show_result(result, self.folder.path, self.console)
+        return result
+
+    def train(self) -> Result:
+        """Train to the end of the budget, from the last checkpoint if there is one, score, and write the result.
+
+        Whatever ends the training by itself is in the result. The last checkpoint holds the trained method.
+
+        Raises:
+            Interrupted: it was stopped from outside; the checkpoint was written.
+            CheckpointError, RunFolderError: nothing can be read or written.
+        """
+        config, folder = self.config, self.folder
         folder.prepare(config.values())
-        return _finish(config, scene, folder, console, watch)
-    if result.ok and not _is_scored(result, config):
-        console.print("finished before; only the new protocol is missing")
-        result = _score_again(result, config, scene, folder)
-    experiments = tuple(sorted({*result.experiments, *config.labels.experiments}))  # a run may serve several tables
-    return result if experiments == result.experiments else folder.finish(replace(result, experiments=experiments))
+        method = build(config)
+        progress = folder.resume(method, self.scene.points.device)
+        if progress.iteration:
+            self._say(f"resuming after iteration {progress.iteration}")
+        result = outcome.begun(config, self.scene, folder.path.name)
+        try:
+            saved, saved_iteration = time.monotonic(), progress.iteration
+            with (
+                Interrupt(self.watch.stop_requested) as stop,
+                LiveLine(self.console, config.train.iterations) as line,
+            ):
+                for record in method.fit(self.scene, config.train.budget):
+                    progress = Progress(record.iteration, record.seconds)
+                    line.update(record, self._logged(record, method))
+                    stopping = stop.requested
+                    if stopping or self._is_due(record, saved):
+                        folder.save(method, progress)
+                        self.watch.saved(folder.path)
+                        saved, saved_iteration = time.monotonic(), record.iteration
+                    if stopping and record.iteration < config.train.iterations:
+                        raise Interrupted(f"stopped after iteration {record.iteration}, the checkpoint is written")
+                if saved_iteration != progress.iteration:
+                    folder.save(method, progress)
+            result = replace(result, **self._trained(method, progress))
+            if self.scene.test:
+                result = replace(result, **self._tested(method, progress))
+        except Interrupted:
+            raise
+        except KeyboardInterrupt as error:
+            raise Interrupted("stopped at once, the last checkpoint stands") from error
+        except (Failure, ValueError, MemoryError, RuntimeError) as error:
+            what = {"status": outcome.status(error), "reason": str(error)}
+            result = replace(result, **what, **outcome.peak_memory(self.scene))
+        finished = datetime.now(timezone.utc).isoformat(timespec="seconds")
+        return folder.finish(replace(result, iterations_done=progress.iteration, finished=finished))
 
+    def _logged(self, record: Record, method: Method) -> float | None:
+        """Log an iteration where that is due; PSNR of the held-out view where it was measured."""
+        options, views = self.config.run, self.scene.test
+        last = record.iteration == self.config.train.iterations
+        probe = bool(views) and (last or record.iteration % options.probe_every == 0)
+        psnr = held_out_psnr(method, views[len(views) // 2]) if probe else None
+        if last or probe or record.events or record.iteration % options.log_every == 0:
+            self.folder.log(record, psnr)
+        return psnr
 
-def _is_missing(result: Result, config: RunConfig) -> bool:
-    """Whether there is anything left to do about a finished run."""
-    if not result.ok and config.retry == "failed":
-        return True
-    return result.ok and not _is_scored(result, config) or not {*config.labels.experiments} <= {*result.experiments}
+    def _is_due(self, record: Record, saved: float) -> bool:
+        """Whether it is time for a checkpoint, the last one having been written at `saved`."""
+        every = self.config.run.checkpoint_every
+        if every is not None and record.iteration % every == 0:
+            return True
+        return time.monotonic() - saved > self.config.run.checkpoint_seconds
 
-
-def _finish(config: RunConfig, scene: Scene, folder: RunFolder, console: Console, watch: Watch) -> Result:
-    method = build(config)
-    progress = resume(method, folder, scene.points.device)
-    if progress.iteration:
-        console.print(f"resuming after iteration {progress.iteration}", highlight=False)
-    result = _blank(config, scene, folder)
-    try:
-        progress = train(method, scene, config, folder, progress, console, watch)
+    def _trained(self, method: Method, progress: Progress) -> dict[str, Any]:
+        """The fields of a result about a trained method."""
         size = method.size()
-        result = replace(
-            result,
-            status="ok" if progress.iteration == config.train.iterations else "timeout",
-            counts={**size.counts, "parameters": size.parameters},
-            model_bytes=size.bytes,
-            **_peak_memory(scene),  # of training; scoring has networks of its own
-        )
-        if scene.test:
-            save_picture = folder.save_picture if config.run.pictures else None
-            timing = {"train_seconds": progress.seconds, **frame_times(method, scene)}
-            result = replace(result, scores=scores(method, scene, config.protocols, save_picture), timing=timing)
-    except Interrupted:
-        raise
-    except KeyboardInterrupt as error:
-        raise Interrupted("stopped at once, the last checkpoint stands") from error
-    except (Failure, ValueError, MemoryError, RuntimeError) as error:
-        result = replace(result, status=_status(error), reason=str(error), scores={}, **_peak_memory(scene))
-    result = replace(
-        result,
-        iterations_done=progress.iteration,
-        finished=datetime.now(timezone.utc).isoformat(timespec="seconds"),
-    )
-    return folder.finish(result)
+        return {
+            "status": "ok" if progress.iteration == self.config.train.iterations else "timeout",
+            "counts": {**size.counts, "parameters": size.parameters},
+            "model_bytes": size.bytes,
+            **outcome.peak_memory(self.scene),  # of training; scoring has networks of its own
+        }
+
+    def _tested(self, method: Method, progress: Progress) -> dict[str, Any]:
+        """The fields of a result that take test views."""
+        save_picture = self.folder.save_picture if self.config.run.pictures else None
+        timing = {"train_seconds": progress.seconds, **frame_times(method, self.scene)}
+        return {"timing": timing, "scores": scores(method, self.scene, self.config.protocols, save_picture)}
+
+    def _is_missing(self, result: Result) -> bool:
+        """Whether there is anything left to do about a finished run."""
+        unknown = {*self.config.labels.experiments} - {*result.experiments}
+        return self._is_retried(result) or bool(self._unscored(result)) or bool(unknown)
+
+    def _is_retried(self, result: Result) -> bool:
+        return not result.ok and self.config.retry == "failed"
+
+    def _unscored(self, result: Result) -> dict[str, Protocol]:
+        """The protocols under whose rules a run that ended well has no marks."""
+        return {
+            name: protocol
+            for name, protocol in self.config.protocols.items()
+            if result.ok and (name not in result.scores or not same_rules(result.scores[name], protocol))
+        }
+
+    def _completed(self, result: Result) -> Result:
+        """A finished run with marks under the rules that it lacks; it may serve several experiments."""
+        experiments = tuple(sorted({*result.experiments, *self.config.labels.experiments}))
+        complete = replace(result, experiments=experiments)
+        if unscored := self._unscored(result):
+            self._say("finished before; only the new protocol is missing")
+            if not checkpoint.exists(self.folder.checkpoint):  # an untrained method would be scored
+                raise RunFolderError(
+                    f"{self.folder.path} has a result but no checkpoint any more, so it cannot be scored under other "
+                    f"rules of {', '.join(unscored)}; keep the old rules, or delete the folder to train again"
+                )
+            method = build(self.config)
+            self.folder.resume(method, self.scene.points.device)
+            complete = replace(complete, scores={**result.scores, **scores(method, self.scene, unscored, None)})
+        return result if complete == result else self.folder.finish(complete)
+
+    def _say(self, text: str) -> None:
+        self.console.print(text, highlight=False, soft_wrap=True)
 
 
 def build(config: RunConfig) -> Method:
     """The method of a configuration, untrained."""
     return lookup(METHODS, config.method, "method")(config.options, config.render, config.train, seed=config.seed)
-
-
-def _score_again(result: Result, config: RunConfig, scene: Scene, folder: RunFolder) -> Result:
-    missing = {
-        name: protocol
-        for name, protocol in config.protocols.items()
-        if name not in result.scores or not same_rules(result.scores[name], protocol)
-    }
-    if not checkpoint.exists(folder.checkpoint):  # an untrained method would be scored
-        raise RunFolderError(
-            f"{folder.path} has a result but no checkpoint any more, so it cannot be scored under other rules of "
-            f"{', '.join(missing)}; keep the old rules, or delete the folder to train again"
-        )
-    method = build(config)
-    resume(method, folder, scene.points.device)
-    result = replace(result, scores={**result.scores, **scores(method, scene, missing, None)})
-    return folder.finish(result)
-
-
-def _is_scored(result: Result, config: RunConfig) -> bool:
-    return all(
-        name in result.scores and same_rules(result.scores[name], protocol)
-        for name, protocol in config.protocols.items()
-    )
-
-
-def _peak_memory(scene: Scene) -> dict[str, int | None]:
-    peak = clock.peak_memory(scene.points.device)
-    return {"peak_memory_bytes": peak["host"], "peak_device_memory_bytes": peak["device"]}
-
-
-def _status(error: BaseException) -> str:
-    if isinstance(error, Failure):
-        return error.status
-    if isinstance(error, ValueError):
-        return "rejected"
-    if is_out_of_memory(error):
-        return "oom"
-    raise error
-
-
-def _blank(config: RunConfig, scene: Scene, folder: RunFolder) -> Result:
-    view = (scene.test or scene.train)[0]
-    machine = clock.machine(scene.points.device)
-    values = config.values()
-    return Result(
-        run=folder.path.name,
-        status="ok",
-        method=config.method,
-        preset=config.preset,
-        variant=config.variant,
-        dataset=config.data.dataset or ("" if config.data.path else "synthetic"),
-        scene=scene.name,
-        width=view.width,
-        height=view.height,
-        iterations=config.train.iterations,
-        iterations_done=0,
-        seed=config.seed,
-        code_version=" ".join(part for part in (machine["padgs"], (machine["commit"] or "")[:10]) if part) or "unknown",
-        machine=machine,
-        config_hash=config_hash(values),
-        fingerprint=scene.fingerprint,
-        finished="",
-        config=values,
-        experiments=config.labels.experiments,
-    )
-
-
-def _introduce(config: RunConfig, scene: Scene, folder: RunFolder, console: Console) -> None:
-    view = scene.train[0]
-    what = f"{config.preset}{f' ({config.variant})' if config.variant else ''} on {scene.name}"
-    views = f"{len(scene.train)} training and {len(scene.test)} test views of {view.width}x{view.height}"
-    console.print(
-        f"[bold]{what}[/]: {views}, {len(scene.points)} points, {config.train.iterations} iterations",
-        highlight=False,
-        soft_wrap=True,
-    )
-    for note in scene.notes:
-        console.print(f"  {note}", style="dim", highlight=False, soft_wrap=True)
-    console.print(f"  {folder.path}", style="dim", highlight=False, soft_wrap=True)

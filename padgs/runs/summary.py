@@ -1,4 +1,4 @@
-"""The small table at the end of a run."""
+"""What a person reads about a run: what it is, at its beginning, and a small table at its end."""
 
 from __future__ import annotations
 
@@ -9,9 +9,25 @@ from rich.console import Console
 from rich.table import Table
 
 from padgs.results import Result
+from padgs.runs.config import RunConfig
 from padgs.runs.live import clock, compact
+from padgs.scene import Scene
 
 MISSING = "–"
+
+
+def introduce(config: RunConfig, scene: Scene, folder: Path, console: Console) -> None:
+    """Print what is trained on what, the notes of the loader, and where the files will be."""
+    view = scene.train[0]
+    what = f"{config.preset}{f' ({config.variant})' if config.variant else ''} on {scene.name}"
+    views = f"{len(scene.train)} training and {len(scene.test)} test views of {view.width}x{view.height}"
+    console.print(
+        f"[bold]{what}[/]: {views}, {len(scene.points)} points, {config.train.iterations} iterations",
+        highlight=False,
+        soft_wrap=True,
+    )
+    for note in (*scene.notes, folder):
+        console.print(f"  {note}", style="dim", highlight=False, soft_wrap=True)
 
 
 def show_result(result: Result, folder: Path, console: Console) -> None:

@@ -3,34 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import asdict
 
 import torch
 from torch import Tensor
 
-from padgs.clock import timed
-from padgs.learning.method import Failure
+from padgs.learning.failure import Failure
 from padgs.render import Rendering
+from padgs.results import Scores
 from padgs.scene import View
 from padgs.scoring.lpips import lpips, weighted_lpips
 from padgs.scoring.lpips_weights import LpipsUnavailable
 from padgs.scoring.metrics import METRICS, sphere_weight
 from padgs.scoring.protocols import Protocol
 
-Scores = dict[str, float | None]  # metric -> value; None = missing (no weights, or no pixel that counts)
+Marks = dict[str, float | None]  # metric -> value; None = missing (no weights, or no pixel that counts)
 OnView = Callable[[View, Tensor, Tensor], None]  # view, truth, image: [H, W, 3] in [0, 1], as they were compared
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """What `evaluate` measured."""
-
-    protocol: dict[str, Any]  # the whole record of the protocol
-    views: dict[str, Scores]  # view -> its scores
-    mean: Scores  # over the views that have a value
-    seconds: dict[str, float]  # view -> wall time of rendering it
-    notes: tuple[str, ...]  # what is missing and why, each said once
 
 
 def evaluate(
@@ -38,16 +26,14 @@ def evaluate(
     views: Sequence[View],
     protocol: Protocol,
     *,
-    device: torch.device | str = "cpu",
     on_view: OnView | None = None,
-) -> Evaluation:
+) -> Scores:
     """Render each view and compare it with its image.
 
     Args:
         render: a trained method's `render`.
         views: the test views; each has an image, and may have a mask.
         protocol: the rules.
-        device: where renders are made; only for waiting until they are done.
         on_view: called with each view, its truth and its render (clamped, 8-bit, not cropped), to save pictures.
 
     Raises:
@@ -56,22 +42,22 @@ def evaluate(
     """
     if not views:
         raise ValueError("no test views to evaluate; give the scene a test split")
-    scores, seconds, notes = {}, {}, {}  # notes as keys: each once, in order
+    marks: dict[str, Marks] = {}
+    notes: dict[str, None] = {}  # as keys: each once, in order
     with torch.no_grad():
         for view in views:
-            rendering, seconds[view.name] = timed(lambda view=view: render(view), device)
-            image = as_stored(checked(rendering.image, view))
+            image = as_stored(checked(render(view).image, view))
             truth = view.image(dtype=image.dtype, device=image.device)
             mask = view.mask(dtype=image.dtype, device=image.device)
-            scores[view.name] = score(image, truth, mask, protocol, notes)
+            marks[view.name] = score(image, truth, mask, protocol, notes)
             if on_view is not None:
                 on_view(view, truth, image)
-    return Evaluation(asdict(protocol), scores, mean_scores(list(scores.values())), seconds, tuple(notes))
+    return Scores(asdict(protocol), mean_marks(list(marks.values())), marks, tuple(notes))
 
 
 def score(
     image: Tensor, truth: Tensor, mask: Tensor | None, protocol: Protocol, notes: dict[str, None] | None = None
-) -> Scores:
+) -> Marks:
     """The protocol's metrics of one image [H, W, 3] against the truth, with a weight [H, W] per pixel or None.
 
     Why LPIPS is missing, where it is, is added to `notes`.
@@ -82,26 +68,26 @@ def score(
         mask = counts[:, None] * (torch.ones_like(image[..., 0]) if mask is None else mask)
     elif rows < image.shape[0]:
         image, truth, mask = image[:rows], truth[:rows], None if mask is None else mask[:rows]
-    scores: Scores = {name: _value(METRICS[name](image, truth, mask)) for name in protocol.metrics}
+    marks: Marks = {name: _value(METRICS[name](image, truth, mask)) for name in protocol.metrics}
     if protocol.lpips_name is not None:
         try:
-            scores[protocol.lpips_name] = _value(_lpips(image, truth, mask, protocol))
+            marks[protocol.lpips_name] = _value(_lpips(image, truth, mask, protocol))
         except LpipsUnavailable as reason:
-            scores[protocol.lpips_name] = None
+            marks[protocol.lpips_name] = None
             if notes is not None:
                 notes[f"{protocol.lpips_name} is missing: {reason}"] = None
-    return scores
+    return marks
 
 
-def mean_scores(views: Sequence[Scores]) -> Scores:
+def mean_marks(views: Sequence[Marks]) -> Marks:
     """Mean of each metric over the views that have it; None where none has.
 
-    >>> mean_scores([{"psnr": 20.0, "seam": None}, {"psnr": 30.0, "seam": None}])
+    >>> mean_marks([{"psnr": 20.0, "seam": None}, {"psnr": 30.0, "seam": None}])
     {'psnr': 25.0, 'seam': None}
     """
-    mean: Scores = {}
+    mean: Marks = {}
     for name in views[0]:
-        present = [value for scores in views if (value := scores[name]) is not None]
+        present = [value for marks in views if (value := marks[name]) is not None]
         mean[name] = sum(present) / len(present) if present else None
     return mean
 

@@ -103,10 +103,6 @@ METRICS: dict[str, Metric] = {
     **{f"ws_psnr_{band}": partial(band_ws_psnr, band=band) for band in BANDS},
     "seam": seam,
 }
-HIGHER_IS_BETTER = {  # so that a table knows which way to bold
-    **{name: name != "seam" for name in METRICS},
-    **{f"{ws}lpips_{net}{inputs}": False for ws in ("", "ws_") for net in ("alex", "vgg") for inputs in ("", "_01")},
-}
 
 
 def sphere_weight(image: Tensor, mask: Tensor | None = None) -> Tensor:

@@ -1,4 +1,4 @@
-"""Training explicit Gaussians: splats, their learning rates, and their densification, as one `Trainable`."""
+"""Training explicit Gaussians: splats, their learning rates, and their densification, as a trainee."""
 
 from __future__ import annotations
 
@@ -7,23 +7,21 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from padgs.learning.method import RenderConfig, State
 from padgs.learning.schedule import Constant, LogLinear, ParameterGroup, scaled
-from padgs.learning.views import Drawing
+from padgs.learning.trainee import Drawing, Size, State
 from padgs.render import Rendering, RenderOptions, render
-from padgs.scene import Scene, View
+from padgs.render.config import RenderConfig
+from padgs.scene import View
 from padgs.sphere.camera import Panorama
 from padgs.sphere.panorama import longitude_latitude
 from padgs.splats.clone_split import CloneSplit, CloneSplitOptions
 from padgs.splats.model import Splats
 from padgs.splats.probes import render_probed
 
-MIN_EXTENT = 0.1  # scene units
-ONE_PLACE = 1e-6  # scene units; an extent up to here is rounding
 DEGREE_EVERY = 1000  # published iterations after which the next SH degree comes into use
 
 
-class TrainableSplats:
+class SplatTrainee:
     """Splats with the schedule of 3DGS for a run of `iterations`.
 
     Attributes:
@@ -42,7 +40,7 @@ class TrainableSplats:
         learning_rate_factor: float = 1.0,
         seed: int = 0,
     ) -> None:
-        """Wrap splats; `extent` is `extent_of` the scene, `options` are those of a published run (see `for_run`).
+        """Wrap splats; `extent` is the scene's, `options` are those of a published run (see `for_run`).
 
         Raises:
             ValueError: a signal that the projection does not have.
@@ -71,9 +69,22 @@ class TrainableSplats:
             ParameterGroup("sh_rest", (splats.sh_rest,), Constant(2.5e-3 / 20 * factor)),
         ]
 
-    def draw(self, view: View) -> Drawing:
-        """Render all Gaussians, differentiably."""
-        return self._drawing(view)
+    def draw(self, view: View, probe: Tensor | None = None) -> Drawing:
+        """Render all Gaussians, differentiably.
+
+        `probe` is that of another drawing of the same Gaussians, for views that are made of several.
+        """
+        self._drawn = view
+        gaussians = self.splats.gaussians(view)
+        rendering, probe = render_probed(
+            gaussians,
+            view,
+            self._render_options(view),
+            signal=self.densifier.options.signal,
+            probe=probe,
+            backend=self._config.backend,
+        )
+        return Drawing(rendering, probe, gaussians, torch.arange(len(probe), device=probe.device))
 
     def observe(self, drawing: Drawing, iteration: int) -> None:
         """Note how hard each Gaussian was pulled."""
@@ -103,6 +114,15 @@ class TrainableSplats:
         """Render a view without gradients."""
         return render(self.splats.gaussians(view), view, self._render_options(view), backend=self._config.backend)
 
+    def size(self) -> Size:
+        """Counts and bytes of the model."""
+        parameters = self.splats.rows().values()
+        return Size(
+            counts=self.counts(),
+            parameters=sum(p.numel() for p in parameters),
+            bytes=sum(p.numel() * p.element_size() for p in parameters),
+        )
+
     def state(self) -> State:
         """Parameters, statistics, random state; not copies."""
         tensors = {f"splats/{name}": tensor for name, tensor in self.splats.state_dict().items()}
@@ -123,42 +143,14 @@ class TrainableSplats:
         Raises:
             ValueError: the state is of a model with other options.
         """
-        self.splats.load(_under("splats/", state))
+        self.splats.load(state.under("splats/"))
         self.splats.active_degree = state.values["active_degree"]
         device = self.splats.means.device
-        self.densifier.statistics = {n: t.to(device, copy=True) for n, t in _under("statistics/", state).items()}
+        self.densifier.statistics = {n: t.to(device, copy=True) for n, t in state.under("statistics/").items()}
         self.densifier.generator.set_state(state.tensors["random/pieces"].cpu())
-
-    def _drawing(self, view: View, probe: Tensor | None = None) -> Drawing:
-        """`draw`; `probe` is that of another drawing of the same Gaussians, for views that are made of several."""
-        self._drawn = view
-        gaussians = self.splats.gaussians(view)
-        rendering, probe = render_probed(
-            gaussians,
-            view,
-            self._render_options(view),
-            signal=self.densifier.options.signal,
-            probe=probe,
-            backend=self._config.backend,
-        )
-        return Drawing(rendering, probe, gaussians, torch.arange(len(probe), device=probe.device))
 
     def _render_options(self, view: View) -> RenderOptions:
         options = self._config.options(self.splats.unit)
         if options.cubemap and not isinstance(view.camera, Panorama):  # one face of a cube, or a crop: draw it as it is
             return replace(options, cubemap=False, face_size=None)
         return options
-
-
-def extent_of(scene: Scene) -> float:
-    """`Scene.extent`, world units, but for cameras that hardly move: they must be able to place Gaussians, too."""
-    return max(scene.extent, MIN_EXTENT * scene.unit)
-
-
-def stands_still(scene: Scene) -> bool:
-    """Whether all training cameras stand in one place, up to the rounding of their poses."""
-    return scene.extent <= ONE_PLACE * scene.unit
-
-
-def _under(prefix: str, state: State) -> dict[str, torch.Tensor]:
-    return {name.removeprefix(prefix): tensor for name, tensor in state.tensors.items() if name.startswith(prefix)}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -12,8 +11,11 @@ from omegaconf import OmegaConf
 
 from padgs import results
 from padgs.results import Result
+from reports.frame import frame
+from reports.gathered import Gathered
 from reports.request import Request
-from reports.tables import runs
+from reports.store import Run
+from reports.tables.runs import runs
 from reports.writers import csv_text, markdown
 
 RUN, PARENT, MULTIRUN, LOGGED = "padgs.run", "mlflow.parentRunId", "padgs.multirun", "padgs.logged_iteration"  # tags
@@ -74,7 +76,7 @@ class Mirror:
 
         known = int(self._client.get_run(identity).data.tags.get(LOGGED, 0))
         now, metrics, last = int(1000 * time.time()), [], known
-        for line in log_lines(run):
+        for line in results.log_lines(run):
             if line["iteration"] > known:
                 last = line["iteration"]
                 numbers = {key: value for key, value in line.items() if isinstance(value, (int, float))}
@@ -99,7 +101,7 @@ class Mirror:
         self._client.set_terminated(identity, "FINISHED" if result.ok else "FAILED")
 
     def _log_table(self, identity: str, found: Sequence[Result]) -> None:
-        table = runs.build(found, Request(mix=True))
+        table = runs(Gathered(frame(map(Run, found)), Request(mix=True)))
         self._client.log_text(identity, markdown.text(table), "tables/runs.md")
         self._client.log_text(identity, csv_text.text(table), "tables/runs.csv")
 
@@ -130,21 +132,6 @@ def final_numbers(result: Result) -> dict[str, float]:
     if result.peak_device_memory_bytes is not None:
         numbers["peak_device_memory_bytes"] = result.peak_device_memory_bytes
     return numbers | {"size/model_bytes": float(result.model_bytes), "peak_memory_bytes": result.peak_memory_bytes}
-
-
-def log_lines(run: Path) -> Iterator[dict[str, Any]]:
-    """The whole lines of a run's log.jsonl."""
-    try:
-        lines = (run / "log.jsonl").read_text().splitlines()
-    except OSError:
-        return
-    for line in lines:
-        try:
-            entry = json.loads(line)
-            entry["iteration"] = int(entry["iteration"])
-        except (ValueError, KeyError, TypeError):
-            continue  # being written
-        yield entry
 
 
 def batches(items: Sequence[Any], size: int) -> Iterator[Sequence[Any]]:

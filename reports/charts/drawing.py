@@ -12,6 +12,8 @@ from functools import wraps
 from textwrap import wrap
 from typing import Any, ParamSpec, TypeVar
 
+from pandas import DataFrame
+
 from reports import methods
 
 P = ParamSpec("P")
@@ -53,12 +55,14 @@ class Tips:
 
 @dataclass(frozen=True)
 class Chart:
-    """A finished chart in both formats."""
+    """A finished chart in both formats, with the numbers in it."""
 
     name: str  # file name without extension
     title: str
     svg: str
     png: bytes
+    notes: tuple[str, ...] = ()
+    points: DataFrame | None = None  # None: they are in no file
 
 
 def styled(draw: Callable[P, T]) -> Callable[P, T]:
@@ -99,7 +103,9 @@ def dress(axis: Any, values: Sequence[float], log_from: float = math.inf) -> Non
         axis.set_major_formatter(EngFormatter(sep=""))
 
 
-def finish(made: Any, name: str, title: str, tips: Tips) -> Chart:
+def finish(
+    made: Any, name: str, title: str, tips: Tips, notes: tuple[str, ...], points: DataFrame | None = None
+) -> Chart:
     """Title and files of a figure."""
     width = int(LETTERS_PER_INCH * made.get_figwidth())
     made.suptitle("\n".join(part for line in title.split("\n") for part in wrap(line, width)), fontsize=10.5)
@@ -108,7 +114,7 @@ def finish(made: Any, name: str, title: str, tips: Tips) -> Chart:
     svg, png = io.StringIO(), io.BytesIO()
     made.savefig(svg, format="svg", metadata={"Date": None, "Creator": None})
     made.savefig(png, format="png", dpi=DPI, metadata={"Software": None})
-    return Chart(name, title, _with_tips(svg.getvalue(), tips), png.getvalue())
+    return Chart(name, title, _with_tips(svg.getvalue(), tips), png.getvalue(), notes, points)
 
 
 def color_of(preset: str, presets: Sequence[str]) -> str:

@@ -5,12 +5,18 @@ from __future__ import annotations
 from typing import Any
 
 from reports.charts.drawing import COLORS, MARKERS, Chart, Tips, dress, figure, finish, styled
-from reports.charts.sweeps import Line, Sweep, cell
+from reports.charts.sweeps import Line, Sweep, sweeps
+from reports.gathered import Gathered
 from reports.measures import Measure
 
 COLUMNS = 3
 LOGARITHMIC = 20  # from this ratio of the largest to the smallest value on
 PAPER_CHOICES = {"method.tau": 0.9, "train.lambda_l1": 0.8, "method.offsets": 10, "method.features": 32}
+
+
+def charts(gathered: Gathered) -> list[Chart]:
+    """A picture of each sweep."""
+    return [chart(sweep) for sweep in sweeps(gathered)]
 
 
 @styled
@@ -19,21 +25,22 @@ def chart(sweep: Sweep) -> Chart:
     rows = -(-len(sweep.measures) // COLUMNS)
     made, axes = figure(min(COLUMNS, len(sweep.measures)), rows, 3.6)
     tips = Tips()
-    for panel, measure in zip(axes.flat, sweep.measures, strict=False):
+    for index, (panel, measure) in enumerate(zip(axes.flat, sweep.measures, strict=False)):
         for number, line in enumerate(sweep.lines):
-            _draw(panel, line, measure, number, tips)
-        _dress(panel, sweep, measure)
+            _draw(panel, line, index, measure, number, tips)
+        _dress(panel, sweep, index, measure)
     for panel in axes.flat[len(sweep.measures) :]:
         panel.set_axis_off()
     handles, labels = axes[0, 0].get_legend_handles_labels()
     if handles:
         made.legend(handles, labels, loc="outside lower center", ncols=3)
-    return finish(made, sweep.file_name, f"Sweep {sweep.name}: mean and standard deviation over seeds", tips)
+    title = f"Sweep {sweep.name}: mean and standard deviation over seeds"
+    return finish(made, sweep.file_name, title, tips, sweep.notes, sweep.points)
 
 
-def _draw(panel: Any, line: Line, measure: Measure, number: int, tips: Tips) -> None:
+def _draw(panel: Any, line: Line, index: int, measure: Measure, number: int, tips: Tips) -> None:
     color = COLORS[number % len(COLORS)]
-    cells = [(x, cell(setting, measure)) for x, setting in line.points]
+    cells = [(x, cells[index]) for x, cells in line.points]
     there = [(x, c) for x, c in cells if c.value is not None]
     xs, values = [x for x, _ in there], [c.value for _, c in there]
     connected = "-" if all(isinstance(x, (int, float)) for x in xs) else ""
@@ -52,9 +59,9 @@ def _draw(panel: Any, line: Line, measure: Measure, number: int, tips: Tips) -> 
             panel.annotate(c.status.upper(), (x, 0.05), xycoords=failed, fontsize=6, color=color, ha="center")
 
 
-def _dress(panel: Any, sweep: Sweep, measure: Measure) -> None:
+def _dress(panel: Any, sweep: Sweep, index: int, measure: Measure) -> None:
     xs = [x for line in sweep.lines for x, _ in line.points]
-    values = [number for line in sweep.lines for _, s in line.points if (number := cell(s, measure).value) is not None]
+    values = [value for line in sweep.lines for _, cells in line.points if (value := cells[index].value) is not None]
     dress(panel.yaxis, values)
     panel.set_title(measure.column.heading, fontsize=9)
     panel.set_xlabel(sweep.key or "setting")

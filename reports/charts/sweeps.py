@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from padgs.results import Result
+from pandas import DataFrame
+
 from reports import methods
-from reports.conditions import OF_A_POINT, OF_A_SWEEP, refuse_mixture
-from reports.measures import QUANTITIES, Measure, marks, quantity
-from reports.request import Request, admitted
-from reports.scenes import Place, at, places
-from reports.settings import Setting, of_a_table, settings, sort_key
+from reports.conditions import OF_A_POINT, OF_A_SWEEP, footnotes, refuse_mixture
+from reports.frame import by_place, grouped
+from reports.gathered import Gathered, of_a_table
+from reports.measures import Measure, costs, marks, quantity
+from reports.request import Request
+from reports.scenes import Place
+from reports.settings import Setting, is_number, settings, sort_key
 from reports.tables.cells import over_seeds
-from reports.tables.footnotes import conditions
 from reports.tables.table import Cell
 
 COSTS_SHOWN = ("gaussians", "train_seconds", "frame_ms")
-HEADER = ("sweep", "dataset", "scene", "preset", "line", "key", "x", "quantity", "mean", "std", "n", "status")
 
 
 @dataclass(frozen=True)
@@ -31,7 +30,7 @@ class Line:
     preset: str
     fixed: str
     key: str  # dotted key along x; empty where its settings have names only
-    points: tuple[tuple[Any, Setting], ...]  # x, setting
+    points: tuple[tuple[Any, list[Cell]], ...]  # x, a cell for each measure of the sweep
 
     @property
     def title(self) -> str:
@@ -59,85 +58,72 @@ class Sweep:
         """The name without what files should not have in theirs."""
         return f"sweep_{self.name.replace('@', '_')}"
 
+    @property
+    def points(self) -> DataFrame:
+        """A row for each quantity of each point, all digits."""
+        rows = []
+        for line in self.lines:
+            where = {"sweep": self.name, "dataset": line.place.dataset, "scene": line.place.scene}
+            where |= {"preset": line.preset, "line": line.fixed, "key": line.key}
+            for x, cells in line.points:
+                for measure, cell in zip(self.measures, cells, strict=True):
+                    rows.append({**where, "x": x, "quantity": measure.column.title, **cell.numbers})
+        return DataFrame(rows, dtype=object).rename(columns={"value": "mean"})
 
-def sweeps(results: Sequence[Result], request: Request) -> list[Sweep]:
+
+def sweeps(gathered: Gathered) -> list[Sweep]:
     """Each sweep in which a preset was run on a scene in more than one setting; an experiment of a table, if asked for.
 
     Raises:
         ReportError: a metric that nobody knows, or results that must not stand together.
     """
-    runs = admitted(results, request)
+    request, runs = gathered.request, gathered.asked_for
     measures = _measures(request, runs)
+    names = sorted(name for name in runs["experiments"].explode().dropna().unique() if not of_a_table(name))
     found = []
-    names = sorted({name for result in runs for name in result.experiments})
-    for name in [request.experiment] if request.experiment else [name for name in names if not of_a_table(name)]:
-        own = [result for result in runs if name in result.experiments]
-        lines = [line for place in places(own) for line in _lines(place, at(place, own))]
-        if not lines:
-            continue
-        drawn = {line.place: at(line.place, own) for line in lines}
-        for place, of in drawn.items():
-            refuse_mixture(of, request, f"{name}, {place.title}", OF_A_SWEEP)
-        for line in lines:
-            for _, setting in line.points:
-                refuse_mixture(setting.runs, request, f"{name}, {line.place.title}, {setting.title}", OF_A_POINT)
-        notes = conditions({place.title: of for place, of in drawn.items()}, request.protocol)
-        found.append(Sweep(name, tuple(lines), measures, tuple(notes)))
+    for name in [request.experiment] if request.experiment else names:
+        own = runs.loc[runs["experiments"].map(lambda of, name=name: name in of).astype(bool)]
+        lines, drawn = [], {}
+        for place, there in by_place(own).items():
+            curves = list(_curves(there))
+            if not curves:
+                continue
+            refuse_mixture(there, request, f"{name}, {place.title}", OF_A_SWEEP)
+            drawn[place.title] = there
+            for preset, fixed, key, points in curves:
+                for _, setting in points:
+                    refuse_mixture(setting.runs, request, f"{name}, {place.title}, {setting.title}", OF_A_POINT)
+                cells = tuple((x, over_seeds(setting.runs, measures)) for x, setting in points)
+                lines.append(Line(place, preset, fixed, key, cells))
+        if lines:
+            found.append(Sweep(name, tuple(lines), measures, tuple(footnotes(drawn, request.protocol))))
     return found
 
 
-def cell(setting: Setting, measure: Measure) -> Cell:
-    """Mean and spread of a quantity over the seeds of a point."""
-    return over_seeds(setting.runs, measure.number)
-
-
-def csv_text(sweep: Sweep) -> str:
-    """All points of all curves, all digits."""
-    file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(HEADER)
-    for line in sweep.lines:
-        for x, setting in line.points:
-            for measure in sweep.measures:
-                number = cell(setting, measure)
-                count = "" if number.value is None else number.count
-                where = (sweep.name, line.place.dataset, line.place.scene, line.preset, line.fixed, line.key, x)
-                writer.writerow((*where, measure.column.title, number.value, number.std, count, number.status))
-    return file.getvalue()
-
-
-def _measures(request: Request, results: Sequence[Result]) -> tuple[Measure, ...]:
+def _measures(request: Request, runs: DataFrame) -> tuple[Measure, ...]:
     if request.metrics:
-        return tuple(quantity(name, request.protocol, results) for name in request.metrics)
-    return (*marks(request.protocol), *(QUANTITIES[name] for name in COSTS_SHOWN))
+        return tuple(quantity(name, request.protocol, runs) for name in request.metrics)
+    return (*marks(request.protocol), *costs(*COSTS_SHOWN))
 
 
-def _lines(place: Place, results: Sequence[Result]) -> Iterable[Line]:
-    """The curves of one scene; none for a preset in a single setting."""
-    groups: dict[tuple[str, str], list[Result]] = {}
-    for result in results:
-        groups.setdefault((result.preset, result.variant), []).append(result)
-    for (preset, variant), runs in groups.items():
-        points = settings(runs)
-        if len(points) < 2:
+def _curves(runs: DataFrame) -> Iterator[tuple[str, str, str, list[tuple[Any, Setting]]]]:
+    """Preset, what is fixed, key along x and points of each curve of a scene; none for a preset in a single setting."""
+    for (preset, variant), own in grouped(runs, "preset", "variant"):
+        found = settings(own)
+        if len(found) < 2:
             continue
-        keys = list(points[0].changed)
-        numeric = [key for key in keys if all(_is_number(point.changed[key]) for point in points)]
+        keys = list(found[0].changed)
+        numeric = [key for key in keys if all(is_number(setting.changed[key]) for setting in found)]
         if len(keys) > 2 or not numeric:
-            named = tuple((_words(point, keys), point) for point in points)
-            yield Line(place, preset, variant, "", named)
+            yield preset, variant, "", [(_words(setting, keys), setting) for setting in found]
             continue
         along = numeric[0]
         others = [key for key in keys if key != along]
-        for fixed in dict.fromkeys(_words(point, others) for point in points):
-            own = [(point.changed[along], point) for point in points if _words(point, others) == fixed]
-            own.sort(key=lambda pair: sort_key(pair[0]))
-            yield Line(place, preset, ", ".join(part for part in (variant, fixed) if part), along, tuple(own))
+        for fixed in dict.fromkeys(_words(setting, others) for setting in found):
+            points = [(setting.changed[along], setting) for setting in found if _words(setting, others) == fixed]
+            words = ", ".join(part for part in (variant, fixed) if part)
+            yield preset, words, along, sorted(points, key=lambda point: sort_key(point[0]))
 
 
 def _words(setting: Setting, keys: Sequence[str]) -> str:
     return ", ".join(f"{key.rpartition('.')[2]} {setting.changed[key]}" for key in keys)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)

@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from padgs.results import Result
+import pandas as pd
+from pandas import DataFrame
+
 from reports import published
-from reports.conditions import OF_A_CHART, OF_A_MEAN, refuse_mixture
-from reports.measures import QUANTITIES, Measure, mark
-from reports.metrics import column
+from reports.conditions import OF_A_CHART, OF_A_MEAN, footnotes, refuse_mixture
+from reports.frame import by_place
+from reports.gathered import Gathered
+from reports.measures import Measure, costs, mark
 from reports.request import Request
-from reports.scenes import Place, at, places
-from reports.settings import Setting, chosen, settings
+from reports.scenes import Place
+from reports.settings import Setting, settings
 from reports.tables.cells import over_scenes
-from reports.tables.footnotes import conditions
 from reports.tables.table import Cell
 
-COSTS = tuple(QUANTITIES[name] for name in ("frame_ms", "train_seconds", "gaussians", "megabytes"))
-QUALITIES = (("sphere", "ws_psnr"), ("sphere", "ws_lpips_alex"), ("paper", "psnr"), ("paper", "lpips_vgg_01"))
-HEADER = ("chart", "setting", "preset", "quantity", "mean", "std", "n")
+COSTS = costs("frame_ms", "train_seconds", "gaussians", "megabytes")
+QUALITIES = (
+    *(mark("sphere", metric) for metric in ("ws_psnr", "ws_lpips_alex")),
+    *(mark("paper", metric) for metric in ("psnr", "lpips_vgg_01")),
+)
 
 
 @dataclass(frozen=True)
@@ -42,29 +44,40 @@ class TradeOff:
     qualities: tuple[Measure, ...]  # two: one where more is better, one where less is
     points: tuple[Point, ...]
     beside: str  # data set of the paper whose published numbers may be looked at with it
-    runs: tuple[Result, ...]
+    runs: DataFrame
     notes: tuple[str, ...]
 
+    @property
+    def numbers(self) -> DataFrame:
+        """A row for each number of each point, all digits."""
+        rows = [
+            {"chart": self.name, "setting": point.title, "preset": point.preset, "quantity": title, **cell.numbers}
+            for point in self.points
+            for title, cell in point.numbers.items()
+            if cell.value is not None
+        ]
+        return DataFrame(rows, dtype=object).drop(columns="status").rename(columns={"value": "mean"})
 
-def trade_offs(results: Sequence[Result], request: Request) -> list[TradeOff]:
+
+def trade_offs(gathered: Gathered) -> list[TradeOff]:
     """A chart for each data set of the paper that was run, and for each other scene.
 
     Raises:
         ReportError: results of one chart that were not made, scored and timed alike.
     """
-    runs = [result for result in chosen(results, "chart", request) if not result.variant]
-    groups: dict[str, list[Place]] = {}
-    for place in places(runs):
+    runs = gathered.chosen("chart")
+    groups: dict[str, dict[Place, DataFrame]] = {}
+    for place, own in by_place(runs.loc[runs["variant"] == ""]).items():
         name = place.dataset if place.published else place.scene
         if name in groups and not place.published:  # scenes of two data sets, or a scene called like a data set
             name = f"{name}_{place.dataset or 'capture'}"
-        groups.setdefault(name, []).append(place)
+        groups.setdefault(name, {})[place] = own
     found = []
     for name, group in groups.items():
-        shown = replace(request, protocol=_protocol([result for place in group for result in at(place, runs)]))
-        for place in group:
-            refuse_mixture(at(place, runs), shown, place.title, OF_A_CHART)
-        made = _trade_off(name, group, runs, shown)
+        shown = replace(gathered.request, protocol=_protocol(pd.concat(group.values())))
+        for place, own in group.items():
+            refuse_mixture(own, shown, place.title, OF_A_CHART)
+        made = _trade_off(name, group, shown)
         if made.points:
             found.append(made)
     return found
@@ -84,53 +97,37 @@ def pareto(points: Sequence[tuple[float, float]], higher_is_better: bool) -> lis
     return front
 
 
-def csv_text(chart: TradeOff) -> str:
-    """All numbers of the chart, all digits."""
-    file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(HEADER)
-    for point in chart.points:
-        for title, cell in point.numbers.items():
-            if cell.value is not None:
-                writer.writerow((chart.name, point.title, point.preset, title, cell.value, cell.std, cell.count))
-    return file.getvalue()
-
-
-def _trade_off(name: str, group: Sequence[Place], runs: Sequence[Result], request: Request) -> TradeOff:
-    by_place = [at(place, runs) for place in group]
-    qualities = _qualities(request.protocol)
-    found: dict[str, tuple[Setting, list[list[Result]]]] = {}
-    for index, own in enumerate(by_place):
+def _trade_off(name: str, group: Mapping[Place, DataFrame], request: Request) -> TradeOff:
+    qualities = tuple(measure for measure in QUALITIES if measure.name.startswith(f"{request.protocol}/"))
+    found: dict[str, list[Setting]] = {}
+    for own in group.values():
         for setting in settings(own):
-            _, columns = found.setdefault(setting.title, (setting, [[] for _ in group]))
-            columns[index] = list(setting.runs)
-    for title, (_, columns) in found.items():
-        together = [result for runs_of_scene in columns for result in runs_of_scene]
-        refuse_mixture(together, request, f"{name}, {title}", OF_A_MEAN)
-    found = {title: (s, c) for title, (s, c) in found.items() if any(r.ok for runs in c for r in runs)}
-    finished = [i for i in range(len(group)) if all(any(r.ok for r in c[i]) for _, c in found.values())]
+            found.setdefault(setting.title, []).append(setting)
+    runs_of = {title: pd.concat([setting.runs for setting in alike]) for title, alike in found.items()}
+    for title, runs in runs_of.items():
+        refuse_mixture(runs, request, f"{name}, {title}", OF_A_MEAN)
+    runs_of = {title: runs for title, runs in runs_of.items() if runs["ok"].any()}
+    finished = [p for p in group if all((runs["ok"] & (runs["place"] == p)).any() for runs in runs_of.values())]
     if len(group) == 1:
-        finished = [0]  # who failed there has no point
+        finished = list(group)  # who failed there has no point
+    first, scenes = next(iter(group)), [place.scene for place in finished]
     points = []
-    for title, (setting, columns) in found.items():
-        own = [columns[i] for i in finished]
-        numbers = {m.column.title: over_scenes(own, m.number) for m in (*qualities, *COSTS)}
-        if any(cell.value is not None for cell in numbers.values()):
-            points.append(Point(title, setting.preset, numbers))
-    what = group[0].title if len(group) == 1 else published.TITLES[name]
-    if len(group) > 1 or group[0].published:
-        what += f", mean over its scenes {', '.join(group[i].scene for i in finished)}"
-    beside = group[0].dataset if group[0].published else "ricoh360" if group[0].outdoor else "roam360"
-    shown = [result for i in finished for result in by_place[i]]
-    notes = conditions({what: shown}, request.protocol)
-    return TradeOff(f"chart_{name}", what, qualities, tuple(points), beside, tuple(shown), tuple(notes))
+    for title, runs in runs_of.items():
+        measures = (*qualities, *COSTS)
+        cells = over_scenes(runs, scenes, measures)
+        if any(cell.value is not None for cell in cells):
+            titles = [measure.column.title for measure in measures]
+            points.append(Point(title, runs["preset"].iloc[0], dict(zip(titles, cells, strict=True))))
+    what = first.title if len(group) == 1 else published.TITLES[name]
+    if len(group) > 1 or first.published:
+        what += f", mean over its scenes {', '.join(scenes)}"
+    beside = first.dataset if first.published else "ricoh360" if first.outdoor else "roam360"
+    shown = pd.concat([group[place] for place in finished]) if finished else group[first].iloc[:0]
+    notes = footnotes({what: shown}, request.protocol)
+    return TradeOff(f"chart_{name}", what, qualities, tuple(points), beside, shown, tuple(notes))
 
 
-def _protocol(results: Sequence[Result]) -> str:
+def _protocol(runs: DataFrame) -> str:
     """The sphere's; that of the paper where nothing was scored on the sphere."""
-    there = [p for p, metric in QUALITIES if any(mark(p, metric)(result) is not None for result in results)]
-    return there[0] if there else "sphere"
-
-
-def _qualities(protocol: str) -> tuple[Measure, ...]:
-    return tuple(Measure(column(metric), mark(protocol, metric)) for of, metric in QUALITIES if of == protocol)
+    there = [m.name for m in QUALITIES if m.name in runs and runs[m.name].notna().any()]
+    return there[0].partition("/")[0] if there else "sphere"

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from reports import methods, published
 from reports.charts.drawing import Chart, Tips, color_of, dress, figure, finish, marker_of, styled
-from reports.charts.trade_off import COSTS, Point, TradeOff, pareto
+from reports.charts.trade_off import COSTS, Point, TradeOff, pareto, trade_offs
+from reports.frame import by_place
+from reports.gathered import Gathered
 from reports.measures import Measure
 from reports.published import Key
-from reports.quality_log import Probe
 from reports.settings import settings
 
 AREA = 60.0  # points^2 of a marker with the median number of Gaussians
@@ -22,6 +23,12 @@ PUBLISHED = (  # metric and cost of the paper, how to read the cost
     ("lpips", "LPIPS ↓", False),
 )
 PUBLISHED_COSTS = (("fps", "ms per frame ↓", lambda fps: 1000 / fps), ("train_hours", "training h ↓", lambda h: h))
+
+
+def charts(gathered: Gathered) -> list[Chart]:
+    """Speed against accuracy, and quality over training time where runs left a log."""
+    made = [drawn for trade_off in trade_offs(gathered) for drawn in (chart(trade_off), time_chart(trade_off))]
+    return [drawn for drawn in made if drawn is not None]
 
 
 @styled
@@ -41,34 +48,34 @@ def chart(trade_off: TradeOff) -> Chart:
         axes[0, 0].plot([], [], label=methods.title(preset), **style)
     made.legend(loc="outside lower center", ncols=6)
     title = f"{trade_off.title}\nfilled: measured here, area = Gaussians, line = Pareto front; hollow: published"
-    return finish(made, trade_off.name, f"{title}, {published.TITLES[trade_off.beside]}, one RTX 3090 Ti", tips)
+    title += f", {published.TITLES[trade_off.beside]}, one RTX 3090 Ti"
+    return finish(made, trade_off.name, title, tips, trade_off.notes, trade_off.numbers)
 
 
 @styled
-def time_chart(trade_off: TradeOff, probes: Mapping[str, Sequence[Probe]]) -> Chart | None:
+def time_chart(trade_off: TradeOff) -> Chart | None:
     """Held-out PSNR over training seconds; None where no run left a log.
 
     A line for each run of one scene; of the scenes of a data set, whose lines would bury each other, the first seed.
     """
     made, axes = figure(1, 1, 7.5, 3.6)
     panel, tips = axes[0, 0], Tips()
-    presets = methods.ordered(result.preset for result in trade_off.runs)
+    presets = methods.ordered(trade_off.runs["preset"])
     drawn: dict[str, None] = {}
     ends: list[float] = []
-    scenes = dict.fromkeys(result.scene for result in trade_off.runs)
-    by_scene = ([result for result in trade_off.runs if result.scene == scene] for scene in scenes)
-    for setting in (setting for runs in by_scene for setting in settings(runs)):
+    by_scene = by_place(trade_off.runs)
+    for setting in (setting for runs in by_scene.values() for setting in settings(runs)):
         color, marker = color_of(setting.preset, presets), marker_of(setting.preset, presets)
-        for result in setting.runs[: 1 if len(scenes) > 1 else None]:
-            points = probes.get(result.run, ())
-            if not points:
+        shown = setting.runs[: 1 if len(by_scene) > 1 else None]
+        for log, scene, seed in zip(shown["log"], shown["scene"], shown["seed"], strict=True):
+            xs, ys = log["seconds"], log["psnr"]
+            if not ys:
                 continue
             label = None if setting.title in drawn else setting.title
             drawn[setting.title] = None
-            xs, ys = [p.seconds for p in points], [p.psnr for p in points]
             panel.plot(xs, ys, color=color, linewidth=1.1, alpha=0.8, label=label)
             ends.append(xs[-1])
-            tip = tips.add(f"{setting.title}, {result.scene}, seed {result.seed}\n{ys[-1]:.2f} dB after {xs[-1]:.0f} s")
+            tip = tips.add(f"{setting.title}, {scene}, seed {seed}\n{ys[-1]:.2f} dB after {xs[-1]:.0f} s")
             panel.plot(xs[-1:], ys[-1:], marker, color=color, markersize=5, gid=tip)
     if not drawn:
         return None
@@ -76,9 +83,8 @@ def time_chart(trade_off: TradeOff, probes: Mapping[str, Sequence[Probe]]) -> Ch
     panel.set_xlabel("training time in seconds, rendering of probes not counted")
     panel.set_ylabel("PSNR of a held-out view, dB")
     made.legend(loc="outside right center", fontsize=8)
-    return finish(
-        made, trade_off.name.replace("chart_", "time_", 1), f"{trade_off.title}\nquality over training time", tips
-    )
+    name, title = trade_off.name.replace("chart_", "time_", 1), f"{trade_off.title}\nquality over training time"
+    return finish(made, name, title, tips, trade_off.notes)
 
 
 def _measured(

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from reports.gathered import TABLES, Gathered
+from pandas import DataFrame
+
+from reports import REPORTS
+from reports.gathered import Gathered
 from reports.page.pictures import album
-from reports.tables.footnotes import machine
 from reports.tables.ranking import BEST, emphasis
 from reports.tables.table import Block, Cell, ReportError, Table
 
@@ -20,25 +21,23 @@ STYLES = ("pannellum.css", "img-comparison-slider.css")
 LOWEST = "-1e99"  # where a cell without a number is sorted
 
 
-def text(gathered: Gathered) -> str:
-    """The page as HTML."""
+def html(gathered: Gathered) -> str:
+    """The page with all other reports."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     environment = Environment(
         loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     refused: list[str] = []
-    made = [_attempt(lambda name=name: gathered.table(name), refused) for name in TABLES]
-    tables = [table for table in made if table is not None and table.blocks]
-    trade_offs = _attempt(lambda: gathered.trade_offs, refused) or []
-    sweeps = _attempt(lambda: gathered.sweeps, refused) or []
-    pictures = album(gathered.folder, gathered.results, gathered.request)
+    made = {name: _attempt(gathered, name, refused) for name in REPORTS if name != "html"}
+    tables = [report for report in made.values() if isinstance(report, Table) and report.blocks]
+    pictures = album(gathered)
     return environment.get_template("page.html.j2").render(
-        facts=_facts(gathered),
+        facts=_facts(gathered.runs),
         problems=[*gathered.left_out, *refused],
         tables=[_table(table) for table in tables],
-        charts=[(chart.title, _inline(chart.svg), made.notes) for made, charts in trade_offs for chart in charts],
-        sweeps=[(chart.title, _inline(chart.svg), made.notes) for made, chart in sweeps],
+        charts=[(chart.title, _inline(chart.svg), chart.notes) for chart in made["chart"] or ()],
+        sweeps=[(chart.title, _inline(chart.svg), chart.notes) for chart in made["sweep"] or ()],
         pictures=pictures,
         data=_script(json.dumps({"images": pictures.images, "scenes": pictures.scenes})),
         styles="\n".join([*(_vendored(name) for name in STYLES), (HERE / "page.css").read_text()]),
@@ -47,27 +46,20 @@ def text(gathered: Gathered) -> str:
     )
 
 
-def _attempt(make: Callable[[], Any], refused: list[str]) -> Any:
-    """What can be made; else None, with the reason kept for the page."""
+def _attempt(gathered: Gathered, name: str, refused: list[str]) -> Any:
+    """A report that can be made; else None, with the reason kept for the page."""
     try:
-        return make()
+        return gathered.report(name)
     except ReportError as error:
         refused.append(str(error))
         return None
 
 
-def _facts(gathered: Gathered) -> list[tuple[str, str]]:
-    results = gathered.results
-    lists: Sequence[tuple[str, Callable[[Any], str]]] = (
-        ("Scenes", lambda result: result.scene),
-        ("Methods", lambda result: result.preset),
-        ("Code", lambda result: result.code_version),
-        ("Machines", machine),
-    )
-    failed = sum(not result.ok for result in results)
-    facts = [("Runs", f"{len(results)}, of which {failed} failed")]
-    facts += [(name, ", ".join(sorted({of(result) for result in results}))) for name, of in lists]
-    return [*facts, ("Last run", max((result.finished for result in results), default="none"))]
+def _facts(runs: DataFrame) -> list[tuple[str, str]]:
+    columns = {"Scenes": "scene", "Methods": "preset", "Code": "code_version", "Machines": "hardware"}
+    facts = [("Runs", f"{len(runs)}, of which {(~runs['ok']).sum()} failed")]
+    facts += [(name, ", ".join(sorted(runs[column].unique()))) for name, column in columns.items()]
+    return [*facts, ("Last run", max(runs["finished"], default="none"))]
 
 
 def _table(table: Table) -> dict[str, Any]:

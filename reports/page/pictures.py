@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import base64
 import io
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 from PIL import Image
 
-from padgs.results import Result
-from reports.request import Request
-from reports.scenes import at, places
-from reports.settings import Setting, chosen, settings
+from reports.frame import by_place
+from reports.gathered import Gathered
+from reports.settings import Setting, settings
 
-FOLDER = "renders"  # of a run: truth | render | error of each test view, side by side
 WIDTH = 1024  # pixels of an embedded panorama at most
 QUALITY = 80  # of JPEG
 VIEWS = 3  # of a scene at most
@@ -42,33 +40,35 @@ class Album:
         return len(self.images) - 1
 
 
-def album(folder: Path, results: Sequence[Result], request: Request) -> Album:
+def album(gathered: Gathered) -> Album:
     """Each setting of the methods, and the rows of ablations, on a few views of each scene; one seed is enough."""
-    own = [*chosen(results, "table1", request), *(r for r in chosen(results, "table3", request) if r.variant)]
-    seen = list({result.run: result for result in own if _files(folder, result)}.values())
-    groups = {place: settings(at(place, seen)) for place in places(seen)}
+    methods, parts = gathered.chosen("table1"), gathered.chosen("table3")
+    own = pd.concat([methods, parts.loc[parts["variant"] != ""]]).drop_duplicates("run")
+    own = own.loc[own["pictures"].map(_files).map(len) > 0]
+    groups = {place: settings(runs) for place, runs in by_place(own).items()}
     views = min(VIEWS, max(1, MOST_FILES // max(1, sum(map(len, groups.values())))))
     made, opened = Album(), 0
-    for place, runs in groups.items():
-        names = _spread(_files(folder, runs[0].runs[0]), views)
-        opened += len(runs) * len(names)
+    for place, shown in groups.items():
+        names = _spread(_files(shown[0].runs["pictures"].iloc[0]), views)
+        opened += len(shown) * len(names)
         if opened > MOST_FILES:
             made.left_out.append(place.title)
             continue
-        shown = [view for name in names if (view := _view(made, folder, runs, name))["methods"]]
-        if shown:
-            made.scenes.append({"title": place.title, "views": shown})
+        pictured = [view for name in names if (view := _view(made, shown, name))["methods"]]
+        if pictured:
+            made.scenes.append({"title": place.title, "views": pictured})
     return made
 
 
-def _view(made: Album, folder: Path, runs: Sequence[Setting], name: str) -> dict[str, Any]:
+def _view(made: Album, shown: Sequence[Setting], name: str) -> dict[str, Any]:
     view: dict[str, Any] = {"title": Path(name).stem, "truth": None, "methods": []}
-    for setting in runs:
-        run = next((run for run in setting.runs if (folder / run.run / FOLDER / name).is_file()), None)
-        if run is None:
+    for setting in shown:
+        runs = setting.runs.loc[[(folder / name).is_file() for folder in setting.runs["pictures"]]]
+        if runs.empty:
             continue
+        run = runs.iloc[0]
         try:
-            with Image.open(folder / run.run / FOLDER / name) as picture:
+            with Image.open(run["pictures"] / name) as picture:
                 picture.load()
         except OSError:
             continue  # a picture that a kill has cut: the numbers do not depend on it
@@ -77,12 +77,14 @@ def _view(made: Album, folder: Path, runs: Sequence[Setting], name: str) -> dict
         if view["truth"] is None:
             view["truth"] = made.add(truth)
         images = {"render": made.add(render), "error": made.add(error, WIDTH // 2)}
-        view["methods"].append({"title": f"{setting.title}{_mark(run, name)}", **images})
+        psnr = run["view_psnr"].get(name)
+        mark = "" if psnr is None else f" ({psnr:.2f} dB)"
+        view["methods"].append({"title": f"{setting.title}{mark}", **images})
     return view
 
 
-def _files(folder: Path, run: Result) -> list[str]:
-    return sorted(path.name for path in (folder / run.run / FOLDER).glob("*.png"))
+def _files(folder: Path | None) -> list[str]:
+    return [] if folder is None else sorted(path.name for path in folder.glob("*.png"))
 
 
 def _spread(names: Sequence[str], count: int) -> list[str]:
@@ -94,13 +96,3 @@ def _spread(names: Sequence[str], count: int) -> list[str]:
     if len(names) <= count:
         return list(names)
     return [names[round(i * (len(names) - 1) / max(1, count - 1))] for i in range(count)]
-
-
-def _mark(run: Result, name: str) -> str:
-    """The PSNR of the view, after the name of the method."""
-    for scores in run.scores.values():
-        for view, numbers in scores.views.items():
-            value = numbers.get("psnr")
-            if re.sub(r"[^A-Za-z0-9._-]+", "-", view) == Path(name).stem and value is not None:
-                return f" ({value:.2f} dB)"
-    return ""

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-from padgs.results import Result
+from pandas import DataFrame
+
 from reports import methods, published
-from reports.conditions import CONDITIONS, OF_A_DATA_SET, Condition, refuse_mixture
-from reports.measures import Measure
+from reports.conditions import CONDITIONS, footnotes, refuse_mixture
+from reports.frame import by_place
+from reports.gathered import Gathered
+from reports.measures import Measure, alone
 from reports.published import Key, Published
-from reports.request import Request
-from reports.scenes import Place, at, places
-from reports.settings import chosen
-from reports.tables.cells import difference, of_the_paper, one_setting, over_scenes, over_seeds
-from reports.tables.footnotes import conditions
-from reports.tables.table import Block, Cell, Column, Row, Table
+from reports.scenes import Place
+from reports.settings import one_setting
+from reports.tables import beside_paper
+from reports.tables.cells import over_scenes, over_seeds
+from reports.tables.table import Block, Cell, Row, Table
 
+Measures = Sequence[Measure]
+Numbers = Mapping[Key, Published]  # of the paper; none under a protocol that is not its own
 AVERAGE = "average"
 
 
@@ -29,89 +33,66 @@ class Comparison:
     measures: tuple[Measure, ...]
     tables: Mapping[str, int]  # data set of the paper -> the paper's table about it
     belongs: Callable[[Place], bool]
-    alike: Mapping[str, Condition] = field(default_factory=lambda: CONDITIONS)
+    alike: Sequence[str] = CONDITIONS
     notes: tuple[str, ...] = ()
 
-    def build(self, results: Sequence[Result], request: Request) -> Table:
-        """The table of all results that the request admits; rows of an ablation (`variant`) are not methods.
+    def build(self, gathered: Gathered) -> Table:
+        """The table of all runs that the request admits; rows of an ablation (`variant`) are not methods.
 
         Raises:
             ReportError: results that must not stand together.
         """
+        request, runs = gathered.request, gathered.chosen(self.name)
+        runs = runs.loc[runs["variant"] == ""]
+        found = {place: own for place, own in by_place(runs).items() if self.belongs(place)}
         paper = published.load() if request.protocol == published.PROTOCOL else {}
-        runs = [result for result in chosen(results, self.name, request) if not result.variant]
-        found = [place for place in places(runs) if self.belongs(place)]
+        measures = self.measures if paper else tuple(map(alone, self.measures))
         blocks: list[Block] = []
         notes: list[str] = []
         for dataset in dict.fromkeys((*self.tables, *(place.dataset for place in found))):
-            for place in (place for place in found if place.dataset == dataset):
-                refuse_mixture(at(place, runs), request, place.title, self.alike)
-                blocks.append(self._scene(place, at(place, runs), paper))
+            for place, own in found.items():
+                if place.dataset == dataset:
+                    refuse_mixture(own, request, place.title, self.alike)
+                    blocks.append(self._scene(place, own, measures, paper))
             if dataset not in self.tables:
                 continue
-            own = [result for result in runs if result.dataset == dataset]
-            refuse_mixture(own, request, published.TITLES[dataset], self._of_a_data_set)
-            blocks.append(self._average(dataset, own, paper))
-            not_run = [scene for scene in self._scenes(dataset, paper) if Place(dataset, scene) not in found]
+            own = runs.loc[runs["dataset"] == dataset]
+            refuse_mixture(own, request, published.TITLES[dataset], [what for what in self.alike if what != "data"])
+            scenes = published.scenes(paper or published.load(), published.DATASETS[dataset])
+            blocks.append(self._average(dataset, scenes, own, measures, paper))
+            not_run = [scene for scene in scenes if Place(dataset, scene) not in found]
             if not_run:
                 notes.append(f"{published.TITLES[dataset]}, not run: {', '.join(not_run)}.")
-        notes += conditions({place.title: at(place, runs) for place in found}, request.protocol)
+        notes += footnotes({place.title: own for place, own in found.items()}, request.protocol)
         if paper:
-            delta = "; Δ = ours - paper" if any(measure.difference for measure in self.measures) else ""
+            delta = "; Δ = ours - paper" if any(measure.difference for measure in measures) else ""
             notes.append(f"Columns 'paper': published numbers, from one RTX 3090 Ti{delta}.")
-        columns = tuple(column for measure in self.measures for column in _columns(measure, bool(paper)))
+        columns = beside_paper.columns(measures)
         return Table(self.name, self.title, "Method", columns, tuple(blocks), (*notes, *self.notes))
 
-    @property
-    def _of_a_data_set(self) -> dict[str, Condition]:
-        return {what: of for what, of in self.alike.items() if what in OF_A_DATA_SET or what not in CONDITIONS}
-
-    def _scenes(self, dataset: str, paper: Mapping[Key, Published]) -> list[str]:
-        return published.scenes(paper or published.load(), published.DATASETS[dataset])
-
-    def _scene(self, place: Place, own: Sequence[Result], paper: Mapping[Key, Published]) -> Block:
-        known = self._published_methods(place.dataset, place.scene, paper)
+    def _scene(self, place: Place, own: DataFrame, measures: Measures, paper: Numbers) -> Block:
         rows = []
-        for preset in methods.ordered([*known, *(result.preset for result in own)]):
-            runs = [result for result in own if result.preset == preset]
-            runs = one_setting(runs, f"{place.title}, {methods.title(preset)}")
-            ours = [over_seeds(runs, measure.number) for measure in self.measures]
-            rows.append(self._row(preset, ours, place.dataset, place.scene, paper))
+        for preset in self._presets(place, own, paper):
+            runs = one_setting(own.loc[own["preset"] == preset], f"{place.title}, {methods.title(preset)}")
+            rows.append(self._row(preset, place, measures, over_seeds(runs, measures), paper))
         return Block(place.title, tuple(rows))
 
-    def _average(self, dataset: str, own: Sequence[Result], paper: Mapping[Key, Published]) -> Block:
-        scenes = self._scenes(dataset, paper)
-        known = self._published_methods(dataset, AVERAGE, paper)
-        rows = []
-        for preset in methods.ordered([*known, *(result.preset for result in own)]):
-            runs = [at(Place(dataset, scene), (r for r in own if r.preset == preset)) for scene in scenes]
-            ours = [over_scenes(runs, measure.number) for measure in self.measures]
-            rows.append(self._row(preset, ours, dataset, AVERAGE, paper))
+    def _average(
+        self, dataset: str, scenes: Sequence[str], own: DataFrame, measures: Measures, paper: Numbers
+    ) -> Block:
+        rows, place = [], Place(dataset, AVERAGE)
+        for preset in self._presets(place, own, paper):
+            ours = over_scenes(own.loc[own["preset"] == preset], scenes, measures)
+            rows.append(self._row(preset, place, measures, ours, paper))
         return Block(f"{published.TITLES[dataset]}, average over its {len(scenes)} scenes", tuple(rows))
 
-    def _published_methods(self, dataset: str, scene: str, paper: Mapping[Key, Published]) -> set[str]:
-        table, theirs = self.tables.get(dataset), published.DATASETS.get(dataset)
-        return {key.method for key in paper if (key.table, key.dataset, key.scene) == (table, theirs, scene)}
+    def _presets(self, place: Place, own: DataFrame, paper: Numbers) -> list[str]:
+        """Those that were run, and the methods that the paper has numbers of."""
+        where = (self.tables.get(place.dataset), published.DATASETS.get(place.dataset), place.scene)
+        known = (key.method for key in paper if (key.table, key.dataset, key.scene) == where)
+        return methods.ordered((*known, *own["preset"]))
 
-    def _row(self, preset: str, ours: Sequence[Cell], dataset: str, scene: str, paper: Mapping[Key, Published]) -> Row:
-        cells: list[Cell] = []
-        for measure, cell in zip(self.measures, ours, strict=True):
-            cells.append(cell)
-            if paper and measure.published:
-                table, theirs_of = self.tables.get(dataset, 0), published.DATASETS.get(dataset, dataset)
-                key = Key(table, theirs_of, scene, methods.published_as(preset), measure.published)
-                theirs = of_the_paper(paper.get(key))
-                cells += [theirs, difference(cell, theirs)] if measure.difference else [theirs]
-        return Row(methods.title(preset), tuple(cells))
-
-
-def _columns(measure: Measure, beside_the_paper: bool) -> list[Column]:
-    columns = [measure.column]
-    if beside_the_paper and measure.published:
-        decimals = min(measure.column.decimals, 2) if not measure.difference else measure.column.decimals
-        columns.append(
-            Column("paper", decimals, measure.column.higher_is_better, group=measure.column.group, optional=True)
-        )
-        if measure.difference:
-            columns.append(Column("Δ", measure.column.decimals, signed=True, group=measure.column.group, optional=True))
-    return columns
+    def _row(self, preset: str, place: Place, measures: Measures, ours: Sequence[Cell], paper: Numbers) -> Row:
+        table, method = self.tables.get(place.dataset, 0), methods.published_as(preset)
+        theirs = published.row(paper, table, place.dataset, place.scene, method)
+        return Row(methods.title(preset), beside_paper.cells(measures, ours, theirs))

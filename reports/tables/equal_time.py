@@ -2,47 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from typing import Any
 
-from padgs.results import Result
-from reports.measures import train_seconds
+import numpy as np
+from pandas import DataFrame
 
 EXPERIMENT = "equal_time"
 TOLERANCE = 0.1  # of the time: what the same run takes twice differs by less on a quiet machine
 
 
-def is_near(result: Result, seconds: float) -> bool:
-    """Whether the training took that long, up to `TOLERANCE`."""
-    taken = train_seconds(result)
-    return taken is not None and abs(taken - seconds) <= TOLERANCE * seconds
+def is_near(taken: Any, seconds: float) -> Any:
+    """Whether the training took that long, up to `TOLERANCE`; of one run or a column of many."""
+    return abs(taken - seconds) <= TOLERANCE * seconds
 
 
-def of_any_length(result: Result) -> Result:
-    """The result as if its configuration did not say how long to train."""
-    train = {key: value for key, value in result.config.get("train", {}).items() if key != "iterations"}
-    return replace(result, config={**result.config, "train": train})
+def of_any_length(runs: DataFrame) -> DataFrame:
+    """The runs as if their configuration did not say how long to train."""
+    return runs.drop(columns="config.train.iterations", errors="ignore")
 
 
-def common_seconds(results: Sequence[Result]) -> float:
+def common_seconds(runs: DataFrame) -> float:
     """The time that most runs took: of all training times the one with the most others near it, the shortest of such.
 
     Runs on the way to that time lie scattered.
     """
-    times = sorted(seconds for result in results if result.ok and (seconds := train_seconds(result)))
+    times = sorted(runs.loc[runs["ok"], "train_seconds"].dropna())
     return max(times, key=lambda t: (sum(abs(other - t) <= TOLERANCE * t for other in times), -t), default=0.0)
 
 
-def nearest_to(seconds: float, results: Sequence[Result]) -> list[Result]:
+def nearest_to(seconds: float, runs: DataFrame) -> DataFrame:
     """For each method and seed the run whose training time is nearest to `seconds`; failed runs where no other is."""
-    best: dict[tuple[str, int], Result] = {}
-    for result in results:
-        key = (result.preset, result.seed)
-        if key not in best or _distance(result, seconds) < _distance(best[key], seconds):
-            best[key] = result
-    return list(best.values())
-
-
-def _distance(result: Result, seconds: float) -> float:
-    taken = train_seconds(result)
-    return abs(taken - seconds) if result.ok and taken else float("inf")
+    distance = (runs["train_seconds"].where(runs["ok"]) - seconds).abs().fillna(np.inf)
+    return runs.loc[distance.groupby([runs["preset"], runs["seed"]], sort=False).idxmin()]

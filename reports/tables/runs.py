@@ -5,60 +5,46 @@ No number stands out and no column has a better end: the lead of a single run ma
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from padgs.results import Result
-from reports.measures import on_gpu, peak_gpu_gigabytes
-from reports.metrics import column
+from reports.conditions import footnotes
+from reports.frame import grouped
+from reports.gathered import Gathered
+from reports.measures import costs, gpu_memory, mark
 from reports.published import scene_title
-from reports.request import Request, admitted
 from reports.tables.cells import over_seeds
-from reports.tables.footnotes import conditions
-from reports.tables.table import Block, Column, Row, Table
+from reports.tables.table import Block, Row, Table
 
-Number = Callable[[Result], "float | None"]
+MARKS = {
+    "paper": ("psnr", "ssim", "lpips_vgg_01"),
+    "sphere": ("ws_psnr", "ws_ssim", "ws_lpips_alex", *(f"ws_psnr_{b}" for b in ("equator", "middle", "high", "pole"))),
+}
+AMONG_COSTS = {"group": "cost", "higher_is_better": None}
+COSTS = (
+    *costs("anchors", "gaussians", **AMONG_COSTS),
+    *costs("megabytes", title="MB", **AMONG_COSTS),
+    *costs("train_seconds", "frame_ms", "peak_gigabytes", **AMONG_COSTS),
+)
 
-FLAT = ("psnr", "ssim", "lpips_vgg_01")
-SPHERE = ("ws_psnr", "ws_ssim", "ws_lpips_alex", *(f"ws_psnr_{band}" for band in ("equator", "middle", "high", "pole")))
 
-
-def build(results: Sequence[Result], request: Request) -> Table:
-    """A block per scene and resolution, a row per run."""
-    chosen = admitted(results, request)
-    costs = {**COSTS, **GPU_MEMORY} if on_gpu(chosen) else COSTS
-    columns = {**_marks("paper", FLAT), **_marks("sphere", SPHERE), **costs}
-    places = dict.fromkeys((r.dataset, r.scene, r.width, r.height, r.iterations) for r in chosen)
+def runs(gathered: Gathered) -> Table:
+    """A block per scene, resolution and number of iterations, a row per run."""
+    found = gathered.asked_for
+    measured = [mark(protocol, metric, protocol) for protocol, metrics in MARKS.items() for metric in metrics]
+    plain = [replace(measure, column=replace(measure.column, higher_is_better=None)) for measure in measured]
+    measures = (*plain, *COSTS, *gpu_memory(found, **AMONG_COSTS))
     blocks, runs_of = [], {}
-    for place in places:
-        dataset, scene, width, height, iterations = place
-        title = f"{scene_title(dataset, scene)}, {width}x{height}, {iterations} iterations"
-        own = [r for r in chosen if (r.dataset, r.scene, r.width, r.height, r.iterations) == place]
-        rows = [Row(_title(r), tuple(over_seeds([r], number) for number in columns.values())) for r in own]
+    for (place, resolution, iterations), own in grouped(found, "place", "resolution", "iterations"):
+        title = f"{scene_title(place.dataset, place.scene)}, {resolution}, {iterations} iterations"
+        rows = (
+            Row(_title(*words), tuple(over_seeds(own.loc[[index]], measures)))
+            for index, *words in own[["preset", "variant", "seed", "run"]].itertuples()
+        )
         blocks.append(Block(title, tuple(rows)))
         runs_of[title] = own
-    notes = [note for protocol in ("paper", "sphere") for note in conditions(runs_of, protocol)]
-    return Table("runs", "Runs", "Run", tuple(columns), tuple(blocks), tuple(notes))
+    notes = [note for protocol in MARKS for note in footnotes(runs_of, protocol)]
+    return Table("runs", "Runs", "Run", tuple(m.column for m in measures), tuple(blocks), tuple(notes))
 
 
-def _title(result: Result) -> str:
-    words = [result.preset, result.variant, f"seed {result.seed}", result.run.rpartition("_")[2]]
-    return ", ".join(word for word in words if word)
-
-
-def _marks(protocol: str, metrics: Sequence[str]) -> dict[Column, Number]:
-    def number(metric: str) -> Number:
-        return lambda result: result.scores[protocol].metrics.get(metric) if protocol in result.scores else None
-
-    return {replace(column(metric, group=protocol), higher_is_better=None): number(metric) for metric in metrics}
-
-
-COSTS: dict[Column, Number] = {
-    Column("anchors", 0, group="cost"): lambda r: r.counts.get("anchors"),
-    Column("Gaussians", 0, group="cost"): lambda r: r.counts.get("gaussians"),
-    Column("MB", 1, group="cost"): lambda r: r.model_bytes / 1e6,
-    Column("training s", 0, group="cost"): lambda r: r.timing.get("train_seconds"),
-    Column("ms per frame", 1, group="cost"): lambda r: r.timing.get("render_ms_median"),
-    Column("peak GB", 2, group="cost"): lambda r: r.peak_memory_bytes / 1e9,
-}
-GPU_MEMORY: dict[Column, Number] = {Column("peak GPU GB", 2, group="cost"): peak_gpu_gigabytes}
+def _title(preset: str, variant: str, seed: int, run: str) -> str:
+    return ", ".join(word for word in (preset, variant, f"seed {seed}", run.rpartition("_")[2]) if word)

@@ -4,97 +4,80 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from padgs.results import Result
+import pandas as pd
+from pandas import DataFrame
+
 from reports import methods as names
-from reports.conditions import CONDITIONS, OF_TIMES, refuse_mixture
-from reports.measures import (
-    GPU_MEMORY,
-    Measure,
-    frame_ms,
-    gaussians,
-    mark,
-    megabytes,
-    on_gpu,
-    peak_gigabytes,
-    train_seconds,
-)
-from reports.metrics import column
-from reports.request import Request
-from reports.scenes import Place, at, places
-from reports.settings import chosen
-from reports.tables.cells import one_setting, over_seeds, refuse_differences
+from reports.conditions import OF_EQUAL_TIMES, footnotes, refuse_mixture
+from reports.frame import by_place
+from reports.gathered import Gathered
+from reports.measures import costs, gpu_memory, mark
+from reports.scenes import Place
+from reports.settings import one_setting, refuse_differences
+from reports.tables.cells import over_seeds
 from reports.tables.equal_time import EXPERIMENT, TOLERANCE, common_seconds, is_near, nearest_to, of_any_length
-from reports.tables.footnotes import conditions
 from reports.tables.ranking import NOTE
-from reports.tables.table import Block, Column, Row, Table
+from reports.tables.table import Block, Row, Table
 
 MARKS = {
     "paper": ("psnr", "ssim", "lpips_vgg_01"),
     "sphere": ("ws_psnr", "ws_psnr_equator", "ws_psnr_middle", "ws_psnr_high", "ws_psnr_pole", "seam"),
 }
 COSTS = (
-    Measure(Column("iterations", 0), lambda result: result.iterations_done),
-    Measure(Column("training s", 0, False), train_seconds),
-    Measure(Column("ms per frame", 1, False), frame_ms),
-    Measure(Column("Gaussians", 0), gaussians),
-    Measure(Column("MB", 1, False), megabytes),
-    Measure(Column("peak GB", 2, False), peak_gigabytes),
+    *costs("iterations_done", "train_seconds", "frame_ms", "gaussians"),
+    *costs("megabytes", title="MB"),
+    *costs("peak_gigabytes"),
 )
 
 
-def methods(results: Sequence[Result], request: Request) -> Table:
+def methods(gathered: Gathered) -> Table:
     """Every method after the same number of iterations."""
-    runs = [result for result in chosen(results, "methods", request) if not result.variant]
-    blocks = {}
-    for place in places(runs):
-        own = at(place, runs)
-        refuse_mixture(own, request, place.title, CONDITIONS)
-        blocks[place] = own
-    return _table("methods", "Every method after the same number of iterations", blocks)
+    runs = _methods(gathered, "methods")
+    for place, own in by_place(runs).items():
+        refuse_mixture(own, gathered.request, place.title)
+    return _table("methods", "Every method after the same number of iterations", by_place(runs))
 
 
-def equal_time(results: Sequence[Result], request: Request) -> Table:
+def equal_time(gathered: Gathered) -> Table:
     """Every method after the same training time: of the runs of each, the one nearest to the time that most took.
 
     A run of the comparison after equal iterations counts where it happened to take as long.
     """
-    runs = [r for r in chosen(results, "equal_time", request) if EXPERIMENT in r.experiments and not r.variant]
-    others = [r for r in chosen(results, "methods", request) if r not in runs and not r.variant]
-    alike = {what: of for what, of in OF_TIMES.items() if what != "iterations"}
-    blocks, notes = {}, []
-    for place in places(runs):
-        seconds = common_seconds(at(place, runs))
-        own = [*at(place, runs), *(result for result in at(place, others) if is_near(result, seconds))]
-        refuse_mixture(own, request, place.title, alike)
-        for preset in names.ordered(result.preset for result in own):
-            own_runs = [of_any_length(r) for r in own if r.preset == preset]
-            # Else the nearer of two settings would stand for both.
-            refuse_differences(own_runs, f"{place.title}, {names.title(preset)}")
-        blocks[place] = [of_any_length(r) for r in nearest_to(seconds, own)]
-        off = names.ordered(r.preset for r in blocks[place] if r.ok and not is_near(r, seconds))
-        if off:
-            notes.append(
-                f"{place.title}: not within {TOLERANCE:.0%} of {seconds:.0f} s: {', '.join(map(names.title, off))}."
-            )
-    return _table("equal_time", "Every method after the same training time", blocks, notes)
+    runs = _methods(gathered, "equal_time")
+    runs = runs.loc[runs["experiments"].map(lambda of: EXPERIMENT in of).astype(bool)]
+    others = _methods(gathered, "methods").drop(runs.index, errors="ignore")
+    found, notes = {}, []
+    for place, own in by_place(runs).items():
+        seconds = common_seconds(own)
+        near = others.loc[(others["place"] == place) & is_near(others["train_seconds"], seconds)]
+        own = of_any_length(gathered.runs.loc[[*own.index, *near.index]])
+        refuse_mixture(own, gathered.request, place.title, OF_EQUAL_TIMES)
+        for preset in names.ordered(own["preset"]):  # else the nearer of two settings would stand for both
+            refuse_differences(own.loc[own["preset"] == preset], f"{place.title}, {names.title(preset)}")
+        found[place] = nearest_to(seconds, own)
+        off = found[place].loc[found[place]["ok"] & ~is_near(found[place]["train_seconds"], seconds)]
+        if len(off):
+            titles = ", ".join(map(names.title, names.ordered(off["preset"])))
+            notes.append(f"{place.title}: not within {TOLERANCE:.0%} of {seconds:.0f} s: {titles}.")
+    return _table("equal_time", "Every method after the same training time", found, notes)
 
 
-def _table(name: str, title: str, runs: dict[Place, list[Result]], notes: Sequence[str] = ()) -> Table:
-    measured = [result for own in runs.values() for result in own]
-    measures = (*_marks(), *COSTS, *((GPU_MEMORY,) if on_gpu(measured) else ()))
+def _methods(gathered: Gathered, report: str) -> DataFrame:
+    """The runs for a report; rows of an ablation (`variant`) are not methods."""
+    runs = gathered.chosen(report)
+    return runs.loc[runs["variant"] == ""]
+
+
+def _table(name: str, title: str, found: dict[Place, DataFrame], notes: Sequence[str] = ()) -> Table:
+    gpu = gpu_memory(pd.concat(found.values())) if found else ()
+    measures = (*(mark(protocol, metric, protocol) for protocol, of in MARKS.items() for metric in of), *COSTS, *gpu)
     blocks = []
-    for place, own in runs.items():
+    for place, own in found.items():
         rows = []
-        for preset in names.ordered(result.preset for result in own):
-            setting = one_setting([r for r in own if r.preset == preset], f"{place.title}, {names.title(preset)}")
-            rows.append(Row(names.title(preset), tuple(over_seeds(setting, m.number) for m in measures)))
+        for preset in names.ordered(own["preset"]):
+            runs = one_setting(own.loc[own["preset"] == preset], f"{place.title}, {names.title(preset)}")
+            rows.append(Row(names.title(preset), tuple(over_seeds(runs, measures))))
         blocks.append(Block(place.title, tuple(rows)))
-    by_title = {place.title: own for place, own in runs.items()}
-    notes = [*notes, *(note for protocol in MARKS for note in conditions(by_title, protocol))]
+    by_title = {place.title: own for place, own in found.items()}
+    notes = [*notes, *(note for protocol in MARKS for note in footnotes(by_title, protocol))]
     return Table(name, title, "Method", tuple(m.column for m in measures), tuple(blocks), (*notes, NOTE))
-
-
-def _marks() -> tuple[Measure, ...]:
-    return tuple(
-        Measure(column(metric, protocol), mark(protocol, metric)) for protocol, of in MARKS.items() for metric in of
-    )

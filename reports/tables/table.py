@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 MISSING = "–"
 
@@ -38,6 +39,12 @@ class Cell:
     std: float | None = None  # over seeds; None for a single run
     count: int = 1
     status: str = ""  # of failed runs: oom, nan, ...
+
+    @property
+    def numbers(self) -> dict[str, Any]:
+        """All that it knows, for a file of numbers."""
+        count = None if self.value is None else self.count
+        return {"value": self.value, "std": self.std, "n": count, "status": self.status}
 
     def text(self, column: Column, *, counted: bool = True) -> str:
         """What stands in the cell, without emphasis; `counted`: with the number of seeds.

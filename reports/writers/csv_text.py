@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
-import csv
-import io
+from pandas import DataFrame
 
 from reports.tables.ranking import emphasis
 from reports.tables.table import Table
 
-HEADER = ("table", "block", "row", "group", "column", "value", "std", "n", "status", "rank")
-
 
 def text(table: Table) -> str:
     """All cells; `value` is empty where there is no number, `status` says why."""
-    file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(HEADER)
+    return of_frame(cells(table))
+
+
+def cells(table: Table) -> DataFrame:
+    """A row a cell."""
+    rows = []
     for block in table.blocks:
         ranks = [emphasis(block, index, table.columns) for index in range(len(table.columns))]
         for number, row in enumerate(block.rows):
             for cell, column, rank in zip(row.cells, table.columns, ranks, strict=True):
-                count = "" if cell.value is None else cell.count
-                place = (table.name, block.title, row.title, column.group, column.title)
-                writer.writerow((*place, cell.value, cell.std, count, cell.status, rank.get(number, "")))
-    return file.getvalue()
+                place = {"table": table.name, "block": block.title, "row": row.title}
+                place |= {"group": column.group, "column": column.title}
+                rows.append({**place, **cell.numbers, "rank": rank.get(number, "")})
+    return DataFrame(rows, dtype=object)
+
+
+def of_frame(frame: DataFrame) -> str:
+    """A frame of such rows, without its index."""
+    return frame.to_csv(index=False, lineterminator="\n")

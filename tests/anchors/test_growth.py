@@ -6,12 +6,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from padgs.anchors.growth import RELEASED_GROWTH, Growth, GrowthOptions, find_seeds
+from padgs.anchors.growth import PUBLISHED_THRESHOLD, Growth, GrowthOptions, find_seeds
 from padgs.anchors.model import PaDGS, PaDGSOptions
-from padgs.learning.method import Failure
+from padgs.learning.failure import Failure
 
 VOXEL = 0.5
-PUBLISHED = GrowthOptions(**RELEASED_GROWTH)
+PUBLISHED = GrowthOptions(gradient_threshold=PUBLISHED_THRESHOLD, log_scale_cap=0.05, max_anchors=None)
 
 
 @pytest.fixture
@@ -212,7 +212,7 @@ def test_only_the_released_code_caps_the_size_of_gaussians(cap, expected):
         model.log_scales.fill_(2.0)
     Growth(model, GrowthOptions(log_scale_cap=cap)).adapt(1600, adam(model))
     assert torch.allclose(model.log_scales[0], torch.tensor([2.0] * 3 + [expected] * 3))
-    assert GrowthOptions().log_scale_cap is None and RELEASED_GROWTH["log_scale_cap"] == 0.05
+    assert GrowthOptions().log_scale_cap is None
 
 
 def test_the_limit_keeps_the_strongest_and_says_so(lucky):

@@ -1,17 +1,17 @@
 """PaD-GS as a method: it learns, resumes bit-identically, and does not care about the units of the world."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import pytest
 import torch
 
-from padgs.anchors.method import PRESETS, LearningRates, PaDGSMethod, PaDGSMethodOptions, preset
+from padgs.anchors.method import PaDGSMethod, PaDGSMethodOptions
 from padgs.anchors.model import PaDGS
-from padgs.learning.method import Budget, RenderConfig
-from padgs.learning.views import TrainOptions
-from padgs.scene import Scene, View
+from padgs.anchors.trainee import LearningRates
+from padgs.learning.loop import Budget, TrainOptions
+from padgs.render.config import RenderConfig
+from padgs.scene import MIN_EXTENT, Scene, View
 from padgs.sphere.panorama import rays
-from padgs.splats.trainee import MIN_EXTENT
 
 WIDTH, HEIGHT = 48, 24
 EAGER = PaDGSMethodOptions(  # growth early and often, so that a short run has it
@@ -108,7 +108,7 @@ def test_seeds_matter_and_repeat():
 def test_size_is_what_is_stored(long_run):
     method, records = long_run
     size, anchors = method.size(), records[-1].counts["anchors"]
-    networks = sum(p.numel() for p in method.model.decoder.parameters())
+    networks = sum(p.numel() for p in method.trainee.model.decoder.parameters())
     assert size.counts == {"anchors": anchors, "gaussians": 4 * anchors}
     assert size.parameters == anchors * (32 + 4 * 3 + 6) + networks
     assert size.bytes == 4 * (size.parameters + 3 * anchors)
@@ -120,28 +120,9 @@ def test_a_state_of_other_options_is_refused(long_run):
         other.load_state(long_run[0].state())
 
 
-def test_nothing_to_show_before_training():
-    method = PaDGSMethod()
-    for ask in (method.state, method.size, lambda: method.render(scene().test[0])):
-        with pytest.raises(RuntimeError, match="call fit or load_state first"):
-            ask()
-
-
-def test_presets():
-    method, render, train = preset("padgs")
-    assert (method, render, train) == (PaDGSMethodOptions(), RenderConfig(), TrainOptions())
-    released, render, train = preset("padgs_release")
-    changed = {f.name for f in fields(released) if getattr(released, f.name) != getattr(method, f.name)}
-    assert changed == set(PRESETS["padgs_release"]["method"])
-    assert (released.gradient_threshold, released.tau, train.normalisation) == (2e-4, 0.9, "channel_sum")
-    assert (render.near, render.near_unit, render.wrap, render.bounds) == (0.2, "world", False, "square")
-    with pytest.raises(ValueError, match="unknown preset 'paper'; known: padgs, padgs_release"):
-        preset("paper")
-
-
 def test_published_learning_rates():
     model, world = PaDGS.from_scene(scene()), scene()
-    groups = {g.name: g for g in LearningRates(offset_rate_unit="world").groups(model, world, 30_000)}
+    groups = {g.name: g for g in LearningRates(offset_rate_unit="world").groups(model, world.extent, 30_000)}
     ends = {
         "offsets": (0.01 * world.extent, 0.0001 * world.extent),
         "features": (0.0075, 0.0075),
@@ -160,8 +141,9 @@ def test_published_learning_rates():
 def test_a_single_camera_can_still_place_gaussians():
     world = scene()
     alone = replace(world, train=world.train[:1])
-    groups = LearningRates().groups(PaDGS.from_scene(alone), alone, 100)
-    assert groups[0].learning_rate(0) == pytest.approx(0.01 * MIN_EXTENT)
+    method = PaDGSMethod(EAGER, TORCH)
+    next(method.fit(alone, Budget(100)))
+    assert method.trainee.groups()[0].learning_rate(0) == pytest.approx(0.01 * MIN_EXTENT)
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,9 @@ from tiny_scene import tiny_scene
 from baselines.egonerf import EgoNeRFMethod, EgoNeRFMethodOptions
 from padgs.data.synthetic import SyntheticOptions, generate
 from padgs.egonerf.model import EgoNeRF
-from padgs.egonerf.trainee import TrainableEgoNeRF
-from padgs.learning.method import Budget, RenderConfig
-from padgs.learning.views import TrainOptions
+from padgs.egonerf.trainee import EgoNeRFTrainee
+from padgs.learning.loop import Budget, TrainOptions
+from padgs.render.config import RenderConfig
 from padgs.runs.session import build
 from padgs.scene import Scene, View
 
@@ -134,13 +134,13 @@ def test_variation_smooths_the_planes():
     for weight in (0.0, 1e4):
         trained = method(density_variation=weight, appearance_variation=0.0)
         list(trained.fit(scene, Budget(20)))
-        roughness.append(trained._trained().density.variation().item())
+        roughness.append(trained.trainee.model.density.variation().item())
     assert roughness[1] < 0.5 * roughness[0]
 
 
 def test_published_learning_rates():
     model = EgoNeRF.from_scene(tiny_scene(), SMALL)
-    groups = {group.name: group for group in TrainableEgoNeRF(model, SMALL, 100_000).groups()}
+    groups = {group.name: group for group in EgoNeRFTrainee(model, SMALL, 100_000).groups()}
     starts = {"density": 0.02, "appearance": 0.02, "shader": 1e-3, "environment": 5e-3}
     assert groups.keys() == starts.keys()
     for name, start in starts.items():
@@ -155,7 +155,7 @@ def test_adam_gets_the_published_betas_and_rates_that_fall_to_a_tenth():
     trained = method()
     records, rates = trained.fit(tiny_scene(), Budget(4)), []
     for _ in records:
-        (*groups, environment) = trained._trainer._optimizer.param_groups
+        (*groups, environment) = trained._trainer._optimiser.adam.param_groups
         assert {group["betas"] for group in (*groups, environment)} == {(0.9, 0.99)}
         rates.append((groups[0]["lr"], environment["lr"]))
     expected = [0.1 ** (iteration / 4) for iteration in range(1, 5)]
@@ -169,9 +169,9 @@ def test_the_environment_can_learn_alone_first():
     records, moved, rates = trained.fit(tiny_scene(), Budget(7)), [], []
     before = {name: value.clone() for name, value in EgoNeRF.from_scene(tiny_scene(), SMALL).named_parameters()}
     for _ in records:
-        now = dict(trained._trained().named_parameters())
+        now = dict(trained.trainee.model.named_parameters())
         moved.append({name for name, value in now.items() if not torch.equal(value, before[name])})
-        rates.append([group["lr"] for group in trained._trainer._optimizer.param_groups][::3])  # density, environment
+        rates.append([group["lr"] for group in trained._trainer._optimiser.adam.param_groups][::3])
         before = {name: value.clone() for name, value in now.items()}
     assert moved[:3] == 3 * [{"environment.emission"}]
     assert all(names == before.keys() for names in moved[3:])
@@ -191,7 +191,7 @@ def test_alone_the_environment_becomes_the_mean_panorama(room):
     rays = room.train[0].camera.rays().reshape(-1, 3)
     directions = torch.cat([rays @ rotation for rotation in rotations])
     up = directions[:, 2] > 0.7
-    learned = trained._trained().environment(directions[up]).mean(0)
+    learned = trained.trainee.model.environment(directions[up]).mean(0)
     assert torch.allclose(learned, colors[up].mean(0), atol=0.05)
 
 
@@ -210,7 +210,7 @@ def test_published_weights_of_the_variation_fall_like_the_rates():
         for plane in model.appearance.planes:
             plane.mul_(3)  # at first both vary alike, and could be mistaken for one another
     density, appearance = model.density.variation().item(), model.appearance.variation().item()
-    trainable = TrainableEgoNeRF(model, SMALL, 100_000)
+    trainable = EgoNeRFTrainee(model, SMALL, 100_000)
     for iteration, share in ((0, 1.0), (50_000, 0.1**0.5), (100_000, 0.1)):
         expected = 1e-2 * share * (0.1 * density + 0.01 * appearance)
         assert trainable.regularisation(iteration).item() == pytest.approx(expected, rel=1e-5)

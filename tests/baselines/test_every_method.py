@@ -4,7 +4,7 @@ A new method needs no line here, unless its defaults are too large for a test (`
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import cache
 from pathlib import Path
 
@@ -14,7 +14,9 @@ from composed import composed
 
 from baselines import METHODS
 from padgs.data.synthetic import SCENES, SyntheticOptions, generate
-from padgs.learning.method import Budget, Method, Record, State
+from padgs.learning.loop import Budget, Record
+from padgs.learning.method import Method
+from padgs.learning.trainee import State
 from padgs.registry import lookup
 from padgs.runs import checkpoint
 from padgs.runs.config import RunConfig
@@ -118,6 +120,16 @@ def survives(setting: str, scene: Scene) -> None:
         assert rendering.image.std() > 0.01, "it shows something"
     size = method.size()
     assert size.parameters > 0 and size.bytes >= size.parameters and all(n > 0 for n in size.counts.values())
+
+
+@pytest.mark.parametrize("setting", EVERY)
+def test_before_a_scene_is_known_every_method_says_so_and_an_empty_one_is_refused_at_once(setting, scenes):
+    method, scene = method_of(setting), scenes("room")
+    for ask in (method.state, method.size, lambda: method.render(scene.test[0])):
+        with pytest.raises(RuntimeError, match="call fit or load_state first"):
+            ask()
+    with pytest.raises(ValueError, match="scene 'synthetic-room' has no training view"):
+        method.fit(replace(scene, train=()), Budget(STEPS))
 
 
 @pytest.mark.parametrize("setting", EVERY)

@@ -7,9 +7,12 @@ from tiny_scene import tiny_scene
 
 from baselines import METHODS
 from baselines.omnigs import OmniGSMethod
-from padgs.learning.method import Budget, Failure, RenderConfig, State
+from padgs.learning.failure import Failure
+from padgs.learning.loop import Budget
+from padgs.learning.trainee import State
 from padgs.native import cpu
 from padgs.registry import lookup
+from padgs.render.config import RenderConfig
 from padgs.runs import checkpoint
 from padgs.scene import Scene, View
 from padgs.splats.method import SplatOptions
@@ -157,13 +160,6 @@ def test_released_bugs_are_off_unless_asked_for(root, monkeypatch):
     quirks = {"released_start": True, "released_reset": True, "prune_by_extent_from": 0, "max_gaussians": None}
     assert released.options == replace(described.options, **quirks)
     assert described.train == released.train and released.train.weight == "uniform"
-
-
-def test_before_training_there_is_nothing(scene):
-    with pytest.raises(RuntimeError, match="no model before fit"):
-        method().render(scene.test[0])
-    with pytest.raises(RuntimeError, match="no state before fit"):
-        method().state()
 
 
 def test_other_options_than_the_state_are_refused(finished):

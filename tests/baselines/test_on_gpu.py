@@ -10,7 +10,9 @@ from composed import composed
 from pretended_gpu import GPU, pretended_gpu
 
 from padgs.data.synthetic import SyntheticOptions, generate
-from padgs.learning.method import Budget, Failure, State
+from padgs.learning.failure import Failure
+from padgs.learning.loop import Budget
+from padgs.learning.trainee import State
 from padgs.runs import checkpoint, scoring
 from padgs.runs.scoring import frame_times, scores
 from padgs.runs.session import build
@@ -93,7 +95,9 @@ def test_every_method_lives_where_its_scene_is(setting, scene, tmp_path, monkeyp
     assert marks.keys() == scores(here, scene, config.protocols, None).keys()
     list(here.fit(scene, Budget(STEPS + 1)))
     fresh = [float(record.loss) for record in build(config).fit(scene, Budget(STEPS))]
-    assert [float(loss) for loss in losses] == pytest.approx(fresh, rel=1e-2)
+    assert [float(loss) for loss in losses[:3]] == pytest.approx(fresh[:3], rel=1e-3)
+    # Later a Gaussian at a threshold may be cloned here and not there: sums of float32 differ between processors.
+    assert sum(map(float, losses)) == pytest.approx(sum(fresh), rel=3e-2)
 
 
 def test_a_nan_is_found_at_the_next_check(scene):
@@ -102,7 +106,7 @@ def test_a_nan_is_found_at_the_next_check(scene):
     with pretended_gpu():
         records = method.fit(scene.to(GPU), Budget(STEPS))
         next(records)
-        method._trained().splats.sh_dc.data[:] = float("nan")
+        method.trainee.splats.sh_dc.data[:] = float("nan")
         with pytest.raises(Failure, match=f"is nan at iteration {CHECK_EVERY}") as failure:
             list(records)
     assert failure.value.status == "nan"

@@ -12,7 +12,7 @@ from tiny_scene import tiny_scene
 
 from baselines.op43dgs import OP43DGSMethod
 from padgs import results
-from padgs.learning.method import Budget
+from padgs.learning.loop import Budget
 from padgs.runs import session
 from padgs.scene import Scene, View
 
@@ -61,7 +61,7 @@ def test_the_release_differs_by_its_quirks_only():
 def run(setting: str, scene: Scene, folder, monkeypatch, *overrides: str) -> results.Result:
     monkeypatch.setattr(session.data, "load", lambda path, format, options: scene)
     tiny = (f"run.folder={folder}", "train.iterations=4", "protocol=paper", "protocol.paper.lpips=none")
-    return session.run(composed(f"method={setting}", *tiny, *overrides), Console(file=io.StringIO()))
+    return session.Session(composed(f"method={setting}", *tiny, *overrides), Console(file=io.StringIO())).run()
 
 
 def test_far_away_the_release_ends_as_oom_with_the_numbers(tmp_path, monkeypatch):

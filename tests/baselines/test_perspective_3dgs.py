@@ -12,9 +12,9 @@ from tiny_scene import tiny_scene
 from baselines import METHODS
 from baselines.crops_3dgs import NARROWEST, Crops3DGSMethod, Crops3DGSOptions
 from baselines.cubemap_3dgs import Cubemap3DGSMethod
-from padgs.learning.method import Budget, RenderConfig
-from padgs.learning.views import TrainOptions
+from padgs.learning.loop import Budget, TrainOptions
 from padgs.registry import lookup
+from padgs.render.config import RenderConfig
 from padgs.sphere.camera import Panorama, Pinhole
 
 PANORAMA = Panorama(256, 128)

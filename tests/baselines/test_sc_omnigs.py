@@ -11,9 +11,9 @@ from padgs.calibration.align import Similarity, align
 from padgs.calibration.poses import PoseRates
 from padgs.data.synthetic import SyntheticOptions, SyntheticTruth, generate
 from padgs.gaussians import rotation_matrices
-from padgs.learning.method import Budget, RenderConfig
+from padgs.learning.loop import Budget, TrainOptions
 from padgs.learning.targets import Targets
-from padgs.learning.views import TrainOptions
+from padgs.render.config import RenderConfig
 from padgs.scene import Scene
 from padgs.scoring.metrics import psnr
 from padgs.splats.method import SplatOptions
@@ -27,7 +27,7 @@ def scene() -> Scene:
 
 
 def calibration_of(method: SCOmniGSMethod):
-    return method._trained().calibration
+    return method.trainee.calibration
 
 
 def test_the_first_step_is_that_of_omnigs_to_the_bit(scene):
@@ -118,7 +118,7 @@ def test_published_learning_rates_of_the_poses_and_ours_of_the_camera(scene):
     method, steps = SCOmniGSMethod(render=TORCH), 400
     next(method.fit(scene, Budget(steps)))
     poses, camera = calibration_of(method).poses, calibration_of(method).camera
-    groups = {group.name: group for group in method._trained().groups()}
+    groups = {group.name: group for group in method.trainee.groups()}
     ends = {  # rates at the start and at the end, and what has them
         "pose_quaternions": (1e-2, 1.6e-4, poses.quaternions),
         "pose_shifts": (1e-2, 6e-3, poses.shifts),
@@ -133,7 +133,7 @@ def test_published_learning_rates_of_the_poses_and_ours_of_the_camera(scene):
         assert rate(steps) == pytest.approx(last), name
         assert [id(p) for p in groups[name].parameters] == [id(p) for p in parameters], name
     held = [id(p) for group in groups.values() for p in group.parameters]
-    everything = [*calibration_of(method).parameters(), *method._trained().splats.parameters()]
+    everything = [*calibration_of(method).parameters(), *method.trainee.splats.parameters()]
     assert sorted(held) == sorted(id(p) for p in everything)
 
 

@@ -7,9 +7,10 @@ from tiny_scene import tiny_scene, truth
 from baselines.seam360gs import Seam360GSMethod, Seam360GSOptions
 from padgs.calibration.dual_lens import DualLens
 from padgs.data.synthetic import SyntheticOptions, SyntheticTruth, generate
-from padgs.learning.method import Budget, RenderConfig
-from padgs.learning.views import Drawing
+from padgs.learning.loop import Budget
+from padgs.learning.trainee import Drawing
 from padgs.render import RenderOptions, render
+from padgs.render.config import RenderConfig
 from padgs.scene import Scene, View
 from padgs.scoring.metrics import seam, ws_psnr
 from padgs.splats.method import SplatMethod, SplatOptions
@@ -23,7 +24,7 @@ def scene() -> Scene:
 
 
 def lenses_of(method: Seam360GSMethod):
-    return method._trained().calibration
+    return method.trainee.calibration
 
 
 def test_an_ideal_camera_starts_as_one(scene):
@@ -64,8 +65,8 @@ def test_lenses_are_found_and_the_test_camera_is_ideal(sign):
     records = method.fit(scene, Budget(60))
     next(records)
     with torch.no_grad():
-        method._trained().splats.log_scales.copy_(truth().scales.log())
-        method._trained().splats.opacity_logits.copy_(torch.logit(truth().opacities))
+        method.trainee.splats.log_scales.copy_(truth().scales.log())
+        method.trainee.splats.opacity_logits.copy_(torch.logit(truth().opacities))
     *_, last = records
     lenses = lenses_of(method)
     assert lenses.gap.item() == pytest.approx(gap, rel=0.3)  # measured: 13 %
@@ -80,7 +81,7 @@ def test_lenses_are_found_and_the_test_camera_is_ideal(sign):
 def test_learning_rates_of_the_lenses_fall_to_a_tenth(scene):
     method, steps = Seam360GSMethod(render=TORCH), 400
     next(method.fit(scene, Budget(steps)))
-    groups = {group.name: group for group in method._trained().groups()}
+    groups = {group.name: group for group in method.trainee.groups()}
     for name, parameter in (("lens_gap", lenses_of(method).gap), ("lens_coefficients", lenses_of(method).coefficients)):
         rate = groups[name].learning_rate
         assert rate(0) == pytest.approx(1e-3), name

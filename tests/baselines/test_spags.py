@@ -12,12 +12,13 @@ from tiny_scene import tiny_scene
 from baselines import METHODS
 from baselines.spags import SPaGSMethod, SPaGSOptions
 from padgs.gaussians import Gaussians, rotation_matrices
-from padgs.learning.method import Budget, RenderConfig
+from padgs.learning.loop import Budget
 from padgs.native import cpu
 from padgs.native.abi import Inputs, pointer
 from padgs.registry import lookup
 from padgs.render import RenderOptions
 from padgs.render.backends.native_camera import native_camera
+from padgs.render.config import RenderConfig
 from padgs.render.low_pass import low_pass_of, widened
 from padgs.render.tiles import Projected
 from padgs.scene import Scene

@@ -7,7 +7,7 @@ import torch
 from tiny_scene import tiny_scene
 
 from baselines import METHODS
-from padgs.learning.method import Budget
+from padgs.learning.loop import Budget
 from padgs.registry import lookup
 from padgs.scene import Scene, View
 from padgs.splats.method import SplatMethod
@@ -32,7 +32,7 @@ def trained(name: str, scene: Scene) -> tuple[torch.Tensor, torch.Tensor, list[f
     method = lookup(METHODS, name, "method")()
     losses = [float(record.loss) for record in method.fit(scene, Budget(STEPS))]
     image = method.render(scene.test[0]).image
-    return method._trained().splats.means.detach() - scene.points, image, losses
+    return method.trainee.splats.means.detach() - scene.points, image, losses
 
 
 @pytest.mark.parametrize("name", EXPLICIT)

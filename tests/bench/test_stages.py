@@ -5,8 +5,9 @@ from types import SimpleNamespace
 import pytest
 
 from padgs.bench import stages
-from padgs.bench.stages import STAGES, StageClock, amortised, native_calls_watched
+from padgs.bench.stages import STAGES, StageClock, amortised
 from padgs.native import cpu
+from padgs.native.watch import Watchable, watched
 
 
 @pytest.fixture
@@ -25,7 +26,7 @@ def tick(monkeypatch):
 def test_an_inner_stage_is_not_charged_to_the_outer_one(tick):
     clock = StageClock()
     tick(100)
-    with clock.stage("backward_rest"):
+    with clock.stage("backward"):
         tick(1)
         with clock.stage("blend_backward"):
             tick(10)
@@ -36,7 +37,7 @@ def test_an_inner_stage_is_not_charged_to_the_outer_one(tick):
     with clock.stage("optimiser"):
         tick(4)
     clock.finish_round()
-    assert clock.rounds == [{"backward_rest": (3, 6), "blend_backward": (30, 60), "optimiser": (4, 8)}]
+    assert clock.rounds == [{"backward": (3, 6), "blend_backward": (30, 60), "optimiser": (4, 8)}]
     assert clock.total()["wall"]["median"] == 37
 
 
@@ -61,16 +62,15 @@ def test_a_stage_that_fails_is_left(tick):
     assert clock.rounds == [{"loss": (1, 2), "decode": (2, 4)}]
 
 
-def test_native_calls_are_charged_to_their_stages(tick, monkeypatch):
-    library = SimpleNamespace(padgs_bin=lambda x: (tick(3), x)[1], padgs_isa=lambda: b"none")
-    monkeypatch.setattr(cpu, "library", lambda: library)
+def test_native_calls_are_charged_to_their_stages(tick):
+    library = Watchable(SimpleNamespace(padgs_bin=lambda x: (tick(3), x)[1], padgs_isa=lambda: b"none"))
     clock = StageClock()
-    with native_calls_watched(clock), clock.stage("render_rest"):
-        assert cpu.library().padgs_bin(7) == 7
-        assert cpu.library().padgs_isa() == b"none"
+    with watched(clock.native_call), clock.stage("draw"):
+        assert library.padgs_bin(7) == 7
+        assert library.padgs_isa() == b"none"
+    library.padgs_bin(7)  # nobody watches any more
     clock.finish_round()
-    assert clock.rounds == [{"render_rest": (0, 0), "sort": (3, 6)}]
-    assert cpu.library() is library
+    assert clock.rounds == [{"draw": (0, 0), "sort": (3, 6)}]
 
 
 def test_watched_calls_exist_and_belong_to_a_stage():

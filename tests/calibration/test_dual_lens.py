@@ -6,7 +6,7 @@ from tiny_scene import tiny_scene, truth
 
 from padgs.calibration.dual_lens import DualLens
 from padgs.gaussians import Gaussians
-from padgs.learning.views import Drawing
+from padgs.learning.trainee import Drawing
 from padgs.render import RenderOptions, render
 from padgs.scene import View
 from padgs.sphere.camera import Panorama, Pinhole, RayTable

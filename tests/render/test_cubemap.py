@@ -21,8 +21,8 @@ from render_cases import (
 )
 
 from padgs.gaussians import Gaussians
-from padgs.learning.method import RenderConfig
 from padgs.render import Rendering, RenderOptions, render
+from padgs.render.config import RenderConfig
 from padgs.render.cubemap import FACES, _corners, face_camera, panorama_from_faces
 from padgs.scene import View
 from padgs.sphere.camera import Panorama, Pinhole

@@ -7,8 +7,8 @@ import torch
 from hybrid_reference import one_pixel
 from torch import Tensor
 
-from padgs.learning.method import RenderConfig
 from padgs.render import RenderOptions
+from padgs.render.config import RenderConfig
 from padgs.render.hybrid import hybrid_weights
 
 

@@ -11,10 +11,10 @@ import torch
 from render_cases import INPUTS, identity_pose, leaves, mixture, needs_native, random_pose, row_error
 
 from padgs.gaussians import Gaussians
-from padgs.learning.method import RenderConfig
 from padgs.native import cpu
 from padgs.native.abi import NativeCamera
 from padgs.render import RenderOptions, render
+from padgs.render.config import RenderConfig
 from padgs.render.contract import ALPHA_MIN, LOW_PASS_KINDS, PUBLISHED_FOCAL
 from padgs.render.planar import PlanarFootprints
 from padgs.render.projection import PROJECTIONS, project

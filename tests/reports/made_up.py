@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -10,6 +11,10 @@ from PIL import Image
 from padgs import results
 from padgs.results import Result, Scores
 from reports import published
+from reports.frame import frame
+from reports.gathered import Gathered
+from reports.request import Request
+from reports.store import Run
 
 RULES = {"name": "paper", "lpips": "vgg", "lpips_inputs": "01", "bottom_crop": 0.0}
 
@@ -172,3 +177,8 @@ def picture(one: Result, run: Path, width: int = 128) -> None:
         render = np.roll(truth, 2, 1) * 0.95
         three = np.concatenate([truth, render, np.abs(truth - render)], 1)
         Image.fromarray((255 * three).astype("uint8")).save(run / "renders" / f"view{view}.png")
+
+
+def gathered(results_: list[Result], **asked: Any) -> Gathered:
+    """What a report is made from, of runs that left nothing but their results."""
+    return Gathered(frame(map(Run, results_)), Request(**asked))

@@ -6,7 +6,7 @@ import signal
 import pytest
 import torch
 
-from padgs.learning.method import State
+from padgs.learning.trainee import State
 from padgs.runs import checkpoint
 from padgs.runs.checkpoint import CheckpointError
 

@@ -1,10 +1,18 @@
+import io
+
 import pytest
 import torch
+from composed import composed
+from rich.console import Console
+from tiny_scene import tiny_scene
 
-from padgs.learning.method import RenderConfig
 from padgs.native import cuda
+from padgs.render.config import RenderConfig
+from padgs.runs import session
 from padgs.runs.config import RunOptions
 from padgs.runs.device import chosen
+from padgs.runs.session import Session
+from padgs.runs.typed import ConfigError
 
 GPU = torch.device("cuda", 0)
 
@@ -61,6 +69,29 @@ def test_without_the_library_auto_is_the_cpu(monkeypatch):
     assert chosen("auto", RenderConfig()).type == "cpu"
 
 
-def test_an_unknown_device_is_refused():
+def test_an_unknown_place_is_refused():
     with pytest.raises(ValueError, match="unknown run.device 'gpu'; known: auto, cpu, cuda"):
         RunOptions(device="gpu")
+    with pytest.raises(ValueError, match="unknown run.images_on 'gpu'; known: device, cpu"):
+        RunOptions(images_on="gpu")
+
+
+def test_panoramas_are_kept_where_the_run_trains_or_in_main_memory(monkeypatch, root):
+    monkeypatch.setenv("PADGS_ROOT", str(root))
+    monkeypatch.setattr(session, "chosen", lambda name, render: torch.device("meta"))
+    places = []
+
+    def load(path, format, options):
+        places.append(options.device)
+        return tiny_scene()
+
+    monkeypatch.setattr(session.data, "load", load)
+    for setting in ("run.images_on=device", "run.images_on=cpu"):
+        Session(composed(setting), Console(file=io.StringIO()))
+    assert places == ["meta", "cpu"]
+
+
+def test_the_second_key_for_the_device_names_the_first(monkeypatch, root):
+    monkeypatch.setenv("PADGS_ROOT", str(root))
+    with pytest.raises(ConfigError, match="data.device is no key any more: run.device .*run.images_on=cpu"):
+        composed("data.device=cpu")

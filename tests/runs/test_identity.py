@@ -23,7 +23,15 @@ def test_it_reads_like_what_it_is():
 
 @pytest.mark.parametrize(
     "same",
-    ["run.threads=1", "run.folder=elsewhere", "data.path=/mnt/x", "data.cache_bytes=1", "protocol=paper", "seed=0"],
+    [
+        "run.threads=1",
+        "run.folder=elsewhere",
+        "data.path=/mnt/x",
+        "data.cache_bytes=1",
+        "run.images_on=cpu",
+        "protocol=paper",
+        "seed=0",
+    ],
 )
 def test_paths_machine_and_scoring_are_no_part_of_it(same):
     assert name(same) == name()
@@ -52,6 +60,12 @@ def test_other_data_is_another_run():
 def test_spelling_of_numbers_does_not_matter():
     assert name("method.tau=1") == name("method.tau=1.0")
     assert name("train.iterations=2000") == name("train.iterations=2e3")
+
+
+def test_what_a_machine_decided_in_old_runs_is_no_part_of_it():
+    values = composed().values()
+    old = {**values, "data": {**values["data"], "device": "cuda:0"}}
+    assert run_id(old, "room", "f00d") == run_id(values, "room", "f00d")
 
 
 def test_the_hash_of_a_configuration_survives_its_file():

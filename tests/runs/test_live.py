@@ -2,7 +2,7 @@ import io
 
 from rich.console import Console
 
-from padgs.learning.method import Record
+from padgs.learning.loop import Record
 from padgs.runs import live
 from padgs.runs.live import LiveLine
 

@@ -14,13 +14,15 @@ from rich.console import Console
 from tiny_scene import HEIGHT, WIDTH, tiny_scene
 
 from padgs import results
-from padgs.learning.method import Failure
-from padgs.runs import checkpoint, session, training
+from padgs.anchors.method import PaDGSMethod
+from padgs.learning.failure import Failure
+from padgs.runs import checkpoint, session
 from padgs.runs.checkpoint import CheckpointError
 from padgs.runs.folder import RunFolder, RunFolderError
 from padgs.runs.interrupt import Interrupted
 from padgs.runs.labels import Labels
 from padgs.runs.lock import RunBusy
+from padgs.runs.session import Session
 
 ITERATIONS = 12
 
@@ -46,7 +48,7 @@ def config(tmp_path):
 
 def run(config) -> tuple[results.Result, str]:
     out = io.StringIO()
-    return session.run(config, Console(file=out, width=200)), out.getvalue()
+    return Session(config, Console(file=out, width=200)).run(), out.getvalue()
 
 
 def folder_of(config) -> RunFolder:
@@ -95,7 +97,7 @@ def test_the_log_has_losses_and_the_held_out_view(config):
 
 def test_a_finished_run_is_shown_and_not_repeated(config, monkeypatch):
     first, _ = run(config)
-    monkeypatch.setattr(session, "train", lambda *_: pytest.fail("trained again"))
+    monkeypatch.setattr(PaDGSMethod, "fit", lambda *_: pytest.fail("trained again"))
     again, said = run(config)
     assert again == first
     assert "finished before" in said and f"{first.scores['paper'].metrics['psnr']:.2f}" in said
@@ -103,7 +105,7 @@ def test_a_finished_run_is_shown_and_not_repeated(config, monkeypatch):
 
 def test_another_protocol_scores_the_finished_run_without_training(config, monkeypatch):
     first, _ = run(config)
-    monkeypatch.setattr(session, "train", lambda *_: pytest.fail("trained again"))
+    monkeypatch.setattr(PaDGSMethod, "fit", lambda *_: pytest.fail("trained again"))
     sphere = composed("protocol=sphere", "protocol.sphere.lpips=none").protocols
     both, _ = run(replace(config, protocols={**config.protocols, **sphere}))
     assert both.scores["paper"] == first.scores["paper"]
@@ -124,14 +126,14 @@ def test_without_its_checkpoint_a_finished_run_is_not_scored_anew(config):
 
 def stop_at(iteration: int, monkeypatch, how) -> None:
     """Do `how` right after an iteration was shown."""
-    update = training.LiveLine.update
+    update = session.LiveLine.update
 
     def stopping(self, record, psnr):
         update(self, record, psnr)
         if record.iteration == iteration:
             how()
 
-    monkeypatch.setattr(training.LiveLine, "update", stopping)
+    monkeypatch.setattr(session.LiveLine, "update", stopping)
 
 
 def test_ctrl_c_finishes_the_step_and_the_next_start_ends_bit_identically(config, monkeypatch, tmp_path):
@@ -177,7 +179,7 @@ def test_a_damaged_checkpoint_is_named_and_nothing_is_started(config, monkeypatc
             run(config)
     (tensors,) = folder_of(config).checkpoint.glob("*.safetensors")
     tensors.write_bytes(tensors.read_bytes()[:-1])
-    monkeypatch.setattr(session, "train", lambda *_: pytest.fail("trained"))
+    monkeypatch.setattr(PaDGSMethod, "fit", lambda *_: pytest.fail("trained"))
     with pytest.raises(CheckpointError, match=tensors.name):
         run(config)
     assert not (folder_of(config).path / "result.json").exists()
@@ -196,7 +198,7 @@ def test_a_failed_run_has_a_result_with_its_status(config, monkeypatch, error, s
     def fail(*_):
         raise error
 
-    monkeypatch.setattr(session, "train", fail)
+    monkeypatch.setattr(PaDGSMethod, "fit", fail)
     result, said = run(config)
     assert (result.status, result.reason, result.scores) == (status, str(error), {})
     assert status in said and str(error) in said
@@ -232,7 +234,7 @@ def test_a_run_that_another_process_works_on_is_left_alone(config):
 
 def test_a_finished_run_learns_which_other_experiments_want_it(config, monkeypatch):
     first, _ = run(replace(config, labels=Labels("padgs", ("table1",))))
-    monkeypatch.setattr(session, "train", lambda *_: pytest.fail("trained again"))
+    monkeypatch.setattr(PaDGSMethod, "fit", lambda *_: pytest.fail("trained again"))
     again, _ = run(replace(config, labels=Labels("padgs", ("table4",))))
     assert again.experiments == ("table1", "table4") and first.experiments == ("table1",)
     assert replace(again, experiments=first.experiments) == first
@@ -243,7 +245,7 @@ def test_an_error_of_ours_is_no_result(config, monkeypatch):
     def fail(*_):
         raise RuntimeError("a bug")
 
-    monkeypatch.setattr(session, "train", fail)
+    monkeypatch.setattr(PaDGSMethod, "fit", fail)
     with pytest.raises(RuntimeError, match="a bug"):
         run(config)
     assert not (folder_of(config).path / "result.json").exists()

@@ -5,10 +5,10 @@ import torch
 from tiny_scene import tiny_scene
 
 from padgs.gaussians import rotation_matrices
-from padgs.learning.method import RenderConfig
+from padgs.render.config import RenderConfig
 from padgs.splats.clone_split import SHRINK, CloneSplit, CloneSplitOptions
 from padgs.splats.model import Splats
-from padgs.splats.trainee import TrainableSplats
+from padgs.splats.trainee import SplatTrainee
 
 LARGE, SMALL = 0.5, 0.005  # scales above and below percent_dense x extent = 0.01
 EVERY = 10
@@ -76,7 +76,7 @@ def test_the_latitude_is_that_in_the_view():
     splats = Splats(torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[-1.0] * 3]), torch.ones(1, 3))
     above = torch.eye(4)
     above[:3, 3] = torch.tensor([0.0, 2.0, 0.0])  # the camera is 2 above the origin (y is down): it looks down by 45
-    trained = TrainableSplats(splats, CloneSplitOptions(polar_threshold=1e-3), RenderConfig(), extent=1.0, iterations=9)
+    trained = SplatTrainee(splats, CloneSplitOptions(polar_threshold=1e-3), RenderConfig(), extent=1.0, iterations=9)
     drawing = trained.draw(scene.train[0].at(above))
     drawing.rendering.image.sum().backward()
     trained.observe(drawing, 1)

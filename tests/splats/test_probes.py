@@ -8,14 +8,14 @@ import pytest
 import torch
 
 from padgs.gaussians import Gaussians, rotation_matrices
-from padgs.learning.method import RenderConfig
 from padgs.render import RenderOptions, render
+from padgs.render.config import RenderConfig
 from padgs.scene import View
 from padgs.sphere.panorama import direction
 from padgs.splats.clone_split import CloneSplitOptions
 from padgs.splats.model import Splats
 from padgs.splats.probes import render_probed
-from padgs.splats.trainee import TrainableSplats
+from padgs.splats.trainee import SplatTrainee
 
 RAY = RenderOptions(projection="ray")
 
@@ -123,7 +123,7 @@ def test_the_absolute_signal_is_half_the_distance_times_the_pulls_of_all_pixels(
 @pytest.mark.parametrize(("signal", "axes"), [("image", 2), ("space", 3), ("space_absolute", 4)])
 def test_the_densifier_is_given_the_signal_of_its_options(signal, axes, generator):
     splats, render_config = colored_splats(10, generator), RenderConfig(backend="torch", projection="ray")
-    trainee = TrainableSplats(splats, CloneSplitOptions(signal=signal), render_config, extent=1.0, iterations=100)
+    trainee = SplatTrainee(splats, CloneSplitOptions(signal=signal), render_config, extent=1.0, iterations=100)
     drawing = trainee.draw(view_at(generator))
     drawing.rendering.image.sum().backward()
     assert drawing.probe.grad is not None and drawing.probe.grad.shape == (10, axes)
@@ -139,7 +139,7 @@ def test_the_absolute_signal_wants_the_projection_that_has_it(generator):
     with pytest.raises(
         ValueError, match=r"space_absolute is made for render\.projection=ray, not erp; set .*signal=space"
     ):
-        TrainableSplats(
+        SplatTrainee(
             colored_splats(1, generator),
             CloneSplitOptions(signal="space_absolute"),
             RenderConfig(),

@@ -6,13 +6,14 @@ import pytest
 import torch
 from tiny_scene import tiny_scene
 
-from padgs.learning.method import Budget, RenderConfig
+from padgs.learning.loop import Budget
 from padgs.learning.schedule import PUBLISHED_ITERATIONS
+from padgs.render.config import RenderConfig
 from padgs.scene import Scene
 from padgs.splats.clone_split import CloneSplitOptions
 from padgs.splats.method import SplatMethod, SplatOptions
 from padgs.splats.model import Splats
-from padgs.splats.trainee import TrainableSplats, extent_of, stands_still
+from padgs.splats.trainee import SplatTrainee
 
 EXTENT = 7.0
 # group -> learning rates of 3DGS at the start and at the end; that of the means is for an extent of 1
@@ -27,9 +28,9 @@ RATES = {
 LENGTHS = {"means": EXTENT}  # what a rate is multiplied by
 
 
-def trainable(iterations: int = PUBLISHED_ITERATIONS, **options) -> TrainableSplats:
+def trainable(iterations: int = PUBLISHED_ITERATIONS, **options) -> SplatTrainee:
     splats = Splats.from_scene(tiny_scene(), generator=torch.Generator())
-    return TrainableSplats(splats, CloneSplitOptions(), RenderConfig(), extent=EXTENT, iterations=iterations, **options)
+    return SplatTrainee(splats, CloneSplitOptions(), RenderConfig(), extent=EXTENT, iterations=iterations, **options)
 
 
 def travelling(scene: Scene, times: float) -> Scene:
@@ -71,7 +72,7 @@ def test_published_learning_rates(factor, iterations):
 def test_adam_is_that_of_3dgs():
     method = SplatMethod(render=RenderConfig(backend="torch"))
     next(method.fit(tiny_scene(), Budget(10)))
-    for settings in method._trainer._optimizer.param_groups:
+    for settings in method._trainer._optimiser.adam.param_groups:
         assert (settings["betas"], settings["eps"], settings["weight_decay"]) == ((0.9, 0.999), 1e-15, 0)
 
 
@@ -94,13 +95,13 @@ def test_lengths_are_measured_with_the_extent_of_cameras_that_move(apart):
     centers = torch.stack([view.center for view in scene.train])
     extent = 1.1 * (centers - centers.mean(0)).norm(dim=-1).max().item()
     assert 0.15 < extent / scene.unit < 0.9
-    assert extent_of(scene) == pytest.approx(extent)
+    assert scene.extent == pytest.approx(extent)
 
 
 @pytest.mark.parametrize("apart", [0.0, 1e-8, 0.5])
 def test_lengths_are_measured_with_a_tenth_of_the_unit_where_cameras_hardly_move(apart):
     scene = travelling(tiny_scene(), apart)
-    assert extent_of(scene) == pytest.approx(0.1 * scene.unit)
+    assert scene.extent == pytest.approx(0.1 * scene.unit)
 
 
 def test_the_least_that_counts_as_a_move():
@@ -108,7 +109,7 @@ def test_the_least_that_counts_as_a_move():
     scene = tiny_scene()
     for times, still in ((0.3, True), (3.0, False)):
         moved = in_one_place(scene, times * 1e-6 * scene.unit / 2.2)  # the extent of steps 0 to 4 is 2.2 of them
-        assert stands_still(moved) == still
+        assert moved.stands_still == still
 
 
 @pytest.mark.parametrize(
@@ -117,6 +118,6 @@ def test_the_least_that_counts_as_a_move():
 def test_a_method_trains_means_at_the_rate_of_its_scene(scene):
     method = SplatMethod(SplatOptions(learning_rate_factor=2.0), RenderConfig(backend="torch"))
     next(method.fit(scene, Budget(10)))
-    means = next(group for group in method._trained().groups() if group.name == "means")
-    assert means.learning_rate(0) == pytest.approx(2 * 1.6e-4 * extent_of(scene))
-    assert method._trained().densifier.extent == extent_of(scene)
+    means = next(group for group in method.trainee.groups() if group.name == "means")
+    assert means.learning_rate(0) == pytest.approx(2 * 1.6e-4 * scene.extent)
+    assert method.trainee.densifier.extent == scene.extent

@@ -3,27 +3,27 @@ import io
 from dataclasses import replace
 
 import pytest
-from made_up import compared, small, swept
+from made_up import compared, gathered, small, swept
 
 from reports.charts import sweep_chart
-from reports.charts.sweeps import csv_text, sweeps
-from reports.request import Request
+from reports.charts.sweeps import sweeps
 from reports.tables.table import ReportError
+from reports.writers import csv_text
 
 
 def rows(sweep) -> list[dict[str, str]]:
-    return list(csv.DictReader(io.StringIO(csv_text(sweep))))
+    return list(csv.DictReader(io.StringIO(csv_text.of_frame(sweep.points))))
 
 
 def test_a_curve_for_each_scene_along_the_key_that_differs():
-    (sweep,) = sweeps([*swept("tau"), *compared()], Request(protocol="sphere"))
+    (sweep,) = sweeps(gathered([*swept("tau"), *compared()], protocol="sphere"))
     assert (sweep.name, sweep.key, sweep.file_name) == ("tau@cpu", "method.tau", "sweep_tau_cpu")
     assert [line.place.scene for line in sweep.lines] == ["synthetic-outdoor", "synthetic-room"]
     assert [x for x, _ in sweep.lines[0].points] == [0.0, 0.5, 0.9, 1.0]
 
 
 def test_points_are_means_over_seeds_with_their_spread():
-    (sweep,) = sweeps(swept("tau"), Request(protocol="sphere"))
+    (sweep,) = sweeps(gathered(swept("tau"), protocol="sphere"))
     at = {(r["scene"], r["x"], r["quantity"]): r for r in rows(sweep)}
     best = at["synthetic-room", "0.9", "WS-PSNR"]
     assert float(best["mean"]) == pytest.approx(25 + 0.1 - 0.4) and best["n"] == "3"
@@ -38,7 +38,7 @@ def test_two_keys_give_a_line_for_each_value_of_the_second():
         for features in (16, 32, 64)
         if (method := {"offsets": offsets, "features": features})
     ]
-    (sweep,) = sweeps(grid, Request())
+    (sweep,) = sweeps(gathered(grid))
     assert sweep.key == "method.features" or sweep.key == "method.offsets"
     assert {len(line.points) for line in sweep.lines} in ({2}, {3})
     assert all(line.fixed for line in sweep.lines)
@@ -49,45 +49,45 @@ def test_settings_without_numbers_have_names():
         small(25 + i, 1 + i, experiments=("projections",), config={"render": {"projection": name}})
         for i, name in enumerate(("tangent", "erp"))
     ]
-    (sweep,) = sweeps(projections, Request())
+    (sweep,) = sweeps(gathered(projections))
     assert sweep.key == "" and [x for x, _ in sweep.lines[0].points] == ["projection erp", "projection tangent"]
     assert "projection tangent" in sweep_chart.chart(sweep).svg
 
 
 def test_an_experiment_in_one_setting_is_no_sweep():
-    assert sweeps(compared(), Request()) == []
+    assert sweeps(gathered(compared())) == []
 
 
 def test_a_failed_point_says_so():
     runs = [replace(r, status="nan", scores={}) if r.config["method"]["tau"] == 1.0 else r for r in swept("tau")]
-    (sweep,) = sweeps(runs, Request(metrics=("ssim",)))
+    (sweep,) = sweeps(gathered(runs, metrics=("ssim",)))
     failed = [r for r in rows(sweep) if r["x"] == "1.0"]
     assert {(r["mean"], r["status"]) for r in failed} == {("", "nan")}
     assert ">NAN<" in sweep_chart.chart(sweep).svg
 
 
 def test_metrics_are_chosen_by_name_and_unknown_ones_list_the_known():
-    (sweep,) = sweeps(swept("tau"), Request(protocol="sphere", metrics=("ws_psnr", "frame_ms")))
+    (sweep,) = sweeps(gathered(swept("tau"), protocol="sphere", metrics=("ws_psnr", "frame_ms")))
     assert [measure.column.title for measure in sweep.measures] == ["WS-PSNR", "ms per frame"]
     with pytest.raises(ReportError, match="unknown metric 'psrn'; known under protocol paper: psnr, ssim, .*frame_ms"):
-        sweeps(swept("tau"), Request(metrics=("psrn",)))
+        sweeps(gathered(swept("tau"), metrics=("psrn",)))
 
 
 def test_the_experiment_chooses():
     runs = [*swept("tau"), *swept("lambda_l1")]
-    assert [sweep.name for sweep in sweeps(runs, Request())] == ["lambda_l1@cpu", "tau@cpu"]
-    assert [sweep.name for sweep in sweeps(runs, Request(experiment="tau@cpu"))] == ["tau@cpu"]
+    assert [sweep.name for sweep in sweeps(gathered(runs))] == ["lambda_l1@cpu", "tau@cpu"]
+    assert [sweep.name for sweep in sweeps(gathered(runs, experiment="tau@cpu"))] == ["tau@cpu"]
 
 
 def test_rules_are_not_mixed_along_a_curve():
     first, *others = swept("tau")
     other = replace(first, scores={"paper": replace(first.scores["paper"], protocol={"lpips": "alex"})})
     with pytest.raises(ReportError, match="tau@cpu, .*differ in protocol"):
-        sweeps([other, *others], Request())
+        sweeps(gathered([other, *others]))
 
 
 def test_the_picture_has_words_that_can_be_read_and_markers_that_say_their_numbers():
-    (sweep,) = sweeps(swept("tau"), Request(protocol="sphere"))
+    (sweep,) = sweeps(gathered(swept("tau"), protocol="sphere"))
     chart = sweep_chart.chart(sweep)
     assert ">method.tau<" in chart.svg and "WS-PSNR" in chart.svg and chart.png.startswith(b"\x89PNG")
     assert "<title>synthetic-room, PaD-GS\n0.9: 24.70 ± 0.10 (n=3)</title>" in chart.svg
@@ -95,11 +95,11 @@ def test_the_picture_has_words_that_can_be_read_and_markers_that_say_their_numbe
 
 def test_lengths_of_the_chart_are_a_sweep_only_if_asked_for():
     lengths = [small(25.0, 1.0 + n, experiments=("pareto",), config={"train": {"iterations": n}}) for n in (1, 2)]
-    assert sweeps(lengths, Request()) == []
-    assert [sweep.key for sweep in sweeps(lengths, Request(experiment="pareto"))] == ["train.iterations"]
+    assert sweeps(gathered(lengths)) == []
+    assert [sweep.key for sweep in sweeps(gathered(lengths, experiment="pareto"))] == ["train.iterations"]
 
 
 def test_runs_on_other_data_are_no_other_seed_of_a_point():
     first, *others = swept("tau")
     with pytest.raises(ReportError, match="tau@cpu, .*tau 0.0: results differ in data"):
-        sweeps([first, replace(first, fingerprint="other", run="other"), *others], Request())
+        sweeps(gathered([first, replace(first, fingerprint="other", run="other"), *others]))

@@ -3,28 +3,28 @@ import io
 from dataclasses import replace
 
 import pytest
-from made_up import METHODS, compared, data_set, small, write
+from made_up import METHODS, compared, data_set, gathered, small, write
 
+from reports import store
 from reports.charts import trade_off_chart
 from reports.charts.drawing import color_of, marker_of
-from reports.charts.trade_off import csv_text, pareto, trade_offs
+from reports.charts.trade_off import pareto, trade_offs
+from reports.frame import frame
+from reports.gathered import Gathered
 from reports.methods import TITLES, ordered
-from reports.quality_log import probes
-from reports.request import Request
 from reports.tables.table import ReportError
+from reports.writers import csv_text
 
 
 def numbers(chart) -> dict[tuple[str, str], float]:
-    lines = csv.DictReader(io.StringIO(csv_text(chart)))
+    lines = csv.DictReader(io.StringIO(csv_text.of_frame(chart.numbers)))
     return {(line["setting"], line["quantity"]): float(line["mean"]) for line in lines}
 
 
 def test_a_point_for_each_method_and_setting():
     config = {"train": {"iterations": 3000}, "method": {"tau": 0.9}}
     longer = [small(28.0, 3.0, experiments=("pareto@cpu",), iterations=3000, config=config)]
-    room = next(
-        chart for chart in trade_offs([*compared(), *longer], Request()) if chart.name == "chart_synthetic-room"
-    )
+    room = next(chart for chart in trade_offs(gathered([*compared(), *longer])) if chart.name == "chart_synthetic-room")
     found = numbers(room)
     assert found["ODGS", "WS-PSNR"] == pytest.approx(22 + 1.6 + 0.05 - 0.4)
     assert found["ODGS", "ms per frame"] == pytest.approx(40 * 1.1)
@@ -35,7 +35,7 @@ def test_a_point_for_each_method_and_setting():
 
 
 def test_who_failed_has_no_point():
-    outdoor = next(chart for chart in trade_offs(compared(), Request()) if "outdoor" in chart.name)
+    outdoor = next(chart for chart in trade_offs(gathered(compared())) if "outdoor" in chart.name)
     assert {point.preset for point in outdoor.points} == set(METHODS) - {"op43dgs"}
 
 
@@ -44,7 +44,7 @@ def test_a_data_set_is_averaged_over_the_scenes_that_all_finished():
         replace(r, status="oom", scores={}) if (r.scene, r.method) == ("bar", "padgs") else r
         for r in data_set("roam360")
     ]
-    (chart,) = trade_offs(runs, Request())
+    (chart,) = trade_offs(gathered(runs))
     assert "mean over its scenes base, cafe" in chart.title and chart.beside == "roam360"
     assert numbers(chart)["OmniGS", "PSNR"] == pytest.approx(20 + 5.5)  # scenes 1..10
 
@@ -52,7 +52,7 @@ def test_a_data_set_is_averaged_over_the_scenes_that_all_finished():
 def test_times_of_two_machines_do_not_share_a_chart():
     first, *others = compared()
     with pytest.raises(ReportError, match="differ in machine"):
-        trade_offs([replace(first, machine={"gpu": "H200"}), *others], Request())
+        trade_offs(gathered([replace(first, machine={"gpu": "H200"}), *others]))
 
 
 def test_no_point_of_the_front_is_beaten():
@@ -62,7 +62,7 @@ def test_no_point_of_the_front_is_beaten():
 
 
 def test_published_numbers_stand_on_axes_of_their_own():
-    room = next(chart for chart in trade_offs(compared(), Request()) if "room" in chart.name)
+    room = next(chart for chart in trade_offs(gathered(compared())) if "room" in chart.name)
     svg = trade_off_chart.chart(room).svg
     assert "PSNR ↑ (published)" in svg and "WS-PSNR ↑" in svg
     assert "<title>PaD-GS, published\nPSNR ↑: 26.02\nms per frame ↓: 33.5</title>" in svg
@@ -70,34 +70,37 @@ def test_published_numbers_stand_on_axes_of_their_own():
 
 def test_quality_over_training_time_comes_from_the_logs(tmp_path):
     runs = compared(seeds=1)
-    logs = probes(write(runs, tmp_path), runs)
-    room = next(chart for chart in trade_offs(runs, Request()) if "room" in chart.name)
-    svg = trade_off_chart.time_chart(room, logs).svg
+    logged = Gathered(frame(store.read(write(runs, tmp_path))[0]))
+    room = next(chart for chart in trade_offs(logged) if "room" in chart.name)
+    svg = trade_off_chart.time_chart(room).svg
     assert "<title>PaD-GS, synthetic-room, seed 0\n25.47 dB after 200 s</title>" in svg  # 26 - 8 / 15 at the last probe
-    assert trade_off_chart.time_chart(room, {}) is None
+    assert [chart.name for chart in trade_off_chart.charts(gathered(runs))] == [
+        "chart_synthetic-outdoor",
+        "chart_synthetic-room",
+    ], "no quality over time without a log"
 
 
 def test_a_method_that_never_finishes_does_not_empty_the_chart():
     runs = [replace(r, status="oom", scores={}) if r.method == "padgs" else r for r in data_set("roam360")]
-    (chart,) = trade_offs(runs, Request())
+    (chart,) = trade_offs(gathered(runs))
     assert "scenes bar, base" in chart.title and [point.preset for point in chart.points] == ["omnigs"]
 
 
 def test_lengths_are_not_mixed_in_a_mean_over_scenes():
     runs = [replace(r, iterations=7000) if r.scene == "bar" else r for r in data_set("roam360")]
     with pytest.raises(ReportError, match="roam360, OmniGS: results differ in iterations"):
-        trade_offs(runs, Request())
+        trade_offs(gathered(runs))
 
 
 def test_rules_of_the_protocol_that_is_shown_are_not_mixed():
     first, *others = compared()
     sphere = replace(first.scores["sphere"], protocol=first.scores["sphere"].protocol | {"bottom_crop": 0.1})
     with pytest.raises(ReportError, match="differ in protocol"):
-        trade_offs([replace(first, scores=first.scores | {"sphere": sphere}), *others], Request())
+        trade_offs(gathered([replace(first, scores=first.scores | {"sphere": sphere}), *others]))
 
 
 def test_scenes_of_two_data_sets_may_have_one_name():
-    charts = trade_offs([small(25.0, scene="room"), small(26.0, scene="room", dataset="")], Request())
+    charts = trade_offs(gathered([small(25.0, scene="room"), small(26.0, scene="room", dataset="")]))
     assert [chart.name for chart in charts] == ["chart_room", "chart_room_synthetic"]
 
 

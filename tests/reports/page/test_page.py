@@ -4,27 +4,25 @@ from dataclasses import replace
 
 import pytest
 from chromium import PROGRAM, Browser
-from made_up import compared, data_set, failed, small, swept, write
+from made_up import compared, data_set, failed, gathered, small, swept, write
 
+from reports import store
+from reports.frame import frame
 from reports.gathered import Gathered
 from reports.page import page, pictures
 from reports.request import Request
 
 
-def gathered(folder, results, **others) -> Gathered:
-    return Gathered(folder, results, Request(), **others)
-
-
 @pytest.fixture(scope="module")
-def folder_and_results(tmp_path_factory):
+def runs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("page") / "runs"
     results = [*compared(["synthetic-room"], seeds=1), *swept(scenes=["synthetic-room"], seeds=2)]
-    return write(results, folder, pictures=True), results
+    return frame(store.read(write(results, folder, pictures=True))[0])
 
 
 @pytest.fixture(scope="module")
-def html(folder_and_results) -> str:
-    return page.text(gathered(*folder_and_results, left_out=("runs/x/result.json was edited",)))
+def html(runs) -> str:
+    return page.html(Gathered(runs, Request(), ("runs/x/result.json was edited",)))
 
 
 def test_it_needs_nothing_from_outside(html):
@@ -40,44 +38,40 @@ def test_it_has_the_tables_the_charts_and_what_was_left_out(html):
     assert html.count('<figure class="chart"') == 3 and html.count('class="tip"><title>') > 50
 
 
-def test_what_names_contain_is_text_and_not_markup(tmp_path):
+def test_what_names_contain_is_text_and_not_markup():
     evil = small(25.0, scene="</script><b-x>$a_b", method="<i-x>")
-    html = page.text(gathered(tmp_path, [evil]))
+    html = page.html(gathered([evil]))
     assert "<b-x>" not in html and "<i-x>" not in html and "&lt;b-x&gt;$a_b" in html
 
 
-def test_a_folder_without_pictures_gives_a_page_without_them(tmp_path):
-    html = page.text(gathered(tmp_path, [failed("", "oom")]))
+def test_runs_without_pictures_give_a_page_without_them():
+    html = page.html(gathered([failed("", "oom")]))
     assert 'id="slider"' not in html and "OOM" in html
 
 
-def test_a_refused_table_is_named_and_the_others_are_there(tmp_path):
+def test_a_refused_table_is_named_and_the_others_are_there():
     first, *others = data_set("roam360")
-    html = page.text(gathered(tmp_path, [replace(first, machine={"gpu": "H200"}), *others]))
+    html = page.html(gathered([replace(first, machine={"gpu": "H200"}), *others]))
     assert "differ in machine" in html and 'id="table1"' in html and 'id="table4"' not in html
 
 
-def test_pictures_are_bounded(folder_and_results, monkeypatch, tmp_path):
-    folder, results = folder_and_results
-    made = pictures.album(folder, results, Request())
+def test_pictures_are_bounded(runs, monkeypatch):
+    made = pictures.album(Gathered(runs))
     (scene,) = made.scenes
     assert [view["title"] for view in scene["views"]] == ["view0", "view1"]
     assert [method["title"] for method in scene["views"][0]["methods"]][-1] == "PaD-GS (26.00 dB)"
     assert len(made.images) == 2 * (1 + 2 * 6) and max(map(len, made.images)) < 10_000
     monkeypatch.setattr(pictures, "MOST_FILES", 6)
-    assert [len(scene["views"]) for scene in pictures.album(folder, results, Request()).scenes] == [1]
+    assert [len(scene["views"]) for scene in pictures.album(Gathered(runs)).scenes] == [1]
     monkeypatch.setattr(pictures, "MOST_FILES", 5)
-    assert pictures.album(folder, results, Request()).left_out == [
-        "synthetic-room (built in, generated; no scene of the paper)"
-    ]
+    assert pictures.album(Gathered(runs)).left_out == ["synthetic-room (built in, generated; no scene of the paper)"]
 
 
 def test_a_picture_that_was_cut_is_left_out(tmp_path):
-    runs = compared(["synthetic-room"], seeds=1)[:2]
-    folder = write(runs, tmp_path, pictures=True)
-    broken = folder / runs[0].run / "renders" / "view0.png"
+    runs = frame(store.read(write(compared(["synthetic-room"], seeds=1)[:2], tmp_path, pictures=True))[0])
+    broken = runs["pictures"][0] / "view0.png"
     broken.write_bytes(broken.read_bytes()[:300])
-    first, second = pictures.album(folder, runs, Request()).scenes[0]["views"]
+    first, second = pictures.album(Gathered(runs)).scenes[0]["views"]
     assert (len(first["methods"]), len(second["methods"])) == (1, 2)
 
 

@@ -3,9 +3,8 @@
 from dataclasses import replace
 
 import pytest
-from made_up import compared, failed, small
+from made_up import compared, failed, gathered, small
 
-from reports.request import Request
 from reports.tables.equal_time import EXPERIMENT, common_seconds, is_near, nearest_to
 from reports.tables.side_by_side import equal_time, methods
 from reports.tables.table import ReportError, Table
@@ -28,7 +27,7 @@ def trained(method: str, seconds: float, iterations: int, psnr: float = 25.0, **
 
 
 def test_every_method_with_all_that_is_measured():
-    table = methods(compared(seeds=2), Request())
+    table = methods(gathered(compared(seeds=2)))
     assert [block.title.split()[0] for block in table.blocks] == ["synthetic-outdoor", "synthetic-room"]
     assert {"PSNR", "SSIM", "WS-PSNR", "WS-PSNR pole", "seam", "training s", "ms per frame", "MB"} <= {*columns(table)}
     assert value(table, "synthetic-room", "OmniGS", "PSNR") == pytest.approx(22 + 0.8 * 3 + 0.05), "mean of two seeds"
@@ -38,7 +37,7 @@ def test_every_method_with_all_that_is_measured():
 
 def test_runs_of_different_lengths_do_not_stand_together():
     with pytest.raises(ReportError, match="differ in iterations"):
-        methods([small(25), small(26, method="omnigs", iterations=3000)], Request())
+        methods(gathered([small(25), small(26, method="omnigs", iterations=3000)]))
 
 
 def test_of_each_method_the_run_nearest_to_the_common_time_counts():
@@ -48,7 +47,7 @@ def test_of_each_method_the_run_nearest_to_the_common_time_counts():
         small(30, cost, method=method, experiments=("all_methods",))
         for cost, method in ((1.05, "odgs"), (9, "op43dgs"))
     ]
-    table = equal_time([*on_the_way, *there, *others], Request())
+    table = equal_time(gathered([*on_the_way, *there, *others]))
     rows = [row.title for row in table.blocks[0].rows]
     assert rows == ["ODGS", "OmniGS", "SPaGS", "PaD-GS"], "of another experiment what happened to take as long"
     for method, *expected in (("PaD-GS", 103, 1300, 26), ("OmniGS", 98, 1600, 27), ("SPaGS", 108, 170, 21)):
@@ -59,33 +58,34 @@ def test_of_each_method_the_run_nearest_to_the_common_time_counts():
 def test_times_of_different_machines_do_not_stand_together():
     runs = [trained("padgs", 100, 900), trained("omnigs", 100, 900, machine={"cores": 64, "cpu": "B", "torch": "2"})]
     with pytest.raises(ReportError, match="differ in machine"):
-        equal_time(runs, Request())
-    assert equal_time(runs, Request(mix=True)).blocks
+        equal_time(gathered(runs))
+    assert equal_time(gathered(runs, mix=True)).blocks
 
 
 def test_seeds_may_differ_in_length_but_in_nothing_else():
     runs = [trained("padgs", 100, 900, 25), trained("padgs", 102, 950, 27, seed=1)]
-    assert value(equal_time(runs, Request()), "synthetic-room", "PaD-GS", "PSNR") == pytest.approx(26)
+    assert value(equal_time(gathered(runs)), "synthetic-room", "PaD-GS", "PSNR") == pytest.approx(26)
     other = replace(runs[1], config={**runs[1].config, "method": {"sh_degree": 0}})
     for seed in (0, 1):
         with pytest.raises(ReportError, match="differ in method.sh_degree"):
-            equal_time([runs[0], replace(other, seed=seed)], Request())
+            equal_time(gathered([runs[0], replace(other, seed=seed)]))
 
 
 def test_what_is_not_near_the_common_time_is_named():
     runs = [trained("padgs", 100, 900), trained("omnigs", 105, 900), trained("cubemap_3dgs", 300, 900)]
-    assert "not within 10% of 100 s: 3DGS on cube faces." in equal_time(runs, Request()).notes[0]
-    assert "not within" not in equal_time(runs[:2], Request()).notes[0]
+    assert "not within 10% of 100 s: 3DGS on cube faces." in equal_time(gathered(runs)).notes[0]
+    assert "not within" not in equal_time(gathered(runs[:2])).notes[0]
 
 
 def test_a_method_that_failed_shows_its_status():
     late = replace(trained("odgs", 250, 900), status="timeout", scores={})
-    table = equal_time([trained("padgs", 100, 900), late], Request())
+    table = equal_time(gathered([trained("padgs", 100, 900), late]))
     assert next(r for r in table.blocks[0].rows if r.title == "ODGS").cells[0].status == "timeout"
 
 
 def test_the_common_time_is_that_of_the_most_runs():
     runs = [trained("padgs", seconds, 10 + seconds) for seconds in (20, 35, 61, 60, 57, 90)]
-    assert 57 <= round(common_seconds(runs)) <= 61 and common_seconds([]) == 0
-    assert is_near(runs[2], 60) and not is_near(runs[5], 60) and not is_near(failed("", "oom"), 60)
-    assert [r.timing["train_seconds"] for r in nearest_to(59.5, runs)] == [60.0]
+    of = gathered([*runs, failed("", "oom")]).runs
+    assert 57 <= round(common_seconds(of)) <= 61 and common_seconds(gathered([]).runs) == 0
+    assert is_near(of["train_seconds"], 60).tolist() == [False, False, True, True, True, False, False]
+    assert nearest_to(59.5, of)["train_seconds"].tolist() == [60.0]

@@ -3,10 +3,9 @@ import io
 from dataclasses import replace
 
 import pytest
-from made_up import data_set, failed, result
+from made_up import data_set, failed, gathered, result
 
-from reports.request import Request
-from reports.tables import runs
+from reports.tables.runs import runs
 from reports.tables.table import MISSING, ReportError, Table
 from reports.tables.tables_of_methods import table1, table2, table4
 from reports.writers import csv_text, markdown
@@ -36,7 +35,7 @@ def block(text: str, title: str) -> list[list[str]]:
 
 
 def test_published_numbers_stand_beside_ours_with_the_difference():
-    text = markdown.text(table1([result("", psnr=23.5, ssim=0.81, lpips=0.229)], Request()))
+    text = markdown.text(table1(gathered([result("", psnr=23.5, ssim=0.81, lpips=0.229)])))
     padgs = block(text, "360Roam, bar")[-1]
     assert padgs[:4] == ["PaD-GS", "0.810", "**0.808**", "+0.002"] and padgs[4:7] == ["23.50", "**23.40**", "+0.10"]
     omnigs = next(row for row in block(text, "360Roam, bar") if row[0] == "OmniGS")
@@ -45,13 +44,13 @@ def test_published_numbers_stand_beside_ours_with_the_difference():
 
 def test_a_failure_of_ours_and_of_the_paper_says_so():
     bricks = failed("", "oom", dataset="ricoh360", scene="bricks")
-    rows = {row[0]: row for row in block(markdown.text(table2([bricks], Request())), "Ricoh360, bricks")}
+    rows = {row[0]: row for row in block(markdown.text(table2(gathered([bricks]))), "Ricoh360, bricks")}
     assert rows["PaD-GS"][1] == "OOM" and rows["OP43DGS"][2] == "OOM"
 
 
 def test_the_average_of_all_scenes_is_theirs():
     title = "360Roam, average over its 11 scenes"
-    average = cells(table1(data_set("roam360", seeds=2), Request()))
+    average = cells(table1(gathered(data_set("roam360", seeds=2))))
     ours = average[title, "OmniGS", "PSNR", "PSNR"]
     assert float(ours["value"]) == pytest.approx(20 + 5 + 0.05) and ours["n"] == "2"  # scenes 0..10, seeds 0, 1
     assert float(ours["std"]) == pytest.approx(0.1 / 2**0.5)
@@ -61,15 +60,15 @@ def test_the_average_of_all_scenes_is_theirs():
 
 def test_the_average_of_an_incomplete_column_is_missing():
     all_but_one = [r for r in data_set("roam360") if (r.scene, r.method) != ("lab", "omnigs")]
-    table = table1(all_but_one, Request())
+    table = table1(gathered(all_but_one))
     rows = {row[0]: row for row in block(markdown.text(table), "360Roam, average")}
     assert rows["OmniGS"][4] == MISSING and rows["PaD-GS"][4] == "25.50"
     broken = [r if r.scene != "lab" else replace(r, status="oom", scores={}) for r in data_set("roam360")]
-    found = cells(table1(broken, Request()))
+    found = cells(table1(gathered(broken)))
     assert {found["360Roam, average over its 11 scenes", m, "PSNR", "PSNR"]["value"] for m in ("OmniGS", "PaD-GS")} == {
         ""
     }
-    op43dgs = next(r for r in block(markdown.text(table2([], Request())), "Ricoh360, average") if r[0] == "OP43DGS")
+    op43dgs = next(r for r in block(markdown.text(table2(gathered([]))), "Ricoh360, average") if r[0] == "OP43DGS")
     assert set(op43dgs[1:]) == {MISSING}
 
 
@@ -77,7 +76,7 @@ def test_stand_ins_have_blocks_of_their_own_and_say_what_they_are():
     room = result("", dataset="synthetic", scene="synthetic-room")
     outdoor = replace(room, scene="synthetic-outdoor")
     capture = replace(room, dataset="", scene="flat")
-    indoor, outdoors = (markdown.text(build([room, outdoor, capture], Request())) for build in (table1, table2))
+    indoor, outdoors = (markdown.text(build(gathered([room, outdoor, capture]))) for build in (table1, table2))
     assert "### synthetic-room (built in, generated; no scene of the paper)" in indoor
     assert "### flat (a capture that is no scene of the paper)" in indoor
     assert "synthetic-outdoor" in outdoors and "flat" not in outdoors and "synthetic-outdoor" not in indoor
@@ -86,7 +85,7 @@ def test_stand_ins_have_blocks_of_their_own_and_say_what_they_are():
 
 def test_presets_of_a_method_are_rows_of_their_own():
     runs = [result("", method="odgs", preset=preset) for preset in ("odgs", "odgs_release", "odgs_fast")]
-    rows = {row[0]: row for row in block(markdown.text(table1(runs, Request())), "360Roam, bar")}
+    rows = {row[0]: row for row in block(markdown.text(table1(gathered(runs))), "360Roam, bar")}
     assert rows["ODGS"][5].strip("*") == rows["ODGS, release"][5].strip("*") == "20.17"
     assert rows["ODGS, fast"][5] == MISSING
 
@@ -96,27 +95,27 @@ def test_only_runs_of_the_tables_own_experiments_compete_where_there_are_any():
     trial = result("", psnr=9.0, experiments=("smoke",), iterations=7)
     other_tau = result("", psnr=8.0, experiments=("tau@cpu",), config={"method": {"tau": 0.5}})
     for build in (table1, table4):
-        build([own, trial, other_tau], Request())
-    assert block(markdown.text(table1([own, trial, other_tau], Request())), "360Roam, bar")[-1][4] == "23.50"
+        build(gathered([own, trial, other_tau]))
+    assert block(markdown.text(table1(gathered([own, trial, other_tau]))), "360Roam, bar")[-1][4] == "23.50"
     with pytest.raises(ReportError, match="differ in iterations"):
-        table1([replace(r, experiments=()) for r in (own, trial)], Request())
-    assert block(markdown.text(table1([own, trial], Request(experiment="smoke"))), "360Roam, bar")[-1][4] == "9.00"
+        table1(gathered([replace(r, experiments=()) for r in (own, trial)]))
+    assert block(markdown.text(table1(gathered([own, trial], experiment="smoke"))), "360Roam, bar")[-1][4] == "9.00"
 
 
 def test_scenes_without_an_experiment_of_the_table_show_what_was_run_freely():
     own = result("", experiments=("table1_360roam",))
     room = [result("", dataset="", scene="room"), result("", dataset="", scene="room", psnr=9.0, experiments=("tau",))]
-    text = markdown.text(table1([own, *room], Request()))
+    text = markdown.text(table1(gathered([own, *room])))
     assert block(text, "room (a capture")[0][2] == "23.50"
 
 
 def test_rows_of_an_ablation_are_not_methods():
-    assert "23.50" not in markdown.text(table1([result("full")], Request()))
+    assert "23.50" not in markdown.text(table1(gathered([result("full")])))
 
 
 def test_efficiency_beside_the_published_hours_and_frames():
     title = "Ricoh360, average over its 12 scenes"
-    found = cells(table4(data_set("ricoh360"), Request()))
+    found = cells(table4(gathered(data_set("ricoh360"))))
     values = {(group, column): float(found[title, "PaD-GS", group, column]["value"]) for group, column in COSTS}
     assert values == COSTS
 
@@ -124,40 +123,40 @@ def test_efficiency_beside_the_published_hours_and_frames():
 def test_memory_of_a_gpu_has_a_column_where_a_run_was_on_one():
     title = "Ricoh360, average over its 12 scenes"
     on_gpu = [replace(r, peak_device_memory_bytes=7_250_000_000) for r in data_set("ricoh360")]
-    for build in (table4, runs.build):
-        assert "peak GPU GB" not in markdown.text(build(data_set("ricoh360"), Request()))
-        assert "peak GPU GB" in markdown.text(build(on_gpu, Request())) and "7.25" in markdown.text(
-            build(on_gpu, Request())
+    for build in (table4, runs):
+        assert "peak GPU GB" not in markdown.text(build(gathered(data_set("ricoh360"))))
+        assert "peak GPU GB" in markdown.text(build(gathered(on_gpu))) and "7.25" in markdown.text(
+            build(gathered(on_gpu))
         )
-    found = block(markdown.text(table4(on_gpu, Request())), title)
+    found = block(markdown.text(table4(gathered(on_gpu))), title)
     assert [cell.strip("*") for cell in found[-1][-2:]] == ["2.50", "7.25"]
-    assert "Memory of the GPU: peak of the tensors there" in markdown.text(table4(on_gpu, Request()))
+    assert "Memory of the GPU: peak of the tensors there" in markdown.text(table4(gathered(on_gpu)))
 
 
 def test_times_of_two_machines_are_not_compared_unless_told():
     here = data_set("roam360", methods=("padgs",))
     there = [replace(r, method="omnigs", preset="omnigs", machine={**r.machine, "cores": 64}) for r in here]
-    table1([*here, *there], Request())
+    table1(gathered([*here, *there]))
     with pytest.raises(ReportError, match="differ in machine .*64 cores.*--mix"):
-        table4([*here, *there], Request())
-    table4([*here, *there], Request(mix=True))
+        table4(gathered([*here, *there]))
+    table4(gathered([*here, *there], mix=True))
 
 
 def test_scenes_of_a_data_set_scored_by_other_rules_are_not_averaged():
     runs = data_set("roam360")
     runs[3:] = [replace(r, width=512, height=256) for r in runs[3:]]
     with pytest.raises(ReportError, match="differ in resolution"):
-        table1(runs, Request())
+        table1(gathered(runs))
 
 
 def test_footnotes_say_who_is_published_with_more_iterations():
     note = "EgoNeRF is published with 100000 iterations"
-    assert note in markdown.text(table1([result("", method="egonerf", preset="egonerf_small")], Request()))
-    assert note not in markdown.text(table1([result("", method="egonerf", iterations=100_000)], Request()))
-    assert note not in markdown.text(table1([result("")], Request()))
+    assert note in markdown.text(table1(gathered([result("", method="egonerf", preset="egonerf_small")])))
+    assert note not in markdown.text(table1(gathered([result("", method="egonerf", iterations=100_000)])))
+    assert note not in markdown.text(table1(gathered([result("")])))
 
 
 def test_footnotes_say_how_and_where():
-    text = markdown.text(table4(data_set("roam360"), Request()))
+    text = markdown.text(table4(gathered(data_set("roam360"))))
     for words in ("paper, LPIPS-vgg fed", "2048x1024", "30000 iterations", "0.1.0 abc", "2 cores of A & B", "RTX 3090"):
         assert words in text

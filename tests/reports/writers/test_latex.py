@@ -2,11 +2,10 @@ import shutil
 import subprocess
 
 import pytest
-from made_up import data_set, failed, result
+from made_up import data_set, failed, gathered, result
 
-from reports.request import Request
-from reports.tables import table3
 from reports.tables.tables_of_methods import table1, table2, table4
+from reports.tables.variants import table3
 from reports.writers import latex
 
 ABLATION = [result("full"), failed("baseline", "oom")]
@@ -14,7 +13,7 @@ ABLATION = [result("full"), failed("baseline", "oom")]
 
 @pytest.fixture
 def text() -> str:
-    return latex.text(table3.build(ABLATION, Request()))
+    return latex.text(table3(gathered(ABLATION)))
 
 
 def test_every_line_of_the_tabular_has_all_columns(text):
@@ -34,7 +33,7 @@ def test_numbers_and_emphasis(text):
 
 
 def test_a_long_table_may_break_over_pages():
-    text = latex.text(table1(data_set("roam360"), Request()))
+    text = latex.text(table1(gathered(data_set("roam360"))))
     assert r"\begin{longtable}{lrrrrrrrrr}" in text and r"\endhead" in text and r"\begin{table}" not in text
 
 
@@ -42,8 +41,8 @@ def test_a_long_table_may_break_over_pages():
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="no pdflatex here")
 def test_they_compile(tmp_path):
     results = [*data_set("roam360"), *data_set("ricoh360", seeds=2)]
-    tables = [build(results, Request()) for build in (table1, table2, table4)]
-    body = "\n".join(latex.text(table) for table in (*tables, table3.build(ABLATION, Request())))
+    tables = [build(gathered(results)) for build in (table1, table2, table4)]
+    body = "\n".join(latex.text(table) for table in (*tables, table3(gathered(ABLATION))))
     packages = r"\usepackage{booktabs, graphicx, longtable}"
     document = rf"\documentclass{{article}}{packages}\begin{{document}}{body}\end{{document}}"
     (tmp_path / "tables.tex").write_text(document)

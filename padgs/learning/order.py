@@ -1,0 +1,65 @@
+"""Which training view comes when: in random order, without replacement until all had their turn."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import torch
+
+from padgs.learning.trainee import State
+from padgs.scene import Scene
+
+
+class Order(Protocol):
+    """What decides which data the next iterations see."""
+
+    def state(self) -> State:
+        """All of it; not copies."""
+        ...
+
+    def load(self, state: State) -> None:
+        """Take that back out of a whole state; raises ValueError if it is of other data."""
+        ...
+
+
+class ViewOrder:
+    """Numbers of the training views of a scene, one after the other."""
+
+    def __init__(self, scene: Scene, seed: int) -> None:
+        self._scene = scene
+        self._shuffler = torch.Generator().manual_seed(seed)
+        self._order = torch.randperm(len(scene.train), generator=self._shuffler)  # of this epoch
+        self._position = 0  # in it
+
+    def next(self) -> int:
+        """The next view."""
+        if self._position == len(self._order):
+            self._order = torch.randperm(len(self._order), generator=self._shuffler)
+            self._position = 0
+        self._position += 1
+        return int(self._order[self._position - 1])
+
+    def upcoming(self) -> int:
+        """The view after that; at the end of an epoch, where it is not drawn yet, the present one."""
+        return int(self._order[min(self._position, len(self._order) - 1)])
+
+    def state(self) -> State:
+        """What decides the views to come."""
+        tensors = {"random/views": self._shuffler.get_state(), "order": self._order}
+        return State(tensors, {"position": self._position})
+
+    def load(self, state: State) -> None:
+        """Take that back out of a whole state.
+
+        Raises:
+            ValueError: it is of a run with other views.
+        """
+        views = len(state.tensors["order"])
+        if views != len(self._scene.train):
+            raise ValueError(
+                f"the state is of a run with {views} training views, but scene {self._scene.name!r} has "
+                f"{len(self._scene.train)}; resume with the data it was trained on"
+            )
+        self._shuffler.set_state(state.tensors["random/views"].cpu())
+        self._order = state.tensors["order"].to("cpu", copy=True)
+        self._position = state.values["position"]

@@ -1,0 +1,97 @@
+"""What can be trained: a model with its densifier and its learning rates, as the loop sees them.
+
+Each family has one: `padgs.anchors.trainee` (PaD-GS), `padgs.splats.trainee` (3DGS), `padgs.egonerf.trainee`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from padgs.gaussians import Gaussians
+from padgs.learning.schedule import ParameterGroup
+from padgs.learning.targets import Target
+from padgs.render import Rendering
+from padgs.scene import View
+
+
+@dataclass(frozen=True)
+class State:
+    """Everything that continuing bit-identically needs: tensors, and values that JSON can hold."""
+
+    tensors: dict[str, Tensor]
+    values: dict[str, Any]
+
+    def under(self, prefix: str) -> dict[str, Tensor]:
+        """The tensors whose names begin so, without that beginning."""
+        return {name.removeprefix(prefix): t for name, t in self.tensors.items() if name.startswith(prefix)}
+
+
+@dataclass(frozen=True)
+class Size:
+    """What a trained model costs to keep."""
+
+    counts: dict[str, int]  # anchors, gaussians (potential), ...
+    parameters: int  # learnable scalars
+    bytes: int  # of the model alone, as stored in the checkpoint
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """What a model drew of one view, with all that the densification statistics need after `backward`."""
+
+    rendering: Rendering
+    probe: Tensor  # [N, 2] or [N, 3], see `padgs.splats.probes`; its .grad is filled by backward
+    gaussians: Gaussians  # the N that were drawn
+    slots: Tensor  # [N] int64: the row of the model's statistics that each drawn Gaussian counts for
+    _: KW_ONLY
+    penalty: Tensor | None = None  # a scalar to be added to the loss
+    photo: Callable[[Target], Target] | None = None  # brings the training image to where it was drawn; differentiable
+
+
+class Trainee(Protocol):
+    """A model in training.
+
+    `load_state` must make it what `state` was taken of, sizes included, and may replace the data of parameters but not
+    the parameters returned by `groups`.
+    """
+
+    def groups(self) -> list[ParameterGroup]:
+        """All learnable parameters, each in exactly one group, with their learning rates in this run."""
+        ...
+
+    def draw(self, view: View) -> Drawing:
+        """Render a view, differentiably."""
+        ...
+
+    def observe(self, drawing: Drawing, iteration: int) -> None:
+        """Collect statistics; called after `backward` and before the optimiser step."""
+        ...
+
+    def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
+        """Grow and prune where it is time to; called after the optimiser step. Returns events for the record."""
+        ...
+
+    def render(self, view: View) -> Rendering:
+        """Render a view without gradients."""
+        ...
+
+    def counts(self) -> dict[str, int]:
+        """What the model consists of now: anchors, gaussians, ..."""
+        ...
+
+    def size(self) -> Size:
+        """What keeping the model costs."""
+        ...
+
+    def state(self) -> State:
+        """Parameters, statistics and random state, without the optimiser; not copies."""
+        ...
+
+    def load_state(self, state: State) -> None:
+        """Become the model that `state` was taken of."""
+        ...

@@ -1,0 +1,55 @@
+"""The result of a run that has just begun, and the status of what may end it."""
+
+from __future__ import annotations
+
+from padgs import clock
+from padgs.learning.failure import Failure, is_out_of_memory
+from padgs.results import Result
+from padgs.runs.config import RunConfig
+from padgs.runs.identity import config_hash
+from padgs.scene import Scene
+
+
+def begun(config: RunConfig, scene: Scene, run: str) -> Result:
+    """What is known before the first iteration; status ok, as long as nothing says otherwise."""
+    view = (scene.test or scene.train)[0]
+    machine = clock.machine(scene.points.device)
+    values = config.values()
+    return Result(
+        run=run,
+        status="ok",
+        method=config.method,
+        preset=config.preset,
+        variant=config.variant,
+        dataset=config.data.dataset or ("" if config.data.path else "synthetic"),
+        scene=scene.name,
+        width=view.width,
+        height=view.height,
+        iterations=config.train.iterations,
+        iterations_done=0,
+        seed=config.seed,
+        code_version=" ".join(part for part in (machine["padgs"], (machine["commit"] or "")[:10]) if part) or "unknown",
+        machine=machine,
+        config_hash=config_hash(values),
+        fingerprint=scene.fingerprint,
+        finished="",
+        config=values,
+        experiments=config.labels.experiments,
+    )
+
+
+def status(error: Exception) -> str:
+    """The status of a run that this ended; an error of ours is none, and raised again."""
+    if isinstance(error, Failure):
+        return error.status
+    if isinstance(error, ValueError):
+        return "rejected"
+    if is_out_of_memory(error):
+        return "oom"
+    raise error
+
+
+def peak_memory(scene: Scene) -> dict[str, int | None]:
+    """The fields of a result about the memory that was used so far, where the scene is."""
+    peak = clock.peak_memory(scene.points.device)
+    return {"peak_memory_bytes": peak["host"], "peak_device_memory_bytes": peak["device"]}

@@ -1,0 +1,143 @@
+"""All runs in one data frame, a row a run, from which every table, chart and CSV file is made.
+
+Columns: what a run is (`place`, `preset`, `variant`, `seed`, ...) and how it went (`ok`, `status`); under what
+conditions it was made (`resolution`, `data`, `machine`, `paper rules`, ...); its numbers (`paper/psnr`, `frame_ms`,
+...), NaN where missing; and each key of its configuration (`config.train.iterations`), None where there is none.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from operator import attrgetter
+from typing import Any
+
+import pandas as pd
+from pandas import DataFrame
+
+from padgs.results import Result, Scores, picture_name
+from reports.scenes import Place
+from reports.store import Run
+
+CONFIG = "config."  # and the dotted key
+# Keys that no trained number depends on, and the seed; a section stands for all in it.
+NO_SETTING = ("seed", "run", "protocol", "data.path", "data.cache_bytes", "data.read_ahead", "data.device")
+INPUT_RANGES = {"01": "[0, 1]", "11": "[-1, 1]"}
+
+
+def frame(runs: Iterable[Run]) -> DataFrame:
+    """The runs in their order; the index counts them."""
+    runs = list(runs)
+    results = [run.result for run in runs]
+    facts = DataFrame({name: [of(result) for result in results] for name, of in FACTS.items()})
+    facts["log"], facts["pictures"] = [run.log for run in runs], [run.pictures for run in runs]
+    numbers = DataFrame({name: [of(result) for result in results] for name, of in NUMBERS.items()}, dtype=float)
+    numbers["train_hours"], numbers["fps"] = numbers["train_seconds"] / 3600, 1000 / numbers["frame_ms"]
+    rules, marks, config = (
+        DataFrame([dict(of(result)) for result in results], index=facts.index, dtype=kind)
+        for of, kind in ((_rules, object), (_marks, float), (_config, object))
+    )
+    config = config.where(config.notna(), None).add_prefix(CONFIG)  # None: no such key in a method or version
+    return pd.concat([facts.astype({"ok": bool}), rules, marks, numbers, config], axis=1)
+
+
+def grouped(runs: DataFrame, *columns: str) -> list[tuple[tuple[Any, ...], DataFrame]]:
+    """The runs that agree in some columns, and in what; in the order of the first of each."""
+    groups: Any = runs.groupby(list(columns), sort=False)
+    return list(groups)
+
+
+def by_place(runs: DataFrame) -> dict[Place, DataFrame]:
+    """The runs of each scene, in the order of the tables."""
+    found = {place: own for (place,), own in grouped(runs, "place")}
+    return {place: found[place] for place in sorted(found, key=lambda place: place.rank)}
+
+
+def hardware(result: Result) -> str:
+    """The machine in a few words, with the version of torch."""
+    known = result.machine
+    where = known.get("gpu") or f"{known.get('cores')} cores of {known.get('cpu')}"
+    return f"{where}, torch {known.get('torch')}"
+
+
+def machine(result: Result) -> str:
+    """The same with the number of threads: what times depend on."""
+    threads = result.machine.get("threads")
+    return hardware(result) + (f", {threads} threads" if threads else "")
+
+
+def decides(key: str) -> bool:
+    """Whether runs that differ in a dotted key of their configurations are runs of different settings.
+
+    >>> decides("train.iterations"), decides("run.threads")
+    (True, False)
+    """
+    return not any(key == other or key.startswith(f"{other}.") for other in NO_SETTING)
+
+
+FACTS: Mapping[str, Callable[[Result], Any]] = {
+    **{
+        name: attrgetter(name)
+        for name in (
+            *("run", "ok", "status", "method", "preset", "variant", "dataset", "scene", "seed", "iterations"),
+            *("experiments", "code_version", "finished"),
+        )
+    },
+    "place": lambda result: Place(result.dataset, result.scene),
+    "resolution": lambda result: f"{result.width}x{result.height}",
+    "data": lambda result: result.fingerprint[:10],
+    "hardware": hardware,
+    "machine": machine,
+    "setting": lambda result: json.dumps(
+        {key: value for key, value in _config(result) if decides(key)}, sort_keys=True
+    ),
+    "view_psnr": lambda result: _view_psnr(result.scores),
+}
+NUMBERS: Mapping[str, Callable[[Result], float | None]] = {
+    "iterations_done": lambda result: result.iterations_done,
+    "train_seconds": lambda result: result.timing.get("train_seconds"),
+    "frame_ms": lambda result: result.timing.get("render_ms_median"),  # over the test views, decoding included
+    "anchors": lambda result: result.counts.get("anchors"),
+    "gaussians": lambda result: result.counts.get("gaussians"),  # none in a method without any
+    "megabytes": lambda result: result.model_bytes / 1e6 or None,
+    "peak_gigabytes": lambda result: result.peak_memory_bytes / 1e9 or None,  # of the process, while training
+    "peak_gpu_gigabytes": lambda result: (result.peak_device_memory_bytes or math.nan) / 1e9,  # of the tensors there
+}
+
+
+def _rules(result: Result) -> Iterator[tuple[str, str]]:
+    """What is asked of each protocol, and what was done under it."""
+    scored = {name: scores.protocol for name, scores in result.scores.items()}
+    for name, rules in {**result.config.get("protocol", {}), **scored}.items():
+        words = [name, f"LPIPS-{rules.get('lpips')} fed {INPUT_RANGES.get(rules.get('lpips_inputs', ''))}"]
+        if rules.get("bottom_crop"):
+            words.append(f"without the last {100 * rules['bottom_crop']:.1f} % of the rows")
+        yield f"{name} rules", ", ".join(words)
+
+
+def _marks(result: Result) -> Iterator[tuple[str, float | None]]:
+    for name, scores in result.scores.items():
+        for metric, value in scores.metrics.items():
+            yield f"{name}/{metric}", value
+
+
+def _view_psnr(scores: Mapping[str, Scores]) -> dict[str, float]:
+    """File name of a picture -> PSNR of the view, by the first protocol that has one."""
+    found: dict[str, float] = {}
+    for view, numbers in (pair for one in scores.values() for pair in one.views.items()):
+        if (psnr := numbers.get("psnr")) is not None:
+            found.setdefault(picture_name(view), psnr)
+    return found
+
+
+def _config(result: Result) -> Iterator[tuple[str, Any]]:
+    return _flat(result.config)
+
+
+def _flat(values: Mapping[str, Any], where: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{where}{key}.")
+        else:
+            yield f"{where}{key}", value

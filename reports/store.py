@@ -1,0 +1,85 @@
+"""Where finished runs are read from: a folder of run folders, or a store, which is one file with a line for each run.
+
+A line is the content of the `result.json` with its digest, and under `log` the PSNR of a held-out view that the run
+measured while it was training. Pictures are not stored.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from padgs import results
+from padgs.results import Result, ResultError
+
+FILE_NAME = "results.jsonl"
+LOGGED = ("iteration", "seconds", "psnr")  # seconds of training so far; dB
+NO_LOG: Mapping[str, Sequence[float]] = {name: () for name in LOGGED}
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run, and what it left beside its result."""
+
+    result: Result
+    log: Mapping[str, Sequence[float]] = field(default_factory=lambda: NO_LOG)  # name of `LOGGED` -> its values
+    document: Mapping[str, Any] | None = None  # content of the result file
+    pictures: Path | None = None  # folder of truth | render | error of each test view; None in a store
+
+
+def read(source: Path) -> tuple[list[Run], list[ResultError]]:
+    """The runs of a folder or a store in the order of their names, and why others were left out.
+
+    Raises:
+        ResultError: the store cannot be read at all.
+    """
+    if source.is_file():
+        lines = enumerate(results.file_content(source).splitlines(), start=1)
+        loads = [partial(_of_line, line, f"{source}:{number}") for number, line in lines]
+    else:
+        loads = [partial(_of_folder, path) for path in sorted(source.glob(f"*/{results.FILE_NAME}"))]
+    runs: list[Run] = []
+    errors: list[ResultError] = []
+    for load in loads:
+        try:
+            runs.append(load())
+        except ResultError as error:
+            errors.append(error)
+    return runs, errors
+
+
+def add(runs: Iterable[Run], store: Path) -> list[Run]:
+    """Put runs into a store, each in the place of what it holds of the same name; returns all that are there then.
+
+    Raises:
+        ResultError: a line of the store is damaged; it would be lost.
+        OSError: the store cannot be written; an older one stays.
+    """
+    there, damaged = read(store) if store.exists() else ([], [])
+    if damaged:
+        raise damaged[0]
+    by_name = {run.result.run: run for run in (*there, *runs)}
+    together = [by_name[name] for name in sorted(by_name)]
+    lines = ({**(run.document or results.encoded(run.result)), "log": run.log} for run in together)
+    texts = (json.dumps(line, separators=(",", ":"), allow_nan=False) for line in lines)
+    results.replace_file(store, "".join(f"{text}\n" for text in texts).encode())
+    return together
+
+
+def _of_line(line: bytes, where: str) -> Run:
+    document = results.parsed(line, where)
+    log = document.pop("log", None)
+    if not isinstance(log, dict) or log.keys() != set(LOGGED):
+        raise ResultError(f"{where} has no log of {', '.join(LOGGED)}; delete it and collect the run again")
+    return Run(results.decoded(document, where), log, document)
+
+
+def _of_folder(file: Path) -> Run:
+    document = results.parsed(results.file_content(file), str(file))
+    probes = [line for line in results.log_lines(file.parent) if line.keys() >= set(LOGGED)]
+    log = {name: [probe[name] for probe in probes] for name in LOGGED}
+    return Run(results.decoded(document, str(file)), log, document, file.parent / results.PICTURES)

@@ -1,0 +1,179 @@
+"""What a multirun makes of its jobs, with launchers that only write on the board."""
+
+import io
+import os
+import signal
+import threading
+
+import pytest
+from omegaconf import OmegaConf
+from rich.console import Console
+
+from padgs.multirun import overview
+from padgs.multirun.board import Board, JobState
+from padgs.multirun.jobs import Multirun
+from padgs.runs.interrupt import Interrupted
+
+IN_PROCESS = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"
+ELSEWHERE = "hydra_plugins.hydra_joblib_launcher.joblib_launcher.JoblibLauncher"
+JOBS = [["++seed=0"], ["++seed=1"], ["++seed=2"]]
+
+
+class Start:
+    """One start of the same sweep, and how often each of its jobs was launched."""
+
+    def __init__(self, tmp_path, number: int, target: str, retry: str = "none", jobs=JOBS):
+        self.runs, self.out = tmp_path / "runs", io.StringIO()
+        self.folder = self.runs / ".multirun" / str(number)
+        config = {
+            "run": {"folder": str(self.runs)},
+            "retry": retry,
+            "tracking": {"kind": "none"},
+            "hydra": {
+                "sweep": {"dir": str(self.folder)},
+                "launcher": {"_target_": target},
+                "runtime": {"choices": {"experiment": "test"}},
+            },
+        }
+        self.multirun = Multirun(OmegaConf.create(config), jobs, Console(file=self.out, width=200))
+        self.board, self.launched = Board(self.folder), []
+
+    def launch(self, jobs, initial_job_idx):
+        """What Hydra's launchers do; subclasses say how jobs end."""
+        self.launched += [job[0] for job in jobs]
+        for number, job in enumerate(jobs, initial_job_idx):
+            self.end(number, job[0])
+
+    def end(self, number: int, job: str) -> None:
+        self.finish(number, job, "ok")
+
+    def finish(self, number: int, job: str, status: str) -> None:
+        run = f"room_{job[-1]}"
+        (self.runs / run).mkdir(parents=True, exist_ok=True)
+        (self.runs / run / "result.json").write_text("{}")
+        self.board.write(number, JobState(status, run, 10))
+
+    def counts(self) -> dict[str, int]:
+        try:
+            self.multirun.run(self, None)
+        finally:
+            seen = self.multirun.close()
+        return dict(seen.counts)
+
+
+@pytest.mark.parametrize("target", [IN_PROCESS, ELSEWHERE])
+def test_a_second_start_launches_nothing(tmp_path, target):
+    assert Start(tmp_path, 1, target).counts() == {"ok": 3}
+    again = Start(tmp_path, 2, target)
+    assert again.counts() == {"ok": 3} and again.launched == []
+    assert again.out.getvalue() == "3 of 3 done (3 before)\n"
+    assert not again.folder.exists()
+
+
+def test_only_what_is_missing_is_launched(tmp_path):
+    Start(tmp_path, 1, ELSEWHERE, jobs=JOBS[:2]).counts()
+    more = Start(tmp_path, 2, ELSEWHERE)
+    assert more.counts() == {"ok": 3} and more.launched == ["++seed=2"]
+
+
+class OneFails(Start):
+    def end(self, number, job):
+        self.finish(number, job, "nan" if job == "++seed=1" else "ok")
+
+
+def test_failed_runs_are_kept_and_retried_only_if_asked(tmp_path, capsys):
+    first = OneFails(tmp_path, 1, ELSEWHERE)
+    assert first.counts() == {"ok": 2, "nan": 1} and "retry=failed" in first.out.getvalue()
+    kept = Start(tmp_path, 2, ELSEWHERE)
+    assert kept.counts() == {"ok": 2, "nan": 1} and kept.launched == []
+    retried = Start(tmp_path, 3, ELSEWHERE, retry="failed")
+    assert retried.counts() == {"ok": 3} and retried.launched == ["++seed=1"]
+
+
+class OneKills(Start):
+    """Its second job takes the process down each time, together with whatever else runs there."""
+
+    def end(self, number, job):
+        self.board.write(number, JobState("running", f"room_{job[-1]}", 10))
+        if job == "++seed=1":
+            raise RuntimeError("a worker process was terminated")
+        self.finish(number, job, "ok")
+
+
+def test_a_job_whose_process_dies_ends_no_other_and_gets_a_second_chance(tmp_path, capsys):
+    start = OneKills(tmp_path, 1, ELSEWHERE)
+    assert start.counts() == {"ok": 2, "killed": 1}
+    assert start.launched.count("++seed=1") == 2 and start.launched.count("++seed=0") == 1
+    assert "a worker process was terminated" in capsys.readouterr().err
+    assert start.folder.exists() and str(start.folder) in start.out.getvalue()  # what it said can be read there
+    assert Start(tmp_path, 2, ELSEWHERE).counts() == {"ok": 3}  # there was no result, so it is still missing
+
+
+class NeverStarts(Start):
+    def launch(self, jobs, initial_job_idx):
+        self.launched += [job[0] for job in jobs]
+        raise RuntimeError("there is no such partition")
+
+
+def test_a_launcher_that_starts_nothing_is_not_asked_for_ever(tmp_path, capsys):
+    start = NeverStarts(tmp_path, 1, ELSEWHERE)
+    assert start.counts() == {"killed": 3} and len(start.launched) == 6
+    assert capsys.readouterr().err.count("there is no such partition") == 1
+
+
+class Refuses(Start):
+    def end(self, number, job):
+        self.board.write(number, JobState("refused", reason="the data set is not there"))
+
+
+def test_what_is_wrong_with_all_jobs_is_said_once(tmp_path, capsys):
+    for target in (IN_PROCESS, ELSEWHERE):
+        assert Refuses(tmp_path, 1, target).counts() == {"refused": 3}
+        assert capsys.readouterr().err == "error: the data set is not there\n"
+
+
+class AtWorkElsewhere(Start):
+    def end(self, number, job):
+        if job == "++seed=2":
+            self.board.write(number, JobState("elsewhere", "room_2", 10, "worked on by another process"))
+        else:
+            self.finish(number, job, "ok")
+
+
+def test_what_another_process_does_is_no_failure_and_not_done(tmp_path, capsys):
+    start = AtWorkElsewhere(tmp_path, 1, ELSEWHERE)
+    assert start.counts() == {"ok": 2, "elsewhere": 1}
+    assert "2 of 3 done, 1 elsewhere" in start.out.getvalue()
+
+
+class Interrupts(Start):
+    """Somebody presses Ctrl-C while the second job runs; it sees the board and stops, and the third does not start."""
+
+    def end(self, number, job):
+        if job == "++seed=0":
+            return self.finish(number, job, "ok")
+        if job == "++seed=1":
+            os.kill(os.getpid(), signal.SIGINT)
+            for _ in range(500):
+                if (self.folder / "stop").exists():
+                    break
+                threading.Event().wait(0.01)
+        assert (self.folder / "stop").exists()
+        self.board.write(number, JobState("stopped", reason="stopped after iteration 5"))
+
+
+def test_ctrl_c_lets_running_jobs_stop_by_themselves(tmp_path, monkeypatch):
+    monkeypatch.setattr(overview, "SECONDS_BETWEEN_LOOKS", 0.01)
+    start = Interrupts(tmp_path, 1, ELSEWHERE)
+    with pytest.raises(Interrupted, match="running jobs wrote their checkpoints"):
+        start.counts()
+    assert dict(start.multirun.look().counts) == {"ok": 1, "stopped": 2}
+    again = Start(tmp_path, 2, ELSEWHERE)
+    assert again.counts() == {"ok": 3} and again.launched == ["++seed=1", "++seed=2"]
+
+
+def test_a_folder_that_cannot_be_written_refuses_all_jobs(tmp_path, capsys):
+    (tmp_path / "runs").write_text("a file where the folder should be")
+    start = Start(tmp_path, 1, ELSEWHERE)
+    assert start.counts() == {"refused": 3} and start.launched == []
+    assert "cannot write run folder" in capsys.readouterr().err
