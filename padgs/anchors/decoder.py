@@ -13,11 +13,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from padgs.anchors.cpu_decoder import decode_on_cpu
 from padgs.anchors.gpu_decoder import decode_on_gpu
-from padgs.anchors.native_decoder import fits, fused_decode
 from padgs.anchors.precision import linear, reduced
 from padgs.gaussians import Gaussians
-from padgs.native import cuda
+from padgs.native import LIBRARIES, cpu, cuda
 
 OPACITY_VALUES, COLOR_VALUES, COVARIANCE_VALUES = 1, 3, 7  # outputs of each head per Gaussian
 SORT_OUT_BELOW = 0.9  # share of anchors with a positive opacity
@@ -121,11 +121,14 @@ def decode_gaussians(
         ValueError: an unknown precision.
     """
     dtype, tensors = reduced(precision), (features, seen, positions, offsets, log_scales, attenuation)
-    if fits(features, dtype):
-        flat = tuple(tensor for head in weights for tensor in head)
-        *values, slots, raw = fused_decode(flat, *tensors, dtype)
-        return Gaussians(*values), slots, raw
-    return define_gaussians(weights, *tensors, precision)
+    library = LIBRARIES.get(features.device.type)
+    no_reduced_types = dtype is not None and library is cpu
+    if library is None or no_reduced_types or features.dtype != torch.float32 or not library.available():
+        return define_gaussians(weights, *tensors, precision)
+    flat = tuple(tensor for head in weights for tensor in head)
+    fused = decode_on_gpu(flat, *tensors, dtype=dtype) if library is cuda else decode_on_cpu(flat, *tensors)
+    *values, slots, raw = fused
+    return Gaussians(*values), slots, raw
 
 
 def decode_padded(

@@ -13,19 +13,19 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from padgs.anchors.cpu_decoder import SIZES, decode_arguments
 from padgs.anchors.precision import OF_GRADIENTS
 from padgs.native import cuda
-from padgs.native.abi import DecodeArguments, DecodeGradientArguments, HeadWeights, pointer
-
-SIZES = (3, 4, 3, 0, 3)  # values per Gaussian of means, quats, scales, opacities, colors; 0 = a scalar
+from padgs.native.abi import DecodeGradientArguments, pointer
 
 
 def decode_on_gpu(
     weights: tuple[Tensor, ...], *tensors: Tensor, dtype: torch.dtype | None = None, padded: bool = False
 ) -> tuple[Tensor, ...]:
-    """`padgs.anchors.native_decoder.fused_decode` where the GPU's library keeps its tensors; waits once, for a count.
+    """`padgs.anchors.cpu_decoder.decode_on_cpu` where the GPU's library keeps its tensors; waits once, for a count.
 
-    Padded, it waits for nothing: behind the selected Gaussians come zeros, as many as there are others.
+    Products may be taken in a reduced type. Padded, it waits for nothing: behind the selected Gaussians come zeros, as
+    many as there are others.
     """
     return _DecodeOnGPU.apply(dtype, padded, *tensors, *weights)
 
@@ -51,7 +51,7 @@ class _DecodeOnGPU(torch.autograd.Function):
         slots = new(starts, (count,))
         outputs = [new(raw, (count, size) if size else (count,)) for size in SIZES]
         arguments = cuda.DeviceDecodeArguments(
-            _arguments(constants, raw, starts, slots, outputs), pointer(color), pointer(covariance)
+            decode_arguments(constants, raw, starts, slots, outputs), pointer(color), pointer(covariance)
         )
         cuda.call("padgs_cuda_decode_place", cuda.queue(raw.device), arguments)
         ctx.save_for_backward(inputs, w1, hidden, *weights, *constants, raw, starts, slots, *outputs)
@@ -70,7 +70,7 @@ class _DecodeOnGPU(torch.autograd.Function):
         anchors, per_anchor = raw.shape
         grad_logits = [raw.new_empty(anchors, values * per_anchor) for values in (1, 3, 7)]
         gradient = DecodeGradientArguments(
-            _arguments(constants, raw, starts, slots, outputs),
+            decode_arguments(constants, raw, starts, slots, outputs),
             *map(pointer, upstream),
             ctx.features,
             None,
@@ -92,11 +92,3 @@ class _DecodeOnGPU(torch.autograd.Function):
         of_weights = [grad.to(raw.dtype) for head in zip(of_w1, of_b1, of_w2, of_b2, strict=True) for grad in head]
         grad_features = (grad_hidden @ w1[:, : ctx.features]).to(raw.dtype)
         return None, None, grad_features, None, None, grad_offsets, grad_log_scales, None, *of_weights
-
-
-def _arguments(constants, raw, starts, slots, outputs) -> DecodeArguments:
-    """Without the networks, which the kernels do not see."""
-    nobody = HeadWeights(None, None, None, None)
-    positions, offsets, log_scales, attenuation = constants
-    buffers = (positions, offsets, log_scales, attenuation, raw, starts, slots, *outputs)
-    return DecodeArguments(*raw.shape, 0, 0, nobody, nobody, nobody, None, *map(pointer, buffers))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -31,37 +32,30 @@ def fused_photometric_loss(image: Tensor, target: Tensor, weight: Tensor, lambda
         lambda_l1: lambda of Eq. 16.
         total: what the weighted sum over pixels and channels is divided by, a scalar.
     """
-    if image.device.type == "cuda":
-        return loss_on_gpu(image, target, weight, lambda_l1, total)
-    return _FusedLoss.apply(image, target, weight, lambda_l1, total)
+    return _FusedLoss.apply(image, target, weight, lambda_l1, total, EVALUATIONS[image.device.type])
 
 
 class _FusedLoss(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, image: Tensor, target: Tensor, weight: Tensor, lambda_l1: float, total: Tensor) -> Tensor:
+    def forward(
+        ctx: Any, image: Tensor, target: Tensor, weight: Tensor, lambda_l1: float, total: Tensor, evaluate: Callable
+    ) -> Tensor:
         height, width, _ = image.shape
         image, target = image.contiguous(), target.contiguous()
         weight = weight.to(torch.float32).expand(height, width)
-        gradient = torch.empty_like(image) if ctx.needs_input_grad[0] else None
-        arguments = LossArguments(
-            width,
-            height,
-            pointer(image),
-            pointer(target),
-            weight.data_ptr(),
-            *weight.stride(),
-            lambda_l1,
-            1 / float(total),
-            pointer(_workspace(height, width)),
-            pointer(gradient),
-        )
-        loss = cpu.library().padgs_photometric_loss(ctypes.byref(arguments))
-        ctx.gradient = gradient
-        return image.new_tensor(loss)
+        ctx.gradient = torch.empty_like(image) if ctx.needs_input_grad[0] else None
+        arguments = LossArguments(width, height, pointer(image), pointer(target), weight.data_ptr(), *weight.stride())
+        arguments.lambda_l1, arguments.gradient = lambda_l1, pointer(ctx.gradient)
+        return evaluate(arguments, image, total)
 
     @staticmethod
     def backward(ctx: Any, grad_loss: Tensor):
-        return ctx.gradient * grad_loss, None, None, None, None
+        return ctx.gradient * grad_loss, None, None, None, None, None
+
+
+def _on_cpu(arguments: LossArguments, image: Tensor, total: Tensor) -> Tensor:
+    arguments.normalizer, arguments.workspace = 1 / float(total), pointer(_workspace(*image.shape[:2]))
+    return image.new_tensor(cpu.library().padgs_photometric_loss(ctypes.byref(arguments)))
 
 
 @functools.lru_cache(maxsize=2)
@@ -70,37 +64,16 @@ def _workspace(height: int, width: int) -> Tensor:
     return torch.zeros(cpu.library().padgs_loss_workspace(height, width))
 
 
-def loss_on_gpu(image: Tensor, target: Tensor, weight: Tensor, lambda_l1: float, total: Tensor) -> Tensor:
-    """`fused_photometric_loss` where the GPU's library keeps its tensors; the host waits for nothing."""
-    return _LossOnGPU.apply(image, target, weight, lambda_l1, total)
+def _on_gpu(arguments: LossArguments, image: Tensor, total: Tensor) -> Tensor:
+    """The host waits for nothing: what to divide by stays on the device, and so does the loss."""
+    height, width, _ = image.shape
+    total = total.to(torch.float32)
+    partials = None if arguments.gradient is None else image.new_empty(3, height, width, 3)
+    sums = image.new_empty(cuda.library().padgs_cuda_loss_blocks(height, width))
+    arguments.workspace = pointer(partials)
+    device_arguments = cuda.DeviceLossArguments(arguments, pointer(total), pointer(sums))
+    cuda.call("padgs_cuda_photometric_loss", cuda.queue(image.device), device_arguments)
+    return (sums.sum(dtype=torch.float64) / total).to(torch.float32)
 
 
-class _LossOnGPU(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, image: Tensor, target: Tensor, weight: Tensor, lambda_l1: float, total: Tensor) -> Tensor:
-        height, width, _ = image.shape
-        image, target = image.contiguous(), target.contiguous()
-        weight, total = weight.to(torch.float32).expand(height, width), total.to(torch.float32)
-        gradient = torch.empty_like(image) if ctx.needs_input_grad[0] else None
-        partials = None if gradient is None else image.new_empty(3, height, width, 3)
-        sums = image.new_empty(cuda.library().padgs_cuda_loss_blocks(height, width))
-        loss = LossArguments(
-            width,
-            height,
-            pointer(image),
-            pointer(target),
-            weight.data_ptr(),
-            *weight.stride(),
-            lambda_l1,
-            0.0,
-            pointer(partials),
-            pointer(gradient),
-        )
-        arguments = cuda.DeviceLossArguments(loss, pointer(total), pointer(sums))
-        cuda.call("padgs_cuda_photometric_loss", cuda.queue(image.device), arguments)
-        ctx.gradient = gradient
-        return (sums.sum(dtype=torch.float64) / total).to(torch.float32)
-
-    @staticmethod
-    def backward(ctx: Any, grad_loss: Tensor):
-        return ctx.gradient * grad_loss, None, None, None, None
+EVALUATIONS = {"cpu": _on_cpu, "cuda": _on_gpu}  # by the type of the device

@@ -57,7 +57,6 @@ class RenderOptions:
     memory_cap: int | None = None  # square: bytes of the published lists of all pairs; more than that is a MemoryError
 
     def __post_init__(self) -> None:
-        """Reject values that no backend can honour."""
         if self.bounds not in BOUNDS:
             raise ValueError(f"unknown bounds {self.bounds!r}; known: {', '.join(BOUNDS)}")
         if self.near_cull not in NEAR_CULLS:

@@ -18,7 +18,7 @@ from padgs.render.published_bounds import square_boxes
 from padgs.sphere.camera import Panorama, Pinhole
 from padgs.sphere.panorama import longitude_latitude, pixel_from_angles, projection_jacobian
 
-MIN_COS_LATITUDE = 1e-4  # an erp footprint nearer to the axis than 0.006 degrees is undefined; see design.md section 3
+MIN_COS_LATITUDE = 1e-4  # nearer to the axis than 0.006 degrees an erp footprint is undefined: its width is 1 / cos
 SLOPE_LIMIT = 1.3  # pinhole: slopes in the Jacobian are limited to this times the half field of view
 
 

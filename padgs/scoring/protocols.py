@@ -60,7 +60,7 @@ class Protocol:
 
 
 PROTOCOLS = {
-    # What the released evaluation does (method card, section 6): flat image, LPIPS-VGG fed [0, 1].
+    # What the evaluation does that was released with the paper: flat image, LPIPS-VGG fed [0, 1].
     "paper": Protocol("paper", ("psnr", "ssim"), lpips="vgg", lpips_inputs="01", solid_angle=False),
     # Every direction counts alike.
     "sphere": Protocol(

@@ -208,7 +208,7 @@ def stable_pixels(
 
 
 def row_error(actual: Tensor, expected: Tensor) -> float:
-    """Largest error of a gradient, row by row: max |g - e| / (|e| + 1e-3 E), E the largest row (golden README)."""
+    """Largest error of a gradient, row by row: max |g - e| / (|e| + 1e-3 E), E the largest row."""
     actual, expected = actual.double(), expected.double()
     if actual.ndim == 1:
         actual, expected = actual[:, None], expected[:, None]

@@ -1,4 +1,4 @@
-"""One picture, whatever describes the camera: a formula, a table of rays, or another pose (T0, N7)."""
+"""One picture, whatever describes the camera: a formula, a table of rays, or another pose."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_a_formula_is_its_table_of_rays(size, lens: str, projection: str, backen
 
 @each_free
 @each_engine
-def test_n7_turning_the_camera_turns_its_rays(projection: str, backend: str, dtype: torch.dtype):
+def test_turning_the_camera_turns_its_rays(projection: str, backend: str, dtype: torch.dtype):
     """A panorama from a turned camera is what the unturned camera sees along the turned rays, poles and all."""
     generator = torch.Generator().manual_seed(32)
     gaussians = mixture(4, generator)
@@ -94,7 +94,7 @@ def resampled(image: Tensor, directions: Tensor) -> Tensor:
 
 @each_free
 @each_engine
-def test_n7_a_turned_panorama_is_the_old_one_resampled(projection: str, backend: str, dtype: torch.dtype):
+def test_a_turned_panorama_is_the_old_one_resampled(projection: str, backend: str, dtype: torch.dtype):
     generator = torch.Generator().manual_seed(33)
     gaussians = gaussians_of("ordinary", 25, generator)
     broad = Gaussians(**{**vars(gaussians), "scales": gaussians.scales.clamp(min=0.1)})
@@ -127,7 +127,7 @@ def test_on_the_axis_the_perspective_jacobian_is_the_tangent_plane(backend: str,
 
 @each_engine
 def test_the_smaller_a_gaussian_the_less_ray_and_tangent_differ(backend: str, dtype: torch.dtype):
-    """tangent is the limit of ray; halving the angle halves the difference (baselines-and-projections.md 3.4)."""
+    """tangent is the limit of ray; halving the angle halves the difference."""
     differences = []
     for size in (0.08, 0.04, 0.02):
         generator = torch.Generator().manual_seed(35)

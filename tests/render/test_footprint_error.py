@@ -6,8 +6,7 @@ import re
 from pathlib import Path
 
 import pytest
-
-from padgs.render.footprint_error import LATITUDES, SIGMAS, footprint_error
+from footprint_error import LATITUDES, REFERENCE, SIGMAS, footprint_error
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "projections.md"
 
@@ -38,24 +37,13 @@ def test_all_faces_of_a_cube_are_alike():
         assert above == pytest.approx(below, rel=0.03)
 
 
-# Computed by another program: baselines-and-projections.md, section 3.8.
-@pytest.mark.parametrize(
-    ("projection", "sigma", "latitude", "percent"),
-    [
-        ("erp", 2, 0, 0.2),
-        ("erp", 2, 70, 3.8),
-        ("erp", 2, 89, 28.9),
-        ("erp", 5, 45, 3.6),
-        ("erp", 5, 85, 27.5),
-        ("erp", 10, 70, 17.3),
-        ("erp", 10, 89, 9.0),
-        ("tangent", 2, 45, 0.5),
-        ("tangent", 5, 45, 3.0),
-        ("tangent", 10, 45, 11.2),
-    ],
-)
-def test_known_numbers(projection: str, sigma: float, latitude: float, percent: float):
-    assert 100 * footprint_error(projection, sigma, latitude) == pytest.approx(percent, abs=0.25)
+@pytest.mark.parametrize("projection", ["erp", "tangent"])
+def test_known_numbers(projection: str):
+    """Of another program."""
+    for sigma, percents in REFERENCE[projection].items():
+        for latitude, percent in percents.items():
+            if 2 <= sigma <= 10:  # below, the same code is slow; above, the programs differ, as the table shows
+                assert 100 * footprint_error(projection, sigma, latitude) == pytest.approx(percent, abs=0.25), sigma
 
 
 def test_the_table_in_the_docs_is_current():

@@ -1,4 +1,8 @@
-"""Every golden render case on every backend: values, number of pairs, derivatives. Rules: shared/golden/README.md."""
+"""Every golden render case on every backend: values, number of pairs, derivatives.
+
+The cases, made by another program in float64, lie beside the checkout. They say themselves where a decision is so near
+that rounding may take it: pixels that are not `stable`, `close_pairs`, gradients that are not `valid`.
+"""
 
 from __future__ import annotations
 

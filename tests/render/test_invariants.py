@@ -1,8 +1,4 @@
-"""What must hold for any renderer: T0 of the stability reference, N4, N6, N7 and N10.
-
-N1-N2 are in test_extremes, N3, N5 in test_footprints, N7 by turned rays in test_cameras, N8, N11 in test_gradients,
-N9 in test_parity and test_determinism.
-"""
+"""What must hold for any renderer: no place, direction, unit of length or order of the input is special."""
 
 from __future__ import annotations
 
@@ -37,7 +33,7 @@ def yaw(angle: float) -> torch.Tensor:
 
 @each_panorama
 @each_engine
-def test_n4_a_yaw_of_the_world_shifts_the_image(projection: str, backend: str, dtype: torch.dtype):
+def test_a_yaw_of_the_world_shifts_the_image(projection: str, backend: str, dtype: torch.dtype):
     width, height = 64, 33
     gaussians = mixture(6, torch.Generator().manual_seed(4), ("ordinary", "polar", "seam", "near"))
     engine = {"backend": backend, "dtype": dtype, "options": RenderOptions(projection)}
@@ -55,7 +51,7 @@ def test_n4_a_yaw_of_the_world_shifts_the_image(projection: str, backend: str, d
 @pytest.mark.parametrize("kind", KINDS)
 @each_setup
 @each_engine
-def test_n6_the_unit_of_length_does_not_matter(kind: str, projection: str, lens: str, backend: str, dtype: torch.dtype):
+def test_the_unit_of_length_does_not_matter(kind: str, projection: str, lens: str, backend: str, dtype: torch.dtype):
     generator = torch.Generator().manual_seed(6)
     gaussians, pose = gaussians_of(kind, 20, generator), random_pose(generator, shift=0.01)
     options, engine = RenderOptions(projection, near=0.003), {"backend": backend, "dtype": dtype, "lens": lens}
@@ -78,7 +74,7 @@ def test_n6_the_unit_of_length_does_not_matter(kind: str, projection: str, lens:
 
 @each_setup
 @each_engine
-def test_n7_moving_world_and_camera_together_changes_nothing(projection, lens, backend, dtype):
+def test_moving_world_and_camera_together_changes_nothing(projection, lens, backend, dtype):
     generator = torch.Generator().manual_seed(7)
     gaussians, options = mixture(4, generator), RenderOptions(projection)
     stable = stable_pixels(gaussians, 48, 24, lens=lens, options=options)
@@ -114,7 +110,7 @@ def product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 
 @each_setup
 @each_engine
-def test_n10_the_order_of_the_input_does_not_matter(projection, lens, backend, dtype):
+def test_the_order_of_the_input_does_not_matter(projection, lens, backend, dtype):
     generator = torch.Generator().manual_seed(10)
     gaussians = mixture(8, generator)
     assert gaussians.means.float().norm(dim=-1).unique().numel() == len(gaussians), "the case has ties"
@@ -128,7 +124,7 @@ def test_n10_the_order_of_the_input_does_not_matter(projection, lens, backend, d
 
 @each_setup
 @each_engine
-def test_n10_equal_depths_are_drawn_in_the_order_of_the_input(projection, lens, backend, dtype):
+def test_equal_depths_are_drawn_in_the_order_of_the_input(projection, lens, backend, dtype):
     def ball(color: tuple[float, float, float]) -> Gaussians:
         row = ((0.1, 0, 2), (1.0, 0, 0, 0), (0.5, 0.5, 0.5), 0.95, color)
         return Gaussians(*(torch.tensor([value], dtype=torch.float64) for value in row))

@@ -73,8 +73,8 @@ def test_of_what_is_drawn_nothing_lies_before_the_near_plane(backend, dtype, gen
 
 
 @pytest.mark.parametrize(("relative_size", "published"), [(0.02, 1.9), (0.1, 18), (0.3, 75), (0.5, 95)])
-def test_shares_that_are_culled_agree_with_the_table_of_the_method_card(relative_size, published, generator):
-    """Axes log-normal with deviation 0.7 and opacity 1: our reading of how the card's numbers were sampled."""
+def test_shares_that_are_culled_agree_with_those_that_another_program_found(relative_size, published, generator):
+    """Axes log-normal with deviation 0.7 and opacity 1: our reading of how that program sampled."""
     gaussians = balls(relative_size, 0.7, generator, count=20_000)
     kept = project(gaussians, identity_pose(), VIEW.camera, options(near_cull="ellipsoid")).visible
     culled = 100 * (~kept).double().mean().item()

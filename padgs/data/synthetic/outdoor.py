@@ -1,4 +1,4 @@
-"""S3: ground, houses and street furniture near and far, a ring of mountains at 300 m, and a sky: range 1 : 1000."""
+"""Ground, houses and street furniture near and far, a ring of mountains at 300 m, and a sky: range 1 : 1000."""
 
 from __future__ import annotations
 

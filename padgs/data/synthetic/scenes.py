@@ -1,8 +1,8 @@
-"""The scenes S1-S7 of the stress suite, as blueprints of one generator.
+"""The scenes of the stress suite, as blueprints of one generator.
 
-S1 room, S2 two_rooms (a door between them), S3 outdoor (far ring and sky), S4 pole_torture (Siemens stars and rods
-at both poles), S5 bare_room (posters on a tenth of the walls), S6 near_clutter (objects 5-30 cm from the path),
-S7 glossy (mirror-like materials, so colours depend on the view).
+room, two_rooms (a door between them), outdoor (far ring and sky), pole_torture (Siemens stars and rods at both poles),
+bare_room (posters on a tenth of the walls), near_clutter (objects 5-30 cm from the path), glossy (mirror-like
+materials, so colours depend on the view).
 """
 
 from __future__ import annotations
@@ -103,27 +103,27 @@ _LIGHT = Light((((0.0, 0.0, 2.4), 0.85), ((2.6, 0.7, 1.75), 0.35)))
 
 
 def room(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
-    """S1: a furnished room, 6 x 5 x 2.8 m."""
+    """A furnished room, 6 x 5 x 2.8 m."""
     shapes = [Room(_LOW, _HIGH, _room_materials(options, 6, 5)), *_furniture(rng)]
     shapes += fu.scatter(_objects(options), path, (-2.0, -1.8, 0.5), (2.0, 1.5, 2.5), 0.35, rng)
     return World(tuple(shapes), _LIGHT)
 
 
 def near_clutter(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
-    """S6: the room with small objects hanging 5-30 cm from the camera path."""
+    """The room with small objects hanging 5-30 cm from the camera path."""
     shapes = [Room(_LOW, _HIGH, _room_materials(options, 6, 5)), *_furniture(rng)]
     return World((*shapes, *fu.beside(_objects(options), path, 0.05, 0.3, rng)), _LIGHT)
 
 
 def glossy(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
-    """S7: the room with a polished floor and mirror-like objects."""
+    """The room with a polished floor and mirror-like objects."""
     shapes = [Room(_LOW, _HIGH, _room_materials(options, 6, 5, gloss=0.12)), *_furniture(rng)]
     shapes += fu.scatter(_objects(options), path, (-2.0, -1.8, 0.5), (2.0, 1.5, 2.5), 0.35, rng, reflectance=0.3)
     return World(tuple(shapes), _LIGHT)
 
 
 def bare_room(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
-    """S5: smooth one-coloured surfaces; posters cover a tenth of the walls."""
+    """Smooth one-coloured surfaces; posters cover a tenth of the walls."""
     white, gray = tx.plain((0.8, 0.8, 0.78)), tx.plain((0.55, 0.55, 0.55))
     # 4 walls are 61.6 m2; 9 posters of 0.72 x 0.975 m cover a tenth.
     rows = [
@@ -135,7 +135,7 @@ def bare_room(options: SyntheticOptions, path: Array, rng: np.random.Generator) 
 
 
 def pole_torture(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
-    """S4: Siemens stars on floor and ceiling, and thin rods across, above, below and beside the cameras."""
+    """Siemens stars on floor and ceiling, and thin rods across, above, below and beside the cameras."""
     f = options.texture_frequency
     star = tx.siemens_star(INK, PAPER, options.spokes, 0.8 / f)
     walls = _room_materials(options, 6, 5)[:4]
@@ -154,7 +154,7 @@ def pole_torture(options: SyntheticOptions, path: Array, rng: np.random.Generato
 
 
 def two_rooms(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
-    """S2: two furnished rooms of 5 x 5 m with an open door between them; most things are hidden from most views."""
+    """Two furnished rooms of 5 x 5 m with an open door between them; most things are hidden from most views."""
     f = options.texture_frequency
     partition = Material(scaled(tx.wallpaper((0.62, 0.5, 0.42), (0.9, 0.82, 0.7)), f))
     frame = fu.matt(tx.planks(*fu.WALNUT, width=0.06))

@@ -1,4 +1,4 @@
-// The C ABI of libpadgs_cpu. Plain pointers and sizes; the caller (padgs/render/backends/cpu.py) allocates every buffer
+// The C ABI of libpadgs_cpu. Plain pointers and sizes; the caller, in Python, allocates every buffer
 // and has checked every shape. All floats are float32, all integers int32 unless they say otherwise.
 #pragma once
 
@@ -22,12 +22,12 @@ constexpr float kAlphaMax = 0.99f;
 constexpr float kTransmittanceMin = 1e-4f;
 constexpr float kCoreAlphaMin = 0.05f;  // hybrid: fainter fragments go to the tail
 constexpr int kMaxCoreSize = 256;       // hybrid
-constexpr float kNearest = 1e-15f, kFurthest = 1e15f;  // distances of means that are drawn; see contract.py
+constexpr float kNearest = 1e-15f, kFurthest = 1e15f;  // distances of means that are drawn; see padgs/render/contract.py
 
 enum Projection : int32_t { kErp = 0, kPinhole = 1, kTangent = 2, kRay = 3 };
 enum CameraModel : int32_t { kPanoramaModel = 0, kPinholeModel = 1, kTableModel = 2 };
 
-// What a camera and its options are to the kernels. Mirrored by `Camera` in native.py.
+// What a camera and its options are to the kernels. Mirrored by `NativeCamera` in padgs/native/abi.py.
 struct Camera {
   int32_t width, height;
   int32_t projection, model;
@@ -50,14 +50,14 @@ struct alignas(16) Footprint {
   float depth;
   float red, green, blue;
 };
-static_assert(sizeof(Footprint) == 64, "padgs/render/backends/cpu.py allocates 16 floats per footprint");
+static_assert(sizeof(Footprint) == 64, "padgs/render/tiles.py allocates 16 floats per footprint");
 
 // Pixels that a footprint can reach: rows [row, row_end), columns [column, column_end) and, beyond the seam,
 // [0, second_end) with second_end <= column. Nothing where row == row_end.
 struct PixelBox {
   int32_t column, column_end, second_end, row, row_end;
 };
-static_assert(sizeof(PixelBox) == 20, "padgs/render/backends/cpu.py allocates 5 integers per box");
+static_assert(sizeof(PixelBox) == 20, "padgs/render/tiles.py allocates 5 integers per box");
 
 // Tiles: rows of 16 pixels; in a row of level l a tile is 16 2^l pixels wide.
 struct TileGrid {
@@ -73,7 +73,7 @@ struct Instance {
   uint32_t slot;                             // where its moments go
   uint8_t row, row_end, column, column_end;  // of patches, from the tile's corner; ends are exclusive
 };
-static_assert(sizeof(Instance) == 12, "padgs/render/backends/cpu.py allocates 3 integers per instance");
+static_assert(sizeof(Instance) == 12, "padgs/render/tiles.py allocates 3 integers per instance");
 
 struct Inputs {
   int64_t count;

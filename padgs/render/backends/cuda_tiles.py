@@ -1,4 +1,4 @@
-"""DeviceProjected Gaussians and tile lists in the memory of a GPU, strip by strip; `padgs.render.tiles` is the CPU's.
+"""Projected Gaussians and tile lists in the memory of a GPU, strip by strip; `padgs.render.tiles` is the CPU's.
 
 The host reads one thing back: how many instances each row of tiles has, before anything of their size is allocated.
 Where it must not wait (`padgs.render.backends.captured`), there is room for a stated number of them instead: Gaussians

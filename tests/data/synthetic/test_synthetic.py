@@ -1,4 +1,4 @@
-"""Whole scenes: deterministic, cached, each of S1-S7 with the property that it is there for."""
+"""Whole scenes: deterministic, cached, each with the property that it is there for."""
 
 import os
 

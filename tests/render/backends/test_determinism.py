@@ -1,4 +1,4 @@
-"""Native results are bit-equal for any number of threads (T0, N9), and nearly so on any instruction set."""
+"""Native results are bit-equal for any number of threads, and nearly so on any instruction set."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def restored_threads() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("name", EVERYTHING)
-def test_n9_results_are_bit_equal_for_any_number_of_threads(name: str, restored_threads: None):
+def test_results_are_bit_equal_for_any_number_of_threads(name: str, restored_threads: None):
     function, *arguments = EVERYTHING[name]
     results = []
     for threads in (1, 2, 3):

@@ -1,4 +1,4 @@
-"""Gaussians at the limits of arithmetic: nothing becomes infinite or NaN, and neighbours are not harmed (T0, N1-N2)."""
+"""Gaussians at the limits of arithmetic: nothing becomes infinite or NaN, and neighbours are not harmed."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ EXTREME = {
 @pytest.mark.parametrize("name", EXTREME)
 @each_setup
 @each_engine
-def test_n1_n2_extreme_gaussians_stay_finite_beside_ordinary_ones(name: str, projection, lens, backend, dtype):
+def test_extreme_gaussians_stay_finite_beside_ordinary_ones(name: str, projection, lens, backend, dtype):
     both = joined(EXTREME[name], gaussians_of("ordinary", 3, torch.Generator().manual_seed(1)))
     inputs, pose = leaves(both, dtype), identity_pose().to(dtype).requires_grad_()
     view = view_of(camera_of(lens, 32, 16), pose)
@@ -78,7 +78,7 @@ def test_n1_n2_extreme_gaussians_stay_finite_beside_ordinary_ones(name: str, pro
 @pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities"])
 @each_setup
 @each_engine
-def test_n2_a_non_finite_gaussian_is_rejected_or_not_drawn(name: str, bad: float, projection, lens, backend, dtype):
+def test_a_non_finite_gaussian_is_rejected_or_not_drawn(name: str, bad: float, projection, lens, backend, dtype):
     gaussians = gaussians_of("ordinary", 4, torch.Generator().manual_seed(2))
     broken, options = leaves(gaussians, dtype), RenderOptions(projection)
     getattr(broken, name).data[1] = bad

@@ -1,4 +1,4 @@
-"""Derivatives against central differences (T0, N8): random latitudes, 89.9 degrees, across the seam; all inputs."""
+"""Derivatives against central differences: random latitudes, 89.9 degrees, across the seam; all inputs."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ def slopes(scene: Scene, step: float, backend: str, generator: torch.Generator) 
 
 @pytest.mark.parametrize(("projection", "lens", "place"), PLACES_OF_SETUPS)
 @pytest.mark.parametrize(("backend", "dtype"), [engine for engine in engines() if engine.id != "torch-32"])
-def test_n8_gradients_match_central_differences(projection: str, lens: str, place: str, backend, dtype):
+def test_gradients_match_central_differences(projection: str, lens: str, place: str, backend, dtype):
     scenes, step, median_limit, tail_limit, ratio_limit = LIMITS[dtype]
     generator = torch.Generator().manual_seed(8 + PLACES.index(place))
     pairs: dict[str, list[tuple[Tensor, Tensor]]] = {}
@@ -171,7 +171,7 @@ def test_n8_gradients_match_central_differences(projection: str, lens: str, plac
 
 @each_setup
 @each_engine
-def test_n11_every_input_receives_a_gradient(projection: str, lens: str, backend: str, dtype: torch.dtype):
+def test_every_input_receives_a_gradient(projection: str, lens: str, backend: str, dtype: torch.dtype):
     generator = torch.Generator().manual_seed(11)
     gaussians = gaussians_of("ordinary", 20, generator)
     if lens != "panorama":  # in front of it

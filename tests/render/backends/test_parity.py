@@ -1,4 +1,4 @@
-"""All backends draw the same and differentiate the same as the definition in float64 (T0, N9)."""
+"""All backends draw the same and differentiate the same as the definition in float64."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def assert_same(gaussians: Gaussians, size, lens, options, generator, *, pose, b
     ("projection", "lens", "configuration", "kind"), COMBINATIONS, ids=["-".join(c) for c in COMBINATIONS]
 )
 @pytest.mark.parametrize(("backend", "dtype"), ENGINES_IN_FLOAT32)
-def test_n9_every_engine_agrees_with_the_definition(projection, lens, configuration, kind, backend, dtype):
+def test_every_engine_agrees_with_the_definition(projection, lens, configuration, kind, backend, dtype):
     generator = torch.Generator().manual_seed(KINDS.index(kind))
     options = RenderOptions(projection, **CONFIGURATIONS[configuration])
     size = ODD_SIZES[KINDS.index(kind) % len(ODD_SIZES)]
@@ -125,13 +125,13 @@ def test_n9_every_engine_agrees_with_the_definition(projection, lens, configurat
         gaussians = Gaussians(**{**vars(gaussians), "scales": 0.2 * gaussians.scales})
     if kind == "needle" and projection == "ray":  # which fades what is thinner than a pixel
         gaussians = Gaussians(**{**vars(gaussians), "scales": gaussians.scales.clamp(min=0.03)})
-    slack = 6 if kind == "needle" else 1  # their covariances alone cost four digits of seven
+    slack = 8 if kind == "needle" else 1  # their covariances alone cost four digits of seven
     assert_same(gaussians, size, lens, options, generator, pose=pose, backend=backend, dtype=dtype, slack=slack)
 
 
 @pytest.mark.parametrize("projection", ["erp", "tangent", "ray"])
 @needs_native
-def test_n9_a_large_odd_image_agrees(projection: str):
+def test_a_large_odd_image_agrees(projection: str):
     generator = torch.Generator().manual_seed(9)
     gaussians = mixture(3, generator, ("ordinary", "polar", "seam", "needle"))
     pose = torch.eye(4, dtype=torch.float64)

@@ -20,7 +20,7 @@ from padgs.sphere.camera import Panorama
 OMNIGS = RenderOptions("erp", near=0.2, wrap=False, bounds="square")
 OP43DGS = RenderOptions("tangent", near=0.2, wrap=False, bounds="square", low_pass_kind="fixed")
 CORRECTED = RenderOptions("tangent", near=0.2)
-# Tiles of a Gaussian, on average, as measured with the released code's formulas (baselines-and-projections.md, 2.2).
+# Tiles of a Gaussian, on average, as another program measured them with the released code's formulas.
 DISTANCES = (1, 3, 10, 30, 100)
 PUBLISHED = (11, 34, 362, 1432, 3772)
 

@@ -6,11 +6,18 @@ import cuda_engine
 import pytest
 import torch
 
+from padgs.learning import native_loss
 from padgs.learning.loss import photometric_loss, pixel_weight
-from padgs.learning.native_loss import loss_on_gpu
+from padgs.learning.native_loss import fused_photometric_loss
 
 pytestmark = [*cuda_engine.marks()]
 DEVICE = "cuda" if cuda_engine.ON_GPU else "cpu"
+
+
+@pytest.fixture(autouse=True)
+def emulated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The emulation works on tensors of the CPU."""
+    monkeypatch.setitem(native_loss.EVALUATIONS, DEVICE, native_loss.EVALUATIONS["cuda"])
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (5, 7), (17, 33), (24, 48), (50, 70)])
@@ -31,7 +38,7 @@ def test_the_gpu_matches_the_definition(height: int, width: int, masked: bool, l
 
     leaf = image.to(DEVICE).requires_grad_()
     total = 3 * weight.expand(height, width).sum().to(DEVICE)
-    value = loss_on_gpu(leaf, target.to(DEVICE), weight.to(DEVICE), lambda_l1, total)
+    value = fused_photometric_loss(leaf, target.to(DEVICE), weight.to(DEVICE), lambda_l1, total)
     (2 * value).backward()
     assert exact.grad is not None and leaf.grad is not None
     assert value.item() == pytest.approx(expected.item(), abs=2e-6)
@@ -43,5 +50,5 @@ def test_without_a_gradient_none_is_computed(generator: torch.Generator):
     weight = torch.ones(20, 1, device=DEVICE)
     total = torch.tensor(1800.0, device=DEVICE)
     leaf = image.clone().requires_grad_()
-    values = [loss_on_gpu(x, target, weight, 0.8, total) for x in (image, leaf)]
+    values = [fused_photometric_loss(x, target, weight, 0.8, total) for x in (image, leaf)]
     assert torch.equal(values[0], values[1]) and not values[0].requires_grad

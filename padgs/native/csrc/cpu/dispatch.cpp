@@ -59,8 +59,8 @@ static const Kernels &kernels() {
 
 using namespace padgs;
 
-// Bytes of the structures of abi.h that cross the border, in the order of STRUCTURES in native.py, which refuses to
-// talk to a library that was built from other sources.
+// Bytes of the structures of abi.h that cross the border, in the order of STRUCTURES in padgs/native/cpu.py, which
+// refuses to talk to a library that was built from other sources.
 PADGS_API int64_t padgs_structure_bytes(int32_t index) {
   const size_t bytes[] = {sizeof(Camera), sizeof(Inputs), sizeof(Gradients), sizeof(BlendGradientArguments),
                           sizeof(DecodeGradientArguments), sizeof(LossArguments)};

@@ -1,7 +1,7 @@
 // Sixteen floats at a time, with the same few operations on every instruction set.
 //
 // A Vec is one AVX-512 register, two AVX2 registers, or four of the 16-byte registers that every other machine has;
-// GCC/Clang vector extensions do the arithmetic. Lanes are the 16 pixels of one tile row, or 16 independent items.
+// GCC/Clang vector extensions do the arithmetic. Lanes are the 16 pixels of one patch of a tile, or 16 independent items.
 #pragma once
 
 #include <cstdint>

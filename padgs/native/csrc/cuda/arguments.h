@@ -1,6 +1,5 @@
 // The C ABI of libpadgs_cuda, beside the structures that it shares with the CPU library. Every pointer is to memory
-// of the device, and was allocated by padgs/render/backends/cuda.py. Every function returns a cudaError_t, 0 where all
-// is well.
+// of the device, allocated by the caller, in Python. Every function returns a cudaError_t, 0 where all is well.
 #pragma once
 
 #include "core.h"

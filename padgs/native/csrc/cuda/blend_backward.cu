@@ -12,7 +12,7 @@ namespace {
 
 constexpr int kGaussiansPerBlock = 16;
 
-// dL/d of one pixel, as the definition of its outputs gives it; see also load_row in blend.cpp.
+// dL/d of one pixel, as the definition of its outputs gives it; blend.cpp of the CPU does so by patches.
 __device__ PixelState load_pixel(const BlendGradientInputs &args, int64_t p, Upstream &upstream) {
   const float t = args.forward.transmittance[p];
   float grad_t = load_upstream(args, p, upstream);

@@ -24,12 +24,11 @@ struct Reach {
   int32_t gaussian;
   uint8_t row, row_end, chunk, chunk_end;  // from the tile's corner; chunk_end is exclusive
 };
-static_assert(sizeof(Reach) == 8, "padgs/render/backends/cuda.py allocates 2 integers per instance");
+static_assert(sizeof(Reach) == 8, "padgs/render/backends/cuda_tiles.py allocates 2 integers per instance");
 
 PADGS_HD int tiles_before(const TileTable &table, int row) {
   return table.row_start[row] - table.row_start[table.first_row];
 }
-PADGS_HD int tiles_drawn(const TileTable &table) { return tiles_before(table, table.end_row); }
 
 // How many drawn tiles a box touches.
 PADGS_HD uint32_t tiles_of(const PixelBox &box, const TileTable &table) {

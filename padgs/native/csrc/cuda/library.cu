@@ -12,7 +12,7 @@ __global__ void probe_kernel(int32_t *) {}
 
 using namespace padgs;
 
-// Bytes of the structures that cross the border, in the order of STRUCTURES in cuda_native.py.
+// Bytes of the structures that cross the border, in the order of STRUCTURES in padgs/native/cuda.py.
 PADGS_API int64_t padgs_cuda_structure_bytes(int32_t index) {
   const size_t bytes[] = {sizeof(Queue),
                           sizeof(ProjectArguments),
