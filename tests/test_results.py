@@ -125,3 +125,9 @@ def test_read_all_keeps_the_good_and_names_the_bad(result, tmp_path):
     good, bad = results.read_all(tmp_path)
     assert [r.run for r in good] == ["a", "c"]
     assert len(bad) == 1 and "b/result.json" in str(bad[0])
+
+
+def test_whole_lines_of_a_log_are_read(tmp_path):
+    assert list(results.log_lines(tmp_path)) == []
+    (tmp_path / "log.jsonl").write_text('{"iteration": 1}\n{"loss": 2}\n[3]\n{"iteration": 2, "lo')
+    assert list(results.log_lines(tmp_path)) == [{"iteration": 1}]
