@@ -7,6 +7,7 @@ measured while it was training. Pictures are not stored.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -80,6 +81,7 @@ def _of_line(line: bytes, where: str) -> Run:
 
 def _of_folder(file: Path) -> Run:
     document = results.parsed(results.file_content(file), str(file))
-    probes = [line for line in results.log_lines(file.parent) if line.keys() >= set(LOGGED)]
-    log = {name: [probe[name] for probe in probes] for name in LOGGED}
+    lines = [[line.get(name) for name in LOGGED] for line in results.log_lines(file.parent)]
+    probes = [line for line in lines if all(isinstance(value, (int, float)) and math.isfinite(value) for value in line)]
+    log = {name: [probe[index] for probe in probes] for index, name in enumerate(LOGGED)}
     return Run(results.decoded(document, str(file)), log, document, file.parent / results.PICTURES)
