@@ -81,7 +81,10 @@ def _of_line(line: bytes, where: str) -> Run:
 
 def _of_folder(file: Path) -> Run:
     document = results.parsed(results.file_content(file), str(file))
-    lines = [[line.get(name) for name in LOGGED] for line in results.log_lines(file.parent)]
-    probes = [line for line in lines if all(isinstance(value, (int, float)) and math.isfinite(value) for value in line)]
-    log = {name: [probe[index] for probe in probes] for index, name in enumerate(LOGGED)}
+    probes = [line for line in results.log_lines(file.parent) if all(_is_finite(line.get(name)) for name in LOGGED)]
+    log = {name: [probe[name] for probe in probes] for name in LOGGED}
     return Run(results.decoded(document, str(file)), log, document, file.parent / results.PICTURES)
+
+
+def _is_finite(value: Any) -> bool:
+    return isinstance(value, (int, float)) and math.isfinite(value)
