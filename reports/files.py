@@ -22,5 +22,5 @@ def files(made: Table | Sequence[Chart] | str) -> Iterator[tuple[str, bytes]]:
         for chart in made:
             yield f"{chart.name}.svg", chart.svg.encode()
             yield f"{chart.name}.png", chart.png
-            if chart.points is not None:
-                yield f"{chart.name}.csv", csv_text.of_frame(chart.points).encode()
+            if chart.numbers is not None:
+                yield f"{chart.name}.csv", csv_text.of_frame(chart.numbers).encode()

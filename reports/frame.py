@@ -9,20 +9,19 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from operator import attrgetter
 from typing import Any
 
 import pandas as pd
 from pandas import DataFrame
 
-from padgs.results import Result, Scores, picture_name
+from padgs.results import DECIDE_NOTHING, Result, Scores, picture_name
 from reports.scenes import Place
 from reports.store import Run
 
 CONFIG = "config."  # and the dotted key
-# Keys that no trained number depends on, and the seed; a section stands for all in it.
-NO_SETTING = ("seed", "run", "protocol", "data.path", "data.cache_bytes", "data.read_ahead", "data.device")
+NO_SETTING = ("seed", *DECIDE_NOTHING)  # a section stands for all in it
 INPUT_RANGES = {"01": "[0, 1]", "11": "[-1, 1]"}
 
 
@@ -34,11 +33,9 @@ def frame(runs: Iterable[Run]) -> DataFrame:
     facts["log"], facts["pictures"] = [run.log for run in runs], [run.pictures for run in runs]
     numbers = DataFrame({name: [of(result) for result in results] for name, of in NUMBERS.items()}, dtype=float)
     numbers["train_hours"], numbers["fps"] = numbers["train_seconds"] / 3600, 1000 / numbers["frame_ms"]
-    rules, marks, config = (
-        DataFrame([dict(of(result)) for result in results], index=facts.index, dtype=kind)
-        for of, kind in ((_rules, object), (_marks, float), (_config, object))
-    )
-    config = config.where(config.notna(), None).add_prefix(CONFIG)  # None: no such key in a method or version
+    rules = _columns([dict(_rules(result)) for result in results], object)
+    marks = _columns([dict(_marks(result)) for result in results], float)
+    config = _columns([dict(_config(result.config)) for result in results], object).add_prefix(CONFIG)
     return pd.concat([facts.astype({"ok": bool}), rules, marks, numbers, config], axis=1)
 
 
@@ -90,7 +87,7 @@ FACTS: Mapping[str, Callable[[Result], Any]] = {
     "hardware": hardware,
     "machine": machine,
     "setting": lambda result: json.dumps(
-        {key: value for key, value in _config(result) if decides(key)}, sort_keys=True
+        {key: value for key, value in _config(result.config) if decides(key)}, sort_keys=True
     ),
     "view_psnr": lambda result: _view_psnr(result.scores),
 }
@@ -104,6 +101,12 @@ NUMBERS: Mapping[str, Callable[[Result], float | None]] = {
     "peak_gigabytes": lambda result: result.peak_memory_bytes / 1e9 or None,  # of the process, while training
     "peak_gpu_gigabytes": lambda result: (result.peak_device_memory_bytes or math.nan) / 1e9,  # of the tensors there
 }
+
+
+def _columns(rows: Sequence[Mapping[str, Any]], dtype: type) -> DataFrame:
+    """A column for each name in any of the rows; what a row does not have is None, or NaN among numbers."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    return DataFrame({name: [row.get(name) for row in rows] for name in names}, index=range(len(rows)), dtype=dtype)
 
 
 def _rules(result: Result) -> Iterator[tuple[str, str]]:
@@ -131,13 +134,10 @@ def _view_psnr(scores: Mapping[str, Scores]) -> dict[str, float]:
     return found
 
 
-def _config(result: Result) -> Iterator[tuple[str, Any]]:
-    return _flat(result.config)
-
-
-def _flat(values: Mapping[str, Any], where: str = "") -> Iterator[tuple[str, Any]]:
+def _config(values: Mapping[str, Any], where: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted keys and values."""
     for key, value in values.items():
         if isinstance(value, Mapping):
-            yield from _flat(value, f"{where}{key}.")
+            yield from _config(value, f"{where}{key}.")
         else:
             yield f"{where}{key}", value

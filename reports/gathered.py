@@ -50,9 +50,8 @@ class Gathered:
         runs, names = self.asked_for, set(REPORTS[name].experiments)
         if self.request.experiment:
             return runs
-        experiments = runs["experiments"]
-        own = runs.loc[experiments.map(lambda of: not names.isdisjoint(map(_experiment, of))).astype(bool)]
-        free = runs.loc[(experiments.map(len) == 0) & ~runs["place"].isin(own["place"])]
+        own = runs.loc[[not names.isdisjoint(map(_experiment, of)) for of in runs["experiments"]]]
+        free = runs.loc[~runs["place"].isin(own["place"]) & (runs["experiments"].map(len) == 0)]
         return runs.loc[[*own.index, *free.index]] if len(own) + len(free) else runs
 
 

@@ -32,7 +32,7 @@ def admitted(runs: DataFrame, request: Request) -> DataFrame:
     if request.experiment:
         if request.experiment not in known:
             raise ReportError(f"unknown experiment {request.experiment!r}; known: {', '.join(known) or 'none'}")
-        runs = runs.loc[runs["experiments"].map(lambda of: request.experiment in of).astype(bool)]
+        runs = runs.loc[[request.experiment in of for of in runs["experiments"]]]
     for key, value in request.where.items() if len(every) else ():
         column = f"{CONFIG}{key}"
         if column not in every or every[column].isna().all():

@@ -7,6 +7,7 @@ measured while it was training. Pictures are not stored.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -80,6 +81,10 @@ def _of_line(line: bytes, where: str) -> Run:
 
 def _of_folder(file: Path) -> Run:
     document = results.parsed(results.file_content(file), str(file))
-    probes = [line for line in results.log_lines(file.parent) if line.keys() >= set(LOGGED)]
+    probes = [line for line in results.log_lines(file.parent) if all(_is_finite(line.get(name)) for name in LOGGED)]
     log = {name: [probe[name] for probe in probes] for name in LOGGED}
     return Run(results.decoded(document, str(file)), log, document, file.parent / results.PICTURES)
+
+
+def _is_finite(value: Any) -> bool:
+    return isinstance(value, (int, float)) and math.isfinite(value)

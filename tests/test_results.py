@@ -129,7 +129,7 @@ def test_read_all_keeps_the_good_and_names_the_bad(result, tmp_path):
 
 def test_lines_of_a_log_that_are_being_written_are_left_for_later(tmp_path):
     assert list(results.log_lines(tmp_path)) == []
-    (tmp_path / "log.jsonl").write_text('{"iteration": 1}\n{"loss": 2}\n{"iteration": 2, "lo')
+    (tmp_path / "log.jsonl").write_text('{"iteration": 1}\n{"loss": 2}\n[3]\n{"iteration": 2, "lo')
     assert list(results.log_lines(tmp_path)) == [{"iteration": 1}]
 
 

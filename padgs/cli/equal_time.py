@@ -45,12 +45,10 @@ def equal_time(
         methods = Gathered(frame(map(Run, found)), Request(experiment=experiment)).chosen("methods")
     except ReportError as error:
         raise _refused(str(error)) from error
-    known = {
-        result.run: result for result in found if result.run in set(methods["run"]) or EXPERIMENT in result.experiments
-    }
-    usable = [
-        result for result in known.values() if result.ok and not result.variant and result.timing.get("train_seconds")
-    ]
+    by_name = {result.run: result for result in found}
+    names = dict.fromkeys((*methods["run"], *(result.run for result in found if EXPERIMENT in result.experiments)))
+    known = [by_name[name] for name in names]
+    usable = [result for result in known if result.ok and not result.variant and result.timing.get("train_seconds")]
     if not usable:
         raise _refused(
             f"no run in {folder} has ended well; run the methods first, "

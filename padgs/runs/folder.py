@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -48,7 +47,7 @@ class RunFolder:
         """Nothing is touched before it is needed."""
         self.path = path
         self.checkpoint = path / "checkpoint"
-        self.renders = path / "renders"
+        self.renders = path / results.PICTURES
         self._log = path / results.LOG_NAME
 
     def prepare(self, values: Mapping[str, Any]) -> None:
@@ -142,9 +141,8 @@ class RunFolder:
 
     def save_picture(self, name: str, truth: Tensor, image: Tensor) -> None:
         """Save truth | render | error of the view `name`; images [H, W, 3]."""
-        path = self.renders / f"{re.sub(r'[^A-Za-z0-9._-]+', '-', name)}.png"
         with self._writing():
-            Image.fromarray(comparison(truth, image)).save(path)
+            Image.fromarray(comparison(truth, image)).save(self.renders / results.picture_name(name))
 
     @contextmanager
     def _writing(self) -> Iterator[None]:

@@ -62,7 +62,7 @@ class Chart:
     svg: str
     png: bytes
     notes: tuple[str, ...] = ()
-    points: DataFrame | None = None  # None: they are in no file
+    numbers: DataFrame | None = None  # None: they are in no file
 
 
 def styled(draw: Callable[P, T]) -> Callable[P, T]:
@@ -104,7 +104,7 @@ def dress(axis: Any, values: Sequence[float], log_from: float = math.inf) -> Non
 
 
 def finish(
-    made: Any, name: str, title: str, tips: Tips, notes: tuple[str, ...], points: DataFrame | None = None
+    made: Any, name: str, title: str, tips: Tips, notes: tuple[str, ...], numbers: DataFrame | None = None
 ) -> Chart:
     """Title and files of a figure."""
     width = int(LETTERS_PER_INCH * made.get_figwidth())
@@ -114,7 +114,7 @@ def finish(
     svg, png = io.StringIO(), io.BytesIO()
     made.savefig(svg, format="svg", metadata={"Date": None, "Creator": None})
     made.savefig(png, format="png", dpi=DPI, metadata={"Software": None})
-    return Chart(name, title, _with_tips(svg.getvalue(), tips), png.getvalue(), notes, points)
+    return Chart(name, title, _with_tips(svg.getvalue(), tips), png.getvalue(), notes, numbers)
 
 
 def color_of(preset: str, presets: Sequence[str]) -> str:

@@ -35,7 +35,7 @@ def chart(sweep: Sweep) -> Chart:
     if handles:
         made.legend(handles, labels, loc="outside lower center", ncols=3)
     title = f"Sweep {sweep.name}: mean and standard deviation over seeds"
-    return finish(made, sweep.file_name, title, tips, sweep.notes, sweep.points)
+    return finish(made, sweep.file_name, title, tips, sweep.notes, sweep.numbers)
 
 
 def _draw(panel: Any, line: Line, index: int, measure: Measure, number: int, tips: Tips) -> None:

@@ -59,7 +59,7 @@ class Sweep:
         return f"sweep_{self.name.replace('@', '_')}"
 
     @property
-    def points(self) -> DataFrame:
+    def numbers(self) -> DataFrame:
         """A row for each quantity of each point, all digits."""
         rows = []
         for line in self.lines:
@@ -82,7 +82,7 @@ def sweeps(gathered: Gathered) -> list[Sweep]:
     names = sorted(name for name in runs["experiments"].explode().dropna().unique() if not of_a_table(name))
     found = []
     for name in [request.experiment] if request.experiment else names:
-        own = runs.loc[runs["experiments"].map(lambda of, name=name: name in of).astype(bool)]
+        own = runs.loc[[name in of for of in runs["experiments"]]]
         lines, drawn = [], {}
         for place, there in by_place(own).items():
             curves = list(_curves(there))

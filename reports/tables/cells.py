@@ -4,13 +4,28 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from pandas import DataFrame
 
 from reports.measures import Measure
+from reports.settings import one_setting
 from reports.tables.table import Cell
+
+
+def of_each(
+    runs: DataFrame, column: str, titles: Mapping[str, str], where: str, measures: Sequence[Measure]
+) -> dict[str, list[Cell]]:
+    """Value of a column -> a cell for each measure over the runs that have it, in the order of `titles`.
+
+    Raises:
+        ReportError: runs of one value differ in more than the seed.
+    """
+    own = {value: runs.loc[runs[column] == value] for value in titles}
+    return {
+        value: over_seeds(one_setting(own[value], f"{where}, {title}"), measures) for value, title in titles.items()
+    }
 
 
 def over_seeds(runs: DataFrame, measures: Sequence[Measure]) -> list[Cell]:

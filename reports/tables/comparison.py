@@ -14,9 +14,8 @@ from reports.gathered import Gathered
 from reports.measures import Measure, alone
 from reports.published import Key, Published
 from reports.scenes import Place
-from reports.settings import one_setting
 from reports.tables import beside_paper
-from reports.tables.cells import over_scenes, over_seeds
+from reports.tables.cells import of_each, over_scenes
 from reports.tables.table import Block, Cell, Row, Table
 
 Measures = Sequence[Measure]
@@ -71,10 +70,9 @@ class Comparison:
         return Table(self.name, self.title, "Method", columns, tuple(blocks), (*notes, *self.notes))
 
     def _scene(self, place: Place, own: DataFrame, measures: Measures, paper: Numbers) -> Block:
-        rows = []
-        for preset in self._presets(place, own, paper):
-            runs = one_setting(own.loc[own["preset"] == preset], f"{place.title}, {methods.title(preset)}")
-            rows.append(self._row(preset, place, measures, over_seeds(runs, measures), paper))
+        titles = {preset: methods.title(preset) for preset in self._presets(place, own, paper)}
+        cells = of_each(own, "preset", titles, place.title, measures)
+        rows = (self._row(preset, place, measures, ours, paper) for preset, ours in cells.items())
         return Block(place.title, tuple(rows))
 
     def _average(

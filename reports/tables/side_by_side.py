@@ -13,8 +13,8 @@ from reports.frame import by_place
 from reports.gathered import Gathered
 from reports.measures import costs, gpu_memory, mark
 from reports.scenes import Place
-from reports.settings import one_setting, refuse_differences
-from reports.tables.cells import over_seeds
+from reports.settings import refuse_differences
+from reports.tables.cells import of_each
 from reports.tables.equal_time import EXPERIMENT, TOLERANCE, common_seconds, is_near, nearest_to, of_any_length
 from reports.tables.ranking import NOTE
 from reports.tables.table import Block, Row, Table
@@ -44,7 +44,7 @@ def equal_time(gathered: Gathered) -> Table:
     A run of the comparison after equal iterations counts where it happened to take as long.
     """
     runs = _methods(gathered, "equal_time")
-    runs = runs.loc[runs["experiments"].map(lambda of: EXPERIMENT in of).astype(bool)]
+    runs = runs.loc[[EXPERIMENT in of for of in runs["experiments"]]]
     others = _methods(gathered, "methods").drop(runs.index, errors="ignore")
     found, notes = {}, []
     for place, own in by_place(runs).items():
@@ -73,11 +73,9 @@ def _table(name: str, title: str, found: dict[Place, DataFrame], notes: Sequence
     measures = (*(mark(protocol, metric, protocol) for protocol, of in MARKS.items() for metric in of), *COSTS, *gpu)
     blocks = []
     for place, own in found.items():
-        rows = []
-        for preset in names.ordered(own["preset"]):
-            runs = one_setting(own.loc[own["preset"] == preset], f"{place.title}, {names.title(preset)}")
-            rows.append(Row(names.title(preset), tuple(over_seeds(runs, measures))))
-        blocks.append(Block(place.title, tuple(rows)))
+        titles = {preset: names.title(preset) for preset in names.ordered(own["preset"])}
+        cells = of_each(own, "preset", titles, place.title, measures)
+        blocks.append(Block(place.title, tuple(Row(titles[preset], tuple(row)) for preset, row in cells.items())))
     by_title = {place.title: own for place, own in found.items()}
     notes = [*notes, *(note for protocol in MARKS for note in footnotes(by_title, protocol))]
     return Table(name, title, "Method", tuple(m.column for m in measures), tuple(blocks), (*notes, NOTE))

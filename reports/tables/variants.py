@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 from pandas import DataFrame
 
@@ -10,13 +10,12 @@ from reports import methods, published
 from reports.conditions import OF_TIMES, footnotes, refuse_mixture
 from reports.frame import by_place
 from reports.gathered import Gathered
-from reports.measures import PAPER_METRICS, Measure, costs, marks
+from reports.measures import PAPER_METRICS, costs, marks
 from reports.scenes import Place
-from reports.settings import one_setting
 from reports.tables import beside_paper
-from reports.tables.cells import over_seeds
+from reports.tables.cells import of_each
 from reports.tables.ranking import NOTE
-from reports.tables.table import Block, Cell, Column, Row, Table
+from reports.tables.table import Block, Column, Row, Table
 
 PARTS = {  # variant (conf/ablation) -> title
     "baseline": "Baseline",
@@ -68,7 +67,7 @@ def table3(gathered: Gathered) -> Table:
         title = published.scene_title(place.dataset, place.scene)
         refuse_mixture(own, gathered.request, title)
         rows = []
-        for variant, ours in _cells(own, PARTS, title, measures).items():
+        for variant, ours in of_each(own, "variant", PARTS, title, measures).items():
             theirs = published.row(paper, 3, place.dataset, place.scene, f"padgs/{variant}")
             rows.append(Row(PARTS[variant], beside_paper.cells(measures, ours, theirs)))
         blocks.append(Block(title, tuple(rows)))
@@ -90,8 +89,8 @@ def ladder(gathered: Gathered) -> Table:
     blocks, runs_of = [], {}
     for place, own in by_place(_runs(gathered, "ladder", RUNGS)).items():
         refuse_mixture(own, gathered.request, place.title, OF_TIMES)
-        cells = _cells(own, RUNGS, place.title, measures)
-        blocks.append(Block(place.title, tuple(Row(RUNGS[variant], tuple(cells[variant])) for variant in RUNGS)))
+        cells = of_each(own, "variant", RUNGS, place.title, measures)
+        blocks.append(Block(place.title, tuple(Row(RUNGS[variant], tuple(row)) for variant, row in cells.items())))
         runs_of[place.title] = own
     columns = tuple(measure.column for measure in measures)
     notes = (*footnotes(runs_of, gathered.request.protocol), NOTE)
@@ -110,12 +109,12 @@ def quirks(gathered: Gathered) -> Table:
     for place, own in by_place(_runs(gathered, "quirks", *QUIRKS.values())).items():
         refuse_mixture(own, gathered.request, place.title, OF_TIMES)
         for method, titles in QUIRKS.items():
-            cells = _cells(own, titles, place.title, measures)
+            cells = of_each(own, "variant", titles, place.title, measures)
             described = cells[method][psnr]
             for row in cells.values():
                 row.insert(psnr + 1, beside_paper.difference(row[psnr], described))
             if own["variant"].isin(titles).any():
-                rows = (Row(titles[variant], tuple(cells[variant])) for variant in titles)
+                rows = (Row(titles[variant], tuple(row)) for variant, row in cells.items())
                 blocks.append(Block(f"{methods.title(method)}, {place.title}", tuple(rows)))
         runs_of[place.title] = own
     columns = [measure.column for measure in measures]
@@ -129,13 +128,3 @@ def _runs(gathered: Gathered, report: str, *titles: Mapping[str, str]) -> DataFr
     """The runs for a report that are of these variants."""
     runs = gathered.chosen(report)
     return runs.loc[runs["variant"].isin([variant for of in titles for variant in of])]
-
-
-def _cells(
-    runs: DataFrame, titles: Mapping[str, str], where: str, measures: Sequence[Measure]
-) -> dict[str, list[Cell]]:
-    """Variant -> its cells."""
-    return {
-        variant: over_seeds(one_setting(runs.loc[runs["variant"] == variant], f"{where}, {title}"), measures)
-        for variant, title in titles.items()
-    }

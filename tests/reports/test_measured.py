@@ -32,7 +32,7 @@ def test_the_tables_come_out_again(measured, found, name):
 
 
 def test_the_points_of_all_charts_come_out_again(measured, found):
-    made = {f"{sweep.file_name}.csv": csv_text.of_frame(sweep.points) for sweep in sweeps.sweeps(found)}
+    made = {f"{sweep.file_name}.csv": csv_text.of_frame(sweep.numbers) for sweep in sweeps.sweeps(found)}
     made |= {f"{chart.name}.csv": csv_text.of_frame(chart.numbers) for chart in trade_off.trade_offs(found)}
     committed = {p.name: p.read_text() for p in measured.glob("*.csv") if p.stem not in TABLES}
     assert committed == made

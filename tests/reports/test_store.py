@@ -47,7 +47,10 @@ def test_a_line_is_the_result_file_with_its_digest_and_the_log(runs, tmp_path):
 def test_lines_of_a_log_that_are_no_probes_do_not_count(tmp_path):
     write([small(25.0)], tmp_path)
     (log,) = tmp_path.glob("*/log.jsonl")
-    log.write_text('{"iteration": 9, "seconds": 1.5, "psnr": 20.0}\n{"iteration": 10, "seconds": 1.6}\n{"iter')
+    log.write_text(
+        '{"iteration": 9, "seconds": 1.5, "psnr": 20.0}\n{"iteration": 10, "seconds": 1.6}\n'
+        '{"iteration": 11, "seconds": 1.7, "psnr": NaN}\n{"iter'
+    )
     assert store.read(tmp_path)[0][0].log == {"iteration": [9], "seconds": [1.5], "psnr": [20.0]}
     log.unlink()
     assert store.read(tmp_path)[0][0].log == {"iteration": [], "seconds": [], "psnr": []}

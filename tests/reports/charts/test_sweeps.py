@@ -12,7 +12,7 @@ from reports.writers import csv_text
 
 
 def rows(sweep) -> list[dict[str, str]]:
-    return list(csv.DictReader(io.StringIO(csv_text.of_frame(sweep.points))))
+    return list(csv.DictReader(io.StringIO(csv_text.of_frame(sweep.numbers))))
 
 
 def test_a_curve_for_each_scene_along_the_key_that_differs():
