@@ -39,7 +39,7 @@ LOW_PASS_KINDS = {  # of each projection, its natural one first; `padgs.render.l
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """How Gaussians become an image. The defaults are ours; `RELEASED` in `padgs.render` is the published behaviour."""
+    """How Gaussians become an image. The defaults are ours; conf/render/released.yaml is the published rasterizer."""
 
     projection: str = "erp"
     near: float = 0.0  # world units; Gaussians whose mean is at most this far away are culled

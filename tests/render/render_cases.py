@@ -24,6 +24,7 @@ from padgs.sphere.panorama import direction
 INPUTS = ("means", "quats", "scales", "opacities", "colors")
 KINDS = ("ordinary", "polar", "pole", "seam", "near", "huge", "needle")
 ODD_SIZES = ((72, 36), (70, 44), (33, 17))
+RELEASED = RenderOptions(near=0.2, wrap=False, bounds="square")  # as conf/render/released.yaml, one world unit
 SETUPS = (  # every projection with every camera that it takes
     ("erp", "panorama"),
     ("tangent", "panorama"),
