@@ -21,6 +21,7 @@ from padgs.multirun.overrides import expand
 from padgs.registry import lookup
 from padgs.render.config import RenderConfig
 from padgs.runs.config import RunOptions, TrainConfig
+from padgs.runs.typed import ConfigError
 from padgs.scoring.protocols import PROTOCOLS, ROAM_360_BOTTOM_CROP
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
@@ -173,6 +174,26 @@ def test_the_release_of_padgs_differs_from_the_paper_where_its_code_does():
     }
     assert released.render == RenderConfig(near=0.2, near_unit="world", wrap=False, bounds="square")
     assert (released.train.weight, released.train.normalisation) == ("end_rows", "channel_sum")
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (
+            ["render.bounds=square"],
+            "render: bounds=square are the published bounds, which end at the seam; set wrap=false",
+        ),
+        (
+            ["method=omnigs", "render.near_cull=ellipsoid"],
+            "near_cull=ellipsoid is made for projection 'ray', not 'erp'",
+        ),
+        (["method=spags_sorted", "render.core_size=8"], "core_size is 8, but blending=sorted keeps no core"),
+        (["render.near_unit=metre"], "unknown near_unit 'metre'; known: scene, world"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused_before_anything_is_read(settings, message):
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        composed(*settings)
 
 
 @pytest.mark.parametrize("name", sorted(METHODS.keys() - {"padgs"}))
