@@ -15,22 +15,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from padgs.data.assemble import assemble, image_folder
+from padgs.data.assemble import image_folder
 from padgs.data.capture import Capture, Cloud, Frame, Tracks
 from padgs.data.errors import DataError, listed
 from padgs.data.formats.colmap_binary import check_whole
 from padgs.data.formats.poses import cam_from_world
 from padgs.data.options import DataOptions
 from padgs.data.splits import check_inside
-from padgs.scene import Scene
 
 FILES = ("cameras", "images", "points3D")
 _ALIAS = re.compile(r"^(\s*\d+\s+)SPHERICAL\s+(\d+)\s+(\d+).*$", re.MULTILINE)
-
-
-def load(path: Path, options: DataOptions) -> Scene:
-    """The scene of a COLMAP model and its images."""
-    return assemble(read(path, options), options)
 
 
 def find_model(path: Path) -> Path | None:

@@ -7,22 +7,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from padgs.data.assemble import assemble, image_folder
+from padgs.data.assemble import image_folder
 from padgs.data.capture import Capture, Frame
 from padgs.data.cloud import existing_ply
 from padgs.data.formats.json_file import entries, entry, numbers, read_json
 from padgs.data.formats.poses import cam_from_opengl_pose
 from padgs.data.options import DataOptions
 from padgs.data.splits import check_inside
-from padgs.scene import Scene
 
 FILE = "transform.json"
 _PLY = ("pcd.ply", "scene.ply", "openMVG/scene.ply", "openMVG/reconstruction/colorized.ply")
-
-
-def load(path: Path, options: DataOptions) -> Scene:
-    """The scene in a folder of OmniBlender."""
-    return assemble(read(path, options), options)
 
 
 def read(path: Path, options: DataOptions) -> Capture:

@@ -7,22 +7,16 @@ from typing import Any
 
 import torch
 
-from padgs.data.assemble import assemble, image_folder
+from padgs.data.assemble import image_folder
 from padgs.data.capture import Capture, Cloud, Frame, Tracks
 from padgs.data.cloud import existing_ply
 from padgs.data.errors import DataError
 from padgs.data.formats.json_file import entries, entry, numbers, read_json
 from padgs.data.formats.openmvg_views import read_extrinsics, read_views
 from padgs.data.options import DataOptions
-from padgs.scene import Scene
 
 FILE = "sfm_data.json"
 _PLY = ("colorized.ply", "scene.ply", "pcd.ply")
-
-
-def load(path: Path, options: DataOptions) -> Scene:
-    """The scene of an `sfm_data.json` and its images."""
-    return assemble(read(path, options), options)
 
 
 def read(path: Path, options: DataOptions) -> Capture:

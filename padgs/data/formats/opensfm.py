@@ -10,22 +10,16 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from padgs.data.assemble import assemble, image_folder
+from padgs.data.assemble import image_folder
 from padgs.data.capture import Capture, Cloud, Frame
 from padgs.data.errors import DataError
 from padgs.data.formats.json_file import entry, numbers, read_json
 from padgs.data.formats.poses import cam_from_world, rotation_from_vector
 from padgs.data.options import DataOptions
 from padgs.data.splits import check_inside
-from padgs.scene import Scene
 
 FILE = "reconstruction.json"
 MODELS = ("spherical", "equirectangular")
-
-
-def load(path: Path, options: DataOptions) -> Scene:
-    """The scene of a `reconstruction.json` and its images."""
-    return assemble(read(path, options), options)
 
 
 def read(path: Path, options: DataOptions) -> Capture:

@@ -8,20 +8,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from padgs.data.assemble import assemble, image_folder
+from padgs.data.assemble import image_folder
 from padgs.data.capture import Capture, Frame
 from padgs.data.cloud import existing_ply
 from padgs.data.formats.json_file import read_json
 from padgs.data.formats.openmvg_views import read_extrinsics, read_views
 from padgs.data.options import DataOptions
-from padgs.scene import Scene
 
 VIEWS, EXTRINSICS = "data_views.json", "data_extrinsics.json"
-
-
-def load(path: Path, options: DataOptions) -> Scene:
-    """The scene in a processed folder."""
-    return assemble(read(path, options), options)
 
 
 def read(path: Path, options: DataOptions) -> Capture:

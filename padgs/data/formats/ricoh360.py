@@ -10,21 +10,15 @@ from pathlib import Path, PurePosixPath
 
 import torch
 
-from padgs.data.assemble import assemble, image_folder, image_names
+from padgs.data.assemble import image_folder, image_names
 from padgs.data.capture import Capture, Cloud, Frame
 from padgs.data.cloud import existing_ply
 from padgs.data.errors import DataError
 from padgs.data.formats.poses import cam_from_world, rotation_from_quaternion
 from padgs.data.options import DataOptions
 from padgs.data.splits import check_inside
-from padgs.scene import Scene
 
 MODEL = "output_dir/colmap"
-
-
-def load(path: Path, options: DataOptions) -> Scene:
-    """The scene in a folder of Ricoh360."""
-    return assemble(read(path, options), options)
 
 
 def read(path: Path, options: DataOptions) -> Capture:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path, PurePosixPath
 
-from padgs.data.assemble import assemble, image_folder
+from padgs.data.assemble import image_folder
 from padgs.data.capture import Capture, Frame
 from padgs.data.cloud import existing_ply
 from padgs.data.datasets import DATASETS
@@ -17,14 +17,8 @@ from padgs.data.formats.json_file import entries, entry, numbers, read_json
 from padgs.data.formats.poses import cam_from_pose
 from padgs.data.options import DataOptions
 from padgs.data.splits import check_inside
-from padgs.scene import Scene
 
 FILE = "pose_c2w.json"
-
-
-def load(path: Path, options: DataOptions) -> Scene:
-    """The scene in a folder of 360Roam."""
-    return assemble(read(path, options), options)
 
 
 def read(path: Path, options: DataOptions) -> Capture:

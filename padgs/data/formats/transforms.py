@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from padgs.data.assemble import assemble
 from padgs.data.capture import Capture, Frame
 from padgs.data.cloud import existing_ply
 from padgs.data.errors import DataError
@@ -19,17 +18,11 @@ from padgs.data.images import EXTENSIONS
 from padgs.data.options import DataOptions
 from padgs.data.ply import read_ply
 from padgs.data.splits import check_inside
-from padgs.scene import Scene
 
 FILE = "transforms.json"
 SIDES = {"train": "transforms_train.json", "test": "transforms_test.json"}
 MODELS = ("EQUIRECTANGULAR", "SPHERICAL")
 _PLY = ("sparse_pc.ply", "points3d.ply", "points3D.ply", "pcd.ply", "scene.ply")
-
-
-def load(path: Path, options: DataOptions) -> Scene:
-    """The scene of a `transforms.json` and its images."""
-    return assemble(read(path, options), options)
 
 
 def read(path: Path, options: DataOptions) -> Capture:
