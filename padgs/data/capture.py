@@ -6,10 +6,13 @@ Every file format has one reader, `read(path, options) -> Capture`; `padgs.data.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+import torch
 from torch import Tensor
 
 
@@ -40,6 +43,16 @@ class Tracks:
     frame: Tensor  # [T] int64, index into Capture.frames
     point: Tensor  # [T] int64, index into Cloud.points
     pixels: Tensor  # [T, 2] float64, continuous (u, v) at the camera's size
+
+    @classmethod
+    def of(cls, seen: Iterable[tuple[int, int, Any]]) -> Tracks:
+        """Of (frame, point, pixel) of every observation."""
+        rows = list(seen)
+        return cls(
+            torch.tensor([frame for frame, _, _ in rows], dtype=torch.int64),
+            torch.tensor([point for _, point, _ in rows], dtype=torch.int64),
+            torch.from_numpy(np.array([pixel for _, _, pixel in rows], np.float64).reshape(-1, 2)),
+        )
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ def inspect(path: Path, *, mask: bool = False) -> ImageFile:
     Raises:
         DataError: not there, unreadable, not an image, cut short, turned by EXIF, 16-bit, grey, CMYK or not 2:1.
     """
-    data = _read(path)
+    data = read_bytes(path)
     try:
         with Image.open(BytesIO(data)) as image:
             width, height, mode = image.width, image.height, image.mode
@@ -73,7 +73,7 @@ def decode(path: Path, mode: str = "RGB") -> NDArray[np.uint8]:
     Raises:
         DataError: the file is cut short or damaged, or partly transparent.
     """
-    return _decode(BytesIO(_read(path)), path, mode)
+    return _decode(BytesIO(read_bytes(path)), path, mode)
 
 
 def _decode(file: BytesIO, path: Path, mode: str) -> NDArray[np.uint8]:
@@ -100,7 +100,12 @@ def _eight_bit(image: Image.Image) -> Image.Image:
     return Image.fromarray((np.asarray(image).astype(np.int64) >> 8).clip(0, 255).astype(np.uint8))
 
 
-def _read(path: Path) -> bytes:
+def read_bytes(path: Path) -> bytes:
+    """The contents of a file.
+
+    Raises:
+        DataError: not there, unreadable or empty.
+    """
     try:
         data = path.read_bytes()
     except FileNotFoundError as error:

@@ -13,29 +13,25 @@ from padgs.data.capture import Capture, Frame
 from padgs.data.cloud import existing_ply
 from padgs.data.datasets import DATASETS
 from padgs.data.errors import DataError
-from padgs.data.formats.json_file import entries, entry, numbers, read_json
+from padgs.data.formats.json_file import Json, read_json
 from padgs.data.formats.poses import cam_from_pose
 from padgs.data.options import DataOptions
-from padgs.data.splits import check_inside
-
-FILE = "pose_c2w.json"
 
 
 def read(path: Path, options: DataOptions) -> Capture:
     """Read the poses and the split."""
-    file = path / FILE
+    file = path / "pose_c2w.json"
     data = read_json(file)
     images = image_folder(path, options.images)
     frames: list[Frame] = []
     split: dict[str, tuple[str, ...]] = {}
     for side in ("train", "test"):
         names = []
-        for item in entries(data, side, str(file)):
-            stated = check_inside(str(entry(item, "rgb_file", f"a {side} view of {file}")), str(file))
+        for item in data[side].entries():
+            stated = item["rgb_file"].name()
             name = stated if (images / stated).is_file() else PurePosixPath(stated).name
-            where = f"transform_matrix of {name} in {file}"
-            pose = numbers(entry(item, "transform_matrix", f"{name} in {file}"), (4, 4), where)
-            frames.append(Frame(name, images / name, cam_from_pose(pose, where)))
+            matrix = Json(item.value, f"{name} in {file}")["transform_matrix"]
+            frames.append(Frame(name, images / name, cam_from_pose(matrix.numbers(4, 4), matrix.where)))
             names.append(name)
         split[side] = tuple(names)
     twice = set(split["train"]) & set(split["test"])

@@ -17,7 +17,7 @@ from PIL import Image
 from torch import Tensor
 
 from padgs.data.capture import Cloud, Frame, Tracks
-from padgs.data.formats.colmap import pycolmap_module
+from padgs.data.formats.colmap import cloud_of, pycolmap_module
 from padgs.data.formats.poses import rigid
 from padgs.data.images import decode
 from padgs.sphere.panorama import direction, project, sample
@@ -135,8 +135,7 @@ def panoramas(model: Any, images: dict[str, Path], width: int) -> tuple[tuple[Fr
         width: of the panoramas, in pixels.
     """
     rotations = cam_from_pano()
-    point_ids = sorted(model.points3D.keys())
-    row_of = {point_id: row for row, point_id in enumerate(point_ids)}
+    cloud, row_of = cloud_of(model)
     poses: dict[str, Tensor] = {}
     seen: dict[str, list[tuple[Tensor, Tensor]]] = {}  # name -> (point rows, pixels) of its views
     for image in model.images.values():
@@ -159,11 +158,6 @@ def panoramas(model: Any, images: dict[str, Path], width: int) -> tuple[tuple[Fr
         frame=torch.cat([torch.full((len(rows),), index) for index, rows, _ in parts]),
         point=torch.cat([rows for _, rows, _ in parts]),
         pixels=torch.cat([pixels for _, _, pixels in parts]),
-    )
-    points = [model.points3D[point_id] for point_id in point_ids]
-    cloud = Cloud(
-        torch.from_numpy(np.array([point.xyz for point in points])),
-        torch.from_numpy(np.array([point.color for point in points], np.uint8)),
     )
     return frames, cloud, tracks
 
