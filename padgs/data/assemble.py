@@ -27,7 +27,9 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
     """
     capture = replace(capture, frames=tuple(sorted(capture.frames, key=lambda frame: frame.name)))
     names = [frame.name for frame in capture.frames]
-    _refuse_clashes(names, capture)
+    if not names:
+        raise DataError(f"the {capture.format} model in {capture.folder} holds no posed image")
+    refuse_clashes(names)
     _refuse_absent(capture)
     images = [inspect(frame.image) for frame in capture.frames]
     notes = [*capture.notes, *_camera_notes(capture.frames, images)]
@@ -104,14 +106,19 @@ def image_names(folder: Path) -> list[str]:
     return sorted(found)
 
 
-def _refuse_clashes(names: Sequence[str], capture: Capture) -> None:
-    if not names:
-        raise DataError(f"the {capture.format} model in {capture.folder} holds no posed image")
+def refuse_clashes(names: Sequence[str]) -> None:
+    """Raise if two images would give views of one name.
+
+    Raises:
+        DataError: they would.
+    """
     seen: dict[str, str] = {}
     for name in names:
         key = view_name(name).casefold()
         if key in seen:
-            raise DataError(f"the images {seen[key]!r} and {name!r} would share one name (without case and extension)")
+            raise DataError(
+                f"the images {seen[key]!r} and {name!r} would share one name (without case and extension); rename one"
+            )
         seen[key] = name
 
 

@@ -12,8 +12,10 @@ from io import BytesIO
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
+from torch import Tensor
 
 from padgs.data.errors import DataError
 
@@ -74,6 +76,12 @@ def decode(path: Path, mode: str = "RGB") -> NDArray[np.uint8]:
         DataError: the file is cut short or damaged, or partly transparent.
     """
     return _decode(BytesIO(read_bytes(path)), path, mode)
+
+
+def save_png(pixels: Tensor, path: Path) -> None:
+    """Write pixels [H, W, 3] or [H, W] in 0..255, rounded, in a folder that is made where it is not there."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(pixels.round().to(torch.uint8).cpu().numpy()).save(path)
 
 
 def _decode(file: BytesIO, path: Path, mode: str) -> NDArray[np.uint8]:

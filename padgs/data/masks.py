@@ -6,7 +6,7 @@ A mask is one file for the scene, one file per image, the rule that only the fir
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from padgs.data.capture import Capture, Frame
 from padgs.data.errors import DataError
-from padgs.data.images import EXTENSIONS, ImageFile, inspect
+from padgs.data.images import EXTENSIONS, ImageFile, inspect, save_png
 from padgs.data.store import ImageStore, StoredImage
 
 SCENE_MASKS = ("mask.png", "mask.jpg", "mask.bmp")
@@ -144,3 +144,14 @@ def _in_folder(folder: Path, name: str) -> Path | None:
     stem = PurePosixPath(name).with_suffix("")
     candidates = [f"{name}.png", *(f"{stem}{extension}" for extension in (".png", *EXTENSIONS))]
     return next((folder / file for file in candidates if (folder / file).is_file()), None)
+
+
+def write_masks(masks: Mapping[str, Tensor | None], folder: Path) -> None:
+    """mask.png if all views (name -> weights) have the same weights, else masks/ with one file per masked view."""
+    present = {name: mask for name, mask in masks.items() if mask is not None}
+    first = next(iter(present.values()), None)
+    if first is not None and len(present) == len(masks) and all(mask.equal(first) for mask in present.values()):
+        save_png(first * 255, folder / "mask.png")
+        return
+    for name, mask in present.items():
+        save_png(mask * 255, folder / "masks" / f"{name}.png")

@@ -24,10 +24,12 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from padgs.data.assemble import view_name
 from padgs.data.capture import Cloud, Frame, Tracks
 from padgs.data.errors import DataError, listed
 from padgs.data.formats import colmap
 from padgs.data.formats.writers import Content, write_colmap
+from padgs.data.masks import write_masks
 from padgs.data.options import DataOptions
 from padgs.data.prepare import rig, sfm
 from padgs.data.prepare.pairs import PAIRS, image_pairs
@@ -286,17 +288,12 @@ class _Job:
         return renamed, cloud, tracks
 
     def _copy_images(self, frames: tuple[Frame, ...], folder: Path) -> None:
-        masks = {frame.name: self.source.masks[frame.name]() for frame in frames if frame.name in self.source.masks}
-        first = next(iter(masks.values()), None)
-        shared = first is not None and len(masks) == len(frames) and all(m.equal(first) for m in masks.values())
         for frame in frames:
             target = folder / "images" / frame.name
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(frame.image, target)
-            if frame.name in masks and not shared:
-                _save_mask(masks[frame.name], folder / "masks" / f"{Path(frame.name).with_suffix('.png')}")
-        if shared:
-            _save_mask(masks[frames[0].name], folder / "mask.png")
+        masks = {view_name(frame.name): self.source.masks.get(frame.name) for frame in frames}
+        write_masks({name: None if mask is None else mask() for name, mask in masks.items()}, folder)
 
     # Bookkeeping.
 
@@ -356,11 +353,6 @@ def rotation_between(up: Tensor) -> Tensor:
     k = 1 / (1 + z)
     rows = ((1 - k * x * x, -k * x * y, -x), (-k * x * y, 1 - k * y * y, -y), (x, y, z))
     return torch.tensor(rows, dtype=up.dtype) + 0.0
-
-
-def _save_mask(mask: Tensor, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray((mask * 255).round().to(torch.uint8).numpy()).save(path)
 
 
 def _file_digest(path: Path) -> str:
