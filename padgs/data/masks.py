@@ -71,19 +71,18 @@ def find_masks(
     rule = _ROWS.fullmatch(spec)
     files, note = _mask_files(capture, None if rule or spec == "auto" else capture.folder / spec)
     notes = [note] if note else []
+    rows: dict[int, Tensor] = {}  # by height
     if rule:
         keep, of = int(rule[1]), int(rule[2])
         if not 0 < keep <= of:
             raise DataError(f"data.mask={spec}: the first number is how many of the second are kept; 1 to {of}")
         notes.append(f"mask: rows from {keep} of {of} on are ignored ({1 - keep / of:.1%} of the image)")
+        rows = {height: row_weights(keep, of, height) for _, height in sizes}
     masks: list[Mask | None] = []
     digests = [spec] if rule else []
     inspected: dict[Path, ImageFile] = {}
-    rows: dict[int, Tensor] = {}
     for frame, image, (width, height) in zip(capture.frames, images, sizes, strict=True):
         path = files.get(frame.name)
-        if rule and height not in rows:
-            rows[height] = row_weights(int(rule[1]), int(rule[2]), height)
         if path is None:
             masks.append(Mask(None, rows[height]) if rule else None)
             continue
@@ -95,7 +94,7 @@ def find_masks(
                 f"{path} is {mask_file.width}x{mask_file.height} but {image.path.name} is "
                 f"{image.width}x{image.height}; a mask must have the size of its image"
             )
-        masks.append(Mask(StoredImage(path, width, height, store, "L"), rows.get(height) if rule else None))
+        masks.append(Mask(StoredImage(path, width, height, store, "L"), rows.get(height)))
         digests.append(f"{frame.name}:{mask_file.digest}")
     _refuse_empty(masks, capture.frames)
     return masks, digests, notes
