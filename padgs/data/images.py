@@ -88,16 +88,15 @@ def _decode(file: BytesIO, path: Path, mode: str) -> NDArray[np.uint8]:
     try:
         with Image.open(file) as image:
             image.load()
-            if mode == "RGB" and "A" in image.getbands() and np.asarray(image.getchannel("A")).min() < 255:
-                raise DataError(
-                    f"{path} has transparent pixels; save it without alpha and say which pixels to ignore in a mask "
-                    "file (data.mask)"
-                )
+            transparent = mode == "RGB" and "A" in image.getbands() and np.asarray(image.getchannel("A")).min() < 255
             pixels = np.array(_eight_bit(image).convert(mode))
-    except DataError:
-        raise
     except (OSError, SyntaxError, ValueError) as error:
         raise DataError(f"{path} is cut short or damaged ({error}); copy it again or remove it") from error
+    if transparent:
+        raise DataError(
+            f"{path} has transparent pixels; save it without alpha and say which pixels to ignore in a mask "
+            "file (data.mask)"
+        )
     return pixels if mode == "RGB" else pixels[..., None]
 
 

@@ -7,7 +7,7 @@ is nearest, so that no feature is found twice. The views' focal length has the p
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -137,7 +137,7 @@ def panoramas(model: Any, images: dict[str, Path], width: int) -> tuple[tuple[Fr
     rotations = cam_from_pano()
     cloud, row_of = cloud_of(model)
     poses: dict[str, Tensor] = {}
-    seen: dict[str, list[tuple[Tensor, Tensor]]] = {}  # name -> (point rows, pixels) of its views
+    seen: list[tuple[str, Tensor, Tensor]] = []  # name, rows of the points and pixels, of every view
     for image in model.images.values():
         if not image.has_pose:
             continue
@@ -150,14 +150,14 @@ def panoramas(model: Any, images: dict[str, Path], width: int) -> tuple[tuple[Fr
             half = view_size(width) / 2
             rays = torch.cat((pixels / half - 1, torch.ones(len(pixels), 1, dtype=torch.float64)), dim=1)
             rows = torch.tensor([row_of[point.point3D_id] for point in with_point])
-            seen.setdefault(name, []).append((rows, project(rays @ rotations[view], width, width // 2)))
-    names: Sequence[str] = sorted(poses)
+            seen.append((name, rows, project(rays @ rotations[view], width, width // 2)))
+    names = sorted(poses)
+    seen.sort(key=lambda part: part[0])
     frames = tuple(Frame(name, images[name], poses[name], width, width // 2) for name in names)
-    parts = [(index, rows, pixels) for index, name in enumerate(names) for rows, pixels in seen.get(name, [])]
     tracks = Tracks(
-        frame=torch.cat([torch.full((len(rows),), index) for index, rows, _ in parts]),
-        point=torch.cat([rows for _, rows, _ in parts]),
-        pixels=torch.cat([pixels for _, _, pixels in parts]),
+        frame=torch.cat([torch.full((len(rows),), names.index(name)) for name, rows, _ in seen]),
+        point=torch.cat([rows for _, rows, _ in seen]),
+        pixels=torch.cat([pixels for _, _, pixels in seen]),
     )
     return frames, cloud, tracks
 
