@@ -49,15 +49,8 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
     store = ImageStore(options.cache_bytes, options.read_ahead, options.device)
     masks, mask_digests, mask_notes = find_masks(capture, options.mask, images, sizes, store)
     views = [
-        View(
-            view_name(frame.name),
-            frame.cam_from_world,
-            width,
-            height,
-            StoredImage(frame.image, width, height, store),
-            mask,
-        )
-        for frame, (width, height), mask in zip(capture.frames, sizes, masks, strict=True)
+        View(view_name(frame.name), frame.cam_from_world, *size, StoredImage(frame.image, *size, store), mask)
+        for frame, size, mask in zip(capture.frames, sizes, masks, strict=True)
     ]
     digest = hashlib.sha256()
     for view, image in zip(views, images, strict=True):

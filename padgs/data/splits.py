@@ -124,10 +124,9 @@ def _every(names: Sequence[str], every: int, mode: str) -> Split:
 
 
 def _resolve(lines: Sequence[str], names: Sequence[str], which: str, unposed: Sequence[str]) -> set[int]:
-    exact: dict[str, set[int]] = {}
+    exact = {name: {i} for i, name in enumerate(names)}
     loose: dict[str, set[int]] = {}
     for i, name in enumerate(names):
-        exact.setdefault(name, set()).add(i)
         for key in _keys(name):
             loose.setdefault(key, set()).add(i)
     chosen: set[int] = set()

@@ -130,6 +130,7 @@ class _Job:
         self._open("images", self.source.fingerprint, keep=of_video)
         # pycolmap's list of pairs knows no spaces, so it gets names of ours.
         self.files = {f"{index:06d}{Path(name).suffix}": name for index, name in enumerate(self.source.images)}
+        self.paths = {short: self.source.images[name].path for short, name in self.files.items()}
         self.views = rig.VIEWS_PER_ROW * len(rig.LATITUDES) if options.accurate else 1
         self.database = self.work / "database.db"
         self.pictures = self.work / ("views" if options.accurate else "images")  # in which features are found
@@ -169,7 +170,7 @@ class _Job:
                 "needs one: resize them, or do without it"
             )
         rig.render_views(
-            {short: self.source.images[name].path for short, name in self.files.items()},
+            self.paths,
             {short: self.work / "masks" / f"{short}.png" for short in self.files} if self.source.masks else {},
             self.work / "views",
             self.work / "view_masks",
@@ -255,19 +256,15 @@ class _Job:
     def _panoramas(self, model: Any) -> tuple[tuple[Frame, ...], Cloud, Tracks]:
         """Frames under their own names, points and observations."""
         if self.options.accurate:
-            paths = {short: self.source.images[name].path for short, name in self.files.items()}
-            frames, cloud, tracks = rig.panoramas(model, paths, next(iter(self.source.images.values())).width)
+            frames, cloud, tracks = rig.panoramas(model, self.paths, next(iter(self.source.images.values())).width)
         else:
             refined = _empty(self.work / "refined")
             model.write_binary(str(refined))
             capture = colmap.read(self.work, DataOptions(images="images"), refined)
             assert capture.cloud is not None and capture.tracks is not None
             frames, cloud, tracks = capture.frames, capture.cloud, capture.tracks()
-        renamed = tuple(
-            replace(frame, name=self.files[frame.name], image=self.source.images[self.files[frame.name]].path)
-            for frame in frames
-        )
-        return renamed, cloud, tracks
+        named = (replace(frame, name=self.files[frame.name], image=self.paths[frame.name]) for frame in frames)
+        return tuple(named), cloud, tracks
 
     def _copy_images(self, frames: tuple[Frame, ...], folder: Path) -> None:
         for frame in frames:

@@ -87,7 +87,13 @@ def _register(database: Path, groups: Sequence[Group]) -> list[int]:
                 camera_id = known[group.names[0]].camera_id
                 rig_id = entries.read_rig_with_sensor(entries.read_camera(camera_id).sensor_id).rig_id
             else:
-                camera_id = entries.write_camera(_camera(group))
+                if group.focal is None:
+                    model, params = "EQUIRECTANGULAR", [group.width, group.height]
+                else:
+                    model, params = "SIMPLE_PINHOLE", [group.focal, group.width / 2, group.height / 2]
+                camera = pycolmap.Camera(model=model, width=group.width, height=group.height, params=params)
+                camera.has_prior_focal_length = True
+                camera_id = entries.write_camera(camera)
                 rig = pycolmap.Rig()
                 rig.add_ref_sensor(entries.read_camera(camera_id).sensor_id)
                 rig_id = entries.write_rig(rig)
@@ -100,17 +106,6 @@ def _register(database: Path, groups: Sequence[Group]) -> list[int]:
                     entries.write_frame(frame)
             cameras.append(camera_id)
     return cameras
-
-
-def _camera(group: Group) -> Any:
-    pycolmap = pycolmap_module()
-    if group.focal is None:
-        model, params = "EQUIRECTANGULAR", [group.width, group.height]
-    else:
-        model, params = "SIMPLE_PINHOLE", [group.focal, group.width / 2, group.height / 2]
-    camera = pycolmap.Camera(model=model, width=group.width, height=group.height, params=params)
-    camera.has_prior_focal_length = True
-    return camera
 
 
 def make_rig(database: Path, config: Any) -> None:
