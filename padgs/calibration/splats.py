@@ -68,7 +68,7 @@ class CalibratedTrainee(SplatTrainee):
     def size(self) -> Size:
         """Counts and bytes of the model, calibration included."""
         size = super().size()
-        parameters = [p for group in self.calibration.groups(1) for p in group.parameters]
+        parameters = list(self.calibration.parameters())
         return Size(
             counts={**size.counts, **self.calibration.counts()},
             parameters=size.parameters + sum(p.numel() for p in parameters),

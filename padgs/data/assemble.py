@@ -33,7 +33,9 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
     _refuse_absent(capture)
     images = [inspect(frame.image) for frame in capture.frames]
     notes = [*capture.notes, *_camera_notes(capture.frames, images)]
-    target = options.width or capture.width
+    target = options.width
+    if target is None and capture.width is not None and images[0].width > capture.width:
+        target = capture.width
     sizes = [_view_size(image, target) for image in images]
     reduced = {(image.width, image.height) for image, size in zip(images, sizes, strict=True) if size[0] < image.width}
     if reduced:

@@ -66,6 +66,6 @@ class Capture:
     cloud: Cloud | None
     split: Mapping[str, tuple[str, ...]] | None = None  # "train", "test" -> names, where the format states them
     mask: str = "auto"  # what data.mask=auto means for this format
-    width: int | None = None  # what data.width=null means for this format; None = as stored
+    width: int | None = None  # what wider images are reduced to if data.width is null; None = as stored
     tracks: Callable[[], Tracks] | None = None
     notes: tuple[str, ...] = ()

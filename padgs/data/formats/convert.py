@@ -119,11 +119,8 @@ def _kept_tracks(capture: Capture, kept: list[int], frames: list[Frame]) -> Trac
     tracks = capture.tracks()
     position = torch.full((len(capture.frames),), -1)
     position[kept] = torch.arange(len(kept))
-    scale = torch.ones(len(capture.frames), dtype=torch.float64)
-    for i, frame in zip(kept, frames, strict=True):
-        before = capture.frames[i].width
-        assert before is not None and frame.width is not None
-        scale[i] = frame.width / before
-    rows = position[tracks.frame] >= 0
-    pixels = tracks.pixels[rows] * scale[tracks.frame[rows], None]
-    return Tracks(position[tracks.frame[rows]], tracks.point[rows], pixels)
+    frame = position[tracks.frame]
+    seen = frame >= 0
+    before, after = (torch.tensor([f.width for f in part], dtype=torch.float64) for part in (capture.frames, frames))
+    scale = after[frame[seen]] / before[tracks.frame[seen]]
+    return Tracks(frame[seen], tracks.point[seen], tracks.pixels[seen] * scale[:, None])

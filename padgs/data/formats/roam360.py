@@ -38,17 +38,5 @@ def read(path: Path, options: DataOptions) -> Capture:
     if twice:
         raise DataError(f"{file}: {sorted(twice)[0]} is both a train and a test view; it may be one of them")
     known = DATASETS["roam360"]
-    width = known.width if (options.width is None and _is_native(frames)) else None
     cloud = existing_ply(path, ("scene.ply", f"{path.name}.ply", "pcd.ply"))
-    return Capture("roam360", path, images, tuple(frames), cloud, split, known.mask, width)
-
-
-def _is_native(frames: list[Frame]) -> bool:
-    """Whether the images are larger than the paper's size, as downloaded; the first tells."""
-    from PIL import Image
-
-    try:
-        with Image.open(frames[0].image) as image:
-            return image.width > DATASETS["roam360"].width
-    except (OSError, IndexError):
-        return False  # whoever reads the images will say what is wrong
+    return Capture("roam360", path, images, tuple(frames), cloud, split, known.mask, known.width)
