@@ -12,12 +12,12 @@ from functools import partial
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from padgs.calibration.align import Difference, Similarity, align
 from padgs.calibration.camera_map import CameraMap
 from padgs.calibration.poses import PoseRates, PoseRefinement
-from padgs.calibration.splats import CalibratedMethod
+from padgs.calibration.splats import CalibratedMethod, Calibration
 from padgs.learning.loop import TrainOptions
 from padgs.learning.loss import pixel_weight
 from padgs.learning.schedule import Constant, ParameterGroup
@@ -50,8 +50,8 @@ class SCOmniGSOptions(SplatOptions):
             raise ValueError(f"anisotropy_ratio is {self.anisotropy_ratio}; longest to shortest is at least 1")
 
 
-class SelfCalibration(nn.Module):
-    """Poses of all training views and the one camera that took them; see `padgs.calibration.splats.Calibration`."""
+class SelfCalibration(Calibration):
+    """Poses of all training views and the one camera that took them."""
 
     def __init__(self, poses: PoseRefinement, camera: CameraMap, options: SCOmniGSOptions, weight: str) -> None:
         """Start from the given poses and an ideal camera; `weight` is a name of `padgs.learning.loss.ROW_WEIGHTS`."""

@@ -272,12 +272,11 @@ def test_padgs_on_another_projection_differs_in_nothing_else(projection):
     assert other.render.options(1.0).resolved_low_pass_kind == "angular"
 
 
-@pytest.mark.parametrize("name", ["roam360", "ricoh360"])
-def test_data_sets_have_the_size_and_voxels_of_the_paper(name):
+@pytest.mark.parametrize(("name", "voxel_size"), [("roam360", 0.001), ("ricoh360", 0.005)])
+def test_data_sets_have_the_size_and_voxels_of_the_paper(name, voxel_size):
     config = composed(f"data={name}")
-    known = DATASETS[name]
-    assert (config.data.dataset, config.data.width) == (name, known.width)
-    assert config.data.voxel_size == known.voxel_size == config.options.voxel_size
+    assert (config.data.dataset, config.data.width) == (name, DATASETS[name].width)
+    assert config.data.voxel_size == voxel_size == config.options.voxel_size
 
 
 def test_360roam_is_cut_for_the_paper_and_not_for_the_sphere():
