@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from padgs.anchors.decoder import Decoder, decode_gaussians, decode_padded
+from padgs.anchors.decoder import Decoder, SeenAnchors, decode_gaussians, decode_padded
 from padgs.anchors.grid import anchors_from_points, automatic_voxel_size, initial_log_scales
 from padgs.anchors.precision import PRECISIONS
 from padgs.gaussians import Gaussians
@@ -174,7 +174,7 @@ class PaDGS(nn.Module):
 
     def decode(self, view: View) -> Decoded:
         """The Gaussians that this view shows (Eq. 13-15)."""
-        return Decoded(*decode_gaussians(self.decoder.weights(), *self.as_seen(view), self.options.precision))
+        return Decoded(*decode_gaussians(self.decoder.weights(), self.as_seen(view), self.options.precision))
 
     def show(self, view: View) -> Gaussians:
         """The same for `padgs.render.backends.captured`: A K Gaussians, of which those that are not selected are zeros.
@@ -182,10 +182,10 @@ class PaDGS(nn.Module):
         Raises:
             ValueError, OSError: as `padgs.anchors.decoder.decode_padded` does.
         """
-        return decode_padded(self.decoder.weights(), *self.as_seen(view), self.options.precision)
+        return decode_padded(self.decoder.weights(), self.as_seen(view), self.options.precision)
 
-    def as_seen(self, view: View) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """What is decoded: features, how the camera sees them, positions, offsets, log-scales, attenuation."""
+    def as_seen(self, view: View) -> SeenAnchors:
+        """What is decoded."""
         options = self.options
         direction, distance, omega = self.seen_from(view)
         seen = [direction]
@@ -195,5 +195,5 @@ class PaDGS(nn.Module):
             seen_omega = omega if options.omega_input == "sin2" else torch.sqrt((1 - omega).clamp(min=0))
             seen.append(seen_omega[:, None])
         attenuation = opacity_factor(omega, options.tau, options.max_modulated_omega)
-        constants = torch.cat(seen, dim=-1), self.positions
-        return self.features, *constants, self.offsets, self.log_scales, attenuation
+        seen = torch.cat(seen, dim=-1)
+        return SeenAnchors(self.features, seen, self.positions, self.offsets, self.log_scales, attenuation)
