@@ -18,6 +18,7 @@ from padgs.calibration.align import Difference, Similarity, align
 from padgs.calibration.camera_map import CameraMap
 from padgs.calibration.poses import PoseRates, PoseRefinement
 from padgs.calibration.splats import CalibratedMethod, Calibration
+from padgs.checks import check
 from padgs.learning.loop import TrainOptions
 from padgs.learning.loss import pixel_weight
 from padgs.learning.schedule import Constant, ParameterGroup
@@ -41,11 +42,9 @@ class SCOmniGSOptions(SplatOptions):
     anisotropy_ratio: float = 10.0  # longest to shortest axis that a Gaussian may have unpunished
 
     def __post_init__(self) -> None:
-        """Reject values without a meaning."""
         super().__post_init__()
-        for name in ("focal_rate", "distortion_rate", "roughness_weight", "anisotropy_weight"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 0, which switches it off")
+        rates, weights = ("focal_rate", "distortion_rate"), ("roughness_weight", "anisotropy_weight")
+        check(self, "at least 0, which switches it off", lambda value: value >= 0, *rates, *weights)
         if not self.anisotropy_ratio >= 1:
             raise ValueError(f"anisotropy_ratio is {self.anisotropy_ratio}; longest to shortest is at least 1")
 
