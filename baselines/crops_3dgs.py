@@ -31,7 +31,6 @@ class Crops3DGSOptions(SplatOptions):
     field_of_view: float = 75.0  # degrees across each square crop
 
     def __post_init__(self) -> None:
-        """Reject crops that leave holes between them, or are no perspective images."""
         super().__post_init__()
         if not NARROWEST <= self.field_of_view < 180:
             raise ValueError(

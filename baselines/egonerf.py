@@ -24,7 +24,6 @@ class EgoNeRFMethodOptions(EgoNeRFOptions, EgoNeRFTraining):
     """The `method` group of the configuration: the model and its training, all in one list."""
 
     def __post_init__(self) -> None:
-        """Check both parts."""
         EgoNeRFOptions.__post_init__(self)
         EgoNeRFTraining.__post_init__(self)
         if self.environment_pretraining and not self.environment:

@@ -12,12 +12,13 @@ from functools import partial
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from padgs.calibration.align import Difference, Similarity, align
 from padgs.calibration.camera_map import CameraMap
 from padgs.calibration.poses import PoseRates, PoseRefinement
-from padgs.calibration.splats import CalibratedMethod
+from padgs.calibration.splats import CalibratedMethod, Calibration
+from padgs.checks import check
 from padgs.learning.loop import TrainOptions
 from padgs.learning.loss import pixel_weight
 from padgs.learning.schedule import Constant, ParameterGroup
@@ -41,17 +42,15 @@ class SCOmniGSOptions(SplatOptions):
     anisotropy_ratio: float = 10.0  # longest to shortest axis that a Gaussian may have unpunished
 
     def __post_init__(self) -> None:
-        """Reject values without a meaning."""
         super().__post_init__()
-        for name in ("focal_rate", "distortion_rate", "roughness_weight", "anisotropy_weight"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 0, which switches it off")
+        rates, weights = ("focal_rate", "distortion_rate"), ("roughness_weight", "anisotropy_weight")
+        check(self, "at least 0, which switches it off", lambda value: value >= 0, *rates, *weights)
         if not self.anisotropy_ratio >= 1:
             raise ValueError(f"anisotropy_ratio is {self.anisotropy_ratio}; longest to shortest is at least 1")
 
 
-class SelfCalibration(nn.Module):
-    """Poses of all training views and the one camera that took them; see `padgs.calibration.splats.Calibration`."""
+class SelfCalibration(Calibration):
+    """Poses of all training views and the one camera that took them."""
 
     def __init__(self, poses: PoseRefinement, camera: CameraMap, options: SCOmniGSOptions, weight: str) -> None:
         """Start from the given poses and an ideal camera; `weight` is a name of `padgs.learning.loss.ROW_WEIGHTS`."""

@@ -27,7 +27,6 @@ class Seam360GSOptions(SplatOptions):
     coefficient_rate: float = 1e-3  # ... of the radial maps
 
     def __post_init__(self) -> None:
-        """Reject rates that have no log-linear decay."""
         super().__post_init__()
         for name in ("gap_rate", "coefficient_rate"):
             if not getattr(self, name) > 0:

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from padgs.gaussians import Gaussians
-from padgs.render.contract import RenderOptions
+from padgs.render.contract import RenderOptions, Request
 from padgs.render.cubemap import FACES
 from padgs.render.planar import PlanarFootprints
 from padgs.render.projection import project
@@ -109,7 +109,8 @@ def _values(
     gaussian: Gaussians, pose: Tensor, camera: Camera, projection: str, rows: Tensor, columns: Tensor
 ) -> Tensor:
     """exp(-q / 2) at pixels [P], which may lie between the pixel centres in a plane."""
-    footprints = project(gaussian, pose, camera, RenderOptions(projection=projection, low_pass=0.0))
+    options = RenderOptions(projection=projection, low_pass=0.0)
+    footprints = project(Request(gaussian, pose, camera, options, background=pose.new_zeros(3)))
     if isinstance(footprints, PlanarFootprints):  # boxes belong to the cut at 1/255, which is left out here
         everywhere = footprints.boxes.new_tensor([[-math.inf, math.inf, -math.inf, math.inf]])
         footprints = replace(footprints, boxes=everywhere)

@@ -21,6 +21,7 @@ from padgs.multirun.overrides import expand
 from padgs.registry import lookup
 from padgs.render.config import RenderConfig
 from padgs.runs.config import RunOptions, TrainConfig
+from padgs.runs.typed import ConfigError
 from padgs.scoring.protocols import PROTOCOLS, ROAM_360_BOTTOM_CROP
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
@@ -175,6 +176,26 @@ def test_the_release_of_padgs_differs_from_the_paper_where_its_code_does():
     assert (released.train.weight, released.train.normalisation) == ("end_rows", "channel_sum")
 
 
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (
+            ["render.bounds=square"],
+            "render: bounds=square are the published bounds, which end at the seam; set wrap=false",
+        ),
+        (
+            ["method=omnigs", "render.near_cull=ellipsoid"],
+            "near_cull=ellipsoid is made for projection 'ray', not 'erp'",
+        ),
+        (["method=spags_sorted", "render.core_size=8"], "core_size is 8, but blending=sorted keeps no core"),
+        (["render.near_unit=metre"], "unknown near_unit 'metre'; known: scene, world"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused_before_anything_is_read(settings, message):
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        composed(*settings)
+
+
 @pytest.mark.parametrize("name", sorted(METHODS.keys() - {"padgs"}))
 def test_every_method_is_drawn_and_trained_as_its_class_says(name):
     method, config = lookup(METHODS, name, "method"), composed(f"method={name}")
@@ -251,12 +272,11 @@ def test_padgs_on_another_projection_differs_in_nothing_else(projection):
     assert other.render.options(1.0).resolved_low_pass_kind == "angular"
 
 
-@pytest.mark.parametrize("name", ["roam360", "ricoh360"])
-def test_data_sets_have_the_size_and_voxels_of_the_paper(name):
+@pytest.mark.parametrize(("name", "voxel_size"), [("roam360", 0.001), ("ricoh360", 0.005)])
+def test_data_sets_have_the_size_and_voxels_of_the_paper(name, voxel_size):
     config = composed(f"data={name}")
-    known = DATASETS[name]
-    assert (config.data.dataset, config.data.width) == (name, known.width)
-    assert config.data.voxel_size == known.voxel_size == config.options.voxel_size
+    assert (config.data.dataset, config.data.width) == (name, DATASETS[name].width)
+    assert config.data.voxel_size == voxel_size == config.options.voxel_size
 
 
 def test_360roam_is_cut_for_the_paper_and_not_for_the_sphere():

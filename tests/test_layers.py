@@ -14,6 +14,7 @@ import pytest
 # From the ground up; a folder stands for all that is in it. A file imports from its own line and those above it here.
 ROOMS = (
     "padgs.registry",
+    "padgs.checks",
     "padgs.results",
     "padgs.sphere",
     "padgs.scene",

@@ -70,11 +70,44 @@ def test_files_that_are_named_exist(path):
     assert (ROOT / path).exists() or "yours" in path
 
 
-@pytest.mark.slow
-def test_the_smoke_experiment_runs_and_is_reported(tmp_path):
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    for module, arguments in (("run", ["+experiment=smoke"]), ("app", ["report", "runs"])):
-        command = [sys.executable, "-m", f"padgs.cli.{module}", *arguments]
-        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
-        assert done.returncode == 0, done.stderr
-    assert "synthetic-room" in done.stdout
+@pytest.fixture(scope="module")
+def smoke(tmp_path_factory) -> Path:
+    """A folder in which the smoke experiment was run."""
+    folder = tmp_path_factory.mktemp("smoke")
+    assert_runs(folder, "-m", "padgs.multirun.run", "+experiment=smoke", "tracking=none", "run.device=cpu")
+    return folder
+
+
+def assert_runs(folder: Path, *arguments: str) -> str:
+    """Run Python in a folder; what it printed."""
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "PADGS_CACHE": str(folder / "cache")}
+    done = subprocess.run(
+        [sys.executable, *arguments], cwd=folder, env=environment, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_the_smoke_experiment_is_reported(smoke):
+    assert "synthetic-room" in assert_runs(smoke, "-m", "padgs.cli.app", "report", "runs")
+
+
+def test_the_lines_of_python_run(smoke):
+    """As written, but on the run of the smoke experiment and a scene that is as small."""
+    (lines,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    small = {"train_views": 3, "test_views": 1, "samples": 1, "points": 300, "width": 64}
+    run = next((smoke / "runs").glob("*/result.json")).parent
+    exchanged = {
+        'load_scene("FOLDER", width=512)': f"load_scene(generator={small})",
+        "runs/RUN": str(run),
+        "iterations=300": "iterations=20",
+        "% 100": "% 10",
+        "frames=120": "frames=2",
+        "cam_from_world)": "scene.train[0].cam_from_world)",
+    }
+    for written, here in exchanged.items():
+        assert lines.count(written) == 1
+        lines = lines.replace(written, here)
+    checks = "assert picture.image.shape == (32, 64, 3) and len(frames) == 2 and elsewhere.alpha.max() <= 1"
+    said = assert_runs(smoke, "-c", f"{lines}\n{checks}")
+    assert said.startswith("10 ") and "'ssim'" in said

@@ -45,6 +45,17 @@ class DecoderWeights(NamedTuple):
     covariance: Head
 
 
+class SeenAnchors(NamedTuple):
+    """A anchors as a camera sees them; differentiable by features, offsets and log-scales."""
+
+    features: Tensor  # [A, C]
+    seen: Tensor  # [A, I - C] direction from the camera, and distance and distortion if they are inputs
+    positions: Tensor  # [A, 3] world
+    offsets: Tensor  # [A, K, 3] in units of the anchor's scale
+    log_scales: Tensor  # [A, 6]; the first three scale the offsets, the last three the Gaussians
+    attenuation: Tensor  # [A], what Eq. 15 multiplies opacities by
+
+
 class Attributes(NamedTuple):
     """What the networks say, for the N selected of the A K Gaussians, in the order of their slots."""
 
@@ -92,25 +103,13 @@ def decode(weights: DecoderWeights, inputs: Tensor, dtype: torch.dtype | None = 
 
 
 def decode_gaussians(
-    weights: DecoderWeights,
-    features: Tensor,
-    seen: Tensor,
-    positions: Tensor,
-    offsets: Tensor,
-    log_scales: Tensor,
-    attenuation: Tensor,
-    precision: str = "float32",
+    weights: DecoderWeights, anchors: SeenAnchors, precision: str = "float32"
 ) -> tuple[Gaussians, Tensor, Tensor]:
     """The selected Gaussians of all anchors (Eq. 13-15); differentiable by weights, features, offsets and log-scales.
 
     Args:
         weights: the three networks, of I inputs.
-        features: [A, C].
-        seen: [A, I - C], how the camera sees each anchor: direction, and distance and distortion if they are inputs.
-        positions: [A, 3] world.
-        offsets: [A, K, 3] in units of the anchor's scale.
-        log_scales: [A, 6]; the first three scale the offsets, the last three the Gaussians.
-        attenuation: [A], what Eq. 15 multiplies opacities by.
+        anchors: what is decoded.
         precision: of the networks' products, a name of `padgs.anchors.precision.PRECISIONS`. Others than float32 are
             made for GPUs; on the CPU they are slower.
 
@@ -120,27 +119,17 @@ def decode_gaussians(
     Raises:
         ValueError: an unknown precision.
     """
-    dtype, tensors = reduced(precision), (features, seen, positions, offsets, log_scales, attenuation)
-    library = LIBRARIES.get(features.device.type)
+    dtype, library = reduced(precision), LIBRARIES.get(anchors.features.device.type)
     no_reduced_types = dtype is not None and library is cpu
-    if library is None or no_reduced_types or features.dtype != torch.float32 or not library.available():
-        return define_gaussians(weights, *tensors, precision)
+    if library is None or no_reduced_types or anchors.features.dtype != torch.float32 or not library.available():
+        return define_gaussians(weights, anchors, precision)
     flat = tuple(tensor for head in weights for tensor in head)
-    fused = decode_on_gpu(flat, *tensors, dtype=dtype) if library is cuda else decode_on_cpu(flat, *tensors)
+    fused = decode_on_gpu(flat, *anchors, dtype=dtype) if library is cuda else decode_on_cpu(flat, *anchors)
     *values, slots, raw = fused
     return Gaussians(*values), slots, raw
 
 
-def decode_padded(
-    weights: DecoderWeights,
-    features: Tensor,
-    seen: Tensor,
-    positions: Tensor,
-    offsets: Tensor,
-    log_scales: Tensor,
-    attenuation: Tensor,
-    precision: str = "float32",
-) -> Gaussians:
+def decode_padded(weights: DecoderWeights, anchors: SeenAnchors, precision: str = "float32") -> Gaussians:
     """`decode_gaussians` for frames that a GPU draws without its host waiting (`padgs.render.backends.captured`).
 
     There are A K Gaussians however many are selected: those in order, and behind them zeros, which nobody draws.
@@ -149,36 +138,29 @@ def decode_padded(
         ValueError: tensors that are not float32 on a GPU, or an unknown precision.
         OSError: the GPU's library was not built.
     """
+    features = anchors.features
     if features.dtype != torch.float32 or features.device.type != cuda.device_type():
         raise ValueError(
             f"only a GPU decodes without counting, and float32; got {features.dtype} on {features.device}. Convert "
             "them, or use decode_gaussians"
         )
     flat = tuple(tensor for head in weights for tensor in head)
-    tensors = (features, seen, positions, offsets, log_scales, attenuation)
-    *values, _, _ = decode_on_gpu(flat, *tensors, dtype=reduced(precision), padded=True)
+    *values, _, _ = decode_on_gpu(flat, *anchors, dtype=reduced(precision), padded=True)
     return Gaussians(*values)
 
 
 def define_gaussians(
-    weights: DecoderWeights,
-    features: Tensor,
-    seen: Tensor,
-    positions: Tensor,
-    offsets: Tensor,
-    log_scales: Tensor,
-    attenuation: Tensor,
-    precision: str = "float32",
+    weights: DecoderWeights, anchors: SeenAnchors, precision: str = "float32"
 ) -> tuple[Gaussians, Tensor, Tensor]:
     """`decode_gaussians` in torch, for any dtype, precision and device."""
-    said = decode(weights, torch.cat((features, seen), dim=-1), reduced(precision))
-    anchors = said.slots // offsets.shape[1]
-    reach, size = take_rows(torch.exp(log_scales), anchors).split((3, 3), dim=-1)
+    said = decode(weights, torch.cat((anchors.features, anchors.seen), dim=-1), reduced(precision))
+    rows = said.slots // anchors.offsets.shape[1]
+    reach, size = take_rows(torch.exp(anchors.log_scales), rows).split((3, 3), dim=-1)
     gaussians = Gaussians(
-        means=take_rows(positions, anchors) + reach * take_rows(offsets.view(-1, 3), said.slots),
+        means=take_rows(anchors.positions, rows) + reach * take_rows(anchors.offsets.view(-1, 3), said.slots),
         quats=said.quats,
         scales=size * said.shrinkage,
-        opacities=said.opacities * attenuation[anchors],
+        opacities=said.opacities * anchors.attenuation[rows],
         colors=said.colors,
     )
     return gaussians, said.slots, said.raw_opacities.detach()

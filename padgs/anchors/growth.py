@@ -12,6 +12,7 @@ from torch import Tensor
 
 from padgs.anchors.grid import cells_from_points, occupied, points_from_cells, unique_cells
 from padgs.anchors.model import PaDGS
+from padgs.checks import check
 from padgs.learning.failure import Failure
 from padgs.learning.rows import append_rows, keep_rows
 from padgs.learning.schedule import scaled
@@ -39,16 +40,13 @@ class GrowthOptions:
     max_anchors: int | None = 1_000_000  # of ten Gaussians each; those with the largest gradients grow
 
     def __post_init__(self) -> None:
-        """Reject grids that are not multiples of a voxel, and limits without a meaning."""
         if self.levels < 1 or self.refinement < 2 or self.coarsest % self.refinement ** (self.levels - 1):
             raise ValueError(
                 f"coarsest is {self.coarsest} voxels; it must be a multiple of refinement ** (levels - 1), "
                 f"here {self.refinement} ** {self.levels - 1}"
             )
-        if self.grow_every < 1:
-            raise ValueError(f"grow_every is {self.grow_every}; it must be at least 1 iteration")
-        if self.max_anchors is not None and self.max_anchors < 1:
-            raise ValueError(f"max_anchors is {self.max_anchors}; it must be at least 1, or none for no limit")
+        check(self, "at least 1 iteration", lambda every: every >= 1, "grow_every")
+        check(self, "at least 1, or none for no limit", lambda most: most is None or most >= 1, "max_anchors")
 
     def for_run(self, iterations: int) -> GrowthOptions:
         """The same phases in a run of another length: every window is the same share of the run as published.
@@ -83,7 +81,6 @@ class Seeds:
     strength: Tensor  # [M] largest mean gradient of the Gaussians in that cell
 
     def __len__(self) -> int:
-        """Number of new anchors."""
         return len(self.cells)
 
     def strongest(self, count: int) -> Seeds:
@@ -103,7 +100,6 @@ class Growth:
     """
 
     def __init__(self, model: PaDGS, options: GrowthOptions, *, seed: int = 0) -> None:
-        """Start with empty statistics."""
         self.model, self.options = model, options
         self.generator = torch.Generator().manual_seed(seed)
         self.statistics = self._empty(len(model))

@@ -8,10 +8,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from padgs.anchors.decoder import Decoder, decode_gaussians, decode_padded
+from padgs.anchors.decoder import Decoder, SeenAnchors, decode_gaussians, decode_padded
 from padgs.anchors.grid import anchors_from_points, automatic_voxel_size, initial_log_scales
 from padgs.anchors.precision import PRECISIONS
+from padgs.checks import check, check_known
 from padgs.gaussians import Gaussians
+from padgs.learning.rows import load_rows
 from padgs.scene import Scene, View
 from padgs.sphere.distortion import OMEGA_AXES, distortion, opacity_factor, polar_axis
 
@@ -39,20 +41,10 @@ class PaDGSOptions:
     voxel_size: float | str = "auto"  # world units, or auto: see `automatic_voxel_size`
 
     def __post_init__(self) -> None:
-        """Reject what the model cannot be built with."""
-        for name, known in (
-            ("omega_axis", OMEGA_AXES),
-            ("omega_input", OMEGA_INPUTS),
-            ("distance_unit", DISTANCE_UNITS),
-            ("precision", PRECISIONS),
-        ):
-            if getattr(self, name) not in known:
-                raise ValueError(f"unknown {name} {getattr(self, name)!r}; known: {', '.join(known)}")
-        for name in ("features", "offsets", "hidden"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
-        if not 0 <= self.tau <= 1:
-            raise ValueError(f"tau is {self.tau}; it must be in [0, 1], or opacities turn negative at the poles")
+        check_known(self, omega_axis=OMEGA_AXES, omega_input=OMEGA_INPUTS)
+        check_known(self, distance_unit=DISTANCE_UNITS, precision=PRECISIONS)
+        check(self, "at least 1", lambda count: count >= 1, "features", "offsets", "hidden")
+        check(self, "in [0, 1], or opacities turn negative at the poles", lambda tau: 0 <= tau <= 1, "tau")
         if isinstance(self.voxel_size, str) and self.voxel_size != "auto":
             raise ValueError(f"unknown voxel_size {self.voxel_size!r}; known: auto, or a length in world units")
 
@@ -126,7 +118,6 @@ class PaDGS(nn.Module):
         )
 
     def __len__(self) -> int:
-        """Number of anchors."""
         return len(self.positions)
 
     def rows(self) -> dict[str, nn.Parameter]:
@@ -134,23 +125,12 @@ class PaDGS(nn.Module):
         return {"offsets": self.offsets, "features": self.features, "log_scales": self.log_scales}
 
     def load(self, tensors: Mapping[str, Tensor]) -> None:
-        """Take over what `state_dict` of another model gave; the number of anchors may differ, all else may not.
-
-        The parameters stay the same objects, so an optimiser that holds them goes on doing so.
+        """Take over what `state_dict` of another model gave; the number of anchors may differ.
 
         Raises:
-            ValueError: a tensor is missing, or has another shape than the options of this model make it.
+            ValueError: as `padgs.learning.rows.load_rows` does.
         """
-        own = self.state_dict()
-        count = len(tensors["positions"]) if "positions" in tensors else 0
-        for name, mine in own.items():
-            shape = [count, *mine.shape[1:]] if name in (*self.rows(), "positions") else list(mine.shape)
-            given = list(tensors[name].shape) if name in tensors else None
-            if given != shape:
-                raise ValueError(f"{name} of the stored model has shape {given}; with these options it is {shape}")
-        for name, parameter in self.named_parameters():
-            parameter.data = tensors[name].to(parameter).clone()
-            parameter.grad = None
+        load_rows(self, tensors, ("positions", *self.rows()))
         self.positions = tensors["positions"].to(self.positions).clone()
 
     @torch.no_grad()
@@ -174,7 +154,7 @@ class PaDGS(nn.Module):
 
     def decode(self, view: View) -> Decoded:
         """The Gaussians that this view shows (Eq. 13-15)."""
-        return Decoded(*decode_gaussians(self.decoder.weights(), *self.as_seen(view), self.options.precision))
+        return Decoded(*decode_gaussians(self.decoder.weights(), self.as_seen(view), self.options.precision))
 
     def show(self, view: View) -> Gaussians:
         """The same for `padgs.render.backends.captured`: A K Gaussians, of which those that are not selected are zeros.
@@ -182,10 +162,10 @@ class PaDGS(nn.Module):
         Raises:
             ValueError, OSError: as `padgs.anchors.decoder.decode_padded` does.
         """
-        return decode_padded(self.decoder.weights(), *self.as_seen(view), self.options.precision)
+        return decode_padded(self.decoder.weights(), self.as_seen(view), self.options.precision)
 
-    def as_seen(self, view: View) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """What is decoded: features, how the camera sees them, positions, offsets, log-scales, attenuation."""
+    def as_seen(self, view: View) -> SeenAnchors:
+        """What is decoded."""
         options = self.options
         direction, distance, omega = self.seen_from(view)
         seen = [direction]
@@ -195,5 +175,5 @@ class PaDGS(nn.Module):
             seen_omega = omega if options.omega_input == "sin2" else torch.sqrt((1 - omega).clamp(min=0))
             seen.append(seen_omega[:, None])
         attenuation = opacity_factor(omega, options.tau, options.max_modulated_omega)
-        constants = torch.cat(seen, dim=-1), self.positions
-        return self.features, *constants, self.offsets, self.log_scales, attenuation
+        seen = torch.cat(seen, dim=-1)
+        return SeenAnchors(self.features, seen, self.positions, self.offsets, self.log_scales, attenuation)

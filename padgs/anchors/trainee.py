@@ -9,6 +9,7 @@ from torch import Tensor
 
 from padgs.anchors.growth import Growth, GrowthOptions
 from padgs.anchors.model import PaDGS
+from padgs.checks import check_known
 from padgs.learning.schedule import Constant, LogLinear, ParameterGroup
 from padgs.learning.trainee import Drawing, Size, State
 from padgs.render import Rendering, RenderOptions, render
@@ -30,9 +31,7 @@ class LearningRates:
     covariance_rate: tuple[float, float] = (0.004, 0.004)
 
     def __post_init__(self) -> None:
-        if self.offset_rate_unit not in OFFSET_RATE_UNITS:
-            known = ", ".join(OFFSET_RATE_UNITS)
-            raise ValueError(f"unknown offset_rate_unit {self.offset_rate_unit!r}; known: {known}")
+        check_known(self, offset_rate_unit=OFFSET_RATE_UNITS)
 
     def groups(self, model: PaDGS, extent: float, iterations: int) -> list[ParameterGroup]:
         """The parameters of a model with their rates in a run of `iterations`; `extent` in `offset_rate_unit`."""
@@ -123,11 +122,8 @@ class AnchorTrainee:
     def size(self) -> Size:
         """Anchors, the Gaussians that they can show, and the bytes of the stored model."""
         model = self.model
-        return Size(
-            counts={"anchors": len(model), "gaussians": len(model) * model.options.offsets},
-            parameters=sum(p.numel() for p in model.parameters()),
-            bytes=sum(t.numel() * t.element_size() for t in model.state_dict().values()),
-        )
+        counts = {"anchors": len(model), "gaussians": len(model) * model.options.offsets}
+        return Size.of(counts, model.parameters(), stored=model.state_dict().values())
 
     def state(self) -> State:
         """Model, growth statistics and random state."""

@@ -112,7 +112,7 @@ def _decoding_and_drawing(work: Workload) -> Callable[[], None]:
 
 def _decoding(work: Workload, decode: Callable = decode_gaussians) -> Callable[[], None]:
     def both_ways() -> None:
-        found = decode(work.model.decoder.weights(), *work.model.as_seen(work.view))[0]
+        found = decode(work.model.decoder.weights(), work.model.as_seen(work.view))[0]
         leaves = (found.means, found.quats, found.scales, found.opacities, found.colors)
         torch.autograd.backward(leaves, tuple(map(torch.ones_like, leaves)))
         work.model.zero_grad(set_to_none=True)

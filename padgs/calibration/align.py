@@ -66,10 +66,6 @@ def align(first: Tensor, second: Tensor) -> tuple[Similarity, Difference]:
         raise ValueError("cannot align poses whose centres all coincide: there is no scale")
     scale = ((a - a.mean(0)) * spread).sum().item() / variance
     similarity = Similarity(scale, rotation, a.mean(0) - scale * rotation @ b.mean(0))
-    return similarity, Difference((similarity(b) - a).norm(dim=1), _angles(rotations, rotation))
-
-
-def _angles(rotations: Tensor, reference: Tensor) -> Tensor:
-    """Angle in degrees of rotations [F, 3, 3] to a reference; from the chord, which is exact for small angles too."""
-    chord = (rotations - reference).flatten(1).norm(dim=1) / (2 * 2**0.5)
-    return torch.rad2deg(2 * torch.asin(chord.clamp(max=1)))
+    chord = (rotations - rotation).flatten(1).norm(dim=1) / (2 * 2**0.5)  # exact for small angles too
+    degrees = torch.rad2deg(2 * torch.asin(chord.clamp(max=1)))
+    return similarity, Difference((similarity(b) - a).norm(dim=1), degrees)

@@ -15,6 +15,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor, nn
 
+from padgs.calibration.splats import Calibration
 from padgs.learning.schedule import LogLinear, ParameterGroup
 from padgs.learning.trainee import Drawing
 from padgs.render import Rendering
@@ -25,7 +26,7 @@ from padgs.sphere.lens import axis_direction, bend, check_blend, hemisphere_weig
 DECAY = 0.1  # learning rates fall to this share over a run
 
 
-class DualLens(nn.Module):
+class DualLens(Calibration):
     """Two lenses at centre +- (gap / 2) axis, along +- axis.
 
     Attributes:

@@ -27,7 +27,6 @@ class PoseRates:
     translation_end: float = 6e-3
 
     def __post_init__(self) -> None:
-        """Reject rates that have no log-linear decay."""
         for field in fields(self):
             if not getattr(self, field.name) > 0:
                 raise ValueError(f"poses.{field.name} is {getattr(self, field.name)}; a learning rate must be > 0")
@@ -71,15 +70,11 @@ class PoseRefinement(nn.Module):
 
     def groups(self, rates: PoseRates, iterations: int) -> list[ParameterGroup]:
         """Learning rates for a run of `iterations`."""
+        turning = LogLinear(rates.rotation, rates.rotation_end, iterations)
+        moving = LogLinear(rates.translation, rates.translation_end, iterations)
         return [
-            ParameterGroup(
-                "pose_quaternions",
-                tuple(self.quaternions),
-                LogLinear(rates.rotation, rates.rotation_end, iterations),
-            ),
-            ParameterGroup(
-                "pose_shifts", tuple(self.shifts), LogLinear(rates.translation, rates.translation_end, iterations)
-            ),
+            ParameterGroup("pose_quaternions", tuple(self.quaternions), turning),
+            ParameterGroup("pose_shifts", tuple(self.shifts), moving),
         ]
 
     def refined(self, view: View) -> View:

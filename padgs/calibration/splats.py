@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import torch
-from torch import Tensor
+from torch import nn
 
 from padgs.learning.loop import model_state
 from padgs.learning.schedule import ParameterGroup
@@ -20,40 +20,28 @@ from padgs.splats.trainee import SplatTrainee
 PREFIX = "calibration/"  # of its tensors in a state
 
 
-class Calibration(Protocol):
-    """A differentiable model of the cameras: an `nn.Module` that draws views through itself."""
+class Calibration(nn.Module):
+    """A differentiable model of the cameras that draws views through itself."""
 
-    def to(self, device: torch.device) -> Any:
-        """Move all of its tensors, in place."""
-        ...
-
+    @abstractmethod
     def groups(self, iterations: int) -> list[ParameterGroup]:
         """Its parameters and their learning rates in a run of `iterations`."""
-        ...
 
+    @abstractmethod
     def draw(self, draw: Callable[..., Drawing], view: View) -> Drawing:
         """Draw a training view as its camera takes it; `draw(view, probe=None)` draws as an ideal camera does."""
-        ...
 
+    @abstractmethod
     def summary(self) -> str:
         """What was found, for people."""
-        ...
 
+    @abstractmethod
     def counts(self) -> dict[str, int]:
         """What it consists of: poses, lenses, ..."""
-        ...
 
+    @abstractmethod
     def values(self) -> dict[str, Any]:
         """What building it again takes besides the options, as JSON can hold it."""
-        ...
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """Its tensors by name."""
-        ...
-
-    def load_state_dict(self, state_dict: dict[str, Tensor]) -> Any:
-        """Take over tensors; the parameters stay the same objects."""
-        ...
 
 
 class CalibratedTrainee(SplatTrainee):
@@ -80,7 +68,7 @@ class CalibratedTrainee(SplatTrainee):
     def size(self) -> Size:
         """Counts and bytes of the model, calibration included."""
         size = super().size()
-        parameters = [p for group in self.calibration.groups(1) for p in group.parameters]
+        parameters = list(self.calibration.parameters())
         return Size(
             counts={**size.counts, **self.calibration.counts()},
             parameters=size.parameters + sum(p.numel() for p in parameters),

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from padgs.data.assemble import assemble
 from padgs.data.capture import Capture
 from padgs.data.datasets import DATASETS, lookup_dataset, refuse_missing
 from padgs.data.errors import DataError
@@ -16,16 +17,16 @@ from padgs.data.options import DataOptions
 from padgs.registry import lookup
 from padgs.scene import Scene
 
-# Each is `load(path, options) -> Scene`. All but synthetic read files; their modules also have `read`, to a Capture.
+# Each is `read(path, options) -> Capture`; synthetic alone reads no files and is `load(path, options) -> Scene`.
 LOADERS = {
-    "colmap": "padgs.data.formats.colmap:load",
-    "transforms": "padgs.data.formats.transforms:load",
-    "openmvg": "padgs.data.formats.openmvg:load",
-    "opensfm": "padgs.data.formats.opensfm:load",
-    "roam360": "padgs.data.formats.roam360:load",
-    "ricoh360": "padgs.data.formats.ricoh360:load",
-    "omniblender": "padgs.data.formats.omniblender:load",
-    "released": "padgs.data.formats.released:load",
+    "colmap": "padgs.data.formats.colmap:read",
+    "transforms": "padgs.data.formats.transforms:read",
+    "openmvg": "padgs.data.formats.openmvg:read",
+    "opensfm": "padgs.data.formats.opensfm:read",
+    "roam360": "padgs.data.formats.roam360:read",
+    "ricoh360": "padgs.data.formats.ricoh360:read",
+    "omniblender": "padgs.data.formats.omniblender:read",
+    "released": "padgs.data.formats.released:read",
     "synthetic": "padgs.data.synthetic:load",
 }
 
@@ -51,27 +52,21 @@ def load(
         ValueError: unknown format.
     """
     options = replace(options, **fields)  # type: ignore[arg-type]
-    if path is None or format == "synthetic":
-        return lookup(LOADERS, "synthetic" if format == "auto" else format, "data.format")(path or "", options)
-    path, format, options, notes = _decide(Path(path), format, options)
-    scene: Scene = lookup(LOADERS, format, "data.format")(path, options)
-    return replace(scene, notes=(*notes, *scene.notes))
+    if format == "synthetic" or (path is None and format == "auto"):
+        return lookup(LOADERS, "synthetic", "data.format")(path or "", options)
+    return assemble(read(path or "", format, options), options)
 
 
 def read(path: str | Path, format: str = "auto", options: DataOptions = DataOptions()) -> Capture:  # noqa: B008
     """What a folder holds, images unread: the half of `load` that `padgs convert` and `padgs check` need."""
-    path, format, options, notes = _decide(Path(path), format, options)
-    readers = {name: entry.replace(":load", ":read") for name, entry in LOADERS.items() if name != "synthetic"}
-    capture: Capture = lookup(readers, format, "data.format")(path, options)
-    return replace(capture, notes=(*notes, *capture.notes))
-
-
-def _decide(path: Path, format: str, options: DataOptions) -> tuple[Path, str, DataOptions, tuple[str, ...]]:
+    path = Path(path)
     refuse_missing(path, options.dataset)
     notes = ()
     if format == "auto":
         format, reason = detect(path)
         notes = (reason,)
-    if options.dataset is not None and options.mask == "auto":
-        options = replace(options, mask=lookup_dataset(options.dataset).mask)
-    return path, format, options, notes
+    if format == "synthetic":
+        raise DataError(f"{path}: synthetic scenes are made, not read from a folder; give another format, or auto")
+    capture: Capture = lookup(LOADERS, format, "data.format")(path, options)
+    mask = capture.mask if options.dataset is None else lookup_dataset(options.dataset).mask
+    return replace(capture, mask=mask, notes=(*notes, *capture.notes))

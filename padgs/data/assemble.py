@@ -27,11 +27,15 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
     """
     capture = replace(capture, frames=tuple(sorted(capture.frames, key=lambda frame: frame.name)))
     names = [frame.name for frame in capture.frames]
-    _refuse_clashes(names, capture)
+    if not names:
+        raise DataError(f"the {capture.format} model in {capture.folder} holds no posed image")
+    refuse_clashes(names)
     _refuse_absent(capture)
     images = [inspect(frame.image) for frame in capture.frames]
     notes = [*capture.notes, *_camera_notes(capture.frames, images)]
-    target = options.width or capture.width
+    target = options.width
+    if target is None and capture.width is not None and images[0].width > capture.width:
+        target = capture.width
     sizes = [_view_size(image, target) for image in images]
     reduced = {(image.width, image.height) for image, size in zip(images, sizes, strict=True) if size[0] < image.width}
     if reduced:
@@ -47,15 +51,8 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
     store = ImageStore(options.cache_bytes, options.read_ahead, options.device)
     masks, mask_digests, mask_notes = find_masks(capture, options.mask, images, sizes, store)
     views = [
-        View(
-            view_name(frame.name),
-            frame.cam_from_world,
-            width,
-            height,
-            StoredImage(frame.image, width, height, store),
-            mask,
-        )
-        for frame, (width, height), mask in zip(capture.frames, sizes, masks, strict=True)
+        View(view_name(frame.name), frame.cam_from_world, *size, StoredImage(frame.image, *size, store), mask)
+        for frame, size, mask in zip(capture.frames, sizes, masks, strict=True)
     ]
     digest = hashlib.sha256()
     for view, image in zip(views, images, strict=True):
@@ -104,14 +101,19 @@ def image_names(folder: Path) -> list[str]:
     return sorted(found)
 
 
-def _refuse_clashes(names: Sequence[str], capture: Capture) -> None:
-    if not names:
-        raise DataError(f"the {capture.format} model in {capture.folder} holds no posed image")
+def refuse_clashes(names: Sequence[str]) -> None:
+    """Raise if two images would give views of one name.
+
+    Raises:
+        DataError: they would.
+    """
     seen: dict[str, str] = {}
     for name in names:
         key = view_name(name).casefold()
         if key in seen:
-            raise DataError(f"the images {seen[key]!r} and {name!r} would share one name (without case and extension)")
+            raise DataError(
+                f"the images {seen[key]!r} and {name!r} would share one name (without case and extension); rename one"
+            )
         seen[key] = name
 
 

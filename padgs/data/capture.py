@@ -6,10 +6,13 @@ Every file format has one reader, `read(path, options) -> Capture`; `padgs.data.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+import torch
 from torch import Tensor
 
 
@@ -41,6 +44,16 @@ class Tracks:
     point: Tensor  # [T] int64, index into Cloud.points
     pixels: Tensor  # [T, 2] float64, continuous (u, v) at the camera's size
 
+    @classmethod
+    def of(cls, seen: Iterable[tuple[int, int, Any]]) -> Tracks:
+        """Of (frame, point, pixel) of every observation."""
+        rows = list(seen)
+        return cls(
+            torch.tensor([frame for frame, _, _ in rows], dtype=torch.int64),
+            torch.tensor([point for _, point, _ in rows], dtype=torch.int64),
+            torch.from_numpy(np.array([pixel for _, _, pixel in rows], np.float64).reshape(-1, 2)),
+        )
+
 
 @dataclass(frozen=True)
 class Capture:
@@ -53,6 +66,6 @@ class Capture:
     cloud: Cloud | None
     split: Mapping[str, tuple[str, ...]] | None = None  # "train", "test" -> names, where the format states them
     mask: str = "auto"  # what data.mask=auto means for this format
-    width: int | None = None  # what data.width=null means for this format; None = as stored
+    width: int | None = None  # what wider images are reduced to if data.width is null; None = as stored
     tracks: Callable[[], Tracks] | None = None
     notes: tuple[str, ...] = ()

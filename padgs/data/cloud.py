@@ -10,6 +10,7 @@ from torch import Tensor
 from padgs.data.capture import Capture, Cloud
 from padgs.data.errors import DataError
 from padgs.data.ply import read_ply
+from padgs.data.trajectory import centers
 
 RANDOM_POINTS = 100_000
 RANDOM_RADII = (0.5, 50.0)  # nearest and farthest made-up point, in multiples of the cameras' spread
@@ -58,9 +59,9 @@ def random_cloud(cam_from_world: Tensor, count: int = RANDOM_POINTS) -> Cloud:
 
     Always the same for the same cameras, and it scales with them.
     """
-    centers = -(cam_from_world[:, :3, :3].mT @ cam_from_world[:, :3, 3:])[..., 0]
-    middle = centers.mean(0)
-    spread = (centers - middle).norm(dim=1).max().clamp(min=1e-9)
+    places = centers(cam_from_world)
+    middle = places.mean(0)
+    spread = (places - middle).norm(dim=1).max().clamp(min=1e-9)
     source = torch.Generator().manual_seed(0)
     direction = torch.nn.functional.normalize(torch.randn(count, 3, generator=source, dtype=torch.float64), dim=1)
     near, far = RANDOM_RADII

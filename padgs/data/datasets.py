@@ -17,10 +17,8 @@ class Dataset:
 
     title: str
     scenes: tuple[str, ...]
-    stored: str  # size as downloaded
     width: int  # at which the paper reports (OmniBlender is not in the paper)
     mask: str  # what data.mask=auto means
-    voxel_size: float | None  # of the anchors, in scene units, as published
     source: str  # where to get it
     holds: str  # what the folder of a scene must hold
 
@@ -41,10 +39,8 @@ DATASETS = {
             "library",
             "office",
         ),
-        stored="6080x3040",
         width=2048,
         mask="rows:959/1024",
-        voxel_size=0.001,
         source="its authors, https://huajianup.github.io/research/360Roam/ (it may not be redistributed)",
         holds="images/, pose_c2w.json and scene.ply",
     ),
@@ -64,10 +60,8 @@ DATASETS = {
             "garden",
             "poster",
         ),
-        stored="1920x960",
         width=1920,
         mask="none",
-        voxel_size=0.005,
         source="the 'Data' link of github.com/changwoonchoi/EgoNeRF",
         holds="imgs/, train.txt, test.txt and output_dir/colmap/",
     ),
@@ -86,10 +80,8 @@ DATASETS = {
             "pavilion_midday_pond",
             "restroom",
         ),
-        stored="2000x1000",
         width=2000,
         mask="none",
-        voxel_size=None,
         source="the 'Data' link of github.com/changwoonchoi/EgoNeRF",
         holds="images/ and transform.json",
     ),

@@ -12,8 +12,10 @@ from io import BytesIO
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
+from torch import Tensor
 
 from padgs.data.errors import DataError
 
@@ -38,7 +40,7 @@ def inspect(path: Path, *, mask: bool = False) -> ImageFile:
     Raises:
         DataError: not there, unreadable, not an image, cut short, turned by EXIF, 16-bit, grey, CMYK or not 2:1.
     """
-    data = _read(path)
+    data = read_bytes(path)
     try:
         with Image.open(BytesIO(data)) as image:
             width, height, mode = image.width, image.height, image.mode
@@ -73,23 +75,28 @@ def decode(path: Path, mode: str = "RGB") -> NDArray[np.uint8]:
     Raises:
         DataError: the file is cut short or damaged, or partly transparent.
     """
-    return _decode(BytesIO(_read(path)), path, mode)
+    return _decode(BytesIO(read_bytes(path)), path, mode)
+
+
+def save_png(pixels: Tensor, path: Path) -> None:
+    """Write pixels [H, W, 3] or [H, W] in 0..255, rounded, in a folder that is made where it is not there."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(pixels.round().to(torch.uint8).cpu().numpy()).save(path)
 
 
 def _decode(file: BytesIO, path: Path, mode: str) -> NDArray[np.uint8]:
     try:
         with Image.open(file) as image:
             image.load()
-            if mode == "RGB" and "A" in image.getbands() and np.asarray(image.getchannel("A")).min() < 255:
-                raise DataError(
-                    f"{path} has transparent pixels; save it without alpha and say which pixels to ignore in a mask "
-                    "file (data.mask)"
-                )
+            transparent = mode == "RGB" and "A" in image.getbands() and np.asarray(image.getchannel("A")).min() < 255
             pixels = np.array(_eight_bit(image).convert(mode))
-    except DataError:
-        raise
     except (OSError, SyntaxError, ValueError) as error:
         raise DataError(f"{path} is cut short or damaged ({error}); copy it again or remove it") from error
+    if transparent:
+        raise DataError(
+            f"{path} has transparent pixels; save it without alpha and say which pixels to ignore in a mask "
+            "file (data.mask)"
+        )
     return pixels if mode == "RGB" else pixels[..., None]
 
 
@@ -100,7 +107,12 @@ def _eight_bit(image: Image.Image) -> Image.Image:
     return Image.fromarray((np.asarray(image).astype(np.int64) >> 8).clip(0, 255).astype(np.uint8))
 
 
-def _read(path: Path) -> bytes:
+def read_bytes(path: Path) -> bytes:
+    """The contents of a file.
+
+    Raises:
+        DataError: not there, unreadable or empty.
+    """
     try:
         data = path.read_bytes()
     except FileNotFoundError as error:

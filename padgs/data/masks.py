@@ -6,7 +6,7 @@ A mask is one file for the scene, one file per image, the rule that only the fir
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from padgs.data.capture import Capture, Frame
 from padgs.data.errors import DataError
-from padgs.data.images import EXTENSIONS, ImageFile, inspect
+from padgs.data.images import EXTENSIONS, ImageFile, inspect, save_png
 from padgs.data.store import ImageStore, StoredImage
 
 SCENE_MASKS = ("mask.png", "mask.jpg", "mask.bmp")
@@ -71,19 +71,18 @@ def find_masks(
     rule = _ROWS.fullmatch(spec)
     files, note = _mask_files(capture, None if rule or spec == "auto" else capture.folder / spec)
     notes = [note] if note else []
+    rows: dict[int, Tensor] = {}  # by height
     if rule:
         keep, of = int(rule[1]), int(rule[2])
         if not 0 < keep <= of:
             raise DataError(f"data.mask={spec}: the first number is how many of the second are kept; 1 to {of}")
         notes.append(f"mask: rows from {keep} of {of} on are ignored ({1 - keep / of:.1%} of the image)")
+        rows = {height: row_weights(keep, of, height) for _, height in sizes}
     masks: list[Mask | None] = []
     digests = [spec] if rule else []
     inspected: dict[Path, ImageFile] = {}
-    rows: dict[int, Tensor] = {}
     for frame, image, (width, height) in zip(capture.frames, images, sizes, strict=True):
         path = files.get(frame.name)
-        if rule and height not in rows:
-            rows[height] = row_weights(int(rule[1]), int(rule[2]), height)
         if path is None:
             masks.append(Mask(None, rows[height]) if rule else None)
             continue
@@ -95,7 +94,7 @@ def find_masks(
                 f"{path} is {mask_file.width}x{mask_file.height} but {image.path.name} is "
                 f"{image.width}x{image.height}; a mask must have the size of its image"
             )
-        masks.append(Mask(StoredImage(path, width, height, store, "L"), rows.get(height) if rule else None))
+        masks.append(Mask(StoredImage(path, width, height, store, "L"), rows.get(height)))
         digests.append(f"{frame.name}:{mask_file.digest}")
     _refuse_empty(masks, capture.frames)
     return masks, digests, notes
@@ -144,3 +143,14 @@ def _in_folder(folder: Path, name: str) -> Path | None:
     stem = PurePosixPath(name).with_suffix("")
     candidates = [f"{name}.png", *(f"{stem}{extension}" for extension in (".png", *EXTENSIONS))]
     return next((folder / file for file in candidates if (folder / file).is_file()), None)
+
+
+def write_masks(masks: Mapping[str, Tensor | None], folder: Path) -> None:
+    """mask.png if all views (name -> weights) have the same weights, else masks/ with one file per masked view."""
+    present = {name: mask for name, mask in masks.items() if mask is not None}
+    first = next(iter(present.values()), None)
+    if first is not None and len(present) == len(masks) and all(mask.equal(first) for mask in present.values()):
+        save_png(first * 255, folder / "mask.png")
+        return
+    for name, mask in present.items():
+        save_png(mask * 255, folder / "masks" / f"{name}.png")

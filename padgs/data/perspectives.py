@@ -26,17 +26,15 @@ class _Cut:
     panorama: View
     turn: Tensor  # [3, 3]
     lens: Pinhole
+    load: Callable[[], Tensor]  # of the panorama's pixels, or its mask
 
     def sampled(self, image: Tensor) -> Tensor:
         rays = self.lens.rays(dtype=torch.float64, device=image.device)
         return sample(image, rays @ self.turn.to(image.device))  # d_panorama = turn^T d_view
 
 
-@dataclass(frozen=True, eq=False)
 class _Pixels(_Cut):
     """Loads the colours of a view."""
-
-    load: Callable[[], Tensor]
 
     @property
     def store(self) -> ImageStore | None:
@@ -61,11 +59,8 @@ class _Pixels(_Cut):
             self.panorama.prefetch()
 
 
-@dataclass(frozen=True, eq=False)
 class _Mask(_Cut):
     """Loads the mask of a view."""
-
-    load: Callable[[], Tensor]
 
     def __call__(self) -> Tensor:
         """Weights [H, W] in [0, 1]."""

@@ -49,13 +49,9 @@ def write_ply(path: Path, cloud: Cloud) -> None:
     """Write a binary PLY file with x, y, z as doubles (nothing is lost) and red, green, blue if there are colours."""
     from plyfile import PlyData, PlyElement
 
-    fields: list[tuple[str, str]] = [(axis, "f8") for axis in "xyz"]
+    columns, fields = [*cloud.points.T.numpy()], [(axis, "f8") for axis in "xyz"]
     if cloud.colors is not None:
+        columns += [*cloud.colors.T.numpy()]
         fields += [(channel, "u1") for channel in _COLORS[0]]
-    vertex = np.empty(len(cloud.points), dtype=fields)
-    for i, axis in enumerate("xyz"):
-        vertex[axis] = cloud.points[:, i].numpy()
-    if cloud.colors is not None:
-        for i, channel in enumerate(_COLORS[0]):
-            vertex[channel] = cloud.colors[:, i].numpy()
+    vertex = np.rec.fromarrays(columns, dtype=fields)
     PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(path))

@@ -82,14 +82,22 @@ def read_list(path: Path) -> tuple[str, ...]:
     Raises:
         DataError: not text, or a name that points outside the image folder.
     """
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path} cannot be read as UTF-8 text ({error}); write one image name a line") from error
-    names = tuple(line.strip().replace("\\", "/") for line in lines if line.strip())
+    names = tuple(line.strip().replace("\\", "/") for line in read_lines(path) if line.strip())
     for name in names:
         check_inside(name, f"{path}")
     return names
+
+
+def read_lines(path: Path) -> list[str]:
+    """The lines of a text file.
+
+    Raises:
+        DataError: not text.
+    """
+    try:
+        return path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path} cannot be read as UTF-8 text ({error}); save it as such") from error
 
 
 def check_inside(name: str, where: str) -> str:
@@ -116,10 +124,9 @@ def _every(names: Sequence[str], every: int, mode: str) -> Split:
 
 
 def _resolve(lines: Sequence[str], names: Sequence[str], which: str, unposed: Sequence[str]) -> set[int]:
-    exact: dict[str, set[int]] = {}
+    exact = {name: {i} for i, name in enumerate(names)}
     loose: dict[str, set[int]] = {}
     for i, name in enumerate(names):
-        exact.setdefault(name, set()).add(i)
         for key in _keys(name):
             loose.setdefault(key, set()).add(i)
     chosen: set[int] = set()

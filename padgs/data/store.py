@@ -26,10 +26,6 @@ class Decodable(Protocol):
         """The pixels, past the cache."""
         ...
 
-    def __hash__(self) -> int:
-        """Equal for equal images."""
-        ...
-
 
 class ImageStore:
     """Least-recently-used cache of decoded images, bounded in bytes. Safe to use from several threads."""

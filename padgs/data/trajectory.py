@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-_AXES = ("x", "y", "z")
-
 
 @dataclass(frozen=True)
 class Gravity:
@@ -31,7 +29,7 @@ def gravity(poses: Tensor) -> Gravity:
     return Gravity(
         up=(up[0].item(), up[1].item(), up[2].item()),
         agreement=mean.norm().item(),
-        axis=f"{sign}{_AXES[strongest]}",
+        axis=f"{sign}{'xyz'[strongest]}",
         off_axis=_degrees(up[strongest].abs()),
         tilt=_degrees((ups @ up).median()),
     )

@@ -47,13 +47,7 @@ class EgoNeRF(nn.Module):
         shape = {"radius": options.radial_nodes, "polar": options.polar_nodes, "azimuth": options.azimuth_nodes}
         self.density = PlaneLines(options.density_components, shape)
         self.appearance = PlaneLines(options.appearance_components, shape)
-        self.shader = Shader(
-            options.appearance_components,
-            options.features,
-            options.hidden,
-            options.feature_frequencies,
-            options.direction_frequencies,
-        )
+        self.shader = Shader(options)
         self.environment = EnvironmentMap(options.environment_height) if options.environment else None
         # Half the diagonal of a cube around all that rays can reach, as published.
         reach = math.sqrt(3) * (travel + options.far)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from padgs.checks import check, check_known
+
 LENGTH_UNITS = ("scene", "world")
 
 
@@ -35,19 +37,12 @@ class EgoNeRFOptions:
     samples_at_once: int = 1 << 18  # ours: bounds the memory of a pass, in training and rendering
 
     def __post_init__(self) -> None:
-        """Reject what the model cannot be built with."""
-        if self.length_unit not in LENGTH_UNITS:
-            raise ValueError(f"unknown length_unit {self.length_unit!r}; known: {', '.join(LENGTH_UNITS)}")
-        for name in ("radial_nodes", "polar_nodes", "azimuth_nodes"):
-            value = getattr(self, name)
-            if value < 4 or value % 2:
-                raise ValueError(f"{name} is {value}; it must be even, for the coarse grid halves it, and at least 4")
-        for name in ("density_components", "appearance_components", "features", "hidden", "environment_height"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
-        for name in ("feature_frequencies", "direction_frequencies"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 0")
+        check_known(self, length_unit=LENGTH_UNITS)
+        nodes, halved = ("radial_nodes", "polar_nodes", "azimuth_nodes"), "even, for the coarse grid halves it"
+        check(self, f"{halved}, and at least 4", lambda count: count >= 4 and count % 2 == 0, *nodes)
+        sizes = ("density_components", "appearance_components", "features", "hidden", "environment_height")
+        check(self, "at least 1", lambda size: size >= 1, *sizes)
+        check(self, "at least 0", lambda count: count >= 0, "feature_frequencies", "direction_frequencies")
         if self.coarse_samples < 4 or self.fine_samples < 1:
             raise ValueError(
                 f"coarse_samples is {self.coarse_samples} and fine_samples {self.fine_samples}; "
@@ -58,10 +53,8 @@ class EgoNeRFOptions:
                 f"near is {self.near}, far {self.far} and first_radius {self.first_radius}; near and first_radius must "
                 "be > 0, and far - near larger than first_radius"
             )
-        if not self.distance_scale > 0:
-            raise ValueError(f"distance_scale is {self.distance_scale}; it must be > 0")
-        if not 0 <= self.min_weight < 1:
-            raise ValueError(f"min_weight is {self.min_weight}; it must be in [0, 1)")
+        check(self, "> 0", lambda scale: scale > 0, "distance_scale")
+        check(self, "in [0, 1)", lambda weight: 0 <= weight < 1, "min_weight")
         if self.samples_at_once < self.samples:
             raise ValueError(
                 f"samples_at_once is {self.samples_at_once}, less than the {self.samples} of a single ray; raise it"

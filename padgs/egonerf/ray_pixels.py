@@ -63,7 +63,6 @@ class RayPixels:
         self._rotations = torch.stack([view.cam_from_world[:3, :3] for view in views]).to(self._directions)
 
     def __len__(self) -> int:
-        """Number of pixels that can be drawn."""
         return len(self._colors)
 
     def draw(self, count: int) -> Rays:

@@ -9,22 +9,20 @@ import torch
 from torch import Tensor, nn
 
 from padgs.egonerf.charts import YANG, YIN
+from padgs.egonerf.options import EgoNeRFOptions
 from padgs.egonerf.plane_lines import CHARTS, MODES
 
 
 class Shader(nn.Module):
     """Products of planes and lines, and a viewing direction -> RGB in (0, 1)."""
 
-    def __init__(
-        self, components: int, features: int, hidden: int, feature_frequencies: int, direction_frequencies: int
-    ) -> None:
-        """Layers inputs-hidden-hidden-3 after a basis of `features`; frequencies are those of the encodings."""
+    def __init__(self, options: EgoNeRFOptions) -> None:
         super().__init__()
-        inputs = len(MODES) * components
+        self.options, features, hidden = options, options.features, options.hidden
+        inputs = len(MODES) * options.appearance_components
         bound = 1 / math.sqrt(inputs)
         self.basis = nn.Parameter(torch.empty(CHARTS, features, inputs).uniform_(-bound, bound))
-        self.feature_frequencies, self.direction_frequencies = feature_frequencies, direction_frequencies
-        width = features * (1 + 2 * feature_frequencies) + 3 * (1 + 2 * direction_frequencies)
+        width = features * (1 + 2 * options.feature_frequencies) + 3 * (1 + 2 * options.direction_frequencies)
         last = nn.Linear(hidden, 3)
         nn.init.zeros_(last.bias)
         self.network = nn.Sequential(
@@ -41,11 +39,8 @@ class Shader(nn.Module):
         """
         stacked = torch.cat(list(products))
         features = torch.where(chart == YANG, self.basis[YANG] @ stacked, self.basis[YIN] @ stacked).T
-        encoded = (
-            encoding(features, self.feature_frequencies),
-            encoding(directions, self.direction_frequencies),
-        )
-        return self.network(torch.cat(encoded, dim=-1))
+        seen = encoding(directions, self.options.direction_frequencies)
+        return self.network(torch.cat((encoding(features, self.options.feature_frequencies), seen), dim=-1))
 
 
 def encoding(values: Tensor, frequencies: int) -> Tensor:

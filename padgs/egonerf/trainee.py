@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from padgs.checks import check
 from padgs.egonerf.model import EgoNeRF
 from padgs.learning.schedule import LogLinear, ParameterGroup
 from padgs.learning.trainee import Size, State
@@ -32,17 +33,11 @@ class EgoNeRFTraining:
     appearance_variation: float = 0.01
 
     def __post_init__(self) -> None:
-        """Reject what nothing can be learned with."""
-        if self.rays < 1:
-            raise ValueError(f"rays is {self.rays}; it must be at least 1")
-        if self.environment_pretraining < 0:
-            raise ValueError(f"environment_pretraining is {self.environment_pretraining}; it must be at least 0")
-        for name in ("grid_rate", "network_rate", "environment_rate", "pretraining_rate", "rate_decay"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be > 0")
-        for name in ("density_variation", "appearance_variation"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be >= 0")
+        check(self, "at least 1", lambda count: count >= 1, "rays")
+        check(self, "at least 0", lambda count: count >= 0, "environment_pretraining")
+        rates = ("grid_rate", "network_rate", "environment_rate", "pretraining_rate", "rate_decay")
+        check(self, "> 0", lambda rate: rate > 0, *rates)
+        check(self, ">= 0", lambda weight: weight >= 0, "density_variation", "appearance_variation")
 
 
 class EgoNeRFTrainee:
@@ -113,12 +108,7 @@ class EgoNeRFTrainee:
 
     def size(self) -> Size:
         """Parameters and their bytes."""
-        parameters = list(self.model.parameters())
-        return Size(
-            counts={},
-            parameters=sum(p.numel() for p in parameters),
-            bytes=sum(p.numel() * p.element_size() for p in parameters),
-        )
+        return Size.of({}, self.model.parameters(), stored=self.model.parameters())
 
     def state(self) -> State:
         """The parameters, and where the model is; not copies."""

@@ -1,4 +1,4 @@
-"""Removing and adding rows of per-anchor or per-Gaussian parameters while an Adam optimiser holds them.
+"""Removing, adding and loading rows of per-anchor or per-Gaussian parameters while an Adam optimiser holds them.
 
 The `nn.Parameter` objects keep their identity, so the optimiser, its groups and the model go on referring to them;
 their `.data` and Adam moments are replaced, and their gradients are dropped. No graph that was built on the old rows
@@ -7,7 +7,7 @@ may be alive when the next one is built.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import torch
 from torch import Tensor, nn
@@ -64,6 +64,23 @@ def append_rows(parameters: Mapping[str, nn.Parameter], optimizer: torch.optim.A
         for moment in MOMENTS:
             if moment in moments:
                 moments[moment] = torch.cat((moments[moment], torch.zeros_like(rows)))
+
+
+def load_rows(model: nn.Module, tensors: Mapping[str, Tensor], growing: Collection[str]) -> None:
+    """Set all parameters to what `state_dict` of another model gave, whose `growing` tensors may have other row counts.
+
+    Raises:
+        ValueError: a tensor is missing, or has another shape than the options of this model make it.
+    """
+    count = len(tensors[first]) if (first := next(iter(growing))) in tensors else 0
+    for name, own in model.state_dict().items():
+        shape = [count, *own.shape[1:]] if name in growing else list(own.shape)
+        given = list(tensors[name].shape) if name in tensors else None
+        if given != shape:
+            raise ValueError(f"{name} of the stored model has shape {given}; with these options it is {shape}")
+    for name, parameter in model.named_parameters():
+        parameter.data = tensors[name].to(parameter).clone()
+        parameter.grad = None
 
 
 def _row_count(parameters: Mapping[str, nn.Parameter]) -> int:

@@ -5,7 +5,7 @@ Each family has one: `padgs.anchors.trainee` (PaD-GS), `padgs.splats.trainee` (3
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import KW_ONLY, dataclass
 from typing import Any, Protocol
 
@@ -38,6 +38,11 @@ class Size:
     counts: dict[str, int]  # anchors, gaussians (potential), ...
     parameters: int  # learnable scalars
     bytes: int  # of the model alone, as stored in the checkpoint
+
+    @staticmethod
+    def of(counts: dict[str, int], parameters: Iterable[Tensor], stored: Iterable[Tensor]) -> Size:
+        """The size of a model of which these tensors are learned, and those stored."""
+        return Size(counts, sum(tensor.numel() for tensor in parameters), sum(tensor.nbytes for tensor in stored))
 
 
 @dataclass(frozen=True)

@@ -23,9 +23,8 @@ BACKENDS = {
     "cpu": "padgs.render.backends.cpu:rasterize",
     "cuda": "padgs.render.backends.cuda:rasterize",
 }
-RELEASED = RenderOptions(near=0.2, wrap=False, bounds="square")  # the published rasterizer, near in scene units
 
-__all__ = ["BACKENDS", "RELEASED", "RenderOptions", "Rendering", "render", "resolve_backend"]
+__all__ = ["BACKENDS", "RenderOptions", "Rendering", "render", "resolve_backend"]
 
 
 def render(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any
 
+from padgs.checks import check_known
 from padgs.render.contract import RenderOptions
 
 NEAR_UNITS = ("scene", "world")
@@ -20,8 +21,7 @@ class RenderConfig(RenderOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.near_unit not in NEAR_UNITS:
-            raise ValueError(f"unknown near_unit {self.near_unit!r}; known: {', '.join(NEAR_UNITS)}")
+        check_known(self, near_unit=NEAR_UNITS)
 
     def options(self, scene_unit: float) -> RenderOptions:
         """Renderer options for a scene whose own unit of length is `scene_unit` world units."""

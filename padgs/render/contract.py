@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from padgs.checks import check, check_known
 from padgs.gaussians import Gaussians
 from padgs.sphere.camera import Camera, Panorama, Pinhole, RayTable
 
@@ -39,7 +40,7 @@ LOW_PASS_KINDS = {  # of each projection, its natural one first; `padgs.render.l
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """How Gaussians become an image. The defaults are ours; `RELEASED` in `padgs.render` is the published behaviour."""
+    """How Gaussians become an image. The defaults are ours; conf/render/released.yaml is the published rasterizer."""
 
     projection: str = "erp"
     near: float = 0.0  # world units; Gaussians whose mean is at most this far away are culled
@@ -57,18 +58,16 @@ class RenderOptions:
     memory_cap: int | None = None  # square: bytes of the published lists of all pairs; more than that is a MemoryError
 
     def __post_init__(self) -> None:
-        if self.bounds not in BOUNDS:
-            raise ValueError(f"unknown bounds {self.bounds!r}; known: {', '.join(BOUNDS)}")
-        if self.near_cull not in NEAR_CULLS:
-            raise ValueError(f"unknown near_cull {self.near_cull!r}; known: {', '.join(NEAR_CULLS)}")
+        check_known(self, bounds=BOUNDS, near_cull=NEAR_CULLS, blending=BLENDINGS)
+        check(self, "a distance >= 0 in world units", lambda near: near >= 0, "near")
+        check(self, "a variance >= 0 in square pixels", lambda variance: variance >= 0, "low_pass")
+        check(self, f"from 1 to {MAX_CORE_SIZE} fragments a pixel", lambda n: 1 <= n <= MAX_CORE_SIZE, "core_size")
+        check(self, "at least 1", lambda most: most >= 1, "max_instances")
+        check(self, "at least 1 byte, or None", lambda cap: cap is None or cap >= 1, "memory_cap")
         if self.near_cull == "ellipsoid" and self.projection != "ray":
             raise ValueError(
                 f"near_cull=ellipsoid is made for projection 'ray', not {self.projection!r}; set near_cull=mean"
             )
-        if self.blending not in BLENDINGS:
-            raise ValueError(f"unknown blending {self.blending!r}; known: {', '.join(BLENDINGS)}")
-        if not 1 <= self.core_size <= MAX_CORE_SIZE:
-            raise ValueError(f"core_size is {self.core_size}; it must be from 1 to {MAX_CORE_SIZE} fragments a pixel")
         if self.core_size != CORE_SIZE and self.blending != "hybrid":
             raise ValueError(
                 f"core_size is {self.core_size}, but blending={self.blending} keeps no core; set blending=hybrid, "
@@ -80,16 +79,8 @@ class RenderOptions:
             raise ValueError(
                 f"projection {self.projection!r} knows of no seam that wrap=false could cut; set wrap=true"
             )
-        if not self.near >= 0:
-            raise ValueError(f"near is {self.near}; it must be a distance >= 0 in world units")
-        if not self.low_pass >= 0:
-            raise ValueError(f"low_pass is {self.low_pass}; it must be a variance >= 0 in square pixels")
         if self.pixel_bias and self.projection != "erp":
             raise ValueError(f"pixel_bias is a defect of projection 'erp', not of {self.projection!r}; set it to 0")
-        if not self.max_instances >= 1:
-            raise ValueError(f"max_instances is {self.max_instances}; it must be at least 1")
-        if self.memory_cap is not None and not self.memory_cap >= 1:
-            raise ValueError(f"memory_cap is {self.memory_cap}; it must be at least 1 byte, or None")
         if self.memory_cap is not None and self.bounds != "square":
             raise ValueError(
                 "memory_cap is for the published rasterizers (bounds=square), which need all instances at once; with "

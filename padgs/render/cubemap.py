@@ -58,7 +58,7 @@ def rasterize_cubemap(rasterize: Backend, request: Request) -> Rendering:
     gaussians, cam_from_world, camera = request.gaussians, request.cam_from_world, request.camera
     assert isinstance(camera, Panorama), type(camera)  # `check_inputs` has seen to it
     if request.probe is not None:  # it is given in units of the panorama, so it moves the means, once for all faces
-        shift = shift_of_probe(camera_frame(gaussians, cam_from_world)[0], request.probe)
+        shift = shift_of_probe(camera_frame(request)[0], request.probe)
         gaussians = replace(gaussians, means=gaussians.means + shift @ cam_from_world[:3, :3])
     lens = face_camera(camera, request.options.face_size)
     turns = torch.eye(4, dtype=cam_from_world.dtype, device=cam_from_world.device).repeat(6, 1, 1)

@@ -5,13 +5,12 @@ erp is the chart model of OmniGS, ODGS and PaD-GS; pinhole is the one of ordinar
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from padgs.gaussians import Gaussians
-from padgs.render.contract import ALPHA_MIN, RenderOptions
+from padgs.render.contract import ALPHA_MIN, Request
 from padgs.render.low_pass import low_pass_of, widened
 from padgs.render.projection import Footprints, camera_frame
 from padgs.render.published_bounds import square_boxes
@@ -50,16 +49,11 @@ class PlanarFootprints(Footprints):
         return q, inside
 
 
-def project_erp(
-    gaussians: Gaussians,
-    cam_from_world: Tensor,
-    camera: Panorama,
-    options: RenderOptions,
-    probe: Tensor | None = None,
-) -> PlanarFootprints:
+def project_erp(request: Request) -> PlanarFootprints:
     """Chart model: mean through Eq. 6-7, covariance through their Jacobian (Eq. 3, 5)."""
-    means, orientations = camera_frame(gaussians, cam_from_world)
-    gaussians = widened(gaussians, means, low_pass_of(options, camera))
+    camera, options = request.camera, request.options
+    means, orientations = camera_frame(request)
+    request = replace(request, gaussians=widened(request.gaussians, means, low_pass_of(options, camera)))
     squared_radius = (means * means).sum(-1).detach()
     in_front = squared_radius > options.near**2
     # Next to the axis the chart has no derivative worth the name; such a footprint is held constant.
@@ -67,19 +61,15 @@ def project_erp(
     means = torch.where(near_axis[:, None], means.detach(), means)
     centers = pixel_from_angles(*longitude_latitude(means), camera.width, camera.height)
     jacobian = projection_jacobian(means, camera.width, camera.height, min_cos_latitude=MIN_COS_LATITUDE)
-    return _footprints(gaussians, means, orientations, centers, jacobian, in_front, camera, options, probe)
+    return _footprints(request, means, orientations, centers, jacobian, in_front)
 
 
-def project_pinhole(
-    gaussians: Gaussians,
-    cam_from_world: Tensor,
-    camera: Pinhole,
-    options: RenderOptions,
-    probe: Tensor | None = None,
-) -> PlanarFootprints:
+def project_pinhole(request: Request) -> PlanarFootprints:
     """The perspective model of 3D Gaussian splatting: u = fx x / z + cx, Jacobian with limited slopes."""
-    means, orientations = camera_frame(gaussians, cam_from_world)
-    gaussians = widened(gaussians, means, low_pass_of(options, camera))
+    camera, options = request.camera, request.options
+    assert isinstance(camera, Pinhole), type(camera)  # `check_inputs` has seen to it
+    means, orientations = camera_frame(request)
+    request = replace(request, gaussians=widened(request.gaussians, means, low_pass_of(options, camera)))
     in_front = means[:, 2].detach() > options.near
     x, y, z = means.unbind(-1)
     centers = torch.stack((camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy), dim=-1)
@@ -89,22 +79,15 @@ def project_pinhole(
     row_u = torch.stack((camera.fx / z, zero, -camera.fx / z * (x / z).clamp(-limit_x, limit_x)), dim=-1)
     row_v = torch.stack((zero, camera.fy / z, -camera.fy / z * (y / z).clamp(-limit_y, limit_y)), dim=-1)
     jacobian = torch.stack((row_u, row_v), dim=-2)
-    return _footprints(gaussians, means, orientations, centers, jacobian, in_front, camera, options, probe)
+    return _footprints(request, means, orientations, centers, jacobian, in_front)
 
 
 def _footprints(
-    gaussians: Gaussians,
-    means: Tensor,
-    orientations: Tensor,
-    centers: Tensor,
-    jacobian: Tensor,
-    in_front: Tensor,
-    camera: Panorama | Pinhole,
-    options: RenderOptions,
-    probe: Tensor | None,
+    request: Request, means: Tensor, orientations: Tensor, centers: Tensor, jacobian: Tensor, in_front: Tensor
 ) -> PlanarFootprints:
-    if probe is not None:
-        centers = centers + probe * centers.new_tensor([camera.width / 2, camera.height / 2])
+    gaussians, camera, options = request.gaussians, request.camera, request.options
+    if request.probe is not None:
+        centers = centers + request.probe * centers.new_tensor([camera.width / 2, camera.height / 2])
     half_covariance = jacobian @ (orientations * gaussians.scales[:, None, :])  # [N, 2, 3]
     var_u, var_v = (half_covariance**2).sum(-1).unbind(-1)
     cov_uv = (half_covariance[:, 0] * half_covariance[:, 1]).sum(-1)

@@ -1,7 +1,7 @@
 """How one Gaussian becomes a footprint on the image (torch): the entries of `PROJECTIONS`.
 
-Each entry is a function (gaussians, cam_from_world, camera, options, probe) -> Footprints. A footprint gives every
-pixel a squared distance q; everything after that (order, alpha, blending) is the same for all.
+Each entry is a function Request -> Footprints. A footprint gives every pixel a squared distance q; everything after
+that (order, alpha, blending) is the same for all.
 """
 
 from __future__ import annotations
@@ -12,10 +12,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from padgs.gaussians import Gaussians, rotation_matrices
+from padgs.gaussians import rotation_matrices
 from padgs.registry import lookup
-from padgs.render.contract import FURTHEST, NEAREST, RenderOptions
-from padgs.sphere.camera import Camera
+from padgs.render.contract import FURTHEST, NEAREST, Request
 
 PROJECTIONS = {
     "erp": "padgs.render.planar:project_erp",
@@ -47,17 +46,12 @@ class Footprints(ABC):
         raise NotImplementedError(f"{type(self).__name__} do not say how q changes with their means")
 
 
-def project(
-    gaussians: Gaussians,
-    cam_from_world: Tensor,
-    camera: Camera,
-    options: RenderOptions,
-    probe: Tensor | None = None,
-) -> Footprints:
-    """Footprints under `options.projection`; arguments as in `padgs.render.contract.Request`."""
-    footprints_of = lookup(PROJECTIONS, options.projection, "projection")
+def project(request: Request) -> Footprints:
+    """Footprints under the projection of the options."""
+    footprints_of = lookup(PROJECTIONS, request.options.projection, "projection")
+    gaussians, cam_from_world = request.gaussians, request.cam_from_world
     with torch.no_grad():
-        first = footprints_of(gaussians, cam_from_world, camera, options, probe)
+        first = footprints_of(request)
         visible = first.visible & (first.depths >= NEAREST) & (first.depths <= FURTHEST)
         rotation, translation = cam_from_world[:3, :3], cam_from_world[:3, 3]
         ahead = rotation.T @ (rotation.new_tensor([0.0, 0.0, 1.0]) - translation)
@@ -70,10 +64,10 @@ def project(
         quats=torch.where(chosen, gaussians.quats, gaussians.quats.new_tensor([1.0, 0.0, 0.0, 0.0])),
         scales=torch.where(chosen, gaussians.scales, torch.ones_like(gaussians.scales)),
     )
-    return replace(footprints_of(harmless, cam_from_world, camera, options, probe), visible=visible)
+    return replace(footprints_of(replace(request, gaussians=harmless)), visible=visible)
 
 
-def camera_frame(gaussians: Gaussians, cam_from_world: Tensor) -> tuple[Tensor, Tensor]:
+def camera_frame(request: Request) -> tuple[Tensor, Tensor]:
     """Means [N, 3] and orientations R_cam R(q) [N, 3, 3] in the camera frame; Sigma = (R diag(s)) (R diag(s))^T."""
-    rotation, translation = cam_from_world[:3, :3], cam_from_world[:3, 3]
-    return gaussians.means @ rotation.T + translation, rotation @ rotation_matrices(gaussians.quats)
+    rotation, translation = request.cam_from_world[:3, :3], request.cam_from_world[:3, 3]
+    return request.gaussians.means @ rotation.T + translation, rotation @ rotation_matrices(request.gaussians.quats)

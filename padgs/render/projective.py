@@ -13,8 +13,7 @@ from math import pi
 import torch
 from torch import Tensor
 
-from padgs.gaussians import Gaussians
-from padgs.render.contract import ALPHA_MIN, RenderOptions
+from padgs.render.contract import ALPHA_MIN, Request
 from padgs.render.low_pass import low_pass_of, widened
 from padgs.render.projection import Footprints, camera_frame
 from padgs.render.published_bounds import is_on_image, tangent_boxes
@@ -77,19 +76,14 @@ class RayFootprints(Footprints):
         return o, w, (o * w).sum(-1) / (w * w).sum(-1)
 
 
-def project_tangent(
-    gaussians: Gaussians,
-    cam_from_world: Tensor,
-    camera: Camera,
-    options: RenderOptions,
-    probe: Tensor | None = None,
-) -> TangentFootprints:
+def project_tangent(request: Request) -> TangentFootprints:
     """S = E Sigma E^T / r^2 (+ the angular low-pass) on the tangent plane spanned by E."""
-    means, orientations = camera_frame(gaussians, cam_from_world)
+    camera, options = request.camera, request.options
+    means, orientations = camera_frame(request)
     in_front = (means * means).sum(-1).detach() > options.near**2
-    means = _probed(means, probe)
+    means = _probed(means, request.probe)
     low_pass = low_pass_of(options, camera)
-    gaussians, low_pass = widened(gaussians, means, low_pass), low_pass.own
+    gaussians, low_pass = widened(request.gaussians, means, low_pass), low_pass.own
     radius = means.norm(dim=-1)
     normal = means / radius[:, None]
     tangent = _tangent_basis(normal)  # [N, 2, 3]
@@ -113,22 +107,17 @@ def project_tangent(
     return TangentFootprints(gaussians.opacities, radius, visible, boxes, normal, whitening, _rays(camera, means))
 
 
-def project_ray(
-    gaussians: Gaussians,
-    cam_from_world: Tensor,
-    camera: Camera,
-    options: RenderOptions,
-    probe: Tensor | None = None,
-) -> RayFootprints:
+def project_ray(request: Request) -> RayFootprints:
     """M^-1 = diag(1 / scale) R^T; not drawn from inside, that is where |M^-1 mean|^2 <= k = 2 ln(255 opacity).
 
     With near_cull=ellipsoid neither where the ellipsoid of what is drawn reaches the plane n.x = near, n the direction
     of the mean: r - sqrt(k n^T Sigma n) <= near (SPaGS).
     """
-    means, orientations = camera_frame(gaussians, cam_from_world)
+    camera, options = request.camera, request.options
+    means, orientations = camera_frame(request)
     in_front = (means * means).sum(-1).detach() > options.near**2
-    means = _probed(means, probe)
-    gaussians = widened(gaussians, means, low_pass_of(options, camera))
+    means = _probed(means, request.probe)
+    gaussians = widened(request.gaussians, means, low_pass_of(options, camera))
     radius, opacities = means.norm(dim=-1), gaussians.opacities
     whitening = orientations.transpose(-1, -2) / gaussians.scales[:, :, None]
     distance = (torch.einsum("kic,kc->ki", whitening, means) ** 2).sum(-1).detach()

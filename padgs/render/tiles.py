@@ -23,7 +23,6 @@ class Strip:
     """The lists of some rows of tiles."""
 
     def __init__(self, projected: Projected, first_row: int, end_row: int) -> None:
-        """Fill the lists of tile rows [first_row, end_row)."""
         camera, count = projected.camera, len(projected.boxes)
         columns = -(-camera.width // TILE)
         per_row = -(-columns // (1 << projected.level[first_row:end_row].long()))
@@ -52,7 +51,6 @@ class Projected:
     """All Gaussians as one view sees them, in depth order, and how they spread over the tiles."""
 
     def __init__(self, camera: NativeCamera, inputs: Inputs, max_instances: int) -> None:
-        """Project, sort, count."""
         library, count = cpu.library(), inputs.count
         rows = -(-camera.height // TILE)
         self.camera = camera

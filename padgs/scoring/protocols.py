@@ -13,6 +13,7 @@ import math
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
+from padgs.checks import check, check_known
 from padgs.scoring.lpips import INPUTS
 from padgs.scoring.lpips_weights import NETS
 from padgs.scoring.metrics import BANDS, METRICS
@@ -32,16 +33,11 @@ class Protocol:
     bottom_crop: float = 0.0  # share of the rows, at the bottom, that does not count (a tripod, a car)
 
     def __post_init__(self) -> None:
-        """Reject names and shares that cannot be evaluated."""
         unknown = [name for name in self.metrics if name not in METRICS]
         if unknown:
             raise ValueError(f"unknown metric {unknown[0]!r}; known: {', '.join(METRICS)}")
-        if self.lpips not in LPIPS_CHOICES:
-            raise ValueError(f"unknown lpips {self.lpips!r}; known: {', '.join(LPIPS_CHOICES)}")
-        if self.lpips_inputs not in INPUTS:
-            raise ValueError(f"unknown lpips_inputs {self.lpips_inputs!r}; known: {', '.join(INPUTS)}")
-        if not 0 <= self.bottom_crop < 1:
-            raise ValueError(f"bottom_crop is {self.bottom_crop}; it must be a share of the rows, 0 <= share < 1")
+        check_known(self, lpips=LPIPS_CHOICES, lpips_inputs=INPUTS)
+        check(self, "a share of the rows, 0 <= share < 1", lambda share: 0 <= share < 1, "bottom_crop")
 
     @property
     def lpips_name(self) -> str | None:

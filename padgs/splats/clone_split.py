@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from padgs.checks import check, check_known
 from padgs.gaussians import rotation_matrices
 from padgs.learning.rows import append_rows, keep_rows
 from padgs.learning.schedule import scaled
@@ -53,17 +54,11 @@ class CloneSplitOptions:
     released_reset: bool = False  # bug of the released OmniGS: resets clear Adam moments but keep the opacities
 
     def __post_init__(self) -> None:
-        """Reject intervals and limits without a meaning."""
-        for name in ("densify_every", "reset_every"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1 iteration")
-        if self.signal not in SIGNALS:
-            raise ValueError(f"unknown signal {self.signal!r}; known: {', '.join(SIGNALS)}")
-        if not (0 < self.reset_opacity < 1 and 0 <= self.opacity_decay < 1):
-            wrong = "opacity_decay" if 0 < self.reset_opacity < 1 else "reset_opacity"
-            raise ValueError(f"{wrong} is {getattr(self, wrong)}; it must be an opacity below 1")
-        if self.max_gaussians is not None and self.max_gaussians < 1:
-            raise ValueError(f"max_gaussians is {self.max_gaussians}; it must be at least 1, or none for no limit")
+        check(self, "at least 1 iteration", lambda every: every >= 1, "densify_every", "reset_every")
+        check_known(self, signal=SIGNALS)
+        check(self, "an opacity below 1", lambda opacity: 0 < opacity < 1, "reset_opacity")
+        check(self, "an opacity below 1", lambda opacity: 0 <= opacity < 1, "opacity_decay")
+        check(self, "at least 1, or none for no limit", lambda most: most is None or most >= 1, "max_gaussians")
 
     def for_run(self, iterations: int) -> CloneSplitOptions:
         """The same phases in a run of another length: every window is the same share of the run as published.

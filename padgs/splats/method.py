@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import torch
 
+from padgs.checks import check
 from padgs.learning.loop import TrainOptions, model_state
 from padgs.learning.method import Method
 from padgs.learning.trainee import State
@@ -28,8 +29,7 @@ class SplatOptions(CloneSplitOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.learning_rate_factor > 0:
-            raise ValueError(f"learning_rate_factor is {self.learning_rate_factor}; it must be > 0")
+        check(self, "> 0", lambda factor: factor > 0, "learning_rate_factor")
 
 
 def refuse_polar_threshold(options: SplatOptions, why: str) -> None:

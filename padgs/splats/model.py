@@ -10,6 +10,7 @@ from scipy.spatial import KDTree
 from torch import Tensor, nn
 
 from padgs.gaussians import Gaussians
+from padgs.learning.rows import load_rows
 from padgs.scene import Scene, View
 from padgs.sphere import harmonics as spherical_harmonics
 
@@ -75,7 +76,6 @@ class Splats(nn.Module):
         return cls(points, torch.log(scales)[:, None].repeat(1, 3), colors, degree=degree, unit=scene.unit)
 
     def __len__(self) -> int:
-        """Number of Gaussians."""
         return len(self.means)
 
     def rows(self) -> dict[str, nn.Parameter]:
@@ -85,20 +85,10 @@ class Splats(nn.Module):
     def load(self, tensors: Mapping[str, Tensor]) -> None:
         """Take over what `state_dict` of another model gave; the number of Gaussians may differ.
 
-        The parameters stay the same objects, so an optimiser that holds them goes on doing so.
-
         Raises:
-            ValueError: a tensor is missing or has another shape than the SH degree of this model makes it.
+            ValueError: as `padgs.learning.rows.load_rows` does.
         """
-        count = len(tensors["means"]) if "means" in tensors else 0
-        for name, parameter in self.named_parameters():
-            shape = [count, *parameter.shape[1:]]
-            given = list(tensors[name].shape) if name in tensors else None
-            if given != shape:
-                raise ValueError(f"{name} of the stored model has shape {given}; with these options it is {shape}")
-        for name, parameter in self.named_parameters():
-            parameter.data = tensors[name].to(parameter).clone()
-            parameter.grad = None
+        load_rows(self, tensors, self.rows())
 
     def gaussians(self, view: View) -> Gaussians:
         """The Gaussians with the colours that this view sees."""

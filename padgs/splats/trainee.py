@@ -116,12 +116,7 @@ class SplatTrainee:
 
     def size(self) -> Size:
         """Counts and bytes of the model."""
-        parameters = self.splats.rows().values()
-        return Size(
-            counts=self.counts(),
-            parameters=sum(p.numel() for p in parameters),
-            bytes=sum(p.numel() * p.element_size() for p in parameters),
-        )
+        return Size.of(self.counts(), self.splats.parameters(), stored=self.splats.parameters())
 
     def state(self) -> State:
         """Parameters, statistics, random state; not copies."""

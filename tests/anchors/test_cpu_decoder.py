@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from padgs.anchors.decoder import Decoder, decode_gaussians, define_gaussians
+from padgs.anchors.decoder import Decoder, SeenAnchors, decode_gaussians, define_gaussians
 from padgs.native import cpu
 
 pytestmark = pytest.mark.skipif(not cpu.available(), reason="the native library is not built")
@@ -17,7 +17,7 @@ def decoded(function, tensors, decoder, generator_seed=0):
         for name, tensor in tensors.items()
     }
     decoder.zero_grad()
-    gaussians, slots, raw = function(decoder.weights(), **leaves)
+    gaussians, slots, raw = function(decoder.weights(), SeenAnchors(**leaves))
     generator = torch.Generator().manual_seed(generator_seed)
     loss = sum(
         (getattr(gaussians, name) * torch.randn(getattr(gaussians, name).shape, generator=generator)).sum()

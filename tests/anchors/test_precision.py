@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from padgs.anchors.decoder import Decoder, decode, define_gaussians
+from padgs.anchors.decoder import Decoder, SeenAnchors, decode, define_gaussians
 from padgs.anchors.precision import OF_GRADIENTS, linear, reduced
 
 each_reduced = pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16], ids=str)
@@ -73,9 +73,10 @@ def test_geometry_stays_float32(dtype: torch.dtype, generator: torch.Generator):
     decoder, k = Decoder(37, 10, generator=generator), 10
     shapes = ((32,), (5,), (3,), (k, 3), (6,))
     features, seen, positions, offsets, log_scales = (torch.randn(50, *s, generator=generator) for s in shapes)
-    anchors = features, seen, positions, offsets, log_scales, torch.rand(50, generator=generator)
-    ours, slots, _ = define_gaussians(decoder.weights(), *anchors, str(dtype).removeprefix("torch."))
-    truth, true_slots, _ = define_gaussians(decoder.weights(), *anchors)
+    attenuation = torch.rand(50, generator=generator)
+    anchors = SeenAnchors(features, seen, positions, offsets, log_scales, attenuation)
+    ours, slots, _ = define_gaussians(decoder.weights(), anchors, str(dtype).removeprefix("torch."))
+    truth, true_slots, _ = define_gaussians(decoder.weights(), anchors)
     shared = slots[torch.isin(slots, true_slots)]
     assert len(shared) > 0.9 * len(true_slots) > 0
     places, true_places = torch.searchsorted(slots, shared), torch.searchsorted(true_slots, shared)

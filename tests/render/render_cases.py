@@ -13,9 +13,9 @@ from torch import Tensor
 from padgs.gaussians import Gaussians, rotation_matrices
 from padgs.native import cpu
 from padgs.render import BACKENDS, Rendering, RenderOptions, render
-from padgs.render.contract import ALPHA_MIN
+from padgs.render.contract import ALPHA_MIN, Request
 from padgs.render.planar import PlanarFootprints
-from padgs.render.projection import project
+from padgs.render.projection import Footprints, project
 from padgs.render.projective import RayFootprints
 from padgs.scene import View
 from padgs.sphere.camera import Camera, Panorama, Pinhole, RayTable
@@ -24,6 +24,7 @@ from padgs.sphere.panorama import direction
 INPUTS = ("means", "quats", "scales", "opacities", "colors")
 KINDS = ("ordinary", "polar", "pole", "seam", "near", "huge", "needle")
 ODD_SIZES = ((72, 36), (70, 44), (33, 17))
+RELEASED = RenderOptions(near=0.2, wrap=False, bounds="square")  # as conf/render/released.yaml, one world unit
 SETUPS = (  # every projection with every camera that it takes
     ("erp", "panorama"),
     ("tangent", "panorama"),
@@ -52,6 +53,11 @@ each_engine = pytest.mark.parametrize(("backend", "dtype"), engines())
 needs_native = pytest.mark.skipif(not cpu.available(), reason="the native library is not built")
 each_setup = pytest.mark.parametrize(("projection", "lens"), SETUPS, ids=["-".join(setup) for setup in SETUPS])
 each_panorama = pytest.mark.parametrize("projection", ("erp", "tangent", "ray"))
+
+
+def projected(gaussians: Gaussians, cam_from_world: Tensor, camera: Camera, options: RenderOptions) -> Footprints:
+    """What the torch backend draws."""
+    return project(Request(gaussians, cam_from_world, camera, options, background=gaussians.means.new_zeros(3)))
 
 
 def camera_of(lens: str, width: int, height: int) -> Camera:
@@ -186,7 +192,7 @@ def stable_pixels(
     ray meets a Gaussian within `margin` (relative) of the near radius.
     """
     pose = identity_pose() if pose is None else pose
-    footprints = project(gaussians, pose.to(gaussians.means.dtype), camera_of(lens, width, height), options)
+    footprints = projected(gaussians, pose.to(gaussians.means.dtype), camera_of(lens, width, height), options)
     everything = torch.arange(len(gaussians))[footprints.visible]
     pixels = torch.arange(height * width)
     rows, columns = pixels // width, pixels % width

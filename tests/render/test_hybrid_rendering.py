@@ -23,6 +23,7 @@ from render_cases import (
     leaves,
     mixture,
     needs_native,
+    projected,
     random_pose,
     row_error,
 )
@@ -31,7 +32,6 @@ from torch import Tensor
 from padgs.gaussians import Gaussians, rotation_matrices
 from padgs.render import Rendering, RenderOptions, render
 from padgs.render.planar import PlanarFootprints
-from padgs.render.projection import project
 from padgs.scene import View
 from padgs.sphere.camera import Camera, Panorama, Pinhole, RayTable
 from padgs.sphere.panorama import direction
@@ -57,7 +57,7 @@ def options_of(projection: str, size: int, **more) -> RenderOptions:
 
 def fragments(gaussians: Gaussians, camera: Camera, options: RenderOptions, pose: Tensor) -> tuple[Tensor, ...]:
     """alpha, distance [P, N], radial depths [N] of every pair, and which pixels [P] are far from any decision."""
-    footprints = project(gaussians, pose, camera, options)
+    footprints = projected(gaussians, pose, camera, options)
     everything, pixels = torch.arange(len(gaussians)), torch.arange(camera.height * camera.width)
     rows, columns = pixels // camera.width, pixels % camera.width
     q, inside = footprints.squared_distance(everything, rows, columns)

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from render_cases import INPUTS, identity_pose, leaves, mixture, needs_native, random_pose, row_error
+from render_cases import INPUTS, identity_pose, leaves, mixture, needs_native, projected, random_pose, row_error
 
 from padgs.gaussians import Gaussians
 from padgs.native import cpu
@@ -17,7 +17,7 @@ from padgs.render import RenderOptions, render
 from padgs.render.config import RenderConfig
 from padgs.render.contract import ALPHA_MIN, LOW_PASS_KINDS, PUBLISHED_FOCAL
 from padgs.render.planar import PlanarFootprints
-from padgs.render.projection import PROJECTIONS, project
+from padgs.render.projection import PROJECTIONS
 from padgs.scene import View
 from padgs.sphere.camera import Camera, Panorama, Pinhole
 from padgs.sphere.panorama import direction
@@ -58,7 +58,7 @@ def test_a_point_on_the_chart_becomes_a_circle_of_pixels_or_of_angle(latitude: f
     camera, point = camera_of("erp"), small(latitude, 1e-9)
     widths = {}
     for kind in ("pixels", "angular"):
-        footprints = project(point, identity_pose(), camera, options_of("erp", kind))
+        footprints = projected(point, identity_pose(), camera, options_of("erp", kind))
         assert isinstance(footprints, PlanarFootprints)
         a, b, c = footprints.whitening[0].tolist()
         assert abs(b) < 1e-9
@@ -72,7 +72,7 @@ def test_a_point_on_the_chart_becomes_a_circle_of_pixels_or_of_angle(latitude: f
 def test_a_point_spans_the_same_angle_in_every_projection(projection: str):
     """Along a meridian: q = (gamma f)^2 / low_pass, for small angles gamma."""
     camera, point = camera_of(projection, 512), small(0.0, 1e-9)
-    footprints = project(point, identity_pose(), camera, options_of(projection, "angular"))
+    footprints = projected(point, identity_pose(), camera, options_of(projection, "angular"))
     row = camera.height // 2 + torch.arange(-2, 2)
     column = torch.full_like(row, int(camera.width * 0.5 + 0.05 * camera.focal))
     q, inside = footprints.squared_distance(torch.tensor([0]), row, column)
@@ -88,7 +88,7 @@ def test_solid_is_angular_with_the_opacity_of_the_larger_volume(projection: str,
     gaussians = mixture(20, generator, ("ordinary", "polar", "seam"))
     camera, pixels = camera_of(projection), torch.arange(64)
     kinds = ("angular", "solid")
-    angular, solid = (project(gaussians, identity_pose(), camera, options_of(projection, kind)) for kind in kinds)
+    angular, solid = (projected(gaussians, identity_pose(), camera, options_of(projection, kind)) for kind in kinds)
     both = (angular.visible & solid.visible).nonzero()[:, 0]
     assert len(both) >= 2
     q = [footprints.squared_distance(both, pixels // 4, pixels)[0] for footprints in (angular, solid)]
@@ -139,7 +139,7 @@ def thin_mixture(generator: torch.Generator) -> Gaussians:
 def test_native_matches_the_definition(projection: str, kind: str, generator):
     gaussians, pose = thin_mixture(generator), random_pose(generator, shift=0.05)
     camera, options = camera_of(projection, 96), options_of(projection, kind, near=0.02)
-    footprints = project(gaussians, pose, camera, options)
+    footprints = projected(gaussians, pose, camera, options)
     weight = torch.rand(48, 96, 3, generator=generator, dtype=torch.float64)
     weight *= stable(footprints, camera)[..., None]
     found = {}

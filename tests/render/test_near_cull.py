@@ -7,11 +7,10 @@ from dataclasses import replace
 
 import pytest
 import torch
-from render_cases import each_engine, gaussians_of, identity_pose
+from render_cases import each_engine, gaussians_of, identity_pose, projected
 
 from padgs.gaussians import Gaussians, rotation_matrices
 from padgs.render import RenderOptions, render
-from padgs.render.projection import project
 from padgs.scene import View
 from padgs.sphere.camera import Panorama
 from padgs.sphere.panorama import direction
@@ -76,7 +75,7 @@ def test_of_what_is_drawn_nothing_lies_before_the_near_plane(backend, dtype, gen
 def test_shares_that_are_culled_agree_with_those_that_another_program_found(relative_size, published, generator):
     """Axes log-normal with deviation 0.7 and opacity 1: our reading of how that program sampled."""
     gaussians = balls(relative_size, 0.7, generator, count=20_000)
-    kept = project(gaussians, identity_pose(), VIEW.camera, options(near_cull="ellipsoid")).visible
+    kept = projected(gaussians, identity_pose(), VIEW.camera, options(near_cull="ellipsoid")).visible
     culled = 100 * (~kept).double().mean().item()
     assert culled == pytest.approx(published, abs=3 * math.sqrt(culled * (100 - culled) / 20_000) + 0.6)
 

@@ -29,6 +29,7 @@ def test_it_reads_like_what_it_is():
         "data.path=/mnt/x",
         "data.cache_bytes=1",
         "run.images_on=cpu",
+        "render.max_instances=1000",
         "protocol=paper",
         "seed=0",
     ],

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from padgs.data.capture import Tracks
+from padgs.data.trajectory import centers
 from padgs.sphere.panorama import project
 
 POINTS = 3000  # a sample is enough to tell conventions apart
@@ -92,11 +93,6 @@ def reprojection_error(points: Tensor, pixels: Tensor, width: int, height: int) 
 
 def known_conventions() -> list[Convention]:
     """As stated first, then every reading that files of other programs have been seen to need."""
-    return list(_conventions())
-
-
-def _conventions() -> Iterator[Convention]:
-    yield Convention("the poses are right as they are", lambda poses: poses)
     readings: dict[str, Callable[[Tensor], Tensor]] = {
         "": lambda poses: poses,
         "the poses are world from camera: invert them": torch.linalg.inv,
@@ -104,46 +100,34 @@ def _conventions() -> Iterator[Convention]:
         "what stands for the translation is the centre: use t = -R t": _from_center,
         "what stands for the centre is the translation: use C = -R^T C": _to_center,
     }
-    axes = list(_signed_axes())
-    for reading, convert in readings.items():
-        for words, matrix in axes:
-            if not reading and words is None:
-                continue
-            text = "; ".join(part for part in (reading, words) if part)
-            yield Convention(text, lambda poses, convert=convert, matrix=matrix: matrix @ convert(poses))
-    for words, matrix in axes:
-        if words is None:
-            continue
-        text = f"poses and points stand in different worlds: rotate the points, {words.removeprefix('camera axes: ')}"
-        yield Convention(text, lambda poses, matrix=matrix: poses @ matrix)
+    same, *others = _signed_axes()
+    found = []
+    for (reading, convert), (words, axes) in product(readings.items(), (same, *others)):
+        text = "; ".join(filter(None, (reading, words and f"camera axes: {words}")))
+        whole = text or "the poses are right as they are"
+        found.append(Convention(whole, lambda poses, convert=convert, axes=axes: axes @ convert(poses)))
+    for words, axes in others:
+        text = f"poses and points stand in different worlds: rotate the points, {words}"
+        found.append(Convention(text, lambda poses, axes=axes: poses @ axes))
+    return found
 
 
-def _signed_axes() -> Iterator[tuple[str | None, Tensor]]:
-    """The 48 ways to name and point three axes, as [4, 4], with words; None for the identity."""
-    for order in permutations(range(3)):
-        for signs in product((1.0, -1.0), repeat=3):
-            matrix = torch.zeros(4, 4, dtype=torch.float64)
-            matrix[3, 3] = 1
-            for row, (column, sign) in enumerate(zip(order, signs, strict=True)):
-                matrix[row, column] = sign
-            yield _axis_words(matrix), matrix
-
-
-def _axis_words(matrix: Tensor) -> str | None:
-    rows = matrix[:3, :3].tolist()
-    if rows == torch.eye(3).tolist():
-        return None
-    names = [f"{'-' if min(row) < 0 else ''}{'xyz'[[abs(value) for value in row].index(1)]}" for row in rows]
-    words = f"camera axes: take ({', '.join(names)}) for (x, y, z)"
-    if names == ["x", "-y", "-z"]:
-        words += ", as from OpenGL, Blender or nerfstudio"
-    return words + (", which mirrors" if torch.linalg.det(matrix) < 0 else "")
+def _signed_axes() -> Iterator[tuple[str, Tensor]]:
+    """The 48 ways to name and point three axes, in words and as [4, 4]; the first is the identity, without words."""
+    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
+        matrix = torch.zeros(4, 4, dtype=torch.float64)
+        matrix[3, 3] = 1
+        matrix[range(3), order] = torch.tensor(signs, dtype=torch.float64)
+        names = [f"{'-' if sign < 0 else ''}{'xyz'[axis]}" for axis, sign in zip(order, signs, strict=True)]
+        words = f"take ({', '.join(names)}) for (x, y, z)" if names != ["x", "y", "z"] else ""
+        if names == ["x", "-y", "-z"]:
+            words += ", as from OpenGL, Blender or nerfstudio"
+        yield words + (", which mirrors" if torch.linalg.det(matrix) < 0 else ""), matrix
 
 
 def _transposed(poses: Tensor) -> Tensor:
     turned = poses[:, :3, :3].mT
-    centers = -turned @ poses[:, :3, 3:]
-    return _with(poses, turned, -turned @ centers)
+    return _with(poses, turned, -turned @ centers(poses)[..., None])
 
 
 def _from_center(poses: Tensor) -> Tensor:
@@ -151,7 +135,7 @@ def _from_center(poses: Tensor) -> Tensor:
 
 
 def _to_center(poses: Tensor) -> Tensor:
-    return _with(poses, poses[:, :3, :3], -poses[:, :3, :3].mT @ poses[:, :3, 3:])
+    return _with(poses, poses[:, :3, :3], centers(poses)[..., None])
 
 
 def _with(poses: Tensor, rotation: Tensor, translation: Tensor) -> Tensor:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -83,18 +84,19 @@ def check(
     scene = _assemble(capture, options, report)
     if scene is None:
         return report
-    poses = torch.stack([view.cam_from_world for view in (*scene.train, *scene.test)])
+    views = (*scene.train, *scene.test)
+    poses = torch.stack([view.cam_from_world for view in views])
     report.train, report.test = len(scene.train), len(scene.test)
     report.unused = len(capture.frames) - report.train - report.test
     report.points, report.coloured = len(scene.points), capture.cloud is not None and capture.cloud.colors is not None
-    sizes = sorted({(view.width, view.height) for view in (*scene.train, *scene.test)})
+    sizes = sorted({(view.width, view.height) for view in views})
     report.resolution = listed(f"{width}x{height}" for width, height in sizes)
     report.notes += scene.notes
     report.gravity = gravity(poses)
     ordered = sorted(capture.frames, key=lambda frame: frame.name)
     report.path_length = path_length(torch.stack([frame.cam_from_world for frame in ordered]))
     report.median_depth = median_depth(poses, scene.points)
-    report.masked = {view.name: 1 - mask.mean().item() for view in _views(scene) if (mask := view.mask()) is not None}
+    report.masked = {view.name: 1 - mask.mean().item() for view in views if (mask := view.mask()) is not None}
     _check_leaks(scene, capture, report)
     _check_digits(scene, poses, report)
     _check_fit(capture, scene, report)
@@ -105,10 +107,6 @@ def check(
         except DataError as error:
             report.problems.append(str(error))
     return report
-
-
-def _views(scene: Scene) -> tuple[View, ...]:
-    return (*scene.train, *scene.test)
 
 
 def _check_images(capture: Capture, report: Report, progress: Callable[[int, int], None]) -> None:
@@ -125,12 +123,8 @@ def _check_images(capture: Capture, report: Report, progress: Callable[[int, int
 
 def _assemble(capture: Capture, options: DataOptions, report: Report) -> Scene | None:
     """The scene, or what keeps it from being one: each part is tried by itself, so that all problems are told."""
-    try:
-        return assemble(capture, options)
-    except DataError as error:
-        if str(error) not in report.problems:
-            report.problems.append(str(error))
-    easier = (
+    easier: tuple[dict[str, Any], ...] = (
+        {},
         {"mask": "none"},
         {"split": "all"},
         {"points": "random"},
@@ -158,8 +152,7 @@ def _check_leaks(scene: Scene, capture: Capture, report: Report) -> None:
             )
     if not scene.test:
         return
-    train = centers(torch.stack([view.cam_from_world for view in scene.train]))
-    test = centers(torch.stack([view.cam_from_world for view in scene.test]))
+    train, test = (centers(torch.stack([view.cam_from_world for view in views])) for views in (scene.train, scene.test))
     near = torch.cdist(test, train).min(1).values < SAME_PLACE * report.median_depth
     if near.any():
         names = [view.name for view, is_near in zip(scene.test, near.tolist(), strict=True) if is_near]
@@ -183,7 +176,6 @@ def _check_digits(scene: Scene, poses: Tensor, report: Report) -> None:
 def _check_fit(capture: Capture, scene: Scene, report: Report) -> None:
     """Reprojection of observations, else colours; and whether another convention does better."""
     conventions = known_conventions()
-    fits = []
     tracks = None if capture.tracks is None or capture.cloud is None else capture.tracks()
     sizes = {(frame.width, frame.height) for frame in capture.frames}
     width, height = next(iter(sizes))
@@ -208,8 +200,8 @@ def _check_fit(capture: Capture, scene: Scene, report: Report) -> None:
                 report.suggestion = best.convention.words
     if not report.coloured or any("random ones" in note for note in scene.notes):
         return
-    step = max(1, len(_views(scene)) // VIEWS)
-    views = [view for view in _views(scene)[::step] if view.load_pixels is not None][:VIEWS]
+    views = (*scene.train, *scene.test)
+    views = views[:: max(1, len(views) // VIEWS)][:VIEWS]
     poses = torch.stack([view.cam_from_world for view in views])
     fits = colour_fit(poses, _small(views), scene.points, scene.point_colors, conventions)
     stated, best = fits[0], max(fits, key=lambda fit: fit.score)
@@ -227,7 +219,7 @@ def _check_fit(capture: Capture, scene: Scene, report: Report) -> None:
         )
 
 
-def _small(views: list[View]) -> Tensor:
+def _small(views: Sequence[View]) -> Tensor:
     """The panoramas [F, H, W, 3] uint8, all reduced to one width of a few hundred pixels."""
     width = min(SMALL, *(view.width for view in views))
     images = []

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -15,22 +14,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from padgs.data.assemble import assemble, image_folder
+from padgs.data.assemble import image_folder
 from padgs.data.capture import Capture, Cloud, Frame, Tracks
 from padgs.data.errors import DataError, listed
 from padgs.data.formats.colmap_binary import check_whole
 from padgs.data.formats.poses import cam_from_world
 from padgs.data.options import DataOptions
 from padgs.data.splits import check_inside
-from padgs.scene import Scene
 
 FILES = ("cameras", "images", "points3D")
 _ALIAS = re.compile(r"^(\s*\d+\s+)SPHERICAL\s+(\d+)\s+(\d+).*$", re.MULTILINE)
-
-
-def load(path: Path, options: DataOptions) -> Scene:
-    """The scene of a COLMAP model and its images."""
-    return assemble(read(path, options), options)
 
 
 def find_model(path: Path) -> Path | None:
@@ -70,19 +63,14 @@ def read(path: Path, options: DataOptions, model: Path | None = None) -> Capture
     if without:
         notes.append(f"{len(without)} images of the model are not registered: {listed(sorted(without))}")
     frames = tuple(_frame(image, names.get(image.image_id) or str(image.name), folder, model) for image in images)
-    point_ids = sorted(reconstruction.points3D.keys())
-    points = [reconstruction.points3D[point_id] for point_id in point_ids]
-    cloud = Cloud(
-        torch.from_numpy(np.array([point.xyz for point in points], np.float64).reshape(-1, 3)),
-        torch.from_numpy(np.array([point.color for point in points], np.uint8).reshape(-1, 3)),
-    )
+    cloud, row_of = cloud_of(reconstruction)
     return Capture(
         format="colmap",
         folder=path,
         image_folder=folder,
         frames=frames,
         cloud=cloud,
-        tracks=lambda: _tracks(images, point_ids),
+        tracks=lambda: _tracks(images, row_of),
         notes=tuple(notes),
     )
 
@@ -94,6 +82,17 @@ def pycolmap_module() -> ModuleType:
     import pycolmap
 
     return pycolmap
+
+
+def cloud_of(reconstruction: Any) -> tuple[Cloud, dict[int, int]]:
+    """The points of a pycolmap.Reconstruction, and the row of each by its id."""
+    ids = sorted(reconstruction.points3D.keys())
+    points = [reconstruction.points3D[point_id] for point_id in ids]
+    cloud = Cloud(
+        torch.from_numpy(np.array([point.xyz for point in points], np.float64).reshape(-1, 3)),
+        torch.from_numpy(np.array([point.color for point in points], np.uint8).reshape(-1, 3)),
+    )
+    return cloud, {point_id: row for row, point_id in enumerate(ids)}
 
 
 def _suffix(folder: Path) -> str | None:
@@ -158,18 +157,9 @@ def _frame(image: Any, name: str, folder: Path, model: Path) -> Frame:
     )
 
 
-def _tracks(images: list[Any], point_ids: Sequence[int]) -> Tracks:
-    index = {point_id: i for i, point_id in enumerate(point_ids)}
-    frame: list[int] = []
-    point: list[int] = []
-    pixels: list[Any] = []
-    for i, image in enumerate(images):
-        for seen in image.get_observation_points2D():
-            frame.append(i)
-            point.append(index[seen.point3D_id])
-            pixels.append(seen.xy)
-    return Tracks(
-        torch.tensor(frame, dtype=torch.int64),
-        torch.tensor(point, dtype=torch.int64),
-        torch.from_numpy(np.array(pixels, np.float64).reshape(-1, 2)),
+def _tracks(images: list[Any], row_of: dict[int, int]) -> Tracks:
+    return Tracks.of(
+        (frame, row_of[seen.point3D_id], seen.xy)
+        for frame, image in enumerate(images)
+        for seen in image.get_observation_points2D()
     )

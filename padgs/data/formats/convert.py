@@ -16,8 +16,10 @@ from padgs.data.assemble import assemble, view_name
 from padgs.data.capture import Capture, Cloud, Frame, Tracks
 from padgs.data.errors import DataError
 from padgs.data.formats.writers import WRITERS, Content
+from padgs.data.images import save_png
+from padgs.data.masks import write_masks
 from padgs.data.options import DataOptions
-from padgs.scene import Scene, View
+from padgs.scene import Scene
 
 IMAGE_FOLDERS = {"ricoh360": "imgs"}  # "images" otherwise
 PNG_ONLY = ("ricoh360",)  # EgoNeRF appends .png to the names in its lists
@@ -64,7 +66,7 @@ def convert(
         content = _write_images(capture, scene, partial, to, progress)
         if options.points != "auto":
             content = replace(content, cloud=Cloud(scene.points.double(), scene.point_colors), tracks=None)
-        _write_masks((*scene.train, *scene.test), partial)
+        write_masks({view.name: view.mask() for view in (*scene.train, *scene.test)}, partial)
         WRITERS[to](content, partial)
         if destination.exists():
             destination.rmdir()
@@ -92,11 +94,11 @@ def _write_images(
             reduced = image.width != view.width
         encode = reduced or (to in PNG_ONLY and frame.image.suffix.lower() != ".png")
         name = str(PurePosixPath(frame.name).with_suffix(".png")) if encode else frame.name
-        (target / name).parent.mkdir(parents=True, exist_ok=True)
         if encode:
             assert view.load_pixels is not None
-            Image.fromarray(view.load_pixels().cpu().numpy()).save(target / name)
+            save_png(view.load_pixels(), target / name)
         else:
+            (target / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(frame.image, target / name)
         frames.append(replace(frame, name=name, width=view.width, height=view.height, mask=None))
         renamed[view.name] = name
@@ -117,30 +119,8 @@ def _kept_tracks(capture: Capture, kept: list[int], frames: list[Frame]) -> Trac
     tracks = capture.tracks()
     position = torch.full((len(capture.frames),), -1)
     position[kept] = torch.arange(len(kept))
-    scale = torch.ones(len(capture.frames), dtype=torch.float64)
-    for i, frame in zip(kept, frames, strict=True):
-        before = capture.frames[i].width
-        assert before is not None and frame.width is not None
-        scale[i] = frame.width / before
-    rows = position[tracks.frame] >= 0
-    pixels = tracks.pixels[rows] * scale[tracks.frame[rows], None]
-    return Tracks(position[tracks.frame[rows]], tracks.point[rows], pixels)
-
-
-def _write_masks(views: tuple[View, ...], folder: Path) -> None:
-    """mask.png if all views have the same weights, else one file per masked view."""
-    masks = {view.name: view.mask() for view in views}
-    present = {name: mask for name, mask in masks.items() if mask is not None}
-    if not present:
-        return
-    first = next(iter(present.values()))
-    if len(present) == len(masks) and all(torch.equal(mask, first) for mask in present.values()):
-        _save_mask(first, folder / "mask.png")
-        return
-    for name, mask in present.items():
-        (folder / "masks" / name).parent.mkdir(parents=True, exist_ok=True)
-        _save_mask(mask, folder / "masks" / f"{name}.png")
-
-
-def _save_mask(mask: torch.Tensor, path: Path) -> None:
-    Image.fromarray((mask * 255).round().to(torch.uint8).cpu().numpy()).save(path)
+    frame = position[tracks.frame]
+    seen = frame >= 0
+    before, after = (torch.tensor([f.width for f in part], dtype=torch.float64) for part in (capture.frames, frames))
+    scale = after[frame[seen]] / before[tracks.frame[seen]]
+    return Tracks(frame[seen], tracks.point[seen], tracks.pixels[seen] * scale[:, None])

@@ -2,47 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 from padgs.data.errors import DataError, listed
 from padgs.data.formats.colmap import find_model
 
-Sign = Callable[[Path], str | None]
-
-
-def _has(*names: str) -> Sign:
-    def sign(path: Path) -> str | None:
-        return " and ".join(names) if all((path / name).exists() for name in names) else None
-
-    return sign
-
-
-def _file(name: str) -> Sign:
-    def sign(path: Path) -> str | None:
-        if path.is_file():
-            return path.name if path.name == name else None
-        return name if (path / name).is_file() else None
-
-    return sign
-
-
-def _colmap(path: Path) -> str | None:
-    model = find_model(path) if path.is_dir() else None
-    return None if model is None else f"the COLMAP model in {model.relative_to(path)}"
-
-
-# Most specific first: the native folders of data sets also hold files of the general formats.
-SIGNS: dict[str, tuple[Sign, ...]] = {
-    "roam360": (_has("pose_c2w.json"),),
-    "ricoh360": (_has("output_dir/colmap/images.txt"),),
-    "released": (_has("data_extrinsics.json", "data_views.json"),),
-    "colmap": (_colmap,),
-    "omniblender": (_file("transform.json"),),
-    "transforms": (_file("transforms.json"), _has("transforms_train.json")),
-    "openmvg": (_file("sfm_data.json"),),
-    "opensfm": (_file("reconstruction.json"),),
-}
+# Files that together tell a format, most specific first: the native folders of data sets also hold files of the
+# general formats. No files: a COLMAP model.
+SIGNS: tuple[tuple[str, tuple[str, ...]], ...] = (
+    ("roam360", ("pose_c2w.json",)),
+    ("ricoh360", ("output_dir/colmap/images.txt",)),
+    ("released", ("data_extrinsics.json", "data_views.json")),
+    ("colmap", ()),
+    ("omniblender", ("transform.json",)),
+    ("transforms", ("transforms.json",)),
+    ("transforms", ("transforms_train.json",)),
+    ("openmvg", ("sfm_data.json",)),
+    ("opensfm", ("reconstruction.json",)),
+)
+# Files that may be given themselves, instead of their folder.
+ALONE = ("transform.json", "transforms.json", "sfm_data.json", "reconstruction.json")
 
 
 def detect(path: Path) -> tuple[str, str]:
@@ -52,7 +31,14 @@ def detect(path: Path) -> tuple[str, str]:
         DataError: nothing known is there; the message says what was looked for.
 
     """
-    found = {name: sign for name, signs in SIGNS.items() for test in reversed(signs) if (sign := test(path))}
+    found: dict[str, str] = {}
+    for format, files in SIGNS:
+        if not files and path.is_dir() and (model := find_model(path)):
+            found[format] = f"the COLMAP model in {model.relative_to(path)}"
+        elif files == (path.name,) and path.is_file() and path.name in ALONE:
+            found[format] = path.name
+        elif files and all((path / file).exists() for file in files):
+            found.setdefault(format, " and ".join(files))
     if not found:
         inside = listed(sorted(child.name for child in path.iterdir())) if path.is_dir() else "a file"
         raise DataError(

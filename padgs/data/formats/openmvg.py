@@ -1,37 +1,34 @@
-"""OpenMVG's `sfm_data.json` with a spherical camera: views, intrinsics, extrinsics, structure."""
+"""OpenMVG's `sfm_data.json` with a spherical camera: views, intrinsics, extrinsics, structure.
+
+An extrinsic is the rotation cam from world (row by row) and the camera's centre in the world; camera axes are ours.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
+from torch import Tensor
 
-from padgs.data.assemble import assemble, image_folder
+from padgs.data.assemble import image_folder
 from padgs.data.capture import Capture, Cloud, Frame, Tracks
 from padgs.data.cloud import existing_ply
 from padgs.data.errors import DataError
-from padgs.data.formats.json_file import entries, entry, numbers, read_json
-from padgs.data.formats.openmvg_views import read_extrinsics, read_views
+from padgs.data.formats.json_file import Json, file_in, read_json
+from padgs.data.formats.poses import cam_from_center
 from padgs.data.options import DataOptions
-from padgs.scene import Scene
+from padgs.data.splits import check_inside
 
-FILE = "sfm_data.json"
 _PLY = ("colorized.ply", "scene.ply", "pcd.ply")
-
-
-def load(path: Path, options: DataOptions) -> Scene:
-    """The scene of an `sfm_data.json` and its images."""
-    return assemble(read(path, options), options)
 
 
 def read(path: Path, options: DataOptions) -> Capture:
     """Read `sfm_data.json`. Its points have no colours; a colorized.ply beside it is preferred."""
-    folder = path.parent if path.is_file() else path
-    file = path if path.is_file() else folder / FILE
-    data = read_json(file)
-    _check_cameras(data, file)
-    views, poses = read_views(data, file), read_extrinsics(data, file)
+    file = file_in(path, "sfm_data.json")
+    folder, data = file.parent, read_json(file)
+    _check_cameras(data)
+    views, poses = read_views(data), read_extrinsics(data)
     root = Path(str(data.get("root_path", "")))  # where it was on the machine that reconstructed
     usual = ("images", "imgs", root.name) if root.name else ("images", "imgs")
     images = image_folder(folder, options.images, usual)
@@ -43,9 +40,9 @@ def read(path: Path, options: DataOptions) -> Capture:
     colored = existing_ply(folder, _PLY)
     cloud = colored
     if cloud is None and structure:
-        where = f"X of the structure of {file}"
-        points = [entry(entry(item, "value", where), "X", where) for item in structure]
-        cloud = Cloud(numbers(points, (len(points), 3), where), None)
+        where = f"structure of {file}"
+        points = Json([Json(item, where)["value"]["X"].value for item in structure], f"X of the {where}")
+        cloud = Cloud(points.numbers(len(structure), 3), None)
     return Capture(
         format="openmvg",
         folder=folder,
@@ -57,24 +54,57 @@ def read(path: Path, options: DataOptions) -> Capture:
     )
 
 
-def _check_cameras(data: Any, file: Path) -> None:
+@dataclass(frozen=True)
+class MvgView:
+    """One entry of `views`."""
+
+    key: int
+    pose: int  # id_pose
+    name: str  # local_path and filename
+    width: int
+    height: int
+
+
+def read_views(data: Json) -> list[MvgView]:
+    """The entries of `views`, in the file's order."""
+    views = []
+    for item in data["views"].entries():
+        view = item["value"]["ptr_wrapper"]["data"]
+        local = str(view.get("local_path", "")).strip("/")
+        name = str(view["filename"].value)
+        name = check_inside(f"{local}/{name}" if local else name, data.where)
+        key = int(item["key"].value)
+        size = int(view["width"].value), int(view["height"].value)
+        views.append(MvgView(key, int(view.get("id_pose", key)), name, *size))
+    return views
+
+
+def read_extrinsics(data: Json) -> dict[int, Tensor]:
+    """Key of the pose -> cam_from_world [4, 4] float64."""
+    poses = {}
+    for item in data["extrinsics"].entries():
+        key = int(item["key"].value)
+        pose = Json(item["value"].value, f"extrinsic {key} of {data.where}")
+        poses[key] = cam_from_center(pose["rotation"].numbers(3, 3), pose["center"].numbers(3), pose.where)
+    if not poses:
+        raise DataError(
+            f"{data.where} holds no extrinsics; export them too (openMVG_main_ConvertSfM_DataFormat -V -I -E -S)"
+        )
+    return poses
+
+
+def _check_cameras(data: Json) -> None:
     """cereal names a class where it first occurs, so a file of only spherical cameras names "spherical" once."""
-    for item in entries(data, "intrinsics", str(file)):
-        name = entry(item, "value", f"an intrinsic of {file}").get("polymorphic_name")
+    for item in data["intrinsics"].entries():
+        name = item["value"].get("polymorphic_name")
         if name not in (None, "spherical"):
-            raise DataError(f"{file} holds a {name!r} camera; only spherical ones (panoramas) can be used")
+            raise DataError(f"{data.where} holds a {name!r} camera; only spherical ones (panoramas) can be used")
 
 
 def _tracks(structure: list[Any], frame_of_view: dict[int, int]) -> Tracks:
-    frame, point, pixels = [], [], []
-    for i, item in enumerate(structure):
-        for seen in item["value"].get("observations", []):
-            if seen["key"] in frame_of_view:
-                frame.append(frame_of_view[seen["key"]])
-                point.append(i)
-                pixels.append(seen["value"]["x"])
-    return Tracks(
-        torch.tensor(frame, dtype=torch.int64),
-        torch.tensor(point, dtype=torch.int64),
-        torch.tensor(pixels, dtype=torch.float64).reshape(-1, 2),
+    return Tracks.of(
+        (frame_of_view[seen["key"]], point, seen["value"]["x"])
+        for point, item in enumerate(structure)
+        for seen in item["value"].get("observations", [])
+        if seen["key"] in frame_of_view
     )

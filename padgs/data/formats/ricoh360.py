@@ -10,21 +10,15 @@ from pathlib import Path, PurePosixPath
 
 import torch
 
-from padgs.data.assemble import assemble, image_folder, image_names
+from padgs.data.assemble import image_folder, image_names
 from padgs.data.capture import Capture, Cloud, Frame
 from padgs.data.cloud import existing_ply
 from padgs.data.errors import DataError
 from padgs.data.formats.poses import cam_from_world, rotation_from_quaternion
 from padgs.data.options import DataOptions
-from padgs.data.splits import check_inside
-from padgs.scene import Scene
+from padgs.data.splits import check_inside, read_lines
 
 MODEL = "output_dir/colmap"
-
-
-def load(path: Path, options: DataOptions) -> Scene:
-    """The scene in a folder of Ricoh360."""
-    return assemble(read(path, options), options)
 
 
 def read(path: Path, options: DataOptions) -> Capture:
@@ -57,7 +51,7 @@ def read(path: Path, options: DataOptions) -> Capture:
 
 def _pose_lines(file: Path) -> list[str]:
     """The first line of each pair; the second one, the observations, may be empty."""
-    lines = iter(_lines(file))
+    lines = iter(read_lines(file))
     poses = []
     for line in lines:
         if line.strip() and not line.startswith("#"):
@@ -67,7 +61,7 @@ def _pose_lines(file: Path) -> list[str]:
 
 
 def _cloud(file: Path) -> Cloud | None:
-    rows = [line.split()[1:7] for line in _lines(file) if line.strip() and not line.startswith("#")]
+    rows = [line.split()[1:7] for line in read_lines(file) if line.strip() and not line.startswith("#")]
     if not rows:
         return None
     try:
@@ -77,10 +71,3 @@ def _cloud(file: Path) -> Cloud | None:
     if values.shape[1] < 6:
         raise DataError(f"{file}: a point has {values.shape[1] + 1} fields; it must have id x y z red green blue")
     return Cloud(values[:, :3], values[:, 3:].clamp(0, 255).to(torch.uint8))
-
-
-def _lines(file: Path) -> list[str]:
-    try:
-        return file.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{file} cannot be read as text ({error})") from error

@@ -8,57 +8,35 @@ from __future__ import annotations
 
 from pathlib import Path, PurePosixPath
 
-from padgs.data.assemble import assemble, image_folder
+from padgs.data.assemble import image_folder
 from padgs.data.capture import Capture, Frame
 from padgs.data.cloud import existing_ply
 from padgs.data.datasets import DATASETS
 from padgs.data.errors import DataError
-from padgs.data.formats.json_file import entries, entry, numbers, read_json
+from padgs.data.formats.json_file import Json, read_json
 from padgs.data.formats.poses import cam_from_pose
 from padgs.data.options import DataOptions
-from padgs.data.splits import check_inside
-from padgs.scene import Scene
-
-FILE = "pose_c2w.json"
-
-
-def load(path: Path, options: DataOptions) -> Scene:
-    """The scene in a folder of 360Roam."""
-    return assemble(read(path, options), options)
 
 
 def read(path: Path, options: DataOptions) -> Capture:
     """Read the poses and the split."""
-    file = path / FILE
+    file = path / "pose_c2w.json"
     data = read_json(file)
     images = image_folder(path, options.images)
     frames: list[Frame] = []
     split: dict[str, tuple[str, ...]] = {}
     for side in ("train", "test"):
         names = []
-        for item in entries(data, side, str(file)):
-            stated = check_inside(str(entry(item, "rgb_file", f"a {side} view of {file}")), str(file))
+        for item in data[side].entries():
+            stated = item["rgb_file"].name()
             name = stated if (images / stated).is_file() else PurePosixPath(stated).name
-            where = f"transform_matrix of {name} in {file}"
-            pose = numbers(entry(item, "transform_matrix", f"{name} in {file}"), (4, 4), where)
-            frames.append(Frame(name, images / name, cam_from_pose(pose, where)))
+            matrix = Json(item.value, f"{name} in {file}")["transform_matrix"]
+            frames.append(Frame(name, images / name, cam_from_pose(matrix.numbers(4, 4), matrix.where)))
             names.append(name)
         split[side] = tuple(names)
     twice = set(split["train"]) & set(split["test"])
     if twice:
         raise DataError(f"{file}: {sorted(twice)[0]} is both a train and a test view; it may be one of them")
     known = DATASETS["roam360"]
-    width = known.width if (options.width is None and _is_native(frames)) else None
     cloud = existing_ply(path, ("scene.ply", f"{path.name}.ply", "pcd.ply"))
-    return Capture("roam360", path, images, tuple(frames), cloud, split, known.mask, width)
-
-
-def _is_native(frames: list[Frame]) -> bool:
-    """Whether the images are larger than the paper's size, as downloaded; the first tells."""
-    from PIL import Image
-
-    try:
-        with Image.open(frames[0].image) as image:
-            return image.width > DATASETS["roam360"].width
-    except (OSError, IndexError):
-        return False  # whoever reads the images will say what is wrong
+    return Capture("roam360", path, images, tuple(frames), cloud, split, known.mask, known.width)

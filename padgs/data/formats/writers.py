@@ -35,34 +35,22 @@ def write_colmap(content: Content, folder: Path) -> None:
         raise DataError(
             "there is no point cloud, and a COLMAP model needs one; set data.points to a PLY file or random"
         )
-    tracks, model = content.tracks, pycolmap.Reconstruction()
-    seen: list[list[int]] = [[] for _ in content.frames]  # rows of tracks, by frame
-    if tracks is not None:
-        for row, frame in enumerate(tracks.frame.tolist()):
-            seen[frame].append(row)
-    elements: dict[int, list[Any]] = {}
+    tracks, model = content.tracks or Tracks.of([]), pycolmap.Reconstruction()
+    elements: dict[int, list[Any]] = {}  # of the points' tracks
     cameras: dict[tuple[int, int], int] = {}
-    for i, frame in enumerate(content.frames):
-        width, height = _size(frame)
-        if (width, height) not in cameras:
-            cameras[width, height] = len(cameras) + 1
-            model.add_camera_with_trivial_rig(
-                pycolmap.Camera(
-                    camera_id=cameras[width, height],
-                    model="EQUIRECTANGULAR",
-                    width=width,
-                    height=height,
-                    params=[width, height],
-                )
-            )
-        pixels = torch.zeros(0, 2) if tracks is None else tracks.pixels[seen[i]]
+    for image_id, frame in enumerate(content.frames, 1):
+        size = _size(frame)
+        if size not in cameras:
+            cameras[size] = len(cameras) + 1
+            camera = {"model": "EQUIRECTANGULAR", "width": size[0], "height": size[1], "params": size}
+            model.add_camera_with_trivial_rig(pycolmap.Camera(camera_id=cameras[size], **camera))
+        seen = tracks.frame == image_id - 1
         image = pycolmap.Image(
-            name=frame.name, keypoints=pixels.double().numpy(), camera_id=cameras[width, height], image_id=i + 1
+            name=frame.name, keypoints=tracks.pixels[seen].numpy(), camera_id=cameras[size], image_id=image_id
         )
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(frame.cam_from_world[:3].numpy()))
-        for index, row in enumerate(seen[i]):
-            assert tracks is not None
-            elements.setdefault(int(tracks.point[row]), []).append(pycolmap.TrackElement(i + 1, index))
+        for index, point in enumerate(tracks.point[seen].tolist()):
+            elements.setdefault(point, []).append(pycolmap.TrackElement(image_id, index))
     colors = _colors(content.cloud)
     for k, point in enumerate(content.cloud.points.numpy()):
         model.add_point3D(point[:, None], pycolmap.Track(elements.get(k, [])), colors[k][:, None])
@@ -95,18 +83,16 @@ def write_openmvg(content: Content, folder: Path) -> None:
     width, height = _size(content.frames[0])
     cereal = {"polymorphic_id": 2147483649, "polymorphic_name": "spherical"}
     intrinsic = {"id": 2147483649, "data": {"value0": {"width": width, "height": height}}}
-    structure: list[dict[str, Any]] = []
-    if content.cloud is not None:
-        for key, point in enumerate(content.cloud.points.tolist()):
-            structure.append({"key": key, "value": {"X": point, "observations": []}})
-        if content.cloud.colors is not None:
-            write_ply(folder / "colorized.ply", content.cloud)
-    if content.tracks is not None:
-        tracks = content.tracks
-        rows = zip(tracks.frame.tolist(), tracks.point.tolist(), tracks.pixels.tolist(), strict=True)
-        for feature, (frame, point, pixel) in enumerate(rows):
-            seen = {"key": frame, "value": {"id_feat": feature, "x": pixel}}
-            structure[point]["value"]["observations"].append(seen)
+    cloud, tracks = content.cloud or Cloud(torch.zeros(0, 3), None), content.tracks or Tracks.of([])
+    structure = [
+        {"key": key, "value": {"X": point, "observations": []}} for key, point in enumerate(cloud.points.tolist())
+    ]
+    if cloud.colors is not None:
+        write_ply(folder / "colorized.ply", cloud)
+    rows = zip(tracks.frame.tolist(), tracks.point.tolist(), tracks.pixels.tolist(), strict=True)
+    for feature, (frame, point, pixel) in enumerate(rows):
+        seen = {"key": frame, "value": {"id_feat": feature, "x": pixel}}
+        structure[point]["value"]["observations"].append(seen)
     data = {
         "sfm_data_version": "0.3",
         "root_path": "images",
@@ -153,8 +139,7 @@ def write_roam360(content: Content, folder: Path) -> None:
         for side in ("train", "test")
     }
     _write_json(folder / "pose_c2w.json", poses)
-    if content.cloud is not None:
-        write_ply(folder / "scene.ply", content.cloud)
+    _write_cloud(content, folder / "scene.ply")
 
 
 def write_ricoh360(content: Content, folder: Path) -> None:
@@ -185,8 +170,7 @@ def write_omniblender(content: Content, folder: Path) -> None:
     frames = [{"file_path": frame.name, "transform_matrix": _opengl_pose(frame)} for frame in content.frames]
     meta = {"indoor": False, "width": width, "height": height, "frames": frames}
     _write_json(folder / "transform.json", meta)
-    if content.cloud is not None:
-        write_ply(folder / "pcd.ply", content.cloud)
+    _write_cloud(content, folder / "pcd.ply")
     _write_lists(content, folder, extensions=False)
 
 
@@ -195,8 +179,7 @@ def write_released(content: Content, folder: Path) -> None:
     views, extrinsics = _mvg_views(content)
     _write_json(folder / "data_views.json", {"views": views})
     _write_json(folder / "data_extrinsics.json", {"extrinsics": extrinsics})
-    if content.cloud is not None:
-        write_ply(folder / "pcd.ply", content.cloud)
+    _write_cloud(content, folder / "pcd.ply")
     _write_lists(content, folder, extensions=False)
 
 
@@ -240,6 +223,11 @@ def _size(frame: Frame) -> tuple[int, int]:
 def _colors(cloud: Cloud) -> Any:
     colors = torch.full((len(cloud.points), 3), 128, dtype=torch.uint8) if cloud.colors is None else cloud.colors
     return colors.numpy()
+
+
+def _write_cloud(content: Content, path: Path) -> None:
+    if content.cloud is not None:
+        write_ply(path, content.cloud)
 
 
 def _write_json(path: Path, value: Any) -> None:

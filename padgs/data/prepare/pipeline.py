@@ -24,10 +24,12 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from padgs.data.assemble import view_name
 from padgs.data.capture import Cloud, Frame, Tracks
 from padgs.data.errors import DataError, listed
 from padgs.data.formats import colmap
 from padgs.data.formats.writers import Content, write_colmap
+from padgs.data.masks import write_masks
 from padgs.data.options import DataOptions
 from padgs.data.prepare import rig, sfm
 from padgs.data.prepare.pairs import PAIRS, image_pairs
@@ -55,7 +57,6 @@ class PrepareOptions:
     threads: int = 0  # 0 = one per processor, at most 8; each takes about 0.6 GB at 2048 x 1024
 
     def __post_init__(self) -> None:
-        """Reject what cannot be followed."""
         if self.pairs not in PAIRS:
             raise DataError(f"unknown pairs {self.pairs!r}; known: {', '.join(PAIRS)}")
         if not 0 < self.per_second <= 1000:
@@ -121,8 +122,7 @@ class _Job:
         self.seconds: dict[str, float] = {}
         if is_video(source):
             self._open("video", _file_digest(source))
-            with self._step("frames"):
-                self._extract_frames(source)
+            self._once("frames", partial(self._extract_frames, source))
             source = self.work / "frames"
         with self._step("images"):
             self.source: Source = find_source(source, options.mask)
@@ -130,47 +130,37 @@ class _Job:
         self._open("images", self.source.fingerprint, keep=of_video)
         # pycolmap's list of pairs knows no spaces, so it gets names of ours.
         self.files = {f"{index:06d}{Path(name).suffix}": name for index, name in enumerate(self.source.images)}
+        self.paths = {short: self.source.images[name].path for short, name in self.files.items()}
         self.views = rig.VIEWS_PER_ROW * len(rig.LATITUDES) if options.accurate else 1
+        self.database = self.work / "database.db"
+        self.pictures = self.work / ("views" if options.accurate else "images")  # in which features are found
 
     def run(self) -> Prepared:
         """All steps; those that are done already are skipped."""
-        database, images, masks = self.work / "database.db", self.work / "images", self.work / "masks"
         with sfm.log_to(self.work / "log.txt"):
-            with self._step("views"):
-                self._link_images(images, masks)
-                if self.options.accurate:
-                    self._once("views", self._render_views)
-                    images, masks = self.work / "views", self.work / "view_masks"
-            with self._step("features"):
-                self._once("features", partial(self._find_features, database, images, masks))
-            with self._step("matches"):
-                self._once("matches", partial(self._match, database))
-            with self._step("poses"):
-                self._once("poses", partial(self._place, database, images))
+            self._once("views", self._lay_out)
+            self._once("features", self._find_features)
+            self._once("matches", self._match)
+            self._once("poses", self._place)
             with self._step("result"):
                 return self._write()
 
     # Steps, in order.
 
     def _extract_frames(self, video: Path) -> None:
-        def extract() -> None:
-            (self.work / "frames").mkdir(exist_ok=True)
-            extract_frames(video, self.work / "frames", self.options.per_second, partial(self.progress, "frames"))
+        (self.work / "frames").mkdir(exist_ok=True)
+        extract_frames(video, self.work / "frames", self.options.per_second, partial(self.progress, "frames"))
 
-        self._once("frames", extract)
-
-    def _link_images(self, images: Path, masks: Path) -> None:
-        images.mkdir(exist_ok=True)
+    def _lay_out(self) -> None:
+        images, masks = _empty(self.work / "images"), _empty(self.work / "masks")
         for short, name in self.files.items():
-            if not (images / short).is_symlink():
-                (images / short).symlink_to(self.source.images[name].path.absolute())
-        if self.source.masks:
-            masks.mkdir(exist_ok=True)
-            for short, name in self.files.items():
-                mask = self.source.masks.get(name)
-                image = self.source.images[name]
+            image, mask = self.source.images[name], self.source.masks.get(name)
+            (images / short).symlink_to(image.path.absolute())
+            if self.source.masks:
                 use = np.ones((image.height, image.width), bool) if mask is None else mask().numpy() >= 0.5
                 Image.fromarray(use * np.uint8(255)).save(masks / f"{short}.png", compress_level=1)
+        if self.options.accurate:
+            self._render_views()
 
     def _render_views(self) -> None:
         sizes = {(image.width, image.height) for image in self.source.images.values()}
@@ -180,19 +170,20 @@ class _Job:
                 "needs one: resize them, or do without it"
             )
         rig.render_views(
-            {short: self.source.images[name].path for short, name in self.files.items()},
+            self.paths,
             {short: self.work / "masks" / f"{short}.png" for short in self.files} if self.source.masks else {},
             self.work / "views",
             self.work / "view_masks",
             partial(self.progress, "views"),
         )
 
-    def _find_features(self, database: Path, images: Path, masks: Path) -> None:
-        sfm.extract_features(
-            database, images, self._groups(), masks if masks.is_dir() else None, self.threads, self._tell("features")
-        )
+    def _find_features(self) -> None:
+        masks = self.work / ("view_masks" if self.options.accurate else "masks")
+        given = masks if self.options.accurate or self.source.masks else None
+        tell = partial(self.progress, "features")
+        sfm.extract_features(self.database, self.pictures, self._groups(), given, self.threads, tell)
         if self.options.accurate:
-            sfm.make_rig(database, rig.rig_config())
+            sfm.make_rig(self.database, rig.rig_config())
 
     def _groups(self) -> list[sfm.Group]:
         """Images that share a camera: panoramas of one size, or one view of all panoramas."""
@@ -208,21 +199,18 @@ class _Job:
             by_size.setdefault((image.width, image.height), []).append(short)
         return [sfm.Group(tuple(names), *size) for size, names in by_size.items()]
 
-    def _match(self, database: Path) -> None:
+    def _match(self) -> None:
         pairs = [[pair] for pair in image_pairs(list(self.files), self.options.pairs)]
         if self.options.accurate:
             both = list(product(range(self.views), repeat=2))
             pairs = [[(rig.view_name(i, a), rig.view_name(j, b)) for i, j in both] for [(a, b)] in pairs]
-        sfm.match(database, pairs, self.options.accurate, self.threads, self.options.seed, self._tell("matches"))
+        tell = partial(self.progress, "matches")
+        sfm.match(self.database, pairs, self.options.accurate, self.threads, self.options.seed, tell)
 
-    def _place(self, database: Path, images: Path) -> None:
-        parts = self.work / "parts"
-        shutil.rmtree(parts, ignore_errors=True)
-        parts.mkdir()
-        found = sfm.reconstruct(
-            database, images, parts, self.threads, self.options.seed, self.views, self._tell("poses")
-        )
-        if not found:
+    def _place(self) -> None:
+        parts = _empty(self.work / "parts")
+        tell = partial(self.progress, "poses")
+        if not sfm.reconstruct(self.database, self.pictures, parts, self.threads, self.options.seed, self.views, tell):
             raise DataError(f"no two of the {len(self.files)} panoramas could be placed together; {_REMEDIES}")
 
     def _write(self) -> Prepared:
@@ -246,9 +234,7 @@ class _Job:
         result = Prepared(
             self.destination, registered, unregistered, len(cloud.points), len(tracks.frame), self.seconds, tuple(notes)
         )
-        partial_folder = self.work / "out"
-        shutil.rmtree(partial_folder, ignore_errors=True)
-        partial_folder.mkdir()
+        partial_folder = _empty(self.work / "out")
         self._copy_images(frames, partial_folder)
         write_colmap(Content(frames, cloud, tracks, {}), partial_folder)
         stated = {**asdict(result), "folder": ".", "options": asdict(self.options)}
@@ -270,33 +256,23 @@ class _Job:
     def _panoramas(self, model: Any) -> tuple[tuple[Frame, ...], Cloud, Tracks]:
         """Frames under their own names, points and observations."""
         if self.options.accurate:
-            paths = {short: self.source.images[name].path for short, name in self.files.items()}
-            frames, cloud, tracks = rig.panoramas(model, paths, next(iter(self.source.images.values())).width)
+            frames, cloud, tracks = rig.panoramas(model, self.paths, next(iter(self.source.images.values())).width)
         else:
-            refined = self.work / "refined"
-            refined.mkdir(exist_ok=True)
+            refined = _empty(self.work / "refined")
             model.write_binary(str(refined))
             capture = colmap.read(self.work, DataOptions(images="images"), refined)
             assert capture.cloud is not None and capture.tracks is not None
             frames, cloud, tracks = capture.frames, capture.cloud, capture.tracks()
-        renamed = tuple(
-            replace(frame, name=self.files[frame.name], image=self.source.images[self.files[frame.name]].path)
-            for frame in frames
-        )
-        return renamed, cloud, tracks
+        named = (replace(frame, name=self.files[frame.name], image=self.paths[frame.name]) for frame in frames)
+        return tuple(named), cloud, tracks
 
     def _copy_images(self, frames: tuple[Frame, ...], folder: Path) -> None:
-        masks = {frame.name: self.source.masks[frame.name]() for frame in frames if frame.name in self.source.masks}
-        first = next(iter(masks.values()), None)
-        shared = first is not None and len(masks) == len(frames) and all(m.equal(first) for m in masks.values())
         for frame in frames:
             target = folder / "images" / frame.name
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(frame.image, target)
-            if frame.name in masks and not shared:
-                _save_mask(masks[frame.name], folder / "masks" / f"{Path(frame.name).with_suffix('.png')}")
-        if shared:
-            _save_mask(masks[frames[0].name], folder / "mask.png")
+        masks = {view_name(frame.name): self.source.masks.get(frame.name) for frame in frames}
+        write_masks({name: None if mask is None else mask() for name, mask in masks.items()}, folder)
 
     # Bookkeeping.
 
@@ -321,12 +297,17 @@ class _Job:
     def _once(self, step: str, action: Callable[[], None]) -> None:
         """Do a step unless it has been done in the working folder."""
         marker = self.work / f"{step}.done"
-        if not marker.exists():
-            action()
-            marker.touch()
+        with self._step(step):
+            if not marker.exists():
+                action()
+                marker.touch()
 
-    def _tell(self, step: str) -> Callable[[int, int], None]:
-        return partial(self.progress, step)
+
+def _empty(folder: Path) -> Path:
+    """Make a folder with nothing in it."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    return folder
 
 
 def _levelled(frames: tuple[Frame, ...], cloud: Cloud) -> tuple[tuple[Frame, ...], Cloud, str]:
@@ -356,11 +337,6 @@ def rotation_between(up: Tensor) -> Tensor:
     k = 1 / (1 + z)
     rows = ((1 - k * x * x, -k * x * y, -x), (-k * x * y, 1 - k * y * y, -y), (x, y, z))
     return torch.tensor(rows, dtype=up.dtype) + 0.0
-
-
-def _save_mask(mask: Tensor, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray((mask * 255).round().to(torch.uint8).numpy()).save(path)
 
 
 def _file_digest(path: Path) -> str:

@@ -7,7 +7,7 @@ is nearest, so that no feature is found twice. The views' focal length has the p
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from PIL import Image
 from torch import Tensor
 
 from padgs.data.capture import Cloud, Frame, Tracks
-from padgs.data.formats.colmap import pycolmap_module
+from padgs.data.formats.colmap import cloud_of, pycolmap_module
 from padgs.data.formats.poses import rigid
 from padgs.data.images import decode
 from padgs.sphere.panorama import direction, project, sample
@@ -135,10 +135,9 @@ def panoramas(model: Any, images: dict[str, Path], width: int) -> tuple[tuple[Fr
         width: of the panoramas, in pixels.
     """
     rotations = cam_from_pano()
-    point_ids = sorted(model.points3D.keys())
-    row_of = {point_id: row for row, point_id in enumerate(point_ids)}
+    cloud, row_of = cloud_of(model)
     poses: dict[str, Tensor] = {}
-    seen: dict[str, list[tuple[Tensor, Tensor]]] = {}  # name -> (point rows, pixels) of its views
+    seen: list[tuple[str, Tensor, Tensor]] = []  # name, rows of the points and pixels, of every view
     for image in model.images.values():
         if not image.has_pose:
             continue
@@ -151,19 +150,14 @@ def panoramas(model: Any, images: dict[str, Path], width: int) -> tuple[tuple[Fr
             half = view_size(width) / 2
             rays = torch.cat((pixels / half - 1, torch.ones(len(pixels), 1, dtype=torch.float64)), dim=1)
             rows = torch.tensor([row_of[point.point3D_id] for point in with_point])
-            seen.setdefault(name, []).append((rows, project(rays @ rotations[view], width, width // 2)))
-    names: Sequence[str] = sorted(poses)
+            seen.append((name, rows, project(rays @ rotations[view], width, width // 2)))
+    names = sorted(poses)
+    seen.sort(key=lambda part: part[0])
     frames = tuple(Frame(name, images[name], poses[name], width, width // 2) for name in names)
-    parts = [(index, rows, pixels) for index, name in enumerate(names) for rows, pixels in seen.get(name, [])]
     tracks = Tracks(
-        frame=torch.cat([torch.full((len(rows),), index) for index, rows, _ in parts]),
-        point=torch.cat([rows for _, rows, _ in parts]),
-        pixels=torch.cat([pixels for _, _, pixels in parts]),
-    )
-    points = [model.points3D[point_id] for point_id in point_ids]
-    cloud = Cloud(
-        torch.from_numpy(np.array([point.xyz for point in points])),
-        torch.from_numpy(np.array([point.color for point in points], np.uint8)),
+        frame=torch.cat([torch.full((len(rows),), names.index(name)) for name, rows, _ in seen]),
+        point=torch.cat([rows for _, rows, _ in seen]),
+        pixels=torch.cat([pixels for _, _, pixels in seen]),
     )
     return frames, cloud, tracks
 

@@ -40,7 +40,7 @@ class Group:
 
 def extract_features(
     database: Path, folder: Path, groups: Sequence[Group], masks: Path | None, threads: int, progress: Progress
-) -> int:
+) -> None:
     """Find features in all images; those that are in the database already are left alone.
 
     Args:
@@ -50,9 +50,6 @@ def extract_features(
         masks: a folder with <image name>.png for every image, 0 = ignore; or None.
         threads: processor threads.
         progress: called with (images done, in all).
-
-    Returns:
-        Number of features, all images together.
     """
     pycolmap = pycolmap_module()
     cameras = _register(database, groups)
@@ -74,8 +71,6 @@ def extract_features(
             )
             done += len(batch)
             progress(done, total)
-    with pycolmap.Database.open(database) as found:
-        return int(found.num_keypoints())
 
 
 def _register(database: Path, groups: Sequence[Group]) -> list[int]:
@@ -92,7 +87,13 @@ def _register(database: Path, groups: Sequence[Group]) -> list[int]:
                 camera_id = known[group.names[0]].camera_id
                 rig_id = entries.read_rig_with_sensor(entries.read_camera(camera_id).sensor_id).rig_id
             else:
-                camera_id = entries.write_camera(_camera(group))
+                if group.focal is None:
+                    model, params = "EQUIRECTANGULAR", [group.width, group.height]
+                else:
+                    model, params = "SIMPLE_PINHOLE", [group.focal, group.width / 2, group.height / 2]
+                camera = pycolmap.Camera(model=model, width=group.width, height=group.height, params=params)
+                camera.has_prior_focal_length = True
+                camera_id = entries.write_camera(camera)
                 rig = pycolmap.Rig()
                 rig.add_ref_sensor(entries.read_camera(camera_id).sensor_id)
                 rig_id = entries.write_rig(rig)
@@ -107,17 +108,6 @@ def _register(database: Path, groups: Sequence[Group]) -> list[int]:
     return cameras
 
 
-def _camera(group: Group) -> Any:
-    pycolmap = pycolmap_module()
-    if group.focal is None:
-        model, params = "EQUIRECTANGULAR", [group.width, group.height]
-    else:
-        model, params = "SIMPLE_PINHOLE", [group.focal, group.width / 2, group.height / 2]
-    camera = pycolmap.Camera(model=model, width=group.width, height=group.height, params=params)
-    camera.has_prior_focal_length = True
-    return camera
-
-
 def make_rig(database: Path, config: Any) -> None:
     """Tell the database which images were taken at once, from one place."""
     pycolmap = pycolmap_module()
@@ -127,7 +117,7 @@ def make_rig(database: Path, config: Any) -> None:
 
 def match(
     database: Path, pairs: Sequence[Sequence[tuple[str, str]]], rig: bool, threads: int, seed: int, progress: Progress
-) -> int:
+) -> None:
     """Match and verify pairs of images; those that have been matched before are left alone.
 
     Args:
@@ -137,9 +127,6 @@ def match(
         threads: processor threads.
         seed: of the random samples in the verification.
         progress: called with (groups done, in all).
-
-    Returns:
-        Number of image pairs that show the same things.
     """
     pycolmap = pycolmap_module()
     matching = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=threads)
@@ -159,26 +146,24 @@ def match(
         done += len(batch)
         progress(done, len(pairs))
     file.unlink(missing_ok=True)
-    with pycolmap.Database.open(database) as found:
-        return int(found.num_verified_image_pairs())
 
 
 def reconstruct(
     database: Path, folder: Path, parts: Path, threads: int, seed: int, images_per_pose: int, progress: Progress
-) -> list[Any]:
-    """Poses and points, largest part first. Parts are what could not be connected.
+) -> int:
+    """Poses and points, in parts that could not be connected.
 
     Args:
         database: with matches.
         folder: of the images, for the colours of the points.
-        parts: folder that pycolmap writes to.
+        parts: folder that pycolmap writes a model of each part to.
         threads: processor threads.
         seed: of all random choices.
         images_per_pose: views in a rig, else 1.
         progress: called with (panoramas placed, in all).
 
     Returns:
-        pycolmap.Reconstruction objects, none if no two images could be placed.
+        Number of parts; 0 if no two images could be placed.
     """
     pycolmap = pycolmap_module()
     pycolmap.set_random_seed(seed)
@@ -191,25 +176,20 @@ def reconstruct(
     options.ba_refine_sensor_from_rig = False
     placed = 0
 
-    def placed_one() -> None:
+    def tell(number: int) -> None:
         nonlocal placed
-        placed += 1
+        placed = number
         progress(min(placed, total), total)
-
-    def placed_two() -> None:
-        nonlocal placed
-        placed = 2
-        progress(placed, total)
 
     found_parts = pycolmap.incremental_mapping(
         database,
         folder,
         parts,
         options,
-        initial_image_pair_callback=placed_two,
-        next_image_callback=placed_one,
+        initial_image_pair_callback=lambda: tell(2),
+        next_image_callback=lambda: tell(placed + 1),
     )
-    return sorted(found_parts.values(), key=lambda part: -part.num_reg_frames())
+    return len(found_parts)
 
 
 def refine(model: Any, threads: int) -> None:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
-from padgs.data.assemble import image_folder, image_names, view_name
+from padgs.data.assemble import image_folder, image_names, refuse_clashes
 from padgs.data.capture import Capture, Frame
 from padgs.data.errors import DataError
 from padgs.data.images import ImageFile, inspect
@@ -43,10 +42,10 @@ def find_source(path: Path, mask: str) -> Source:
         raise DataError(f"{path} is not a folder; give a folder of panoramas, or a video file")
     folder = image_folder(path, None)
     base = folder.parent if folder.name == "images" else folder  # where masks are looked for
-    names = [name for name in image_names(folder) if not _is_mask(name)]
+    names = [name for name in image_names(folder) if name not in SCENE_MASKS and not name.startswith("masks/")]
     if len(names) < 2:
         raise DataError(f"{folder} holds {len(names)} images; structure from motion needs at least two")
-    _refuse_clashes(names)
+    refuse_clashes(names)
     images = {name: inspect(folder / name) for name in names}
     nowhere = torch.eye(4, dtype=torch.float64)
     frames = tuple(Frame(name, image.path, nowhere, image.width, image.height) for name, image in images.items())
@@ -65,18 +64,3 @@ def find_source(path: Path, mask: str) -> Source:
         fingerprint=digest.hexdigest(),
         notes=tuple(notes),
     )
-
-
-def _is_mask(name: str) -> bool:
-    return name in SCENE_MASKS or name.startswith("masks/")
-
-
-def _refuse_clashes(names: Sequence[str]) -> None:
-    seen: dict[str, str] = {}
-    for name in names:
-        key = view_name(name).casefold()
-        if key in seen:
-            raise DataError(
-                f"the images {seen[key]!r} and {name!r} would share one name (without case and extension); rename one"
-            )
-        seen[key] = name

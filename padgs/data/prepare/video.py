@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -43,18 +44,16 @@ def extract_frames(
         rate = float(meta.get("fps") or 30.0)
         total = round(rate * float(meta.get("duration") or 0.0))
         interval = max(1, round(rate / per_second))
-        best, sharpest, written = None, -1.0, 0
-        for index, frame in enumerate(imageio.imiter(video, plugin="pyav")):
-            if (value := sharpness(frame)) > sharpest:
-                best, sharpest = frame, value
-            if (index + 1) % interval == 0:
-                written += 1
-                _save(best, folder / f"frame_{written:05d}.jpg")
-                best, sharpest = None, -1.0
-            progress(index + 1, max(total, index + 1))
-        if best is not None:
+
+        def frames() -> Iterator[NDArray[np.uint8]]:
+            for index, frame in enumerate(imageio.imiter(video, plugin="pyav")):
+                progress(index + 1, max(total, index + 1))
+                yield frame
+
+        decoded, written = frames(), 0
+        while (best := max(islice(decoded, interval), key=sharpness, default=None)) is not None:
             written += 1
-            _save(best, folder / f"frame_{written:05d}.jpg")
+            Image.fromarray(best).save(folder / f"frame_{written:05d}.jpg", quality=95, subsampling=0)
     except ImportError as error:
         raise DataError(f"reading {video} needs imageio and PyAV: pip install 'padgs[video]'") from error
     except (OSError, ValueError, RuntimeError, StopIteration) as error:
@@ -74,8 +73,3 @@ def sharpness(frame: NDArray[np.uint8]) -> float:
     return float(
         np.abs(4 * gray[1:-1, 1:-1] - gray[:-2, 1:-1] - gray[2:, 1:-1] - gray[1:-1, :-2] - gray[1:-1, 2:]).mean()
     )
-
-
-def _save(frame: NDArray[np.uint8] | None, path: Path) -> None:
-    assert frame is not None
-    Image.fromarray(frame).save(path, quality=95, subsampling=0)

@@ -26,8 +26,7 @@ SPINES = (*BRIGHT, (0.3, 0.16, 0.1), (0.1, 0.2, 0.3), (0.75, 0.7, 0.6), (0.15, 0
 
 def point(values: Array) -> Point:
     """Three numbers of an array as a point."""
-    x, y, z = (float(value) for value in values)
-    return x, y, z
+    return float(values[0]), float(values[1]), float(values[2])
 
 
 def matt(texture: Texture, reflectance: float = 0.0) -> tuple[Material, ...]:
@@ -41,26 +40,24 @@ def metal(color: tx.Color = (0.75, 0.75, 0.78)) -> tuple[Material, ...]:
     return matt(tx.stripes((color, color, color, darker), 0.06, 0.0))
 
 
-def table(x: float, y: float, width: float, depth: float, height: float, yaw: float = 0.0) -> list[Shape]:
+def table(x: float, y: float, width: float, depth: float, height: float) -> list[Shape]:
     """A wooden table top on four thin legs."""
-    top = Box((x, y, height - 0.02), (width / 2, depth / 2, 0.02), matt(tx.planks(*OAK, width=0.11)), yaw)
-    legs: list[Shape] = []
+    shapes: list[Shape] = [Box((x, y, height - 0.02), (width / 2, depth / 2, 0.02), matt(tx.planks(*OAK, width=0.11)))]
     for i, j in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
-        a, b = i * (width / 2 - 0.05), j * (depth / 2 - 0.05)
-        px, py = x + a * math.cos(yaw) - b * math.sin(yaw), y + a * math.sin(yaw) + b * math.cos(yaw)
-        legs.append(Rod((px, py, 0), (px, py, height - 0.04), 0.018, metal((0.25, 0.25, 0.27))))
-    return [top, *legs]
+        px, py = x + i * (width / 2 - 0.05), y + j * (depth / 2 - 0.05)
+        shapes.append(Rod((px, py, 0), (px, py, height - 0.04), 0.018, metal((0.25, 0.25, 0.27))))
+    return shapes
 
 
-def bookshelf(x: float, y: float, width: float, height: float, yaw: float = 0.0) -> list[Shape]:
+def bookshelf(x: float, y: float, width: float, height: float) -> list[Shape]:
     """A shelf full of books."""
     wood = Material(tx.planks(*WALNUT))
     front = Material(tx.books(SPINES, (0.45, 0.3, 0.18)))
-    return [Box((x, y, height / 2), (width / 2, 0.15, height / 2), (wood, wood, front, front, wood, wood), yaw)]
+    return [Box((x, y, height / 2), (width / 2, 0.15, height / 2), (wood, wood, front, front, wood, wood))]
 
 
-def sofa(x: float, y: float, yaw: float = 0.0) -> list[Shape]:
-    """A sofa of four cushions' worth of boxes; its back is towards local +y."""
+def sofa(x: float, y: float) -> list[Shape]:
+    """A sofa of four cushions' worth of boxes; its back is towards +y."""
     cloth = matt(tx.wallpaper((0.2, 0.36, 0.4), (0.75, 0.78, 0.68), 0.16))
     pillow = matt(tx.checker((0.85, 0.55, 0.2), (0.95, 0.9, 0.8), 0.08))
     parts = (
@@ -71,17 +68,15 @@ def sofa(x: float, y: float, yaw: float = 0.0) -> list[Shape]:
         ((-0.55, 0.1, 0.56), (0.2, 0.07, 0.15), pillow),
         ((0.5, 0.1, 0.55), (0.2, 0.07, 0.14), pillow),
     )
-    c, s = math.cos(yaw), math.sin(yaw)
-    return [Box((x + c * a - s * b, y + s * a + c * b, z), half, skin, yaw) for (a, b, z), half, skin in parts]
+    return [Box((x + a, y + b, z), half, skin) for (a, b, z), half, skin in parts]
 
 
 def floor_lamp(x: float, y: float, height: float = 1.7) -> list[Shape]:
     """A thin vertical rod with a glowing globe; thin structure against the wall."""
+    globe = Material(tx.stripes(((1, 0.95, 0.8), (0.98, 0.85, 0.6)), 0.04), glows=True)
     return [
         Rod((x, y, 0.02), (x, y, height), 0.012, metal((0.8, 0.65, 0.3))),
-        Sphere(
-            (x, y, height + 0.11), 0.13, (Material(tx.stripes(((1, 0.95, 0.8), (0.98, 0.85, 0.6)), 0.04), glows=True),)
-        ),
+        Sphere((x, y, height + 0.11), 0.13, (globe,)),
         Box((x, y, 0.015), (0.15, 0.15, 0.015), matt(tx.plain((0.3, 0.25, 0.15), 0.4))),
     ]
 
@@ -97,13 +92,8 @@ def pendant(x: float, y: float, ceiling: float, drop: float) -> list[Shape]:
 
 def plant(x: float, y: float, height: float, rng: np.random.Generator) -> list[Shape]:
     """A pot with thin leaning stems that carry small leaves and blossoms."""
-    shapes: list[Shape] = [
-        Box(
-            (x, y, 0.2),
-            (0.16, 0.16, 0.2),
-            matt(tx.bricks((0.5, 0.22, 0.14), (0.8, 0.45, 0.3), (0.9, 0.8, 0.7), 0.1, 0.05)),
-        )
-    ]
+    pot = matt(tx.bricks((0.5, 0.22, 0.14), (0.8, 0.45, 0.3), (0.9, 0.8, 0.7), 0.1, 0.05))
+    shapes: list[Shape] = [Box((x, y, 0.2), (0.16, 0.16, 0.2), pot)]
     leaf = matt(tx.plain((0.2, 0.5, 0.2), 0.6, 0.2))
     for k in range(9):
         angle, lean = 2 * math.pi * k / 9 + rng.uniform(-0.2, 0.2), rng.uniform(0.1, 0.35)

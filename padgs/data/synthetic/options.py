@@ -47,7 +47,6 @@ class SyntheticOptions:
     world_rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)  # degrees about world x, then y, then z
 
     def __post_init__(self) -> None:
-        """Reject what cannot be generated, naming the value, the rule and the way out."""
         for field, known in (("scene", SCENES), ("path", (None, *PATHS)), ("heading", HEADINGS)):
             if getattr(self, field) not in known:
                 names = ", ".join(sorted(name for name in known if name is not None))

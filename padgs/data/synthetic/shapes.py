@@ -58,27 +58,16 @@ class Shape(Protocol):
         ...
 
 
-def _column(point: Point, like: Array) -> Array:
+def _column(point: Point | Array, like: Array) -> Array:
     return np.asarray(point, like.dtype).reshape(3, 1)
 
 
-class Flat(Protocol):
-    """A shape with flat faces that carry light maps."""
-
-    texel: float  # metres, of the light maps
-    faces: int
-
-    def size(self, face: int) -> tuple[float, float]:
-        """Extent (u, v) of a face in metres."""
-        ...
-
-    def point_at(self, face: int, uv: Array) -> Array:
-        """The point [3, n] of a face at texture coordinates [2, n]: the inverse of `surface`."""
-        ...
-
-    def surface(self, points: Array) -> Surface:
-        """As in Shape."""
-        ...
+def _turned(vectors: Array, yaw: float) -> Array:
+    """Vectors [3, n] turned about the vertical, to the left."""
+    if yaw == 0:
+        return vectors
+    c, s = math.cos(yaw), math.sin(yaw)
+    return np.stack((c * vectors[0] - s * vectors[1], c * vectors[1] + s * vectors[0], vectors[2]))
 
 
 _FACE_AXES = np.array(((1, 1, 0, 0, 0, 0), (2, 2, 2, 2, 1, 1)))  # which coordinate is u, which v
@@ -109,37 +98,38 @@ class Room:
     high: Point
     materials: tuple[Material, ...]
 
-    bounds, texel, faces = None, 0.08, 6
+    bounds = None
+    texel, faces = 0.08, 6  # metres, of the light maps that each face carries
 
     def hit(self, origin: Array, direction: Array) -> Array:
-        """See Shape."""
         low, high = _column(self.low, direction), _column(self.high, direction)
         wall = np.where(direction > 0, high - origin, low - origin)
         t = np.divide(wall, direction, out=np.full_like(wall, np.inf), where=direction != 0)
         return t.min(0)
 
     def surface(self, points: Array) -> Surface:
-        """See Shape."""
         gaps = np.empty((6, points.shape[1]), points.dtype)
         gaps[0::2], gaps[1::2] = points - _column(self.low, points), _column(self.high, points) - points
         face = np.argmin(np.abs(gaps), axis=0)
-        middle = (np.asarray(self.low) + np.asarray(self.high)) / 2
-        local = points - _column(tuple(middle), points)
+        local = points - self._middle(points)
         return Surface(-_face_normal(face, points.dtype), _face_uv(local, face, -1), face)
 
     def size(self, face: int) -> tuple[float, float]:
-        """See Flat."""
+        """Extent (u, v) of a face in metres."""
         extent = np.subtract(self.high, self.low)
         return ((extent[1], extent[2]), (extent[0], extent[2]), (extent[0], extent[1]))[face // 2]
 
     def point_at(self, face: int, uv: Array) -> Array:
-        """See Flat."""
+        """The point [3, n] of a face at texture coordinates [2, n]: the inverse of `surface`."""
         axis, sign = face // 2, 1.0 if face % 2 else -1.0
         points = np.empty((3, uv.shape[1]), uv.dtype)
         points[axis] = sign * (self.high[axis] - self.low[axis]) / 2
         points[(1, 0, 0)[axis]] = uv[0] * (-sign if axis == 0 else sign if axis == 1 else 1.0)
         points[(2, 2, 1)[axis]] = uv[1]
-        return points + _column(tuple((np.asarray(self.low) + np.asarray(self.high)) / 2), points)
+        return points + self._middle(points)
+
+    def _middle(self, like: Array) -> Array:
+        return _column((np.asarray(self.low) + np.asarray(self.high)) / 2, like)
 
 
 @dataclass(frozen=True)
@@ -153,18 +143,10 @@ class Box:
 
     @property
     def bounds(self) -> tuple[Point, float]:
-        """See Shape."""
         return self.center, math.hypot(*self.half)
 
-    def _local(self, vectors: Array) -> Array:
-        if self.yaw == 0:
-            return vectors
-        c, s = math.cos(self.yaw), math.sin(self.yaw)
-        return np.stack((c * vectors[0] + s * vectors[1], c * vectors[1] - s * vectors[0], vectors[2]))
-
     def hit(self, origin: Array, direction: Array) -> Array:
-        """See Shape."""
-        start, ray = self._local(origin - _column(self.center, direction)), self._local(direction)
+        start, ray = _turned(origin - _column(self.center, direction), -self.yaw), _turned(direction, -self.yaw)
         half = _column(self.half, direction)
         with np.errstate(divide="ignore", invalid="ignore"):
             inverse = 1 / ray
@@ -175,16 +157,11 @@ class Box:
         return np.where((enter <= leave) & (enter > 0), enter, np.inf)
 
     def surface(self, points: Array) -> Surface:
-        """See Shape."""
-        local = self._local(points - _column(self.center, points))
+        local = _turned(points - _column(self.center, points), -self.yaw)
         outside = np.abs(local) - _column(self.half, points)
         axis = np.argmax(outside, axis=0)
         face = 2 * axis + (np.take_along_axis(local, axis[None], 0)[0] > 0)
-        normal = _face_normal(face, points.dtype)
-        if self.yaw:
-            c, s = math.cos(self.yaw), math.sin(self.yaw)
-            normal = np.stack((c * normal[0] - s * normal[1], s * normal[0] + c * normal[1], normal[2]))
-        return Surface(normal, _face_uv(local, face, 1), face)
+        return Surface(_turned(_face_normal(face, points.dtype), self.yaw), _face_uv(local, face, 1), face)
 
 
 @dataclass(frozen=True)
@@ -197,11 +174,9 @@ class Sphere:
 
     @property
     def bounds(self) -> tuple[Point, float]:
-        """See Shape."""
         return self.center, self.radius
 
     def hit(self, origin: Array, direction: Array) -> Array:
-        """See Shape."""
         start = origin - _column(self.center, direction)
         along = (start * direction).sum(0)
         miss = start - along * direction  # from the centre to the ray: no cancellation, unlike |start|^2 - r^2
@@ -210,7 +185,6 @@ class Sphere:
         return np.where((inside > 0) & (t > 0), t, np.inf)
 
     def surface(self, points: Array) -> Surface:
-        """See Shape."""
         normal = (points - _column(self.center, points)) / np.asarray(self.radius, points.dtype)
         latitude = np.arcsin(np.clip(normal[2], -1, 1))
         uv = np.stack((np.arctan2(normal[1], normal[0]), latitude)) * np.asarray(self.radius, points.dtype)
@@ -229,7 +203,6 @@ class Rod:
 
     @property
     def bounds(self) -> tuple[Point, float]:
-        """See Shape."""
         a, b = np.asarray(self.start), np.asarray(self.end)
         return tuple((a + b) / 2), float(np.linalg.norm(b - a)) / 2 + self.radius
 
@@ -240,9 +213,8 @@ class Rod:
         return span / length, length
 
     def hit(self, origin: Array, direction: Array) -> Array:
-        """See Shape."""
         unit, length = self._axis
-        axis = _column(tuple(unit), direction)
+        axis = _column(unit, direction)
         start = origin - _column(self.start, direction)
         ray_along, start_along = axis[:, 0] @ direction, axis[:, 0] @ start
         ray_across, start_across = direction - ray_along * axis, start - start_along * axis
@@ -260,9 +232,8 @@ class Rod:
         return np.minimum(side, np.minimum(*ends))
 
     def surface(self, points: Array) -> Surface:
-        """See Shape."""
         unit, length = self._axis
-        axis = _column(tuple(unit), points)
+        axis = _column(unit, points)
         start = points - _column(self.start, points)
         along = (axis * start).sum(0)
         normal = (start - np.clip(along, 0, length) * axis) / np.asarray(self.radius, points.dtype)
@@ -270,7 +241,7 @@ class Rod:
         first = np.cross(unit, helper)
         first /= np.linalg.norm(first)
         second = np.cross(unit, first)
-        angle = np.arctan2(*((_column(tuple(e), points) * normal).sum(0) for e in (second, first)))
+        angle = np.arctan2(*((_column(e, points) * normal).sum(0) for e in (second, first)))
         uv = np.stack((angle * np.asarray(self.radius, points.dtype), along))
         return Surface(normal, uv, np.zeros(points.shape[1], np.int64))
 
@@ -281,26 +252,23 @@ class Ground:
 
     materials: tuple[Material, ...]
 
-    bounds, texel, faces = None, 0.15, 1
+    bounds = None
+    texel, faces = 0.15, 1  # as of a room
 
     def hit(self, origin: Array, direction: Array) -> Array:
-        """See Shape."""
         with np.errstate(divide="ignore", invalid="ignore"):
             t = -origin[2] / direction[2]
         return np.where((direction[2] < 0) & (t > 0), t, np.inf)
 
     def surface(self, points: Array) -> Surface:
-        """See Shape."""
         normal = np.zeros_like(points)
         normal[2] = 1
         return Surface(normal, points[:2], np.zeros(points.shape[1], np.int64))
 
     def size(self, face: int) -> tuple[float, float]:
-        """See Flat."""
         return 64.0, 64.0
 
     def point_at(self, face: int, uv: Array) -> Array:
-        """See Flat."""
         return np.concatenate((uv, np.zeros_like(uv[:1])))
 
 
@@ -320,7 +288,6 @@ class Ring:
         return self.height * (0.55 + 0.3 * waves)
 
     def hit(self, origin: Array, direction: Array) -> Array:
-        """See Shape."""
         a = direction[0] ** 2 + direction[1] ** 2
         b = origin[0] * direction[0] + origin[1] * direction[1]
         c = origin[0] ** 2 + origin[1] ** 2 - self.radius**2
@@ -330,8 +297,10 @@ class Ring:
             return np.where((z >= 0) & (z < self.ridge(np.arctan2(y, x))), t, np.inf)
 
     def surface(self, points: Array) -> Surface:
-        """See Shape."""
         normal = -points / np.asarray(self.radius, points.dtype)
         normal[2] = 0
         angle = np.arctan2(points[1], points[0])
         return Surface(normal, np.stack((angle * self.radius, points[2])), np.zeros(points.shape[1], np.int64))
+
+
+Flat = Room | Ground  # their faces carry light maps

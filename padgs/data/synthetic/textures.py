@@ -1,14 +1,14 @@
 """Procedural surface textures: functions of the position on a surface in metres, resolution-free and seeded.
 
 A texture maps uv [2, n] (metres from the centre of a face, u to the right, v up) to colours [3, n] in [0, 1].
-Factories below return such functions; `layered` and `framed` compose them.
+What is marked `texture` below is called without uv, and returns such a function.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cache
-from typing import Any
+from functools import cache, wraps
+from typing import Any, Concatenate, ParamSpec
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +16,19 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 Texture = Callable[[Array], Array]
 Color = tuple[float, float, float]
+Knobs = ParamSpec("Knobs")
 
 _TABLE = 4096
+
+
+def texture(draw: Callable[Concatenate[Array, Knobs], Array]) -> Callable[Knobs, Texture]:
+    """Make a factory of textures of a function that draws one."""
+
+    @wraps(draw)
+    def factory(*args: Knobs.args, **kwargs: Knobs.kwargs) -> Texture:
+        return lambda uv: draw(uv, *args, **kwargs)
+
+    return factory
 
 
 @cache
@@ -33,6 +44,13 @@ def _noise_table(size: int = 512) -> Array:
     frequency[0, 0] = 1
     pink = np.fft.irfft2(white / frequency**1.2 * (frequency > 1.5), s=(size, size))
     return np.clip(pink / (5 * pink.std()) + 0.5, 0, 1).astype(np.float32)
+
+
+@cache
+def _glyphs() -> Array:
+    glyphs = np.random.default_rng(11).random((32, 7, 5)) < 0.5
+    glyphs[:6] = False  # spaces between words
+    return glyphs
 
 
 def bilinear(table: Array, x: Array, y: Array) -> Array:
@@ -82,195 +100,154 @@ def step(edge: float, x: Array, blur: float) -> Array:
     return np.clip((x - edge) / blur + 0.5, 0, 1)
 
 
-def plain(color: Color, mottle: float = 0.0, period: float = 1.5) -> Texture:
+@texture
+def plain(uv: Array, color: Color, mottle: float = 0.0, period: float = 1.5) -> Array:
     """One colour, mottled by noise of relative strength `mottle`."""
-
-    def texture(uv: Array) -> Array:
-        tone = 1 + mottle * (2 * noise(uv[0], uv[1], period) - 1) if mottle else np.ones_like(uv[0])
-        return np.asarray(color, np.float32)[:, None] * tone
-
-    return texture
+    tone = 1 + mottle * (2 * noise(uv[0], uv[1], period) - 1) if mottle else np.ones_like(uv[0])
+    return np.asarray(color, np.float32)[:, None] * tone
 
 
-def planks(dark: Color, light: Color, width: float = 0.14, length: float = 1.3) -> Texture:
+@texture
+def planks(uv: Array, dark: Color, light: Color, width: float = 0.14, length: float = 1.3) -> Array:
     """Wooden boards along u with grain and dark gaps."""
-
-    def texture(uv: Array) -> Array:
-        row = np.floor(uv[1] / width)
-        along = uv[0] / length + random_of(row, 3)
-        column = np.floor(along)
-        tone = random_of(row, column)
-        grain = noise(uv[0] * 0.12 + 3 * tone, uv[1] + 0.7 * tone, 0.8)
-        fibre = noise(uv[0] * 0.03 + tone, uv[1], 0.22)
-        edge = np.minimum(np.abs(uv[1] / width - row - 0.5), 0.5)
-        end = np.abs(along - column - 0.5)
-        gap = np.maximum(step(0.478, edge, 0.02), step(0.497, end, 0.003))
-        return mix(dark, light, 0.45 * tone + 0.45 * grain + 0.25 * fibre) * (1 - 0.6 * gap)
-
-    return texture
+    row = np.floor(uv[1] / width)
+    along = uv[0] / length + random_of(row, 3)
+    column = np.floor(along)
+    tone = random_of(row, column)
+    grain = noise(uv[0] * 0.12 + 3 * tone, uv[1] + 0.7 * tone, 0.8)
+    fibre = noise(uv[0] * 0.03 + tone, uv[1], 0.22)
+    edge = np.minimum(np.abs(uv[1] / width - row - 0.5), 0.5)
+    end = np.abs(along - column - 0.5)
+    gap = np.maximum(step(0.478, edge, 0.02), step(0.497, end, 0.003))
+    return mix(dark, light, 0.45 * tone + 0.45 * grain + 0.25 * fibre) * (1 - 0.6 * gap)
 
 
-def bricks(dark: Color, light: Color, mortar: Color, length: float = 0.25, height: float = 0.085) -> Texture:
+@texture
+def bricks(uv: Array, dark: Color, light: Color, mortar: Color, length: float = 0.25, height: float = 0.085) -> Array:
     """A running bond of bricks."""
-
-    def texture(uv: Array) -> Array:
-        row = np.floor(uv[1] / height)
-        along = uv[0] / length + 0.5 * (row % 2)
-        column = np.floor(along)
-        inside_u = (0.5 - np.abs(along - column - 0.5)) * length
-        inside_v = (0.5 - np.abs(uv[1] / height - row - 0.5)) * height
-        speckle = noise(uv[0], uv[1], 0.35)
-        brick = mix(dark, light, 0.65 * random_of(row, column) + 0.5 * speckle)
-        joint = 1 - step(0.007, np.minimum(inside_u, inside_v) + 0.004 * (speckle - 0.5), 0.003)
-        return mix(brick, np.asarray(mortar, np.float32)[:, None] * (0.8 + 0.4 * speckle), joint)
-
-    return texture
+    row = np.floor(uv[1] / height)
+    along = uv[0] / length + 0.5 * (row % 2)
+    column = np.floor(along)
+    inside_u = (0.5 - np.abs(along - column - 0.5)) * length
+    inside_v = (0.5 - np.abs(uv[1] / height - row - 0.5)) * height
+    speckle = noise(uv[0], uv[1], 0.35)
+    brick = mix(dark, light, 0.65 * random_of(row, column) + 0.5 * speckle)
+    joint = 1 - step(0.007, np.minimum(inside_u, inside_v) + 0.004 * (speckle - 0.5), 0.003)
+    return mix(brick, np.asarray(mortar, np.float32)[:, None] * (0.8 + 0.4 * speckle), joint)
 
 
-def checker(first: Color, second: Color, size: float = 0.3, mottle: float = 0.25) -> Texture:
+@texture
+def checker(uv: Array, first: Color, second: Color, size: float = 0.3, mottle: float = 0.25) -> Array:
     """Two-coloured square tiles with fine joints and marble-like veins."""
-
-    def texture(uv: Array) -> Array:
-        column, row = np.floor(uv[0] / size), np.floor(uv[1] / size)
-        tone = 1 + mottle * (noise(uv[0] + 3 * random_of(row, column), uv[1], 0.9) - 0.5)
-        edge = np.maximum(np.abs(uv[0] / size - column - 0.5), np.abs(uv[1] / size - row - 0.5))
-        return mix(first, second, (row + column) % 2) * tone * (1 - 0.5 * step(0.488, edge, 0.01))
-
-    return texture
+    column, row = np.floor(uv[0] / size), np.floor(uv[1] / size)
+    tone = 1 + mottle * (noise(uv[0] + 3 * random_of(row, column), uv[1], 0.9) - 0.5)
+    edge = np.maximum(np.abs(uv[0] / size - column - 0.5), np.abs(uv[1] / size - row - 0.5))
+    return mix(first, second, (row + column) % 2) * tone * (1 - 0.5 * step(0.488, edge, 0.01))
 
 
-def wallpaper(ground: Color, figure: Color, period: float = 0.42) -> Texture:
+@texture
+def wallpaper(uv: Array, ground: Color, figure: Color, period: float = 0.42) -> Array:
     """An ornamental repeat: two interlocked families of soft rosettes with fine stripes between."""
-
-    def texture(uv: Array) -> Array:
-        a, b = uv[0] * (2 * np.pi / period), uv[1] * (2 * np.pi / period)
-        bloom = np.cos(a) * np.cos(b) + 0.45 * np.cos(2 * a + np.sin(b)) * np.cos(3 * b) + 0.3 * np.cos(4 * a)
-        ring = np.abs(bloom - 0.35)
-        weight = 0.75 * (1 - step(0.12, ring, 0.08)) + 0.5 * step(0.85, bloom, 0.1)
-        stripe = 0.06 * np.cos(uv[0] * (2 * np.pi / 0.03))
-        return mix(ground, figure, np.clip(weight, 0, 1)) * (1 + stripe + 0.12 * (noise(uv[0], uv[1], 1.1) - 0.5))
-
-    return texture
+    a, b = uv[0] * (2 * np.pi / period), uv[1] * (2 * np.pi / period)
+    bloom = np.cos(a) * np.cos(b) + 0.45 * np.cos(2 * a + np.sin(b)) * np.cos(3 * b) + 0.3 * np.cos(4 * a)
+    ring = np.abs(bloom - 0.35)
+    weight = 0.75 * (1 - step(0.12, ring, 0.08)) + 0.5 * step(0.85, bloom, 0.1)
+    stripe = 0.06 * np.cos(uv[0] * (2 * np.pi / 0.03))
+    return mix(ground, figure, np.clip(weight, 0, 1)) * (1 + stripe + 0.12 * (noise(uv[0], uv[1], 1.1) - 0.5))
 
 
-def stripes(colors: Sequence[Color], width: float = 0.05, mottle: float = 0.1) -> Texture:
+@texture
+def stripes(uv: Array, colors: Sequence[Color], width: float = 0.05, mottle: float = 0.1) -> Array:
     """Bands across v that go through the colours in order."""
     palette = np.asarray(colors, np.float32)
-
-    def texture(uv: Array) -> Array:
-        band = np.floor(uv[1] / width).astype(np.int64) % len(palette)
-        return palette[band].T * (1 + mottle * (noise(uv[0], uv[1], 0.6) - 0.5))
-
-    return texture
+    band = np.floor(uv[1] / width).astype(np.int64) % len(palette)
+    return palette[band].T * (1 + mottle * (noise(uv[0], uv[1], 0.6) - 0.5))
 
 
-def print_of(paper: Color, ink: Color, size: float = 0.06) -> Texture:
+@texture
+def print_of(uv: Array, paper: Color, ink: Color, size: float = 0.06) -> Array:
     """Lines of text-like marks: random glyphs of 5 x 7 dots, grouped into words."""
-    glyphs = np.random.default_rng(11).random((32, 7, 5)) < 0.5
-    glyphs[:6] = False  # spaces between words
-
-    def texture(uv: Array) -> Array:
-        column, line = np.floor(uv[0] / (0.75 * size)), np.floor(uv[1] / (1.6 * size))
-        x = ((uv[0] / (0.75 * size) - column) * 6).astype(np.int64)
-        y = ((uv[1] / (1.6 * size) - line) * 11).astype(np.int64)
-        glyph = (random_of(line, column, 5) * 32).astype(np.int64)
-        inside = (x < 5) & (y < 7)
-        dot = inside & glyphs[glyph, np.minimum(y, 6), np.minimum(x, 4)]
-        return mix(paper, ink, dot.astype(np.float32)) * (1 + 0.06 * (noise(uv[0], uv[1], 0.5) - 0.5))
-
-    return texture
+    column, line = np.floor(uv[0] / (0.75 * size)), np.floor(uv[1] / (1.6 * size))
+    x = ((uv[0] / (0.75 * size) - column) * 6).astype(np.int64)
+    y = ((uv[1] / (1.6 * size) - line) * 11).astype(np.int64)
+    glyph = (random_of(line, column, 5) * 32).astype(np.int64)
+    inside = (x < 5) & (y < 7)
+    dot = inside & _glyphs()[glyph, np.minimum(y, 6), np.minimum(x, 4)]
+    return mix(paper, ink, dot.astype(np.float32)) * (1 + 0.06 * (noise(uv[0], uv[1], 0.5) - 0.5))
 
 
-def books(spines: Sequence[Color], board: Color, shelf: float = 0.32) -> Texture:
+@texture
+def books(uv: Array, spines: Sequence[Color], board: Color, shelf: float = 0.32) -> Array:
     """Shelves of book spines of different heights and colours, with labels."""
     palette = np.asarray(spines, np.float32)
-
-    def texture(uv: Array) -> Array:
-        level = np.floor(uv[1] / shelf)
-        up = (uv[1] / shelf - level) * shelf
-        book = np.floor(uv[0] / 0.038 + 7 * random_of(level, 9))
-        across = uv[0] / 0.038 + 7 * random_of(level, 9) - book
-        top = 0.2 + 0.09 * random_of(level, book, 1)
-        color = palette[(random_of(level, book, 2) * len(palette)).astype(np.int64)].T
-        label = (np.abs(up - 0.6 * top) < 0.02) & (random_of(level, book, 4) > 0.4)
-        color = mix(color, (0.9, 0.85, 0.7), np.float32(0.8) * label) * (
-            0.65 + 0.35 * np.sin(np.pi * np.clip(across, 0, 1))
-        )
-        color = np.where(up > top, np.float32(0.06), color)
-        wood = np.asarray(board, np.float32)[:, None] * (0.8 + 0.4 * noise(uv[0] * 0.2, uv[1], 0.4))
-        return np.where(up < 0.03, wood, color)
-
-    return texture
+    level = np.floor(uv[1] / shelf)
+    up = (uv[1] / shelf - level) * shelf
+    book = np.floor(uv[0] / 0.038 + 7 * random_of(level, 9))
+    across = uv[0] / 0.038 + 7 * random_of(level, 9) - book
+    top = 0.2 + 0.09 * random_of(level, book, 1)
+    color = palette[(random_of(level, book, 2) * len(palette)).astype(np.int64)].T
+    label = (np.abs(up - 0.6 * top) < 0.02) & (random_of(level, book, 4) > 0.4)
+    color = mix(color, (0.9, 0.85, 0.7), np.float32(0.8) * label) * (
+        0.65 + 0.35 * np.sin(np.pi * np.clip(across, 0, 1))
+    )
+    color = np.where(up > top, np.float32(0.06), color)
+    wood = np.asarray(board, np.float32)[:, None] * (0.8 + 0.4 * noise(uv[0] * 0.2, uv[1], 0.4))
+    return np.where(up < 0.03, wood, color)
 
 
-def siemens_star(dark: Color, light: Color, spokes: int, pitch: float) -> Texture:
+@texture
+def siemens_star(uv: Array, dark: Color, light: Color, spokes: int, pitch: float) -> Array:
     """A lattice of Siemens stars, `pitch` apart, one at the origin; detail of every size towards each centre."""
-
-    def texture(uv: Array) -> Array:
-        x, y = uv / pitch - np.round(uv / pitch)
-        radius = np.hypot(x, y)
-        spoke = (np.arctan2(y, x) * (spokes / (2 * np.pi))) % 1 < 0.5
-        ring = (np.floor(radius * 60) % 2 == 0) & (radius > 0.46)
-        return mix(light, dark, np.where(radius < 0.46, spoke, ring & (radius < 0.5)).astype(np.float32))
-
-    return texture
+    x, y = uv / pitch - np.round(uv / pitch)
+    radius = np.hypot(x, y)
+    spoke = (np.arctan2(y, x) * (spokes / (2 * np.pi))) % 1 < 0.5
+    ring = (np.floor(radius * 60) % 2 == 0) & (radius > 0.46)
+    return mix(light, dark, np.where(radius < 0.46, spoke, ring & (radius < 0.5)).astype(np.float32))
 
 
-def medallion(ground: Color, figure: Color, accent: Color, radius: float, fold: int) -> Texture:
+@texture
+def medallion(uv: Array, ground: Color, figure: Color, accent: Color, radius: float, fold: int) -> Array:
     """A round ornament of `fold`-fold symmetry: a rug on the floor, a rosette on the ceiling."""
-
-    def texture(uv: Array) -> Array:
-        r, angle = np.hypot(uv[0], uv[1]) / radius, np.arctan2(uv[1], uv[0])
-        petal = np.cos(fold * angle)
-        wave = np.sin(18 * r + 1.4 * petal) * np.cos(2 * fold * angle * np.floor(1 + 2 * r))
-        color = mix(ground, figure, step(0.15, wave, 0.25))
-        color = mix(color, accent, 1 - step(0.035, np.abs(r - 0.42 - 0.09 * petal), 0.02))
-        color = mix(color, accent, step(0.55, np.cos(4 * fold * angle), 0.2) * (np.abs(r - 0.88) < 0.05))
-        color = mix(color, figure, (np.abs(r - 0.8) < 0.012) | (np.abs(r - 0.96) < 0.015))
-        return color * (1 + 0.25 * (noise(uv[0], uv[1], 0.3) - 0.5))
-
-    return texture
+    r, angle = np.hypot(uv[0], uv[1]) / radius, np.arctan2(uv[1], uv[0])
+    petal = np.cos(fold * angle)
+    wave = np.sin(18 * r + 1.4 * petal) * np.cos(2 * fold * angle * np.floor(1 + 2 * r))
+    color = mix(ground, figure, step(0.15, wave, 0.25))
+    color = mix(color, accent, 1 - step(0.035, np.abs(r - 0.42 - 0.09 * petal), 0.02))
+    color = mix(color, accent, step(0.55, np.cos(4 * fold * angle), 0.2) * (np.abs(r - 0.88) < 0.05))
+    color = mix(color, figure, (np.abs(r - 0.8) < 0.012) | (np.abs(r - 0.96) < 0.015))
+    return color * (1 + 0.25 * (noise(uv[0], uv[1], 0.3) - 0.5))
 
 
-def picture(sky: Color, land: Color, sun: Color, size: float) -> Texture:
+@texture
+def picture(uv: Array, sky: Color, land: Color, sun: Color, size: float) -> Array:
     """A poster: a landscape of layered hills with a disc, over a line of print."""
     caption = print_of((0.93, 0.91, 0.86), (0.15, 0.13, 0.12), size / 14)
-
-    def texture(uv: Array) -> Array:
-        u, v = uv / size
-        color = mix(sky, (1, 0.97, 0.9), np.clip(0.5 - 0.9 * v, 0, 1))
-        color = mix(color, sun, 1 - step(0.16, np.hypot(u - 0.15, v - 0.18), 0.01))
-        for layer in range(3):
-            ridge = 0.05 - 0.13 * layer + 0.22 * (noise(u + 1.7 * layer, u * 0 + 0.31 * layer, 2.0) - 0.5)
-            color = mix(color, mix(land, sky, 0.55 - 0.25 * layer), step(0, ridge - v, 0.01))
-        return np.where(v < -0.36, caption(uv), color)
-
-    return texture
+    u, v = uv / size
+    color = mix(sky, (1, 0.97, 0.9), np.clip(0.5 - 0.9 * v, 0, 1))
+    color = mix(color, sun, 1 - step(0.16, np.hypot(u - 0.15, v - 0.18), 0.01))
+    for layer in range(3):
+        ridge = 0.05 - 0.13 * layer + 0.22 * (noise(u + 1.7 * layer, u * 0 + 0.31 * layer, 2.0) - 0.5)
+        color = mix(color, mix(land, sky, 0.55 - 0.25 * layer), step(0, ridge - v, 0.01))
+    return np.where(v < -0.36, caption(uv), color)
 
 
-def window(glow: Color, frame: Color, panes: int = 2) -> Texture:
+@texture
+def window(uv: Array, glow: Color, frame: Color, panes: int = 2) -> Array:
     """A window seen from inside: bright sky behind a wooden cross."""
-
-    def texture(uv: Array) -> Array:
-        cloud = noise(uv[0], uv[1] * 2, 2.3)
-        light = mix(glow, (1, 1, 1), np.clip(1.6 * cloud - 0.4, 0, 1))
-        cell = np.abs(uv * panes - np.floor(uv * panes) - 0.5).max(axis=0)
-        return mix(light, frame, step(0.45, cell, 0.01))
-
-    return texture
+    cloud = noise(uv[0], uv[1] * 2, 2.3)
+    light = mix(glow, (1, 1, 1), np.clip(1.6 * cloud - 0.4, 0, 1))
+    cell = np.abs(uv * panes - np.floor(uv * panes) - 0.5).max(axis=0)
+    return mix(light, frame, step(0.45, cell, 0.01))
 
 
-def sectors(colors: Sequence[Color], count: int, radius: float) -> Texture:
+@texture
+def sectors(uv: Array, colors: Sequence[Color], count: int, radius: float) -> Array:
     """Beach-ball gores on a sphere of the given radius (u = longitude x radius, v = latitude x radius)."""
     palette = np.asarray(colors, np.float32)
-
-    def texture(uv: Array) -> Array:
-        sector = np.floor((uv[0] / (2 * np.pi * radius) % 1) * count).astype(np.int64) % len(palette)
-        band = np.abs(uv[1] / radius) < 0.12
-        cap = np.abs(uv[1] / radius) > 1.25
-        return np.where(cap | band, np.float32(0.93), palette[sector].T)
-
-    return texture
+    sector = np.floor((uv[0] / (2 * np.pi * radius) % 1) * count).astype(np.int64) % len(palette)
+    band = np.abs(uv[1] / radius) < 0.12
+    cap = np.abs(uv[1] / radius) > 1.25
+    return np.where(cap | band, np.float32(0.93), palette[sector].T)
 
 
 def scaled(texture: Texture, frequency: float) -> Texture:
@@ -278,39 +255,35 @@ def scaled(texture: Texture, frequency: float) -> Texture:
     return texture if frequency == 1 else lambda uv: texture(uv * frequency)
 
 
-def framed(base: Texture, patches: Sequence[tuple[float, float, float, float, Texture]]) -> Texture:
+@texture
+def framed(uv: Array, base: Texture, patches: Sequence[tuple[float, float, float, float, Texture]]) -> Array:
     """Rectangles (u, v, width, height, texture) with a dark border on top of `base`; each is drawn about its centre."""
-
-    def texture(uv: Array) -> Array:
-        color = np.array(base(uv))
-        for u, v, width, height, patch in patches:
-            local = uv - np.asarray((u, v), uv.dtype)[:, None]
-            border = np.maximum(np.abs(local[0]) - width / 2, np.abs(local[1]) - height / 2)
-            color[:, border < 0.03] *= 0.15
-            inside = np.flatnonzero(border < 0)
-            if inside.size:
-                color[:, inside] = patch(local[:, inside])
-        return color
-
-    return texture
+    color = np.array(base(uv))
+    for u, v, width, height, patch in patches:
+        local = uv - np.asarray((u, v), uv.dtype)[:, None]
+        border = np.maximum(np.abs(local[0]) - width / 2, np.abs(local[1]) - height / 2)
+        color[:, border < 0.03] *= 0.15
+        inside = np.flatnonzero(border < 0)
+        if inside.size:
+            color[:, inside] = patch(local[:, inside])
+    return color
 
 
-def disc(base: Texture, patch: Texture, radius: float, centers: Sequence[tuple[float, float]] = ((0, 0),)) -> Texture:
+@texture
+def disc(
+    uv: Array, base: Texture, patch: Texture, radius: float, centers: Sequence[tuple[float, float]] = ((0, 0),)
+) -> Array:
     """`patch` within `radius` of each centre, drawn about it, `base` outside."""
-
-    def texture(uv: Array) -> Array:
-        color = np.empty((3, uv.shape[1]), np.float32)
-        outside = np.ones(uv.shape[1], bool)
-        for center in centers:
-            local = uv - np.asarray(center, uv.dtype)[:, None]
-            inside = local[0] * local[0] + local[1] * local[1] < radius * radius
-            index = np.flatnonzero(inside)
-            if index.size:
-                color[:, index] = patch(local[:, index])
-                outside &= ~inside
-        index = np.flatnonzero(outside)
+    color = np.empty((3, uv.shape[1]), np.float32)
+    outside = np.ones(uv.shape[1], bool)
+    for center in centers:
+        local = uv - np.asarray(center, uv.dtype)[:, None]
+        inside = local[0] * local[0] + local[1] * local[1] < radius * radius
+        index = np.flatnonzero(inside)
         if index.size:
-            color[:, index] = base(uv[:, index])
-        return color
-
-    return texture
+            color[:, index] = patch(local[:, index])
+            outside &= ~inside
+    index = np.flatnonzero(outside)
+    if index.size:
+        color[:, index] = base(uv[:, index])
+    return color

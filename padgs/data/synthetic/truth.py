@@ -30,7 +30,6 @@ class SyntheticTruth:
     """
 
     def __init__(self, options: SyntheticOptions) -> None:
-        """Build the world; this draws nothing yet."""
         blueprint = BLUEPRINTS[options.scene]
         if options.objects is None:
             options = replace(options, objects=blueprint.objects)

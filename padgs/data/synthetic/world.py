@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from padgs.data.synthetic.light import Light, LightMap, bake
-from padgs.data.synthetic.shapes import Ground, Room, Shape
+from padgs.data.synthetic.shapes import Flat, Shape
 from padgs.data.synthetic.textures import Array
 
 SKY = -1  # object id of a ray that hits nothing
@@ -26,13 +26,12 @@ class World:
     shapes: tuple[Shape, ...]
     light: Light
     sky: Callable[[Array], Array] | None = None  # directions [3, n] -> colours [3, n]
-    light_maps: dict[tuple[int, int], LightMap] = field(default_factory=dict, repr=False)
+    light_maps: dict[tuple[int, int], LightMap] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Bake the light maps."""
-        casts = np.array([not isinstance(s, Room | Ground) and not s.materials[0].glows for s in self.shapes])
+        casts = np.array([not isinstance(s, Flat) and not s.materials[0].glows for s in self.shapes])
         for index, shape in enumerate(self.shapes):
-            if isinstance(shape, Room | Ground):
+            if isinstance(shape, Flat):
                 for face in range(shape.faces):
                     light_map = bake(shape, face, self.light, self._bounds, casts, lambda *a: self.nearest(*a)[0])
                     self.light_maps[index, face] = light_map

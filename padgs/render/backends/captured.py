@@ -129,8 +129,7 @@ class CapturedRender:
         return min(self._most, int(HEADROOM * instances) + 1)
 
     def _projected(self, gaussians: Gaussians, *, room: int) -> DeviceProjected:
-        named = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors)
-        tensors = [tensor.contiguous() for tensor in named]  # which must outlive the call
+        tensors = [tensor.contiguous() for tensor in vars(gaussians).values()]  # which must outlive the call
         pose = self._view.cam_from_world.to(torch.float32)
         inputs = Inputs(len(gaussians), *map(pointer, tensors), None)
         return DeviceProjected(self._camera, pose, inputs, self._options.max_instances, room=room)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from padgs.native import cpu
 from padgs.native.abi import BlendArguments, BlendGradientArguments, Gradients, Inputs, pointer
-from padgs.render.backends.native import Drawing, Pixels, rasterize_as
+from padgs.render.backends.native import Drawing, Pixels, Upstream, rasterize_as
 from padgs.render.backends.native_camera import native_camera, native_rays
 from padgs.render.contract import Rendering, Request
 from padgs.render.published_bounds import check_memory
@@ -35,21 +35,6 @@ def rasterize(request: Request) -> Rendering:
             "backend=torch"
         )
     return rasterize_as(_Drawing(request), request)
-
-
-@dataclass
-class _Buffers:
-    """What blending writes, and needs again to go back."""
-
-    image: Tensor  # [H, W, 3]
-    transmittance: Tensor  # [H, W]
-    depth: Tensor  # [H, W]
-    last: Tensor  # [H, W] int32
-
-    @staticmethod
-    def of_size(width: int, height: int) -> _Buffers:
-        flat = torch.empty(height, width)
-        return _Buffers(torch.empty(height, width, 3), flat, torch.empty_like(flat), flat.to(torch.int32))
 
 
 @dataclass
@@ -74,18 +59,19 @@ class _Drawing(Drawing):
         self._projected = Projected(native_camera(pose, camera, options), inputs, options.max_instances)
         check_memory(self._projected.instances, options)
         self.rays = native_rays(camera)
-        buffers = _Buffers.of_size(camera.width, camera.height)
+        size = (camera.height, camera.width)
+        pixels = (torch.empty(*size, 3), torch.empty(size), torch.empty(size))
+        self._last = torch.empty(size, dtype=torch.int32)  # where each pixel's last contribution is
         pairs = torch.zeros(2, dtype=torch.int64)
         self._cores: list[_Cores] = []  # of each strip where they are kept
         for strip in self._projected.strips():
             pair_counts = torch.empty(strip.tiles, 2, dtype=torch.int64)
-            arguments = self._blend_arguments(strip, background, buffers, pair_counts)
+            arguments = self._blend_arguments(strip, background, pixels, pair_counts)
             if differentiated and options.blending == "hybrid":
                 self._cores.append(_Cores.of(strip, arguments))
                 self._cores[-1].join(arguments)
             cpu.library().padgs_blend_forward(ctypes.byref(arguments))
             pairs += pair_counts.sum(0)
-        self._last = buffers.last
         self.counters = {
             "gaussians": inputs.count,
             "visible": self._projected.visible,
@@ -94,27 +80,18 @@ class _Drawing(Drawing):
             "contributing": int(pairs[1]),
         }
         visible = self._projected.boxes[:, 3] < self._projected.boxes[:, 4]
-        return (buffers.image, buffers.transmittance, buffers.depth), visible
+        return pixels, visible
 
-    def moments(
-        self,
-        pixels: Pixels,
-        background: Tensor,
-        upstream: list[Tensor | None],
-        grad_rays: Tensor | None,
-        *,
-        absolute: bool,
-    ) -> Tensor:
-        buffers, count = _Buffers(*pixels, self._last), len(self._projected.boxes)
+    def moments(self, pixels: Pixels, background: Tensor, upstream: Upstream) -> Tensor:
+        count = len(self._projected.boxes)
         totals = torch.zeros(count, MOMENTS)
         for number, strip in enumerate(self._projected.strips()):
-            forward = self._blend_arguments(strip, background, buffers, None)
+            forward = self._blend_arguments(strip, background, pixels, None)
             if self._cores:
                 self._cores[number].join(forward)
             moments = torch.empty(len(strip.instances), MOMENTS)
-            arguments = BlendGradientArguments(
-                forward, *map(pointer, upstream), pointer(moments), pointer(grad_rays), absolute
-            )
+            grads = (upstream.image, upstream.transmittance, upstream.depth, moments, upstream.rays)
+            arguments = BlendGradientArguments(forward, *map(pointer, grads), upstream.absolute)
             cpu.library().padgs_blend_backward(ctypes.byref(arguments))
             cpu.library().padgs_sum_moments(pointer(moments), pointer(strip.slot_start), count, pointer(totals))
         return totals
@@ -132,12 +109,12 @@ class _Drawing(Drawing):
         return of_pose
 
     def _blend_arguments(
-        self, strip: Strip, background: Tensor, buffers: _Buffers, pair_counts: Tensor | None
+        self, strip: Strip, background: Tensor, pixels: Pixels, pair_counts: Tensor | None
     ) -> BlendArguments:
         """Of both blending passes; the tensors must outlive the call."""
         projected, options = self._projected, self.options
         lists = (projected.footprints, strip.tile_start, strip.instances, background)
-        outputs = (buffers.image, buffers.transmittance, buffers.depth, buffers.last, pair_counts)
+        outputs = (*pixels, self._last, pair_counts)
         core_size = options.core_size if options.blending == "hybrid" else 0
         scalars = (projected.camera.projection, projected.camera.wrap, core_size)
         return BlendArguments(strip.grid, *scalars, self.rays.native(), *map(pointer, (*lists, *outputs)))

@@ -16,7 +16,7 @@ from torch import Tensor
 from padgs.native import cuda
 from padgs.native.abi import Gradients, Inputs, pointer
 from padgs.render.backends.cuda_tiles import DeviceProjected, DeviceStrip
-from padgs.render.backends.native import Drawing, Pixels, rasterize_as
+from padgs.render.backends.native import Drawing, Pixels, Upstream, rasterize_as
 from padgs.render.backends.native_camera import NativeRays, native_camera, native_rays
 from padgs.render.contract import Rendering, RenderOptions, Request
 from padgs.render.published_bounds import check_memory
@@ -119,15 +119,7 @@ class _Drawing(Drawing):
         visible = self._projected.boxes[:, 3] < self._projected.boxes[:, 4]
         return (outputs.image, outputs.transmittance, outputs.depth), visible
 
-    def moments(
-        self,
-        pixels: Pixels,
-        background: Tensor,
-        upstream: list[Tensor | None],
-        grad_rays: Tensor | None,
-        *,
-        absolute: bool,
-    ) -> Tensor:
+    def moments(self, pixels: Pixels, background: Tensor, upstream: Upstream) -> Tensor:
         projected, outputs = self._projected, Outputs(*pixels, *self._kept)
         device, size, hybrid = background.device, outputs.depth.shape, outputs.core_size > 0
         totals = torch.zeros(len(projected.order), MOMENTS, device=device)
@@ -140,13 +132,13 @@ class _Drawing(Drawing):
             moments = torch.empty(strip.instances, MOMENTS, device=device)
             arguments = cuda.BlendGradientInputs(
                 _blend_inputs(projected, strip, self.rays, background, outputs, None),
-                *map(pointer, upstream),
+                *map(pointer, (upstream.image, upstream.transmittance, upstream.depth)),
                 *map(pointer, (packed, states, furthest, core_gradients, tail_gradients)),
                 strip.instances,
-                *map(pointer, (moments, grad_rays, projected.order, strip.slot_start)),
+                *map(pointer, (moments, upstream.rays, projected.order, strip.slot_start)),
                 projected.visible,
                 pointer(totals),
-                absolute,
+                upstream.absolute,
             )
             cuda.call("padgs_cuda_blend_backward", projected.queue, arguments, strip.tiles)
         return totals

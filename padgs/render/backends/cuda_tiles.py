@@ -63,7 +63,6 @@ class DeviceStrip:
     """The lists of some rows of tiles."""
 
     def __init__(self, projected: DeviceProjected, first_row: int, end_row: int) -> None:
-        """Fill the lists of tile rows [first_row, end_row)."""
         device, rows = projected.order.device, projected.rows
         self.first_row, self.end_row = first_row, end_row
         self.tiles = sum(rows.tiles[first_row:end_row])
@@ -103,7 +102,6 @@ class Sorter:
     """Keys, values and scratch for one stable sort, and for a sum."""
 
     def __init__(self, queue: Queue, count: int, device: torch.device, *, summed: int = 0) -> None:
-        """Allocate for sorting `count` items and summing over `summed`."""
         self.queue, self.count = queue, count
         self.keys = torch.empty(count, dtype=torch.int32, device=device)
         self.sorted_keys, self.values = torch.empty_like(self.keys), torch.empty_like(self.keys)

@@ -23,6 +23,16 @@ from padgs.sphere.camera import RayTable
 Pixels = tuple[Tensor, Tensor, Tensor]  # image [H, W, 3], transmittance [H, W], depth [H, W]
 
 
+class Upstream(NamedTuple):
+    """What going back starts with, and the one gradient that is filled on the way."""
+
+    image: Tensor
+    transmittance: Tensor | None
+    depth: Tensor | None
+    rays: Tensor | None  # zeros of the shape of the table; added to
+    absolute: bool  # whether the absolute signal is asked for
+
+
 class Drawing(ABC):
     """One image of a native library, and what going back takes besides its pixels, which autograd keeps.
 
@@ -40,16 +50,8 @@ class Drawing(ABC):
         """The pixels, and which Gaussians [N] bool are visible; sets `counters` and `rays`."""
 
     @abstractmethod
-    def moments(
-        self,
-        pixels: Pixels,
-        background: Tensor,
-        upstream: list[Tensor | None],
-        grad_rays: Tensor | None,
-        *,
-        absolute: bool,
-    ) -> Tensor:
-        """Moments [N, MOMENTS] of all Gaussians, from the gradients of the pixels; adds to the gradient of the rays."""
+    def moments(self, pixels: Pixels, background: Tensor, upstream: Upstream) -> Tensor:
+        """Moments [N, MOMENTS] of all Gaussians, from the gradients of the pixels."""
 
     @abstractmethod
     def project_backward(
@@ -109,10 +111,10 @@ class _Rasterize(torch.autograd.Function):
         *attributes, pose, background, image, transmittance, depth = ctx.saved_tensors
         drawing, needs = ctx.drawing, Leaves(*ctx.needs_input_grad[2:])
         grad_image = torch.zeros_like(image) if grad_image is None else grad_image.contiguous()
-        upstream = [grad_image, *(g if g is None else g.contiguous() for g in (grad_transmittance, grad_depth))]
+        grad_transmittance, grad_depth = (g if g is None else g.contiguous() for g in (grad_transmittance, grad_depth))
         grad_rays = torch.zeros_like(drawing.rays.table) if needs.table else None
-        pixels = (image, transmittance, depth)
-        moments = drawing.moments(pixels, background, upstream, grad_rays, absolute=needs.absolute_probe)
+        upstream = Upstream(grad_image, grad_transmittance, grad_depth, grad_rays, needs.absolute_probe)
+        moments = drawing.moments((image, transmittance, depth), background, upstream)
         inputs = Inputs(len(moments), *map(pointer, attributes))
         gradients = [None if t is None else torch.empty_like(t) for t in attributes]
         of_pose = drawing.project_backward(inputs, pose, moments, gradients, needs_pose=needs.cam_from_world)

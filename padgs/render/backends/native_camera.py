@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -23,8 +23,7 @@ PROJECTIONS = ("erp", "pinhole", "tangent", "ray")  # numbered as in csrc/abi.h
 MODELS = (Panorama, Pinhole, RayTable)
 
 
-@dataclass(frozen=True)
-class NativeRays:
+class NativeRays(NamedTuple):
     """The tensors behind a `RayPointers`, which only points to them."""
 
     column_sine: Tensor | None = None  # [padded W]
@@ -35,9 +34,7 @@ class NativeRays:
 
     def native(self) -> RayPointers:
         """Pointers to the tensors; they must outlive it."""
-        return RayPointers(
-            *map(pointer, (self.column_sine, self.column_cosine, self.row_sine, self.row_cosine, self.table))
-        )
+        return RayPointers(*map(pointer, self))
 
 
 def native_camera(cam_from_world: Tensor, camera: Camera, options: RenderOptions) -> NativeCamera:

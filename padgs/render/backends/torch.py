@@ -22,7 +22,7 @@ PAIRS_PER_BLOCK = 1 << 21  # (pixel, Gaussian) pairs held at once
 def rasterize(request: Request) -> Rendering:
     """Render by brute force: every pixel against every visible Gaussian."""
     gaussians, camera, options, background = request.gaussians, request.camera, request.options, request.background
-    footprints = project(gaussians, request.cam_from_world, camera, options, request.probe)
+    footprints = project(request)
     order = torch.argsort(footprints.depths.detach(), stable=True)
     order = order[footprints.visible[order]]
     if options.memory_cap is not None and footprints.boxes is not None:

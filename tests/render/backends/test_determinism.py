@@ -13,7 +13,7 @@ import torch
 from render_cases import camera_of, leaves, mixture, needs_native, random_pose, view_of
 from torch import Tensor
 
-from padgs.anchors.decoder import Decoder, decode_gaussians
+from padgs.anchors.decoder import Decoder, SeenAnchors, decode_gaussians
 from padgs.learning.loss import photometric_loss
 from padgs.native import cpu
 from padgs.render import RenderOptions, render
@@ -65,10 +65,9 @@ def decoded(anchors: int = 3000) -> dict[str, Tensor]:
     weights = Decoder(36, 10, generator=generator).weights()
     leaf = {"features": randn(anchors, 32), "offsets": randn(anchors, 10, 3), "log_scales": 0.3 * randn(anchors, 6)}
     leaf = {key: value.requires_grad_() for key, value in leaf.items()}
-    gaussians, slots, raw = decode_gaussians(
-        weights, leaf["features"], randn(anchors, 4), randn(anchors, 3), leaf["offsets"], leaf["log_scales"],
-        torch.rand(anchors, generator=generator),
-    )  # fmt: skip
+    seen, positions, attenuation = randn(anchors, 4), randn(anchors, 3), torch.rand(anchors, generator=generator)
+    tensors = SeenAnchors(seen=seen, positions=positions, attenuation=attenuation, **leaf)
+    gaussians, slots, raw = decode_gaussians(weights, tensors)
     loss = sum((value * randn(*value.shape)).sum() for value in vars(gaussians).values())
     flat = [*leaf.values(), *(tensor for head in weights for tensor in head)]
     gradients = torch.autograd.grad(loss, flat)

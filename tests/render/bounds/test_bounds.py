@@ -13,6 +13,7 @@ from native_tiles import pixel_boxes
 from render_cases import (
     KINDS,
     ODD_SIZES,
+    RELEASED,
     SETUPS,
     camera_of,
     chosen,
@@ -27,7 +28,7 @@ from render_cases import (
 from torch import Tensor
 
 from padgs.gaussians import Gaussians
-from padgs.render import RELEASED, RenderOptions, render
+from padgs.render import RenderOptions, render
 from padgs.render.contract import ALPHA_MIN
 from padgs.sphere.camera import Camera, Panorama, Pinhole
 from padgs.sphere.panorama import direction

@@ -8,11 +8,10 @@ from dataclasses import replace
 import pytest
 import torch
 from native_tiles import NativeTiles
-from render_cases import each_engine, identity_pose, needs_native
+from render_cases import each_engine, identity_pose, needs_native, projected
 
 from padgs.gaussians import Gaussians
 from padgs.render import RenderOptions, render
-from padgs.render.projection import project
 from padgs.render.published_bounds import instances
 from padgs.scene import View
 from padgs.sphere.camera import Panorama
@@ -44,7 +43,7 @@ def shell(distance: float, count: int = 2000, sigma: float = 0.1) -> Gaussians:
 def tiles_each(distance: float, options: RenderOptions, width: int) -> float:
     """Mean over the Gaussians, by the definition."""
     gaussians, camera = shell(distance), Panorama(width, width // 2)
-    footprints = project(gaussians, torch.eye(4), camera, options)
+    footprints = projected(gaussians, torch.eye(4), camera, options)
     assert footprints.boxes is not None
     return instances(footprints.boxes[footprints.visible], width, width // 2) / len(gaussians)
 
@@ -84,16 +83,16 @@ def test_the_fixed_low_pass_does_not_follow_the_image():
     by_width = {}
     for width in (256, 512):
         options = RenderOptions("tangent", low_pass_kind="fixed")
-        by_width[width] = project(shell(1, 5), torch.eye(4), Panorama(width, width // 2), options).whitening
+        by_width[width] = projected(shell(1, 5), torch.eye(4), Panorama(width, width // 2), options).whitening
     assert torch.equal(by_width[256], by_width[512])
     same = RenderOptions("tangent", low_pass=0.3 * (256 / (2 * math.pi) / 512) ** 2)
-    torch.testing.assert_close(project(shell(1, 5), torch.eye(4), Panorama(256, 128), same).whitening, by_width[256])
+    torch.testing.assert_close(projected(shell(1, 5), torch.eye(4), Panorama(256, 128), same).whitening, by_width[256])
 
 
 @each_engine
 def test_more_instances_than_the_memory_holds_are_refused_with_the_numbers(backend: str, dtype: torch.dtype):
     gaussians, view = shell(100, 50).to(dtype), View("far", identity_pose(), 128, 64)
-    footprints = project(gaussians, torch.eye(4, dtype=dtype), Panorama(128, 64), OP43DGS)
+    footprints = projected(gaussians, torch.eye(4, dtype=dtype), Panorama(128, 64), OP43DGS)
     assert footprints.boxes is not None
     needed = 24 * instances(footprints.boxes[footprints.visible], 128, 64)
     enough = replace(OP43DGS, memory_cap=needed)

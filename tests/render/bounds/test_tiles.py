@@ -14,6 +14,7 @@ from render_cases import (
     INPUTS,
     KINDS,
     ODD_SIZES,
+    RELEASED,
     SETUPS,
     camera_of,
     each_setup,
@@ -26,7 +27,7 @@ from render_cases import (
     view_of,
 )
 
-from padgs.render import RELEASED, RenderOptions, render
+from padgs.render import RenderOptions, render
 from padgs.render.contract import ALPHA_MIN
 from padgs.render.tiles import TILE
 from padgs.sphere.camera import Panorama

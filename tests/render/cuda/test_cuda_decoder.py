@@ -7,7 +7,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from padgs.anchors.decoder import Decoder, DecoderWeights, decode_gaussians, decode_padded, define_gaussians
+from padgs.anchors.decoder import (
+    Decoder,
+    DecoderWeights,
+    SeenAnchors,
+    decode_gaussians,
+    decode_padded,
+    define_gaussians,
+)
 from padgs.anchors.gpu_decoder import decode_on_gpu
 from padgs.anchors.precision import OF_GRADIENTS, reduced
 from padgs.gaussians import Gaussians
@@ -17,12 +24,14 @@ DEVICE = "cuda" if cuda_engine.ON_GPU else "cpu"
 LEARNED = ("features", "offsets", "log_scales")
 
 
-def on_gpu(weights: DecoderWeights, *tensors: Tensor, precision: str) -> tuple[Gaussians, Tensor, Tensor]:
+def on_gpu(
+    weights: DecoderWeights, anchors: SeenAnchors, precision: str = "float32"
+) -> tuple[Gaussians, Tensor, Tensor]:
     """What `decode_gaussians` does with tensors of a GPU."""
     if cuda_engine.ON_GPU:
-        return decode_gaussians(weights, *tensors, precision=precision)
+        return decode_gaussians(weights, anchors, precision)
     flat = tuple(tensor for head in weights for tensor in head)
-    *values, slots, raw = decode_on_gpu(flat, *tensors, dtype=reduced(precision))
+    *values, slots, raw = decode_on_gpu(flat, *anchors, dtype=reduced(precision))
     return Gaussians(*values), slots, raw
 
 
@@ -30,7 +39,7 @@ def decoded(
     function, tensors: dict[str, Tensor], decoder: Decoder, precision: str = "float32"
 ) -> tuple[Gaussians, Tensor, Tensor, dict]:
     leaves = {name: tensor.clone().requires_grad_(name in LEARNED) for name, tensor in tensors.items()}
-    gaussians, slots, raw = function(decoder.weights(), *leaves.values(), precision=precision)
+    gaussians, slots, raw = function(decoder.weights(), SeenAnchors(**leaves), precision)
     generator = torch.Generator().manual_seed(0)
     values = list(vars(gaussians).values())
     upstream = [torch.randn(value.shape, generator=generator).to(value) for value in values]
@@ -85,14 +94,14 @@ def test_reduced_precisions_match_the_definition_and_stay_near_float32(precision
             assert (getattr(ours, name) - value).norm() < limit * value.norm(), name
         for name, expected in true_gradients.items():
             assert (gradients[name] - expected).norm() < of_gradients * expected.norm(), name
-    exact = on_gpu(decoder.weights(), *tensors.values(), precision="float32")[0]
+    exact = on_gpu(decoder.weights(), SeenAnchors(**tensors))[0]
     assert torch.equal(ours.means, exact.means) and not torch.equal(ours.colors, exact.colors)
 
 
 def test_padded_decoding_is_the_same_with_zeros_behind(generator: torch.Generator):
     tensors, decoder = problem(60, 10, 37, 32, generator)
-    exact = on_gpu(decoder.weights(), *tensors.values(), precision="float32")[0]
-    padded = decode_padded(decoder.weights(), *tensors.values(), precision="float32")
+    exact = on_gpu(decoder.weights(), SeenAnchors(**tensors))[0]
+    padded = decode_padded(decoder.weights(), SeenAnchors(**tensors))
     count = len(exact)
     assert 0 < count < len(padded) == 600
     for name, value in vars(exact).items():
@@ -102,7 +111,7 @@ def test_padded_decoding_is_the_same_with_zeros_behind(generator: torch.Generato
 def test_padded_decoding_elsewhere_is_refused(generator: torch.Generator):
     tensors, decoder = problem(3, 10, 37, 32, generator)
     with pytest.raises(ValueError, match="only a GPU decodes without counting, and float32; got torch.float64 on "):
-        decode_padded(decoder.weights(), *(tensor.double() for tensor in tensors.values()), precision="float32")
+        decode_padded(decoder.weights(), SeenAnchors(*(tensor.double() for tensor in tensors.values())))
 
 
 def test_nothing_selected_is_no_gaussians(generator: torch.Generator):
@@ -118,5 +127,5 @@ def test_nothing_selected_is_no_gaussians(generator: torch.Generator):
         "attenuation": (),
     }
     tensors = {name: torch.zeros(9, *shape, device=DEVICE) for name, shape in shapes.items()}
-    gaussians, slots, raw = on_gpu(decoder.weights(), *tensors.values(), precision="float32")
+    gaussians, slots, raw = on_gpu(decoder.weights(), SeenAnchors(**tensors))
     assert len(gaussians) == len(slots) == 0 and (raw < 0).all()
