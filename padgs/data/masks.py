@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 import torch
 from torch import Tensor
 
-from padgs.data.capture import Capture, Frame
+from padgs.data.capture import Capture
 from padgs.data.errors import DataError
 from padgs.data.images import EXTENSIONS, ImageFile, inspect, save_png
 from padgs.data.store import ImageStore, StoredImage
@@ -81,6 +81,7 @@ def find_masks(
     masks: list[Mask | None] = []
     digests = [spec] if rule else []
     inspected: dict[Path, ImageFile] = {}
+    shown: set[StoredImage | None] = set()  # that are known to show something
     for frame, image, (width, height) in zip(capture.frames, images, sizes, strict=True):
         path = files.get(frame.name)
         if path is None:
@@ -94,22 +95,13 @@ def find_masks(
                 f"{path} is {mask_file.width}x{mask_file.height} but {image.path.name} is "
                 f"{image.width}x{image.height}; a mask must have the size of its image"
             )
-        masks.append(Mask(StoredImage(path, width, height, store, "L"), rows.get(height)))
+        mask = Mask(StoredImage(path, width, height, store, "L"), rows.get(height))
+        if mask.file not in shown and not mask().any():
+            raise DataError(f"{path} hides every pixel of {frame.name}; in a mask 255 means use, 0 means ignore")
+        shown.add(mask.file)
+        masks.append(mask)
         digests.append(f"{frame.name}:{mask_file.digest}")
-    _refuse_empty(masks, capture.frames)
     return masks, digests, notes
-
-
-def _refuse_empty(masks: Sequence[Mask | None], frames: Sequence[Frame]) -> None:
-    seen: set[StoredImage | None] = set()
-    for mask, frame in zip(masks, frames, strict=True):
-        if mask is None or mask.file is None or mask.file in seen:
-            continue
-        seen.add(mask.file)
-        if not mask().any():
-            raise DataError(
-                f"{mask.file.path} hides every pixel of {frame.name}; in a mask 255 means use, 0 means ignore"
-            )
 
 
 def _mask_files(capture: Capture, given: Path | None) -> tuple[dict[str, Path], str | None]:

@@ -19,6 +19,7 @@ from padgs.data.capture import Capture, Cloud, Frame, Tracks
 from padgs.data.errors import DataError, listed
 from padgs.data.formats.colmap_binary import check_whole
 from padgs.data.formats.poses import cam_from_world
+from padgs.data.images import read_bytes
 from padgs.data.options import DataOptions
 from padgs.data.splits import check_inside
 
@@ -58,7 +59,8 @@ def read(path: Path, options: DataOptions, model: Path | None = None) -> Capture
     reconstruction = _open(model, str(suffix))
     images = [image for _, image in sorted(reconstruction.images.items()) if image.has_pose]
     notes = _part_notes(path, model)
-    names = _names(model) if suffix == ".txt" else {}
+    # pycolmap ends the names of text models at the first space.
+    names = {int(line[0]): line[9] for line in image_lines(model / "images.txt")} if suffix == ".txt" else {}
     without = [image.name for image in reconstruction.images.values() if not image.has_pose]
     if without:
         notes.append(f"{len(without)} images of the model are not registered: {listed(sorted(without))}")
@@ -95,6 +97,23 @@ def cloud_of(reconstruction: Any) -> tuple[Cloud, dict[int, int]]:
     return cloud, {point_id: row for row, point_id in enumerate(ids)}
 
 
+def image_lines(file: Path) -> list[list[str]]:
+    """The ten fields of every image in images.txt; each has a second line, its observations, which may be empty.
+
+    Raises:
+        DataError: not there, or a line with fewer fields.
+    """
+    lines = iter(read_bytes(file).decode("utf-8", "surrogateescape").splitlines())
+    found = []
+    for line in lines:
+        if line.strip() and not line.startswith("#"):
+            found.append(line.strip().split(None, 9))
+            next(lines, None)
+            if len(found[-1]) < 10:
+                raise DataError(f"{file}: the line {line[:60]!r} has {len(found[-1])} fields; an image has 10")
+    return found
+
+
 def _suffix(folder: Path) -> str | None:
     return next((end for end in (".bin", ".txt") if (folder / f"images{end}").is_file()), None)
 
@@ -126,18 +145,6 @@ def _open(model: Path, suffix: str) -> Any:
     except (ValueError, IndexError, RuntimeError, OSError) as error:
         raise DataError(f"pycolmap cannot read the COLMAP model {model}: {error}; export the model again") from error
     return reconstruction
-
-
-def _names(model: Path) -> dict[int, str]:
-    """Image id -> name. pycolmap ends the names of text models at the first space."""
-    lines = iter((model / "images.txt").read_text(encoding="utf-8", errors="surrogateescape").splitlines())
-    names = {}
-    for line in lines:
-        fields = line.split(None, 9)
-        if fields and not line.startswith("#") and len(fields) == 10 and fields[0].isdecimal():
-            names[int(fields[0])] = fields[9].rstrip()
-            next(lines, None)  # its observations
-    return names
 
 
 def _frame(image: Any, name: str, folder: Path, model: Path) -> Frame:

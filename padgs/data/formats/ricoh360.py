@@ -14,6 +14,7 @@ from padgs.data.assemble import image_folder, image_names
 from padgs.data.capture import Capture, Cloud, Frame
 from padgs.data.cloud import existing_ply
 from padgs.data.errors import DataError
+from padgs.data.formats.colmap import image_lines
 from padgs.data.formats.poses import cam_from_world, rotation_from_quaternion
 from padgs.data.options import DataOptions
 from padgs.data.splits import check_inside, read_lines
@@ -28,11 +29,8 @@ def read(path: Path, options: DataOptions) -> Capture:
     files.pop("mask", None)
     file = path / MODEL / "images.txt"
     frames = []
-    for line in _pose_lines(file):
-        fields = line.split(None, 9)
-        if len(fields) < 10:
-            raise DataError(f"{file}: the line {line[:60]!r} has {len(fields)} fields; an image has 10")
-        name = check_inside(fields[9].strip(), str(file))
+    for fields in image_lines(file):
+        name = check_inside(fields[9], str(file))
         name = files.get(str(PurePosixPath(name).with_suffix("")), name)
         where = f"{name} in {file}"
         try:
@@ -47,17 +45,6 @@ def read(path: Path, options: DataOptions) -> Capture:
         cloud = _cloud(points)
     mask = "imgs/mask.png" if (path / "imgs" / "mask.png").is_file() else "auto"
     return Capture("ricoh360", path, images, tuple(frames), cloud, mask=mask)
-
-
-def _pose_lines(file: Path) -> list[str]:
-    """The first line of each pair; the second one, the observations, may be empty."""
-    lines = iter(read_lines(file))
-    poses = []
-    for line in lines:
-        if line.strip() and not line.startswith("#"):
-            poses.append(line)
-            next(lines, None)
-    return poses
 
 
 def _cloud(file: Path) -> Cloud | None:
