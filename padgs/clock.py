@@ -101,7 +101,7 @@ def machine(device: Device = "cpu") -> dict[str, Any]:
     """What a measurement needs to be read later: hardware, versions, code, date."""
     gpu = torch.device(device) if torch.device(device).type == "cuda" else None
     return {
-        "cpu": _cpu_model(),
+        "cpu": _linux("/proc/cpuinfo", "model name") or platform.processor() or platform.machine(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "threads": torch.get_num_threads(),
         "memory": os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
@@ -137,20 +137,19 @@ def _git(folder: Path, *arguments: str) -> str | None:
 def _peak_resident() -> int:
     # VmHWM and not ru_maxrss where there is one: ru_maxrss survives exec, so a process that a large one started
     # reports its parent's peak.
-    try:
-        status = Path("/proc/self/status").read_text()
-        return next(int(line.split()[1]) * 1024 for line in status.splitlines() if line.startswith("VmHWM"))
-    except (OSError, StopIteration):
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        return peak if sys.platform == "darwin" else peak * 1024
+    if found := _linux("/proc/self/status", "VmHWM"):
+        return int(found.split()[0]) * 1024
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
 
 
-def _cpu_model() -> str:
+def _linux(file: str, key: str) -> str:
+    """The first value that a file of the kernel has under a key; empty elsewhere."""
     try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor() or platform.machine()
+        lines = Path(file).read_text().splitlines()
+    except OSError:
+        return ""
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith(key)), "")
 
 
 def _package_version() -> str | None:

@@ -39,8 +39,9 @@ import torch
 from padgs import clock
 from padgs.bench import goals, isas, ratios, tile_counts
 from padgs.bench.ceilings import Ceiling, measure_ceilings
-from padgs.bench.sized import add_size_floors, measure_size
-from padgs.bench.workload import SIZES, Size, build
+from padgs.bench.cost import add_floors
+from padgs.bench.sized import measure_size
+from padgs.bench.workload import SIZES, Size, build, refuse_unknown
 from padgs.native import cpu
 
 SCHEMA = 1
@@ -60,14 +61,11 @@ class BenchOptions:
     ceiling_seconds: float = 0.4
 
     def __post_init__(self) -> None:
-        """Reject what cannot be measured."""
-        unknown = [name for name in self.sizes if name not in SIZES]
-        if unknown or not self.sizes:
-            raise ValueError(f"unknown size {', '.join(unknown) or '(none)'}; known: {', '.join(SIZES)}")
-        if self.repeats < 1:
-            raise ValueError(f"repeats is {self.repeats}; it must be at least 1")
-        if self.threads is not None and self.threads < 1:
-            raise ValueError(f"threads is {self.threads}; it must be at least 1")
+        refuse_unknown(self.sizes)
+        for name in ("repeats", "threads"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"{name} is {value}; it must be at least 1")
 
 
 QUICK = BenchOptions(sizes=("quick",), repeats=3, ceiling_seconds=0.05)
@@ -128,7 +126,7 @@ def _judge(report: dict[str, Any], before: dict[str, Ceiling], after: dict[str, 
     best = {name: max(before[name], after[name], key=lambda c: c.per_cpu_second) for name in before}
     report["ceilings"] = {name: dataclasses.asdict(ceiling) for name, ceiling in best.items()}
     for size in report["sizes"].values():
-        add_size_floors(size, best)
+        add_floors(size, best)
     single = [size["iteration_1_thread"] for size in report["sizes"].values()]
     noise = {
         "limit": NOISE_LIMIT,
@@ -138,11 +136,9 @@ def _judge(report: dict[str, Any], before: dict[str, Ceiling], after: dict[str, 
     noise["worst"] = max(noise["parallel"], noise["single"])
     report["noise"], report["noisy"] = noise, noise["worst"] > NOISE_LIMIT
     work = report["sizes"][report["reference"]]
-    report["ratios"]["threads"] = {
-        "slow": {"what": "1 thread", **work["iteration_1_thread"]},
-        "fast": {"what": f"{report['machine']['threads']} threads", **work["iteration"]},
-        **{c: work["iteration_1_thread"][c]["min"] / work["iteration"][c]["min"] for c in ("wall", "cpu")},
-    }
+    report["ratios"]["threads"] = ratios.compared(
+        "1 thread", f"{report['machine']['threads']} threads", work["iteration_1_thread"], work["iteration"]
+    )
     report["targets"] = goals.judge(report)
 
 
