@@ -73,8 +73,8 @@ def test_files_that_are_named_exist(path):
 @pytest.mark.slow
 def test_the_smoke_experiment_runs_and_is_reported(tmp_path):
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    for module, arguments in (("run", ["+experiment=smoke"]), ("app", ["report", "runs"])):
-        command = [sys.executable, "-m", f"padgs.cli.{module}", *arguments]
+    for module, arguments in (("multirun.run", ["+experiment=smoke"]), ("cli.app", ["report", "runs"])):
+        command = [sys.executable, "-m", f"padgs.{module}", *arguments]
         done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
         assert done.returncode == 0, done.stderr
     assert "synthetic-room" in done.stdout

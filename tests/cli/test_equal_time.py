@@ -16,7 +16,7 @@ from padgs.multirun.composition import composing, settings_of
 from padgs.results import Result
 
 LINES = (
-    ("method=omnigs", "seed=3", "data.path=/a b/c", "data.width=512", "render.bounds=square"),
+    ("method=omnigs", "seed=3", "data.path=/a b/c", "render.bounds=square", "render.wrap=false"),
     ("method=padgs", "method.tau=0.8", "method.offset_rate=[0.1,0.2]", "train.max_seconds=10", "data.mask=none"),
     ("method=egonerf_small", "train.iterations=70", "run.threads=1", "data.generator.scene=outdoor"),
     ("method=sc_omnigs", "method.poses.rotation=0.5", "method.max_gaussians=null", "protocol.paper.bottom_crop=0.063"),
