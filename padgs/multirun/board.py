@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import json
 import time
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TextIO
 
 from padgs.results import replace_file
 from padgs.runs.watch import Watch
@@ -52,23 +53,19 @@ class Board:
     """The folder of one multirun."""
 
     def __init__(self, folder: Path) -> None:
-        """Nothing is written before there is something to say."""
         self.folder = folder
         self._looked, self._stop = -float("inf"), False
 
     def write(self, job: int, state: JobState) -> None:
         """Say what a job does; a full disk must not end it, so nothing is raised."""
-        try:
+        with suppress(OSError):
             self.folder.mkdir(parents=True, exist_ok=True)
             replace_file(self._path(job), json.dumps(asdict(state)).encode())
-        except OSError:
-            return
 
     def read(self, job: int) -> JobState:
         """What a job does; waiting, if it has not said anything."""
         try:
-            known: dict[str, Any] = json.loads(self._path(job).read_bytes())
-            return JobState(**known)
+            return JobState(**json.loads(self._path(job).read_bytes()))
         except (OSError, ValueError, TypeError):
             return JobState()
 

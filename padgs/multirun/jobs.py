@@ -22,8 +22,8 @@ from padgs.multirun.launchers import patient
 from padgs.multirun.overview import Overview, iterations_done, shown
 from padgs.results import Result, ResultError
 from padgs.runs.folder import cannot_write
+from padgs.runs.identity import labels
 from padgs.runs.interrupt import Interrupt, Interrupted
-from padgs.runs.labels import labels
 from padgs.runs.typed import typed
 from padgs.tracking.tracker import SECONDS_BETWEEN_LOOKS, Tracker, TrackingOptions
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -23,6 +22,7 @@ from padgs.learning.trainee import State
 from padgs.results import Result
 from padgs.runs import checkpoint
 from padgs.runs import lock as run_lock
+from padgs.scene import View
 from padgs.scoring.pictures import comparison
 
 
@@ -45,10 +45,9 @@ class RunFolder:
     """Reads and writes the files of one run."""
 
     def __init__(self, path: Path) -> None:
-        """Nothing is touched before it is needed."""
         self.path = path
         self.checkpoint = path / "checkpoint"
-        self.renders = path / "renders"
+        self.renders = path / results.PICTURES
         self._log = path / results.LOG_NAME
 
     def prepare(self, values: Mapping[str, Any]) -> None:
@@ -140,11 +139,10 @@ class RunFolder:
                 results.replace_file(self._log, "".join(json.dumps(line) + "\n" for line in kept).encode())
         return progress
 
-    def save_picture(self, name: str, truth: Tensor, image: Tensor) -> None:
-        """Save truth | render | error of the view `name`; images [H, W, 3]."""
-        path = self.renders / f"{re.sub(r'[^A-Za-z0-9._-]+', '-', name)}.png"
+    def save_picture(self, view: View, truth: Tensor, image: Tensor) -> None:
+        """Save truth | render | error of a view; images [H, W, 3]."""
         with self._writing():
-            Image.fromarray(comparison(truth, image)).save(path)
+            Image.fromarray(comparison(truth, image)).save(self.renders / results.picture_name(view.name))
 
     @contextmanager
     def _writing(self) -> Iterator[None]:

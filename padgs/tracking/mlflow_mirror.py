@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import pandas
 from omegaconf import OmegaConf
 
 from padgs import results
@@ -66,7 +67,8 @@ class Mirror:
     def _log_settings(self, identity: str, config: Any) -> None:
         from mlflow.entities import Param
 
-        params = [Param(key, str(value)[:LONGEST_VALUE]) for key, value in flat(config)]
+        (flat,) = pandas.json_normalize(config).to_dict("records")  # with dotted keys
+        params = [Param(str(key), str(value)[:LONGEST_VALUE]) for key, value in flat.items()]
         for batch in batches(params, MOST_PARAMS):
             self._client.log_batch(identity, params=batch)
 
@@ -104,19 +106,6 @@ class Mirror:
         table = runs(Gathered(frame(map(Run, found)), Request(mix=True)))
         self._client.log_text(identity, markdown.text(table), "tables/runs.md")
         self._client.log_text(identity, csv_text.text(table), "tables/runs.csv")
-
-
-def flat(values: Mapping[str, Any], where: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted keys and values of a configuration.
-
-    >>> list(flat({"a": {"b": 1}, "c": [2]}))
-    [('a.b', 1), ('c', [2])]
-    """
-    for key, value in values.items():
-        if isinstance(value, Mapping):
-            yield from flat(value, f"{where}{key}.")
-        else:
-            yield f"{where}{key}", value
 
 
 def final_numbers(result: Result) -> dict[str, float]:
