@@ -14,7 +14,8 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
 from typing import Any, TypedDict, TypeVar
@@ -38,6 +39,17 @@ def timed(work: Callable[[], T], device: Device = "cpu") -> tuple[T, float]:
     value = work()
     synchronise(device)
     return value, time.perf_counter() - start
+
+
+@contextmanager
+def threads(count: int) -> Iterator[None]:
+    """Within it torch works with so many threads."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def measure(
@@ -94,7 +106,11 @@ class Peak(TypedDict):
 def peak_memory(device: Device = "cpu") -> Peak:
     """The peaks since `reset_peak_memory` or the start."""
     on_device = torch.cuda.max_memory_allocated(device) if torch.device(device).type == "cuda" else None
-    return {"host": _peak_resident(), "device": on_device}
+    # VmHWM and not ru_maxrss where there is one: ru_maxrss survives exec, so a process that a large one started
+    # reports its parent's peak.
+    kilobytes = int(_linux("/proc/self/status", "VmHWM").partition(" ")[0] or 0)
+    other = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    return {"host": 1024 * kilobytes or other, "device": on_device}
 
 
 def machine(device: Device = "cpu") -> dict[str, Any]:
@@ -132,15 +148,6 @@ def _git(folder: Path, *arguments: str) -> str | None:
     except (OSError, subprocess.TimeoutExpired):
         return None
     return done.stdout.strip() if done.returncode == 0 else None
-
-
-def _peak_resident() -> int:
-    # VmHWM and not ru_maxrss where there is one: ru_maxrss survives exec, so a process that a large one started
-    # reports its parent's peak.
-    if found := _linux("/proc/self/status", "VmHWM"):
-        return int(found.split()[0]) * 1024
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024
 
 
 def _linux(file: str, key: str) -> str:

@@ -56,7 +56,6 @@ class Stopwatch:
     """Marks on the device's own time line."""
 
     def __init__(self, device: torch.device) -> None:
-        """For one device."""
         self.device = device
 
     def mark(self) -> Any:
@@ -76,7 +75,6 @@ class OnDevice:
     """A workload that is drawn and trained on a device."""
 
     def __init__(self, work: Workload, options: RenderOptions, device: torch.device) -> None:
-        """Take the workload to the device."""
         work.model.to(device)
         self.work, self.options, self.device = work, options, device
         self.backend = resolve_backend("auto", work.model.positions)

@@ -78,12 +78,8 @@ def measure_all(options: BenchOptions, progress: Callable[[str], None] = lambda 
         OSError: the native library is not there.
     """
     cpu.library()
-    threads_before = torch.get_num_threads()
-    torch.set_num_threads(options.threads or clock.machine()["cores"])
-    try:
+    with clock.threads(options.threads or clock.machine()["cores"]):
         return _measure_all(options, progress)
-    finally:
-        torch.set_num_threads(threads_before)
 
 
 def _measure_all(options: BenchOptions, progress: Callable[[str], None]) -> dict[str, Any]:
@@ -101,7 +97,8 @@ def _measure_all(options: BenchOptions, progress: Callable[[str], None]) -> dict
     progress("decoding 10 000 anchors")
     decode = _decode_forward(options)
     progress("the same work in two ways")
-    reference = _reference(options.sizes)
+    # The largest size up to the medium one, if any: beyond it, doing things in several ways takes too long.
+    reference = next(name for name in ("medium", "small", "quick", "large") if name in options.sizes)
     pairs = ratios.ratios(build(SIZES[reference], options.seed), build(SIZES["quick"], options.seed), options.repeats)
     report: dict[str, Any] = {
         "schema": SCHEMA,
@@ -140,13 +137,6 @@ def _judge(report: dict[str, Any], before: dict[str, Ceiling], after: dict[str, 
         "1 thread", f"{report['machine']['threads']} threads", work["iteration_1_thread"], work["iteration"]
     )
     report["targets"] = goals.judge(report)
-
-
-def _reference(sizes: tuple[str, ...]) -> str:
-    """The largest size up to the medium one, if any: beyond it, doing things in several ways takes too long."""
-    ascending = sorted(sizes, key=lambda name: SIZES[name].gaussians)
-    fitting = [name for name in ascending if SIZES[name].gaussians <= SIZES["medium"].gaussians]
-    return fitting[-1] if fitting else ascending[0]
 
 
 def _decode_forward(options: BenchOptions) -> dict[str, Any]:

@@ -36,7 +36,8 @@ def measure_size(
     iteration = clock.measure(lambda: next(records), repeats=repeats, warm_up=WARM_UP)
     peak["training"] = clock.peak_memory()["host"]
     progress("whole iterations on one thread")
-    iteration_1_thread = _on_one_thread(lambda: clock.measure(lambda: next(records), repeats=repeats, warm_up=1))
+    with clock.threads(1):
+        iteration_1_thread = clock.measure(lambda: next(records), repeats=repeats, warm_up=1)
     progress("stages")
     clock_of_stages = measured(work, repeats, WARM_UP)
     event = growing(work, ADAPT_EVENTS)
@@ -65,15 +66,6 @@ def measure_size(
 def _frame(work: Workload) -> Rendering:
     with torch.no_grad():
         return render(work.model.decode(work.view).gaussians, work.view, OPTIONS, backend="cpu")
-
-
-def _on_one_thread(work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        return work()
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _counters(work: Workload) -> dict[str, Any]:
