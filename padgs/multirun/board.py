@@ -13,18 +13,17 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TextIO
 
-from padgs.results import replace_file
-from padgs.runs.watch import Watch
+from padgs.results import STATUSES, replace_file
+from padgs.runs.session import Watch
 
 FOLDER = ".multirun"  # in run.folder
 WAITING, RUNNING, OK = "waiting", "running", "ok"
-# Ends of a job beside the statuses of results:
+# Ends of a job beside the statuses of results, without any:
 REFUSED = "refused"  # the configuration or the data cannot be used; there is no run
 CRASHED = "crashed"  # an error of ours; the traceback is in the job's output
 KILLED = "killed"  # its process died
 ELSEWHERE = "elsewhere"  # another process works on this run
 STOPPED = "stopped"  # it was asked to, and wrote its checkpoint
-UNFINISHED = (REFUSED, CRASHED, KILLED, ELSEWHERE, STOPPED)  # there is no result
 SECONDS_BETWEEN_LOOKS = 1.0  # for `stop`
 
 
@@ -46,7 +45,7 @@ class JobState:
     @property
     def finished(self) -> bool:
         """Whether there is a result, good or bad."""
-        return self.ended and self.status not in UNFINISHED
+        return self.status in STATUSES
 
 
 class Board:

@@ -20,8 +20,7 @@ from padgs.runs.checkpoint import CheckpointError
 from padgs.runs.folder import RunFolderError
 from padgs.runs.interrupt import Interrupted
 from padgs.runs.lock import RunBusy
-from padgs.runs.session import Session
-from padgs.runs.watch import Watch
+from padgs.runs.session import Session, Watch
 from padgs.tracking.tracker import SECONDS_BETWEEN_LOOKS, Tracker
 
 EXPECTED = (ValueError, OSError, CheckpointError, RunFolderError, RunBusy)  # a traceback would only hide what they say

@@ -20,8 +20,7 @@ def missing_plugin(arguments: Sequence[str]) -> str | None:
 
     >>> missing_plugin(["method=padgs", "seed=0,1"])
     """
-    wanted = [argument.partition("=")[2] for argument in arguments if argument.startswith("launcher=")]
-    for name in wanted:
+    for name in (argument.partition("=")[2] for argument in arguments if argument.startswith("launcher=")):
         module, extra = PACKAGES.get(name, ("padgs", ""))
         try:
             found = importlib.util.find_spec(module) is not None

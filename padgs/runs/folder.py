@@ -98,12 +98,8 @@ class RunFolder:
 
     def log(self, record: Record, psnr: float | None) -> None:
         """Append a line to log.jsonl; `psnr` of the held-out view, where it was measured."""
-        line: dict[str, Any] = {
-            "iteration": record.iteration,
-            "loss": float(record.loss),
-            "seconds": round(record.seconds, 4),
-            **record.counts,
-        }
+        line: dict[str, Any] = {"iteration": record.iteration, "loss": float(record.loss)}
+        line |= {"seconds": round(record.seconds, 4), **record.counts}
         if psnr is not None:
             line["psnr"] = psnr
         if record.events:

@@ -43,7 +43,7 @@ class Mirror:
         identity = self._find(RUN, run.name)
         if identity is None:
             identity = self._create(RUN, run.name, {PARENT: self._parent} if self._parent else {})
-            self._log_settings(identity, OmegaConf.to_container(OmegaConf.load(run / "config.yaml")))
+            self._log_settings(identity, run)
         self._log_progress(identity, run)
         if (run / results.FILE_NAME).exists():
             self._log_result(identity, run, results.read(run / results.FILE_NAME))
@@ -64,9 +64,10 @@ class Mirror:
         tags = {tag: name, **(more or {})}
         return self._client.create_run(self._experiment, run_name=name, tags=tags).info.run_id
 
-    def _log_settings(self, identity: str, config: Any) -> None:
+    def _log_settings(self, identity: str, run: Path) -> None:
         from mlflow.entities import Param
 
+        config: Any = OmegaConf.to_container(OmegaConf.load(run / "config.yaml"))
         (flat,) = pandas.json_normalize(config).to_dict("records")  # with dotted keys
         params = [Param(str(key), str(value)[:LONGEST_VALUE]) for key, value in flat.items()]
         for batch in batches(params, MOST_PARAMS):
