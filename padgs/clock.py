@@ -15,10 +15,10 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import metadata
 from pathlib import Path
-from typing import Any, TypedDict, TypeVar
+from typing import Any, TypeVar
 
 import torch
 
@@ -90,21 +90,12 @@ def reset_peak_memory(device: Device = "cpu") -> None:
     """Forget the peak so far, so that several runs in one process are told apart (host: Linux only)."""
     if torch.device(device).type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
-    try:
+    with suppress(OSError):  # not Linux, or not allowed: the peak is that of the whole process
         Path("/proc/self/clear_refs").write_text("5")
-    except OSError:
-        return  # not Linux, or not allowed: the peak is that of the whole process
 
 
-class Peak(TypedDict):
-    """Memory in bytes."""
-
-    host: int  # of the process
-    device: int | None  # of its tensors on the device; None on the CPU
-
-
-def peak_memory(device: Device = "cpu") -> Peak:
-    """The peaks since `reset_peak_memory` or the start."""
+def peak_memory(device: Device = "cpu") -> dict[str, Any]:
+    """Bytes at the peak, since `reset_peak_memory` or the start: of the process, and of tensors on a GPU, or None."""
     on_device = torch.cuda.max_memory_allocated(device) if torch.device(device).type == "cuda" else None
     # VmHWM and not ru_maxrss where there is one: ru_maxrss survives exec, so a process that a large one started
     # reports its parent's peak.

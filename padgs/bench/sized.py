@@ -20,9 +20,7 @@ ADAPT_EVENTS = 2
 WARM_UP = 2
 
 
-def measure_size(
-    size: Size, repeats: int, seed: int = 0, progress: Callable[[str], None] = lambda _: None
-) -> dict[str, Any]:
+def measure_size(size: Size, repeats: int, seed: int, progress: Callable[[str], None]) -> dict[str, Any]:
     """All of one workload, in the layout of `padgs.bench.report`; `padgs.bench.cost` adds floors."""
     repeats = min(repeats, FEW_REPEATS) if size.gaussians >= MANY else repeats
     clock.reset_peak_memory()

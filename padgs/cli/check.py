@@ -57,14 +57,11 @@ def lines(report: Report) -> list[str]:
             f"  camera path    {report.path_length:.4g} long; median depth {report.median_depth:.4g}",
         ]
     if report.gravity is not None:
-        found = report.gravity
+        found, text = report.gravity, "the cameras have no common up direction"
         if found.agreement > 0.5:
-            out.append(
-                f"  gravity        up is {found.axis} within {found.off_axis:.1f} degrees; cameras tilt by "
-                f"{found.tilt:.1f} degrees (median)"
-            )
-        else:
-            out.append("  gravity        the cameras have no common up direction")
+            text = f"up is {found.axis} within {found.off_axis:.1f} degrees; "
+            text += f"cameras tilt by {found.tilt:.1f} degrees (median)"
+        out.append(f"  gravity        {text}")
     if report.reprojection_median is not None:
         out.append(
             f"  reprojection   {report.reprojection_median:.2f} pixels median, {report.reprojection_95:.2f} at 95 % "

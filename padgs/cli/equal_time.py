@@ -44,12 +44,9 @@ def equal_time(
     for error in broken:
         print(f"left out: {error}", file=sys.stderr)
     methods = Gathered(frame(map(Run, found)), Request(experiment=experiment)).chosen("methods")
-    known = {
-        result.run: result for result in found if result.run in set(methods["run"]) or EXPERIMENT in result.experiments
-    }
-    usable = [
-        result for result in known.values() if result.ok and not result.variant and result.timing.get("train_seconds")
-    ]
+    chosen = set(methods["run"])
+    known = [result for result in found if result.run in chosen or EXPERIMENT in result.experiments]
+    usable = [result for result in known if result.ok and not result.variant and result.timing.get("train_seconds")]
     if not usable:
         raise ReportError(
             f"no run in {folder} has ended well; run the methods first, "
