@@ -14,10 +14,11 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from importlib import metadata
 from pathlib import Path
-from typing import Any, TypedDict, TypeVar
+from typing import Any, TypeVar
 
 import torch
 
@@ -38,6 +39,17 @@ def timed(work: Callable[[], T], device: Device = "cpu") -> tuple[T, float]:
     value = work()
     synchronise(device)
     return value, time.perf_counter() - start
+
+
+@contextmanager
+def threads(count: int) -> Iterator[None]:
+    """Within it torch works with so many threads."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def measure(
@@ -78,30 +90,25 @@ def reset_peak_memory(device: Device = "cpu") -> None:
     """Forget the peak so far, so that several runs in one process are told apart (host: Linux only)."""
     if torch.device(device).type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
-    try:
+    with suppress(OSError):  # not Linux, or not allowed: the peak is that of the whole process
         Path("/proc/self/clear_refs").write_text("5")
-    except OSError:
-        return  # not Linux, or not allowed: the peak is that of the whole process
 
 
-class Peak(TypedDict):
-    """Memory in bytes."""
-
-    host: int  # of the process
-    device: int | None  # of its tensors on the device; None on the CPU
-
-
-def peak_memory(device: Device = "cpu") -> Peak:
-    """The peaks since `reset_peak_memory` or the start."""
+def peak_memory(device: Device = "cpu") -> dict[str, Any]:
+    """Bytes at the peak, since `reset_peak_memory` or the start: of the process, and of tensors on a GPU, or None."""
     on_device = torch.cuda.max_memory_allocated(device) if torch.device(device).type == "cuda" else None
-    return {"host": _peak_resident(), "device": on_device}
+    # VmHWM and not ru_maxrss where there is one: ru_maxrss survives exec, so a process that a large one started
+    # reports its parent's peak.
+    kilobytes = int(_linux("/proc/self/status", "VmHWM").partition(" ")[0] or 0)
+    other = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    return {"host": 1024 * kilobytes or other, "device": on_device}
 
 
 def machine(device: Device = "cpu") -> dict[str, Any]:
     """What a measurement needs to be read later: hardware, versions, code, date."""
     gpu = torch.device(device) if torch.device(device).type == "cuda" else None
     return {
-        "cpu": _cpu_model(),
+        "cpu": _linux("/proc/cpuinfo", "model name") or platform.processor() or platform.machine(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "threads": torch.get_num_threads(),
         "memory": os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
@@ -134,23 +141,13 @@ def _git(folder: Path, *arguments: str) -> str | None:
     return done.stdout.strip() if done.returncode == 0 else None
 
 
-def _peak_resident() -> int:
-    # VmHWM and not ru_maxrss where there is one: ru_maxrss survives exec, so a process that a large one started
-    # reports its parent's peak.
+def _linux(file: str, key: str) -> str:
+    """The first value that a file of the kernel has under a key; empty elsewhere."""
     try:
-        status = Path("/proc/self/status").read_text()
-        return next(int(line.split()[1]) * 1024 for line in status.splitlines() if line.startswith("VmHWM"))
-    except (OSError, StopIteration):
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        return peak if sys.platform == "darwin" else peak * 1024
-
-
-def _cpu_model() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor() or platform.machine()
+        lines = Path(file).read_text().splitlines()
+    except OSError:
+        return ""
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith(key)), "")
 
 
 def _package_version() -> str | None:

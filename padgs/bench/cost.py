@@ -1,12 +1,12 @@
 """What each stage has to do at least, in operations and bytes, and how long that takes at the machine's ceilings.
 
-Symbols: A anchors, N Gaussians decoded, I tile instances, E evaluated pairs, P pixels. One lane of one vector
-instruction counts as 2 operations, because at the ceiling it would be a multiply-add.
+Symbols: A anchors, N Gaussians decoded, I tile instances, E evaluated pairs, P pixels, S scalars of the model. One lane
+of one vector instruction counts as 2 operations, because at the ceiling it would be a multiply-add.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from padgs.anchors.model import PaDGSOptions
@@ -32,11 +32,10 @@ class Cost:
         return (arithmetic, "arithmetic") if arithmetic >= memory else (memory, "memory")
 
 
-def costs(
-    *, anchors: int, gaussians: int, instances: int, evaluated: int, pixels: int, parameters: int, model: PaDGSOptions
-) -> dict[str, Cost]:
-    """Stage -> cost, for the stages that there is a model of."""
-    a, n, i, e, p = anchors, gaussians, instances, evaluated, pixels
+def costs(size: dict[str, Any]) -> dict[str, Cost]:
+    """Stage -> cost, for the stages that there is a model of; from the counters of a size in a report."""
+    model, counters, p = PaDGSOptions(), size["counters"], size["width"] * size["height"]
+    a, n, i, e, s = (counters[name] for name in ("anchors", "gaussians", "instances", "evaluated", "parameters"))
     # First layers of three networks, and 1 + 3 + 7 outputs per Gaussian in the second: 14.1 k in the paper's model.
     decode = 2 * a * model.hidden * (3 * model.inputs + 11 * model.offsets)
     return {
@@ -48,15 +47,18 @@ def costs(
         "blend_backward": Cost(2 * BLEND_BACKWARD_LANES * e, (76 + 128) * i + 36 * p),  # moments written and read
         "project_backward": Cost(1000 * n, 200 * n),
         "decode_backward": Cost(2 * decode, 568 * a + 112 * n),
-        "optimiser": Cost(ADAM_OPERATIONS * parameters, ADAM_BYTES * parameters),
+        "optimiser": Cost(ADAM_OPERATIONS * s, ADAM_BYTES * s),
     }
 
 
-def add_floors(stages: dict[str, dict[str, Any]], least: dict[str, Cost], ceilings: dict[str, Ceiling]) -> None:
-    """Write floor (CPU seconds), its bound, and the fraction of the ceiling that is reached beside each stage."""
-    for name, timing in stages.items():
-        if name in least:
-            seconds, bound = least[name].floor(ceilings)
-            timing["operations"], timing["bytes"] = least[name].operations, least[name].bytes
-            timing["floor"], timing["bound"] = seconds, bound
-            timing["fraction"] = seconds / timing["cpu"]["min"]
+def add_floors(size: dict[str, Any], ceilings: dict[str, Ceiling]) -> None:
+    """Write floor (CPU seconds), bound and fraction of the ceiling beside each stage of a size, and their sum."""
+    for name, cost in costs(size).items():
+        seconds, bound = cost.floor(ceilings)
+        size["stages"][name] |= {
+            **asdict(cost),
+            "floor": seconds,
+            "bound": bound,
+            "fraction": seconds / size["stages"][name]["cpu"]["min"],
+        }
+    size["floor"] = sum(timing.get("floor", 0.0) for timing in size["stages"].values())

@@ -6,71 +6,46 @@ with a handicap, which the report states and which nothing corrects for.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 REFERENCE_FMA = 263e9  # FLOP/s of a core
-MS, GIGA = 1e-3, 1e9
+SCALES = {"ms": 1e-3, "GB": 1e9, "G/s": 1e9}  # what is measured is in seconds, bytes, ...
 
 
 @dataclass(frozen=True)
 class Goal:
-    """One number to reach. `read` finds it in a report: a number, or a timing with a wall and a CPU clock."""
+    """One number to reach, and its place in a report: a number there, or a timing with a wall and a CPU clock."""
 
     name: str
     limit: float
     unit: str
     source: str
-    read: Callable[[dict[str, Any]], Any]
-    scale: float = 1.0  # what is read is divided by it, to be in `unit`
+    path: str
     at_least: bool = False  # else at most
-
-
-def _size(name: str, *path: str) -> Callable[[dict[str, Any]], Any]:
-    def read(report: dict[str, Any]) -> Any:
-        value = report["sizes"][name]
-        for key in path:
-            value = value[key]
-        return value
-
-    return read
-
-
-def _against_erp(projection: str) -> Callable[[dict[str, Any]], Any]:
-    return lambda report: report["ratios"][projection]["cpu"]
 
 
 FOUNDATION, RENDERER = "issue 2, speed and memory", "issue 3, speed and memory"
 METHODS = "issue 5, speed and memory"
 GOALS = (
-    Goal("draw and back, 512x256, 100k", 60, "ms", FOUNDATION, _size("medium", "render"), MS),
-    Goal("torch renderer / native", 30, "x", FOUNDATION, lambda r: r["ratios"]["torch_renderer"]["cpu"], at_least=True),
-    Goal("training iteration, 512x256, 100k", 120, "ms", FOUNDATION, _size("medium", "iteration"), MS),
-    Goal(
-        "memory of training, 2048x1024, 11 views", 6, "GB", FOUNDATION, _size("large", "peak_bytes", "training"), GIGA
-    ),
-    Goal("pairs blended per core", 2.5, "G/s", RENDERER, _size("medium", "rates", "forward"), GIGA, at_least=True),
-    Goal(
-        "pairs blended backward per core",
-        1.0,
-        "G/s",
-        RENDERER,
-        _size("medium", "rates", "backward"),
-        GIGA,
-        at_least=True,
-    ),
-    Goal("decode 10k anchors", 2, "ms", RENDERER, lambda r: r["decode_10k"], MS),
-    Goal("loss with gradient, 512x256", 8, "ms", RENDERER, _size("medium", "stages", "loss"), MS),
-    Goal("tiles per Gaussian, mean", 7, "tiles", RENDERER, lambda r: r["bounds"]["exact"]["mean"]),
-    Goal("tiles of any Gaussian", 600, "tiles", RENDERER, lambda r: r["bounds"]["exact"]["max"]),
-    Goal("training iteration, 512x256, 100k", 48, "ms", RENDERER, _size("medium", "iteration"), MS),
-    Goal("training iteration, 256x128, 20k", 11, "ms", RENDERER, _size("small", "iteration"), MS),
-    Goal("frame, 2048x1024, 1M", 250, "ms", RENDERER, _size("large", "frame"), MS),
-    Goal("memory of a frame, 2048x1024, 1M", 2, "GB", RENDERER, _size("large", "peak_bytes", "frame"), GIGA),
-    Goal("tangent / erp, draw and back", 1, "x", METHODS, _against_erp("tangent")),
-    Goal("ray / erp, draw and back", 1, "x", METHODS, _against_erp("ray")),
-    Goal("ray, hybrid / erp, draw and back", 1, "x", METHODS, _against_erp("hybrid")),
+    Goal("draw and back, 512x256, 100k", 60, "ms", FOUNDATION, "sizes.medium.render"),
+    Goal("torch renderer / native", 30, "x", FOUNDATION, "ratios.torch_renderer.cpu", at_least=True),
+    Goal("training iteration, 512x256, 100k", 120, "ms", FOUNDATION, "sizes.medium.iteration"),
+    Goal("memory of training, 2048x1024, 11 views", 6, "GB", FOUNDATION, "sizes.large.peak_bytes.training"),
+    Goal("pairs blended per core", 2.5, "G/s", RENDERER, "sizes.medium.rates.forward", at_least=True),
+    Goal("pairs blended backward per core", 1.0, "G/s", RENDERER, "sizes.medium.rates.backward", at_least=True),
+    Goal("decode 10k anchors", 2, "ms", RENDERER, "decode_10k"),
+    Goal("loss with gradient, 512x256", 8, "ms", RENDERER, "sizes.medium.stages.loss"),
+    Goal("tiles per Gaussian, mean", 7, "tiles", RENDERER, "bounds.exact.mean"),
+    Goal("tiles of any Gaussian", 600, "tiles", RENDERER, "bounds.exact.max"),
+    Goal("training iteration, 512x256, 100k", 48, "ms", RENDERER, "sizes.medium.iteration"),
+    Goal("training iteration, 256x128, 20k", 11, "ms", RENDERER, "sizes.small.iteration"),
+    Goal("frame, 2048x1024, 1M", 250, "ms", RENDERER, "sizes.large.frame"),
+    Goal("memory of a frame, 2048x1024, 1M", 2, "GB", RENDERER, "sizes.large.peak_bytes.frame"),
+    Goal("tangent / erp, draw and back", 1, "x", METHODS, "ratios.tangent.cpu"),
+    Goal("ray / erp, draw and back", 1, "x", METHODS, "ratios.ray.cpu"),
+    Goal("ray, hybrid / erp, draw and back", 1, "x", METHODS, "ratios.hybrid.cpu"),
 )
 
 
@@ -86,16 +61,16 @@ def judge(report: dict[str, Any]) -> list[dict[str, Any]]:
 
 def _judged(goal: Goal, report: dict[str, Any]) -> dict[str, Any]:
     try:
-        value = goal.read(report)
+        value: Any = reduce(lambda part, key: part[key], goal.path.split("."), report)
     except KeyError:
         value = None
-    undisturbed = None
+    scale = SCALES.get(goal.unit, 1.0)
+    undisturbed = measured = factor = None
     if isinstance(value, dict):
-        undisturbed = value["cpu"]["min"] / report["machine"]["threads"] / goal.scale
+        undisturbed = value["cpu"]["min"] / report["machine"]["threads"] / scale
         value = value["wall"]["median"]
-    measured = None if value is None else value / goal.scale
-    factor = None
-    if measured is not None:
+    if value is not None:
+        measured = value / scale
         factor = measured / goal.limit if goal.at_least else goal.limit / measured
     return {
         "name": goal.name,

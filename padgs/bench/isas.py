@@ -37,11 +37,8 @@ def by_instruction_set(size: Size, repeats: int, seed: int) -> dict[str, dict[st
     return found
 
 
-def _main(job: dict[str, Any]) -> None:
+if __name__ == "__main__":
+    job = json.loads(sys.argv[1])
     torch.set_num_threads(job["threads"])
     timing = render_both_ways(build(Size(**job["size"]), job["seed"]), job["repeats"])
     print(json.dumps({"isa": cpu.library().padgs_isa().decode(), **timing}))
-
-
-if __name__ == "__main__":
-    _main(json.loads(sys.argv[1]))

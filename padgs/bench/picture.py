@@ -31,12 +31,10 @@ LABEL_SHARE = 0.05  # of the longest bar, from which a segment has room for its 
 
 def stacked_bars(report: dict[str, Any]) -> bytes:
     """A PNG with one panel for each size of a report: CPU time of the stages, measured and at the ceilings."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     sizes = report["sizes"]
     figure = Figure(figsize=(12, 1.9 + 1.9 * len(sizes)), layout="constrained")
-    FigureCanvasAgg(figure)
     panels = figure.subplots(len(sizes), 1, squeeze=False)[:, 0]
     for panel, size in zip(panels, sizes.values(), strict=True):
         _panel(panel, size)

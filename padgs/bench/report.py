@@ -39,8 +39,9 @@ import torch
 from padgs import clock
 from padgs.bench import goals, isas, ratios, tile_counts
 from padgs.bench.ceilings import Ceiling, measure_ceilings
-from padgs.bench.sized import add_size_floors, measure_size
-from padgs.bench.workload import SIZES, Size, build
+from padgs.bench.cost import add_floors
+from padgs.bench.sized import measure_size
+from padgs.bench.workload import SIZES, Size, build, refuse_unknown
 from padgs.native import cpu
 
 SCHEMA = 1
@@ -60,14 +61,11 @@ class BenchOptions:
     ceiling_seconds: float = 0.4
 
     def __post_init__(self) -> None:
-        """Reject what cannot be measured."""
-        unknown = [name for name in self.sizes if name not in SIZES]
-        if unknown or not self.sizes:
-            raise ValueError(f"unknown size {', '.join(unknown) or '(none)'}; known: {', '.join(SIZES)}")
-        if self.repeats < 1:
-            raise ValueError(f"repeats is {self.repeats}; it must be at least 1")
-        if self.threads is not None and self.threads < 1:
-            raise ValueError(f"threads is {self.threads}; it must be at least 1")
+        refuse_unknown(self.sizes)
+        for name in ("repeats", "threads"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"{name} is {value}; it must be at least 1")
 
 
 QUICK = BenchOptions(sizes=("quick",), repeats=3, ceiling_seconds=0.05)
@@ -80,12 +78,8 @@ def measure_all(options: BenchOptions, progress: Callable[[str], None] = lambda 
         OSError: the native library is not there.
     """
     cpu.library()
-    threads_before = torch.get_num_threads()
-    torch.set_num_threads(options.threads or clock.machine()["cores"])
-    try:
+    with clock.threads(options.threads or clock.machine()["cores"]):
         return _measure_all(options, progress)
-    finally:
-        torch.set_num_threads(threads_before)
 
 
 def _measure_all(options: BenchOptions, progress: Callable[[str], None]) -> dict[str, Any]:
@@ -101,9 +95,12 @@ def _measure_all(options: BenchOptions, progress: Callable[[str], None]) -> dict
     progress("tiles by latitude")
     tiles = tile_counts.tiles_by_latitude(count=50_000 if options.repeats > QUICK.repeats else 20_000)
     progress("decoding 10 000 anchors")
-    decode = _decode_forward(options)
+    small = build(Size(256, 128, 5 * DECODED_ANCHORS), options.seed)
+    with torch.no_grad():
+        decode = clock.measure(lambda: small.model.decode(small.view), repeats=options.repeats)
     progress("the same work in two ways")
-    reference = _reference(options.sizes)
+    # The largest size up to the medium one, if any: beyond it, doing things in several ways takes too long.
+    reference = next(name for name in ("medium", "small", "quick", "large") if name in options.sizes)
     pairs = ratios.ratios(build(SIZES[reference], options.seed), build(SIZES["quick"], options.seed), options.repeats)
     report: dict[str, Any] = {
         "schema": SCHEMA,
@@ -128,7 +125,7 @@ def _judge(report: dict[str, Any], before: dict[str, Ceiling], after: dict[str, 
     best = {name: max(before[name], after[name], key=lambda c: c.per_cpu_second) for name in before}
     report["ceilings"] = {name: dataclasses.asdict(ceiling) for name, ceiling in best.items()}
     for size in report["sizes"].values():
-        add_size_floors(size, best)
+        add_floors(size, best)
     single = [size["iteration_1_thread"] for size in report["sizes"].values()]
     noise = {
         "limit": NOISE_LIMIT,
@@ -138,22 +135,7 @@ def _judge(report: dict[str, Any], before: dict[str, Ceiling], after: dict[str, 
     noise["worst"] = max(noise["parallel"], noise["single"])
     report["noise"], report["noisy"] = noise, noise["worst"] > NOISE_LIMIT
     work = report["sizes"][report["reference"]]
-    report["ratios"]["threads"] = {
-        "slow": {"what": "1 thread", **work["iteration_1_thread"]},
-        "fast": {"what": f"{report['machine']['threads']} threads", **work["iteration"]},
-        **{c: work["iteration_1_thread"][c]["min"] / work["iteration"][c]["min"] for c in ("wall", "cpu")},
-    }
+    report["ratios"]["threads"] = ratios.compared(
+        "1 thread", f"{report['machine']['threads']} threads", work["iteration_1_thread"], work["iteration"]
+    )
     report["targets"] = goals.judge(report)
-
-
-def _reference(sizes: tuple[str, ...]) -> str:
-    """The largest size up to the medium one, if any: beyond it, doing things in several ways takes too long."""
-    ascending = sorted(sizes, key=lambda name: SIZES[name].gaussians)
-    fitting = [name for name in ascending if SIZES[name].gaussians <= SIZES["medium"].gaussians]
-    return fitting[-1] if fitting else ascending[0]
-
-
-def _decode_forward(options: BenchOptions) -> dict[str, Any]:
-    work = build(Size(256, 128, 5 * DECODED_ANCHORS), options.seed)
-    with torch.no_grad():
-        return clock.measure(lambda: work.model.decode(work.view), repeats=options.repeats)

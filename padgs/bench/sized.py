@@ -9,9 +9,6 @@ from typing import Any
 import torch
 
 from padgs import clock
-from padgs.anchors.model import PaDGSOptions
-from padgs.bench.ceilings import Ceiling
-from padgs.bench.cost import add_floors, costs
 from padgs.bench.ratios import render_both_ways
 from padgs.bench.stages import STAGES, amortised, growing, measured
 from padgs.bench.workload import OPTIONS, Size, Workload, build, sigma_quantiles
@@ -23,10 +20,8 @@ ADAPT_EVENTS = 2
 WARM_UP = 2
 
 
-def measure_size(
-    size: Size, repeats: int, seed: int = 0, progress: Callable[[str], None] = lambda _: None
-) -> dict[str, Any]:
-    """All of one workload, in the layout of `padgs.bench.report`; floors are added once the ceilings are known."""
+def measure_size(size: Size, repeats: int, seed: int, progress: Callable[[str], None]) -> dict[str, Any]:
+    """All of one workload, in the layout of `padgs.bench.report`; `padgs.bench.cost` adds floors."""
     repeats = min(repeats, FEW_REPEATS) if size.gaussians >= MANY else repeats
     clock.reset_peak_memory()
     peak = {"start": clock.peak_memory()["host"]}
@@ -39,18 +34,18 @@ def measure_size(
     iteration = clock.measure(lambda: next(records), repeats=repeats, warm_up=WARM_UP)
     peak["training"] = clock.peak_memory()["host"]
     progress("whole iterations on one thread")
-    iteration_1_thread = _on_one_thread(lambda: clock.measure(lambda: next(records), repeats=repeats, warm_up=1))
+    with clock.threads(1):
+        iteration_1_thread = clock.measure(lambda: next(records), repeats=repeats, warm_up=1)
     progress("stages")
     clock_of_stages = measured(work, repeats, WARM_UP)
     event = growing(work, ADAPT_EVENTS)
     stages = {**clock_of_stages.stages(), "adapt": amortised(event)}
-    counters = dict(_frame(work).counters)
+    counters = _counters(work)
     progress("drawing alone")
     drawing = render_both_ways(work, repeats)
-    pairs = counters["evaluated"]
     return {
         **dataclasses.asdict(size),
-        "counters": {**_counts(work), **_shares(counters, size), "sigma": sigma_quantiles(work)},
+        "counters": counters,
         "stages": {name: stages[name] for name in STAGES},
         "stage_sum": clock_of_stages.total(),
         "iteration": iteration,
@@ -59,23 +54,11 @@ def measure_size(
         "frame": frame,
         "render": drawing,
         "rates": {
-            "forward": pairs / stages["blend"]["cpu"]["min"],
-            "backward": pairs / stages["blend_backward"]["cpu"]["min"],
+            way: counters["evaluated"] / stages[stage]["cpu"]["min"]
+            for way, stage in (("forward", "blend"), ("backward", "blend_backward"))
         },
         "peak_bytes": peak,
     }
-
-
-def add_size_floors(size: dict[str, Any], ceilings: dict[str, Ceiling]) -> None:
-    """Write floors beside the stages, and their sum (CPU seconds) as `floor`."""
-    counters = size["counters"]
-    least = costs(
-        pixels=size["width"] * size["height"],
-        model=PaDGSOptions(),
-        **{name: counters[name] for name in ("anchors", "gaussians", "instances", "evaluated", "parameters")},
-    )
-    add_floors(size["stages"], least, ceilings)
-    size["floor"] = sum(timing.get("floor", 0.0) for timing in size["stages"].values())
 
 
 def _frame(work: Workload) -> Rendering:
@@ -83,25 +66,15 @@ def _frame(work: Workload) -> Rendering:
         return render(work.model.decode(work.view).gaussians, work.view, OPTIONS, backend="cpu")
 
 
-def _on_one_thread(work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        return work()
-    finally:
-        torch.set_num_threads(threads)
-
-
-def _counts(work: Workload) -> dict[str, int]:
-    return {"anchors": len(work.model), "parameters": sum(p.numel() for p in work.model.parameters())}
-
-
-def _shares(counters: dict[str, int], size: Size) -> dict[str, float]:
-    pixels = size.width * size.height
+def _counters(work: Workload) -> dict[str, Any]:
+    counted, pixels = _frame(work).counters, work.size.width * work.size.height
     return {
-        **counters,
-        "evaluated_per_pixel": counters["evaluated"] / pixels,
-        "contributing_per_pixel": counters["contributing"] / pixels,
-        "evaluated_per_contributing": counters["evaluated"] / max(1, counters["contributing"]),
-        "tiles_per_gaussian": counters["instances"] / max(1, counters["visible"]),
+        "anchors": len(work.model),
+        "parameters": sum(p.numel() for p in work.model.parameters()),
+        **counted,
+        "evaluated_per_pixel": counted["evaluated"] / pixels,
+        "contributing_per_pixel": counted["contributing"] / pixels,
+        "evaluated_per_contributing": counted["evaluated"] / max(1, counted["contributing"]),
+        "tiles_per_gaussian": counted["instances"] / max(1, counted["visible"]),
+        "sigma": sigma_quantiles(work),
     }

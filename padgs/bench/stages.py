@@ -59,7 +59,6 @@ class StageClock:
     """
 
     def __init__(self) -> None:
-        """Nothing measured yet."""
         self.rounds: list[dict[str, tuple[float, float]]] = []
         self._spent: dict[str, tuple[float, float]] = {}
         self._running: list[str] = []

@@ -11,6 +11,13 @@ from rich.table import Table
 from padgs.bench.goals import REFERENCE_FMA
 from padgs.bench.stages import STAGES
 
+WHOLE = {
+    "iteration": "iteration, undisturbed",
+    "iteration_1_thread": "iteration 1 thread",
+    "frame": "frame",
+    "render": "draw fixed Gaussians, and back",
+}
+
 
 def lines(report: dict[str, Any]) -> Iterator[Table | str]:
     """What to print, in order."""
@@ -38,17 +45,15 @@ def _stages(name: str, size: dict[str, Any]) -> Table:
         f"{name}: one training iteration, {size['width']}x{size['height']}, ms",
         *("stage", "CPU min", "CPU median", "wall min", "wall median", "floor", "of ceiling", "bound by"),
     )
-    rows = [(stage, timing) for stage, timing in size["stages"].items()]
-    for stage, timing in rows:
+    for stage, timing in size["stages"].items():
         floor = (
-            (f"{timing['floor'] * 1e3:.3f}", f"{timing['fraction']:.0%}", timing["bound"]) if "floor" in timing else ()
+            [f"{timing['floor'] * 1e3:.3f}", f"{timing['fraction']:.0%}", timing["bound"]] if "floor" in timing else []
         )
         table.add_row(f"{stage.replace('_', ' ')} [dim]{STAGES[stage]}[/dim]", *_times(timing), *floor)
     table.add_section()
     table.add_row("all stages but adapt", *_times(size["stage_sum"]), f"{size['floor'] * 1e3:.3f}")
-    for key in ("iteration", "iteration_1_thread", "frame", "render"):
-        meaning = {"iteration": "iteration, undisturbed", "render": "draw fixed Gaussians, and back"}.get(key)
-        table.add_row(meaning or key.replace("_", " "), *_times(size[key]))
+    for key, meaning in WHOLE.items():
+        table.add_row(meaning, *_times(size[key]))
     return table
 
 
@@ -71,13 +76,8 @@ def _ratios(report: dict[str, Any]) -> Table:
         if "size" in ratio:
             width, height, gaussians = ratio["size"]
             notes.append(f"on {width}x{height}, {gaussians:,} Gaussians")
-        table.add_row(
-            ratio["slow"]["what"],
-            ratio["fast"]["what"],
-            f"{ratio['cpu']:.2f}",
-            f"{ratio['wall']:.2f}",
-            ", ".join(notes),
-        )
+        names = ratio["slow"]["what"], ratio["fast"]["what"]
+        table.add_row(*names, f"{ratio['cpu']:.2f}", f"{ratio['wall']:.2f}", ", ".join(notes))
     return table
 
 
@@ -105,9 +105,8 @@ def _targets(report: dict[str, Any]) -> Table:
     for target in report["targets"]:
         limit = f"{'≥' if target['relation'] == 'at least' else '≤'} {target['limit']:g} {target['unit']}"
         measured = "not measured" if target["measured"] is None else f"{target['measured']:.3g} {target['unit']}"
-        table.add_row(
-            target["name"], limit, measured, _judgement(target), _number(target["undisturbed"]), target["source"]
-        )
+        undisturbed = "" if target["undisturbed"] is None else f"{target['undisturbed']:.3g}"
+        table.add_row(target["name"], limit, measured, _judgement(target), undisturbed, target["source"])
     return table
 
 
@@ -134,15 +133,10 @@ def _verdict(report: dict[str, Any]) -> str:
 def _table(title: str, *columns: str) -> Table:
     table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
     for number, column in enumerate(columns):
-        table.add_column(
-            column, justify="left" if number == 0 or column in ("bound by", "fast", "source", "") else "right"
-        )
+        words = number == 0 or column in ("bound by", "fast", "source", "")
+        table.add_column(column, justify="left" if words else "right")
     return table
 
 
 def _times(timing: dict[str, Any]) -> list[str]:
     return [f"{timing[c][which] * 1e3:.3f}" for c in ("cpu", "wall") for which in ("min", "median")]
-
-
-def _number(value: float | None) -> str:
-    return "" if value is None else f"{value:.3g}"

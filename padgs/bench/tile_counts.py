@@ -57,10 +57,7 @@ def spheres(directions: Tensor, sigma: float, width: int) -> Gaussians:
 def tiles_per_gaussian(gaussians: Gaussians, width: int, height: int, options: RenderOptions) -> Tensor:
     """Tile instances [N] of each Gaussian, seen by a panorama at the origin."""
     camera = View("origin", torch.eye(4, dtype=torch.float64), width, height).camera
-    tensors = [
-        tensor.contiguous()
-        for tensor in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors)
-    ]
+    tensors = [tensor.contiguous() for tensor in vars(gaussians).values()]
     inputs = Inputs(len(gaussians), *map(pointer, tensors), None)
     projected = Projected(native_camera(torch.eye(4), camera, options), inputs, max_instances=1 << 40)
     (strip,) = projected.strips()

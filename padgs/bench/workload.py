@@ -8,6 +8,7 @@ opacity of 0.15; these Gaussians, 100 k at 512x256, have 40, 3.8, 2.0 and 0.15.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 
@@ -49,6 +50,13 @@ SIZES = {
     "medium": Size(512, 256, 100_000),
     "large": Size(2048, 1024, 1_000_000, views=11),
 }
+
+
+def refuse_unknown(sizes: Sequence[str]) -> None:
+    """Raise ValueError for names that are none of `SIZES`, or none at all."""
+    unknown = [name for name in sizes if name not in SIZES]
+    if unknown or not sizes:
+        raise ValueError(f"unknown size {', '.join(unknown) or '(none)'}; known: {', '.join(SIZES)}")
 
 
 @dataclass(frozen=True)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
+
+from padgs.cli.refusing import refusing
 
 if TYPE_CHECKING:
     from padgs.data.check.report import Report
 
 
+@refusing(ValueError)
 def check(
     path: Annotated[str, typer.Argument(help="folder with panoramas and poses, or the file that describes them")],
     format: Annotated[str, typer.Option(help="auto, or the format's name")] = "auto",
@@ -24,25 +27,22 @@ def check(
     from rich.console import Console
 
     from padgs.data.check.report import check as look_through
-    from padgs.data.errors import DataError
     from padgs.data.options import DataOptions
 
-    console = Console(highlight=False, soft_wrap=True)
-    try:
-        options = DataOptions(mask=mask, images=images or None, split=split)
-        with console.status("looking at the images") as status:
-            report = look_through(
-                Path(path),
-                format=format,
-                options=options,
-                overlay=Path(overlay) if overlay else None,
-                progress=lambda done, total: status.update(f"looking at image {done} of {total}"),
-            )
-    except (DataError, ValueError) as error:
-        console.print(str(error), markup=False)
-        raise typer.Exit(1) from error
-    for line in lines(report):
-        console.print(line, markup=False)
+    with Console().status("looking at the images") as status:
+        report = look_through(
+            Path(path),
+            format=format,
+            options=DataOptions(mask=mask, images=images or None, split=split),
+            overlay=Path(overlay) if overlay else None,
+            progress=lambda done, total: status.update(f"looking at image {done} of {total}"),
+        )
+    end_with(report)
+
+
+def end_with(report: Report) -> NoReturn:
+    """Print the report; exit code 1 if there are problems."""
+    print("\n".join(lines(report)))
     raise typer.Exit(1 if report.problems else 0)
 
 
@@ -57,14 +57,11 @@ def lines(report: Report) -> list[str]:
             f"  camera path    {report.path_length:.4g} long; median depth {report.median_depth:.4g}",
         ]
     if report.gravity is not None:
-        found = report.gravity
+        found, text = report.gravity, "the cameras have no common up direction"
         if found.agreement > 0.5:
-            out.append(
-                f"  gravity        up is {found.axis} within {found.off_axis:.1f} degrees; cameras tilt by "
-                f"{found.tilt:.1f} degrees (median)"
-            )
-        else:
-            out.append("  gravity        the cameras have no common up direction")
+            text = f"up is {found.axis} within {found.off_axis:.1f} degrees; "
+            text += f"cameras tilt by {found.tilt:.1f} degrees (median)"
+        out.append(f"  gravity        {text}")
     if report.reprojection_median is not None:
         out.append(
             f"  reprojection   {report.reprojection_median:.2f} pixels median, {report.reprojection_95:.2f} at 95 % "

@@ -6,7 +6,10 @@ from typing import Annotated
 
 import typer
 
+from padgs.cli.refusing import refusing
 
+
+@refusing(ValueError)
 def convert(
     source: Annotated[str, typer.Argument(help="folder with panoramas and poses, or the file that describes them")],
     destination: Annotated[str, typer.Argument(help="a folder that does not exist yet")],
@@ -22,26 +25,19 @@ def convert(
 
     from rich.console import Console
 
-    from padgs.data.errors import DataError
     from padgs.data.formats.convert import convert as write
     from padgs.data.options import DataOptions
 
-    console = Console(highlight=False, soft_wrap=True)
-    try:
-        options = DataOptions(width=width or None, points=points, mask=mask, split=split)
-        with console.status("reading") as status:
-            scene = write(
-                Path(source),
-                Path(destination),
-                to,
-                format=format,
-                options=options,
-                progress=lambda done, total: status.update(f"image {done} of {total}"),
-            )
-    except (DataError, ValueError) as error:
-        console.print(str(error), markup=False)
-        raise typer.Exit(1) from error
+    with Console().status("reading") as status:
+        scene = write(
+            Path(source),
+            Path(destination),
+            to,
+            format=format,
+            options=DataOptions(width=width or None, points=points, mask=mask, split=split),
+            progress=lambda done, total: status.update(f"image {done} of {total}"),
+        )
     for note in scene.notes:
-        console.print(f"  {note}", markup=False)
+        print(f"  {note}")
     views = f"{len(scene.train)} train and {len(scene.test)} test views, {len(scene.points)} points"
-    console.print(f"{destination}: {views}, as {to}", markup=False)
+    print(f"{destination}: {views}, as {to}")

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from padgs import results
+from padgs.cli.refusing import refusing
 from padgs.results import Result
 from padgs.runs.typed import ConfigError
 from reports.frame import frame, hardware, machine
@@ -22,6 +23,7 @@ from reports.tables.equal_time import EXPERIMENT, is_near
 from reports.tables.table import ReportError
 
 
+@refusing(ReportError)
 def equal_time(
     runs: Annotated[str, typer.Argument(help="folder of run folders, with a finished run of each method")],
     seconds: Annotated[float, typer.Argument(help="of training, that every method shall take")],
@@ -35,28 +37,25 @@ def equal_time(
     """
     folder = Path(runs)
     if not folder.is_dir():
-        raise _refused(f"there is no folder {folder}; give the folder of the runs")
+        raise ReportError(f"there is no folder {folder}; give the folder of the runs")
     if not 0 < seconds < math.inf:
-        raise _refused(f"seconds is {seconds:g}; it must be > 0 and finite")
+        raise ReportError(f"seconds is {seconds:g}; it must be > 0 and finite")
     found, broken = results.read_all(folder)
     for error in broken:
         print(f"left out: {error}", file=sys.stderr)
-    try:
-        methods = Gathered(frame(map(Run, found)), Request(experiment=experiment)).chosen("methods")
-    except ReportError as error:
-        raise _refused(str(error)) from error
+    methods = Gathered(frame(map(Run, found)), Request(experiment=experiment)).chosen("methods")
     by_name = {result.run: result for result in found}
     names = dict.fromkeys((*methods["run"], *(result.run for result in found if EXPERIMENT in result.experiments)))
     known = [by_name[name] for name in names]
     usable = [result for result in known if result.ok and not result.variant and result.timing.get("train_seconds")]
     if not usable:
-        raise _refused(
+        raise ReportError(
             f"no run in {folder} has ended well; run the methods first, "
             "e.g. padgs-run +experiment=all_methods scale=cpu"
         )
     machines = sorted({hardware(result) for result in usable})
     if len(machines) > 1:
-        raise _refused(
+        raise ReportError(
             f"the runs in {folder} are of several machines ({'; '.join(machines)}), whose times say nothing about each "
             "other; give a folder with the runs of one"
         )
@@ -123,8 +122,3 @@ def _values(result: Result, folder: Path, length: int) -> dict[str, Any]:
 
 def _seconds(result: Result) -> float:
     return result.timing["train_seconds"]
-
-
-def _refused(message: str) -> typer.Exit:
-    print(f"error: {message}", file=sys.stderr)
-    return typer.Exit(1)

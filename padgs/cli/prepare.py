@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from padgs.cli.refusing import refusing
+
 if TYPE_CHECKING:
-    from rich.console import Console
     from rich.progress import TaskID
 
 WORDS = {
@@ -38,67 +40,46 @@ def prepare(
     """Find the poses of panoramas, then check the result. Interrupted, the same command goes on where it stopped."""
     from pathlib import Path
 
-    from rich.console import Console
-
-    from padgs.cli.check import lines
+    from padgs.cli.check import end_with
     from padgs.data.check.report import check
     from padgs.data.errors import DataError
     from padgs.data.prepare.pipeline import PrepareOptions
     from padgs.data.prepare.pipeline import prepare as find_poses
 
-    console = Console(highlight=False, soft_wrap=True)
     target = Path(destination)
     try:
-        options = PrepareOptions(accurate, pairs, mask, level, per_second, seed, threads)
-        with _Bars(console) as tell:
+        with refusing(DataError), _bars() as tell:
+            options = PrepareOptions(accurate, pairs, mask, level, per_second, seed, threads)
             result = find_poses(Path(source), target, options, tell)
-        report = check(target, overlay=target / "check.png")
-    except DataError as error:
-        console.print(str(error), markup=False)
-        raise typer.Exit(1) from error
+            report = check(target, overlay=target / "check.png")
     except KeyboardInterrupt as interrupt:
-        console.print("interrupted; the same command goes on where this stopped", markup=False)
+        print("interrupted; the same command goes on where this stopped")
         raise typer.Exit(130) from interrupt
     placed = len(result.registered)
-    console.print(f"{placed} of {placed + len(result.unregistered)} panoramas placed, {result.points} points")
-    for note in result.notes:
-        console.print(f"  {note}", markup=False)
+    print(f"{placed} of {placed + len(result.unregistered)} panoramas placed, {result.points} points")
     spent = ", ".join(f"{WORDS[step]} {seconds:.0f} s" for step, seconds in result.seconds.items() if seconds >= 1)
-    if spent:
-        console.print(f"  {spent}", markup=False)
-    for line in lines(report):
-        console.print(line, markup=False)
-    raise typer.Exit(1 if report.problems else 0)
+    for note in (*result.notes, spent) if spent else result.notes:
+        print(f"  {note}")
+    end_with(report)
 
 
-class _Bars:
+@contextmanager
+def _bars() -> Iterator[Callable[[str, int, int], None]]:
     """One bar per step, with the time that is left; plain lines now and then where there is no terminal."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    def __init__(self, console: Console) -> None:
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    tasks: dict[str, tuple[TaskID, int]] = {}  # step -> bar, tenths that were told
 
-        self._console = console
-        self._bars = Progress(
-            TextColumn("{task.description:<20}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeRemainingColumn(elapsed_when_finished=True),
-            console=console,
-            disable=not console.is_terminal,
-        )
-        self._tasks: dict[str, tuple[TaskID, int]] = {}  # step -> bar, tenths that were told
-
-    def __enter__(self) -> Callable[[str, int, int], None]:
-        self._bars.start()
-        return self._tell
-
-    def __exit__(self, *_: object) -> None:
-        self._bars.stop()
-
-    def _tell(self, step: str, done: int, total: int) -> None:
-        task, told = self._tasks.get(step) or (self._bars.add_task(WORDS[step], total=total), -1)
-        self._bars.update(task, completed=done, total=total)
+    def tell(step: str, done: int, total: int) -> None:
+        task, told = tasks.get(step) or (bars.add_task(WORDS[step], total=total), -1)
+        bars.update(task, completed=done, total=total)
         tenth = 10 * done // total
-        if not self._console.is_terminal and tenth > told:
-            self._console.print(f"{WORDS[step]} {done}/{total}", markup=False)
-        self._tasks[step] = (task, tenth)
+        if bars.disable and tenth > told:
+            print(f"{WORDS[step]} {done}/{total}", flush=True)
+        tasks[step] = (task, tenth)
+
+    columns = (TextColumn("{task.description:<20}"), BarColumn(), MofNCompleteColumn())
+    bars = Progress(*columns, TimeRemainingColumn(elapsed_when_finished=True))
+    bars.disable = not bars.console.is_terminal
+    with bars:
+        yield tell

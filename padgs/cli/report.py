@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from padgs import results
+from padgs.cli.refusing import refusing
 from reports import REPORTS, store
 from reports.tables.table import ReportError
 
 ALL = "all"
 
 
+@refusing(ReportError, results.ResultError)
 def report(
     what: Annotated[str, typer.Argument(help=f"{', '.join(REPORTS)}, or {ALL}")],
     runs: Annotated[str, typer.Argument(help="folder of run folders, or a results.jsonl")] = "runs",
@@ -32,36 +35,39 @@ def report(
 ) -> None:
     """Make tables (Markdown, LaTeX, CSV), charts (SVG, PNG, CSV) and a page (HTML) from result files."""
     if what not in (*REPORTS, ALL):
-        raise _refused(f"unknown report {what!r}; known: {', '.join(sorted(REPORTS))}, {ALL}")
+        raise ReportError(f"unknown report {what!r}; known: {', '.join(sorted(REPORTS))}, {ALL}")
     source = Path(runs)
     if not source.exists():
-        raise _refused(f"there is no folder {source}; give the folder of the runs after the name of the report")
+        raise ReportError(f"there is no folder {source}; give the folder of the runs after the name of the report")
     target = Path(out) if out else (source if source.is_dir() else source.parent) / "reports"
     from reports.files import files  # pandas, which other commands need not wait for
     from reports.frame import frame
     from reports.gathered import Gathered
     from reports.request import Request
 
-    try:
-        request = Request(protocol, mix, tuple(metric or ()), experiment, dict(map(_pair, where or [])))
-        found, broken = store.read(source)
-        if collect:
-            found = _collected(found, target / store.FILE_NAME)
-        for error in broken:
-            print(f"left out: {error}", file=sys.stderr)
-        gathered = Gathered(frame(found), request, tuple(map(str, broken)))
-    except (ReportError, results.ResultError) as error:
-        raise _refused(str(error)) from error
+    request = Request(protocol, mix, tuple(metric or ()), experiment, dict(map(_pair, where or [])))
+    found, broken = store.read(source)
+    if collect:
+        with _writing_to(target):
+            target.mkdir(parents=True, exist_ok=True)
+            found = store.add(found, target / store.FILE_NAME)  # pictures are there of those in `source` only
+    for error in broken:
+        print(f"left out: {error}", file=sys.stderr)
+    gathered = Gathered(frame(found), request, tuple(map(str, broken)))
     refused = 0
     for name in REPORTS if what == ALL else [what]:
         try:
-            texts = _write(files(gathered.report(name)), target)
+            texts = dict(files(gathered.report(name)))
         except ReportError as error:
             refused += 1
             print(f"error: {name}: {error}", file=sys.stderr)
             continue
         if what == name and not texts:
-            raise _refused(f"nothing to show for {name}; no run or experiment in {source} is of that kind")
+            raise ReportError(f"nothing to show for {name}; no run or experiment in {source} is of that kind")
+        with _writing_to(target):
+            for file, content in texts.items():
+                (target / file).parent.mkdir(parents=True, exist_ok=True)
+                results.replace_file(target / file, content)
         if what == name and f"{name}.md" in texts:
             print(texts[f"{name}.md"].decode())
     print(f"{len(found)} results, {len(broken)} left out; see {target}", file=sys.stderr)
@@ -69,24 +75,12 @@ def report(
         raise typer.Exit(1)
 
 
-def _collected(runs: Sequence[store.Run], path: Path) -> list[store.Run]:
-    """The runs, and those that the store holds besides; pictures are there of the former only."""
+@contextmanager
+def _writing_to(folder: Path) -> Iterator[None]:
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        return store.add(runs, path)
+        yield
     except OSError as error:
-        raise _refused(f"cannot write {path}: {error.strerror}; name another folder with --out") from error
-
-
-def _write(files: Iterable[tuple[str, bytes]], folder: Path) -> dict[str, bytes]:
-    written = dict(files)
-    try:
-        for name, content in written.items():
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            results.replace_file(folder / name, content)
-    except OSError as error:
-        raise _refused(f"cannot write to {folder}: {error.strerror}; name another folder with --out") from error
-    return written
+        raise ReportError(f"cannot write to {folder}: {error.strerror}; name another folder with --out") from error
 
 
 def _pair(setting: str) -> tuple[str, str]:
@@ -94,8 +88,3 @@ def _pair(setting: str) -> tuple[str, str]:
     if not equals:
         raise ReportError(f"--where {setting} is not KEY=VALUE, e.g. --where train.iterations=3000")
     return key, value
-
-
-def _refused(message: str) -> typer.Exit:
-    print(f"error: {message}", file=sys.stderr)
-    return typer.Exit(1)

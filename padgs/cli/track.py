@@ -14,21 +14,18 @@ def track(
     """Mirror finished runs into mlflow: those of a cluster, or of a time when its server was away."""
     from pathlib import Path
 
-    from rich.console import Console
-
     from padgs import results
     from padgs.tracking.tracker import Tracker, TrackingOptions
 
-    console = Console(highlight=False, soft_wrap=True)
     found, broken = results.read_all(Path(runs))
     for error in broken:
-        console.print(f"left out: {error}", markup=False)
+        print(f"left out: {error}")
     trackers: dict[str, Tracker] = {}
     for result in found:
         experiment = " ".join(result.experiments)
         if experiment not in trackers:
-            trackers[experiment] = Tracker(TrackingOptions(uri=uri or None), Path(runs), experiment, console.print)
+            trackers[experiment] = Tracker(TrackingOptions(uri=uri or None), Path(runs), experiment, print)
         trackers[experiment].update(Path(runs) / result.run)
         if not trackers[experiment].on:
             raise typer.Exit(1)
-    console.print(f"mirrored: {len(found)} runs, as {', '.join(tracker.name for tracker in trackers.values())}")
+    print(f"mirrored: {len(found)} runs, as {', '.join(tracker.name for tracker in trackers.values())}")

@@ -8,22 +8,22 @@ from __future__ import annotations
 
 import json
 import time
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TextIO
 
-from padgs.results import replace_file
-from padgs.runs.watch import Watch
+from padgs.results import STATUSES, replace_file
+from padgs.runs.session import Watch
 
 FOLDER = ".multirun"  # in run.folder
 WAITING, RUNNING, OK = "waiting", "running", "ok"
-# Ends of a job beside the statuses of results:
+# Ends of a job beside the statuses of results, without any:
 REFUSED = "refused"  # the configuration or the data cannot be used; there is no run
 CRASHED = "crashed"  # an error of ours; the traceback is in the job's output
 KILLED = "killed"  # its process died
 ELSEWHERE = "elsewhere"  # another process works on this run
 STOPPED = "stopped"  # it was asked to, and wrote its checkpoint
-UNFINISHED = (REFUSED, CRASHED, KILLED, ELSEWHERE, STOPPED)  # there is no result
 SECONDS_BETWEEN_LOOKS = 1.0  # for `stop`
 
 
@@ -45,30 +45,26 @@ class JobState:
     @property
     def finished(self) -> bool:
         """Whether there is a result, good or bad."""
-        return self.ended and self.status not in UNFINISHED
+        return self.status in STATUSES
 
 
 class Board:
     """The folder of one multirun."""
 
     def __init__(self, folder: Path) -> None:
-        """Nothing is written before there is something to say."""
         self.folder = folder
         self._looked, self._stop = -float("inf"), False
 
     def write(self, job: int, state: JobState) -> None:
         """Say what a job does; a full disk must not end it, so nothing is raised."""
-        try:
+        with suppress(OSError):
             self.folder.mkdir(parents=True, exist_ok=True)
             replace_file(self._path(job), json.dumps(asdict(state)).encode())
-        except OSError:
-            return
 
     def read(self, job: int) -> JobState:
         """What a job does; waiting, if it has not said anything."""
         try:
-            known: dict[str, Any] = json.loads(self._path(job).read_bytes())
-            return JobState(**known)
+            return JobState(**json.loads(self._path(job).read_bytes()))
         except (OSError, ValueError, TypeError):
             return JobState()
 

@@ -12,13 +12,14 @@ from typing import Any
 from hydra import compose, initialize_config_dir
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
-from omegaconf import OmegaConf, open_dict
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import DictConfig, OmegaConf, open_dict
 
 from padgs.learning.method import Method
 from padgs.multirun.choices import register_choices
 from padgs.multirun.overrides import lenient, root
 from padgs.runs.config import RunConfig, config_from_values
-from padgs.runs.labels import labels
+from padgs.runs.identity import labels
 from padgs.runs.session import build
 
 _PLAIN = re.compile(r"[\w./@:-]+")  # values that Hydra's grammar takes without quotes
@@ -44,9 +45,17 @@ def configuration(settings: Sequence[str]) -> RunConfig:
     choices = config.hydra.runtime.choices
     with open_dict(config):
         del config["hydra"]
-    values = OmegaConf.to_container(config, resolve=True)
-    assert isinstance(values, dict)
-    return config_from_values({str(key): value for key, value in values.items()}, labels(choices))
+    return typed_config(config, choices)
+
+
+def typed_config(composed: DictConfig, choices: Mapping[str, object]) -> RunConfig:
+    """The configuration of a run, from what Hydra composed of these choices.
+
+    Raises:
+        ConfigError: as above.
+    """
+    values: Any = OmegaConf.to_container(composed, resolve=True)
+    return config_from_values(values, labels(choices))
 
 
 def make_method(name: str = "padgs", *settings: str) -> Method:
@@ -98,18 +107,11 @@ def _written(value: Any) -> str:
         return "{" + ",".join(f"{key}:{_written(item)}" for key, item in value.items()) + "}"
     if isinstance(value, Sequence) and not isinstance(value, str):
         return "[" + ",".join(map(_written, value)) + "]"
-    text = str(value)
-    if not isinstance(value, str) or (_PLAIN.fullmatch(text) and not _is_literal(text)):
-        return text
-    return "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
+    if not isinstance(value, str) or _is_plain(value):
+        return str(value)
+    return "'" + value.replace("\\", "\\\\").replace("'", "\\'") + "'"
 
 
-def _is_literal(text: str) -> bool:
-    """Whether Hydra would read these letters as something else than letters."""
-    if text.lower() in ("null", "true", "false", "nan", "inf"):
-        return True
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
+def _is_plain(text: str) -> bool:
+    """Whether Hydra reads these letters as what they are, and not as a number, say."""
+    return bool(_PLAIN.fullmatch(text)) and OverridesParser.create().parse_override(f"key={text}").value() == text

@@ -12,6 +12,7 @@ import json
 import os
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -30,19 +31,13 @@ class FinishedJobs:
     """The list of one run folder."""
 
     def __init__(self, runs: Path) -> None:
-        """Read it; a damaged line only costs time."""
         self._runs, self._path = runs, runs / FOLDER / FILE_NAME
         self._known: dict[str, dict[str, Any]] = {}
-        try:
-            lines = self._path.read_text().splitlines()
-        except OSError:
-            lines = []
-        for line in lines:
-            try:
-                entry = json.loads(line)
-                self._known[entry["job"]] = entry
-            except (ValueError, KeyError, TypeError):
-                continue
+        with suppress(OSError):
+            for line in self._path.read_text().splitlines():
+                with suppress(ValueError, KeyError, TypeError):  # a damaged line only costs time
+                    entry = json.loads(line)
+                    self._known[entry["job"]] = entry
 
     def status(self, overrides: Sequence[str]) -> str | None:
         """The status of a job's result; None where it must be looked at."""
@@ -56,12 +51,10 @@ class FinishedJobs:
         entry = {"job": key(overrides), "run": run, "status": status, "written": _written(self._runs / run)}
         entry |= {"data": data, "signature": None if data is None else signature(data)}
         self._known[entry["job"]] = entry
-        try:
+        with suppress(OSError):
             self._path.parent.mkdir(parents=True, exist_ok=True)
             with self._path.open("a") as file:
                 file.write(json.dumps(entry) + "\n")
-        except OSError:
-            return
 
 
 def key(overrides: Sequence[str]) -> str:
@@ -74,15 +67,10 @@ def key(overrides: Sequence[str]) -> str:
 def signature(folder: str) -> str:
     """Names, sizes and times of all files below a folder."""
     digest = hashlib.sha256()
-    for parent, folders, files in os.walk(folder):
-        folders.sort()
-        for name in sorted(files):
-            path = os.path.join(parent, name)
-            try:
-                status = os.stat(path)
-            except OSError:
-                continue
-            digest.update(f"{path}|{status.st_size}|{status.st_mtime_ns}\n".encode())
+    for path in sorted(Path(folder).rglob("*")):
+        with suppress(OSError):  # it may be gone by now
+            if path.is_file():
+                digest.update(f"{path}|{path.stat().st_size}|{path.stat().st_mtime_ns}\n".encode())
     return digest.hexdigest()
 
 

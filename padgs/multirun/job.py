@@ -8,22 +8,19 @@ import traceback
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from hydra.conf import HydraConf
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from rich.console import Console
 
 from padgs.multirun.board import CRASHED, ELSEWHERE, REFUSED, STOPPED, Board, BoardEntry
+from padgs.multirun.composition import typed_config
 from padgs.runs.checkpoint import CheckpointError
-from padgs.runs.config import RunConfig, config_from_values
 from padgs.runs.folder import RunFolderError
 from padgs.runs.interrupt import Interrupted
-from padgs.runs.labels import labels
 from padgs.runs.lock import RunBusy
-from padgs.runs.session import Session
-from padgs.runs.watch import Watch
+from padgs.runs.session import Session, Watch
 from padgs.tracking.tracker import SECONDS_BETWEEN_LOOKS, Tracker
 
 EXPECTED = (ValueError, OSError, CheckpointError, RunFolderError, RunBusy)  # a traceback would only hide what they say
@@ -33,12 +30,12 @@ ENDS: list[str] = []  # how the job ended that was this process's only one; Hydr
 def only_job(composed: DictConfig) -> None:
     """Run what Hydra composed; how it ended, a status of `padgs.results` or refused, is added to `ENDS`."""
     try:
-        config, console = _typed(composed), Console()
+        config, console = typed_config(composed, HydraConfig.get().runtime.choices), Console()
         say = partial(console.print, style="dim", markup=False, highlight=False, soft_wrap=True)
-        watch = TrackedRun(Tracker(config.tracking, Path(config.run.folder), " ".join(config.labels.experiments), say))
-        result = Session(config, console, watch).run()
-        watch.finished()
-        ENDS.append(result.status)
+        tracker = Tracker(config.tracking, Path(config.run.folder), " ".join(config.labels.experiments), say)
+        session = Session(config, console, TrackedRun(tracker))
+        ENDS.append(session.run().status)
+        tracker.update(session.folder.path)
     except EXPECTED as error:
         if os.environ.get("HYDRA_FULL_ERROR"):
             raise
@@ -61,7 +58,7 @@ def job_of_many(composed: DictConfig) -> str:
         try:
             if entry.stop_requested():
                 raise Interrupted("not started")
-            config = _typed(composed)
+            config = typed_config(composed, hydra.runtime.choices)
             entry.data = None if config.data.path is None else str(Path(config.data.path).absolute())
             result = Session(config, console, entry).run()
             return entry.end(result.status, result.reason)
@@ -92,24 +89,9 @@ class TrackedRun(Watch):
 
     def __init__(self, tracker: Tracker) -> None:
         self._tracker, self._looked = tracker, time.monotonic()
-        self._folder: Path | None = None
-
-    def started(self, folder: Path, iterations: int) -> None:
-        """The run is known."""
-        self._folder = folder
 
     def saved(self, folder: Path) -> None:
         """The log is up to date."""
         if time.monotonic() - self._looked >= SECONDS_BETWEEN_LOOKS:
             self._tracker.update(folder)
             self._looked = time.monotonic()
-
-    def finished(self) -> None:
-        """The result was written."""
-        if self._folder is not None:
-            self._tracker.update(self._folder)
-
-
-def _typed(composed: DictConfig) -> RunConfig:
-    values: Any = OmegaConf.to_container(composed, resolve=True)
-    return config_from_values(values, labels(HydraConfig.get().runtime.choices))

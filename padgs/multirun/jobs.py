@@ -7,6 +7,7 @@ import shutil
 import time
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,9 +22,9 @@ from padgs.multirun.job import complain, in_own_process
 from padgs.multirun.launchers import patient
 from padgs.multirun.overview import Overview, iterations_done, shown
 from padgs.results import Result, ResultError
-from padgs.runs.folder import cannot_write
+from padgs.runs.folder import RunFolder, cannot_write
+from padgs.runs.identity import labels
 from padgs.runs.interrupt import Interrupt, Interrupted
-from padgs.runs.labels import labels
 from padgs.runs.typed import typed
 from padgs.tracking.tracker import SECONDS_BETWEEN_LOOKS, Tracker, TrackingOptions
 
@@ -173,11 +174,8 @@ class Multirun:
             self._finished.add(self.jobs[index], state.run, state.status, state.data)
 
     def _result(self, state: JobState) -> Result | None:
-        path = self.runs / state.run / results.FILE_NAME
-        try:
-            return results.read(path) if state.run and path.exists() else None
-        except ResultError:
-            return None
+        with suppress(ResultError):
+            return RunFolder(self.runs / state.run).result() if state.run else None
 
     def _say(self, text: str) -> None:
         self._console.print(text, markup=False, highlight=False, soft_wrap=True)

@@ -20,8 +20,7 @@ def missing_plugin(arguments: Sequence[str]) -> str | None:
 
     >>> missing_plugin(["method=padgs", "seed=0,1"])
     """
-    wanted = [argument.partition("=")[2] for argument in arguments if argument.startswith("launcher=")]
-    for name in wanted:
+    for name in (argument.partition("=")[2] for argument in arguments if argument.startswith("launcher=")):
         module, extra = PACKAGES.get(name, ("padgs", ""))
         try:
             found = importlib.util.find_spec(module) is not None
@@ -36,36 +35,25 @@ def missing_plugin(arguments: Sequence[str]) -> str | None:
 def patient() -> Iterator[None]:
     """While this lasts, submitit's launcher waits for all jobs, even if the process of one has died.
 
-    As it is, the first one to be found dead is raised, and the others run on unobserved. Hydra's launcher asks for this
-    very class by its name and keeps the jobs that it submits to itself, and what submitit itself can be extended by are
-    entry points of installed packages, so for the time being another class has that name.
+    As it is, the first one found dead is raised, and the others run on unobserved. Hydra's launcher keeps the jobs
+    that it submits to itself, and what submitit itself can be extended by are entry points of installed packages, so
+    for the time being its jobs are told that having no results is one, too; the board says how they ended.
     """
     try:
-        import submitit
+        from submitit import Job
     except ImportError:
         yield
         return
-    executor = submitit.AutoExecutor
+    results = Job.results
 
-    class PatientExecutor(executor):
-        def map_array(self, *arguments: Any) -> list[Any]:
-            return [_Patient(job) for job in super().map_array(*arguments)]
+    def results_if_any(self: Any) -> list[Any]:
+        try:
+            return results(self)
+        except Exception:
+            return [None]
 
-    submitit.AutoExecutor = PatientExecutor
+    Job.results = results_if_any
     try:
         yield
     finally:
-        submitit.AutoExecutor = executor
-
-
-class _Patient:
-    """A job of submitit whose result may also be that there is none; the board says how it ended."""
-
-    def __init__(self, job: Any) -> None:
-        self._job = job
-
-    def results(self) -> list[Any]:
-        try:
-            return self._job.results()
-        except Exception:
-            return [None]
+        Job.results = results

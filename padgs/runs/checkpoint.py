@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
+from typing import Any
 
 import safetensors.torch
 import torch
@@ -63,12 +64,12 @@ def load(folder: Path, device: torch.device | str = "cpu") -> State:
     Raises:
         CheckpointError: a file is missing, truncated, changed, or of another format.
     """
-    manifest = _read_manifest(folder / MANIFEST)
-    path = folder / manifest["tensors"]
     try:
+        manifest = _parsed((folder / MANIFEST).read_bytes(), folder / MANIFEST)
+        path = folder / manifest["tensors"]
         content = path.read_bytes()
     except OSError as error:
-        raise CheckpointError(f"cannot read {path}: {error.strerror}; {WAY_OUT}") from error
+        raise CheckpointError(f"cannot read {error.filename}: {error.strerror}; {WAY_OUT}") from error
     if len(content) != manifest["bytes"]:
         raise CheckpointError(f"{path} has {len(content)} bytes instead of {manifest['bytes']}; {WAY_OUT}")
     if hashlib.sha256(content).hexdigest() != manifest["sha256"]:
@@ -78,17 +79,11 @@ def load(folder: Path, device: torch.device | str = "cpu") -> State:
     return State(tensors, manifest["values"])
 
 
-def _read_manifest(path: Path) -> dict:
+def _parsed(manifest: bytes, path: Path) -> dict[str, Any]:
     try:
-        manifest = json.loads(path.read_bytes())
-        format_found = manifest["format"]
-        complete = {"tensors", "bytes", "sha256", "values"} <= manifest.keys()
-    except OSError as error:
-        raise CheckpointError(f"cannot read {path}: {error.strerror}; {WAY_OUT}") from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise CheckpointError(f"{path} is damaged ({error}); {WAY_OUT}") from error
-    if format_found != FORMAT:
-        raise CheckpointError(f"{path} has format {format_found}, this program reads {FORMAT}; {WAY_OUT}")
-    if not complete:
-        raise CheckpointError(f"{path} is damaged (it has only {sorted(manifest)}); {WAY_OUT}")
-    return manifest
+        known = json.loads(manifest)
+        if known["format"] != FORMAT:
+            raise CheckpointError(f"{path} has format {known['format']}, this program reads {FORMAT}; {WAY_OUT}")
+        return {key: known[key] for key in ("tensors", "bytes", "sha256", "values")}
+    except (ValueError, LookupError, TypeError) as error:
+        raise CheckpointError(f"{path} is damaged ({type(error).__name__}: {error}); {WAY_OUT}") from error

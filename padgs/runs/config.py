@@ -14,10 +14,13 @@ from padgs.learning.schedule import PUBLISHED_ITERATIONS
 from padgs.registry import lookup
 from padgs.render.config import RenderConfig
 from padgs.runs.device import DEVICES
-from padgs.runs.labels import Labels
+from padgs.runs.identity import Labels
 from padgs.runs.typed import ConfigError, typed
 from padgs.scoring.protocols import PROTOCOLS, Protocol, protocol_from_options
 from padgs.tracking.tracker import TrackingOptions
+
+RETRIES = ("none", "failed")
+IMAGES_ON = ("device", "cpu")
 
 
 @dataclass(frozen=True)
@@ -85,25 +88,31 @@ class RunOptions:
 
 
 @dataclass(frozen=True)
-class RunConfig:
-    """One run, ready to start."""
+class Settings:
+    """What can be set whatever the method."""
 
-    data: DataConfig
-    method: str  # a name of baselines.METHODS
-    options: Any  # of the method
-    render: RenderConfig
-    train: TrainConfig
-    protocols: dict[str, Protocol]
-    run: RunOptions
+    data: DataConfig = DataConfig()
+    render: RenderConfig = RenderConfig()
+    train: TrainConfig = TrainConfig()
+    run: RunOptions = RunOptions()
     tracking: TrackingOptions = TrackingOptions()
     variant: str = ""  # name of this setting within an experiment, such as a row of the ablation
     seed: int = 0
     retry: str = "none"  # which finished runs are done again: a name of RETRIES
-    labels: Labels = Labels()
 
     def __post_init__(self) -> None:
         if self.retry not in RETRIES:
             raise ConfigError(f"unknown retry {self.retry!r}; known: {', '.join(RETRIES)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunConfig(Settings):
+    """One run, ready to start."""
+
+    method: str  # a name of baselines.METHODS
+    options: Any  # of the method
+    protocols: dict[str, Protocol]
+    labels: Labels = Labels()
 
     @property
     def preset(self) -> str:
@@ -124,27 +133,15 @@ class RunConfig:
         }
 
 
-GROUPS: dict[str, type] = {
-    "data": DataConfig,
-    "render": RenderConfig,
-    "train": TrainConfig,
-    "run": RunOptions,
-    "tracking": TrackingOptions,
-}
-OTHER_KEYS = ("method", "protocol", "variant", "seed", "retry")
-RETRIES = ("none", "failed")
-IMAGES_ON = ("device", "cpu")
-
-
 def config_from_values(values: Mapping[str, Any], labels: Labels = Labels()) -> RunConfig:  # noqa: B008 - frozen
     """The typed configuration of what Hydra composed.
 
     Raises:
         ConfigError: an unknown key or name (the known ones are listed), or a value of the wrong type.
     """
-    unknown = [key for key in values if key not in (*GROUPS, *OTHER_KEYS)]
-    if unknown:
-        raise ConfigError(f"unknown key {unknown[0]}; known: {', '.join((*GROUPS, *OTHER_KEYS))}")
+    known = (*default_fields(), "method", "protocol")
+    if unknown := [key for key in values if key not in known]:
+        raise ConfigError(f"unknown key {unknown[0]}; known: {', '.join(known)}")
     if "device" in values.get("data", {}):  # a key until run.device decided alone
         raise ConfigError(
             "data.device is no key any more: run.device says where a run trains and keeps its panoramas; "
@@ -160,27 +157,18 @@ def config_from_values(values: Mapping[str, Any], labels: Labels = Labels()) -> 
         }
     except ValueError as error:
         raise ConfigError(str(error)) from error
-    groups = {key: typed(kind, values.get(key, {}), key) for key, kind in GROUPS.items()}
+    settings = typed(Settings, {key: value for key, value in values.items() if key not in ("method", "protocol")})
     typed_options = typed(options, method, "method")
-    top = {key: values[key] for key in ("variant", "seed", "retry") if key in values}
-    top = asdict(typed(_Top, top))
     if not protocols:
         raise ConfigError(f"protocol is empty; name at least one of {', '.join(PROTOCOLS)}")
-    return RunConfig(method=name, options=typed_options, protocols=protocols, labels=labels, **groups, **top)
+    return RunConfig(**vars(settings), method=name, options=typed_options, protocols=protocols, labels=labels)
 
 
 def default_fields() -> dict[str, Any]:
-    """All keys of the configuration with their defaults, except `method`, whose keys depend on its name."""
-    return {**{key: asdict(kind()) for key, kind in GROUPS.items()}, **asdict(_Top())}
+    """All keys of the configuration with their defaults, except those that depend on a name: of method or protocol."""
+    return asdict(Settings())
 
 
 def method_fields(name: str) -> dict[str, Any]:
     """The keys of `method` with their defaults for one method."""
     return {"name": name, **asdict(lookup(METHODS, name, "method").Options())}
-
-
-@dataclass(frozen=True)
-class _Top:
-    variant: str = ""
-    seed: int = 0
-    retry: str = "none"

@@ -25,10 +25,6 @@ def chosen(name: str, render: RenderConfig) -> torch.device:
         if name == "cpu":
             raise ValueError("render.backend=cuda draws on a GPU only, not with run.device=cpu; set run.device=auto")
         cuda.library()
-    on_gpu = name == "cuda" or (name == "auto" and torch.cuda.is_available() and _draws(render))
+    draws = render.backend in ("auto", "cuda") and cuda.available()  # there, and faster than the CPU does
+    on_gpu = name == "cuda" or (name == "auto" and torch.cuda.is_available() and draws)
     return torch.device("cuda", torch.cuda.current_device()) if on_gpu else torch.device("cpu")
-
-
-def _draws(render: RenderConfig) -> bool:
-    """Whether a GPU draws this faster than the CPU does."""
-    return render.backend in ("auto", "cuda") and cuda.available()

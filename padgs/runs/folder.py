@@ -22,6 +22,7 @@ from padgs.learning.trainee import State
 from padgs.results import Result
 from padgs.runs import checkpoint
 from padgs.runs import lock as run_lock
+from padgs.scene import View
 from padgs.scoring.pictures import comparison
 
 
@@ -44,7 +45,6 @@ class RunFolder:
     """Reads and writes the files of one run."""
 
     def __init__(self, path: Path) -> None:
-        """Nothing is touched before it is needed."""
         self.path = path
         self.checkpoint = path / "checkpoint"
         self.renders = path / results.PICTURES
@@ -98,12 +98,8 @@ class RunFolder:
 
     def log(self, record: Record, psnr: float | None) -> None:
         """Append a line to log.jsonl; `psnr` of the held-out view, where it was measured."""
-        line: dict[str, Any] = {
-            "iteration": record.iteration,
-            "loss": float(record.loss),
-            "seconds": round(record.seconds, 4),
-            **record.counts,
-        }
+        line: dict[str, Any] = {"iteration": record.iteration, "loss": float(record.loss)}
+        line |= {"seconds": round(record.seconds, 4), **record.counts}
         if psnr is not None:
             line["psnr"] = psnr
         if record.events:
@@ -139,10 +135,10 @@ class RunFolder:
                 results.replace_file(self._log, "".join(json.dumps(line) + "\n" for line in kept).encode())
         return progress
 
-    def save_picture(self, name: str, truth: Tensor, image: Tensor) -> None:
-        """Save truth | render | error of the view `name`; images [H, W, 3]."""
+    def save_picture(self, view: View, truth: Tensor, image: Tensor) -> None:
+        """Save truth | render | error of a view; images [H, W, 3]."""
         with self._writing():
-            Image.fromarray(comparison(truth, image)).save(self.renders / results.picture_name(name))
+            Image.fromarray(comparison(truth, image)).save(self.renders / results.picture_name(view.name))
 
     @contextmanager
     def _writing(self) -> Iterator[None]:

@@ -1,4 +1,4 @@
-"""The name of a run: readable, and the same exactly where the same numbers must come out."""
+"""The names of a run: its id, the same exactly where the same numbers must come out, and what no number depends on."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import hashlib
 import json
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from padgs.results import decisive
@@ -33,3 +34,23 @@ def run_id(values: Mapping[str, Any], scene: str, fingerprint: str, preset: str 
     words = [scene, preset or values["method"]["name"], values["variant"]]
     readable = [re.sub(r"[^A-Za-z0-9.-]+", "-", word).strip("-.") for word in words]
     return "_".join([*(word for word in readable if word), digest[:HASH_DIGITS]])
+
+
+@dataclass(frozen=True)
+class Labels:
+    """Who asked for a run, and by which names; not part of the hash of its configuration."""
+
+    preset: str = ""  # choice of `method`; empty = the method's own name
+    experiments: tuple[str, ...] = ()  # experiment and sweep, with "@scale" where it is not full; sorted
+
+
+def labels(choices: Mapping[str, object]) -> Labels:
+    """The labels of a job, from the choices that Hydra composed it of.
+
+    >>> labels({"method": "odgs_release", "experiment": "ablation", "sweep": "seeds", "scale": "cpu"})
+    Labels(preset='odgs_release', experiments=('ablation@cpu', 'seeds@cpu'))
+    """
+    names = [str(choices[group]) for group in ("experiment", "sweep") if choices.get(group)]
+    scale = choices.get("scale") or "full"
+    suffix = "" if scale == "full" else f"@{scale}"
+    return Labels(str(choices.get("method") or ""), tuple(sorted(f"{name}{suffix}" for name in names)))

@@ -36,9 +36,10 @@ def held(folder: Path) -> Iterator[None]:
     try:
         lock.acquire(timeout=0)
     except Timeout as error:
-        raise RunBusy(f"{folder} is being worked on by {owner(folder)}; it is left alone") from error
+        raise RunBusy(f"{folder} is being worked on by {_owner(folder)}; it is left alone") from error
     try:
-        (folder / OWNER).write_text(json.dumps(_myself()))
+        now = datetime.now(timezone.utc).isoformat(timespec="seconds")
+        (folder / OWNER).write_text(json.dumps({"host": socket.gethostname(), "pid": os.getpid(), "since": now}))
         yield
         with suppress(OSError):
             (folder / OWNER).unlink()
@@ -46,15 +47,9 @@ def held(folder: Path) -> Iterator[None]:
         lock.release()
 
 
-def owner(folder: Path) -> str:
-    """Who holds the lock of a run folder, in words."""
+def _owner(folder: Path) -> str:
     try:
         known: dict[str, Any] = json.loads((folder / OWNER).read_text())
         return f"process {known['pid']} on {known['host']} since {known['since']}"
     except (OSError, ValueError, KeyError, TypeError):
         return "another process"
-
-
-def _myself() -> dict[str, Any]:
-    now = datetime.now(timezone.utc).isoformat(timespec="seconds")
-    return {"host": socket.gethostname(), "pid": os.getpid(), "since": now}

@@ -45,18 +45,14 @@ def draw(method: Method, view: View) -> Picture:
     return Picture(*(tensor.float().cpu().numpy() for tensor in (image, depth, 1 - rendering.transmittance)))
 
 
+@dataclass
 class OpenedRun:
-    """What `load_run` returns.
+    """What `load_run` returns."""
 
-    Attributes:
-        folder: of the run.
-        config: its configuration.
-        method: as its last checkpoint left it.
-        result: what `result.json` says; None where the run is not finished.
-    """
-
-    def __init__(self, folder: Path, config: RunConfig, method: Method, result: Result | None) -> None:
-        self.folder, self.config, self.method, self.result = folder, config, method, result
+    folder: Path  # of the run
+    config: RunConfig
+    method: Method  # as its last checkpoint left it
+    result: Result | None  # what `result.json` says; None where the run is not finished
 
     @cached_property
     def scene(self) -> Scene:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
 from dataclasses import asdict
 from itertools import cycle, islice
+from typing import Any
 
 from padgs.clock import summary, timed
 from padgs.learning.method import Method
 from padgs.results import Scores
 from padgs.scene import Scene, View
-from padgs.scoring.evaluate import evaluate
+from padgs.scoring.evaluate import OnView, evaluate
 from padgs.scoring.metrics import psnr
 from padgs.scoring.protocols import Protocol
 
@@ -18,24 +19,20 @@ FRAMES = 10  # timed at least, and each test view once
 
 
 def scores(
-    method: Method, scene: Scene, protocols: dict[str, Protocol], save_picture: Callable | None
+    method: Method, scene: Scene, protocols: dict[str, Protocol], save_picture: OnView | None
 ) -> dict[str, Scores]:
     """The marks of the test views under each protocol; pictures are saved once."""
     found = {}
     for name, protocol in protocols.items():
-        on_view = None if save_picture is None or found else _picture_saver(save_picture)
-        found[name] = evaluate(method.render, scene.test, protocol, on_view=on_view)
+        found[name] = evaluate(method.render, scene.test, protocol, on_view=None if found else save_picture)
     return found
 
 
 def held_out_psnr(method: Method, view: View) -> float:
     """PSNR in dB of one test view, all of its pixels that its mask lets through."""
     image = method.render(view).image.clamp(0, 1)
-    return psnr(
-        image,
-        view.image(dtype=image.dtype, device=image.device),
-        view.mask(dtype=image.dtype, device=image.device),
-    ).item()
+    like: dict[str, Any] = {"dtype": image.dtype, "device": image.device}
+    return psnr(image, view.image(**like), view.mask(**like)).item()
 
 
 def frame_times(method: Method, scene: Scene) -> dict[str, float]:
@@ -49,10 +46,4 @@ def frame_times(method: Method, scene: Scene) -> dict[str, float]:
 
 def same_rules(scores: Scores, protocol: Protocol) -> bool:
     """Whether marks were given under exactly these rules."""
-    rules = {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(protocol).items()}
-    stored = {key: list(value) if isinstance(value, tuple) else value for key, value in scores.protocol.items()}
-    return rules == stored
-
-
-def _picture_saver(save_picture: Callable) -> Callable:
-    return lambda view, truth, image: save_picture(view.name, truth, image)
+    return json.dumps(asdict(protocol), sort_keys=True) == json.dumps(scores.protocol, sort_keys=True)

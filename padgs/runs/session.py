@@ -27,8 +27,21 @@ from padgs.runs.interrupt import Interrupt, Interrupted
 from padgs.runs.live import LiveLine
 from padgs.runs.scoring import frame_times, held_out_psnr, same_rules, scores
 from padgs.runs.summary import introduce, show_result
-from padgs.runs.watch import Watch
 from padgs.scoring.protocols import Protocol
+
+
+class Watch:
+    """What a run tells whoever started it, and what it asks: here nobody, who never stops it; subclasses do."""
+
+    def started(self, folder: Path, iterations: int) -> None:
+        """The run has this folder, and goes to so many iterations."""
+
+    def saved(self, folder: Path) -> None:
+        """A checkpoint was written, and the log is up to date."""
+
+    def stop_requested(self) -> bool:
+        """Whether the run should write its checkpoint and stop."""
+        return False
 
 
 class Session:

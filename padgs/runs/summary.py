@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 from rich.box import SIMPLE_HEAD
@@ -21,25 +22,21 @@ def introduce(config: RunConfig, scene: Scene, folder: Path, console: Console) -
     view = scene.train[0]
     what = f"{config.preset}{f' ({config.variant})' if config.variant else ''} on {scene.name}"
     views = f"{len(scene.train)} training and {len(scene.test)} test views of {view.width}x{view.height}"
-    console.print(
-        f"[bold]{what}[/]: {views}, {len(scene.points)} points, {config.train.iterations} iterations",
-        highlight=False,
-        soft_wrap=True,
-    )
+    say = partial(console.print, highlight=False, soft_wrap=True)
+    say(f"[bold]{what}[/]: {views}, {len(scene.points)} points, {config.train.iterations} iterations")
     for note in (*scene.notes, folder):
-        console.print(f"  {note}", style="dim", highlight=False, soft_wrap=True)
+        say(f"  {note}", style="dim")
 
 
 def show_result(result: Result, folder: Path, console: Console) -> None:
     """Print the marks of a run, what it cost, and where its files are."""
+    say = partial(console.print, highlight=False, soft_wrap=True)
     if not result.ok:
-        console.print(
-            f"[bold red]{result.status}[/]: {result.reason or 'stopped early'}", highlight=False, soft_wrap=True
-        )
+        say(f"[bold red]{result.status}[/]: {result.reason or 'stopped early'}")
     if result.scores:
         console.print(marks(result))
     for note in dict.fromkeys(note for scores in result.scores.values() for note in scores.notes):
-        console.print(note, style="yellow", highlight=False, soft_wrap=True)
+        say(note, style="yellow")
     costs = [f"{compact(count)} {name}" for name, count in result.counts.items()]
     costs.append(f"{result.model_bytes / 1e6:.1f} MB")
     if "train_seconds" in result.timing:
@@ -49,8 +46,8 @@ def show_result(result: Result, folder: Path, console: Console) -> None:
     costs.append(f"peak memory {result.peak_memory_bytes / 1e9:.2f} GB")
     if result.peak_device_memory_bytes is not None:
         costs.append(f"{result.peak_device_memory_bytes / 1e9:.2f} GB on the GPU")
-    console.print(", ".join(costs), highlight=False, soft_wrap=True)
-    console.print(str(folder), style="bold", highlight=False, soft_wrap=True)
+    say(", ".join(costs))
+    say(str(folder), style="bold")
 
 
 def marks(result: Result) -> Table:

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import pandas
 from omegaconf import OmegaConf
 
 from padgs import results
@@ -42,7 +43,7 @@ class Mirror:
         identity = self._find(RUN, run.name)
         if identity is None:
             identity = self._create(RUN, run.name, {PARENT: self._parent} if self._parent else {})
-            self._log_settings(identity, OmegaConf.to_container(OmegaConf.load(run / "config.yaml")))
+            self._log_settings(identity, run)
         self._log_progress(identity, run)
         if (run / results.FILE_NAME).exists():
             self._log_result(identity, run, results.read(run / results.FILE_NAME))
@@ -63,10 +64,12 @@ class Mirror:
         tags = {tag: name, **(more or {})}
         return self._client.create_run(self._experiment, run_name=name, tags=tags).info.run_id
 
-    def _log_settings(self, identity: str, config: Any) -> None:
+    def _log_settings(self, identity: str, run: Path) -> None:
         from mlflow.entities import Param
 
-        params = [Param(key, str(value)[:LONGEST_VALUE]) for key, value in flat(config)]
+        config: Any = OmegaConf.to_container(OmegaConf.load(run / "config.yaml"))
+        (flat,) = pandas.json_normalize(config).to_dict("records")  # with dotted keys
+        params = [Param(str(key), str(value)[:LONGEST_VALUE]) for key, value in flat.items()]
         for batch in batches(params, MOST_PARAMS):
             self._client.log_batch(identity, params=batch)
 
@@ -104,19 +107,6 @@ class Mirror:
         table = runs(Gathered(frame(map(Run, found)), Request(mix=True)))
         self._client.log_text(identity, markdown.text(table), "tables/runs.md")
         self._client.log_text(identity, csv_text.text(table), "tables/runs.csv")
-
-
-def flat(values: Mapping[str, Any], where: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted keys and values of a configuration.
-
-    >>> list(flat({"a": {"b": 1}, "c": [2]}))
-    [('a.b', 1), ('c', [2])]
-    """
-    for key, value in values.items():
-        if isinstance(value, Mapping):
-            yield from flat(value, f"{where}{key}.")
-        else:
-            yield f"{where}{key}", value
 
 
 def final_numbers(result: Result) -> dict[str, float]:

@@ -2,18 +2,23 @@
 
 import pytest
 
-from padgs.anchors.model import PaDGSOptions
 from padgs.bench.ceilings import Ceiling
 from padgs.bench.cost import Cost, add_floors, costs
+from padgs.bench.stages import STAGES
 
 CEILINGS = {"fma": Ceiling(200.0, 100.0, 0.0), "triad": Ceiling(20.0, 10.0, 0.0)}
 
 
 def test_decoding_costs_what_the_layers_multiply():
-    counts = {"anchors": 1000, "gaussians": 0, "instances": 0, "evaluated": 0, "pixels": 0, "parameters": 0}
-    found = costs(**counts, model=PaDGSOptions())
+    found = costs(size(anchors=1000))
     assert found["decode"].operations == pytest.approx(14.1e3 * 1000, rel=0.01)  # 37 inputs, 32 hidden, 110 outputs
     assert found["decode_backward"].operations == 2 * found["decode"].operations
+
+
+def size(**counters: int) -> dict:
+    counters = dict.fromkeys(("anchors", "gaussians", "instances", "evaluated", "parameters"), 0) | counters
+    stages = {stage: {"cpu": {"min": 40.0}} for stage in STAGES}
+    return {"width": 0, "height": 0, "counters": counters, "stages": stages}
 
 
 @pytest.mark.parametrize(
@@ -25,7 +30,10 @@ def test_the_scarcer_of_the_two_binds(cost, floor):
 
 
 def test_fractions_compare_the_floor_with_cpu_time():
-    stages = {"blend": {"cpu": {"min": 40.0}}, "rest": {"cpu": {"min": 1.0}}}
-    add_floors(stages, {"blend": Cost(1000, 0)}, CEILINGS)
-    assert stages["blend"]["fraction"] == 0.25
-    assert "fraction" not in stages["rest"]
+    measured = size(parameters=100, evaluated=1)
+    add_floors(measured, CEILINGS)
+    optimiser = measured["stages"]["optimiser"]
+    assert (optimiser["operations"], optimiser["bytes"], optimiser["bound"]) == (1200, 2800, "memory")
+    assert (optimiser["floor"], optimiser["fraction"]) == (280, 7)
+    assert "fraction" not in measured["stages"]["rest"]
+    assert measured["floor"] == pytest.approx(280 + 2 * (28 + 63) / 100)

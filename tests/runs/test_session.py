@@ -20,8 +20,8 @@ from padgs.learning.failure import Failure
 from padgs.runs import checkpoint, session
 from padgs.runs.checkpoint import CheckpointError
 from padgs.runs.folder import RunFolder, RunFolderError
+from padgs.runs.identity import Labels
 from padgs.runs.interrupt import Interrupted
-from padgs.runs.labels import Labels
 from padgs.runs.lock import RunBusy
 from padgs.runs.session import Session
 
