@@ -185,12 +185,7 @@ class Decoder(nn.Module):
 
     def weights(self) -> DecoderWeights:
         """The weights as `decode` takes them."""
-        return DecoderWeights(
-            *(
-                Head(**{name: layers[name] for name in Head._fields})
-                for layers in (self.opacity, self.color, self.covariance)
-            )
-        )
+        return DecoderWeights(Head(**self.opacity), Head(**self.color), Head(**self.covariance))
 
 
 def _layers(inputs: int, hidden: int, outputs: int, generator: torch.Generator | None) -> nn.ParameterDict:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import torch
@@ -69,11 +70,8 @@ class CalibratedTrainee(SplatTrainee):
         """Counts and bytes of the model, calibration included."""
         size = super().size()
         parameters = list(self.calibration.parameters())
-        return Size(
-            counts={**size.counts, **self.calibration.counts()},
-            parameters=size.parameters + sum(p.numel() for p in parameters),
-            bytes=size.bytes + sum(p.numel() * p.element_size() for p in parameters),
-        )
+        own = Size.of(self.calibration.counts(), parameters, stored=parameters)
+        return Size({**size.counts, **own.counts}, size.parameters + own.parameters, size.bytes + own.bytes)
 
     def state(self) -> State:
         """That of the splats, and the calibration."""
@@ -108,15 +106,8 @@ class CalibratedMethod(SplatMethod):
         self._calibration = self._as_stored(model_state(state).values["calibration"])
         return super()._blank(state)
 
-    def _trainee_of(self, splats: Splats, extent: float, iterations: int) -> CalibratedTrainee:
+    def _trainee_of(
+        self, splats: Splats, extent: float, iterations: int, kind: Callable[..., SplatTrainee] = CalibratedTrainee
+    ) -> SplatTrainee:
         self._calibration.to(splats.means.device)
-        return CalibratedTrainee(
-            splats,
-            self.options,
-            self.render_config,
-            extent=extent,
-            iterations=iterations,
-            learning_rate_factor=self.options.learning_rate_factor,
-            seed=self.seed,
-            calibration=self._calibration,
-        )
+        return super()._trainee_of(splats, extent, iterations, partial(kind, calibration=self._calibration))

@@ -9,12 +9,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from padgs.egonerf.absorption import visible_shares
 from padgs.egonerf.environment import EnvironmentMap
 from padgs.egonerf.options import EgoNeRFOptions
 from padgs.egonerf.plane_lines import Factors, GridPosition, PlaneLines, density_feature, grid_position, products
 from padgs.egonerf.radii import exponential_nodes
-from padgs.egonerf.ray_samples import interval_lengths, jittered, refined
+from padgs.egonerf.ray_samples import interval_lengths, jittered, refined, visible_shares
 from padgs.egonerf.shading import Shader
 from padgs.render import Rendering
 from padgs.scene import Scene, View

@@ -38,8 +38,8 @@ class EgoNeRFOptions:
 
     def __post_init__(self) -> None:
         check_known(self, length_unit=LENGTH_UNITS)
-        nodes, halved = ("radial_nodes", "polar_nodes", "azimuth_nodes"), "even, for the coarse grid halves it"
-        check(self, f"{halved}, and at least 4", lambda count: count >= 4 and count % 2 == 0, *nodes)
+        nodes = ("radial_nodes", "polar_nodes", "azimuth_nodes")
+        check(self, "even, for the coarse grid halves it, and at least 4", lambda n: n >= 4 and n % 2 == 0, *nodes)
         sizes = ("density_components", "appearance_components", "features", "hidden", "environment_height")
         check(self, "at least 1", lambda size: size >= 1, *sizes)
         check(self, "at least 0", lambda count: count >= 0, "feature_frequencies", "direction_frequencies")

@@ -16,6 +16,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from padgs.checks import check, check_known
 from padgs.learning.failure import Failure, is_out_of_memory
 from padgs.learning.loss import NORMALISATIONS, ROW_WEIGHTS, photometric_loss
 from padgs.learning.optimiser import Optimiser
@@ -57,14 +58,9 @@ class TrainOptions:
     check_every: int = 50  # iterations between checks of all gradients and parameters; the loss is checked at each
 
     def __post_init__(self) -> None:
-        if not 0 <= self.lambda_l1 <= 1:
-            raise ValueError(f"lambda_l1 is {self.lambda_l1}; it must be in [0, 1]")
-        if self.weight not in ROW_WEIGHTS:
-            raise ValueError(f"unknown weight {self.weight!r}; known: {', '.join(ROW_WEIGHTS)}")
-        if self.normalisation not in NORMALISATIONS:
-            raise ValueError(f"unknown normalisation {self.normalisation!r}; known: {', '.join(NORMALISATIONS)}")
-        if self.check_every < 1:
-            raise ValueError(f"check_every is {self.check_every}; it must be at least 1")
+        check(self, "in [0, 1]", lambda share: 0 <= share <= 1, "lambda_l1")
+        check_known(self, weight=ROW_WEIGHTS, normalisation=NORMALISATIONS)
+        check(self, "at least 1", lambda every: every >= 1, "check_every")
 
 
 class Trainer:

@@ -1,4 +1,7 @@
-"""The structures that the native libraries take, as `csrc/abi.h` has them: plain C, pointers and sizes."""
+"""The structures that the native libraries take, as `csrc/abi.h` has them: plain C, pointers and sizes.
+
+A structure is called as it is there, in the namespace padgs, unless it says otherwise.
+"""
 
 from __future__ import annotations
 
@@ -19,36 +22,30 @@ class NativeCamera(ctypes.Structure):
     """`padgs::Camera`."""
 
     _fields_ = [
-        *fields(ctypes.c_int32, "width", "height", "projection", "model"),
+        *fields(Int32, "width", "height", "projection", "model"),
         ("cam_from_world", ctypes.c_float * 12),
         *fields(ctypes.c_float, "near_radius", "low_pass"),
-        *fields(ctypes.c_int32, "wrap", "square"),
+        *fields(Int32, "wrap", "square"),
         *fields(ctypes.c_float, "fx", "fy", "cx", "cy", "widen", "off_panorama"),
-        *fields(ctypes.c_int32, "compensate", "cull_ellipsoids"),
+        *fields(Int32, "compensate", "cull_ellipsoids"),
     ]
 
 
 class TileGrid(ctypes.Structure):
-    """`padgs::TileGrid`."""
-
     _fields_ = [
-        *fields(ctypes.c_int32, "width", "height", "first_row", "end_row"),
+        *fields(Int32, "width", "height", "first_row", "end_row"),
         *fields(Pointer, "level", "row_start"),
     ]
 
 
 class Inputs(ctypes.Structure):
-    """`padgs::Inputs`."""
-
     _fields_ = [
-        ("count", ctypes.c_int64),
+        ("count", Int64),
         *fields(Pointer, "means", "quats", "scales", "opacities", "colors", "probe"),
     ]
 
 
 class Gradients(ctypes.Structure):
-    """`padgs::Gradients`."""
-
     _fields_ = fields(Pointer, "means", "quats", "scales", "opacities", "colors", "probe", "pose")
 
 
@@ -59,11 +56,9 @@ class RayPointers(ctypes.Structure):
 
 
 class BlendArguments(ctypes.Structure):
-    """`padgs::BlendArguments`."""
-
     _fields_ = [
         ("grid", TileGrid),
-        *fields(ctypes.c_int32, "projection", "wrap", "core_size"),
+        *fields(Int32, "projection", "wrap", "core_size"),
         ("rays", RayPointers),
         *fields(Pointer, "footprints", "tile_start", "instances", "background"),
         *fields(Pointer, "image", "transmittance", "depth", "last", "pair_counts", "cores", "core_start"),
@@ -71,27 +66,21 @@ class BlendArguments(ctypes.Structure):
 
 
 class BlendGradientArguments(ctypes.Structure):
-    """`padgs::BlendGradientArguments`."""
-
     _fields_ = [
         ("forward", BlendArguments),
         *fields(Pointer, "grad_image", "grad_transmittance", "grad_depth", "moments", "grad_rays"),
-        ("absolute", ctypes.c_int32),
+        ("absolute", Int32),
     ]
 
 
 class HeadWeights(ctypes.Structure):
-    """`padgs::HeadWeights`."""
-
     _fields_ = fields(Pointer, "w1", "b1", "w2", "b2")
 
 
 class DecodeArguments(ctypes.Structure):
-    """`padgs::DecodeArguments`."""
-
     _fields_ = [
-        ("anchors", ctypes.c_int64),
-        *fields(ctypes.c_int32, "offsets", "inputs", "hidden"),
+        ("anchors", Int64),
+        *fields(Int32, "offsets", "inputs", "hidden"),
         *fields(HeadWeights, "opacity", "color", "covariance"),
         *fields(Pointer, "input_rows", "positions", "offset_rows", "log_scales", "attenuation"),
         *fields(Pointer, "raw_opacities", "slot_start", "slots"),
@@ -100,23 +89,19 @@ class DecodeArguments(ctypes.Structure):
 
 
 class DecodeGradientArguments(ctypes.Structure):
-    """`padgs::DecodeGradientArguments`."""
-
     _fields_ = [
         ("forward", DecodeArguments),
         *fields(Pointer, "means", "quats", "scales", "opacities", "colors"),
-        ("features", ctypes.c_int32),
+        ("features", Int32),
         *fields(Pointer, "features_out", "offsets_out", "log_scales_out", "weights_out"),
     ]
 
 
 class LossArguments(ctypes.Structure):
-    """`padgs::LossArguments`."""
-
     _fields_ = [
-        *fields(ctypes.c_int32, "width", "height"),
+        *fields(Int32, "width", "height"),
         *fields(Pointer, "image", "target", "weight"),
-        *fields(ctypes.c_int64, "weight_row_stride", "weight_column_stride"),
+        *fields(Int64, "weight_row_stride", "weight_column_stride"),
         *fields(ctypes.c_float, "lambda_l1", "normalizer"),
         *fields(Pointer, "workspace", "gradient"),
     ]

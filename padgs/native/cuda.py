@@ -33,14 +33,10 @@ NOT_COMPILED_FOR = (98, 209, 222)  # no such kernel, no image for this device, P
 
 
 class Queue(ctypes.Structure):
-    """`padgs::Queue`."""
-
     _fields_ = [("device", Int32), ("stream", Pointer)]
 
 
 class TileTable(ctypes.Structure):
-    """`padgs::TileTable`."""
-
     _fields_ = [
         *fields(Int32, "width", "height", "first_row", "end_row"),
         *fields(Pointer, "level", "row_start", "state_start"),
@@ -48,8 +44,6 @@ class TileTable(ctypes.Structure):
 
 
 class ProjectArguments(ctypes.Structure):
-    """`padgs::ProjectArguments`."""
-
     _fields_ = [
         ("camera", NativeCamera),
         ("pose", Pointer),
@@ -61,8 +55,6 @@ class ProjectArguments(ctypes.Structure):
 
 
 class ProjectGradientArguments(ctypes.Structure):
-    """`padgs::ProjectGradientArguments`."""
-
     _fields_ = [
         ("camera", NativeCamera),
         ("pose", Pointer),
@@ -73,8 +65,6 @@ class ProjectGradientArguments(ctypes.Structure):
 
 
 class SortArguments(ctypes.Structure):
-    """`padgs::SortArguments`."""
-
     _fields_ = [
         ("scratch", Pointer),
         *fields(Int64, "scratch_bytes", "count"),
@@ -84,8 +74,6 @@ class SortArguments(ctypes.Structure):
 
 
 class BinArguments(ctypes.Structure):
-    """`padgs::BinArguments`."""
-
     _fields_ = [
         ("table", TileTable),
         *fields(Pointer, "boxes", "order"),
@@ -97,8 +85,6 @@ class BinArguments(ctypes.Structure):
 
 
 class BlendInputs(ctypes.Structure):
-    """`padgs::BlendInputs`."""
-
     _fields_ = [
         ("table", TileTable),
         *fields(Int32, "projection", "wrap", "core_size"),
@@ -109,8 +95,6 @@ class BlendInputs(ctypes.Structure):
 
 
 class BlendGradientInputs(ctypes.Structure):
-    """`padgs::BlendGradientInputs`."""
-
     _fields_ = [
         ("forward", BlendInputs),
         *fields(Pointer, "grad_image", "grad_transmittance", "grad_depth", "upstream", "states", "furthest"),
@@ -124,20 +108,14 @@ class BlendGradientInputs(ctypes.Structure):
 
 
 class DeviceLossArguments(ctypes.Structure):
-    """`padgs::DeviceLossArguments`."""
-
     _fields_ = [("loss", LossArguments), *fields(Pointer, "total", "block_sums")]
 
 
 class DeviceDecodeArguments(ctypes.Structure):
-    """`padgs::DeviceDecodeArguments`."""
-
     _fields_ = [("decode", DecodeArguments), *fields(Pointer, "color_logits", "covariance_logits")]
 
 
 class DeviceDecodeGradientArguments(ctypes.Structure):
-    """`padgs::DeviceDecodeGradientArguments`."""
-
     _fields_ = [("gradient", DecodeGradientArguments), *fields(Pointer, "opacity_out", "color_out", "covariance_out")]
 
 

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from padgs.render.contract import ALPHA_MIN, Request
 from padgs.render.low_pass import low_pass_of, widened
-from padgs.render.projection import Footprints, camera_frame
-from padgs.render.published_bounds import square_boxes
+from padgs.render.projection import Footprints, camera_frame, is_sound, plane_moments
+from padgs.render.published_bounds import is_on_image, square_boxes
 from padgs.sphere.camera import Panorama, Pinhole
 from padgs.sphere.panorama import longitude_latitude, pixel_from_angles, projection_jacobian
 
@@ -89,13 +89,7 @@ def _footprints(
     if request.probe is not None:
         centers = centers + request.probe * centers.new_tensor([camera.width / 2, camera.height / 2])
     half_covariance = jacobian @ (orientations * gaussians.scales[:, None, :])  # [N, 2, 3]
-    var_u, var_v = (half_covariance**2).sum(-1).unbind(-1)
-    cov_uv = (half_covariance[:, 0] * half_covariance[:, 1]).sum(-1)
-    # det(S) without the cancelling difference var_u var_v - cov_uv^2: Lagrange's identity plus the low-pass terms.
-    minors = torch.linalg.cross(half_covariance[:, 0], half_covariance[:, 1])
-    low_pass = low_pass_of(options, camera).own
-    determinant = (minors**2).sum(-1) + low_pass * (var_u + var_v) + low_pass**2
-    var_u, var_v = var_u + low_pass, var_v + low_pass
+    var_u, cov_uv, var_v, determinant = plane_moments(half_covariance, low_pass_of(options, camera).own)
     a = torch.sqrt(var_v / determinant)
     whitening = torch.stack((a, -a * (cov_uv / var_v), torch.rsqrt(var_v)), dim=-1)
     covariance = torch.stack((var_u, cov_uv, var_v), dim=-1).detach()
@@ -104,14 +98,9 @@ def _footprints(
         boxes = square_boxes(centers.detach(), 0.5 * (covariance[:, 0] + covariance[:, 2]), determinant.detach())
     else:
         boxes = _exact_boxes(centers.detach(), covariance, opacities)
-    on_image = (boxes[:, 3] > boxes[:, 2]) & (boxes[:, 3] > 0) & (boxes[:, 2] < camera.height)
-    on_image &= boxes[:, 1] > boxes[:, 0]
-    wrap = options.wrap and isinstance(camera, Panorama)
-    if not wrap:
-        on_image &= (boxes[:, 1] > 0) & (boxes[:, 0] < camera.width)
-    sound = torch.isfinite(determinant.detach()) & (determinant.detach() > 0)  # else float overflows or nothing spreads
-    visible = in_front & (opacities >= ALPHA_MIN) & on_image & sound
-    turn = float(camera.width) if wrap else torch.inf
+    turn = float(camera.width) if options.wrap and isinstance(camera, Panorama) else torch.inf
+    on_image = is_on_image(boxes, camera.width, camera.height, wraps=turn < torch.inf)
+    visible = in_front & (opacities >= ALPHA_MIN) & on_image & is_sound(determinant)
     return PlanarFootprints(gaussians.opacities, means.norm(dim=-1), visible, boxes, centers, whitening, turn)
 
 

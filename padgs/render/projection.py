@@ -67,6 +67,23 @@ def project(request: Request) -> Footprints:
     return replace(footprints_of(replace(request, gaussians=harmless)), visible=visible)
 
 
+def plane_moments(half_covariance: Tensor, low_pass: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Variances and covariance (uu, uv, vv) of A A^T + low_pass for A [N, 2, 3], and the determinant, all [N].
+
+    The determinant is that of Lagrange's identity plus the low-pass terms; uu vv - uv^2 would cancel.
+    """
+    var_u, var_v = (half_covariance**2).sum(-1).unbind(-1)
+    cov_uv = (half_covariance[:, 0] * half_covariance[:, 1]).sum(-1)
+    minors = torch.linalg.cross(half_covariance[:, 0], half_covariance[:, 1])
+    determinant = (minors**2).sum(-1) + low_pass * (var_u + var_v) + low_pass**2
+    return var_u + low_pass, cov_uv, var_v + low_pass, determinant
+
+
+def is_sound(determinant: Tensor) -> Tensor:
+    """Where [N] a covariance can be drawn with: elsewhere float overflows or nothing spreads."""
+    return torch.isfinite(determinant.detach()) & (determinant.detach() > 0)
+
+
 def camera_frame(request: Request) -> tuple[Tensor, Tensor]:
     """Means [N, 3] and orientations R_cam R(q) [N, 3, 3] in the camera frame; Sigma = (R diag(s)) (R diag(s))^T."""
     rotation, translation = request.cam_from_world[:3, :3], request.cam_from_world[:3, 3]

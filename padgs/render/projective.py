@@ -15,7 +15,7 @@ from torch import Tensor
 
 from padgs.render.contract import ALPHA_MIN, Request
 from padgs.render.low_pass import low_pass_of, widened
-from padgs.render.projection import Footprints, camera_frame
+from padgs.render.projection import Footprints, camera_frame, is_sound, plane_moments
 from padgs.render.published_bounds import is_on_image, tangent_boxes
 from padgs.sphere.camera import Camera, Panorama
 
@@ -89,17 +89,12 @@ def project_tangent(request: Request) -> TangentFootprints:
     tangent = _tangent_basis(normal)  # [N, 2, 3]
     spread = orientations * gaussians.scales[:, None, :]
     half = tangent @ spread / radius[:, None, None]  # [N, 2, 3]
-    var_0, var_1 = (half**2).sum(-1).unbind(-1)
-    covariance = (half[:, 0] * half[:, 1]).sum(-1)
-    minors = torch.linalg.cross(half[:, 0], half[:, 1])  # det(S) without a difference that cancels
-    determinant = (minors**2).sum(-1) + low_pass * (var_0 + var_1) + low_pass**2
-    var_0 = var_0 + low_pass
+    var_0, covariance, _, determinant = plane_moments(half, low_pass)
     # L = C^-1 E with the Cholesky factor C of S: its first row is E_0 / c, its second orthogonal to it under S.
     first = tangent[:, 0] / torch.sqrt(var_0)[:, None]
     second = (tangent[:, 1] - (covariance / var_0)[:, None] * tangent[:, 0]) / torch.sqrt(determinant / var_0)[:, None]
     whitening = torch.stack((first, second), dim=-2)
-    sound = torch.isfinite(determinant.detach()) & (determinant.detach() > 0)  # else float overflows or nothing spreads
-    visible = in_front & (gaussians.opacities.detach() >= ALPHA_MIN) & sound
+    visible = in_front & (gaussians.opacities.detach() >= ALPHA_MIN) & is_sound(determinant)
     boxes = None
     if options.bounds == "square" and isinstance(camera, Panorama):
         boxes = tangent_boxes(means.detach(), spread.detach(), determinant.detach(), low_pass, camera)

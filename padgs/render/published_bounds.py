@@ -55,10 +55,10 @@ def tangent_boxes(means: Tensor, spread: Tensor, determinant: Tensor, low_pass: 
     return square_boxes(centers, 0.5 * trace, determinant * PUBLISHED_FOCAL**4)
 
 
-def is_on_image(boxes: Tensor, width: int, height: int) -> Tensor:
-    """Which boxes [N, 4] hold a pixel of the image; [N] bool."""
-    columns = (boxes[:, 1] > 0) & (boxes[:, 0] < width) & (boxes[:, 1] > boxes[:, 0])
-    return columns & (boxes[:, 3] > 0) & (boxes[:, 2] < height) & (boxes[:, 3] > boxes[:, 2])
+def is_on_image(boxes: Tensor, width: int, height: int, *, wraps: bool = False) -> Tensor:
+    """Which boxes [N, 4] hold a pixel of the image, whose columns may go on across the seam; [N] bool."""
+    rows = (boxes[:, 3] > 0) & (boxes[:, 2] < height) & (boxes[:, 3] > boxes[:, 2]) & (boxes[:, 1] > boxes[:, 0])
+    return rows if wraps else rows & (boxes[:, 1] > 0) & (boxes[:, 0] < width)
 
 
 def instances(boxes: Tensor, width: int, height: int) -> int:

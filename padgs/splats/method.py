@@ -6,6 +6,7 @@ subclass in `baselines` that says which.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -62,8 +63,10 @@ class SplatMethod(Method):
         splats = Splats(empty, empty, empty, degree=self.options.sh_degree, unit=values["unit"])
         return self._trainee_of(splats, values["extent"], values["iterations"])
 
-    def _trainee_of(self, splats: Splats, extent: float, iterations: int) -> SplatTrainee:
-        return SplatTrainee(
+    def _trainee_of(
+        self, splats: Splats, extent: float, iterations: int, kind: Callable[..., SplatTrainee] = SplatTrainee
+    ) -> SplatTrainee:
+        return kind(
             splats,
             self.options,
             self.render_config,

@@ -1,6 +1,6 @@
 import torch
 
-from padgs.egonerf.absorption import visible_shares
+from padgs.egonerf.ray_samples import visible_shares
 
 DENSITY = 0.7
 

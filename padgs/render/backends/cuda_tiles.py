@@ -39,11 +39,7 @@ class TileRows:
         self.row_start = starts.to(device, torch.int32)
 
     def state_starts(self, instances: list[int]) -> list[int]:
-        """Blocks of 256 pixel states before each row, and all of them: 2^level for each bucket that a row may have.
-
-        Args:
-            instances: of each row of tiles.
-        """
+        """Blocks of 256 pixel states before each row, and all of them: 2^level for each bucket that a row may have."""
         starts = [0]
         for level, tiles, count in zip(self.levels, self.tiles, instances, strict=True):
             starts.append(starts[-1] + ((count // BUCKET + 1 + tiles) << level))
