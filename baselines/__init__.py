@@ -1,4 +1,4 @@
-"""The methods that are compared, one file each; `padgs.learning.method.Method` is what they have in common."""
+"""The methods that are compared, one file each; PaD-GS, which they are compared with, has a room (padgs/anchors)."""
 
 METHODS = {
     "padgs": "padgs.anchors.method:PaDGSMethod",

@@ -10,7 +10,7 @@ from padgs.egonerf.model import EgoNeRF
 from padgs.egonerf.options import EgoNeRFOptions
 from padgs.egonerf.ray_trainer import RayTrainer
 from padgs.egonerf.trainee import EgoNeRFTrainee, EgoNeRFTraining
-from padgs.learning.loop import Budget, Stage, TrainOptions, model_state
+from padgs.learning.loop import Budget, Stage, TrainOptions
 from padgs.learning.method import Method
 from padgs.learning.trainee import State
 from padgs.render.config import RenderConfig
@@ -44,14 +44,14 @@ class EgoNeRFMethod(Method):
         return EgoNeRFTrainee(EgoNeRF.from_scene(scene, self.options, self.seed), self.options, iterations)
 
     def _blank(self, state: State) -> EgoNeRFTrainee:
-        stored = model_state(state)
+        stored = state.of_model()
         centre = torch.tensor(stored.values["centre"], dtype=torch.float64)
         model = EgoNeRF(self.options, centre, stored.values["unit"], stored.values["travel"])
         model = model.to(next(iter(stored.tensors.values())).device)
         return EgoNeRFTrainee(model, self.options, self.options.environment_pretraining + 1)
 
     def _trained_by(self, trainee: EgoNeRFTrainee, scene: Scene, budget: Budget, stage: Stage) -> RayTrainer:
-        return RayTrainer(trainee, scene, budget, self.train_options, self.seed, rays=self.options.rays)
+        return RayTrainer(trainee, scene, budget, self.train_options, self.seed, rays=self.options.rays, stage=stage)
 
     def _refuse_strangers(self) -> None:
         """Say so where an option is set that this method would have to ignore."""

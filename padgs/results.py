@@ -21,7 +21,7 @@ from typing import Any
 SCHEMA = 2
 ADDED = {"peak_device_memory_bytes"}  # to the schema since: files without them are read, with the default
 FILE_NAME = "result.json"
-LOG_NAME = "log.jsonl"
+LOG_NAME, CONFIG_NAME = "log.jsonl", "config.yaml"
 PICTURES = "renders"  # folder of truth | render | error of each test view, in one picture
 STATUSES = {
     "ok": "trained to the end and evaluated",

@@ -32,7 +32,7 @@ class GrowthOptions:
     gradient_threshold: float = PUBLISHED_THRESHOLD / 3  # the loss is a mean over 3 channels, the published one a sum
     levels: int = 3  # grids from coarse to fine
     coarsest: int = 16  # cell of the first level, in voxels
-    refinement: int = 4  # each level's cells are smaller by this factor, and its threshold larger by its half
+    refinement: int = 4  # each level's cells are smaller by this factor, its threshold larger by refinement / 2
     eligible_share: float = 0.4  # a Gaussian must have been seen in more than this share of grow_every iterations
     prune_share: float = 0.8  # an anchor must have been decoded in more than this share of grow_every iterations
     min_opacity: float = 0.01  # anchors whose positive opacities sum to less, on average over views, are pruned

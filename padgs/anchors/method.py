@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from padgs.anchors.growth import GrowthOptions
 from padgs.anchors.model import PaDGS, PaDGSOptions
 from padgs.anchors.trainee import AnchorTrainee, LearningRates
-from padgs.learning.loop import Budget, Record, Stage, model_state
+from padgs.learning.loop import Budget, Record, Stage
 from padgs.learning.method import Method
 from padgs.learning.schedule import PUBLISHED_ITERATIONS
 from padgs.learning.trainee import State
@@ -59,7 +59,7 @@ class PaDGSMethod(Method):
         return self._trainee_of(PaDGS.from_scene(scene, self.options, seed=self.seed), extent, iterations)
 
     def _blank(self, state: State) -> AnchorTrainee:
-        stored = model_state(state)
+        stored = state.of_model()
         positions, log_scales = stored.tensors["positions"], stored.tensors["log_scales"]
         unit, voxel_size = stored.values["unit"], stored.values["voxel_size"]
         model = PaDGS(positions, log_scales, self.options, voxel_size=voxel_size, unit=unit)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
@@ -10,7 +10,6 @@ from typing import Any
 import torch
 from torch import nn
 
-from padgs.learning.loop import model_state
 from padgs.learning.schedule import ParameterGroup
 from padgs.learning.trainee import Drawing, Size, State
 from padgs.scene import Scene, View
@@ -21,7 +20,7 @@ from padgs.splats.trainee import SplatTrainee
 PREFIX = "calibration/"  # of its tensors in a state
 
 
-class Calibration(nn.Module):
+class Calibration(nn.Module, ABC):
     """A differentiable model of the cameras that draws views through itself."""
 
     @abstractmethod
@@ -62,7 +61,7 @@ class CalibratedTrainee(SplatTrainee):
         return self.calibration.draw(super().draw, view)
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
-        """As the splats do; the last event of a run says what was found of the cameras."""
+        """As the splats do; the last event of a whole run says what was found of the cameras."""
         events = super().adapt(iteration, optimizer)
         return (*events, self.calibration.summary()) if iteration == self.iterations else events
 
@@ -103,7 +102,7 @@ class CalibratedMethod(SplatMethod):
         return super()._start(scene, iterations)
 
     def _blank(self, state: State) -> SplatTrainee:
-        self._calibration = self._as_stored(model_state(state).values["calibration"])
+        self._calibration = self._as_stored(state.of_model().values["calibration"])
         return super()._blank(state)
 
     def _trainee_of(

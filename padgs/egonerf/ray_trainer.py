@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from contextlib import nullcontext
 from typing import Any, ClassVar, cast
 
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from padgs.egonerf.ray_pixels import RayPixels
 from padgs.egonerf.trainee import EgoNeRFTrainee
-from padgs.learning.loop import Budget, Trainer, TrainOptions
+from padgs.learning.loop import Budget, Stage, Trainer, TrainOptions
 from padgs.learning.trainee import Trainee
 from padgs.scene import Scene
 
@@ -33,6 +34,7 @@ class RayTrainer(Trainer):
         seed: int = 0,
         *,
         rays: int,
+        stage: Stage = nullcontext,
     ) -> None:
         """Load all pixels; nothing is traced yet.
 
@@ -41,12 +43,13 @@ class RayTrainer(Trainer):
             options: the weight of pixels in the mean, which masks weigh too, and how often all is checked.
             seed: decides which rays are drawn, and how their samples are jittered.
             rays: rays of an iteration.
+            stage: as of any trainer.
 
         Raises:
             ValueError: the pixels of a view cannot be used.
         """
         # Rays are all that it draws, so of a trainee it has what does not depend on views.
-        super().__init__(cast(Trainee, trainee), scene, budget, options, seed)
+        super().__init__(cast(Trainee, trainee), scene, budget, options, seed, stage=stage)
         self._tracer, self._rays = trainee, rays
         started = time.perf_counter()
         self._pixels = RayPixels(scene.train, options.weight, self._optimiser.device, seed)
@@ -55,21 +58,26 @@ class RayTrainer(Trainer):
 
     def _step(self, iteration: int) -> tuple[float | Tensor, dict[str, int], tuple[str, ...]]:
         tracer, optimiser, generator = self._tracer, self._optimiser, self._pixels.generator
-        rays = self._pixels.draw(self._rays)
+        with self._stage("target"):
+            rays = self._pixels.draw(self._rays)
         value = rays.weight.new_zeros((), dtype=torch.float64)
         total = 3 * rays.weight.sum()
         for part in torch.arange(self._rays, device=total.device).split(tracer.rays_at_once):
-            image = tracer.colors(rays.origins[part], rays.directions[part], generator, iteration)
+            with self._stage("draw"):
+                image = tracer.colors(rays.origins[part], rays.directions[part], generator, iteration)
             error = (image - rays.color[part]).square() * rays.weight[part, None]
             loss = error.sum() / total
             value += loss.detach()
             read = self._read(value, iteration)
             if isinstance(read, float) and not math.isfinite(read):
                 optimiser.refuse_non_finite({**optimiser.parameters(), "image": image, "loss": loss}, iteration)
-            loss.backward()
-        extra = tracer.regularisation(iteration)
-        if extra is not None:
-            extra.backward()
+            with self._stage("backward"):
+                loss.backward()
+        with self._stage("backward"):
+            extra = tracer.regularisation(iteration)
+            if extra is not None:
+                extra.backward()
         optimiser.check(iteration)
-        optimiser.step(iteration)
+        with self._stage("optimiser"):
+            optimiser.step(iteration)
         return self._read(value, iteration), {**tracer.counts(), "rays": self._rays}, ()

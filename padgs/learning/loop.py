@@ -22,10 +22,9 @@ from padgs.learning.loss import NORMALISATIONS, ROW_WEIGHTS, photometric_loss
 from padgs.learning.optimiser import Optimiser
 from padgs.learning.order import Order, ViewOrder
 from padgs.learning.targets import Targets
-from padgs.learning.trainee import State, Trainee
+from padgs.learning.trainee import MODEL, State, Trainee
 from padgs.scene import Scene
 
-MODEL = "model/"  # prefix of the model's own tensors in a state
 Stage = Callable[[str], AbstractContextManager[object]]  # entered with the name of each part of an iteration
 
 
@@ -180,12 +179,7 @@ class Trainer:
             ValueError: the state is of a run on other data.
         """
         self._order.load(state)
-        self._trainee.load_state(model_state(state))
+        self._trainee.load_state(state.of_model())
         self._optimiser.load(state)
         torch.set_rng_state(state.tensors["random/torch"].cpu())
         self.iteration, self.seconds = state.values["iteration"], state.values["seconds"]
-
-
-def model_state(state: State) -> State:
-    """The model's own part of what `Trainer.state` returned, for models that are only looked at."""
-    return State(state.under(MODEL), state.values["model"])

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import nullcontext
 from typing import Any, ClassVar
 
-from padgs.learning.loop import Budget, Record, Stage, Trainer, TrainOptions, model_state
+from padgs.learning.loop import Budget, Record, Stage, Trainer, TrainOptions
 from padgs.learning.trainee import Size, State, Trainee
 from padgs.render import Rendering
 from padgs.render.config import RenderConfig
@@ -86,7 +86,7 @@ class Method(ABC):
     def load_state(self, state: State) -> None:
         """Become the method that `state` was taken of; `render` works at once, `fit` goes on from there."""
         self._trainee = self._blank(state)
-        self._trainee.load_state(model_state(state))
+        self._trainee.load_state(state.of_model())
         self._trainer, self._loaded = None, state
 
     @property

@@ -1,6 +1,7 @@
 """What can be trained: a model with its densifier and its learning rates, as the loop sees them.
 
-Each family has one: `padgs.anchors.trainee` (PaD-GS), `padgs.splats.trainee` (3DGS), `padgs.egonerf.trainee`.
+Each family has one: `padgs.anchors.trainee` (PaD-GS), `padgs.splats.trainee` (3DGS). That of EgoNeRF casts rays instead
+of drawing views, so it has a trainer of its own (`padgs.egonerf.ray_trainer`).
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ from padgs.learning.targets import Target
 from padgs.render import Rendering
 from padgs.scene import View
 
+MODEL = "model/"  # prefix of the model's own tensors in the state of a trainer
+
 
 @dataclass(frozen=True)
 class State:
@@ -29,6 +32,10 @@ class State:
     def under(self, prefix: str) -> dict[str, Tensor]:
         """The tensors whose names begin so, without that beginning."""
         return {name.removeprefix(prefix): t for name, t in self.tensors.items() if name.startswith(prefix)}
+
+    def of_model(self) -> State:
+        """The model's own part of what `Trainer.state` returned."""
+        return State(self.under(MODEL), self.values["model"])
 
 
 @dataclass(frozen=True)
@@ -50,7 +57,7 @@ class Drawing:
     """What a model drew of one view, with all that the densification statistics need after `backward`."""
 
     rendering: Rendering
-    probe: Tensor  # [N, 2] or [N, 3], see `padgs.splats.probes`; its .grad is filled by backward
+    probe: Tensor  # [N, 2], or as `padgs.splats.probes` says; its .grad is filled by backward
     gaussians: Gaussians  # the N that were drawn
     slots: Tensor  # [N] int64: the row of the model's statistics that each drawn Gaussian counts for
     _: KW_ONLY

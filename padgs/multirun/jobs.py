@@ -153,7 +153,7 @@ class Multirun:
         """Have runs mirrored that are running or have ended since the last time."""
         self._looked = time.monotonic()
         for index, state in list(self.states.items()):
-            if index not in self._tracked and state.run and (self.runs / state.run / "config.yaml").exists():
+            if index not in self._tracked and state.run and (self.runs / state.run / results.CONFIG_NAME).exists():
                 self._tracker.update(self.runs / state.run)
                 if state.ended:
                     self._tracked.add(index)

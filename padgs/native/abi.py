@@ -11,6 +11,8 @@ from torch import Tensor
 
 Pointer = ctypes.c_void_p
 Int32, Int64 = ctypes.c_int32, ctypes.c_int64
+MOMENTS = 16  # floats per (Gaussian, tile) instance
+ABSOLUTE_MOMENT = 14  # the one with the sum of absolute pulls
 
 
 def fields(kind: type, *names: str) -> list[tuple[str, type]]:

@@ -58,7 +58,9 @@ class RunFolder:
         """
         with self._writing():
             self.renders.mkdir(parents=True, exist_ok=True)
-            results.replace_file(self.path / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(dict(values))).encode())
+            results.replace_file(
+                self.path / results.CONFIG_NAME, OmegaConf.to_yaml(OmegaConf.create(dict(values))).encode()
+            )
 
     def result(self) -> Result | None:
         """The result, if the run is done.

@@ -12,14 +12,14 @@ import torch
 from omegaconf import OmegaConf
 from scipy.spatial.transform import Rotation, Slerp
 
-from padgs import data
+from padgs import results
 from padgs.learning.method import Method
 from padgs.results import Result, Scores
 from padgs.runs import checkpoint
 from padgs.runs.config import RunConfig, config_from_values
 from padgs.runs.device import chosen
 from padgs.runs.folder import RunFolder, RunFolderError
-from padgs.runs.session import build
+from padgs.runs.session import build, scene_of
 from padgs.scene import Scene, View
 from padgs.scoring.evaluate import evaluate
 from padgs.scoring.protocols import PROTOCOLS
@@ -59,11 +59,9 @@ class OpenedRun:
         """The scene that it was trained on, loaded when first asked for.
 
         Raises:
-            DataError: it is not where it was; `load_run(folder, data=...)` says where it is now.
+            DataError: it is not where it was; `load_run(folder, data_path=...)` says where it is now.
         """
-        device = chosen(self.config.run.device, self.config.render)
-        options = self.config.data.options(str(device))
-        return data.load(self.config.data.path, self.config.data.format, options).to(device)
+        return scene_of(self.config, chosen(self.config.run.device, self.config.render))
 
     @property
     def scores(self) -> dict[str, Scores]:
@@ -85,7 +83,7 @@ class OpenedRun:
             raise ValueError(f"unknown protocol {protocol!r}; known: {', '.join(rules)}")
         return evaluate(self.method.render, self.scene.test, rules[protocol])
 
-    def path(self, frames: int) -> list[View]:
+    def camera_path(self, frames: int) -> list[View]:
         """Views along a path through the training cameras in their order, `frames` of them, evenly spaced in number.
 
         Raises:
@@ -108,20 +106,21 @@ class OpenedRun:
         return found
 
 
-def load_run(folder: str | Path, *, data: str | Path | None = None, device: str = "auto") -> OpenedRun:
+def load_run(folder: str | Path, *, data_path: str | Path | None = None, device: str = "auto") -> OpenedRun:
     """Open the folder of a run.
 
     Args:
         folder: with `config.yaml` and `checkpoint/`, as `padgs-run` writes them.
-        data: where the data set is now, if not where it was.
+        data_path: where the data set is now, if not where it was.
         device: auto, cpu or cuda.
 
     Raises:
         RunFolderError: it is no such folder, or has no checkpoint.
         CheckpointError, ResultError, ConfigError: one of its files is damaged, or of another version.
+        ValueError, OSError: a device that is not there, or cannot draw this.
     """
     files = RunFolder(Path(folder))
-    settings = files.path / "config.yaml"
+    settings = files.path / results.CONFIG_NAME
     if not settings.is_file() or not checkpoint.exists(files.checkpoint):
         raise RunFolderError(
             f"{folder} has no {'checkpoint' if settings.is_file() else settings.name}; give the folder of one run, as "
@@ -129,7 +128,7 @@ def load_run(folder: str | Path, *, data: str | Path | None = None, device: str 
         )
     values: Any = OmegaConf.to_container(OmegaConf.load(settings))
     values["data"].pop("device", None)  # of runs until run.device decided alone
-    values["data"]["path"] = values["data"]["path"] if data is None else str(data)
+    values["data"]["path"] = values["data"]["path"] if data_path is None else str(data_path)
     values["run"]["device"] = device
     config = config_from_values(values)
     method = build(config)

@@ -27,6 +27,7 @@ from padgs.runs.interrupt import Interrupt, Interrupted
 from padgs.runs.live import LiveLine
 from padgs.runs.scoring import frame_times, held_out_psnr, same_rules, scores
 from padgs.runs.summary import introduce, show_result
+from padgs.scene import Scene
 from padgs.scoring.protocols import Protocol
 
 
@@ -58,9 +59,8 @@ class Session:
         torch.manual_seed(config.seed)
         device = chosen(config.run.device, config.render)
         clock.reset_peak_memory(device)
-        images_on = str(device) if config.run.images_on == "device" else config.run.images_on
         self.config, self.console, self.watch = config, console, watch
-        self.scene = data.load(config.data.path, config.data.format, config.data.options(images_on)).to(device)
+        self.scene = scene_of(config, device)
         name = run_id(config.values(), self.scene.name, self.scene.fingerprint, config.preset)
         self.folder = RunFolder(Path(config.run.folder) / name)
 
@@ -159,11 +159,12 @@ class Session:
             "status": "ok" if progress.iteration == self.config.train.iterations else "timeout",
             "counts": {**size.counts, "parameters": size.parameters},
             "model_bytes": size.bytes,
+            "timing": {"train_seconds": progress.seconds},
             **outcome.peak_memory(self.scene),  # of training; scoring has networks of its own
         }
 
     def _tested(self, method: Method, progress: Progress) -> dict[str, Any]:
-        """The fields of a result that take test views."""
+        """The fields of a result that take test views, times of training included."""
         save_picture = self.folder.save_picture if self.config.run.pictures else None
         timing = {"train_seconds": progress.seconds, **frame_times(method, self.scene)}
         return {"timing": timing, "scores": scores(method, self.scene, self.config.protocols, save_picture)}
@@ -202,6 +203,16 @@ class Session:
 
     def _say(self, text: str) -> None:
         self.console.print(text, highlight=False, soft_wrap=True)
+
+
+def scene_of(config: RunConfig, device: torch.device) -> Scene:
+    """The scene of a configuration, on a device, its panoramas where `run.images_on` says.
+
+    Raises:
+        DataError: the input cannot be used.
+    """
+    images_on = str(device) if config.run.images_on == "device" else config.run.images_on
+    return data.load(config.data.path, config.data.format, config.data.options(images_on)).to(device)
 
 
 def build(config: RunConfig) -> Method:

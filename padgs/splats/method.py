@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 
 from padgs.checks import check
-from padgs.learning.loop import TrainOptions, model_state
+from padgs.learning.loop import TrainOptions
 from padgs.learning.method import Method
 from padgs.learning.trainee import State
 from padgs.scene import Scene
@@ -58,7 +58,7 @@ class SplatMethod(Method):
         return self._trainee_of(splats, scene.extent, iterations)
 
     def _blank(self, state: State) -> SplatTrainee:
-        stored = model_state(state)
+        stored = state.of_model()
         values, empty = stored.values, stored.tensors["splats/means"][:0]
         splats = Splats(empty, empty, empty, degree=self.options.sh_degree, unit=values["unit"])
         return self._trainee_of(splats, values["extent"], values["iterations"])

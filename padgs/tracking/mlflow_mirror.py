@@ -67,7 +67,7 @@ class Mirror:
     def _log_settings(self, identity: str, run: Path) -> None:
         from mlflow.entities import Param
 
-        config: Any = OmegaConf.to_container(OmegaConf.load(run / "config.yaml"))
+        config: Any = OmegaConf.to_container(OmegaConf.load(run / results.CONFIG_NAME))
         (flat,) = pandas.json_normalize(config).to_dict("records")  # with dotted keys
         params = [Param(str(key), str(value)[:LONGEST_VALUE]) for key, value in flat.items()]
         for batch in batches(params, MOST_PARAMS):

@@ -17,10 +17,10 @@ from padgs.native import cpu
 from padgs.native.abi import Inputs, pointer
 from padgs.registry import lookup
 from padgs.render import RenderOptions
+from padgs.render.backends.cpu_tiles import Projected
 from padgs.render.backends.native_camera import native_camera
 from padgs.render.config import RenderConfig
 from padgs.render.low_pass import low_pass_of, widened
-from padgs.render.tiles import Projected
 from padgs.scene import Scene
 from padgs.sphere.camera import Panorama
 

@@ -57,7 +57,7 @@ def test_an_opened_run_shows_and_scores_what_was_trained(folder):
 
 def test_a_path_goes_through_the_training_cameras(folder):
     run = padgs.load_run(folder, device="cpu")
-    views = run.path(5)  # three cameras, and one between each two
+    views = run.camera_path(5)  # three cameras, and one between each two
     for view, camera in zip(views[::2], run.scene.train, strict=True):
         assert torch.allclose(view.cam_from_world, camera.cam_from_world, atol=1e-9)
     middle = (run.scene.train[0].center + run.scene.train[1].center) / 2
@@ -66,7 +66,7 @@ def test_a_path_goes_through_the_training_cameras(folder):
     assert torch.allclose(turn @ turn.T, torch.eye(3, dtype=torch.float64), atol=1e-9)
     assert run.render(views[1]).image.shape == (16, 32, 3)
     with pytest.raises(ValueError, match="a path of 1 frames through 3 views"):
-        run.path(1)
+        run.camera_path(1)
 
 
 def test_a_run_that_is_not_finished_opens_too_and_an_old_key_is_passed_over(folder, tmp_path):

@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 
 from padgs.native import cpu
-from padgs.native.abi import BlendArguments, BlendGradientArguments, Gradients, Inputs, pointer
-from padgs.render.backends.native import Drawing, Pixels, Upstream, rasterize_as
+from padgs.native.abi import MOMENTS, BlendArguments, BlendGradientArguments, Gradients, Inputs, pointer
+from padgs.render.backends.cpu_tiles import Projected, Strip
+from padgs.render.backends.native import NativeImage, Pixels, Upstream, rasterize_as
 from padgs.render.backends.native_camera import native_camera, native_rays
 from padgs.render.contract import Rendering, Request
 from padgs.render.published_bounds import check_memory
-from padgs.render.tiles import MOMENTS, Projected, Strip
 
 
 def rasterize(request: Request) -> Rendering:
@@ -53,7 +53,7 @@ class _Cores:
         arguments.cores, arguments.core_start = pointer(self.words), pointer(self.start)
 
 
-class _Drawing(Drawing):
+class _Drawing(NativeImage):
     def draw(self, inputs: Inputs, pose: Tensor, background: Tensor, *, differentiated: bool) -> tuple[Pixels, Tensor]:
         camera, options = self.camera, self.options
         self._projected = Projected(native_camera(pose, camera, options), inputs, options.max_instances)

@@ -14,13 +14,12 @@ import torch
 from torch import Tensor
 
 from padgs.native import cuda
-from padgs.native.abi import Gradients, Inputs, pointer
+from padgs.native.abi import MOMENTS, Gradients, Inputs, pointer
 from padgs.render.backends.cuda_tiles import DeviceProjected, DeviceStrip
-from padgs.render.backends.native import Drawing, Pixels, Upstream, rasterize_as
+from padgs.render.backends.native import NativeImage, Pixels, Upstream, rasterize_as
 from padgs.render.backends.native_camera import NativeRays, native_camera, native_rays
 from padgs.render.contract import Rendering, RenderOptions, Request
 from padgs.render.published_bounds import check_memory
-from padgs.render.tiles import MOMENTS
 from padgs.sphere.camera import Camera
 
 IDENTITY = torch.eye(4)
@@ -105,7 +104,7 @@ class Outputs:
         )
 
 
-class _Drawing(Drawing):
+class _Drawing(NativeImage):
     def draw(self, inputs: Inputs, pose: Tensor, background: Tensor, *, differentiated: bool) -> tuple[Pixels, Tensor]:
         camera, options, device = self.camera, self.options, pose.device
         self._projected = DeviceProjected(native_camera(IDENTITY, camera, options), pose, inputs, options.max_instances)

@@ -1,4 +1,4 @@
-"""Projected Gaussians and tile lists in the memory of a GPU, strip by strip; `padgs.render.tiles` is the CPU's.
+"""Projected Gaussians and tile lists in the memory of a GPU, strip by strip; cpu_tiles.py is the CPU's.
 
 The host reads one thing back: how many instances each row of tiles has, before anything of their size is allocated.
 Where it must not wait (`padgs.render.backends.captured`), there is room for a stated number of them instead: Gaussians
@@ -18,7 +18,7 @@ from torch import Tensor
 from padgs.native import cuda
 from padgs.native.abi import Inputs, NativeCamera, pointer
 from padgs.native.cuda import Queue, SortArguments, TileTable
-from padgs.render.tiles import TILE, strip_cuts
+from padgs.render.backends.cpu_tiles import TILE, strip_cuts
 
 BUCKET = 32  # instances of one list that a warp differentiates together, see csrc/cuda/layout.h
 CHUNK_PIXELS = TILE * TILE

@@ -14,10 +14,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from padgs.native.abi import Inputs, pointer
+from padgs.native.abi import ABSOLUTE_MOMENT, Inputs, pointer
 from padgs.render.backends.native_camera import NativeRays
 from padgs.render.contract import Rendering, Request
-from padgs.render.tiles import ABSOLUTE_MOMENT
 from padgs.sphere.camera import RayTable
 
 Pixels = tuple[Tensor, Tensor, Tensor]  # image [H, W, 3], transmittance [H, W], depth [H, W]
@@ -33,7 +32,7 @@ class Upstream(NamedTuple):
     absolute: bool  # whether the absolute signal is asked for
 
 
-class Drawing(ABC):
+class NativeImage(ABC):
     """One image of a native library, and what going back takes besides its pixels, which autograd keeps.
 
     (Pixels refer to the drawing, by way of autograd; if it referred to them, neither would be freed.)
@@ -75,7 +74,7 @@ class Leaves(NamedTuple):
     table: Any = None  # of the camera's rays
 
 
-def rasterize_as(drawing: Drawing, request: Request) -> Rendering:
+def rasterize_as(drawing: NativeImage, request: Request) -> Rendering:
     """Fill the drawing with what is requested, differentiably."""
     leaves = Leaves(
         **vars(request.gaussians),
@@ -92,7 +91,7 @@ def rasterize_as(drawing: Drawing, request: Request) -> Rendering:
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, drawing: Drawing, grad_enabled: bool, *leaves: Tensor | None):
+    def forward(ctx: Any, drawing: NativeImage, grad_enabled: bool, *leaves: Tensor | None):
         named = Leaves(*leaves)
         attributes = [None if t is None else t.detach().contiguous() for t in named[:6]]
         pose, background = (t.detach().contiguous() for t in (named.cam_from_world, named.background))

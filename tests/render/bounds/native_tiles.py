@@ -9,8 +9,8 @@ from torch import Tensor
 from padgs.gaussians import Gaussians
 from padgs.native.abi import Inputs, pointer
 from padgs.render import RenderOptions
+from padgs.render.backends.cpu_tiles import TILE, Projected
 from padgs.render.backends.native_camera import native_camera
-from padgs.render.tiles import TILE, Projected
 from padgs.sphere.camera import Camera
 
 

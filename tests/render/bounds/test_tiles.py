@@ -28,8 +28,8 @@ from render_cases import (
 )
 
 from padgs.render import RenderOptions, render
+from padgs.render.backends.cpu_tiles import TILE
 from padgs.render.contract import ALPHA_MIN
-from padgs.render.tiles import TILE
 from padgs.sphere.camera import Panorama
 
 few = settings(max_examples=10, deadline=None, derandomize=True, database=None)

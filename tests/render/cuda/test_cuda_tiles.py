@@ -15,9 +15,9 @@ from torch import Tensor
 from padgs.native import cuda
 from padgs.native.abi import Inputs, Pointer, pointer
 from padgs.render import RenderOptions
+from padgs.render.backends.cpu_tiles import TILE
 from padgs.render.backends.cuda_tiles import BUCKET, DeviceProjected, TileRows
 from padgs.render.backends.native_camera import native_camera
-from padgs.render.tiles import TILE
 
 pytestmark = [
     pytest.mark.skipif(cuda_engine.COMPILER is None, reason="no C++ compiler to run the arithmetic on the host"),

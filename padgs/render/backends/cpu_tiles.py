@@ -15,8 +15,6 @@ from padgs.native import cpu
 from padgs.native.abi import Inputs, NativeCamera, TileGrid, pointer
 
 TILE = 16  # pixels
-MOMENTS = 16  # floats per instance, see csrc/abi.h
-ABSOLUTE_MOMENT = 14
 
 
 class Strip:
