@@ -21,31 +21,27 @@ class Goal:
     name: str
     limit: float
     unit: str
-    source: str
     path: str
     at_least: bool = False  # else at most
 
 
-FOUNDATION, RENDERER = "issue 2, speed and memory", "issue 3, speed and memory"
-METHODS = "issue 5, speed and memory"
 GOALS = (
-    Goal("draw and back, 512x256, 100k", 60, "ms", FOUNDATION, "sizes.medium.render"),
-    Goal("torch renderer / native", 30, "x", FOUNDATION, "ratios.torch_renderer.cpu", at_least=True),
-    Goal("training iteration, 512x256, 100k", 120, "ms", FOUNDATION, "sizes.medium.iteration"),
-    Goal("memory of training, 2048x1024, 11 views", 6, "GB", FOUNDATION, "sizes.large.peak_bytes.training"),
-    Goal("pairs blended per core", 2.5, "G/s", RENDERER, "sizes.medium.rates.forward", at_least=True),
-    Goal("pairs blended backward per core", 1.0, "G/s", RENDERER, "sizes.medium.rates.backward", at_least=True),
-    Goal("decode 10k anchors", 2, "ms", RENDERER, "decode_10k"),
-    Goal("loss with gradient, 512x256", 8, "ms", RENDERER, "sizes.medium.stages.loss"),
-    Goal("tiles per Gaussian, mean", 7, "tiles", RENDERER, "bounds.exact.mean"),
-    Goal("tiles of any Gaussian", 600, "tiles", RENDERER, "bounds.exact.max"),
-    Goal("training iteration, 512x256, 100k", 48, "ms", RENDERER, "sizes.medium.iteration"),
-    Goal("training iteration, 256x128, 20k", 11, "ms", RENDERER, "sizes.small.iteration"),
-    Goal("frame, 2048x1024, 1M", 250, "ms", RENDERER, "sizes.large.frame"),
-    Goal("memory of a frame, 2048x1024, 1M", 2, "GB", RENDERER, "sizes.large.peak_bytes.frame"),
-    Goal("tangent / erp, draw and back", 1, "x", METHODS, "ratios.tangent.cpu"),
-    Goal("ray / erp, draw and back", 1, "x", METHODS, "ratios.ray.cpu"),
-    Goal("ray, hybrid / erp, draw and back", 1, "x", METHODS, "ratios.hybrid.cpu"),
+    Goal("draw and back, 512x256, 100k", 60, "ms", "sizes.medium.render"),
+    Goal("torch renderer / native", 30, "x", "ratios.torch_renderer.cpu", at_least=True),
+    Goal("memory of training, 2048x1024, 11 views", 6, "GB", "sizes.large.peak_bytes.training"),
+    Goal("pairs blended per core", 2.5, "G/s", "sizes.medium.rates.forward", at_least=True),
+    Goal("pairs blended backward per core", 1.0, "G/s", "sizes.medium.rates.backward", at_least=True),
+    Goal("decode 10k anchors", 2, "ms", "decode_10k"),
+    Goal("loss with gradient, 512x256", 8, "ms", "sizes.medium.stages.loss"),
+    Goal("tiles per Gaussian, mean", 7, "tiles", "bounds.exact.mean"),
+    Goal("tiles of any Gaussian", 600, "tiles", "bounds.exact.max"),
+    Goal("training iteration, 512x256, 100k", 48, "ms", "sizes.medium.iteration"),
+    Goal("training iteration, 256x128, 20k", 11, "ms", "sizes.small.iteration"),
+    Goal("frame, 2048x1024, 1M", 250, "ms", "sizes.large.frame"),
+    Goal("memory of a frame, 2048x1024, 1M", 2, "GB", "sizes.large.peak_bytes.frame"),
+    Goal("tangent / erp, draw and back", 1, "x", "ratios.tangent.cpu"),
+    Goal("ray / erp, draw and back", 1, "x", "ratios.ray.cpu"),
+    Goal("ray, hybrid / erp, draw and back", 1, "x", "ratios.hybrid.cpu"),
 )
 
 
@@ -77,7 +73,6 @@ def _judged(goal: Goal, report: dict[str, Any]) -> dict[str, Any]:
         "relation": "at least" if goal.at_least else "at most",
         "limit": goal.limit,
         "unit": goal.unit,
-        "source": goal.source,
         "measured": measured,
         "undisturbed": undisturbed,
         "factor": factor,

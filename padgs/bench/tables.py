@@ -101,12 +101,12 @@ def _isas(isas: dict[str, Any]) -> Table:
 
 
 def _targets(report: dict[str, Any]) -> Table:
-    table = _table("targets", "what", "asked", "measured", "", "CPU / threads", "source")
+    table = _table("targets", "what", "asked", "measured", "", "CPU / threads")
     for target in report["targets"]:
         limit = f"{'≥' if target['relation'] == 'at least' else '≤'} {target['limit']:g} {target['unit']}"
         measured = "not measured" if target["measured"] is None else f"{target['measured']:.3g} {target['unit']}"
         undisturbed = "" if target["undisturbed"] is None else f"{target['undisturbed']:.3g}"
-        table.add_row(target["name"], limit, measured, _judgement(target), undisturbed, target["source"])
+        table.add_row(target["name"], limit, measured, _judgement(target), undisturbed)
     return table
 
 
@@ -133,7 +133,7 @@ def _verdict(report: dict[str, Any]) -> str:
 def _table(title: str, *columns: str) -> Table:
     table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
     for number, column in enumerate(columns):
-        words = number == 0 or column in ("bound by", "fast", "source", "")
+        words = number == 0 or column in ("bound by", "fast", "")
         table.add_column(column, justify="left" if words else "right")
     return table
 
