@@ -105,7 +105,7 @@ def _footprints(
 
 
 def _exact_boxes(centers: Tensor, covariance: Tensor, opacities: Tensor) -> Tensor:
-    """Pixels [N, 4] that can have alpha >= 1/255.
+    """Pixels [N, 4] that can have alpha >= 1/255: `bounds=exact`, the default.
 
     opacity exp(-q / 2) >= 1/255 is the ellipse q <= k with k = 2 ln(255 opacity); its box has half widths sqrt(k var).
     """

@@ -11,7 +11,7 @@ DEVICES = ("auto", "cpu", "cuda")
 
 
 def chosen(name: str, render: RenderConfig) -> torch.device:
-    """The device that `run.device` stands for; auto is a GPU where there is one that can draw this, else the CPU.
+    """The device that `run.device` stands for; auto, its default, is a GPU that can draw this, else the CPU.
 
     Raises:
         ValueError: cuda where torch finds no GPU, or backend cuda on the CPU.

@@ -55,6 +55,8 @@ def distortion_map(
 def opacity_factor(omega: Tensor, tau: float, max_omega: float = 1.0) -> Tensor:
     """What opacities are multiplied by at a distortion degree [N]: 1 - tau Omega (Eq. 15); 1 everywhere for tau 0.
 
+    PaD-GS: tau 0.9 and no limit, of `PaDGSOptions`; decoded opacities are multiplied by it as they are drawn.
+
     Args:
         omega: [N] in [0, 1].
         tau: strength in [0, 1].
