@@ -36,7 +36,7 @@ def scene(tmp_path_factory):
 def prepared(scene, tmp_path_factory):
     """The result of an uninterrupted call, and what was told on the way."""
     out, told = tmp_path_factory.mktemp("out") / "done", []
-    result = prepare(scene[1], out, PrepareOptions(threads=2), lambda *step: told.append(step))
+    result = prepare(scene[1], out, PrepareOptions(threads=1), lambda *step: told.append(step))
     return result, out, told
 
 
@@ -81,6 +81,7 @@ def test_progress_counts_up_to_all(prepared):
 
 
 def test_an_interrupted_call_goes_on_and_ends_the_same(scene, prepared, tmp_path):
+    """On one thread: with several, how busy the machine is may decide the last bits of poses."""
     out = tmp_path / "done"
 
     def interrupt(step, done, total):
@@ -88,10 +89,10 @@ def test_an_interrupted_call_goes_on_and_ends_the_same(scene, prepared, tmp_path
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        prepare(scene[1], out, PrepareOptions(threads=2), interrupt)
+        prepare(scene[1], out, PrepareOptions(threads=1), interrupt)
     assert not out.exists()
     told = []
-    prepare(scene[1], out, PrepareOptions(threads=2), lambda *step: told.append(step[0]))
+    prepare(scene[1], out, PrepareOptions(threads=1), lambda *step: told.append(step[0]))
     assert "features" not in told
     for path in (prepared[1] / "sparse" / "0").iterdir():
         assert (out / "sparse" / "0" / path.name).read_bytes() == path.read_bytes(), path.name
