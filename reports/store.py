@@ -19,6 +19,7 @@ from padgs.results import Result, ResultError
 
 FILE_NAME = "results.jsonl"
 LOGGED = ("iteration", "seconds", "psnr")  # seconds of training so far; dB
+LOGGED_SINCE = ("polar_transmittance",)  # see padgs.runs.scoring.probe; older runs did not measure it
 NO_LOG: Mapping[str, Sequence[float]] = {name: () for name in LOGGED}
 
 
@@ -74,7 +75,7 @@ def add(runs: Iterable[Run], store: Path) -> list[Run]:
 def _of_line(line: bytes, where: str) -> Run:
     document = results.parsed(line, where)
     log = document.pop("log", None)
-    if not isinstance(log, dict) or log.keys() != set(LOGGED):
+    if not isinstance(log, dict) or not {*LOGGED} <= log.keys() <= {*LOGGED, *LOGGED_SINCE}:
         raise ResultError(f"{where} has no log of {', '.join(LOGGED)}; delete it and collect the run again")
     return Run(results.decoded(document, where), log, document)
 
@@ -83,6 +84,9 @@ def _of_folder(file: Path) -> Run:
     document = results.parsed(results.file_content(file), str(file))
     probes = [line for line in results.log_lines(file.parent) if all(_is_finite(line.get(name)) for name in LOGGED)]
     log = {name: [probe[name] for probe in probes] for name in LOGGED}
+    log |= {
+        name: [probe[name] for probe in probes] for name in LOGGED_SINCE if probes and all(name in p for p in probes)
+    }
     return Run(results.decoded(document, str(file)), log, document, file.parent / results.PICTURES)
 
 

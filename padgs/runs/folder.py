@@ -99,12 +99,10 @@ class RunFolder:
                 shutil.rmtree(self.checkpoint, ignore_errors=True)
             (self.path / results.FILE_NAME).unlink()
 
-    def log(self, record: Record, psnr: float | None) -> None:
-        """Append a line to log.jsonl; `psnr` of the held-out view, where it was measured."""
+    def log(self, record: Record, probed: Mapping[str, float]) -> None:
+        """Append a line to log.jsonl; `probed` is what a held-out view said, empty where it was not asked."""
         line: dict[str, Any] = {"iteration": record.iteration, "loss": float(record.loss)}
-        line |= {"seconds": round(record.seconds, 4), **record.counts}
-        if psnr is not None:
-            line["psnr"] = psnr
+        line |= {"seconds": round(record.seconds, 4), **record.counts, **probed}
         if record.events:
             line["events"] = list(record.events)
         with self._writing(), self._log.open("a") as file:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import asdict
 from itertools import cycle, islice
 from typing import Any
@@ -14,7 +15,9 @@ from padgs.scene import Scene, View
 from padgs.scoring.evaluate import OnView, evaluate
 from padgs.scoring.metrics import psnr
 from padgs.scoring.protocols import Protocol
+from padgs.sphere.panorama import row_latitudes
 
+POLAR = 85.0  # degrees
 FRAMES = 10  # timed at least, and each test view once
 
 
@@ -28,11 +31,20 @@ def scores(
     return found
 
 
-def held_out_psnr(method: Method, view: View) -> float:
-    """PSNR in dB of one test view, all of its pixels that its mask lets through."""
-    image = method.render(view).image.clamp(0, 1)
+def probe(method: Method, view: View) -> dict[str, float]:
+    """What one test view says while a method is trained: psnr in dB, of all pixels that its mask lets through; and
+    polar_transmittance, the mean share of the background in the rows beyond `POLAR` degrees of latitude (of a tiny
+    image the first and the last), where modulated opacities may let it shine through.
+    """
+    rendering = method.render(view)
+    image = rendering.image.clamp(0, 1)
     like: dict[str, Any] = {"dtype": image.dtype, "device": image.device}
-    return psnr(image, view.image(**like), view.mask(**like)).item()
+    latitudes = row_latitudes(view.height, device=image.device).abs()
+    polar = latitudes >= min(math.radians(POLAR), latitudes.max().item())
+    return {
+        "psnr": psnr(image, view.image(**like), view.mask(**like)).item(),
+        "polar_transmittance": rendering.transmittance[polar].mean().item(),
+    }
 
 
 def frame_times(method: Method, scene: Scene) -> dict[str, float]:

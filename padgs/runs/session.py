@@ -25,7 +25,7 @@ from padgs.runs.folder import Progress, RunFolder, RunFolderError
 from padgs.runs.identity import run_id
 from padgs.runs.interrupt import Interrupt, Interrupted
 from padgs.runs.live import LiveLine
-from padgs.runs.scoring import frame_times, held_out_psnr, same_rules, scores
+from padgs.runs.scoring import frame_times, probe, same_rules, scores
 from padgs.runs.summary import introduce, show_result
 from padgs.scene import Scene
 from padgs.scoring.protocols import Protocol
@@ -139,11 +139,11 @@ class Session:
         """Log an iteration where that is due; PSNR of the held-out view where it was measured."""
         options, views = self.config.run, self.scene.test
         last = record.iteration == self.config.train.iterations
-        probe = bool(views) and (last or record.iteration % options.probe_every == 0)
-        psnr = held_out_psnr(method, views[len(views) // 2]) if probe else None
-        if last or probe or record.events or record.iteration % options.log_every == 0:
-            self.folder.log(record, psnr)
-        return psnr
+        due = bool(views) and (last or record.iteration % options.probe_every == 0)
+        probed = probe(method, views[len(views) // 2]) if due else {}
+        if last or due or record.events or record.iteration % options.log_every == 0:
+            self.folder.log(record, probed)
+        return probed.get("psnr")
 
     def _is_due(self, record: Record, saved: float) -> bool:
         """Whether it is time for a checkpoint, the last one having been written at `saved`."""

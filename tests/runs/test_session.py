@@ -23,7 +23,8 @@ from padgs.runs.folder import RunFolder, RunFolderError
 from padgs.runs.identity import Labels
 from padgs.runs.interrupt import Interrupted
 from padgs.runs.lock import RunBusy
-from padgs.runs.session import Session
+from padgs.runs.scoring import probe
+from padgs.runs.session import Session, build, scene_of
 
 ITERATIONS = 12
 PACKAGE = Path(session.__file__).parents[1]
@@ -94,7 +95,12 @@ def test_the_log_has_losses_and_the_held_out_view(config):
     run(config)
     lines = [json.loads(line) for line in (folder_of(config).path / "log.jsonl").read_text().splitlines()]
     assert [line["iteration"] for line in lines] == [2, 4, 5, 6, 8, 10, 12]
-    assert [line["iteration"] for line in lines if "psnr" in line] == [5, 10, 12]
+    probed = [line for line in lines if "psnr" in line]
+    assert [line["iteration"] for line in probed] == [5, 10, 12]
+    method = build(config)
+    folder_of(config).resume(method)
+    last = probe(method, scene_of(config, torch.device("cpu")).test[0])
+    assert last == {name: probed[-1][name] for name in ("psnr", "polar_transmittance")}
 
 
 def test_a_finished_run_is_shown_and_not_repeated(config, monkeypatch):

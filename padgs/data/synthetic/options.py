@@ -26,6 +26,7 @@ class SyntheticOptions:
     train_views: int = 24
     test_views: int = 6  # spread evenly between the training views along the path
     path: str | None = None  # roaming | cross | line; None = the scene's own
+    reach: float | None = None  # metres from the middle of the path to its ends; None = the scene's own
     heading: str = "path"  # path = look along the path; fixed = along world x; random = any, per view
     yaw: float = 0.0  # degrees, added to every heading
     tilt: float = 0.0  # degrees, standard deviation of roll and of pitch per view
@@ -70,6 +71,8 @@ class SyntheticOptions:
         for field in ("texture_frequency", "world_scale"):
             if not 0 < getattr(self, field) < math.inf:
                 raise DataError(f"{field} {getattr(self, field)} is not a finite number > 0")
+        if self.reach is not None and not 0 < self.reach < math.inf:
+            raise DataError(f"reach {self.reach} is not a finite length > 0 in metres; use null for the scene's own")
         if self.objects is not None and self.objects < 0:
             raise DataError(f"objects {self.objects} is negative; use null for the scene's own number")
 

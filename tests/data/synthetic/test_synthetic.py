@@ -106,6 +106,7 @@ def test_load_takes_name_width_and_knobs_from_the_data_options():
         ({"outliers": 1.0}, "share"),
         ({"world_scale": 0.0}, "world_scale 0.0"),
         ({"point_noise": float("nan")}, "finite"),
+        ({"reach": 0.0}, "reach 0.0 is not a finite length"),
         ({"path": "zigzag"}, "known: cross, line, roaming"),
         ({"objects": 2000}, "no place"),
     ],

@@ -37,6 +37,16 @@ def test_scaling_and_turning_the_world_changes_no_pixel():
     assert other.unit == pytest.approx(100 * scene.unit, rel=1e-5)
 
 
+@pytest.mark.parametrize("scene", ["bare_room", "two_rooms"])  # the second has a route of its own
+def test_a_path_reaches_as_far_as_asked(scene):
+    poses = SyntheticTruth(
+        SyntheticOptions(**SMALL | {"scene": scene, "path": "cross", "reach": 0.5, "train_views": 40})
+    ).poses
+    middle = poses[:, :3, :3].transpose(0, 2, 1) @ -poses[:, :3, 3:]
+    across = middle[:, :2, 0].max(0) - middle[:, :2, 0].min(0)
+    assert across == pytest.approx([1.0, 1.0], rel=0.05)
+
+
 def test_world_rotation_is_about_x_then_y_then_z():
     """A quarter turn about x sends up (+z) to -y, one about z then sends -y to +x: camera 'up' is world +x."""
     truth = SyntheticTruth(SyntheticOptions(**SMALL, world_rotation=(90.0, 0.0, 90.0)))
