@@ -12,7 +12,7 @@ from reports.methods import title
 from reports.tables.table import UNRANKED
 
 ENOUGH = 0.5  # of the images that another method of the block has seen
-MENDS = {  # method -> keys of data.generator that make what it mends; the real thing is of unknown size
+MENDS = {  # method -> keys of data.generator that make what it mends; in photographs it is of unknown size
     "sc_omnigs": ("pose_noise_translation", "pose_noise_rotation"),
     "seam360gs": ("lens_gap", "lens_k1"),
 }
@@ -45,7 +45,10 @@ def unranked(runs: DataFrame, *, equal_images: bool = True) -> dict[str, Reason]
     for method, keys in MENDS.items():
         own = runs.loc[runs["method"] == method]
         there = own.reindex(columns=[f"{CONFIG}data.generator.{key}" for key in keys]).fillna(0).astype(bool)
-        found |= dict.fromkeys(own.loc[~there.any(axis=1), "preset"], Reason(NOTHING_TO_MEND))
+        mended = there.any(axis=1) & (
+            own["dataset"] == "synthetic"
+        )  # a folder's pictures have nothing of the generator
+        found |= dict.fromkeys(own.loc[~mended, "preset"], Reason(NOTHING_TO_MEND))
     return found
 
 

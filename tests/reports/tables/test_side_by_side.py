@@ -78,9 +78,9 @@ def test_after_equal_time_who_saw_fewer_pixels_is_ranked():
     [("sc_omnigs", "pose_noise_rotation"), ("sc_omnigs", "pose_noise_translation"), ("seam360gs", "lens_gap")],
 )
 def test_what_calibrates_is_ranked_where_there_is_something_to_calibrate(method, knob):
-    def ranked(**generator) -> bool:
-        config = {"data": {"generator": {"scene": "room", **generator}}, "seed": 0}
-        table = methods(gathered([small(20, 1.0, config=config), small(30, 0.5, method=method, config=config)]))
+    def ranked(dataset="synthetic", **generator) -> bool:
+        own = {"config": {"data": {"generator": {"scene": "room", **generator}}, "seed": 0}, "dataset": dataset}
+        table = methods(gathered([small(20, 1.0, **own), small(30, 0.5, method=method, **own)]))
         (mine,) = {row.title for row in table.blocks[0].rows} - {"PaD-GS"}
         assert "after the abstract" in mine
         noted = [note for note in table.notes if "+experiment=calibration compares it where it is" in note]
@@ -91,6 +91,7 @@ def test_what_calibrates_is_ranked_where_there_is_something_to_calibrate(method,
     assert ranked(**{knob: 0.1}) and not ranked(**{knob: 0.0}) and not ranked()
     other = "lens_gap" if method == "sc_omnigs" else "pose_noise_rotation"
     assert not ranked(**{other: 0.1}), "what the other one mends"
+    assert not ranked("", **{knob: 0.1}), "a folder's pictures have nothing of the generator"
 
 
 def test_what_a_method_started_from_and_its_processor_time_have_columns():
