@@ -26,7 +26,7 @@ class EgoNeRFMethodOptions(EgoNeRFOptions, EgoNeRFTraining):
     def __post_init__(self) -> None:
         EgoNeRFOptions.__post_init__(self)
         EgoNeRFTraining.__post_init__(self)
-        if self.environment_pretraining and not self.environment:
+        if self.environment_pretraining and self.environment is False:
             raise ValueError(
                 f"environment_pretraining is {self.environment_pretraining}, but environment is false; "
                 "change one of them"
@@ -46,7 +46,7 @@ class EgoNeRFMethod(Method):
     def _blank(self, state: State) -> EgoNeRFTrainee:
         stored = state.of_model()
         centre = torch.tensor(stored.values["centre"], dtype=torch.float64)
-        model = EgoNeRF(self.options, centre, stored.values["unit"], stored.values["travel"])
+        model = EgoNeRF(self.options, centre, *(stored.values[name] for name in ("unit", "travel", "kind")))
         model = model.to(next(iter(stored.tensors.values())).device)
         return EgoNeRFTrainee(model, self.options, self.options.environment_pretraining + 1)
 

@@ -1,6 +1,7 @@
 """SC-OmniGS: OmniGS that calibrates itself; poses and the panoramic camera are optimised with the Gaussians.
 
-No code of it is public. What is known and what is inferred here is told apart in docs/methods.md.
+Made after the abstract and the project page; the paper (arXiv 2502.04734) was not read, and its code is not public.
+What these say and what is inferred here is told apart in docs/methods.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Seam360GS: Gaussians seen through the two fisheye lenses that made the panorama, so that the seam is the camera's.
 
-No code of it is public. What is known and what is inferred here is told apart in docs/methods.md.
+Made after the abstract; the paper (arXiv 2508.20080) was not read, and its code is not public. What the abstract says
+and what is inferred here is told apart in docs/methods.md.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ REPORTS: Mapping[str, Report] = {
     "table2": Report("reports.tables.tables_of_methods:table2", OF_ALL_METHODS),
     "table3": Report("reports.tables.variants:table3", ("ablation", "ablation_bar", "ablation_cat_tower")),
     "table4": Report("reports.tables.tables_of_methods:table4", ("table4_efficiency", *OF_ALL_METHODS)),
-    "methods": Report("reports.tables.side_by_side:methods", OF_ALL_METHODS),
+    "methods": Report("reports.tables.side_by_side:methods", (*OF_ALL_METHODS, "calibration")),
     "equal_time": Report("reports.tables.side_by_side:equal_time", ("equal_time",)),
     "ladder": Report("reports.tables.variants:ladder", ("ladder",)),
     "quirks": Report("reports.tables.variants:quirks", ("quirks",)),

@@ -7,18 +7,19 @@ from collections.abc import Iterable, Mapping
 import pandas as pd
 from pandas import DataFrame
 
-from reports.methods import title
+from reports.methods import name
 from reports.request import Request
 from reports.tables.table import ReportError
 
-CONDITIONS = ("protocol", "resolution", "iterations", "data")  # columns of the frame; the protocol's are its rules
-OF_A_DATA_SET = ("protocol", "resolution", "iterations")  # scenes may differ, rules may not
+# Columns of the frame; the protocol's are its rules.
+CONDITIONS = ("protocol", "resolution", "iterations", "learning_rates", "data")
+OF_A_DATA_SET = ("protocol", "resolution", "iterations", "learning_rates")  # scenes may differ, rules may not
 OF_A_SWEEP = ("protocol", "machine")  # all else shows as a changed key
 OF_A_POINT = ("data",)  # the folder of the data is no part of a setting
 OF_A_CHART = ("protocol", "resolution", "data", "machine")
 OF_A_MEAN = (*OF_A_DATA_SET, "machine")  # of one setting over the scenes of a data set
 OF_TIMES = (*CONDITIONS, "machine")
-OF_EQUAL_TIMES = ("protocol", "resolution", "data", "machine")
+OF_EQUAL_TIMES = ("protocol", "resolution", "learning_rates", "data", "machine")
 PUBLISHED_LENGTHS = {"egonerf": 100_000}  # iterations; of the others 30 000, which tables of the paper have
 
 
@@ -40,8 +41,8 @@ def refuse_mixture(runs: DataFrame, request: Request, where: str, conditions: It
 
 
 def footnotes(blocks: Mapping[str, DataFrame], protocol: str) -> list[str]:
-    """Protocol with all its rules, resolution, iterations, seeds, code version and machine of the runs of blocks, in a
-    sentence for all blocks that share them.
+    """Protocol with all its rules, resolution, iterations, learning rates, seeds, code version and machine of the runs
+    of blocks, in a sentence for all blocks that share them.
     """
     titles: dict[str, list[str]] = {}
     for block, runs in blocks.items():
@@ -49,7 +50,7 @@ def footnotes(blocks: Mapping[str, DataFrame], protocol: str) -> list[str]:
     notes = [f"{'; '.join(of)}: {sentence}" for sentence, of in titles.items()]
     for method, length in PUBLISHED_LENGTHS.items():
         if any(((runs["method"] == method) & (runs["iterations"] < length)).any() for runs in blocks.values()):
-            notes.append(f"{title(method)} is published with {length} iterations.")
+            notes.append(f"{name(method)} is published with {length} iterations.")
     return notes
 
 
@@ -58,10 +59,11 @@ def _sentence(runs: DataFrame, protocol: str) -> str:
         return "not run."
     columns = {what: _values(runs, what, protocol) for what in (*OF_A_DATA_SET, "seed", "code_version", "hardware")}
     columns["seed"] = columns["seed"].sort_values()
-    rules, sizes, lengths, seeds, versions, machines = (
+    rules, sizes, lengths, rates, seeds, versions, machines = (
         " / ".join(map(str, values.unique())) or "none" for values in columns.values()
     )
-    return f"protocol {rules}, {sizes}, {lengths} iterations, seeds {seeds}, padgs {versions}, {machines}."
+    length = f"{lengths} iterations, learning rates {rates}"
+    return f"protocol {rules}, {sizes}, {length}, seeds {seeds}, padgs {versions}, {machines}."
 
 
 def _values(runs: DataFrame, what: str, protocol: str) -> pd.Series:

@@ -17,6 +17,7 @@ import pandas as pd
 from pandas import DataFrame
 
 from padgs.results import DECIDE_NOTHING, Result, Scores, picture_name
+from reports.images_seen import images_seen
 from reports.scenes import Place
 from reports.store import Run
 
@@ -84,6 +85,7 @@ FACTS: Mapping[str, Callable[[Result], Any]] = {
     "place": lambda result: Place(result.dataset, result.scene),
     "resolution": lambda result: f"{result.width}x{result.height}",
     "data": lambda result: result.fingerprint[:10],
+    "learning_rates": lambda result: result.config.get("train", {}).get("learning_rates", "published"),
     "hardware": hardware,
     "machine": machine,
     "setting": lambda result: json.dumps(
@@ -93,9 +95,12 @@ FACTS: Mapping[str, Callable[[Result], Any]] = {
 }
 NUMBERS: Mapping[str, Callable[[Result], float | None]] = {
     "iterations_done": lambda result: result.iterations_done,
+    "images": images_seen,
     "train_seconds": lambda result: result.timing.get("train_seconds"),
+    "cpu_seconds": lambda result: result.timing.get("cpu_seconds"),  # of the process, while training
     "frame_ms": lambda result: result.timing.get("render_ms_median"),  # over the test views, decoding included
     "anchors": lambda result: result.counts.get("anchors"),
+    "start": lambda result: result.counts.get("start"),  # Gaussians or anchors before training
     "gaussians": lambda result: result.counts.get("gaussians"),  # none in a method without any
     "megabytes": lambda result: result.model_bytes / 1e6 or None,
     "peak_gigabytes": lambda result: result.peak_memory_bytes / 1e9 or None,  # of the process, while training

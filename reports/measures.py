@@ -33,11 +33,14 @@ COSTS = {
     measure.name: measure
     for measure in (
         Measure("iterations_done", Column("iterations", 0)),
+        Measure("images", Column("images seen", 0)),
         Measure("train_hours", Column("training h", 4, False, group="training h"), "train_hours"),
         Measure("train_seconds", Column("training s", 0, False)),
+        Measure("cpu_seconds", Column("CPU s", 0, False)),
         Measure("fps", Column("FPS", 2, True, group="FPS"), "fps"),
         Measure("frame_ms", Column("ms per frame", 1, False)),
         Measure("anchors", Column("anchors", 0)),
+        Measure("start", Column("started from", 0)),
         Measure("gaussians", Column("Gaussians", 0)),
         Measure("megabytes", Column("model MB", 1, False)),
         Measure("peak_gigabytes", Column("peak GB", 2, False)),
@@ -51,9 +54,14 @@ def costs(*names: str, **how: Any) -> tuple[Measure, ...]:
     return tuple(replace(COSTS[name], column=replace(COSTS[name].column, **how)) for name in names)
 
 
+def known_costs(runs: DataFrame, *names: str, **how: Any) -> tuple[Measure, ...]:
+    """Those of some of `COSTS` that are known of any of the runs; tables of the others have no column for them."""
+    return costs(*(name for name in names if name in runs and runs[name].notna().any()), **how)
+
+
 def gpu_memory(runs: DataFrame, **how: Any) -> tuple[Measure, ...]:
-    """The memory of the GPU, if it is known of any of the runs; tables of the others have no column for it."""
-    return costs("peak_gpu_gigabytes", **how) if runs["peak_gpu_gigabytes"].notna().any() else ()
+    """The memory of the GPU, if it is known of any of the runs."""
+    return known_costs(runs, "peak_gpu_gigabytes", **how)
 
 
 def alone(measure: Measure) -> Measure:

@@ -16,6 +16,14 @@ TITLES = {
     "sc_omnigs": "SC-OmniGS",
     "seam360gs": "Seam360GS",
 }
+# preset -> what ours is, where it is neither the published method alone nor a preset that says so by its name
+STATUS = {
+    **dict.fromkeys(("op43dgs", "odgs", "omnigs"), "corrected"),  # the releases, without their mistakes
+    **dict.fromkeys(("op43dgs_release", "odgs_release"), "as released, gradients corrected"),
+    **dict.fromkeys(("omnigs_release", "padgs_release"), "as released"),
+    "sc_omnigs": "after the abstract and project page",
+    "seam360gs": "after the abstract",
+}
 
 
 def method_of(preset: str) -> str:
@@ -28,15 +36,20 @@ def method_of(preset: str) -> str:
     return known[0] if known else preset
 
 
-def title(preset: str) -> str:
-    """The name that people know, with the preset; that of the configuration where there is no other.
+def name(method: str) -> str:
+    """What the authors call their method; that of the configuration where there is no other."""
+    return TITLES.get(method, method)
 
-    >>> title("padgs"), title("odgs_release"), title("mine")
-    ('PaD-GS', 'ODGS, release', 'mine')
+
+def title(preset: str) -> str:
+    """What ours is called: the authors' name with what sets ours apart from their program, or with the preset.
+
+    >>> title("padgs"), title("odgs"), title("padgs_ray"), title("mine")
+    ('PaD-GS', 'ODGS, corrected', 'PaD-GS, ray', 'mine')
     """
     method = method_of(preset)
-    rest = preset.removeprefix(method).strip("_").replace("_", " ")
-    return ", ".join(part for part in (TITLES.get(method, method), rest) if part)
+    rest = STATUS.get(preset, preset.removeprefix(method).strip("_").replace("_", " "))
+    return ", ".join(part for part in (name(method), rest) if part)
 
 
 def ordered(presets: Iterable[str]) -> list[str]:
@@ -45,7 +58,7 @@ def ordered(presets: Iterable[str]) -> list[str]:
     >>> ordered(["mine", "padgs", "odgs_release", "odgs", "mine"])
     ['odgs', 'odgs_release', 'padgs', 'mine']
     """
-    ranks = {name: rank for rank, name in enumerate(TITLES)}
+    ranks = {method: rank for rank, method in enumerate(TITLES)}
     return sorted(set(presets), key=lambda preset: (ranks.get(method_of(preset), len(ranks)), preset))
 
 

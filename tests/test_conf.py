@@ -13,6 +13,7 @@ from padgs.anchors.growth import PUBLISHED_THRESHOLD
 from padgs.anchors.method import PaDGSMethodOptions
 from padgs.anchors.model import PaDGSOptions
 from padgs.data.datasets import DATASETS
+from padgs.data.synthetic.options import SyntheticOptions
 from padgs.learning.loop import TrainOptions
 from padgs.multirun.choices import method_choices
 from padgs.multirun.composition import composing
@@ -23,6 +24,7 @@ from padgs.render.config import RenderConfig
 from padgs.runs.config import RunOptions, TrainConfig
 from padgs.runs.typed import ConfigError
 from padgs.scoring.protocols import PROTOCOLS, ROAM_360_BOTTOM_CROP
+from reports.unranked import MENDS
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
@@ -260,6 +262,20 @@ def test_every_quirk_is_a_part_of_its_release_and_changes_something():
         assert bool(changed) == (name != method)
         assert not changed & different_keys(job.values(), released), "and to what the release has"
     assert found["odgs_all"].preset == "odgs_release"
+
+
+def test_calibration_is_compared_where_its_claims_can_show_and_where_not():
+    """Each scene is one that the tables know as such, and the three methods see the same one."""
+    found = jobs("+experiment=calibration", "scale=cpu")
+    knobs = {key: {job.data.generator.get(key, 0) > 0 for job in found} for keys in MENDS.values() for key in keys}
+    assert all(there == {True, False} for there in knobs.values())
+    methods_of: dict[str, list[str]] = {}
+    for job in found:
+        methods_of.setdefault(SyntheticOptions(**job.data.generator).title, []).append(job.method)
+    assert methods_of.keys() == {f"synthetic-room{fault}" for fault in ("", "-noisy-poses", "-two-lenses")}
+    assert all(methods == ["omnigs", "sc_omnigs", "seam360gs"] for methods in methods_of.values())
+    noisy, lenses = (SyntheticOptions(**job.data.generator) for job in (found[3], found[6]))
+    assert noisy.pose_noise_rotation and not noisy.lens_gap and lenses.lens_gap and not lenses.pose_noise_rotation
 
 
 @pytest.mark.parametrize("projection", ["tangent", "ray"])

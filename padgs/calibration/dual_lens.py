@@ -2,8 +2,8 @@
 
 The stitching puts both images on one sphere as if both lenses stood at the camera's centre and bent no rays. What
 comes out has parallax at the plane between the lenses, the seam. Here that camera is a differentiable model: two views,
-each with its own centre and rays, blended per pixel. Source: Seam360GS (arXiv 2508.20080), of which only the idea is
-public; the formulas are ours (docs/methods.md).
+each with its own centre and rays, blended per pixel. Source: the abstract of Seam360GS (arXiv 2508.20080); the
+formulas are ours (docs/methods.md).
 """
 
 from __future__ import annotations

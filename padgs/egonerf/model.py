@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from padgs.egonerf import surroundings
 from padgs.egonerf.environment import EnvironmentMap
 from padgs.egonerf.options import EgoNeRFOptions
 from padgs.egonerf.plane_lines import Factors, GridPosition, PlaneLines, density_feature, grid_position, products
@@ -34,25 +35,28 @@ class EgoNeRF(nn.Module):
         centre: [3] float64, mean camera position in the world.
         unit: world units to one unit of the model.
         travel: how far cameras get from the centre, in units of the model; the grids reach `far` beyond it.
+        kind: of the surroundings, indoor or outdoor.
+        constants: theirs, or given.
     """
 
     centre: Tensor
 
-    def __init__(self, options: EgoNeRFOptions, centre: Tensor, unit: float, travel: float) -> None:
+    def __init__(self, options: EgoNeRFOptions, centre: Tensor, unit: float, travel: float, kind: str) -> None:
         """Grids of noise; random numbers are torch's own."""
         super().__init__()
-        self.options, self.unit, self.travel = options, unit, travel
+        self.options, self.unit, self.travel, self.kind = options, unit, travel, kind
+        self.constants = constants = options.constants(kind)
         self.register_buffer("centre", centre.double(), persistent=False)
         shape = {"radius": options.radial_nodes, "polar": options.polar_nodes, "azimuth": options.azimuth_nodes}
         self.density = PlaneLines(options.density_components, shape)
         self.appearance = PlaneLines(options.appearance_components, shape)
         self.shader = Shader(options)
-        self.environment = EnvironmentMap(options.environment_height) if options.environment else None
+        self.environment = EnvironmentMap(options.environment_height) if constants.environment else None
         # Half the diagonal of a cube around all that rays can reach, as published.
-        reach = math.sqrt(3) * (travel + options.far)
-        first, samples = options.first_radius, options.coarse_samples
+        reach = math.sqrt(3) * (travel + constants.far)
+        first, samples = constants.first_radius, options.coarse_samples
         self.register_buffer("nodes", exponential_nodes(first, reach, options.radial_nodes).float(), persistent=False)
-        distances = options.near + exponential_nodes(first, options.far - options.near, samples)
+        distances = constants.near + exponential_nodes(first, constants.far - constants.near, samples)
         self.register_buffer("distances", distances.float(), persistent=False)
 
     @classmethod
@@ -62,9 +66,10 @@ class EgoNeRF(nn.Module):
         centers = torch.stack([view.center for view in scene.train]).double().cpu()
         centre = centers.mean(0)
         travel = (centers - centre).norm(dim=-1).max().item() / unit
+        kind = surroundings.of_scene(scene) if options.surroundings == "auto" else options.surroundings
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            model = cls(options, centre, unit, travel)
+            model = cls(options, centre, unit, travel, kind)
         return model.to(scene.points.device)
 
     def trace(self, origins: Tensor, directions: Tensor, generator: torch.Generator | None = None) -> RayColors:
@@ -128,8 +133,8 @@ class EgoNeRF(nn.Module):
 
     def _optical_depths(self, factors: Factors, at: GridPosition, distances: Tensor) -> Tensor:
         feature = density_feature(factors, at).view(distances.shape)
-        density = functional.softplus(feature + self.options.density_shift)
-        return density * interval_lengths(distances) * self.options.distance_scale
+        density = functional.softplus(feature + self.constants.density_shift)
+        return density * interval_lengths(distances) * self.constants.distance_scale
 
     def _shade(self, at: GridPosition, directions: Tensor, weights: Tensor) -> Tensor:
         """Colours [B, 3] of all samples together."""

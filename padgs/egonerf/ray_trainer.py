@@ -81,4 +81,5 @@ class RayTrainer(Trainer):
         optimiser.check(iteration)
         with self._stage("optimiser"):
             optimiser.step(iteration)
-        return self._read(value, iteration), {**tracer.counts(), "rays": self._rays}, ()
+        events = (tracer.summary(),) if iteration == 1 else ()
+        return self._read(value, iteration), {**tracer.counts(), "rays": self._rays}, events

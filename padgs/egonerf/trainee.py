@@ -47,7 +47,7 @@ class EgoNeRFTrainee:
         """Tie together a model and its learning rates in a run of `iterations`.
 
         Raises:
-            ValueError: pretraining leaves no iteration for the rest.
+            ValueError: pretraining leaves no iteration for the rest, or there is no environment to be trained.
         """
         self.model, self._options, self._iterations = model, options, iterations
         alone = options.environment_pretraining
@@ -55,6 +55,11 @@ class EgoNeRFTrainee:
             raise ValueError(
                 f"environment_pretraining is {alone} of {iterations} iterations, which leaves none for the grids; "
                 "train longer, or lower it"
+            )
+        if alone and model.environment is None:
+            raise ValueError(
+                f"environment_pretraining is {alone}, but {model.kind}s there is no environment; set "
+                "environment_pretraining=0, environment=true or surroundings=outdoor"
             )
 
     @property
@@ -106,6 +111,11 @@ class EgoNeRFTrainee:
         """Render a view without gradients."""
         return self.model.render(view)
 
+    def summary(self) -> str:
+        """What kind of scene it took this for."""
+        values = self.model.constants._asdict().items()
+        return f"{self.model.kind} constants: {', '.join(f'{name} {value}' for name, value in values)}"
+
     def size(self) -> Size:
         """Parameters and their bytes."""
         return Size.of({}, self.model.parameters(), stored=self.model.parameters())
@@ -113,7 +123,7 @@ class EgoNeRFTrainee:
     def state(self) -> State:
         """The parameters, and where the model is; not copies."""
         model = self.model
-        values = {"unit": model.unit, "travel": model.travel, "centre": model.centre.tolist()}
+        values = {"unit": model.unit, "travel": model.travel, "kind": model.kind, "centre": model.centre.tolist()}
         return State(dict(model.state_dict()), values)
 
     def load_state(self, state: State) -> None:

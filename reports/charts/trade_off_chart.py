@@ -130,9 +130,9 @@ def _published(panel: Any, dataset: str, row: int, index: int, presets: list[str
         there.append((x, y))
         color = color_of(method, presets)
         marker = marker_of(method, presets)
-        tip = tips.add(f"{methods.title(method)}, published\n{title}: {y}\n{cost_title}: {x:.3g}")
+        tip = tips.add(f"{methods.name(method)}, published\n{title}: {y}\n{cost_title}: {x:.3g}")
         panel.scatter([x], [y], s=40, facecolors="none", edgecolors=color, marker=marker, linewidths=1.3, gid=tip)
-        panel.annotate(methods.title(method), (x, y), textcoords="offset points", xytext=(4, 4), fontsize=6.5)
+        panel.annotate(methods.name(method), (x, y), textcoords="offset points", xytext=(4, 4), fontsize=6.5)
     panel.plot(
         *zip(*pareto(there, higher), strict=True), color="#bbbbbb", linewidth=0.9, drawstyle="steps-post", zorder=1
     )

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from pandas import DataFrame
@@ -15,17 +16,29 @@ from reports.tables.table import Cell
 
 
 def of_each(
-    runs: DataFrame, column: str, titles: Mapping[str, str], where: str, measures: Sequence[Measure]
+    runs: DataFrame,
+    column: str,
+    titles: Mapping[str, str],
+    where: str,
+    measures: Sequence[Measure],
+    unranked: Collection[str] = (),
 ) -> dict[str, list[Cell]]:
-    """Value of a column -> a cell for each measure over the runs that have it, in the order of `titles`.
+    """Value of a column -> a cell for each measure over the runs that have it, in the order of `titles`; those of
+    `unranked` values are only shown.
 
     Raises:
         ReportError: runs of one value differ in more than the seed.
     """
     own = {value: runs.loc[runs[column] == value] for value in titles}
-    return {
+    cells = {
         value: over_seeds(one_setting(own[value], f"{where}, {title}"), measures) for value, title in titles.items()
     }
+    return {value: only_shown(row) if value in unranked else row for value, row in cells.items()}
+
+
+def only_shown(cells: Sequence[Cell]) -> list[Cell]:
+    """The same numbers, out of the competition; a missing one is not in it anyway."""
+    return [cell if cell.value is None else replace(cell, ranked=False) for cell in cells]
 
 
 def over_seeds(runs: DataFrame, measures: Sequence[Measure]) -> list[Cell]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 from pandas import DataFrame
@@ -15,8 +15,10 @@ from reports.measures import Measure, alone
 from reports.published import Key, Published
 from reports.scenes import Place
 from reports.tables import beside_paper
-from reports.tables.cells import of_each, over_scenes
+from reports.tables.cells import of_each, only_shown, over_scenes
 from reports.tables.table import Block, Cell, Row, Table
+from reports.unranked import Reason, unranked
+from reports.unranked import notes as notes_on
 
 Measures = Sequence[Measure]
 Numbers = Mapping[Key, Published]  # of the paper; none under a protocol that is not its own
@@ -48,17 +50,20 @@ class Comparison:
         measures = self.measures if paper else tuple(map(alone, self.measures))
         blocks: list[Block] = []
         notes: list[str] = []
+        aside: list[dict[str, Reason]] = []
         for dataset in dict.fromkeys((*self.tables, *(place.dataset for place in found))):
             for place, own in found.items():
                 if place.dataset == dataset:
                     refuse_mixture(own, request, place.title, self.alike)
-                    blocks.append(self._scene(place, own, measures, paper))
+                    aside.append(unranked(own))
+                    blocks.append(self._scene(place, own, measures, paper, aside[-1]))
             if dataset not in self.tables:
                 continue
             own = runs.loc[runs["dataset"] == dataset]
             refuse_mixture(own, request, published.TITLES[dataset], [what for what in self.alike if what != "data"])
             scenes = published.scenes(paper or published.load(), published.DATASETS[dataset])
-            blocks.append(self._average(dataset, scenes, own, measures, paper))
+            aside.append(unranked(own))
+            blocks.append(self._average(dataset, scenes, own, measures, paper, aside[-1]))
             not_run = [scene for scene in scenes if Place(dataset, scene) not in found]
             if not_run:
                 notes.append(f"{published.TITLES[dataset]}, not run: {', '.join(not_run)}.")
@@ -66,31 +71,43 @@ class Comparison:
         if paper:
             delta = "; Δ = ours - paper" if any(measure.difference for measure in measures) else ""
             notes.append(f"Columns 'paper': published numbers, from one RTX 3090 Ti{delta}.")
+        notes += notes_on(aside)
         columns = beside_paper.columns(measures)
         return Table(self.name, self.title, "Method", columns, tuple(blocks), (*notes, *self.notes))
 
-    def _scene(self, place: Place, own: DataFrame, measures: Measures, paper: Numbers) -> Block:
-        titles = {preset: methods.title(preset) for preset in self._presets(place, own, paper)}
-        cells = of_each(own, "preset", titles, place.title, measures)
-        rows = (self._row(preset, place, measures, ours, paper) for preset, ours in cells.items())
+    def _scene(self, place: Place, own: DataFrame, measures: Measures, paper: Numbers, aside: Collection[str]) -> Block:
+        titles = self._titles(place, own, paper)
+        cells = of_each(own, "preset", titles, place.title, measures, aside)
+        rows = (self._row(titles[preset], preset, place, measures, ours, paper) for preset, ours in cells.items())
         return Block(place.title, tuple(rows))
 
     def _average(
-        self, dataset: str, scenes: Sequence[str], own: DataFrame, measures: Measures, paper: Numbers
+        self,
+        dataset: str,
+        scenes: Sequence[str],
+        own: DataFrame,
+        measures: Measures,
+        paper: Numbers,
+        aside: Collection[str],
     ) -> Block:
         rows, place = [], Place(dataset, AVERAGE)
-        for preset in self._presets(place, own, paper):
+        for preset, title in self._titles(place, own, paper).items():
             ours = over_scenes(own.loc[own["preset"] == preset], scenes, measures)
-            rows.append(self._row(preset, place, measures, ours, paper))
+            ours = only_shown(ours) if preset in aside else ours
+            rows.append(self._row(title, preset, place, measures, ours, paper))
         return Block(f"{published.TITLES[dataset]}, average over its {len(scenes)} scenes", tuple(rows))
 
-    def _presets(self, place: Place, own: DataFrame, paper: Numbers) -> list[str]:
-        """Those that were run, and the methods that the paper has numbers of."""
+    def _titles(self, place: Place, own: DataFrame, paper: Numbers) -> dict[str, str]:
+        """Preset -> title of those that were run, and of the methods that the paper has numbers of."""
         where = (self.tables.get(place.dataset), published.DATASETS.get(place.dataset), place.scene)
         known = (key.method for key in paper if (key.table, key.dataset, key.scene) == where)
-        return methods.ordered((*known, *own["preset"]))
+        run = set(own["preset"])
+        presets = methods.ordered((*known, *run))
+        return {preset: methods.title(preset) if preset in run else methods.name(preset) for preset in presets}
 
-    def _row(self, preset: str, place: Place, measures: Measures, ours: Sequence[Cell], paper: Numbers) -> Row:
+    def _row(
+        self, title: str, preset: str, place: Place, measures: Measures, ours: Sequence[Cell], paper: Numbers
+    ) -> Row:
         table, method = self.tables.get(place.dataset, 0), methods.published_as(preset)
         theirs = published.row(paper, table, place.dataset, place.scene, method)
-        return Row(methods.title(preset), beside_paper.cells(measures, ours, theirs))
+        return Row(title, beside_paper.cells(measures, ours, theirs))

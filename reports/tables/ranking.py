@@ -17,11 +17,12 @@ NOTE = (
 def emphasis(block: Block, index: int, columns: tuple[Column, ...]) -> dict[int, str]:
     """Row -> BEST or SECOND for the column `index` of a block.
 
-    What prints the same is equally good. A tie inside the noise leaves the place empty, and those below it too. Nothing
-    stands out where no direction is given or all numbers are the same.
+    Cells that are not `ranked` are left out. What prints the same is equally good. A tie inside the noise leaves the
+    place empty, and those below it too. Nothing stands out where no direction is given or all numbers are the same.
     """
     column = columns[index]
-    cells = {i: cell for i, row in enumerate(block.rows) if (cell := row.cells[index]).value is not None}
+    every = ((i, row.cells[index]) for i, row in enumerate(block.rows))
+    cells = {i: cell for i, cell in every if cell.value is not None and cell.ranked}
     if column.higher_is_better is None or len({shown(cell.value or 0.0, column) for cell in cells.values()}) < 2:
         return {}
     found: dict[int, str] = {}

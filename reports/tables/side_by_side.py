@@ -11,23 +11,20 @@ from reports import methods as names
 from reports.conditions import OF_EQUAL_TIMES, footnotes, refuse_mixture
 from reports.frame import by_place
 from reports.gathered import Gathered
-from reports.measures import costs, gpu_memory, mark
+from reports.measures import Measure, costs, gpu_memory, known_costs, mark
 from reports.scenes import Place
 from reports.settings import refuse_differences
 from reports.tables.cells import of_each
 from reports.tables.equal_time import EXPERIMENT, TOLERANCE, common_seconds, is_near, nearest_to, of_any_length
 from reports.tables.ranking import NOTE
 from reports.tables.table import Block, Row, Table
+from reports.unranked import notes as notes_on
+from reports.unranked import unranked
 
 MARKS = {
     "paper": ("psnr", "ssim", "lpips_vgg_01"),
     "sphere": ("ws_psnr", "ws_psnr_equator", "ws_psnr_middle", "ws_psnr_high", "ws_psnr_pole", "seam"),
 }
-COSTS = (
-    *costs("iterations_done", "train_seconds", "frame_ms", "gaussians"),
-    *costs("megabytes", title="MB"),
-    *costs("peak_gigabytes"),
-)
 
 
 def methods(gathered: Gathered) -> Table:
@@ -57,9 +54,9 @@ def equal_time(gathered: Gathered) -> Table:
         found[place] = nearest_to(seconds, own)
         off = found[place].loc[found[place]["ok"] & ~is_near(found[place]["train_seconds"], seconds)]
         if len(off):
-            titles = ", ".join(map(names.title, names.ordered(off["preset"])))
+            titles = "; ".join(map(names.title, names.ordered(off["preset"])))
             notes.append(f"{place.title}: not within {TOLERANCE:.0%} of {seconds:.0f} s: {titles}.")
-    return _table("equal_time", "Every method after the same training time", found, notes)
+    return _table("equal_time", "Every method after the same training time", found, notes, equal_images=False)
 
 
 def _methods(gathered: Gathered, report: str) -> DataFrame:
@@ -68,14 +65,29 @@ def _methods(gathered: Gathered, report: str) -> DataFrame:
     return runs.loc[runs["variant"] == ""]
 
 
-def _table(name: str, title: str, found: dict[Place, DataFrame], notes: Sequence[str] = ()) -> Table:
-    gpu = gpu_memory(pd.concat(found.values())) if found else ()
-    measures = (*(mark(protocol, metric, protocol) for protocol, of in MARKS.items() for metric in of), *COSTS, *gpu)
+def _costs(runs: DataFrame) -> tuple[Measure, ...]:
+    return (
+        *costs("iterations_done", "images", "train_seconds"),
+        *known_costs(runs, "cpu_seconds"),
+        *costs("frame_ms", "start", "gaussians"),
+        *costs("megabytes", title="MB"),
+        *costs("peak_gigabytes"),
+        *gpu_memory(runs),
+    )
+
+
+def _table(
+    name: str, title: str, found: dict[Place, DataFrame], notes: Sequence[str] = (), *, equal_images: bool = True
+) -> Table:
+    qualities = (mark(protocol, metric, protocol) for protocol, of in MARKS.items() for metric in of)
+    measures = (*qualities, *_costs(pd.concat(found.values()) if found else DataFrame()))
+    aside = {place: unranked(own, equal_images=equal_images) for place, own in found.items()}
     blocks = []
     for place, own in found.items():
         titles = {preset: names.title(preset) for preset in names.ordered(own["preset"])}
-        cells = of_each(own, "preset", titles, place.title, measures)
+        cells = of_each(own, "preset", titles, place.title, measures, aside[place])
         blocks.append(Block(place.title, tuple(Row(titles[preset], tuple(row)) for preset, row in cells.items())))
     by_title = {place.title: own for place, own in found.items()}
     notes = [*notes, *(note for protocol in MARKS for note in footnotes(by_title, protocol))]
-    return Table(name, title, "Method", tuple(m.column for m in measures), tuple(blocks), (*notes, NOTE))
+    notes += [*notes_on(aside.values()), NOTE]
+    return Table(name, title, "Method", tuple(m.column for m in measures), tuple(blocks), tuple(notes))

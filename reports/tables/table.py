@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 MISSING = "–"
+UNRANKED = "†"  # after the title of a row whose numbers compete with no other's; a note says why
 
 
 class ReportError(ValueError):
@@ -39,6 +40,7 @@ class Cell:
     std: float | None = None  # over seeds; None for a single run
     count: int = 1
     status: str = ""  # of failed runs: oom, nan, ...
+    ranked: bool = True  # whether it may stand out among the others of its column
 
     @property
     def numbers(self) -> dict[str, Any]:
@@ -74,7 +76,8 @@ class Row:
         ['PaD-GS (n=5)', '26.02 ± 0.04', '0.800 ± 0.010']
         """
         counts = {cell.count for cell in self.cells if cell.std is not None}
-        title = f"{self.title} (n={min(counts)})" if len(counts) == 1 else self.title
+        title = self.title if all(cell.ranked for cell in self.cells) else f"{self.title} {UNRANKED}"
+        title += f" (n={min(counts)})" if len(counts) == 1 else ""
         cells = zip(self.cells, columns, strict=True)
         return [title, *(cell.text(column, counted=len(counts) > 1) for cell, column in cells)]
 

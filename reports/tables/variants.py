@@ -115,7 +115,7 @@ def quirks(gathered: Gathered) -> Table:
                 row.insert(psnr + 1, beside_paper.difference(row[psnr], described))
             if own["variant"].isin(titles).any():
                 rows = (Row(titles[variant], tuple(row)) for variant, row in cells.items())
-                blocks.append(Block(f"{methods.title(method)}, {place.title}", tuple(rows)))
+                blocks.append(Block(f"{methods.name(method)}, {place.title}", tuple(rows)))
         runs_of[place.title] = own
     columns = [measure.column for measure in measures]
     columns.insert(psnr + 1, Column("Δ", 2, signed=True))

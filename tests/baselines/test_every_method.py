@@ -31,6 +31,7 @@ TINY_EGONERF = tuple(
     for name, value in {
         **{"radial_nodes": 16, "polar_nodes": 12, "azimuth_nodes": 36, "environment_height": 16, "hidden": 16},
         **{"density_components": 4, "appearance_components": 4, "coarse_samples": 16, "fine_samples": 16, "rays": 128},
+        "grid_rate": 0.1,  # twenty steps shall show something
     }.items()
 )
 # setting -> overrides that make it small enough for a test

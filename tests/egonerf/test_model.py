@@ -8,7 +8,7 @@ from tiny_scene import tiny_scene
 from torch.nn.functional import normalize, softplus
 
 from padgs.egonerf.model import EgoNeRF
-from padgs.egonerf.options import EgoNeRFOptions
+from padgs.egonerf.options import Constants, EgoNeRFOptions
 from padgs.learning.loop import Budget
 from padgs.runs.session import build
 from padgs.scene import Scene, View
@@ -24,6 +24,8 @@ SMALL = EgoNeRFOptions(
     hidden=16,
     coarse_samples=24,
     fine_samples=24,
+    surroundings="outdoor",
+    distance_scale=125.0,
     near=0.05,
     far=8.0,
     first_radius=0.05,
@@ -61,7 +63,7 @@ def moved(scene: Scene, scale: float) -> Scene:
 def test_the_defaults_have_the_published_number_of_parameters():
     """Per chart (150 x 172 + 150 x 516 + 172 x 516 + 150 + 172 + 516) x 64 values of the grids."""
     with torch.device("meta"):
-        model = EgoNeRF(EgoNeRFOptions(), torch.zeros(3, device="cpu"), 1.0, 1.0)
+        model = EgoNeRF(EgoNeRFOptions(), torch.zeros(3, device="cpu"), 1.0, 1.0, "outdoor")
     grids = sum(p.numel() for part in (model.density, model.appearance) for p in part.parameters())
     assert grids == 2 * 64 * (150 * 172 + 150 * 516 + 172 * 516 + 150 + 172 + 516)
     assert 12.2e6 < grids / 2 < 12.4e6
@@ -69,20 +71,24 @@ def test_the_defaults_have_the_published_number_of_parameters():
     assert 46e6 < sum(p.numel() for p in model.parameters()) < 47.5e6
 
 
-def test_the_default_is_the_published_model_of_a_scene_whose_unit_is_five(generator):
+@pytest.mark.parametrize(
+    ("surroundings", "unit", "published"),
+    [("outdoor", 5.0, (-10.0, 25.0, 0.1, 300.0, 0.05, True)), ("indoor", 2.5, (-8.0, 25.0, 0.01, 15.0, 0.03, False))],
+)
+def test_the_defaults_are_the_published_model_of_a_scene_of_some_unit(generator, surroundings, unit, published):
     """Lengths are published in units of the data; the optical depth of a length is the same, too."""
     world = tiny_scene()
-    world = moved(world, 5 / world.unit)
-    assert world.unit == pytest.approx(5)
-    lengths = ("length_unit", "near", "far", "first_radius", "distance_scale")
-    sizes = {name: value for name, value in vars(SMALL).items() if name not in lengths}
-    ours = EgoNeRFOptions(**sizes)
-    published = dict(zip(lengths, ("world", 0.1, 300.0, 0.05, 25.0), strict=True))
-    assert (ours.length_unit, ours.distance_scale) == ("scene", 125.0)
-    origins, directions = rays(50, generator)
-    seen = [dense(ours, world).trace(origins, directions)]  # positions inside are in the model's unit
-    seen.append(dense(EgoNeRFOptions(**sizes, **published), world).trace(5 * origins, directions))
-    assert 0.05 < seen[0].transmittance.mean() < 0.95
+    world = moved(world, unit / world.unit)
+    assert world.unit == pytest.approx(unit)
+    free = dict.fromkeys(Constants._fields)
+    ours, theirs = (
+        dense(replace(SMALL, **free, surroundings=surroundings, length_unit=unit_of_lengths), world)
+        for unit_of_lengths in ("scene", "world")
+    )
+    assert theirs.constants == published
+    origins, directions = rays(50, generator)  # positions inside are in the model's unit
+    seen = [ours.trace(origins, directions), theirs.trace(unit * origins, directions)]
+    assert 0.01 < seen[0].transmittance.mean() < 0.95
     assert torch.allclose(seen[0].transmittance, seen[1].transmittance, rtol=1e-3, atol=1e-5)
     assert torch.allclose(seen[0].color, seen[1].color, atol=1e-4)
 
@@ -97,7 +103,7 @@ def test_a_field_of_constant_density_absorbs_as_the_formula_says(generator):
     seen = model.trace(origins, directions)
     distances = model._sample(origins, directions, None)
     length = distances[:, -1] - distances[:, 0] + (distances[:, -1] - distances[:, -2])
-    expected = torch.exp(-softplus(torch.tensor(-3.0)) * SMALL.distance_scale * length)
+    expected = torch.exp(-softplus(torch.tensor(-3.0)) * model.constants.distance_scale * length)
     assert torch.allclose(seen.transmittance, expected, rtol=1e-3, atol=1e-12)
 
 
@@ -129,7 +135,10 @@ def test_samples_start_at_near_reach_far_and_increase(generator):
     distances = model._sample(origins, directions, generator)
     assert distances.shape == (50, 48) and (distances.diff(dim=-1) >= 0).all()
     still = model._sample(origins, directions, None)
-    assert torch.equal(still[:, 0], torch.full((50,), SMALL.near)) and (still[:, -1] >= SMALL.far - 1e-4).all()
+    assert (
+        torch.equal(still[:, 0], torch.full((50,), model.constants.near))
+        and (still[:, -1] >= model.constants.far - 1e-4).all()
+    )
 
 
 def test_fine_samples_gather_at_a_shell(generator):
@@ -168,7 +177,7 @@ def test_a_rendering_has_depth_in_world_units_and_residual_transmittance():
     assert rendering.depth.shape == rendering.transmittance.shape == (view.height, view.width)
     assert ((rendering.transmittance >= 0) & (rendering.transmittance <= 1)).all()
     seen = rendering.transmittance < 0.5
-    assert seen.any() and (rendering.depth[seen] >= SMALL.near * model.unit * 0.99).all()
+    assert seen.any() and (rendering.depth[seen] >= model.constants.near * model.unit * 0.99).all()
     assert rendering.depth.max() <= model.get_buffer("distances")[-1] * model.unit * 1.01
     assert len(rendering.visible) == 0 and rendering.counters["rays"] == view.width * view.height
 

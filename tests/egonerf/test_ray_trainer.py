@@ -34,6 +34,9 @@ class Flat:
     def counts(self) -> dict[str, int]:
         return {"colors": 1}
 
+    def summary(self) -> str:
+        return "flat"
+
     def state(self) -> State:
         return State({"color": self.color}, {})
 

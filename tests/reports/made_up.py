@@ -100,6 +100,7 @@ def small(psnr: float, cost: float = 1.0, **others) -> Result:
         "width": 512,
         "height": 256,
         "iterations": 1500,
+        "iterations_done": 1500,
         "fingerprint": scene,
         "config": {"train": {"iterations": 1500}, "method": {"tau": 0.9}, "seed": others.get("seed", 0)},
         "scores": scored(psnr),

@@ -79,7 +79,7 @@ def generate(options: SyntheticOptions, store: ImageStore | None = None) -> Scen
         view = View(f"{index:03d}", torch.from_numpy(pose), options.width, options.height, pixels)
         (test if index in held_out else train).append(view)
     return Scene(
-        name=f"synthetic-{options.scene}",
+        name=options.title,
         train=tuple(train),
         test=tuple(test),
         points=torch.from_numpy(stored.points).float(),

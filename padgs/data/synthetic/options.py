@@ -77,6 +77,20 @@ class SyntheticOptions:
             raise DataError(f"objects {self.objects} is negative; use null for the scene's own number")
 
     @property
+    def title(self) -> str:
+        """What the scene is called. With noisy poses, or seen by two lenses, a room is another scene than the room.
+
+        >>> SyntheticOptions(pose_noise_rotation=0.2).title, SyntheticOptions(lens_gap=0.05).title
+        ('synthetic-room-noisy-poses', 'synthetic-room-two-lenses')
+        """
+        words = ["synthetic", self.scene]
+        if self.pose_noise_translation or self.pose_noise_rotation:
+            words.append("noisy-poses")
+        if self.lens_gap or self.lens_k1:
+            words.append("two-lenses")
+        return "-".join(words)
+
+    @property
     def height(self) -> int:
         """Image height in pixels."""
         return self.width // 2

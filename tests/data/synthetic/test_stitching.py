@@ -38,6 +38,7 @@ def test_each_half_is_seen_from_its_own_lens():
 def test_lenses_touch_training_views_only():
     plain = generate(SyntheticOptions(**SMALL))
     stitched = generate(SyntheticOptions(**SMALL, lens_gap=0.05, lens_k1=0.02))
+    assert (plain.name, stitched.name) == ("synthetic-bare_room", "synthetic-bare_room-two-lenses")
     assert all(torch.equal(a.image(), b.image()) for a, b in zip(plain.test, stitched.test, strict=True))
     for a, b in zip(plain.train, stitched.train, strict=True):
         assert torch.equal(a.cam_from_world, b.cam_from_world)

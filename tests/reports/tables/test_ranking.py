@@ -46,6 +46,12 @@ def test_a_single_run_scatters_as_the_seeds_beside_it():
     assert not within_noise(Cell(25.0), Cell(25.0001))
 
 
+def test_what_is_not_ranked_neither_stands_out_nor_stands_in_the_way():
+    aside = Cell(9.0, ranked=False)
+    assert ranks(PSNR, Cell(1.0), aside, Cell(2.0)) == {2: BEST, 0: SECOND}
+    assert Row("A", (Cell(1.0), aside)).texts((PSNR, PSNR)) == ["A †", "1.00", "9.00"]
+
+
 @pytest.mark.parametrize("value", [float("inf"), float("-inf")])
 def test_infinities_are_ranked(value):
     assert ranks(PSNR, Cell(value), Cell(1.0))[0 if value > 0 else 1] == BEST

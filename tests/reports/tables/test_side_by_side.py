@@ -6,8 +6,11 @@ import pytest
 from made_up import compared, failed, gathered, small
 
 from reports.tables.equal_time import EXPERIMENT, common_seconds, is_near, nearest_to
+from reports.tables.ranking import BEST, SECOND, emphasis
 from reports.tables.side_by_side import equal_time, methods
 from reports.tables.table import ReportError, Table
+from reports.tables.tables_of_methods import table1, table4
+from reports.writers import markdown
 
 
 def columns(table: Table) -> list[str]:
@@ -17,6 +20,13 @@ def columns(table: Table) -> list[str]:
 def value(table: Table, block: str, row: str, column: str) -> float | None:
     rows = next(b.rows for b in table.blocks if b.title.startswith(block))
     return next(r for r in rows if r.title == row).cells[columns(table).index(column)].value
+
+
+def ranks(table: Table, block: str) -> dict[str, set[str]]:
+    """Row of a block -> the places that it takes in any column."""
+    found = next(b for b in table.blocks if b.title.startswith(block))
+    places = [emphasis(found, index, table.columns) for index in range(len(table.columns))]
+    return {row.title: {of[number] for of in places if number in of} for number, row in enumerate(found.rows)}
 
 
 def trained(method: str, seconds: float, iterations: int, psnr: float = 25.0, **others):
@@ -30,9 +40,76 @@ def test_every_method_with_all_that_is_measured():
     table = methods(gathered(compared(seeds=2)))
     assert [block.title.split()[0] for block in table.blocks] == ["synthetic-outdoor", "synthetic-room"]
     assert {"PSNR", "SSIM", "WS-PSNR", "WS-PSNR pole", "seam", "training s", "ms per frame", "MB"} <= {*columns(table)}
-    assert value(table, "synthetic-room", "OmniGS", "PSNR") == pytest.approx(22 + 0.8 * 3 + 0.05), "mean of two seeds"
+    assert value(table, "synthetic-room", "OmniGS, corrected", "PSNR") == pytest.approx(22 + 0.8 * 3 + 0.05), (
+        "mean of two seeds"
+    )
     outdoor = next(b for b in table.blocks if "outdoor" in b.title)
-    assert next(r for r in outdoor.rows if r.title == "OP43DGS").cells[0].status == "oom"
+    assert next(r for r in outdoor.rows if r.title == "OP43DGS, corrected").cells[0].status == "oom"
+
+
+def seen_less(**others):
+    config = {"train": {"iterations": 1500}, "method": {"rays": 1024}, "seed": 0}
+    return small(30, 0.1, method="egonerf", preset="egonerf_small", config=config, **others)
+
+
+def test_who_saw_far_fewer_pixels_is_shown_and_not_ranked():
+    of = gathered([seen_less(), small(25), small(24, 2.0, method="omnigs")])
+    table = methods(of)
+    assert value(table, "synthetic-room", "EgoNeRF, small", "PSNR") == 30, "the best, at the smallest costs"
+    assert value(table, "synthetic-room", "EgoNeRF, small", "images seen") == pytest.approx(1500 * 1024 / (512 * 256))
+    assert value(table, "synthetic-room", "PaD-GS", "images seen") == 1500
+    assert ranks(table, "synthetic-room") == {"EgoNeRF, small": set(), "OmniGS, corrected": {SECOND}, "PaD-GS": {BEST}}
+    reason = "Not ranked: EgoNeRF, small (12 of 1500 images): for it saw less than half"
+    text = markdown.text(table)
+    assert "| EgoNeRF, small † |" in text and "| PaD-GS |" in text and f"- † {reason}" in text
+    for build in (table1, table4):
+        other = build(of)
+        assert not ranks(other, "synthetic-room")["EgoNeRF, small"] and any(reason in note for note in other.notes)
+
+
+def test_after_equal_time_who_saw_fewer_pixels_is_ranked():
+    fast = [trained("padgs", 100, 900), trained("omnigs", 105, 900, 24)]
+    table = equal_time(gathered([*fast, replace(seen_less(), experiments=(EXPERIMENT,), timing={"train_seconds": 99})]))
+    assert BEST in ranks(table, "synthetic-room")["EgoNeRF, small"] and "Not ranked" not in markdown.text(table)
+
+
+@pytest.mark.parametrize(
+    ("method", "knob"),
+    [("sc_omnigs", "pose_noise_rotation"), ("sc_omnigs", "pose_noise_translation"), ("seam360gs", "lens_gap")],
+)
+def test_what_calibrates_is_ranked_where_there_is_something_to_calibrate(method, knob):
+    def ranked(dataset="synthetic", **generator) -> bool:
+        own = {"config": {"data": {"generator": {"scene": "room", **generator}}, "seed": 0}, "dataset": dataset}
+        table = methods(gathered([small(20, 1.0, **own), small(30, 0.5, method=method, **own)]))
+        (mine,) = {row.title for row in table.blocks[0].rows} - {"PaD-GS"}
+        assert "after the abstract" in mine
+        noted = [note for note in table.notes if "+experiment=calibration compares it where it is" in note]
+        best = bool(ranks(table, "synthetic-room")[mine])
+        assert len(noted) == (not best)
+        return best
+
+    assert ranked(**{knob: 0.1}) and not ranked(**{knob: 0.0}) and not ranked()
+    other = "lens_gap" if method == "sc_omnigs" else "pose_noise_rotation"
+    assert not ranked(**{other: 0.1}), "what the other one mends"
+    assert not ranked("", **{knob: 0.1}), "a folder's pictures have nothing of the generator"
+
+
+def test_what_a_method_started_from_and_its_processor_time_have_columns():
+    old, new = small(24, method="omnigs"), small(25)
+    counts, timing = {**new.counts, "start": 72_000}, {**new.timing, "cpu_seconds": 57.0}
+    table = methods(gathered([old, replace(new, counts=counts, timing=timing)]))
+    assert [value(table, "synthetic-room", "PaD-GS", name) for name in ("started from", "CPU s")] == [72_000, 57]
+    assert value(table, "synthetic-room", "OmniGS, corrected", "started from") is None
+    assert "CPU s" not in columns(methods(gathered([old]))) and "started from" in columns(methods(gathered([old])))
+
+
+def test_learning_rates_are_named_and_not_mixed():
+    rates = {"train": {"iterations": 1500, "learning_rates": "run"}, "seed": 0}
+    scaled, old = small(25, config=rates), small(24, method="omnigs")
+    assert any("learning rates run, seeds" in note for note in methods(gathered([scaled])).notes)
+    assert any("learning rates published, seeds" in note for note in methods(gathered([old])).notes)
+    with pytest.raises(ReportError, match="differ in learning_rates"):
+        methods(gathered([scaled, old]))
 
 
 def test_runs_of_different_lengths_do_not_stand_together():
@@ -49,8 +126,10 @@ def test_of_each_method_the_run_nearest_to_the_common_time_counts():
     ]
     table = equal_time(gathered([*on_the_way, *there, *others]))
     rows = [row.title for row in table.blocks[0].rows]
-    assert rows == ["ODGS", "OmniGS", "SPaGS", "PaD-GS"], "of another experiment what happened to take as long"
-    for method, *expected in (("PaD-GS", 103, 1300, 26), ("OmniGS", 98, 1600, 27), ("SPaGS", 108, 170, 21)):
+    assert rows == ["ODGS, corrected", "OmniGS, corrected", "SPaGS", "PaD-GS"], (
+        "of another experiment what happened to take as long"
+    )
+    for method, *expected in (("PaD-GS", 103, 1300, 26), ("OmniGS, corrected", 98, 1600, 27), ("SPaGS", 108, 170, 21)):
         found = [value(table, "synthetic-room", method, name) for name in ("training s", "iterations", "PSNR")]
         assert found == pytest.approx(expected)
 
@@ -80,7 +159,7 @@ def test_what_is_not_near_the_common_time_is_named():
 def test_a_method_that_failed_shows_its_status():
     late = replace(trained("odgs", 250, 900), status="timeout", scores={})
     table = equal_time(gathered([trained("padgs", 100, 900), late]))
-    assert next(r for r in table.blocks[0].rows if r.title == "ODGS").cells[0].status == "timeout"
+    assert next(r for r in table.blocks[0].rows if r.title == "ODGS, corrected").cells[0].status == "timeout"
 
 
 def test_the_common_time_is_that_of_the_most_runs():
