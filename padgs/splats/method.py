@@ -15,7 +15,7 @@ from padgs.checks import check
 from padgs.learning.loop import TrainOptions
 from padgs.learning.method import Method
 from padgs.learning.trainee import State
-from padgs.scene import Scene
+from padgs.scene import MIN_EXTENT, Scene
 from padgs.splats.clone_split import CloneSplitOptions
 from padgs.splats.model import Splats
 from padgs.splats.trainee import SplatTrainee
@@ -26,10 +26,12 @@ class SplatOptions(CloneSplitOptions):
     """The `method` group of the configuration: the model, and its densification."""
 
     sh_degree: int = 3  # 0: colours do not depend on the direction
+    min_extent: float = MIN_EXTENT  # units of the scene that its extent counts as at least; 0: as published
     learning_rate_factor: float = 1.0  # on all learning rates of Gaussians; cameras have their own
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        check(self, "a length >= 0 in units of the scene", lambda least: least >= 0, "min_extent")
         check(self, "> 0", lambda factor: factor > 0, "learning_rate_factor")
 
 
@@ -55,7 +57,7 @@ class SplatMethod(Method):
         splats = Splats.from_scene(
             scene, degree=options.sh_degree, max_gaussians=options.max_gaussians, generator=generator
         )
-        return self._trainee_of(splats, scene.extent, iterations)
+        return self._trainee_of(splats, scene.extent_of_at_least(options.min_extent), iterations)
 
     def _blank(self, state: State) -> SplatTrainee:
         stored = state.of_model()
