@@ -95,7 +95,7 @@ class Scene:
 
     @cached_property
     def extent(self) -> float:
-        """What 3DGS measures lengths with: 1.1 x the largest distance of a training camera from their mean, world units."""
+        """What 3DGS measures with, in world units: 1.1 x the largest distance of a training camera from their mean."""
         centers = torch.stack([view.center for view in self.train])
         return 1.1 * (centers - centers.mean(0)).norm(dim=-1).max().item()
 

@@ -6,7 +6,7 @@ subclass in `baselines` that says which.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -15,7 +15,7 @@ from padgs.checks import check
 from padgs.learning.loop import TrainOptions
 from padgs.learning.method import Method
 from padgs.learning.trainee import State
-from padgs.scene import MIN_EXTENT, Scene
+from padgs.scene import MIN_EXTENT, Scene, View
 from padgs.splats.clone_split import CloneSplitOptions
 from padgs.splats.model import Splats
 from padgs.splats.trainee import SplatTrainee
@@ -57,7 +57,7 @@ class SplatMethod(Method):
         splats = Splats.from_scene(
             scene, degree=options.sh_degree, max_gaussians=options.max_gaussians, generator=generator
         )
-        return self._trainee_of(splats, scene.extent_of_at_least(options.min_extent), iterations)
+        return self._trainee_of(splats, scene.extent_of_at_least(options.min_extent), iterations, scene.train)
 
     def _blank(self, state: State) -> SplatTrainee:
         stored = state.of_model()
@@ -66,7 +66,12 @@ class SplatMethod(Method):
         return self._trainee_of(splats, values["extent"], values["iterations"])
 
     def _trainee_of(
-        self, splats: Splats, extent: float, iterations: int, kind: Callable[..., SplatTrainee] = SplatTrainee
+        self,
+        splats: Splats,
+        extent: float,
+        iterations: int,
+        views: Sequence[View] = (),
+        kind: Callable[..., SplatTrainee] = SplatTrainee,
     ) -> SplatTrainee:
         return kind(
             splats,
@@ -74,6 +79,7 @@ class SplatMethod(Method):
             self.render_config,
             extent=extent,
             iterations=iterations,
+            views=views,
             learning_rate_factor=self.options.learning_rate_factor,
             seed=self.seed,
         )
