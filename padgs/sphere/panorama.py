@@ -14,6 +14,8 @@ import math
 import torch
 from torch import Tensor
 
+CUBIC_REACH = 2  # pixels around a place that a bicubic sample leans on
+
 
 def longitude_latitude(points: Tensor) -> tuple[Tensor, Tensor]:
     """Longitude in (-pi, pi] and latitude in [-pi/2, pi/2] of camera-frame points (Eq. 6).
@@ -129,6 +131,36 @@ def sample(image: Tensor, directions: Tensor) -> Tensor:
     """
     height, width = image.shape[:2]
     return sample_pixels(image, project(directions, width, height))
+
+
+def sample_sharply(image: Tensor, directions: Tensor) -> Tensor:
+    """Bicubic samples [..., C] of a panorama [H, W, C], across the seam and the poles.
+
+    They keep what bilinear ones blur, and may overshoot the values of the image beside sharp edges.
+
+    Args:
+        image: any dtype, values as they are.
+        directions: [..., 3] camera frame, any length but zero.
+    """
+    height, width = image.shape[:2]
+    image = image if image.is_floating_point() else image.float()
+    around = continued(image, CUBIC_REACH).movedim(-1, 0)[None]  # [1, C, H + 2 reach, W + 2 reach]
+    size = directions.new_tensor([width + 2 * CUBIC_REACH, height + 2 * CUBIC_REACH])
+    grid = 2 * (project(directions, width, height) + CUBIC_REACH) / size - 1
+    samples = torch.nn.functional.grid_sample(
+        around, grid.reshape(1, 1, -1, 2).to(image), mode="bicubic", align_corners=False
+    )
+    return samples[0, :, 0].T.reshape(*directions.shape[:-1], -1)
+
+
+def continued(image: Tensor, margin: int) -> Tensor:
+    """A panorama [H, W, C] with so many pixels more on each side: what lies beyond its seam and its poles.
+
+    Beyond a pole its rows come again, half a turn further.
+    """
+    turned = image.roll(image.shape[1] // 2, dims=1)
+    image = torch.cat((turned[:margin].flip(0), image, turned[-margin:].flip(0)))
+    return torch.cat((image[:, -margin:], image, image[:, :margin]), dim=1)
 
 
 def sample_pixels(image: Tensor, pixels: Tensor) -> Tensor:

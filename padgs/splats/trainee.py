@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import reduce
 
 import torch
@@ -15,7 +14,6 @@ from padgs.render import Rendering, RenderOptions, render
 from padgs.render.config import RenderConfig
 from padgs.render.low_pass import LowPass, low_pass_of, widened
 from padgs.scene import View
-from padgs.sphere.camera import Panorama
 from padgs.sphere.panorama import longitude_latitude
 from padgs.splats.clone_split import CloneSplit, CloneSplitOptions
 from padgs.splats.model import Splats
@@ -86,7 +84,7 @@ class SplatTrainee:
         rendering, gaussians, probe = render_probed(
             self.splats,
             view,
-            self._render_options(view),
+            self.render_options(view),
             signal=self.densifier.options.signal,
             probe=probe,
             backend=self._config.backend,
@@ -119,7 +117,7 @@ class SplatTrainee:
     @torch.no_grad()
     def render(self, view: View) -> Rendering:
         """Render a view without gradients."""
-        return render(self.splats.gaussians(view), view, self._render_options(view), backend=self._config.backend)
+        return render(self.splats.gaussians(view), view, self.render_options(view), backend=self._config.backend)
 
     def size(self) -> Size:
         """Counts and bytes of the model."""
@@ -164,10 +162,8 @@ class SplatTrainee:
         return reduce(torch.maximum, of_views)
 
     def _low_pass(self, view: View) -> LowPass:
-        return low_pass_of(self._render_options(view), view.camera)
+        return low_pass_of(self.render_options(view), view.camera)
 
-    def _render_options(self, view: View) -> RenderOptions:
-        options = self._config.options(self.splats.unit)
-        if options.cubemap and not isinstance(view.camera, Panorama):  # one face of a cube, or a crop: draw it as it is
-            return replace(options, cubemap=False, face_size=None)
-        return options
+    def render_options(self, view: View) -> RenderOptions:
+        """How a view is drawn."""
+        return self._config.options(self.splats.unit)
