@@ -51,7 +51,7 @@ class RenderOptions:
     pixel_bias: float = 0.0  # erp: pixels right and down of the truth that means are drawn; released ODGS: 0.5
     wrap: bool = True  # erp: continue footprints across the +-180 degree seam; tangent and ray know of no seam
     cubemap: bool = False  # draw a panorama through the six faces of a cube, each an ordinary perspective view
-    face_size: int | None = None  # cubemap: pixels across the 90 degrees of a face; None: as `render.cubemap` says
+    face_size: int | None = None  # cubemap: pixels across the 90 degrees of a face; None: twice as fine as the panorama
     bounds: str = "exact"  # exact: every pixel with alpha >= 1/255; square: as published, see `published_bounds`
     blending: str = "sorted"  # sorted: by distance of the means; hybrid: by distance on each ray, the rest unordered
     core_size: int = CORE_SIZE  # hybrid: how many fragments of a pixel are kept in order
