@@ -13,6 +13,7 @@ from torch import Tensor
 
 from baselines.cubemap_3dgs import Cubemap3DGSMethod
 from padgs.data.perspectives import looking_at, square_lens
+from padgs.render.cubemap import FINENESS
 from padgs.sphere.camera import Panorama, Pinhole
 from padgs.splats.method import SplatOptions
 
@@ -50,4 +51,4 @@ class Crops3DGSMethod(Cubemap3DGSMethod):
 
     def lens(self, panorama: Panorama) -> Pinhole:
         """The camera of the crops."""
-        return square_lens(panorama, math.tan(math.radians(self.options.field_of_view / 2)))
+        return square_lens(panorama, math.tan(math.radians(self.options.field_of_view / 2)), FINENESS)

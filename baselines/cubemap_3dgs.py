@@ -1,32 +1,51 @@
 """Ordinary 3DGS on the faces of a cube: what most people do with a 360 degree camera today.
 
 Each training panorama becomes six perspective views of 90 degrees, each a view of its own. Test panoramas stay whole:
-they are drawn face by face and put together (`padgs.render.cubemap`).
+they are drawn face by face and put together (`padgs.render.cubemap`). An iteration trains on as many views as together
+show the whole sphere once, so that it sees what an iteration of a panoramic method sees.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 
 from torch import Tensor
 
-from padgs.data.perspectives import perspective_scene, square_lens
-from padgs.learning.loop import Budget, Record, Stage
+from padgs.data.perspectives import perspective_scene, solid_angle, square_lens
+from padgs.learning.loop import Budget, Record, Stage, Trainer
+from padgs.learning.trainee import Trainee
+from padgs.render import RenderOptions
 from padgs.render.config import RenderConfig
-from padgs.render.cubemap import FACES
-from padgs.scene import Scene
+from padgs.render.cubemap import FACES, FINENESS
+from padgs.scene import Scene, View
 from padgs.sphere.camera import Panorama, Pinhole
 from padgs.splats.method import SplatMethod, refuse_polar_threshold
+from padgs.splats.model import Splats
+from padgs.splats.trainee import SplatTrainee
+
+
+class CutTrainee(SplatTrainee):
+    """Splats that train on views cut out of panoramas, and finer than those."""
+
+    def render_options(self, view: View) -> RenderOptions:
+        """A cut view is drawn as it is, with filters of the size of the panorama's pixels."""
+        options = super().render_options(view)
+        if isinstance(view.camera, Panorama):
+            return options
+        return replace(options, cubemap=False, face_size=None).on_finer_pixels(FINENESS)
 
 
 class Cubemap3DGSMethod(SplatMethod):
     """See `padgs.learning.method.Method`."""
 
     RENDER = RenderConfig(projection="pinhole", cubemap=True)
+    _views_each = 1  # training views of an iteration; of the scene of `fit`
 
     def fit(self, scene: Scene, budget: Budget, *, stage: Stage = nullcontext) -> Iterator[Record]:
-        """Train on what is cut out of the panoramas; an iteration is one such view.
+        """Train on what is cut out of the panoramas; an iteration is one panorama's worth of such views.
 
         Raises:
             ValueError: a training view is no panorama, or held-out panoramas could not be drawn, or pixels shall be
@@ -43,7 +62,9 @@ class Cubemap3DGSMethod(SplatMethod):
                 "set uniform"
             )
         refuse_polar_threshold(self.options, "perspective views have no poles")
-        return super().fit(perspective_scene(scene, self.turns(), self.lens), budget, stage=stage)
+        cut = perspective_scene(scene, self.turns(), self.lens)
+        self._views_each = self._worth_a_panorama(scene, cut)
+        return super().fit(cut, budget, stage=stage)
 
     def turns(self) -> Tensor:
         """Rotations [K, 3, 3] from a panorama's camera frame to those of the views."""
@@ -51,4 +72,25 @@ class Cubemap3DGSMethod(SplatMethod):
 
     def lens(self, panorama: Panorama) -> Pinhole:
         """The camera of the views; together they see every direction once."""
-        return square_lens(panorama, tangent=1.0)
+        return square_lens(panorama, 1.0, FINENESS)
+
+    def _worth_a_panorama(self, scene: Scene, cut: Scene) -> int:
+        """How many of the views that were cut show what there is to see once; each direction is in some of them."""
+        if not scene.train:
+            return 1  # `Method.fit` says what is wrong
+        lens = self.lens(Panorama(scene.train[0].width, scene.train[0].height))
+        times_seen = len(self.turns()) * solid_angle(lens) / (4 * math.pi)
+        return max(1, round(len(cut.train) / len(scene.train) / times_seen))
+
+    def _trained_by(self, trainee: Trainee, scene: Scene, budget: Budget, stage: Stage) -> Trainer:
+        return Trainer(trainee, scene, budget, self.train_options, self.seed, views_each=self._views_each, stage=stage)
+
+    def _trainee_of(
+        self,
+        splats: Splats,
+        extent: float,
+        iterations: int,
+        views: Sequence[View] = (),
+        kind: Callable[..., SplatTrainee] = CutTrainee,
+    ) -> SplatTrainee:
+        return super()._trainee_of(splats, extent, iterations, views, kind)

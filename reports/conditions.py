@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 import pandas as pd
 from pandas import DataFrame
 
-from reports.methods import name
+from reports.methods import name, title
 from reports.request import Request
 from reports.tables.table import ReportError
 
@@ -21,6 +21,11 @@ OF_A_MEAN = (*OF_A_DATA_SET, "machine")  # of one setting over the scenes of a d
 OF_TIMES = (*CONDITIONS, "machine")
 OF_EQUAL_TIMES = ("protocol", "resolution", "learning_rates", "data", "machine")
 PUBLISHED_LENGTHS = {"egonerf": 100_000}  # iterations; of the others 30 000, which tables of the paper have
+PUBLISHED_WIDTH = 1920  # pixels; the narrowest panoramas of the paper
+PUBLISHED_PIXELS = {  # preset -> what of it means something else in narrower panoramas
+    "op43dgs_release": "has a low-pass of 0.12 square pixels at a width of 2048, and of 0.0076 at 512",
+    "odgs_release": "draws half a pixel off, which is 0.09 degrees at a width of 2048, and 0.35 at 512",
+}
 
 
 def refuse_mixture(runs: DataFrame, request: Request, where: str, conditions: Iterable[str] = CONDITIONS) -> None:
@@ -51,6 +56,10 @@ def footnotes(blocks: Mapping[str, DataFrame], protocol: str) -> list[str]:
     for method, length in PUBLISHED_LENGTHS.items():
         if any(((runs["method"] == method) & (runs["iterations"] < length)).any() for runs in blocks.values()):
             notes.append(f"{name(method)} is published with {length} iterations.")
+    for preset, what in PUBLISHED_PIXELS.items():
+        sizes = (size for runs in blocks.values() for size in runs["resolution"][runs["preset"] == preset])
+        if any(int(size.partition("x")[0]) < PUBLISHED_WIDTH for size in sizes):
+            notes.append(f"{title(preset)} {what}.")
     return notes
 
 

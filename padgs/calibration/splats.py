@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -106,7 +106,12 @@ class CalibratedMethod(SplatMethod):
         return super()._blank(state)
 
     def _trainee_of(
-        self, splats: Splats, extent: float, iterations: int, kind: Callable[..., SplatTrainee] = CalibratedTrainee
+        self,
+        splats: Splats,
+        extent: float,
+        iterations: int,
+        views: Sequence[View] = (),
+        kind: Callable[..., SplatTrainee] = CalibratedTrainee,
     ) -> SplatTrainee:
         self._calibration.to(splats.means.device)
-        return super()._trainee_of(splats, extent, iterations, partial(kind, calibration=self._calibration))
+        return super()._trainee_of(splats, extent, iterations, views, partial(kind, calibration=self._calibration))

@@ -1,22 +1,25 @@
 """Perspective views cut out of panoramas, for methods that know ordinary cameras only.
 
 Pixels are interpolated when they are asked for, from the panorama as its own loader gives it, and kept where the
-panorama's are, within the same bytes (`padgs.data.store`); without such a store nothing is kept. What the panorama's
-mask ignores colours no pixel of a view: colours are interpolated weighted by the mask.
+panorama's are, within the same bytes (`padgs.data.store`); without such a store nothing is kept. Interpolation is
+bicubic, which blurs little. What the panorama's mask ignores colours no pixel of a view: beside it, colours are
+interpolated bilinearly, weighted by the mask.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from padgs.data.store import ImageStore, StoredImage
 from padgs.scene import Scene, View
 from padgs.sphere.camera import Panorama, Pinhole
-from padgs.sphere.panorama import sample
+from padgs.sphere.panorama import CUBIC_REACH, continued, sample, sample_sharply
 
 
 @dataclass(frozen=True, eq=False)  # a key of the store by identity: tensors are neither compared nor hashed by value
@@ -28,9 +31,9 @@ class _Cut:
     lens: Pinhole
     load: Callable[[], Tensor]  # of the panorama's pixels, or its mask
 
-    def sampled(self, image: Tensor) -> Tensor:
-        rays = self.lens.rays(dtype=torch.float64, device=image.device)
-        return sample(image, rays @ self.turn.to(image.device))  # d_panorama = turn^T d_view
+    def rays(self, like: Tensor) -> Tensor:
+        """Directions [H, W, 3] in the frame of the panorama, where its pixels are; d_panorama = turn^T d_view."""
+        return self.lens.rays(dtype=torch.float64, device=like.device) @ self.turn.to(like.device)
 
 
 class _Pixels(_Cut):
@@ -47,11 +50,16 @@ class _Pixels(_Cut):
     def decode(self) -> Tensor:
         """Interpolate, past the cache."""
         image = self.load()
-        mask = self.panorama.mask(device=image.device)
-        if mask is None:
-            return self.sampled(image).round().to(torch.uint8)
-        weighted = self.sampled(torch.cat((image * mask[..., None], mask[..., None]), dim=-1))
-        return (weighted[..., :3] / weighted[..., 3:].clamp(min=1e-6)).round().to(torch.uint8)
+        rays, mask = self.rays(image), self.panorama.mask(device=image.device)
+        colors = sample_sharply(image, rays)
+        if mask is not None:
+            mask = mask[..., None]
+            weighted = sample(torch.cat((image * mask, mask), dim=-1), rays)
+            hidden = continued((mask < 1).float(), CUBIC_REACH).movedim(-1, 0)
+            beside = max_pool2d(hidden, 2 * CUBIC_REACH + 1, stride=1).movedim(0, -1)
+            careful = weighted[..., :3] / weighted[..., 3:].clamp(min=1e-6)
+            colors = torch.where(sample(beside, rays) > 0, careful, colors)
+        return colors.clamp(0, 255).round().to(torch.uint8)
 
     def prefetch(self) -> None:
         """Have the panorama loaded in the background, where its source can, unless it is not needed any more."""
@@ -64,7 +72,8 @@ class _Mask(_Cut):
 
     def __call__(self) -> Tensor:
         """Weights [H, W] in [0, 1]."""
-        return self.sampled(self.load()[..., None])[..., 0]
+        mask = self.load()[..., None]
+        return sample(mask, self.rays(mask))[..., 0]
 
 
 def perspective_views(panorama: View, turns: Tensor, lens: Pinhole) -> tuple[View, ...]:
@@ -124,14 +133,20 @@ def _shows_something(view: View) -> bool:
     return bool((replace(view.load_mask, lens=grid)() > 0).any())
 
 
-def square_lens(panorama: Panorama, tangent: float) -> Pinhole:
-    """A square view that reaches `tangent` = tan(field of view / 2) to each side, as fine as the panorama's horizon.
+def square_lens(panorama: Panorama, tangent: float, fineness: float = 1.0) -> Pinhole:
+    """A square view that reaches `tangent` = tan(field of view / 2) to each side.
 
-    The side is rounded to whole pixels and the focal length follows, so that the field of view is exact.
+    Its middle has `fineness` times the pixels per radian of the panorama's horizon. The side is rounded to whole pixels
+    and the focal length follows, so that the field of view is exact.
     """
-    side = max(1, round(2 * panorama.focal * tangent))
+    side = max(1, round(2 * fineness * panorama.focal * tangent))
     focal = side / 2 / tangent
     return Pinhole(side, side, focal, focal, side / 2, side / 2)
+
+
+def solid_angle(lens: Pinhole) -> float:
+    """What a square view shows of the sphere, in steradians: 4 asin(sin^2(half its field of view))."""
+    return 4 * math.asin(math.sin(math.atan(lens.width / 2 / lens.fx)) ** 2)
 
 
 def looking_at(directions: Sequence[Sequence[float]] | Tensor) -> Tensor:

@@ -1,7 +1,8 @@
 """The training loop: from a photograph to a step of the optimiser, again and again.
 
-One iteration draws one training view, compares it with its photograph, goes back to the gradients, lets the trainee
-note where they are large, steps Adam, and lets the trainee grow or prune. Knows no files.
+One iteration draws one training view (or several, where a panorama is cut into them), compares it with its photograph,
+goes back to the gradients, lets the trainee note where they are large, steps Adam, and lets the trainee grow or prune.
+Knows no files.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ class TrainOptions:
 
 
 class Trainer:
-    """Optimises a trainee on the training views of a scene, one random view per iteration.
+    """Optimises a trainee on the training views of a scene, by default one random view per iteration.
 
     Attributes:
         iteration, seconds, cpu_seconds: how far it is, and what that took.
@@ -93,13 +94,21 @@ class Trainer:
         options: TrainOptions = TrainOptions(),
         seed: int = 0,
         *,
+        views_each: int = 1,
         stage: Stage = nullcontext,
     ) -> None:
-        """Prepare; nothing is drawn yet. `stage` is for whoever wants to know what an iteration spends its time on."""
+        """Prepare; nothing is drawn yet.
+
+        Args:
+            trainee, scene, budget, options, seed: what is trained, on what, for how long and how.
+            views_each: views that an iteration draws one after the other, before Adam steps on the sum of their losses.
+            stage: for whoever wants to know what an iteration spends its time on.
+        """
         self.iteration = 0
         self.seconds = self.cpu_seconds = 0.0
         self.start = next(iter(trainee.counts().values()))
         self._trainee, self._scene, self._budget, self._options, self._stage = trainee, scene, budget, options, stage
+        self._views_each = views_each
         pace = Pace.of(options.learning_rates, budget.iterations)
         self._optimiser = Optimiser(trainee.groups(), pace, options.check_every, **self.ADAM)
         self._targets = Targets(scene.train, options.weight, self._optimiser.device)
@@ -133,7 +142,18 @@ class Trainer:
             yield Record(iteration, loss, self.seconds, self.cpu_seconds, counts, events)
 
     def _step(self, iteration: int) -> tuple[float | Tensor, dict[str, int], tuple[str, ...]]:
-        """One iteration. Returns loss, counts and events of its record."""
+        """One iteration. Returns loss (a mean over its views), counts and events of its record."""
+        trainee, optimiser, stage = self._trainee, self._optimiser, self._stage
+        losses, drawn = zip(*(self._pull(iteration) for _ in range(self._views_each)), strict=True)
+        optimiser.check(iteration)
+        with stage("optimiser"):
+            optimiser.step(iteration)
+        with stage("adapt"), torch.no_grad():
+            events = trainee.adapt(iteration, optimiser.adam)
+        return sum(losses) / len(losses), {**trainee.counts(), "drawn": max(drawn)}, events
+
+    def _pull(self, iteration: int) -> tuple[float | Tensor, int]:
+        """Draw the next view and add its gradients. Returns its loss, and how many Gaussians were drawn."""
         trainee, optimiser, stage, options = self._trainee, self._optimiser, self._stage, self._options
         with stage("target"):
             index = self._views.next()
@@ -164,16 +184,9 @@ class Trainer:
             optimiser.refuse_non_finite({**optimiser.parameters(), **inputs, "image": image, "loss": loss}, iteration)
         with stage("backward"):
             loss.backward()
-        optimiser.check(iteration)
         with stage("observe"), torch.no_grad():
             trainee.observe(drawing, iteration)
-        drawn = len(drawing.gaussians)
-        del drawing, image, loss, target  # the graph must be gone before rows of its leaves come and go
-        with stage("optimiser"):
-            optimiser.step(iteration)
-        with stage("adapt"), torch.no_grad():
-            events = trainee.adapt(iteration, optimiser.adam)
-        return value, {**trainee.counts(), "drawn": drawn}, events
+        return value, len(drawing.gaussians)  # and the graph is gone before rows of its leaves come and go
 
     def _read(self, loss: Tensor, iteration: int) -> float | Tensor:
         """The loss as a number. On a GPU, which the host would have to wait for, only where all is checked."""

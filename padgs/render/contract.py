@@ -11,7 +11,7 @@ That is blending "sorted"; "hybrid" shares all but the order and the stop, see `
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -45,12 +45,13 @@ class RenderOptions:
     projection: str = "erp"
     near: float = 0.0  # world units; Gaussians whose mean is at most this far away are culled
     near_cull: str = "mean"  # what must be farther than near: the mean, or (ray) all that is drawn of the Gaussian
-    low_pass: float = 0.3  # variance of the low-pass filter in square pixels (at the centre of a perspective image)
+    low_pass: float = 0.3  # variance of the low-pass filter in square pixels (of a cubemap: of its panorama; of a
+    # perspective image: at its centre)
     low_pass_kind: str = "auto"  # pixels, angular, solid or fixed; auto: the first one of the projection
     pixel_bias: float = 0.0  # erp: pixels right and down of the truth that means are drawn; released ODGS: 0.5
     wrap: bool = True  # erp: continue footprints across the +-180 degree seam; tangent and ray know of no seam
     cubemap: bool = False  # draw a panorama through the six faces of a cube, each an ordinary perspective view
-    face_size: int | None = None  # cubemap: pixels across the 90 degrees of a face; None: as fine as the panorama
+    face_size: int | None = None  # cubemap: pixels across the 90 degrees of a face; None: twice as fine as the panorama
     bounds: str = "exact"  # exact: every pixel with alpha >= 1/255; square: as published, see `published_bounds`
     blending: str = "sorted"  # sorted: by distance of the means; hybrid: by distance on each ray, the rest unordered
     core_size: int = CORE_SIZE  # hybrid: how many fragments of a pixel are kept in order
@@ -102,6 +103,12 @@ class RenderOptions:
             )
         if self.face_size is not None and not self.face_size >= 2:
             raise ValueError(f"face_size is {self.face_size}; a face must be at least 2 pixels wide, or None")
+
+    def on_finer_pixels(self, times: float) -> RenderOptions:
+        """The same low-pass, as an angle, for a camera with so many times the pixels per radian."""
+        if self.resolved_low_pass_kind == "fixed":  # it knows no pixels
+            return self
+        return replace(self, low_pass=self.low_pass * times**2)
 
     @property
     def resolved_low_pass_kind(self) -> str:

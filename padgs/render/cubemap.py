@@ -22,6 +22,8 @@ from padgs.render.projective import shift_of_probe
 from padgs.sphere.camera import Panorama, Pinhole
 from padgs.sphere.panorama import rays
 
+FINENESS = 2  # pixels per radian at the middle of a face, where it is coarsest, over those of the panorama's horizon
+
 # face_from_camera: turned and looked through, each face is a camera like any other (x right, y down, z forward).
 FACES = torch.tensor(
     [
@@ -44,17 +46,17 @@ def face_camera(panorama: Panorama, face_size: int | None = None) -> Pinhole:
 
     Args:
         panorama: what the faces will be resampled to.
-        face_size: pixels across 90 degrees. If not given, the centre of a face has the pixels per radian of the
-            panorama, W / 2 pi (H / pi where that is more), hence W / pi across: the smallest face that loses nothing,
-            because a face is coarsest at its centre, and the one whose low-pass filters have the panorama's size.
+        face_size: pixels across 90 degrees. If not given, the centre of a face has `FINENESS` times the pixels per
+            radian of the panorama, W / 2 pi (H / pi where that is more). With as many, W / pi across, faces have all
+            the pixels it takes, but interpolating between them blurs (docs/projections.md).
     """
-    focal = max(panorama.width / (2 * pi), panorama.height / pi) if face_size is None else face_size / 2
+    focal = FINENESS * max(panorama.width / (2 * pi), panorama.height / pi) if face_size is None else face_size / 2
     size = 2 * (ceil(focal) + 1)
     return Pinhole(size, size, focal, focal, size / 2, size / 2)
 
 
 def rasterize_cubemap(rasterize: Backend, request: Request) -> Rendering:
-    """Draw a panorama with a backend's perspective views."""
+    """Draw a panorama with a backend's perspective views; low-pass filters are of the size of its own pixels."""
     gaussians, cam_from_world, camera = request.gaussians, request.cam_from_world, request.camera
     assert isinstance(camera, Panorama), type(camera)  # `check_inputs` has seen to it
     if request.probe is not None:  # it is given in units of the panorama, so it moves the means, once for all faces
@@ -63,7 +65,7 @@ def rasterize_cubemap(rasterize: Backend, request: Request) -> Rendering:
     lens = face_camera(camera, request.options.face_size)
     turns = torch.eye(4, dtype=cam_from_world.dtype, device=cam_from_world.device).repeat(6, 1, 1)
     turns[:, :3, :3] = FACES
-    options = replace(request.options, cubemap=False, face_size=None)
+    options = replace(request.options, cubemap=False, face_size=None).on_finer_pixels(lens.focal / camera.focal)
     each = replace(request, gaussians=gaussians, camera=lens, options=options, probe=None)
     faces = [rasterize(replace(each, cam_from_world=turn @ cam_from_world)) for turn in turns]
     return panorama_from_faces(faces, camera, lens)

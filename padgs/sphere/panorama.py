@@ -14,6 +14,8 @@ import math
 import torch
 from torch import Tensor
 
+CUBIC_REACH = 2  # pixels around a place that a bicubic sample leans on
+
 
 def longitude_latitude(points: Tensor) -> tuple[Tensor, Tensor]:
     """Longitude in (-pi, pi] and latitude in [-pi/2, pi/2] of camera-frame points (Eq. 6).
@@ -129,6 +131,47 @@ def sample(image: Tensor, directions: Tensor) -> Tensor:
     """
     height, width = image.shape[:2]
     return sample_pixels(image, project(directions, width, height))
+
+
+def sample_sharply(image: Tensor, directions: Tensor) -> Tensor:
+    """Bicubic samples [..., C] of a panorama [H, W, C], across the seam and the poles; at pixel centres its own values.
+
+    The convolution of Keys (1981) with a = -1/2: exact for parabolas, where bilinear samples are for ramps, so that it
+    keeps what those blur. Beside sharp edges it overshoots the values of the image.
+
+    Args:
+        image: any dtype, values as they are.
+        directions: [..., 3] camera frame, any length but zero.
+    """
+    height, width = image.shape[:2]
+    around = continued(image if image.is_floating_point() else image.float(), CUBIC_REACH)
+    u, v = (project(directions, width, height) - 0.5).unbind(-1)
+    column, row = u.floor(), v.floor()
+    across, down = _keys(u - column).to(around), _keys(v - row).to(around)
+    columns = (column.long() + CUBIC_REACH - 1)[..., None] + torch.arange(4, device=image.device)
+    rows = row.long() + CUBIC_REACH - 1
+    samples = torch.zeros(*directions.shape[:-1], image.shape[2], dtype=around.dtype, device=image.device)
+    for step in range(4):
+        line = (across[..., None] * around[(rows + step)[..., None], columns]).sum(-2)
+        samples += down[..., step, None] * line
+    return samples
+
+
+def _keys(t: Tensor) -> Tensor:
+    """Weights [..., 4] of the pixels -1, 0, 1 and 2 for places t in [0, 1) after pixel 0."""
+    return torch.stack(
+        (((2 - t) * t - 1) * t, (3 * t - 5) * t * t + 2, ((4 - 3 * t) * t + 1) * t, (t - 1) * t * t), dim=-1
+    ).div(2)
+
+
+def continued(image: Tensor, margin: int) -> Tensor:
+    """A panorama [H, W, C] with so many pixels more on each side: what lies beyond its seam and its poles.
+
+    Beyond a pole its rows come again, half a turn further.
+    """
+    turned = image.roll(image.shape[1] // 2, dims=1)
+    image = torch.cat((turned[:margin].flip(0), image, turned[-margin:].flip(0)))
+    return torch.cat((image[:, -margin:], image, image[:, :margin]), dim=1)
 
 
 def sample_pixels(image: Tensor, pixels: Tensor) -> Tensor:

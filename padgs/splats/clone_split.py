@@ -8,6 +8,7 @@ place.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -48,7 +49,7 @@ class CloneSplitOptions:
     prune_by_extent_from: int = 3000  # ... after this iteration
     extent_margin: float = 0.0  # world units added to the extent that sizes are compared with (the released ODGS)
     reset_every: int = 3000  # iterations between opacity resets
-    reset_opacity: float = 0.01  # no opacity is larger after a reset
+    reset_opacity: float = 0.01  # none is drawn with a larger opacity after a reset
     max_gaussians: int | None = 10_000_000  # as many as PaD-GS may have; those with the largest gradients multiply
     released_start: bool = False  # bug of the released OmniGS: densify_from is read as 0
     released_reset: bool = False  # bug of the released OmniGS: resets clear Adam moments but keep the opacities
@@ -86,8 +87,25 @@ class CloneSplit:
         generator: source of the random positions of split Gaussians, on the CPU.
     """
 
-    def __init__(self, splats: Splats, options: CloneSplitOptions, *, extent: float, seed: int = 0) -> None:
-        """Start with empty statistics; `extent` is the length that sizes are compared with, in world units."""
+    def __init__(
+        self,
+        splats: Splats,
+        options: CloneSplitOptions,
+        *,
+        extent: float,
+        drawn_opacities: Callable[[], Tensor] | None = None,
+        seed: int = 0,
+    ) -> None:
+        """Start with empty statistics.
+
+        Args:
+            splats: the model.
+            options: iterations are those of the run.
+            extent: the length that sizes are compared with, in world units.
+            drawn_opacities: of the model as it is then, [N] in [0, 1], at most its own, where a filter lowers them.
+            seed: of all that is random.
+        """
+        self._drawn_opacities = drawn_opacities or (lambda: torch.sigmoid(splats.opacity_logits))
         self.splats, self.options, self.extent = splats, options, extent + options.extent_margin
         self.generator = torch.Generator().manual_seed(seed)
         self.statistics = self._empty()
@@ -121,7 +139,7 @@ class CloneSplit:
         begin = 0 if options.released_start else options.densify_from
         if iteration > begin and iteration % options.densify_every == 0:
             cloned, split, left_out = self._multiply(optimizer)
-            self._decay_opacities()
+            self._decay_opacities(optimizer)
             pruned = self._prune(optimizer, iteration)
             self.statistics = self._empty()
             events.append(f"cloned {cloned}, split {split}, pruned {pruned} Gaussians")
@@ -186,18 +204,26 @@ class CloneSplit:
         keep_rows(self.splats.rows(), optimizer, keep)
         return int((~keep).sum())
 
-    def _decay_opacities(self) -> None:
+    def _decay_opacities(self, optimizer: torch.optim.Adam) -> None:
         if self.options.opacity_decay > 0:
             logits = self.splats.opacity_logits
             logits.copy_(torch.logit((torch.sigmoid(logits) - self.options.opacity_decay).clamp(min=FAINTEST)))
+            self._forget_moments_of_opacities(optimizer)
 
     def _reset_opacities(self, optimizer: torch.optim.Adam) -> None:
-        """Make everything nearly transparent, so that only what the images ask for comes back."""
-        logits = self.splats.opacity_logits
+        """Make everything nearly transparent, so that only what the images ask for comes back.
+
+        What is limited is the opacity that is drawn, o c with the compensation c of a filter, by o = limit / c (GOF).
+        """
+        logits, highest = self.splats.opacity_logits, self.options.reset_opacity
         if not self.options.released_reset:
-            highest = self.options.reset_opacity
-            logits.clamp_(max=math.log(highest / (1 - highest)))
-        moments = optimizer.state.get(logits, {})
+            drawn = self._drawn_opacities()
+            lowered = torch.logit(torch.sigmoid(logits) * highest / drawn)
+            logits.copy_(torch.where(drawn > highest, lowered, logits))
+        self._forget_moments_of_opacities(optimizer)
+
+    def _forget_moments_of_opacities(self, optimizer: torch.optim.Adam) -> None:
+        moments = optimizer.state.get(self.splats.opacity_logits, {})
         for name in ("exp_avg", "exp_avg_sq"):
             if name in moments:
                 moments[name].zero_()

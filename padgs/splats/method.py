@@ -6,15 +6,16 @@ subclass in `baselines` that says which.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 
+from padgs.checks import check
 from padgs.learning.loop import TrainOptions
 from padgs.learning.method import Method
 from padgs.learning.trainee import State
-from padgs.scene import Scene
+from padgs.scene import MIN_EXTENT, Scene, View
 from padgs.splats.clone_split import CloneSplitOptions
 from padgs.splats.model import Splats
 from padgs.splats.trainee import SplatTrainee
@@ -25,6 +26,11 @@ class SplatOptions(CloneSplitOptions):
     """The `method` group of the configuration: the model, and its densification."""
 
     sh_degree: int = 3  # 0: colours do not depend on the direction
+    min_extent: float = MIN_EXTENT  # units of the scene that its extent counts as at least; 0: as published
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(self, "a length >= 0 in units of the scene", lambda least: least >= 0, "min_extent")
 
 
 def refuse_polar_threshold(options: SplatOptions, why: str) -> None:
@@ -49,7 +55,7 @@ class SplatMethod(Method):
         splats = Splats.from_scene(
             scene, degree=options.sh_degree, max_gaussians=options.max_gaussians, generator=generator
         )
-        return self._trainee_of(splats, scene.extent, iterations)
+        return self._trainee_of(splats, scene.extent_of_at_least(options.min_extent), iterations, scene.train)
 
     def _blank(self, state: State) -> SplatTrainee:
         stored = state.of_model()
@@ -58,7 +64,12 @@ class SplatMethod(Method):
         return self._trainee_of(splats, values["extent"], values["iterations"])
 
     def _trainee_of(
-        self, splats: Splats, extent: float, iterations: int, kind: Callable[..., SplatTrainee] = SplatTrainee
+        self,
+        splats: Splats,
+        extent: float,
+        iterations: int,
+        views: Sequence[View] = (),
+        kind: Callable[..., SplatTrainee] = SplatTrainee,
     ) -> SplatTrainee:
         return kind(
             splats,
@@ -66,5 +77,6 @@ class SplatMethod(Method):
             self.render_config,
             extent=extent,
             iterations=iterations,
+            views=views,
             seed=self.seed,
         )

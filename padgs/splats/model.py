@@ -90,21 +90,22 @@ class Splats(nn.Module):
         """
         load_rows(self, tensors, self.rows())
 
-    def gaussians(self, view: View) -> Gaussians:
-        """The Gaussians with the colours that this view sees."""
+    def gaussians(self, view: View, shift: Tensor | None = None) -> Gaussians:
+        """The Gaussians with the colours that this view sees, shift [N, 3] world units away from where they are."""
+        means = self.means if shift is None else self.means + shift
         return Gaussians(
-            means=self.means,
+            means=means,
             quats=self.quats,
             scales=torch.exp(self.log_scales),
             opacities=torch.sigmoid(self.opacity_logits),
-            colors=self._colors(view),
+            colors=self._colors(view, means),
         )
 
-    def _colors(self, view: View) -> Tensor:
+    def _colors(self, view: View, means: Tensor) -> Tensor:
         """Max(0, 1/2 + SH), [N, 3], seen along camera -> Gaussian in the world frame."""
         colors = 0.5 + spherical_harmonics.DC * self.sh_dc
         if self.active_degree > 0:
-            rays = self.means - view.center.to(self.means)
+            rays = means - view.center.to(means)
             directions = rays / torch.sqrt((rays * rays).sum(-1, keepdim=True) + (TINY * self.unit) ** 2)
             values = spherical_harmonics.basis(directions, self.active_degree)[:, 1:]  # [N, K]
             colors = colors + torch.einsum("nk,nkc->nc", values, self.sh_rest[:, : values.shape[1]])

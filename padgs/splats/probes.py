@@ -2,49 +2,52 @@
 
 That gradient is the densification signal of `padgs.splats.clone_split`. image: the pull on the projected mean, in
 normalised image units (3DGS, OmniGS). space: on the mean itself, in units of half its distance from the camera, so that
-no projection is involved: 0.5 * distance * |dL/dmean| (SPaGS). space_absolute: that, and the pulls of all pixels one by
-one, which do not cancel: 0.5 * distance * sum |dL/dmean| (`padgs.render.absolute`).
+no projection is involved: 0.5 * distance * |dL/dmean|, the pull by way of colours that depend on the direction included
+(SPaGS). space_absolute: that, and the pulls of all pixels one by one, which do not cancel: 0.5 * distance *
+sum |dL/dmean|, by way of the footprints alone (`padgs.render.absolute`).
 """
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 from torch import Tensor
 
 from padgs.gaussians import Gaussians
 from padgs.render import Rendering, RenderOptions, render
 from padgs.scene import View
+from padgs.splats.model import Splats
 
 SIGNALS = ("image", "space", "space_absolute")
 
 
 def render_probed(
-    gaussians: Gaussians,
+    splats: Splats,
     view: View,
     options: RenderOptions,
     *,
     signal: str,
     probe: Tensor | None = None,
     backend: str = "auto",
-) -> tuple[Rendering, Tensor]:
-    """Render, and the probe, whose gradient `backward` fills.
+) -> tuple[Rendering, Gaussians, Tensor]:
+    """Render; returns what was drawn, too, and the probe, whose gradient `backward` fills.
 
     The probe is [N, 2] for signal image, [N, 3] world axes for space, and [N, 4] for space_absolute, which takes
     projection ray: world axes, then the sum of absolute pulls.
 
     A `probe` that is given is used again: its gradient is then the sum of several drawings of the same Gaussians.
 
-    What the colours depend on is no part of either signal, also where they depend on the direction of the mean.
+    Raises:
+        ValueError: unknown signal, or what `render` raises.
     """
-    means = gaussians.means
+    means = splats.means
     if signal == "image":
         probe = means.new_zeros(len(means), 2, requires_grad=True) if probe is None else probe
-        return render(gaussians, view, options, probe=probe, backend=backend), probe
+        gaussians = splats.gaussians(view)
+        return render(gaussians, view, options, probe=probe, backend=backend), gaussians, probe
     if signal not in SIGNALS:
         raise ValueError(f"unknown signal {signal!r}; known: {', '.join(SIGNALS)}")
     absolute = signal == "space_absolute"
     probe = means.new_zeros(len(means), 4 if absolute else 3, requires_grad=True) if probe is None else probe
     steps = 0.5 * (means.detach() - view.center.to(means)).norm(dim=-1, keepdim=True) * probe
-    moved = replace(gaussians, means=means + steps[:, :3])
-    return render(moved, view, options, absolute_probe=steps[:, 3] if absolute else None, backend=backend), probe
+    gaussians = splats.gaussians(view, shift=steps[:, :3])
+    pulls = steps[:, 3] if absolute else None
+    return render(gaussians, view, options, absolute_probe=pulls, backend=backend), gaussians, probe

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from functools import reduce
 
 import torch
 from torch import Tensor
@@ -11,8 +12,8 @@ from padgs.learning.schedule import Constant, LogLinear, ParameterGroup, scaled
 from padgs.learning.trainee import Drawing, Size, State
 from padgs.render import Rendering, RenderOptions, render
 from padgs.render.config import RenderConfig
+from padgs.render.low_pass import LowPass, low_pass_of, widened
 from padgs.scene import View
-from padgs.sphere.camera import Panorama
 from padgs.sphere.panorama import longitude_latitude
 from padgs.splats.clone_split import CloneSplit, CloneSplitOptions
 from padgs.splats.model import Splats
@@ -37,9 +38,12 @@ class SplatTrainee:
         *,
         extent: float,
         iterations: int,
+        views: Sequence[View] = (),
         seed: int = 0,
     ) -> None:
         """Wrap splats; `extent` is the scene's, `options` are those of a published run (see `for_run`).
+
+        `views` are those of the training; without them there can be none.
 
         Raises:
             ValueError: a signal that the projection does not have.
@@ -50,8 +54,10 @@ class SplatTrainee:
                 "set method.signal=space"
             )
         self.splats, self.iterations = splats, iterations
-        self.densifier = CloneSplit(splats, options.for_run(iterations), extent=extent, seed=seed)
-        self._config, self._extent = config, extent
+        self._config, self._views, self._extent = config, views, extent
+        self.densifier = CloneSplit(
+            splats, options.for_run(iterations), extent=extent, drawn_opacities=self._drawn_opacities, seed=seed
+        )
         self._drawn: View | None = None  # the view of the last drawing
 
     def groups(self) -> list[ParameterGroup]:
@@ -73,11 +79,10 @@ class SplatTrainee:
         `probe` is that of another drawing of the same Gaussians, for views that are made of several.
         """
         self._drawn = view
-        gaussians = self.splats.gaussians(view)
-        rendering, probe = render_probed(
-            gaussians,
+        rendering, gaussians, probe = render_probed(
+            self.splats,
             view,
-            self._render_options(view),
+            self.render_options(view),
             signal=self.densifier.options.signal,
             probe=probe,
             backend=self._config.backend,
@@ -110,7 +115,7 @@ class SplatTrainee:
     @torch.no_grad()
     def render(self, view: View) -> Rendering:
         """Render a view without gradients."""
-        return render(self.splats.gaussians(view), view, self._render_options(view), backend=self._config.backend)
+        return render(self.splats.gaussians(view), view, self.render_options(view), backend=self._config.backend)
 
     def size(self) -> Size:
         """Counts and bytes of the model."""
@@ -142,8 +147,21 @@ class SplatTrainee:
         self.densifier.statistics = {n: t.to(device, copy=True) for n, t in state.under("statistics/").items()}
         self.densifier.generator.set_state(state.tensors["random/pieces"].cpu())
 
-    def _render_options(self, view: View) -> RenderOptions:
-        options = self._config.options(self.splats.unit)
-        if options.cubemap and not isinstance(view.camera, Panorama):  # one face of a cube, or a crop: draw it as it is
-            return replace(options, cubemap=False, face_size=None)
-        return options
+    @torch.no_grad()
+    def _drawn_opacities(self) -> Tensor:
+        """Opacities [N] as the nearest training camera draws them: the solid low-pass lowers them with the distance."""
+        if self._config.resolved_low_pass_kind != "solid":
+            return torch.sigmoid(self.splats.opacity_logits)
+        gaussians = self.splats.gaussians(self._views[0])
+        of_views = (
+            widened(gaussians, gaussians.means - view.center.to(gaussians.means), self._low_pass(view)).opacities
+            for view in self._views
+        )
+        return reduce(torch.maximum, of_views)
+
+    def _low_pass(self, view: View) -> LowPass:
+        return low_pass_of(self.render_options(view), view.camera)
+
+    def render_options(self, view: View) -> RenderOptions:
+        """How a view is drawn."""
+        return self._config.options(self.splats.unit)

@@ -157,7 +157,13 @@ def test_released_bugs_are_off_unless_asked_for(root, monkeypatch):
     described, released = (composed(f"method={name}") for name in ("omnigs", "omnigs_release"))
     assert not any((described.options.released_start, described.options.released_reset))
     assert described.render == RenderConfig() and released.render == composed("render=released").render
-    quirks = {"released_start": True, "released_reset": True, "prune_by_extent_from": 0, "max_gaussians": None}
+    quirks = {
+        "released_start": True,
+        "released_reset": True,
+        "prune_by_extent_from": 0,
+        "min_extent": 0.0,
+        "max_gaussians": None,
+    }
     assert released.options == replace(described.options, **quirks)
     assert described.train == released.train and released.train.weight == "uniform"
 

@@ -34,7 +34,7 @@ METHODS = {
     "omnigs": (SPLATS, 6),
     "sc_omnigs": (SPLATS, 6),
     "seam360gs": (SPLATS, 7),
-    "cubemap_3dgs": (SPLATS, 6),
+    "cubemap_3dgs": (SPLATS, 6 * 6),  # an iteration draws six views
     "egonerf_small": (
         tuple(
             f"method.{name}={value}"

@@ -44,15 +44,27 @@ def test_a_view_shows_what_lies_in_its_directions(panorama: View):
 
 
 def test_faces_put_together_again_are_the_panorama(panorama: View):
-    """With a border of a pixel around each face, so that the way back interpolates inside of them."""
+    assert (through_faces(panorama) - panorama.image()).abs().max() < 3 / 255
+
+
+def test_the_way_through_faces_keeps_detail(panorama: View, generator: torch.Generator):
+    """Noise of three pixels: 37 dB over the sphere. Bilinear cuts lose 2.5 dB of it, faces half as fine 5.6."""
+    noise = torch.rand(1, 3, HEIGHT, WIDTH, generator=generator)
+    image = (255 * torch.nn.functional.avg_pool2d(noise, 3, 1, 1)[0].permute(1, 2, 0)).to(torch.uint8)
+    square = (through_faces(replace(panorama, load_pixels=lambda: image)) - image / 255).square().mean(-1)
+    weight = rays(WIDTH, HEIGHT)[..., ::2].norm(dim=-1)  # cosine of the latitude
+    assert -10 * torch.log10((weight * square).sum() / weight.sum()) > 36
+
+
+def through_faces(panorama: View) -> torch.Tensor:
+    """A panorama cut into faces as they are drawn, and put together again."""
     lens = face_camera(Panorama(WIDTH, HEIGHT))
     empty = torch.zeros(lens.height, lens.width)
     faces = [
         Rendering(view.image(), empty, empty, torch.zeros(0, dtype=torch.bool))
         for view in perspective_views(panorama, FACES, lens)
     ]
-    back = panorama_from_faces(faces, Panorama(WIDTH, HEIGHT), lens).image
-    assert (back - panorama.image()).abs().max() < 3 / 255
+    return panorama_from_faces(faces, Panorama(WIDTH, HEIGHT), lens).image
 
 
 def test_poses_say_where_the_pixels_are_in_the_world(panorama: View):

@@ -100,6 +100,27 @@ def test_records_count_and_tell():
     assert model.calls[:3] == ["draw", "observe", "adapt"]
 
 
+def test_an_iteration_may_draw_several_views_before_adam_steps_on_the_sum_of_their_losses():
+    model = Flat()
+    model.draw = lambda view: plain(Flat.draw(model, view), model.color)
+    scene, color = tiny_scene(), model.color.detach().clone().requires_grad_()
+    run = Trainer(model, scene, Budget(2), TrainOptions(lambda_l1=1.0, weight="uniform"), seed=3, views_each=5)
+    record = next(run.records())
+    assert model.calls == [*["draw", "observe"] * 5, "adapt"]
+    assert sorted(model.views) == [view.name for view in scene.train]
+    losses = [(color - view.image()).abs().mean() for view in scene.train]
+    assert record.loss == pytest.approx(sum(losses).item() / 5, rel=1e-5)
+    (gradient,) = torch.autograd.grad(sum(losses), color)
+    moments = run._optimiser.adam.state[model.color]
+    assert torch.allclose(moments["exp_avg"], 0.1 * gradient, rtol=1e-4, atol=1e-7)
+
+
+def plain(drawing: Drawing, color: Tensor) -> Drawing:
+    """The same without noise."""
+    image = color + 0 * drawing.rendering.image.detach() + drawing.probe.sum()
+    return replace(drawing, rendering=replace(drawing.rendering, image=image))
+
+
 def test_learning_rates_follow_their_schedule():
     """The first steps of Adam have the size of the learning rate, whatever the gradient."""
     for choice, factor in (("published", 1.0), ("run", 8.0), (3, 3.0)):

@@ -23,7 +23,7 @@ from render_cases import (
 from padgs.gaussians import Gaussians
 from padgs.render import Rendering, RenderOptions, render
 from padgs.render.config import RenderConfig
-from padgs.render.cubemap import FACES, _corners, face_camera, panorama_from_faces
+from padgs.render.cubemap import FACES, FINENESS, _corners, face_camera, panorama_from_faces
 from padgs.scene import View
 from padgs.sphere.camera import Panorama, Pinhole
 from padgs.sphere.panorama import rays
@@ -77,10 +77,32 @@ def test_every_pixel_is_interpolated_inside_one_face(width: int, height: int, fa
     assert (column[:, 1] - column[:, 0] == 1).all() and (row[:, 2] - row[:, 0] == 1).all()
 
 
-def test_a_face_is_as_fine_as_the_panorama_and_can_be_made_finer():
-    assert face_camera(Panorama(1024, 512)).focal == pytest.approx(1024 / (2 * math.pi))
-    assert face_camera(Panorama(100, 100)).focal == pytest.approx(100 / math.pi)
+def test_a_face_is_twice_as_fine_as_the_panorama_unless_its_size_is_given():
+    assert FINENESS == 2
+    assert face_camera(Panorama(1024, 512)).focal == pytest.approx(2 * 1024 / (2 * math.pi))
+    assert face_camera(Panorama(100, 100)).focal == pytest.approx(2 * 100 / math.pi)
     assert face_camera(Panorama(1024, 512), 500).fx == 250
+
+
+@pytest.mark.parametrize(
+    ("projection", "kind"), [("pinhole", "pixels"), ("pinhole", "solid"), ("tangent", "angular"), ("ray", "solid")]
+)
+@each_engine
+def test_a_gaussian_below_a_pixel_looks_the_same_through_faces_of_any_size(projection, kind, backend, dtype):
+    """The low-pass is of the panorama's pixels: finer faces do not sharpen what it widens."""
+    options = RenderOptions(projection=projection, cubemap=True, low_pass_kind=kind, low_pass=4.0)
+    gaussian = replace(broad("middle of a face", 3.0), means=torch.tensor([[0.02, 0.01, 2.0]]).double())
+    coarse, fine = (
+        draw(gaussian, 128, 64, backend=backend, dtype=dtype, options=replace(options, face_size=size)).image
+        for size in (82, 328)
+    )
+    assert fine.max() > 0.02
+    assert (coarse - fine).abs().max() < 0.06 * fine.max() + 1 / 255
+
+
+def test_a_low_pass_that_knows_no_pixels_is_the_same_on_finer_ones():
+    fixed = RenderOptions(projection="tangent", low_pass_kind="fixed")
+    assert fixed.on_finer_pixels(2) == fixed
 
 
 @pytest.mark.parametrize(("width", "height"), [(64, 32), (70, 44), (256, 128)])
@@ -118,7 +140,7 @@ def test_rays_see_the_same_through_faces(place: str, backend: str, dtype: torch.
         faces = draw(broad(place, sigma), width, width // 2, backend=backend, dtype=dtype, options=options_of_faces)
         error = (faces.image - whole.image).abs().amax(-1)
         # Bilinear: (|f_uu| + |f_vv|) / 8 <= 2 o / 8 (h / sigma)^2, a pixel being h = 1 / f at the centre of a face.
-        bound = 0.9 / 4 * (2 * math.pi / width / math.radians(sigma)) ** 2
+        bound = 0.9 / 4 * (2 * math.pi / (FINENESS * width) / math.radians(sigma)) ** 2
         smooth = whole.transmittance < 1 - 4 / 255  # away from where alpha is cut off at 1/255
         assert error[smooth].max() <= bound
         assert error.max() <= bound + 1 / 255
@@ -185,8 +207,8 @@ def test_native_faces_lose_nothing_and_draw_little_in_vain(projection: str, gene
     small = gaussians_of("ordinary", 300, generator)
     small = replace(small, scales=0.15 * small.scales).to(torch.float32)
     whole, faces = (
-        render(small, View("v", identity_pose(), 512, 256), replace(options, cubemap=cubemap)).counters["instances"]
-        for cubemap in (False, True)
+        render(small, View("v", identity_pose(), 512, 256), how).counters["instances"]
+        for how in (options, replace(options, cubemap=True, face_size=163))  # as fine as the horizon
     )
     assert faces < 1.6 * whole  # 1.3, as faces are finer towards their edges; whole faces in vain made it 15
 

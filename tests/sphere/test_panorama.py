@@ -18,6 +18,7 @@ from padgs.sphere.panorama import (
     row_latitudes,
     sample,
     sample_pixels,
+    sample_sharply,
     unproject,
 )
 
@@ -225,6 +226,22 @@ def test_samples_at_pixel_coordinates_are_exact_wrap_and_have_gradients(generato
     assert sample_pixels((image * 255).to(torch.uint8), centres).dtype == torch.float32
     places = (centres + 0.3).requires_grad_()
     assert torch.autograd.gradcheck(sample_pixels, (image.requires_grad_(), places))
+
+
+def test_sharp_samples_keep_the_pixels_and_err_less_between_them(generator):
+    """Of a smooth function of the direction, also at the poles and the seam: of third order, bilinear of second."""
+
+    def smooth(directions):
+        return torch.sin(4 * directions) + directions.roll(1, -1)
+
+    image = smooth(rays(64, 32, dtype=torch.float64))
+    assert torch.allclose(sample_sharply(image, rays(64, 32, dtype=torch.float64)), image, atol=1e-9)
+    anywhere = torch.nn.functional.normalize(torch.randn(500, 3, generator=generator, dtype=torch.float64), dim=-1)
+    pole = torch.tensor([[0.02, 1.0, 0.03], [-0.04, -1.0, 0.01], [0.001, 0.2, -1.0], [-0.001, 0.2, -1.0]]).double()
+    for directions in (anywhere, torch.nn.functional.normalize(pole, dim=-1)):
+        error, blurred = ((of(image, directions) - smooth(directions)).abs().max() for of in (sample_sharply, sample))
+        assert error < 0.5 * blurred
+    assert sample_sharply((image * 50 + 100).byte(), anywhere.view(10, 50, 3)).shape == (10, 50, 3)
 
 
 def test_samples_are_continuous_across_the_seam(generator):

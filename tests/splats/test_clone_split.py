@@ -6,6 +6,7 @@ from tiny_scene import tiny_scene
 
 from padgs.gaussians import rotation_matrices
 from padgs.render.config import RenderConfig
+from padgs.scene import View
 from padgs.splats.clone_split import SHRINK, CloneSplit, CloneSplitOptions
 from padgs.splats.model import Splats
 from padgs.splats.trainee import SplatTrainee
@@ -209,6 +210,8 @@ def test_opacities_decay_in_every_round_and_the_faintest_go():
     grown.splats.opacity_logits.data = torch.logit(opacities)
     assert grown.adapt(EVERY, optimizer) == ("cloned 0, split 0, pruned 2 Gaussians",)
     assert torch.allclose(torch.sigmoid(grown.splats.opacity_logits), opacities[1:3] - 0.001, rtol=1e-4)
+    moments = {name: optimizer.state[parameter]["exp_avg_sq"] for name, parameter in grown.splats.rows().items()}
+    assert [name for name, moment in moments.items() if not moment.any()] == ["opacity_logits"]
 
 
 def test_the_opacity_after_a_reset_is_an_option():
@@ -216,6 +219,32 @@ def test_the_opacity_after_a_reset_is_an_option():
     grown.splats.opacity_logits.data = torch.logit(torch.tensor([0.05, 0.9]))
     grown.adapt(30, optimizer)
     assert torch.allclose(torch.sigmoid(grown.splats.opacity_logits), torch.tensor([0.05, 0.1]))
+
+
+@pytest.mark.parametrize("kind", ["solid", "angular"])
+def test_a_reset_limits_the_opacity_that_the_nearest_camera_draws(kind, generator):
+    """SPaGS: min(o c, 0.1) / c, with c^2 = prod s^2 / (s^2 + 0.2 (r / f)^2); without the 3D filter c is 1."""
+    count, width = 40, 64
+    means, centers = torch.randn(count, 3, generator=generator), torch.randn(3, 3, generator=generator)
+    scales = 0.1 * torch.rand(count, 3, generator=generator) + 0.02
+    splats = Splats(means, scales.log(), torch.rand(count, 3, generator=generator))
+    before = torch.rand(count, generator=generator)
+    splats.opacity_logits.data = torch.logit(before)
+    views = [View("v", torch.eye(4), width, width // 2) for _ in centers]
+    for view, center in zip(views, centers, strict=True):
+        view.cam_from_world[:3, 3] = -center
+    options = CloneSplitOptions(densify_from=10**6, reset_every=3000, reset_opacity=0.1)
+    render = RenderConfig(projection="ray", low_pass=0.2, low_pass_kind=kind)
+    trained = SplatTrainee(splats, options, render, extent=1.0, iterations=30_000, views=views)
+    trained.adapt(3000, torch.optim.Adam(splats.parameters()))
+
+    nearest = torch.cdist(means, centers).amin(-1)[:, None]
+    squares = scales**2
+    c = (squares / (squares + 0.2 * (nearest * 2 * math.pi / width) ** 2)).prod(-1).sqrt()
+    c = c if kind == "solid" else torch.ones(count)
+    after = torch.sigmoid(splats.opacity_logits)
+    assert torch.allclose(after, (before * c).clamp(max=0.1) / c, rtol=1e-4)
+    assert (after < before - 1e-3).sum() > 5 and (kind == "angular" or (after > 0.2).sum() > 5)
 
 
 def test_released_reset_keeps_the_opacities_and_clears_their_moments():

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
-from padgs.gaussians import Gaussians, rotation_matrices
+from padgs.gaussians import rotation_matrices
 from padgs.render import RenderOptions, render
 from padgs.render.config import RenderConfig
 from padgs.scene import View
@@ -41,20 +42,26 @@ def view_at(generator: torch.Generator | None, width: int = 48) -> View:
 
 @pytest.mark.parametrize("projection", ["erp", "tangent", "ray"])
 def test_the_signal_in_space_is_half_the_distance_times_the_gradient_of_the_mean(projection, generator):
-    """By autograd, in float64, with a pose that is turned and shifted: 0.5 |mean - centre| |dL/dmean|."""
+    """By autograd, in float64, with a pose that is turned and shifted: 0.5 |mean - centre| |dL/dmean|.
+
+    The direction of the mean, which its colour depends on, counts.
+    """
     splats, view = colored_splats(30, generator), view_at(generator)
     options, weight = RenderOptions(projection=projection), torch.rand(24, 48, 3, generator=generator).double()
-    gaussians = splats.gaussians(view)
-    rendering, probe = render_probed(gaussians, view, options, signal="space", backend="torch")
+    rendering, _, probe = render_probed(splats, view, options, signal="space", backend="torch")
     (weight * rendering.image).sum().backward()
 
-    means = gaussians.means.detach().requires_grad_()
-    rest = {name: tensor.detach() for name, tensor in vars(gaussians).items() if name != "means"}
-    plain = render(Gaussians(means, **rest), view, options)
-    (weight * plain.image).sum().backward()
-    assert means.grad is not None and probe.grad is not None
-    in_camera = view.cam_from_world[:3, :3] @ means.detach().T + view.cam_from_world[:3, 3:]
-    expected = 0.5 * in_camera.norm(dim=0) * means.grad.norm(dim=-1)
+    gaussians = splats.gaussians(view)
+    plain = render(gaussians, view, options)
+    painted = render(replace(gaussians, colors=gaussians.colors.detach()), view, options)
+    whole, footprint = (
+        torch.autograd.grad((weight * drawn.image).sum(), splats.means, retain_graph=True)[0]
+        for drawn in (plain, painted)
+    )
+    assert (whole - footprint).norm() > 0.1 * whole.norm(), "colours matter here"
+    in_camera = view.cam_from_world[:3, :3] @ splats.means.detach().T + view.cam_from_world[:3, 3:]
+    expected = 0.5 * in_camera.norm(dim=0) * whole.norm(dim=-1)
+    assert probe.grad is not None
     assert torch.equal(rendering.image, plain.image), "a probe of zeros moves nothing"
     assert (expected > 0).sum() > 20
     assert torch.allclose(probe.grad.norm(dim=-1), expected, rtol=1e-9, atol=1e-14)
@@ -71,7 +78,7 @@ def test_a_small_gaussian_is_pulled_alike_wherever_it_is(generator):
         splats.sh_dc.data[:] = 1.0
         splats.active_degree = 0
         view = view_at(None, width=256)
-        rendering, probe = render_probed(splats.gaussians(view), view, RAY, signal="space", backend="torch")
+        rendering, _, probe = render_probed(splats, view, RAY, signal="space", backend="torch")
         rays = view.camera.rays(dtype=torch.float64)
         aside = (splats.means.detach()[0].roll(1) / (2 * scale) * rays).sum(-1)  # odd about the ball's centre
         (rendering.image.sum(-1) * aside * (1 - rays[..., 1] ** 2).sqrt()).sum().backward()
@@ -89,13 +96,14 @@ def test_the_signal_in_the_image_has_one_unit_in_every_projection(projection, la
     means = 2 * direction(longitude, torch.full_like(longitude, math.radians(latitude)))
     sizes = 2 * 2 * math.pi / width * (0.6 + 0.8 * torch.rand(count, 3, generator=generator, dtype=torch.float64))
     quats = torch.randn(count, 4, generator=generator, dtype=torch.float64)
-    gaussians = Gaussians(means, quats, sizes, torch.full_like(longitude, 0.5), torch.rand(count, 3).double())
+    splats = Splats(means, sizes.log(), torch.rand(count, 3, generator=generator).double())
+    splats.quats.data, splats.opacity_logits.data = quats, torch.zeros_like(longitude)
     blobs = torch.rand(1, 3, 8, 16, generator=generator, dtype=torch.float64)
     target = torch.nn.functional.interpolate(blobs, (width // 2, width), mode="bicubic")[0].permute(1, 2, 0)
     signals = {}
     for name, kind in (("erp", "pixels"), (projection, "angular")):
         options = RenderOptions(projection=name, low_pass_kind=kind)
-        rendering, probe = render_probed(gaussians, view_at(None, width), options, signal="image", backend="torch")
+        rendering, _, probe = render_probed(splats, view_at(None, width), options, signal="image", backend="torch")
         ((rendering.image - target) ** 2).mean().backward()
         assert probe.grad is not None
         signals[name] = probe.grad.norm(dim=-1)
@@ -108,8 +116,8 @@ def test_the_absolute_signal_is_half_the_distance_times_the_pulls_of_all_pixels(
     gaussians, weight = splats.gaussians(view), torch.randn(24, 48, 3, generator=generator).double()
     probes = []
     for signal in ("space", "space_absolute"):
-        rendering, probe = render_probed(gaussians, view, RAY, signal=signal, backend="torch")
-        (weight * rendering.image).sum().backward(retain_graph=True)
+        rendering, _, probe = render_probed(splats, view, RAY, signal=signal, backend="torch")
+        (weight * rendering.image).sum().backward()
         probes.append(probe.grad)
     assert torch.equal(probes[0], probes[1][:, :3])
 
@@ -153,4 +161,4 @@ def test_unknown_signals_are_named(generator):
         CloneSplitOptions(signal="pixels")
     view = view_at(generator)
     with pytest.raises(ValueError, match="unknown signal 'pixels'; known: image, space, space_absolute"):
-        render_probed(colored_splats(1, generator).gaussians(view), view, RAY, signal="pixels")
+        render_probed(colored_splats(1, generator), view, RAY, signal="pixels")

@@ -4,11 +4,13 @@ from dataclasses import replace
 
 import pytest
 import torch
+from composed import composed
 from tiny_scene import tiny_scene
 
 from padgs.learning.loop import Budget
 from padgs.learning.schedule import PUBLISHED_ITERATIONS
 from padgs.render.config import RenderConfig
+from padgs.runs.session import build
 from padgs.scene import Scene
 from padgs.splats.clone_split import CloneSplitOptions
 from padgs.splats.method import SplatMethod
@@ -94,13 +96,27 @@ def test_lengths_are_measured_with_the_extent_of_cameras_that_move(apart):
     centers = torch.stack([view.center for view in scene.train])
     extent = 1.1 * (centers - centers.mean(0)).norm(dim=-1).max().item()
     assert 0.15 < extent / scene.unit < 0.9
-    assert scene.extent == pytest.approx(extent)
+    assert scene.extent == scene.extent_of_at_least(0.1) == pytest.approx(extent)
 
 
 @pytest.mark.parametrize("apart", [0.0, 1e-8, 0.5])
 def test_lengths_are_measured_with_a_tenth_of_the_unit_where_cameras_hardly_move(apart):
     scene = travelling(tiny_scene(), apart)
-    assert scene.extent == pytest.approx(0.1 * scene.unit)
+    assert scene.extent_of_at_least(0.1) == pytest.approx(0.1 * scene.unit)
+
+
+@pytest.mark.parametrize("release", ["padgs_release", "omnigs_release", "odgs_release", "op43dgs_release"])
+def test_releases_measure_with_the_extent_of_their_cameras_however_little_they_move(release, monkeypatch, root):
+    """The rate of the means or offsets falls from a published share of it; in one place they could not learn."""
+    monkeypatch.setenv("PADGS_ROOT", str(root))
+    config, scene = composed(f"method={release}"), travelling(tiny_scene(), 0.1)
+    assert 0 < scene.extent < 0.05 * scene.unit
+    method = build(config)
+    method.fit(scene, Budget(1))
+    published = 0.01 if release == "padgs_release" else 1.6e-4
+    assert method.trainee.groups()[0].learning_rate(0) == pytest.approx(published * scene.extent, rel=1e-6)
+    with pytest.raises(ValueError, match=r"stand in one place, so their extent is 0 .* set method\.min_extent to a"):
+        build(config).fit(travelling(scene, 0.0), Budget(1))
 
 
 def test_the_least_that_counts_as_a_move():
@@ -118,5 +134,6 @@ def test_a_method_trains_means_at_the_rate_of_its_scene(scene):
     method = SplatMethod(render=RenderConfig(backend="torch"))
     next(method.fit(scene, Budget(10)))
     means = next(group for group in method.trainee.groups() if group.name == "means")
-    assert means.learning_rate(0) == pytest.approx(1.6e-4 * scene.extent)
-    assert method.trainee.densifier.extent == scene.extent
+    extent = scene.extent_of_at_least(0.1)
+    assert means.learning_rate(0) == pytest.approx(1.6e-4 * extent)
+    assert method.trainee.densifier.extent == extent

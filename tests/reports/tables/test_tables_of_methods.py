@@ -158,6 +158,13 @@ def test_footnotes_say_who_is_published_with_more_iterations():
     assert note not in markdown.text(table1(gathered([result("")])))
 
 
+def test_footnotes_say_whose_constants_are_pixels_of_wider_panoramas():
+    note = "ODGS, release draws half a pixel off, which is 0.09 degrees at a width of 2048, and 0.35 at 512."
+    for preset, width, noted in (("odgs_release", 512, True), ("odgs_release", 1920, False), ("odgs", 512, False)):
+        run = replace(result("", method="odgs"), preset=preset, width=width, height=width // 2)
+        assert (note in markdown.text(table1(gathered([run])))) == noted
+
+
 def test_footnotes_say_how_and_where():
     text = markdown.text(table4(gathered(data_set("roam360"))))
     for words in ("paper, LPIPS-vgg fed", "2048x1024", "30000 iterations", "0.1.0 abc", "2 cores of A & B", "RTX 3090"):
