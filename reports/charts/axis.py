@@ -18,7 +18,7 @@ TICKS = 3  # at least
 ROUND = ((1.0,), (1.0, 3.0), (1.0, 2.0, 5.0), (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0))  # leading digits, sparse to dense
 
 
-def window(values: Sequence[float], fence: float = FENCE) -> tuple[float, float]:
+def window(values: Sequence[float]) -> tuple[float, float]:
     """The smallest and the largest value that an axis shows in its place; what lies beyond stands at the margin.
 
     The rule is that of box plots (Tukey, Exploratory Data Analysis, 1977): a value is left out if it lies more than
@@ -30,7 +30,7 @@ def window(values: Sequence[float], fence: float = FENCE) -> tuple[float, float]
     ((27.4, 31.5), (20.0, 30.0))
     """
     first, third = np.quantile(values, [0.25, 0.75])
-    reach = fence * (third - first)
+    reach = FENCE * (third - first)
     kept = [value for value in values if first - reach <= value <= third + reach]
     return min(kept), max(kept)
 
@@ -44,11 +44,11 @@ class Axis:
     logarithmic: bool
 
     @classmethod
-    def of(cls, values: Sequence[float], logarithmic: bool = False, fence: float = FENCE) -> Axis:
-        """The axis for some values, all positive if it is logarithmic. An infinite fence keeps all in the window."""
+    def of(cls, values: Sequence[float], logarithmic: bool = False, whole: bool = False) -> Axis:
+        """The axis for some values, all positive if it is logarithmic. A whole one leaves nothing out."""
         values = values or [1.0]
         scaled = [math.log10(value) if logarithmic else value for value in values]
-        low, high = window(scaled, fence)
+        low, high = (min(scaled), max(scaled)) if whole else window(scaled)
         if high == low:
             low, high = low - ALONE[logarithmic] / 2, high + ALONE[logarithmic] / 2
         size = high - low
