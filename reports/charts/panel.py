@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -15,9 +16,9 @@ from reports.charts.palette import ALPHA, INK, PAPER, SOFT, color_of, weight_of
 from reports.charts.trade_off import Point, TradeOff, pareto
 from reports.measures import Measure
 
-SMALLEST = 14.0  # points^2 of a mark that would be too small to see
+SMALLEST = 25.0  # points^2 of a mark that would be too small to see
 FIXED = 30.0  # points^2 of a mark whose area says nothing: a released program, a method without Gaussians
-ARROW = 70.0  # points^2 of a mark at the margin
+ARROW = 70.0  # points^2 of the arrow head of a mark at the margin
 
 
 @dataclass(frozen=True)
@@ -30,32 +31,52 @@ class Mark:
     y: float  # its quality
     at: tuple[float, float]  # where it is drawn: there, or at the margin
     sides: tuple[int, int]  # beyond which side of either axis it lies: -1, 0 or 1
-    area: float  # points^2
 
     @property
     def gaussians(self) -> float:
-        """How many it was drawn for: 0 in a method without any, and where the area does not say them."""
-        return 0.0 if self.role == "release" else self.point.gaussians
+        """How many its area says: 0 for a released program, at the margin, and in a method without any."""
+        return 0.0 if self.role == "release" or any(self.sides) else self.point.gaussians
 
-    @property
-    def radius(self) -> float:
-        """Points."""
-        return math.sqrt(self.area) / 2
+    def area(self, scale: float) -> float:
+        """Points^2, of which a Gaussian has `scale`."""
+        if any(self.sides):
+            return ARROW
+        return area(self.gaussians, scale) if self.gaussians else FIXED
 
 
-@dataclass(frozen=True)
+@dataclass
 class Panel:
-    """Axes of matplotlib, what they show, and the lines that names should not hide."""
+    """Axes of matplotlib and what they show."""
 
     axes: Any
     trade_off: TradeOff
     cost: Measure
     quality: Measure
     unit: str  # of the cost
-    marks: tuple[Mark, ...]
-    lines: list[Line]
+    x_axis: Axis
+    y_axis: Axis
+    lines: list[Line] = field(default_factory=list)  # that names should not hide
 
-    def name(self) -> list[Any]:
+    @cached_property
+    def marks(self) -> list[Mark]:
+        """One for each point that has both numbers."""
+        found = []
+        for point in self.trade_off.points:
+            x, y, role = point.value(self.cost), point.value(self.quality), self.trade_off.role(point.preset)
+            if not x or y is None:  # a logarithmic axis has no place for 0
+                continue
+            at, sides = (self.x_axis.position(x), self.y_axis.position(y)), (self.x_axis.side(x), self.y_axis.side(y))
+            found.append(Mark(point, role, x, y, at, sides))
+        return found
+
+    def draw(self, scale: float, tips: Tips) -> None:
+        """All but the names. A Gaussian has `scale` points^2; `tips` takes what the marks say."""
+        self.x_axis.dress(self.axes.xaxis)
+        self.y_axis.dress(self.axes.yaxis)
+        self._draw_front()
+        self._draw_marks(scale, tips)
+
+    def name(self, scale: float) -> list[Any]:
         """Write names at the marks, main methods first, once the layout is fixed; released programs have none beside
         their corrected twins. What stands at the margin says its numbers. The texts are those that found room.
         """
@@ -66,19 +87,21 @@ class Panel:
             x_side, y_side = mark.sides
             values = [f"{mark.y:.1f} dB"] * bool(y_side) + [f"{brief(mark.x)} {self.unit}"] * bool(x_side)
             text = "\n".join([mark.point.title, ", ".join(values)]).strip()
-            wanted.append(Name(text, mark.at, mark.radius, weight_of(mark.point.preset, mark.role)))
-        return names.write(self.axes, wanted, [(*mark.at, mark.radius) for mark in self.marks], self.lines)
+            radius = math.sqrt(mark.area(scale)) / 2
+            wanted.append(Name(text, mark.at, radius, weight_of(mark.point.preset, mark.role)))
+        marks = [(*mark.at, math.sqrt(mark.area(scale)) / 2) for mark in self.marks]
+        return names.write(self.axes, wanted, marks, self.lines)
 
-    def draw_front(self, end: float) -> None:
-        """The Pareto front of all but released programs, as far as an x."""
+    def _draw_front(self) -> None:
+        """The Pareto front of all but released programs, as far as the window goes."""
         front = pareto([(mark.x, mark.y) for mark in self.marks if mark.role != "release"], higher_is_better=True)
         drawn = {(mark.x, mark.y): mark.at for mark in self.marks}
         corners = [drawn[point] for point in front]
-        corners += [(end, corners[-1][1])] if corners else []
+        corners += [(max(self.x_axis.window[1], corners[-1][0]), corners[-1][1])] if corners else []
         steps = [corner for (_, y), (x, top) in pairwise(corners) for corner in ((x, y), (x, top))]
         self._line([*corners[:1], *steps], color=SOFT[0], linewidth=0.9, zorder=1.5)
 
-    def draw_marks(self, tips: Tips) -> None:
+    def _draw_marks(self, scale: float, tips: Tips) -> None:
         """All marks, with links between twins and a standard deviation to each side where there are several seeds."""
         presets = [point.preset for point in self.trade_off.points]
         for mark in self.marks:
@@ -89,7 +112,7 @@ class Panel:
                 self._line(ends, color=color, linewidth=0.8, alpha=0.6 * ALPHA[mark.role], zorder=2)
             numbers = [f"{name}: {brief(c.value, 4)}" for name, c in mark.point.numbers.items() if c.value is not None]
             tip = tips.add("\n".join([mark.point.title, *numbers]))
-            self.axes.scatter(*mark.at, clip_on=False, gid=tip, **_look(mark, color))
+            self.axes.scatter(*mark.at, clip_on=False, gid=tip, s=mark.area(scale), **_look(mark, color))
 
     def _line(self, corners: Line, **look: Any) -> None:
         if corners:
@@ -108,47 +131,9 @@ class Panel:
         return along + ([[(x, y - y_std), (x, y + y_std)]] if y_std and not y_side else [])
 
 
-def panel(
-    axes: Any,
-    trade_off: TradeOff,
-    cost: Measure,
-    quality: Measure,
-    y_axis: Axis,
-    unit: str,
-    largest: float,
-    tips: Tips,
-) -> Panel:
-    """Dressed axes with marks for the points that have both numbers, but without names.
-
-    Args:
-        axes: of matplotlib.
-        trade_off: the points.
-        cost: along x, logarithmic.
-        quality: along y.
-        y_axis: of the quality.
-        unit: of the cost.
-        largest: points^2 of the mark with the most Gaussians.
-        tips: takes what the marks say.
-    """
-    there = [
-        (point, x, y)
-        for point in trade_off.points
-        if (x := point.value(cost)) and (y := point.value(quality)) is not None  # no place for a cost of 0
-    ]
-    x_axis = Axis.of([x for _, x, _ in there], logarithmic=True)
-    x_axis.dress(axes.xaxis)
-    y_axis.dress(axes.yaxis)
-    counts = [point.gaussians for point, _, _ in there if trade_off.role(point.preset) != "release"]
-    scale = largest / max([*counts, 1.0])
-    marks = []
-    for point, x, y in there:
-        role, at = trade_off.role(point.preset), (x_axis.position(x), y_axis.position(y))
-        area = max(scale * point.gaussians, SMALLEST) if point.gaussians and role != "release" else FIXED
-        marks.append(Mark(point, role, x, y, at, (x_axis.side(x), y_axis.side(y)), area))
-    made = Panel(axes, trade_off, cost, quality, unit, tuple(marks), [])
-    made.draw_front(x_axis.window[1])
-    made.draw_marks(tips)
-    return made
+def area(gaussians: float, scale: float) -> float:
+    """Points^2 of a mark for so many Gaussians, of which one has `scale`."""
+    return max(scale * gaussians, SMALLEST)
 
 
 def brief(value: float, digits: int = 3) -> str:
@@ -161,9 +146,9 @@ def brief(value: float, digits: int = 3) -> str:
 
 
 def _look(mark: Mark, color: str) -> dict[str, Any]:
-    look: dict[str, Any] = {"s": mark.area, "alpha": ALPHA[mark.role], "zorder": 3 if mark.role == "main" else 2.5}
+    look: dict[str, Any] = {"alpha": ALPHA[mark.role], "zorder": 3 if mark.role == "main" else 2.5}
     if any(mark.sides):  # an arrow head that points to where the mark is
-        look |= {"s": ARROW, "marker": (3, 0, math.degrees(math.atan2(mark.sides[1], mark.sides[0])) - 90)}
+        look["marker"] = (3, 0, math.degrees(math.atan2(mark.sides[1], mark.sides[0])) - 90)
     elif mark.role != "release" and not mark.gaussians:
         look["marker"] = "D"
     if mark.role == "release":

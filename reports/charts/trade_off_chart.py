@@ -11,7 +11,7 @@ from reports.charts import time_chart
 from reports.charts.axis import Axis
 from reports.charts.drawing import Chart, Tips, figure, lay_out, png, styled, svg
 from reports.charts.palette import ALPHA, SOFT
-from reports.charts.panel import ARROW, FIXED, Panel, panel
+from reports.charts.panel import ARROW, FIXED, Panel, area
 from reports.charts.trade_off import TradeOff, trade_offs
 from reports.gathered import Gathered
 from reports.measures import COSTS
@@ -46,35 +46,38 @@ def drawn(trade_off: TradeOff, size: tuple[float, float]) -> tuple[Any, Tips, li
     """The figure with panels of a size, what its marks say, and each panel with the names in it."""
     quality, columns = trade_off.qualities[0], len(PANELS) if size == WIDE else 1
     made, axes = figure(columns, len(PANELS) // columns, *size)
-    tips, y_axis = Tips(), Axis.of([y for point in trade_off.points if (y := point.value(quality)) is not None])
+    tips, costs = Tips(), [COSTS[cost] for cost, _, _ in PANELS]
+    there = [point for point in trade_off.points if point.value(quality) is not None]
+    y_axis = Axis.of([point.value(quality) or 0.0 for point in there])
+    x_axes = [Axis.of([x for point in there if (x := point.value(cost))], logarithmic=True) for cost in costs]
     panels = []
-    for own, (cost, words, unit) in zip(axes.flat, PANELS, strict=True):
-        panels.append(panel(own, trade_off, COSTS[cost], quality, y_axis, unit, LARGEST[size], tips))
+    for own, cost, x_axis, (_, words, unit) in zip(axes.flat, costs, x_axes, PANELS, strict=True):
         own.set_xlabel(f"{words}, {unit} ↓")
         own.set_ylabel(f"{quality.column.title}, dB ↑")
-    handles, conditions = _handles(panels), _conditions(trade_off)
+        panels.append(Panel(own, trade_off, cost, quality, unit, x_axis, y_axis))
+    scale = LARGEST[size] / max([1.0, *(mark.gaussians for one in panels for mark in one.marks)])
+    for one in panels:
+        one.draw(scale, tips)
+    handles, conditions = _handles(panels, scale), _conditions(trade_off)
     look = {"ncols": 2, "title": fill(conditions, LETTERS)} if columns == 1 else {"ncols": 8, "title": conditions}
     made.legend(handles=handles, loc="outside lower center", fontsize=8, title_fontsize=8, **look)
     lay_out(made, trade_off.title)
-    return made, tips, [(one, one.name()) for one in panels]
+    return made, tips, [(one, one.name(scale)) for one in panels]
 
 
-def _handles(panels: Sequence[Panel]) -> list[Any]:
+def _handles(panels: Sequence[Panel], scale: float) -> list[Any]:
     """What is drawn and needs a word."""
     from matplotlib.lines import Line2D
     from matplotlib.ticker import EngFormatter
 
-    def dot(area: float, label: str, **look: Any) -> Line2D:
+    def dot(size: float, label: str, **look: Any) -> Line2D:
         look = {"marker": "o", "color": SOFT[0], "markeredgewidth": 0} | look
-        return Line2D([], [], linestyle="none", markersize=math.sqrt(area), label=label, **look)
+        return Line2D([], [], linestyle="none", markersize=math.sqrt(size), label=label, **look)
 
     marks = [mark for one in panels for mark in one.marks]
-    most = max((mark for mark in marks if mark.gaussians), key=lambda mark: mark.gaussians, default=None)
-    handles = []
-    if most is not None:
-        counts = [_round(count(mark.gaussians for mark in marks if mark.gaussians)) for count in (min, max)]
-        areas = {count: most.area * count / most.gaussians for count in counts}
-        handles += [dot(area, f"{EngFormatter(sep='')(count)} Gaussians") for count, area in areas.items()]
+    counts = [mark.gaussians for mark in marks if mark.gaussians]
+    examples = dict.fromkeys((_round(min(counts)), _round(max(counts)))) if counts else ()
+    handles = [dot(area(count, scale), f"{EngFormatter(sep='')(count)} Gaussians") for count in examples]
     if any(mark.role != "release" and not mark.gaussians and not any(mark.sides) for mark in marks):
         handles.append(dot(FIXED, "without Gaussians", marker="D"))
     if any(mark.role == "variant" for mark in marks):

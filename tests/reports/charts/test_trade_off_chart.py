@@ -5,7 +5,7 @@ from made_up import assert_apart, compared, gathered, small, write
 from reports import store
 from reports.charts import time_chart
 from reports.charts.trade_off import trade_offs
-from reports.charts.trade_off_chart import NARROW, WIDE, charts, drawn
+from reports.charts.trade_off_chart import LARGEST, NARROW, WIDE, charts, drawn
 from reports.frame import frame
 from reports.gathered import Gathered
 
@@ -45,6 +45,7 @@ def test_a_method_far_below_stands_at_the_margin_with_its_numbers():
         assert stray.sides == (1, -1) and all(mark.sides == (0, 0) for mark in others)
         words = next(text.get_text() for text in texts if "EgoNeRF" in text.get_text())
         assert "15.6 dB" in words and words.endswith("s")
+        assert max(found.get_sizes()[0] for found in scatters(panel)) == LARGEST[WIDE], "its Gaussians scale no area"
 
 
 def test_released_programs_are_small_rings_without_names_that_count_for_nothing():
