@@ -18,6 +18,7 @@ ON_A_MARK = 0.8  # a square pixel of another mark, hidden
 ON_A_LINE = 4.0  # a point of a line, struck through
 LED = 12.0  # a leader, which a name further than `BESIDE` from its mark needs
 ACROSS = 60.0  # a leader that crosses a mark or a name
+ASTRAY = 10.0  # to stand nearer to another mark
 BELOW_LEFT = 2.0  # not to stand right of the mark and above
 
 
@@ -84,8 +85,11 @@ def _candidates(
     cost += ON_A_MARK * _overlap(boxes, discs).sum(1)
     struck = (lines >= boxes[:, None, :2] - CLEARANCE).all(2) & (lines <= boxes[:, None, 2:] + CLEARANCE).all(2)
     cost += ON_A_LINE * struck.sum(1)
-    own = (marks[:, :2] == one.at).all(1)
-    return boxes, cost + ACROSS * _crossed(_leaders(boxes, one), discs[~own]).sum(1)
+    others = (marks[:, :2] != one.at).any(1)
+    distances = np.linalg.norm(np.clip(marks[:, :2], boxes[:, None, :2], boxes[:, None, 2:]) - marks[:, :2], axis=2)
+    edges = np.where(others, distances - marks[:, 2], np.inf).min(1, initial=np.inf)
+    cost += ASTRAY * (edges < distances[:, ~others].min(1, initial=np.inf) - one.radius)
+    return boxes, cost + ACROSS * _crossed(_leaders(boxes, one), discs[others]).sum(1)
 
 
 def _overlap(boxes: NDArray, others: NDArray, clearance: float = 0.0) -> NDArray:
