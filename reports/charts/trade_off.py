@@ -64,8 +64,9 @@ class TradeOff:
         """
         if _is_released(preset):
             return "release"
-        kin = [p.preset for p in self.points if family(p.preset) == family(preset) and not _is_released(p.preset)]
-        return "main" if preset == (family(preset) if family(preset) in kin else kin[0]) else "variant"
+        method = family(preset)
+        kin = [p.preset for p in self.points if family(p.preset) == method and not _is_released(p.preset)]
+        return "main" if preset == (method if method in kin else [*kin, preset][0]) else "variant"
 
     def corrected(self, point: Point) -> Point | None:
         """The twin of a released program: the corrected method in the same setting; None if it is not there."""

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from made_up import assert_apart, compared, gathered, small, write
@@ -88,8 +90,9 @@ def test_a_mark_says_its_numbers_and_a_phone_has_a_picture_of_its_own():
 
 def test_quality_over_training_time_comes_from_the_logs(tmp_path):
     runs = compared(["synthetic-room"], seeds=2)
+    runs.append(replace(small(20.0, method="mine", experiments=("all_methods",)), status="oom"))
     (logged,) = trade_offs(Gathered(frame(store.read(write(runs, tmp_path))[0])))
     chart = time_chart.chart(logged)
-    assert chart.name == "time_synthetic-room" and ">PaD-GS<" in chart.narrow
+    assert chart.name == "time_synthetic-room" and ">PaD-GS<" in chart.narrow and ">mine<" in chart.svg
     assert "<title>PaD-GS\n25.52 dB after 200 s</title>" in chart.svg  # 26.05 of two seeds - 8 / 15 at the last probe
     assert time_chart.chart(one(runs)) is None, "no quality over time without a log"
