@@ -14,30 +14,35 @@ from typing import Any, ParamSpec, TypeVar
 
 from pandas import DataFrame
 
-from reports import methods
+from reports.charts.palette import GRID, INK, PAPER, dark_rules
 
 P = ParamSpec("P")
 T = TypeVar("T")
-# Okabe and Ito's colours, which colour-blind readers can tell apart; one for each method, in the order of the tables.
-COLORS = ("#E69F00", "#56B4E9", "#009E73", "#D55E00", "#0072B2", "#CC79A7", "#000000", "#8c6d31", "#7f7f7f", "#661100")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*")
-MARKER_STEP = 3  # from one preset of a method to the next; no divisor of their number
 STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",  # text stays text
-    "svg.hashsalt": "padgs",  # the same numbers give the same file
     "font.size": 9,
     "font.family": "sans-serif",
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
-    "grid.color": "#e3e3e3",
+    "grid.color": GRID[0],
     "grid.linewidth": 0.6,
     "axes.axisbelow": True,
     "legend.frameon": False,
+    "figure.facecolor": PAPER[0],
+    "axes.facecolor": "none",
+    "text.color": INK[0],
+    "axes.labelcolor": INK[0],
+    "axes.edgecolor": INK[0],
+    "xtick.color": INK[0],
+    "ytick.color": INK[0],
     "text.parse_math": False,  # a name with a $ in it is a name
 }
 DPI = 110
-LETTERS_PER_INCH = 12  # of a title
+TITLE, SMALL_TITLE = 10.5, 9.0  # points, in figures of up to NARROW inches the second
+NARROW = 5.0
+LETTERS = 126  # of a point's height that fit into an inch
 
 
 @dataclass
@@ -55,7 +60,7 @@ class Tips:
 
 @dataclass(frozen=True)
 class Chart:
-    """A finished chart in both formats, with the numbers in it."""
+    """A finished chart in both formats, with the numbers in it. The SVG turns dark where the reader's screen is."""
 
     name: str  # file name without extension
     title: str
@@ -63,6 +68,7 @@ class Chart:
     png: bytes
     notes: tuple[str, ...] = ()
     numbers: DataFrame | None = None  # None: they are in no file
+    narrow: str = ""  # the SVG for the width of a phone; empty where there is none
 
 
 def styled(draw: Callable[P, T]) -> Callable[P, T]:
@@ -103,33 +109,30 @@ def dress(axis: Any, values: Sequence[float], log_from: float = math.inf) -> Non
         axis.set_major_formatter(EngFormatter(sep=""))
 
 
-def finish(
-    made: Any, name: str, title: str, tips: Tips, notes: tuple[str, ...], numbers: DataFrame | None = None
-) -> Chart:
-    """Title and files of a figure."""
-    width = int(LETTERS_PER_INCH * made.get_figwidth())
-    made.suptitle("\n".join(part for line in title.split("\n") for part in wrap(line, width)), fontsize=10.5)
+def lay_out(made: Any, title: str) -> None:
+    """Write the title and find the layout, once for all files; what is drawn after this has fixed axes to refer to."""
+    size = TITLE if made.get_figwidth() > NARROW else SMALL_TITLE
+    letters = int(LETTERS * made.get_figwidth() / size)
+    made.suptitle("\n".join(part for line in title.split("\n") for part in wrap(line, letters)), fontsize=size)
     made.draw_without_rendering()
-    made.set_layout_engine("none")  # the layout is found; each file would find it again
-    svg, png = io.StringIO(), io.BytesIO()
-    made.savefig(svg, format="svg", metadata={"Date": None, "Creator": None})
-    made.savefig(png, format="png", dpi=DPI, metadata={"Software": None})
-    return Chart(name, title, _with_tips(svg.getvalue(), tips), png.getvalue(), notes, numbers)
+    made.set_layout_engine("none")
 
 
-def color_of(preset: str, presets: Sequence[str]) -> str:
-    """The colour of a preset's method: the paper's always have the same."""
-    known = list(methods.TITLES)
-    others = [name for name in dict.fromkeys(map(methods.method_of, presets)) if name not in known]
-    return COLORS[[*known, *others].index(methods.method_of(preset)) % len(COLORS)]
+def svg(made: Any, name: str, tips: Tips) -> str:
+    """A figure as text. The same numbers give the same text; figures of other names or widths share no id with it."""
+    from matplotlib import rc_context
+
+    text = io.StringIO()
+    with rc_context({"svg.hashsalt": f"padgs {name} {made.get_figwidth():g}"}):
+        made.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
+    return _with_tips(text.getvalue().replace("</style>", f"\n{dark_rules()}</style>", 1), tips)
 
 
-def marker_of(preset: str, presets: Sequence[str]) -> str:
-    """The shape of a preset: presets of one method have its colour and differ in shape."""
-    method = methods.method_of(preset)
-    known = [*methods.TITLES, *(name for name in map(methods.method_of, presets) if name not in methods.TITLES)]
-    own = [name for name in methods.ordered([preset, *presets]) if methods.method_of(name) == method]
-    return MARKERS[(known.index(method) + MARKER_STEP * own.index(preset)) % len(MARKERS)]
+def png(made: Any) -> bytes:
+    """A figure as pixels, on white paper."""
+    data = io.BytesIO()
+    made.savefig(data, format="png", dpi=DPI, metadata={"Software": None})
+    return data.getvalue()
 
 
 def _with_tips(svg: str, tips: Tips) -> str:

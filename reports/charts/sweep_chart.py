@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from reports.charts.drawing import COLORS, MARKERS, Chart, Tips, dress, figure, finish, styled
+from reports.charts.drawing import MARKERS, Chart, Tips, dress, figure, lay_out, png, styled, svg
+from reports.charts.palette import COLORS, SOFT
 from reports.charts.sweeps import Line, Sweep, sweeps
 from reports.gathered import Gathered
 from reports.measures import Measure
@@ -35,7 +36,8 @@ def chart(sweep: Sweep) -> Chart:
     if handles:
         made.legend(handles, labels, loc="outside lower center", ncols=3)
     title = f"Sweep {sweep.name}: mean and standard deviation over seeds"
-    return finish(made, sweep.file_name, title, tips, sweep.notes, sweep.numbers)
+    lay_out(made, title)
+    return Chart(sweep.file_name, title, svg(made, sweep.file_name, tips), png(made), sweep.notes, sweep.numbers)
 
 
 def _draw(panel: Any, line: Line, index: int, measure: Measure, number: int, tips: Tips) -> None:
@@ -70,4 +72,4 @@ def _dress(panel: Any, sweep: Sweep, index: int, measure: Measure) -> None:
         return
     dress(panel.xaxis, xs, log_from=LOGARITHMIC)
     if sweep.key in PAPER_CHOICES:
-        panel.axvline(PAPER_CHOICES[sweep.key], color="#888888", linestyle=":", linewidth=1)
+        panel.axvline(PAPER_CHOICES[sweep.key], color=SOFT[0], linestyle=":", linewidth=1)

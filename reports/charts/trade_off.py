@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import pandas as pd
 from pandas import DataFrame
 
-from reports import published
+from reports import methods, published
+from reports.charts.palette import family
 from reports.conditions import OF_A_CHART, OF_A_MEAN, footnotes, refuse_mixture
 from reports.frame import by_place
 from reports.gathered import Gathered
@@ -34,6 +36,16 @@ class Point:
     preset: str
     numbers: dict[str, Cell]
 
+    @property
+    def gaussians(self) -> float:
+        """How many; 0 in a method without any."""
+        return self.numbers["Gaussians"].value or 0.0
+
+    def value(self, measure: Measure) -> float | None:
+        """Its number, if that has a place on an axis."""
+        value = self.numbers[measure.column.title].value
+        return value if value is not None and math.isfinite(value) else None
+
 
 @dataclass(frozen=True)
 class TradeOff:
@@ -43,9 +55,25 @@ class TradeOff:
     title: str
     qualities: tuple[Measure, ...]  # two: one where more is better, one where less is
     points: tuple[Point, ...]
-    beside: str  # data set of the paper whose published numbers may be looked at with it
     runs: DataFrame
     notes: tuple[str, ...]
+
+    def role(self, preset: str) -> str:
+        """What a preset is among the others: "release", a released program with its quirks; "main", the one that stands
+        for its method, which is that with the method's name or else the first; "variant", any other.
+        """
+        if _is_released(preset):
+            return "release"
+        method = family(preset)
+        kin = [p.preset for p in self.points if family(p.preset) == method and not _is_released(p.preset)]
+        return "main" if preset == (method if method in kin else [*kin, preset][0]) else "variant"
+
+    def corrected(self, point: Point) -> Point | None:
+        """The twin of a released program: the corrected method in the same setting; None if it is not there."""
+        preset = methods.published_as(point.preset)
+        title = point.title.replace(methods.title(point.preset), methods.title(preset), 1)
+        twins = [p for p in self.points if (p.preset, p.title) == (preset, title) and p is not point]
+        return twins[0] if twins else None
 
     @property
     def numbers(self) -> DataFrame:
@@ -97,6 +125,10 @@ def pareto(points: Sequence[tuple[float, float]], higher_is_better: bool) -> lis
     return front
 
 
+def _is_released(preset: str) -> bool:
+    return methods.published_as(preset) != preset
+
+
 def _trade_off(name: str, group: Mapping[Place, DataFrame], request: Request) -> TradeOff:
     qualities = tuple(measure for measure in QUALITIES if measure.name.startswith(f"{request.protocol}/"))
     found: dict[str, list[Setting]] = {}
@@ -121,10 +153,9 @@ def _trade_off(name: str, group: Mapping[Place, DataFrame], request: Request) ->
     what = first.title if len(group) == 1 else published.TITLES[name]
     if len(group) > 1 or first.published:
         what += f", mean over its scenes {', '.join(scenes)}"
-    beside = first.dataset if first.published else "ricoh360" if first.outdoor else "roam360"
     shown = pd.concat([group[place] for place in finished]) if finished else group[first].iloc[:0]
     notes = footnotes({what: shown}, request.protocol)
-    return TradeOff(f"chart_{name}", what, qualities, tuple(points), beside, shown, tuple(notes))
+    return TradeOff(f"chart_{name}", what, qualities, tuple(points), shown, tuple(notes))
 
 
 def _protocol(runs: DataFrame) -> str:

@@ -10,6 +10,7 @@ from typing import Any
 from pandas import DataFrame
 
 from reports import REPORTS
+from reports.charts.drawing import Chart
 from reports.gathered import Gathered
 from reports.page.pictures import album
 from reports.tables.ranking import BEST, emphasis
@@ -36,8 +37,8 @@ def html(gathered: Gathered) -> str:
         facts=_facts(gathered.runs),
         problems=[*gathered.left_out, *refused],
         tables=[_table(table) for table in tables],
-        charts=[(chart.title, _inline(chart.svg), chart.notes) for chart in made["chart"] or ()],
-        sweeps=[(chart.title, _inline(chart.svg), chart.notes) for chart in made["sweep"] or ()],
+        charts=[_chart(chart) for chart in made["chart"] or ()],
+        sweeps=[_chart(chart) for chart in made["sweep"] or ()],
         pictures=pictures,
         data=_script(json.dumps({"images": pictures.images, "scenes": pictures.scenes})),
         styles="\n".join([*(_vendored(name) for name in STYLES), (HERE / "page.css").read_text()]),
@@ -104,9 +105,11 @@ def _mark(rank: str | None) -> str:
     return "" if rank is None else "best" if rank == BEST else "second"
 
 
-def _inline(svg: str) -> str:
-    """A picture without the lines that only a file of its own needs."""
-    return svg[svg.index("<svg") :]
+def _chart(chart: Chart) -> dict[str, Any]:
+    """A chart for a page, and for a phone where it has such a picture."""
+    sizes = {"wide": chart.svg, "narrow": chart.narrow} if chart.narrow else {"": chart.svg}
+    pictures = {size: svg[svg.index("<svg") :] for size, svg in sizes.items()}  # the lines before are for a file
+    return {"title": chart.title, "pictures": pictures, "notes": chart.notes}
 
 
 def _script(text: str) -> str:

@@ -1,4 +1,4 @@
-"""Results that nobody measured, for tests of tables."""
+"""Results that nobody measured, for tests of tables and charts."""
 
 import json
 from dataclasses import replace
@@ -11,6 +11,7 @@ from PIL import Image
 from padgs import results
 from padgs.results import Result, Scores
 from reports import published
+from reports.charts.panel import Panel
 from reports.frame import frame
 from reports.gathered import Gathered
 from reports.request import Request
@@ -183,3 +184,11 @@ def picture(one: Result, run: Path, width: int = 128) -> None:
 def gathered(results_: list[Result], **asked: Any) -> Gathered:
     """What a report is made from, of runs that left nothing but their results."""
     return Gathered(frame(map(Run, results_)), Request(**asked))
+
+
+def assert_apart(panel: Panel, texts: list[Any]) -> None:
+    """No name in a panel touches another one or leaves the axes."""
+    boxes = [text.get_window_extent() for text in texts]
+    inside = panel.axes.get_window_extent().padded(0.5)
+    assert all(inside.contains(*corner) for box in boxes for corner in (box.min, box.max))
+    assert not any(first.overlaps(second) for n, first in enumerate(boxes) for second in boxes[:n])

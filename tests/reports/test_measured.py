@@ -1,9 +1,10 @@
 """The committed tables are those of the committed runs: nobody typed a number."""
 
 import pytest
+from made_up import assert_apart
 
 from reports import REPORTS, store
-from reports.charts import sweeps, trade_off
+from reports.charts import sweeps, trade_off, trade_off_chart
 from reports.files import files
 from reports.frame import frame
 from reports.gathered import Gathered
@@ -24,6 +25,11 @@ def found(measured):
     return Gathered(frame(read))
 
 
+@pytest.fixture(scope="module")
+def all_trade_offs(found):
+    return {chart.name: chart for chart in trade_off.trade_offs(found)}
+
+
 @pytest.mark.parametrize("name", TABLES)
 def test_the_tables_come_out_again(measured, found, name):
     committed = {path.name: path.read_bytes() for path in measured.glob(f"{name}.*")}
@@ -31,11 +37,21 @@ def test_the_tables_come_out_again(measured, found, name):
     assert dict(files(found.report(name))) == committed
 
 
-def test_the_points_of_all_charts_come_out_again(measured, found):
+def test_the_points_of_all_charts_come_out_again(measured, found, all_trade_offs):
     made = {f"{sweep.file_name}.csv": csv_text.of_frame(sweep.numbers) for sweep in sweeps.sweeps(found)}
-    made |= {f"{chart.name}.csv": csv_text.of_frame(chart.numbers) for chart in trade_off.trade_offs(found)}
+    made |= {f"{chart.name}.csv": csv_text.of_frame(chart.numbers) for chart in all_trade_offs.values()}
     committed = {p.name: p.read_text() for p in measured.glob("*.csv") if p.stem not in TABLES}
     assert committed == made
+
+
+@pytest.mark.parametrize("scene", ["flat", "room", "synthetic-outdoor", "synthetic-room"])
+def test_names_in_the_charts_do_not_touch(all_trade_offs, scene):
+    for size in (trade_off_chart.WIDE, trade_off_chart.NARROW):
+        _, _, panels = trade_off_chart.drawn(all_trade_offs[f"chart_{scene}"], size)
+        for panel, texts in panels:
+            assert_apart(panel, texts)
+            named = {text.get_text().split("\n")[0] for text in texts}
+            assert {mark.point.title for mark in panel.marks if mark.role != "release"} <= named
 
 
 def test_it_is_small(measured):

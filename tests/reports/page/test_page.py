@@ -36,6 +36,7 @@ def test_it_has_the_tables_the_charts_and_what_was_left_out(html):
     for words in ("Table 4", "26.02", "Sweep tau@cpu", "synthetic-room (built in", "runs/x/result.json was edited"):
         assert words in html
     assert html.count('<figure class="chart"') == 3 and html.count('class="tip"><title>') > 50
+    assert html.count('<div class="wide"><svg') == html.count('<div class="narrow"><svg') == 2
 
 
 def test_what_names_contain_is_text_and_not_markup():
