@@ -51,6 +51,16 @@ def by_place(runs: DataFrame) -> dict[Place, DataFrame]:
     return {place: found[place] for place in sorted(found, key=lambda place: place.rank)}
 
 
+def by_conditions(runs: DataFrame, *columns: str) -> dict[str, DataFrame]:
+    """The runs of each scene that agree in some more columns, in the order of the tables, by what tells them apart."""
+    found = {}
+    for place, own in by_place(runs).items():
+        for values, alike in grouped(own.sort_values(list(columns), kind="stable"), *columns):
+            words = [f"{v} iterations" if c == "iterations" else v for c, v in zip(columns, values, strict=True)]
+            found[", ".join([place.title, *words])] = alike
+    return found
+
+
 def hardware(result: Result) -> str:
     """The machine in a few words, with the version of torch."""
     known = result.machine
@@ -94,9 +104,11 @@ FACTS: Mapping[str, Callable[[Result], Any]] = {
 NUMBERS: Mapping[str, Callable[[Result], float | None]] = {
     "iterations_done": lambda result: result.iterations_done,
     "train_seconds": lambda result: result.timing.get("train_seconds"),
+    "cpu_seconds": lambda result: result.timing.get("cpu_seconds"),  # of training, over all threads
     "frame_ms": lambda result: result.timing.get("render_ms_median"),  # over the test views, decoding included
     "anchors": lambda result: result.counts.get("anchors"),
     "gaussians": lambda result: result.counts.get("gaussians"),  # none in a method without any
+    "start": lambda result: result.counts.get("start"),  # Gaussians or anchors before the first step
     "megabytes": lambda result: result.model_bytes / 1e6 or None,
     "peak_gigabytes": lambda result: result.peak_memory_bytes / 1e9 or None,  # of the process, while training
     "peak_gpu_gigabytes": lambda result: (result.peak_device_memory_bytes or math.nan) / 1e9,  # of the tensors there

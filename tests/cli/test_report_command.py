@@ -8,6 +8,7 @@ from typer.testing import CliRunner
 
 from padgs import results
 from padgs.cli.app import app
+from reports import REPORTS
 
 
 @pytest.fixture
@@ -46,11 +47,7 @@ def test_a_broken_file_is_named_and_left_out_and_strict_fails(runs):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (
-            ["table9"],
-            "unknown report 'table9'; known: chart, equal_time, html, ladder, methods, quirks, runs, sweep, table1, "
-            "table2, table3, table4, all",
-        ),
+        (["table9"], f"unknown report 'table9'; known: {', '.join(sorted(REPORTS))}, all"),
         (["table3", "--where", "x"], "--where x is not KEY=VALUE"),
         (["table3", "--protocol", "x"], "unknown protocol 'x'"),
         (["sweep", "--metric", "x"], "unknown metric 'x'; known under protocol paper: psnr, ssim"),

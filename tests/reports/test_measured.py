@@ -27,8 +27,7 @@ def found(measured):
 @pytest.mark.parametrize("name", TABLES)
 def test_the_tables_come_out_again(measured, found, name):
     committed = {path.name: path.read_bytes() for path in measured.glob(f"{name}.*")}
-    assert committed.keys() == {f"{name}.{extension}" for extension in ("md", "tex", "csv")}
-    assert dict(files(found.report(name))) == committed
+    assert dict(files(found.report(name))) == committed, "none of a table whose experiment was not run"
 
 
 def test_the_points_of_all_charts_come_out_again(measured, found):
