@@ -1,0 +1,57 @@
+from dataclasses import replace
+
+import pytest
+from made_up import gathered, of_experiment
+
+from padgs.results import Scores
+from reports.tables.modulation import EFFECTS, modulation
+from reports.writers import csv_text, markdown
+
+VOXEL, TAU, BOTH = 2.0, -2.6, 0.3  # dB
+
+
+def runs(seeds=(0.0, 0.1)):
+    return [
+        of_experiment(
+            "modulation@cpu",
+            26 + off + VOXEL * paper + (TAU + seed * 0.2) * dimmed + BOTH * paper * dimmed,
+            preset="padgs" if paper else "padgs_small",
+            options={"tau": 0.9 * dimmed},
+            seed=seed,
+        )
+        for paper in (0, 1)
+        for dimmed in (0, 1)
+        for seed, off in enumerate(seeds)
+    ]
+
+
+def values(table, column: str) -> dict[str, tuple[float | None, float | None]]:
+    index = [c.title for c in table.columns].index(column)
+    cells = {row.title: row.cells[index] for block in table.blocks for row in block.rows}
+    return {title: (cell.value, cell.std) for title, cell in cells.items()}
+
+
+def test_effects_are_those_that_were_put_in_whatever_the_seed_adds():
+    found = values(modulation(gathered(runs())), "WS-PSNR")
+    assert found["one anchor per 3 px, τ = 0"] == pytest.approx((25.65, 0.0707), abs=1e-4)
+    voxel, tau, both = (found[title] for title in EFFECTS)
+    assert voxel == pytest.approx((VOXEL + BOTH / 2, 0)) and both == pytest.approx((BOTH, 0))
+    assert tau == pytest.approx((TAU + 0.1 + BOTH / 2, 0.2 / 2**0.5))
+
+
+def test_effects_have_their_sign_and_none_is_the_best():
+    table = modulation(gathered(runs()))
+    effects = markdown.text(table).split("### Effects")[1].split("\n- ")[0]
+    assert "+2.15" in effects and "**" not in effects and "↑" not in effects and "<ins>" not in effects
+    numbers = csv_text.cells(table)
+    assert set(numbers.loc[numbers["row"].isin(EFFECTS), "rank"]) == {""} != set(numbers["rank"])
+
+
+def test_the_crop_of_360roam_has_a_column_and_a_missing_setting_no_effect():
+    cropped = [
+        replace(r, scores={**r.scores, "roam360": Scores({"name": "roam360"}, {"psnr": 30.0}, {})}) for r in runs()
+    ]
+    assert values(modulation(gathered(cropped)), "PSNR without the bottom")["voxel of the paper, τ = 0.9"][0] == 30
+    found = values(modulation(gathered(runs()[2:])), "PSNR")
+    assert [found[title][0] for title in EFFECTS] == [None] * 3
+    assert modulation(gathered([])).blocks == ()
