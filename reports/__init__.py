@@ -37,5 +37,6 @@ REPORTS: Mapping[str, Report] = {
     "runs": Report("reports.tables.runs:runs"),
     "chart": Report("reports.charts.trade_off_chart:charts", ("pareto", "table4_efficiency", *OF_ALL_METHODS)),
     "sweep": Report("reports.charts.sweep_chart:charts"),
+    "findings": Report("reports.findings.page:findings"),
     "html": Report("reports.page.page:html"),
 }

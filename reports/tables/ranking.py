@@ -71,13 +71,13 @@ def pooled_variance(cells: Collection[Cell]) -> tuple[float, int]:
     return (squares / freedom, freedom) if freedom > 1 else (0.0, 0)
 
 
-def quantile(freedom: float) -> float:
-    """Student's t that leaves `1 - CONFIDENCE` outside both its ends.
+def quantile(freedom: float, tests: int = 1) -> float:
+    """Student's t that leaves `1 - CONFIDENCE` outside both its ends, shared among some tests (Bonferroni).
 
-    >>> round(quantile(2), 3)
-    4.303
+    >>> round(quantile(2), 3), round(quantile(2, tests=2), 3)
+    (4.303, 6.205)
     """
-    return float(stdtrit(freedom, (1 + CONFIDENCE) / 2))
+    return float(stdtrit(freedom, 1 - (1 - CONFIDENCE) / (2 * tests)))
 
 
 def _least_difference(first: Cell, second: Cell, alone: tuple[float, int]) -> float:
