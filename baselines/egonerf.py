@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
 
@@ -37,7 +37,7 @@ class EgoNeRFMethod(Method):
     """See `padgs.learning.method.Method`; most options of renderer and loss mean nothing to it."""
 
     Options = EgoNeRFMethodOptions
-    TRAIN = TrainOptions(weight="uniform")
+    TRAIN = TrainOptions(weight="uniform", learning_rates="published")
 
     def _start(self, scene: Scene, iterations: int) -> EgoNeRFTrainee:
         self._refuse_strangers()
@@ -55,7 +55,7 @@ class EgoNeRFMethod(Method):
 
     def _refuse_strangers(self) -> None:
         """Say so where an option is set that this method would have to ignore."""
-        loss = TrainOptions(weight=self.train_options.weight, check_every=self.train_options.check_every)
+        loss = replace(self.TRAIN, weight=self.train_options.weight, check_every=self.train_options.check_every)
         if self.render_config.backend not in BACKENDS:
             raise ValueError(
                 f"egonerf has no backend {self.render_config.backend!r}; it casts rays in torch, known: "

@@ -63,8 +63,8 @@ class SelfCalibration(Calibration):
         options, camera = self._options, self.camera
         return [
             *self.poses.groups(options.poses, iterations),
-            ParameterGroup("camera_focal", (camera.focal,), Constant(options.focal_rate)),
-            ParameterGroup("camera_offsets", (camera.offsets,), Constant(options.distortion_rate)),
+            ParameterGroup("camera_focal", (camera.focal,), Constant(options.focal_rate), paced=False),
+            ParameterGroup("camera_offsets", (camera.offsets,), Constant(options.distortion_rate), paced=False),
         ]
 
     def draw(self, draw: Callable[..., Drawing], view: View) -> Drawing:

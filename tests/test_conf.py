@@ -170,7 +170,6 @@ def test_the_release_of_padgs_differs_from_the_paper_where_its_code_does():
         "gradient_threshold": PUBLISHED_THRESHOLD,
         "log_scale_cap": 0.05,
         "max_anchors": None,
-        "offset_rate_unit": "world",
     }
     assert released.render == RenderConfig(near=0.2, near_unit="world", wrap=False, bounds="square")
     assert (released.train.weight, released.train.normalisation) == ("end_rows", "channel_sum")

@@ -14,17 +14,14 @@ from torch import Tensor
 
 from padgs.scene import Scene
 
-VOXEL_PIXELS = 3.0  # automatic voxel size, in pixels of the training images at the scene's own distance
 NEIGHBOURS = 3  # distances that set an anchor's initial size
 
 
-def automatic_voxel_size(scene: Scene) -> float:
-    """A voxel size in world units that depends on neither the units nor the density of the point cloud.
-
-    One voxel spans `VOXEL_PIXELS` pixels of the training panoramas (pi / H radians each) at the scene's median depth.
-    Closer together than that, two anchors with ten free Gaussians each describe the same pixels.
+def automatic_voxel_size(scene: Scene, pixels: float) -> float:
+    """The voxel size in world units that spans so many pixels of the training panoramas (pi / H radians each) at the
+    scene's median depth, so that neither the world's units nor the density of the point cloud matter.
     """
-    return VOXEL_PIXELS * math.pi / scene.train[0].height * scene.unit
+    return pixels * math.pi / scene.train[0].height * scene.unit
 
 
 def cells_from_points(points: Tensor, size: float) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -38,13 +39,15 @@ class PaDGSOptions:
     omega_input: str = "sin2"  # what the networks see: sin2 = Omega | cos = sqrt(1 - Omega)
     max_modulated_omega: float = 1.0  # limit of Omega in Eq. 15
     distance_unit: str = "scene"  # distances as input are in Scene.unit, or in units of the world
-    voxel_size: float | str = "auto"  # world units, or auto: see `automatic_voxel_size`
+    voxel_size: float | str = "auto"  # world units, as the paper states it for its data sets; auto: `voxel_pixels`
+    voxel_pixels: float = 0.1  # ... at the median depth, with voxel_size auto: below a pixel, as the paper's voxels are
 
     def __post_init__(self) -> None:
         check_known(self, omega_axis=OMEGA_AXES, omega_input=OMEGA_INPUTS)
         check_known(self, distance_unit=DISTANCE_UNITS, precision=PRECISIONS)
         check(self, "at least 1", lambda count: count >= 1, "features", "offsets", "hidden")
         check(self, "in [0, 1], or opacities turn negative at the poles", lambda tau: 0 <= tau <= 1, "tau")
+        check(self, "> 0 and finite", lambda pixels: 0 < pixels < math.inf, "voxel_pixels")
         if isinstance(self.voxel_size, str) and self.voxel_size != "auto":
             raise ValueError(f"unknown voxel_size {self.voxel_size!r}; known: auto, or a length in world units")
 
@@ -106,7 +109,8 @@ class PaDGS(nn.Module):
         Raises:
             ValueError: the point cloud is empty or not finite.
         """
-        voxel_size = automatic_voxel_size(scene) if options.voxel_size == "auto" else float(options.voxel_size)
+        automatic = automatic_voxel_size(scene, options.voxel_pixels)
+        voxel_size = automatic if options.voxel_size == "auto" else float(options.voxel_size)
         positions = anchors_from_points(scene.points, voxel_size)
         return cls(
             positions,

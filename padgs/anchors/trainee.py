@@ -23,7 +23,7 @@ class LearningRates:
     """Learning rates of Adam; pairs are the first and the last of a log-linear decay over the run."""
 
     offset_rate: tuple[float, float] = (0.01, 0.0001)  # times the extent of the cameras in `offset_rate_unit`
-    offset_rate_unit: str = "scene"  # scene: Scene.unit, so the world's units do not matter | world: as published
+    offset_rate_unit: str = "world"  # world: as released | scene: Scene.unit, so the world's units do not matter
     feature_rate: float = 0.0075
     log_scale_rate: float = 0.007
     opacity_rate: tuple[float, float] = (0.002, 2e-5)  # the three networks

@@ -75,8 +75,8 @@ class DualLens(Calibration):
         """Learning rates for a run of `iterations`."""
         gap, coefficients = (LogLinear(rate, DECAY * rate, iterations) for rate in self._rates)
         return [
-            ParameterGroup("lens_gap", (self.gap,), gap),
-            ParameterGroup("lens_coefficients", (self.coefficients,), coefficients),
+            ParameterGroup("lens_gap", (self.gap,), gap, paced=False),
+            ParameterGroup("lens_coefficients", (self.coefficients,), coefficients, paced=False),
         ]
 
     def lenses(self, view: View) -> tuple[View, View]:

@@ -73,8 +73,8 @@ class PoseRefinement(nn.Module):
         turning = LogLinear(rates.rotation, rates.rotation_end, iterations)
         moving = LogLinear(rates.translation, rates.translation_end, iterations)
         return [
-            ParameterGroup("pose_quaternions", tuple(self.quaternions), turning),
-            ParameterGroup("pose_shifts", tuple(self.shifts), moving),
+            ParameterGroup("pose_quaternions", tuple(self.quaternions), turning, paced=False),
+            ParameterGroup("pose_shifts", tuple(self.shifts), moving, paced=False),
         ]
 
     def refined(self, view: View) -> View:

@@ -30,7 +30,7 @@ class RayTrainer(Trainer):
         trainee: EgoNeRFTrainee,
         scene: Scene,
         budget: Budget,
-        options: TrainOptions = TrainOptions(weight="uniform"),  # noqa: B008 - frozen
+        options: TrainOptions = TrainOptions(weight="uniform", learning_rates="published"),  # noqa: B008 - frozen
         seed: int = 0,
         *,
         rays: int,
@@ -51,10 +51,11 @@ class RayTrainer(Trainer):
         # Rays are all that it draws, so of a trainee it has what does not depend on views.
         super().__init__(cast(Trainee, trainee), scene, budget, options, seed, stage=stage)
         self._tracer, self._rays = trainee, rays
-        started = time.perf_counter()
+        started, started_cpu = time.perf_counter(), time.process_time()
         self._pixels = RayPixels(scene.train, options.weight, self._optimiser.device, seed)
         self._order = self._pixels
-        self.seconds = time.perf_counter() - started  # reading images is training, as where they are read view by view
+        # Reading images is training, as it is where they are read view by view.
+        self.seconds, self.cpu_seconds = time.perf_counter() - started, time.process_time() - started_cpu
 
     def _step(self, iteration: int) -> tuple[float | Tensor, dict[str, int], tuple[str, ...]]:
         tracer, optimiser, generator = self._tracer, self._optimiser, self._pixels.generator

@@ -90,6 +90,11 @@ class Method(ABC):
         self._trainer, self._loaded = None, state
 
     @property
+    def start(self) -> int:
+        """How many Gaussians, anchors or other parts the model had before the first iteration of `fit`."""
+        return self.state().values["start"] if self._trainer is None else self._trainer.start
+
+    @property
     def trainee(self) -> Any:
         """The model, as it is in training: a `Trainee`, of the type that `_start` of the method makes.
 

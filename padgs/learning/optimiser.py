@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from padgs.learning.failure import Failure, first_non_finite
-from padgs.learning.schedule import ParameterGroup
+from padgs.learning.schedule import Pace, ParameterGroup
 from padgs.learning.trainee import State
 
 PREFIX = "adam/"  # of its tensors in a state
@@ -22,15 +22,16 @@ class Optimiser:
         adam: what densification changes rows of.
     """
 
-    def __init__(self, groups: Sequence[ParameterGroup], check_every: int, **adam: Any) -> None:
+    def __init__(self, groups: Sequence[ParameterGroup], pace: Pace, check_every: int, **adam: Any) -> None:
         """No step is taken yet.
 
         Args:
             groups: what is optimised.
+            pace: of their learning rates.
             check_every: iterations between checks of all gradients and parameters for values that are not finite.
             adam: betas and eps.
         """
-        self._groups, self._check_every = groups, check_every
+        self._groups, self._pace, self._check_every = groups, pace, check_every
         parameters = [{"params": list(group.parameters), "name": group.name} for group in groups]
         self.adam = torch.optim.Adam(parameters, fused=True, **adam)  # fused: 2 to 3 times faster on CPUs
 
@@ -53,7 +54,7 @@ class Optimiser:
         The graph must be gone by now if rows of its leaves come and go afterwards.
         """
         for group, settings in zip(self._groups, self.adam.param_groups, strict=True):
-            settings["lr"] = group.learning_rate(iteration)
+            settings["lr"] = group.learning_rate(iteration) * (self._pace(iteration) if group.paced else 1.0)
         self.adam.step()
         self.adam.zero_grad(set_to_none=True)
 

@@ -9,6 +9,9 @@ from dataclasses import dataclass
 from torch import nn
 
 PUBLISHED_ITERATIONS = 30_000  # the run length that all published schedules are written for
+LEARNING_RATES = ("published", "run")
+FASTEST = 8.0  # no rate is larger than so many published ones: beyond it nothing is gained (docs/methods.md)
+SLOWING_FROM = 0.6  # share of the run after which faster rates come back to the published ones
 
 
 @dataclass(frozen=True)
@@ -17,7 +20,8 @@ class ParameterGroup:
 
     name: str
     parameters: tuple[nn.Parameter, ...]
-    learning_rate: Callable[[int], float]  # iteration (1 for the first step) -> learning rate
+    learning_rate: Callable[[int], float]  # iteration (1 for the first step) -> published learning rate
+    paced: bool = True  # whether it follows `Pace`; cameras that learn do not
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,40 @@ class LogLinear:
         """Learning rate at an iteration."""
         t = min(max(iteration / self.steps, 0.0), 1.0)
         return math.exp((1 - t) * math.log(self.start) + t * math.log(self.end))
+
+
+@dataclass(frozen=True)
+class Pace:
+    """By how much learning rates exceed the published ones: by `factor`, which fades away at the end of the run.
+
+    Adam moves a parameter by about its learning rate in a step, so in a run with fewer steps than the published one
+    nothing comes as far. Where steps are random, distances grow with the square root of their number; so the factor
+    that fits a run is the square root of what it is shorter, bounded by `FASTEST`. From `SLOWING_FROM` on it falls
+    log-linearly to 1, so that models settle as they do at published rates. At the published length it is 1.
+
+    >>> Pace.of("run", 30_000).factor, Pace.of("run", 7500).factor, Pace.of("run", 60).factor
+    (1.0, 2.0, 8.0)
+    >>> pace = Pace.of(4.0, iterations=1000)
+    >>> pace(600), pace(800), pace(1000)
+    (4.0, 2.0, 1.0)
+    """
+
+    factor: float
+    iterations: int
+
+    @classmethod
+    def of(cls, choice: str | float, iterations: int) -> Pace:
+        """That of a run of so many iterations: `published`, `run` for the factor that fits it, or a factor."""
+        if choice == "published":
+            return cls(1.0, iterations)
+        if choice == "run":
+            return cls(min(max(math.sqrt(PUBLISHED_ITERATIONS / iterations), 1.0), FASTEST), iterations)
+        return cls(float(choice), iterations)
+
+    def __call__(self, iteration: int) -> float:
+        """The factor at an iteration."""
+        t = iteration / self.iterations
+        return self.factor ** min((1 - t) / (1 - SLOWING_FROM), 1.0)
 
 
 def scaled(published: int, total: int) -> int:

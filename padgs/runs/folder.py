@@ -39,6 +39,7 @@ class Progress:
 
     iteration: int = 0
     seconds: float = 0.0  # of training
+    cpu_seconds: float = 0.0
 
 
 class RunFolder:

@@ -111,7 +111,7 @@ class Session:
                 LiveLine(self.console, config.train.iterations) as line,
             ):
                 for record in method.fit(self.scene, config.train.budget):
-                    progress = Progress(record.iteration, record.seconds)
+                    progress = Progress(record.iteration, record.seconds, record.cpu_seconds)
                     line.update(record, self._logged(record, method))
                     stopping = stop.requested
                     if stopping or self._is_due(record, saved):
@@ -155,18 +155,19 @@ class Session:
     def _trained(self, method: Method, progress: Progress) -> dict[str, Any]:
         """The fields of a result about a trained method."""
         size = method.size()
+        start = {"start": method.start} if "gaussians" in size.counts else {}
         return {
             "status": "ok" if progress.iteration == self.config.train.iterations else "timeout",
-            "counts": {**size.counts, "parameters": size.parameters},
+            "counts": {**size.counts, "parameters": size.parameters, **start},
             "model_bytes": size.bytes,
-            "timing": {"train_seconds": progress.seconds},
+            "timing": _training_time(progress),
             **outcome.peak_memory(self.scene),  # of training; scoring has networks of its own
         }
 
     def _tested(self, method: Method, progress: Progress) -> dict[str, Any]:
         """The fields of a result that take test views, times of training included."""
         save_picture = self.folder.save_picture if self.config.run.pictures else None
-        timing = {"train_seconds": progress.seconds, **frame_times(method, self.scene)}
+        timing = {**_training_time(progress), **frame_times(method, self.scene)}
         return {"timing": timing, "scores": scores(method, self.scene, self.config.protocols, save_picture)}
 
     def _is_missing(self, result: Result) -> bool:
@@ -203,6 +204,10 @@ class Session:
 
     def _say(self, text: str) -> None:
         self.console.print(text, highlight=False, soft_wrap=True)
+
+
+def _training_time(progress: Progress) -> dict[str, float]:
+    return {"train_seconds": progress.seconds, "cpu_seconds": progress.cpu_seconds}
 
 
 def scene_of(config: RunConfig, device: torch.device) -> Scene:

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import torch
 
-from padgs.checks import check
 from padgs.learning.loop import TrainOptions
 from padgs.learning.method import Method
 from padgs.learning.trainee import State
@@ -26,11 +25,6 @@ class SplatOptions(CloneSplitOptions):
     """The `method` group of the configuration: the model, and its densification."""
 
     sh_degree: int = 3  # 0: colours do not depend on the direction
-    learning_rate_factor: float = 1.0  # on all learning rates of Gaussians; cameras have their own
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check(self, "> 0", lambda factor: factor > 0, "learning_rate_factor")
 
 
 def refuse_polar_threshold(options: SplatOptions, why: str) -> None:
@@ -72,6 +66,5 @@ class SplatMethod(Method):
             self.render_config,
             extent=extent,
             iterations=iterations,
-            learning_rate_factor=self.options.learning_rate_factor,
             seed=self.seed,
         )

@@ -37,7 +37,6 @@ class SplatTrainee:
         *,
         extent: float,
         iterations: int,
-        learning_rate_factor: float = 1.0,
         seed: int = 0,
     ) -> None:
         """Wrap splats; `extent` is the scene's, `options` are those of a published run (see `for_run`).
@@ -52,21 +51,20 @@ class SplatTrainee:
             )
         self.splats, self.iterations = splats, iterations
         self.densifier = CloneSplit(splats, options.for_run(iterations), extent=extent, seed=seed)
-        self._config, self._extent, self._factor = config, extent, learning_rate_factor
+        self._config, self._extent = config, extent
         self._drawn: View | None = None  # the view of the last drawing
 
     def groups(self) -> list[ParameterGroup]:
         """Learning rates of 3DGS; that of the means falls over the whole run and follows the size of the scene."""
-        splats, factor = self.splats, self._factor
-        rate = factor * self._extent
-        means = LogLinear(1.6e-4 * rate, 1.6e-6 * rate, self.iterations)
+        splats = self.splats
+        means = LogLinear(1.6e-4 * self._extent, 1.6e-6 * self._extent, self.iterations)
         return [
             ParameterGroup("means", (splats.means,), means),
-            ParameterGroup("quats", (splats.quats,), Constant(1e-3 * factor)),
-            ParameterGroup("log_scales", (splats.log_scales,), Constant(5e-3 * factor)),
-            ParameterGroup("opacity_logits", (splats.opacity_logits,), Constant(5e-2 * factor)),
-            ParameterGroup("sh_dc", (splats.sh_dc,), Constant(2.5e-3 * factor)),
-            ParameterGroup("sh_rest", (splats.sh_rest,), Constant(2.5e-3 / 20 * factor)),
+            ParameterGroup("quats", (splats.quats,), Constant(1e-3)),
+            ParameterGroup("log_scales", (splats.log_scales,), Constant(5e-3)),
+            ParameterGroup("opacity_logits", (splats.opacity_logits,), Constant(5e-2)),
+            ParameterGroup("sh_dc", (splats.sh_dc,), Constant(2.5e-3)),
+            ParameterGroup("sh_rest", (splats.sh_rest,), Constant(2.5e-3 / 20)),
         ]
 
     def draw(self, view: View, probe: Tensor | None = None) -> Drawing:

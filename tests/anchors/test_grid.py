@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from padgs.anchors.grid import (
-    VOXEL_PIXELS,
     anchors_from_points,
     automatic_voxel_size,
     cell_keys,
@@ -79,7 +78,7 @@ def test_automatic_voxel_is_an_angle_at_the_training_resolution(scale):
     points = scale * torch.tensor([[0.0, 0.0, 5.0], [0.0, 5.0, 0.0], [-5.0, 0.0, 0.0]])
     view = View("v", torch.eye(4, dtype=torch.float64), 400, 200)
     scene = Scene("s", (view,), (), points, torch.zeros(3, 3, dtype=torch.uint8), "0")
-    assert automatic_voxel_size(scene) == pytest.approx(VOXEL_PIXELS * math.pi / 200 * 5.0 * scale)
+    assert automatic_voxel_size(scene, 0.25) == pytest.approx(0.25 * math.pi / 200 * 5.0 * scale)
 
 
 def test_bad_clouds_and_sizes_are_named():

@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from padgs import load_scene
 from padgs.anchors.growth import PUBLISHED_THRESHOLD, Growth, GrowthOptions, find_seeds
 from padgs.anchors.model import PaDGS, PaDGSOptions
 from padgs.learning.failure import Failure
@@ -40,6 +41,20 @@ def adam(model) -> torch.optim.Adam:
     optimizer.step()
     optimizer.zero_grad()
     return optimizer
+
+
+@pytest.mark.parametrize("name", ["room", "flat"])
+def test_a_real_cloud_leaves_room_for_growth_by_default(name, shared, generator):
+    """The voxels are so small that nearly every point is an anchor, and that around them even the coarsest cells are
+    free: where none is, finer ones are not tried, and nothing ever grows.
+    """
+    scene = load_scene(shared / "data" / name, width=512)
+    model = PaDGS.from_scene(scene)
+    assert len(model) > 0.85 * len(scene.points)
+    model.offsets.data.normal_(std=0.5, generator=generator)
+    pulled = torch.full((len(model) * model.options.offsets,), 1.0)
+    seeds = find_seeds(model, pulled, GrowthOptions(), generator)
+    assert (seeds.sizes == GrowthOptions().coarsest).sum() > 0.05 * len(model)
 
 
 def seeds_of(model, gradients, options=PUBLISHED):

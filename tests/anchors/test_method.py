@@ -90,7 +90,7 @@ def test_resumed_run_is_bit_identical(long_run):
 
 
 def test_multiplying_the_world_by_100_changes_nothing():
-    options = replace(EAGER, voxel_size="auto", coarsest=4, refinement=2)
+    options = replace(EAGER, voxel_size="auto", voxel_pixels=3.0, coarsest=4, refinement=2, offset_rate_unit="scene")
     (small, before), (large, after) = trained(14, options=options), trained(14, scale=100.0, options=options)
     assert [r.counts for r in before] == [r.counts for r in after]
     assert before[-1].counts["anchors"] > before[0].counts["anchors"]
@@ -122,7 +122,7 @@ def test_a_state_of_other_options_is_refused(long_run):
 
 def test_published_learning_rates():
     model, world = PaDGS.from_scene(scene()), scene()
-    groups = {g.name: g for g in LearningRates(offset_rate_unit="world").groups(model, world.extent, 30_000)}
+    groups = {g.name: g for g in LearningRates().groups(model, world.extent, 30_000)}
     ends = {
         "offsets": (0.01 * world.extent, 0.0001 * world.extent),
         "features": (0.0075, 0.0075),
@@ -141,7 +141,7 @@ def test_published_learning_rates():
 def test_a_single_camera_can_still_place_gaussians():
     world = scene()
     alone = replace(world, train=world.train[:1])
-    method = PaDGSMethod(EAGER, TORCH)
+    method = PaDGSMethod(replace(EAGER, offset_rate_unit="scene"), TORCH)
     next(method.fit(alone, Budget(100)))
     assert method.trainee.groups()[0].learning_rate(0) == pytest.approx(0.01 * MIN_EXTENT)
 

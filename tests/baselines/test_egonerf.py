@@ -28,7 +28,7 @@ SMALL = EgoNeRFMethodOptions(
 )
 
 
-def method(train: TrainOptions = TrainOptions(weight="uniform"), **options) -> EgoNeRFMethod:  # noqa: B008
+def method(train: TrainOptions = EgoNeRFMethod.TRAIN, **options) -> EgoNeRFMethod:
     return EgoNeRFMethod(replace(SMALL, **options), RenderConfig(), train)
 
 
@@ -99,7 +99,7 @@ def test_masked_pixels_teach_nothing():
 
 def test_weights_of_rows_are_honoured():
     losses = [
-        next(method(TrainOptions(weight=weight)).fit(tiny_scene(), Budget(1))).loss
+        next(method(replace(EgoNeRFMethod.TRAIN, weight=weight)).fit(tiny_scene(), Budget(1))).loss
         for weight in ("uniform", "solid_angle")
     ]
     assert losses[0] != losses[1]
@@ -120,7 +120,11 @@ def test_weights_of_rows_are_honoured():
 )
 def test_options_of_splatting_are_refused_and_not_ignored(render, train, reason):
     with pytest.raises(ValueError, match=reason):
-        next(EgoNeRFMethod(SMALL, RenderConfig(**render), TrainOptions(**train)).fit(tiny_scene(), Budget(1)))
+        next(
+            EgoNeRFMethod(SMALL, RenderConfig(**render), replace(EgoNeRFMethod.TRAIN, **train)).fit(
+                tiny_scene(), Budget(1)
+            )
+        )
 
 
 @pytest.mark.parametrize("name, value", [("rays", 0), ("grid_rate", 0.0), ("density_variation", -1.0)])

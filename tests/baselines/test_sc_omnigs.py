@@ -110,8 +110,6 @@ def test_options_without_a_meaning_are_refused():
         SCOmniGSOptions(distortion_rate=-1.0)
     with pytest.raises(ValueError, match=r"poses\.rotation is 0\.0; a learning rate must be > 0"):
         PoseRates(rotation=0.0)
-    with pytest.raises(ValueError, match=r"learning_rate_factor is 0\.0"):
-        SCOmniGSOptions(learning_rate_factor=0.0)
 
 
 def test_published_learning_rates_of_the_poses_and_ours_of_the_camera(scene):

@@ -60,8 +60,8 @@ def test_lenses_are_found_and_the_test_camera_is_ideal(sign):
     """With Gaussians that are right from the start and learn next to nothing, all that is wrong is the camera."""
     gap, bending = sign * 0.06, (sign * 0.02, sign * -0.03)
     scene = photographed(gap, bending)
-    options = Seam360GSOptions(lens_order=1, gap_rate=5e-3, coefficient_rate=5e-3, learning_rate_factor=1e-3)
-    method = Seam360GSMethod(options)
+    options = Seam360GSOptions(lens_order=1, gap_rate=5e-3, coefficient_rate=5e-3)
+    method = Seam360GSMethod(options, train=replace(Seam360GSMethod.TRAIN, learning_rates=1e-3))
     records = method.fit(scene, Budget(60))
     next(records)
     with torch.no_grad():

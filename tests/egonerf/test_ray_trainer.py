@@ -42,7 +42,7 @@ class Flat:
 
 
 def trainer(model: Flat, iterations: int = 400, **options) -> RayTrainer:
-    weight = TrainOptions(weight=options.pop("weight", "uniform"))
+    weight = TrainOptions(weight=options.pop("weight", "uniform"), learning_rates="published")
     return RayTrainer(model, tiny_scene(), Budget(iterations), weight, seed=3, rays=200)
 
 

@@ -16,7 +16,7 @@ def lines(monkeypatch, *, terminal: bool, seconds_per_iteration: float = 2.0, it
     with LiveLine(console, iterations) as line:
         for iteration in range(1, iterations + 1):
             now[0] += seconds_per_iteration
-            line.update(Record(iteration, 0.25, 0.0, {"anchors": 1234}), 21.5 if iteration == 4 else None)
+            line.update(Record(iteration, 0.25, 0.0, 0.0, {"anchors": 1234}), 21.5 if iteration == 4 else None)
     return out.getvalue()
 
 

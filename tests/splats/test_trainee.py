@@ -11,7 +11,7 @@ from padgs.learning.schedule import PUBLISHED_ITERATIONS
 from padgs.render.config import RenderConfig
 from padgs.scene import Scene
 from padgs.splats.clone_split import CloneSplitOptions
-from padgs.splats.method import SplatMethod, SplatOptions
+from padgs.splats.method import SplatMethod
 from padgs.splats.model import Splats
 from padgs.splats.trainee import SplatTrainee
 
@@ -28,9 +28,9 @@ RATES = {
 LENGTHS = {"means": EXTENT}  # what a rate is multiplied by
 
 
-def trainable(iterations: int = PUBLISHED_ITERATIONS, **options) -> SplatTrainee:
+def trainable(iterations: int = PUBLISHED_ITERATIONS) -> SplatTrainee:
     splats = Splats.from_scene(tiny_scene(), generator=torch.Generator())
-    return SplatTrainee(splats, CloneSplitOptions(), RenderConfig(), extent=EXTENT, iterations=iterations, **options)
+    return SplatTrainee(splats, CloneSplitOptions(), RenderConfig(), extent=EXTENT, iterations=iterations)
 
 
 def travelling(scene: Scene, times: float) -> Scene:
@@ -53,14 +53,13 @@ def in_one_place(scene: Scene, rounding: float) -> Scene:
     return replace(scene, train=tuple(train))
 
 
-@pytest.mark.parametrize("factor", [1.0, 3.0])
 @pytest.mark.parametrize("iterations", [PUBLISHED_ITERATIONS, 600])
-def test_published_learning_rates(factor, iterations):
-    model = trainable(iterations, learning_rate_factor=factor)
+def test_published_learning_rates(iterations):
+    model = trainable(iterations)
     groups = {group.name: group for group in model.groups()}
     assert groups.keys() == RATES.keys()
     for name, (first, last) in RATES.items():
-        times, rate = factor * LENGTHS.get(name, 1.0), groups[name].learning_rate
+        times, rate = LENGTHS.get(name, 1.0), groups[name].learning_rate
         assert rate(0) == pytest.approx(times * first), name
         assert rate(iterations // 2) == pytest.approx(times * (first * last) ** 0.5), name
         assert rate(iterations) == pytest.approx(times * last), name
@@ -116,8 +115,8 @@ def test_the_least_that_counts_as_a_move():
     "scene", [travelling(tiny_scene(), 3.0), travelling(tiny_scene(), 0.0)], ids=["moving", "still"]
 )
 def test_a_method_trains_means_at_the_rate_of_its_scene(scene):
-    method = SplatMethod(SplatOptions(learning_rate_factor=2.0), RenderConfig(backend="torch"))
+    method = SplatMethod(render=RenderConfig(backend="torch"))
     next(method.fit(scene, Budget(10)))
     means = next(group for group in method.trainee.groups() if group.name == "means")
-    assert means.learning_rate(0) == pytest.approx(2 * 1.6e-4 * scene.extent)
+    assert means.learning_rate(0) == pytest.approx(1.6e-4 * scene.extent)
     assert method.trainee.densifier.extent == scene.extent
