@@ -24,12 +24,15 @@ What the paper claims, and what the runs in `reports/measured/results.jsonl` say
 
 makes this page: verdicts and numbers follow from rules (`reports/findings`), only the words are written by hand.
 
-Every number says by how much the side that the claim favours is better than the best of the others: a difference, or for
-costs a quotient (×). Behind ours stands the half-width of its {CONFIDENCE:.0%} interval: Student's t over pairs of runs
-with the same seed, the spread pooled over the scenes of a claim, corrected for the number of others (Bonferroni). A
-claim *holds* where a scene is beyond its interval on the claim's side and none on the other, *does not hold* where it is
-the reverse, *depends on the scene* where both are, and is a *tie* where none is beyond.
+Every number says by how much the side that the claim favours is better than the best of the others: a difference, or
+for costs a quotient (×). Behind ours stands the half-width of its {CONFIDENCE:.0%} interval: Student's t over pairs of
+runs with the same seed, the spread pooled over the scenes of a claim, corrected for the number of others (Bonferroni).
+A claim *holds* where a scene is beyond its interval on the claim's side and none on the other, *does not hold* where it
+is the reverse, *depends on the scene* where both are, and is a *tie* where none is beyond.
 """
+
+
+HEADINGS = "| claim | in the paper | here | verdict | why | measured by |\n| --- | --- | --- | --- | --- | --- |"
 
 
 @dataclass(frozen=True)
@@ -46,16 +49,14 @@ def findings(gathered: Gathered) -> Page:
     Raises:
         ReportError: results that must not stand together.
     """
-    paper, judged = published.load(), [(claim, judge(claim, gathered)) for claim in CLAIMS]
-    lines = ["| claim | in the paper | here | verdict | why | measured by |", "| --- | --- | --- | --- | --- | --- |"]
-    runs_of: dict[str, DataFrame] = {}
-    for claim, judgement in judged:
-        theirs = in_the_paper(claim, paper)
+    paper, rows = published.load(), []
+    weighed: dict[str, set[int]] = {}  # experiment -> index of its runs that some claim rests on
+    for claim in CLAIMS:
+        judgement, theirs = judge(claim, gathered), in_the_paper(claim, paper)
         names = _experiments(claim, judgement)
         for name in names:
             own = judgement.runs.loc[[name in of for of in judgement.runs["experiments"]]]
-            known = runs_of.get(name, own)
-            runs_of[name] = gathered.runs.loc[sorted({*known.index, *own.index})]  # of all claims
+            weighed.setdefault(name, set()).update(own.index.to_list())
         cells = (
             f"{claim.text} ({claim.place}; {claim.measure.column.title})",
             "<br>".join(f"{where}: {_number(claim, value)}" for where, value in theirs.items()) or MISSING,
@@ -64,12 +65,13 @@ def findings(gathered: Gathered) -> Page:
             _reason(claim, judgement, theirs),
             ", ".join(f"`{name}`" for name in names),
         )
-        lines.append(f"| {' | '.join(cells)} |")
-    commands = [
-        f"- `{name}`: `{_command(name, own)}`; {_conditions(own, gathered)}" for name, own in sorted(runs_of.items())
-    ]
-    text = "\n".join([INTRODUCTION, *lines, "", "## Commands", "", *commands]) + "\n"
-    return Page("findings.md", text)
+        rows.append(f"| {' | '.join(cells)} |")
+    commands = []
+    for name in sorted(weighed):
+        own = gathered.runs.loc[sorted(weighed[name])]
+        conditions = footnotes({name: own}, gathered.request.protocol)[0].removeprefix(f"{name}: ")
+        commands.append(f"- `{name}`: `{_command(name, own)}`; {conditions}")
+    return Page("findings.md", "\n".join([INTRODUCTION, HEADINGS, *rows, "", "## Commands", "", *commands]) + "\n")
 
 
 def _number(claim: Claim, value: float, half_width: float | None = None) -> str:
@@ -101,11 +103,6 @@ def _experiments(claim: Claim, judgement: Judgement) -> list[str]:
     """Those whose runs were weighed, with their scale; what to run where there are none."""
     names = {name for of in judgement.runs["experiments"] for name in of}
     return sorted(name for name in names if experiment_of(name) in claim.experiments) or [claim.experiments[0]]
-
-
-def _conditions(runs: DataFrame, gathered: Gathered) -> str:
-    """What stands under tables, about the runs that were weighed."""
-    return footnotes({"": runs}, gathered.request.protocol)[0].removeprefix(": ")
 
 
 def _command(name: str, runs: DataFrame) -> str:

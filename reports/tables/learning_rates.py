@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 from pandas import DataFrame
 
@@ -17,18 +18,19 @@ from reports.tables.cells import over_pairs, over_seeds
 from reports.tables.ranking import NOTE
 from reports.tables.table import Block, Cell, Column, Row, Table
 
-FACTOR = "config.train.learning_rate_factor"
+RATES = "config.train.learning_rates"  # published, run, or a factor
+FACTOR = "factor"
 PUBLISHED_ITERATIONS, LARGEST = 30_000, 8.0
 QUALITY = mark("sphere", "ws_psnr")
 
 
 def law(iterations: int) -> float:
-    """The factor on all learning rates of a run: √(30 000 / iterations), at most 8. That of `train.learning_rates=run`.
+    """The factor on all learning rates that `train.learning_rates=run` chooses: √(30 000 / iterations), in [1, 8].
 
     >>> law(30_000), law(7500), law(100)
     (1.0, 2.0, 8.0)
     """
-    return min(math.sqrt(PUBLISHED_ITERATIONS / iterations), LARGEST)
+    return min(max(math.sqrt(PUBLISHED_ITERATIONS / iterations), 1.0), LARGEST)
 
 
 def learning_rates(gathered: Gathered) -> Table:
@@ -39,7 +41,8 @@ def learning_rates(gathered: Gathered) -> Table:
         ReportError: results that must not stand together.
     """
     runs = gathered.of_experiments("learning_rates")
-    runs = runs.assign(**{FACTOR: 1.0 if FACTOR not in runs else runs[FACTOR].astype(float).fillna(1.0)})
+    choices = runs[RATES] if RATES in runs else [None] * len(runs)
+    runs = runs.assign(**{FACTOR: list(map(_factor, choices, runs["iterations"]))})
     lengths = sorted(runs["iterations"].unique())
     blocks, runs_of = [], {}
     for title, own in by_conditions(runs, "resolution").items():
@@ -64,6 +67,11 @@ def learning_rates(gathered: Gathered) -> Table:
     columns = tuple(Column(f"{n} iterations", 2, True) for n in lengths)
     title = "WS-PSNR for factors on all learning rates"
     return Table("learning_rates", title, "Factor", columns, tuple(blocks), (*notes, NOTE))
+
+
+def _factor(choice: Any, iterations: int) -> float:
+    """None: of a run from before there was a choice."""
+    return 1.0 if choice in ("published", None) else law(iterations) if choice == "run" else float(choice)
 
 
 def _factors(runs: DataFrame, where: str) -> dict[float, DataFrame]:

@@ -19,7 +19,7 @@ from reports.tables.cells import over_seeds
 from reports.tables.ranking import NOTE, better_rows
 from reports.tables.table import Block, Cell, Column, Row, Table
 
-RATES = "config.train.learning_rates"
+RATES = "config.train.learning_rates"  # absent in runs from before there was a choice
 TITLES = {"published": "published rates", "run": "rates for the run"}  # value of RATES -> title
 QUALITY = mark("sphere", "ws_psnr")
 

@@ -84,7 +84,12 @@ def test_everything_at_once(tmp_path):
     made = ("table1", "table2", "table3", "table4", "methods", "runs")
     tables = {f"{name}.{extension}" for name in made for extension in ("md", "tex", "csv")}
     charts = {f"{name}.{e}" for name in ("chart_synthetic-room", "sweep_tau_cpu") for e in ("svg", "png", "csv")}
-    assert written == tables | charts | {"time_synthetic-room.svg", "time_synthetic-room.png", "report.html"}
+    assert written == tables | charts | {
+        "time_synthetic-room.svg",
+        "time_synthetic-room.png",
+        "report.html",
+        "findings.md",
+    }
 
 
 def test_what_is_refused_does_not_keep_the_rest_back(tmp_path):

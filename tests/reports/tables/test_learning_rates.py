@@ -3,6 +3,7 @@ import math
 import pytest
 from made_up import gathered, of_experiment
 
+from padgs.learning.schedule import Pace
 from reports.tables.learning_rates import law, learning_rates
 
 FACTORS, LENGTHS = (1.0, 2.0, 4.0, 8.0), (400, 1600, 6400)
@@ -17,7 +18,7 @@ def runs(best):
             preset="omnigs",
             iterations=n,
             seed=seed,
-            train={"learning_rate_factor": factor if factor > 1 else None},
+            train={"learning_rates": factor if factor > 1 else "published"},
         )
         for factor in FACTORS
         for n in LENGTHS
@@ -37,6 +38,11 @@ def test_the_law_loses_what_lies_between_its_factor_and_the_best(best, losses):
     assert [cell.value for cell in lost.rows[0].cells] == pytest.approx(losses)
     assert [cell.std for cell in lost.rows[0].cells] == pytest.approx([0, 0, 0]), "seed by seed"
     assert "× 8.00 after 400, × 4.33 after 1600, × 2.17 after 6400 iterations" in "".join(table.notes)
+
+
+@pytest.mark.parametrize("iterations", [1, 400, 1600, 6400, 30_000, 100_000])
+def test_the_law_is_that_of_training(iterations):
+    assert law(iterations) == Pace.of("run", iterations).factor
 
 
 def test_without_runs_there_is_no_block():
