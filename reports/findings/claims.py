@@ -54,7 +54,8 @@ def _best_of_six() -> Iterator[Claim]:
             ("PaD-GS is the best of the six at the poles", "sphere/ws_psnr_pole", PADGS),
             ("PaD-GS without opacity modulation (τ = 0) would be the best", f"paper/{PAPER['psnr']}", UNDIMMED),
         ):
-            yield Claim(f"beside Table {table}", text, metric, side, OTHERS, ORDER, outdoor=outdoor)
+            reasons = {Verdict.FAILS: DIMMED} if side is PADGS else {}
+            yield Claim(f"beside Table {table}", text, metric, side, OTHERS, ORDER, outdoor=outdoor, reasons=reasons)
         yield Claim(
             f"Table {table}",
             f"The same on {title} itself",
@@ -71,7 +72,7 @@ def _best_of_six() -> Iterator[Claim]:
 
 def _speed() -> Iterator[Claim]:
     one = {name: Side((name,), published=(name,)) for name in ("op43dgs", "odgs", "omnigs")}
-    one["spags"] = Side(("spags", "spags_sorted"), published=("spags",))
+    one["spags"] = Side(("spags_sorted",), published=("spags",))  # the setting that `order` runs
     one["egonerf"] = Side(("egonerf", "egonerf_small"), published=("egonerf",))
     faster = {"omnigs": ("train_hours", "fps"), "spags": ("train_hours", "fps")}  # than PaD-GS
     slower = {"egonerf": ("train_hours", "fps"), "op43dgs": ("train_hours",), "odgs": ("fps",)}
@@ -150,7 +151,7 @@ def _modulation() -> Iterator[Claim]:
     )
     yield Claim(
         "Sec. 4.2",
-        "τ = 0.9 is the best",
+        "τ = 0.9, as set, is the best of the sweep",
         f"paper/{PAPER['psnr']}",
         PADGS,
         Side(("padgs",)),
@@ -159,7 +160,7 @@ def _modulation() -> Iterator[Claim]:
     )
     yield Claim(
         "Sec. 4.2",
-        "λ = 0.8 is the best",
+        "λ = 0.8, as set, is the best of the sweep",
         f"paper/{PAPER['psnr']}",
         Side(("padgs",), keys={"train.lambda_l1": 0.8}),
         Side(("padgs",)),

@@ -39,7 +39,7 @@ class Verdict(Enum):
 
 @dataclass(frozen=True)
 class Side:
-    """Which runs stand on one side. Where they are of several settings, the one with the best mean speaks for all."""
+    """Which runs stand on one side: of one setting, or of several rivals, of which the best mean counts."""
 
     presets: tuple[str, ...]
     variant: str | None = ""  # None: any
@@ -156,12 +156,16 @@ def in_the_paper(claim: Claim, numbers: Mapping[Key, Published]) -> dict[str, fl
 
 
 def _conditions(runs: DataFrame, claim: Claim) -> Iterator[tuple[str, DataFrame]]:
-    """The longest runs of each scene that may stand together, and where that is."""
+    """The longest runs of each scene in which both sides meet, and where that is."""
     shared = ["resolution", "data", *claim.apart, *(["machine"] if claim.quotient else [])]
     for (place, resolution, *_), own in grouped(runs, "place", *shared) if len(runs) else ():
-        longest = own.loc[own["iterations"] == own["iterations"].max()]
-        words = [f"{column.rpartition('.')[2]} {longest[column].iloc[0]}" for column in claim.apart]
-        yield ", ".join([place.scene, resolution, f"{longest['iterations'].iloc[0]} iterations", *words]), longest
+        ours, others = (set(side.of(own)["iterations"]) for side in (claim.ours, claim.others))
+        if not ours & others:
+            continue
+        iterations = max(ours & others)
+        words = [f"{column.rpartition('.')[2]} {own[column].iloc[0]}" for column in claim.apart]
+        where = ", ".join([place.scene, resolution, f"{iterations} iterations", *words])
+        yield where, own.loc[own["iterations"] == iterations]
 
 
 def _sides(claim: Claim, runs: DataFrame, where: str) -> tuple[DataFrame, list[Setting]]:
@@ -183,7 +187,7 @@ def _advantages(claim: Claim, ours: DataFrame, others: DataFrame) -> list[float]
     """One for each seed that both have."""
     first, second = _numbers(claim, ours), _numbers(claim, others)
     higher = claim.measure.column.higher_is_better
-    return [claim.advantage(first[seed], second[seed], higher) for seed in first.keys() & second.keys()]
+    return [claim.advantage(first[seed], second[seed], higher) for seed in sorted(first.keys() & second.keys())]
 
 
 def _verdict(lines: Sequence[Line], claim: Claim) -> Verdict:

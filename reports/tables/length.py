@@ -36,6 +36,7 @@ def length(gathered: Gathered) -> Table:
     """
     runs = gathered.of_experiments("length")
     runs = runs.assign(**{RATES: "published" if RATES not in runs else runs[RATES].fillna("published")})
+    runs = runs.loc[runs[RATES].isin(TITLES)]  # runs at a factor of their own are those of `learning_rates`
     keys = sorted({*zip(runs[RATES], runs["iterations"], strict=True)})  # "published" stands before "run"
     blocks, runs_of, notes = [], {}, []
     for title, own in by_conditions(runs, "resolution").items():

@@ -10,6 +10,7 @@ from reports.tables.table import Block, Table
 SPECIAL = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
 SPECIAL |= {character: f"\\{character}" for character in "&%$#_{}"}
 SYMBOLS = {"↑": r"$\uparrow$", "↓": r"$\downarrow$", "Δ": r"$\Delta$", "±": r"$\pm$", "–": "--", "×": r"$\times$"}
+SYMBOLS |= {"τ": r"$\tau$", "√": r"$\surd$"}
 
 
 LINES_OF_A_PAGE = 55

@@ -88,6 +88,8 @@ def test_the_longest_runs_of_a_scene_count_and_other_experiments_do_not():
     short = [*runs([-1, -1.1, -0.9]), *runs([0] * 3, "omnigs")]
     long = [*runs([1, 1.1, 0.9], iterations=7000), *runs([0] * 3, "omnigs", iterations=7000)]
     assert verdict(short) is Verdict.FAILS and verdict(short, long) is Verdict.HOLDS
+    alone = runs([0] * 3, "omnigs", iterations=30_000)
+    assert verdict(short, long, alone) is Verdict.HOLDS, "nothing to compare it with"
     elsewhere = [of_experiment("length", 20 + seed, preset="padgs", seed=seed, iterations=9000) for seed in range(3)]
     assert verdict(long, elsewhere) is Verdict.HOLDS
 

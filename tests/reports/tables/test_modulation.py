@@ -5,7 +5,7 @@ from made_up import gathered, of_experiment
 
 from padgs.results import Scores
 from reports.tables.modulation import EFFECTS, modulation
-from reports.writers import csv_text, markdown
+from reports.writers import csv_text, latex, markdown
 
 VOXEL, TAU, BOTH = 2.0, -2.6, 0.3  # dB
 
@@ -43,6 +43,7 @@ def test_effects_have_their_sign_and_none_is_the_best():
     table = modulation(gathered(runs()))
     effects = markdown.text(table).split("### Effects")[1].split("\n- ")[0]
     assert "+2.15" in effects and "**" not in effects and "↑" not in effects and "<ins>" not in effects
+    assert r"$\tau$ = 0.9 instead of 0" in latex.text(table)
     numbers = csv_text.cells(table)
     assert set(numbers.loc[numbers["row"].isin(EFFECTS), "rank"]) == {""} != set(numbers["rank"])
 
