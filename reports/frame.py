@@ -104,11 +104,11 @@ FACTS: Mapping[str, Callable[[Result], Any]] = {
 NUMBERS: Mapping[str, Callable[[Result], float | None]] = {
     "iterations_done": lambda result: result.iterations_done,
     "train_seconds": lambda result: result.timing.get("train_seconds"),
-    "cpu_seconds": lambda result: result.timing.get("cpu_seconds"),  # of training, over all threads
+    "cpu_seconds": lambda result: result.timing.get("cpu_seconds"),  # of the process, while training
     "frame_ms": lambda result: result.timing.get("render_ms_median"),  # over the test views, decoding included
     "anchors": lambda result: result.counts.get("anchors"),
+    "start": lambda result: result.counts.get("start"),  # Gaussians or anchors before training
     "gaussians": lambda result: result.counts.get("gaussians"),  # none in a method without any
-    "start": lambda result: result.counts.get("start"),  # Gaussians or anchors before the first step
     "megabytes": lambda result: result.model_bytes / 1e6 or None,
     "peak_gigabytes": lambda result: result.peak_memory_bytes / 1e9 or None,  # of the process, while training
     "peak_gpu_gigabytes": lambda result: (result.peak_device_memory_bytes or math.nan) / 1e9,  # of the tensors there

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from reports import OF_ALL_METHODS, REPORTS
+from reports import OF_ALL_METHODS, REPORTS, methods
 from reports.findings.judging import Claim, Side, Verdict
 from reports.measures import PAPER_METRICS, PROTOCOL_METRICS
-from reports.methods import title as title_of
 from reports.published import TITLES
 
 ORDER = REPORTS["order"].experiments
@@ -79,7 +78,7 @@ def _speed() -> Iterator[Claim]:
     for name, metrics in (faster | slower).items():
         for metric in metrics:
             does = "trains in less time" if metric == "train_hours" else "renders faster"
-            first, second = (title_of(name), "PaD-GS") if name in faster else ("PaD-GS", title_of(name))
+            first, second = (methods.TITLES[name], "PaD-GS") if name in faster else ("PaD-GS", methods.TITLES[name])
             ours, others = (one[name], PADGS) if name in faster else (PADGS, one[name])
             yield Claim(
                 "Table 4",
@@ -176,7 +175,7 @@ def _projections() -> Iterator[Claim]:
     for name, reason in reasons.items():
         yield Claim(
             "Sec. 4.3",
-            f"OmniGS is better than {title_of(name)}",
+            f"OmniGS is better than {methods.TITLES[name]}",
             f"paper/{PAPER['psnr']}",
             Side(("omnigs",), published=("omnigs",)),
             Side((name,), published=(name,)),

@@ -9,6 +9,7 @@ from scipy.stats import ttest_1samp
 
 from reports import published
 from reports.findings.judging import Claim, Side, Verdict, in_the_paper, judge
+from reports.methods import title
 
 PADGS = Side(("padgs",), published=("padgs",))
 RIVALS = Side(("omnigs", "spags"), published=("omnigs", "spags"))
@@ -64,7 +65,7 @@ def test_the_best_rival_counts_and_many_of_them_widen_the_interval():
     made = [*runs([1, 1.1, 0.9]), *runs([0] * 3, "omnigs")]
     alone = judge(claim(), gathered(made)).lines[0]
     (line,) = judge(claim(), gathered([*made, *runs([0.5] * 3, "spags")])).lines
-    assert (line.rivals, line.against) == (2, "SPaGS") and line.advantage.value == pytest.approx(0.5)
+    assert (line.rivals, line.against) == (2, title("spags")) and line.advantage.value == pytest.approx(0.5)
     assert line.half_width > alone.half_width
     assert judge(claim(), gathered([*made, *runs([0.5] * 3, "odgs")])).lines == (alone,), "no rival of this claim"
 

@@ -1,6 +1,7 @@
 import pytest
 from made_up import gathered, of_experiment
 
+from reports.methods import title
 from reports.tables.length import length
 
 FINAL = {"omnigs": 27.0, "odgs": 28.0, "spags": 29.0, "op43dgs": 26.0}
@@ -23,7 +24,7 @@ def test_a_column_for_each_length_and_choice_of_rates_and_the_order_beside_that_
     titles = [column.title for column in table.columns]
     assert titles[0] == "500 iterations, published rates" and titles[3] == "500 iterations, rates for the run"
     methods, correlation = table.blocks
-    assert {row.title: row.cells[0].value for row in methods.rows}["ODGS"] == pytest.approx(22.6)
+    assert {row.title: row.cells[0].value for row in methods.rows}[title("odgs")] == pytest.approx(22.6)
     assert [cell.value for cell in correlation.rows[0].cells] == pytest.approx([-1, 1, 1, 1])
 
 
