@@ -42,14 +42,13 @@ class Side:
     """Which runs stand on one side: of one setting, or of several rivals, of which the best mean counts."""
 
     presets: tuple[str, ...]
-    variant: str | None = ""  # None: any
+    variant: str = ""
     keys: Mapping[str, float] = field(default_factory=dict)  # dotted key -> value
     published: tuple[str, ...] = ()  # methods in baselines/published.csv
 
     def of(self, runs: DataFrame) -> DataFrame:
         """The runs on this side."""
-        found = runs.loc[runs["preset"].isin(self.presets)]
-        found = found if self.variant is None else found.loc[found["variant"] == self.variant]
+        found = runs.loc[runs["preset"].isin(self.presets) & (runs["variant"] == self.variant)]
         for key, value in self.keys.items():
             found = found.loc[found[CONFIG + key] == value] if CONFIG + key in found else found.iloc[:0]
         return found

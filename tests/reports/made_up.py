@@ -85,7 +85,7 @@ def data_set(dataset: str, methods: tuple[str, ...] = ("omnigs", "padgs"), seeds
 def scored(psnr: float) -> dict[str, Scores]:
     """Marks under both protocols that hang together."""
     flat = {"psnr": psnr, "ssim": 0.5 + psnr / 80, "lpips_vgg_01": 0.8 - psnr / 50}
-    sphere = {"ws_psnr": psnr - 0.4, "ws_ssim": 0.5 + psnr / 80, "ws_lpips_alex": 0.7 - psnr / 50}
+    sphere = {"psnr": psnr, "ws_psnr": psnr - 0.4, "ws_ssim": 0.5 + psnr / 80, "ws_lpips_alex": 0.7 - psnr / 50}
     views = {f"view{i}": flat for i in range(4)}
     return {"paper": Scores(RULES, flat, views), "sphere": Scores(SPHERE_RULES, sphere, views)}
 
