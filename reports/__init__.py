@@ -30,8 +30,13 @@ REPORTS: Mapping[str, Report] = {
     "equal_time": Report("reports.tables.side_by_side:equal_time", ("equal_time",)),
     "ladder": Report("reports.tables.variants:ladder", ("ladder",)),
     "quirks": Report("reports.tables.variants:quirks", ("quirks",)),
+    "order": Report("reports.tables.order:order", ("order", "photographs", "parallax", "resolution")),
+    "length": Report("reports.tables.length:length", ("length",)),
+    "learning_rates": Report("reports.tables.learning_rates:learning_rates", ("learning_rates",)),
+    "modulation": Report("reports.tables.modulation:modulation", ("modulation",)),
     "runs": Report("reports.tables.runs:runs"),
     "chart": Report("reports.charts.trade_off_chart:charts", ("pareto", "table4_efficiency", *OF_ALL_METHODS)),
     "sweep": Report("reports.charts.sweep_chart:charts"),
+    "findings": Report("reports.findings.page:findings"),
     "html": Report("reports.page.page:html"),
 }

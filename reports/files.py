@@ -5,16 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from reports.charts.drawing import Chart
+from reports.findings.page import Page
 from reports.tables.table import Table
 from reports.writers import csv_text, latex, markdown
 
 WRITERS = {"md": markdown.text, "tex": latex.text, "csv": csv_text.text}
 
 
-def files(made: Table | Sequence[Chart] | str) -> Iterator[tuple[str, bytes]]:
-    """The files of a table, of charts or of a page; none of a table that has nothing in it."""
+def files(made: Table | Page | Sequence[Chart] | str) -> Iterator[tuple[str, bytes]]:
+    """The files of a table, of charts or of pages; none of a table that has nothing in it."""
     if isinstance(made, str):
         yield "report.html", made.encode()
+    elif isinstance(made, Page):
+        yield made.name, made.text.encode()
     elif isinstance(made, Table):
         for extension, text in WRITERS.items() if made.blocks else ():
             yield f"{made.name}.{extension}", text(made).encode()

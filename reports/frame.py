@@ -52,6 +52,16 @@ def by_place(runs: DataFrame) -> dict[Place, DataFrame]:
     return {place: found[place] for place in sorted(found, key=lambda place: place.rank)}
 
 
+def by_conditions(runs: DataFrame, *columns: str) -> dict[str, DataFrame]:
+    """The runs of each scene that agree in some more columns, in the order of the tables, by what tells them apart."""
+    found = {}
+    for place, own in by_place(runs).items():
+        for values, alike in grouped(own.sort_values(list(columns), kind="stable"), *columns):
+            words = [f"{v} iterations" if c == "iterations" else v for c, v in zip(columns, values, strict=True)]
+            found[", ".join([place.title, *words])] = alike
+    return found
+
+
 def hardware(result: Result) -> str:
     """The machine in a few words, with the version of torch."""
     known = result.machine

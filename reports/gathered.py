@@ -47,12 +47,17 @@ class Gathered:
         A folder may hold sweeps and trials beside the runs of a table; without the choice they would compete for its
         cells.
         """
-        runs, names = self.asked_for, set(REPORTS[name].experiments)
+        runs = self.asked_for
         if self.request.experiment:
             return runs
-        own = runs.loc[[not names.isdisjoint(map(_experiment, of)) for of in runs["experiments"]]]
+        own = self.of_experiments(*REPORTS[name].experiments)
         free = runs.loc[~runs["place"].isin(own["place"]) & (runs["experiments"].map(len) == 0)]
         return runs.loc[[*own.index, *free.index]] if len(own) + len(free) else runs
+
+    def of_experiments(self, *names: str) -> DataFrame:
+        """The runs of some experiments or sweeps, at whatever scale; none if none was run."""
+        runs = self.asked_for
+        return runs.loc[[not set(names).isdisjoint(map(experiment_of, of)) for of in runs["experiments"]]]
 
 
 def of_a_table(experiment: str) -> bool:
@@ -61,9 +66,13 @@ def of_a_table(experiment: str) -> bool:
     >>> of_a_table("table1_360roam@cpu"), of_a_table("tau@cpu")
     (True, False)
     """
-    return any(_experiment(experiment) in report.experiments for report in REPORTS.values())
+    return any(experiment_of(experiment) in report.experiments for report in REPORTS.values())
 
 
-def _experiment(name: str) -> str:
-    """The experiment without the scale that it was run at: tau@cpu is tau."""
+def experiment_of(name: str) -> str:
+    """The experiment without the scale that it was run at.
+
+    >>> experiment_of("tau@cpu")
+    'tau'
+    """
     return name.partition("@")[0]

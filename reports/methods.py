@@ -52,6 +52,17 @@ def title(preset: str) -> str:
     return ", ".join(part for part in (name(method), rest) if part)
 
 
+def short(title_of_one: str, preset: str) -> str:
+    """A title that begins with the preset's own, for a mark in a chart: without what a table says of its status.
+
+    >>> short("ODGS, corrected, iterations 300", "odgs"), short(title("odgs_release"), "odgs_release")
+    ('ODGS, iterations 300', 'ODGS, release')
+    """
+    method = method_of(preset)
+    rest = preset.removeprefix(method).replace("_", " ").replace(" ", ", ", 1)
+    return title_of_one.replace(title(preset), name(method) + rest, 1)
+
+
 def ordered(presets: Iterable[str]) -> list[str]:
     """Each preset once, in the order of the tables.
 

@@ -71,8 +71,8 @@ class Pace:
     >>> Pace.of("run", 30_000).factor, Pace.of("run", 7500).factor, Pace.of("run", 60).factor
     (1.0, 2.0, 8.0)
     >>> pace = Pace.of(4.0, iterations=1000)
-    >>> pace(600), pace(800), pace(1000)
-    (4.0, 2.0, 1.0)
+    >>> [round(pace(iteration), 9) for iteration in (600, 800, 1000)]
+    [4.0, 2.0, 1.0]
     """
 
     factor: float

@@ -8,6 +8,7 @@ from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
+from reports import methods
 from reports.charts import names
 from reports.charts.axis import Axis
 from reports.charts.drawing import Tips
@@ -86,7 +87,7 @@ class Panel:
                 continue
             x_side, y_side = mark.sides
             values = [f"{mark.y:.1f} dB"] * bool(y_side) + [f"{brief(mark.x)} {self.unit}"] * bool(x_side)
-            text = "\n".join([mark.point.title, ", ".join(values)]).strip()
+            text = "\n".join([methods.short(mark.point.title, mark.point.preset), ", ".join(values)]).strip()
             radius = math.sqrt(mark.area(scale)) / 2
             wanted.append(Name(text, mark.at, radius, weight_of(mark.point.preset, mark.role)))
         marks = [(*mark.at, math.sqrt(mark.area(scale)) / 2) for mark in self.marks]

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from reports import methods
 from reports.charts import names
 from reports.charts.axis import Axis
 from reports.charts.drawing import Chart, Tips, figure, lay_out, png, styled, svg
@@ -91,7 +92,7 @@ def _drawn(trade_off: TradeOff, curves: list[Curve], title: str, size: tuple[flo
         marks.append((*end, END))
         lines.append([(s, value) for s, value in zip(curve.seconds, curve.psnr, strict=True) if s > 0])
         if role != "release" or side:
-            text = f"{curve.title}\n{psnr:.1f} dB" if side else curve.title
+            text = methods.short(curve.title, curve.preset) + (f"\n{psnr:.1f} dB" if side else "")
             wanted.append(Name(text, end, END, weight_of(curve.preset, role)))
     panel.set_xlabel("training time in seconds, probes not counted")
     panel.set_ylabel("PSNR of a held-out view, dB ↑")

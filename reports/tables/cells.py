@@ -48,6 +48,12 @@ def over_seeds(runs: DataFrame, measures: Sequence[Measure]) -> list[Cell]:
     return [spread(column[~np.isnan(column)].tolist(), failed) for column in numbers.T]
 
 
+def over_pairs(ours: DataFrame, others: DataFrame, column: str) -> Cell:
+    """Ours minus the others' of a column, over the seeds that both have."""
+    first, second = (runs.loc[runs["ok"]].set_index("seed")[column].astype(float) for runs in (ours, others))
+    return spread((first - second).dropna().tolist())
+
+
 def over_scenes(runs: DataFrame, scenes: Sequence[str], measures: Sequence[Measure]) -> list[Cell]:
     """A cell for each measure: mean over scenes, with its spread over the seeds that every scene has.
 

@@ -3,57 +3,90 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection, Mapping
+
+from scipy.special import stdtrit
 
 from reports.tables.table import Block, Cell, Column, shown
 
 BEST, SECOND = "best", "second"
-STANDARD_ERRORS = 2.0  # two means that differ by less, in standard errors of their difference, are a tie
+CONFIDENCE = 0.95
 NOTE = (
-    f"Bold: best; underlined: second; neither where two means differ by less than {STANDARD_ERRORS:g} standard errors "
-    "of their difference over the seeds."
+    "Bold: best; underlined: second; rows that seeds cannot separate share a place (Welch's t-test, two-sided, "
+    f"{CONFIDENCE:.0%}; a single run is taken to scatter as the seeds of the other rows; where these are no more than "
+    "one pair, single runs tie with their equals only)."
 )
 
 
 def emphasis(block: Block, index: int, columns: tuple[Column, ...]) -> dict[int, str]:
     """Row -> BEST or SECOND for the column `index` of a block.
 
-    Cells that are not `ranked` are left out. What prints the same is equally good. A tie inside the noise leaves the
-    place empty, and those below it too. Nothing stands out where no direction is given or all numbers are the same.
+    Cells that are not `ranked` are left out. Nothing stands out where no direction is given or all share one place.
     """
-    column = columns[index]
     every = ((i, row.cells[index]) for i, row in enumerate(block.rows))
     cells = {i: cell for i, cell in every if cell.value is not None and cell.ranked}
-    if column.higher_is_better is None or len({shown(cell.value or 0.0, column) for cell in cells.values()}) < 2:
-        return {}
-    found: dict[int, str] = {}
-    for place in (BEST, SECOND):
-        if not cells:
-            break
-        first = _first(cells, column)
-        lead = next(iter(first.values()))
-        if any(within_noise(lead, cell) for i, cell in cells.items() if i not in first):
-            break
-        found |= dict.fromkeys(first, place)
-        cells = {i: cell for i, cell in cells.items() if i not in first}
+    shared = places(cells, columns[index])
+    return {i: mark for mark, rows in zip((BEST, SECOND), shared, strict=False) for i in rows if len(shared) > 1}
+
+
+def places(cells: Mapping[int, Cell], column: Column) -> list[list[int]]:
+    """Rows that share a place, the best first; all share one in a column without a direction.
+
+    Down the means, a new place begins where a row is worse than one of the place above beyond the noise. So none stands
+    above a row with a better mean, and two rows of one place are never separate.
+
+    >>> places(dict(enumerate([Cell(24.0, 0.1, 3), Cell(25.0, 0.1, 3), Cell(25.1, 0.1, 3)])), Column("PSNR", 2, True))
+    [[2, 1], [0]]
+    """
+    better = better_rows(cells, column)
+    sign = -1.0 if column.higher_is_better else 1.0
+    found: list[list[int]] = []
+    for i in sorted(cells, key=lambda i: sign * (cells[i].value or 0.0)):
+        if found and better[i].isdisjoint(found[-1]):
+            found[-1].append(i)
+        else:
+            found.append([i])
     return found
 
 
-def within_noise(first: Cell, second: Cell) -> bool:
-    """Whether the spread over seeds could explain the difference; never where no cell has a spread.
+def better_rows(cells: Mapping[int, Cell], column: Column) -> dict[int, set[int]]:
+    """Row -> the rows that are better beyond the noise, by the column's own direction; none if it has no direction.
 
-    A single run beside a mean over seeds is taken to scatter as the seeds do.
-
-    >>> within_noise(Cell(25.0, 0.1, 3), Cell(25.1, 0.1, 3)), within_noise(Cell(25.0, 0.1, 3), Cell(25.5, 0.1, 3))
-    (True, False)
+    What prints the same is equally good.
     """
-    if first.value is None or second.value is None or first.std is second.std is None:
-        return False
-    spreads = [cell.std if cell.std is not None else other.std for cell, other in ((first, second), (second, first))]
-    error = math.sqrt(sum((s or 0.0) ** 2 / c.count for s, c in zip(spreads, (first, second), strict=True)))
-    return abs(first.value - second.value) < STANDARD_ERRORS * error
+    sign = {True: 1.0, False: -1.0, None: math.nan}[column.higher_is_better]
+    numbers = {i: sign * float(shown(cell.value or 0.0, column)) for i, cell in cells.items()}
+    alone = pooled_variance(cells.values())
+    return {
+        i: {j for j in cells if numbers[j] - numbers[i] > _least_difference(cells[i], cells[j], alone)} for i in cells
+    }
 
 
-def _first(cells: dict[int, Cell], column: Column) -> dict[int, Cell]:
-    numbers = {i: float(shown(cell.value, column)) for i, cell in cells.items() if cell.value is not None}
-    best = max(numbers.values()) if column.higher_is_better else min(numbers.values())
-    return {i: cells[i] for i, number in numbers.items() if number == best}
+def pooled_variance(cells: Collection[Cell]) -> tuple[float, int]:
+    """Variance of one run about the mean of its cell, over all cells with more than one, and its degrees of freedom.
+
+    A single pair of seeds says next to nothing (t = 12.7): it counts as none.
+    """
+    freedom = sum(cell.count - 1 for cell in cells if cell.std is not None)
+    squares = sum((cell.count - 1) * cell.std**2 for cell in cells if cell.std is not None)
+    return (squares / freedom, freedom) if freedom > 1 else (0.0, 0)
+
+
+def quantile(freedom: float, tests: int = 1) -> float:
+    """Student's t that leaves `1 - CONFIDENCE` outside both its ends, shared among some tests (Bonferroni).
+
+    >>> round(quantile(2), 3), round(quantile(2, tests=2), 3)
+    (4.303, 6.205)
+    """
+    return float(stdtrit(freedom, 1 - (1 - CONFIDENCE) / (2 * tests)))
+
+
+def _least_difference(first: Cell, second: Cell, alone: tuple[float, int]) -> float:
+    """By how much two means must differ: Welch's test, with the degrees of freedom after Satterthwaite."""
+    parts = [(c.std**2, c.count - 1) if c.std is not None else alone for c in (first, second)]
+    shares = [(variance / c.count, df) for (variance, df), c in zip(parts, (first, second), strict=True)]
+    total = sum(share for share, _ in shares)
+    if not total:
+        return 0.0
+    freedom = total**2 / sum(share**2 / df for share, df in shares if share)
+    return quantile(freedom) * math.sqrt(total)

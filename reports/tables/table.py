@@ -88,6 +88,13 @@ class Block:
 
     title: str
     rows: tuple[Row, ...]
+    signed: bool = False  # differences or correlations: numbers have their sign, and none is the best
+
+    def reads(self, columns: Sequence[Column]) -> tuple[Column, ...]:
+        """The columns of the table as they are meant here."""
+        if not self.signed:
+            return tuple(columns)
+        return tuple(replace(column, signed=True, higher_is_better=None) for column in columns)
 
 
 @dataclass(frozen=True)
@@ -109,8 +116,8 @@ class Table:
             if not column.optional or any(row.cells[index] != Cell() for row in block.rows)
         ]
         rows = tuple(Row(row.title, tuple(row.cells[index] for index in kept)) for row in block.rows)
-        columns = tuple(self.columns[index] for index in kept)
-        return replace(self, columns=columns, blocks=(Block(block.title, rows),))
+        columns = block.reads([self.columns[index] for index in kept])
+        return replace(self, columns=columns, blocks=(replace(block, rows=rows),))
 
 
 def shown(value: float, column: Column) -> str:

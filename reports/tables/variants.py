@@ -43,7 +43,6 @@ QUIRKS = {  # method -> variant (conf/quirk) -> title
         "padgs": {
             "distortion": "distortion by world z",
             "distance": "distance in world units",
-            "offsets": "offset rate in world units",
             "scale_cap": "limit on scales",
             "loss": "weights and three-fold loss",
             "bounds": "squares, no seam",

@@ -17,9 +17,10 @@ def cells(table: Table) -> DataFrame:
     """A row a cell."""
     rows = []
     for block in table.blocks:
-        ranks = [emphasis(block, index, table.columns) for index in range(len(table.columns))]
+        columns = block.reads(table.columns)
+        ranks = [emphasis(block, index, columns) for index in range(len(columns))]
         for number, row in enumerate(block.rows):
-            for cell, column, rank in zip(row.cells, table.columns, ranks, strict=True):
+            for cell, column, rank in zip(row.cells, columns, ranks, strict=True):
                 place = {"table": table.name, "block": block.title, "row": row.title}
                 place |= {"group": column.group, "column": column.title}
                 rows.append({**place, **cell.numbers, "rank": rank.get(number, "")})

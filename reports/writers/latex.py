@@ -11,6 +11,7 @@ SPECIAL = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasc
 SPECIAL |= {character: f"\\{character}" for character in "&%$#_{}"}
 SYMBOLS = {"↑": r"$\uparrow$", "↓": r"$\downarrow$", "Δ": r"$\Delta$", "±": r"$\pm$", "–": "--", "×": r"$\times$"}
 SYMBOLS |= {"†": r"\dag{}"}
+SYMBOLS |= {"τ": r"$\tau$", "√": r"$\surd$"}
 
 
 LINES_OF_A_PAGE = 55
@@ -64,11 +65,12 @@ def _caption(table: Table) -> str:
 
 
 def _block(block: Block, table: Table) -> list[str]:
-    ranks = [emphasis(block, index, table.columns) for index in range(len(table.columns))]
-    title = f"\\multicolumn{{{len(table.columns) + 1}}}{{l}}{{\\emph{{{escaped(block.title)}}}}}"
+    columns = block.reads(table.columns)
+    ranks = [emphasis(block, index, columns) for index in range(len(columns))]
+    title = f"\\multicolumn{{{len(columns) + 1}}}{{l}}{{\\emph{{{escaped(block.title)}}}}}"
     lines = [r"    \midrule", _line([title])]
     for number, row in enumerate(block.rows):
-        title, *texts = row.texts(table.columns)
+        title, *texts = row.texts(columns)
         cells = [escaped(title)]
         for words, ranked in zip(texts, ranks, strict=True):
             shown, rank = _number(words), ranked.get(number)

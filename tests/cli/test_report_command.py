@@ -8,6 +8,7 @@ from typer.testing import CliRunner
 
 from padgs import results
 from padgs.cli.app import app
+from reports import REPORTS
 
 
 @pytest.fixture
@@ -46,11 +47,7 @@ def test_a_broken_file_is_named_and_left_out_and_strict_fails(runs):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (
-            ["table9"],
-            "unknown report 'table9'; known: chart, equal_time, html, ladder, methods, quirks, runs, sweep, table1, "
-            "table2, table3, table4, all",
-        ),
+        (["table9"], f"unknown report 'table9'; known: {', '.join(sorted(REPORTS))}, all"),
         (["table3", "--where", "x"], "--where x is not KEY=VALUE"),
         (["table3", "--protocol", "x"], "unknown protocol 'x'"),
         (["sweep", "--metric", "x"], "unknown metric 'x'; known under protocol paper: psnr, ssim"),
@@ -87,7 +84,12 @@ def test_everything_at_once(tmp_path):
     made = ("table1", "table2", "table3", "table4", "methods", "runs")
     tables = {f"{name}.{extension}" for name in made for extension in ("md", "tex", "csv")}
     charts = {f"{name}.{e}" for name in ("chart_synthetic-room", "sweep_tau_cpu") for e in ("svg", "png", "csv")}
-    assert written == tables | charts | {"time_synthetic-room.svg", "time_synthetic-room.png", "report.html"}
+    assert written == tables | charts | {
+        "time_synthetic-room.svg",
+        "time_synthetic-room.png",
+        "report.html",
+        "findings.md",
+    }
 
 
 def test_what_is_refused_does_not_keep_the_rest_back(tmp_path):

@@ -1,7 +1,21 @@
-import pytest
+from itertools import pairwise
 
-from reports.tables.ranking import BEST, SECOND, emphasis, within_noise
-from reports.tables.table import Block, Cell, Column, Row
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import ttest_ind_from_stats
+
+from reports.tables.ranking import (
+    BEST,
+    CONFIDENCE,
+    SECOND,
+    better_rows,
+    emphasis,
+    places,
+    pooled_variance,
+    quantile,
+)
+from reports.tables.table import Block, Cell, Column, Row, shown
 
 PSNR, LPIPS, COUNT = Column("PSNR", 2, True), Column("LPIPS", 3, False), Column("Gaussians", 0)
 
@@ -30,20 +44,45 @@ def test_nothing_stands_out_among_equals():
     assert ranks(PSNR, Cell(1.001), Cell(1.0)) == {}
 
 
-def test_a_tie_inside_the_noise_has_no_winner():
-    #           the standard error of the difference of two means over 4 seeds is 0.1 sqrt(2 / 4) = 0.07
-    assert ranks(PSNR, Cell(25.0, 0.1, 4), Cell(25.13, 0.1, 4)) == {}
-    assert ranks(PSNR, Cell(25.0, 0.1, 4), Cell(25.15, 0.1, 4)) == {1: BEST, 0: SECOND}
+@given(
+    st.lists(st.tuples(st.floats(20, 30), st.floats(0.01, 1), st.integers(1, 4)), min_size=2, max_size=6),
+    st.sampled_from([PSNR, LPIPS]),
+)
+def test_rows_share_a_place_exactly_as_long_as_no_test_separates_them(numbers, column):
+    cells = {i: Cell(mean, std if count > 1 else None, count) for i, (mean, std, count) in enumerate(numbers)}
+    shared, better = places(cells, column), better_rows(cells, column)
+    assert sorted(i for place in shared for i in place) == list(cells)
+    means = [cells[i].value for place in shared for i in place]
+    assert means == sorted(means, reverse=column.higher_is_better), "none stands above a better mean"
+    assert all(better[i].isdisjoint(place) for place in shared for i in place)
+    assert all(better[below[0]] & set(above) for above, below in pairwise(shared))
+    for i, j in ((i, j) for i in cells for j in cells if cells[i].count > 1 and cells[j].count > 1):
+        first, second = cells[i], cells[j]
+        apart = float(shown(first.value, column)), float(shown(second.value, column))
+        test = ttest_ind_from_stats(
+            apart[0], first.std, first.count, apart[1], second.std, second.count, equal_var=False
+        )
+        assert (i in better[j] or j in better[i]) == (test.pvalue < 1 - CONFIDENCE)
 
 
-def test_a_clear_winner_stands_above_a_tie_for_the_second_place():
-    assert ranks(PSNR, Cell(27.0, 0.1, 4), Cell(25.0, 0.1, 4), Cell(25.1, 0.1, 4)) == {0: BEST}
+def test_a_tie_for_the_first_place_is_shared_and_a_tie_of_all_is_none():
+    first, near, far = Cell(25.0, 0.1, 3), Cell(25.1, 0.1, 3), Cell(24.0, 0.1, 3)
+    assert ranks(PSNR, first, near, far) == {0: BEST, 1: BEST, 2: SECOND}
+    assert ranks(PSNR, far, first, near, Cell(20.0)) == {1: BEST, 2: BEST, 0: SECOND}
+    assert ranks(PSNR, first, near) == {}
 
 
-def test_a_single_run_scatters_as_the_seeds_beside_it():
-    assert within_noise(Cell(25.0, 0.1, 4), Cell(25.2))  # sqrt(0.01 / 4 + 0.01) = 0.11
-    assert not within_noise(Cell(25.0, 0.1, 4), Cell(25.25))
-    assert not within_noise(Cell(25.0), Cell(25.0001))
+def test_single_runs_scatter_as_the_seeds_of_the_other_rows():
+    pooled = Cell(20.0, 0.1, 3), Cell(21.0, 0.3, 2)
+    variance, freedom = pooled_variance(pooled)
+    assert (variance, freedom) == (pytest.approx((2 * 0.01 + 0.09) / 3), 3)
+    apart = quantile(freedom * 2) * (2 * variance) ** 0.5  # two single runs, each with these degrees of freedom
+    for far, expected in ((0.95 * apart, set()), (1.05 * apart, {1})):
+        cells = dict(enumerate((Cell(25.0), Cell(25.0 + far), *pooled)))
+        assert better_rows(cells, Column("", 6, True))[0] == expected
+    for others in ((), (Cell(20.0, 3.0, 2),)):
+        cells = dict(enumerate((Cell(25.0), Cell(25.01), *others)))
+        assert 1 in better_rows(cells, PSNR)[0], "with one pair of seeds or none the number decides"
 
 
 def test_what_is_not_ranked_neither_stands_out_nor_stands_in_the_way():

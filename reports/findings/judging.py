@@ -1,0 +1,199 @@
+"""How a verdict follows from runs.
+
+A claim says that one side is better than another in one number; a line of evidence is the advantage of that side over
+the seeds that both have, on one scene under one set of conditions.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from statistics import fmean
+
+from pandas import DataFrame
+
+from padgs.results import higher_is_better
+from reports.conditions import refuse_mixture
+from reports.frame import CONFIG, grouped
+from reports.gathered import Gathered
+from reports.measures import COSTS, Measure, mark
+from reports.published import DATASETS, Key, Published, scene_title
+from reports.settings import Setting, one_setting, settings
+from reports.tables.cells import spread
+from reports.tables.ranking import pooled_variance, quantile
+from reports.tables.table import Cell
+
+
+class Verdict(Enum):
+    """What can be said of a claim."""
+
+    HOLDS = "holds"
+    FAILS = "does not hold"
+    TIE = "tie"
+    MIXED = "depends on the scene"
+    UNTESTABLE = "not testable here"
+    UNMEASURED = "not measured yet"
+
+
+@dataclass(frozen=True)
+class Side:
+    """Which runs stand on one side: of one setting, or of several rivals, of which the best mean counts."""
+
+    presets: tuple[str, ...]
+    variant: str = ""
+    keys: Mapping[str, float] = field(default_factory=dict)  # dotted key -> value
+    published: tuple[str, ...] = ()  # methods in baselines/published.csv
+
+    def of(self, runs: DataFrame) -> DataFrame:
+        """The runs on this side."""
+        found = runs.loc[runs["preset"].isin(self.presets) & (runs["variant"] == self.variant)]
+        for key, value in self.keys.items():
+            found = found.loc[found[CONFIG + key] == value] if CONFIG + key in found else found.iloc[:0]
+        return found
+
+
+@dataclass(frozen=True)
+class Claim:
+    """`ours` is better than `others`, by the metric's own direction."""
+
+    place: str  # in the paper
+    text: str
+    metric: str  # column of the frame
+    ours: Side
+    others: Side  # what is also in `ours` does not count
+    experiments: tuple[str, ...]  # whose runs may judge it; the first is the one to run
+    published: tuple[tuple[int, str, str], ...] = ()  # table, data set as results name it, scene
+    published_metric: str = ""
+    outdoor: bool | None = None  # only scenes like those of Ricoh360, or only others
+    dataset: str = ""  # only this data set, as results name it
+    apart: tuple[str, ...] = ()  # further columns in which both sides agree
+    reasons: Mapping[Verdict, str] = field(default_factory=dict)  # shown with that verdict only
+
+    @property
+    def measure(self) -> Measure:
+        """How its number is read."""
+        return COSTS[self.metric] if self.metric in COSTS else mark(*self.metric.split("/"))
+
+    @property
+    def quotient(self) -> bool:
+        """Costs are compared by their quotient, which machines share more or less, marks by their difference."""
+        return self.metric in COSTS
+
+    def advantage(self, ours: float, others: float, higher: bool | None) -> float:
+        """By how much ours is better: a difference, or the logarithm of a quotient."""
+        difference = math.log(ours / others) if self.quotient else ours - others
+        return difference if higher else -difference
+
+
+@dataclass(frozen=True)
+class Line:
+    """The advantage of a claim's side under one set of conditions."""
+
+    where: str
+    rivals: int  # settings among the others
+    against: str  # the best of them
+    advantage: Cell  # over the seeds that both sides have; positive where the claim is right
+    half_width: float | None = None  # of the interval of confidence; None where too few seeds tell
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """A verdict and what it rests on."""
+
+    verdict: Verdict
+    lines: tuple[Line, ...]
+    runs: DataFrame  # of all lines
+
+
+def judge(claim: Claim, gathered: Gathered) -> Judgement:
+    """Weigh a claim: it holds where a line speaks for it beyond the noise of the seeds, and none against it.
+
+    On each scene the longest runs count. The half-width of a line is t s / √n; s, the spread over seeds, and its
+    degrees of freedom are pooled over the lines of the claim, and t is for as many tests as there are rivals, because
+    the best of many is partly lucky.
+
+    Raises:
+        ReportError: results that must not stand together.
+    """
+    runs = gathered.of_experiments(*claim.experiments)
+    runs = runs.loc[[claim.outdoor in (None, place.outdoor) for place in runs["place"]]]
+    if claim.dataset:
+        runs = runs.loc[runs["dataset"] == claim.dataset]
+    lines: list[Line] = []
+    used: list[int] = []
+    for where, own in _conditions(runs, claim):
+        refuse_mixture(own, gathered.request, f"{claim.text}, {where}", ("protocol",))
+        ours, rivals = _sides(claim, own, where)
+        if rivals and (advantages := _advantages(claim, ours, rivals[0].runs)):
+            lines.append(Line(where, len(rivals), rivals[0].title, spread(advantages)))
+            used += [*ours.index, *(index for rival in rivals for index in rival.runs.index)]
+    variance, freedom = pooled_variance([line.advantage for line in lines])
+    if freedom:
+        lines = [
+            replace(line, half_width=quantile(freedom, line.rivals) * math.sqrt(variance / line.advantage.count))
+            for line in lines
+        ]
+    return Judgement(_verdict(lines, claim), tuple(lines), runs.loc[list(dict.fromkeys(used))])
+
+
+def in_the_paper(claim: Claim, numbers: Mapping[Key, Published]) -> dict[str, float]:
+    """The same advantage in the paper's numbers, over the best of the others: scene -> advantage."""
+    metric, found = claim.published_metric, {}
+    higher = metric == "fps" or (metric != "train_hours" and higher_is_better(metric))
+    for table, dataset, scene in claim.published:
+        keys = (
+            [Key(table, DATASETS[dataset], scene, method, metric) for method in side.published]
+            for side in (claim.ours, claim.others)
+        )
+        ours, others = ([n.value for key in of if (n := numbers.get(key)) and n.value is not None] for of in keys)
+        if ours and others:
+            best = max if higher else min
+            found[scene_title(dataset, scene)] = claim.advantage(best(ours), best(others), higher)
+    return found
+
+
+def _conditions(runs: DataFrame, claim: Claim) -> Iterator[tuple[str, DataFrame]]:
+    """The longest runs of each scene in which both sides meet, and where that is."""
+    shared = ["resolution", "data", *claim.apart, *(["machine"] if claim.quotient else [])]
+    for (place, resolution, *_), own in grouped(runs, "place", *shared) if len(runs) else ():
+        ours, others = (set(side.of(own)["iterations"]) for side in (claim.ours, claim.others))
+        if not ours & others:
+            continue
+        iterations = max(ours & others)
+        words = [f"{column.rpartition('.')[2]} {own[column].iloc[0]}" for column in claim.apart]
+        where = ", ".join([place.scene, resolution, f"{iterations} iterations", *words])
+        yield where, own.loc[own["iterations"] == iterations]
+
+
+def _sides(claim: Claim, runs: DataFrame, where: str) -> tuple[DataFrame, list[Setting]]:
+    """The runs of the claim's side, and the settings of the others that have numbers, the best mean first."""
+    ours = one_setting(claim.ours.of(runs), f"{claim.text}, {where}")
+    others = settings(claim.others.of(runs).drop(index=ours.index, errors="ignore"))
+    known = [(fmean(numbers.values()), made) for made in others if (numbers := _numbers(claim, made.runs))]
+    known.sort(key=lambda pair: pair[0], reverse=bool(claim.measure.column.higher_is_better))
+    return ours, [made for _, made in known]
+
+
+def _numbers(claim: Claim, runs: DataFrame) -> dict[int, float]:
+    """Seed -> number, of the runs that have one."""
+    numbers = runs.loc[runs["ok"]].reindex(columns=["seed", claim.metric]).dropna()
+    return dict(zip(numbers["seed"], numbers[claim.metric].astype(float), strict=True))
+
+
+def _advantages(claim: Claim, ours: DataFrame, others: DataFrame) -> list[float]:
+    """One for each seed that both have."""
+    first, second = _numbers(claim, ours), _numbers(claim, others)
+    higher = claim.measure.column.higher_is_better
+    return [claim.advantage(first[seed], second[seed], higher) for seed in sorted(first.keys() & second.keys())]
+
+
+def _verdict(lines: Sequence[Line], claim: Claim) -> Verdict:
+    told = [(line.advantage.value or 0.0, line.half_width) for line in lines if line.half_width is not None]
+    if not told:
+        return Verdict.UNTESTABLE if claim.dataset and not lines else Verdict.UNMEASURED
+    right, wrong = any(value > half for value, half in told), any(-value > half for value, half in told)
+    if right and wrong:
+        return Verdict.MIXED
+    return Verdict.HOLDS if right else Verdict.FAILS if wrong else Verdict.TIE

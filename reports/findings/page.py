@@ -1,0 +1,121 @@
+"""The findings as one page of Markdown."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from pandas import DataFrame
+
+from reports import published
+from reports.conditions import footnotes
+from reports.findings.claims import CLAIMS
+from reports.findings.judging import Claim, Judgement, Line, Verdict, in_the_paper, judge
+from reports.gathered import Gathered, experiment_of, of_a_table
+from reports.tables.ranking import CONFIDENCE
+from reports.tables.table import MISSING
+
+INTRODUCTION = f"""# Findings
+
+What the paper claims, and what the runs in `reports/measured/results.jsonl` say of it. The command
+
+    padgs report findings reports/measured/results.jsonl --out docs
+
+makes this page: verdicts and numbers follow from rules (`reports/findings`), only the words are written by hand.
+
+Every number says by how much the side that the claim favours is better than the best of the others: a difference, or
+for costs a quotient (×). Behind ours stands the half-width of its {CONFIDENCE:.0%} interval: Student's t over pairs of
+runs with the same seed, the spread pooled over the scenes of a claim, corrected for the number of others (Bonferroni).
+A claim *holds* where a scene is beyond its interval on the claim's side and none on the other, *does not hold* where it
+is the reverse, *depends on the scene* where both are, and is a *tie* where none is beyond.
+"""
+
+
+HEADINGS = "| claim | in the paper | here | verdict | why | measured by |\n| --- | --- | --- | --- | --- | --- |"
+
+
+@dataclass(frozen=True)
+class Page:
+    """A text that is written as it is."""
+
+    name: str  # of the file
+    text: str
+
+
+def findings(gathered: Gathered) -> Page:
+    """Every claim with its verdict, numbers, reason and the experiments that measured it; then their commands.
+
+    Raises:
+        ReportError: results that must not stand together.
+    """
+    paper, rows = published.load(), []
+    weighed: dict[str, set[int]] = {}  # experiment -> index of its runs that some claim rests on
+    for claim in CLAIMS:
+        judgement, theirs = judge(claim, gathered), in_the_paper(claim, paper)
+        names = _experiments(claim, judgement)
+        for name in names:
+            own = judgement.runs.loc[[name in of for of in judgement.runs["experiments"]]]
+            weighed.setdefault(name, set()).update(own.index.to_list())
+        cells = (
+            f"{claim.text} ({claim.place}; {claim.measure.column.title})",
+            "<br>".join(f"{where}: {_number(claim, value)}" for where, value in theirs.items()) or MISSING,
+            "<br>".join(_line(claim, line) for line in judgement.lines) or MISSING,
+            f"**{judgement.verdict.value}**",
+            _reason(claim, judgement, theirs),
+            ", ".join(f"`{name}`" for name in names),
+        )
+        rows.append(f"| {' | '.join(cells)} |")
+    commands = []
+    for name in sorted(weighed):
+        own = gathered.runs.loc[sorted(weighed[name])]
+        conditions = footnotes({name: own}, gathered.request.protocol)[0].removeprefix(f"{name}: ")
+        commands.append(f"- `{name}`: `{_command(name, own)}`; {conditions}")
+    return Page("findings.md", "\n".join([INTRODUCTION, HEADINGS, *rows, "", "## Commands", "", *commands]) + "\n")
+
+
+def _number(claim: Claim, value: float, half_width: float | None = None) -> str:
+    if not claim.quotient:
+        half = "" if half_width is None else f" ± {half_width:.{claim.measure.column.decimals}f}"
+        return f"{value:+.{claim.measure.column.decimals}f}{half}"
+    ends = "" if half_width is None else f" ({math.exp(value - half_width):.2f} to {math.exp(value + half_width):.2f})"
+    return f"× {math.exp(value):.2f}{ends}"
+
+
+def _line(claim: Claim, line: Line) -> str:
+    against = f" over {line.against}" if line.rivals > 1 else ""
+    return f"{line.where}: {_number(claim, line.advantage.value or 0.0, line.half_width)}{against}"
+
+
+def _reason(claim: Claim, judgement: Judgement, theirs: Mapping[str, float]) -> str:
+    """Ours, where there is one for the verdict; else what the numbers themselves say."""
+    widths = [line.half_width for line in judgement.lines if line.half_width is not None]
+    if judgement.verdict in claim.reasons:
+        return claim.reasons[judgement.verdict]
+    if judgement.verdict is Verdict.UNMEASURED and judgement.lines:
+        return "Too few seeds for an interval."
+    if judgement.verdict is Verdict.TIE and theirs and min(widths) > max(map(abs, theirs.values())):
+        return "Our intervals are wider than the paper's difference."
+    return MISSING
+
+
+def _experiments(claim: Claim, judgement: Judgement) -> list[str]:
+    """Those whose runs were weighed, with their scale; what to run where there are none."""
+    names = {name for of in judgement.runs["experiments"] for name in of}
+    return sorted(name for name in names if experiment_of(name) in claim.experiments) or [claim.experiments[0]]
+
+
+def _command(name: str, runs: DataFrame) -> str:
+    """What ran an experiment or sweep, as far as results tell."""
+    experiment, _, scale = name.partition("@")
+    table = of_a_table(name)
+    words = ["padgs-run", f"{'+experiment' if table else '+sweep'}={experiment}"]
+    if scale:
+        words.append(f"{'scale' if table else '+scale'}={scale}")
+    if len(runs):
+        words.append(f"seed={','.join(map(str, sorted(runs['seed'].unique())))}")
+        if runs["iterations"].nunique() == 1:
+            words.append(f"train.iterations={runs['iterations'].iloc[0]}")
+        if (runs["dataset"] == "").any():
+            words.append("data.path=FOLDER")
+    return " ".join(words)
