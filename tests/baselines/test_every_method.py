@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 import torch
 from composed import composed
+from states import assert_same_but_time
 
 from baselines import METHODS
 from padgs.data.synthetic import SCENES, SyntheticOptions, generate
 from padgs.learning.loop import Budget, Record
 from padgs.learning.method import Method
-from padgs.learning.trainee import State
 from padgs.registry import lookup
 from padgs.runs import checkpoint
 from padgs.runs.config import RunConfig
@@ -70,13 +70,6 @@ def method_of(setting: str) -> Method:
 def trained(setting: str, scene: Scene, steps: int = STEPS) -> tuple[Method, list[Record]]:
     method = method_of(setting)
     return method, list(method.fit(scene, Budget(steps)))
-
-
-def assert_same_but_time(a: State, b: State) -> None:
-    assert {**a.values, "seconds": 0} == {**b.values, "seconds": 0}
-    assert a.tensors.keys() == b.tensors.keys()
-    for name, tensor in a.tensors.items():
-        assert torch.equal(tensor, b.tensors[name]), name
 
 
 def test_every_method_has_a_setting_of_its_name():

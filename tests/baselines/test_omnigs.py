@@ -3,6 +3,7 @@ from dataclasses import replace
 import pytest
 import torch
 from composed import composed
+from states import assert_same_but_time
 from tiny_scene import tiny_scene
 
 from baselines import METHODS
@@ -22,7 +23,8 @@ ITERATIONS = 120  # densifies at 50, and goes through all degrees
 
 def method(seed: int = 0, backend: str = "torch", **options) -> OmniGSMethod:
     options = {"densify_until": 20_000, "max_gaussians": 60} | options
-    return OmniGSMethod(SplatOptions(**options), RenderConfig(backend=backend), seed=seed)
+    train = replace(OmniGSMethod.TRAIN, learning_rates="published")
+    return OmniGSMethod(SplatOptions(**options), RenderConfig(backend=backend), train, seed=seed)
 
 
 def psnr(trained: OmniGSMethod, view: View) -> float:
@@ -41,13 +43,6 @@ def finished(scene) -> State:
     for _ in trained.fit(scene, Budget(ITERATIONS)):
         pass
     return trained.state()
-
-
-def assert_same_but_time(a: State, b: State) -> None:
-    assert {**a.values, "seconds": 0} == {**b.values, "seconds": 0}
-    assert a.tensors.keys() == b.tensors.keys()
-    for name, tensor in a.tensors.items():
-        assert torch.equal(tensor, b.tensors[name]), name
 
 
 def test_is_registered():

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from states import assert_same_but_time
 from tiny_scene import tiny_scene
 from torch import Tensor, nn
 
@@ -169,16 +170,6 @@ def test_resuming_changes_nothing(stop):
     assert before + after == losses
     assert_same_but_time(second.state(), final)
     assert second.seconds > state.values["seconds"] or stop == 20
-
-
-NO_TIME = {"seconds": 0, "cpu_seconds": 0}
-
-
-def assert_same_but_time(a: State, b: State) -> None:
-    assert a.values | NO_TIME == b.values | NO_TIME
-    assert a.tensors.keys() == b.tensors.keys()
-    for name, tensor in a.tensors.items():
-        assert torch.equal(tensor, b.tensors[name]), name
 
 
 def test_state_of_another_scene_is_refused():
