@@ -11,4 +11,5 @@ METHODS = {
     "egonerf": "baselines.egonerf:EgoNeRFMethod",
     "sc_omnigs": "baselines.sc_omnigs:SCOmniGSMethod",
     "seam360gs": "baselines.seam360gs:Seam360GSMethod",
+    "padgs_plus": "padgs.plus.method:PlusMethod",
 }

@@ -11,6 +11,7 @@ TITLES = {
     "omnigs": "OmniGS",
     "spags": "SPaGS",
     "padgs": "PaD-GS",
+    "padgs_plus": "padgs+",
     "cubemap_3dgs": "3DGS on cube faces",
     "crops_3dgs": "3DGS on crops",
     "sc_omnigs": "SC-OmniGS",

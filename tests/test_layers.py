@@ -23,6 +23,7 @@ ROOMS = (
     "padgs.render",
     "padgs.learning",
     "padgs.splats",
+    "padgs.plus",
     "padgs.anchors",
     "padgs.egonerf",
     "padgs.clock",

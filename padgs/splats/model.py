@@ -35,7 +35,14 @@ class Splats(nn.Module):
     """
 
     def __init__(
-        self, means: Tensor, log_scales: Tensor, colors: Tensor, *, degree: int = 3, unit: float = 1.0
+        self,
+        means: Tensor,
+        log_scales: Tensor,
+        colors: Tensor,
+        *,
+        degree: int = 3,
+        unit: float = 1.0,
+        opacity: float = INITIAL_OPACITY,
     ) -> None:
         """Round Gaussians of one colour: means [N, 3], log-scales [N, 3], RGB in [0, 1] [N, 3].
 
@@ -50,15 +57,30 @@ class Splats(nn.Module):
         self.means = nn.Parameter(means.clone())
         self.quats = nn.Parameter(means.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1))
         self.log_scales = nn.Parameter(log_scales.clone())
-        self.opacity_logits = nn.Parameter(means.new_full((count,), math.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY))))
+        self.opacity_logits = nn.Parameter(means.new_full((count,), math.log(opacity / (1 - opacity))))
         self.sh_dc = nn.Parameter(spherical_harmonics.dc_from_colors(colors))
         self.sh_rest = nn.Parameter(means.new_zeros(count, (degree + 1) ** 2 - 1, 3))
 
     @classmethod
     def from_scene(
-        cls, scene: Scene, *, degree: int = 3, max_gaussians: int | None = None, generator: torch.Generator
+        cls,
+        scene: Scene,
+        *,
+        degree: int = 3,
+        max_gaussians: int | None = None,
+        opacity: float = INITIAL_OPACITY,
+        scale: float = 1.0,
+        generator: torch.Generator,
     ) -> Splats:
         """One Gaussian per point of the cloud; a random choice of points where there are more than `max_gaussians`.
+
+        Args:
+            scene: its cloud, and its unit.
+            degree: of the spherical harmonics.
+            max_gaussians: as many as there are at most; None: all.
+            opacity: of all.
+            scale: times `initial_scales`.
+            generator: of the random choice, on the CPU.
 
         Raises:
             ValueError: the point cloud is empty or not finite.
@@ -72,8 +94,8 @@ class Splats(nn.Module):
         if max_gaussians is not None and len(points) > max_gaussians:
             chosen = torch.randperm(len(points), generator=generator)[:max_gaussians].sort().values
             points, colors = points[chosen], colors[chosen]
-        scales = initial_scales(points, scene.unit)
-        return cls(points, torch.log(scales)[:, None].repeat(1, 3), colors, degree=degree, unit=scene.unit)
+        log_scales = torch.log(scale * initial_scales(points, scene.unit))[:, None].repeat(1, 3)
+        return cls(points, log_scales, colors, degree=degree, unit=scene.unit, opacity=opacity)
 
     def __len__(self) -> int:
         return len(self.means)

@@ -60,10 +60,10 @@ class SplatTrainee:
         )
         self._drawn: View | None = None  # the view of the last drawing
 
-    def groups(self) -> list[ParameterGroup]:
+    def groups(self, means_speed: float = 1.0) -> list[ParameterGroup]:
         """Learning rates of 3DGS; that of the means falls over the whole run and follows the size of the scene."""
-        splats = self.splats
-        means = LogLinear(1.6e-4 * self._extent, 1.6e-6 * self._extent, self.iterations)
+        splats, speed = self.splats, means_speed * self._extent
+        means = LogLinear(1.6e-4 * speed, 1.6e-6 * speed, self.iterations)
         return [
             ParameterGroup("means", (splats.means,), means),
             ParameterGroup("quats", (splats.quats,), Constant(1e-3)),
@@ -102,11 +102,15 @@ class SplatTrainee:
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
         """Densify, and bring the next SH degree into use, where it is time to."""
         events = self.densifier.adapt(iteration, optimizer)
-        degree = min(self.splats.degree, (iteration + 1) // scaled(DEGREE_EVERY, self.iterations))
+        degree = min(self.splats.degree, self.degree_at(iteration + 1))
         if degree > self.splats.active_degree:
             self.splats.active_degree = degree
             events += (f"spherical harmonics of degree {degree}",)
         return events
+
+    def degree_at(self, iteration: int) -> int:
+        """The SH degree that is in use by then, if the model has it."""
+        return iteration // scaled(DEGREE_EVERY, self.iterations)
 
     def counts(self) -> dict[str, int]:
         """Number of Gaussians."""

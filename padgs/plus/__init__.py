@@ -1,0 +1,1 @@
+"""padgs_plus, the method of this project: explicit Gaussians that know the sphere in every part."""

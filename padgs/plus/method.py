@@ -1,0 +1,72 @@
+"""padgs_plus: what one gets when the measured facts of this project decide.
+
+Explicit Gaussians, drawn exactly along each ray, that start few, grow in eight rounds by the pull in space, and are
+kept small as seen from the cameras. No constant is in world units or pixels, none must be chosen for a scene, and
+latitude is nowhere a special case. docs/plus.md has the reason for each part; each is an option with a value that takes
+it away (`+experiment=plus_ablation`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import torch
+
+from padgs.learning.loop import TrainOptions
+from padgs.plus.options import PlusOptions
+from padgs.plus.sky import with_sky
+from padgs.plus.trainee import PlusTrainee
+from padgs.render.config import RenderConfig
+from padgs.scene import Scene, View
+from padgs.splats.method import SplatMethod
+from padgs.splats.model import Splats
+from padgs.splats.trainee import SplatTrainee
+
+
+def independent_pixels(view: View) -> float:
+    """As many pixels of equal solid angle as a panorama shows: W H times the mean cosine of the latitude, 2 / pi."""
+    return 2 * view.width * view.height / math.pi
+
+
+class PlusMethod(SplatMethod):
+    """See `padgs.learning.method.Method`."""
+
+    Options = PlusOptions
+    RENDER = RenderConfig(projection="ray", low_pass=0.2, near=0.05)
+    TRAIN = TrainOptions(weight="solid_angle")
+
+    def _start(self, scene: Scene, iterations: int) -> SplatTrainee:
+        options, pixels = self.options, independent_pixels(scene.train[0])
+        start, limit = (
+            _fewest(options.max_gaussians, share, pixels) for share in (options.start_share, options.limit_share)
+        )
+        splats = Splats.from_scene(
+            scene,
+            degree=options.sh_degree,
+            max_gaussians=start,
+            opacity=options.initial_opacity,
+            scale=options.initial_scale,
+            generator=torch.Generator().manual_seed(self.seed),
+        )
+        if options.sky:
+            splats = with_sky(splats, scene)
+        extent = scene.extent_of_at_least(options.min_extent)
+        return self._trainee_of(splats, extent, iterations, scene.train, partial(PlusTrainee, limit=limit))
+
+    def _trainee_of(
+        self,
+        splats: Splats,
+        extent: float,
+        iterations: int,
+        views: Sequence[View] = (),
+        kind: Callable[..., SplatTrainee] = PlusTrainee,
+    ) -> SplatTrainee:
+        return super()._trainee_of(splats, extent, iterations, views, kind)
+
+
+def _fewest(most: int | None, share: float | None, pixels: float) -> int | None:
+    """The smaller one of a number and a share of the pixels; None where neither is a limit."""
+    limits = (most, None if share is None else max(1, round(share * pixels)))
+    return min((limit for limit in limits if limit is not None), default=None)

@@ -1,0 +1,48 @@
+"""What padgs_plus consists of, part by part; each has a value that takes it away."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+from padgs.checks import check
+from padgs.splats.clone_split import CloneSplitOptions
+from padgs.splats.method import SplatOptions
+
+ROUNDS = 8
+GROWN = 0.5  # share of the run after which nothing grows any more
+
+
+@dataclass(frozen=True)
+class PlusOptions(SplatOptions):
+    """The `method` group of the configuration. Shares of the run are in [0, 1], so no schedule has a length."""
+
+    sh_degree: int = 2  # a degree more each tenth of the run; the third gains nothing and costs a fifth of the time
+    signal: str = "space_absolute"  # the pull on the mean itself, in no image plane and at no latitude
+    gradient_threshold: float = 1e-4  # twice SPaGS's: half of the Gaussians for the same quality
+    sample_clones: bool = True
+    min_opacity: float = 0.05  # what is fainter when a round ends was not needed
+    start_share: float | None = 0.29  # points to begin with, per independent pixel of a view; None: all that there are
+    limit_share: float | None = 1.3  # ... and Gaussians at most, which eight views cannot overfit
+    initial_opacity: float = 0.5  # 0.1 hides what lies in front until opacities have grown
+    initial_scale: float = 0.6  # times the distance of the nearest points; 1 is 3DGS's, whose Gaussians overlap
+    means_speed: float = 2.0  # learning rate of the means, beside that of 3DGS
+    size_weight: float = 0.2  # in the loss, of the mean angular size: half of the pairs of a frame, at no loss
+    average_share: float = 0.04  # of the run: parameters are averaged over about so much of its end; 0: not
+    sky: bool = True  # far Gaussians in directions in which the cloud has no point
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(self, "an opacity below 1", lambda opacity: 0 < opacity < 1, "initial_opacity")
+        check(self, "> 0 and finite", lambda factor: 0 < factor < math.inf, "initial_scale", "means_speed")
+        check(self, "at least 0, which switches it off", lambda weight: 0 <= weight < math.inf, "size_weight")
+        check(self, "a share of the run in [0, 0.1]", lambda share: 0 <= share <= 0.1, "average_share")
+        for name in ("start_share", "limit_share"):
+            check(self, "> 0, or none for no limit", lambda share: share is None or share > 0, name)
+
+    def for_run(self, iterations: int) -> CloneSplitOptions:
+        """Rounds of growth at even distances up to `GROWN`; no resets, which a run of any length must recover from."""
+        every = max(1, round(GROWN * iterations / ROUNDS))
+        return replace(
+            self, densify_from=0, densify_until=ROUNDS * every + 1, densify_every=every, reset_every=iterations + 1
+        )

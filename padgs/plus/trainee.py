@@ -1,0 +1,84 @@
+"""padgs_plus in training: splats with schedules in shares of the run, kept small, and averaged at the end."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from padgs.learning.schedule import ParameterGroup
+from padgs.learning.trainee import Drawing, State
+from padgs.plus.options import PlusOptions
+from padgs.render.config import RenderConfig
+from padgs.scene import View
+from padgs.splats.model import Splats
+from padgs.splats.trainee import SplatTrainee
+
+DEGREE_SHARE = 0.1  # of the run, after which the next SH degree comes into use
+AVERAGED_FROM = 0.9  # share of the run after which parameters are averaged
+AVERAGE = "average/"  # of its tensors in a state
+
+
+class PlusTrainee(SplatTrainee):
+    """Splats with the schedule of padgs_plus for a run of `iterations`.
+
+    Attributes:
+        average: name of a parameter -> its running mean; empty until the last tenth of the run.
+    """
+
+    def __init__(
+        self, splats: Splats, options: PlusOptions, config: RenderConfig, *, limit: int | None = None, **kwargs: Any
+    ) -> None:
+        """Arguments as for `SplatTrainee`; `limit`: as many Gaussians as there may be."""
+        super().__init__(splats, replace(options, max_gaussians=limit), config, **kwargs)
+        self.options, self.average = options, dict[str, Tensor]()
+
+    def groups(self, means_speed: float = 1.0) -> list[ParameterGroup]:
+        """Those of 3DGS, the means faster."""
+        return super().groups(means_speed * self.options.means_speed)
+
+    def degree_at(self, iteration: int) -> int:
+        """A degree more each tenth of the run."""
+        return int(iteration / (DEGREE_SHARE * self.iterations))
+
+    def draw(self, view: View, probe: Tensor | None = None) -> Drawing:
+        """Render all Gaussians, differentiably; the penalty is their mean size as the view sees them."""
+        drawing = super().draw(view, probe)
+        if self.options.size_weight == 0:
+            return drawing
+        means = drawing.gaussians.means.detach()
+        distances = (means - view.center.to(means)).norm(dim=-1).clamp(min=self.render_options(view).near)
+        size = (drawing.gaussians.scales / distances[:, None]).mean()
+        return replace(drawing, penalty=self.options.size_weight * size)
+
+    def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
+        """Densify, average, and bring the next SH degree into use, where it is time to."""
+        events = super().adapt(iteration, optimizer)
+        if iteration > AVERAGED_FROM * self.iterations and self.options.average_share > 0:
+            events += self._averaged(iteration)
+        return events
+
+    def _averaged(self, iteration: int) -> tuple[str, ...]:
+        """Note the parameters; at the end of the run their mean takes their place."""
+        parameters = self.splats.rows()
+        new = 1 / max(1.0, self.options.average_share * self.iterations)
+        for name, parameter in parameters.items():
+            self.average.setdefault(name, parameter.detach().clone()).lerp_(parameter, new)
+        if iteration < self.iterations:
+            return ()
+        for name, parameter in parameters.items():
+            parameter.copy_(self.average[name])
+        return ("the model is the mean of its last states",)
+
+    def state(self) -> State:
+        """That of splats, and the running means."""
+        state = super().state()
+        return State(state.tensors | {AVERAGE + name: mean for name, mean in self.average.items()}, state.values)
+
+    def load_state(self, state: State) -> None:
+        """Become the model that `state` was taken of."""
+        super().load_state(state)
+        device = self.splats.means.device
+        self.average = {name: mean.to(device, copy=True) for name, mean in state.under(AVERAGE).items()}

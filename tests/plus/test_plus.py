@@ -1,0 +1,81 @@
+"""What padgs_plus promises: schedules for any length, no units, small Gaussians, a mean of its last states."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from tiny_scene import HEIGHT, WIDTH, tiny_scene
+
+from padgs.learning.loop import Budget
+from padgs.plus.method import PlusMethod, independent_pixels
+from padgs.plus.options import GROWN, ROUNDS, PlusOptions
+from padgs.scene import Scene
+from padgs.sphere.distortion import solid_angle_weight
+
+OPTIONS = PlusOptions(gradient_threshold=1e-6, start_share=None, limit_share=None)
+
+
+def in_other_units(scene: Scene, scale: float) -> Scene:
+    def moved(view):
+        pose = view.cam_from_world.clone()
+        pose[:3, 3] *= scale
+        return replace(view, cam_from_world=pose)
+
+    views = {"train": tuple(map(moved, scene.train)), "test": tuple(map(moved, scene.test))}
+    return replace(scene, points=scene.points * scale, **views)
+
+
+@pytest.mark.parametrize("iterations", [16, 60, 500, 7000, 30_000])
+def test_growth_has_as_many_rounds_in_a_run_of_any_length(iterations):
+    options = PlusOptions().for_run(iterations)
+    rounds = [i for i in range(1, iterations + 1) if i < options.densify_until and i % options.densify_every == 0]
+    assert len(rounds) == ROUNDS and options.reset_every > iterations
+    assert rounds[-1] == pytest.approx(GROWN * iterations, abs=ROUNDS / 2)
+
+
+def test_pixels_are_counted_by_what_they_see():
+    view = tiny_scene().train[0]
+    weight = solid_angle_weight(HEIGHT).sum().item() * WIDTH  # 1 at the horizon
+    assert independent_pixels(view) == pytest.approx(weight, rel=0.01)
+
+
+def test_the_units_of_the_world_do_not_matter():
+    losses = []
+    for scale in (1.0, 100.0):
+        records = list(PlusMethod(OPTIONS).fit(in_other_units(tiny_scene(), scale), Budget(32)))
+        losses.append([record.loss for record in records])
+        assert records[-1].counts["gaussians"] > records[0].counts["gaussians"]
+    assert losses[1] == pytest.approx(losses[0], rel=1e-3)
+
+
+def test_it_starts_with_a_share_of_the_pixels_and_stays_below_another():
+    options = replace(OPTIONS, start_share=0.05, limit_share=0.15, sky=False)
+    method = PlusMethod(options)
+    counts = [record.counts["gaussians"] for record in method.fit(tiny_scene(), Budget(32))]
+    pixels = independent_pixels(tiny_scene().train[0])
+    assert method.start == round(0.05 * pixels) and max(counts) <= round(0.15 * pixels) < 10 * counts[0]
+    assert max(counts) > counts[0]
+
+
+def test_the_penalty_is_the_mean_size_as_the_view_sees_it():
+    method, scene = PlusMethod(replace(OPTIONS, size_weight=0.7)), tiny_scene()
+    next(method.fit(scene, Budget(10)))
+    drawing = method.trainee.draw(scene.train[1])
+    splats, centre = method.trainee.splats, scene.train[1].center
+    angles = torch.exp(splats.log_scales) / (splats.means - centre).norm(dim=-1, keepdim=True)
+    assert drawing.penalty.item() == pytest.approx(0.7 * angles.mean().item())
+    (gradient,) = torch.autograd.grad(drawing.penalty, splats.means, allow_unused=True)
+    assert gradient is None or not gradient.any()  # it shall not push Gaussians away
+
+
+def test_the_end_is_the_mean_of_the_last_states():
+    states = {}
+    for share in (0.0, 0.1):
+        method = PlusMethod(replace(OPTIONS, average_share=share))
+        for record in method.fit(tiny_scene(), Budget(40)):
+            states[share, record.iteration] = method.trainee.splats.means.detach().clone()
+    assert torch.equal(states[0.0, 39], states[0.1, 39])  # training itself does not notice
+    mean = states[0.0, 37].clone()
+    for iteration in (38, 39, 40):
+        mean.lerp_(states[0.0, iteration], 1 / 4)
+    torch.testing.assert_close(states[0.1, 40], mean)
