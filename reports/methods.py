@@ -28,13 +28,13 @@ STATUS = {
 
 
 def method_of(preset: str) -> str:
-    """The method of a preset: the known name that it begins with, else itself.
+    """The method of a preset: the longest known name that it begins with, else itself.
 
-    >>> method_of("odgs_release"), method_of("cubemap_3dgs"), method_of("my_own")
-    ('odgs', 'cubemap_3dgs', 'my_own')
+    >>> method_of("odgs_release"), method_of("padgs_plus"), method_of("my_own")
+    ('odgs', 'padgs_plus', 'my_own')
     """
     known = [method for method in TITLES if preset == method or preset.startswith(f"{method}_")]
-    return known[0] if known else preset
+    return max(known, key=len, default=preset)
 
 
 def name(method: str) -> str:

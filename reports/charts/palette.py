@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from reports import methods
+from reports.methods import method_of
 
 # Okabe and Ito's colours first, which colour-blind readers can tell apart; where one is lost on black, a lighter one of
 # the same hue stands for it there. Ours are the only pinks, published or plus.
@@ -33,27 +33,17 @@ PAPER = ("#ffffff", "#171b22")
 COLORS = tuple(light for light, _ in (*FAMILIES.values(), *OTHERS))
 
 
-def family(preset: str) -> str:
-    """The method whose colour a preset has.
-
-    >>> family("padgs_ray"), family("padgs_plus_small"), family("mine")
-    ('padgs', 'padgs_plus', 'mine')
-    """
-    known = [name for name in FAMILIES if preset == name or preset.startswith(f"{name}_")]
-    return max(known, key=len, default=methods.method_of(preset))
-
-
 def color_of(preset: str, presets: Sequence[str]) -> str:
     """The colour of a preset's method on white; of methods that nobody foresaw, by their order among `presets`."""
-    if family(preset) in FAMILIES:
-        return FAMILIES[family(preset)][0]
-    others = [name for name in dict.fromkeys(map(family, (*presets, preset))) if name not in FAMILIES]
-    return OTHERS[others.index(family(preset)) % len(OTHERS)][0]
+    if method_of(preset) in FAMILIES:
+        return FAMILIES[method_of(preset)][0]
+    others = [name for name in dict.fromkeys(map(method_of, (*presets, preset))) if name not in FAMILIES]
+    return OTHERS[others.index(method_of(preset)) % len(OTHERS)][0]
 
 
 def weight_of(preset: str, role: str) -> str:
     """How a preset's name is written: bold if it stands for a method of ours, faint if it stands for none."""
-    return "faint" if role != "main" else "bold" if family(preset) in OURS else "normal"
+    return "faint" if role != "main" else "bold" if method_of(preset) in OURS else "normal"
 
 
 def dark_rules() -> str:

@@ -10,7 +10,6 @@ import pandas as pd
 from pandas import DataFrame
 
 from reports import methods, published
-from reports.charts.palette import family
 from reports.conditions import OF_A_CHART, OF_A_MEAN, footnotes, refuse_mixture
 from reports.frame import by_place
 from reports.gathered import Gathered
@@ -64,8 +63,8 @@ class TradeOff:
         """
         if _is_released(preset):
             return "release"
-        method = family(preset)
-        kin = [p.preset for p in self.points if family(p.preset) == method and not _is_released(p.preset)]
+        method = methods.method_of(preset)
+        kin = [p.preset for p in self.points if methods.method_of(p.preset) == method and not _is_released(p.preset)]
         return "main" if preset == (method if method in kin else [*kin, preset][0]) else "variant"
 
     def corrected(self, point: Point) -> Point | None:

@@ -24,7 +24,7 @@ ANCHORS = tuple(
     f"method.{name}={value}"
     for name, value in {
         **{"scale_windows": "false", "statistics_from": 0, "grow_from": 1, "grow_until": 7, "grow_every": 2},
-        **{"gradient_threshold": 1e-9, "offset_rate": "[2,2]"},
+        **{"gradient_threshold": 1e-9, "offset_rate": "[2,2]", "offset_rate_unit": "scene", "voxel_pixels": 3},
     }.items()
 )
 # setting -> overrides that make it small, and grow; how often the host waits in an iteration without growth or
@@ -64,7 +64,8 @@ def scene(tmp_path_factory) -> Scene:
 def test_every_method_lives_where_its_scene_is(setting, scene, tmp_path, monkeypatch):
     monkeypatch.setattr(scoring, "FRAMES", 1)
     overrides, waits_each = METHODS[setting]
-    config = composed(f"method={setting}", *overrides, f"train.check_every={CHECK_EVERY}", "render.backend=torch")
+    common = f"train.check_every={CHECK_EVERY}", "train.learning_rates=published", "render.backend=torch"
+    config = composed(f"method={setting}", *overrides, *common)
     method, losses, waited, events = build(config), [], [], []
     with pretended_gpu() as waits:
         there = scene.to(GPU)

@@ -6,9 +6,10 @@ from made_up import compared, small, swept, write
 import baselines
 from reports import store
 from reports.charts import sweep_chart, trade_off_chart
-from reports.charts.palette import BEYOND, FAMILIES, GRID, INK, OTHERS, PAPER, SOFT, color_of, dark_rules, family
+from reports.charts.palette import BEYOND, FAMILIES, GRID, INK, OTHERS, PAPER, SOFT, color_of, dark_rules
 from reports.frame import frame
 from reports.gathered import Gathered
+from reports.methods import method_of
 
 
 def contrast(one: str, other: str) -> float:
@@ -25,7 +26,7 @@ def contrast(one: str, other: str) -> float:
 
 def test_every_method_has_a_colour_of_its_own_that_is_seen_on_both_papers(root):
     presets = {*baselines.METHODS, *(path.stem for path in (root / "conf" / "method").glob("*.yaml"))}
-    assert {family(preset) for preset in presets} <= FAMILIES.keys(), "give new methods a line in FAMILIES"
+    assert {method_of(preset) for preset in presets} <= FAMILIES.keys(), "give new methods a line in FAMILIES"
     for paper, colors in zip(PAPER, zip(*FAMILIES.values(), *OTHERS, strict=True), strict=True):
         assert len(set(colors)) == len(colors) and min(contrast(color, paper) for color in colors) > 2
     assert min(contrast(*pair) for pair in zip(INK, PAPER, strict=True)) > 12

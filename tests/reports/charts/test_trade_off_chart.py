@@ -10,6 +10,7 @@ from reports.charts.trade_off import trade_offs
 from reports.charts.trade_off_chart import LARGEST, NARROW, WIDE, charts, drawn
 from reports.frame import frame
 from reports.gathered import Gathered
+from reports.methods import short
 
 
 def one(runs):
@@ -31,7 +32,7 @@ def crowd(count: int):
 def test_one_method_is_drawn_and_twenty_have_names_that_do_not_touch(count):
     made, _, panels = drawn(one(crowd(count)), NARROW)
     for panel, texts in panels:
-        named = {mark.point.title for mark in panel.marks if mark.role != "release"}
+        named = {short(mark.point.title, mark.point.preset) for mark in panel.marks if mark.role != "release"}
         assert {text.get_text().split("\n")[0] for text in texts} == named
         assert_apart(panel, texts)
 
