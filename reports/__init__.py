@@ -30,7 +30,7 @@ REPORTS: Mapping[str, Report] = {
     "equal_time": Report("reports.tables.side_by_side:equal_time", ("equal_time",)),
     "ladder": Report("reports.tables.variants:ladder", ("ladder",)),
     "quirks": Report("reports.tables.variants:quirks", ("quirks",)),
-    "order": Report("reports.tables.order:order", ("order", "photographs", "parallax", "resolution")),
+    "order": Report("reports.tables.order:order", ("order", "photographs", "parallax", "pixel_constants")),
     "length": Report("reports.tables.length:length", ("length",)),
     "learning_rates": Report("reports.tables.learning_rates:learning_rates", ("learning_rates",)),
     "modulation": Report("reports.tables.modulation:modulation", ("modulation",)),

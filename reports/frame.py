@@ -18,6 +18,7 @@ from pandas import DataFrame
 
 from padgs.results import DECIDE_NOTHING, Result, Scores, picture_name
 from reports.images_seen import images_seen
+from reports.learning_rates import law
 from reports.scenes import Place
 from reports.store import Run
 
@@ -95,7 +96,7 @@ FACTS: Mapping[str, Callable[[Result], Any]] = {
     "place": lambda result: Place(result.dataset, result.scene),
     "resolution": lambda result: f"{result.width}x{result.height}",
     "data": lambda result: result.fingerprint[:10],
-    "learning_rates": lambda result: result.config.get("train", {}).get("learning_rates", "published"),
+    "learning_rates": lambda result: _learning_rates(result),
     "hardware": hardware,
     "machine": machine,
     "setting": lambda result: json.dumps(
@@ -138,6 +139,14 @@ def _marks(result: Result) -> Iterator[tuple[str, float | None]]:
     for name, scores in result.scores.items():
         for metric, value in scores.metrics.items():
             yield f"{name}/{metric}", value
+
+
+def _learning_rates(result: Result) -> Any:
+    """The choice of `train.learning_rates`, as far as it decides anything; None for methods that have but one."""
+    choice = result.config.get("train", {}).get("learning_rates", "published")  # older runs had no choice
+    if result.method == "egonerf":
+        return None
+    return "published" if choice == 1 or (choice == "run" and law(result.iterations) == 1) else choice
 
 
 def _view_psnr(scores: Mapping[str, Scores]) -> dict[str, float]:

@@ -1,7 +1,7 @@
 """padgs_plus: what one gets when the measured facts of this project decide.
 
 Explicit Gaussians, drawn exactly along each ray, that start few, grow in eight rounds by the pull in space, and are
-kept small as seen from the cameras. No constant is in world units or pixels, none must be chosen for a scene, and
+kept small as seen from the cameras. No constant is in world units, counts follow the pixels of the images, and
 latitude is nowhere a special case. docs/plus.md has the reason for each part; each is an option with a value that takes
 it away (`+experiment=plus_ablation`).
 """
@@ -16,7 +16,7 @@ import torch
 
 from padgs.learning.loop import TrainOptions
 from padgs.plus.options import PlusOptions
-from padgs.plus.sky import with_sky
+from padgs.plus.sky import far_gaussians
 from padgs.plus.trainee import PlusTrainee
 from padgs.render.config import RenderConfig
 from padgs.scene import Scene, View
@@ -50,8 +50,11 @@ class PlusMethod(SplatMethod):
             scale=options.initial_scale,
             generator=torch.Generator().manual_seed(self.seed),
         )
-        if options.sky:
-            splats = with_sky(splats, scene)
+        directions = round(options.sky_share * len(splats))
+        directions = directions if limit is None else min(directions, limit - len(splats))
+        if directions > 0:
+            sky = far_gaussians(scene, directions, degree=options.sh_degree, opacity=options.initial_opacity)
+            splats.load({name: torch.cat((own, sky.rows()[name])) for name, own in splats.rows().items()})
         extent = scene.extent_of_at_least(options.min_extent)
         return self._trainee_of(splats, extent, iterations, scene.train, partial(PlusTrainee, limit=limit))
 

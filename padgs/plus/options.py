@@ -23,19 +23,20 @@ class PlusOptions(SplatOptions):
     sample_clones: bool = True
     min_opacity: float = 0.05  # what is fainter when a round ends was not needed
     start_share: float | None = 0.29  # points to begin with, per independent pixel of a view; None: all that there are
-    limit_share: float | None = 1.3  # ... and Gaussians at most, which eight views cannot overfit
+    limit_share: float | None = 1.3  # ... and Gaussians at most, sky included: a guard on memory and time
     initial_opacity: float = 0.5  # 0.1 hides what lies in front until opacities have grown
     initial_scale: float = 0.6  # times the distance of the nearest points; 1 is 3DGS's, whose Gaussians overlap
     means_speed: float = 2.0  # learning rate of the means, beside that of 3DGS
     size_weight: float = 0.2  # in the loss, of the mean angular size: half of the pairs of a frame, at no loss
     average_share: float = 0.04  # of the run: parameters are averaged over about so much of its end; 0: not
-    sky: bool = True  # far Gaussians in directions in which the cloud has no point
+    sky_share: float = 0.5  # directions, per point to begin with, that get a far Gaussian if no point is there
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check(self, "an opacity below 1", lambda opacity: 0 < opacity < 1, "initial_opacity")
         check(self, "> 0 and finite", lambda factor: 0 < factor < math.inf, "initial_scale", "means_speed")
-        check(self, "at least 0, which switches it off", lambda weight: 0 <= weight < math.inf, "size_weight")
+        off = "at least 0, which switches it off"
+        check(self, off, lambda value: 0 <= value < math.inf, "size_weight", "sky_share")
         check(self, "a share of the run in [0, 0.1]", lambda share: 0 <= share <= 0.1, "average_share")
         for name in ("start_share", "limit_share"):
             check(self, "> 0, or none for no limit", lambda share: share is None or share > 0, name)

@@ -11,37 +11,32 @@ from torch import Tensor
 from padgs.scene import Scene
 from padgs.splats.model import Splats
 
-COUNT = 3000  # directions on the whole sphere, before those are left out that a point covers
-COVERED = 2.0  # a direction is covered by a point that is nearer than so many mean distances of neighbouring directions
+COVERED = (
+    2.0  # a point covers directions nearer than so many spacings of directions, or of the points if those are wider
+)
 FARTHEST = 3.0  # times the distance that `QUANTILE` of the points are within
 QUANTILE = 0.99
 
 
-def with_sky(splats: Splats, scene: Scene) -> Splats:
-    """The Gaussians, and a far one in each direction, seen from the middle of the cameras, that no point covers.
+def far_gaussians(scene: Scene, count: int, *, degree: int, opacity: float) -> Splats:
+    """A far Gaussian in each of `count` even directions, seen from the middle of the cameras, that no point covers.
 
     They are grey until the images say more, and touch each other. A room whose cloud covers all directions gets none.
     """
     centre = torch.stack([view.center for view in scene.train]).median(0).values
     rays = scene.points.double() - centre.to(scene.points).double()
     distances = rays.norm(dim=-1)
-    directions = fibonacci_sphere(COUNT).to(rays)
-    spacing = math.sqrt(4 * math.pi / COUNT)
-    seen = (rays / distances.clamp(min=1e-12)[:, None])[distances > 0]
-    nearest, _ = KDTree(seen.cpu().numpy()).query(directions.cpu().numpy())
-    free = directions[torch.from_numpy(nearest).to(directions.device) > COVERED * spacing]
-    if len(free) == 0:
-        return splats
-    far = (
-        FARTHEST * distances.quantile(QUANTILE, interpolation="nearest") if len(distances) < 2**24 else distances.max()
-    )
-    means = (centre.to(free) + far * free).to(splats.means)
-    log_scales = torch.full_like(means, math.log(0.5 * spacing * far.item()))
+    seen = (rays / distances[:, None])[distances > 0]
+    spacing = math.sqrt(4 * math.pi / count)
+    reach = COVERED * max(spacing, math.sqrt(4 * math.pi / len(seen)))
+    directions = fibonacci_sphere(count)
+    nearest, _ = KDTree(seen.cpu().numpy()).query(directions.numpy(), distance_upper_bound=reach)
+    free = directions[torch.from_numpy(nearest).isinf()].to(rays)
+    far = FARTHEST * distances[:: max(1, len(distances) // 20_000)].quantile(QUANTILE).item()
+    means = (centre.to(free) + far * free).to(scene.points)
+    log_scales = torch.full_like(means, math.log(0.5 * spacing * far))
     grey = torch.full_like(means, 0.5)
-    sky = Splats(means, log_scales, grey, degree=splats.degree, unit=splats.unit, opacity=0.5)
-    joined = Splats(means[:0], means[:0], means[:0], degree=splats.degree, unit=splats.unit)
-    joined.load({name: torch.cat((own, sky.rows()[name])) for name, own in splats.rows().items()})
-    return joined
+    return Splats(means, log_scales, grey, degree=degree, unit=scene.unit, opacity=opacity)
 
 
 def fibonacci_sphere(count: int) -> Tensor:

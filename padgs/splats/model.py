@@ -44,7 +44,7 @@ class Splats(nn.Module):
         unit: float = 1.0,
         opacity: float = INITIAL_OPACITY,
     ) -> None:
-        """Round Gaussians of one colour: means [N, 3], log-scales [N, 3], RGB in [0, 1] [N, 3].
+        """Round Gaussians of one opacity: means [N, 3], log-scales [N, 3], RGB in [0, 1] [N, 3].
 
         Raises:
             ValueError: the degree is not 0, 1, 2 or 3.

@@ -12,6 +12,7 @@ from reports import methods
 from reports.conditions import footnotes, refuse_mixture
 from reports.frame import by_conditions, grouped
 from reports.gathered import Gathered
+from reports.learning_rates import LARGEST, PUBLISHED_ITERATIONS, law
 from reports.measures import mark
 from reports.settings import one_setting
 from reports.tables.cells import over_pairs, over_seeds
@@ -20,17 +21,7 @@ from reports.tables.table import Block, Cell, Column, Row, Table
 
 RATES = "config.train.learning_rates"  # published, run, or a factor
 FACTOR = "factor"
-PUBLISHED_ITERATIONS, LARGEST = 30_000, 8.0
 QUALITY = mark("sphere", "ws_psnr")
-
-
-def law(iterations: int) -> float:
-    """The factor on all learning rates that `train.learning_rates=run` chooses: √(30 000 / iterations), in [1, 8].
-
-    >>> law(30_000), law(7500), law(100)
-    (1.0, 2.0, 8.0)
-    """
-    return min(max(math.sqrt(PUBLISHED_ITERATIONS / iterations), 1.0), LARGEST)
 
 
 def learning_rates(gathered: Gathered) -> Table:

@@ -86,7 +86,7 @@ def _earliest(cells: Cells, rates: str) -> str:
     """From which length on every pair that seeds separate after the longest has its order there."""
     longest, since = _longest(cells, rates), None
     numbered = {name: cell for name, cell in longest.items() if cell.value is not None}
-    names = list(numbered)
+    names, repeated = list(numbered), any(cell.count > 1 for cell in numbered.values())
     better = better_rows(dict(enumerate(numbered.values())), QUALITY.column)
     pairs = [(names[i], names[j]) for i, those in better.items() for j in those]  # worse, better
     for iterations in sorted((n for of, n in cells if of == rates), reverse=True):
@@ -94,6 +94,9 @@ def _earliest(cells: Cells, rates: str) -> str:
         if not all(here[first] < here[second] for first, second in pairs if {first, second} <= {*here.dropna().index}):
             break
         since = iterations
+    if not pairs:
+        return f"{TITLES[rates]}: seeds separate nothing after the longest."
     if since is None:
         return f"{TITLES[rates]}: no length has the order of the longest."
-    return f"{TITLES[rates]}: from {since} iterations on, all that seeds separate after the longest has its order."
+    what = "all that seeds separate after the longest has its order" if repeated else "the order is that of the longest"
+    return f"{TITLES[rates]}: from {since} iterations on, {what}{'' if repeated else ' (one seed each)'}."

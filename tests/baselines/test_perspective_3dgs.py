@@ -90,7 +90,7 @@ def test_cut_views_are_twice_as_fine_with_filters_of_the_panoramas_size(name):
 @each_method
 def test_learns_whole_panoramas_from_their_parts(name):
     scene = tiny_scene()
-    method = METHOD[name](METHOD[name].Options(learning_rate_factor=4.0))
+    method = METHOD[name](train=replace(METHOD[name].TRAIN, learning_rates=4.0))
     records = list(method.fit(scene, Budget(25)))
     view = scene.test[0]
     error = (method.render(view).image.clamp(0, 1) - view.image()).square().mean()

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from states import assert_same_but_time
 from tiny_scene import HEIGHT, WIDTH, tiny_scene
 
 from padgs.learning.loop import Budget
@@ -11,6 +12,7 @@ from padgs.plus.method import PlusMethod, independent_pixels
 from padgs.plus.options import GROWN, ROUNDS, PlusOptions
 from padgs.scene import Scene
 from padgs.sphere.distortion import solid_angle_weight
+from padgs.splats.method import SplatMethod
 
 OPTIONS = PlusOptions(gradient_threshold=1e-6, start_share=None, limit_share=None)
 
@@ -49,11 +51,11 @@ def test_the_units_of_the_world_do_not_matter():
 
 
 def test_it_starts_with_a_share_of_the_pixels_and_stays_below_another():
-    options = replace(OPTIONS, start_share=0.05, limit_share=0.15, sky=False)
+    options = replace(OPTIONS, start_share=0.05, limit_share=0.15, sky_share=0.5)
     method = PlusMethod(options)
     counts = [record.counts["gaussians"] for record in method.fit(tiny_scene(), Budget(32))]
     pixels = independent_pixels(tiny_scene().train[0])
-    assert method.start == round(0.05 * pixels) and max(counts) <= round(0.15 * pixels) < 10 * counts[0]
+    assert 0 <= method.start - round(0.05 * pixels) <= 0.025 * pixels + 1 and max(counts) <= round(0.15 * pixels)
     assert max(counts) > counts[0]
 
 
@@ -66,6 +68,30 @@ def test_the_penalty_is_the_mean_size_as_the_view_sees_it():
     assert drawing.penalty.item() == pytest.approx(0.7 * angles.mean().item())
     (gradient,) = torch.autograd.grad(drawing.penalty, splats.means, allow_unused=True)
     assert gradient is None or not gradient.any()  # it shall not push Gaussians away
+
+
+def test_degrees_come_each_tenth_and_means_are_faster_than_those_of_3dgs():
+    method, scene = PlusMethod(replace(OPTIONS, means_speed=3.0, initial_opacity=0.3, initial_scale=0.5)), tiny_scene()
+    degrees = {r.iteration: method.trainee.splats.active_degree for r in method.fit(scene, Budget(100))}
+    assert [degrees[i] for i in (8, 9, 18, 19, 100)] == [0, 1, 1, 2, 2]  # as the next iteration will draw
+    usual, ours = SplatMethod(), PlusMethod(replace(OPTIONS, initial_opacity=0.3, initial_scale=0.5, sky_share=0.0))
+    for started in (usual, ours):
+        started.fit(scene, Budget(100))
+    rates = [{g.name: g.learning_rate(50) for g in m.trainee.groups()} for m in (usual, method)]
+    assert {name: rate / rates[0][name] for name, rate in rates[1].items()} == pytest.approx(
+        dict.fromkeys(rates[0], 1.0) | {"means": 3.0}
+    )
+    assert torch.allclose(torch.sigmoid(ours.trainee.splats.opacity_logits), torch.tensor(0.3))
+    torch.testing.assert_close(ours.trainee.splats.log_scales.exp(), 0.5 * usual.trainee.splats.log_scales.exp())
+
+
+def test_resumed_while_it_averages_it_ends_the_same():
+    whole = PlusMethod(OPTIONS)
+    states = [whole.state() for record in whole.fit(tiny_scene(), Budget(40)) if record.iteration in (38, 40)]
+    again = PlusMethod(OPTIONS)
+    again.load_state(states[0])
+    list(again.fit(tiny_scene(), Budget(40)))
+    assert_same_but_time(again.state(), states[1])
 
 
 def test_the_end_is_the_mean_of_the_last_states():
