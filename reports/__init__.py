@@ -34,6 +34,7 @@ REPORTS: Mapping[str, Report] = {
     "length": Report("reports.tables.length:length", ("length",)),
     "learning_rates": Report("reports.tables.learning_rates:learning_rates", ("learning_rates",)),
     "modulation": Report("reports.tables.modulation:modulation", ("modulation",)),
+    "plus_ablation": Report("reports.tables.variants:plus_ablation", ("plus_ablation",)),
     "runs": Report("reports.tables.runs:runs"),
     "chart": Report("reports.charts.trade_off_chart:charts", ("pareto", "table4_efficiency", *OF_ALL_METHODS)),
     "sweep": Report("reports.charts.sweep_chart:charts"),

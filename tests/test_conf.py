@@ -80,7 +80,7 @@ def test_every_sweep_varies_its_key_alone_and_says_how_to_run_it(name):
         "resolution": {"data.width"},
         "seeds": {"seed"},
         "tau": {"method.tau"},
-        "voxel_size": {"method.voxel_size"},
+        "voxel_size": {"method.voxel_pixels"},
     }[name]
     differing = {key for job in found for key in different_keys(found[0].values(), job.values())}
     assert differing == keys

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields
 
 from padgs.checks import check
 from padgs.splats.clone_split import CloneSplitOptions
 from padgs.splats.method import SplatOptions
 
 ROUNDS = 8
+SCHEDULE = (  # options of 3DGS that mean nothing here
+    *("densify_from", "densify_until", "densify_every", "prune_by_extent", "prune_by_extent_from"),
+    *("reset_every", "reset_opacity", "released_start", "released_reset"),
+)
 GROWN = 0.5  # share of the run after which nothing grows any more
 
 
@@ -41,9 +45,16 @@ class PlusOptions(SplatOptions):
         for name in ("start_share", "limit_share"):
             check(self, "> 0, or none for no limit", lambda share: share is None or share > 0, name)
 
+        for field in fields(CloneSplitOptions):
+            if field.name in SCHEDULE and getattr(self, field.name) != field.default:
+                raise ValueError(
+                    f"{field.name} is {getattr(self, field.name)}, but padgs_plus has rounds of growth of its own "
+                    f"and no resets; leave it at {field.default}"
+                )
+
     def for_run(self, iterations: int) -> CloneSplitOptions:
         """Rounds of growth at even distances up to `GROWN`; no resets, which a run of any length must recover from."""
         every = max(1, round(GROWN * iterations / ROUNDS))
-        return replace(
-            self, densify_from=0, densify_until=ROUNDS * every + 1, densify_every=every, reset_every=iterations + 1
-        )
+        plain = CloneSplitOptions(**{field.name: getattr(self, field.name) for field in fields(CloneSplitOptions)})
+        until = ROUNDS * every + 1
+        return replace(plain, densify_from=0, densify_until=until, densify_every=every, reset_every=iterations + 1)

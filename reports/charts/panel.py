@@ -94,8 +94,9 @@ class Panel:
         return names.write(self.axes, wanted, marks, self.lines)
 
     def _draw_front(self) -> None:
-        """The Pareto front of all but released programs, as far as the window goes."""
-        front = pareto([(mark.x, mark.y) for mark in self.marks if mark.role != "release"], higher_is_better=True)
+        """The Pareto front of all that compete, without released programs, as far as the window goes."""
+        rivals = [m for m in self.marks if m.role != "release" and m.point.preset not in self.trade_off.unranked]
+        front = pareto([(mark.x, mark.y) for mark in rivals], higher_is_better=True)
         drawn = {(mark.x, mark.y): mark.at for mark in self.marks}
         corners = [drawn[point] for point in front]
         corners += [(max(self.x_axis.window[1], corners[-1][0]), corners[-1][1])] if corners else []

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import pandas as pd
 from pandas import DataFrame
@@ -19,6 +20,7 @@ from reports.scenes import Place
 from reports.settings import Setting, settings
 from reports.tables.cells import over_scenes
 from reports.tables.table import Cell
+from reports.unranked import unranked
 
 COSTS = costs("frame_ms", "train_seconds", "gaussians", "megabytes")
 QUALITIES = (
@@ -66,6 +68,11 @@ class TradeOff:
         method = methods.method_of(preset)
         kin = [p.preset for p in self.points if methods.method_of(p.preset) == method and not _is_released(p.preset)]
         return "main" if preset == (method if method in kin else [*kin, preset][0]) else "variant"
+
+    @cached_property
+    def unranked(self) -> Collection[str]:
+        """Presets that are shown but compete with none, see `reports.unranked`."""
+        return unranked(self.runs)
 
     def corrected(self, point: Point) -> Point | None:
         """The twin of a released program: the corrected method in the same setting; None if it is not there."""

@@ -24,6 +24,26 @@ PARTS = {  # variant (conf/ablation) -> title
     "full": "+ DAGD + DAOM + M",
 }
 PAPER_SCENES = (Place("roam360", "bar"), Place("ricoh360", "cat_tower"))
+WITHOUT = {  # variant (conf/without) -> title
+    "complete": "complete",
+    **{
+        f"without_{part}": title
+        for part, title in {
+            "rays": "tangent planes for rays",
+            "weight": "no solid-angle weight",
+            "rates": "published rates",
+            "speed": "means at the rate of 3DGS",
+            "size": "no weight of the size",
+            "start": "all points to begin with",
+            "opacity": "initial opacity of 3DGS",
+            "scale": "initial scale of 3DGS",
+            "threshold": "half the threshold",
+            "limit": "no limit",
+            "average": "the last state",
+            "sky": "no sky",
+        }.items()
+    },
+}
 RUNGS = {  # variant (conf/ablation) -> title
     "a0_pano_3dgs": "A0 panoramic 3DGS",
     "a1_anchors": "A1 + anchors and networks",
@@ -103,24 +123,41 @@ def quirks(gathered: Gathered) -> Table:
     Raises:
         ReportError: results that must not stand together.
     """
+    title = "Quirks of released programs, one at a time"
+    return _changes(gathered, "quirks", title, QUIRKS, "PSNR beside the method as described")
+
+
+def plus_ablation(gathered: Gathered) -> Table:
+    """What each part of padgs+ is worth: a block for each scene; rows: complete, and without each part; and the change.
+
+    Raises:
+        ReportError: results that must not stand together.
+    """
+    title = "padgs+ without each of its parts"
+    return _changes(gathered, "plus_ablation", title, {"padgs_plus": WITHOUT}, "PSNR beside the complete method")
+
+
+def _changes(
+    gathered: Gathered, name: str, title: str, variants: Mapping[str, Mapping[str, str]], change: str
+) -> Table:
+    """A block for each scene and method of `variants`: a row for each of its variants, beside the first."""
     measures, psnr = (*marks(gathered.request.protocol), *COSTS), PAPER_METRICS.index("psnr")
     blocks, runs_of = [], {}
-    for place, own in by_place(_runs(gathered, "quirks", *QUIRKS.values())).items():
+    for place, own in by_place(_runs(gathered, name, *variants.values())).items():
         refuse_mixture(own, gathered.request, place.title, OF_TIMES)
-        for method, titles in QUIRKS.items():
+        for method, titles in variants.items():
             cells = of_each(own, "variant", titles, place.title, measures)
-            described = cells[method][psnr]
+            unchanged = cells[next(iter(titles))][psnr]
             for row in cells.values():
-                row.insert(psnr + 1, beside_paper.difference(row[psnr], described))
+                row.insert(psnr + 1, beside_paper.difference(row[psnr], unchanged))
             if own["variant"].isin(titles).any():
                 rows = (Row(titles[variant], tuple(row)) for variant, row in cells.items())
                 blocks.append(Block(f"{methods.name(method)}, {place.title}", tuple(rows)))
         runs_of[place.title] = own
     columns = [measure.column for measure in measures]
     columns.insert(psnr + 1, Column("Δ", 2, signed=True))
-    notes = (*footnotes(runs_of, gathered.request.protocol), "Δ: PSNR beside the method as described.", NOTE)
-    title = "Quirks of released programs, one at a time"
-    return Table("quirks", title, "Setting", tuple(columns), tuple(blocks), notes)
+    notes = (*footnotes(runs_of, gathered.request.protocol), f"Δ: {change}.", NOTE)
+    return Table(name, title, "Setting", tuple(columns), tuple(blocks), notes)
 
 
 def _runs(gathered: Gathered, report: str, *titles: Mapping[str, str]) -> DataFrame:

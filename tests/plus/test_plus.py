@@ -35,6 +35,11 @@ def test_growth_has_as_many_rounds_in_a_run_of_any_length(iterations):
     assert rounds[-1] == pytest.approx(GROWN * iterations, abs=ROUNDS / 2)
 
 
+def test_options_of_the_schedule_of_3dgs_are_refused_and_not_ignored():
+    with pytest.raises(ValueError, match="reset_every is 100, but padgs_plus has rounds of growth of its own"):
+        PlusOptions(reset_every=100)
+
+
 def test_pixels_are_counted_by_what_they_see():
     view = tiny_scene().train[0]
     weight = solid_angle_weight(HEIGHT).sum().item() * WIDTH  # 1 at the horizon

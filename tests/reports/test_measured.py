@@ -8,6 +8,7 @@ from reports.charts import sweeps, trade_off, trade_off_chart
 from reports.files import files
 from reports.frame import frame
 from reports.gathered import Gathered
+from reports.methods import short
 from reports.writers import csv_text
 
 TABLES = [name for name, report in REPORTS.items() if report.function.startswith("reports.tables.")]
@@ -54,7 +55,7 @@ def test_names_in_the_charts_do_not_touch(all_trade_offs, scene):
         for panel, texts in panels:
             assert_apart(panel, texts)
             named = {text.get_text().split("\n")[0] for text in texts}
-            assert {mark.point.title for mark in panel.marks if mark.role != "release"} <= named
+            assert {short(m.point.title, m.point.preset) for m in panel.marks if m.role != "release"} <= named
 
 
 def test_it_is_small(measured):
