@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 from padgs.checks import check
 from padgs.splats.clone_split import CloneSplitOptions
