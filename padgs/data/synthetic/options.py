@@ -78,12 +78,15 @@ class SyntheticOptions:
 
     @property
     def title(self) -> str:
-        """What the scene is called. With noisy poses, or seen by two lenses, a room is another scene than the room.
+        """What the scene is called. From a path of another length, with noisy poses, or seen by two lenses, a room is
+        another scene than the room.
 
-        >>> SyntheticOptions(pose_noise_rotation=0.2).title, SyntheticOptions(lens_gap=0.05).title
-        ('synthetic-room-noisy-poses', 'synthetic-room-two-lenses')
+        >>> SyntheticOptions(pose_noise_rotation=0.2).title, SyntheticOptions(reach=1.0, lens_gap=0.05).title
+        ('synthetic-room-noisy-poses', 'synthetic-room-other-path-two-lenses')
         """
         words = ["synthetic", self.scene]
+        if self.reach is not None:
+            words.append("other-path")
         if self.pose_noise_translation or self.pose_noise_rotation:
             words.append("noisy-poses")
         if self.lens_gap or self.lens_k1:
