@@ -34,6 +34,8 @@ def frame(runs: Iterable[Run]) -> DataFrame:
     facts = DataFrame({name: [of(result) for result in results] for name, of in FACTS.items()})
     facts["log"], facts["pictures"] = [run.log for run in runs], [run.pictures for run in runs]
     numbers = DataFrame({name: [of(result) for result in results] for name, of in NUMBERS.items()}, dtype=float)
+    last = [run.log.get("polar_transmittance", ())[-1:] for run in runs]
+    numbers["polar_transmittance"] = [value[0] if value else math.nan for value in last]
     numbers["train_hours"], numbers["fps"] = numbers["train_seconds"] / 3600, 1000 / numbers["frame_ms"]
     rules = _columns([dict(_rules(result)) for result in results], object)
     marks = _columns([dict(_marks(result)) for result in results], float)

@@ -43,6 +43,7 @@ COSTS = {
         Measure("start", Column("started from", 0)),
         Measure("gaussians", Column("Gaussians", 0)),
         Measure("megabytes", Column("model MB", 1, False)),
+        Measure("polar_transmittance", Column("transmittance above 85°", 3, False)),
         Measure("peak_gigabytes", Column("peak GB", 2, False)),
         Measure("peak_gpu_gigabytes", Column("peak GPU GB", 2, False)),
     )

@@ -31,7 +31,7 @@ MEASURES = (
     mark("sphere", "ws_psnr", "sphere"),
     mark("sphere", "ws_psnr_pole", "sphere"),
     replace(CROPPED, column=replace(CROPPED.column, title="PSNR by the paper's protocol")),
-    *costs("start", "gaussians", "cpu_seconds"),
+    *costs("polar_transmittance", "start", "gaussians", "cpu_seconds"),
 )
 PROTOCOLS = ("paper", "sphere")
 

@@ -1,3 +1,4 @@
+import math
 from dataclasses import replace
 
 import pandas as pd
@@ -17,6 +18,12 @@ def test_a_row_a_run_with_its_numbers_conditions_and_keys():
     assert first["resolution"] == "512x256" and first["machine"] == "2 cores of A & B_1, torch 2.13.0"
     assert first["paper rules"] == "paper, LPIPS-vgg fed [0, 1]" and first["config.train.iterations"] == 1500
     assert made["paper/psnr"].isna().tolist() == [False, True]
+
+
+def test_what_was_logged_last_is_a_number_of_the_run():
+    log = {"iteration": [5, 9], "seconds": [1.0, 2.0], "psnr": [20.0, 21.0], "polar_transmittance": [0.2, 0.1]}
+    found = frame([Run(small(25.0), log), Run(small(26.0))])["polar_transmittance"]
+    assert found[0] == 0.1 and math.isnan(found[1])
 
 
 def test_keys_keep_their_values_and_are_none_where_there_are_none():
