@@ -14,7 +14,6 @@ from torch import Tensor
 
 from padgs.sphere.camera import Camera, Panorama
 
-MIN_EXTENT = 0.1  # units of the scene: cameras that hardly move must be able to place Gaussians, too
 ONE_PLACE = 1e-6  # units of the scene; a reach up to here is rounding
 
 
@@ -98,19 +97,6 @@ class Scene:
         """What 3DGS measures with, in world units: 1.1 x the largest distance of a training camera from their mean."""
         centers = torch.stack([view.center for view in self.train])
         return 1.1 * (centers - centers.mean(0)).norm(dim=-1).max().item()
-
-    def extent_of_at_least(self, units: float) -> float:
-        """The extent in world units, but no less than so many units of the scene (`MIN_EXTENT`; 0: as published).
-
-        Raises:
-            ValueError: nothing is left, because the cameras stand in one place.
-        """
-        if self.stands_still and not units > 0:
-            raise ValueError(
-                f"the training cameras of scene {self.name!r} stand in one place, so their extent is 0 and no Gaussian "
-                f"would ever move; set method.min_extent to a share of the scene's unit, such as {MIN_EXTENT}"
-            )
-        return max(self.extent, units * self.unit)
 
     @property
     def stands_still(self) -> bool:

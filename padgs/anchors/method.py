@@ -55,7 +55,7 @@ class PaDGSMethod(Method):
         super().load_state(state)
 
     def _start(self, scene: Scene, iterations: int) -> AnchorTrainee:
-        extent = scene.extent_of_at_least(self.options.min_extent)
+        extent = self.options.extent_of(scene)
         extent /= scene.unit if self.options.offset_rate_unit == "scene" else 1.0
         return self._trainee_of(PaDGS.from_scene(scene, self.options, seed=self.seed), extent, iterations)
 

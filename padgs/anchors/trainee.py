@@ -9,22 +9,22 @@ from torch import Tensor
 
 from padgs.anchors.growth import Growth, GrowthOptions
 from padgs.anchors.model import PaDGS
-from padgs.checks import check, check_known
+from padgs.checks import check_known
+from padgs.learning.extent import ExtentOptions
 from padgs.learning.schedule import Constant, LogLinear, ParameterGroup
 from padgs.learning.trainee import Drawing, Size, State
 from padgs.render import Rendering, RenderOptions, render
-from padgs.scene import MIN_EXTENT, View
+from padgs.scene import View
 
 OFFSET_RATE_UNITS = ("scene", "world")
 
 
 @dataclass(frozen=True)
-class LearningRates:
+class LearningRates(ExtentOptions):
     """Learning rates of Adam; pairs are the first and the last of a log-linear decay over the run."""
 
     offset_rate: tuple[float, float] = (0.01, 0.0001)  # times the extent of the cameras in `offset_rate_unit`
     offset_rate_unit: str = "world"  # world: as released | scene: Scene.unit, so the world's units do not matter
-    min_extent: float = MIN_EXTENT  # units of the scene that its extent counts as at least; 0: as published
     feature_rate: float = 0.0075
     log_scale_rate: float = 0.007
     opacity_rate: tuple[float, float] = (0.002, 2e-5)  # the three networks
@@ -33,7 +33,7 @@ class LearningRates:
 
     def __post_init__(self) -> None:
         check_known(self, offset_rate_unit=OFFSET_RATE_UNITS)
-        check(self, "a length >= 0 in units of the scene", lambda least: least >= 0, "min_extent")
+        super().__post_init__()
 
     def groups(self, model: PaDGS, extent: float, iterations: int) -> list[ParameterGroup]:
         """The parameters of a model with their rates in a run of `iterations`; `extent` in `offset_rate_unit`."""

@@ -31,7 +31,13 @@ RAW_DEVIATIONS = {"opacity": 0.35, "color": 1.0, "covariance": 1.0}  # of the ne
 OPTIONS = RenderOptions(near=0.01)
 NEVER = 1 << 40  # iterations
 LEAST = (1e-30, 1e-30)  # a learning rate that changes no float32, for schedules that have no 0
-STILL = LearningRates(LEAST, "scene", 0.0, 0.0, opacity_rate=LEAST, color_rate=LEAST, covariance_rate=LEAST)
+STILL = LearningRates(
+    offset_rate=LEAST,
+    offset_rate_unit="scene",
+    feature_rate=0.0,
+    log_scale_rate=0.0,
+    **dict.fromkeys(("opacity_rate", "color_rate", "covariance_rate"), LEAST),
+)
 
 
 @dataclass(frozen=True)

@@ -55,7 +55,7 @@ class PlusMethod(SplatMethod):
         if directions > 0:
             sky = far_gaussians(scene, directions, degree=options.sh_degree, opacity=options.initial_opacity)
             splats.load({name: torch.cat((own, sky.rows()[name])) for name, own in splats.rows().items()})
-        extent = scene.extent_of_at_least(options.min_extent)
+        extent = options.extent_of(scene)
         return self._trainee_of(splats, extent, iterations, scene.train, partial(PlusTrainee, limit=limit))
 
     def _trainee_of(

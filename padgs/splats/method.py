@@ -11,26 +11,25 @@ from dataclasses import dataclass
 
 import torch
 
-from padgs.checks import check
+from padgs.learning.extent import ExtentOptions
 from padgs.learning.loop import TrainOptions
 from padgs.learning.method import Method
 from padgs.learning.trainee import State
-from padgs.scene import MIN_EXTENT, Scene, View
+from padgs.scene import Scene, View
 from padgs.splats.clone_split import CloneSplitOptions
 from padgs.splats.model import Splats
 from padgs.splats.trainee import SplatTrainee
 
 
 @dataclass(frozen=True)
-class SplatOptions(CloneSplitOptions):
+class SplatOptions(CloneSplitOptions, ExtentOptions):
     """The `method` group of the configuration: the model, and its densification."""
 
     sh_degree: int = 3  # 0: colours do not depend on the direction
-    min_extent: float = MIN_EXTENT  # units of the scene that its extent counts as at least; 0: as published
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        check(self, "a length >= 0 in units of the scene", lambda least: least >= 0, "min_extent")
+        for part in (CloneSplitOptions, ExtentOptions):
+            part.__post_init__(self)
 
 
 def refuse_polar_threshold(options: SplatOptions, why: str) -> None:
@@ -55,7 +54,7 @@ class SplatMethod(Method):
         splats = Splats.from_scene(
             scene, degree=options.sh_degree, max_gaussians=options.max_gaussians, generator=generator
         )
-        return self._trainee_of(splats, scene.extent_of_at_least(options.min_extent), iterations, scene.train)
+        return self._trainee_of(splats, options.extent_of(scene), iterations, scene.train)
 
     def _blank(self, state: State) -> SplatTrainee:
         stored = state.of_model()

@@ -10,7 +10,7 @@ from padgs.anchors.model import PaDGS
 from padgs.anchors.trainee import LearningRates
 from padgs.learning.loop import Budget, TrainOptions
 from padgs.render.config import RenderConfig
-from padgs.scene import MIN_EXTENT, Scene, View
+from padgs.scene import Scene, View
 from padgs.sphere.panorama import rays
 
 WIDTH, HEIGHT = 48, 24
@@ -143,7 +143,7 @@ def test_a_single_camera_can_still_place_gaussians():
     alone = replace(world, train=world.train[:1])
     method = PaDGSMethod(replace(EAGER, offset_rate_unit="scene"), TORCH)
     next(method.fit(alone, Budget(100)))
-    assert method.trainee.groups()[0].learning_rate(0) == pytest.approx(0.01 * MIN_EXTENT)
+    assert method.trainee.groups()[0].learning_rate(0) == pytest.approx(0.01 * EAGER.min_extent)
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import torch
 from composed import composed
 from tiny_scene import tiny_scene
 
+from padgs.learning.extent import ExtentOptions
 from padgs.learning.loop import Budget
 from padgs.learning.schedule import PUBLISHED_ITERATIONS
 from padgs.render.config import RenderConfig
@@ -96,13 +97,13 @@ def test_lengths_are_measured_with_the_extent_of_cameras_that_move(apart):
     centers = torch.stack([view.center for view in scene.train])
     extent = 1.1 * (centers - centers.mean(0)).norm(dim=-1).max().item()
     assert 0.15 < extent / scene.unit < 0.9
-    assert scene.extent == scene.extent_of_at_least(0.1) == pytest.approx(extent)
+    assert scene.extent == ExtentOptions(0.1).extent_of(scene) == pytest.approx(extent)
 
 
 @pytest.mark.parametrize("apart", [0.0, 1e-8, 0.5])
 def test_lengths_are_measured_with_a_tenth_of_the_unit_where_cameras_hardly_move(apart):
     scene = travelling(tiny_scene(), apart)
-    assert scene.extent_of_at_least(0.1) == pytest.approx(0.1 * scene.unit)
+    assert ExtentOptions(0.1).extent_of(scene) == pytest.approx(0.1 * scene.unit)
 
 
 @pytest.mark.parametrize("release", ["padgs_release", "omnigs_release", "odgs_release", "op43dgs_release"])
@@ -134,6 +135,6 @@ def test_a_method_trains_means_at_the_rate_of_its_scene(scene):
     method = SplatMethod(render=RenderConfig(backend="torch"))
     next(method.fit(scene, Budget(10)))
     means = next(group for group in method.trainee.groups() if group.name == "means")
-    extent = scene.extent_of_at_least(0.1)
+    extent = ExtentOptions(0.1).extent_of(scene)
     assert means.learning_rate(0) == pytest.approx(1.6e-4 * extent)
     assert method.trainee.densifier.extent == extent
