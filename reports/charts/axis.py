@@ -18,20 +18,21 @@ TICKS = 3  # at least
 ROUND = ((1.0,), (1.0, 3.0), (1.0, 2.0, 5.0), (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0))  # leading digits, sparse to dense
 
 
-def window(values: Sequence[float]) -> tuple[float, float]:
+def window(values: Sequence[float], worse: int) -> tuple[float, float]:
     """The smallest and the largest value that an axis shows in its place; what lies beyond stands at the margin.
 
-    The rule is that of box plots (Tukey, Exploratory Data Analysis, 1977): a value is left out if it lies more than
-    1.5 interquartile ranges below the first quartile or above the third. So the middle half of the values always takes
-    a quarter of the axis or more, however far below them a method is, and no more than a quarter of the values is left
-    out at either end. On a logarithmic axis, give logarithms.
+    The rule is that of box plots (Tukey, Exploratory Data Analysis, 1977) at the worse end of the axis (-1 its low, 1
+    its high one, 0 neither): a value is left out if it lies more than 1.5 interquartile ranges beyond the quartile
+    there. So no method squeezes the others by how bad it is, no more than a quarter of the values is left out, and
+    none for being good. On a logarithmic axis, give logarithms.
 
-    >>> window([19.8, 27.4, 27.8, 29.0, 30.0, 31.5]), window([20.0, 30.0])
+    >>> window([19.8, 27.4, 27.8, 29.0, 30.0, 31.5], worse=-1), window([20.0, 30.0], worse=-1)
     ((27.4, 31.5), (20.0, 30.0))
     """
     first, third = np.quantile(values, [0.25, 0.75])
     reach = FENCE * (third - first)
-    kept = [value for value in values if first - reach <= value <= third + reach]
+    low, high = (first - reach if worse < 0 else -math.inf), (third + reach if worse > 0 else math.inf)
+    kept = [value for value in values if low <= value <= high]
     return min(kept), max(kept)
 
 
@@ -44,11 +45,11 @@ class Axis:
     logarithmic: bool
 
     @classmethod
-    def of(cls, values: Sequence[float], logarithmic: bool = False, whole: bool = False) -> Axis:
-        """The axis for some values, all positive if it is logarithmic. A whole one leaves nothing out."""
+    def of(cls, values: Sequence[float], logarithmic: bool = False, worse: int = 0) -> Axis:
+        """The axis for some values, all positive if it is logarithmic; `worse` as for `window`."""
         values = values or [1.0]
         scaled = [math.log10(value) if logarithmic else value for value in values]
-        low, high = (min(scaled), max(scaled)) if whole else window(scaled)
+        low, high = window(scaled, worse)
         if high == low:
             low, high = low - ALONE[logarithmic] / 2, high + ALONE[logarithmic] / 2
         size = high - low

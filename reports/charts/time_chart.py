@@ -75,8 +75,8 @@ def _drawn(trade_off: TradeOff, curves: list[Curve], title: str, size: tuple[flo
     made, axes = figure(1, 1, *size)
     panel, tips = axes[0, 0], Tips()
     presets = [curve.preset for curve in curves]
-    x_axis = Axis.of([s for curve in curves for s in curve.seconds if s > 0], logarithmic=True, whole=True)
-    y_axis = Axis.of([value for curve in curves for value in curve.psnr[len(curve.psnr) // 2 :]])
+    x_axis = Axis.of([s for curve in curves for s in curve.seconds if s > 0], logarithmic=True)
+    y_axis = Axis.of([value for curve in curves for value in curve.psnr[len(curve.psnr) // 2 :]], worse=-1)
     x_axis.dress(panel.xaxis)
     y_axis.dress(panel.yaxis)
     wanted, marks, lines = [], [], []

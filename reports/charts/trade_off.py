@@ -22,7 +22,7 @@ from reports.tables.cells import over_scenes
 from reports.tables.table import Cell
 from reports.unranked import unranked
 
-COSTS = costs("frame_ms", "train_seconds", "gaussians", "megabytes")
+COSTS = costs("frame_ms", "train_seconds", "cpu_seconds", "gaussians", "megabytes")
 QUALITIES = (
     *(mark("sphere", metric) for metric in ("ws_psnr", "ws_lpips_alex")),
     *(mark("paper", metric) for metric in ("psnr", "lpips_vgg_01")),
@@ -68,6 +68,15 @@ class TradeOff:
         method = methods.method_of(preset)
         kin = [p.preset for p in self.points if methods.method_of(p.preset) == method and not _is_released(p.preset)]
         return "main" if preset == (method if method in kin else [*kin, preset][0]) else "variant"
+
+    @property
+    def on_cpu(self) -> bool:
+        """Whether CPU time says how long training takes: it is known of all runs, and none had a GPU.
+
+        Other programs on the machine change it less than they change the time on the clock.
+        """
+        own = self.runs.loc[self.runs["ok"]]
+        return bool(own["cpu_seconds"].notna().all() and own["peak_gpu_gigabytes"].isna().all())
 
     @cached_property
     def unranked(self) -> Collection[str]:

@@ -17,6 +17,7 @@ from reports.gathered import Gathered
 from reports.measures import COSTS
 
 PANELS = (("train_seconds", "training time", "s"), ("frame_ms", "time per frame", "ms"))  # cost, words, unit
+ON_CPU = ("cpu_seconds", "training time on the CPU", "s")  # in place of the first, where it is known of all
 WIDE, NARROW = (5.3, 4.6), (3.7, 4.2)  # inches of a panel: side by side on a page, one above the other on a phone
 LARGEST = {WIDE: 300.0, NARROW: 170.0}  # points^2 of the mark with the most Gaussians
 LETTERS = 55  # of a line below a narrow figure
@@ -46,12 +47,13 @@ def drawn(trade_off: TradeOff, size: tuple[float, float]) -> tuple[Any, Tips, li
     """The figure with panels of a size, what its marks say, and each panel with the names in it."""
     quality, columns = trade_off.qualities[0], len(PANELS) if size == WIDE else 1
     made, axes = figure(columns, len(PANELS) // columns, *size)
-    tips, costs = Tips(), [COSTS[cost] for cost, _, _ in PANELS]
+    shown = (ON_CPU, *PANELS[1:]) if trade_off.on_cpu else PANELS
+    tips, costs = Tips(), [COSTS[cost] for cost, _, _ in shown]
     there = [point for point in trade_off.points if point.value(quality) is not None]
-    y_axis = Axis.of([point.value(quality) or 0.0 for point in there])
-    x_axes = [Axis.of([x for point in there if (x := point.value(cost))], logarithmic=True) for cost in costs]
+    y_axis = Axis.of([point.value(quality) or 0.0 for point in there], worse=-1)
+    x_axes = [Axis.of([x for point in there if (x := point.value(cost))], True, worse=1) for cost in costs]
     panels = []
-    for own, cost, x_axis, (_, words, unit) in zip(axes.flat, costs, x_axes, PANELS, strict=True):
+    for own, cost, x_axis, (_, words, unit) in zip(axes.flat, costs, x_axes, shown, strict=True):
         own.set_xlabel(f"{words}, {unit} ↓")
         own.set_ylabel(f"{quality.column.title}, dB ↑")
         panels.append(Panel(own, trade_off, cost, quality, unit, x_axis, y_axis))
