@@ -34,6 +34,7 @@ class Verdict(Enum):
     TIE = "tie"
     MIXED = "depends on the scene"
     UNTESTABLE = "not testable here"
+    UNDECIDED = "undecided"  # measured, but with too few seeds for an interval
     UNMEASURED = "not measured yet"
 
 
@@ -192,7 +193,7 @@ def _advantages(claim: Claim, ours: DataFrame, others: DataFrame) -> list[float]
 def _verdict(lines: Sequence[Line], claim: Claim) -> Verdict:
     told = [(line.advantage.value or 0.0, line.half_width) for line in lines if line.half_width is not None]
     if not told:
-        return Verdict.UNTESTABLE if claim.dataset and not lines else Verdict.UNMEASURED
+        return Verdict.UNDECIDED if lines else Verdict.UNTESTABLE if claim.dataset else Verdict.UNMEASURED
     right, wrong = any(value > half for value, half in told), any(-value > half for value, half in told)
     if right and wrong:
         return Verdict.MIXED

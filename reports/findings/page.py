@@ -92,7 +92,7 @@ def _reason(claim: Claim, judgement: Judgement, theirs: Mapping[str, float]) -> 
     widths = [line.half_width for line in judgement.lines if line.half_width is not None]
     if judgement.verdict in claim.reasons:
         return claim.reasons[judgement.verdict]
-    if judgement.verdict is Verdict.UNMEASURED and judgement.lines:
+    if judgement.verdict is Verdict.UNDECIDED:
         return "Too few seeds for an interval."
     if judgement.verdict is Verdict.TIE and theirs and min(widths) > max(map(abs, theirs.values())):
         return "Our intervals are wider than the paper's difference."

@@ -55,7 +55,7 @@ def test_scenes_decide_together_and_may_disagree():
 
 def test_two_seeds_are_enough_on_two_scenes_and_too_few_on_one():
     pair, rival = [1, 1.1], [0, 0]
-    assert verdict(runs(pair), runs(rival, "omnigs")) is Verdict.UNMEASURED
+    assert verdict(runs(pair), runs(rival, "omnigs")) is Verdict.UNDECIDED
     assert verdict(runs(pair), runs(rival, "omnigs"), runs(pair, scene="flat"), runs(rival, "omnigs", "flat")) is (
         Verdict.HOLDS
     )
