@@ -36,7 +36,8 @@ TINY_EGONERF = tuple(
 )
 # setting -> overrides that make it small enough for a test
 TINY: dict[str, tuple[str, ...]] = {"egonerf": TINY_EGONERF, "egonerf_small": TINY_EGONERF}
-SLOW: set[str] = set()  # settings that are not fast enough for every run of the tests
+# Settings that only `make test-all` tries: PaD-GS with an option or two that have tests of their own.
+SLOW = {"padgs_small", "padgs_tangent", "padgs_unmodulated"}
 CONF = Path(__file__).resolve().parents[2] / "conf"
 SETTINGS = sorted({*METHODS, *(path.stem for path in (CONF / "method").glob("*.yaml"))})
 EXPLICIT = [name for name in METHODS if issubclass(lookup(METHODS, name, "method"), SplatMethod)]
