@@ -8,7 +8,7 @@ show the whole sphere once, so that it sees what an iteration of a panoramic met
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import replace
 
@@ -23,7 +23,6 @@ from padgs.render.cubemap import FACES, FINENESS
 from padgs.scene import Scene, View
 from padgs.sphere.camera import Panorama, Pinhole
 from padgs.splats.method import SplatMethod, refuse_polar_threshold
-from padgs.splats.model import Splats
 from padgs.splats.trainee import SplatTrainee
 
 
@@ -41,6 +40,7 @@ class CutTrainee(SplatTrainee):
 class Cubemap3DGSMethod(SplatMethod):
     """See `padgs.learning.method.Method`."""
 
+    TRAINEE = CutTrainee
     RENDER = RenderConfig(projection="pinhole", cubemap=True)
     _views_each = 1  # training views of an iteration; of the scene of `fit`
 
@@ -84,13 +84,3 @@ class Cubemap3DGSMethod(SplatMethod):
 
     def _trained_by(self, trainee: Trainee, scene: Scene, budget: Budget, stage: Stage) -> Trainer:
         return Trainer(trainee, scene, budget, self.train_options, self.seed, views_each=self._views_each, stage=stage)
-
-    def _trainee_of(
-        self,
-        splats: Splats,
-        extent: float,
-        iterations: int,
-        views: Sequence[View] = (),
-        kind: Callable[..., SplatTrainee] = CutTrainee,
-    ) -> SplatTrainee:
-        return super()._trainee_of(splats, extent, iterations, views, kind)

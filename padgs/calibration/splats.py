@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -87,6 +86,7 @@ class CalibratedTrainee(SplatTrainee):
 class CalibratedMethod(SplatMethod):
     """A method whose cameras learn, too; a subclass says which calibration they have."""
 
+    TRAINEE = CalibratedTrainee
     _calibration: Calibration  # what the next trainee is made with
 
     @abstractmethod
@@ -105,13 +105,6 @@ class CalibratedMethod(SplatMethod):
         self._calibration = self._as_stored(state.of_model().values["calibration"])
         return super()._blank(state)
 
-    def _trainee_of(
-        self,
-        splats: Splats,
-        extent: float,
-        iterations: int,
-        views: Sequence[View] = (),
-        kind: Callable[..., SplatTrainee] = CalibratedTrainee,
-    ) -> SplatTrainee:
+    def _trainee_of(self, splats: Splats, *args: Any, **more: Any) -> SplatTrainee:
         self._calibration.to(splats.means.device)
-        return super()._trainee_of(splats, extent, iterations, views, partial(kind, calibration=self._calibration))
+        return super()._trainee_of(splats, *args, calibration=self._calibration, **more)

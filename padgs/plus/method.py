@@ -9,8 +9,6 @@ it away (`+experiment=plus_ablation`).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from functools import partial
 
 import torch
 
@@ -34,6 +32,7 @@ class PlusMethod(SplatMethod):
     """See `padgs.learning.method.Method`."""
 
     Options = PlusOptions
+    TRAINEE = PlusTrainee
     RENDER = RenderConfig(projection="ray", low_pass=0.2, near=0.05)
     TRAIN = TrainOptions(weight="solid_angle")
 
@@ -55,18 +54,7 @@ class PlusMethod(SplatMethod):
         if directions > 0:
             sky = far_gaussians(scene, directions, degree=options.sh_degree, opacity=options.initial_opacity)
             splats.load({name: torch.cat((own, sky.rows()[name])) for name, own in splats.rows().items()})
-        extent = options.extent_of(scene)
-        return self._trainee_of(splats, extent, iterations, scene.train, partial(PlusTrainee, limit=limit))
-
-    def _trainee_of(
-        self,
-        splats: Splats,
-        extent: float,
-        iterations: int,
-        views: Sequence[View] = (),
-        kind: Callable[..., SplatTrainee] = PlusTrainee,
-    ) -> SplatTrainee:
-        return super()._trainee_of(splats, extent, iterations, views, kind)
+        return self._trainee_of(splats, options.extent_of(scene), iterations, scene.train, limit=limit)
 
 
 def _fewest(most: int | None, share: float | None, pixels: float) -> int | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import torch
 
@@ -46,6 +47,7 @@ class SplatMethod(Method):
     """See `padgs.learning.method.Method`; a subclass says which options, and how it is drawn."""
 
     Options = SplatOptions
+    TRAINEE: ClassVar[Callable[..., SplatTrainee]] = SplatTrainee
     TRAIN = TrainOptions(weight="uniform")
 
     def _start(self, scene: Scene, iterations: int) -> SplatTrainee:
@@ -63,14 +65,10 @@ class SplatMethod(Method):
         return self._trainee_of(splats, values["extent"], values["iterations"])
 
     def _trainee_of(
-        self,
-        splats: Splats,
-        extent: float,
-        iterations: int,
-        views: Sequence[View] = (),
-        kind: Callable[..., SplatTrainee] = SplatTrainee,
+        self, splats: Splats, extent: float, iterations: int, views: Sequence[View] = (), **more: Any
     ) -> SplatTrainee:
-        return kind(
+        """A trainee of the kind that this method has; `more` is what that kind takes besides."""
+        return self.TRAINEE(
             splats,
             self.options,
             self.render_config,
@@ -78,4 +76,5 @@ class SplatMethod(Method):
             iterations=iterations,
             views=views,
             seed=self.seed,
+            **more,
         )
