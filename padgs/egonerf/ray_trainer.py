@@ -30,7 +30,7 @@ class RayTrainer(Trainer):
         trainee: EgoNeRFTrainee,
         scene: Scene,
         budget: Budget,
-        options: TrainOptions = TrainOptions(weight="uniform", learning_rates="published"),  # noqa: B008 - frozen
+        options: TrainOptions,
         seed: int = 0,
         *,
         rays: int,

@@ -11,6 +11,7 @@ from padgs.learning.failure import Failure
 from padgs.learning.loop import Budget, TrainOptions
 from padgs.learning.schedule import Constant, ParameterGroup
 from padgs.learning.trainee import State
+from padgs.scene import Scene
 
 
 class Flat:
@@ -44,9 +45,9 @@ class Flat:
         self.color.data = state.tensors["color"].clone()
 
 
-def trainer(model: Flat, iterations: int = 400, **options) -> RayTrainer:
-    weight = TrainOptions(weight=options.pop("weight", "uniform"), learning_rates="published")
-    return RayTrainer(model, tiny_scene(), Budget(iterations), weight, seed=3, rays=200)
+def trainer(model: Flat, iterations: int = 400, weight: str = "uniform", scene: Scene | None = None) -> RayTrainer:
+    options = TrainOptions(weight=weight, learning_rates="published")
+    return RayTrainer(model, scene or tiny_scene(), Budget(iterations), options, seed=3, rays=200)
 
 
 def test_the_mean_colour_is_learned():
@@ -65,7 +66,7 @@ def test_reading_the_images_is_training_time():
         return (views[0].image() * 255).round().to(torch.uint8)
 
     first = replace(views[0], load_pixels=slow)
-    run = RayTrainer(Flat(), replace(tiny_scene(), train=(first, *views[1:])), Budget(10), seed=3, rays=200)
+    run = trainer(Flat(), 10, scene=replace(tiny_scene(), train=(first, *views[1:])))
     reading = run.seconds
     assert reading >= 0.05 and next(run.records()).seconds > reading
 
@@ -111,7 +112,7 @@ def test_resuming_changes_nothing(stop):
 
 def test_a_state_of_other_data_is_refused():
     state = trainer(Flat(), 5).state()
-    other = RayTrainer(Flat(), replace(tiny_scene(), train=tiny_scene().train[:2]), Budget(5), rays=10)
+    other = trainer(Flat(), 5, scene=replace(tiny_scene(), train=tiny_scene().train[:2]))
     with pytest.raises(ValueError, match="a run on 2560 pixels, but the training views have 1024"):
         other.load_state(state)
 
