@@ -45,7 +45,7 @@ class Record:
     iteration: int  # 1 for the first step
     loss: float | Tensor  # a scalar on the GPU where nobody has read it yet: `float` of it waits for the iteration
     seconds: float  # training time so far, evaluation and files excluded
-    cpu_seconds: float  # the same of all threads of the process on the CPU, which other programs hardly change
+    cpu_seconds: float  # the same of all threads of the process on the CPU, which other programs change less
     counts: dict[str, int] = field(default_factory=dict)  # anchors, gaussians drawn, ...
     events: tuple[str, ...] = ()  # what happened besides the step: "grew 120 anchors", ...
 

@@ -23,7 +23,7 @@ class PlusOptions(SplatOptions):
 
     sh_degree: int = 2  # a degree more each tenth of the run; the third gains nothing and costs a fifth of the time
     signal: str = "space_absolute"  # the pull on the mean itself, in no image plane and at no latitude
-    gradient_threshold: float = 1e-4  # twice SPaGS's: half of the Gaussians for the same quality
+    gradient_threshold: float = 1e-4  # twice SPaGS's: fewer Gaussians, where a scene needs more at a loss
     sample_clones: bool = True
     min_opacity: float = 0.05  # what is fainter when a round ends was not needed
     start_share: float | None = 0.29  # points to begin with, per independent pixel of a view; None: all that there are
@@ -44,7 +44,6 @@ class PlusOptions(SplatOptions):
         check(self, "a share of the run in [0, 0.1]", lambda share: 0 <= share <= 0.1, "average_share")
         for name in ("start_share", "limit_share"):
             check(self, "> 0, or none for no limit", lambda share: share is None or share > 0, name)
-
         for field in fields(CloneSplitOptions):
             if field.name in SCHEDULE and getattr(self, field.name) != field.default:
                 raise ValueError(
