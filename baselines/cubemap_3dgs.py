@@ -15,7 +15,8 @@ from dataclasses import replace
 from torch import Tensor
 
 from padgs.data.perspectives import perspective_scene, solid_angle, square_lens
-from padgs.learning.loop import Budget, Record, Stage, Trainer
+from padgs.learning.budget import Budget
+from padgs.learning.loop import Record, Stage, Trainer
 from padgs.learning.trainee import Trainee
 from padgs.render import RenderOptions
 from padgs.render.config import RenderConfig

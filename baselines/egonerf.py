@@ -10,7 +10,8 @@ from padgs.egonerf.model import EgoNeRF
 from padgs.egonerf.options import EgoNeRFOptions
 from padgs.egonerf.ray_trainer import RayTrainer
 from padgs.egonerf.trainee import EgoNeRFTrainee, EgoNeRFTraining
-from padgs.learning.loop import Budget, Stage, TrainOptions
+from padgs.learning.budget import Budget
+from padgs.learning.loop import Stage, TrainOptions
 from padgs.learning.method import Method
 from padgs.learning.trainee import State
 from padgs.render.config import RenderConfig

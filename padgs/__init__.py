@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from padgs.data import load as load_scene
-    from padgs.learning.loop import Budget
+    from padgs.learning.budget import Budget
     from padgs.multirun.composition import make_method
     from padgs.runs.opened import draw, load_run
     from padgs.sphere.distortion import distortion_map

@@ -65,7 +65,7 @@ class Result:
     scene: str
     width: int  # of the test views, pixels
     height: int
-    iterations: int  # asked for
+    iterations: int  # asked for; those that were done, where seconds were asked for
     iterations_done: int
     seed: int
     code_version: str

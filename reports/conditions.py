@@ -12,14 +12,13 @@ from reports.request import Request
 from reports.tables.table import ReportError
 
 # Columns of the frame; the protocol's are its rules.
-CONDITIONS = ("protocol", "resolution", "iterations", "learning_rates", "data")
-OF_A_DATA_SET = ("protocol", "resolution", "iterations", "learning_rates")  # scenes may differ, rules may not
+CONDITIONS = ("protocol", "resolution", "length", "learning_rates", "data")
+OF_A_DATA_SET = ("protocol", "resolution", "length", "learning_rates")  # scenes may differ, rules may not
 OF_A_SWEEP = ("protocol", "machine")  # all else shows as a changed key
 OF_A_POINT = ("data",)  # the folder of the data is no part of a setting
 OF_A_CHART = ("protocol", "resolution", "learning_rates", "data", "machine")
 OF_A_MEAN = (*OF_A_DATA_SET, "machine")  # of one setting over the scenes of a data set
 OF_TIMES = (*CONDITIONS, "machine")
-OF_EQUAL_TIMES = ("protocol", "resolution", "learning_rates", "data", "machine")
 PUBLISHED_LENGTHS = {"egonerf": 100_000}  # iterations; of the others 30 000, which tables of the paper have
 PUBLISHED_WIDTH = 1920  # pixels; the narrowest panoramas of the paper
 PUBLISHED_PIXELS = {  # preset -> what of it means something else in narrower panoramas
@@ -46,7 +45,7 @@ def refuse_mixture(runs: DataFrame, request: Request, where: str, conditions: It
 
 
 def footnotes(blocks: Mapping[str, DataFrame], protocol: str) -> list[str]:
-    """Protocol with all its rules, resolution, iterations, learning rates, seeds, code version and machine of the runs
+    """Protocol with all its rules, resolution, length, learning rates, seeds, code version and machine of the runs
     of blocks, in a sentence for all blocks that share them.
     """
     titles: dict[str, list[str]] = {}
@@ -71,8 +70,7 @@ def _sentence(runs: DataFrame, protocol: str) -> str:
     rules, sizes, lengths, rates, seeds, versions, machines = (
         " / ".join(map(str, values.unique())) or "none" for values in columns.values()
     )
-    length = f"{lengths} iterations, learning rates {rates}"
-    return f"protocol {rules}, {sizes}, {length}, seeds {seeds}, padgs {versions}, {machines}."
+    return f"protocol {rules}, {sizes}, {lengths}, learning rates {rates}, seeds {seeds}, padgs {versions}, {machines}."
 
 
 def _values(runs: DataFrame, what: str, protocol: str) -> pd.Series:

@@ -59,9 +59,8 @@ def by_conditions(runs: DataFrame, *columns: str) -> dict[str, DataFrame]:
     """The runs of each scene that agree in some more columns, in the order of the tables, by what tells them apart."""
     found = {}
     for place, own in by_place(runs).items():
-        for values, alike in grouped(own.sort_values(list(columns), kind="stable"), *columns):
-            words = [f"{v} iterations" if c == "iterations" else v for c, v in zip(columns, values, strict=True)]
-            found[", ".join([place.title, *words])] = alike
+        for values, alike in grouped(own.sort_values(["resolution", "iterations"], kind="stable"), *columns):
+            found[", ".join([place.title, *values])] = alike
     return found
 
 
@@ -98,6 +97,7 @@ FACTS: Mapping[str, Callable[[Result], Any]] = {
     "place": lambda result: Place(result.dataset, result.scene),
     "resolution": lambda result: f"{result.width}x{result.height}",
     "data": lambda result: result.fingerprint[:10],
+    "length": lambda result: _length(result),
     "learning_rates": lambda result: _learning_rates(result),
     "hardware": hardware,
     "machine": machine,
@@ -141,6 +141,14 @@ def _marks(result: Result) -> Iterator[tuple[str, float | None]]:
     for name, scores in result.scores.items():
         for metric, value in scores.metrics.items():
             yield f"{name}/{metric}", value
+
+
+def _length(result: Result) -> str:
+    """How long a run was asked to be: iterations, or time."""
+    budget = result.config.get("budget")
+    if budget is None:
+        return f"{result.iterations} iterations"
+    return f"{budget['seconds']:g} s{' of CPU time' if budget['clock'] == 'cpu' else ''}"
 
 
 def _learning_rates(result: Result) -> Any:

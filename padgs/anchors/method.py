@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from padgs.anchors.growth import GrowthOptions
 from padgs.anchors.model import PaDGS, PaDGSOptions
 from padgs.anchors.trainee import AnchorTrainee, LearningRates
-from padgs.learning.loop import Budget, Record, Stage
+from padgs.learning.budget import Budget
+from padgs.learning.loop import Record, Stage
 from padgs.learning.method import Method
 from padgs.learning.schedule import PUBLISHED_ITERATIONS
 from padgs.learning.trainee import State

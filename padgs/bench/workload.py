@@ -18,7 +18,8 @@ from torch import Tensor
 from padgs.anchors.growth import GrowthOptions
 from padgs.anchors.model import PaDGS
 from padgs.anchors.trainee import AnchorTrainee, LearningRates
-from padgs.learning.loop import Budget, Stage, Trainer
+from padgs.learning.budget import Budget
+from padgs.learning.loop import Stage, Trainer
 from padgs.render import RenderOptions
 from padgs.scene import Scene, View
 

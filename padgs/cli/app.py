@@ -10,7 +10,6 @@ import padgs
 from padgs.cli.bench import bench
 from padgs.cli.check import check
 from padgs.cli.convert import convert
-from padgs.cli.equal_time import equal_time
 from padgs.cli.prepare import prepare
 from padgs.cli.report import report
 from padgs.cli.track import track
@@ -32,7 +31,7 @@ def commands(
     """Panoramic Gaussian splatting, measured fairly."""
 
 
-for command in (bench, check, convert, equal_time, prepare, report, track):
+for command in (bench, check, convert, prepare, report, track):
     app.command()(command)
 
 

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from padgs.egonerf.ray_pixels import RayPixels
 from padgs.egonerf.trainee import EgoNeRFTrainee
-from padgs.learning.loop import Budget, Stage, Trainer, TrainOptions
+from padgs.learning.budget import Budget
+from padgs.learning.loop import Stage, Trainer, TrainOptions
 from padgs.learning.trainee import Trainee
 from padgs.scene import Scene
 
@@ -57,7 +58,7 @@ class RayTrainer(Trainer):
         # Reading images is training, as it is where they are read view by view.
         self.seconds, self.cpu_seconds = time.perf_counter() - started, time.process_time() - started_cpu
 
-    def _step(self, iteration: int) -> tuple[float | Tensor, dict[str, int], tuple[str, ...]]:
+    def _step(self, iteration: int, moment: int) -> tuple[float | Tensor, dict[str, int], tuple[str, ...]]:
         tracer, optimiser, generator = self._tracer, self._optimiser, self._pixels.generator
         with self._stage("target"):
             rays = self._pixels.draw(self._rays)
@@ -65,7 +66,7 @@ class RayTrainer(Trainer):
         total = 3 * rays.weight.sum()
         for part in torch.arange(self._rays, device=total.device).split(tracer.rays_at_once):
             with self._stage("draw"):
-                image = tracer.colors(rays.origins[part], rays.directions[part], generator, iteration)
+                image = tracer.colors(rays.origins[part], rays.directions[part], generator, moment)
             error = (image - rays.color[part]).square() * rays.weight[part, None]
             loss = error.sum() / total
             value += loss.detach()
@@ -75,11 +76,11 @@ class RayTrainer(Trainer):
             with self._stage("backward"):
                 loss.backward()
         with self._stage("backward"):
-            extra = tracer.regularisation(iteration)
+            extra = tracer.regularisation(moment)
             if extra is not None:
                 extra.backward()
         optimiser.check(iteration)
         with self._stage("optimiser"):
-            optimiser.step(iteration)
+            optimiser.step(moment)
         events = (tracer.summary(),) if iteration == 1 else ()
         return self._read(value, iteration), {**tracer.counts(), "rays": self._rays}, events

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from padgs.checks import check, check_known
+from padgs.learning.budget import Budget
 from padgs.learning.failure import Failure, is_out_of_memory
 from padgs.learning.loss import NORMALISATIONS, ROW_WEIGHTS, photometric_loss
 from padgs.learning.optimiser import Optimiser
@@ -31,18 +32,11 @@ Stage = Callable[[str], AbstractContextManager[object]]  # entered with the name
 
 
 @dataclass(frozen=True)
-class Budget:
-    """How long a method may train."""
-
-    iterations: int
-    max_seconds: float | None = None  # training time, evaluation excluded
-
-
-@dataclass(frozen=True)
 class Record:
     """One training iteration, after the optimiser step."""
 
     iteration: int  # 1 for the first step
+    progress: float  # share of the schedule, 1 for the last step
     loss: float | Tensor  # a scalar on the GPU where nobody has read it yet: `float` of it waits for the iteration
     seconds: float  # training time so far, evaluation and files excluded
     cpu_seconds: float  # the same of all threads of the process on the CPU, which other programs change less
@@ -76,7 +70,8 @@ class Trainer:
     """Optimises a trainee on the training views of a scene, by default one random view per iteration.
 
     Attributes:
-        iteration, seconds, cpu_seconds: how far it is, and what that took.
+        iteration, seconds, cpu_seconds: steps that were taken, and what they took.
+        moment: iteration of the schedule that the last step stood for; another one in budgets of seconds only.
         start: how many Gaussians, anchors or other parts the trainee had at the beginning.
 
     Between two records `state` holds all that continuing bit-identically needs (on the CPU); `load_state` goes back
@@ -84,7 +79,7 @@ class Trainer:
     """
 
     ADAM: ClassVar[dict[str, Any]] = {"betas": (0.9, 0.999), "eps": 1e-15}  # of 3DGS: single Gaussians pull tiny
-    PROGRESS = ("iteration", "seconds", "cpu_seconds", "start")
+    PROGRESS = ("iteration", "moment", "schedule", "seconds", "cpu_seconds", "step_seconds", "start")
 
     def __init__(
         self,
@@ -104,8 +99,9 @@ class Trainer:
             views_each: views that an iteration draws one after the other, before Adam steps on the sum of their losses.
             stage: for whoever wants to know what an iteration spends its time on.
         """
-        self.iteration = 0
-        self.seconds = self.cpu_seconds = 0.0
+        self.iteration = self.moment = 0
+        self.schedule = budget.iterations
+        self.seconds = self.cpu_seconds = self.step_seconds = 0.0
         self.start = next(iter(trainee.counts().values()))
         self._trainee, self._scene, self._budget, self._options, self._stage = trainee, scene, budget, options, stage
         self._views_each = views_each
@@ -125,34 +121,43 @@ class Trainer:
             Failure: nan (a loss, gradient or parameter is not finite; the reason names it and the iteration), oom, or
                 collapsed (nothing is left to draw). The model is of no use then.
         """
-        limit = self._budget.max_seconds
-        while self.iteration < self._budget.iterations and (limit is None or self.seconds < limit):
+        budget, limit = self._budget, self._budget.max_seconds
+        while self.moment < budget.iterations and (limit is None or self.seconds < limit):
             started, iteration = (time.perf_counter(), time.process_time()), self.iteration + 1
+            moment = budget.moment(self.moment, self.spent, self.step_seconds)
             try:
-                loss, counts, events = self._step(iteration)
+                loss, counts, events = self._step(iteration, moment)
             except (MemoryError, RuntimeError) as error:
                 if isinstance(error, Failure) or not is_out_of_memory(error):
                     raise
                 raise Failure("oom", f"out of memory at iteration {iteration}: {error}") from error
-            if iteration == self._budget.iterations:
+            if moment == budget.iterations:
                 self._optimiser.refuse_non_finite(self._optimiser.parameters(), iteration)
-            self.iteration = iteration
+            self.iteration, self.moment, before = iteration, moment, self.spent
             self.seconds += time.perf_counter() - started[0]
             self.cpu_seconds += time.process_time() - started[1]
-            yield Record(iteration, loss, self.seconds, self.cpu_seconds, counts, events)
+            self.step_seconds = self.spent - before
+            progress = moment / budget.iterations
+            yield Record(iteration, progress, loss, self.seconds, self.cpu_seconds, counts, events)
 
-    def _step(self, iteration: int) -> tuple[float | Tensor, dict[str, int], tuple[str, ...]]:
+    @property
+    def spent(self) -> float:
+        """Seconds of training so far, on the clock of the budget."""
+        return self.seconds if self._budget.clock == "wall" else self.cpu_seconds
+
+    def _step(self, iteration: int, moment: int) -> tuple[float | Tensor, dict[str, int], tuple[str, ...]]:
         """One iteration. Returns loss (a mean over its views), counts and events of its record."""
         trainee, optimiser, stage = self._trainee, self._optimiser, self._stage
-        losses, drawn = zip(*(self._pull(iteration) for _ in range(self._views_each)), strict=True)
+        losses, drawn = zip(*(self._pull(iteration, moment) for _ in range(self._views_each)), strict=True)
         optimiser.check(iteration)
         with stage("optimiser"):
-            optimiser.step(iteration)
+            optimiser.step(moment)
         with stage("adapt"), torch.no_grad():
-            events = trainee.adapt(iteration, optimiser.adam)
+            passed = range(self.moment + 1, moment + 1)  # all that comes at a moment of the schedule comes once
+            events = tuple(event for one in passed for event in trainee.adapt(one, optimiser.adam))
         return sum(losses) / len(losses), {**trainee.counts(), "drawn": max(drawn)}, events
 
-    def _pull(self, iteration: int) -> tuple[float | Tensor, int]:
+    def _pull(self, iteration: int, moment: int) -> tuple[float | Tensor, int]:
         """Draw the next view and add its gradients. Returns its loss, and how many Gaussians were drawn."""
         trainee, optimiser, stage, options = self._trainee, self._optimiser, self._stage, self._options
         with stage("target"):
@@ -185,7 +190,7 @@ class Trainer:
         with stage("backward"):
             loss.backward()
         with stage("observe"), torch.no_grad():
-            trainee.observe(drawing, iteration)
+            trainee.observe(drawing, moment)
         return value, len(drawing.gaussians)  # and the graph is gone before rows of its leaves come and go
 
     def _read(self, loss: Tensor, iteration: int) -> float | Tensor:

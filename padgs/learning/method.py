@@ -9,13 +9,20 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import nullcontext
+from dataclasses import replace
 from typing import Any, ClassVar
 
-from padgs.learning.loop import Budget, Record, Stage, Trainer, TrainOptions
+import torch
+
+from padgs.learning.budget import Budget
+from padgs.learning.loop import Record, Stage, Trainer, TrainOptions
+from padgs.learning.schedule import PUBLISHED_ITERATIONS
 from padgs.learning.trainee import Size, State, Trainee
 from padgs.render import Rendering
 from padgs.render.config import RenderConfig
 from padgs.scene import Scene, View
+
+REHEARSED = 0.02  # share of a budget of seconds after which the speed of a method is known
 
 
 class Method(ABC):
@@ -50,14 +57,26 @@ class Method(ABC):
 
         The caller may stop between two records, at any time, and call `state()` then. `stage`: see `Trainer`.
 
+        With seconds instead of iterations a few steps are taken first and thrown away, on account of the seconds: they
+        say how many iterations the schedule is written for.
+
         Raises:
             ValueError: at once: the scene, or what is asked for, is nothing for this method.
             Failure: while training: the run ends with a status other than ok.
         """
         if not scene.train:
             raise ValueError(f"scene {scene.name!r} has no training view; mend its split")
+        spent = {"seconds": 0.0, "cpu_seconds": 0.0}
+        if budget.seconds is not None:
+            if self._loaded is None:
+                length, spent = self._rehearsed(scene, budget)
+            else:
+                length = self._loaded.values["schedule"]
+            budget = replace(budget, iterations=length)
         self._trainee = self._start(scene, budget.iterations)
         self._trainer = self._trained_by(self._trainee, scene, budget, stage)
+        self._trainer.seconds += spent["seconds"]
+        self._trainer.cpu_seconds += spent["cpu_seconds"]
         if self._loaded is not None:
             self._trainer.load_state(self._loaded)
             self._loaded = None
@@ -116,6 +135,22 @@ class Method(ABC):
     @abstractmethod
     def _blank(self, state: State) -> Trainee:
         """A trainee that can load the model of this state, to be looked at; `fit` makes another one."""
+
+    def _rehearsed(self, scene: Scene, budget: Budget) -> tuple[int, dict[str, float]]:
+        """How many iterations a budget of seconds should do, and what it took to find out."""
+        assert budget.seconds is not None
+        random, first = torch.get_rng_state(), 0.0
+        short = replace(budget, iterations=PUBLISHED_ITERATIONS, seconds=None)
+        trainer = self._trained_by(self._start(scene, short.iterations), scene, short, nullcontext)
+        for record in trainer.records():
+            if record.iteration == 1:  # which does what is done but once
+                first = trainer.spent
+            elif trainer.spent >= REHEARSED * budget.seconds:
+                break
+        torch.set_rng_state(random)
+        each = (trainer.spent - first) / (trainer.iteration - 1)
+        length = max(2, round((budget.seconds - trainer.spent) / each))
+        return length, {"seconds": trainer.seconds, "cpu_seconds": trainer.cpu_seconds}
 
     def _trained_by(self, trainee: Trainee, scene: Scene, budget: Budget, stage: Stage) -> Trainer:
         """The loop that it is trained in."""

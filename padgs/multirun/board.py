@@ -33,7 +33,6 @@ class JobState:
 
     status: str = WAITING
     run: str = ""  # its run folder, once it is known
-    iterations: int = 0  # that the run goes to
     reason: str = ""  # why it failed
     data: str | None = None  # folder of the data set, absolute; None for a generated scene
 
@@ -98,9 +97,9 @@ class BoardEntry(Watch):
         self._board, self._number, self._state = board, number, JobState(RUNNING)
         self._board.write(number, self._state)
 
-    def started(self, folder: Path, iterations: int) -> None:
+    def started(self, folder: Path) -> None:
         """The run is known."""
-        self._state = replace(self._state, run=folder.name, iterations=iterations, data=self.data)
+        self._state = replace(self._state, run=folder.name, data=self.data)
         self._board.write(self._number, self._state)
 
     def stop_requested(self) -> bool:

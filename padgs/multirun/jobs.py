@@ -20,7 +20,7 @@ from padgs.multirun.board import CRASHED, ELSEWHERE, KILLED, OK, REFUSED, RUNNIN
 from padgs.multirun.finished import FinishedJobs
 from padgs.multirun.job import complain, in_own_process
 from padgs.multirun.launchers import patient
-from padgs.multirun.overview import Overview, iterations_done, shown
+from padgs.multirun.overview import Overview, share_done, shown
 from padgs.results import Result, ResultError
 from padgs.runs.folder import RunFolder, cannot_write
 from padgs.runs.identity import labels
@@ -106,9 +106,9 @@ class Multirun:
         """How things stand."""
         self._follow(index for index, state in self.states.items() if not state.ended and self._numbers[index] >= 0)
         progress = {
-            index: min(1.0, iterations_done(self.runs / state.run) / state.iterations)
+            index: share_done(self.runs / state.run)
             for index, state in self.states.items()
-            if state.status == RUNNING and state.iterations
+            if state.status == RUNNING and state.run
         }
         return Overview(self.before, dict(self.states), time.monotonic() - self._began, progress)
 

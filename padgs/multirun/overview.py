@@ -31,7 +31,7 @@ class Overview:
     before: Counter[str]  # status -> runs that were finished when it started
     jobs: Mapping[int, JobState]
     seconds: float  # since it started
-    progress: Mapping[int, float]  # job -> share of its iterations, for those that run
+    progress: Mapping[int, float]  # job -> share of its training, for those that run
 
     @property
     def counts(self) -> Counter[str]:
@@ -80,9 +80,9 @@ class Overview:
         return table
 
 
-def iterations_done(run: Path) -> int:
-    """The last iteration that the log of a run speaks of; 0 if there is none."""
-    return max((line["iteration"] for line in results.log_lines(run, TAIL)), default=0)
+def share_done(run: Path) -> float:
+    """The share of its training that a run has behind it by the last line of its log; 0 if there is none."""
+    return max((line.get("progress", 0.0) for line in results.log_lines(run, TAIL)), default=0.0)
 
 
 @contextmanager

@@ -9,7 +9,8 @@ from typing import Any
 
 from baselines import METHODS
 from padgs.data.options import DataOptions, DataSettings
-from padgs.learning.loop import Budget, TrainOptions
+from padgs.learning.budget import Budget
+from padgs.learning.loop import TrainOptions
 from padgs.learning.schedule import PUBLISHED_ITERATIONS
 from padgs.registry import lookup
 from padgs.render.config import RenderConfig
@@ -45,13 +46,18 @@ class TrainConfig(TrainOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.iterations < 1:
-            raise ValueError(f"iterations is {self.iterations}; it must be at least 1")
+        Budget(self.iterations, self.max_seconds)
 
-    @property
-    def budget(self) -> Budget:
-        """How long the method may train."""
-        return Budget(self.iterations, self.max_seconds)
+
+@dataclass(frozen=True)
+class BudgetOptions:
+    """The `budget` group: what a run may spend, instead of `train.iterations`."""
+
+    seconds: float | None = None  # of training: schedules follow the clock, and the run ends on time
+    clock: str = "wall"  # wall | cpu: cpu counts what the process itself takes, whatever else the machine does
+
+    def __post_init__(self) -> None:
+        Budget(1, seconds=self.seconds, clock=self.clock)
 
 
 @dataclass(frozen=True)
@@ -94,6 +100,7 @@ class Settings:
     data: DataConfig = DataConfig()
     render: RenderConfig = RenderConfig()
     train: TrainConfig = TrainConfig()
+    budget: BudgetOptions = BudgetOptions()
     run: RunOptions = RunOptions()
     tracking: TrackingOptions = TrackingOptions()
     variant: str = ""  # name of this setting within an experiment, such as a row of the ablation
@@ -119,9 +126,18 @@ class RunConfig(Settings):
         """The name of the method's settings: its own, or that of a file in conf/method."""
         return self.labels.preset or self.method
 
+    @property
+    def time(self) -> Budget:
+        """How long the method may train."""
+        return Budget(self.train.iterations, self.train.max_seconds, self.budget.seconds, self.budget.clock)
+
     def values(self) -> dict[str, Any]:
-        """The configuration of a run as plain values in the shape of the YAML files, defaults included."""
+        """The configuration of a run as plain values in the shape of the YAML files, defaults included.
+
+        A budget in seconds is there only if it is one: runs without are the same as before there were any.
+        """
         return {
+            **({} if self.budget.seconds is None else {"budget": asdict(self.budget)}),
             "data": asdict(self.data),
             "method": {"name": self.method, **asdict(self.options)},
             "render": asdict(self.render),

@@ -40,6 +40,7 @@ class Progress:
     iteration: int = 0
     seconds: float = 0.0  # of training
     cpu_seconds: float = 0.0
+    share: float = 0.0  # of the schedule
 
 
 class RunFolder:
@@ -101,8 +102,8 @@ class RunFolder:
 
     def log(self, record: Record, probed: Mapping[str, float]) -> None:
         """Append a line to log.jsonl; `probed` is what a held-out view said, empty where it was not asked."""
-        line: dict[str, Any] = {"iteration": record.iteration, "loss": float(record.loss)}
-        line |= {"seconds": round(record.seconds, 4), **record.counts, **probed}
+        line: dict[str, Any] = {"iteration": record.iteration, "progress": round(record.progress, 6)}
+        line |= {"loss": float(record.loss), "seconds": round(record.seconds, 4), **record.counts, **probed}
         if record.events:
             line["events"] = list(record.events)
         with self._writing(), self._log.open("a") as file:

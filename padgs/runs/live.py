@@ -54,30 +54,29 @@ class Display:
 
 
 class LiveLine(Display):
-    """Of one run: iteration, loss, held-out PSNR, counts, iterations per second and the time that is left."""
+    """Of one run: iteration and share of the run, loss, held-out PSNR, counts, speed and the time that is left."""
 
-    def __init__(self, console: Console, iterations: int) -> None:
+    def __init__(self, console: Console) -> None:
         super().__init__(console, redraw=1 / REDRAWS_PER_SECOND, line=SECONDS_BETWEEN_LINES)
-        self._iterations = iterations
-        self._times: deque[tuple[int, float]] = deque(maxlen=RECENT)
+        self._times: deque[tuple[int, float, float]] = deque(maxlen=RECENT)
         self._psnr: float | None = None
 
     def update(self, record: Record, psnr: float | None) -> None:
         """Take in a record and, where it was measured, the PSNR of the held-out view."""
-        self._times.append((record.iteration, time.monotonic()))
+        self._times.append((record.iteration, record.progress, time.monotonic()))
         self._psnr = self._psnr if psnr is None else psnr
-        if self.is_due or len(self._times) == 1 or record.iteration == self._iterations:
+        if self.is_due or len(self._times) == 1 or record.progress == 1:
             self.show(self._line(record))
 
     def _line(self, record: Record) -> str:
-        parts = [f"{record.iteration}/{self._iterations}", f"loss {float(record.loss):.4f}"]
+        parts = [f"{record.iteration} ({record.progress:.0%})", f"loss {float(record.loss):.4f}"]
         if self._psnr is not None:
             parts.append(f"PSNR {self._psnr:.2f}")
         parts += [f"{name} {compact(count)}" for name, count in record.counts.items()]
-        (first, start), (latest, end) = self._times[0], self._times[-1]
-        if latest > first:
-            speed = (latest - first) / max(end - start, 1e-9)
-            parts += [f"{speed:.1f} it/s", f"ETA {clock((self._iterations - latest) / speed)}"]
+        (first, behind, start), (latest, share, end) = self._times[0], self._times[-1]
+        if share > behind:
+            parts += [f"{(latest - first) / max(end - start, 1e-9):.1f} it/s"]
+            parts += [f"ETA {clock((1 - share) / (share - behind) * (end - start))}"]
         return "  ".join(parts)
 
 

@@ -34,8 +34,8 @@ from padgs.scoring.protocols import Protocol
 class Watch:
     """What a run tells whoever started it, and what it asks: here nobody, who never stops it; subclasses do."""
 
-    def started(self, folder: Path, iterations: int) -> None:
-        """The run has this folder, and goes to so many iterations."""
+    def started(self, folder: Path) -> None:
+        """The run has this folder."""
 
     def saved(self, folder: Path) -> None:
         """A checkpoint was written, and the log is up to date."""
@@ -72,7 +72,7 @@ class Session:
             RunBusy: another process works on this run.
             Interrupted: stopped from outside; starting again goes on.
         """
-        self.watch.started(self.folder.path, self.config.train.iterations)
+        self.watch.started(self.folder.path)
         introduce(self.config, self.scene, self.folder.path, self.console)
         result = self.folder.result()
         if result is None or self._is_missing(result):
@@ -108,17 +108,17 @@ class Session:
             saved, saved_iteration = time.monotonic(), progress.iteration
             with (
                 Interrupt(self.watch.stop_requested) as stop,
-                LiveLine(self.console, config.train.iterations) as line,
+                LiveLine(self.console) as line,
             ):
-                for record in method.fit(self.scene, config.train.budget):
-                    progress = Progress(record.iteration, record.seconds, record.cpu_seconds)
+                for record in method.fit(self.scene, config.time):
+                    progress = Progress(record.iteration, record.seconds, record.cpu_seconds, record.progress)
                     line.update(record, self._logged(record, method))
                     stopping = stop.requested
                     if stopping or self._is_due(record, saved):
                         folder.save(method, progress)
                         self.watch.saved(folder.path)
                         saved, saved_iteration = time.monotonic(), record.iteration
-                    if stopping and record.iteration < config.train.iterations:
+                    if stopping and record.progress < 1:
                         raise Interrupted(f"stopped after iteration {record.iteration}, the checkpoint is written")
                 if saved_iteration != progress.iteration:
                     folder.save(method, progress)
@@ -133,12 +133,13 @@ class Session:
             what = {"status": outcome.status(error), "reason": str(error)}
             result = replace(result, **what, **outcome.peak_memory(self.scene))
         finished = datetime.now(timezone.utc).isoformat(timespec="seconds")
-        return folder.finish(replace(result, iterations_done=progress.iteration, finished=finished))
+        asked = progress.iteration if config.budget.seconds is not None else result.iterations
+        return folder.finish(replace(result, iterations=asked, iterations_done=progress.iteration, finished=finished))
 
     def _logged(self, record: Record, method: Method) -> float | None:
         """Log an iteration where that is due; PSNR of the held-out view where it was measured."""
         options, views = self.config.run, self.scene.test
-        last = record.iteration == self.config.train.iterations
+        last = record.progress == 1
         due = bool(views) and (last or record.iteration % options.probe_every == 0)
         probed = probe(method, views[len(views) // 2]) if due else {}
         if last or due or record.events or record.iteration % options.log_every == 0:
@@ -157,7 +158,7 @@ class Session:
         size = method.size()
         start = {"start": method.start} if "gaussians" in size.counts else {}
         return {
-            "status": "ok" if progress.iteration == self.config.train.iterations else "timeout",
+            "status": "ok" if progress.share == 1 else "timeout",
             "counts": {**size.counts, "parameters": size.parameters, **start},
             "model_bytes": size.bytes,
             "timing": _training_time(progress),

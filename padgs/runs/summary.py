@@ -23,7 +23,7 @@ def introduce(config: RunConfig, scene: Scene, folder: Path, console: Console) -
     what = f"{config.preset}{f' ({config.variant})' if config.variant else ''} on {scene.name}"
     views = f"{len(scene.train)} training and {len(scene.test)} test views of {view.width}x{view.height}"
     say = partial(console.print, highlight=False, soft_wrap=True)
-    say(f"[bold]{what}[/]: {views}, {len(scene.points)} points, {config.train.iterations} iterations")
+    say(f"[bold]{what}[/]: {views}, {len(scene.points)} points, {config.time}")
     for note in (*scene.notes, folder):
         say(f"  {note}", style="dim")
 

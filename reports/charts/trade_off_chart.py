@@ -94,9 +94,9 @@ def _handles(panels: Sequence[Panel], scale: float) -> list[Any]:
 def _conditions(trade_off: TradeOff) -> str:
     """What the runs have in common, for who sees the picture alone."""
     parts = ["up and to the left is better"]
-    for column, words in (("resolution", "pixels"), ("iterations", "iterations")):
+    for column in ("resolution", "length"):
         known = trade_off.runs[column].unique()
-        parts += [f"{known[0]} {words}"] if len(known) == 1 else []
+        parts += [known[0]] if len(known) == 1 else []
     seeds = trade_off.runs["seed"].nunique()
     return ", ".join([*parts, *([f"bars: standard deviation over {seeds} seeds"] if seeds > 1 else [])])
 

@@ -159,13 +159,14 @@ def _conditions(runs: DataFrame, claim: Claim) -> Iterator[tuple[str, DataFrame]
     """The longest runs of each scene in which both sides meet, and where that is."""
     shared = ["resolution", "data", *claim.apart, *(["machine"] if claim.quotient else [])]
     for (place, resolution, *_), own in grouped(runs, "place", *shared) if len(runs) else ():
-        ours, others = (set(side.of(own)["iterations"]) for side in (claim.ours, claim.others))
+        ours, others = (set(side.of(own)["length"]) for side in (claim.ours, claim.others))
         if not ours & others:
             continue
-        iterations = max(ours & others)
+        longest = own.loc[own["length"].isin(ours & others), "iterations"].idxmax()
+        length = str(own.at[longest, "length"])
         words = [f"{column.rpartition('.')[2]} {own[column].iloc[0]}" for column in claim.apart]
-        where = ", ".join([place.scene, resolution, f"{iterations} iterations", *words])
-        yield where, own.loc[own["iterations"] == iterations]
+        where = ", ".join([place.scene, resolution, length, *words])
+        yield where, own.loc[own["length"] == length]
 
 
 def _sides(claim: Claim, runs: DataFrame, where: str) -> tuple[DataFrame, list[Setting]]:

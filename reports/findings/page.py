@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from pandas import DataFrame
+from pandas import DataFrame, Series
 
 from reports import published
 from reports.conditions import footnotes
@@ -114,8 +114,15 @@ def _command(name: str, runs: DataFrame) -> str:
         words.append(f"{'scale' if table else '+scale'}={scale}")
     if len(runs):
         words.append(f"seed={','.join(map(str, sorted(runs['seed'].unique())))}")
-        if runs["iterations"].nunique() == 1:
-            words.append(f"train.iterations={runs['iterations'].iloc[0]}")
+        if runs["length"].nunique() == 1:
+            words += _length(runs.iloc[0])
         if (runs["dataset"] == "").any():
             words.append("data.path=FOLDER")
     return " ".join(words)
+
+
+def _length(run: Series) -> list[str]:
+    """The settings that say how long a run was."""
+    if run.get("config.budget.seconds") is None:
+        return [f"train.iterations={run['iterations']}"]
+    return [f"{key}={run[f'config.{key}']}" for key in ("budget.seconds", "budget.clock")]

@@ -45,7 +45,7 @@ def modulation(gathered: Gathered) -> Table:
         ReportError: results that must not stand together.
     """
     runs, blocks, runs_of = gathered.of_experiments("modulation"), [], {}
-    for title, own in by_conditions(runs, "resolution", "iterations").items():
+    for title, own in by_conditions(runs, "resolution", "length").items():
         refuse_mixture(own, gathered.request, title, OF_TIMES)
         found = {cell: one_setting(_of_cell(own, *cell), f"{title}, {words}") for cell, words in CELLS.items()}
         rows = (Row(words, tuple(over_seeds(found[cell], MEASURES))) for cell, words in CELLS.items())

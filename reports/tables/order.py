@@ -32,7 +32,7 @@ def order(gathered: Gathered) -> Table:
     """
     blocks, runs_of = [], {}
     for experiment in REPORTS["order"].experiments:
-        for title, own in by_conditions(gathered.of_experiments(experiment), "resolution", "iterations").items():
+        for title, own in by_conditions(gathered.of_experiments(experiment), "resolution", "length").items():
             where = f"{experiment}: {title}"
             refuse_mixture(own, gathered.request, where, OF_TIMES)
             blocks.append(Block(where, _rows(own, where)))

@@ -28,14 +28,14 @@ COSTS = (
 
 
 def runs(gathered: Gathered) -> Table:
-    """A block per scene, resolution and number of iterations, a row per run."""
+    """A block per scene, resolution and length, a row per run."""
     found = gathered.asked_for
     measured = [mark(protocol, metric, protocol) for protocol, metrics in MARKS.items() for metric in metrics]
     plain = [replace(measure, column=replace(measure.column, higher_is_better=None)) for measure in measured]
     measures = (*plain, *COSTS, *gpu_memory(found, **AMONG_COSTS))
     blocks, runs_of = [], {}
-    for (place, resolution, iterations), own in grouped(found, "place", "resolution", "iterations"):
-        title = f"{scene_title(place.dataset, place.scene)}, {resolution}, {iterations} iterations"
+    for (place, resolution, length), own in grouped(found, "place", "resolution", "length"):
+        title = f"{scene_title(place.dataset, place.scene)}, {resolution}, {length}"
         rows = (
             Row(_title(*words), tuple(over_seeds(own.loc[[index]], measures)))
             for index, *words in own[["preset", "variant", "seed", "run"]].itertuples()

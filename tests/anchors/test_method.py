@@ -8,7 +8,8 @@ import torch
 from padgs.anchors.method import PaDGSMethod, PaDGSMethodOptions
 from padgs.anchors.model import PaDGS
 from padgs.anchors.trainee import LearningRates
-from padgs.learning.loop import Budget, TrainOptions
+from padgs.learning.budget import Budget
+from padgs.learning.loop import TrainOptions
 from padgs.render.config import RenderConfig
 from padgs.scene import Scene, View
 from padgs.sphere.panorama import rays

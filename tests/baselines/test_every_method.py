@@ -15,7 +15,8 @@ from states import assert_same_but_time
 
 from baselines import METHODS
 from padgs.data.synthetic import SCENES, SyntheticOptions, generate
-from padgs.learning.loop import Budget, Record
+from padgs.learning.budget import Budget
+from padgs.learning.loop import Record
 from padgs.learning.method import Method
 from padgs.registry import lookup
 from padgs.runs import checkpoint

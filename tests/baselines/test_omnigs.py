@@ -8,8 +8,8 @@ from tiny_scene import tiny_scene
 
 from baselines import METHODS
 from baselines.omnigs import OmniGSMethod
+from padgs.learning.budget import Budget
 from padgs.learning.failure import Failure
-from padgs.learning.loop import Budget
 from padgs.learning.trainee import State
 from padgs.native import cpu
 from padgs.registry import lookup

@@ -10,8 +10,8 @@ from composed import composed
 from pretended_gpu import GPU, pretended_gpu
 
 from padgs.data.synthetic import SyntheticOptions, generate
+from padgs.learning.budget import Budget
 from padgs.learning.failure import Failure
-from padgs.learning.loop import Budget
 from padgs.learning.trainee import State
 from padgs.runs import checkpoint, scoring
 from padgs.runs.scoring import frame_times, scores

@@ -12,7 +12,7 @@ from tiny_scene import tiny_scene
 
 from baselines.op43dgs import OP43DGSMethod
 from padgs import results
-from padgs.learning.loop import Budget
+from padgs.learning.budget import Budget
 from padgs.runs import session
 from padgs.scene import Scene, View
 

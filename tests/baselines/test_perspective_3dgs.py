@@ -14,7 +14,8 @@ from baselines import METHODS
 from baselines.crops_3dgs import NARROWEST, Crops3DGSMethod, Crops3DGSOptions
 from baselines.cubemap_3dgs import Cubemap3DGSMethod
 from padgs.data.perspectives import solid_angle
-from padgs.learning.loop import Budget, TrainOptions
+from padgs.learning.budget import Budget
+from padgs.learning.loop import TrainOptions
 from padgs.registry import lookup
 from padgs.render.config import RenderConfig
 from padgs.sphere.camera import Panorama

@@ -11,7 +11,8 @@ from padgs.calibration.align import Similarity, align
 from padgs.calibration.poses import PoseRates
 from padgs.data.synthetic import SyntheticOptions, SyntheticTruth, generate
 from padgs.gaussians import rotation_matrices
-from padgs.learning.loop import Budget, TrainOptions
+from padgs.learning.budget import Budget
+from padgs.learning.loop import TrainOptions
 from padgs.learning.targets import Targets
 from padgs.render.config import RenderConfig
 from padgs.scene import Scene

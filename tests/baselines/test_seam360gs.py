@@ -7,7 +7,7 @@ from tiny_scene import tiny_scene, truth
 from baselines.seam360gs import Seam360GSMethod, Seam360GSOptions
 from padgs.calibration.dual_lens import DualLens
 from padgs.data.synthetic import SyntheticOptions, SyntheticTruth, generate
-from padgs.learning.loop import Budget
+from padgs.learning.budget import Budget
 from padgs.learning.trainee import Drawing
 from padgs.render import RenderOptions, render
 from padgs.render.config import RenderConfig

@@ -12,7 +12,7 @@ from tiny_scene import tiny_scene
 from baselines import METHODS
 from baselines.spags import SPaGSMethod, SPaGSOptions
 from padgs.gaussians import Gaussians, rotation_matrices
-from padgs.learning.loop import Budget
+from padgs.learning.budget import Budget
 from padgs.native import cpu
 from padgs.native.abi import Inputs, pointer
 from padgs.registry import lookup

@@ -7,7 +7,7 @@ import torch
 from tiny_scene import tiny_scene
 
 from baselines import METHODS
-from padgs.learning.loop import Budget
+from padgs.learning.budget import Budget
 from padgs.registry import lookup
 from padgs.scene import Scene, View
 from padgs.splats.method import SplatMethod

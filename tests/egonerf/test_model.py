@@ -9,7 +9,7 @@ from torch.nn.functional import normalize, softplus
 
 from padgs.egonerf.model import EgoNeRF
 from padgs.egonerf.options import Constants, EgoNeRFOptions
-from padgs.learning.loop import Budget
+from padgs.learning.budget import Budget
 from padgs.runs.session import build
 from padgs.scene import Scene, View
 from padgs.sphere.camera import Pinhole, RayTable

@@ -7,8 +7,9 @@ from tiny_scene import tiny_scene
 from torch import Tensor, nn
 
 from padgs.egonerf.ray_trainer import RayTrainer
+from padgs.learning.budget import Budget
 from padgs.learning.failure import Failure
-from padgs.learning.loop import Budget, TrainOptions
+from padgs.learning.loop import TrainOptions
 from padgs.learning.schedule import Constant, ParameterGroup
 from padgs.learning.trainee import State
 from padgs.scene import Scene

@@ -9,8 +9,10 @@ from tiny_scene import tiny_scene
 from torch import Tensor, nn
 
 from padgs.gaussians import Gaussians
+from padgs.learning import loop
+from padgs.learning.budget import Budget
 from padgs.learning.failure import Failure
-from padgs.learning.loop import Budget, Trainer, TrainOptions
+from padgs.learning.loop import Trainer, TrainOptions
 from padgs.learning.schedule import Constant, LogLinear, ParameterGroup
 from padgs.learning.trainee import Drawing, State
 from padgs.render import Rendering
@@ -288,3 +290,67 @@ def test_wrong_options_are_named():
         TrainOptions(lambda_l1=1.2)
     with pytest.raises(ValueError, match="check_every is 0"):
         TrainOptions(check_every=0)
+
+
+TICK = 1 / 128  # seconds; sums of it are exact
+
+
+class Clock:
+    """Time that passes only in steps of a trainer, each longer than the one before."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, first: float = TICK, growth: float = 1.0) -> None:
+        self.now, self._step, self._growth = 0.0, first, growth
+        for name in ("perf_counter", "process_time"):
+            monkeypatch.setattr(loop.time, name, lambda: self.now)
+
+    def tick(self) -> None:
+        self.now, self._step = self.now + self._step, self._step * self._growth
+
+
+class Timed(Flat):
+    """Takes as long as a clock says, and notes which moments of its schedule came."""
+
+    def __init__(self, clock: Clock) -> None:
+        super().__init__()
+        self.clock, self.moments = clock, list[int]()
+
+    def draw(self, view: View, probe: Tensor | None = None) -> Drawing:
+        self.clock.tick()
+        return super().draw(view)
+
+    def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
+        self.moments.append(iteration)
+        return super().adapt(iteration, optimizer)
+
+
+@pytest.mark.parametrize("clock", ["wall", "cpu"])
+@pytest.mark.parametrize(("schedule", "growth"), [(100, 1.0), (30, 1.0), (400, 1.0), (100, 1.02), (100, 0.98)], ids=str)
+def test_a_budget_of_seconds_ends_on_time_and_goes_once_through_the_whole_schedule(
+    monkeypatch, schedule, growth, clock
+):
+    seconds = 1.0 if growth == 1 else 0.4
+    trainee = Timed(Clock(monkeypatch, growth=growth))
+    run = Trainer(trainee, tiny_scene(), Budget(schedule, seconds=seconds, clock=clock), seed=3)
+    records = list(run.records())
+    assert records[-1].seconds == pytest.approx(seconds, rel=0.05)
+    assert trainee.moments == list(range(1, schedule + 1))
+    for record in records:
+        assert record.progress == pytest.approx(record.seconds / seconds, abs=0.05 + 1 / schedule)
+    assert [record.progress == 1 for record in records] == [False] * (len(records) - 1) + [True]
+
+
+def test_resuming_in_a_budget_of_seconds_changes_nothing_but_what_the_clock_does(monkeypatch):
+    def trainer(clock: Clock) -> Trainer:
+        torch.manual_seed(0)
+        return Trainer(Timed(clock), tiny_scene(), Budget(50, seconds=40 * TICK), seed=3)
+
+    whole = trainer(Clock(monkeypatch))
+    expected = list(whole.records())
+    stopped = trainer(Clock(monkeypatch))
+    records = stopped.records()
+    first = [next(records) for _ in range(7)]
+    state = stopped.state()
+    resumed = trainer(Clock(monkeypatch))
+    resumed.load_state(state)
+    assert [*first, *resumed.records()] == expected
+    assert_same_but_time(resumed.state(), whole.state())

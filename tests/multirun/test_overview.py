@@ -7,7 +7,7 @@ from rich.console import Console
 
 from padgs.multirun import overview
 from padgs.multirun.board import Board, JobState
-from padgs.multirun.overview import Overview, iterations_done, shown
+from padgs.multirun.overview import Overview, share_done, shown
 
 
 def seen(*statuses: str, before: dict[str, int] | None = None, progress: dict[int, float] | None = None) -> Overview:
@@ -30,9 +30,10 @@ def test_time_left_follows_from_what_was_done_since_the_start():
 
 
 def test_progress_is_the_last_whole_line_of_the_log(tmp_path):
-    assert iterations_done(tmp_path) == 0
-    (tmp_path / "log.jsonl").write_text("".join(f'{{"iteration": {n}, "loss": 0.1}}\n' for n in range(1, 200)))
-    assert iterations_done(tmp_path) == 199
+    assert share_done(tmp_path) == 0
+    lines = (f'{{"iteration": {n}, "progress": {n / 200}}}\n' for n in range(1, 200))
+    (tmp_path / "log.jsonl").write_text("".join(lines))
+    assert share_done(tmp_path) == 199 / 200
 
 
 def test_without_a_terminal_there_is_a_line_now_and_then(monkeypatch):
@@ -47,7 +48,7 @@ def test_without_a_terminal_there_is_a_line_now_and_then(monkeypatch):
 
 def test_in_a_terminal_the_picture_is_live_and_the_last_one_stays():
     out = io.StringIO()
-    states = {0: JobState("running", run="room_padgs_1", iterations=10)}
+    states = {0: JobState("running", run="room_padgs_1")}
     final = Overview(Counter(), states, 1.0, {0: 0.4})
     with shown(lambda: final, lambda: None, Console(file=out, width=100, force_terminal=True)):
         pass

@@ -1,13 +1,17 @@
 """What padgs_plus promises: schedules for any length, no units, small Gaussians, a mean of its last states."""
 
+from collections.abc import Iterator
 from dataclasses import replace
+from itertools import count, islice
 
 import pytest
 import torch
 from states import assert_same_but_time
 from tiny_scene import HEIGHT, WIDTH, tiny_scene
 
-from padgs.learning.loop import Budget
+from padgs.learning import loop
+from padgs.learning.budget import Budget
+from padgs.learning.loop import Record
 from padgs.plus.method import PlusMethod, independent_pixels
 from padgs.plus.options import GROWN, ROUNDS, PlusOptions
 from padgs.scene import Scene
@@ -33,6 +37,28 @@ def test_growth_has_as_many_rounds_in_a_run_of_any_length(iterations):
     rounds = [i for i in range(1, iterations + 1) if i < options.densify_until and i % options.densify_every == 0]
     assert len(rounds) == ROUNDS and options.reset_every > iterations
     assert rounds[-1] == pytest.approx(GROWN * iterations, abs=ROUNDS / 2)
+
+
+def test_a_run_of_seconds_rehearses_ends_on_time_and_resumes_bit_identically(monkeypatch):
+    def fitted(method: PlusMethod) -> Iterator[Record]:
+        ticks = count()
+        monkeypatch.setattr(loop.time, "perf_counter", lambda: next(ticks) / 64)  # so each step takes as long
+        monkeypatch.setattr(loop.time, "process_time", lambda: 0.0)
+        return method.fit(tiny_scene(), Budget(1, seconds=60 / 64))
+
+    torch.manual_seed(5)
+    whole = PlusMethod(OPTIONS)
+    records = list(fitted(whole))
+    assert records[-1].seconds == pytest.approx(60 / 64, rel=0.05) and records[-1].progress == 1
+    assert len(records) == 60 - 2, "two steps were thrown away, and counted"
+    assert records[-1].counts["gaussians"] > records[0].counts["gaussians"]
+    torch.manual_seed(5)
+    stopped = PlusMethod(OPTIONS)
+    first = list(islice(fitted(stopped), 23))
+    resumed = PlusMethod(OPTIONS)
+    resumed.load_state(stopped.state())
+    assert [*first, *fitted(resumed)] == records
+    assert_same_but_time(resumed.state(), whole.state())
 
 
 def test_options_of_the_schedule_of_3dgs_are_refused_and_not_ignored():

@@ -13,21 +13,22 @@ def lines(monkeypatch, *, terminal: bool, seconds_per_iteration: float = 2.0, it
     monkeypatch.setattr(live.time, "monotonic", lambda: now[0])
     out = io.StringIO()
     console = Console(file=out, force_terminal=terminal, width=200, color_system=None)
-    with LiveLine(console, iterations) as line:
+    with LiveLine(console) as line:
         for iteration in range(1, iterations + 1):
             now[0] += seconds_per_iteration
-            line.update(Record(iteration, 0.25, 0.0, 0.0, {"anchors": 1234}), 21.5 if iteration == 4 else None)
+            record = Record(iteration, iteration / iterations, 0.25, 0.0, 0.0, {"anchors": 1234})
+            line.update(record, 21.5 if iteration == 4 else None)
     return out.getvalue()
 
 
 def test_without_a_terminal_a_line_every_ten_seconds_and_the_last(monkeypatch):
     shown = lines(monkeypatch, terminal=False).splitlines()
-    assert [line.split("/")[0] for line in shown] == ["1", "6", "11", "12"]
-    assert shown[1] == "6/12  loss 0.2500  PSNR 21.50  anchors 1.23k  0.5 it/s  ETA 0:12"
+    assert [line.split()[0] for line in shown] == ["1", "6", "11", "12"]
+    assert shown[1] == "6 (50%)  loss 0.2500  PSNR 21.50  anchors 1.23k  0.5 it/s  ETA 0:12"
     assert "PSNR" not in shown[0]
 
 
 def test_a_terminal_has_one_line_that_changes(monkeypatch):
     shown = lines(monkeypatch, terminal=True)
-    assert "1/12" in shown and "12/12" in shown
+    assert "1 (8%)" in shown and "12 (100%)" in shown
     assert shown.count("\n") <= 1

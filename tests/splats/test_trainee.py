@@ -7,8 +7,8 @@ import torch
 from composed import composed
 from tiny_scene import tiny_scene
 
+from padgs.learning.budget import Budget
 from padgs.learning.extent import ExtentOptions
-from padgs.learning.loop import Budget
 from padgs.learning.schedule import PUBLISHED_ITERATIONS
 from padgs.render.config import RenderConfig
 from padgs.runs.session import build

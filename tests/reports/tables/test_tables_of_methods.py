@@ -99,7 +99,7 @@ def test_only_runs_of_the_tables_own_experiments_compete_where_there_are_any():
     for build in (table1, table4):
         build(gathered([own, trial, other_tau]))
     assert block(markdown.text(table1(gathered([own, trial, other_tau]))), "360Roam, bar")[-1][4] == "23.50"
-    with pytest.raises(ReportError, match="differ in iterations"):
+    with pytest.raises(ReportError, match="differ in length"):
         table1(gathered([replace(r, experiments=()) for r in (own, trial)]))
     assert block(markdown.text(table1(gathered([own, trial], experiment="smoke"))), "360Roam, bar")[-1][4] == "9.00"
 

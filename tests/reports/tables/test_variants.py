@@ -94,7 +94,7 @@ def test_the_footnote_says_how_the_numbers_were_made():
     ("other", "what"),
     [
         (replace(FOUR[1], width=512, height=256), "resolution"),
-        (replace(FOUR[1], iterations=7), "iterations"),
+        (replace(FOUR[1], iterations=7), "length"),
         (replace(FOUR[1], fingerprint="other"), "data"),
         (
             replace(FOUR[1], scores={"paper": Scores({**RULES, "lpips": "alex"}, FOUR[1].scores["paper"].metrics, {})}),
@@ -171,7 +171,7 @@ def test_each_quirk_beside_the_method_as_described():
 
 def test_what_was_measured_otherwise_does_not_stand_beside():
     first, second = quirky(odgs=25.0, odgs_bias=24.25)
-    with pytest.raises(ReportError, match="differ in iterations"):
+    with pytest.raises(ReportError, match="differ in length"):
         quirks(gathered([first, replace(second, iterations=7)]))
 
 
