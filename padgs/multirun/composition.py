@@ -53,7 +53,7 @@ def typed_config(composed: DictConfig, choices: Mapping[str, object]) -> RunConf
     return config_from_values(values, labels(choices))
 
 
-def make_method(name: str = "padgs", *settings: str) -> Method:
+def make_method(name: str = "padgs_plus", *settings: str) -> Method:
     """An untrained method, as `padgs-run method=NAME SETTINGS` would train it.
 
     Args:

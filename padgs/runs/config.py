@@ -164,7 +164,7 @@ def config_from_values(values: Mapping[str, Any], labels: Labels = Labels()) -> 
             "run.images_on=cpu keeps them in main memory while it trains on a GPU"
         )
     method = dict(values.get("method", {}))
-    name = method.pop("name", "padgs")
+    name = method.pop("name", "padgs_plus")
     try:
         options = lookup(METHODS, name, "method").Options
         protocols = {

@@ -328,7 +328,7 @@ class Timed(Flat):
 def test_a_budget_of_seconds_ends_on_time_and_goes_once_through_the_whole_schedule(
     monkeypatch, schedule, growth, clock
 ):
-    seconds = 1.0 if growth == 1 else 0.4
+    seconds = 100 * TICK if growth == 1 else 40 * TICK
     trainee = Timed(Clock(monkeypatch, growth=growth))
     run = Trainer(trainee, tiny_scene(), Budget(schedule, seconds=seconds, clock=clock), seed=3)
     records = list(run.records())
