@@ -19,6 +19,8 @@ from padgs.multirun.choices import method_choices
 from padgs.multirun.composition import composing
 from padgs.multirun.launchers import missing_plugin
 from padgs.multirun.overrides import expand
+from padgs.plus.method import PlusMethod
+from padgs.plus.options import PlusOptions
 from padgs.registry import lookup
 from padgs.render.config import RenderConfig
 from padgs.runs.config import RunOptions, TrainConfig
@@ -46,8 +48,10 @@ def padgs_root(monkeypatch, root):
 
 def test_without_arguments_all_values_are_the_defaults_of_the_dataclasses():
     config = composed()
-    assert config.method == "padgs" and config.options == PaDGSMethodOptions()
-    assert config.render == RenderConfig()
+    assert config.method == "padgs_plus" and config.options == PlusOptions()
+    assert config.render == PlusMethod.RENDER
+    paper = composed("method=padgs")
+    assert paper.options == PaDGSMethodOptions() and paper.render == RenderConfig()
     assert config.run == RunOptions()
     assert replace(config.train, iterations=1) == TrainConfig(iterations=1)
     assert config.protocols == PROTOCOLS
@@ -247,7 +251,7 @@ def test_every_rung_of_the_ladder_changes_one_thing():
     ]
     assert [rung.options.inputs for rung in rungs[1:4]] == [35, 36, 37]
     # The last is the paper's method: its threshold, three times ours, on a loss three times ours.
-    paper = composed("train.iterations=30000")
+    paper = composed("method=padgs", "train.iterations=30000")
     assert replace(rungs[-1].options, gradient_threshold=paper.options.gradient_threshold) == paper.options
     assert rungs[-1].options.gradient_threshold == pytest.approx(3 * paper.options.gradient_threshold)
     assert replace(rungs[-1].train, normalisation="mean") == paper.train
@@ -281,7 +285,7 @@ def test_calibration_is_compared_where_its_claims_can_show_and_where_not():
 
 @pytest.mark.parametrize("projection", ["tangent", "ray"])
 def test_padgs_on_another_projection_differs_in_nothing_else(projection):
-    other, paper = composed(f"method=padgs_{projection}"), composed()
+    other, paper = composed(f"method=padgs_{projection}"), composed("method=padgs")
     differing = different_keys(paper.values(), other.values())
     assert differing - {"render.low_pass_kind"} == {"render.projection"}
     assert other.render.projection == projection
@@ -290,7 +294,7 @@ def test_padgs_on_another_projection_differs_in_nothing_else(projection):
 
 @pytest.mark.parametrize(("name", "voxel_size"), [("roam360", 0.001), ("ricoh360", 0.005)])
 def test_data_sets_have_the_size_and_voxels_of_the_paper(name, voxel_size):
-    config = composed(f"data={name}")
+    config = composed(f"data={name}", "method=padgs")
     assert (config.data.dataset, config.data.width) == (name, DATASETS[name].width)
     assert config.data.voxel_size == voxel_size == config.options.voxel_size
 

@@ -109,6 +109,16 @@ class LossArguments(ctypes.Structure):
     ]
 
 
+class ColorArguments(ctypes.Structure):
+    _fields_ = [
+        ("count", Int64),
+        *fields(Int32, "degree", "stored"),
+        ("center", ctypes.c_float * 3),
+        ("tiny", ctypes.c_float),
+        *fields(Pointer, "means", "dc", "rest", "colors", "grad_colors", "grad_means", "grad_dc", "grad_rest"),
+    ]
+
+
 def pointer(tensor: Tensor | None) -> int | None:
     """Address of a contiguous tensor, or None."""
     if tensor is None:

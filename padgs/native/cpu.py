@@ -7,6 +7,7 @@ import functools
 
 from padgs.native.abi import (
     BlendGradientArguments,
+    ColorArguments,
     DecodeGradientArguments,
     Gradients,
     Inputs,
@@ -19,7 +20,10 @@ from padgs.native.abi import (
 from padgs.native.loading import declared, opened
 from padgs.native.watch import Watchable
 
-STRUCTURES = (NativeCamera, Inputs, Gradients, BlendGradientArguments, DecodeGradientArguments, LossArguments)
+STRUCTURES = (
+    *(NativeCamera, Inputs, Gradients, BlendGradientArguments),
+    *(DecodeGradientArguments, LossArguments, ColorArguments),
+)
 SIGNATURES = {
     "padgs_isa": ([], ctypes.c_char_p),
     "padgs_structure_bytes": ([Int32], Int64),
@@ -36,6 +40,7 @@ SIGNATURES = {
     "padgs_decode_select": ([Pointer], None),
     "padgs_decode_place": ([Pointer], None),
     "padgs_decode_backward": ([Pointer], None),
+    "padgs_colors": ([Pointer], None),
     "padgs_photometric_loss": ([Pointer], ctypes.c_double),
     "padgs_loss_workspace": ([Int32, Int32], Int64),
     "padgs_measure_fma": ([Int64], ctypes.c_double),

@@ -13,6 +13,7 @@ from padgs.gaussians import Gaussians
 from padgs.learning.rows import load_rows
 from padgs.scene import Scene, View
 from padgs.sphere import harmonics as spherical_harmonics
+from padgs.splats import cpu_colors
 
 INITIAL_OPACITY = 0.1
 NEIGHBOURS = 3  # distances that set a Gaussian's initial size
@@ -125,10 +126,13 @@ class Splats(nn.Module):
 
     def _colors(self, view: View, means: Tensor) -> Tensor:
         """Max(0, 1/2 + SH), [N, 3], seen along camera -> Gaussian in the world frame."""
+        center, tiny = view.center.to(means), TINY * self.unit
+        if cpu_colors.fits(means, center):
+            return cpu_colors.native_colors(means, self.sh_dc, self.sh_rest, self.active_degree, center, tiny)
         colors = 0.5 + spherical_harmonics.DC * self.sh_dc
         if self.active_degree > 0:
-            rays = means - view.center.to(means)
-            directions = rays / torch.sqrt((rays * rays).sum(-1, keepdim=True) + (TINY * self.unit) ** 2)
+            rays = means - center
+            directions = rays / torch.sqrt((rays * rays).sum(-1, keepdim=True) + tiny**2)
             values = spherical_harmonics.basis(directions, self.active_degree)[:, 1:]  # [N, K]
             colors = colors + torch.einsum("nk,nkc->nc", values, self.sh_rest[:, : values.shape[1]])
         return colors.clamp(min=0)

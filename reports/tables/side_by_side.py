@@ -24,21 +24,17 @@ MARKS = {
 
 def methods(gathered: Gathered) -> Table:
     """Every method after the same number of iterations."""
-    runs = _methods(gathered, "methods")
-    found = {place.title: own for place, own in by_place(runs).items()}
+    runs = gathered.chosen("methods")
+    found = {
+        place.title: own for place, own in by_place(runs.loc[runs["variant"] == ""]).items()
+    }  # rows of an ablation are not methods
     return _table(gathered, "methods", "Every method after the same number of iterations", found)
 
 
 def equal_time(gathered: Gathered) -> Table:
     """Every method after the same training time, a block for each scene, resolution and time."""
-    found = by_conditions(_methods(gathered, "equal_time"), "resolution", "length")
+    found = by_conditions(gathered.of_experiments("equal_time"), "resolution", "length")
     return _table(gathered, "equal_time", "Every method after the same training time", found, equal_images=False)
-
-
-def _methods(gathered: Gathered, report: str) -> DataFrame:
-    """The runs for a report; rows of an ablation (`variant`) are not methods."""
-    runs = gathered.chosen(report)
-    return runs.loc[runs["variant"] == ""]
 
 
 def _costs(runs: DataFrame) -> tuple[Measure, ...]:

@@ -12,7 +12,7 @@ def padgs_root(monkeypatch, root):
 
 
 def name(*overrides: str, scene: str = "room", fingerprint: str = "f00d") -> str:
-    return run_id(composed(*overrides).values(), scene, fingerprint)
+    return run_id(composed("method=padgs", *overrides).values(), scene, fingerprint)
 
 
 def test_it_reads_like_what_it_is():
@@ -64,11 +64,11 @@ def test_spelling_of_numbers_does_not_matter():
 
 
 def test_what_a_machine_decided_in_old_runs_is_no_part_of_it():
-    values = composed().values()
+    values = composed("method=padgs").values()
     old = {**values, "data": {**values["data"], "device": "cuda:0"}}
     assert run_id(old, "room", "f00d") == run_id(values, "room", "f00d")
 
 
 def test_the_hash_of_a_configuration_survives_its_file():
-    config = composed("method.tau=0.5")
+    config = composed("method=padgs", "method.tau=0.5")
     assert config_hash(config.values()) == config_hash(replace(config).values())

@@ -39,6 +39,7 @@ def tiny(monkeypatch, root):
 @pytest.fixture
 def config(tmp_path):
     return composed(
+        "method=padgs",
         f"run.folder={tmp_path}/runs",
         f"train.iterations={ITERATIONS}",
         "run.log_every=2",

@@ -158,4 +158,17 @@ struct LossArguments {
   float *gradient;   // [H,W,3], dL/dimage, or null
 };
 
+// Colours of explicit Gaussians as a view sees them; with `grad_colors` their derivatives instead.
+struct ColorArguments {
+  int64_t count;
+  int32_t degree;  // of the spherical harmonics that are in use, 0 to 3
+  int32_t stored;  // coefficients of a row of `rest`, which may be more
+  float center[3], tiny;  // of the camera; what a distance is at least taken for; world units
+  const float *means, *dc;  // [N,3]
+  const float *rest;        // [N,stored,3]
+  float *colors;            // [N,3]
+  const float *grad_colors;              // [N,3], or null
+  float *grad_means, *grad_dc, *grad_rest;  // as means, dc and rest
+};
+
 }  // namespace padgs

@@ -19,6 +19,10 @@ struct HybridKernels : BlendKernels {
   int64_t (*core_words)(const BlendArguments &);  // the most that forward can leave to backward
 };
 
+struct ColorKernels {
+  void (*run)(const ColorArguments &);
+};
+
 struct LossKernels {
   double (*photometric)(const LossArguments &);
   int64_t (*workspace)(int32_t height, int32_t width);
