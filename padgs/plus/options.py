@@ -14,6 +14,7 @@ SCHEDULE = (  # options of 3DGS that mean nothing here
     *("densify_from", "densify_until", "densify_every", "prune_by_extent", "prune_by_extent_from"),
     *("reset_every", "reset_opacity", "released_start", "released_reset"),
 )
+LONG = 2000  # iterations from which on the threshold of growth does not fall any more
 GROWN = 0.5  # share of the run after which nothing grows any more
 
 
@@ -23,11 +24,11 @@ class PlusOptions(SplatOptions):
 
     sh_degree: int = 2  # a degree more each tenth of the run; the third gains nothing and costs a fifth of the time
     signal: str = "space_absolute"  # the pull on the mean itself, in no image plane and at no latitude
-    gradient_threshold: float = 1e-4  # twice SPaGS's: fewer Gaussians, where a scene needs more at a loss
+    gradient_threshold: float = 5e-5  # SPaGS's, in runs of `LONG` iterations or more; see `for_run`
     sample_clones: bool = True
     min_opacity: float = 0.05  # what is fainter when a round ends was not needed
     start_share: float | None = 0.29  # points to begin with, per independent pixel of a view; None: all that there are
-    limit_share: float | None = 1.3  # ... and Gaussians at most, sky included: a guard on memory and time
+    limit_share: float | None = 2.6  # ... and Gaussians at most, sky included: a guard on memory and time
     initial_opacity: float = 0.5  # 0.1 hides what lies in front until opacities have grown
     initial_scale: float = 0.6  # times the distance of the nearest points; 1 is 3DGS's, whose Gaussians overlap
     means_speed: float = 2.0  # learning rate of the means, beside that of 3DGS
@@ -52,8 +53,14 @@ class PlusOptions(SplatOptions):
                 )
 
     def for_run(self, iterations: int) -> CloneSplitOptions:
-        """Rounds of growth at even distances up to `GROWN`; no resets, which a run of any length must recover from."""
+        """Rounds of growth at even distances up to `GROWN`; no resets, which a run of any length must recover from.
+
+        The threshold is higher in short runs, by the square root of what they are shorter: what grows must be fitted,
+        and each Gaussian makes every later iteration slower.
+        """
         every = max(1, round(GROWN * iterations / ROUNDS))
         plain = CloneSplitOptions(**{field.name: getattr(self, field.name) for field in fields(CloneSplitOptions)})
         until = ROUNDS * every + 1
-        return replace(plain, densify_from=0, densify_until=until, densify_every=every, reset_every=iterations + 1)
+        threshold = self.gradient_threshold * max(1.0, math.sqrt(LONG / iterations))
+        when = {"densify_from": 0, "densify_until": until, "densify_every": every, "reset_every": iterations + 1}
+        return replace(plain, gradient_threshold=threshold, **when)

@@ -39,6 +39,11 @@ def test_growth_has_as_many_rounds_in_a_run_of_any_length(iterations):
     assert rounds[-1] == pytest.approx(GROWN * iterations, abs=ROUNDS / 2)
 
 
+def test_the_threshold_of_growth_falls_with_the_length_of_a_run_and_then_stays():
+    found = [PlusOptions().for_run(iterations).gradient_threshold for iterations in (125, 500, 2000, 30_000)]
+    assert found == pytest.approx([2e-4, 1e-4, 5e-5, 5e-5])
+
+
 def test_a_run_of_seconds_rehearses_ends_on_time_and_resumes_bit_identically(monkeypatch):
     def fitted(method: PlusMethod) -> Iterator[Record]:
         ticks = count()
