@@ -130,14 +130,19 @@ class CloneSplit:
                 self.statistics["polar"] += torch.where(visible, 1 - cos_latitudes, 0.0)
 
     @torch.no_grad()
-    def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
-        """Clone, split, prune and reset opacities where it is time to; returns what happened."""
+    def adapt(
+        self, iteration: int, optimizer: torch.optim.Adam, *, grows: Callable[[], bool] = lambda: True
+    ) -> tuple[str, ...]:
+        """Clone, split, prune and reset opacities where it is time to; returns what happened.
+
+        `grows` is asked when a round of growth is due, and says whether there is one.
+        """
         options = self.options
         if iteration >= options.densify_until:
             return ()
         events = []
         begin = 0 if options.released_start else options.densify_from
-        if iteration > begin and iteration % options.densify_every == 0:
+        if iteration > begin and iteration % options.densify_every == 0 and grows():
             cloned, split, left_out = self._multiply(optimizer)
             self._decay_opacities(optimizer)
             pruned = self._prune(optimizer, iteration)

@@ -15,7 +15,7 @@ from padgs.render.config import RenderConfig
 from padgs.render.low_pass import LowPass, low_pass_of, widened
 from padgs.scene import View
 from padgs.sphere.panorama import longitude_latitude
-from padgs.splats.clone_split import CloneSplit, CloneSplitOptions
+from padgs.splats.clone_split import MIN_DENSIFY_EVERY, CloneSplit, CloneSplitOptions
 from padgs.splats.model import Splats
 from padgs.splats.probes import render_probed
 
@@ -101,12 +101,21 @@ class SplatTrainee:
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
         """Densify, and bring the next SH degree into use, where it is time to."""
-        events = self.densifier.adapt(iteration, optimizer)
+        events = self.densifier.adapt(iteration, optimizer, grows=self._has_seen_enough)
         degree = min(self.splats.degree, self.degree_at(iteration + 1))
         if degree > self.splats.active_degree:
             self.splats.active_degree = degree
             events += (f"spherical harmonics of degree {degree}",)
         return events
+
+    def _has_seen_enough(self) -> bool:
+        """Whether a round of growth has views enough behind it for their mean to say something.
+
+        Where a schedule follows the clock, a round may come after few: it is left out, for growth on their noise would
+        feed on itself, as larger models take fewer steps in the time.
+        """
+        views = int(self.densifier.statistics["seen"].max())  # some Gaussian is seen by all
+        return 2 * views >= min(self.densifier.options.densify_every, MIN_DENSIFY_EVERY)
 
     def degree_at(self, iteration: int) -> int:
         """The SH degree that is in use by then, if the model has it."""
