@@ -135,6 +135,7 @@ SIGNATURES: dict[str, tuple[list, Any]] = {
     "padgs_cuda_structure_bytes": ([Int32], Int64),
     "padgs_cuda_device_type": ([], ctypes.c_char_p),
     "padgs_cuda_architectures": ([], ctypes.c_char_p),
+    "padgs_cuda_versions": ([Pointer, Pointer], None),
     "padgs_cuda_check": ([Pointer], Int32),
     "padgs_cuda_error": ([Int32], ctypes.c_char_p),
     "padgs_cuda_tile_levels": ([Pointer, Pointer], None),
@@ -158,14 +159,29 @@ def library() -> Watchable:
     """The loaded library.
 
     Raises:
-        OSError: it was not built (no nvcc when padgs was installed), does not load, or was built from other sources.
+        OSError: it was not built (no nvcc when padgs was installed), does not load, was built from other sources, or by
+            a compiler that the driver is too old for.
     """
-    return declared(opened("padgs_cuda", "nvcc"), SIGNATURES, "padgs_cuda_structure_bytes", STRUCTURES)
+    loaded = declared(opened("padgs_cuda", "nvcc"), SIGNATURES, "padgs_cuda_structure_bytes", STRUCTURES)
+    refuse_old_driver(loaded)
+    return loaded
+
+
+def refuse_old_driver(loaded: Watchable) -> None:
+    """Raise OSError where there is a driver, but one of an older major version of CUDA than the library's runtime."""
+    driver, built_with = Int32(), Int32()
+    loaded.padgs_cuda_versions(ctypes.byref(driver), ctypes.byref(built_with))
+    if 0 < driver.value // 1000 < built_with.value // 1000:
+        has, wants = (f"{version.value // 1000}.{version.value % 1000 // 10}" for version in (driver, built_with))
+        raise OSError(
+            f"libpadgs_cuda was compiled by CUDA {wants}, and the driver here knows CUDA {has}; update the driver, "
+            f"install padgs where nvcc is of CUDA {has} or older, or render with backend=torch"
+        )
 
 
 @functools.cache
 def available() -> bool:
-    """Whether the library is built and loads; a GPU that can run it is another question."""
+    """Whether the library is built, loads and fits the driver; a GPU that can run it is another question."""
     try:
         library()
     except OSError:

@@ -23,6 +23,8 @@ from padgs.render.published_bounds import check_memory
 from padgs.sphere.camera import Camera
 
 IDENTITY = torch.eye(4)
+FLOATS = functools.partial(torch.empty, dtype=torch.float32)
+INTEGERS = functools.partial(torch.empty, dtype=torch.int32)
 
 
 def rasterize(request: Request) -> Rendering:
@@ -91,16 +93,15 @@ class Outputs:
         size, hybrid = (camera.height, camera.width), options.blending == "hybrid"
         core_size = options.core_size if hybrid else 0
         kept = hybrid and differentiated
-        transmittance, depth = torch.empty(2, *size, device=device)
-        integers = functools.partial(torch.empty, dtype=torch.int32, device=device)
+        transmittance, depth = FLOATS(2, *size, device=device)
         return Outputs(
-            torch.empty(*size, 3, device=device),
+            FLOATS(*size, 3, device=device),
             transmittance,
             depth,
-            None if hybrid else integers(size),
+            None if hybrid else INTEGERS(size, device=device),
             core_size,
-            integers((*size, core_size)) if kept else None,
-            torch.empty(*size, 6, device=device) if kept else None,
+            INTEGERS((*size, core_size), device=device) if kept else None,
+            FLOATS(*size, 6, device=device) if kept else None,
         )
 
 
@@ -121,14 +122,14 @@ class _Drawing(NativeImage):
     def moments(self, pixels: Pixels, background: Tensor, upstream: Upstream) -> Tensor:
         projected, outputs = self._projected, Outputs(*pixels, *self._kept)
         device, size, hybrid = background.device, outputs.depth.shape, outputs.core_size > 0
-        totals = torch.zeros(len(projected.order), MOMENTS, device=device)
-        packed = torch.empty(*size, 4, device=device)
-        core_gradients = torch.empty(*size, outputs.core_size, 2, device=device) if hybrid else None
-        tail_gradients = torch.empty(*size, 4, device=device) if hybrid else None
+        totals = torch.zeros(len(projected.order), MOMENTS, dtype=torch.float32, device=device)
+        packed = FLOATS(*size, 4, device=device)
+        core_gradients = FLOATS(*size, outputs.core_size, 2, device=device) if hybrid else None
+        tail_gradients = FLOATS(*size, 4, device=device) if hybrid else None
         for strip in projected.strips():
             states = None if hybrid else projected.states(strip)
-            furthest = None if hybrid else torch.empty(strip.chunks, dtype=torch.int32, device=device)
-            moments = torch.empty(strip.instances, MOMENTS, device=device)
+            furthest = None if hybrid else INTEGERS(strip.chunks, device=device)
+            moments = FLOATS(strip.instances, MOMENTS, device=device)
             arguments = cuda.BlendGradientInputs(
                 _blend_inputs(projected, strip, self.rays, background, outputs, None),
                 *map(pointer, (upstream.image, upstream.transmittance, upstream.depth)),
@@ -158,7 +159,7 @@ def blend(projected: DeviceProjected, rays: NativeRays, background: Tensor, outp
     """Fill the outputs; returns how many pairs were evaluated, and how many contributed, [2] int64."""
     pairs = torch.zeros(2, dtype=torch.int64, device=background.device)
     for strip in projected.strips():
-        pair_counts = torch.empty(strip.chunks, 2, dtype=torch.int32, device=background.device)
+        pair_counts = INTEGERS(strip.chunks, 2, device=background.device)
         arguments = _blend_inputs(projected, strip, rays, background, outputs, pair_counts)
         cuda.call("padgs_cuda_blend", projected.queue, arguments)
         pairs += pair_counts.sum(0)

@@ -22,7 +22,9 @@ from padgs.render.backends.cpu_tiles import TILE, strip_cuts
 
 BUCKET = 32  # instances of one list that a warp differentiates together, see csrc/cuda/layout.h
 CHUNK_PIXELS = TILE * TILE
-MAX_INSTANCES = (1 << 31) - 1  # of one strip: positions in its lists are 32-bit integers
+MAX_INSTANCES = (
+    (1 << 31) - 1 - 512
+)  # of one strip: positions in its lists, and a batch behind, are 32-bit integers
 
 
 class TileRows:
@@ -130,7 +132,7 @@ class DeviceProjected:
         self.queue = cuda.queue(device)
         self.camera = camera
         self.rows = tile_rows(camera.width, camera.height, camera.model, camera.square, device)
-        self.footprints = torch.empty(count, 16, device=device)
+        self.footprints = torch.empty(count, 16, dtype=torch.float32, device=device)
         self.boxes = torch.empty(count, 5, dtype=torch.int32, device=device)
         self.order = torch.empty(count, dtype=torch.int32, device=device)
         self.per_row: list[int] = []
@@ -178,4 +180,4 @@ class DeviceProjected:
             self._state_start = torch.tensor(starts).to(self.order.device)
         strip.table = self.table(strip.first_row, strip.end_row)
         total = starts[strip.end_row] - starts[strip.first_row]
-        return torch.empty(total, CHUNK_PIXELS, 2, device=self.order.device)
+        return torch.empty(total, CHUNK_PIXELS, 2, dtype=torch.float32, device=self.order.device)

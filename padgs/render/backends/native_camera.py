@@ -93,7 +93,7 @@ def native_rays(camera: Camera, device: torch.device = CPU) -> NativeRays:
 @functools.lru_cache(maxsize=16)
 def _formula_rays(camera: Panorama | Pinhole, device: torch.device) -> NativeRays:
     if isinstance(camera, Pinhole):
-        return NativeRays(table=_padded_table(camera.rays()).to(device))
+        return NativeRays(table=_padded_table(camera.rays()).to(device, torch.float32))
     padded = -(-camera.width // CHUNK) * CHUNK
     longitude = ((torch.arange(padded, dtype=torch.float64) + 0.5) / camera.width - 0.5) * (2 * torch.pi)
     latitude = row_latitudes(camera.height, dtype=torch.float64)

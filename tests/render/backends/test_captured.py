@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cuda_engine
 import pytest
@@ -23,6 +25,7 @@ from padgs.render.contract import Request
 from padgs.scene import View
 
 pytestmark = [*cuda_engine.marks()]
+captured_for_real = captured.captured
 DEVICE = torch.device("cuda" if cuda_engine.ON_GPU else "cpu")
 
 
@@ -197,6 +200,23 @@ def test_a_recording_reads_nothing_back(options, generator: torch.Generator, mon
         assert draw._record().image.shape == (20, 40, 3)
     with pytest.raises(AssertionError), NothingIsRead():
         torch.ones(1).sum().item()
+
+
+def test_a_frame_is_recorded_on_its_own_stream_and_other_threads_may_go_on(monkeypatch: pytest.MonkeyPatch):
+    """Torch's own stream for recordings is of one device, and its usual mode ends them if any thread allocates."""
+    how, inside = [], []
+
+    def graph(graph, **options):
+        how.append(options)
+        return contextlib.nullcontext()
+
+    streams = [SimpleNamespace(wait_stream=lambda other: None) for _ in range(2)]
+    names = {"CUDAGraph": SimpleNamespace, "Stream": lambda: streams[0], "current_stream": lambda: streams[1]}
+    names |= {"device": contextlib.nullcontext, "stream": lambda stream: contextlib.nullcontext(), "graph": graph}
+    for name, fake in names.items():
+        monkeypatch.setattr(torch.cuda, name, fake)
+    captured_for_real(lambda: inside.append(len(how)), torch.device("cuda", 1))
+    assert inside == [0, 1] and how == [{"stream": streams[0], "capture_error_mode": "thread_local"}]
 
 
 def test_nothing_to_draw_is_the_background(generator: torch.Generator):

@@ -25,7 +25,14 @@ struct Dim {
   unsigned x;
 };
 inline Dim threadIdx, blockIdx, blockDim;
+inline int current_device, last_error;  // of CUDA's, which nothing here runs on, but which code may choose and read
 
+inline int cudaGetDevice(int *device) { return *device = current_device, 0; }
+inline int cudaSetDevice(int device) { return current_device = device, 0; }
+inline int cudaGetLastError() {
+  const int error = last_error;
+  return last_error = 0, error;
+}
 
 namespace emulation {
 

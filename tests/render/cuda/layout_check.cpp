@@ -1,4 +1,5 @@
-// csrc/cuda/layout.h for tests: what it says of every bucket, chunk and block.
+// csrc/cuda/layout.h and device.cuh for tests: what they say of every bucket, chunk and block, and of devices.
+#include "device.cuh"
 #include "layout.h"
 
 using namespace padgs;
@@ -26,6 +27,19 @@ extern "C" int64_t check_blocks(const TileTable *table, ChunkPlace *places) {
   const int64_t blocks = chunks_drawn(*table);
   for (int64_t b = 0; places && b < blocks; ++b) places[b] = chunk_place(*table, b);
   return blocks;
+}
+
+// Work on one device whose launches and own return leave errors. Returns the error; the device within and those
+// afterwards [3]: current device, and the error that the next call would find.
+extern "C" int check_on_device(int32_t device, int32_t current, int32_t of_work, int32_t of_launch, int32_t *found) {
+  current_device = current;
+  const int error = on_device({device, nullptr}, [&] {
+    found[0] = current_device;
+    last_error = of_launch;
+    return int(of_work);
+  });
+  found[1] = current_device, found[2] = last_error;
+  return error;
 }
 
 extern "C" int64_t check_lower_bound(const uint32_t *keys, int64_t count, uint32_t key) {

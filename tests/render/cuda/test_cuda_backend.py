@@ -19,7 +19,7 @@ from padgs.learning.failure import is_out_of_memory
 from padgs.native import cuda, loading
 from padgs.render import Rendering, RenderOptions, render
 from padgs.render.backends import cuda as cuda_backend
-from padgs.render.backends import cuda_tiles
+from padgs.render.backends import cuda_tiles, native_camera
 
 pytestmark = [*cuda_engine.marks()]
 
@@ -31,6 +31,7 @@ def drawn(
     *,
     backend: str = "cuda",
     lens: str = "panorama",
+    weights: torch.dtype | None = None,
 ) -> tuple[Rendering, dict[str, Tensor]]:
     """A rendering in a random pose, and gradients of a random weighting of all its outputs."""
     generator = torch.Generator().manual_seed(5)
@@ -38,7 +39,7 @@ def drawn(
     pose = random_pose(generator, shift=0.1).float().requires_grad_()
     rendering = render(inputs, view_of(camera_of(lens, *size), pose), options, backend=backend)
     outputs = (rendering.image, rendering.transmittance, rendering.depth)
-    sum((out * torch.randn(out.shape, generator=generator)).sum() for out in outputs).backward()
+    sum((out * torch.randn(out.shape, generator=generator, dtype=weights)).sum() for out in outputs).backward()
     return rendering, {**{name: getattr(inputs, name).grad for name in INPUTS}, "pose": pose.grad}
 
 
@@ -197,6 +198,48 @@ def test_a_gpu_that_nothing_was_compiled_for_is_named(monkeypatch: pytest.Monkey
         RuntimeError, match="compiled for compute capabilities 80 90; Tesla T4 has 75. .*ARCHITECTURES=75"
     ):
         cuda.check_device.__wrapped__(0)
+
+
+@pytest.mark.parametrize(("driver", "built_with"), [(0, 13000), (13000, 13020), (13020, 13000), (0, 0)])
+def test_a_driver_of_the_same_major_version_or_none_at_all_is_taken(driver: int, built_with: int):
+    cuda.refuse_old_driver(versions_of(driver, built_with))
+
+
+def test_a_driver_that_is_too_old_means_torch_and_says_so(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(cuda, "opened", lambda *_: None)
+    monkeypatch.setattr(cuda, "declared", lambda *_: versions_of(12080, 13000))
+    monkeypatch.setattr(cuda, "library", cuda_engine.real_library.__wrapped__)
+    cuda.available.cache_clear()
+    package._say_that_native_is_missing.cache_clear()
+    means = SimpleNamespace(device=torch.device("cuda"), dtype=torch.float32)
+    with pytest.warns(UserWarning, match=r"compiled by CUDA 13\.0, and the driver here knows CUDA 12\.8; update"):
+        assert package.resolve_backend("auto", means) == "torch"
+    cuda.available.cache_clear()
+
+
+def versions_of(driver: int, built_with: int) -> SimpleNamespace:
+    def answer(first, second) -> None:
+        first._obj.value, second._obj.value = driver, built_with
+
+    return SimpleNamespace(padgs_cuda_versions=answer)
+
+
+@pytest.mark.parametrize("blending", ["sorted", "hybrid"])
+@pytest.mark.parametrize("lens", ["panorama", "pinhole"])
+def test_the_default_dtype_of_torch_changes_nothing(lens: str, blending: str, generator: torch.Generator):
+    gaussians, options = crowd(40, generator), RenderOptions("ray", **blended(blending, 3))
+    native_camera._formula_rays.cache_clear()
+    usual = drawn(gaussians, (40, 20), options, lens=lens)
+    native_camera._formula_rays.cache_clear()
+    weights = torch.get_default_dtype()
+    try:
+        torch.set_default_dtype(torch.float64)
+        doubled = drawn(gaussians, (40, 20), options, lens=lens, weights=weights)
+    finally:
+        torch.set_default_dtype(weights)
+        native_camera._formula_rays.cache_clear()
+    assert torch.equal(usual[0].image, doubled[0].image)
+    assert all(torch.equal(gradient, doubled[1][name]) for name, gradient in usual[1].items())
 
 
 def test_without_the_library_auto_means_torch_and_says_so(tmp_path, monkeypatch: pytest.MonkeyPatch):

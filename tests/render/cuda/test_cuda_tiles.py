@@ -137,6 +137,15 @@ def test_every_bucket_has_room_of_its_own_for_its_pixels(rows, data):
     assert all(0 <= place < starts[end] - starts[first] for place in taken)
 
 
+@pytest.mark.parametrize(("device", "current"), [(1, 0), (0, 0), (0, 2)])
+@pytest.mark.parametrize(("of_work", "of_launch", "error"), [(0, 0, 0), (2, 0, 2), (0, 700, 700), (2, 700, 2)])
+def test_work_on_a_device_leaves_the_thread_its_own_and_no_error(device, current, of_work, of_launch, error):
+    found = torch.empty(3, dtype=torch.int32)
+    check = cuda_engine.layout_library().check_on_device
+    assert check(device, current, of_work, of_launch, Pointer(found.data_ptr())) == error
+    assert found.tolist() == [device, current, 0]
+
+
 def test_blocks_draw_every_chunk_once():
     table = TileRows([2, 1, 0], 5 * TILE - 3, CPU)  # five chunks across
     native_table = cuda.TileTable(5 * TILE - 3, 40, 1, 3, *map(pointer, (table.level, table.row_start)))

@@ -56,14 +56,15 @@ using namespace padgs;
 
 // Launches with a table of the host's sizes: the number of tiles comes from the caller, who has the table's rows.
 PADGS_API int padgs_cuda_bin(const Queue *queue, const BinArguments *args, int32_t tiles) {
-  if (const int error = begin(*queue)) return error;
-  if (args->sort.count) {
-    launch(count_kernel, blocks_for(args->visible + 1, kThreads), kThreads, *queue, *args);
-    if (const int error = exclusive_sum(*queue, args->sort, args->tiles, args->slot_start, args->visible + 1))
-      return error;
-    launch(emit_kernel, blocks_for(args->visible, kThreads), kThreads, *queue, *args);
-    if (const int error = sort_pairs(*queue, args->sort)) return error;
-  }
-  launch(tile_start_kernel, blocks_for(int64_t(tiles) + 1, kThreads), kThreads, *queue, *args, tiles);
-  return finish();
+  return on_device(*queue, [&] {
+    if (args->sort.count) {
+      launch(count_kernel, blocks_for(args->visible + 1, kThreads), kThreads, *queue, *args);
+      if (const int error = exclusive_sum(*queue, args->sort, args->tiles, args->slot_start, args->visible + 1))
+        return error;
+      launch(emit_kernel, blocks_for(args->visible, kThreads), kThreads, *queue, *args);
+      if (const int error = sort_pairs(*queue, args->sort)) return error;
+    }
+    launch(tile_start_kernel, blocks_for(int64_t(tiles) + 1, kThreads), kThreads, *queue, *args, tiles);
+    return 0;
+  });
 }

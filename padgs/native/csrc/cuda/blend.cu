@@ -62,11 +62,12 @@ __global__ void __launch_bounds__(kBatch) blend_kernel(BlendInputs args) {
 using namespace padgs;
 
 PADGS_API int padgs_cuda_blend(const Queue *queue, const BlendInputs *args) {
-  if (const int error = begin(*queue)) return error;
-  if (args->core_size)
-    hybrid_forward(*queue, *args);
-  else
-    launch(planar(args->projection) ? blend_kernel<true> : blend_kernel<false>, blocks_of(args->table), kBatch, *queue,
-           *args);
-  return finish();
+  return on_device(*queue, [&] {
+    if (args->core_size)
+      hybrid_forward(*queue, *args);
+    else
+      launch(planar(args->projection) ? blend_kernel<true> : blend_kernel<false>, blocks_of(args->table), kBatch, *queue,
+             *args);
+    return 0;
+  });
 }

@@ -171,11 +171,12 @@ void sorted_backward(const Queue &queue, const BlendGradientInputs &args, int ti
 using namespace padgs;
 
 PADGS_API int padgs_cuda_blend_backward(const Queue *queue, const BlendGradientInputs *args, int32_t tiles) {
-  if (const int error = begin(*queue)) return error;
-  if (args->forward.core_size)
-    hybrid_backward(*queue, *args, tiles);
-  else
-    sorted_backward(*queue, *args, tiles);
-  launch(sum_kernel, blocks_for(args->visible, kGaussiansPerBlock), kGaussiansPerBlock * kMoments, *queue, *args);
-  return finish();
+  return on_device(*queue, [&] {
+    if (args->forward.core_size)
+      hybrid_backward(*queue, *args, tiles);
+    else
+      sorted_backward(*queue, *args, tiles);
+    launch(sum_kernel, blocks_for(args->visible, kGaussiansPerBlock), kGaussiansPerBlock * kMoments, *queue, *args);
+    return 0;
+  });
 }

@@ -76,13 +76,15 @@ __global__ void take_back_kernel(DeviceDecodeGradientArguments device) {
 using namespace padgs;
 
 PADGS_API int padgs_cuda_decode_place(const Queue *queue, const DeviceDecodeArguments *args) {
-  if (const int error = begin(*queue)) return error;
-  launch(place_kernel, blocks_for(args->decode.anchors * args->decode.offsets, kThreads), kThreads, *queue, *args);
-  return finish();
+  return on_device(*queue, [&] {
+    launch(place_kernel, blocks_for(args->decode.anchors * args->decode.offsets, kThreads), kThreads, *queue, *args);
+    return 0;
+  });
 }
 
 PADGS_API int padgs_cuda_decode_take_back(const Queue *queue, const DeviceDecodeGradientArguments *args) {
-  if (const int error = begin(*queue)) return error;
-  launch(take_back_kernel, blocks_for(args->gradient.forward.anchors, kThreads), kThreads, *queue, *args);
-  return finish();
+  return on_device(*queue, [&] {
+    launch(take_back_kernel, blocks_for(args->gradient.forward.anchors, kThreads), kThreads, *queue, *args);
+    return 0;
+  });
 }

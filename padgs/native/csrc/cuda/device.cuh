@@ -27,8 +27,6 @@ template <class... P, class... A>
 void launch(void (*kernel)(P...), int64_t blocks, int threads, const Queue &, A... arguments) {
   emulate(unsigned(blocks), unsigned(threads), [=] { kernel(arguments...); });
 }
-inline int begin(const Queue &) { return 0; }
-inline int finish() { return 0; }
 inline float quick_inverse(float x) { return 1.0f / x; }
 
 #else
@@ -37,12 +35,23 @@ template <class... P, class... A>
 void launch(void (*kernel)(P...), int64_t blocks, int threads, const Queue &queue, A... arguments) {
   if (blocks > 0) kernel<<<unsigned(blocks), threads, 0, cudaStream_t(queue.stream)>>>(arguments...);
 }
-// This library has a CUDA runtime of its own, which knows nothing of the device that torch chose.
-inline int begin(const Queue &queue) { return int(cudaSetDevice(queue.device)); }
-inline int finish() { return int(cudaGetLastError()); }
 __device__ inline float quick_inverse(float x) { return __fdividef(1.0f, x); }
 
 #endif
+
+// Does work that launches kernels and returns an error or 0, on the queue's device; the thread's own device, which torch
+// chose, is then what it was. Returns the work's error, or that of its launches, and leaves none behind: the next call
+// would be blamed for it.
+template <class Work>
+int on_device(const Queue &queue, Work work) {
+  int before = queue.device;
+  int error = int(cudaGetDevice(&before));
+  if (!error && before != queue.device) error = int(cudaSetDevice(queue.device));
+  if (!error) error = work();
+  const int launched = int(cudaGetLastError());
+  if (before != queue.device) cudaSetDevice(before);
+  return error ? error : launched;
+}
 
 inline int64_t blocks_for(int64_t items, int per_block) { return (items + per_block - 1) / per_block; }
 

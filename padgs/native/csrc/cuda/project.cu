@@ -103,16 +103,18 @@ __global__ void project_backward_kernel(ProjectGradientArguments args) {
 using namespace padgs;
 
 PADGS_API int padgs_cuda_project(const Queue *queue, const ProjectArguments *args) {
-  if (const int error = begin(*queue)) return error;
-  launch(project_kernel, blocks_for(args->in.count, kThreads), kThreads, *queue, *args);
-  return finish();
+  return on_device(*queue, [&] {
+    launch(project_kernel, blocks_for(args->in.count, kThreads), kThreads, *queue, *args);
+    return 0;
+  });
 }
 
 // Blocks of the kernel below, each of which leaves a partial sum of the pose gradient.
 PADGS_API int64_t padgs_cuda_pose_blocks(int64_t count) { return blocks_for(count, kThreads); }
 
 PADGS_API int padgs_cuda_project_backward(const Queue *queue, const ProjectGradientArguments *args) {
-  if (const int error = begin(*queue)) return error;
-  launch(project_backward_kernel, padgs_cuda_pose_blocks(args->in.count), kThreads, *queue, *args);
-  return finish();
+  return on_device(*queue, [&] {
+    launch(project_backward_kernel, padgs_cuda_pose_blocks(args->in.count), kThreads, *queue, *args);
+    return 0;
+  });
 }
