@@ -162,7 +162,7 @@ def library() -> Watchable:
         OSError: it was not built (no nvcc when padgs was installed), does not load, was built from other sources, or by
             a compiler that the driver is too old for.
     """
-    loaded = declared(opened("padgs_cuda", "nvcc"), SIGNATURES, "padgs_cuda_structure_bytes", STRUCTURES)
+    loaded = declared(opened("padgs_cuda", "nvcc and a GPU"), SIGNATURES, "padgs_cuda_structure_bytes", STRUCTURES)
     refuse_old_driver(loaded)
     return loaded
 

@@ -22,9 +22,7 @@ from padgs.render.backends.cpu_tiles import TILE, strip_cuts
 
 BUCKET = 32  # instances of one list that a warp differentiates together, see csrc/cuda/layout.h
 CHUNK_PIXELS = TILE * TILE
-MAX_INSTANCES = (
-    (1 << 31) - 1 - 512
-)  # of one strip: positions in its lists, and a batch behind, are 32-bit integers
+MAX_INSTANCES = (1 << 31) - 1 - 512  # of one strip: positions in its lists, and a batch behind, are 32-bit integers
 
 
 class TileRows:
