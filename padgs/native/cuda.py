@@ -37,10 +37,7 @@ class Queue(ctypes.Structure):
 
 
 class TileTable(ctypes.Structure):
-    _fields_ = [
-        *fields(Int32, "width", "height", "first_row", "end_row"),
-        *fields(Pointer, "level", "row_start", "state_start"),
-    ]
+    _fields_ = fields(Int32, "width", "height", "first_row", "end_row")
 
 
 class ProjectArguments(ctypes.Structure):
@@ -97,9 +94,7 @@ class BlendInputs(ctypes.Structure):
 class BlendGradientInputs(ctypes.Structure):
     _fields_ = [
         ("forward", BlendInputs),
-        *fields(Pointer, "grad_image", "grad_transmittance", "grad_depth", "upstream", "states", "furthest"),
-        *fields(Pointer, "core_gradients", "tail_gradients"),
-        ("instances", Int64),
+        *fields(Pointer, "grad_image", "grad_transmittance", "grad_depth", "core_gradients"),
         *fields(Pointer, "moments", "grad_rays", "order", "slot_start"),
         ("visible", Int64),
         ("totals", Pointer),
@@ -138,14 +133,13 @@ SIGNATURES: dict[str, tuple[list, Any]] = {
     "padgs_cuda_versions": ([Pointer, Pointer], None),
     "padgs_cuda_check": ([Pointer], Int32),
     "padgs_cuda_error": ([Int32], ctypes.c_char_p),
-    "padgs_cuda_tile_levels": ([Pointer, Pointer], None),
     "padgs_cuda_scratch_bytes": ([Pointer, Int64], Int64),
     "padgs_cuda_pose_blocks": ([Int64], Int64),
     "padgs_cuda_project": ([Pointer, Pointer], Int32),
     "padgs_cuda_sort": ([Pointer, Pointer], Int32),
     "padgs_cuda_bin": ([Pointer, Pointer, Int32], Int32),
     "padgs_cuda_blend": ([Pointer, Pointer], Int32),
-    "padgs_cuda_blend_backward": ([Pointer, Pointer, Int32], Int32),
+    "padgs_cuda_blend_backward": ([Pointer, Pointer], Int32),
     "padgs_cuda_project_backward": ([Pointer, Pointer], Int32),
     "padgs_cuda_decode_place": ([Pointer, Pointer], Int32),
     "padgs_cuda_decode_take_back": ([Pointer, Pointer], Int32),

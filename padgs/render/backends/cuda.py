@@ -123,24 +123,18 @@ class _Drawing(NativeImage):
         projected, outputs = self._projected, Outputs(*pixels, *self._kept)
         device, size, hybrid = background.device, outputs.depth.shape, outputs.core_size > 0
         totals = torch.zeros(len(projected.order), MOMENTS, dtype=torch.float32, device=device)
-        packed = FLOATS(*size, 4, device=device)
         core_gradients = FLOATS(*size, outputs.core_size, 2, device=device) if hybrid else None
-        tail_gradients = FLOATS(*size, 4, device=device) if hybrid else None
         for strip in projected.strips():
-            states = None if hybrid else projected.states(strip)
-            furthest = None if hybrid else INTEGERS(strip.chunks, device=device)
             moments = FLOATS(strip.instances, MOMENTS, device=device)
             arguments = cuda.BlendGradientInputs(
                 _blend_inputs(projected, strip, self.rays, background, outputs, None),
                 *map(pointer, (upstream.image, upstream.transmittance, upstream.depth)),
-                *map(pointer, (packed, states, furthest, core_gradients, tail_gradients)),
-                strip.instances,
-                *map(pointer, (moments, upstream.rays, projected.order, strip.slot_start)),
+                *map(pointer, (core_gradients, moments, upstream.rays, projected.order, strip.slot_start)),
                 projected.visible,
                 pointer(totals),
                 upstream.absolute,
             )
-            cuda.call("padgs_cuda_blend_backward", projected.queue, arguments, strip.tiles)
+            cuda.call("padgs_cuda_blend_backward", projected.queue, arguments)
         return totals
 
     def project_backward(
@@ -159,7 +153,7 @@ def blend(projected: DeviceProjected, rays: NativeRays, background: Tensor, outp
     """Fill the outputs; returns how many pairs were evaluated, and how many contributed, [2] int64."""
     pairs = torch.zeros(2, dtype=torch.int64, device=background.device)
     for strip in projected.strips():
-        pair_counts = INTEGERS(strip.chunks, 2, device=background.device)
+        pair_counts = INTEGERS(strip.tiles, 2, device=background.device)
         arguments = _blend_inputs(projected, strip, rays, background, outputs, pair_counts)
         cuda.call("padgs_cuda_blend", projected.queue, arguments)
         pairs += pair_counts.sum(0)

@@ -19,7 +19,7 @@ from padgs.render import Rendering, RenderOptions
 from padgs.render.backends import captured
 from padgs.render.backends import cuda as cuda_backend
 from padgs.render.backends.captured import CapturedRender
-from padgs.render.backends.cuda_tiles import DeviceProjected, DeviceStrip, tile_rows
+from padgs.render.backends.cuda_tiles import DeviceProjected, DeviceStrip
 from padgs.render.backends.native_camera import native_camera
 from padgs.render.contract import Request
 from padgs.scene import View
@@ -257,11 +257,10 @@ def test_more_instances_than_32_bits_count_leave_the_first_ones_in_place():
     side, count, room = 8192, 16_400, 100
     view = DeviceProjected.__new__(DeviceProjected)
     view.camera = native_camera(cuda_backend.IDENTITY, camera_of("pinhole", side, side), RenderOptions("pinhole"))
-    view.rows = tile_rows(side, side, view.camera.model, view.camera.square, DEVICE)
-    view.queue, view.room, view.visible, view._state_start = cuda.queue(DEVICE), room, count, None
+    view.queue, view.room, view.visible = cuda.queue(DEVICE), room, count
     view.boxes = torch.tensor([0, side, 0, 0, side], dtype=torch.int32, device=DEVICE).repeat(count, 1)
     view.order = torch.arange(count, dtype=torch.int32, device=DEVICE)
-    strip = DeviceStrip(view, 0, len(view.rows.levels))
+    strip = DeviceStrip(view, 0, side // 16)
     assert count * strip.tiles > 2**32
     wanted = (strip.tiles * torch.arange(count + 1)).clamp(max=2**31 - 1)
     assert torch.equal(strip.slot_start.cpu().long(), wanted)

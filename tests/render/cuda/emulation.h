@@ -174,19 +174,15 @@ T __shfl_xor_sync(unsigned, T value, int mask) {
   const uint64_t *all = emulation::exchange(value);
   return emulation::from<T>(all, (emulation::running % 32) ^ mask);
 }
-template <class T>
-T __shfl_down_sync(unsigned, T value, int delta) {
-  const uint64_t *all = emulation::exchange(value);
-  const int lane = emulation::running % 32 + delta;
-  return emulation::from<T>(all, lane < 32 ? lane : emulation::running % 32);
-}
 inline unsigned __ballot_sync(unsigned, bool vote) {
   const uint64_t *all = emulation::exchange(int(vote));
   unsigned bits = 0;
   for (int lane = 0; lane < 32; ++lane) bits |= unsigned(emulation::from<int>(all, lane) != 0) << lane;
   return bits;
 }
-inline int __popc(unsigned bits) { return __builtin_popcount(bits); }
+inline bool __any_sync(unsigned lanes, bool vote) { return __ballot_sync(lanes, vote); }
+inline int __ffs(unsigned bits) { return __builtin_ffs(int(bits)); }
+inline int __clz(int bits) { return bits ? __builtin_clz(unsigned(bits)) : 32; }
 
 template <class T>
 T atomicAdd(T *at, T value) {

@@ -122,12 +122,14 @@ def test_results_repeat_bit_by_bit(blending: str, generator: torch.Generator):
 
 
 @pytest.mark.parametrize("blending", ["sorted", "hybrid"])
-def test_counters_are_those_of_the_cpu(blending: str, generator: torch.Generator):
-    gaussians, options = gaussians_of("ordinary", 40, generator), RenderOptions(**blended(blending, 2))
-    expected, actual = (drawn(gaussians, (72, 36), options, backend=name)[0] for name in ("cpu", "cuda"))
+@pytest.mark.parametrize("lens", ["panorama", "pinhole"])
+def test_counters_are_those_of_the_cpu(lens: str, blending: str, generator: torch.Generator):
+    gaussians, options = gaussians_of("ordinary", 40, generator), RenderOptions("ray", **blended(blending, 2))
+    expected, actual = (drawn(gaussians, (72, 36), options, backend=name, lens=lens)[0] for name in ("cpu", "cuda"))
     assert set(actual.counters) == set(expected.counters) and len(actual.counters) == 5
-    for name in ("gaussians", "visible", "instances", "contributing"):
+    for name in ("gaussians", "visible", "contributing"):
         assert actual.counters[name] == expected.counters[name]
+    assert (actual.counters["instances"] > expected.counters["instances"]) == (lens == "panorama")  # of narrower tiles
     assert 0 < actual.counters["contributing"] <= actual.counters["evaluated"]
     with pytest.raises(KeyError):
         actual.counters["pixels"]

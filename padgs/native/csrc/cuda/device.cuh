@@ -28,6 +28,7 @@ void launch(void (*kernel)(P...), int64_t blocks, int threads, const Queue &, A.
   emulate(unsigned(blocks), unsigned(threads), [=] { kernel(arguments...); });
 }
 inline float quick_inverse(float x) { return 1.0f / x; }
+inline float quick_exp2(float x) { return exp2f(x); }
 
 #else
 
@@ -35,7 +36,17 @@ template <class... P, class... A>
 void launch(void (*kernel)(P...), int64_t blocks, int threads, const Queue &queue, A... arguments) {
   if (blocks > 0) kernel<<<unsigned(blocks), threads, 0, cudaStream_t(queue.stream)>>>(arguments...);
 }
-__device__ inline float quick_inverse(float x) { return __fdividef(1.0f, x); }
+// To the last bit but one, without detours for the smallest numbers, for which they give or take 0.
+__device__ inline float quick_inverse(float x) {
+  float y;
+  asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+  return y;
+}
+__device__ inline float quick_exp2(float x) {
+  float y;
+  asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+  return y;
+}
 
 #endif
 
@@ -70,6 +81,38 @@ __device__ inline int warp_max(int value) {
     value = other > value ? other : value;
   }
   return value;
+}
+
+// Several sums over a warp at once: a lane returns the one that `dealt_index` names. With every step the lanes split, and
+// each half goes on with half of the values, so that 16 sums take 16 exchanges rather than 80.
+template <int kCount, int kStep = kWarp / 2>
+__device__ float dealt_sum(const float (&values)[kCount]) {
+  if constexpr (kCount == 1) {
+    float total = values[0];
+    for (int step = kStep; step; step /= 2) total += __shfl_xor_sync(kAllLanes, total, step);
+    return total;
+  } else {
+    constexpr int kHalf = (kCount + 1) / 2;
+    const bool upper = lane_index() & kStep;
+    float kept[kHalf];
+    for (int k = 0; k < kHalf; ++k) {
+      const float low = values[k], high = k + kHalf < kCount ? values[k + kHalf] : 0.0f;
+      kept[k] = (upper ? high : low) + __shfl_xor_sync(kAllLanes, upper ? low : high, kStep);
+    }
+    return dealt_sum<kHalf, kStep / 2>(kept);
+  }
+}
+// Which of `count` <= 16 values a lane has the sum of; -1 where it has none, or another lane's.
+__device__ inline int dealt_index(int count, int lane) {
+  int index = 0, here = count, step = kWarp / 2;  // values of the lane's half, without what fills it up
+  for (int size = count; size > 1; step /= 2) {
+    const int half = (size + 1) / 2;
+    const bool upper = lane & step;
+    index += upper ? half : 0;
+    here = upper ? here - half : here < half ? here : half;
+    size = half;
+  }
+  return here > 0 && lane % (2 * step) == 0 ? index : -1;
 }
 
 }  // namespace padgs

@@ -45,10 +45,6 @@ PADGS_API const char *padgs_cuda_architectures() {
 #endif
 }
 
-PADGS_API void padgs_cuda_tile_levels(const Camera *camera, int32_t *level) {
-  for (int row = 0; row < chunks(camera->height); ++row) level[row] = tile_level(*camera, row);
-}
-
 // The versions of CUDA, 1000 major + 10 minor, that the driver goes up to (0: there is none) and that this was built with.
 PADGS_API void padgs_cuda_versions(int32_t *driver, int32_t *built_with) {
 #if defined(PADGS_EMULATED)

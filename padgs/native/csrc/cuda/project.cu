@@ -48,11 +48,8 @@ __global__ void project_kernel(ProjectArguments args) {
     args.depth_keys[i] = seen ? bits_of(p.depth) : kAllLanes;  // positive floats order as their bits do
     args.indices[i] = int32_t(i);
     if (seen) atomicAdd(histogram + counted, 1u);
+    const unsigned tiles = seen ? tiles_in_row(box) : 0;
     for (int row = box.row / kTile; seen && row <= (box.row_end - 1) / kTile; ++row) {
-      Run runs[2];
-      unsigned tiles = 0;
-      const int pieces = runs_in_row(box, args.table.level[row], runs);
-      for (int r = 0; r < pieces; ++r) tiles += unsigned(runs[r].tile_end - runs[r].tile);
       if (row < counted)
         atomicAdd(histogram + row, tiles);
       else
