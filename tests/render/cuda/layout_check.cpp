@@ -9,7 +9,7 @@ using namespace padgs;
 extern "C" void check_pixels(const TileTable *table, const Reach *reaches, int32_t count, PixelPlace *places,
                              int32_t *reached) {
   for (int64_t i = 0; i < tiles_drawn(*table) * kTilePixels; ++i) {
-    places[i] = pixel_place(*table, i / kTilePixels, int(i % kTilePixels));
+    places[i] = pixel_place(*table, int(i / kTilePixels), int(i % kTilePixels));
     for (int k = 0; k < count; ++k) reached[i] |= int(reaches_part(reaches[k], places[i])) << k;
   }
 }

@@ -40,7 +40,7 @@ struct SortedPixel {
 };
 
 // Sixteen threads add up the moments of a Gaussian's instances, in the order of their slots.
-__global__ void sum_kernel(BlendGradientInputs args) {
+__global__ void __launch_bounds__(kGaussiansPerBlock *kMoments) sum_kernel(BlendGradientInputs args) {
   const int64_t i = global_thread() / kMoments;
   const int k = int(threadIdx.x) % kMoments;
   if (i >= args.visible) return;

@@ -9,7 +9,7 @@ template <bool kPlanar, int kRoom>
 __global__ void __launch_bounds__(kTilePixels, kBlocks) hybrid_kernel(BlendInputs args) {
   typedef typename PixelOf<kPlanar>::Type Pixel;
   __shared__ Batch<kTilePixels> batch;
-  const PixelPlace place = pixel_place(args.table, blockIdx.x, int(threadIdx.x));
+  const PixelPlace place = pixel_place(args.table, int(blockIdx.x), int(threadIdx.x));
   const int begin = args.tile_start[blockIdx.x], length = args.tile_start[blockIdx.x + 1] - begin;
   const Pixel pixel = pixel_at<Pixel>(args, place);
   const bool largest = args.projection == kRay;

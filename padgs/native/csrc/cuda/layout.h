@@ -72,14 +72,14 @@ struct PixelPlace {
   bool inside;
   int64_t index;
 };
-PADGS_HD PixelPlace pixel_place(const TileTable &table, int64_t tile, int thread) {
+PADGS_HD PixelPlace pixel_place(const TileTable &table, int tile, int thread) {
   const int across = chunks(table.width), part = thread / (kPartWidth * kPartHeight);
   const int pixel = thread % (kPartWidth * kPartHeight);
   PixelPlace p;
   p.column = part % (kTile / kPartWidth) * kPartWidth;
   p.row = part / (kTile / kPartWidth) * kPartHeight;
-  p.x = int(tile % across) * kTile + p.column + pixel % kPartWidth;
-  p.y = (table.first_row + int(tile / across)) * kTile + p.row + pixel / kPartWidth;
+  p.x = tile % across * kTile + p.column + pixel % kPartWidth;
+  p.y = (table.first_row + tile / across) * kTile + p.row + pixel / kPartWidth;
   p.inside = p.x < table.width && p.y < table.height;
   p.index = int64_t(p.y) * table.width + p.x;
   return p;

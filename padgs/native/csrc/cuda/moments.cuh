@@ -46,11 +46,13 @@ __global__ void __launch_bounds__(kTilePixels, kBlocks) moments_kernel(BlendGrad
   constexpr int kShape = Pixel::Pair::kMoments, kSums = kShape + 4 + !kPlanar;  // colour, depth; pulls
   __shared__ Batch<kGradientBatch> batch;
   __shared__ float partial[kWarps][kWarp][kSums];
-  __shared__ unsigned drawn[kWarps];  // which instances of the group each warp has sums of
+  __shared__ bool summed_by[kWarp][kWarps];  // which instances of the group each warp has sums of
   __shared__ int furthest_of_block;
   const BlendInputs &forward = args.forward;
   const int thread = int(threadIdx.x), warp = thread / kWarp, lane = lane_index(), own = dealt_index(kSums, lane);
-  const PixelPlace place = pixel_place(forward.table, blockIdx.x, thread);
+  const int moment = thread % kMoments;  // that the thread adds up; of some there are no sums
+  const int sum_of_moment = moment < kShape ? moment : moment < kColorMoment ? kSums : moment - kColorMoment + kShape;
+  const PixelPlace place = pixel_place(forward.table, int(blockIdx.x), thread);
   const int begin = forward.tile_start[blockIdx.x], length = forward.tile_start[blockIdx.x + 1] - begin;
   const Pixel pixel = pixel_at<Pixel>(forward, place);
   State state(args, place, length);
@@ -94,16 +96,13 @@ __global__ void __launch_bounds__(kTilePixels, kBlocks) moments_kernel(BlendGrad
         if (own >= 0) partial[warp][bit][own] = sum;
         summed |= 1u << bit;
       }
-      if (lane == 0) drawn[warp] = summed;
+      summed_by[lane][warp] = summed >> lane & 1;
       __syncthreads();
-      for (int i = thread; i < kWarp * kMoments; i += kTilePixels) {
-        const int bit = i / kMoments, moment = i % kMoments;
-        if (group + bit >= count) continue;
-        const int k = moment < kShape ? moment : moment - kColorMoment + kShape;
-        const bool any = moment < kShape || (moment >= kColorMoment && k < kSums);
+      for (int bit = thread / kMoments; bit < least(count - group, kWarp); bit += kTilePixels / kMoments) {
         float total = 0;
-        for (int w = 0; any && w < kWarps; ++w)
-          if (drawn[w] >> bit & 1) total += partial[w][bit][k];
+        if (sum_of_moment < kSums)
+          for (int w = 0; w < kWarps; ++w)
+            if (summed_by[bit][w]) total += partial[w][bit][sum_of_moment];
         args.moments[forward.slots[begin + first + group + bit]].of[moment] = total;
       }
       __syncthreads();  // nobody reads the sums, or the batch, any more

@@ -27,7 +27,7 @@ __device__ uint32_t bits_of(float x) {
   return both.bits;
 }
 
-__global__ void project_kernel(ProjectArguments args) {
+__global__ void __launch_bounds__(kThreads) project_kernel(ProjectArguments args) {
   __shared__ unsigned histogram[kHistogram + 1];
   const int rows = args.table.end_row, counted = least(rows, kHistogram);
   for (int k = int(threadIdx.x); k <= counted; k += kThreads) histogram[k] = 0;  // the last: how many are drawn
@@ -61,7 +61,7 @@ __global__ void project_kernel(ProjectArguments args) {
     if (histogram[k]) atomicAdd(args.counts + (k < counted ? k : rows), (unsigned long long)histogram[k]);
 }
 
-__global__ void project_backward_kernel(ProjectGradientArguments args) {
+__global__ void __launch_bounds__(kThreads) project_backward_kernel(ProjectGradientArguments args) {
   __shared__ double partial[kThreads / kWarp][12];
   const int64_t i = global_thread();
   float pose[12] = {};
