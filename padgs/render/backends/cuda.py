@@ -15,7 +15,7 @@ from torch import Tensor
 
 from padgs.native import cuda
 from padgs.native.abi import MOMENTS, Gradients, Inputs, pointer
-from padgs.render.backends.cuda_tiles import DeviceProjected, DeviceStrip
+from padgs.render.backends.cuda_tiles import MAX_INSTANCES, DeviceProjected, DeviceStrip, Reading
 from padgs.render.backends.native import NativeImage, Pixels, Upstream, rasterize_as
 from padgs.render.backends.native_camera import NativeRays, native_camera, native_rays
 from padgs.render.contract import Rendering, RenderOptions, Request
@@ -23,6 +23,8 @@ from padgs.render.published_bounds import check_memory
 from padgs.sphere.camera import Camera
 
 IDENTITY = torch.eye(4)
+HEADROOM = 1.3  # room for so many times the instances of the last image of this size
+_rooms: dict[tuple, int] = {}  # device, width and height -> room for the next
 FLOATS = functools.partial(torch.empty, dtype=torch.float32)
 INTEGERS = functools.partial(torch.empty, dtype=torch.int32)
 
@@ -108,11 +110,23 @@ class Outputs:
 class _Drawing(NativeImage):
     def draw(self, inputs: Inputs, pose: Tensor, background: Tensor, *, differentiated: bool) -> tuple[Pixels, Tensor]:
         camera, options, device = self.camera, self.options, pose.device
-        self._projected = DeviceProjected(native_camera(IDENTITY, camera, options), pose, inputs, options.max_instances)
-        check_memory(self._projected.instances, options)
         self.rays = native_rays(camera, device)
         outputs = Outputs.of(camera, options, device, differentiated=differentiated)
-        pairs = blend(self._projected, self.rays, background, outputs)
+        native, alike = native_camera(IDENTITY, camera, options), (device, camera.width, camera.height)
+        limit = min(options.max_instances, MAX_INSTANCES)
+        room = _rooms.get(alike, 0) if options.memory_cap is None else 0
+        if not 0 < room <= limit:
+            room = 0
+        while True:
+            self._projected = DeviceProjected(native, pose, inputs, options.max_instances, room=room)
+            counts = Reading(self._projected.counts) if room else None
+            if counts is None:
+                check_memory(self._projected.instances, options)
+            pairs = blend(self._projected, self.rays, background, outputs)
+            if counts is None or self._projected.fits(counts.values()):
+                break
+            room = 0
+        _rooms[alike] = max(int(HEADROOM * self._projected.instances) + 1, room * 15 // 16)
         self._kept = (outputs.last, outputs.core_size, outputs.core, outputs.tails)
         known = {"visible": self._projected.visible, "instances": self._projected.instances}
         self.counters = Counters(pairs, gaussians=inputs.count, **known)

@@ -144,6 +144,39 @@ def test_what_is_drawn_does_not_depend_on_what_a_compiler_fuses(projection, lens
     torch.testing.assert_close(fused[0].image, usual[0].image, rtol=1e-5, atol=1e-6)
 
 
+@pytest.fixture(autouse=True)
+def no_image_before(monkeypatch: pytest.MonkeyPatch):
+    """Every test begins without a last image, of whose size room for the next is taken."""
+    monkeypatch.setattr(cuda_backend, "_rooms", {})
+
+
+@pytest.mark.parametrize("blending", ["sorted", "hybrid"])
+def test_room_of_the_last_image_changes_nothing_and_too_little_is_noticed(
+    blending: str, generator: torch.Generator, monkeypatch: pytest.MonkeyPatch
+):
+    gaussians, options, rooms = crowd(200, generator), RenderOptions("ray", **blended(blending, 3)), []
+    call = cuda.call
+
+    def spy(name: str, where, *arguments) -> None:
+        if name == "padgs_cuda_bin":
+            rooms.append(arguments[0].sort.count)
+        call(name, where, *arguments)
+
+    monkeypatch.setattr(cuda, "call", spy)
+    usual = drawn(gaussians, (72, 36), options)
+    count = usual[0].counters["instances"]
+    outputs = ("image", "transmittance", "depth", "visible")
+    assert_same_bits(drawn(gaussians, (72, 36), options), usual, outputs)
+    assert rooms == [count, int(1.3 * count) + 1]
+    for (_, *size), room in list(cuda_backend._rooms.items()):
+        assert size == [72, 36] and room == int(1.3 * count) + 1
+    cuda_backend._rooms = dict.fromkeys(cuda_backend._rooms, count - 1)
+    assert_same_bits(drawn(gaussians, (72, 36), options), usual, outputs)
+    assert rooms[2:] == [count - 1, count]  # drawn again
+    assert_same_bits(drawn(gaussians, (72, 36), replace(options, max_instances=count)), usual, outputs)
+    assert rooms[4:] == [count]  # the room would be for more than may be
+
+
 @pytest.mark.parametrize("blending", ["sorted", "hybrid"])
 def test_results_repeat_bit_by_bit(blending: str, generator: torch.Generator):
     gaussians, options = crowd(400, generator), RenderOptions("tangent", blending=blending)
