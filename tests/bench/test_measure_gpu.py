@@ -15,7 +15,9 @@ SCRIPT = Path(__file__).parents[2] / "reports" / "measure_gpu.sh"
 PYTHON = f"""#!/bin/sh
 case "$*" in
   *"-m pytest"*) echo "tests $TOOL" >> "$CALLS"; test -z "$BROKEN" ;;
-  *"bench --device cuda"*) echo bench >> "$CALLS"; echo '{{"machine": {{"gpu": "Some GPU"}}}}' > "$OUT/bench_gpu.json" ;;
+  *"bench --device cuda"*)
+    echo bench >> "$CALLS"
+    echo '{{"machine": {{"gpu": "Some GPU"}}}}' > "$OUT/bench_gpu.json" ;;
   *) exec {sys.executable} "$@" ;;
 esac
 """
