@@ -14,9 +14,10 @@ import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
+RESERVED = 1 << 10  # bytes of shared memory of every block that are the system's; from 9.0 on cuobjdump counts them
 REGISTERS = 65536  # of an SM; a warp takes them in units of 256
 # Threads, blocks and bytes of shared memory of an SM, by compute capability: CUDA C++ Programming Guide, "Compute
-# Capabilities". cuobjdump counts the 1 KiB that the system takes of every block as the block's.
+# Capabilities".
 SMS = {
     80: (2048, 32, 164 << 10),
     86: (1536, 16, 100 << 10),
@@ -44,7 +45,7 @@ class Kernel:
         threads, blocks, shared = SMS[self.architecture]
         warps = -(-self.threads // 32)
         by_registers = REGISTERS // (warps * -(-self.registers * 32 // 256) * 256)
-        by_shared = shared // self.shared if self.shared else blocks
+        by_shared = shared // (self.shared + (RESERVED if self.architecture < 90 else 0) or 1)
         return min(blocks, by_registers, by_shared, threads // (32 * warps)) * self.threads / threads
 
 
