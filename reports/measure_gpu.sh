@@ -1,49 +1,85 @@
 #!/bin/sh
-# On a machine with an NVIDIA GPU: build, test, benchmark, and write reports/measured/<device>.json. Needs no network:
-# nvcc, cmake, a C++ compiler, and a python3 with torch, numpy, pytest, hypothesis, typer and rich. What is missing of the
-# pure-Python ones may lie in the folder wheels/ as wheels. PYTHON names another python3; FULL=0 leaves out a million
-# Gaussians. Fails if the build fails; failing tests are counted in the result instead.
+# On a machine with an NVIDIA GPU: build, benchmark, test, and look for faults, in this order; what is known by then is
+# written after each step to reports/measured/<device>.json, and the last line says what has been verified and what not.
+#
+#   reports/measure_gpu.sh [STEP...]     all of: build bench tests memcheck synccheck racecheck initcheck
+#
+# A step that is done is not done again, so the same command goes on where it was cut off; $OUT/STEP.state says how each
+# ended, $OUT/STEP.log what it printed (OUT: build/gpu/out). Delete $OUT to start over.
+#
+# Needs no network: nvcc, cmake, a C++ compiler, and a python3 (PYTHON names another) with torch, numpy, pytest,
+# hypothesis, typer and rich. What is missing of the pure-Python ones may lie in the folder wheels/ as wheels. FULL=0
+# leaves out a million Gaussians, LIMIT=900 gives a step so many seconds.
 set -eu
 cd "$(dirname "$0")/.."
 python=${PYTHON:-python3}
 build=$PWD/build/gpu
+out=${OUT:-$build/out}
 site=$build/site
-mkdir -p "$site" reports/measured
-if [ -d wheels ]; then $python -m pip install -q --no-index --no-deps --upgrade --target "$site" wheels/*.whl; fi
-
-capability=$(nvidia-smi --query-gpu=compute_cap --format=csv,noheader | head -n 1 | tr -d .)
-cmake -S . -B "$build" -DCMAKE_BUILD_TYPE=Release -DPADGS_CUDA=ON -DPADGS_CUDA_ARCHITECTURES="$capability"
-cmake --build "$build" --parallel
-mkdir -p "$build/lib"
-find "$build/padgs" -name 'libpadgs_*.so' -exec cp {} "$build/lib" \;
+all="build bench tests memcheck synccheck racecheck initcheck"
+mkdir -p "$site" "$out" reports/measured
 export PADGS_LIBRARY_DIR="$build/lib" PYTHONPATH="$PWD:$site" PYTHONUNBUFFERED=1 OMP_NUM_THREADS=4
 
-$python -m pytest -q -m cuda tests/render --junitxml="$build/tests.xml" || echo "some tests failed"
-sanitizer=not-run
-if command -v compute-sanitizer >/dev/null; then
-  if timeout 300 compute-sanitizer --tool memcheck --error-exitcode 99 \
-    $python -m pytest -q -x -m cuda tests/render/cuda/test_cuda_backend.py tests/render/cuda/test_cuda_loss.py >"$build/sanitizer.log" 2>&1
-  then sanitizer=passed; else sanitizer="failed ($?)"; fi
-  tail -n 3 "$build/sanitizer.log"
-fi
-full=--full
-if [ "${FULL:-1}" = 0 ]; then full=--no-full; fi
-$python -c 'from padgs.cli.app import app; app()' bench --device cuda $full --out "$build/bench"
+build() {
+  if [ -d wheels ]; then $python -m pip install -q --no-index --no-deps --upgrade --target "$site" wheels/*.whl; fi
+  cmake -S . -B "$build" -DCMAKE_BUILD_TYPE=Release -DPADGS_CUDA=ON && cmake --build "$build" --parallel
+  mkdir -p "$build/lib"
+  find "$build/padgs" -name 'libpadgs_*.so' -exec cp {} "$build/lib" \;
+}
+bench() {
+  full=--full
+  if [ "${FULL:-1}" = 0 ]; then full=--no-full; fi
+  $python -c 'from padgs.cli.app import app; app()' bench --device cuda $full --out "$out"
+}
+tests() { $python -m pytest -q -m cuda tests/render --junitxml="$out/tests.xml"; }
+sanitizer() {
+  compute-sanitizer --tool "$1" --error-exitcode 99 $python -m pytest -q -x -m cuda -k "not long and not any_size" \
+    tests/render/cuda/test_cuda_backend.py tests/render/cuda/test_cuda_loss.py
+}
+memcheck() { PYTORCH_NO_CUDA_MEMORY_CACHING=1 sanitizer memcheck; }  # else it sees one large block
+synccheck() { sanitizer synccheck; }
+racecheck() { sanitizer racecheck; }
+initcheck() { sanitizer initcheck; }
 
-SANITIZER="$sanitizer" $python - "$build" <<'END'
-import json, os, re, sys
+conclude() {
+  $python - "$out" $all <<'END'
+import json, re, sys
 from pathlib import Path
 from xml.etree import ElementTree
 
-build = Path(sys.argv[1])
-report = json.loads((build / "bench" / "bench_gpu.json").read_text())
-suite = ElementTree.parse(build / "tests.xml").getroot().find("testsuite")
-counts = {key: int(suite.get(key)) for key in ("tests", "failures", "errors", "skipped")}
-failed = [f"{c.get('classname')}::{c.get('name')}" for c in suite.iter("testcase") if c.find("failure") is not None]
-report["tests"] = {**counts, "failed": failed}
-report["compute_sanitizer"] = os.environ["SANITIZER"]
-name = re.sub(r"[^a-z0-9]+", "-", report["machine"]["gpu"].lower()).strip("-")
-target = Path("reports/measured") / f"{name}.json"
-target.write_text(json.dumps(report, indent=1) + "\n")
-print(f"written: {target}; tests: {counts}")
+out, steps = Path(sys.argv[1]), sys.argv[2:]
+states = {step: (out / f"{step}.state").read_text().strip() if (out / f"{step}.state").exists() else "not run" for step in steps}
+if (out / "bench_gpu.json").exists():
+    report = json.loads((out / "bench_gpu.json").read_text()) | {"steps": states}
+    if (out / "tests.xml").exists():
+        suite = ElementTree.parse(out / "tests.xml").getroot().find("testsuite")
+        counts = {key: int(suite.get(key)) for key in ("tests", "failures", "errors", "skipped")}
+        cases = [case for case in suite.iter("testcase") if case.find("failure") is not None]
+        report["tests"] = {**counts, "failed": [f"{case.get('classname')}::{case.get('name')}" for case in cases]}
+    name = re.sub(r"[^a-z0-9]+", "-", report["machine"]["gpu"].lower()).strip("-")
+    Path("reports/measured", f"{name}.json").write_text(json.dumps(report, indent=1) + "\n")
+verified = " ".join(step for step, state in states.items() if state == "ok")
+missing = ", ".join(f"{step} ({state})" for step, state in states.items() if state != "ok")
+print(f"verified: {verified or 'nothing'}; not verified: {missing or 'nothing'}")
 END
+}
+
+# In a process of its own, which the limit ends: the script itself, told to do only this.
+if [ "${1:-}" = --only ]; then
+  "$2"
+  exit
+fi
+for step in ${*:-$all}; do
+  case " $all " in *" $step "*) ;; *) echo "unknown step $step; known: $all" >&2; exit 2 ;; esac
+  if [ "$(cat "$out/$step.state" 2>/dev/null)" = ok ]; then continue; fi
+  echo "$step ..."
+  if timeout "${LIMIT:-900}" "$0" --only "$step" >"$out/$step.log" 2>&1; then
+    echo ok >"$out/$step.state"
+  else
+    echo "failed ($?)" >"$out/$step.state"
+    tail -n 5 "$out/$step.log"
+  fi
+  conclude >"$out/verdict"
+  if [ "$step" = build ] && [ "$(cat "$out/build.state")" != ok ]; then break; fi
+done
+cat "$out/verdict"

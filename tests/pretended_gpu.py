@@ -83,6 +83,8 @@ class _Operations(TorchDispatchMode):
         else:
             on_gpu = isinstance(tensors[0], OnGPU) if there and name in (*COPYING, *INDEXING) else there
         sent = name == "_to_copy" and there != on_gpu  # either way; CUDA waits for copies from pageable memory too
+        if there and name in INDEXING and any(t.dtype in (torch.bool, torch.uint8) for t in indices_of(args)):
+            self._waits["mask"] += 1  # becomes as many numbers as it has ones
         if sent or (name == "copy_" and len({type(t) for t in tensors}) > 1) or (there and name in READING):
             self._waits[name] += 1
         plain_args, plain_kwargs = tree_map(_plain, (args, kwargs))
@@ -122,6 +124,11 @@ class _Functions(TorchFunctionMode):
             places = args[1] if isinstance(args[1], tuple) else (args[1],)
             args = args[0], tuple(torch.tensor(place) if isinstance(place, list) else place for place in places)
         return function(*args, **kwargs)
+
+
+def indices_of(args: tuple) -> list[Tensor]:
+    """The second argument of an operation of `INDEXING`."""
+    return [index for index in args[1] if isinstance(index, Tensor)]
 
 
 def _plain(value: Any) -> Any:

@@ -119,9 +119,9 @@ class Growth:
         statistics = self.statistics
         statistics["opacity"] += raw_opacities.clamp(min=0).sum(-1)
         statistics["decoded"] += 1
-        seen = slots[visible]
-        statistics["gradient"].view(-1)[seen] += gradient[visible].norm(dim=-1)
-        statistics["seen"].view(-1)[seen] += 1
+        # All of them, the others with zeros: how many are visible is a number that the host would wait for.
+        statistics["gradient"].view(-1)[slots] += torch.where(visible, gradient.norm(dim=-1), 0)
+        statistics["seen"].view(-1)[slots] += visible
 
     @torch.no_grad()
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:

@@ -35,6 +35,9 @@ def bench(
     from padgs.bench.tables import lines
     from padgs.results import replace_file
 
+    def as_json(report: dict) -> bytes:
+        return json.dumps(report, indent=1, allow_nan=False).encode()
+
     folder, console = Path(out), Console(highlight=False)
     folder.mkdir(parents=True, exist_ok=True)  # before minutes of measuring, not after
     measure: Any
@@ -48,15 +51,16 @@ def bench(
         sizes = ("quick",) if quick else ("medium", "large") if full else ("medium",)
         repeats = repeats or (3 if quick else 50)
         where = torch.device(device)
-        measure = partial(measure_gpu, sizes, where, repeats=repeats, warm_up=min(10, repeats), seed=seed)
         shown, written = gpu_lines, [folder / "bench_gpu.json"]
+
+        def keep(report: dict) -> None:  # what has been measured when somebody, or a time limit, ends it
+            replace_file(written[0], as_json(report))
+
+        measure = partial(measure_gpu, sizes, where, repeats=repeats, warm_up=min(10, repeats), seed=seed, keep=keep)
     with console.status("measuring") as status:
         report = measure(progress=lambda what: status.update(f"measuring {what}"))
     for line in shown(report):
         console.print(line)
     for path in written:
-        content = (
-            stacked_bars(report) if path.suffix == ".png" else json.dumps(report, indent=1, allow_nan=False).encode()
-        )
-        replace_file(path, content)
+        replace_file(path, stacked_bars(report) if path.suffix == ".png" else as_json(report))
     print(f"written: {', '.join(map(str, written))}")

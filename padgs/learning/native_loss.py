@@ -61,7 +61,7 @@ def _on_cpu(arguments: LossArguments, image: Tensor, total: Tensor) -> Tensor:
 @functools.lru_cache(maxsize=2)
 def _workspace(height: int, width: int) -> Tensor:
     # Kept between iterations: fresh memory costs more in page faults than the loss does in arithmetic.
-    return torch.zeros(cpu.library().padgs_loss_workspace(height, width))
+    return torch.zeros(cpu.library().padgs_loss_workspace(height, width), dtype=torch.float32)
 
 
 def _on_gpu(arguments: LossArguments, image: Tensor, total: Tensor) -> Tensor:

@@ -37,10 +37,7 @@ class Queue(ctypes.Structure):
 
 
 class TileTable(ctypes.Structure):
-    _fields_ = [
-        *fields(Int32, "width", "height", "first_row", "end_row"),
-        *fields(Pointer, "level", "row_start", "state_start"),
-    ]
+    _fields_ = fields(Int32, "width", "height", "first_row", "end_row")
 
 
 class ProjectArguments(ctypes.Structure):
@@ -97,9 +94,7 @@ class BlendInputs(ctypes.Structure):
 class BlendGradientInputs(ctypes.Structure):
     _fields_ = [
         ("forward", BlendInputs),
-        *fields(Pointer, "grad_image", "grad_transmittance", "grad_depth", "upstream", "states", "furthest"),
-        *fields(Pointer, "core_gradients", "tail_gradients"),
-        ("instances", Int64),
+        *fields(Pointer, "grad_image", "grad_transmittance", "grad_depth", "core_gradients"),
         *fields(Pointer, "moments", "grad_rays", "order", "slot_start"),
         ("visible", Int64),
         ("totals", Pointer),
@@ -135,16 +130,16 @@ SIGNATURES: dict[str, tuple[list, Any]] = {
     "padgs_cuda_structure_bytes": ([Int32], Int64),
     "padgs_cuda_device_type": ([], ctypes.c_char_p),
     "padgs_cuda_architectures": ([], ctypes.c_char_p),
+    "padgs_cuda_versions": ([Pointer, Pointer], None),
     "padgs_cuda_check": ([Pointer], Int32),
     "padgs_cuda_error": ([Int32], ctypes.c_char_p),
-    "padgs_cuda_tile_levels": ([Pointer, Pointer], None),
     "padgs_cuda_scratch_bytes": ([Pointer, Int64], Int64),
     "padgs_cuda_pose_blocks": ([Int64], Int64),
     "padgs_cuda_project": ([Pointer, Pointer], Int32),
     "padgs_cuda_sort": ([Pointer, Pointer], Int32),
     "padgs_cuda_bin": ([Pointer, Pointer, Int32], Int32),
     "padgs_cuda_blend": ([Pointer, Pointer], Int32),
-    "padgs_cuda_blend_backward": ([Pointer, Pointer, Int32], Int32),
+    "padgs_cuda_blend_backward": ([Pointer, Pointer], Int32),
     "padgs_cuda_project_backward": ([Pointer, Pointer], Int32),
     "padgs_cuda_decode_place": ([Pointer, Pointer], Int32),
     "padgs_cuda_decode_take_back": ([Pointer, Pointer], Int32),
@@ -158,14 +153,29 @@ def library() -> Watchable:
     """The loaded library.
 
     Raises:
-        OSError: it was not built (no nvcc when padgs was installed), does not load, or was built from other sources.
+        OSError: it was not built (no nvcc when padgs was installed), does not load, was built from other sources, or by
+            a compiler that the driver is too old for.
     """
-    return declared(opened("padgs_cuda", "nvcc"), SIGNATURES, "padgs_cuda_structure_bytes", STRUCTURES)
+    loaded = declared(opened("padgs_cuda", "nvcc and a GPU"), SIGNATURES, "padgs_cuda_structure_bytes", STRUCTURES)
+    refuse_old_driver(loaded)
+    return loaded
+
+
+def refuse_old_driver(loaded: Watchable) -> None:
+    """Raise OSError where there is a driver, but one of an older major version of CUDA than the library's runtime."""
+    driver, built_with = Int32(), Int32()
+    loaded.padgs_cuda_versions(ctypes.byref(driver), ctypes.byref(built_with))
+    if 0 < driver.value // 1000 < built_with.value // 1000:
+        has, wants = (f"{version.value // 1000}.{version.value % 1000 // 10}" for version in (driver, built_with))
+        raise OSError(
+            f"libpadgs_cuda was compiled by CUDA {wants}, and the driver here knows CUDA {has}; update the driver, "
+            f"install padgs where nvcc is of CUDA {has} or older, or render with backend=torch"
+        )
 
 
 @functools.cache
 def available() -> bool:
-    """Whether the library is built and loads; a GPU that can run it is another question."""
+    """Whether the library is built, loads and fits the driver; a GPU that can run it is another question."""
     try:
         library()
     except OSError:

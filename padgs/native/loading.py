@@ -19,7 +19,7 @@ def opened(stem: str, needs: str) -> ctypes.CDLL:
     """The library lib`stem` of this package, or of the folder PADGS_LIBRARY_DIR while someone works on the kernels.
 
     Raises:
-        OSError: it is not there, because `needs` was not when padgs was installed, or does not load.
+        OSError: it is not there, because there was no `needs` when padgs was installed, or does not load.
     """
     suffix = {"darwin": ".dylib", "win32": ".dll"}.get(sys.platform, ".so")
     name = ("" if sys.platform == "win32" else "lib") + stem + suffix
@@ -30,7 +30,7 @@ def opened(stem: str, needs: str) -> ctypes.CDLL:
         if (folder / name).exists():
             return ctypes.CDLL(str(folder / name))
     raise OSError(
-        f"{name} not found in {', '.join(map(str, folders))}; install padgs where {needs} is on the PATH, "
+        f"{name} not found in {', '.join(map(str, folders))}; install padgs where there is {needs}, "
         "or render with backend=torch"
     )
 

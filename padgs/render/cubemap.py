@@ -9,6 +9,7 @@ baselines, which no resampling removes.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from math import ceil, pi
@@ -63,8 +64,7 @@ def rasterize_cubemap(rasterize: Backend, request: Request) -> Rendering:
         shift = shift_of_probe(camera_frame(request)[0], request.probe)
         gaussians = replace(gaussians, means=gaussians.means + shift @ cam_from_world[:3, :3])
     lens = face_camera(camera, request.options.face_size)
-    turns = torch.eye(4, dtype=cam_from_world.dtype, device=cam_from_world.device).repeat(6, 1, 1)
-    turns[:, :3, :3] = FACES
+    turns = _turns(cam_from_world.dtype, cam_from_world.device)
     options = replace(request.options, cubemap=False, face_size=None).on_finer_pixels(lens.focal / camera.focal)
     each = replace(request, gaussians=gaussians, camera=lens, options=options, probe=None)
     faces = [rasterize(replace(each, cam_from_world=turn @ cam_from_world)) for turn in turns]
@@ -90,9 +90,33 @@ def panorama_from_faces(faces: list[Rendering], panorama: Panorama, lens: Pinhol
     covered = coverage > 0
     depth = torch.where(covered, depth, 0) / torch.where(covered, coverage, 1)
     visible = torch.stack([face.visible for face in faces]).any(0)
-    counters = {name: sum(face.counters[name] for face in faces) for name in faces[0].counters}
-    counters |= {"gaussians": len(visible), "visible": int(visible.sum())}
-    return Rendering(image, (1 - coverage).squeeze(-1), depth.squeeze(-1), visible, counters)
+    return Rendering(image, (1 - coverage).squeeze(-1), depth.squeeze(-1), visible, _Counters(faces, visible))
+
+
+class _Counters(Mapping[str, int]):
+    """Of six faces; added up, which waits for a GPU, when somebody asks."""
+
+    def __init__(self, faces: list[Rendering], visible: Tensor) -> None:
+        self._of_faces, self._visible = [face.counters for face in faces], visible
+
+    def __getitem__(self, name: str) -> int:
+        if name == "gaussians":
+            return len(self._visible)
+        return int(self._visible.sum()) if name == "visible" else sum(counters[name] for counters in self._of_faces)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._of_faces[0])
+
+    def __len__(self) -> int:
+        return len(self._of_faces[0])
+
+
+@lru_cache(maxsize=16)
+def _turns(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """From the camera to each face, [6, 4, 4]."""
+    turns = torch.eye(4, dtype=dtype).repeat(6, 1, 1)
+    turns[:, :3, :3] = FACES
+    return turns.to(device)
 
 
 @lru_cache(maxsize=16)

@@ -30,11 +30,11 @@ ANCHORS = tuple(
 # setting -> overrides that make it small, and grow; how often the host waits in an iteration without growth or
 # checks: once for the pixels, which are not kept there, the rest is of backend torch, the decoder, and random rays
 METHODS = {
-    "padgs": (ANCHORS, 8),
-    "omnigs": (SPLATS, 6),
-    "sc_omnigs": (SPLATS, 6),
-    "seam360gs": (SPLATS, 7),
-    "cubemap_3dgs": (SPLATS, 6 * 6),  # an iteration draws six views
+    "padgs": (ANCHORS, 9),
+    "omnigs": (SPLATS, 7),
+    "sc_omnigs": (SPLATS, 7),
+    "seam360gs": (SPLATS, 9),
+    "cubemap_3dgs": (SPLATS, 6 * 7),  # an iteration draws six views
     "egonerf_small": (
         tuple(
             f"method.{name}={value}"

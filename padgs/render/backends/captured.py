@@ -153,7 +153,9 @@ def captured(record: Callable[[], Frame], device: torch.device) -> Callable[[], 
         with torch.cuda.stream(aside):  # once before: nothing may be loaded, or cached, while recording
             record()
         torch.cuda.current_stream().wait_stream(aside)
-        with torch.cuda.graph(graph):
+        # Of this device (torch's own stream for it is of the first that anything was recorded on); what other threads
+        # do meanwhile, such as allocating, does not end the recording.
+        with torch.cuda.graph(graph, stream=aside, capture_error_mode="thread_local"):
             frame = record()
 
     def replay() -> Frame:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from padgs.native import cuda
 from padgs.native.abi import MOMENTS, Gradients, Inputs, pointer
-from padgs.render.backends.cuda_tiles import DeviceProjected, DeviceStrip
+from padgs.render.backends.cuda_tiles import MAX_INSTANCES, DeviceProjected, DeviceStrip, Reading
 from padgs.render.backends.native import NativeImage, Pixels, Upstream, rasterize_as
 from padgs.render.backends.native_camera import NativeRays, native_camera, native_rays
 from padgs.render.contract import Rendering, RenderOptions, Request
@@ -23,6 +23,10 @@ from padgs.render.published_bounds import check_memory
 from padgs.sphere.camera import Camera
 
 IDENTITY = torch.eye(4)
+HEADROOM = 1.3  # room for so many times the instances of the last image of this size
+_rooms: dict[tuple, int] = {}  # device, width and height -> room for the next
+FLOATS = functools.partial(torch.empty, dtype=torch.float32)
+INTEGERS = functools.partial(torch.empty, dtype=torch.int32)
 
 
 def rasterize(request: Request) -> Rendering:
@@ -91,27 +95,38 @@ class Outputs:
         size, hybrid = (camera.height, camera.width), options.blending == "hybrid"
         core_size = options.core_size if hybrid else 0
         kept = hybrid and differentiated
-        transmittance, depth = torch.empty(2, *size, device=device)
-        integers = functools.partial(torch.empty, dtype=torch.int32, device=device)
+        transmittance, depth = FLOATS(2, *size, device=device)
         return Outputs(
-            torch.empty(*size, 3, device=device),
+            FLOATS(*size, 3, device=device),
             transmittance,
             depth,
-            None if hybrid else integers(size),
+            None if hybrid else INTEGERS(size, device=device),
             core_size,
-            integers((*size, core_size)) if kept else None,
-            torch.empty(*size, 6, device=device) if kept else None,
+            INTEGERS((*size, core_size), device=device) if kept else None,
+            FLOATS(*size, 6, device=device) if kept else None,
         )
 
 
 class _Drawing(NativeImage):
     def draw(self, inputs: Inputs, pose: Tensor, background: Tensor, *, differentiated: bool) -> tuple[Pixels, Tensor]:
         camera, options, device = self.camera, self.options, pose.device
-        self._projected = DeviceProjected(native_camera(IDENTITY, camera, options), pose, inputs, options.max_instances)
-        check_memory(self._projected.instances, options)
         self.rays = native_rays(camera, device)
         outputs = Outputs.of(camera, options, device, differentiated=differentiated)
-        pairs = blend(self._projected, self.rays, background, outputs)
+        native, alike = native_camera(IDENTITY, camera, options), (device, camera.width, camera.height)
+        limit = min(options.max_instances, MAX_INSTANCES)
+        room = _rooms.get(alike, 0) if options.memory_cap is None else 0
+        if not 0 < room <= limit:
+            room = 0
+        while True:
+            self._projected = DeviceProjected(native, pose, inputs, options.max_instances, room=room)
+            counts = Reading(self._projected.counts) if room else None
+            if counts is None:
+                check_memory(self._projected.instances, options)
+            pairs = blend(self._projected, self.rays, background, outputs)
+            if counts is None or self._projected.fits(counts.values()):
+                break
+            room = 0
+        _rooms[alike] = max(int(HEADROOM * self._projected.instances) + 1, room * 15 // 16)
         self._kept = (outputs.last, outputs.core_size, outputs.core, outputs.tails)
         known = {"visible": self._projected.visible, "instances": self._projected.instances}
         self.counters = Counters(pairs, gaussians=inputs.count, **known)
@@ -121,25 +136,19 @@ class _Drawing(NativeImage):
     def moments(self, pixels: Pixels, background: Tensor, upstream: Upstream) -> Tensor:
         projected, outputs = self._projected, Outputs(*pixels, *self._kept)
         device, size, hybrid = background.device, outputs.depth.shape, outputs.core_size > 0
-        totals = torch.zeros(len(projected.order), MOMENTS, device=device)
-        packed = torch.empty(*size, 4, device=device)
-        core_gradients = torch.empty(*size, outputs.core_size, 2, device=device) if hybrid else None
-        tail_gradients = torch.empty(*size, 4, device=device) if hybrid else None
+        totals = torch.zeros(len(projected.order), MOMENTS, dtype=torch.float32, device=device)
+        core_gradients = FLOATS(*size, outputs.core_size, 2, device=device) if hybrid else None
         for strip in projected.strips():
-            states = None if hybrid else projected.states(strip)
-            furthest = None if hybrid else torch.empty(strip.chunks, dtype=torch.int32, device=device)
-            moments = torch.empty(strip.instances, MOMENTS, device=device)
+            moments = FLOATS(strip.instances, MOMENTS, device=device)
             arguments = cuda.BlendGradientInputs(
                 _blend_inputs(projected, strip, self.rays, background, outputs, None),
                 *map(pointer, (upstream.image, upstream.transmittance, upstream.depth)),
-                *map(pointer, (packed, states, furthest, core_gradients, tail_gradients)),
-                strip.instances,
-                *map(pointer, (moments, upstream.rays, projected.order, strip.slot_start)),
+                *map(pointer, (core_gradients, moments, upstream.rays, projected.order, strip.slot_start)),
                 projected.visible,
                 pointer(totals),
                 upstream.absolute,
             )
-            cuda.call("padgs_cuda_blend_backward", projected.queue, arguments, strip.tiles)
+            cuda.call("padgs_cuda_blend_backward", projected.queue, arguments)
         return totals
 
     def project_backward(
@@ -158,7 +167,7 @@ def blend(projected: DeviceProjected, rays: NativeRays, background: Tensor, outp
     """Fill the outputs; returns how many pairs were evaluated, and how many contributed, [2] int64."""
     pairs = torch.zeros(2, dtype=torch.int64, device=background.device)
     for strip in projected.strips():
-        pair_counts = torch.empty(strip.chunks, 2, dtype=torch.int32, device=background.device)
+        pair_counts = INTEGERS(strip.tiles, 2, device=background.device)
         arguments = _blend_inputs(projected, strip, rays, background, outputs, pair_counts)
         cuda.call("padgs_cuda_blend", projected.queue, arguments)
         pairs += pair_counts.sum(0)

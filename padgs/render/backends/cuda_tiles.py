@@ -20,49 +20,15 @@ from padgs.native.abi import Inputs, NativeCamera, pointer
 from padgs.native.cuda import Queue, SortArguments, TileTable
 from padgs.render.backends.cpu_tiles import TILE, strip_cuts
 
-BUCKET = 32  # instances of one list that a warp differentiates together, see csrc/cuda/layout.h
-CHUNK_PIXELS = TILE * TILE
-MAX_INSTANCES = (1 << 31) - 1  # of one strip: positions in its lists are 32-bit integers
-
-
-class TileRows:
-    """Widths of the tiles of an image, by row of tiles: on the host, and as the kernels read them."""
-
-    def __init__(self, level: list[int], width: int, device: torch.device) -> None:
-        """From the level of each row: its tiles are 16 * 2^level pixels wide."""
-        columns = -(-width // TILE)
-        self.levels = level
-        self.tiles = [-(-columns // (1 << one)) for one in level]
-        self.columns = columns
-        self.level = torch.tensor(level, dtype=torch.int32).to(device)
-        starts = torch.tensor([0, *self.tiles]).cumsum(0)
-        self.row_start = starts.to(device, torch.int32)
-
-    def state_starts(self, instances: list[int]) -> list[int]:
-        """Blocks of 256 pixel states before each row, and all of them: 2^level for each bucket that a row may have."""
-        starts = [0]
-        for level, tiles, count in zip(self.levels, self.tiles, instances, strict=True):
-            starts.append(starts[-1] + ((count // BUCKET + 1 + tiles) << level))
-        return starts
-
-
-@functools.lru_cache(maxsize=16)
-def tile_rows(width: int, height: int, model: int, square: int, device: torch.device) -> TileRows:
-    """The rows of tiles of a camera; computed once for each device."""
-    level = torch.empty(-(-height // TILE), dtype=torch.int32)
-    camera = NativeCamera(width=width, height=height, model=model, square=square)
-    cuda.library().padgs_cuda_tile_levels(ctypes.byref(camera), pointer(level))
-    return TileRows(level.tolist(), width, device)
+MAX_INSTANCES = (1 << 31) - 1 - 512  # of one strip: positions in its lists, and a batch behind, are 32-bit integers
 
 
 class DeviceStrip:
     """The lists of some rows of tiles."""
 
     def __init__(self, projected: DeviceProjected, first_row: int, end_row: int) -> None:
-        device, rows = projected.order.device, projected.rows
-        self.first_row, self.end_row = first_row, end_row
-        self.tiles = sum(rows.tiles[first_row:end_row])
-        self.chunks = (end_row - first_row) * rows.columns
+        device = projected.order.device
+        self.tiles = (end_row - first_row) * -(-projected.camera.width // TILE)
         self.instances = projected.room if projected.room else sum(projected.per_row[first_row:end_row])
         if self.instances > MAX_INSTANCES:
             raise ValueError(
@@ -110,6 +76,25 @@ class Sorter:
         return SortArguments(pointer(self.scratch), len(self.scratch), self.count, *map(pointer, buffers), bits)
 
 
+class Reading:
+    """Numbers on their way to the host, which does other things meanwhile, and which the device need not stop for."""
+
+    def __init__(self, values: Tensor) -> None:
+        self._event = None
+        device = values.device
+        if device.type == "cuda":
+            values = torch.empty(values.shape, dtype=values.dtype, pin_memory=True).copy_(values, non_blocking=True)
+            self._event = torch.cuda.Event()
+            self._event.record(torch.cuda.current_stream(device))
+        self._values = values
+
+    def values(self) -> list[int]:
+        """The numbers; waits until the device has got that far."""
+        if self._event is not None:
+            self._event.synchronize()
+        return self._values.tolist()
+
+
 class DeviceProjected:
     """All Gaussians as one view sees them, in depth order, and how they spread over the tiles."""
 
@@ -129,27 +114,31 @@ class DeviceProjected:
         device, count = pose.device, inputs.count
         self.queue = cuda.queue(device)
         self.camera = camera
-        self.rows = tile_rows(camera.width, camera.height, camera.model, camera.square, device)
-        self.footprints = torch.empty(count, 16, device=device)
+        rows = -(-camera.height // TILE)
+        self.footprints = torch.empty(count, 16, dtype=torch.float32, device=device)
         self.boxes = torch.empty(count, 5, dtype=torch.int32, device=device)
         self.order = torch.empty(count, dtype=torch.int32, device=device)
         self.per_row: list[int] = []
-        self._state_start: Tensor | None = None
         self._only: DeviceStrip | None = None
         sort = Sorter(self.queue, count, device)
-        self.counts = torch.zeros(len(self.rows.levels) + 1, dtype=torch.int64, device=device)
+        self.counts = torch.zeros(rows + 1, dtype=torch.int64, device=device)
         outputs = (self.footprints, self.boxes, sort.keys, sort.values)
-        table = self.table(0, len(self.rows.levels))
+        table = self.table(0, rows)
         arguments = cuda.ProjectArguments(
             camera, pointer(pose), inputs, *map(pointer, outputs), table, pointer(self.counts)
         )
         cuda.call("padgs_cuda_project", self.queue, arguments)
         cuda.call("padgs_cuda_sort", self.queue, sort.arguments(self.order, bits=32))
         self.room, self.visible = room, count
-        self._cuts = [0, len(self.rows.levels)]
+        self._cuts = [0, rows]
         if not room:
             *self.per_row, self.visible = self.counts.tolist()
             self._cuts = strip_cuts(self.per_row, min(max_instances, MAX_INSTANCES))
+
+    def fits(self, counts: list[int]) -> bool:
+        """Whether there was room for all instances; `self.counts`, once they are known."""
+        *self.per_row, self.visible = counts
+        return self.instances <= self.room
 
     @property
     def instances(self) -> int:
@@ -157,9 +146,8 @@ class DeviceProjected:
         return sum(self.per_row)
 
     def table(self, first_row: int, end_row: int) -> TileTable:
-        """Some rows of tiles, for the library; with the places of pixel states once there are any."""
-        rows = (self.rows.level, self.rows.row_start, self._state_start)
-        return TileTable(self.camera.width, self.camera.height, first_row, end_row, *map(pointer, rows))
+        """Some rows of tiles, for the library."""
+        return TileTable(self.camera.width, self.camera.height, first_row, end_row)
 
     def strips(self) -> Iterator[DeviceStrip]:
         """The strips of the image from top to bottom; a single one is kept for the backward pass, more are not."""
@@ -170,12 +158,3 @@ class DeviceProjected:
             return
         for first, end in zip(self._cuts, self._cuts[1:], strict=False):
             yield DeviceStrip(self, first, end)
-
-    def states(self, strip: DeviceStrip) -> Tensor:
-        """Room for the states of a strip's pixels behind each of its buckets, [states, 256, 2]; sets their places."""
-        starts = self.rows.state_starts(self.per_row)
-        if self._state_start is None:
-            self._state_start = torch.tensor(starts).to(self.order.device)
-        strip.table = self.table(strip.first_row, strip.end_row)
-        total = starts[strip.end_row] - starts[strip.first_row]
-        return torch.empty(total, CHUNK_PIXELS, 2, device=self.order.device)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import ctypes
 import functools
+from collections.abc import MutableMapping
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.utils.weak import WeakTensorKeyDictionary
 
 from padgs.native.abi import NativeCamera, RayPointers, pointer
 from padgs.render.contract import RenderOptions
@@ -72,15 +74,22 @@ def _off_panorama(camera: Camera) -> float:
     large: a table that is nearly a panorama has its bounds, any other may look anywhere."""
     if not isinstance(camera, RayTable):
         return -1.0
-    table = camera.table.detach().float()
-    chord = (table - _panorama_rays(camera.width, camera.height).to(table.device)).norm(dim=-1)
-    angle = 2 * torch.asin((chord.max() / 2).clamp(max=1)).item() + SLACK
-    return angle if angle < FAR_OFF else -1.0
+    known = _off_panoramas.get(camera.table)
+    if known is None or known[0] != camera.table._version:
+        table = camera.table.detach().float()
+        chord = (table - _panorama_rays(camera.width, camera.height, table.device)).norm(dim=-1)
+        angle = 2 * torch.asin((chord.max() / 2).clamp(max=1)).item() + SLACK  # waits for a GPU, once for a table
+        known = _off_panoramas[camera.table] = camera.table._version, angle if angle < FAR_OFF else -1.0
+    return known[1]
+
+
+# Of tables as they were at some version of theirs.
+_off_panoramas: MutableMapping[Tensor, tuple[int, float]] = WeakTensorKeyDictionary()
 
 
 @functools.lru_cache(maxsize=4)
-def _panorama_rays(width: int, height: int) -> Tensor:
-    return Panorama(width, height).rays()
+def _panorama_rays(width: int, height: int, device: torch.device) -> Tensor:
+    return Panorama(width, height).rays(dtype=torch.float32).to(device)
 
 
 def native_rays(camera: Camera, device: torch.device = CPU) -> NativeRays:
@@ -93,7 +102,7 @@ def native_rays(camera: Camera, device: torch.device = CPU) -> NativeRays:
 @functools.lru_cache(maxsize=16)
 def _formula_rays(camera: Panorama | Pinhole, device: torch.device) -> NativeRays:
     if isinstance(camera, Pinhole):
-        return NativeRays(table=_padded_table(camera.rays()).to(device))
+        return NativeRays(table=_padded_table(camera.rays()).to(device, torch.float32))
     padded = -(-camera.width // CHUNK) * CHUNK
     longitude = ((torch.arange(padded, dtype=torch.float64) + 0.5) / camera.width - 0.5) * (2 * torch.pi)
     latitude = row_latitudes(camera.height, dtype=torch.float64)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cuda_engine
 import pytest
@@ -17,12 +19,13 @@ from padgs.render import Rendering, RenderOptions
 from padgs.render.backends import captured
 from padgs.render.backends import cuda as cuda_backend
 from padgs.render.backends.captured import CapturedRender
-from padgs.render.backends.cuda_tiles import DeviceProjected, DeviceStrip, tile_rows
+from padgs.render.backends.cuda_tiles import DeviceProjected, DeviceStrip
 from padgs.render.backends.native_camera import native_camera
 from padgs.render.contract import Request
 from padgs.scene import View
 
 pytestmark = [*cuda_engine.marks()]
+captured_for_real = captured.captured
 DEVICE = torch.device("cuda" if cuda_engine.ON_GPU else "cpu")
 
 
@@ -199,6 +202,23 @@ def test_a_recording_reads_nothing_back(options, generator: torch.Generator, mon
         torch.ones(1).sum().item()
 
 
+def test_a_frame_is_recorded_on_its_own_stream_and_other_threads_may_go_on(monkeypatch: pytest.MonkeyPatch):
+    """Torch's own stream for recordings is of one device, and its usual mode ends them if any thread allocates."""
+    how, inside = [], []
+
+    def graph(graph, **options):
+        how.append(options)
+        return contextlib.nullcontext()
+
+    streams = [SimpleNamespace(wait_stream=lambda other: None) for _ in range(2)]
+    names = {"CUDAGraph": SimpleNamespace, "Stream": lambda: streams[0], "current_stream": lambda: streams[1]}
+    names |= {"device": contextlib.nullcontext, "stream": lambda stream: contextlib.nullcontext(), "graph": graph}
+    for name, fake in names.items():
+        monkeypatch.setattr(torch.cuda, name, fake)
+    captured_for_real(lambda: inside.append(len(how)), torch.device("cuda", 1))
+    assert inside == [0, 1] and how == [{"stream": streams[0], "capture_error_mode": "thread_local"}]
+
+
 def test_nothing_to_draw_is_the_background(generator: torch.Generator):
     nothing = Gaussians(**{name: getattr(scene_of(generator), name)[:0] for name in INPUTS})
     view = view_of(camera_of("panorama", 40, 20))
@@ -237,11 +257,10 @@ def test_more_instances_than_32_bits_count_leave_the_first_ones_in_place():
     side, count, room = 8192, 16_400, 100
     view = DeviceProjected.__new__(DeviceProjected)
     view.camera = native_camera(cuda_backend.IDENTITY, camera_of("pinhole", side, side), RenderOptions("pinhole"))
-    view.rows = tile_rows(side, side, view.camera.model, view.camera.square, DEVICE)
-    view.queue, view.room, view.visible, view._state_start = cuda.queue(DEVICE), room, count, None
+    view.queue, view.room, view.visible = cuda.queue(DEVICE), room, count
     view.boxes = torch.tensor([0, side, 0, 0, side], dtype=torch.int32, device=DEVICE).repeat(count, 1)
     view.order = torch.arange(count, dtype=torch.int32, device=DEVICE)
-    strip = DeviceStrip(view, 0, len(view.rows.levels))
+    strip = DeviceStrip(view, 0, side // 16)
     assert count * strip.tiles > 2**32
     wanted = (strip.tiles * torch.arange(count + 1)).clamp(max=2**31 - 1)
     assert torch.equal(strip.slot_start.cpu().long(), wanted)

@@ -27,6 +27,8 @@ from padgs.sphere.camera import RayTable
 HERE = Path(__file__).parent
 SOURCES = Path(cuda.__file__).parent / "csrc" / "cuda"
 COMPILER = shutil.which("c++") or shutil.which("g++")
+FUSED = ("-mfma", "-ffp-contract=fast")
+FUSES = Path("/proc/cpuinfo").exists() and " fma " in Path("/proc/cpuinfo").read_text()
 ON_GPU = torch.cuda.is_available() and cuda.available()
 real_library = cuda.library
 
@@ -44,15 +46,22 @@ def layout_library() -> ctypes.CDLL:
     return compiled("layout", [HERE / "layout_check.cpp"])
 
 
-def compiled(name: str, sources: list[Path]) -> ctypes.CDLL:
-    """A shared library of C++ sources, CUDA ones included, for as long as this process lives."""
+@functools.cache
+def fused_library() -> ctypes.CDLL:
+    """Drawing as in `emulated_library`, with products fused into sums wherever the compiler may, as nvcc does."""
+    return compiled("padgs_cuda_fused", [SOURCES / "blend.cu", SOURCES / "hybrid.cu"], *FUSED)
+
+
+def compiled(name: str, sources: list[Path], *more: str) -> ctypes.CDLL:
+    """A shared library of C++ sources, CUDA ones included, for as long as this process lives; `more` flags."""
     folder = Path(tempfile.mkdtemp(prefix="padgs-emulated-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     target = folder / f"lib{name}.so"
     flags = ["-std=c++17", "-O2", "-fPIC", "-shared", "-Wall", "-Wextra", "-Werror", "-DPADGS_EMULATED"]
+    flags += ["-fno-gnu-unique"]  # or the emulations of two libraries would be one
     flags += ["-fsanitize=bounds", "-fsanitize-undefined-trap-on-error"]  # of arrays: ends the process
-    command = [str(COMPILER), *flags, f"-I{HERE}", f"-I{SOURCES}", "-x", "c++", *map(str, sources), "-o", str(target)]
-    done = subprocess.run(command, capture_output=True, text=True)
+    paths = [f"-I{HERE}", f"-I{SOURCES}", "-x", "c++", *map(str, sources), "-o", str(target)]
+    done = subprocess.run([str(COMPILER), *flags, *more, *paths], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return ctypes.CDLL(str(target))
 

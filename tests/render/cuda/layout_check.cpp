@@ -1,31 +1,35 @@
-// csrc/cuda/layout.h for tests: what it says of every bucket, chunk and block.
+// csrc/cuda/layout.h and device.cuh for tests: what they say of every pixel, sum and device.
+#include "device.cuh"
 #include "layout.h"
 
 using namespace padgs;
 
-// The tile of each bucket [buckets]; -1 for the gaps in their numbering.
-extern "C" void check_buckets(const int32_t *tile_start, int32_t tiles, int64_t buckets, int32_t *tile) {
-  for (int64_t b = 0; b < buckets; ++b) {
-    const int t = tile_of_bucket(tile_start, tiles, b);
-    const int64_t from = (b - first_bucket(tile_start[t], t)) * kBucket;
-    tile[b] = from < tile_start[t + 1] - tile_start[t] ? t : -1;
+// Where each thread of each block draws [blocks, 256], and which of the instances of its block reach its warp's part of
+// the tile, a bit each [blocks, 256].
+extern "C" void check_pixels(const TileTable *table, const Reach *reaches, int32_t count, PixelPlace *places,
+                             int32_t *reached) {
+  for (int64_t i = 0; i < tiles_drawn(*table) * kTilePixels; ++i) {
+    places[i] = pixel_place(*table, int(i / kTilePixels), int(i % kTilePixels));
+    for (int k = 0; k < count; ++k) reached[i] |= int(reaches_part(reaches[k], places[i])) << k;
   }
 }
 
-// Row and places of states of one bucket [1 + 2^level].
-extern "C" int32_t check_states(const TileTable *table, const int32_t *tile_start, int32_t tile, int64_t bucket,
-                                int64_t *places) {
-  const int row = row_of_tile(*table, tile);
-  for (int chunk = 0; chunk < 1 << table->level[row]; ++chunk)
-    places[chunk] = state_index(*table, tile_start, row, bucket, chunk);
-  return row;
+// Work on one device whose launches and own return leave errors. Returns the error; the device within and those
+// afterwards [3]: current device, and the error that the next call would find.
+extern "C" int check_on_device(int32_t device, int32_t current, int32_t of_work, int32_t of_launch, int32_t *found) {
+  current_device = current;
+  const int error = on_device({device, nullptr}, [&] {
+    found[0] = current_device;
+    last_error = of_launch;
+    return int(of_work);
+  });
+  found[1] = current_device, found[2] = last_error;
+  return error;
 }
 
-// Where each block draws [blocks, 6].
-extern "C" int64_t check_blocks(const TileTable *table, ChunkPlace *places) {
-  const int64_t blocks = chunks_drawn(*table);
-  for (int64_t b = 0; places && b < blocks; ++b) places[b] = chunk_place(*table, b);
-  return blocks;
+// Which of `count` sums each lane of a warp has [32].
+extern "C" void check_dealt_index(int32_t count, int32_t *index) {
+  for (int lane = 0; lane < kWarp; ++lane) index[lane] = dealt_index(count, lane);
 }
 
 extern "C" int64_t check_lower_bound(const uint32_t *keys, int64_t count, uint32_t key) {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import warnings
 from dataclasses import replace
 from itertools import pairwise
@@ -19,7 +20,7 @@ from padgs.learning.failure import is_out_of_memory
 from padgs.native import cuda, loading
 from padgs.render import Rendering, RenderOptions, render
 from padgs.render.backends import cuda as cuda_backend
-from padgs.render.backends import cuda_tiles
+from padgs.render.backends import cuda_tiles, native_camera
 
 pytestmark = [*cuda_engine.marks()]
 
@@ -31,14 +32,16 @@ def drawn(
     *,
     backend: str = "cuda",
     lens: str = "panorama",
+    weights: torch.dtype | None = None,
+    outputs: tuple[str, ...] = ("image", "transmittance", "depth"),
 ) -> tuple[Rendering, dict[str, Tensor]]:
-    """A rendering in a random pose, and gradients of a random weighting of all its outputs."""
+    """A rendering in a random pose, and gradients of a random weighting of outputs of it."""
     generator = torch.Generator().manual_seed(5)
     inputs = leaves(gaussians, torch.float32)
     pose = random_pose(generator, shift=0.1).float().requires_grad_()
     rendering = render(inputs, view_of(camera_of(lens, *size), pose), options, backend=backend)
-    outputs = (rendering.image, rendering.transmittance, rendering.depth)
-    sum((out * torch.randn(out.shape, generator=generator)).sum() for out in outputs).backward()
+    weighed = (getattr(rendering, name) for name in outputs)
+    sum((out * torch.randn(out.shape, generator=generator, dtype=weights)).sum() for out in weighed).backward()
     return rendering, {**{name: getattr(inputs, name).grad for name in INPUTS}, "pose": pose.grad}
 
 
@@ -102,14 +105,76 @@ def test_results_do_not_depend_on_which_thread_runs_first(
     projection, lens, blending, generator, monkeypatch: pytest.MonkeyPatch
 ):
     gaussians, options = crowd(400, generator), RenderOptions(projection, **blended(blending, 3))
-    forwards = drawn(gaussians, (40, 20), options, lens=lens)
-    monkeypatch.setenv("PADGS_EMULATION_REVERSED", "1")
-    backwards = drawn(gaussians, (40, 20), options, lens=lens)
-    for name in ("image", "transmittance", "depth"):
-        assert torch.equal(getattr(forwards[0], name), getattr(backwards[0], name)), name
-    assert dict(forwards[0].counters) == dict(backwards[0].counters)
-    for name in forwards[1]:
-        assert torch.equal(forwards[1][name], backwards[1][name]), name
+    usual = drawn(gaussians, (40, 20), options, lens=lens)
+    for seed in range(3):
+        monkeypatch.setenv("PADGS_EMULATION_SEED", str(seed))
+        assert_same_bits(drawn(gaussians, (40, 20), options, lens=lens), usual, ("image", "transmittance", "depth"))
+
+
+def assert_same_bits(actual, expected, outputs: tuple[str, ...]) -> None:
+    for name in outputs:
+        assert torch.equal(getattr(actual[0], name), getattr(expected[0], name)), name
+    assert dict(actual[0].counters) == dict(expected[0].counters)
+    for name, gradient in expected[1].items():
+        assert torch.equal(actual[1][name], gradient), name
+
+
+@pytest.mark.skipif(cuda_engine.ON_GPU or not cuda_engine.FUSES, reason="about what compilers may do, on the host")
+@pytest.mark.parametrize(
+    ("projection", "lens"), [("erp", "panorama"), ("ray", "panorama"), ("tangent", "fisheye"), ("pinhole", "pinhole")]
+)
+def test_what_is_drawn_does_not_depend_on_what_a_compiler_fuses(projection, lens, generator, monkeypatch):
+    """Forward by one build and backward by another agree on every pair to the last bit, or gradients would differ."""
+    gaussians, options = crowd(400, generator), RenderOptions(projection)
+    call = cuda.call
+
+    def forward_fused(name: str, where, *arguments) -> None:
+        if name != "padgs_cuda_blend":
+            return call(name, where, *arguments)
+        return cuda.raise_for(
+            cuda_engine.fused_library().padgs_cuda_blend(*map(ctypes.byref, (where, *arguments))), name
+        )
+
+    monkeypatch.setattr(cuda, "call", forward_fused)
+    fused = drawn(gaussians, (72, 36), options, lens=lens, outputs=("image", "transmittance"))
+    monkeypatch.setattr(cuda, "call", call)
+    usual = drawn(gaussians, (72, 36), options, lens=lens, outputs=("image", "transmittance"))
+    assert_same_bits(fused, usual, ("transmittance",))
+    assert not torch.equal(fused[0].image, usual[0].image)  # whose sums the compiler may round as it likes
+    torch.testing.assert_close(fused[0].image, usual[0].image, rtol=1e-5, atol=1e-6)
+
+
+@pytest.fixture(autouse=True)
+def no_image_before(monkeypatch: pytest.MonkeyPatch):
+    """Every test begins without a last image, of whose size room for the next is taken."""
+    monkeypatch.setattr(cuda_backend, "_rooms", {})
+
+
+@pytest.mark.parametrize("blending", ["sorted", "hybrid"])
+def test_room_of_the_last_image_changes_nothing_and_too_little_is_noticed(
+    blending: str, generator: torch.Generator, monkeypatch: pytest.MonkeyPatch
+):
+    gaussians, options, rooms = crowd(200, generator), RenderOptions("ray", **blended(blending, 3)), []
+    call = cuda.call
+
+    def spy(name: str, where, *arguments) -> None:
+        if name == "padgs_cuda_bin":
+            rooms.append(arguments[0].sort.count)
+        call(name, where, *arguments)
+
+    monkeypatch.setattr(cuda, "call", spy)
+    usual = drawn(gaussians, (72, 36), options)
+    count = usual[0].counters["instances"]
+    outputs = ("image", "transmittance", "depth", "visible")
+    assert_same_bits(drawn(gaussians, (72, 36), options), usual, outputs)
+    assert rooms == [count, int(1.3 * count) + 1]
+    for (_, *size), room in list(cuda_backend._rooms.items()):
+        assert size == [72, 36] and room == int(1.3 * count) + 1
+    cuda_backend._rooms = dict.fromkeys(cuda_backend._rooms, count - 1)
+    assert_same_bits(drawn(gaussians, (72, 36), options), usual, outputs)
+    assert rooms[2:] == [count - 1, count]  # drawn again
+    assert_same_bits(drawn(gaussians, (72, 36), replace(options, max_instances=count)), usual, outputs)
+    assert rooms[4:] == [count]  # the room would be for more than may be
 
 
 @pytest.mark.parametrize("blending", ["sorted", "hybrid"])
@@ -121,12 +186,14 @@ def test_results_repeat_bit_by_bit(blending: str, generator: torch.Generator):
 
 
 @pytest.mark.parametrize("blending", ["sorted", "hybrid"])
-def test_counters_are_those_of_the_cpu(blending: str, generator: torch.Generator):
-    gaussians, options = gaussians_of("ordinary", 40, generator), RenderOptions(**blended(blending, 2))
-    expected, actual = (drawn(gaussians, (72, 36), options, backend=name)[0] for name in ("cpu", "cuda"))
+@pytest.mark.parametrize("lens", ["panorama", "pinhole"])
+def test_counters_are_those_of_the_cpu(lens: str, blending: str, generator: torch.Generator):
+    gaussians, options = gaussians_of("ordinary", 40, generator), RenderOptions("ray", **blended(blending, 2))
+    expected, actual = (drawn(gaussians, (72, 36), options, backend=name, lens=lens)[0] for name in ("cpu", "cuda"))
     assert set(actual.counters) == set(expected.counters) and len(actual.counters) == 5
-    for name in ("gaussians", "visible", "instances", "contributing"):
+    for name in ("gaussians", "visible", "contributing"):
         assert actual.counters[name] == expected.counters[name]
+    assert (actual.counters["instances"] > expected.counters["instances"]) == (lens == "panorama")  # of narrower tiles
     assert 0 < actual.counters["contributing"] <= actual.counters["evaluated"]
     with pytest.raises(KeyError):
         actual.counters["pixels"]
@@ -197,6 +264,48 @@ def test_a_gpu_that_nothing_was_compiled_for_is_named(monkeypatch: pytest.Monkey
         RuntimeError, match="compiled for compute capabilities 80 90; Tesla T4 has 75. .*ARCHITECTURES=75"
     ):
         cuda.check_device.__wrapped__(0)
+
+
+@pytest.mark.parametrize(("driver", "built_with"), [(0, 13000), (13000, 13020), (13020, 13000), (0, 0)])
+def test_a_driver_of_the_same_major_version_or_none_at_all_is_taken(driver: int, built_with: int):
+    cuda.refuse_old_driver(versions_of(driver, built_with))
+
+
+def test_a_driver_that_is_too_old_means_torch_and_says_so(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(cuda, "opened", lambda *_: None)
+    monkeypatch.setattr(cuda, "declared", lambda *_: versions_of(12080, 13000))
+    monkeypatch.setattr(cuda, "library", cuda_engine.real_library.__wrapped__)
+    cuda.available.cache_clear()
+    package._say_that_native_is_missing.cache_clear()
+    means = SimpleNamespace(device=torch.device("cuda"), dtype=torch.float32)
+    with pytest.warns(UserWarning, match=r"compiled by CUDA 13\.0, and the driver here knows CUDA 12\.8; update"):
+        assert package.resolve_backend("auto", means) == "torch"
+    cuda.available.cache_clear()
+
+
+def versions_of(driver: int, built_with: int) -> SimpleNamespace:
+    def answer(first, second) -> None:
+        first._obj.value, second._obj.value = driver, built_with
+
+    return SimpleNamespace(padgs_cuda_versions=answer)
+
+
+@pytest.mark.parametrize("blending", ["sorted", "hybrid"])
+@pytest.mark.parametrize("lens", ["panorama", "pinhole"])
+def test_the_default_dtype_of_torch_changes_nothing(lens: str, blending: str, generator: torch.Generator):
+    gaussians, options = crowd(40, generator), RenderOptions("ray", **blended(blending, 3))
+    native_camera._formula_rays.cache_clear()
+    usual = drawn(gaussians, (40, 20), options, lens=lens)
+    native_camera._formula_rays.cache_clear()
+    weights = torch.get_default_dtype()
+    try:
+        torch.set_default_dtype(torch.float64)
+        doubled = drawn(gaussians, (40, 20), options, lens=lens, weights=weights)
+    finally:
+        torch.set_default_dtype(weights)
+        native_camera._formula_rays.cache_clear()
+    assert torch.equal(usual[0].image, doubled[0].image)
+    assert all(torch.equal(gradient, doubled[1][name]) for name, gradient in usual[1].items())
 
 
 def test_without_the_library_auto_means_torch_and_says_so(tmp_path, monkeypatch: pytest.MonkeyPatch):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import itertools
 
 import cuda_engine
 import pytest
@@ -13,10 +14,10 @@ from render_cases import INPUTS, camera_of, identity_pose, mixture, random_pose
 from torch import Tensor
 
 from padgs.native import cuda
-from padgs.native.abi import Inputs, Pointer, pointer
+from padgs.native.abi import Inputs, Pointer, fields, pointer
 from padgs.render import RenderOptions
 from padgs.render.backends.cpu_tiles import TILE
-from padgs.render.backends.cuda_tiles import BUCKET, DeviceProjected, TileRows
+from padgs.render.backends.cuda_tiles import DeviceProjected
 from padgs.render.backends.native_camera import native_camera
 
 pytestmark = [
@@ -58,29 +59,21 @@ def test_each_tile_lists_the_gaussians_whose_boxes_touch_it_front_to_back(size, 
     boxes, depths = view.boxes.tolist(), view.footprints[:, 12]
     drawn = [i for i, box in enumerate(boxes) if box[3] < box[4]]
     assert view.order[: view.visible].tolist() == sorted(drawn, key=lambda i: (depths[i].item(), i))
-    touched = {i: pixels_of(boxes[i], size) for i in drawn}
-    level, seen = view.rows.levels, 0
+    touched: dict[tuple[int, int], dict[int, list[tuple[int, int]]]] = {}  # tile -> Gaussian -> pixels of the tile
+    for i in view.order[: view.visible].tolist():
+        for y, x in pixels_of(boxes[i], size):
+            touched.setdefault((y // TILE, x // TILE), {}).setdefault(i, []).append((y % TILE, x % TILE))
+    seen, columns = 0, range(-(-size[0] // TILE))
     for strip in view.strips():
-        tile = 0
-        for row in range(strip.first_row, strip.end_row):
-            for column in range(view.rows.tiles[row]):
-                wide = TILE << level[row]
-                inside = {
-                    i: [(y - row * TILE, (x - column * wide) // TILE) for y, x in touched[i]
-                        if y // TILE == row and x // wide == column]
-                    for i in drawn
-                }  # fmt: skip
-                first, end = strip.tile_start[tile : tile + 2].tolist()
-                reaches = strip.reaches[strip.slots[first:end].long()]
-                wanted = [i for i in view.order[: view.visible].tolist() if inside[i]]
-                assert reaches[:, 0].tolist() == wanted
-                for gaussian, packed in reaches.tolist():
-                    rows, chunks = zip(*inside[gaussian], strict=True)
-                    top, bottom, left, right = (packed >> shift & 255 for shift in (0, 8, 16, 24))
-                    assert (top, bottom) == (min(rows), max(rows) + 1)
-                    assert left <= min(chunks) and max(chunks) < right
-                seen += end - first
-                tile += 1
+        for tile, place in enumerate(itertools.product(range(strip.table.first_row, strip.table.end_row), columns)):
+            first, end = strip.tile_start[tile : tile + 2].tolist()
+            reaches = strip.reaches[strip.slots[first:end].long()]
+            assert reaches[:, 0].tolist() == list(touched.get(place, {}))
+            for gaussian, packed in reaches.tolist():
+                rows, along = zip(*touched[place][gaussian], strict=True)
+                top, bottom, left, right = (packed >> shift & 255 for shift in (0, 8, 16, 24))
+                assert (top, bottom, left, right) == (min(rows), max(rows) + 1, min(along), max(along) + 1)
+            seen += end - first
     assert seen == view.instances > 100
 
 
@@ -95,61 +88,55 @@ def test_slots_of_a_gaussian_are_consecutive_and_everybody_has_one(generator: to
     assert torch.equal(strip.reaches[:, 0].long(), owners)
 
 
-ROWS = st.lists(st.tuples(st.integers(0, 4), st.lists(st.integers(0, 100), min_size=16, max_size=16)), min_size=1)
+@pytest.mark.parametrize(("device", "current"), [(1, 0), (0, 0), (0, 2)])
+@pytest.mark.parametrize(("of_work", "of_launch", "error"), [(0, 0, 0), (2, 0, 2), (0, 700, 700), (2, 700, 2)])
+def test_work_on_a_device_leaves_the_thread_its_own_and_no_error(device, current, of_work, of_launch, error):
+    found = torch.empty(3, dtype=torch.int32)
+    check = cuda_engine.layout_library().check_on_device
+    assert check(device, current, of_work, of_launch, Pointer(found.data_ptr())) == error
+    assert found.tolist() == [device, current, 0]
 
 
-@settings(max_examples=60)
-@given(ROWS.filter(lambda rows: len(rows) < 9), st.data())
-def test_every_bucket_has_room_of_its_own_for_its_pixels(rows, data):
-    """Over all tiles, buckets and chunks of any lists: no place twice, none outside."""
-    width = 16 * TILE
-    table = TileRows([level for level, _ in rows], width, CPU)
-    per_tile = [counts[: table.tiles[r]] for r, (_, counts) in enumerate(rows)]
-    instances = [sum(counts) for counts in per_tile]
-    first = data.draw(st.integers(0, len(rows) - 1))
-    end = data.draw(st.integers(first + 1, len(rows)))
-    starts = torch.tensor(table.state_starts(instances))
-    flat = torch.tensor([0, *(count for counts in per_tile[first:end] for count in counts)]).cumsum(0)
-    tile_start, tiles = flat.to(torch.int32), len(flat) - 1
-    tensors = (table.level, table.row_start, starts)
-    native_table = cuda.TileTable(width, len(rows) * TILE, first, end, *map(pointer, tensors))
-
-    library = cuda_engine.layout_library()
-    buckets = int(tile_start[-1]) // BUCKET + tiles
-    tile_of = torch.empty(buckets, dtype=torch.int32)
-    library.check_buckets(Pointer(tile_start.data_ptr()), tiles, ctypes.c_int64(buckets), Pointer(tile_of.data_ptr()))
-    wanted = [t for t in range(tiles) for _ in range(-(-int(tile_start[t + 1] - tile_start[t]) // BUCKET))]
-    assert [t for t in tile_of.tolist() if t >= 0] == wanted
-
-    taken: list[int] = []
-    row_of_tile = [r for r in range(first, end) for _ in range(table.tiles[r])]
-    for bucket, tile in enumerate(tile_of.tolist()):
-        if tile < 0:
-            continue
-        places = torch.empty(16, dtype=torch.int64)
-        row = library.check_states(
-            ctypes.byref(native_table), Pointer(tile_start.data_ptr()), tile, ctypes.c_int64(bucket),
-            Pointer(places.data_ptr()),
-        )  # fmt: skip
-        assert row == row_of_tile[tile]
-        taken += places[: 1 << table.levels[row]].tolist()
-    assert len(set(taken)) == len(taken)
-    assert all(0 <= place < starts[end] - starts[first] for place in taken)
+class PixelPlace(ctypes.Structure):
+    _fields_ = [
+        *fields(ctypes.c_int32, "column", "row", "x", "y"),
+        ("inside", ctypes.c_bool),
+        ("index", ctypes.c_int64),
+    ]
 
 
-def test_blocks_draw_every_chunk_once():
-    table = TileRows([2, 1, 0], 5 * TILE - 3, CPU)  # five chunks across
-    native_table = cuda.TileTable(5 * TILE - 3, 40, 1, 3, *map(pointer, (table.level, table.row_start)))
-    library = cuda_engine.layout_library()
-    library.check_blocks.restype = ctypes.c_int64
-    blocks = library.check_blocks(ctypes.byref(native_table), None)
-    places = torch.empty(blocks, 6, dtype=torch.int32)
-    library.check_blocks(ctypes.byref(native_table), Pointer(places.data_ptr()))
-    row, level, tile, chunk, x0, y0 = places.unbind(1)
-    assert row.tolist() == [1] * 5 + [2] * 5 and level.tolist() == [1] * 5 + [0] * 5
-    assert tile.tolist() == [0, 0, 1, 1, 2, 3, 4, 5, 6, 7]
-    assert chunk.tolist() == [0, 1, 0, 1, 0, 0, 0, 0, 0, 0]
-    assert x0.tolist() == [0, 16, 32, 48, 64] * 2 and y0.tolist() == [16] * 5 + [32] * 5
+EDGES = st.tuples(st.integers(0, 15), st.integers(1, 16)).filter(lambda edge: edge[0] < edge[1])
+
+
+@settings(max_examples=20)
+@given(st.lists(st.tuples(EDGES, EDGES), min_size=1, max_size=8))
+def test_every_pixel_has_one_thread_whose_warp_visits_what_reaches_it(reaches):
+    width, height, threads = 5 * TILE - 3, 40, 2 * 5 * 256
+    table = cuda.TileTable(width, height, 1, 3)
+    packed = [top | bottom << 8 | left << 16 | right << 24 for (top, bottom), (left, right) in reaches]
+    instances = torch.tensor([[0, one] for one in packed], dtype=torch.int64).to(torch.int32)
+    places, reached = (PixelPlace * threads)(), (ctypes.c_int32 * threads)()
+    cuda_engine.layout_library().check_pixels(
+        ctypes.byref(table), Pointer(instances.data_ptr()), len(reaches), places, reached
+    )
+    inside = [place for place in places if place.inside]
+    assert {(place.x, place.y) for place in inside} == {(x, y) for x in range(width) for y in range(TILE, height)}
+    assert len(inside) == width * (height - TILE) and all(p.index == p.y * width + p.x for p in inside)
+    for thread in range(0, threads, 32):  # a warp
+        tile, warp = thread // 256, [(place.x % TILE, place.y % TILE) for place in places[thread : thread + 32]]
+        assert {(p.x // TILE, p.y // TILE - 1) for p in places[thread : thread + 32]} == {(tile % 5, tile // 5)}
+        wanted = sum(
+            any(left <= x < right and top <= y < bottom for x, y in warp) << k
+            for k, ((top, bottom), (left, right)) in enumerate(reaches)
+        )
+        assert set(reached[thread : thread + 32]) == {wanted}
+
+
+@pytest.mark.parametrize("count", range(1, 17))
+def test_every_sum_is_dealt_to_one_lane(count: int):
+    index = (ctypes.c_int32 * 32)()
+    cuda_engine.layout_library().check_dealt_index(count, index)
+    assert sorted(one for one in index if one >= 0) == list(range(count))
 
 
 @given(st.lists(st.integers(0, 20)).map(sorted), st.integers(0, 21))

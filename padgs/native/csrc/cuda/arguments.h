@@ -63,18 +63,10 @@ struct BlendInputs {
   int32_t *last;                         // [H,W] 1 + position in the tile's list of the last contribution; sorted only
   int32_t *core;  // [H,W,core_size] Gaussians in order, -1 behind the last; hybrid where a gradient is wanted, or null
   Tail *tails;    // [H,W] as core
-  int32_t *pair_counts;                  // [chunks, 2] evaluated and contributing pairs, or null
+  int32_t *pair_counts;                  // [tiles, 2] evaluated and contributing pairs, or null
 };
 
 // Aligned, so that the GPU moves sixteen bytes at a time.
-struct alignas(16) Upstream {
-  float red, green, blue, depth;  // dL/d of what the weights multiply
-};
-struct alignas(8) PixelState {
-  float transmittance;  // in front of all that has been visited
-  float behind;         // sum of weight * (dL/dcolour . colour) behind it, background included
-};
-
 struct alignas(16) Moments {
   float of[kMoments];
 };
@@ -82,12 +74,7 @@ struct alignas(16) Moments {
 struct BlendGradientInputs {
   BlendInputs forward;
   const float *grad_image, *grad_transmittance, *grad_depth;  // [H,W,3] [H,W] or null, [H,W] or null
-  Upstream *upstream;      // [H,W]
-  PixelState *states;      // [states, 256]; sorted only, as the next
-  int32_t *furthest;       // [chunks] largest `last` of the chunk's pixels
-  CoreGradient *core_gradients;  // [H,W,core_size]; hybrid only, as the next
-  TailGradient *tail_gradients;  // [H,W]
-  int64_t instances;
+  CoreGradient *core_gradients;  // [H,W,core_size]; hybrid only
   Moments *moments;        // [I] by slot
   float *grad_rays;        // [H, 3, padded W] or null
   const int32_t *order;    // [visible]

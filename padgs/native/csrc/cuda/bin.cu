@@ -8,14 +8,14 @@ namespace {
 constexpr int kThreads = 128;
 constexpr int kWarps = kThreads / kWarp;
 
-__global__ void count_kernel(BinArguments args) {
+__global__ void __launch_bounds__(kThreads) count_kernel(BinArguments args) {
   const int64_t i = global_thread();
   if (i <= args.visible) args.tiles[i] = i < args.visible ? tiles_of(args.boxes[args.order[i]], args.table) : 0;
 }
 
 // A warp lists the instances of 32 Gaussians, as many to each lane whatever their sizes, and writes them side by
 // side; those that there is no room for are left out.
-__global__ void emit_kernel(BinArguments args) {
+__global__ void __launch_bounds__(kThreads) emit_kernel(BinArguments args) {
   __shared__ PixelBox boxes[kWarps][kWarp];
   __shared__ int32_t gaussians[kWarps][kWarp];
   __shared__ uint32_t starts[kWarps][kWarp];
@@ -43,7 +43,7 @@ __global__ void emit_kernel(BinArguments args) {
   }
 }
 
-__global__ void tile_start_kernel(BinArguments args, int tiles) {
+__global__ void __launch_bounds__(kThreads) tile_start_kernel(BinArguments args, int tiles) {
   const int64_t tile = global_thread();
   if (tile <= tiles)
     args.tile_start[tile] = int32_t(lower_bound(args.sort.sorted_keys, args.sort.count, uint32_t(tile)));
@@ -56,14 +56,15 @@ using namespace padgs;
 
 // Launches with a table of the host's sizes: the number of tiles comes from the caller, who has the table's rows.
 PADGS_API int padgs_cuda_bin(const Queue *queue, const BinArguments *args, int32_t tiles) {
-  if (const int error = begin(*queue)) return error;
-  if (args->sort.count) {
-    launch(count_kernel, blocks_for(args->visible + 1, kThreads), kThreads, *queue, *args);
-    if (const int error = exclusive_sum(*queue, args->sort, args->tiles, args->slot_start, args->visible + 1))
-      return error;
-    launch(emit_kernel, blocks_for(args->visible, kThreads), kThreads, *queue, *args);
-    if (const int error = sort_pairs(*queue, args->sort)) return error;
-  }
-  launch(tile_start_kernel, blocks_for(int64_t(tiles) + 1, kThreads), kThreads, *queue, *args, tiles);
-  return finish();
+  return on_device(*queue, [&] {
+    if (args->sort.count) {
+      launch(count_kernel, blocks_for(args->visible + 1, kThreads), kThreads, *queue, *args);
+      if (const int error = exclusive_sum(*queue, args->sort, args->tiles, args->slot_start, args->visible + 1))
+        return error;
+      launch(emit_kernel, blocks_for(args->visible, kThreads), kThreads, *queue, *args);
+      if (const int error = sort_pairs(*queue, args->sort)) return error;
+    }
+    launch(tile_start_kernel, blocks_for(int64_t(tiles) + 1, kThreads), kThreads, *queue, *args, tiles);
+    return 0;
+  });
 }

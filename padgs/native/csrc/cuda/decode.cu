@@ -12,7 +12,7 @@ constexpr int kThreads = 128;
 __device__ float sigmoid(float x) { return 1.0f / (1.0f + expf(-x)); }
 
 // A thread for each of the A K Gaussians.
-__global__ void place_kernel(DeviceDecodeArguments device) {
+__global__ void __launch_bounds__(kThreads) place_kernel(DeviceDecodeArguments device) {
   const DecodeArguments &args = device.decode;
   const int64_t slot = global_thread();
   const int k = args.offsets;
@@ -35,7 +35,7 @@ __global__ void place_kernel(DeviceDecodeArguments device) {
 }
 
 // A thread for each anchor, which sums over its Gaussians in their order.
-__global__ void take_back_kernel(DeviceDecodeGradientArguments device) {
+__global__ void __launch_bounds__(kThreads) take_back_kernel(DeviceDecodeGradientArguments device) {
   const DecodeGradientArguments &args = device.gradient;
   const DecodeArguments &in = args.forward;
   const int64_t anchor = global_thread();
@@ -76,13 +76,15 @@ __global__ void take_back_kernel(DeviceDecodeGradientArguments device) {
 using namespace padgs;
 
 PADGS_API int padgs_cuda_decode_place(const Queue *queue, const DeviceDecodeArguments *args) {
-  if (const int error = begin(*queue)) return error;
-  launch(place_kernel, blocks_for(args->decode.anchors * args->decode.offsets, kThreads), kThreads, *queue, *args);
-  return finish();
+  return on_device(*queue, [&] {
+    launch(place_kernel, blocks_for(args->decode.anchors * args->decode.offsets, kThreads), kThreads, *queue, *args);
+    return 0;
+  });
 }
 
 PADGS_API int padgs_cuda_decode_take_back(const Queue *queue, const DeviceDecodeGradientArguments *args) {
-  if (const int error = begin(*queue)) return error;
-  launch(take_back_kernel, blocks_for(args->gradient.forward.anchors, kThreads), kThreads, *queue, *args);
-  return finish();
+  return on_device(*queue, [&] {
+    launch(take_back_kernel, blocks_for(args->gradient.forward.anchors, kThreads), kThreads, *queue, *args);
+    return 0;
+  });
 }

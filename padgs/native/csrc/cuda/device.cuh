@@ -27,9 +27,8 @@ template <class... P, class... A>
 void launch(void (*kernel)(P...), int64_t blocks, int threads, const Queue &, A... arguments) {
   emulate(unsigned(blocks), unsigned(threads), [=] { kernel(arguments...); });
 }
-inline int begin(const Queue &) { return 0; }
-inline int finish() { return 0; }
 inline float quick_inverse(float x) { return 1.0f / x; }
+inline float quick_exp2(float x) { return exp2f(x); }
 
 #else
 
@@ -37,12 +36,33 @@ template <class... P, class... A>
 void launch(void (*kernel)(P...), int64_t blocks, int threads, const Queue &queue, A... arguments) {
   if (blocks > 0) kernel<<<unsigned(blocks), threads, 0, cudaStream_t(queue.stream)>>>(arguments...);
 }
-// This library has a CUDA runtime of its own, which knows nothing of the device that torch chose.
-inline int begin(const Queue &queue) { return int(cudaSetDevice(queue.device)); }
-inline int finish() { return int(cudaGetLastError()); }
-__device__ inline float quick_inverse(float x) { return __fdividef(1.0f, x); }
+// To the last bit but one, without detours for the smallest numbers, for which they give or take 0.
+__device__ inline float quick_inverse(float x) {
+  float y;
+  asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+  return y;
+}
+__device__ inline float quick_exp2(float x) {
+  float y;
+  asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+  return y;
+}
 
 #endif
+
+// Does work that launches kernels and returns an error or 0, on the queue's device; the thread's own device, which torch
+// chose, is then what it was. Returns the work's error, or that of its launches, and leaves none behind: the next call
+// would be blamed for it.
+template <class Work>
+int on_device(const Queue &queue, Work work) {
+  int before = queue.device;
+  int error = int(cudaGetDevice(&before));
+  if (!error && before != queue.device) error = int(cudaSetDevice(queue.device));
+  if (!error) error = work();
+  const int launched = int(cudaGetLastError());
+  if (before != queue.device) cudaSetDevice(before);
+  return error ? error : launched;
+}
 
 inline int64_t blocks_for(int64_t items, int per_block) { return (items + per_block - 1) / per_block; }
 
@@ -61,6 +81,38 @@ __device__ inline int warp_max(int value) {
     value = other > value ? other : value;
   }
   return value;
+}
+
+// Several sums over a warp at once: a lane returns the one that `dealt_index` names. With every step the lanes split, and
+// each half goes on with half of the values, so that 16 sums take 16 exchanges rather than 80.
+template <int kCount, int kStep = kWarp / 2>
+__device__ float dealt_sum(const float (&values)[kCount]) {
+  if constexpr (kCount == 1) {
+    float total = values[0];
+    for (int step = kStep; step; step /= 2) total += __shfl_xor_sync(kAllLanes, total, step);
+    return total;
+  } else {
+    constexpr int kHalf = (kCount + 1) / 2;
+    const bool upper = lane_index() & kStep;
+    float kept[kHalf];
+    for (int k = 0; k < kHalf; ++k) {
+      const float low = values[k], high = k + kHalf < kCount ? values[k + kHalf] : 0.0f;
+      kept[k] = (upper ? high : low) + __shfl_xor_sync(kAllLanes, upper ? low : high, kStep);
+    }
+    return dealt_sum<kHalf, kStep / 2>(kept);
+  }
+}
+// Which of `count` <= 16 values a lane has the sum of; -1 where it has none, or another lane's.
+__device__ inline int dealt_index(int count, int lane) {
+  int index = 0, here = count, step = kWarp / 2;  // values of the lane's half, without what fills it up
+  for (int size = count; size > 1; step /= 2) {
+    const int half = (size + 1) / 2;
+    const bool upper = lane & step;
+    index += upper ? half : 0;
+    here = upper ? here - half : here < half ? here : half;
+    size = half;
+  }
+  return here > 0 && lane % (2 * step) == 0 ? index : -1;
 }
 
 }  // namespace padgs

@@ -1,39 +1,42 @@
-// Hybrid blending, forward: a block draws one chunk of pixels from the list of its tile, a thread each. Every pixel
-// keeps its nearest fragments in its thread's own memory. The order of the list only decides ties; it is read to the
-// end.
+// Hybrid blending, forward: a block draws one tile, a thread for each pixel, which keeps its nearest fragments in its own
+// memory. The order of the list only decides ties; it is read to the end.
 #include "blend.cuh"
 
 namespace padgs {
 namespace {
 
 template <bool kPlanar, int kRoom>
-__global__ void __launch_bounds__(kBatch) hybrid_kernel(BlendInputs args) {
+__global__ void __launch_bounds__(kTilePixels, kBlocks) hybrid_kernel(BlendInputs args) {
   typedef typename PixelOf<kPlanar>::Type Pixel;
-  __shared__ Batch batch;
-  const PixelPlace place = pixel_place(args.table, blockIdx.x, int(threadIdx.x));
-  const int begin = args.tile_start[place.chunk.tile], end = args.tile_start[place.chunk.tile + 1];
-  const int y = place.y - place.chunk.y0;
-  const Pixel pixel(args.rays, args.wrap, args.table.width, place.inside ? place.x : 0, place.inside ? place.y : 0);
+  __shared__ Batch<kTilePixels> batch;
+  const PixelPlace place = pixel_place(args.table, int(blockIdx.x), int(threadIdx.x));
+  const int begin = args.tile_start[blockIdx.x], length = args.tile_start[blockIdx.x + 1] - begin;
+  const Pixel pixel = pixel_at<Pixel>(args, place);
   const bool largest = args.projection == kRay;
   Core<kRoom> core(args.core_size);
   Tail tail{0, 1, 0, 0, 0, 0};
   int evaluated = 0, contributing = 0, in_tail = 0;
 
-  for (int first = begin; first < end; first += kBatch) {
+  for (int first = 0; first < length; first += batch.kSize) {
     __syncthreads();  // nobody reads the last batch any more
-    const int total = fill(batch, args, place.chunk, begin, first, end);
-    for (int k = 0; k < total && place.inside; ++k) {
-      const Reach reach = batch.reaches[k];
-      if (y < reach.row || y >= reach.row_end) continue;
-      const Footprint &f = batch.footprints[k];
-      const typename Pixel::Pair pair = pixel.at(f);
-      ++evaluated;
-      if (!pair.reached) continue;
-      Fragment rest{0.0f, smaller(exp2f(pair.log2_alpha), kAlphaMax), reach.gaussian};
-      if (rest.alpha >= kCoreAlphaMin) rest = core.insert({pair.distance(f, largest), rest.alpha, reach.gaussian});
-      if (rest.alpha == 0) continue;
-      tail.add(rest.alpha, rest.gaussian == reach.gaussian ? f : args.footprints[rest.gaussian]);
-      ++in_tail;
+    const int count = least(length - first, batch.kSize);
+    fill(batch, args, begin + first, count);
+    __syncthreads();
+    for (int group = 0; group < count; group += kWarp) {
+      for (unsigned left = reaching(batch, group, count, place); left; left &= left - 1) {
+        const int k = group + __ffs(left) - 1;
+        if (!place.inside) continue;
+        const Footprint &f = batch.footprints[k];
+        const int32_t gaussian = batch.reaches[k].gaussian;
+        const typename Pixel::Pair pair = pixel.at(f);
+        ++evaluated;
+        if (!pair.reached) continue;
+        Fragment rest{0.0f, smaller(quick_exp2(pair.log2_alpha), kAlphaMax), gaussian};
+        if (rest.alpha >= kCoreAlphaMin) rest = core.insert({pair.distance(f, largest), rest.alpha, gaussian});
+        if (rest.alpha == 0) continue;
+        tail.add(rest.alpha, rest.gaussian == gaussian ? f : args.footprints[rest.gaussian]);
+        ++in_tail;
+      }
     }
   }
 
@@ -74,7 +77,7 @@ void draw(const Queue &queue, const BlendInputs &args) {
   const auto kernel = args.core_size <= 16   ? hybrid_kernel<kPlanar, 16>
                       : args.core_size <= 64 ? hybrid_kernel<kPlanar, 64>
                                              : hybrid_kernel<kPlanar, kMaxCoreSize>;
-  launch(kernel, blocks_of(args.table), kBatch, queue, args);
+  launch(kernel, tiles_drawn(args.table), kTilePixels, queue, args);
 }
 
 }  // namespace

@@ -1,5 +1,5 @@
-// Where things lie: which tiles a box touches, which chunk a block draws, where a bucket's pixels are kept. Plain
-// arithmetic without a GPU in it, for the kernels and for the tests on the host.
+// Where things lie: which tiles a box touches, which pixels a thread draws. Plain arithmetic without a GPU in it, for the
+// kernels and for the tests on the host.
 #pragma once
 
 #include "../mathematics/boxes.h"
@@ -7,119 +7,88 @@
 
 namespace padgs {
 
-constexpr int kChunkPixels = kTile * kTile;
-constexpr int kBucket = 32;  // instances of one list that a warp differentiates together, a lane each
+constexpr int kTileShift = 4, kTilePixels = kTile * kTile;
+static_assert(1 << kTileShift == kTile, "");
+constexpr int kPartWidth = 8, kPartHeight = 4;  // the part of a tile that a warp draws, a lane a pixel
 
-// The rows of tiles of an image, and which of them are being drawn. Indices of tiles count from the first drawn row.
+// An image of tiles of 16x16 pixels, also near the poles: a wide tile would need several blocks. And which rows of it are
+// being drawn; indices of tiles count from the first of them.
 struct TileTable {
   int32_t width, height;
   int32_t first_row, end_row;
-  const int32_t *level;       // [rows of tiles]
-  const int32_t *row_start;   // [rows + 1] tiles before each row of the whole image
-  const int64_t *state_start;  // [rows + 1] states before each row of the whole image, backward only
 };
 
-// One (Gaussian, tile) pair: whose it is, and the part of the tile that it can reach.
-struct Reach {
+// One (Gaussian, tile) pair: whose it is, and the pixels of the tile that it can reach.
+struct alignas(8) Reach {
   int32_t gaussian;
-  uint8_t row, row_end, chunk, chunk_end;  // from the tile's corner; chunk_end is exclusive
+  uint8_t row, row_end, column, column_end;  // from the tile's corner; ends are exclusive
 };
 static_assert(sizeof(Reach) == 8, "padgs/render/backends/cuda_tiles.py allocates 2 integers per instance");
 
-PADGS_HD int tiles_before(const TileTable &table, int row) {
-  return table.row_start[row] - table.row_start[table.first_row];
+PADGS_HD int runs_in_row(const PixelBox &box, Run *runs) {
+  return runs_in_row(box.column, box.column_end, box.second_end, kTileShift, runs);
+}
+
+// How many tiles a box touches in each row of tiles that it reaches.
+PADGS_HD uint32_t tiles_in_row(const PixelBox &box) {
+  Run runs[2];
+  uint32_t total = 0;
+  const int pieces = runs_in_row(box, runs);
+  for (int r = 0; r < pieces; ++r) total += uint32_t(runs[r].tile_end - runs[r].tile);
+  return total;
 }
 
 // How many drawn tiles a box touches.
 PADGS_HD uint32_t tiles_of(const PixelBox &box, const TileTable &table) {
   if (box.row == box.row_end) return 0;
-  uint32_t total = 0;
-  const int end = least((box.row_end - 1) / kTile + 1, table.end_row);
-  for (int row = most(box.row / kTile, table.first_row); row < end; ++row) {
-    Run runs[2];
-    const int pieces = runs_in_row(box, table.level[row], runs);
-    for (int r = 0; r < pieces; ++r) total += uint32_t(runs[r].tile_end - runs[r].tile);
-  }
-  return total;
+  const int first = most(box.row / kTile, table.first_row), end = least((box.row_end - 1) / kTile + 1, table.end_row);
+  return end > first ? uint32_t(end - first) * tiles_in_row(box) : 0;
 }
 
 // The n-th of them, row by row, and the part of it that is reached; its gaussian is left out.
 PADGS_HD int nth_tile(const PixelBox &box, const TileTable &table, uint32_t n, Reach &reach) {
-  for (int row = most(box.row / kTile, table.first_row); row < table.end_row; ++row) {
-    Run runs[2];
-    const int level = table.level[row], pieces = runs_in_row(box, level, runs);
-    for (int r = 0; r < pieces; ++r) {
-      const uint32_t here = uint32_t(runs[r].tile_end - runs[r].tile);
-      if (n >= here) {
-        n -= here;
-        continue;
-      }
-      const int tile = runs[r].tile + int(n), first = tile << level, y0 = row * kTile;
-      reach.row = uint8_t(most(box.row - y0, 0));
-      reach.row_end = uint8_t(least(box.row_end - y0, kTile));
-      reach.chunk = uint8_t(most(runs[r].column - first, 0));
-      reach.chunk_end = uint8_t(least(runs[r].column_end - first, 1 << level));
-      return tiles_before(table, row) + tile;
-    }
-  }
-  return -1;  // n was not less than tiles_of
+  Run runs[2];
+  runs_in_row(box, runs);
+  const uint32_t in_row = tiles_in_row(box), in_first = uint32_t(runs[0].tile_end - runs[0].tile);
+  const int row = most(box.row / kTile, table.first_row) + int(n / in_row), y0 = row * kTile;
+  const uint32_t place = n % in_row;
+  const Run &run = place < in_first ? runs[0] : runs[1];
+  const int tile = run.tile + int(place < in_first ? place : place - in_first), x0 = tile * kTile;
+  reach.row = uint8_t(most(box.row - y0, 0));
+  reach.row_end = uint8_t(least(box.row_end - y0, kTile));
+  reach.column = uint8_t(most(run.column - x0, 0));
+  reach.column_end = uint8_t(least(run.column_end - x0, kTile));
+  return (row - table.first_row) * chunks(table.width) + tile;
 }
 
-// The 16x16 pixels that one block draws, counted row by row from the first drawn one.
-struct ChunkPlace {
-  int row, level;   // of tiles
-  int tile, chunk;  // among the drawn tiles; within its tile
-  int x0, y0;       // pixels
-};
-PADGS_HD int64_t chunks_drawn(const TileTable &table) {
+PADGS_HD int64_t tiles_drawn(const TileTable &table) {
   return int64_t(table.end_row - table.first_row) * chunks(table.width);
 }
-PADGS_HD ChunkPlace chunk_place(const TileTable &table, int64_t block) {
-  const int across = chunks(table.width), row = table.first_row + int(block / across), column = int(block % across);
-  const int level = table.level[row];
-  return {row,
-          level,
-          tiles_before(table, row) + (column >> level),
-          column & ((1 << level) - 1),
-          column * kTile,
-          row * kTile};
+
+// The pixel of a thread of the block that draws a tile, and the part of the tile that its warp draws.
+struct PixelPlace {
+  int column, row;  // of the part's corner, from the tile's
+  int x, y;         // in the image
+  bool inside;
+  int64_t index;
+};
+PADGS_HD PixelPlace pixel_place(const TileTable &table, int tile, int thread) {
+  const int across = chunks(table.width), part = thread / (kPartWidth * kPartHeight);
+  const int pixel = thread % (kPartWidth * kPartHeight);
+  PixelPlace p;
+  p.column = part % (kTile / kPartWidth) * kPartWidth;
+  p.row = part / (kTile / kPartWidth) * kPartHeight;
+  p.x = tile % across * kTile + p.column + pixel % kPartWidth;
+  p.y = (table.first_row + tile / across) * kTile + p.row + pixel / kPartWidth;
+  p.inside = p.x < table.width && p.y < table.height;
+  p.index = int64_t(p.y) * table.width + p.x;
+  return p;
 }
 
-// Buckets of a tile's list, numbered without gaps within a tile and at most one gap between tiles: no sum over tiles is
-// needed to say where a tile's buckets begin. start: where its instances begin.
-PADGS_HD int64_t first_bucket(int64_t start, int64_t tile) { return start / kBucket + tile; }
-PADGS_HD int64_t buckets_at_most(int64_t instances, int64_t tiles) { return instances / kBucket + tiles; }
-
-// The tile whose buckets begin last at or before this one.
-PADGS_HD int tile_of_bucket(const int32_t *tile_start, int tiles, int64_t bucket) {
-  int low = 0, high = tiles;  // tile 0 begins at bucket 0
-  while (high - low > 1) {
-    const int middle = (low + high) / 2;
-    if (first_bucket(tile_start[middle], middle) <= bucket)
-      low = middle;
-    else
-      high = middle;
-  }
-  return low;
-}
-PADGS_HD int row_of_tile(const TileTable &table, int tile) {
-  int low = table.first_row, high = table.end_row;
-  while (high - low > 1) {
-    const int middle = (low + high) / 2;
-    if (tiles_before(table, middle) <= tile)
-      low = middle;
-    else
-      high = middle;
-  }
-  return low;
-}
-
-// Where the states of a chunk's 256 pixels behind one bucket are kept, in units of 256. A row of level l has 2^l for
-// each of its buckets.
-PADGS_HD int64_t state_index(const TileTable &table, const int32_t *tile_start, int row, int64_t bucket, int chunk) {
-  const int first = tiles_before(table, row);
-  const int64_t in_row = bucket - first_bucket(tile_start[first], first);
-  return table.state_start[row] - table.state_start[table.first_row] + (in_row << table.level[row]) + chunk;
+// Whether an instance reaches any pixel of a warp's part of its tile.
+PADGS_HD bool reaches_part(const Reach &reach, const PixelPlace &p) {
+  return reach.row < p.row + kPartHeight && p.row < reach.row_end && reach.column < p.column + kPartWidth &&
+         p.column < reach.column_end;
 }
 
 // The first of sorted keys that is not less.

@@ -5,7 +5,7 @@
 namespace padgs {
 namespace {
 
-__global__ void probe_kernel(int32_t *) {}
+__global__ void __launch_bounds__(kWarp) probe_kernel(int32_t *) {}
 
 }  // namespace
 }  // namespace padgs
@@ -45,15 +45,23 @@ PADGS_API const char *padgs_cuda_architectures() {
 #endif
 }
 
-PADGS_API void padgs_cuda_tile_levels(const Camera *camera, int32_t *level) {
-  for (int row = 0; row < chunks(camera->height); ++row) level[row] = tile_level(*camera, row);
+// The versions of CUDA, 1000 major + 10 minor, that the driver goes up to (0: there is none) and that this was built with.
+PADGS_API void padgs_cuda_versions(int32_t *driver, int32_t *built_with) {
+#if defined(PADGS_EMULATED)
+  *driver = *built_with = 0;
+#else
+  *built_with = CUDART_VERSION;
+  if (cudaDriverGetVersion(driver) != cudaSuccess) *driver = 0;
+  cudaGetLastError();
+#endif
 }
 
 // Whether the kernels can run on a device: 0, or an error such as that none was compiled for it.
 PADGS_API int padgs_cuda_check(const Queue *queue) {
-  if (const int error = begin(*queue)) return error;
-  launch(probe_kernel, 1, 32, *queue, (int32_t *)nullptr);
-  return finish();
+  return on_device(*queue, [&] {
+    launch(probe_kernel, 1, kWarp, *queue, (int32_t *)nullptr);
+    return 0;
+  });
 }
 
 PADGS_API const char *padgs_cuda_error(int code) {

@@ -148,9 +148,10 @@ PADGS_API int64_t padgs_cuda_loss_blocks(int32_t height, int32_t width) {
 }
 
 PADGS_API int padgs_cuda_photometric_loss(const Queue *queue, const DeviceLossArguments *args) {
-  if (const int error = begin(*queue)) return error;
-  const int64_t blocks = padgs_cuda_loss_blocks(args->loss.height, args->loss.width);
-  launch(compare_kernel, blocks, kThreads, *queue, *args);
-  if (args->loss.gradient) launch(gradient_kernel, blocks, kThreads, *queue, *args);
-  return finish();
+  return on_device(*queue, [&] {
+    const int64_t blocks = padgs_cuda_loss_blocks(args->loss.height, args->loss.width);
+    launch(compare_kernel, blocks, kThreads, *queue, *args);
+    if (args->loss.gradient) launch(gradient_kernel, blocks, kThreads, *queue, *args);
+    return 0;
+  });
 }

@@ -27,7 +27,7 @@ __device__ uint32_t bits_of(float x) {
   return both.bits;
 }
 
-__global__ void project_kernel(ProjectArguments args) {
+__global__ void __launch_bounds__(kThreads) project_kernel(ProjectArguments args) {
   __shared__ unsigned histogram[kHistogram + 1];
   const int rows = args.table.end_row, counted = least(rows, kHistogram);
   for (int k = int(threadIdx.x); k <= counted; k += kThreads) histogram[k] = 0;  // the last: how many are drawn
@@ -48,11 +48,8 @@ __global__ void project_kernel(ProjectArguments args) {
     args.depth_keys[i] = seen ? bits_of(p.depth) : kAllLanes;  // positive floats order as their bits do
     args.indices[i] = int32_t(i);
     if (seen) atomicAdd(histogram + counted, 1u);
+    const unsigned tiles = seen ? tiles_in_row(box) : 0;
     for (int row = box.row / kTile; seen && row <= (box.row_end - 1) / kTile; ++row) {
-      Run runs[2];
-      unsigned tiles = 0;
-      const int pieces = runs_in_row(box, args.table.level[row], runs);
-      for (int r = 0; r < pieces; ++r) tiles += unsigned(runs[r].tile_end - runs[r].tile);
       if (row < counted)
         atomicAdd(histogram + row, tiles);
       else
@@ -64,7 +61,7 @@ __global__ void project_kernel(ProjectArguments args) {
     if (histogram[k]) atomicAdd(args.counts + (k < counted ? k : rows), (unsigned long long)histogram[k]);
 }
 
-__global__ void project_backward_kernel(ProjectGradientArguments args) {
+__global__ void __launch_bounds__(kThreads) project_backward_kernel(ProjectGradientArguments args) {
   __shared__ double partial[kThreads / kWarp][12];
   const int64_t i = global_thread();
   float pose[12] = {};
@@ -103,16 +100,18 @@ __global__ void project_backward_kernel(ProjectGradientArguments args) {
 using namespace padgs;
 
 PADGS_API int padgs_cuda_project(const Queue *queue, const ProjectArguments *args) {
-  if (const int error = begin(*queue)) return error;
-  launch(project_kernel, blocks_for(args->in.count, kThreads), kThreads, *queue, *args);
-  return finish();
+  return on_device(*queue, [&] {
+    launch(project_kernel, blocks_for(args->in.count, kThreads), kThreads, *queue, *args);
+    return 0;
+  });
 }
 
 // Blocks of the kernel below, each of which leaves a partial sum of the pose gradient.
 PADGS_API int64_t padgs_cuda_pose_blocks(int64_t count) { return blocks_for(count, kThreads); }
 
 PADGS_API int padgs_cuda_project_backward(const Queue *queue, const ProjectGradientArguments *args) {
-  if (const int error = begin(*queue)) return error;
-  launch(project_backward_kernel, padgs_cuda_pose_blocks(args->in.count), kThreads, *queue, *args);
-  return finish();
+  return on_device(*queue, [&] {
+    launch(project_backward_kernel, padgs_cuda_pose_blocks(args->in.count), kThreads, *queue, *args);
+    return 0;
+  });
 }

@@ -81,12 +81,14 @@ using namespace padgs;
 
 // Bytes of scratch for sorting, or summing over, so many items.
 PADGS_API int64_t padgs_cuda_scratch_bytes(const Queue *queue, int64_t count) {
-  if (begin(*queue)) return -1;
-  const int64_t sort = sort_bytes(count), scan = scan_bytes(count);
-  return sort > scan ? sort : scan;
+  int64_t sort = -1, scan = -1;
+  const int error = on_device(*queue, [&] {
+    sort = sort_bytes(count), scan = scan_bytes(count);
+    return 0;
+  });
+  return error ? -1 : sort > scan ? sort : scan;
 }
 
 PADGS_API int padgs_cuda_sort(const Queue *queue, const SortArguments *args) {
-  if (const int error = begin(*queue)) return error;
-  return args->count ? sort_pairs(*queue, *args) : 0;
+  return on_device(*queue, [&] { return args->count ? sort_pairs(*queue, *args) : 0; });
 }

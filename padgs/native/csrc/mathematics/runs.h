@@ -38,9 +38,4 @@ PADGS_HD int runs_in_row(int column, int column_end, int second_end, int shift, 
   return 1;
 }
 
-// The same for a box of pixels and tiles of level `level`, in chunks of 16 pixels.
-PADGS_HD int runs_in_row(const PixelBox &box, int level, Run *runs) {
-  return runs_in_row(box.column / kTile, chunks(box.column_end), chunks(box.second_end), level, runs);
-}
-
 }  // namespace padgs

@@ -1,0 +1,103 @@
+"""Registers, stack, shared memory and occupancy of every kernel of ours in compiled CUDA code, as a table in Markdown.
+
+    python docs/cuda_resources.py build/libpadgs_cuda.so [--cuobjdump PROGRAM]
+
+The code says it itself, through cuobjdump of CUDA's toolkit (or `pip install nvidia-cuda-cuobjdump`), without a GPU.
+Occupancy is the share of an SM's threads that may be there at once. A stack is either an array of the source or spills.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+
+RESERVED = 1 << 10  # bytes of shared memory of every block that are the system's; from 9.0 on cuobjdump counts them
+REGISTERS = 65536  # of an SM; a warp takes them in units of 256
+# Threads, blocks and bytes of shared memory of an SM, by compute capability: CUDA C++ Programming Guide, "Compute
+# Capabilities".
+SMS = {
+    80: (2048, 32, 164 << 10),
+    86: (1536, 16, 100 << 10),
+    89: (1536, 24, 100 << 10),
+    90: (2048, 32, 228 << 10),
+    100: (2048, 32, 228 << 10),
+    120: (1536, 24, 100 << 10),
+}
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """What one kernel takes on one architecture; bytes, of stack for each thread, of shared memory for each block."""
+
+    name: str
+    architecture: int
+    registers: int
+    stack: int
+    shared: int
+    threads: int  # of a block
+
+    @property
+    def occupancy(self) -> float:
+        """Share of an SM's threads; 0 where not even one block fits."""
+        threads, blocks, shared = SMS[self.architecture]
+        warps = -(-self.threads // 32)
+        by_registers = REGISTERS // (warps * -(-self.registers * 32 // 256) * 256)
+        by_shared = shared // (self.shared + (RESERVED if self.architecture < 90 else 0) or 1)
+        return min(blocks, by_registers, by_shared, threads // (32 * warps)) * self.threads / threads
+
+
+def kernels(usage: str, elf: str) -> list[Kernel]:
+    """From what `cuobjdump --dump-resource-usage` and `--dump-elf` print, architecture by architecture.
+
+    Raises:
+        ValueError: a kernel whose source does not say by `__launch_bounds__` how many threads a block has.
+    """
+    in_its_section = r"\.nv\.info\.(\w+)\n(?:(?!\.nv\.info).)*?"
+    threads = dict(re.findall(in_its_section + r"EIATTR_MAX_THREADS.*?Value:\s*0x(\w+)", elf, re.S))
+    of_kernel = r"Function (_ZN5padgs\w+):\s*REG:(\d+) STACK:(\d+) SHARED:(\d+)"
+    found = []
+    for architecture, part in re.findall(r"arch = sm_(\d+)(.*?)(?=arch = |\Z)", usage, re.S):
+        for name, registers, stack, shared in re.findall(of_kernel, part):
+            if name not in threads:
+                raise ValueError(f"{name} has no __launch_bounds__, so that nobody knows how large its blocks are")
+            numbers = map(int, (architecture, registers, stack, shared))
+            found.append(Kernel(readable(name), *numbers, threads=int(threads[name], 16)))
+    return sorted(found, key=lambda kernel: (kernel.name, kernel.architecture))
+
+
+def readable(mangled: str) -> str:
+    """What of a kernel's name tells it from the others, without a demangler."""
+    (own,) = re.findall(r"\d([a-z_]+_kernel)", mangled)
+    arguments = mangled.split(own)[1].split("EEv")[0]
+    told = re.findall(r"(Planar|Projective)Pixel|(Sorted|Hybrid)Pixel|Lb([01])|Li(\d+)", arguments)
+    words = [next(filter(None, groups)).lower() for groups in told]
+    return f"{own.removesuffix('_kernel')} {' '.join(dict.fromkeys(words))}".strip()
+
+
+def table(found: list[Kernel]) -> str:
+    """One row for each kernel and architecture."""
+    rows = ["| kernel | sm | registers | stack, B | shared, B | threads | occupancy |", "| --- |" + " ---: |" * 6]
+    for k in found:
+        numbers = (k.architecture, k.registers, k.stack, k.shared, k.threads, f"{k.occupancy:.0%}")
+        rows.append(f"| {k.name} | {' | '.join(map(str, numbers))} |")
+    return "\n".join(rows)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("code", type=Path, help="a library or a cubin")
+    parser.add_argument("--cuobjdump", default="cuobjdump", help="the program")
+    chosen = parser.parse_args()
+    printed = [
+        subprocess.run([chosen.cuobjdump, how, chosen.code], check=True, capture_output=True, text=True).stdout
+        for how in ("--dump-resource-usage", "--dump-elf")
+    ]
+    print(table(kernels(*printed)))
+
+
+if __name__ == "__main__":
+    main()

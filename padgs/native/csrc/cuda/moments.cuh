@@ -1,0 +1,124 @@
+// Blending, backward: a block goes through the list of its tile from behind, a thread for each pixel, and leaves the
+// moments (sums over pixels that gradients are made of) of every instance in its slot.
+//
+// A warp visits the instances that reach its 8x4 pixels, sums their moments over its lanes, and leaves them in shared
+// memory; the sums of the eight warps are then added in order. Nothing is kept from the forward pass but what each pixel
+// ended with, no float is added atomically, and a slot is written once: the results do not depend on scheduling.
+#pragma once
+
+#include "blend.cuh"
+
+namespace padgs {
+
+constexpr int kColorMoment = 10;  // colour and depth; before it the shape's
+constexpr int kGradientBatch = 128;
+
+// What one pixel's fragments have in common on the way back.
+struct Upstream {
+  float red, green, blue, depth;  // dL/d of what the weights multiply
+
+  __device__ float along(float r, float g, float b, float z) const { return red * r + green * g + blue * b + depth * z; }
+  __device__ float along(const Footprint &f) const { return along(f.red, f.green, f.blue, f.depth); }
+};
+// dL by a pixel's colour, and by what it leaves for the background.
+__device__ inline float load_upstream(const BlendGradientInputs &args, int64_t p, Upstream &upstream) {
+  const float *grad = args.grad_image + 3 * p, *background = args.forward.background;
+  upstream = {grad[0], grad[1], grad[2], 0.0f};
+  const float grad_t = args.grad_transmittance ? args.grad_transmittance[p] : 0.0f;
+  return grad_t + (grad[0] * background[0] + grad[1] * background[1] + grad[2] * background[2]);
+}
+
+__device__ inline void write_ray_gradient(const BlendGradientInputs &args, const PixelPlace &place,
+                                          Vec3<float> gradient) {
+  const int64_t stride = int64_t(chunks(args.forward.table.width)) * kTile;
+  float *out = args.grad_rays + 3 * stride * place.y + place.x;
+  out[0] = gradient.x, out[stride] = gradient.y, out[2 * stride] = gradient.z;
+}
+
+// A State is one pixel of a way of blending:
+//   State(args, place, length)                  before any of the `length` instances of the list is visited
+//   end                                         instances from here on draw nothing
+//   up                                          what the weights are multiplied with
+//   step_back(f, gaussian, log2_alpha, weight)  visits one; returns M = dL/d(ln alpha), and its weight
+template <class Pixel, class State, bool kWithRays>
+__global__ void __launch_bounds__(kTilePixels, kBlocks) moments_kernel(BlendGradientInputs args) {
+  constexpr bool kPlanar = Pixel::Pair::kMoments < kColorMoment;
+  constexpr int kShape = Pixel::Pair::kMoments, kSums = kShape + 4 + !kPlanar;  // colour, depth; pulls
+  __shared__ Batch<kGradientBatch> batch;
+  __shared__ float partial[kWarps][kWarp][kSums];
+  __shared__ bool summed_by[kWarp][kWarps];  // which instances of the group each warp has sums of
+  __shared__ int furthest_of_block;
+  const BlendInputs &forward = args.forward;
+  const int thread = int(threadIdx.x), warp = thread / kWarp, lane = lane_index(), own = dealt_index(kSums, lane);
+  const int moment = thread % kMoments;  // that the thread adds up; of some there are no sums
+  const int sum_of_moment = moment < kShape ? moment : moment < kColorMoment ? kSums : moment - kColorMoment + kShape;
+  const PixelPlace place = pixel_place(forward.table, int(blockIdx.x), thread);
+  const int begin = forward.tile_start[blockIdx.x], length = forward.tile_start[blockIdx.x + 1] - begin;
+  const Pixel pixel = pixel_at<Pixel>(forward, place);
+  State state(args, place, length);
+  Vec3<float> grad_ray{0, 0, 0};
+
+  if (thread == 0) furthest_of_block = 0;
+  __syncthreads();
+  const int furthest_of_warp = warp_max(state.end);
+  if (lane == 0) atomicMax(&furthest_of_block, furthest_of_warp);
+  __syncthreads();
+  const int furthest = furthest_of_block;
+  for (int64_t i = int64_t(furthest) * kMoments + thread; i < int64_t(length) * kMoments; i += kTilePixels)
+    args.moments[forward.slots[begin + i / kMoments]].of[i % kMoments] = 0;
+
+  for (int first = (furthest - 1) / batch.kSize * batch.kSize; first >= 0 && furthest > 0; first -= batch.kSize) {
+    const int count = least(furthest - first, batch.kSize);
+    fill(batch, forward, begin + first, count);
+    __syncthreads();
+    for (int group = (count - 1) / kWarp * kWarp; group >= 0; group -= kWarp) {
+      unsigned summed = 0;
+      for (unsigned left = reaching(batch, group, least(count, furthest_of_warp - first), place); left;) {
+        const int bit = kWarp - 1 - __clz(int(left)), k = group + bit;
+        left ^= 1u << bit;
+        const Footprint &f = batch.footprints[k];
+        const typename Pixel::Pair pair = pixel.at(f);
+        const bool reached = first + k < state.end && pair.reached;
+        if (!__any_sync(kAllLanes, reached)) continue;
+        float sums[kSums] = {};
+        if (reached) {
+          float weight;
+          const float m = state.step_back(f, batch.reaches[k].gaussian, pair.log2_alpha, weight);
+          pair.moments(m, sums);
+          sums[kShape] = weight * state.up.red;
+          sums[kShape + 1] = weight * state.up.green;
+          sums[kShape + 2] = weight * state.up.blue;
+          sums[kShape + 3] = weight * state.up.depth;
+          if constexpr (!kPlanar) sums[kSums - 1] = args.absolute ? pair.pull(f, m) : 0.0f;
+          if constexpr (kWithRays) grad_ray = grad_ray + pixel.ray_gradient(f, pair, m);
+        }
+        const float sum = dealt_sum(sums);
+        if (own >= 0) partial[warp][bit][own] = sum;
+        summed |= 1u << bit;
+      }
+      summed_by[lane][warp] = summed >> lane & 1;
+      __syncthreads();
+      for (int bit = thread / kMoments; bit < least(count - group, kWarp); bit += kTilePixels / kMoments) {
+        float total = 0;
+        if (sum_of_moment < kSums)
+          for (int w = 0; w < kWarps; ++w)
+            if (summed_by[bit][w]) total += partial[w][bit][sum_of_moment];
+        args.moments[forward.slots[begin + first + group + bit]].of[moment] = total;
+      }
+      __syncthreads();  // nobody reads the sums, or the batch, any more
+    }
+  }
+  if constexpr (kWithRays)
+    if (place.inside) write_ray_gradient(args, place, grad_ray);
+}
+
+template <class PlanarState, class ProjectiveState>
+void launch_moments(const Queue &queue, const BlendGradientInputs &args) {
+  const bool flat = planar(args.forward.projection);
+  const auto kernel = flat             ? moments_kernel<PlanarPixel, PlanarState, false>
+                      : args.grad_rays ? moments_kernel<ProjectivePixel, ProjectiveState, true>
+                                       : moments_kernel<ProjectivePixel, ProjectiveState, false>;
+  launch(kernel, tiles_drawn(args.forward.table), kTilePixels, queue, args);
+}
+
+}  // namespace padgs

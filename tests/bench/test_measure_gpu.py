@@ -1,0 +1,76 @@
+"""reports/measure_gpu.sh with programs that only pretend: what it does in which order, and where it goes on."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+SCRIPT = Path(__file__).parents[2] / "reports" / "measure_gpu.sh"
+PYTHON = f"""#!/bin/sh
+case "$*" in
+  *"-m pytest"*) echo "tests $TOOL" >> "$CALLS"; test -z "$BROKEN" ;;
+  *"bench --device cuda"*)
+    echo bench >> "$CALLS"
+    echo '{{"machine": {{"gpu": "Some GPU"}}}}' > "$OUT/bench_gpu.json" ;;
+  *) exec {sys.executable} "$@" ;;
+esac
+"""
+
+
+@pytest.fixture
+def measure(tmp_path: Path):
+    """Run the script; returns its last line, and the calls that it made [(what)]."""
+    (tmp_path / "reports").mkdir()
+    shutil.copy(SCRIPT, tmp_path / "reports")
+    (tmp_path / "build/gpu/padgs").mkdir(parents=True)
+    calls, programs = tmp_path / "calls", tmp_path / "programs"
+    programs.mkdir()
+    pretended = {
+        "python": PYTHON,
+        "cmake": '#!/bin/sh\necho "cmake $1" >> "$CALLS"\n',
+        "compute-sanitizer": '#!/bin/sh\nexport TOOL=$2\nshift 4\nexec "$@"\n',
+    }
+    for name, text in pretended.items():
+        (programs / name).write_text(text)
+        (programs / name).chmod(0o755)
+
+    def run(*steps: str, **variables: str) -> tuple[str, list[str]]:
+        calls.write_text("")
+        environment = {
+            **{"PATH": f"{programs}:{os.environ['PATH']}", "PYTHON": str(programs / "python"), "CALLS": str(calls)},
+            **{"OUT": str(tmp_path / "out"), "BROKEN": "", **variables},
+        }
+        command = [str(tmp_path / "reports" / SCRIPT.name), *steps]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True)
+        return (done.stdout + done.stderr).splitlines()[-1], calls.read_text().split("\n")[:-1]
+
+    return run
+
+
+def test_the_benchmark_comes_first_and_what_is_done_is_not_done_again(measure, tmp_path: Path):
+    line, calls = measure("build", "bench")
+    assert calls == ["cmake -S", "cmake --build", "bench"]
+    assert line.startswith("verified: build bench; not verified: tests (not run), memcheck (not run)")
+    line, calls = measure()
+    assert calls == ["tests ", *(f"tests {tool}" for tool in ("memcheck", "synccheck", "racecheck", "initcheck"))]
+    assert line.endswith("racecheck initcheck; not verified: nothing")
+    assert measure()[1] == []
+    assert json.loads((tmp_path / "reports/measured/some-gpu.json").read_text())["steps"]["racecheck"] == "ok"
+
+
+def test_what_fails_is_said_and_tried_again(measure):
+    line, _ = measure("build", "bench", "tests", BROKEN="yes")
+    assert "verified: build bench; not verified: tests (failed (1))" in line
+    line, calls = measure("tests")
+    assert calls == ["tests "] and line.startswith("verified: build bench tests;")
+
+
+def test_unknown_steps_list_the_known_ones(measure):
+    line, _ = measure("racechek")
+    assert line.startswith("unknown step racechek; known: build bench tests")

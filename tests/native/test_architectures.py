@@ -1,0 +1,55 @@
+"""What libpadgs_cuda is compiled for, decided by CMake from what nvcc and nvidia-smi say; both are pretended here."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from padgs.native import cuda
+
+SCRIPT = Path(cuda.__file__).parent / "csrc" / "cuda" / "architectures.cmake"
+pytestmark = pytest.mark.skipif(shutil.which("cmake") is None, reason="no cmake")
+
+
+def program(folder: Path, name: str, *lines: str) -> str:
+    """A program that prints these lines."""
+    path = folder / name
+    path.write_text("#!/bin/sh\n" + "".join(f"echo {line}\n" for line in lines))
+    path.chmod(0o755)
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("asked", "gpus", "architectures", "problem"),
+    [
+        ("native", ["9.0"], "90", ""),
+        ("native", ["12.0", "8.9", "12.0"], "89;120", ""),
+        ("native", ["No devices were found"], "", "nvidia-smi finds no GPU here"),
+        ("native", ["13.5"], "135", "nvcc does not know compute capability 135; it knows 75, 80, 89, 90, 120"),
+        ("90;80", [], "80;90", ""),
+        ("all", [], "80;89;90;120", ""),
+        ("90;35", [], "35;90", "nvcc does not know compute capability 35; it knows 75, 80, 89, 90, 120"),
+    ],
+)
+def test_architectures_are_those_of_the_machine_or_the_list_that_is_asked_for(
+    asked, gpus, architectures, problem, tmp_path: Path
+):
+    nvcc = program(tmp_path, "nvcc", "compute_75", "compute_80", "compute_89", "compute_90", "compute_120")
+    program(tmp_path, "nvidia-smi", *gpus)
+    script = tmp_path / "ask.cmake"
+    script.write_text(
+        f'include("{SCRIPT}")\nchoose_architectures({nvcc} "{asked}")\n'
+        'message(STATUS "found ${architectures} | ${problem}")\n'
+    )
+    done = subprocess.run(
+        [str(shutil.which("cmake")), "-P", str(script)],
+        env={"PATH": f"{tmp_path}:/usr/bin:/bin"},
+        capture_output=True,
+        text=True,
+    )
+    found, told = done.stdout.removeprefix("-- found ").rstrip("\n").split(" | ")
+    assert (done.returncode, found, done.stderr) == (0, architectures, "")
+    assert problem in told and bool(problem) == bool(told)

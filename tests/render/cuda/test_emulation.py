@@ -1,0 +1,66 @@
+"""The emulated GPU finds faults that are planted, each of a kind that hardware would not forgive."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import subprocess
+import sys
+
+import cuda_engine
+import pytest
+import torch
+
+from padgs.native.abi import Pointer
+
+pytestmark = pytest.mark.skipif(cuda_engine.COMPILER is None, reason="no C++ compiler")
+FAULTS = ("unwritten", "race", "two barriers", "two votes", "contraction")
+ALONE = """
+import ctypes, sys
+ctypes.CDLL(sys.argv[1]).plant(int(sys.argv[2]), (ctypes.c_float * 64)())
+"""
+
+
+@functools.cache
+def library(*flags: str) -> ctypes.CDLL:
+    return cuda_engine.compiled("planted", [cuda_engine.HERE / "planted.cpp"], *flags)
+
+
+def planted(fault: str, *flags: str) -> torch.Tensor:
+    """What a faulty kernel of 64 threads leaves [64]."""
+    out = torch.zeros(64)
+    library(*flags).plant(FAULTS.index(fault), Pointer(out.data_ptr()))
+    return out
+
+
+def test_shared_memory_that_nobody_wrote_to_is_no_number():
+    assert planted("unwritten").isnan().all()
+
+
+def test_a_race_that_neither_order_of_turns_brings_out_shows_in_some_schedule(monkeypatch: pytest.MonkeyPatch):
+    outcomes = [planted("race").tolist()]
+    for seed in range(3):
+        monkeypatch.setenv("PADGS_EMULATION_SEED", str(seed))
+        outcomes.append(planted("race").tolist())
+    assert outcomes[0] == [1.0] * 64 and all(outcome != outcomes[0] for outcome in outcomes[1:])
+    monkeypatch.setenv("PADGS_EMULATION_SEED", "0")
+    assert planted("race").tolist() == outcomes[1]  # a schedule can be had again
+
+
+@pytest.mark.parametrize(
+    ("fault", "word"),
+    [
+        ("two barriers", "threads of a block wait at different barriers"),
+        ("two votes", "lanes of a warp wait for different things"),
+    ],
+)
+def test_waits_at_different_places_end_the_process(fault: str, word: str):
+    command = [sys.executable, "-c", ALONE, library()._name, str(FAULTS.index(fault))]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode < 0 and word in done.stderr
+
+
+@pytest.mark.skipif(not cuda_engine.FUSES, reason="this CPU has no fused multiply-add")
+def test_a_second_build_fuses_products_into_sums():
+    assert not planted("contraction").any()
+    assert planted("contraction", *cuda_engine.FUSED).any()
