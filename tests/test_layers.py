@@ -35,6 +35,7 @@ ROOMS = (
     "reports",
     "padgs.tracking",
     "padgs.runs",
+    "padgs.export",
     "padgs.multirun",
     "padgs.cli",
 )

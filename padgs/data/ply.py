@@ -1,8 +1,9 @@
-"""Point clouds in PLY files, ASCII or binary, through plyfile."""
+"""PLY files, ASCII or binary, through plyfile: what any of them must be, and point clouds."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,6 +20,26 @@ def read_ply(path: Path) -> Cloud:
     Raises:
         DataError: not there, not a PLY file, cut short, or without x, y, z.
     """
+    vertex, names = read_vertices(path)
+    if not {"x", "y", "z"} <= names:
+        raise DataError(f"{path} has the properties {', '.join(sorted(names))}; a point cloud needs x, y and z")
+    points = np.stack([np.asarray(vertex[axis], dtype=np.float64) for axis in "xyz"], axis=1)
+    channels = next((group for group in _COLORS if set(group) <= names), None)
+    colors = None
+    if channels is not None:
+        values = np.stack([np.asarray(vertex[channel]) for channel in channels], axis=1)
+        if values.dtype.kind == "f":
+            values = np.nan_to_num(values) * (255 if len(values) == 0 or np.nanmax(values) <= 1 else 1)
+        colors = torch.from_numpy(np.rint(values).clip(0, 255).astype(np.uint8))
+    return Cloud(torch.from_numpy(points), colors)
+
+
+def read_vertices(path: Path) -> tuple[Any, set[str]]:
+    """The vertices of a PLY file, a column for each property's name, and those names.
+
+    Raises:
+        DataError: not there, not a PLY file, cut short, or without vertices.
+    """
     from plyfile import PlyData, PlyParseError
 
     try:
@@ -31,18 +52,7 @@ def read_ply(path: Path) -> Cloud:
         raise DataError(
             f"{path} is not a readable PLY file ({error or type(error).__name__}); export it again"
         ) from error
-    names = {prop.name for prop in vertex.properties}
-    if not {"x", "y", "z"} <= names:
-        raise DataError(f"{path} has the properties {', '.join(sorted(names))}; a point cloud needs x, y and z")
-    points = np.stack([np.asarray(vertex[axis], dtype=np.float64) for axis in "xyz"], axis=1)
-    channels = next((group for group in _COLORS if set(group) <= names), None)
-    colors = None
-    if channels is not None:
-        values = np.stack([np.asarray(vertex[channel]) for channel in channels], axis=1)
-        if values.dtype.kind == "f":
-            values = np.nan_to_num(values) * (255 if len(values) == 0 or np.nanmax(values) <= 1 else 1)
-        colors = torch.from_numpy(np.rint(values).clip(0, 255).astype(np.uint8))
-    return Cloud(torch.from_numpy(points), colors)
+    return vertex, {prop.name for prop in vertex.properties}
 
 
 def write_ply(path: Path, cloud: Cloud) -> None:

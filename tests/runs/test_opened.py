@@ -5,38 +5,16 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from rich.console import Console
+from tiny_run import tiny_run
 
 import padgs
-from padgs.multirun.composition import composing, configuration
 from padgs.results import read
 from padgs.runs.folder import RunFolderError
-from padgs.runs.session import Session
-
-SETTINGS = [
-    "method=omnigs",
-    "train.iterations=30",
-    "data.generator.width=32",
-    "data.generator.train_views=3",
-    "data.generator.test_views=2",
-    "data.generator.samples=1",
-    "data.generator.points=200",
-    "protocol=sphere",
-    "protocol.sphere.lpips=none",
-    "run.device=cpu",
-    "tracking=none",
-]
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PADGS_CACHE", str(tmp_path_factory.mktemp("cache")))
-        runs = tmp_path_factory.mktemp("runs")
-        with composing():
-            config = configuration([*SETTINGS, f"run.folder={runs}"])
-        Session(config, Console(quiet=True)).run()
-        yield next(path.parent for path in runs.glob("*/result.json"))
+    return tiny_run(tmp_path_factory)
 
 
 def test_an_opened_run_shows_and_scores_what_was_trained(folder):
