@@ -31,6 +31,7 @@ ROOMS = (
     "padgs.bench",
     "padgs.data",
     "padgs.calibration",
+    "padgs.film",
     "baselines",
     "reports",
     "padgs.tracking",

@@ -12,6 +12,7 @@ from padgs.cli.check import check
 from padgs.cli.convert import convert
 from padgs.cli.export import export
 from padgs.cli.prepare import prepare
+from padgs.cli.render import render
 from padgs.cli.report import report
 from padgs.cli.track import track
 
@@ -32,7 +33,7 @@ def commands(
     """Panoramic Gaussian splatting, measured fairly."""
 
 
-for command in (bench, check, convert, export, prepare, report, track):
+for command in (bench, check, convert, export, prepare, render, report, track):
     app.command()(command)
 
 

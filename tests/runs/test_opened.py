@@ -1,6 +1,7 @@
 """Runs opened from Python: what they show, how they score, and what is wrong with folders that are none."""
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ from tiny_run import tiny_run
 import padgs
 from padgs.results import read
 from padgs.runs.folder import RunFolderError
+from padgs.sphere.camera import Panorama, perspective
+from padgs.sphere.panorama import sample
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +48,16 @@ def test_a_path_goes_through_the_training_cameras(folder):
     assert run.render(views[1]).image.shape == (16, 32, 3)
     with pytest.raises(ValueError, match="a path of 1 frames through 3 views"):
         run.camera_path(1)
+
+
+def test_other_cameras_see_the_same(folder):
+    run = padgs.load_run(folder, device="cpu")
+    lens, fine, view = perspective(16, 16, 60.0), Panorama(256, 128), run.scene.train[0]
+    seen = run.through(lens).render(replace(view, width=16, height=16, lens=lens)).image
+    panorama = run.through(fine).render(replace(view, width=256, height=128)).image
+    assert (seen - sample(panorama, lens.rays())).abs().mean() < 0.02 < seen.std()
+    assert run.through(view.camera) is run.method
+    assert run.through(fine).render_config.low_pass == pytest.approx(64 * run.method.render_config.low_pass)
 
 
 def test_a_run_that_is_not_finished_opens_too_and_an_old_key_is_passed_over(folder, tmp_path):
