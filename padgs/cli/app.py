@@ -15,6 +15,7 @@ from padgs.cli.prepare import prepare
 from padgs.cli.render import render
 from padgs.cli.report import report
 from padgs.cli.track import track
+from padgs.cli.view import view
 
 app = typer.Typer(no_args_is_help=True, add_completion=False)
 
@@ -33,7 +34,7 @@ def commands(
     """Panoramic Gaussian splatting, measured fairly."""
 
 
-for command in (bench, check, convert, export, prepare, render, report, track):
+for command in (bench, check, convert, export, prepare, render, report, track, view):
     app.command()(command)
 
 
