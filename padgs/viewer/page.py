@@ -63,8 +63,10 @@ class Page:
         self._facts = gui.add_markdown("drawing the first picture")
         self._camera = gui.add_dropdown("camera", CAMERAS)
         self._layer = gui.add_dropdown("show", LAYERS)
-        names = [gallery.run.folder.name for gallery in galleries]
-        self._which = gui.add_dropdown("run", (*names, BOTH) if len(names) > 1 else names)
+        folders = [gallery.run.folder.name for gallery in galleries]
+        names = folders if len(folders) == 1 else [f"{number}: {name}" for number, name in enumerate(folders, 1)]
+        self._named = dict(zip(names, self._galleries, strict=True))
+        self._which = gui.add_dropdown("run", names if len(names) == 1 else (*names, BOTH))
         self._fov = gui.add_slider("degrees across", min=20, max=140, step=1, initial_value=75)
         self._width = gui.add_dropdown("pixels across", WIDTHS, initial_value="1024")
         self._goal = gui.add_dropdown("go to", ("", *self._views))
@@ -114,11 +116,8 @@ class Page:
         pose[:3, :3], pose[:3, 3] = world_from_cam.T, -world_from_cam.T @ camera.position
         width = int(self._width.value)
         height = max(2, round(width / camera.aspect))
-        shown = self._galleries if self._which.value == BOTH else (self._galleries[self._which_number()],)
+        shown = self._galleries if self._which.value == BOTH else (self._named[self._which.value],)
         return Asked(look, torch.from_numpy(pose), width, height, shown)
-
-    def _which_number(self) -> int:
-        return next(i for i, gallery in enumerate(self._galleries) if gallery.run.folder.name == self._which.value)
 
     def _change(self, _: object) -> None:
         self._changed.set()
@@ -129,6 +128,8 @@ class Page:
             fov=1.0,
             aspect=1.5,
             scale=0.05 * self._galleries[0].run.scene.unit,
+            thickness=1.5,
+            thickness_units="screen",
             color=(40, 120, 220),
             wxyz=np.roll(Rotation.from_matrix(view.cam_from_world[:3, :3].mT.cpu().numpy()).as_quat(), 1),
             position=view.center.cpu().numpy(),

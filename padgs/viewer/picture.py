@@ -100,7 +100,8 @@ class Gallery:
         scene = self.run.scene
         view = next(view for view in (*scene.train, *scene.test) if view.name == name)
         image = self.run.method.render(view).image
-        return error_picture(image, view.image(device=image.device)).copy()
+        truth, mask = view.image(device=image.device), view.mask(device=image.device)
+        return error_picture(image if mask is None else torch.lerp(truth, image, mask[..., None]), truth).copy()
 
 
 def cropped(method: Method, crop: Box) -> Method:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, field
@@ -42,6 +43,7 @@ def serving(runs: Sequence[OpenedRun], *, host: str = "127.0.0.1", port: int = 8
         import viser
     except ImportError as error:
         raise ValueError("the viewer needs viser: pip install 'padgs[view]'") from error
+    warnings.filterwarnings("ignore", message="Queued .* on a closed connection")  # a page left while it was drawn for
     galleries, scene = [Gallery(run) for run in runs], runs[0].scene
     with redirect_stdout(None):  # it draws a box around addresses, whatever `verbose` says
         server = viser.ViserServer(host=host, port=port, label=f"padgs: {scene.name}", verbose=False)
@@ -71,7 +73,8 @@ def serving(runs: Sequence[OpenedRun], *, host: str = "127.0.0.1", port: int = 8
     finally:
         for page in list(found.pages.values()):
             page.leave()
-        server.stop()
+        with redirect_stdout(None):
+            server.stop()
 
 
 def box_of(points: torch.Tensor) -> Box:
