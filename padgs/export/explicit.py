@@ -60,7 +60,7 @@ def exported(
     if isinstance(trainee, SplatTrainee):
         splats = trainee.splats
         if isinstance(run.method, SCOmniGSMethod):  # it trained in the world of its refined poses
-            splats = moved(splats, aligned(trainee.calibration.poses)[0].inverse())
+            splats = moved(splats, aligned(run.method.trainee.calibration.poses)[0].inverse())
         notes.append("Gaussians as trained")
     elif isinstance(trainee, AnchorTrainee):
         splats, loss = _baked(run, lessons, progress)

@@ -51,5 +51,5 @@ def harmonics_turn(rotation: Tensor, degree: int) -> Tensor:
 
 def upright(up: Tensor) -> Similarity:
     """The smallest turn after which `up` [3] points against `DOWN`."""
-    turn, _ = Rotation.align_vectors([-torch.tensor(DOWN).numpy()], [up.cpu().numpy()])
+    turn = Rotation.align_vectors([-torch.tensor(DOWN).numpy()], [up.cpu().numpy()])[0]
     return Similarity(1.0, torch.from_numpy(turn.as_matrix()), torch.zeros(3, dtype=torch.float64))

@@ -7,8 +7,10 @@ from tiny_run import tiny_run
 from typer.testing import CliRunner
 
 import padgs
+from baselines.sc_omnigs import aligned, carried
 from padgs.cli.app import app
 from padgs.data.ply import read_ply
+from padgs.export.explicit import exported
 from padgs.export.splat_file import read_splats
 from padgs.render import render
 from padgs.scoring.evaluate import evaluate
@@ -36,6 +38,20 @@ def test_an_exported_run_scores_as_it_did(splat_run):
     own = evaluate(run.method.render, run.scene.test, RULES)
     assert again.metrics["ws_psnr"] == pytest.approx(own.metrics["ws_psnr"], abs=1e-6)
     (splat_run / "splats.ply").unlink()
+
+
+def test_refined_poses_do_not_move_the_world(tmp_path_factory):
+    run = padgs.load_run(tiny_run(tmp_path_factory, "method=sc_omnigs", "data.generator.train_views=4"))
+    poses = run.method.trainee.calibration.poses
+    with torch.no_grad():
+        for correction in poses.parameters():
+            correction += 0.02 * torch.randn(correction.shape, generator=torch.Generator().manual_seed(1))
+    splats, view = exported(run).splats, run.scene.test[0]
+    carried_view = view.at(carried(view.cam_from_world, aligned(poses)[0]))
+    options = run.config.render.options(run.scene.unit)
+    own = run.method.trainee.render(carried_view).image
+    assert torch.allclose(render(splats.gaussians(view), view, options).image, own, atol=0.02)
+    assert (run.method.trainee.render(view).image - own).abs().max() > 0.05, "it is another world"
 
 
 def test_points_and_upright_worlds(splat_run, tmp_path):
