@@ -16,7 +16,8 @@ from torch import Tensor
 
 from padgs.anchors.model import PaDGS
 from padgs.gaussians import Gaussians, rotation_matrices
-from padgs.learning.loop import Budget, Trainer, TrainOptions
+from padgs.learning.budget import Budget
+from padgs.learning.loop import Trainer, TrainOptions
 from padgs.learning.trainee import Drawing
 from padgs.render import Rendering, RenderOptions, render
 from padgs.render.config import RenderConfig

@@ -5,7 +5,7 @@ from tiny_scene import tiny_scene, truth
 from padgs.anchors.method import PaDGSMethod
 from padgs.export.bake import axes_of, baked, cameras_around, contributions, teach
 from padgs.gaussians import rotation_matrices
-from padgs.learning.loop import Budget
+from padgs.learning.budget import Budget
 from padgs.render import RenderOptions, render
 from padgs.splats.model import Splats
 
