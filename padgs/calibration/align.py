@@ -26,6 +26,10 @@ class Similarity:
         """Points [..., 3] of the second world in the first."""
         return self.scale * points @ self.rotation.mT + self.translation
 
+    def inverse(self) -> Similarity:
+        """second_from_first."""
+        return Similarity(1 / self.scale, self.rotation.mT, -self.translation @ self.rotation / self.scale)
+
 
 @dataclass(frozen=True)
 class Difference:

@@ -10,9 +10,12 @@ import padgs
 from padgs.cli.bench import bench
 from padgs.cli.check import check
 from padgs.cli.convert import convert
+from padgs.cli.export import export
 from padgs.cli.prepare import prepare
+from padgs.cli.render import render
 from padgs.cli.report import report
 from padgs.cli.track import track
+from padgs.cli.view import view
 
 app = typer.Typer(no_args_is_help=True, add_completion=False)
 
@@ -31,7 +34,7 @@ def commands(
     """Panoramic Gaussian splatting, measured fairly."""
 
 
-for command in (bench, check, convert, prepare, report, track):
+for command in (bench, check, convert, export, prepare, render, report, track, view):
     app.command()(command)
 
 

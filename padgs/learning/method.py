@@ -109,6 +109,12 @@ class Method(ABC):
         self._trainee.load_state(state.of_model())
         self._trainer, self._loaded = None, state
 
+    def drawn_with(self, render: RenderConfig) -> Method:
+        """A copy of the trained method that draws in another way."""
+        other = type(self)(self.options, render, self.train_options, self.seed)
+        other.load_state(self.state())
+        return other
+
     @property
     def start(self) -> int:
         """How many Gaussians, anchors or other parts the model had before the first iteration of `fit`."""

@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 import torch
 from omegaconf import OmegaConf
-from scipy.spatial.transform import Rotation, Slerp
 
+from baselines.cubemap_3dgs import Cubemap3DGSMethod
 from padgs import results
+from padgs.film.paths import between
 from padgs.learning.method import Method
+from padgs.render.cubemap import FINENESS
 from padgs.results import Result, Scores
 from padgs.runs import checkpoint
 from padgs.runs.config import RunConfig, config_from_values
@@ -23,6 +25,7 @@ from padgs.runs.session import build, scene_of
 from padgs.scene import Scene, View
 from padgs.scoring.evaluate import evaluate
 from padgs.scoring.protocols import PROTOCOLS
+from padgs.sphere.camera import Camera, Panorama, Pinhole
 
 
 @dataclass(frozen=True)
@@ -92,18 +95,38 @@ class OpenedRun:
         views = self.scene.train
         if len(views) < 2 or frames < 2:
             raise ValueError(f"a path of {frames} frames through {len(views)} views; it takes at least two of both")
-        poses = torch.stack([view.cam_from_world for view in views]).cpu().numpy()
-        times = np.linspace(0, len(views) - 1, frames)
-        turns = Slerp(np.arange(len(views)), Rotation.from_matrix(poses[:, :3, :3]))(times).as_matrix()
-        centers = np.stack([view.center.cpu().numpy() for view in views])
-        at = np.stack([np.interp(times, np.arange(len(views)), axis) for axis in centers.T], axis=-1)
-        found = []
-        for number, (turn, center) in enumerate(zip(turns, at, strict=True)):
-            pose = np.eye(4)
-            pose[:3, :3], pose[:3, 3] = turn, -turn @ center
-            view = views[0].at(torch.from_numpy(pose).to(views[0].cam_from_world))
-            found.append(replace(view, name=f"frame-{number:05d}"))
-        return found
+        poses = between(torch.stack([view.cam_from_world for view in views]), np.linspace(0, len(views) - 1, frames))
+        return [
+            replace(views[0].at(pose.to(views[0].cam_from_world)), name=f"frame-{number:05d}")
+            for number, pose in enumerate(poses)
+        ]
+
+    def through(self, camera: Camera) -> Method:
+        """The method as this camera sees it: the run's own, or a copy that draws what that does not.
+
+        Filters keep the angle that they had in training where the camera has finer pixels, as between those Gaussians
+        were never seen; a projection of whole panoramas gives way to `pinhole` for a perspective camera.
+        """
+        ways, trained = self.config.render, self.scene.train[0].camera
+        if isinstance(camera, Pinhole):
+            only = ways.projection == "erp" or ways.cubemap
+            kind = "angular" if only and ways.low_pass_kind in ("auto", "pixels") else ways.low_pass_kind
+            ways = replace(
+                ways,
+                projection="pinhole" if only else ways.projection,
+                low_pass_kind=kind,
+                cubemap=False,
+                face_size=None,
+                pixel_bias=0.0,
+                bounds="exact",
+                wrap=True,
+                memory_cap=None,
+            )
+        finer = max(1.0, camera.focal / trained.focal)
+        if isinstance(self.method, Cubemap3DGSMethod) and not isinstance(camera, Panorama):
+            finer /= FINENESS  # which it assumes of every view that is no panorama
+        ways = replace(ways, low_pass=ways.low_pass if ways.low_pass_kind == "fixed" else ways.low_pass * finer**2)
+        return self.method if ways == self.config.render else self.method.drawn_with(ways)
 
 
 def load_run(folder: str | Path, *, data_path: str | Path | None = None, device: str = "auto") -> OpenedRun:

@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 from torch import Tensor
 
+from padgs.render import Rendering
+
 ERROR_FULL_SCALE = 0.25  # an error of a quarter of the range or more has the brightest colour, in every picture alike
 ERROR_COLORS = "inferno"  # black = equal; brightness grows evenly with the error
+DEPTH_COLORS = "magma"  # black = nothing, or far away
 
 
 def eight_bit(image: Tensor) -> np.ndarray:
@@ -25,3 +28,11 @@ def error_picture(image: Tensor, truth: Tensor) -> np.ndarray:
 def comparison(truth: Tensor, image: Tensor) -> np.ndarray:
     """truth | render | error as one picture [H, 3 W, 3] uint8, from floats [H, W, 3]."""
     return np.concatenate((eight_bit(truth), eight_bit(image), error_picture(image, truth)), axis=1)
+
+
+def depth_picture(rendering: Rendering, unit: float) -> np.ndarray:
+    """Depth as colours [H, W, 3] uint8, bright is near: u / (d + u) at distance d, half of the scale at the unit u."""
+    import matplotlib
+
+    nearness = unit / (rendering.depth + unit) * (1 - rendering.transmittance)
+    return matplotlib.colormaps[DEPTH_COLORS](nearness.cpu().numpy(), bytes=True)[..., :3]

@@ -6,6 +6,7 @@ rays. Cameras are values: two of the same numbers are the same camera.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -53,6 +54,18 @@ class Pinhole:
     def focal(self) -> float:
         """Pixels per radian at the principal point, the geometric mean of both focal lengths."""
         return (self.fx * self.fy) ** 0.5
+
+
+def perspective(width: int, height: int, fov: float) -> Pinhole:
+    """A pinhole that shows `fov` degrees across the width, with square pixels and its axis in the middle.
+
+    Raises:
+        ValueError: a side without a pixel, or a field of view that is not between 0 and 180 degrees.
+    """
+    if width < 1 or height < 1 or not 0 < fov < 180:
+        raise ValueError(f"no perspective picture has {width}x{height} pixels across {fov:g} degrees (0 to 180)")
+    focal = width / 2 / math.tan(math.radians(fov) / 2)
+    return Pinhole(width, height, focal, focal, width / 2, height / 2)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,42 +1,23 @@
 """Runs opened from Python: what they show, how they score, and what is wrong with folders that are none."""
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from rich.console import Console
+from tiny_run import tiny_run
 
 import padgs
-from padgs.multirun.composition import composing, configuration
 from padgs.results import read
 from padgs.runs.folder import RunFolderError
-from padgs.runs.session import Session
-
-SETTINGS = [
-    "method=omnigs",
-    "train.iterations=30",
-    "data.generator.width=32",
-    "data.generator.train_views=3",
-    "data.generator.test_views=2",
-    "data.generator.samples=1",
-    "data.generator.points=200",
-    "protocol=sphere",
-    "protocol.sphere.lpips=none",
-    "run.device=cpu",
-    "tracking=none",
-]
+from padgs.sphere.camera import Panorama, perspective
+from padgs.sphere.panorama import sample
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PADGS_CACHE", str(tmp_path_factory.mktemp("cache")))
-        runs = tmp_path_factory.mktemp("runs")
-        with composing():
-            config = configuration([*SETTINGS, f"run.folder={runs}"])
-        Session(config, Console(quiet=True)).run()
-        yield next(path.parent for path in runs.glob("*/result.json"))
+    return tiny_run(tmp_path_factory)
 
 
 def test_an_opened_run_shows_and_scores_what_was_trained(folder):
@@ -67,6 +48,25 @@ def test_a_path_goes_through_the_training_cameras(folder):
     assert run.render(views[1]).image.shape == (16, 32, 3)
     with pytest.raises(ValueError, match="a path of 1 frames through 3 views"):
         run.camera_path(1)
+
+
+def test_other_cameras_see_the_same(tmp_path_factory):
+    run = padgs.load_run(tiny_run(tmp_path_factory, "method=spags_sorted"), device="cpu")  # exact for every camera
+    lens, fine, view = perspective(32, 32, 60.0), Panorama(256, 128), run.scene.train[0]
+    seen = run.through(lens).render(replace(view, width=32, height=32, lens=lens)).image
+    panorama = run.through(fine).render(replace(view, width=256, height=128)).image
+    assert (seen - sample(panorama, lens.rays())).abs().mean() < 0.01 < seen.std()
+
+
+def test_what_draws_panoramas_only_draws_other_cameras_by_pinhole(folder):
+    run = padgs.load_run(folder, device="cpu")
+    view, fine = run.scene.train[0], Panorama(256, 128)
+    assert run.through(view.camera) is run.method and run.method.render_config.projection == "erp"
+    assert run.through(fine).render_config.low_pass == pytest.approx(64 * run.method.render_config.low_pass)
+    lens = perspective(16, 8, 90.0)
+    drawn = run.through(lens)
+    assert (drawn.render_config.projection, drawn.render_config.low_pass_kind) == ("pinhole", "angular")
+    assert drawn.render(replace(view, width=16, height=8, lens=lens)).image.isfinite().all()
 
 
 def test_a_run_that_is_not_finished_opens_too_and_an_old_key_is_passed_over(folder, tmp_path):

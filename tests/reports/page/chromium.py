@@ -64,9 +64,9 @@ class Browser:
         os.close(self._out)
         os.close(self._in)
 
-    def open(self, path: Path) -> None:
-        """Load a file, and wait until it is there."""
-        self._call("Page.navigate", url=path.resolve().as_uri())
+    def open(self, page: Path | str) -> None:
+        """Load a file or an address, and wait until it is there."""
+        self._call("Page.navigate", url=page if isinstance(page, str) else page.resolve().as_uri())
         self.wait("document.readyState === 'complete'")
 
     def run(self, script: str):

@@ -1,0 +1,55 @@
+"""`padgs export`: a run as a file that other programs open."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from padgs.cli.opening import DataPath, Run, opened
+from padgs.cli.refusing import refusing
+
+
+@refusing(ValueError, OSError)
+def export(
+    run: Run,
+    to: Annotated[str, typer.Option(help="file to write; .ply, .compressed.ply, .spz, .sog or .html")] = "",
+    points: Annotated[bool, typer.Option("--points", help="only centres of opaque Gaussians, coloured")] = False,
+    upright: Annotated[bool, typer.Option("--upright", help="turn -y up, as viewers expect; .html always is")] = False,
+    lessons: Annotated[int, typer.Option(help="iterations of PaD-GS's baked anchors on own pictures")] = 300,
+    data: DataPath = None,
+) -> None:
+    """Write a run's Gaussians, by default into its folder as splats.ply (--points: points.ply).
+
+    Those of PaD-GS, which differ from view to view, are baked into ones that do not; what that costs is measured, said
+    and written into the file. All but .ply is made by splat-transform (npm install -g @playcanvas/splat-transform).
+    """
+    from pathlib import Path
+
+    from rich.console import Console
+
+    from padgs.data.ply import write_ply
+    from padgs.export.explicit import exported, point_cloud
+    from padgs.export.splat_file import refuse_impossible, write_splats
+
+    path = Path(to) if to else Path(run) / ("points.ply" if points else "splats.ply")
+    if points and path.suffixes != [".ply"]:
+        raise ValueError(f"{path} is no plain .ply, which point clouds are written as")
+    refuse_impossible(path)
+    with Console().status("opening the run") as status:
+        found = exported(
+            opened(run, data),
+            lessons=lessons,
+            stand_up=upright or path.suffix == ".html",
+            progress=lambda done: status.update(f"lesson {done} of {lessons}"),
+        )
+        status.update(f"writing {path}")
+        if points:
+            cloud = point_cloud(found.splats)
+            write_ply(path, cloud)
+            what = f"{len(cloud.points)} points"
+        else:
+            write_splats(path, found.splats, found.notes)
+            what = f"{len(found.splats)} Gaussians"
+    print("\n".join(f"  {note}" for note in found.notes))
+    print(f"{path}: {what}, {path.stat().st_size / 1e6:.1f} MB")

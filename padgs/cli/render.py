@@ -1,0 +1,76 @@
+"""`padgs render`: a film, or pictures, along a path through what a run has learned."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from padgs.cli.opening import DataPath, Run, opened
+from padgs.cli.refusing import refusing
+
+
+@refusing(ValueError, OSError)
+def render(
+    run: Run,
+    to: Annotated[str, typer.Option(help="an .mp4, or a folder for PNGs; its own folder's film.mp4 if not said")] = "",
+    path: Annotated[
+        str, typer.Option(help="cameras, orbit, dolly, or a JSON: keyframes, nerfstudio's path")
+    ] = "cameras",
+    camera: Annotated[str, typer.Option(help="panorama or perspective")] = "panorama",
+    fov: Annotated[float, typer.Option(help="degrees across a perspective picture")] = 90.0,
+    width: Annotated[int, typer.Option(help="pixels; 0: the run's, for a perspective half as many")] = 0,
+    height: Annotated[int, typer.Option(help="pixels of a perspective picture; 0: 9/16 of the width")] = 0,
+    seconds: Annotated[float | None, typer.Option(help="length; 10 if not said, or what a camera path has")] = None,
+    fps: Annotated[float, typer.Option(help="frames per second")] = 30.0,
+    depth: Annotated[bool, typer.Option("--depth", help="also write depth, beside the colours")] = False,
+    data: DataPath = None,
+) -> None:
+    """Write a film (or PNGs) along a path, as panoramas, which players show as such, or in perspective."""
+    from pathlib import Path
+
+    import torch
+    from rich.console import Console
+
+    from padgs.data.trajectory import gravity
+    from padgs.film.frames import write_film
+    from padgs.film.keyframes import read_path
+    from padgs.film.paths import PATHS
+    from padgs.scene import View
+    from padgs.sphere.camera import Panorama, perspective
+
+    if camera not in ("panorama", "perspective"):
+        raise ValueError(f"unknown camera {camera!r}; known: panorama, perspective")
+    if not (fps > 0 and (seconds is None or seconds > 0)):
+        raise ValueError(f"a film of {seconds} seconds at {fps} frames per second has no frame; both must be > 0")
+    with Console().status("opening the run") as status:
+        found = opened(run, data)
+        scene = found.scene
+        trained = scene.train[0]
+        if camera == "panorama":
+            lens = Panorama(width or trained.width, (width or trained.width) // 2)
+        else:
+            width = width or trained.width // 2
+            lens = perspective(width, height or 2 * round(width * 9 / 32), fov)
+        frames = None if seconds is None else max(2, round(seconds * fps))
+        if path in PATHS:
+            poses = PATHS[path](scene, frames or max(2, round(10 * fps)))
+        else:
+            up = gravity(torch.stack([view.cam_from_world for view in scene.train])).up
+            poses = read_path(Path(path), frames, up)
+        views = [
+            View(f"frame {number}", pose.to(trained.cam_from_world), lens.width, lens.height, lens=lens)
+            for number, pose in enumerate(poses)
+        ]
+        places = write_film(
+            Path(to) if to else found.folder / "film.mp4",
+            views,
+            found.through(lens).render,
+            fps=fps,
+            unit=scene.unit,
+            depth=depth,
+            spherical=camera == "panorama",
+            progress=lambda done: status.update(f"frame {done} of {len(views)}"),
+        )
+    for place in places:
+        print(f"{place}: {len(views)} frames of {lens.width}x{lens.height}")

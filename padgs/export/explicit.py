@@ -1,0 +1,109 @@
+"""A run as explicit Gaussians, and what that costs it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+
+import padgs
+from baselines.sc_omnigs import SCOmniGSMethod, aligned
+from padgs.anchors.trainee import AnchorTrainee
+from padgs.data.capture import Cloud
+from padgs.data.trajectory import gravity
+from padgs.export.bake import baked, cameras_around, teach
+from padgs.export.moved import moved, upright
+from padgs.render import Rendering, render
+from padgs.runs.opened import OpenedRun
+from padgs.scene import View
+from padgs.scoring.evaluate import evaluate
+from padgs.scoring.protocols import PROTOCOLS
+from padgs.sphere import harmonics
+from padgs.splats.model import Splats
+from padgs.splats.trainee import SplatTrainee
+
+LESSONS = 300
+OPAQUE = 0.5  # opacity from which on a Gaussian is a point of something
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What is written, and what is to be said of it."""
+
+    splats: Splats
+    notes: tuple[str, ...]  # lines of ASCII
+
+
+def exported(
+    run: OpenedRun,
+    *,
+    lessons: int = LESSONS,
+    stand_up: bool = False,
+    progress: Callable[[int], None] = lambda done: None,
+) -> Exported:
+    """The explicit Gaussians of a run, in the world of its scene.
+
+    Args:
+        run: any but EgoNeRF's.
+        lessons: iterations that baked anchors learn from their own pictures.
+        stand_up: turn the world so that the cameras' up is -y, as viewers expect it.
+        progress: called with the number of lessons that are over.
+
+    Raises:
+        ValueError: the run has no Gaussians.
+        DataError: its data set, which this takes, is not where it was.
+    """
+    trainee = run.method.trainee
+    config = run.config.render
+    notes = [f"padgs {padgs.__version__}, run {run.folder.name}"]
+    if isinstance(trainee, SplatTrainee):
+        splats = trainee.splats
+        if isinstance(run.method, SCOmniGSMethod):  # it trained in the world of its refined poses
+            splats = moved(splats, aligned(run.method.trainee.calibration.poses)[0].inverse())
+        notes.append("Gaussians as trained")
+    elif isinstance(trainee, AnchorTrainee):
+        splats, loss = _baked(run, lessons, progress)
+        notes.append(loss)
+    else:
+        raise ValueError(
+            f"{run.config.method} has no Gaussians to export; padgs render and padgs view show what it has learned"
+        )
+    kind = f"{config.low_pass:g} in {config.resolved_low_pass_kind}"
+    notes.append(f"trained with projection {config.projection} and a low-pass of {kind}; viewers have others")
+    notes.append("axes and units of the scene; its cameras look along z, x is right, y down")
+    if stand_up:
+        up = torch.tensor(gravity(torch.stack([view.cam_from_world for view in run.scene.train])).up)
+        splats = moved(splats, upright(up))
+        notes[-1] = "units of the scene, turned so that -y is up"
+    return Exported(splats, tuple(notes))
+
+
+def _baked(run: OpenedRun, lessons: int, progress: Callable[[int], None]) -> tuple[Splats, str]:
+    scene, config, method = run.scene, run.config.render, run.method
+    options = config.options(scene.unit)
+    views = cameras_around(scene.train)
+    splats = baked(method.trainee.model, views, options, config.backend, scene.unit)
+    if lessons:
+        teach(splats, method.render, replace(scene, train=tuple(views)), config, lessons, progress)
+
+    def show(view: View) -> Rendering:
+        return render(splats.gaussians(view), view, options, backend=config.backend)
+
+    held_out = "test" if scene.test else "training"
+    protocol = replace(PROTOCOLS["sphere"], lpips="none", metrics=("ws_psnr",))
+    marks = [
+        evaluate(drawn, scene.test or scene.train, protocol).metrics["ws_psnr"] or 0 for drawn in (method.render, show)
+    ]
+    return splats, (
+        f"baked: {len(splats)} of {method.size().counts['gaussians']} Gaussians show; WS-PSNR of the {held_out} views "
+        f"{marks[1]:.2f} dB, {marks[0] - marks[1]:.2f} dB less than the run's {marks[0]:.2f}"
+    )
+
+
+@torch.no_grad()
+def point_cloud(splats: Splats) -> Cloud:
+    """The centres of the Gaussians that are opaque, with the mean of their colours over all directions."""
+    opaque = torch.sigmoid(splats.opacity_logits) >= OPAQUE
+    colors = (0.5 + harmonics.DC * splats.sh_dc[opaque]).clamp(0, 1)
+    return Cloud(splats.means[opaque].double().cpu(), (255 * colors).round().to(torch.uint8).cpu())

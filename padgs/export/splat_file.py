@@ -1,0 +1,114 @@
+"""Explicit Gaussians as files: the PLY of 3DGS, written and read; other formats by way of splat-transform.
+
+A PLY holds per Gaussian x y z, f_dc_0..2, f_rest_0.. (all coefficients of red, then of green, then of blue), opacity (a
+logit), scale_0..2 (logarithms) and rot_0..3 (w, x, y, z), as float32: what `Splats` holds, number for number.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from padgs.data.errors import DataError
+from padgs.data.ply import read_vertices
+from padgs.splats.model import Splats
+
+CONVERTER = "splat-transform"
+CONVERTED = (".compressed.ply", ".sog", ".spz", ".html")  # endings that the converter writes
+_FIRST = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2")
+_LAST = ("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
+
+
+def write_splats(path: Path, splats: Splats, comments: Sequence[str] = ()) -> None:
+    """Write Gaussians to a file whose ending says the format.
+
+    Args:
+        path: *.ply, or one of `CONVERTED`; a file that is there is replaced.
+        splats: what is written, only the harmonics in use.
+        comments: lines of a PLY's header.
+
+    Raises:
+        ValueError: an unknown ending, or the converter is not installed or fails.
+    """
+    refuse_impossible(path)
+    if not path.name.endswith(CONVERTED):
+        _write_ply(path, splats, comments)
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        plain = Path(folder) / "splats.ply"
+        _write_ply(plain, splats, comments)
+        command = [CONVERTER, "--quiet", "--overwrite", "--gpu", "cpu", str(plain), str(path.resolve())]
+        done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    if done.returncode:
+        raise ValueError(f"{CONVERTER} could not write {path}: {done.stdout.strip()[-500:]}")
+
+
+def refuse_impossible(path: Path) -> None:
+    """Say early what `write_splats` would say late.
+
+    Raises:
+        ValueError: as there.
+    """
+    if not path.name.endswith((".ply", *CONVERTED)):
+        raise ValueError(f"{path} ends in none of the known formats: .ply, {', '.join(CONVERTED)}")
+    if path.name.endswith(CONVERTED) and shutil.which(CONVERTER) is None:
+        raise ValueError(
+            f"writing {path.name} takes {CONVERTER}, which is not installed: npm install -g @playcanvas/{CONVERTER}; "
+            "or write a .ply, which it and most viewers read"
+        )
+
+
+def read_splats(path: Path, *, unit: float = 1.0) -> Splats:
+    """The Gaussians of a PLY; `unit` is the scene's unit of length, which the file does not say.
+
+    Raises:
+        DataError: no readable PLY, or not one of Gaussians.
+    """
+    vertex, names = read_vertices(path)
+    rest = 0
+    while f"f_rest_{rest}" in names:
+        rest += 1
+    if missing := [name for name in (*_FIRST, *_LAST) if name not in names]:
+        raise DataError(f"{path} has no property {missing[0]}; Gaussians of 3DGS have {', '.join((*_FIRST, *_LAST))}")
+    degree = round((rest / 3 + 1) ** 0.5) - 1
+    if rest != 3 * ((degree + 1) ** 2 - 1) or degree > 3:
+        raise DataError(f"{path} has {rest} properties f_rest_*; spherical harmonics have 0, 9, 24 or 45 of them")
+
+    def columns(*wanted: str) -> torch.Tensor:  # [N, len(wanted)]
+        return torch.from_numpy(np.stack([np.asarray(vertex[name], np.float32) for name in wanted], axis=1))
+
+    empty = torch.zeros(0, 3)
+    splats = Splats(empty, empty, empty, degree=degree, unit=unit)
+    count = len(vertex[_FIRST[0]])
+    sh_rest = columns(*(f"f_rest_{n}" for n in range(rest))) if rest else torch.zeros(count, 0)
+    splats.load(
+        {
+            "means": columns("x", "y", "z"),
+            "quats": columns("rot_0", "rot_1", "rot_2", "rot_3"),
+            "log_scales": columns("scale_0", "scale_1", "scale_2"),
+            "opacity_logits": columns("opacity")[:, 0],
+            "sh_dc": columns("f_dc_0", "f_dc_1", "f_dc_2"),
+            "sh_rest": sh_rest.view(count, 3, rest // 3).transpose(1, 2),
+        }
+    )
+    splats.active_degree = degree
+    return splats
+
+
+def _write_ply(path: Path, splats: Splats, comments: Sequence[str]) -> None:
+    from plyfile import PlyData, PlyElement
+
+    in_use = (splats.active_degree + 1) ** 2 - 1
+    rest = splats.sh_rest[:, :in_use].transpose(1, 2).flatten(1)  # [N, 3 in_use], red first
+    rows = (splats.means, splats.sh_dc, rest, splats.opacity_logits[:, None], splats.log_scales, splats.quats)
+    table = torch.cat(rows, dim=1).detach().float().cpu().contiguous().numpy()
+    names = (*_FIRST, *(f"f_rest_{number}" for number in range(rest.shape[1])), *_LAST)
+    vertex = table.view([(name, "<f4") for name in names])[:, 0]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<", comments=list(comments)).write(str(path))

@@ -1,0 +1,1 @@
+"""Films: paths of a camera, and the files that their frames go into."""

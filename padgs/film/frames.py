@@ -1,0 +1,102 @@
+"""Where the frames of a film go: a folder of PNGs, or an .mp4 (H.264); colours, and depth beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from torch import Tensor
+
+from padgs.film.spherical import mark_spherical
+from padgs.render import Rendering
+from padgs.scene import View
+from padgs.scoring.pictures import depth_picture, eight_bit
+
+Put = Callable[[np.ndarray], None]  # takes the next frame, [H, W, 3] uint8
+DEPTH_STEPS = 1000  # of a 16-bit depth picture, in the unit of the scene
+
+
+def write_film(
+    to: Path,
+    views: Sequence[View],
+    draw: Callable[[View], Rendering],
+    *,
+    fps: float,
+    unit: float,
+    depth: bool = False,
+    spherical: bool = False,
+    progress: Callable[[int], None] = lambda done: None,
+) -> list[Path]:
+    """Draw the views and write them, in order.
+
+    Args:
+        to: *.mp4, or a folder for PNGs.
+        views, draw: what is drawn, and who does it.
+        fps: frames per second of an .mp4.
+        unit: of the scene, which depths are shown and stored in.
+        depth: write depth too: for films one of colours, bright is near; for PNGs 16 bits, `DEPTH_STEPS` to a unit.
+        spherical: the views are panoramas, and players of an .mp4 shall know.
+        progress: called with the number of frames that are done.
+
+    Returns:
+        What was written: films, or folders.
+
+    Raises:
+        ValueError: the extra `video` is not installed, or sides that H.264 does not take.
+        OSError: it cannot be written.
+    """
+    film = to.suffix.lower() == ".mp4"
+    places = [to, to.with_name(f"{to.stem}-depth{to.suffix}")] if depth else [to]
+    with ExitStack() as stack:
+        if film:
+            puts = [stack.enter_context(_film(place, views[0], fps)) for place in places]
+        else:
+            puts = [_folder(place) for place in places]
+        for number, view in enumerate(views):
+            rendering = draw(view)
+            puts[0](eight_bit(rendering.image))
+            if depth:
+                puts[1](depth_picture(rendering, unit) if film else _sixteen_bit(rendering.depth / unit))
+            progress(number + 1)
+    if film and spherical:
+        for place in places:
+            mark_spherical(place)
+    return places
+
+
+def _sixteen_bit(depth: Tensor) -> np.ndarray:
+    return (depth * DEPTH_STEPS).round().clamp(0, 2**16 - 1).cpu().numpy().astype(np.uint16)
+
+
+def _folder(place: Path) -> Put:
+    place.mkdir(parents=True, exist_ok=True)
+    if stale := next(place.glob("*.png"), None):
+        raise ValueError(f"{place} holds pictures already, such as {stale.name}; name another folder with --to")
+    numbers = iter(range(1, 1 << 30))
+
+    def put(frame: np.ndarray) -> None:
+        Image.fromarray(frame).save(place / f"{next(numbers):05d}.png")
+
+    return put
+
+
+@contextmanager
+def _film(place: Path, view: View, fps: float) -> Iterator[Put]:
+    if view.width % 2 or view.height % 2:
+        raise ValueError(f"frames are {view.width}x{view.height}; H.264 takes even sides only, or name a folder")
+    try:
+        import imageio.v3 as imageio
+
+        place.parent.mkdir(parents=True, exist_ok=True)
+        film = imageio.imopen(place, "w", plugin="pyav")
+    except ImportError as error:
+        raise ValueError(
+            f"writing {place} needs imageio and PyAV: pip install 'padgs[video]'; a folder for PNGs needs neither"
+        ) from error
+    with film:
+        film.init_video_stream("libx264", fps=fps, pixel_format="yuv420p")  # type: ignore[attr-defined]
+        film._video_stream.options = {"crf": "18"}  # type: ignore[attr-defined]
+        yield film.write_frame  # type: ignore[attr-defined]

@@ -1,0 +1,84 @@
+"""The server that pages come from: viser, on this machine alone unless another address is given."""
+
+from __future__ import annotations
+
+import threading
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, redirect_stdout
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from padgs.data.trajectory import gravity
+from padgs.runs.opened import OpenedRun
+from padgs.viewer.page import Page
+from padgs.viewer.picture import Box, Gallery
+
+
+@dataclass(frozen=True)
+class Serving:
+    """A server at work."""
+
+    address: str  # for a browser
+    pages: dict[int, Page] = field(default_factory=dict)  # by the number of the client
+
+
+@contextmanager
+def serving(runs: Sequence[OpenedRun], *, host: str = "127.0.0.1", port: int = 8080) -> Iterator[Serving]:
+    """Serve one run, or two to compare, to any number of browsers, which change nothing; until the context ends.
+
+    Args:
+        runs: of one scene, the first one's.
+        host: 127.0.0.1 is this machine alone.
+        port: the first to try; the next free one is taken.
+
+    Raises:
+        ValueError: the extra `view` is not installed.
+        OSError: the address cannot be served.
+    """
+    try:
+        import viser
+    except ImportError as error:
+        raise ValueError("the viewer needs viser: pip install 'padgs[view]'") from error
+    warnings.filterwarnings("ignore", message="Queued .* on a closed connection")  # a page left while it was drawn for
+    galleries, scene = [Gallery(run) for run in runs], runs[0].scene
+    with redirect_stdout(None):  # it draws a box around addresses, whatever `verbose` says
+        server = viser.ViserServer(host=host, port=port, label=f"padgs: {scene.name}", verbose=False)
+    up = np.array(gravity(torch.stack([view.cam_from_world for view in scene.train])).up)
+    server.scene.set_up_direction(up)
+    server.gui.configure_theme(dark_mode=True, show_share_button=False)  # sharing would go through a stranger's server
+    first = scene.train[len(scene.train) // 2]
+    center = first.center.cpu().numpy()
+    server.initial_camera.position = center
+    server.initial_camera.look_at = center + 0.3 * scene.unit * first.cam_from_world[2, :3].cpu().numpy()
+    server.initial_camera.up = up
+    box, drawing = box_of(scene.points), threading.Lock()
+    found = Serving(f"http://{'localhost' if host == '127.0.0.1' else host}:{server.get_port()}")
+
+    @server.on_client_connect
+    def _(client: Any) -> None:
+        page = found.pages[client.client_id] = Page(client, galleries, box, drawing)
+        page.start()
+
+    @server.on_client_disconnect
+    def _(client: Any) -> None:
+        if page := found.pages.pop(client.client_id, None):
+            page.leave()
+
+    try:
+        yield found
+    finally:
+        for page in list(found.pages.values()):
+            page.leave()
+        with redirect_stdout(None):
+            server.stop()
+
+
+def box_of(points: torch.Tensor) -> Box:
+    """A box around nearly all of the points [P, 3]."""
+    some = points[:: max(1, len(points) // 100_000)].double()
+    low, high = (some.quantile(share, dim=0).tolist() for share in (0.01, 0.99))
+    return (low[0], low[1], low[2]), (high[0], high[1], high[2])

@@ -1,0 +1,85 @@
+"""The command, from a run to a file and back."""
+
+import pytest
+import torch
+from plyfile import PlyData
+from tiny_run import tiny_run
+from typer.testing import CliRunner
+
+import padgs
+from baselines.sc_omnigs import aligned, carried
+from padgs.cli.app import app
+from padgs.data.ply import read_ply
+from padgs.export.explicit import exported
+from padgs.export.splat_file import read_splats
+from padgs.render import render
+from padgs.scoring.evaluate import evaluate
+from padgs.scoring.protocols import protocol_from_options
+
+RULES = protocol_from_options("sphere", lpips="none", metrics=["ws_psnr"])
+
+
+def export(*arguments: str):
+    return CliRunner().invoke(app, ["export", *arguments])
+
+
+@pytest.fixture(scope="module")
+def splat_run(tmp_path_factory):
+    return tiny_run(tmp_path_factory, "method=padgs_plus")
+
+
+def test_an_exported_run_scores_as_it_did(splat_run):
+    said = export(str(splat_run))
+    assert said.exit_code == 0 and "Gaussians as trained" in said.output
+    run = padgs.load_run(splat_run)
+    splats = read_splats(splat_run / "splats.ply", unit=run.scene.unit)
+    options = run.config.render.options(run.scene.unit)
+    again = evaluate(lambda view: render(splats.gaussians(view), view, options), run.scene.test, RULES)
+    own = evaluate(run.method.render, run.scene.test, RULES)
+    assert again.metrics["ws_psnr"] == pytest.approx(own.metrics["ws_psnr"], abs=1e-6)
+    (splat_run / "splats.ply").unlink()
+
+
+def test_refined_poses_do_not_move_the_world(tmp_path_factory):
+    run = padgs.load_run(tiny_run(tmp_path_factory, "method=sc_omnigs", "data.generator.train_views=4"))
+    poses = run.method.trainee.calibration.poses
+    with torch.no_grad():
+        for correction in poses.parameters():
+            correction += 0.02 * torch.randn(correction.shape, generator=torch.Generator().manual_seed(1))
+    splats, view = exported(run).splats, run.scene.test[0]
+    carried_view = view.at(carried(view.cam_from_world, aligned(poses)[0]))
+    options = run.config.render.options(run.scene.unit)
+    own = run.method.trainee.render(carried_view).image
+    assert torch.allclose(render(splats.gaussians(view), view, options).image, own, atol=0.02)
+    assert (run.method.trainee.render(view).image - own).abs().max() > 0.05, "it is another world"
+
+
+def test_points_and_upright_worlds(splat_run, tmp_path):
+    assert export(str(splat_run), "--points", "--to", str(tmp_path / "p.ply")).exit_code == 0
+    cloud = read_ply(tmp_path / "p.ply")
+    assert len(cloud.points) > 10 and cloud.colors is not None
+    assert export(str(splat_run), "--upright", "--to", str(tmp_path / "u.ply")).exit_code == 0
+    assert any("-y is up" in line for line in PlyData.read(str(tmp_path / "u.ply")).comments)
+    up, plain = read_splats(tmp_path / "u.ply").means, padgs.load_run(splat_run).method.trainee.splats.means
+    assert torch.allclose(-up[:, 1], plain[:, 2], atol=1e-4), "z is up in the built-in room"
+
+
+def test_anchors_are_baked_and_the_loss_is_said_and_written(tmp_path_factory, tmp_path):
+    folder = tiny_run(tmp_path_factory, "method=padgs_small", "train.iterations=60")
+    said = export(str(folder), "--to", str(tmp_path / "a.ply"), "--lessons", "40")
+    assert said.exit_code == 0, said.output
+    (line,) = [line for line in PlyData.read(str(tmp_path / "a.ply")).comments if line.startswith("baked")]
+    assert line in said.output and "WS-PSNR of the test views" in line
+    assert len(read_splats(tmp_path / "a.ply")) > 0
+
+
+def test_what_cannot_be_exported_says_why(tmp_path_factory, tmp_path, splat_run):
+    folder = tiny_run(tmp_path_factory, "method=egonerf_small", "train.iterations=2")
+    for arguments, message in (
+        ((str(folder),), "egonerf has no Gaussians to export; padgs render and padgs view"),
+        ((str(tmp_path),), "has no config.yaml"),
+        ((str(splat_run), "--to", "a.obj"), "none of the known formats"),
+        ((str(splat_run), "--points", "--to", str(tmp_path / "a.compressed.ply")), "is no plain .ply"),
+    ):
+        said = export(*arguments)
+        assert said.exit_code == 1 and message in said.output + said.stderr

@@ -1,0 +1,76 @@
+import shutil
+
+import pytest
+import torch
+from plyfile import PlyData
+from random_splats import random_splats
+
+from padgs.data.capture import Cloud
+from padgs.data.errors import DataError
+from padgs.data.ply import write_ply
+from padgs.export import splat_file
+from padgs.export.splat_file import read_splats, write_splats
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_what_is_read_is_what_was_written_bit_by_bit(degree, tmp_path, generator):
+    splats = random_splats(degree, generator)
+    write_splats(tmp_path / "new" / "a.ply", splats, ["said of it"])
+    found = read_splats(tmp_path / "new" / "a.ply", unit=splats.unit)
+    assert (found.degree, found.active_degree, found.unit) == (degree, degree, splats.unit)
+    for name, row in splats.rows().items():
+        assert torch.equal(found.rows()[name], row), name
+    assert PlyData.read(str(tmp_path / "new" / "a.ply")).comments == ["said of it"]
+
+
+def test_the_columns_are_those_of_3dgs(tmp_path, generator):
+    splats = random_splats(2, generator)
+    write_splats(tmp_path / "a.ply", splats)
+    vertex = PlyData.read(str(tmp_path / "a.ply"))["vertex"]
+    assert vertex["f_rest_1"][5] == splats.sh_rest[5, 1, 0].item(), "all of red comes first"
+    assert vertex["f_rest_8"][5] == splats.sh_rest[5, 0, 1].item()
+    assert vertex["rot_0"][5] == splats.quats[5, 0].item(), "w"
+    splats.active_degree = 1
+    write_splats(tmp_path / "a.ply", splats)
+    assert read_splats(tmp_path / "a.ply").degree == 1, "harmonics that wait are not written"
+
+
+def test_files_that_are_none_are_refused(tmp_path, generator):
+    splats = random_splats(0, generator)
+    with pytest.raises(ValueError, match=r"a.obj ends in none of the known formats: .ply, .compressed.ply"):
+        write_splats(tmp_path / "a.obj", splats)
+    write_ply(tmp_path / "cloud.ply", Cloud(torch.zeros(2, 3), None))
+    with pytest.raises(DataError, match="has no property f_dc_0; Gaussians of 3DGS have x, y, z"):
+        read_splats(tmp_path / "cloud.ply")
+    write_splats(tmp_path / "a.ply", splats)
+    text = (tmp_path / "a.ply").read_bytes().replace(b"float opacity", b"float f_rest_0")
+    (tmp_path / "a.ply").write_bytes(text)
+    with pytest.raises(DataError, match="no property opacity"):
+        read_splats(tmp_path / "a.ply")
+
+
+def test_without_the_converter_the_way_out_is_said(tmp_path, generator, monkeypatch):
+    monkeypatch.setattr(splat_file.shutil, "which", lambda name: None)
+    with pytest.raises(ValueError, match="npm install -g @playcanvas/splat-transform; or write a .ply"):
+        write_splats(tmp_path / "a.spz", random_splats(0, generator))
+
+
+@pytest.mark.skipif(shutil.which(splat_file.CONVERTER) is None, reason="splat-transform is not installed")
+def test_a_converted_file_holds_the_same_gaussians(tmp_path, generator):
+    splats = random_splats(1, generator)
+    write_splats(tmp_path / "a.spz", splats)
+    splat_file.subprocess.run(
+        [splat_file.CONVERTER, "-q", str(tmp_path / "a.spz"), str(tmp_path / "back.ply")], check=True
+    )
+    back = read_splats(tmp_path / "back.ply")
+    nearest = torch.cdist(splats.means, back.means).min(dim=1)
+    assert nearest.values.max() < 1e-3
+    assert torch.allclose(back.log_scales[nearest.indices], splats.log_scales, atol=0.05)
+
+
+def test_a_converter_that_fails_is_quoted(tmp_path, generator, monkeypatch):
+    (tmp_path / splat_file.CONVERTER).write_text("#!/bin/sh\necho no room left\nexit 3\n")
+    (tmp_path / splat_file.CONVERTER).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    with pytest.raises(ValueError, match="could not write .*: no room left"):
+        write_splats(tmp_path / "a.spz", random_splats(0, generator))

@@ -1,0 +1,98 @@
+"""The command, from a run to a film."""
+
+import struct
+
+import numpy as np
+import pytest
+from PIL import Image
+from tiny_run import tiny_run
+from typer.testing import CliRunner
+
+from padgs.cli.app import app
+
+try:
+    import imageio.plugins.pyav
+    import imageio.v3 as imageio
+except ImportError:
+    imageio = None
+WITH_VIDEO = pytest.mark.skipif(imageio is None, reason="the extra `video` is not installed")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tiny_run(tmp_path_factory)  # omnigs, whose projection erp draws whole panoramas only
+
+
+def render(*arguments: str):
+    return CliRunner().invoke(app, ["render", *arguments])
+
+
+def boxes(data: bytes) -> list[tuple[bytes, bytes]]:
+    """Type and content of each box in a row of them."""
+    found, at = [], 0
+    while at < len(data):
+        size, kind = struct.unpack_from(">I4s", data, at)
+        found.append((kind, data[at + 8 : at + size]))
+        at += size
+    assert at == len(data), "sizes add up"
+    return found
+
+
+@WITH_VIDEO
+def test_a_film_of_panoramas_says_so_and_plays(folder, tmp_path):
+    said = render(str(folder), "--to", str(tmp_path / "new" / "a.mp4"), "--seconds", "0.5", "--fps", "10", "--depth")
+    assert said.exit_code == 0 and "5 frames of 32x16" in said.output, said.output
+    for name in ("a.mp4", "a-depth.mp4"):
+        frames = imageio.imread(tmp_path / "new" / name, plugin="pyav")
+        assert frames.shape == (5, 16, 32, 3) and frames.std() > 5
+        index = dict(boxes((tmp_path / "new" / name).read_bytes()))[b"moov"]
+        (mark,) = [content for kind, content in boxes(dict(boxes(index))[b"trak"]) if kind == b"uuid"]
+        assert mark[:16].hex() == "ffcc8263f8554a938814587a02521fdd"
+        assert b"<GSpherical:ProjectionType>equirectangular<" in mark
+
+
+@WITH_VIDEO
+def test_a_film_in_perspective_is_no_panorama(folder, tmp_path):
+    arguments = ("--camera", "perspective", "--width", "32", "--seconds", "0.2", "--fps", "10", "--path", "orbit")
+    assert render(str(folder), *arguments, "--to", str(tmp_path / "a.mp4")).exit_code == 0
+    assert b"GSpherical" not in (tmp_path / "a.mp4").read_bytes()
+    assert render(str(folder), *arguments, "--height", "17", "--to", str(tmp_path / "b.mp4")).exit_code == 1
+
+
+def test_a_perspective_picture_shows_what_the_panorama_shows_there(folder, tmp_path):
+    """Both look along the same axis; the middle of the former is the middle of the latter, at another size."""
+    same = ("--path", "dolly", "--seconds", "0.1", "--fps", "20", "--depth")
+    assert render(str(folder), *same, "--to", str(tmp_path / "p")).exit_code == 0
+    focal_of_panorama = 32 / (2 * np.pi)
+    fov = 2 * np.degrees(np.arctan(4 / focal_of_panorama))
+    assert (
+        render(
+            *(str(folder), *same, "--to", str(tmp_path / "q"), "--camera", "perspective", "--fov", str(fov)),
+            *("--width", "8", "--height", "4"),
+        ).exit_code
+        == 0
+    )
+    panorama, perspective = (np.array(Image.open(tmp_path / name / "00001.png"), float) for name in ("p", "q"))
+    assert np.abs(panorama[7:9, 15:17].mean((0, 1)) - perspective[1:3, 3:5].mean((0, 1))).max() < 12
+    depth = np.array(Image.open(tmp_path / "q-depth" / "00001.png"))
+    assert depth.dtype == np.uint16 and depth.min() > 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--camera", "fisheye"), "unknown camera 'fisheye'; known: panorama, perspective"),
+        (("--fps", "0"), "both must be > 0"),
+        (("--path", "spiral"), "there is no path spiral; known: cameras, orbit, dolly"),
+        (("--camera", "perspective", "--fov", "180"), "across 180 degrees"),
+    ],
+)
+def test_what_cannot_be_rendered_says_why(arguments, message, folder, tmp_path):
+    said = render(str(folder), *arguments, "--to", str(tmp_path / "frames"))
+    assert said.exit_code == 1 and message in " ".join((said.output + said.stderr).split())
+
+
+def test_pictures_are_not_mixed_with_others(folder, tmp_path):
+    arguments = (str(folder), "--to", str(tmp_path / "f"), "--seconds", "0.1", "--fps", "20")
+    assert render(*arguments).exit_code == 0
+    assert "holds pictures already" in render(*arguments).stderr

@@ -1,0 +1,14 @@
+"""Gaussians with all of their numbers at random."""
+
+import torch
+from tiny_scene import tiny_scene
+
+from padgs.splats.model import Splats
+
+
+def random_splats(degree: int, generator: torch.Generator) -> Splats:
+    splats = Splats.from_scene(tiny_scene(), degree=degree, generator=generator)
+    for row in splats.rows().values():
+        row.data = torch.randn(row.shape, generator=generator)
+    splats.active_degree = degree
+    return splats

@@ -1,0 +1,33 @@
+"""A finished run, small enough to be made in a second or two: 3 training and 2 test views of 32x16 of the room."""
+
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from padgs.multirun.composition import composing, configuration
+from padgs.runs.session import Session
+
+SETTINGS = [
+    "train.iterations=30",
+    "data.generator.width=32",
+    "data.generator.train_views=3",
+    "data.generator.test_views=2",
+    "data.generator.samples=1",
+    "data.generator.points=200",
+    "protocol=sphere",
+    "protocol.sphere.lpips=none",
+    "run.device=cpu",
+    "tracking=none",
+]
+
+
+def tiny_run(factory: pytest.TempPathFactory, *settings: str) -> Path:
+    """The folder of a run of `method=omnigs`, or of what the settings say."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PADGS_CACHE", str(factory.getbasetemp() / "scenes"))
+        runs = factory.mktemp("runs")
+        with composing():
+            config = configuration(["method=omnigs", *SETTINGS, *settings, f"run.folder={runs}"])
+        Session(config, Console(quiet=True)).run()
+    return next(path.parent for path in runs.glob("*/result.json"))
