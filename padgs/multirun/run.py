@@ -17,6 +17,7 @@ from padgs.multirun.choices import register_choices
 from padgs.multirun.launchers import missing_plugin
 from padgs.multirun.overrides import conflict, lenient, options_first, root
 from padgs.runs.interrupt import Interrupted
+from padgs.runs.terminal import say
 
 INTERRUPTED = 130  # exit code of a command that Ctrl-C ended
 
@@ -37,7 +38,7 @@ def main() -> None:
         hydra.main(version_base="1.3", config_path=str(root() / "conf"), config_name="config")(job.only_job)()
     except (Interrupted, KeyboardInterrupt) as stopped:
         advice = f"{str(stopped) or 'stopped'}; to go on: {shlex.join(['padgs-run', *arguments])}"
-        Console(stderr=True).print(advice, markup=False, highlight=False, soft_wrap=True)
+        say(Console(stderr=True), advice)
         sys.exit(INTERRUPTED)
     sys.exit(0 if {*job.ENDS, *sweeper.ENDS} <= {OK} else 1)
 

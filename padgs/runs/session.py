@@ -27,6 +27,7 @@ from padgs.runs.interrupt import Interrupt, Interrupted
 from padgs.runs.live import LiveLine
 from padgs.runs.scoring import frame_times, probe, same_rules, scores
 from padgs.runs.summary import introduce, show_result
+from padgs.runs.terminal import say
 from padgs.scene import Scene
 from padgs.scoring.protocols import Protocol
 
@@ -204,7 +205,7 @@ class Session:
         return result if complete == result else self.folder.finish(complete)
 
     def _say(self, text: str) -> None:
-        self.console.print(text, highlight=False, soft_wrap=True)
+        say(self.console, text)
 
 
 def _training_time(progress: Progress) -> dict[str, float]:
