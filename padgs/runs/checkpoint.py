@@ -3,7 +3,7 @@
 `state.json` names the file of tensors with its size and SHA-256, says which run it is of, and ends with a SHA-256 of
 itself. The tensors are written first, under a new name, and replacing `state.json` is the one step that makes the new
 checkpoint count. So at every moment, whatever is killed or full, the folder holds one complete checkpoint: the old one
-or the new one. Format 1, of earlier versions, says nothing of its run and has no digest of itself; it is taken as it is.
+or the new one. Format 1, of earlier versions, names no run and has no digest of itself; it is taken as it is.
 """
 
 from __future__ import annotations
