@@ -22,7 +22,7 @@ MEANINGLESS = {
 }
 TOO_LATE = {
     "render.projection=erpp": "unknown projection 'erpp'; known: erp, pinhole, tangent, ray",
-    "render.projection=pinhole": "cubemap=true draws panoramas with it",
+    "method=padgs render.projection=pinhole": "cubemap=true draws panoramas with it",
     "render.backend=gpu": "unknown backend 'gpu'; known: auto, torch, cpu, cuda",
     "method=seam360gs render.projection=erp": "made for a Panorama camera, not a RayTable",
     "method=crops_3dgs render.projection=erp render.cubemap=false": "made for a Panorama camera, not a Pinhole",
@@ -32,10 +32,10 @@ TOO_LATE = {
     "render.projection=ray render.bounds=square render.wrap=false": "has no square bounds",
     "render.core_size=1000": "core_size is 1000; it must be from 1 to 256",
     "method=omnigs method.sh_degree=9": "sh_degree is 9; it must be 0 to 3",
-    "method.voxel_size=-1": "voxel_size is -1.0; it must be a length > 0",
-    "data.voxel_size=-1": "voxel_size is -1.0",
-    "method.offset_rate=[0,1]": "it must be two rates > 0",
-    "method.feature_rate=-1": "feature_rate is -1.0",
+    "method=padgs method.voxel_size=-1": "voxel_size is -1.0; it must be a length > 0",
+    "method=padgs data.voxel_size=-1": "voxel_size is -1.0",
+    "method=padgs method.offset_rate=[0,1]": "it must be two rates > 0",
+    "method=padgs method.feature_rate=-1": "feature_rate is -1.0",
     "data.format=x": "unknown format 'x'; known: auto, colmap",
     "data.dataset=x": "unknown dataset 'x'; known: roam360",
 }

@@ -27,7 +27,7 @@ from padgs.runs.scoring import probe
 from padgs.runs.session import Session, build, scene_of
 
 ITERATIONS = 12
-WITHOUT_LPIPS = ("protocol=paper", "protocol.paper.lpips=none", "render.backend=torch")
+SMALL = ("method=padgs", "protocol=paper", "protocol.paper.lpips=none", "render.backend=torch")
 PACKAGE = Path(session.__file__).parents[1]
 
 
@@ -40,7 +40,7 @@ def tiny(monkeypatch, root):
 @pytest.fixture
 def config(tmp_path):
     return composed(
-        *WITHOUT_LPIPS,
+        *SMALL,
         f"run.folder={tmp_path}/runs",
         f"train.iterations={ITERATIONS}",
         "run.log_every=2",
@@ -194,7 +194,7 @@ def test_a_damaged_checkpoint_is_named_and_nothing_is_started(config, monkeypatc
 
 @pytest.mark.parametrize("change", ["seed=1", "method.features=16", "train.lambda_l1=0.5"])
 def test_a_checkpoint_of_another_run_is_refused(config, monkeypatch, tmp_path, change):
-    other = composed(*WITHOUT_LPIPS, f"run.folder={tmp_path}/other", f"train.iterations={ITERATIONS}", change)
+    other = composed(*SMALL, f"run.folder={tmp_path}/other", f"train.iterations={ITERATIONS}", change)
     for one in (config, other):
         with monkeypatch.context() as patch:
             stop_at(7, patch, lambda: os.kill(os.getpid(), signal.SIGINT))
