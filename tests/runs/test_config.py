@@ -10,7 +10,7 @@ MEANINGLESS = {
     "render.near=inf": "render.near is inf; it must be finite",
     "render.low_pass=inf": "it must be finite",
     "render.pixel_bias=nan": "render.pixel_bias is nan",
-    "train.max_seconds=-1": "it must be > 0, or null for no limit",
+    "train.max_seconds=-1": "max_seconds is -1.0; it must be > 0",
     "run.checkpoint_seconds=nan": "it must be finite",
     "run.checkpoint_seconds=-1": "checkpoint_seconds is -1.0; it must be >= 0",
     "seed=-1": "seed is -1",
