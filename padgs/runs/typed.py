@@ -72,11 +72,11 @@ def _value(kind: Any, value: Any, where: str) -> Any:
         if any(0xD800 <= ord(character) < 0xE000 for character in value):
             raise ConfigError(f"{where} is {value!r}, which is not Unicode; rename what it names")
         return value
-    number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    if number and not -sys.float_info.max <= value <= sys.float_info.max:
-        raise ConfigError(f"{where} is {value}; it must be finite")
-    if number and (kind is float or kind is int and value == int(value)):
-        return kind(value)
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        if not -sys.float_info.max <= value <= sys.float_info.max:
+            raise ConfigError(f"{where} is {value}; it must be finite")
+        if kind is float or kind is int and value == int(value):
+            return kind(value)
     raise ConfigError(f"{where} is {value!r}; it must be {_name(kind)}")
 
 

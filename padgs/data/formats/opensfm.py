@@ -38,8 +38,8 @@ def read(path: Path, options: DataOptions) -> Capture:
         rotation = rotation_from_vector(shot["rotation"].numbers(3), shot.where)
         pose = cam_from_world(rotation, shot["translation"].numbers(3), shot.where)
         name = check_inside(name, str(file))
-        size = (side and side.whole() for side in (camera.get("width"), camera.get("height")))
-        frames.append(Frame(name, images / name, pose, *size))
+        width, height = (side and side.whole() for side in (camera.get("width"), camera.get("height")))
+        frames.append(Frame(name, images / name, pose, width, height))
     used = f"{file.name} holds {len(parts)} reconstructions; the one with most shots, {len(frames)}, is used"
     notes = (used,) if len(parts) > 1 else ()
     return Capture("opensfm", file.parent, images, tuple(frames), _cloud(best), notes=notes)
