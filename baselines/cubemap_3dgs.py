@@ -20,11 +20,17 @@ from padgs.learning.loop import Record, Stage, Trainer
 from padgs.learning.trainee import Trainee
 from padgs.render import RenderOptions
 from padgs.render.config import RenderConfig
+from padgs.render.contract import check_camera
 from padgs.render.cubemap import FACES, FINENESS
 from padgs.scene import Scene, View
 from padgs.sphere.camera import Panorama, Pinhole
 from padgs.splats.method import SplatMethod, refuse_polar_threshold
 from padgs.splats.trainee import SplatTrainee
+
+
+def of_cut_views(options: RenderOptions) -> RenderOptions:
+    """How views are drawn that are cut out of panoramas which are drawn with these options."""
+    return replace(options, cubemap=False, face_size=None).on_finer_pixels(FINENESS)
 
 
 class CutTrainee(SplatTrainee):
@@ -35,7 +41,7 @@ class CutTrainee(SplatTrainee):
         options = super().render_options(view)
         if isinstance(view.camera, Panorama):
             return options
-        return replace(options, cubemap=False, face_size=None).on_finer_pixels(FINENESS)
+        return of_cut_views(options)
 
 
 class Cubemap3DGSMethod(SplatMethod):
@@ -49,9 +55,14 @@ class Cubemap3DGSMethod(SplatMethod):
         """Train on what is cut out of the panoramas; an iteration is one panorama's worth of such views.
 
         Raises:
-            ValueError: a training view is no panorama, or held-out panoramas could not be drawn, or pixels shall be
-                weighted, or Gaussians chosen, by a latitude that they do not have.
+            ValueError: a training view is no panorama.
         """
+        cut = perspective_scene(scene, self.turns(), self.lens)
+        self._views_each = self._worth_a_panorama(scene, cut)
+        return super().fit(cut, budget, stage=stage)
+
+    def _refuse_impossible(self) -> None:
+        """Also where pixels shall be weighted, or Gaussians chosen, by a latitude that cut views do not have."""
         if self.render_config.projection == "pinhole" and not self.render_config.cubemap:
             raise ValueError(
                 "projection pinhole cannot draw the held-out panoramas at once; set render.cubemap=true, or "
@@ -63,9 +74,8 @@ class Cubemap3DGSMethod(SplatMethod):
                 "set uniform"
             )
         refuse_polar_threshold(self.options, "perspective views have no poles")
-        cut = perspective_scene(scene, self.turns(), self.lens)
-        self._views_each = self._worth_a_panorama(scene, cut)
-        return super().fit(cut, budget, stage=stage)
+        super()._refuse_impossible()
+        check_camera(self.lens(Panorama(8, 4)), of_cut_views(self.render_config.options(scene_unit=1.0)))
 
     def turns(self) -> Tensor:
         """Rotations [K, 3, 3] from a panorama's camera frame to those of the views."""

@@ -41,7 +41,6 @@ class EgoNeRFMethod(Method):
     TRAIN = TrainOptions(weight="uniform", learning_rates="published")
 
     def _start(self, scene: Scene, iterations: int) -> EgoNeRFTrainee:
-        self._refuse_strangers()
         return EgoNeRFTrainee(EgoNeRF.from_scene(scene, self.options, self.seed), self.options, iterations)
 
     def _blank(self, state: State) -> EgoNeRFTrainee:
@@ -54,8 +53,8 @@ class EgoNeRFMethod(Method):
     def _trained_by(self, trainee: EgoNeRFTrainee, scene: Scene, budget: Budget, stage: Stage) -> RayTrainer:
         return RayTrainer(trainee, scene, budget, self.train_options, self.seed, rays=self.options.rays, stage=stage)
 
-    def _refuse_strangers(self) -> None:
-        """Say so where an option is set that this method would have to ignore."""
+    def _refuse_impossible(self) -> None:
+        """Also say so where an option is set that this method would have to ignore."""
         loss = replace(self.TRAIN, weight=self.train_options.weight, check_every=self.train_options.check_every)
         if self.render_config.backend not in BACKENDS:
             raise ValueError(

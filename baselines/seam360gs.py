@@ -6,14 +6,20 @@ and what is inferred here is told apart in docs/methods.md.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import torch
+
 from padgs.calibration.dual_lens import DualLens
 from padgs.calibration.splats import CalibratedMethod
+from padgs.checks import check, check_known
 from padgs.render.config import RenderConfig
+from padgs.render.contract import check_camera
 from padgs.scene import Scene
+from padgs.sphere.camera import RayTable
 from padgs.splats.method import SplatOptions, refuse_polar_threshold
 
 
@@ -29,22 +35,27 @@ class Seam360GSOptions(SplatOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("gap_rate", "coefficient_rate"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} is {getattr(self, name)}; a learning rate must be > 0")
+        check_known(self, lens_axis="xyz")
+        check(self, "at least 1", lambda order: order >= 1, "lens_order")
+        check(self, "in [0, 90) degrees", lambda degrees: 0 <= degrees < 90, "lens_blend")
+        check(self, "a learning rate > 0", lambda rate: 0 < rate < math.inf, "gap_rate", "coefficient_rate")
 
 
 class Seam360GSMethod(CalibratedMethod):
     """See `padgs.learning.method.Method`. Trained through `DualLens`; `render` is the ideal camera, without a seam.
 
-    Lenses see along rays of their own, which the projection erp cannot draw; it ends as rejected.
+    Lenses see along rays of their own, which the projection erp cannot draw.
     """
 
     Options = Seam360GSOptions
     RENDER = RenderConfig(projection="ray")
 
-    def _as_given(self, scene: Scene) -> DualLens:
+    def _refuse_impossible(self) -> None:
+        super()._refuse_impossible()
+        check_camera(RayTable(torch.zeros(1, 1, 3), focal=1.0), self.render_config.options(scene_unit=1.0))
         refuse_polar_threshold(self.options, "a view is made of two, each by a lens of its own")
+
+    def _as_given(self, scene: Scene) -> DualLens:
         return self._as_stored({"unit": scene.unit})
 
     def _as_stored(self, values: Mapping[str, Any]) -> DualLens:

@@ -22,6 +22,8 @@ from typing import Any, TypeVar
 
 import torch
 
+from padgs.stopwatch import Lap
+
 T = TypeVar("T")
 Device = torch.device | str
 
@@ -35,10 +37,10 @@ def synchronise(device: Device = "cpu") -> None:
 def timed(work: Callable[[], T], device: Device = "cpu") -> tuple[T, float]:
     """The value of `work()` and the wall time in seconds that it took, on the device too."""
     synchronise(device)
-    start = time.perf_counter()
+    lap = Lap()
     value = work()
     synchronise(device)
-    return value, time.perf_counter() - start
+    return value, lap.seconds()[0]
 
 
 @contextmanager

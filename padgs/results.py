@@ -16,7 +16,8 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Any, get_args, get_origin, get_type_hints
 
 SCHEMA = 2
 ADDED = {"peak_device_memory_bytes"}  # to the schema since: files without them are read, with the default
@@ -35,6 +36,8 @@ STATUSES = {
 # read is said by the fingerprint of the data; scoring comes after training. `data.device` is in files of old runs only.
 OF_THE_MACHINE = ("run", "render.max_instances", "data.cache_bytes", "data.read_ahead", "data.device")
 DECIDE_NOTHING = (*OF_THE_MACHINE, "data.path", "protocol")
+# What is no more than a name, even in a command line or a path; `@` parts an experiment from its scale.
+PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*(@[A-Za-z0-9._-]+)?")
 HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "lpips": False, "seam": False}  # of every metric with the word in it
 
 
@@ -140,7 +143,7 @@ def parsed(content: bytes, where: str) -> dict[str, Any]:
     """
     try:
         document = json.loads(content)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ResultError(f"{where} is not JSON ({error}); delete it and run again") from error
     if not isinstance(document, dict) or "schema" not in document:
         raise ResultError(f"{where} is not a result file (no schema); delete it and run again")
@@ -151,7 +154,8 @@ def decoded(document: Mapping[str, Any], where: str) -> Result:
     """The result that `encoded` made a document of; `where` names it in errors.
 
     Raises:
-        ResultError: it is of another version, or was edited.
+        ResultError: it is of another version, or was edited; or, as a digest is no signature and the file may be from
+            elsewhere, it has values of other types, or texts for names that would mean something in a path or command.
     """
     document = dict(document)
     if document.pop("schema") != SCHEMA:
@@ -164,9 +168,15 @@ def decoded(document: Mapping[str, Any], where: str) -> Result:
     if digest != _digest(document):
         raise ResultError(f"{where} was edited after it was written (SHA-256 differs); delete it and run again")
     try:
-        return Result(**document | {key: _DECODERS[key](document[key]) for key in _DECODERS})
+        result = Result(**document | {key: _DECODERS[key](document[key]) for key in _DECODERS})
+        _refuse_other_types(result)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ResultError(f"{where}: {error}; delete it and run again") from error
+    names = [result.run, result.method, result.preset, *result.experiments, *result.scores]
+    for name in (*names, *filter(None, [result.dataset])):
+        if not PLAIN.fullmatch(name):
+            raise ResultError(f"{where}: {name!r} is no name that this program gives; leave the file out")
+    return result
 
 
 def read_all(folder: Path) -> tuple[list[Result], list[ResultError]]:
@@ -217,13 +227,22 @@ def decisive(config: Mapping[str, Any], where: str = "") -> dict[str, Any]:
     }
 
 
+def file_name(text: str) -> str:
+    """A text as the name of a file, which leads nowhere else.
+
+    >>> file_name("left/R001 a"), file_name("chart_../../etc")
+    ('left-R001-a', 'chart_..-..-etc')
+    """
+    return re.sub(r"[^A-Za-z0-9._-]+", "-", text)
+
+
 def picture_name(view: str) -> str:
     """The name of the file with the picture of a test view, among the `renders` of a run.
 
     >>> picture_name("left/R001 a")
     'left-R001-a.png'
     """
-    return re.sub(r"[^A-Za-z0-9._-]+", "-", view) + ".png"
+    return file_name(view) + ".png"
 
 
 def higher_is_better(metric: str) -> bool | None:
@@ -253,6 +272,17 @@ def replace_file(path: Path, content: bytes) -> None:
         os.fsync(folder)  # the rename itself must survive a power cut
     finally:
         os.close(folder)
+
+
+def _refuse_other_types(result: Result) -> None:
+    for name, hint in get_type_hints(Result).items():
+        hints = get_args(hint) if get_origin(hint) is UnionType else (hint,)
+        kinds = tuple(get_origin(kind) or kind for kind in hints)
+        value = getattr(result, name)
+        if not isinstance(value, kinds) or isinstance(value, bool):
+            raise TypeError(f"{name} is {value!r}, which is no {' or '.join(kind.__name__ for kind in kinds)}")
+    if not all(isinstance(name, str) for name in result.experiments):
+        raise TypeError(f"experiments are {result.experiments!r}; they must be names")
 
 
 def _digest(content: dict[str, Any]) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from padgs.results import file_name
 from reports.charts.drawing import Chart
 from reports.findings.page import Page
 from reports.tables.table import Table
@@ -13,7 +14,10 @@ WRITERS = {"md": markdown.text, "tex": latex.text, "csv": csv_text.text}
 
 
 def files(made: Table | Page | Sequence[Chart] | str) -> Iterator[tuple[str, bytes]]:
-    """The files of a table, of charts or of pages; none of a table that has nothing in it."""
+    """The files of a table, of charts or of pages; none of a table that has nothing in it.
+
+    Names of charts are those of scenes and sweeps, which may come from elsewhere; a file is in its folder all the same.
+    """
     if isinstance(made, str):
         yield "report.html", made.encode()
     elif isinstance(made, Page):
@@ -23,7 +27,8 @@ def files(made: Table | Page | Sequence[Chart] | str) -> Iterator[tuple[str, byt
             yield f"{made.name}.{extension}", text(made).encode()
     else:
         for chart in made:
-            yield f"{chart.name}.svg", chart.svg.encode()
-            yield f"{chart.name}.png", chart.png
+            name = file_name(chart.name)
+            yield f"{name}.svg", chart.svg.encode()
+            yield f"{name}.png", chart.png
             if chart.numbers is not None:
-                yield f"{chart.name}.csv", csv_text.of_frame(chart.numbers).encode()
+                yield f"{name}.csv", csv_text.of_frame(chart.numbers).encode()

@@ -16,6 +16,7 @@ ROOMS = (
     "padgs.registry",
     "padgs.checks",
     "padgs.results",
+    "padgs.stopwatch",
     "padgs.sphere",
     "padgs.scene",
     "padgs.gaussians",

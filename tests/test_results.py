@@ -98,6 +98,32 @@ def test_a_file_from_before_the_memory_of_a_gpu_was_measured_is_read(result, tmp
     assert results.read(path) == result
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"run": "../x"}, "'../x' is no name that this program gives"),
+        ({"preset": "x y"}, "'x y' is no name"),
+        ({"dataset": "/etc"}, "'/etc' is no name"),
+        ({"experiments": ("tau@cpu", "../../x")}, "'../../x' is no name"),
+        ({"experiments": (1,)}, "they must be names"),
+        ({"seed": "0"}, "seed is '0', which is no int"),
+        ({"config": []}, "config is .., which is no dict"),
+        ({"iterations": True}, "iterations is True"),
+        ({"timing": 3}, "timing|items"),
+    ],
+)
+def test_files_from_elsewhere_hold_names_and_numbers_where_they_should(result, tmp_path, change, message):
+    """A digest is no signature: whoever sends a file can make it fit."""
+    with pytest.raises(ResultError, match=rf"result.json: .*({message})"):
+        results.read(results.write(replace(result, **change), tmp_path))
+
+
+def test_a_file_that_is_nested_too_deep_is_named(tmp_path):
+    (tmp_path / "result.json").write_text("[" * 100_000)
+    with pytest.raises(ResultError, match="result.json is not JSON"):
+        results.read(tmp_path / "result.json")
+
+
 def test_unknown_status_lists_the_known(result):
     with pytest.raises(ValueError, match="unknown status 'fine'; known: ok, oom, nan"):
         replace(result, status="fine")

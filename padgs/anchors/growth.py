@@ -5,6 +5,7 @@ Statistics are collected over many views (`observe`) and acted upon every `grow_
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -46,6 +47,10 @@ class GrowthOptions:
                 f"here {self.refinement} ** {self.levels - 1}"
             )
         check(self, "at least 1 iteration", lambda every: every >= 1, "grow_every")
+        times = ("statistics_from", "grow_from", "grow_until")
+        check(self, "an iteration, at least 0", lambda iteration: iteration >= 0, *times)
+        check(self, ">= 0 and finite", lambda value: 0 <= value < math.inf, "gradient_threshold", "min_opacity")
+        check(self, "a share in [0, 1]", lambda share: 0 <= share <= 1, "eligible_share", "prune_share")
         check(self, "at least 1, or none for no limit", lambda most: most is None or most >= 1, "max_anchors")
 
     def for_run(self, iterations: int) -> GrowthOptions:

@@ -50,6 +50,8 @@ class PaDGSOptions:
         check(self, "> 0 and finite", lambda pixels: 0 < pixels < math.inf, "voxel_pixels")
         if isinstance(self.voxel_size, str) and self.voxel_size != "auto":
             raise ValueError(f"unknown voxel_size {self.voxel_size!r}; known: auto, or a length in world units")
+        rule = "a length > 0 in world units, or auto"
+        check(self, rule, lambda size: size == "auto" or 0 < size < math.inf, "voxel_size")
 
     @property
     def inputs(self) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -9,7 +10,7 @@ from torch import Tensor
 
 from padgs.anchors.growth import Growth, GrowthOptions
 from padgs.anchors.model import PaDGS
-from padgs.checks import check_known
+from padgs.checks import check, check_known
 from padgs.learning.extent import ExtentOptions
 from padgs.learning.schedule import Constant, LogLinear, ParameterGroup
 from padgs.learning.trainee import Drawing, Size, State
@@ -33,6 +34,9 @@ class LearningRates(ExtentOptions):
 
     def __post_init__(self) -> None:
         check_known(self, offset_rate_unit=OFFSET_RATE_UNITS)
+        pairs = ("offset_rate", "opacity_rate", "color_rate", "covariance_rate")
+        check(self, "two rates > 0", lambda pair: all(0 < rate < math.inf for rate in pair), *pairs)
+        check(self, ">= 0 and finite", lambda rate: 0 <= rate < math.inf, "feature_rate", "log_scale_rate")
         super().__post_init__()
 
     def groups(self, model: PaDGS, extent: float, iterations: int) -> list[ParameterGroup]:

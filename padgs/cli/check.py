@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from padgs.cli.refusing import refusing
+from padgs.cli.refusing import refusing, show
 
 if TYPE_CHECKING:
     from padgs.data.check.report import Report
 
 
-@refusing(ValueError)
+@refusing(ValueError, OSError)
 def check(
     path: Annotated[str, typer.Argument(help="folder with panoramas and poses, or the file that describes them")],
     format: Annotated[str, typer.Option(help="auto, or the format's name")] = "auto",
@@ -42,7 +42,7 @@ def check(
 
 def end_with(report: Report) -> NoReturn:
     """Print the report; exit code 1 if there are problems."""
-    print("\n".join(lines(report)))
+    show("\n".join(lines(report)))
     raise typer.Exit(1 if report.problems else 0)
 
 

@@ -6,10 +6,10 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.refusing import refusing
+from padgs.cli.refusing import refusing, show
 
 
-@refusing(ValueError)
+@refusing(ValueError, OSError)
 def convert(
     source: Annotated[str, typer.Argument(help="folder with panoramas and poses, or the file that describes them")],
     destination: Annotated[str, typer.Argument(help="a folder that does not exist yet")],
@@ -38,6 +38,6 @@ def convert(
             progress=lambda done, total: status.update(f"image {done} of {total}"),
         )
     for note in scene.notes:
-        print(f"  {note}")
+        show(f"  {note}")
     views = f"{len(scene.train)} train and {len(scene.test)} test views, {len(scene.points)} points"
-    print(f"{destination}: {views}, as {to}")
+    show(f"{destination}: {views}, as {to}")

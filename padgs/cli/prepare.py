@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from padgs.cli.refusing import refusing
+from padgs.cli.refusing import refusing, show
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
@@ -48,7 +48,7 @@ def prepare(
 
     target = Path(destination)
     try:
-        with refusing(DataError), _bars() as tell:
+        with refusing(DataError, OSError), _bars() as tell:
             options = PrepareOptions(accurate, pairs, mask, level, per_second, seed, threads)
             result = find_poses(Path(source), target, options, tell)
             report = check(target, overlay=target / "check.png")
@@ -59,7 +59,7 @@ def prepare(
     print(f"{placed} of {placed + len(result.unregistered)} panoramas placed, {result.points} points")
     spent = ", ".join(f"{WORDS[step]} {seconds:.0f} s" for step, seconds in result.seconds.items() if seconds >= 1)
     for note in (*result.notes, spent) if spent else result.notes:
-        print(f"  {note}")
+        show(f"  {note}")
     end_with(report)
 
 

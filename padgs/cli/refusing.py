@@ -1,12 +1,20 @@
-"""How every command says that it cannot do what it was asked for."""
+"""How every command says what it found, and that it cannot do what it was asked for."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TextIO
 
 import typer
+
+from padgs.runs.terminal import printable
+
+
+def show(text: str, stream: TextIO | None = None) -> None:
+    """Print what holds names and messages from elsewhere."""
+    print(printable(text), file=stream)
 
 
 @contextmanager
@@ -15,5 +23,5 @@ def refusing(*kinds: type[Exception]) -> Iterator[None]:
     try:
         yield
     except kinds as error:
-        print(f"error: {error}", file=sys.stderr)
+        show(f"error: {error}", sys.stderr)
         raise typer.Exit(1) from error

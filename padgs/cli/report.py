@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from padgs import results
-from padgs.cli.refusing import refusing
+from padgs.cli.refusing import refusing, show
 from reports import REPORTS, store
 from reports.tables.table import ReportError
 
@@ -52,7 +52,7 @@ def report(
             target.mkdir(parents=True, exist_ok=True)
             found = store.add(found, target / store.FILE_NAME)  # pictures are there of those in `source` only
     for error in broken:
-        print(f"left out: {error}", file=sys.stderr)
+        show(f"left out: {error}", sys.stderr)
     gathered = Gathered(frame(found), request, tuple(map(str, broken)))
     refused = 0
     for name in REPORTS if what == ALL else [what]:
@@ -60,7 +60,7 @@ def report(
             texts = dict(files(gathered.report(name)))
         except ReportError as error:
             refused += 1
-            print(f"error: {name}: {error}", file=sys.stderr)
+            show(f"error: {name}: {error}", sys.stderr)
             continue
         if what == name and not texts:
             raise ReportError(f"nothing to show for {name}; no run or experiment in {source} is of that kind")
@@ -69,7 +69,7 @@ def report(
                 (target / file).parent.mkdir(parents=True, exist_ok=True)
                 results.replace_file(target / file, content)
         if what == name and f"{name}.md" in texts:
-            print(texts[f"{name}.md"].decode())
+            show(texts[f"{name}.md"].decode())
     print(f"{len(found)} results, {len(broken)} left out; see {target}", file=sys.stderr)
     if refused or (strict and broken):
         raise typer.Exit(1)

@@ -6,6 +6,8 @@ from typing import Annotated
 
 import typer
 
+from padgs.cli.refusing import show
+
 
 def track(
     runs: Annotated[str, typer.Argument(help="folder of run folders")] = "runs",
@@ -19,12 +21,12 @@ def track(
 
     found, broken = results.read_all(Path(runs))
     for error in broken:
-        print(f"left out: {error}")
+        show(f"left out: {error}")
     trackers: dict[str, Tracker] = {}
     for result in found:
         experiment = " ".join(result.experiments)
         if experiment not in trackers:
-            trackers[experiment] = Tracker(TrackingOptions(uri=uri or None), Path(runs), experiment, print)
+            trackers[experiment] = Tracker(TrackingOptions(uri=uri or None), Path(runs), experiment, show)
         trackers[experiment].update(Path(runs) / result.run)
         if not trackers[experiment].on:
             raise typer.Exit(1)

@@ -145,7 +145,7 @@ def _camera_notes(frames: Sequence[Frame], images: Sequence[ImageFile]) -> list[
     for frame, image in zip(frames, images, strict=True):
         if frame.width is None or frame.height is None:
             continue
-        if frame.width != 2 * frame.height:
+        if frame.width != 2 * frame.height or frame.width < 1:
             raise DataError(f"the camera of {frame.name} is {frame.width}x{frame.height}; a full panorama is 2:1")
         scales.setdefault(
             image.width / frame.width,

@@ -15,6 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from padgs.data.errors import DataError
+
 
 @dataclass(frozen=True)
 class Frame:
@@ -34,6 +36,17 @@ class Cloud:
 
     points: Tensor  # [P, 3] float64
     colors: Tensor | None  # [P, 3] uint8
+
+
+def color_bytes(values: Tensor, where: str) -> Tensor:
+    """Colours [P, 3] in 0..255 as uint8; values beyond are cut off.
+
+    Raises:
+        DataError: one is not finite.
+    """
+    if not (finite := values.isfinite().all(1)).all():
+        raise DataError(f"the colour of point {(~finite).nonzero()[0].item()} of {where} is not finite; mend the cloud")
+    return values.round().clamp(0, 255).to(torch.uint8)
 
 
 @dataclass(frozen=True)

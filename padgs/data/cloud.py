@@ -45,7 +45,7 @@ def starting_cloud(capture: Capture, source: str) -> tuple[Tensor, Tensor, tuple
         raise DataError(
             f"{where} holds no points; training starts from a point cloud: set data.points to a PLY file, or to random"
         )
-    bad = (~points.isfinite().all(1)).sum().item()
+    bad = (~points.float().isfinite().all(1)).sum().item()
     if bad:
         raise DataError(f"{bad} of {len(points)} points of {where} are not finite; remove them from the cloud")
     if colors is None:

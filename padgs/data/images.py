@@ -22,6 +22,8 @@ from padgs.data.errors import DataError
 EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 _ORIENTATION = 0x0112  # EXIF tag; 1 = stored upright
 _GREY = ("1", "L", "LA", "La")
+GREY = 128  # what libjpeg shows where data end
+FILLING = b"\x55" * 2048  # some pixels of a scan
 
 
 @dataclass(frozen=True)
@@ -90,6 +92,8 @@ def _decode(file: BytesIO, path: Path, mode: str) -> NDArray[np.uint8]:
             image.load()
             transparent = mode == "RGB" and "A" in image.getbands() and np.asarray(image.getchannel("A")).min() < 255
             pixels = np.array(_eight_bit(image).convert(mode))
+            if _misses_pixels(image, file.getvalue(), pixels):
+                raise DataError(f"{path} is cut short, although it has an end marker; copy it again or remove it")
     except (OSError, SyntaxError, ValueError) as error:
         raise DataError(f"{path} is cut short or damaged ({error}); copy it again or remove it") from error
     if transparent:
@@ -139,3 +143,14 @@ def _looks_cut(data: bytes) -> bool:
     if data[:2] == b"\xff\xd8":  # a scan without an end-of-image marker behind it
         return data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda")
     return data[:4] == b"\x89PNG" and b"IEND" not in data[-4096:]
+
+
+def _misses_pixels(image: Image.Image, data: bytes, pixels: NDArray[np.uint8]) -> bool:
+    """Whether a decoded JPEG ends before its last pixel; libjpeg then makes up the rest, grey if it is not progressive.
+    More bytes before the end marker become pixels there, and are passed over in a whole file.
+    """
+    if image.format != "JPEG" or not ("progressive" in image.info or (pixels[-1] == GREY).all()):
+        return False
+    end = data.rfind(b"\xff\xd9")
+    with Image.open(BytesIO(data[:end] + FILLING + data[end:])) as longer:
+        return not np.array_equal(np.array(longer.convert("RGB" if pixels.shape[-1] == 3 else "L")), pixels)

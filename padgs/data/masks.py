@@ -17,8 +17,10 @@ from padgs.data.capture import Capture
 from padgs.data.errors import DataError
 from padgs.data.images import EXTENSIONS, ImageFile, inspect, save_png
 from padgs.data.store import ImageStore, StoredImage
+from padgs.sphere.panorama import row_latitudes
 
 SCENE_MASKS = ("mask.png", "mask.jpg", "mask.bmp")
+LEAST = 0.01  # of the sphere must be seen; from less nothing is learned, and no metric has a value
 _ROWS = re.compile(r"rows:(\d+)/(\d+)")
 
 
@@ -63,7 +65,7 @@ def find_masks(
         store: where decoded masks are kept.
 
     Raises:
-        DataError: a mask of another size than its image, one that hides everything, or an unusable `spec`.
+        DataError: a mask of another size than its image, one that hides all but `LEAST`, or an unusable `spec`.
     """
     spec = capture.mask if spec == "auto" else spec
     if spec == "none":
@@ -78,6 +80,8 @@ def find_masks(
             raise DataError(f"data.mask={spec}: the first number is how many of the second are kept; 1 to {of}")
         notes.append(f"mask: rows from {keep} of {of} on are ignored ({1 - keep / of:.1%} of the image)")
         rows = {height: row_weights(keep, of, height) for _, height in sizes}
+        for weights in rows.values():
+            _refuse_hidden(weights, f"data.mask={spec} hides {{}} of each image; keep more rows")
     masks: list[Mask | None] = []
     digests = [spec] if rule else []
     inspected: dict[Path, ImageFile] = {}
@@ -96,12 +100,21 @@ def find_masks(
                 f"{image.width}x{image.height}; a mask must have the size of its image"
             )
         mask = Mask(StoredImage(path, width, height, store, "L"), rows.get(height))
-        if mask.file not in shown and not mask().any():
-            raise DataError(f"{path} hides every pixel of {frame.name}; in a mask 255 means use, 0 means ignore")
+        if mask.file not in shown:
+            _refuse_hidden(mask(), f"{path} hides {{}} of {frame.name}; in a mask 255 means use, 0 means ignore")
         shown.add(mask.file)
         masks.append(mask)
         digests.append(f"{frame.name}:{mask_file.digest}")
     return masks, digests, notes
+
+
+def _refuse_hidden(weights: Tensor, message: str) -> None:
+    """Refuse weights [H, W or 1] that let next to nothing of the sphere through, with how much they hide."""
+    area = row_latitudes(len(weights)).cos()
+    shown = ((weights > 0).float().mean(-1) @ area / area.sum()).item()
+    if shown < LEAST:
+        much = f"all but {shown:.2%} of the sphere" if shown else "every pixel"
+        raise DataError(message.format(much))
 
 
 def _mask_files(capture: Capture, given: Path | None) -> tuple[dict[str, Path], str | None]:

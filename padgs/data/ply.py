@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from padgs.data.capture import Cloud
+from padgs.data.capture import Cloud, color_bytes
 from padgs.data.errors import DataError
 
 _COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
@@ -28,9 +28,9 @@ def read_ply(path: Path) -> Cloud:
     colors = None
     if channels is not None:
         values = np.stack([np.asarray(vertex[channel]) for channel in channels], axis=1)
-        if values.dtype.kind == "f":
-            values = np.nan_to_num(values) * (255 if len(values) == 0 or np.nanmax(values) <= 1 else 1)
-        colors = torch.from_numpy(np.rint(values).clip(0, 255).astype(np.uint8))
+        if values.dtype.kind == "f" and len(values) and values.max() <= 1:
+            values = values * 255
+        colors = color_bytes(torch.from_numpy(values.astype(np.float64)), str(path))
     return Cloud(torch.from_numpy(points), colors)
 
 

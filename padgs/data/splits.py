@@ -8,6 +8,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from padgs.data.errors import DataError, listed
 
+LONGEST = 255  # bytes of a file's name
 LISTS = {"train": "train.txt", "test": "test.txt"}
 
 
@@ -109,6 +110,10 @@ def check_inside(name: str, where: str) -> str:
     parts = PurePosixPath(name.replace("\\", "/"))
     if parts.is_absolute() or PureWindowsPath(name).drive or ".." in parts.parts or not parts.name or "\0" in name:
         raise DataError(f"{where} names {name!r}; names must be relative and stay inside the image folder (no '..')")
+    if any(0xD800 <= ord(character) < 0xE000 for character in name):
+        raise DataError(f"{where} names {name!r}, which is not Unicode; rename the file, and export again")
+    if any(len(part.encode()) > LONGEST for part in parts.parts):
+        raise DataError(f"{where} names {name[:60]!r}..., a name longer than the {LONGEST} bytes that files can have")
     return name
 
 

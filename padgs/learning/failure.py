@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 
 import torch
@@ -30,6 +31,22 @@ def first_non_finite(tensors: Mapping[str, Tensor | None]) -> str | None:
         index = (~torch.isfinite(tensor)).nonzero()[0].tolist()
         return f"{name}{index if index else ''} is {tensor[tuple(index)].item()}"
     return None
+
+
+def memory_reason(error: BaseException) -> str:
+    """What an error says that means that memory ran out, in words for who chose the sizes, not for who allocated.
+
+    >>> memory_reason(RuntimeError("[enforce fail at x.cpp:90] . DefaultCPUAllocator: can't allocate memory: you tried "
+    ...     "to allocate 8000000000 bytes. Error code 12 (Cannot allocate memory)"))
+    '8.0 GB more were asked for than there are; use smaller panoramas (data.width) or fewer Gaussians'
+    """
+    way_out = "use smaller panoramas (data.width) or fewer Gaussians"
+    if isinstance(error, MemoryError) and str(error):
+        return str(error)  # of a limit of ours, or of an array that is named
+    if asked := re.search(r"allocate ([\d.]+) ?([KMGT]iB|bytes)", str(error)):
+        size = f"{float(asked[1]) / 1e9:.1f} GB" if asked[2] == "bytes" else f"{asked[1]} {asked[2]}"
+        return f"{size} more were asked for than there are; {way_out}"
+    return way_out
 
 
 def is_out_of_memory(error: BaseException) -> bool:

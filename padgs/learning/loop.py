@@ -8,7 +8,6 @@ Knows no files.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, fields
@@ -19,7 +18,7 @@ from torch import Tensor
 
 from padgs.checks import check, check_known
 from padgs.learning.budget import Budget
-from padgs.learning.failure import Failure, is_out_of_memory
+from padgs.learning.failure import Failure, is_out_of_memory, memory_reason
 from padgs.learning.loss import NORMALISATIONS, ROW_WEIGHTS, photometric_loss
 from padgs.learning.optimiser import Optimiser
 from padgs.learning.order import Order, ViewOrder
@@ -27,6 +26,7 @@ from padgs.learning.schedule import LEARNING_RATES, Pace
 from padgs.learning.targets import Targets
 from padgs.learning.trainee import MODEL, State, Trainee
 from padgs.scene import Scene
+from padgs.stopwatch import Lap
 
 Stage = Callable[[str], AbstractContextManager[object]]  # entered with the name of each part of an iteration
 
@@ -123,19 +123,19 @@ class Trainer:
         """
         budget, limit = self._budget, self._budget.max_seconds
         while self.moment < budget.iterations and (limit is None or self.seconds < limit):
-            started, iteration = (time.perf_counter(), time.process_time()), self.iteration + 1
+            lap, iteration = Lap(), self.iteration + 1
             moment = budget.moment(self.moment, self.spent, self.step_seconds)
             try:
                 loss, counts, events = self._step(iteration, moment)
             except (MemoryError, RuntimeError) as error:
                 if isinstance(error, Failure) or not is_out_of_memory(error):
                     raise
-                raise Failure("oom", f"out of memory at iteration {iteration}: {error}") from error
+                raise Failure("oom", f"out of memory at iteration {iteration}: {memory_reason(error)}") from error
             if moment == budget.iterations:
                 self._optimiser.refuse_non_finite(self._optimiser.parameters(), iteration)
             self.iteration, self.moment, before = iteration, moment, self.spent
-            self.seconds += time.perf_counter() - started[0]
-            self.cpu_seconds += time.process_time() - started[1]
+            wall, cpu = lap.seconds(self.seconds / self.cpu_seconds if self.cpu_seconds else 1.0)
+            self.seconds, self.cpu_seconds = self.seconds + wall, self.cpu_seconds + cpu
             self.step_seconds = self.spent - before
             progress = moment / budget.iterations
             yield Record(iteration, progress, loss, self.seconds, self.cpu_seconds, counts, events)

@@ -20,7 +20,9 @@ from padgs.learning.schedule import PUBLISHED_ITERATIONS
 from padgs.learning.trainee import Size, State, Trainee
 from padgs.render import Rendering
 from padgs.render.config import RenderConfig
+from padgs.render.contract import check_camera
 from padgs.scene import Scene, View
+from padgs.sphere.camera import Panorama
 
 REHEARSED = 0.02  # share of a budget of seconds after which the speed of a method is known
 GROWN = 0.6  # of the speed at the beginning, as models have grown; over a run, within a third of what was measured
@@ -46,12 +48,17 @@ class Method(ABC):
         train: TrainOptions | None = None,
         seed: int = 0,
     ) -> None:
-        """Prepare; there is no model before `fit` or `load_state`."""
+        """Prepare; there is no model before `fit` or `load_state`.
+
+        Raises:
+            ValueError: with these options nothing could be trained, whatever the scene.
+        """
         self.options, self.seed = options or self.Options(), seed
         self.render_config, self.train_options = render or self.RENDER, train or self.TRAIN
         self._trainee: Trainee | None = None
         self._trainer: Trainer | None = None
         self._loaded: State | None = None
+        self._refuse_impossible()
 
     def fit(self, scene: Scene, budget: Budget, *, stage: Stage = nullcontext) -> Iterator[Record]:
         """Train, from the point cloud of the scene or from a loaded state, yielding a record per iteration.
@@ -130,6 +137,10 @@ class Method(ABC):
         if self._trainee is None:
             raise RuntimeError(f"{type(self).__name__} has no model yet; call fit or load_state first")
         return self._trainee
+
+    def _refuse_impossible(self) -> None:
+        """Refuse what no scene could be trained or drawn with; subclasses know more."""
+        check_camera(Panorama(8, 4), self.render_config.options(scene_unit=1.0))
 
     @abstractmethod
     def _start(self, scene: Scene, iterations: int) -> Trainee:

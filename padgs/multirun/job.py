@@ -21,6 +21,7 @@ from padgs.runs.folder import RunFolderError
 from padgs.runs.interrupt import Interrupted
 from padgs.runs.lock import RunBusy
 from padgs.runs.session import Session, Watch
+from padgs.runs.terminal import say
 from padgs.tracking.tracker import SECONDS_BETWEEN_LOOKS, Tracker
 
 EXPECTED = (ValueError, OSError, CheckpointError, RunFolderError, RunBusy)  # a traceback would only hide what they say
@@ -31,8 +32,8 @@ def only_job(composed: DictConfig) -> None:
     """Run what Hydra composed; how it ended, a status of `padgs.results` or refused, is added to `ENDS`."""
     try:
         config, console = typed_config(composed, HydraConfig.get().runtime.choices), Console()
-        say = partial(console.print, style="dim", markup=False, highlight=False, soft_wrap=True)
-        tracker = Tracker(config.tracking, Path(config.run.folder), " ".join(config.labels.experiments), say)
+        dimly = partial(say, console, style="dim")
+        tracker = Tracker(config.tracking, Path(config.run.folder), " ".join(config.labels.experiments), dimly)
         session = Session(config, console, TrackedRun(tracker))
         ENDS.append(session.run().status)
         tracker.update(session.folder.path)
@@ -70,13 +71,13 @@ def job_of_many(composed: DictConfig) -> str:
         except EXPECTED as error:
             return entry.end(ELSEWHERE if isinstance(error, RunBusy) else REFUSED, str(error))
         except Exception as error:
-            console.print(traceback.format_exc(), markup=False, highlight=False, soft_wrap=True)
+            say(console, traceback.format_exc())
             return entry.end(CRASHED, f"{type(error).__name__}: {error}")
 
 
 def complain(message: str) -> None:
     """Say what is wrong, on the error stream."""
-    Console(stderr=True).print(f"error: {message}", style="red", markup=False, highlight=False, soft_wrap=True)
+    say(Console(stderr=True), f"error: {message}", "red")
 
 
 def in_own_process(hydra: DictConfig | HydraConf) -> bool:

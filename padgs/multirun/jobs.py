@@ -25,6 +25,7 @@ from padgs.results import Result, ResultError
 from padgs.runs.folder import RunFolder, cannot_write
 from padgs.runs.identity import labels
 from padgs.runs.interrupt import Interrupt, Interrupted
+from padgs.runs.terminal import say
 from padgs.runs.typed import typed
 from padgs.tracking.tracker import SECONDS_BETWEEN_LOOKS, Tracker, TrackingOptions
 
@@ -178,4 +179,4 @@ class Multirun:
             return RunFolder(self.runs / state.run).result() if state.run else None
 
     def _say(self, text: str) -> None:
-        self._console.print(text, markup=False, highlight=False, soft_wrap=True)
+        say(self._console, text)

@@ -41,7 +41,7 @@ def lenient(arguments: Sequence[str]) -> list[str]:
     >>> lenient(["scale=cpu"])
     ['+scale=cpu']
     """
-    groups = {path.name for path in (root() / "conf").iterdir() if path.is_dir()} | {"hydra"}
+    groups = _groups() | {"hydra"}
     has_experiment = any(argument.startswith("+experiment=") for argument in arguments)
 
     def forced(argument: str) -> str:
@@ -54,13 +54,19 @@ def lenient(arguments: Sequence[str]) -> list[str]:
     return [forced(argument) for argument in arguments]
 
 
+def _groups() -> set[str]:
+    return {path.name for path in (root() / "conf").iterdir() if path.is_dir()}
+
+
 def conflict(arguments: Sequence[str]) -> str | None:
-    """What is wrong with a command line that says two things at once; None if it does not.
+    """What is wrong with a command line that says two things at once, or takes a group for a value; None if none is.
 
     >>> conflict(["seed=1", "-m", "method=padgs", "++seed=2"])
     'seed is set twice, by seed=1 and ++seed=2; keep one of them'
     >>> conflict(["+sweep=tau,seeds"])
     '+sweep=tau,seeds: one sweep at a time, because each says itself what is swept'
+    >>> conflict(["protocol=null"])
+    'protocol=null: protocol is a group of settings, chosen by name, e.g. protocol=both'
     """
     settings: dict[str, str] = {}
     for argument in arguments:
@@ -72,6 +78,9 @@ def conflict(arguments: Sequence[str]) -> str | None:
             return f"{key} is set twice, by {settings[key]} and {argument}; keep one of them"
         if key in ("experiment", "sweep") and ("," in value or "(" in value):
             return f"{argument}: one {key} at a time, because each says itself what is swept"
+        if key in _groups() and re.fullmatch(r"null|~|true|false|[-+.\d]*", value, re.IGNORECASE):
+            known = sorted(path.stem for path in (root() / "conf" / key).glob("*.yaml"))
+            return f"{argument}: {key} is a group of settings, chosen by name, e.g. {key}={known[0]}"
         settings[key] = argument
     return None
 

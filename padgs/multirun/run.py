@@ -6,40 +6,46 @@ import os
 import shlex
 import signal
 import sys
+from collections.abc import Sequence
 from datetime import datetime
-
-import hydra
-from rich.console import Console
-
-from padgs.multirun import job, sweeper
-from padgs.multirun.board import FOLDER, OK
-from padgs.multirun.choices import register_choices
-from padgs.multirun.launchers import missing_plugin
-from padgs.multirun.overrides import conflict, lenient, options_first, root
-from padgs.runs.interrupt import Interrupted
 
 INTERRUPTED = 130  # exit code of a command that Ctrl-C ended
 
 
 def main() -> None:
     """Entry point of `padgs-run`; exit code 0, 1 if any run failed, 130 if stopped by Ctrl-C."""
-    os.environ.setdefault("PADGS_ROOT", str(root()))
     arguments = sys.argv[1:]
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # what schedulers send is told apart from a crash
+    try:
+        sys.exit(_run(arguments))
+    except KeyboardInterrupt as stopped:
+        from padgs.runs.terminal import printable
+
+        advice = f"{str(stopped) or 'stopped'}; to go on: {shlex.join(['padgs-run', *arguments])}"
+        print(printable(advice), file=sys.stderr)
+        sys.exit(INTERRUPTED)
+
+
+def _run(arguments: Sequence[str]) -> int:
+    """Exit code. What takes a second to import is imported here, so that Ctrl-C is answered from the beginning."""
+    import hydra
+
+    from padgs.multirun import job, sweeper
+    from padgs.multirun.board import FOLDER, OK
+    from padgs.multirun.choices import register_choices
+    from padgs.multirun.launchers import missing_plugin
+    from padgs.multirun.overrides import conflict, lenient, options_first, root
+
+    os.environ.setdefault("PADGS_ROOT", str(root()))
     if problem := conflict(arguments) or missing_plugin(arguments):
         job.complain(problem)
-        sys.exit(1)
+        return 1
     register_choices()
     sweeper.register()
     start = f"{datetime.now():%Y%m%d-%H%M%S}-{os.getpid()}"
     sys.argv[1:] = [*options_first(lenient(arguments)), f"hydra.sweep.dir=${{run.folder}}/{FOLDER}/{start}"]
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # what schedulers send is told apart from a crash
-    try:
-        hydra.main(version_base="1.3", config_path=str(root() / "conf"), config_name="config")(job.only_job)()
-    except (Interrupted, KeyboardInterrupt) as stopped:
-        advice = f"{str(stopped) or 'stopped'}; to go on: {shlex.join(['padgs-run', *arguments])}"
-        Console(stderr=True).print(advice, markup=False, highlight=False, soft_wrap=True)
-        sys.exit(INTERRUPTED)
-    sys.exit(0 if {*job.ENDS, *sweeper.ENDS} <= {OK} else 1)
+    hydra.main(version_base="1.3", config_path=str(root() / "conf"), config_name="config")(job.only_job)()
+    return 0 if {*job.ENDS, *sweeper.ENDS} <= {OK} else 1
 
 
 if __name__ == "__main__":

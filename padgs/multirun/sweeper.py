@@ -13,12 +13,15 @@ from typing import Any
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.plugins import Plugins
 from hydra.plugins.sweeper import Sweeper
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
-from padgs.multirun.job import job_of_many
+from padgs.multirun.board import REFUSED
+from padgs.multirun.job import complain, job_of_many
 from padgs.multirun.jobs import Multirun
 from padgs.multirun.overrides import expand
+from padgs.runs.config import RunOptions
+from padgs.runs.typed import typed
 
 ENDS: Counter[str] = Counter()  # how the runs of the last multirun ended; Hydra's main returns nothing
 
@@ -45,12 +48,18 @@ def sweep(self: Any, arguments: list[str]) -> None:
     """
     self.launcher.setup(hydra_context=self.hydra_context, task_function=job_of_many, config=self.config)
     loader = self.hydra_context.config_loader
+    ENDS.clear()
+    try:
+        typed(RunOptions, OmegaConf.to_container(self.config.run, resolve=True), "run")  # type: ignore[arg-type]
+    except ValueError as error:
+        complain(str(error))
+        ENDS[REFUSED] += 1
+        return
     multirun = Multirun(self.config, expand(self.params, arguments, loader), Console())
     _refuse_unknown_choices(multirun.jobs, self.config, loader)
     try:
         multirun.run(self.launcher, self.max_batch_size)
     finally:
-        ENDS.clear()
         ENDS.update(multirun.close().counts)
 
 

@@ -6,7 +6,8 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from padgs.checks import check_known
-from padgs.render.contract import RenderOptions
+from padgs.render import BACKENDS
+from padgs.render.contract import LOW_PASS_KINDS, RenderOptions
 
 NEAR_UNITS = ("scene", "world")
 
@@ -20,8 +21,8 @@ class RenderConfig(RenderOptions):
     backend: str = "auto"  # a name of `padgs.render.BACKENDS`, or auto
 
     def __post_init__(self) -> None:
+        check_known(self, projection=LOW_PASS_KINDS, near_unit=NEAR_UNITS, backend=("auto", *BACKENDS))
         super().__post_init__()
-        check_known(self, near_unit=NEAR_UNITS)
 
     def options(self, scene_unit: float) -> RenderOptions:
         """Renderer options for a scene whose own unit of length is `scene_unit` world units."""

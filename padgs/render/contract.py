@@ -10,6 +10,7 @@ That is blending "sorted"; "hybrid" shares all but the order and the stop, see `
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
@@ -60,8 +61,9 @@ class RenderOptions:
 
     def __post_init__(self) -> None:
         check_known(self, bounds=BOUNDS, near_cull=NEAR_CULLS, blending=BLENDINGS)
-        check(self, "a distance >= 0 in world units", lambda near: near >= 0, "near")
-        check(self, "a variance >= 0 in square pixels", lambda variance: variance >= 0, "low_pass")
+        check(self, "a distance >= 0 in world units", lambda near: 0 <= near < math.inf, "near")
+        check(self, "a variance >= 0 in square pixels", lambda v: 0 <= v < math.inf, "low_pass")
+        check(self, "finite", math.isfinite, "pixel_bias")
         check(self, f"from 1 to {MAX_CORE_SIZE} fragments a pixel", lambda n: 1 <= n <= MAX_CORE_SIZE, "core_size")
         check(self, "at least 1", lambda most: most >= 1, "max_instances")
         check(self, "at least 1 byte, or None", lambda cap: cap is None or cap >= 1, "memory_cap")
@@ -180,13 +182,18 @@ def check_inputs(request: Request, *, check_values: bool) -> None:
             raise ValueError(f"{name} has dtype {tensor.dtype} but means has {dtype}; convert one of them")
         if tensor.device != device:
             raise ValueError(f"{name} is on {tensor.device} but means is on {device}; move one of them")
-    _check_camera(request.camera, options)
+    check_camera(request.camera, options)
     if check_values:
         _check_values(gaussians, request.cam_from_world, {name: tensor for name, (tensor, _) in shapes.items()})
         _check_rays(request.camera)
 
 
-def _check_camera(camera: Camera, options: RenderOptions) -> None:
+def check_camera(camera: Camera, options: RenderOptions) -> None:
+    """Refuse a camera that cannot be drawn with these options.
+
+    Raises:
+        ValueError: it has no pixels, or is none that the projection or its bounds are made for.
+    """
     if isinstance(camera, RayTable) and (camera.table.ndim != 3 or camera.table.shape[2] != 3):
         raise ValueError(f"the ray table has shape {tuple(camera.table.shape)}; it must be (height, width, 3)")
     if camera.width < 1 or camera.height < 1:

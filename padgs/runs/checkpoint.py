@@ -1,25 +1,31 @@
 """A `State` as a folder: tensors in safetensors, values in JSON; nothing in it is ever executed.
 
-`state.json` names the file of tensors with its size and SHA-256. The tensors are written first, under a new name, and
-replacing `state.json` is the one step that makes the new checkpoint count. So at every moment, whatever is killed or
-full, the folder holds one complete checkpoint: the old one or the new one.
+`state.json` names the file of tensors with its size and SHA-256, says which run it is of, and ends with a SHA-256 of
+itself. The tensors are written first, under a new name, and replacing `state.json` is the one step that makes the new
+checkpoint count. So at every moment, whatever is killed or full, the folder holds one complete checkpoint: the old one
+or the new one. Format 1, of earlier versions, names no run and has no digest of itself; it is taken as it is.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import safetensors.torch
 import torch
 
+from padgs.learning.failure import is_out_of_memory
 from padgs.learning.trainee import State
 from padgs.results import replace_file
 
-FORMAT = 1
+FORMAT, WITHOUT_RUN = 2, 1
 MANIFEST = "state.json"
+TENSORS = re.compile(r"tensors-[0-9a-f]{16}\.safetensors")
 WAY_OUT = "delete the checkpoint folder to start this run from the beginning"
 
 
@@ -32,8 +38,13 @@ def exists(folder: Path) -> bool:
     return (folder / MANIFEST).exists()
 
 
-def save(state: State, folder: Path) -> None:
+def save(state: State, folder: Path, run: Mapping[str, str] | None = None) -> None:
     """Write a checkpoint, replacing the one in the folder, which stays whole until the new one is.
+
+    Args:
+        state: of a method.
+        folder: of the checkpoint.
+        run: which one it is of, as `padgs.runs.identity.identity` says.
 
     Raises:
         CheckpointError: the disk is full, the folder is read-only, ...; the previous checkpoint is untouched.
@@ -42,8 +53,9 @@ def save(state: State, folder: Path) -> None:
     content = safetensors.torch.save(tensors)
     digest = hashlib.sha256(content).hexdigest()
     name = f"tensors-{digest[:16]}.safetensors"
-    manifest = {"format": FORMAT, "tensors": name, "bytes": len(content), "sha256": digest, "values": state.values}
-    text = json.dumps(manifest, indent=1, allow_nan=False).encode()
+    manifest = {"format": FORMAT, "run": dict(run or {}), "tensors": name, "bytes": len(content), "sha256": digest}
+    manifest |= {"values": json.loads(json.dumps(state.values, allow_nan=False))}
+    text = json.dumps({**manifest, "manifest_sha256": _digest(manifest)}, indent=1).encode()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         replace_file(folder / name, content)
@@ -58,15 +70,23 @@ def save(state: State, folder: Path) -> None:
             stale.unlink(missing_ok=True)
 
 
-def load(folder: Path, device: torch.device | str = "cpu") -> State:
+def load(folder: Path, device: torch.device | str = "cpu", run: Mapping[str, str] | None = None) -> State:
     """Read a checkpoint that `save` wrote, whole or not at all, all tensors on one device.
 
+    Args:
+        folder: of the checkpoint.
+        device: of the tensors.
+        run: what it has to say of its run, if it says anything.
+
     Raises:
-        CheckpointError: a file is missing, truncated, changed, or of another format.
+        CheckpointError: a file is missing, truncated, changed, of another format, or of another run.
     """
+    manifest = _manifest(folder)
+    for what, wanted in (run or {}).items() if manifest["format"] != WITHOUT_RUN else ():
+        if manifest["run"].get(what) != wanted:
+            raise CheckpointError(f"{folder} is of a run with another {what}; put the right one there, or {WAY_OUT}")
+    path = folder / manifest["tensors"]
     try:
-        manifest = _parsed((folder / MANIFEST).read_bytes(), folder / MANIFEST)
-        path = folder / manifest["tensors"]
         content = path.read_bytes()
     except OSError as error:
         raise CheckpointError(f"cannot read {error.filename}: {error.strerror}; {WAY_OUT}") from error
@@ -74,16 +94,58 @@ def load(folder: Path, device: torch.device | str = "cpu") -> State:
         raise CheckpointError(f"{path} has {len(content)} bytes instead of {manifest['bytes']}; {WAY_OUT}")
     if hashlib.sha256(content).hexdigest() != manifest["sha256"]:
         raise CheckpointError(f"{path} was changed after it was written (SHA-256 differs); {WAY_OUT}")
-    # Clones own aligned memory. Views into the file's bytes would not, and matrix products may round differently then.
-    tensors = {name: tensor.to(device, copy=True) for name, tensor in safetensors.torch.load(content).items()}
-    return State(tensors, manifest["values"])
+    with understood(folder):
+        # Clones own aligned memory. Views into the file's bytes would not, and products may round differently then.
+        loaded = safetensors.torch.load(content)
+        return State({name: tensor.to(device, copy=True) for name, tensor in loaded.items()}, manifest["values"])
 
 
-def _parsed(manifest: bytes, path: Path) -> dict[str, Any]:
+def names_its_run(folder: Path) -> bool:
+    """Whether a checkpoint says which run it is of; those of earlier versions do not.
+
+    Raises:
+        CheckpointError: it cannot be read.
+    """
+    return _manifest(folder)["format"] != WITHOUT_RUN
+
+
+@contextmanager
+def understood(folder: Path) -> Iterator[None]:
+    """For work with what a checkpoint holds: whatever goes wrong says that it is none of this method.
+
+    Raises:
+        CheckpointError: something went wrong, and not for lack of memory.
+    """
     try:
-        known = json.loads(manifest)
-        if known["format"] != FORMAT:
+        yield
+    except (LookupError, TypeError, ValueError, AttributeError, RuntimeError, safetensors.SafetensorError) as error:
+        if is_out_of_memory(error):
+            raise
+        reason = f"{type(error).__name__}: {error}"
+        raise CheckpointError(f"{folder} holds no state of this method ({reason}); {WAY_OUT}") from error
+
+
+def _manifest(folder: Path) -> dict[str, Any]:
+    path = folder / MANIFEST
+    try:
+        known = json.loads(path.read_bytes())
+        if known["format"] not in (FORMAT, WITHOUT_RUN):
             raise CheckpointError(f"{path} has format {known['format']}, this program reads {FORMAT}; {WAY_OUT}")
-        return {key: known[key] for key in ("tensors", "bytes", "sha256", "values")}
-    except (ValueError, LookupError, TypeError) as error:
+        kinds = {"tensors": str, "bytes": int, "sha256": str, "values": dict}
+        kinds |= {"run": dict, "manifest_sha256": str} if known["format"] == FORMAT else {}
+        for key, kind in kinds.items():
+            if not isinstance(known[key], kind):
+                raise TypeError(f"{key} is no {kind.__name__}")
+        if not TENSORS.fullmatch(known["tensors"]):
+            raise ValueError(f"{known['tensors']!r} is no file of tensors")
+    except OSError as error:
+        raise CheckpointError(f"cannot read {error.filename}: {error.strerror}; {WAY_OUT}") from error
+    except (ValueError, LookupError, TypeError, RecursionError) as error:
         raise CheckpointError(f"{path} is damaged ({type(error).__name__}: {error}); {WAY_OUT}") from error
+    if known["format"] == FORMAT and known.pop("manifest_sha256") != _digest(known):
+        raise CheckpointError(f"{path} was changed after it was written (SHA-256 differs); {WAY_OUT}")
+    return known
+
+
+def _digest(manifest: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()

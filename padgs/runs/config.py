@@ -8,7 +8,11 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from baselines import METHODS
+from padgs.checks import check, check_known
+from padgs.data import LOADERS
+from padgs.data.datasets import DATASETS
 from padgs.data.options import DataOptions, DataSettings
+from padgs.data.synthetic.options import SyntheticOptions
 from padgs.learning.budget import Budget
 from padgs.learning.loop import TrainOptions
 from padgs.learning.schedule import PUBLISHED_ITERATIONS
@@ -31,6 +35,14 @@ class DataConfig(DataSettings):
     format: str = "synthetic"  # a name of padgs.data.LOADERS
     path: str | None = None  # folder of the scene; null for a scene that is generated
     voxel_size: float | str = "auto"  # of the anchors of methods that have them, where the paper states it
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_known(self, format=("auto", *LOADERS))
+        if self.dataset is not None:
+            check_known(self, dataset=DATASETS)
+        width = {} if self.width is None else {"width": self.width}
+        typed(SyntheticOptions, {**self.generator, **width}, "data.generator")
 
     def options(self, device: str) -> DataOptions:
         """What the loader is told, with the device that keeps decoded images."""
@@ -83,6 +95,7 @@ class RunOptions:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ValueError(f"{name} is {value}; it must be at least 1")
+        check(self, ">= 0", lambda seconds: seconds >= 0, "checkpoint_seconds")
 
     @property
     def threads_per_job(self) -> int | None:
@@ -110,6 +123,7 @@ class Settings:
     def __post_init__(self) -> None:
         if self.retry not in RETRIES:
             raise ConfigError(f"unknown retry {self.retry!r}; known: {', '.join(RETRIES)}")
+        check(self, "in [0, 2^63)", lambda seed: 0 <= seed < 2**63, "seed")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,26 +172,40 @@ def config_from_values(values: Mapping[str, Any], labels: Labels = Labels()) -> 
     known = (*default_fields(), "method", "protocol")
     if unknown := [key for key in values if key not in known]:
         raise ConfigError(f"unknown key {unknown[0]}; known: {', '.join(known)}")
-    if "device" in values.get("data", {}):  # a key until run.device decided alone
+    if "device" in _group(values, "data"):  # a key until run.device decided alone
         raise ConfigError(
             "data.device is no key any more: run.device says where a run trains and keeps its panoramas; "
             "run.images_on=cpu keeps them in main memory while it trains on a GPU"
         )
-    method = dict(values.get("method", {}))
-    name = method.pop("name", "padgs_plus")
+    settings = typed(Settings, {key: value for key, value in values.items() if key not in ("method", "protocol")})
+    method = dict(_group(values, "method"))
+    name = str(method.pop("name", "padgs_plus"))
+    protocols = _group(values, "protocol")
     try:
-        options = lookup(METHODS, name, "method").Options
-        protocols = {
-            key: protocol_from_options(key, **{k: v for k, v in rules.items() if k != "name"})
-            for key, rules in values.get("protocol", {}).items()
-        }
+        kind = lookup(METHODS, name, "method")
+        options = typed(kind.Options, method, "method")
+        kind(options, settings.render, settings.train, settings.seed)  # refuses what goes together in no scene
+        rules = {key: _protocol(key, _group(protocols, key, "protocol.")) for key in protocols}
     except ValueError as error:
         raise ConfigError(str(error)) from error
-    settings = typed(Settings, {key: value for key, value in values.items() if key not in ("method", "protocol")})
-    typed_options = typed(options, method, "method")
-    if not protocols:
+    if not rules:
         raise ConfigError(f"protocol is empty; name at least one of {', '.join(PROTOCOLS)}")
-    return RunConfig(**vars(settings), method=name, options=typed_options, protocols=protocols, labels=labels)
+    return RunConfig(**vars(settings), method=name, options=options, protocols=rules, labels=labels)
+
+
+def _group(values: Mapping[str, Any], key: str, where: str = "") -> Mapping[str, Any]:
+    """The keys of a group; none where there is no such group."""
+    group = values.get(key, {})
+    if not isinstance(group, Mapping):
+        raise ConfigError(f"{where}{key} is {group!r}; it must be a group of keys")
+    return group
+
+
+def _protocol(name: str, rules: Mapping[str, Any]) -> Protocol:
+    """A protocol of which some rules are given, with values of their types."""
+    given = {key: value for key, value in rules.items() if key != "name"}
+    usual = protocol_from_options(name)
+    return typed(Protocol, {**vars(usual), **given}, f"protocol.{name}")
 
 
 def default_fields() -> dict[str, Any]:

@@ -46,8 +46,9 @@ class Progress:
 class RunFolder:
     """Reads and writes the files of one run."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: Path, run: Mapping[str, str] | None = None) -> None:
+        """Of a run of this identity; without one, checkpoints of any run are read."""
+        self.path, self._run = path, run
         self.checkpoint = path / "checkpoint"
         self.renders = path / results.PICTURES
         self._log = path / results.LOG_NAME
@@ -116,7 +117,7 @@ class RunFolder:
             CheckpointError: it cannot be written; the previous one stands.
         """
         state = method.state()
-        checkpoint.save(State(state.tensors, {**state.values, PROGRESS: asdict(progress)}), self.checkpoint)
+        checkpoint.save(State(state.tensors, {**state.values, PROGRESS: asdict(progress)}), self.checkpoint, self._run)
 
     def resume(self, method: Method, device: torch.device | str = "cpu") -> Progress:
         """Put a method where the checkpoint was taken, on this device; the beginning, if there is none.
@@ -124,13 +125,14 @@ class RunFolder:
         What the log says about later iterations is dropped, they will come again; so is a line that a kill has cut.
 
         Raises:
-            CheckpointError: there is one, but it is damaged.
+            CheckpointError: there is one, but it is damaged, or of another run.
         """
         progress = Progress()
         if checkpoint.exists(self.checkpoint):
-            state = checkpoint.load(self.checkpoint, device)
-            method.load_state(state)
-            progress = Progress(**state.values[PROGRESS])
+            state = checkpoint.load(self.checkpoint, device, self._run)
+            with checkpoint.understood(self.checkpoint):
+                method.load_state(state)
+                progress = Progress(**state.values[PROGRESS])
         if self._log.exists():
             kept = [line for line in results.log_lines(self.path) if line["iteration"] <= progress.iteration]
             with self._writing():

@@ -23,6 +23,11 @@ def config_hash(values: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(decisive(values), sort_keys=True).encode()).hexdigest()
 
 
+def identity(values: Mapping[str, Any], fingerprint: str) -> dict[str, str]:
+    """What a checkpoint says of the run that it is of."""
+    return {"configuration": config_hash(values), "data set": fingerprint}
+
+
 def run_id(values: Mapping[str, Any], scene: str, fingerprint: str, preset: str = "") -> str:
     """Scene, preset of the method and variant for people, and a hash of configuration and data for the rest.
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from omegaconf import OmegaConf
+from yaml import YAMLError
 
 from baselines.cubemap_3dgs import Cubemap3DGSMethod
 from padgs import results
@@ -21,6 +22,7 @@ from padgs.runs import checkpoint
 from padgs.runs.config import RunConfig, config_from_values
 from padgs.runs.device import chosen
 from padgs.runs.folder import RunFolder, RunFolderError
+from padgs.runs.identity import config_hash
 from padgs.runs.session import build, scene_of
 from padgs.scene import Scene, View
 from padgs.scoring.evaluate import evaluate
@@ -149,11 +151,17 @@ def load_run(folder: str | Path, *, data_path: str | Path | None = None, device:
             f"{folder} has no {'checkpoint' if settings.is_file() else settings.name}; give the folder of one run, as "
             "padgs-run names it at its end"
         )
-    values: Any = OmegaConf.to_container(OmegaConf.load(settings))
-    values["data"].pop("device", None)  # of runs until run.device decided alone
-    values["data"]["path"] = values["data"]["path"] if data_path is None else str(data_path)
-    values["run"]["device"] = device
+    try:
+        values: Any = OmegaConf.to_container(OmegaConf.load(settings))
+        run = {"configuration": config_hash(values)}  # the data are not looked at
+        values["data"].pop("device", None)  # of runs until run.device decided alone
+        values["data"]["path"] = values["data"]["path"] if data_path is None else str(data_path)
+        values["run"]["device"] = device
+    except (YAMLError, ValueError, LookupError, TypeError, AttributeError) as error:
+        raise RunFolderError(f"{settings} is no configuration that padgs-run wrote ({error}); put that back") from error
     config = config_from_values(values)
     method = build(config)
-    method.load_state(checkpoint.load(files.checkpoint, chosen(device, config.render)))
+    state = checkpoint.load(files.checkpoint, chosen(device, config.render), run)
+    with checkpoint.understood(files.checkpoint):
+        method.load_state(state)
     return OpenedRun(files.path, config, method, files.result())

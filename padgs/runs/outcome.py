@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from padgs import clock
-from padgs.learning.failure import Failure, is_out_of_memory
+from padgs.learning.failure import Failure, is_out_of_memory, memory_reason
 from padgs.results import Result
 from padgs.runs.config import RunConfig
 from padgs.runs.identity import config_hash
@@ -47,6 +47,11 @@ def status(error: Exception) -> str:
     if is_out_of_memory(error):
         return "oom"
     raise error
+
+
+def reason(error: Exception) -> str:
+    """Why a run failed, in words."""
+    return str(error) if isinstance(error, (Failure, ValueError)) else f"out of memory: {memory_reason(error)}"
 
 
 def peak_memory(scene: Scene) -> dict[str, int | None]:

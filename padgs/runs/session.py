@@ -22,13 +22,17 @@ from padgs.runs import checkpoint, outcome
 from padgs.runs.config import RunConfig
 from padgs.runs.device import chosen
 from padgs.runs.folder import Progress, RunFolder, RunFolderError
-from padgs.runs.identity import run_id
+from padgs.runs.identity import identity, run_id
 from padgs.runs.interrupt import Interrupt, Interrupted
 from padgs.runs.live import LiveLine
 from padgs.runs.scoring import frame_times, probe, same_rules, scores
 from padgs.runs.summary import introduce, show_result
+from padgs.runs.terminal import say
 from padgs.scene import Scene
 from padgs.scoring.protocols import Protocol
+from padgs.stopwatch import notice_stops
+
+UNNAMED = "; the checkpoint is of an earlier version and does not say of which run, so its place is trusted"
 
 
 class Watch:
@@ -57,12 +61,14 @@ class Session:
         if config.run.threads_per_job is not None:
             torch.set_num_threads(config.run.threads_per_job)
         torch.manual_seed(config.seed)
+        notice_stops()
         device = chosen(config.run.device, config.render)
         clock.reset_peak_memory(device)
         self.config, self.console, self.watch = config, console, watch
         self.scene = scene_of(config, device)
-        name = run_id(config.values(), self.scene.name, self.scene.fingerprint, config.preset)
-        self.folder = RunFolder(Path(config.run.folder) / name)
+        values, fingerprint = config.values(), self.scene.fingerprint
+        name = run_id(values, self.scene.name, fingerprint, config.preset)
+        self.folder = RunFolder(Path(config.run.folder) / name, identity(values, fingerprint))
 
     def run(self) -> Result:
         """Do what is missing of the run and show its result.
@@ -102,7 +108,8 @@ class Session:
         method = build(config)
         progress = folder.resume(method, self.scene.points.device)
         if progress.iteration:
-            self._say(f"resuming after iteration {progress.iteration}")
+            trust = "" if checkpoint.names_its_run(folder.checkpoint) else UNNAMED
+            self._say(f"resuming after iteration {progress.iteration}{trust}")
         result = outcome.begun(config, self.scene, folder.path.name)
         try:
             saved, saved_iteration = time.monotonic(), progress.iteration
@@ -130,7 +137,7 @@ class Session:
         except KeyboardInterrupt as error:
             raise Interrupted("stopped at once, the last checkpoint stands") from error
         except (Failure, ValueError, MemoryError, RuntimeError) as error:
-            what = {"status": outcome.status(error), "reason": str(error)}
+            what = {"status": outcome.status(error), "reason": outcome.reason(error)}
             result = replace(result, **what, **outcome.peak_memory(self.scene))
         finished = datetime.now(timezone.utc).isoformat(timespec="seconds")
         asked = progress.iteration if config.budget.seconds is not None else result.iterations
@@ -204,7 +211,7 @@ class Session:
         return result if complete == result else self.folder.finish(complete)
 
     def _say(self, text: str) -> None:
-        self.console.print(text, highlight=False, soft_wrap=True)
+        say(self.console, text)
 
 
 def _training_time(progress: Progress) -> dict[str, float]:

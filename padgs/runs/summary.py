@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from padgs.results import Result
 from padgs.runs.config import RunConfig
 from padgs.runs.live import clock, compact
+from padgs.runs.terminal import printable, say
 from padgs.scene import Scene
 
 MISSING = "–"
@@ -22,21 +23,21 @@ def introduce(config: RunConfig, scene: Scene, folder: Path, console: Console) -
     view = scene.train[0]
     what = f"{config.preset}{f' ({config.variant})' if config.variant else ''} on {scene.name}"
     views = f"{len(scene.train)} training and {len(scene.test)} test views of {view.width}x{view.height}"
-    say = partial(console.print, highlight=False, soft_wrap=True)
-    say(f"[bold]{what}[/]: {views}, {len(scene.points)} points, {config.time}")
+    rest = f": {views}, {len(scene.points)} points, {config.time}"
+    console.print(Text(printable(what), "bold"), rest, sep="", highlight=False, soft_wrap=True)
     for note in (*scene.notes, folder):
-        say(f"  {note}", style="dim")
+        say(console, f"  {note}", "dim")
 
 
 def show_result(result: Result, folder: Path, console: Console) -> None:
     """Print the marks of a run, what it cost, and where its files are."""
-    say = partial(console.print, highlight=False, soft_wrap=True)
     if not result.ok:
-        say(f"[bold red]{result.status}[/]: {result.reason or 'stopped early'}")
+        reason = printable(result.reason) or "stopped early"
+        console.print(Text.assemble((result.status, "bold red"), f": {reason}"), soft_wrap=True)
     if result.scores:
         console.print(marks(result))
     for note in dict.fromkeys(note for scores in result.scores.values() for note in scores.notes):
-        say(note, style="yellow")
+        say(console, note, "yellow")
     costs = [f"{compact(count)} {name}" for name, count in result.counts.items()]
     costs.append(f"{result.model_bytes / 1e6:.1f} MB")
     if "train_seconds" in result.timing:
@@ -46,8 +47,8 @@ def show_result(result: Result, folder: Path, console: Console) -> None:
     costs.append(f"peak memory {result.peak_memory_bytes / 1e9:.2f} GB")
     if result.peak_device_memory_bytes is not None:
         costs.append(f"{result.peak_device_memory_bytes / 1e9:.2f} GB on the GPU")
-    say(", ".join(costs))
-    say(str(folder), style="bold")
+    say(console, ", ".join(costs))
+    say(console, folder, "bold")
 
 
 def marks(result: Result) -> Table:

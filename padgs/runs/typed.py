@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import types
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
@@ -65,17 +66,23 @@ def _value(kind: Any, value: Any, where: str) -> Any:
         return _tuple(get_args(kind), value, where)
     if kind is type(None) and value is None:
         return None
-    if kind is bool and isinstance(value, bool) or kind is str and isinstance(value, str):
+    if kind is bool and isinstance(value, bool):
         return value
-    number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    if number and (kind is float or kind is int and float(value).is_integer()):
-        return kind(value)
+    if kind is str and isinstance(value, str):
+        if any(0xD800 <= ord(character) < 0xE000 for character in value):
+            raise ConfigError(f"{where} is {value!r}, which is not Unicode; rename what it names")
+        return value
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        if not -sys.float_info.max <= value <= sys.float_info.max:
+            raise ConfigError(f"{where} is {value}; it must be finite")
+        if kind is float or kind is int and value == int(value):
+            return kind(value)
     raise ConfigError(f"{where} is {value!r}; it must be {_name(kind)}")
 
 
 def _first_fit(kinds: tuple[Any, ...], value: Any, where: str) -> Any:
     if type(value) in kinds:
-        return value
+        return _value(type(value), value, where)
     for kind in kinds:
         try:
             return _value(kind, value, where)
@@ -95,6 +102,8 @@ def _tuple(kinds: tuple[Any, ...], value: Sequence[Any], where: str) -> tuple[An
 
 def _name(kind: Any) -> str:
     names = {type(None): "null", bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
+    if is_dataclass(kind) or get_origin(kind) is Mapping:
+        return "a group of keys"
     return names.get(kind) or getattr(kind, "__name__", str(kind))
 
 

@@ -56,9 +56,14 @@ class CloneSplitOptions:
 
     def __post_init__(self) -> None:
         check(self, "at least 1 iteration", lambda every: every >= 1, "densify_every", "reset_every")
+        times = ("densify_from", "densify_until", "prune_by_extent_from")
+        check(self, "an iteration, at least 0", lambda iteration: iteration >= 0, *times)
+        sizes = ("gradient_threshold", "percent_dense", "max_scale", "extent_margin")
+        check(self, ">= 0 and finite", lambda value: 0 <= value < math.inf, *sizes)
+        check(self, ">= 0, or none", lambda value: value is None or 0 <= value < math.inf, "polar_threshold")
         check_known(self, signal=SIGNALS)
         check(self, "an opacity below 1", lambda opacity: 0 < opacity < 1, "reset_opacity")
-        check(self, "an opacity below 1", lambda opacity: 0 <= opacity < 1, "opacity_decay")
+        check(self, "an opacity below 1", lambda opacity: 0 <= opacity < 1, "opacity_decay", "min_opacity")
         check(self, "at least 1, or none for no limit", lambda most: most is None or most >= 1, "max_gaussians")
 
     def for_run(self, iterations: int) -> CloneSplitOptions:

@@ -12,11 +12,13 @@ from typing import Any, ClassVar
 
 import torch
 
+from padgs.checks import check
 from padgs.learning.extent import ExtentOptions
 from padgs.learning.loop import TrainOptions
 from padgs.learning.method import Method
 from padgs.learning.trainee import State
 from padgs.scene import Scene, View
+from padgs.sphere.harmonics import MAX_DEGREE
 from padgs.splats.clone_split import CloneSplitOptions
 from padgs.splats.model import Splats
 from padgs.splats.trainee import SplatTrainee
@@ -31,6 +33,7 @@ class SplatOptions(CloneSplitOptions, ExtentOptions):
     def __post_init__(self) -> None:
         for part in (CloneSplitOptions, ExtentOptions):
             part.__post_init__(self)
+        check(self, f"0 to {MAX_DEGREE}", lambda degree: 0 <= degree <= MAX_DEGREE, "sh_degree")
 
 
 def refuse_polar_threshold(options: SplatOptions, why: str) -> None:
@@ -49,6 +52,14 @@ class SplatMethod(Method):
     Options = SplatOptions
     TRAINEE: ClassVar[Callable[..., SplatTrainee]] = SplatTrainee
     TRAIN = TrainOptions(weight="uniform")
+
+    def _refuse_impossible(self) -> None:
+        super()._refuse_impossible()
+        if self.options.signal == "space_absolute" and self.render_config.projection != "ray":
+            raise ValueError(
+                f"method.signal=space_absolute is made for render.projection=ray, not {self.render_config.projection}; "
+                "set method.signal=space"
+            )
 
     def _start(self, scene: Scene, iterations: int) -> SplatTrainee:
         options = self.options

@@ -44,15 +44,7 @@ class SplatTrainee:
         """Wrap splats; `extent` is the scene's, `options` are those of a published run (see `for_run`).
 
         `views` are those of the training; without them there can be none.
-
-        Raises:
-            ValueError: a signal that the projection does not have.
         """
-        if options.signal == "space_absolute" and config.projection != "ray":
-            raise ValueError(
-                f"method.signal=space_absolute is made for render.projection=ray, not {config.projection}; "
-                "set method.signal=space"
-            )
         self.splats, self.iterations = splats, iterations
         self._config, self._views, self._extent = config, views, extent
         self.densifier = CloneSplit(

@@ -86,6 +86,7 @@ def escaped(words: str) -> str:
     >>> escaped("50 % of a_b ↑")
     '50 \\\\% of a\\\\_b $\\\\uparrow$'
     """
+    words = "".join(c if c.isprintable() else " " for c in words)  # an empty line would end a caption
     return "".join(SPECIAL.get(character) or SYMBOLS.get(character, character) for character in words)
 
 
@@ -109,4 +110,5 @@ def _number(shown: str) -> str:
 
 
 def _line(cells: list[str]) -> str:
-    return f"    {' & '.join(cells)} \\\\"
+    guard = "{}" if cells[0][:1] in ("[", "*") else ""  # which the end of the line above would take for its own
+    return f"    {guard}{' & '.join(cells)} \\\\"

@@ -8,10 +8,10 @@ from reports.tables.table import Block, Table
 
 def text(table: Table) -> str:
     """The whole table with its title and footnotes."""
-    parts = [f"## {table.title}"]
+    parts = [f"## {_plain(table.title)}"]
     for block in table.blocks:
         alone = table.alone(block)
-        parts.append(f"### {block.title}\n\n{_block(alone, alone.blocks[0])}")
+        parts.append(f"### {_plain(block.title)}\n\n{_block(alone, alone.blocks[0])}")
     if table.notes:
         parts.append("\n".join(f"- {_escaped(note)}" for note in table.notes))
     return "\n\n".join(parts) + "\n"
@@ -38,5 +38,10 @@ def _line(cells: list[str]) -> str:
     return f"| {' | '.join(cells)} |"
 
 
+def _plain(words: str) -> str:
+    """A line without HTML, and without what a terminal would obey."""
+    return "".join(c if c.isprintable() else " " for c in words).replace("<", "&lt;")
+
+
 def _escaped(words: str) -> str:
-    return words.replace("|", "\\|").replace("*", "\\*").replace("_", "\\_")
+    return _plain(words).replace("|", "\\|").replace("*", "\\*").replace("_", "\\_")

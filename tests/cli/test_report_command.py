@@ -44,6 +44,25 @@ def test_a_broken_file_is_named_and_left_out_and_strict_fails(runs):
     assert report("table3", runs, "--strict").exit_code == 1
 
 
+def test_no_name_in_a_result_leads_out_of_the_folder(tmp_path):
+    runs, out = tmp_path / "runs", tmp_path / "a" / "b" / "out"
+    changes = {"scene": "../../x", "dataset": ""}, {"experiments": ("../../../x",)}, {"run": "../x"}
+    for seed, change in enumerate(changes):
+        (runs / str(seed)).mkdir(parents=True)
+        results.write(result("", seed=seed, **change), runs / str(seed))
+    done = report("all", runs, "--out", out)
+    assert "'../../../x' is no name that this program gives" in done.output and "'../x' is no name" in done.output
+    assert (out / "chart_..-..-x.svg").is_file()
+    assert {path for path in tmp_path.rglob("*") if path.is_file() and "runs" not in path.parts} == {*out.glob("*")}
+
+
+def test_a_terminal_obeys_nothing_in_a_name(tmp_path):
+    (tmp_path / "run").mkdir()
+    results.write(result("\x1b]0;title\x07<b>", scene="\x1b[2J", dataset="", run="x"), tmp_path / "run")
+    done = report("runs", tmp_path)
+    assert done.exit_code == 0 and "\x1b" not in done.output and "<b>" not in done.output
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -54,6 +54,25 @@ def test_truncated_files_are_found_when_looked_at(extension: str, share: float, 
         inspect(path)
 
 
+@pytest.mark.parametrize("options", [{}, {"progressive": True}, {"subsampling": 0}], ids=str)
+def test_a_jpeg_that_is_cut_is_found_when_decoded_although_it_has_an_end(options, tmp_path: Path) -> None:
+    path = tmp_path / "a.jpg"
+    Image.fromarray(PIXELS).save(path, **options)
+    whole = path.read_bytes()
+    assert decode(path).shape == PIXELS.shape
+    path.write_bytes(whole[: len(whole) // 2] + b"\xff\xd9")
+    inspect(path)
+    with pytest.raises(DataError, match="a.jpg is cut short, although it has an end marker; copy it again"):
+        decode(path)
+
+
+def test_a_grey_nadir_is_no_cut(tmp_path: Path) -> None:
+    pixels = PIXELS.copy()
+    pixels[-20:] = 128
+    Image.fromarray(pixels).save(tmp_path / "a.jpg")
+    assert (decode(tmp_path / "a.jpg")[-1] == 128).all()
+
+
 def test_a_thumbnail_does_not_hide_a_truncated_jpeg_nor_trailing_bytes_a_whole_one(tmp_path: Path) -> None:
     path = _save(tmp_path / "a.jpg", Image.fromarray(PIXELS))
     thumbnail = b"\xff\xd8 a small image \xff\xda and its end \xff\xd9"

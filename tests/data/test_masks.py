@@ -74,6 +74,16 @@ def test_a_mask_changes_the_fingerprint(folder: Path) -> None:
     assert load(folder, mask="none").fingerprint == plain
 
 
+def test_a_mask_must_show_a_part_of_the_sphere(folder: Path) -> None:
+    mask = np.zeros((32, 64), np.uint8)
+    mask[16, 3] = 255
+    Image.fromarray(mask).save(folder / "pixel.png")
+    with pytest.raises(DataError, match=r"pixel.png hides all but 0.08% of the sphere of pano_00.png; in a mask 255"):
+        load(folder, mask="pixel.png")
+    with pytest.raises(DataError, match=r"data.mask=rows:1/32 hides all but 0.24% of the sphere of each image; keep"):
+        load(folder, mask="rows:1/32")
+
+
 def test_unusable_masks(folder: Path) -> None:
     _mask(folder / "mask.png", size=(62, 31))
     with pytest.raises(DataError, match=r"mask.png is 62x31 but pano_00.png is 64x32; a mask must have the size"):

@@ -22,6 +22,18 @@ ROOT = Path(__file__).resolve().parents[2]
 TINY = [*SMALLEST, "train.iterations=300", "run.checkpoint_every=10", "run.probe_every=50", "tracking=none"]
 
 
+@pytest.mark.parametrize("delay", [0.0, 0.2, 1.0])
+def test_ctrl_c_is_answered_while_the_program_starts(delay):
+    start = "import padgs.multirun.run as run; print('begun', flush=True); run.main()"
+    command = [sys.executable, "-c", start, *TINY]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT)
+    assert process.stdout is not None and process.stdout.readline() == "begun\n"
+    time.sleep(delay)
+    process.send_signal(signal.SIGINT)
+    code, _, error = finish(process)
+    assert code == 130 and "Traceback" not in error and "to go on: padgs-run" in error
+
+
 def newest(folder: Path) -> bytes:
     """What the checkpoint of the only run in a folder says."""
     return next((path.read_bytes() for path in folder.glob("*/checkpoint/state.json")), b"")

@@ -78,12 +78,67 @@ def test_one_flipped_bit_is_refused(tmp_path):
         checkpoint.load(tmp_path)
 
 
-@pytest.mark.parametrize("text", ['{"format": 1, "tens', "[]", "{}", '{"format": 1}', '{"format": 99}'])
+@pytest.mark.parametrize(
+    "text",
+    [
+        *(
+            '{"format": 1, "tens',
+            "[]",
+            "{}",
+            '{"format": 1}',
+            '{"format": 99}',
+            '{"format": []}',
+            "null",
+            "[" * 100_000,
+        ),
+        '{"format": 1, "tensors": 3, "bytes": 1, "sha256": "", "values": {}}',
+        '{"format": 1, "tensors": "../x", "bytes": 1, "sha256": "", "values": {}}',
+        '{"format": 1, "tensors": "x", "bytes": "1", "sha256": "", "values": []}',
+    ],
+)
 def test_damaged_manifest_is_refused(tmp_path, text):
     checkpoint.save(example(), tmp_path)
     (tmp_path / "state.json").write_text(text)
     with pytest.raises(CheckpointError, match=r"state\.json"):
         checkpoint.load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda manifest: manifest["values"].update(iteration=6),
+        lambda manifest: manifest["values"].update(iteration=-7),
+        lambda manifest: manifest["values"]["nested"].update(x=1),
+        lambda manifest: manifest["run"].update(configuration="b"),
+        lambda manifest: manifest.update(more=1),
+    ],
+)
+def test_an_edited_manifest_is_refused(tmp_path, change):
+    checkpoint.save(example(), tmp_path, {"configuration": "a"})
+    manifest = json.loads((tmp_path / "state.json").read_text())
+    change(manifest)
+    (tmp_path / "state.json").write_text(json.dumps(manifest))
+    with pytest.raises(CheckpointError, match=r"state\.json was changed after it was written .* delete the checkpoint"):
+        checkpoint.load(tmp_path)
+
+
+def test_a_checkpoint_of_another_run_is_refused(tmp_path):
+    run = {"configuration": "a", "data set": "b"}
+    checkpoint.save(example(), tmp_path, run)
+    assert_same(checkpoint.load(tmp_path, run=run), example())
+    assert checkpoint.names_its_run(tmp_path)
+    for what in run:
+        with pytest.raises(CheckpointError, match=f"is of a run with another {what}; .* delete the checkpoint folder"):
+            checkpoint.load(tmp_path, run={**run, what: "c"})
+
+
+def test_a_checkpoint_of_the_first_format_is_read(tmp_path):
+    checkpoint.save(example(), tmp_path, {"configuration": "a"})
+    manifest = json.loads((tmp_path / "state.json").read_text())
+    old = {key: manifest[key] for key in ("tensors", "bytes", "sha256", "values")}
+    (tmp_path / "state.json").write_text(json.dumps({"format": 1, **old}))
+    assert_same(checkpoint.load(tmp_path, run={"configuration": "c"}), example())
+    assert not checkpoint.names_its_run(tmp_path)
 
 
 def test_missing_tensors_are_named(tmp_path):

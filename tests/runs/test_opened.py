@@ -79,6 +79,27 @@ def test_a_run_that_is_not_finished_opens_too_and_an_old_key_is_passed_over(fold
     assert run.method.size().counts["gaussians"] > 0
 
 
+@pytest.mark.parametrize(
+    ("file", "old", "new", "error"),
+    [
+        ("config.yaml", "seed: 0\nrender", "seed: 0\nrender", None),
+        ("config.yaml", "iterations: 30", "iterations: 31", "is of a run with another configuration"),
+        ("config.yaml", "data:\n", "date:\n", "is no configuration that padgs-run wrote"),
+        ("config.yaml", "data:\n", "data: [\n", "is no configuration that padgs-run wrote"),
+        ("checkpoint/state.json", '"iteration": 30', '"iteration": 29', "was changed after it was written"),
+    ],
+)
+def test_a_run_that_was_edited_is_refused(folder, tmp_path, file, old, new, error):
+    copy = shutil.copytree(folder, tmp_path / "run")
+    path = copy / file
+    path.write_text(path.read_text().replace(old, new))
+    if error is None:
+        assert padgs.load_run(copy).result.ok
+        return
+    with pytest.raises(RuntimeError, match=error):
+        padgs.load_run(copy)
+
+
 def test_what_is_no_run_is_refused_with_a_way_out(folder, tmp_path):
     with pytest.raises(RunFolderError, match="has no config.yaml; give the folder of one run"):
         padgs.load_run(tmp_path)

@@ -14,6 +14,7 @@ from padgs.render.config import RenderConfig
 from padgs.scene import View
 from padgs.sphere.panorama import direction
 from padgs.splats.clone_split import CloneSplitOptions
+from padgs.splats.method import SplatMethod, SplatOptions
 from padgs.splats.model import Splats
 from padgs.splats.probes import render_probed
 from padgs.splats.trainee import SplatTrainee
@@ -143,17 +144,11 @@ def test_the_densifier_is_given_the_signal_of_its_options(signal, axes, generato
         assert torch.equal(trainee.densifier.statistics["absolute"], drawing.probe.grad[:, 3])
 
 
-def test_the_absolute_signal_wants_the_projection_that_has_it(generator):
+def test_the_absolute_signal_wants_the_projection_that_has_it():
     with pytest.raises(
         ValueError, match=r"space_absolute is made for render\.projection=ray, not erp; set .*signal=space"
     ):
-        SplatTrainee(
-            colored_splats(1, generator),
-            CloneSplitOptions(signal="space_absolute"),
-            RenderConfig(),
-            extent=1.0,
-            iterations=100,
-        )
+        SplatMethod(SplatOptions(signal="space_absolute"), RenderConfig())
 
 
 def test_unknown_signals_are_named(generator):

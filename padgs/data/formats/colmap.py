@@ -18,7 +18,7 @@ from padgs.data.assemble import image_folder
 from padgs.data.capture import Capture, Cloud, Frame, Tracks
 from padgs.data.errors import DataError, listed
 from padgs.data.formats.colmap_binary import check_whole
-from padgs.data.formats.poses import cam_from_world
+from padgs.data.formats.poses import cam_from_world, checked_quaternion
 from padgs.data.images import read_bytes
 from padgs.data.options import DataOptions
 from padgs.data.splits import check_inside
@@ -154,11 +154,13 @@ def _frame(image: Any, name: str, folder: Path, model: Path) -> Frame:
             f"{name} has a {camera.model_name} camera ({model}); only panoramas (EQUIRECTANGULAR) can be used: "
             "reconstruct from the panoramas themselves (`padgs prepare`), or give the sparse_equirectangular model"
         )
+    where = f"{name} in {model}"
+    checked_quaternion(torch.tensor(image.cam_from_world().rotation.quat), where)  # that of 0 0 0 0 is the identity
     pose = torch.from_numpy(np.asarray(image.cam_from_world().matrix(), np.float64))
     return Frame(
         name=check_inside(name, str(model)),
         image=folder / name,
-        cam_from_world=cam_from_world(pose[:, :3], pose[:, 3], f"{name} in {model}"),
+        cam_from_world=cam_from_world(pose[:, :3], pose[:, 3], where),
         width=camera.width,
         height=camera.height,
     )

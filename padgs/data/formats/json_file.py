@@ -1,4 +1,6 @@
-"""JSON files of other programs: values that know where they stand, so that whatever is wrong names its place."""
+"""JSON files of other programs: values that know where they stand and are asked for by type, so that whatever is wrong
+names its place. Readers never touch `value` itself.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +13,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from padgs.data.errors import DataError
+from padgs.data.errors import DataError, listed
 from padgs.data.images import read_bytes
 from padgs.data.splits import check_inside
+
+LARGEST = 2**53  # up to which floats tell whole numbers apart
 
 
 @dataclass(frozen=True)
@@ -24,30 +28,38 @@ class Json:
     where: str  # in words: "transform_matrix of pano_00.png in FILE"
 
     def __getitem__(self, key: str) -> Json:
-        if not isinstance(self.value, Mapping):
-            raise DataError(f"{self.where} must be an object with the field {key!r}, not {type(self.value).__name__}")
-        if key not in self.value:
-            has = ", ".join(map(str, self.value)) or "none"
+        fields = self._of(Mapping, f"an object with the field {key!r}")
+        if key not in fields:
+            has = listed(fields) or "none"
             raise DataError(f"{self.where} lacks the field {key!r}; it has {has}")
-        return Json(self.value[key], f"{key} of {self.where}")
+        return Json(fields[key], f"{key} of {self.where}")
 
-    def get(self, key: str, default: Any = None) -> Any:
-        """The bare value of a field that may be absent."""
-        return self.value.get(key, default)
+    def get(self, key: str) -> Json | None:
+        """A field that may be absent, or null, which is the same."""
+        return self[key] if self._of(Mapping, "an object").get(key) is not None else None
+
+    def items(self) -> dict[str, Json]:
+        """What an object holds."""
+        return {key: Json(value, f"{key} of {self.where}") for key, value in self._of(Mapping, "an object").items()}
 
     def entries(self) -> list[Json]:
-        """What a list holds.
+        """What a list holds."""
+        return [Json(entry, f"entry {i} of {self.where}") for i, entry in enumerate(self._of(list, "a list"))]
 
-        Raises:
-            DataError: it is no list.
-        """
-        if not isinstance(self.value, list):
-            raise DataError(f"{self.where} must be a list, not {type(self.value).__name__}")
-        return [Json(entry, f"entry {i} of {self.where}") for i, entry in enumerate(self.value)]
+    def text(self) -> str:
+        """A text."""
+        return self._of(str, "a text")
+
+    def whole(self) -> int:
+        """A whole number, such as a key or a number of pixels."""
+        value = self._of((int, float), "a whole number")
+        if isinstance(value, bool) or value != value or abs(value) > LARGEST or value != int(value):
+            raise DataError(f"{self.where} is {value!r}; it must be a whole number up to {LARGEST}")
+        return int(value)
 
     def name(self) -> str:
         """The path of a file inside the folder it is relative to."""
-        return check_inside(str(self.value), self.where)
+        return check_inside(self.text(), self.where)
 
     def numbers(self, *shape: int) -> Tensor:
         """A nested list of numbers as a float64 tensor; of the given shape, if one is given.
@@ -57,11 +69,17 @@ class Json:
         """
         try:
             tensor = torch.tensor(self.value, dtype=torch.float64)
-        except (TypeError, ValueError, RuntimeError) as error:
+        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
             raise DataError(f"{self.where} is not an array of numbers ({error})") from error
         if shape and tensor.shape != shape:
             raise DataError(f"{self.where} has the shape {list(tensor.shape)}; it must be {list(shape)}")
         return tensor
+
+    def _of(self, kind: type | tuple[type, ...], words: str) -> Any:
+        """The value, which is of this type, or refused."""
+        if not isinstance(self.value, kind):
+            raise DataError(f"{self.where} must be {words}, not {type(self.value).__name__}")
+        return self.value
 
 
 def read_json(path: Path) -> Json:
@@ -72,7 +90,7 @@ def read_json(path: Path) -> Json:
     """
     try:
         return Json(json.loads(read_bytes(path).decode("utf-8-sig")), str(path))
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # not UTF-8, not JSON, a number of thousands of digits, too deep
         raise DataError(f"{path} is not valid JSON ({error}); export it again") from error
 
 

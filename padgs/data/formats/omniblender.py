@@ -22,10 +22,11 @@ def read(path: Path, options: DataOptions) -> Capture:
     file = file_in(path, "transform.json")
     meta = read_json(file)
     images = image_folder(file.parent, options.images)
+    width, height = (side and side.whole() for side in (meta.get("width"), meta.get("height")))
     frames = []
     for item in meta["frames"].entries():
         name = item["file_path"].name()
         matrix = Json(item.value, f"{name} in {file}")["transform_matrix"]
         pose = cam_from_opengl_pose(matrix.numbers(4, 4), matrix.where)
-        frames.append(Frame(name, images / name, pose, meta.get("width"), meta.get("height")))
+        frames.append(Frame(name, images / name, pose, width, height))
     return Capture("omniblender", file.parent, images, tuple(frames), existing_ply(file.parent, _PLY))

@@ -6,8 +6,7 @@ An extrinsic is the rotation cam from world (row by row) and the camera's centre
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from pathlib import Path, PurePosixPath
 
 from torch import Tensor
 
@@ -29,19 +28,19 @@ def read(path: Path, options: DataOptions) -> Capture:
     folder, data = file.parent, read_json(file)
     _check_cameras(data)
     views, poses = read_views(data), read_extrinsics(data)
-    root = Path(str(data.get("root_path", "")))  # where it was on the machine that reconstructed
-    usual = ("images", "imgs", root.name) if root.name else ("images", "imgs")
-    images = image_folder(folder, options.images, usual)
-    if options.images is None and images == folder and root.is_dir():
-        images = root
+    # Where the images were on the machine that reconstructed. Only its last name counts: a file from elsewhere must not
+    # reach other folders.
+    stated = data.get("root_path")
+    root = PurePosixPath(stated.text().replace("\\", "/")).name if stated else ""
+    images = image_folder(folder, options.images, ("images", "imgs", *([root] if root not in ("", "..") else [])))
     posed = [view for view in views if view.pose in poses]
     frames = tuple(Frame(view.name, images / view.name, poses[view.pose], view.width, view.height) for view in posed)
-    structure = data.get("structure") or []
+    stated = data.get("structure")
+    structure = stated.entries() if stated else []
     colored = existing_ply(folder, _PLY)
     cloud = colored
     if cloud is None and structure:
-        where = f"structure of {file}"
-        points = Json([Json(item, where)["value"]["X"].value for item in structure], f"X of the {where}")
+        points = Json([item["value"]["X"].value for item in structure], f"X of the structure of {file}")
         cloud = Cloud(points.numbers(len(structure), 3), None)
     return Capture(
         format="openmvg",
@@ -70,12 +69,12 @@ def read_views(data: Json) -> list[MvgView]:
     views = []
     for item in data["views"].entries():
         view = item["value"]["ptr_wrapper"]["data"]
-        local = str(view.get("local_path", "")).strip("/")
-        name = str(view["filename"].value)
-        name = check_inside(f"{local}/{name}" if local else name, data.where)
-        key = int(item["key"].value)
-        size = int(view["width"].value), int(view["height"].value)
-        views.append(MvgView(key, int(view.get("id_pose", key)), name, *size))
+        local, name = view.get("local_path"), view["filename"].text()
+        folder = local.text().strip("/") if local else ""
+        name = check_inside(f"{folder}/{name}" if folder else name, data.where)
+        key = item["key"].whole()
+        pose = view.get("id_pose") or item["key"]
+        views.append(MvgView(key, pose.whole(), name, view["width"].whole(), view["height"].whole()))
     return views
 
 
@@ -83,7 +82,7 @@ def read_extrinsics(data: Json) -> dict[int, Tensor]:
     """Key of the pose -> cam_from_world [4, 4] float64."""
     poses = {}
     for item in data["extrinsics"].entries():
-        key = int(item["key"].value)
+        key = item["key"].whole()
         pose = Json(item["value"].value, f"extrinsic {key} of {data.where}")
         poses[key] = cam_from_center(pose["rotation"].numbers(3, 3), pose["center"].numbers(3), pose.where)
     if not poses:
@@ -97,14 +96,15 @@ def _check_cameras(data: Json) -> None:
     """cereal names a class where it first occurs, so a file of only spherical cameras names "spherical" once."""
     for item in data["intrinsics"].entries():
         name = item["value"].get("polymorphic_name")
-        if name not in (None, "spherical"):
-            raise DataError(f"{data.where} holds a {name!r} camera; only spherical ones (panoramas) can be used")
+        if name and name.text() != "spherical":
+            raise DataError(f"{data.where} holds a {name.text()!r} camera; only spherical ones (panoramas) can be used")
 
 
-def _tracks(structure: list[Any], frame_of_view: dict[int, int]) -> Tracks:
+def _tracks(structure: list[Json], frame_of_view: dict[int, int]) -> Tracks:
     return Tracks.of(
-        (frame_of_view[seen["key"]], point, seen["value"]["x"])
+        (frame_of_view[key], point, seen["value"]["x"].numbers(2).tolist())
         for point, item in enumerate(structure)
-        for seen in item["value"].get("observations", [])
-        if seen["key"] in frame_of_view
+        if (observations := item["value"].get("observations"))
+        for seen in observations.entries()
+        if (key := seen["key"].whole()) in frame_of_view
     )

@@ -11,6 +11,7 @@ from torch import Tensor
 from padgs.data.errors import DataError
 
 TOLERANCE = 1e-3  # of R R^T against the identity; files with four digits pass, scaled or sheared matrices do not
+FURTHEST = 1e15  # world units, as for what renderers draw (`padgs.render.contract`)
 
 # Rotations between the camera frames in use: `OPENCV_FROM_OPENGL @ x_gl` is x right, y down, z forward.
 OPENCV_FROM_OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))  # y up, z backward
@@ -58,17 +59,22 @@ def cam_from_opengl_pose(world_from_cam: Tensor, where: str) -> Tensor:
 
 def rotation_from_quaternion(quaternion: Tensor, where: str) -> Tensor:
     """[3, 3] of a quaternion (w, x, y, z); its length must be 1 up to rounding."""
-    quaternion = _finite(quaternion, where)
-    length = quaternion.norm().item()
-    if abs(length - 1) > 0.01:
-        raise DataError(f"{where}: the quaternion has the length {length:.4g}; it must be 1")
-    w, x, y, z = (quaternion / length).tolist()
+    w, x, y, z = checked_quaternion(quaternion, where).tolist()
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     return torch.tensor(rows, dtype=torch.float64)
+
+
+def checked_quaternion(quaternion: Tensor, where: str) -> Tensor:
+    """A quaternion [4] whose length is 1 up to rounding, with the length 1."""
+    quaternion = _finite(quaternion, where)
+    length = quaternion.norm().item()
+    if abs(length - 1) > 0.01:
+        raise DataError(f"{where}: the quaternion has the length {length:.4g}; it must be 1")
+    return quaternion / length
 
 
 def rotation_from_vector(vector: Tensor, where: str) -> Tensor:
@@ -137,6 +143,11 @@ def _finite(values: Tensor, where: str) -> Tensor:
     if not values.isfinite().all():
         raise DataError(
             f"{where}: the pose contains {_numbers(values[~values.isfinite()][:1])}; remove the image or redo it"
+        )
+    if (far := values[values.abs() > FURTHEST]).numel():
+        raise DataError(
+            f"{where}: the pose contains {_numbers(far[:1])}; nothing farther than {FURTHEST:g} from the origin can be "
+            "drawn: remove the image or redo it"
         )
     return values
 

@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 import torch
 
 from padgs.data.assemble import image_folder, image_names
-from padgs.data.capture import Capture, Cloud, Frame
+from padgs.data.capture import Capture, Cloud, Frame, color_bytes
 from padgs.data.cloud import existing_ply
 from padgs.data.errors import DataError
 from padgs.data.formats.colmap import image_lines
@@ -57,4 +57,4 @@ def _cloud(file: Path) -> Cloud | None:
         raise DataError(f"{file}: a point is not 'id x y z red green blue error' ({error})") from error
     if values.shape[1] < 6:
         raise DataError(f"{file}: a point has {values.shape[1] + 1} fields; it must have id x y z red green blue")
-    return Cloud(values[:, :3], values[:, 3:].clamp(0, 255).to(torch.uint8))
+    return Cloud(values[:, :3], color_bytes(values[:, 3:6], str(file)))

@@ -16,7 +16,6 @@ from padgs.data.formats.poses import cam_from_opengl_pose
 from padgs.data.images import EXTENSIONS
 from padgs.data.options import DataOptions
 from padgs.data.ply import read_ply
-from padgs.data.splits import check_inside
 
 FILE = "transforms.json"
 SIDES = {"train": "transforms_train.json", "test": "transforms_test.json"}
@@ -49,13 +48,13 @@ def read(path: Path, options: DataOptions) -> Capture:
     first = next(iter(metas.values()))
     for side in SIDES:
         if "" in metas and (names := first.get(f"{side}_filenames")):
-            split[side] = tuple(_name(str(name), first.where) for name in names)
+            split[side] = tuple(_name(name) for name in names.entries())
     prefix = _shared_folder([frame.name for frame in frames])
     if prefix:
         frames = [replace(frame, name=frame.name.removeprefix(f"{prefix}/")) for frame in frames]
         split = {side: tuple(name.removeprefix(f"{prefix}/") for name in names) for side, names in split.items()}
     named = first.get("ply_file_path")
-    cloud = read_ply(folder / check_inside(named, str(file))) if named else existing_ply(folder, _PLY)
+    cloud = read_ply(folder / named.name()) if named else existing_ply(folder, _PLY)
     return Capture(
         format="transforms",
         folder=folder,
@@ -67,8 +66,9 @@ def read(path: Path, options: DataOptions) -> Capture:
 
 
 def _frame(meta: Json, frame: Json, root: Path) -> Frame:
-    name = _name(str(frame["file_path"].value), meta.where)
-    model = frame.get("camera_model", meta.get("camera_model"))
+    name = _name(frame["file_path"])
+    stated = frame.get("camera_model") or meta.get("camera_model")
+    model = stated and stated.text()
     if model not in MODELS:
         raise DataError(
             f"{meta.where}: {name} has camera_model {model!r}; only EQUIRECTANGULAR panoramas can be used "
@@ -79,19 +79,19 @@ def _frame(meta: Json, frame: Json, root: Path) -> Frame:
         name = found[0] if found else f"{name}.png"
     matrix = Json(frame.value, f"{name} in {meta.where}")["transform_matrix"]
     mask = frame.get("mask_path")
-    width, height = (frame.get(key, meta.get(key)) for key in ("w", "h"))
+    width, height = (frame.get(key) or meta.get(key) for key in ("w", "h"))
     return Frame(
         name=name,
         image=root / name,
         cam_from_world=cam_from_opengl_pose(matrix.numbers(), matrix.where),
-        width=None if width is None else int(width),
-        height=None if height is None else int(height),
-        mask=None if mask is None else root / _name(str(mask), meta.where),
+        width=width and width.whole(),
+        height=height and height.whole(),
+        mask=mask and root / _name(mask),
     )
 
 
-def _name(path: str, where: str) -> str:
-    return str(PurePosixPath(check_inside(path, where).replace("\\", "/")))
+def _name(path: Json) -> str:
+    return str(PurePosixPath(path.name().replace("\\", "/")))
 
 
 def _shared_folder(names: list[str]) -> str:

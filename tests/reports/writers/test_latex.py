@@ -4,6 +4,7 @@ import subprocess
 import pytest
 from made_up import data_set, failed, gathered, result
 
+from reports.tables.runs import runs
 from reports.tables.tables_of_methods import table1, table2, table4
 from reports.tables.variants import table3
 from reports.writers import latex
@@ -26,6 +27,15 @@ def test_every_line_of_the_tabular_has_all_columns(text):
 def test_what_latex_would_misread_is_escaped(text):
     assert r"A \& B\_1" in text and r"cat\_tower" in text
     assert not {"±", "Δ", "↑", "–"} & set(text)
+
+
+def test_no_name_is_a_command_or_ends_a_paragraph():
+    evil = result("[3pt] \\input{x}\n\n%", scene="b\x1b\n\nar", dataset="")
+    text = latex.text(runs(gathered([evil], mix=True)))
+    (row,) = [line for line in text.splitlines() if "input" in line]
+    assert r"\textbackslash{}input\{x\}  \%" in row and "\x1b" not in text and "\n\n" not in text
+    assert r"\emph{b   ar" in text
+    assert latex._line(["[3pt]", "1"]) == r"    {}[3pt] & 1 \\"
 
 
 def test_numbers_and_emphasis(text):

@@ -1,0 +1,62 @@
+"""What no run could do anything sensible with is found when its configuration is composed."""
+
+import pytest
+from composed import configuration
+
+from padgs.multirun.composition import composing
+from padgs.runs.typed import ConfigError
+
+MEANINGLESS = {
+    "render.near=inf": "render.near is inf; it must be finite",
+    "render.low_pass=inf": "it must be finite",
+    "render.pixel_bias=nan": "render.pixel_bias is nan",
+    "train.max_seconds=-1": "max_seconds is -1.0; it must be > 0",
+    "run.checkpoint_seconds=nan": "it must be finite",
+    "run.checkpoint_seconds=-1": "checkpoint_seconds is -1.0; it must be >= 0",
+    "seed=-1": "seed is -1",
+    "method.gradient_threshold=nan": "it must be finite",
+    "method.gradient_threshold=-1": "gradient_threshold is -1.0",
+    "method=omnigs method.gradient_threshold=-1": "gradient_threshold is -1.0",
+    "method=omnigs method.percent_dense=-1": "percent_dense is -1.0",
+    "method=omnigs method.min_opacity=2": "min_opacity is 2.0; it must be an opacity below 1",
+}
+TOO_LATE = {
+    "render.projection=erpp": "unknown projection 'erpp'; known: erp, pinhole, tangent, ray",
+    "method=padgs render.projection=pinhole": "cubemap=true draws panoramas with it",
+    "render.backend=gpu": "unknown backend 'gpu'; known: auto, torch, cpu, cuda",
+    "method=seam360gs render.projection=erp": "made for a Panorama camera, not a RayTable",
+    "method=crops_3dgs render.projection=erp render.cubemap=false": "made for a Panorama camera, not a Pinhole",
+    "method=cubemap_3dgs train.weight=solid_angle": "have no latitude; set uniform",
+    "method=egonerf render.projection=ray": "egonerf casts rays",
+    "method=spags render=default": "signal=space_absolute is made for render.projection=ray",
+    "render.projection=ray render.bounds=square render.wrap=false": "has no square bounds",
+    "render.core_size=1000": "core_size is 1000; it must be from 1 to 256",
+    "method=omnigs method.sh_degree=9": "sh_degree is 9; it must be 0 to 3",
+    "method=padgs method.voxel_size=-1": "voxel_size is -1.0; it must be a length > 0",
+    "method=padgs data.voxel_size=-1": "voxel_size is -1.0",
+    "method=padgs method.offset_rate=[0,1]": "it must be two rates > 0",
+    "method=padgs method.feature_rate=-1": "feature_rate is -1.0",
+    "data.format=x": "unknown format 'x'; known: auto, colmap",
+    "data.dataset=x": "unknown dataset 'x'; known: roam360",
+}
+OF_ANOTHER_TYPE = {
+    "protocol.paper=null": "protocol.paper is None; it must be a group of keys",
+    "protocol.paper.lpips=3": "protocol.paper.lpips is 3; it must be a text",
+    "data.generator=3": "data.generator is 3; it must be a group of keys",
+    "data.generator.width=abc": "data.generator.width is 'abc'; it must be a whole number",
+    "data.generator.width=9": "width 9 is not an even number",
+    "data.generator.x=1": "unknown key data.generator.x; known: data.generator.scene",
+}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def composed_once():
+    with composing():
+        yield
+
+
+@pytest.mark.parametrize("line, message", [*MEANINGLESS.items(), *TOO_LATE.items(), *OF_ANOTHER_TYPE.items()])
+def test_what_makes_no_sense_is_refused_at_composition(line, message):
+    with pytest.raises(ConfigError) as refused:
+        configuration(line.split())
+    assert message in str(refused.value)
