@@ -216,11 +216,13 @@ def scene_of(config: RunConfig, device: torch.device) -> Scene:
 
     Raises:
         DataError: the input cannot be used.
+        ValueError: nor can it be stressed so.
     """
     images_on = str(device) if config.run.images_on == "device" else config.run.images_on
-    return data.load(config.data.path, config.data.format, config.data.options(images_on)).to(device)
+    scene = data.load(config.data.path, config.data.format, config.data.options(images_on)).to(device)
+    return config.stress.scene(scene, config.seed)
 
 
 def build(config: RunConfig) -> Method:
     """The method of a configuration, untrained."""
-    return lookup(METHODS, config.method, "method")(config.options, config.render, config.train, seed=config.seed)
+    return lookup(METHODS, config.method, "method")(config.options, config.render, config.training, seed=config.seed)

@@ -20,7 +20,7 @@ MISSING = "–"
 def introduce(config: RunConfig, scene: Scene, folder: Path, console: Console) -> None:
     """Print what is trained on what, the notes of the loader, and where the files will be."""
     view = scene.train[0]
-    what = f"{config.preset}{f' ({config.variant})' if config.variant else ''} on {scene.name}"
+    what = f"{config.preset}{f' ({config.row})' if config.row else ''} on {scene.name}"
     views = f"{len(scene.train)} training and {len(scene.test)} test views of {view.width}x{view.height}"
     say = partial(console.print, highlight=False, soft_wrap=True)
     say(f"[bold]{what}[/]: {views}, {len(scene.points)} points, {config.time}")
