@@ -29,6 +29,7 @@ MORE = 10  # times as many parts as at the start, or as all training views have 
 ADVICE = "train.monitor=false lets such a run go on"
 GRADIENT = "gradient of "
 LARGER = 10  # times as large as all that there was at the start
+MANY = 0.01  # share of the Gaussians; single ones of PaD-GS grow without any harm
 
 
 class Monitor:
@@ -105,18 +106,19 @@ class Monitor:
                 f"the picture has {shares:.3g} of the variance of the photograph at iteration {iteration}, and since "
                 f"{since}; {ADVICE}",
             )
-        scales = drawing.gaussians.scales.detach()
-        largest = scales.max().item()
+        largest = drawing.gaussians.scales.detach().amax(-1)
         if self.state["largest"] is None:
-            distances = drawing.gaussians.means.detach().double().std(0, correction=0).norm().item()
-            self.state["largest"] = max(largest, distances)
+            extent = drawing.gaussians.means.detach().double().std(0, correction=0).norm().item()
+            self.state["largest"] = max(largest.max().item(), extent)
         limit = LARGER * self.state["largest"]
-        if since := self._lasting("large", largest > limit, iteration):
-            row, axis = divmod(int(scales.argmax()), 3)
+        share = (largest > limit).float().mean().item()
+        if since := self._lasting("large", share > MANY, iteration):
+            row = int(largest.argmax())
             raise Failure(
                 "exploded",
-                f"scales[{row}, {axis}] is {largest:.3g} world units at iteration {iteration}, more than {LARGER} "
-                f"times all that there was at the start ({limit / LARGER:.3g}), since {since}; {ADVICE}",
+                f"scales[{row}] is {largest[row].item():.3g} world units at iteration {iteration}; since {since} more "
+                f"than {MANY:.0%} of all are {LARGER} times as large as anything at the start, {limit / LARGER:.3g}; "
+                f"{ADVICE}",
             )
 
     def gradients(self, without: Sequence[str], iteration: int) -> None:

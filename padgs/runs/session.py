@@ -124,7 +124,7 @@ class Session:
                     folder.save(method, progress)
             result = replace(result, **self._trained(method, progress))
             if self.scene.test:
-                result = replace(result, **self._tested(method, progress))
+                result = outcome.judged(replace(result, **self._tested(method, progress)))
         except Interrupted:
             raise
         except KeyboardInterrupt as error:
@@ -200,7 +200,8 @@ class Session:
                 )
             method = build(self.config)
             self.folder.resume(method, self.scene.points.device)
-            complete = replace(complete, scores={**result.scores, **scores(method, self.scene, unscored, None)})
+            marks = {**result.scores, **scores(method, self.scene, unscored, None)}
+            complete = outcome.judged(replace(complete, scores=marks))
         return result if complete == result else self.folder.finish(complete)
 
     def _say(self, text: str) -> None:

@@ -62,7 +62,7 @@ def rolled(scene: Scene, degrees: float | None, random: np.random.Generator) -> 
 
 
 def pitched(scene: Scene, degrees: float, random: np.random.Generator) -> Scene:
-    """All cameras look up by so much: what was at the horizon comes to the poles."""
+    """All cameras look down by so much: what was at the horizon comes to the poles."""
     turn = torch.from_numpy(Rotation.from_rotvec((degrees, 0, 0), degrees=True).as_matrix())
 
     def pitch(view: View) -> View:
