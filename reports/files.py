@@ -12,8 +12,8 @@ from reports.writers import csv_text, latex, markdown
 WRITERS = {"md": markdown.text, "tex": latex.text, "csv": csv_text.text}
 
 
-def files(made: Table | Page | Sequence[Chart] | str) -> Iterator[tuple[str, bytes]]:
-    """The files of a table, of charts or of pages; none of a table that has nothing in it."""
+def files(made: Table | Page | Chart | Sequence[Table | Chart] | str) -> Iterator[tuple[str, bytes]]:
+    """The files of a table, a chart or a page, or of several; none of a table that has nothing in it."""
     if isinstance(made, str):
         yield "report.html", made.encode()
     elif isinstance(made, Page):
@@ -21,9 +21,11 @@ def files(made: Table | Page | Sequence[Chart] | str) -> Iterator[tuple[str, byt
     elif isinstance(made, Table):
         for extension, text in WRITERS.items() if made.blocks else ():
             yield f"{made.name}.{extension}", text(made).encode()
+    elif isinstance(made, Chart):
+        yield f"{made.name}.svg", made.svg.encode()
+        yield f"{made.name}.png", made.png
+        if made.numbers is not None:
+            yield f"{made.name}.csv", csv_text.of_frame(made.numbers).encode()
     else:
-        for chart in made:
-            yield f"{chart.name}.svg", chart.svg.encode()
-            yield f"{chart.name}.png", chart.png
-            if chart.numbers is not None:
-                yield f"{chart.name}.csv", csv_text.of_frame(chart.numbers).encode()
+        for part in made:
+            yield from files(part)

@@ -41,7 +41,7 @@ def evaluated(method: Method, scene: Scene, protocol: Protocol, on_view: OnView 
 
 
 def stability(method: Method, scene: Scene, protocol: Protocol, on_view: OnView | None) -> Scores:
-    """The same, and besides: geometry (`padgs.scoring.geometry`), and the WS-PSNR of one colour and of training views."""
+    """The same, and besides: geometry (`padgs.scoring.geometry`), the WS-PSNR of one colour, and of training views."""
 
     def also(view: View, rendering: Rendering) -> Marks:
         truth, mask = view.image(device=rendering.image.device), view.mask(device=rendering.image.device)
