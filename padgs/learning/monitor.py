@@ -45,7 +45,7 @@ class Monitor:
         """
         self._iterations, self._start, self._most = iterations, parts, MORE * max(parts, pixels)
         self._smoothed = max(SMOOTHED, SMOOTHED_SHARE * iterations)
-        self.state: dict[str, Any] = {"average": None, "best": None, "seen": 0, "largest": None, "since": {}}
+        self.state: dict[str, Any] = {"sum": 0.0, "weight": 0.0, "seen": 0, "best": None, "largest": None, "since": {}}
 
     def loss(self, value: float, iteration: int) -> None:
         """Take in the loss of an iteration.
@@ -54,11 +54,11 @@ class Monitor:
             Failure: diverged.
         """
         state = self.state
-        average, seen = state["average"], state["seen"]
-        if average is None:
-            average = value
-        average += (value - average) * -math.expm1((seen - iteration) / self._smoothed)
-        state["average"], state["seen"] = average, iteration
+        new = -math.expm1((state["seen"] - iteration) / self._smoothed)
+        state["sum"] += (value - state["sum"]) * new
+        state["weight"] += (1 - state["weight"]) * new
+        state["seen"] = iteration
+        average = state["sum"] / state["weight"]
         if iteration >= self._smoothed:
             state["best"] = average if state["best"] is None else min(average, state["best"])
         best = state["best"]
