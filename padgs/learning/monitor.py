@@ -21,6 +21,7 @@ LASTING, LEAST = 0.1, 100  # a sign lasts for this share of the run, and for so 
 SILENT = 0.25  # share of the run, of silence
 SMOOTHED = 20  # iterations that the loss is averaged over, at least; or the share below of the run
 SMOOTHED_SHARE = 0.02
+FIRST = 5  # iterations that are no best loss yet: single views are easy
 WORSE = 1.5  # times the best average loss
 FEWER = 0.01  # of the parts of the model at the start
 FLATTER = 0.01  # of the variance of the photograph
@@ -59,7 +60,7 @@ class Monitor:
         state["weight"] += (1 - state["weight"]) * new
         state["seen"] = iteration
         average = state["sum"] / state["weight"]
-        if iteration >= self._smoothed:
+        if iteration >= FIRST:
             state["best"] = average if state["best"] is None else min(average, state["best"])
         best = state["best"]
         if since := self._lasting("diverged", best is not None and average > WORSE * best, iteration):
