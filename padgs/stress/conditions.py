@@ -48,7 +48,7 @@ CONDITIONS: Mapping[str, Condition] = {
     "world_rotation": Condition("the world is turned by {} degrees about a tilted axis", (15, 45, 90), worlds.turned),
     "seam": Condition("all cameras turn about their vertical by {} degrees", (90, 180, None), pictures.rolled),
     "pitch": Condition("all cameras look down by {} degrees", (30, 60, 90), pictures.pitched),
-    "world_scale": Condition("a world unit is 1/{} of what it was", (0.1, 10, 100), worlds.scaled),
+    "world_scale": Condition("all lengths are {} times what they were", (0.1, 10, 100), worlds.scaled),
     "near_points": Condition("{:.0%} of the points hang before the cameras", (0.01, 0.05, 0.1), clouds.in_the_face),
     "few_points": Condition("{:.1%} of the points are left", (0.1, 0.01, 0.001), clouds.sparse),
     "random_points": Condition("the points are random: {}", ("box", "sphere", "shell"), clouds.made_up),
