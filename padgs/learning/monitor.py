@@ -34,18 +34,22 @@ MANY = 0.01  # share of the Gaussians; single ones of PaD-GS grow without any ha
 
 
 class Monitor:
-    """Of one run. `state` holds all that it remembers, as JSON can."""
+    """Of one run. `state` holds all that it remembers, as JSON can.
+
+    `moment` is the iteration of the schedule that is looked at, where the schedule follows the clock; None: the same.
+    """
 
     def __init__(self, iterations: int, parts: int, pixels: int) -> None:
         """Nothing was seen yet.
 
         Args:
-            iterations: of the run.
+            iterations: of the schedule.
             parts: Gaussians, anchors or other parts that the model starts with; the largest of its counts.
             pixels: of all training views.
         """
         self._iterations, self._start, self._most = iterations, parts, MORE * max(parts, pixels)
         self._smoothed = max(SMOOTHED, SMOOTHED_SHARE * iterations)
+        self.moment: int | None = None
         self.state: dict[str, Any] = {"sum": 0.0, "weight": 0.0, "seen": 0, "best": None, "largest": None, "since": {}}
 
     def loss(self, value: float, iteration: int) -> None:
@@ -141,5 +145,6 @@ class Monitor:
         if not holds:
             since.pop(sign, None)
             return None
-        first = since.setdefault(sign, iteration)
-        return first if iteration - first >= max(LEAST, share * self._iterations) else None
+        moment = iteration if self.moment is None else self.moment
+        first, began = since.setdefault(sign, [iteration, moment])
+        return first if iteration - first >= LEAST and moment - began >= share * self._iterations else None

@@ -121,6 +121,16 @@ def test_parameters_without_a_gradient_are_silent_after_a_quarter_of_the_run():
         late.gradients(("sh_rest",) if iteration <= 200 else (), iteration)
 
 
+def test_where_the_schedule_follows_the_clock_a_sign_lasts_for_a_share_of_it():
+    watch = monitor()
+    for iteration in range(1, 2000):  # 2000 steps are a tenth of the schedule
+        watch.moment = iteration // 20
+        watch.counts({"gaussians": 9}, iteration)
+    watch.moment = 101
+    with pytest.raises(Failure, match="few since 1"):
+        watch.counts({"gaussians": 9}, 2001)
+
+
 def test_what_it_remembers_is_json_and_goes_on():
     first, second = monitor(), monitor()
     for iteration in range(1, 150):
