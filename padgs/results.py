@@ -28,14 +28,19 @@ STATUSES = {
     "ok": "trained to the end and evaluated",
     "oom": "an allocation failed, or memory would have passed the declared limit",
     "nan": "a loss, gradient or parameter was not finite",
+    "diverged": "the loss rose far above its best and stayed there, or test views are worse than one mean colour",
     "collapsed": "next to nothing was left to draw",
+    "exploded": "Gaussians grew far beyond the scene, or in number beyond all pixels",
+    "degenerate": "pictures may be fine, but the depth behind them is wrong",
+    "silent": "nothing pulled at some of the parameters",
     "timeout": "the time limit came before the last iteration",
     "rejected": "the input was refused with a clear error",
 }
 # Keys of a configuration that no trained number depends on but by rounding: of the machine, and the others. What was
-# read is said by the fingerprint of the data; scoring comes after training. `data.device` is in files of old runs only.
+# read is said by the fingerprint of the data; scoring comes after training; a monitor changes no number, but may end a
+# run. `data.device` is in files of old runs only.
 OF_THE_MACHINE = ("run", "render.max_instances", "data.cache_bytes", "data.read_ahead", "data.device")
-DECIDE_NOTHING = (*OF_THE_MACHINE, "data.path", "protocol")
+DECIDE_NOTHING = (*OF_THE_MACHINE, "data.path", "protocol", "train.monitor")
 # What is no more than a name, even in a command line or a path; `@` parts an experiment from its scale.
 PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*(@[A-Za-z0-9._-]+)?")
 HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "lpips": False, "seam": False}  # of every metric with the word in it

@@ -32,6 +32,7 @@ class View:
     load_pixels: Callable[[], Tensor] | None = None  # () -> [H, W, 3] uint8
     load_mask: Callable[[], Tensor] | None = None  # () -> [H, W] float32 in [0, 1], 0 = ignore this pixel
     lens: Camera | None = None  # None: a panorama of this size
+    load_depth: Callable[[], Tensor] | None = None  # () -> [H, W] true distance, world units, inf = sky; where known
 
     @property
     def camera(self) -> Camera:
@@ -66,7 +67,7 @@ class View:
 
     def at(self, cam_from_world: Tensor) -> View:
         """The same camera at another pose [4, 4], without pixels."""
-        return replace(self, cam_from_world=cam_from_world, load_pixels=None, load_mask=None)
+        return replace(self, cam_from_world=cam_from_world, load_pixels=None, load_mask=None, load_depth=None)
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from reports.writers import csv_text, latex, markdown
 WRITERS = {"md": markdown.text, "tex": latex.text, "csv": csv_text.text}
 
 
-def files(made: Table | Page | Sequence[Chart] | str) -> Iterator[tuple[str, bytes]]:
-    """The files of a table, of charts or of pages; none of a table that has nothing in it.
+def files(made: Table | Page | Chart | Sequence[Table | Chart] | str) -> Iterator[tuple[str, bytes]]:
+    """The files of a table, a chart or a page, or of several; none of a table that has nothing in it.
 
     Names of charts are those of scenes and sweeps, which may come from elsewhere; a file is in its folder all the same.
     """
@@ -25,10 +25,12 @@ def files(made: Table | Page | Sequence[Chart] | str) -> Iterator[tuple[str, byt
     elif isinstance(made, Table):
         for extension, text in WRITERS.items() if made.blocks else ():
             yield f"{made.name}.{extension}", text(made).encode()
+    elif isinstance(made, Chart):
+        name = file_name(made.name)
+        yield f"{name}.svg", made.svg.encode()
+        yield f"{name}.png", made.png
+        if made.numbers is not None:
+            yield f"{name}.csv", csv_text.of_frame(made.numbers).encode()
     else:
-        for chart in made:
-            name = file_name(chart.name)
-            yield f"{name}.svg", chart.svg.encode()
-            yield f"{name}.png", chart.png
-            if chart.numbers is not None:
-                yield f"{name}.csv", csv_text.of_frame(chart.numbers).encode()
+        for part in made:
+            yield from files(part)

@@ -26,6 +26,7 @@ from padgs.render.config import RenderConfig
 from padgs.runs.config import RunOptions, TrainConfig
 from padgs.runs.typed import ConfigError
 from padgs.scoring.protocols import PROTOCOLS, ROAM_360_BOTTOM_CROP
+from padgs.stress.conditions import CONDITIONS
 from reports.unranked import MENDS
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
@@ -54,7 +55,7 @@ def test_without_arguments_all_values_are_the_defaults_of_the_dataclasses():
     assert paper.options == PaDGSMethodOptions() and paper.render == RenderConfig()
     assert config.run == RunOptions()
     assert replace(config.train, iterations=1) == TrainConfig(iterations=1)
-    assert config.protocols == PROTOCOLS
+    assert config.protocols == {name: PROTOCOLS[name] for name in ("paper", "sphere")}
     assert config.data.path is None and config.data.generator == {"scene": "room"}
 
 
@@ -142,6 +143,12 @@ def test_one_scene_indoors_and_one_outdoors_stand_in_for_the_data_sets():
     }
     room, outdoor = {"room"}, {"outdoor"}
     assert list(scenes.values()) == [room, room, outdoor, outdoor, room | outdoor]
+
+
+def test_the_stress_experiment_puts_every_method_under_every_condition_and_under_none():
+    stresses = {tuple(setting for setting in job if "stress." in setting) for job in expanded("+experiment=stress")}
+    names = ("none", *CONDITIONS)
+    assert stresses == {(f"++stress.condition={name}", f"++stress.level={n}") for name in names for n in (1, 2, 3)}
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)

@@ -23,6 +23,7 @@ ROOMS = (
     "padgs.native",
     "padgs.render",
     "padgs.learning",
+    "padgs.stress",
     "padgs.splats",
     "padgs.plus",
     "padgs.anchors",

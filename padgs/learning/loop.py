@@ -7,6 +7,7 @@ Knows no files.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
@@ -20,6 +21,7 @@ from padgs.checks import check, check_known
 from padgs.learning.budget import Budget
 from padgs.learning.failure import Failure, is_out_of_memory, memory_reason
 from padgs.learning.loss import NORMALISATIONS, ROW_WEIGHTS, photometric_loss
+from padgs.learning.monitor import Monitor
 from padgs.learning.optimiser import Optimiser
 from padgs.learning.order import Order, ViewOrder
 from padgs.learning.schedule import LEARNING_RATES, Pace
@@ -55,6 +57,7 @@ class TrainOptions:
     # a factor on the published ones, at the beginning.
     learning_rates: str | float = "run"
     check_every: int = 50  # iterations between checks of all gradients and parameters; the loss is checked at each
+    monitor: bool = True  # end a run that diverges, explodes, collapses or falls silent: see `padgs.learning.monitor`
 
     def __post_init__(self) -> None:
         check(self, "in [0, 1]", lambda share: 0 <= share <= 1, "lambda_l1")
@@ -110,6 +113,8 @@ class Trainer:
         self._targets = Targets(scene.train, options.weight, self._optimiser.device)
         self._views = ViewOrder(scene, seed)
         self._order: Order = self._views
+        pixels = sum(view.width * view.height for view in scene.train)
+        self._monitor = Monitor(budget.iterations, max(trainee.counts().values()), pixels) if options.monitor else None
 
     def records(self) -> Iterator[Record]:
         """Train to the end of the budget, yielding a record after each iteration.
@@ -118,19 +123,22 @@ class Trainer:
         the iteration of the last record and decides which status that is.
 
         Raises:
-            Failure: nan (a loss, gradient or parameter is not finite; the reason names it and the iteration), oom, or
-                collapsed (nothing is left to draw). The model is of no use then.
+            Failure: nan (a loss, gradient or parameter is not finite; the reason names it and the iteration), oom,
+                collapsed (nothing is left to draw), or what a `Monitor` sees. The model is of no use then.
         """
         budget, limit = self._budget, self._budget.max_seconds
         while self.moment < budget.iterations and (limit is None or self.seconds < limit):
             lap, iteration = Lap(), self.iteration + 1
             moment = budget.moment(self.moment, self.spent, self.step_seconds)
+            if self._monitor is not None:
+                self._monitor.moment = moment
             try:
                 loss, counts, events = self._step(iteration, moment)
             except (MemoryError, RuntimeError) as error:
                 if isinstance(error, Failure) or not is_out_of_memory(error):
                     raise
                 raise Failure("oom", f"out of memory at iteration {iteration}: {memory_reason(error)}") from error
+            self._watch(loss, iteration)
             if moment == budget.iterations:
                 self._optimiser.refuse_non_finite(self._optimiser.parameters(), iteration)
             self.iteration, self.moment, before = iteration, moment, self.spent
@@ -156,6 +164,16 @@ class Trainer:
             passed = range(self.moment + 1, moment + 1)  # all that comes at a moment of the schedule comes once
             events = tuple(event for one in passed for event in trainee.adapt(one, optimiser.adam))
         return sum(losses) / len(losses), {**trainee.counts(), "drawn": max(drawn)}, events
+
+    def _watch(self, loss: float | Tensor, iteration: int) -> None:
+        """Have the monitor look at an iteration."""
+        if self._monitor is None:
+            return
+        if isinstance(loss, float):  # known without waiting for a GPU
+            self._monitor.loss(loss, iteration)
+        self._monitor.counts(self._trainee.counts(), iteration)
+        if self._optimiser.is_checked(iteration):
+            self._monitor.gradients(self._optimiser.silent, iteration)
 
     def _pull(self, iteration: int, moment: int) -> tuple[float | Tensor, int]:
         """Draw the next view and add its gradients. Returns its loss, and how many Gaussians were drawn."""
@@ -187,6 +205,8 @@ class Trainer:
         if isinstance(value, float) and not math.isfinite(value):
             inputs = {field.name: getattr(drawing.gaussians, field.name) for field in fields(drawing.gaussians)}
             optimiser.refuse_non_finite({**optimiser.parameters(), **inputs, "image": image, "loss": loss}, iteration)
+        if self._monitor is not None and optimiser.is_checked(iteration):
+            self._monitor.picture(drawing, target.image, iteration)
         with stage("backward"):
             loss.backward()
         with stage("observe"), torch.no_grad():
@@ -205,6 +225,8 @@ class Trainer:
         tensors = {f"{MODEL}{name}": tensor for name, tensor in model.tensors.items()}
         tensors |= self._optimiser.tensors() | {"random/torch": torch.get_rng_state()} | order.tensors
         values = {"model": model.values, **{name: getattr(self, name) for name in self.PROGRESS}, **order.values}
+        if self._monitor is not None:
+            values["monitor"] = copy.deepcopy(self._monitor.state)
         return State({name: tensor.detach().clone() for name, tensor in tensors.items()}, values)
 
     def load_state(self, state: State) -> None:
@@ -219,3 +241,5 @@ class Trainer:
         torch.set_rng_state(state.tensors["random/torch"].cpu())
         for name in self.PROGRESS:
             setattr(self, name, state.values[name])
+        if self._monitor is not None and "monitor" in state.values:  # not in checkpoints from before there was one
+            self._monitor.state = copy.deepcopy(state.values["monitor"])

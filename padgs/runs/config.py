@@ -22,6 +22,7 @@ from padgs.runs.device import DEVICES
 from padgs.runs.identity import Labels
 from padgs.runs.typed import ConfigError, typed
 from padgs.scoring.protocols import PROTOCOLS, Protocol, protocol_from_options
+from padgs.stress.options import StressOptions
 from padgs.tracking.tracker import TrackingOptions
 
 RETRIES = ("none", "failed")
@@ -115,6 +116,7 @@ class Settings:
     train: TrainConfig = TrainConfig()
     budget: BudgetOptions = BudgetOptions()
     run: RunOptions = RunOptions()
+    stress: StressOptions = StressOptions()
     tracking: TrackingOptions = TrackingOptions()
     variant: str = ""  # name of this setting within an experiment, such as a row of the ablation
     seed: int = 0
@@ -143,13 +145,24 @@ class RunConfig(Settings):
     @property
     def time(self) -> Budget:
         """How long the method may train."""
-        return Budget(self.train.iterations, self.train.max_seconds, self.budget.seconds, self.budget.clock)
+        return Budget(self.training.iterations, self.training.max_seconds, self.budget.seconds, self.budget.clock)
+
+    @property
+    def row(self) -> str:
+        """What sets the run apart within an experiment: its variant, and what it is stressed by."""
+        return ", ".join(filter(None, (self.variant, self.stress.title)))
+
+    @property
+    def training(self) -> TrainConfig:
+        """How it is trained: as `train` says, but for what the stress changes."""
+        return self.stress.training(self.train)
 
     def values(self) -> dict[str, Any]:
         """The configuration of a run as plain values in the shape of the YAML files, defaults included.
 
-        A budget in seconds is there only if it is one: runs without are the same as before there were any.
+        Stress, and a budget in seconds, are there only if there are any: ids of runs without are what they were before.
         """
+        stress = {"stress": asdict(self.stress)} if self.stress.title else {}
         return {
             **({} if self.budget.seconds is None else {"budget": asdict(self.budget)}),
             "data": asdict(self.data),
@@ -158,6 +171,7 @@ class RunConfig(Settings):
             "train": asdict(self.train),
             "protocol": {name: asdict(protocol) for name, protocol in self.protocols.items()},
             "run": asdict(self.run),
+            **stress,
             "variant": self.variant,
             "seed": self.seed,
         }

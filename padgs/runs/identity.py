@@ -36,7 +36,8 @@ def run_id(values: Mapping[str, Any], scene: str, fingerprint: str, preset: str 
     'bar_padgs_no-m_37d2ecb9bc'
     """
     digest = hashlib.sha256(f"{config_hash(values)}|{fingerprint}".encode()).hexdigest()
-    words = [scene, preset or values["method"]["name"], values["variant"]]
+    stress = "-".join(map(str, values.get("stress", {}).values()))
+    words = [scene, preset or values["method"]["name"], values["variant"], stress]
     readable = [re.sub(r"[^A-Za-z0-9.-]+", "-", word).strip("-.") for word in words]
     return "_".join([*(word for word in readable if word), digest[:HASH_DIGITS]])
 

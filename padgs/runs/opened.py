@@ -23,9 +23,9 @@ from padgs.runs.config import RunConfig, config_from_values
 from padgs.runs.device import chosen
 from padgs.runs.folder import RunFolder, RunFolderError
 from padgs.runs.identity import config_hash
+from padgs.runs.scoring import scores
 from padgs.runs.session import build, scene_of
 from padgs.scene import Scene, View
-from padgs.scoring.evaluate import evaluate
 from padgs.scoring.protocols import PROTOCOLS
 from padgs.sphere.camera import Camera, Panorama, Pinhole
 
@@ -86,7 +86,7 @@ class OpenedRun:
         rules = {**PROTOCOLS, **self.config.protocols}
         if protocol not in rules:
             raise ValueError(f"unknown protocol {protocol!r}; known: {', '.join(rules)}")
-        return evaluate(self.method.render, self.scene.test, rules[protocol])
+        return scores(self.method, self.scene, {protocol: rules[protocol]}, None)[protocol]
 
     def camera_path(self, frames: int) -> list[View]:
         """Views along a path through the training cameras in their order, `frames` of them, evenly spaced in number.

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from padgs import clock
 from padgs.learning.failure import Failure, is_out_of_memory, memory_reason
 from padgs.results import Result
 from padgs.runs.config import RunConfig
 from padgs.runs.identity import config_hash
+from padgs.runs.scoring import STABILITY
 from padgs.scene import Scene
+
+WRONG_DEPTH = 0.5  # AbsRel
 
 
 def begun(config: RunConfig, scene: Scene, run: str) -> Result:
@@ -20,12 +25,12 @@ def begun(config: RunConfig, scene: Scene, run: str) -> Result:
         status="ok",
         method=config.method,
         preset=config.preset,
-        variant=config.variant,
+        variant=config.row,
         dataset=config.data.dataset or ("" if config.data.path else "synthetic"),
         scene=scene.name,
         width=view.width,
         height=view.height,
-        iterations=config.train.iterations,
+        iterations=config.training.iterations,
         iterations_done=0,
         seed=config.seed,
         code_version=" ".join(part for part in (machine["padgs"], (machine["commit"] or "")[:10]) if part) or "unknown",
@@ -52,6 +57,21 @@ def status(error: Exception) -> str:
 def reason(error: Exception) -> str:
     """Why a run failed, in words."""
     return str(error) if isinstance(error, (Failure, ValueError)) else f"out of memory: {memory_reason(error)}"
+
+
+def judged(result: Result) -> Result:
+    """The result with its status, now that it has marks under the protocol `stability`; without them as it is."""
+    marks = result.scores[STABILITY].metrics if STABILITY in result.scores else {}
+    quality, one_color, depth = (marks.get(name) for name in ("ws_psnr", "ws_psnr_one_color", "depth_error"))
+    if not result.ok:
+        return result
+    if quality is not None and one_color is not None and quality < one_color:
+        reason = f"WS-PSNR {quality:.2f} dB, and one colour for all would have {one_color:.2f} dB"
+        return replace(result, status="diverged", reason=reason)
+    if depth is not None and depth > WRONG_DEPTH:
+        reason = f"depths are off by {depth:.0%} on average (AbsRel), more than {WRONG_DEPTH:.0%}"
+        return replace(result, status="degenerate", reason=reason)
+    return result
 
 
 def peak_memory(scene: Scene) -> dict[str, int | None]:

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from itertools import cycle, islice
 from typing import Any
 
 from padgs.clock import summary, timed
 from padgs.learning.method import Method
+from padgs.render import Rendering
 from padgs.results import Scores
 from padgs.scene import Scene, View
-from padgs.scoring.evaluate import OnView, evaluate
-from padgs.scoring.metrics import psnr
+from padgs.scoring import geometry
+from padgs.scoring.evaluate import Marks, OnView, evaluate
+from padgs.scoring.metrics import mean_color, psnr
 from padgs.scoring.protocols import Protocol
 from padgs.sphere.panorama import row_latitudes
 
 POLAR = 85.0  # degrees
+STABILITY = "stability"  # the protocol that has more than image metrics
 FRAMES = 10  # timed at least, and each test view once
 
 
@@ -27,8 +30,27 @@ def scores(
     """The marks of the test views under each protocol; pictures are saved once."""
     found = {}
     for name, protocol in protocols.items():
-        found[name] = evaluate(method.render, scene.test, protocol, on_view=None if found else save_picture)
+        scored = stability if name == STABILITY else evaluated
+        found[name] = scored(method, scene, protocol, None if found else save_picture)
     return found
+
+
+def evaluated(method: Method, scene: Scene, protocol: Protocol, on_view: OnView | None) -> Scores:
+    """The marks of the test views under a protocol."""
+    return evaluate(method.render, scene.test, protocol, on_view=on_view)
+
+
+def stability(method: Method, scene: Scene, protocol: Protocol, on_view: OnView | None) -> Scores:
+    """The same, and besides: geometry (`padgs.scoring.geometry`), the WS-PSNR of one colour, and of training views."""
+
+    def also(view: View, rendering: Rendering) -> Marks:
+        truth, mask = view.image(device=rendering.image.device), view.mask(device=rendering.image.device)
+        return {"ws_psnr_one_color": mean_color(truth, mask).item(), **geometry.of_view(method.render, view, rendering)}
+
+    found = evaluate(method.render, scene.test, protocol, on_view=on_view, also=also)
+    seen = scene.train[:: max(1, len(scene.train) // len(scene.test))]
+    own = evaluate(method.render, seen, protocol).metrics["ws_psnr"]
+    return replace(found, metrics={**found.metrics, "ws_psnr_training": own})
 
 
 def probe(method: Method, view: View) -> dict[str, float]:

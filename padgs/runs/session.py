@@ -131,7 +131,7 @@ class Session:
                     folder.save(method, progress)
             result = replace(result, **self._trained(method, progress))
             if self.scene.test:
-                result = replace(result, **self._tested(method, progress))
+                result = outcome.judged(replace(result, **self._tested(method, progress)))
         except Interrupted:
             raise
         except KeyboardInterrupt as error:
@@ -207,7 +207,8 @@ class Session:
                 )
             method = build(self.config)
             self.folder.resume(method, self.scene.points.device)
-            complete = replace(complete, scores={**result.scores, **scores(method, self.scene, unscored, None)})
+            marks = {**result.scores, **scores(method, self.scene, unscored, None)}
+            complete = outcome.judged(replace(complete, scores=marks))
         return result if complete == result else self.folder.finish(complete)
 
     def _say(self, text: str) -> None:
@@ -223,11 +224,13 @@ def scene_of(config: RunConfig, device: torch.device) -> Scene:
 
     Raises:
         DataError: the input cannot be used.
+        ValueError: nor can it be stressed so.
     """
     images_on = str(device) if config.run.images_on == "device" else config.run.images_on
-    return data.load(config.data.path, config.data.format, config.data.options(images_on)).to(device)
+    scene = data.load(config.data.path, config.data.format, config.data.options(images_on)).to(device)
+    return config.stress.scene(scene, config.seed)
 
 
 def build(config: RunConfig) -> Method:
     """The method of a configuration, untrained."""
-    return lookup(METHODS, config.method, "method")(config.options, config.render, config.train, seed=config.seed)
+    return lookup(METHODS, config.method, "method")(config.options, config.render, config.training, seed=config.seed)

@@ -21,7 +21,7 @@ MISSING = "–"
 def introduce(config: RunConfig, scene: Scene, folder: Path, console: Console) -> None:
     """Print what is trained on what, the notes of the loader, and where the files will be."""
     view = scene.train[0]
-    what = f"{config.preset}{f' ({config.variant})' if config.variant else ''} on {scene.name}"
+    what = f"{config.preset}{f' ({config.row})' if config.row else ''} on {scene.name}"
     views = f"{len(scene.train)} training and {len(scene.test)} test views of {view.width}x{view.height}"
     rest = f": {views}, {len(scene.points)} points, {config.time}"
     console.print(Text(printable(what), "bold"), rest, sep="", highlight=False, soft_wrap=True)

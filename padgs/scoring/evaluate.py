@@ -18,6 +18,7 @@ from padgs.scoring.metrics import METRICS, sphere_weight
 from padgs.scoring.protocols import Protocol
 
 Marks = dict[str, float | None]  # metric -> value; None = missing (no weights, or no pixel that counts)
+Also = Callable[[View, Rendering], Marks]  # numbers of a view that take more than its image
 OnView = Callable[[View, Tensor, Tensor], None]  # view, truth, image: [H, W, 3] in [0, 1], as they were compared
 
 
@@ -27,6 +28,7 @@ def evaluate(
     protocol: Protocol,
     *,
     on_view: OnView | None = None,
+    also: Also | None = None,
 ) -> Scores:
     """Render each view and compare it with its image.
 
@@ -35,6 +37,7 @@ def evaluate(
         views: the test views; each has an image, and may have a mask.
         protocol: the rules.
         on_view: called with each view, its truth and its render (clamped, 8-bit, not cropped), to save pictures.
+        also: gives more marks of each view.
 
     Raises:
         ValueError: no views, a view without an image, or a render of another size than its view.
@@ -46,10 +49,13 @@ def evaluate(
     notes: dict[str, None] = {}  # as keys: each once, in order
     with torch.no_grad():
         for view in views:
-            image = as_stored(checked(render(view).image, view))
+            rendering = render(view)
+            image = as_stored(checked(rendering.image, view))
             truth = view.image(dtype=image.dtype, device=image.device)
             mask = view.mask(dtype=image.dtype, device=image.device)
             marks[view.name] = score(image, truth, mask, protocol, notes)
+            if also is not None:
+                marks[view.name] |= also(view, rendering)
             if on_view is not None:
                 on_view(view, truth, image)
     return Scores(asdict(protocol), mean_marks(list(marks.values())), marks, tuple(notes))

@@ -94,6 +94,13 @@ def seam(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
     return weighted_mean(steps[:, :1], weight[:, :1]) / inside
 
 
+def mean_color(target: Tensor, mask: Tensor | None = None) -> Tensor:
+    """`ws_psnr` of the one colour that is nearest to the whole target: what a model has that has learned nothing."""
+    weight = sphere_weight(target, mask)
+    color = (target * weight[..., None]).sum((0, 1)) / weight.sum()
+    return ws_psnr(color.expand_as(target), target, mask)
+
+
 METRICS: dict[str, Metric] = {
     "psnr": psnr,
     "ssim": ssim,

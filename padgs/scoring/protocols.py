@@ -66,6 +66,14 @@ PROTOCOLS = {
         lpips_inputs="11",
         solid_angle=True,
     ),
+    # What shows that a run went wrong; `padgs.runs.scoring` adds geometry, and what training views and one colour get.
+    "stability": Protocol(
+        "stability",
+        ("ws_psnr", "ws_psnr_equator", "ws_psnr_pole", "seam"),
+        lpips="none",
+        lpips_inputs="11",
+        solid_angle=True,
+    ),
 }
 ROAM_360_BOTTOM_CROP = 65 / 1024  # 360Roam shows the robot there; the released evaluation cuts rows >= 959 of 1024
 PAPER_360ROAM = replace(PROTOCOLS["paper"], bottom_crop=ROAM_360_BOTTOM_CROP)

@@ -31,12 +31,15 @@ def html(gathered: Gathered) -> str:
     )
     refused: list[str] = []
     made = {name: _attempt(gathered, name, refused) for name in REPORTS if name != "html"}
-    tables = [report for report in made.values() if isinstance(report, Table) and report.blocks]
+    parts = [part for report in made.values() for part in (report if isinstance(report, list) else [report])]
+    tables = [part for part in parts if isinstance(part, Table) and part.blocks]
+    maps = [part for part in made["stability"] or () if isinstance(part, Chart)]
     pictures = album(gathered)
     return environment.get_template("page.html.j2").render(
         facts=_facts(gathered.runs),
         problems=[*gathered.left_out, *refused],
         tables=[_table(table) for table in tables],
+        maps=[_chart(chart) for chart in maps],
         charts=[_chart(chart) for chart in made["chart"] or ()],
         sweeps=[_chart(chart) for chart in made["sweep"] or ()],
         pictures=pictures,

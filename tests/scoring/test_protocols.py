@@ -39,7 +39,7 @@ def test_every_metric_of_a_protocol_has_a_direction(name, lpips, inputs):
 def test_lpips_names_tell_all_variants_apart():
     variants = [
         protocol_from_options(name, lpips=net, lpips_inputs=inputs).lpips_name
-        for name in PROTOCOLS
+        for name in ("paper", "sphere")  # the others have none
         for net in ("alex", "vgg")
         for inputs in ("11", "01")
     ]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import fields
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -76,7 +76,8 @@ def generate(options: SyntheticOptions, store: ImageStore | None = None) -> Scen
             pixels = StoredImage(image, options.width, options.height, store)
         else:
             pixels = partial(torch.from_numpy, image)
-        view = View(f"{index:03d}", torch.from_numpy(pose), options.width, options.height, pixels)
+        size, depth = (options.width, options.height), partial(_depth, options, index)
+        view = View(f"{index:03d}", torch.from_numpy(pose), *size, pixels, load_depth=depth)
         (test if index in held_out else train).append(view)
     return Scene(
         name=options.title,
@@ -87,6 +88,19 @@ def generate(options: SyntheticOptions, store: ImageStore | None = None) -> Scen
         fingerprint=stored.fingerprint,
         notes=tuple(notes),
     )
+
+
+@lru_cache(maxsize=64)
+def _depth(options: SyntheticOptions, index: int) -> torch.Tensor:
+    """True distances [H, W] from where the image of a view was taken."""
+    truth = _truth(options)
+    name = truth.names[index]
+    return truth.depth(View(name, truth.exact_pose(name), options.width, options.height)).float()
+
+
+@lru_cache(maxsize=1)
+def _truth(options: SyntheticOptions) -> SyntheticTruth:
+    return SyntheticTruth(options)
 
 
 def _make(options: SyntheticOptions) -> cache.Stored:

@@ -1,0 +1,150 @@
+"""A watch on a run that goes wrong without a NaN: diverged, exploded, collapsed or silent.
+
+It looks at numbers that are there anyway: the loss at every iteration (on a GPU where somebody has read it), all else
+where gradients and parameters are checked. A sign must last before it ends a run, for healthy runs show each of them
+for a while: after a reset of opacities nearly nothing is seen and the loss jumps, and colours that are not in use yet
+have no gradient.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from torch import Tensor
+
+from padgs.learning.failure import Failure
+from padgs.learning.trainee import Drawing
+
+LASTING, LEAST = 0.1, 100  # a sign lasts for this share of the run, and for so many iterations
+SILENT = 0.25  # share of the run, of silence
+SMOOTHED = 20  # iterations that the loss is averaged over, at least; or the share below of the run
+SMOOTHED_SHARE = 0.02
+FIRST = 5  # iterations that are no best loss yet: single views are easy
+WORSE = 1.5  # times the best average loss
+FEWER = 0.01  # of the parts of the model at the start
+FLATTER = 0.01  # of the variance of the photograph
+FAINTEST = 0.05  # mean opacity of a picture
+MORE = 10  # times as many parts as at the start, or as all training views have pixels
+ADVICE = "train.monitor=false lets such a run go on"
+GRADIENT = "gradient of "
+LARGER = 10  # times as large as all that there was at the start
+MANY = 0.01  # share of the Gaussians; single ones of PaD-GS grow without any harm
+
+
+class Monitor:
+    """Of one run. `state` holds all that it remembers, as JSON can.
+
+    `moment` is the iteration of the schedule that is looked at, where the schedule follows the clock; None: the same.
+    """
+
+    def __init__(self, iterations: int, parts: int, pixels: int) -> None:
+        """Nothing was seen yet.
+
+        Args:
+            iterations: of the schedule.
+            parts: Gaussians, anchors or other parts that the model starts with; the largest of its counts.
+            pixels: of all training views.
+        """
+        self._iterations, self._start, self._most = iterations, parts, MORE * max(parts, pixels)
+        self._smoothed = max(SMOOTHED, SMOOTHED_SHARE * iterations)
+        self.moment: int | None = None
+        self.state: dict[str, Any] = {"sum": 0.0, "weight": 0.0, "seen": 0, "best": None, "largest": None, "since": {}}
+
+    def loss(self, value: float, iteration: int) -> None:
+        """Take in the loss of an iteration.
+
+        Raises:
+            Failure: diverged.
+        """
+        state = self.state
+        new = -math.expm1((state["seen"] - iteration) / self._smoothed)
+        state["sum"] += (value - state["sum"]) * new
+        state["weight"] += (1 - state["weight"]) * new
+        state["seen"] = iteration
+        average = state["sum"] / state["weight"]
+        if iteration >= FIRST:
+            state["best"] = average if state["best"] is None else min(average, state["best"])
+        best = state["best"]
+        if since := self._lasting("diverged", best is not None and average > WORSE * best, iteration):
+            raise Failure(
+                "diverged",
+                f"the loss at iteration {iteration} is {average:.4g}, and since iteration {since} more than {WORSE} "
+                f"times the best, {best:.4g} (averages over {self._smoothed:.0f} iterations); {ADVICE}",
+            )
+
+    def counts(self, counts: Mapping[str, int], iteration: int) -> None:
+        """Take in how many parts the model has.
+
+        Raises:
+            Failure: exploded or collapsed.
+        """
+        name, most = max(counts.items(), key=lambda item: item[1])
+        if most > self._most:
+            raise Failure(
+                "exploded",
+                f"{most} {name} at iteration {iteration}, more than {MORE} times the {self._most // MORE} at the start "
+                f"or pixels of the training views; {ADVICE}",
+            )
+        if since := self._lasting("few", most < FEWER * self._start, iteration):
+            raise Failure(
+                "collapsed",
+                f"{most} of {self._start} {name} are left at iteration {iteration}, few since {since}; {ADVICE}",
+            )
+
+    def picture(self, drawing: Drawing, photograph: Tensor, iteration: int) -> None:
+        """Take in what was drawn of a view, beside its photograph [H, W, 3].
+
+        Raises:
+            Failure: collapsed or exploded.
+        """
+        image, alpha = drawing.rendering.image.detach(), 1 - drawing.rendering.transmittance.detach().mean().item()
+        if since := self._lasting("faint", alpha < FAINTEST, iteration):
+            raise Failure(
+                "collapsed", f"the mean opacity is {alpha:.3g} at iteration {iteration}, and since {since}; {ADVICE}"
+            )
+        shares = (image.var() / photograph.var().clamp(min=1e-12)).item()
+        if since := self._lasting("flat", shares < FLATTER, iteration):
+            raise Failure(
+                "collapsed",
+                f"the picture has {shares:.3g} of the variance of the photograph at iteration {iteration}, and since "
+                f"{since}; {ADVICE}",
+            )
+        largest = drawing.gaussians.scales.detach().amax(-1)
+        if self.state["largest"] is None:
+            extent = drawing.gaussians.means.detach().double().std(0, correction=0).norm().item()
+            self.state["largest"] = max(largest.max().item(), extent)
+        limit = LARGER * self.state["largest"]
+        share = (largest > limit).float().mean().item()
+        if since := self._lasting("large", share > MANY, iteration):
+            row = int(largest.argmax())
+            raise Failure(
+                "exploded",
+                f"scales[{row}] is {largest[row].item():.3g} world units at iteration {iteration}; since {since} more "
+                f"than {MANY:.0%} of all are {LARGER} times as large as anything at the start, {limit / LARGER:.3g}; "
+                f"{ADVICE}",
+            )
+
+    def gradients(self, without: Sequence[str], iteration: int) -> None:
+        """Take in the names of the groups of parameters all of whose gradients are exactly 0.
+
+        Raises:
+            Failure: silent.
+        """
+        known = {sign.removeprefix(GRADIENT) for sign in self.state["since"] if sign.startswith(GRADIENT)}
+        for name in sorted({*without, *known}):
+            if since := self._lasting(GRADIENT + name, name in without, iteration, SILENT):
+                raise Failure(
+                    "silent", f"the {GRADIENT}{name} is exactly 0 at iteration {iteration}, and since {since}; {ADVICE}"
+                )
+
+    def _lasting(self, sign: str, holds: bool, iteration: int, share: float = LASTING) -> int | None:
+        """Since when a sign has lasted, if that is too long."""
+        since = self.state["since"]
+        if not holds:
+            since.pop(sign, None)
+            return None
+        moment = iteration if self.moment is None else self.moment
+        first, began = since.setdefault(sign, [iteration, moment])
+        return first if iteration - first >= LEAST and moment - began >= share * self._iterations else None

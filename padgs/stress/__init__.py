@@ -1,0 +1,1 @@
+"""What goes wrong with captures and settings, as data: a condition changes any scene, or its training, by a level."""

@@ -1,0 +1,96 @@
+"""Which method survives what: retention under each condition and level, where it breaks, and scores of all."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from reports import methods
+from reports.charts import heat_map
+from reports.charts.drawing import Chart
+from reports.conditions import footnotes
+from reports.gathered import Gathered
+from reports.survival import HALF, QUALITY, Survivor, in_order, survivors
+from reports.tables.cells import spread
+from reports.tables.table import Block, Cell, Column, Row, Table
+
+UNSTRESSED = {  # title -> column of the frame, or of the one that is subtracted from the other
+    "WS-PSNR, dB": (QUALITY,),
+    "training views above test views, dB": ("stability/ws_psnr_training", QUALITY),
+    "equator above poles, dB": ("stability/ws_psnr_equator", "stability/ws_psnr_pole"),
+    "seam": ("stability/seam",),
+    "yaw error": ("stability/yaw_error",),
+    "depth error (AbsRel)": ("stability/depth_error",),
+    "floaters": ("stability/floaters",),
+}
+NOTES = (
+    "Retention: how far above one colour for the image a run stays under a condition, as a share of what the same "
+    "method and seed have without it, within [0, 1]; 0 for a run that failed. Level 1 is mild, 3 is severe.",
+    f"A method breaks at the first level where it keeps less than {HALF:g} or a run fails; – where it does not.",
+    "Score: the mean over levels, then conditions. Worst quartile: the mean of the worst quarter of the conditions; "
+    "methods stand in its order, the best first.",
+)
+
+
+def stability(gathered: Gathered) -> list[Table | Chart]:
+    """A table with three blocks for each scene, and a heat map of each.
+
+    Raises:
+        ReportError: results that must not stand together.
+    """
+    found = survivors(gathered)
+    presets = list(dict.fromkeys(one.preset for those in found.values() for one in those))
+    blocks, runs_of = [], {}
+    for title, those in found.items():
+        by_preset = {one.preset: one for one in those}
+        columns = [by_preset.get(preset) for preset in presets]
+        blocks += [Block(title, _scores(columns)), Block(f"Retention, {title}", _retentions(columns))]
+        blocks.append(Block(f"Breaks at level, {title}", _breakdowns(columns)))
+        runs_of[title] = gathered.runs.loc[sorted(i for one in those for i in one.rest.index)]
+    table = Table(
+        "stability",
+        "What methods keep under stress",
+        "Condition",
+        tuple(Column(methods.title(preset), 2) for preset in presets),
+        tuple(blocks),
+        (*footnotes(runs_of, "stability"), *NOTES),
+    )
+    return [table, *(heat_map.chart(title, those) for title, those in found.items())]
+
+
+def _scores(columns: Sequence[Survivor | None]) -> tuple[Row, ...]:
+    rows = [
+        Row("stability score", tuple(Cell(one and one.score) for one in columns)),
+        Row("worst quartile", tuple(Cell(one and one.worst_quartile) for one in columns)),
+        Row("failure rate", tuple(Cell(one and one.failure_rate) for one in columns)),
+    ]
+    for title, names in UNSTRESSED.items():
+        rows.append(Row(f"unstressed: {title}", tuple(_unstressed(one, *names) for one in columns)))
+    return tuple(rows)
+
+
+def _unstressed(one: Survivor | None, name: str, other: str | None = None) -> Cell:
+    if one is None or name not in one.rest:
+        return Cell()
+    values = one.rest[name] - (one.rest[other] if other else 0)
+    return spread(values.dropna().tolist())
+
+
+def _retentions(columns: Sequence[Survivor | None]) -> tuple[Row, ...]:
+    stresses = in_order([one for one in columns if one])
+    return tuple(
+        Row(
+            f"{condition} {level}",
+            tuple(one.retention.get((condition, level), Cell()) if one else Cell() for one in columns),
+        )
+        for condition, level in stresses
+    )
+
+
+def _breakdowns(columns: Sequence[Survivor | None]) -> tuple[Row, ...]:
+    conditions = dict.fromkeys(condition for one in columns if one for condition in one.conditions)
+    return tuple(Row(name, tuple(_breakdown(one, name) for one in columns)) for name in conditions)
+
+
+def _breakdown(one: Survivor | None, condition: str) -> Cell:
+    level = one and one.breakdown(condition)
+    return Cell() if level is None else Cell(status=str(level))

@@ -1,0 +1,105 @@
+from dataclasses import replace
+
+import pytest
+from made_up import failed, gathered, of_experiment
+
+from padgs.results import STATUSES, Scores
+from reports.charts.heat_map import GLYPHS
+from reports.page import page
+from reports.tables.stability import stability
+from reports.tables.table import ReportError
+from reports.writers import latex, markdown
+
+RULES = {"name": "stability", "lpips": "none", "lpips_inputs": "11", "bottom_crop": 0.0}
+ONE_COLOR = 12.0
+
+
+def run(preset: str, quality: float, condition: str = "", level: int = 0, seed: int = 0, status: str = "ok"):
+    made = of_experiment("stress@cpu", quality, preset=preset, seed=seed)
+    marks = {"ws_psnr": quality, "ws_psnr_one_color": ONE_COLOR, "ws_psnr_training": quality + 1, "seam": 1.1}
+    stress = {"stress": {"condition": condition, "level": level}} if condition else {}
+    return replace(
+        made,
+        run=f"{made.run}_{condition}_{level}",
+        variant=f"{condition} {level}" if condition else "",
+        config=made.config | stress,
+        scores={"stability": Scores(RULES, marks, {"a": marks})} if status == "ok" else {},
+        status=status,
+    )
+
+
+def runs(seed: int = 0):
+    return [
+        run("omnigs", 22.0, seed=seed),  # 10 dB above one colour
+        run("omnigs", 21.0, "pose_noise", 1, seed),
+        run("omnigs", 16.0, "pose_noise", 2, seed),
+        run("omnigs", 0.0, "seam", 1, seed, "diverged"),
+        run("omnigs", 30.0, "seam", 2, seed),
+        run("padgs", 32.0, seed=seed),
+        run("padgs", 22.4, "pose_noise", 1, seed),
+        run("padgs", 22.6, "seam", 2, seed),
+    ]
+
+
+def cells(table, title: str) -> dict[str, dict[str, str]]:
+    (block,) = (block for block in table.blocks if block.title.startswith(title))
+    heads = [column.title for column in table.columns]
+    return {row.title: dict(zip(heads, row.texts(table.columns)[1:], strict=True)) for row in block.rows}
+
+
+def test_what_is_kept_is_the_share_above_one_colour():
+    table, _ = stability(gathered(runs()))
+    kept = cells(table, "Retention")
+    assert kept["pose_noise 1"] == {"PaD-GS": "0.52", "OmniGS, corrected": "0.90"}
+    assert kept["pose_noise 2"] == {"PaD-GS": "–", "OmniGS, corrected": "0.40"}
+    assert kept["seam 1"] == {"PaD-GS": "–", "OmniGS, corrected": "0.00 [DIVERGED]"}
+    assert kept["seam 2"]["OmniGS, corrected"] == "1.00"  # more than all is all
+    assert list(kept) == ["pose_noise 1", "pose_noise 2", "seam 1", "seam 2"]
+
+
+def test_scores_and_where_it_breaks():
+    table, _ = stability(gathered(runs()))
+    scores, breaks = cells(table, "synthetic-room"), cells(table, "Breaks at level")
+    # OmniGS: pose noise keeps (0.9 + 0.4) / 2, the seam (0 + 1) / 2; the worst quarter of two conditions is one
+    omnigs = {row: of["OmniGS, corrected"] for row, of in scores.items()}
+    assert (omnigs["stability score"], omnigs["worst quartile"], omnigs["failure rate"]) == ("0.57", "0.50", "0.25")
+    assert omnigs["unstressed: training views above test views, dB"] == "1.00" and omnigs["unstressed: floaters"] == "–"
+    assert breaks == {
+        "pose_noise": {"PaD-GS": "–", "OmniGS, corrected": "2"},
+        "seam": {"PaD-GS": "–", "OmniGS, corrected": "1"},
+    }
+    assert [column.title for column in table.columns] == ["PaD-GS", "OmniGS, corrected"]
+
+
+def test_seeds_are_compared_with_their_own():
+    first, *others = runs(seed=1)
+    lower = replace(first, scores={"stability": Scores(RULES, {"ws_psnr": 17.0, "ws_psnr_one_color": 12.0}, {})})
+    table, _ = stability(gathered([*runs(), lower, *others]))
+    assert cells(table, "Retention")["pose_noise 2"]["OmniGS, corrected"] == "0.60 ± 0.28"  # 4 of 10, and 4 of 5
+
+
+def test_runs_that_differ_in_more_are_refused():
+    other = runs()[1]
+    other = replace(other, run="other", config=other.config | {"method": {"tau": 0.1}})
+    with pytest.raises(ReportError, match=r"differ in method.tau"):
+        stability(gathered([*runs(), other]))
+
+
+def test_every_outcome_has_a_letter_of_its_own():
+    assert set(GLYPHS) == set(STATUSES) - {"ok"} and len(set(GLYPHS.values())) == len(GLYPHS)
+
+
+def test_it_is_written_and_stands_on_the_page():
+    table, chart = stability(gathered(runs()))
+    assert chart.name == "stability-synthetic-room-512x256"
+    assert "pose_noise 2: keeps 0.40; WS-PSNR 16.00 dB, 22.00 without" in chart.svg and ">V<" in chart.svg
+    assert "V diverged" in chart.svg and "exploded" not in chart.svg and chart.png.startswith(b"\x89PNG")
+    assert chart.numbers is not None and len(chart.numbers) == 6
+    assert "| 0.00 [DIVERGED] |" in markdown.text(table) and "DIVERGED" in latex.text(table)
+    html = page.html(gathered(runs()))
+    assert 'id="stability"' in html and 'id="heat_maps"' in html
+
+
+def test_without_such_runs_there_is_nothing():
+    (table,) = stability(gathered([failed("", "oom")]))
+    assert table.blocks == ()

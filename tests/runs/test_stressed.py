@@ -1,0 +1,83 @@
+"""Runs under stress, from the configuration to the result."""
+
+import io
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+from composed import composed
+from made_up import result
+from rich.console import Console
+from tiny_scene import tiny_scene
+
+from padgs.results import Scores
+from padgs.runs import session
+from padgs.runs.outcome import judged
+from padgs.runs.session import Session
+from padgs.scene import Scene
+
+
+def depth_of(distance: float) -> torch.Tensor:
+    return torch.full((16, 32), distance)
+
+
+def with_depth(distance: float) -> Scene:
+    scene = tiny_scene()
+    return replace(scene, test=tuple(replace(view, load_depth=partial(depth_of, distance)) for view in scene.test))
+
+
+@pytest.fixture(autouse=True)
+def tiny(monkeypatch, root):
+    monkeypatch.setenv("PADGS_ROOT", str(root))
+    monkeypatch.setattr(session.data, "load", lambda path, format, options: with_depth(3.0))
+
+
+@pytest.fixture
+def run(tmp_path):
+    def ran(*settings: str):
+        small = ("train.iterations=120", "train.check_every=20", "method=omnigs", "protocol=stability")
+        config = composed(f"run.folder={tmp_path}/runs", *small, *settings)
+        out = io.StringIO()
+        return Session(config, Console(file=out, width=200)).run(), out.getvalue()
+
+    return ran
+
+
+def test_a_run_says_what_it_is_stressed_by_and_has_marks_that_show_harm(run):
+    made, said = run("stress.condition=few_views", "stress.level=1")
+    assert made.ok and made.variant == "few_views 1" and made.config["stress"] == {"condition": "few_views", "level": 1}
+    assert "omnigs (few_views 1) on tiny: 3 training" in said and "stress: one of 2 training views is left" in said
+    assert "_few-views-1_" in made.run
+    marks = made.scores["stability"].metrics
+    assert marks["ws_psnr"] > marks["ws_psnr_one_color"] and marks["ws_psnr_training"] > 0
+    assert 0 < marks["depth_error"] < 0.5 and marks["yaw_error"] < 1e-4
+    assert run("stress.condition=few_views", "stress.level=1")[0] == made  # found again
+
+
+def test_a_longer_schedule_is_trained_to_its_end(run):
+    made, _ = run("stress.condition=schedule", "stress.level=1", "train.iterations=10")
+    assert (made.iterations, made.iterations_done) == (20, 20)
+
+
+def test_wrong_depths_are_degenerate(run, monkeypatch):
+    monkeypatch.setattr(session.data, "load", lambda path, format, options: with_depth(0.3))
+    made, said = run()
+    assert made.status == "degenerate" and "(AbsRel), more than 50%" in made.reason
+    assert made.scores["stability"].metrics["depth_error"] > 0.5 and "degenerate" in said
+
+
+@pytest.mark.parametrize(
+    ("marks", "status"),
+    [
+        ({"ws_psnr": 11.9, "ws_psnr_one_color": 12.0}, "diverged"),
+        ({"ws_psnr": 20.0, "ws_psnr_one_color": 12.0, "depth_error": 0.51}, "degenerate"),
+        ({"ws_psnr": 20.0, "ws_psnr_one_color": 12.0, "depth_error": None}, "ok"),
+        ({}, "ok"),
+    ],
+)
+def test_results_are_judged_by_what_they_show(marks, status):
+    made = replace(result(), scores={"stability": Scores({}, marks, {})})
+    assert judged(made).status == status
+    assert judged(replace(made, status="timeout")).status == "timeout"
+    assert judged(result()).ok  # under other protocols there is nothing to judge by
