@@ -35,6 +35,7 @@ ROOMS = (
     "reports",
     "padgs.tracking",
     "padgs.runs",
+    "padgs.need",
     "padgs.multirun",
     "padgs.cli",
 )

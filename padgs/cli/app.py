@@ -10,6 +10,7 @@ import padgs
 from padgs.cli.bench import bench
 from padgs.cli.check import check
 from padgs.cli.convert import convert
+from padgs.cli.need import need
 from padgs.cli.prepare import prepare
 from padgs.cli.report import report
 from padgs.cli.track import track
@@ -31,7 +32,7 @@ def commands(
     """Panoramic Gaussian splatting, measured fairly."""
 
 
-for command in (bench, check, convert, prepare, report, track):
+for command in (bench, check, convert, need, prepare, report, track):
     app.command()(command)
 
 

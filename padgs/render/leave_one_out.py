@@ -2,8 +2,8 @@
 
 Removing a Gaussian changes a pixel by dC = alpha / (1 - alpha) B - w c: its own colour c with the weight w = alpha T is
 gone, and what lies behind it, blended to B with the background, shines through. With the residual r = image - target
-the squared error changes by ||dC||^2 + 2 <r, dC>. That is no estimate, but for light below 1e-4, before which a pixel
-stops.
+the squared error changes by ||dC||^2 + 2 <r, dC>. That is no estimate, but where a pixel stops, because less than 1e-4
+of the light would be left: then others may stop it instead.
 
 What others prune by (opacity, size, contribution, curvature of the loss) says how much a Gaussian shows; this says what
 its absence costs. A negative change is a Gaussian that does harm.

@@ -32,6 +32,18 @@ def exists(folder: Path) -> bool:
     return (folder / MANIFEST).exists()
 
 
+def digest(folder: Path) -> str:
+    """SHA-256 of the tensors of a checkpoint.
+
+    Raises:
+        CheckpointError: it cannot be read.
+    """
+    try:
+        return json.loads((folder / MANIFEST).read_bytes())["sha256"]
+    except (OSError, ValueError, LookupError) as error:
+        raise CheckpointError(f"cannot read {folder / MANIFEST}: {error}; {WAY_OUT}") from error
+
+
 def save(state: State, folder: Path) -> None:
     """Write a checkpoint, replacing the one in the folder, which stays whole until the new one is.
 
