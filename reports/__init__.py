@@ -36,6 +36,8 @@ REPORTS: Mapping[str, Report] = {
     "learning_rates": Report("reports.tables.learning_rates:learning_rates", ("learning_rates",)),
     "modulation": Report("reports.tables.modulation:modulation", ("modulation",)),
     "plus_ablation": Report("reports.tables.variants:plus_ablation", ("plus_ablation",)),
+    "need": Report("reports.tables.need:need", ("need",)),
+    "need_chart": Report("reports.charts.need_chart:charts", ("need",)),
     "runs": Report("reports.tables.runs:runs"),
     "chart": Report("reports.charts.trade_off_chart:charts", ("pareto", *OF_AN_ORDER, *OF_ALL_METHODS)),
     "sweep": Report("reports.charts.sweep_chart:charts"),

@@ -75,8 +75,8 @@ def write_pruned(search: Search, epsilon: float) -> Path:
         folder.prepare(values)
         folder.save(run.method, Progress(**trained.values[PROGRESS]))
         scene, timing = run.scene, dict(run.result.timing)
-        for name in ("train_seconds", "cpu_seconds"):
-            timing[name] = timing.get(name, math.nan) + found[name.removeprefix("train_")]
+        for name in {"train_seconds", "cpu_seconds"} & timing.keys():
+            timing[name] += found[name.removeprefix("train_")]
         tested = {}
         if scene.test:
             timing |= frame_times(run.method, scene)

@@ -83,7 +83,7 @@ class Search:
         model = self._model_of(number)
         if self.steps[number].depth > 0:
             with Interrupt() as stop:
-                self._refine(model, self.run.scene.train, stop)
+                self._refine(model, self.run.scene.train, f"kept {number}", stop)
         return model
 
     def _model_of(self, number: int) -> Prunable:
@@ -112,25 +112,25 @@ class Search:
         else:
             if wanted.rows is not None:
                 model.keep(most_wanted(worth(model, self.run.scene.train), wanted.rows))
-            self._refine(model, self._views, stop)
+            self._refine(model, self._views, f"step {len(self.steps)}", stop)
         step = self._measured(model, wanted)
         seconds, cpu_seconds = time.perf_counter() - started[0], time.process_time() - started[1]
         return replace(step, seconds=seconds, cpu_seconds=cpu_seconds), model.state()
 
-    def _refine(self, model: Prunable, views: tuple[View, ...], stop: Interrupt) -> None:
-        """Train a model a little on some views."""
-        number, config = len(self.steps), self.run.config
+    def _refine(self, model: Prunable, views: tuple[View, ...], what: str, stop: Interrupt) -> None:
+        """Train a model a little on some views; `what` names this refinement among those of the search."""
+        config = self.run.config
         count = max(len(views), round(refine.SHARE * config.train.iterations))
         refining = Refining(model, config.train, config.train.iterations, count)
-        scene, seed = replace(self.run.scene, train=views), config.seed + number
+        scene, seed = replace(self.run.scene, train=views), config.seed + len(self.steps)
         torch.manual_seed(seed)
         trainer = Trainer(refining, scene, Budget(count), config.train, seed)
-        if (begun := self.folder.begun(number, self._device)) is not None:
+        if (begun := self.folder.begun(what, self._device)) is not None:
             trainer.load_state(begun)
         for record in trainer.records():
             if stop.requested and record.iteration < count:
-                self.folder.begin(number, trainer.state())
-                raise Interrupted(f"stopped within step {number + 1}; nothing is lost, start again to go on")
+                self.folder.begin(what, trainer.state())
+                raise Interrupted(f"stopped within {what}; nothing is lost, start again to go on")
 
     def _measured(self, model: Prunable, wanted: Plan) -> Step:
         scene = self.run.scene

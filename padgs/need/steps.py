@@ -13,7 +13,7 @@ from padgs.need.search import Step
 from padgs.results import Scores
 from padgs.runs import checkpoint
 
-STEP, BEGUN, OF = "step", "begun", "of"  # values of a checkpoint: the numbers of a step, which was begun, of what model
+STEP, BEGUN, OF = "step", "begun", "of"  # values of a checkpoint: the numbers of a step, what was begun, of what model
 
 
 class StepsFolder:
@@ -52,16 +52,16 @@ class StepsFolder:
         checkpoint.save(State(model.tensors, values), self._folder(number))
         shutil.rmtree(self._begun, ignore_errors=True)
 
-    def begin(self, number: int, state: State) -> None:
-        """Keep a refinement that was interrupted.
+    def begin(self, what: str, state: State) -> None:
+        """Keep a refinement that was interrupted, in the place of any other.
 
         Raises:
             CheckpointError: it cannot be written.
         """
-        checkpoint.save(State(state.tensors, {**state.values, BEGUN: number, OF: self._of}), self._begun)
+        checkpoint.save(State(state.tensors, {**state.values, BEGUN: what, OF: self._of}), self._begun)
 
-    def begun(self, number: int, device: torch.device | str = "cpu") -> State | None:
-        """The interrupted refinement of this step, if there is one.
+    def begun(self, what: str, device: torch.device | str = "cpu") -> State | None:
+        """That refinement, if it was the last to be interrupted.
 
         Raises:
             CheckpointError: it is damaged, or of another model.
@@ -69,7 +69,7 @@ class StepsFolder:
         if not checkpoint.exists(self._begun):
             return None
         state = self._checked(checkpoint.load(self._begun, device), self._begun)
-        return state if state.values[BEGUN] == number else None
+        return state if state.values[BEGUN] == what else None
 
     @property
     def _begun(self) -> Path:

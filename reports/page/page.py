@@ -37,7 +37,7 @@ def html(gathered: Gathered) -> str:
         facts=_facts(gathered.runs),
         problems=[*gathered.left_out, *refused],
         tables=[_table(table) for table in tables],
-        charts=[_chart(chart) for chart in made["chart"] or ()],
+        charts=[_chart(chart) for name in ("chart", "need_chart") for chart in made[name] or ()],
         sweeps=[_chart(chart) for chart in made["sweep"] or ()],
         pictures=pictures,
         data=_script(json.dumps({"images": pictures.images, "scenes": pictures.scenes})),
