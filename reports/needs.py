@@ -34,8 +34,19 @@ class Curve:
 
     @property
     def quality(self) -> list[float]:
-        """WS-PSNR, dB, of the test views, which decided nothing; of the calibration views where there are none."""
-        return [step["ws_psnr"] if step["test_ws_psnr"] is None else step["test_ws_psnr"] for step in self.steps]
+        """WS-PSNR, dB, of all steps; see `quality_of`."""
+        return [self.quality_of(step) for step in self.steps]
+
+    def quality_of(self, step: Mapping[str, Any]) -> float:
+        """What the whole model shows of the test views, which decide nothing, less what a step lost against its control.
+
+        Both were trained on with fewer views than the whole model. Of the calibration views where there are no others.
+        """
+        steps = self.found["steps"]
+        control = next(other for other in steps if other["kind"] != "prune" and other["depth"] == step["depth"])
+        if step["test_ws_psnr"] is None:
+            return steps[0]["ws_psnr"] - step["loss"]
+        return steps[0]["test_ws_psnr"] - (control["test_ws_psnr"] - step["test_ws_psnr"])
 
 
 def searched(gathered: Gathered) -> DataFrame:

@@ -57,7 +57,7 @@ def objections(candidate: Scores, reference: Scores, epsilon: float) -> tuple[st
             found.append(f"{band} falls by {-mean:.2f} dB")
     rises = differences(candidate, reference, str(PERCEPTION))
     if rises and not (rise := math.fsum(rises) / len(rises)) <= PERCEPTION_RISE:
-        found.append(f"LPIPS rises by {rise:.3f}")
+        found.append(f"LPIPS rises by {rise:.4f}")
     return tuple(found)
 
 

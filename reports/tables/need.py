@@ -20,8 +20,8 @@ COLUMNS: dict[Column, Callable[[Curve, Curve], float | None]] = {
     Column("knee", 0): lambda own, _: None if own.knee is None else own.knee["blended"],
     Column("MB", 2, False, group=f"for {STATED} dB"): lambda own, _: own.needs[STATED]["bytes"] / 1e6,
     Column("ms per frame", 1, False, group=f"for {STATED} dB"): lambda own, _: own.needs[STATED]["frame_ms"],
-    Column("WS-PSNR", 2, True, group=f"for {STATED} dB"): lambda own, _: own.needs[STATED]["test_ws_psnr"],
-    Column("WS-PSNR of all", 2, True): lambda own, _: own.found["steps"][0]["test_ws_psnr"],
+    Column("WS-PSNR", 2, True, group=f"for {STATED} dB"): lambda own, _: own.quality_of(own.needs[STATED]),
+    Column("WS-PSNR of all", 2, True): lambda own, _: own.quality_of(own.found["steps"][0]),
     Column("dB at equal N", 2, signed=True, group="against the first"): gain,
     Column("N at equal dB", 2, group="against the first"): ratio,
     Column("CPU s of the search", 0): lambda own, _: own.found["cpu_seconds"],
@@ -29,7 +29,8 @@ COLUMNS: dict[Column, Callable[[Curve, Curve], float | None]] = {
 NOTES = (
     "Needed: the smallest model as good as one that was refined as often and lost nothing, on views taken from the "
     "training: WS-PSNR by at most so many dB with 95 % confidence, each latitude band by twice and each view by five "
-    "times that, LPIPS by 0.005. WS-PSNR: of the test views, which decide nothing. Not searched: offsets an anchor, "
+    "times that, LPIPS by 0.005. WS-PSNR: of the test views, which decide nothing, less what was lost there against a model "
+    "refined as often. Not searched: offsets an anchor, "
     "features, degree of the harmonics.",
     "Knee: the largest model below which a halving costs more than 0.1 dB. Against the first: means over what both "
     "curves share.",

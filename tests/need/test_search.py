@@ -74,7 +74,7 @@ def test_a_model_that_needs_nothing_ends_at_a_few_rows_and_one_that_needs_all_ke
         (marks(29.85, 29.85, 29.85), ("WS-PSNR may fall",)),
         (marks(30.2, 30.0, 29.8), ("WS-PSNR may fall",)),
         (marks(30.0, 30.0, 30.0, pole=-0.3), ("pole falls by 0.30 dB",)),
-        (marks(30.0, 30.0, 30.0, lpips=0.106), ("LPIPS rises by 0.006",)),
+        (marks(30.0, 30.0, 30.0, lpips=0.106), ("LPIPS rises by 0.0060",)),
         (marks(30.9, 30.9, 29.4), ("WS-PSNR may fall", "a view falls by 0.60 dB")),
     ],
 )

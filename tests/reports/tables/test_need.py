@@ -34,7 +34,7 @@ def found(best: float, *, rows: str = "gaussians", each: int = 1) -> dict:
         for kind, depth, size, loss in [
             ("waste", 0, SIZES[0], lost[0]),
             ("control", 1, SIZES[0], 0.0),
-            *(("prune", n, SIZES[n], lost[n]) for n in (1, 2, 3)),
+            *(("prune", 1, SIZES[n], lost[n]) for n in (1, 2, 3)),
         ]
     ]
     needs = {"0.05": 0, "0.1": 2, "0.25": 3, "0.5": 3, "1": 4}
