@@ -38,7 +38,7 @@ class Curve:
         return [self.quality_of(step) for step in self.steps]
 
     def quality_of(self, step: Mapping[str, Any]) -> float:
-        """What the whole model shows of the test views, which decide nothing, less what a step lost against its control.
+        """What the whole model shows of the test views, which decide nothing, less what was lost against the control.
 
         Both were trained on with fewer views than the whole model. Of the calibration views where there are no others.
         """

@@ -10,7 +10,8 @@ from itertools import cycle, islice
 import torch
 
 from padgs.clock import timed
-from padgs.learning.loop import Budget, Trainer
+from padgs.learning.budget import Budget
+from padgs.learning.loop import Trainer
 from padgs.learning.trainee import Prunable, State
 from padgs.need import refine
 from padgs.need.calibration import RULES, calibration_split
@@ -96,12 +97,18 @@ class Search:
     def _device(self) -> torch.device:
         return self.run.scene.points.device
 
+    @property
+    def _schedule(self) -> int:
+        """Iterations of the run's schedule; those of a budget of seconds are known afterwards."""
+        return self.run.method.state().values.get("schedule", self.run.config.train.iterations)
+
     def _resumed(self) -> Prunable:
         """The model of the run."""
-        config = self.run.config
-        model = self.run.method.resumed(self.run.scene, config.train.iterations)
+        model = self.run.method.resumed(self.run.scene, self._schedule)
         if not isinstance(model, Prunable):
-            raise ValueError(f"{config.method} has no Gaussians that could be left out; take a method that has")
+            raise ValueError(
+                f"{self.run.config.method} has no Gaussians that could be left out; take a method that has"
+            )
         return model
 
     def _make(self, wanted: Plan, stop: Interrupt) -> tuple[Step, State]:
@@ -121,8 +128,8 @@ class Search:
     def _refine(self, model: Prunable, views: tuple[View, ...], what: str, stop: Interrupt) -> None:
         """Train a model a little on some views; `what` names this refinement among those of the search."""
         config = self.run.config
-        count = max(len(views), round(refine.SHARE * config.train.iterations))
-        refining = Refining(model, config.train, config.train.iterations, count)
+        count = max(len(views), round(refine.SHARE * self._schedule))
+        refining = Refining(model, config.train, self._schedule, count)
         scene, seed = replace(self.run.scene, train=views), config.seed + len(self.steps)
         torch.manual_seed(seed)
         trainer = Trainer(refining, scene, Budget(count), config.train, seed)

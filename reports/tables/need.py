@@ -29,9 +29,8 @@ COLUMNS: dict[Column, Callable[[Curve, Curve], float | None]] = {
 NOTES = (
     "Needed: the smallest model as good as one that was refined as often and lost nothing, on views taken from the "
     "training: WS-PSNR by at most so many dB with 95 % confidence, each latitude band by twice and each view by five "
-    "times that, LPIPS by 0.005. WS-PSNR: of the test views, which decide nothing, less what was lost there against a model "
-    "refined as often. Not searched: offsets an anchor, "
-    "features, degree of the harmonics.",
+    "times that, LPIPS by 0.005. WS-PSNR: of the test views, which decide nothing, less what was lost there against a "
+    "model refined as often. Not searched: offsets an anchor, features, degree of the harmonics.",
     "Knee: the largest model below which a halving costs more than 0.1 dB. Against the first: means over what both "
     "curves share.",
 )
