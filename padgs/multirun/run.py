@@ -16,9 +16,7 @@ from padgs.multirun.board import FOLDER, OK
 from padgs.multirun.choices import register_choices
 from padgs.multirun.launchers import missing_plugin
 from padgs.multirun.overrides import conflict, lenient, options_first, root
-from padgs.runs.interrupt import Interrupted
-
-INTERRUPTED = 130  # exit code of a command that Ctrl-C ended
+from padgs.runs.interrupt import INTERRUPTED, Interrupted
 
 
 def main() -> None:

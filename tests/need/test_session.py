@@ -121,6 +121,12 @@ def test_steps_of_another_model_are_refused(opened):
         search.folder.steps()
 
 
+def test_ctrl_c_says_what_is_safe(opened, monkeypatch):
+    monkeypatch.setattr(session.Interrupt, "requested", True)
+    result = CliRunner().invoke(app, ["need", str(opened("method=omnigs").folder)])
+    assert result.exit_code == 130 and "stopped after step 1; nothing is lost" in result.output
+
+
 def refused(*arguments: str) -> str:
     result = CliRunner().invoke(app, ["need", *map(str, arguments)])
     assert result.exit_code == 1, result.output
