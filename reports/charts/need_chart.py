@@ -25,9 +25,10 @@ def charts(gathered: Gathered) -> list[Chart]:
         ReportError: results that must not stand together.
     """
     found = []
-    for title, own in by_conditions(searched(gathered), "resolution", "iterations").items():
+    for title, own in by_conditions(searched(gathered), "resolution", "length").items():
         refuse_mixture(own, gathered.request, title, ("protocol", "data"))
-        name = "need_" + "_".join(str(own[column].iloc[0]) for column in ("scene", "resolution", "iterations"))
+        words = "_".join(str(own[column].iloc[0]) for column in ("scene", "resolution", "length"))
+        name = "need_" + words.replace(" ", "-")
         found.append(_chart(name, title, own, footnotes({title: own}, gathered.request.protocol)))
     return found
 

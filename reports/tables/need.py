@@ -13,17 +13,17 @@ from reports.tables.table import Block, Cell, Column, Row, Table
 COLUMNS: dict[Column, Callable[[Curve, Curve], float | None]] = {
     Column("Gaussians blended", 0): lambda own, _: own.found["steps"][0]["blended"],
     **{
-        Column(f"for {epsilon} dB", 0, False, group="needed"): lambda own, _, e=epsilon: own.needs[e]["blended"]
+        Column(f"needed for {epsilon} dB", 0, False): lambda own, _, e=epsilon: own.needs[e]["blended"]
         for epsilon in EPSILONS
     },
-    Column("of all", 2, False, group="needed"): lambda own, _: own.needs[STATED]["rows"] / own.found["rows"],
+    Column(f"share for {STATED} dB", 2, False): lambda own, _: own.needs[STATED]["rows"] / own.found["rows"],
     Column("knee", 0): lambda own, _: None if own.knee is None else own.knee["blended"],
-    Column("MB", 2, False, group=f"for {STATED} dB"): lambda own, _: own.needs[STATED]["bytes"] / 1e6,
-    Column("ms per frame", 1, False, group=f"for {STATED} dB"): lambda own, _: own.needs[STATED]["frame_ms"],
-    Column("WS-PSNR", 2, True, group=f"for {STATED} dB"): lambda own, _: own.quality_of(own.needs[STATED]),
+    Column(f"MB for {STATED} dB", 2, False): lambda own, _: own.needs[STATED]["bytes"] / 1e6,
+    Column(f"ms for {STATED} dB", 1, False): lambda own, _: own.needs[STATED]["frame_ms"],
+    Column(f"WS-PSNR for {STATED} dB", 2, True): lambda own, _: own.quality_of(own.needs[STATED]),
     Column("WS-PSNR of all", 2, True): lambda own, _: own.quality_of(own.found["steps"][0]),
-    Column("dB at equal N", 2, signed=True, group="against the first"): gain,
-    Column("N at equal dB", 2, group="against the first"): ratio,
+    Column("dB at equal N against the first", 2, signed=True): gain,
+    Column("N at equal dB over the first's", 2): ratio,
     Column("CPU s of the search", 0): lambda own, _: own.found["cpu_seconds"],
 }
 NOTES = (
@@ -31,7 +31,7 @@ NOTES = (
     "training: WS-PSNR by at most so many dB with 95 % confidence, each latitude band by twice and each view by five "
     "times that, LPIPS by 0.005. WS-PSNR: of the test views, which decide nothing, less what was lost there against a "
     "model refined as often. Not searched: offsets an anchor, features, degree of the harmonics.",
-    "Knee: the largest model below which a halving costs more than 0.1 dB. Against the first: means over what both "
+    "Knee: the largest model below which a halving costs more than 0.1 dB. Beside the first: means over what both "
     "curves share.",
 )
 
@@ -43,7 +43,7 @@ def need(gathered: Gathered) -> Table:
         ReportError: results that must not stand together.
     """
     blocks, runs_of = [], {}
-    for title, own in by_conditions(searched(gathered), "resolution", "iterations").items():
+    for title, own in by_conditions(searched(gathered), "resolution", "length").items():
         refuse_mixture(own, gathered.request, title, ("protocol", "data"))
         found = curves(own)
         rows = (Row(one.title, tuple(Cell(of(one, found[0])) for of in COLUMNS.values())) for one in found)

@@ -73,7 +73,7 @@ def test_curves_are_compared_where_both_are():
 
 def test_the_chart_has_a_point_for_each_size_and_all_numbers():
     (chart,) = charts(gathered(runs()))
-    assert chart.name == "need_synthetic-room_512x256_1500" and chart.png.startswith(b"\x89PNG")
+    assert chart.name == "need_synthetic-room_512x256_1500-iterations" and chart.png.startswith(b"\x89PNG")
     assert chart.numbers is not None and len(chart.numbers) == 2 * len(SIZES)
     assert list(chart.numbers["needed for"])[:4] == ["0.05", "0.1", "0.25 0.5", "1"]
     assert "4000 Gaussians" in chart.svg and "lost 0.65 dB" in chart.svg
