@@ -20,7 +20,7 @@ from types import UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
 SCHEMA = 2
-ADDED = {"peak_device_memory_bytes"}  # to the schema since: files without them are read, with the default
+ADDED = {"peak_device_memory_bytes", "need"}  # to the schema since: files without them are read, with the default
 FILE_NAME = "result.json"
 LOG_NAME, CONFIG_NAME = "log.jsonl", "config.yaml"
 PICTURES = "renders"  # folder of truth | render | error of each test view, in one picture
@@ -90,6 +90,7 @@ class Result:
     peak_device_memory_bytes: int | None = None  # of torch's tensors on the GPU, while training; None on the CPU
     config: dict[str, Any] = field(default_factory=dict)  # the resolved configuration
     experiments: tuple[str, ...] = ()  # experiments and sweeps that it belongs to, sorted
+    need: dict[str, Any] = field(default_factory=dict)  # of a pruned model: what `padgs need` found, see `padgs.need`
 
     def __post_init__(self) -> None:
         """Reject a status that no table knows."""

@@ -37,6 +37,8 @@ REPORTS: Mapping[str, Report] = {
     "modulation": Report("reports.tables.modulation:modulation", ("modulation",)),
     "plus_ablation": Report("reports.tables.variants:plus_ablation", ("plus_ablation",)),
     "stability": Report("reports.tables.stability:stability", ("stress",)),
+    "need": Report("reports.tables.need:need", ("need",)),
+    "need_chart": Report("reports.charts.need_chart:charts", ("need",)),
     "runs": Report("reports.tables.runs:runs"),
     "chart": Report("reports.charts.trade_off_chart:charts", ("pareto", *OF_AN_ORDER, *OF_ALL_METHODS)),
     "sweep": Report("reports.charts.sweep_chart:charts"),

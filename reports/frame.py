@@ -91,7 +91,7 @@ FACTS: Mapping[str, Callable[[Result], Any]] = {
         name: attrgetter(name)
         for name in (
             *("run", "ok", "status", "method", "preset", "variant", "dataset", "scene", "seed", "iterations"),
-            *("experiments", "code_version", "finished"),
+            *("experiments", "code_version", "finished", "need"),
         )
     },
     "place": lambda result: Place(result.dataset, result.scene),

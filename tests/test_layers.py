@@ -40,6 +40,7 @@ ROOMS = (
     "padgs.runs",
     "padgs.export",
     "padgs.viewer",
+    "padgs.need",
     "padgs.multirun",
     "padgs.cli",
 )

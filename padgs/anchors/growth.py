@@ -140,6 +140,12 @@ class Growth:
             return ()
         return (*self._grow(optimizer), *self._prune(optimizer))
 
+    def keep(self, rows: Tensor, optimizer: torch.optim.Adam | None) -> None:
+        """Keep these anchors only, [A] bool or row numbers, with their statistics and moments if there are any."""
+        keep_rows(self.model.rows(), optimizer, rows)
+        self.model.positions = self.model.positions[rows]
+        self.statistics = {name: values[rows] for name, values in self.statistics.items()}
+
     def _grow(self, optimizer: torch.optim.Adam) -> tuple[str, ...]:
         model, options, statistics = self.model, self.options, self.statistics
         eligible = statistics["seen"] > options.eligible_share * options.grow_every
@@ -177,10 +183,7 @@ class Growth:
         if faint.all():
             raise Failure("collapsed", f"all {len(faint)} anchors are fainter than min_opacity {options.min_opacity}")
         if faint.any():
-            keep = ~faint
-            keep_rows(model.rows(), optimizer, keep)
-            model.positions = model.positions[keep]
-            self.statistics = {name: values[keep] for name, values in statistics.items()}
+            self.keep(~faint, optimizer)
         if options.log_scale_cap is not None:
             model.log_scales.data[:, 3:].clamp_(max=options.log_scale_cap)
         count = int(faint.sum())

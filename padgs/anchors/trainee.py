@@ -13,7 +13,7 @@ from padgs.anchors.model import PaDGS
 from padgs.checks import check, check_known
 from padgs.learning.extent import ExtentOptions
 from padgs.learning.schedule import Constant, LogLinear, ParameterGroup
-from padgs.learning.trainee import Drawing, Size, State
+from padgs.learning.trainee import Drawing, Parts, Size, State
 from padgs.render import Rendering, RenderOptions, render
 from padgs.scene import View
 
@@ -115,6 +115,15 @@ class AnchorTrainee:
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
         """Grow and prune anchors."""
         return self.growth.adapt(iteration, optimizer)
+
+    def parts(self, view: View) -> Parts:
+        """The Gaussians that the view shows; an anchor with all of its own is a row."""
+        decoded = self.model.decode(view)
+        return Parts(decoded.gaussians, decoded.slots, self.model.options.offsets, self._options)
+
+    def keep(self, rows: Tensor) -> None:
+        """Keep these anchors only."""
+        self.growth.keep(rows, None)
 
     @torch.no_grad()
     def render(self, view: View) -> Rendering:

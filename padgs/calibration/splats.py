@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from padgs.learning.schedule import ParameterGroup
-from padgs.learning.trainee import Drawing, Size, State
+from padgs.learning.trainee import Drawing, Parts, Size, State
 from padgs.scene import Scene, View
 from padgs.splats.method import SplatMethod
 from padgs.splats.model import Splats
@@ -54,6 +54,17 @@ class CalibratedTrainee(SplatTrainee):
     def groups(self) -> list[ParameterGroup]:
         """Those of the splats and of the cameras."""
         return super().groups() + self.calibration.groups(self.iterations)
+
+    def parts(self, view: View) -> Parts:
+        """Refused: a photograph says little about what an ideal camera in its supposed place sees.
+
+        Raises:
+            ValueError: always.
+        """
+        raise ValueError(
+            "its cameras learn along, so photographs cannot be compared with what stands at their poses; take a method "
+            "that does not calibrate"
+        )
 
     def draw(self, view: View) -> Drawing:
         """Render all Gaussians as the camera of the view takes them, differentiably."""

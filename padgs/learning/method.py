@@ -122,6 +122,18 @@ class Method(ABC):
         other.load_state(self.state())
         return other
 
+    def resumed(self, scene: Scene, iterations: int) -> Any:
+        """The loaded model as it is in training, of so many iterations: for whoever changes or trains it otherwise.
+
+        Raises:
+            RuntimeError: nothing was loaded.
+            ValueError: the scene is nothing for this method.
+        """
+        model = self.state().of_model()
+        trainee = self._start(scene, iterations)
+        trainee.load_state(model)
+        return trainee
+
     @property
     def start(self) -> int:
         """How many Gaussians, anchors or other parts the model had before the first iteration of `fit`."""

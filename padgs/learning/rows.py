@@ -15,8 +15,8 @@ from torch import Tensor, nn
 MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
-def keep_rows(parameters: Mapping[str, nn.Parameter], optimizer: torch.optim.Adam, keep: Tensor) -> None:
-    """Keep only some rows of every parameter, with their Adam moments.
+def keep_rows(parameters: Mapping[str, nn.Parameter], optimizer: torch.optim.Adam | None, keep: Tensor) -> None:
+    """Keep only some rows of every parameter, with their Adam moments if there are any.
 
     Args:
         parameters: name -> [N, ...], all with the same N.
@@ -31,7 +31,7 @@ def keep_rows(parameters: Mapping[str, nn.Parameter], optimizer: torch.optim.Ada
     for parameter in parameters.values():
         parameter.data = parameter.data[keep]
         parameter.grad = None
-        moments = optimizer.state.get(parameter, {})
+        moments = {} if optimizer is None else optimizer.state.get(parameter, {})
         for name in MOMENTS:
             if name in moments:
                 moments[name] = moments[name][keep]

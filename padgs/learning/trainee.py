@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import KW_ONLY, dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -16,7 +16,7 @@ from torch import Tensor
 from padgs.gaussians import Gaussians
 from padgs.learning.schedule import ParameterGroup
 from padgs.learning.targets import Target
-from padgs.render import Rendering
+from padgs.render import Rendering, RenderOptions
 from padgs.scene import View
 
 MODEL = "model/"  # prefix of the model's own tensors in the state of a trainer
@@ -106,4 +106,27 @@ class Trainee(Protocol):
 
     def load_state(self, state: State) -> None:
         """Become the model that `state` was taken of."""
+        ...
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What a view sees of a model that can lose rows, and which Gaussian belongs to which."""
+
+    gaussians: Gaussians  # the N that are drawn
+    slots: Tensor  # [N] int64, no two alike; the same Gaussian has the same one in all views
+    each: int  # Gaussians that a row can show at most: row i has slots from i `each` on
+    options: RenderOptions  # how they are drawn
+
+
+@runtime_checkable
+class Prunable(Trainee, Protocol):
+    """A model of Gaussians whose rows, single Gaussians or anchors, can be taken away."""
+
+    def parts(self, view: View) -> Parts:
+        """What a view sees; raises ValueError where views are drawn otherwise than a plain `render` does."""
+        ...
+
+    def keep(self, rows: Tensor) -> None:
+        """Keep these rows only, [N] bool, or row numbers in ascending order; of all that has rows, but no optimiser."""
         ...

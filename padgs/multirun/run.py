@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 from datetime import datetime
 
-INTERRUPTED = 130  # exit code of a command that Ctrl-C ended
+from padgs.runs.interrupt import INTERRUPTED
 
 
 def main() -> None:

@@ -13,6 +13,7 @@ Pointer = ctypes.c_void_p
 Int32, Int64 = ctypes.c_int32, ctypes.c_int64
 MOMENTS = 16  # floats per (Gaussian, tile) instance
 ABSOLUTE_MOMENT = 14  # the one with the sum of absolute pulls
+REMOVAL = 4  # floats per instance about its removal: changes of error and image, sum and largest contribution
 
 
 def fields(kind: type, *names: str) -> list[tuple[str, type]]:
@@ -73,6 +74,10 @@ class BlendGradientArguments(ctypes.Structure):
         *fields(Pointer, "grad_image", "grad_transmittance", "grad_depth", "moments", "grad_rays"),
         ("absolute", Int32),
     ]
+
+
+class LeaveOneOutArguments(ctypes.Structure):
+    _fields_ = [("forward", BlendArguments), *fields(Pointer, "target", "weight", "removals")]
 
 
 class HeadWeights(ctypes.Structure):

@@ -13,6 +13,7 @@ from padgs.native.abi import (
     Inputs,
     Int32,
     Int64,
+    LeaveOneOutArguments,
     LossArguments,
     NativeCamera,
     Pointer,
@@ -22,7 +23,7 @@ from padgs.native.watch import Watchable
 
 STRUCTURES = (
     *(NativeCamera, Inputs, Gradients, BlendGradientArguments),
-    *(DecodeGradientArguments, LossArguments, ColorArguments),
+    *(DecodeGradientArguments, LossArguments, ColorArguments, LeaveOneOutArguments),
 )
 SIGNATURES = {
     "padgs_isa": ([], ctypes.c_char_p),
@@ -37,6 +38,7 @@ SIGNATURES = {
     "padgs_core_words": ([Pointer], Int64),
     "padgs_blend_forward": ([Pointer], None),
     "padgs_blend_backward": ([Pointer], None),
+    "padgs_leave_one_out": ([Pointer], None),
     "padgs_decode_select": ([Pointer], None),
     "padgs_decode_place": ([Pointer], None),
     "padgs_decode_backward": ([Pointer], None),

@@ -72,6 +72,11 @@ class PlusTrainee(SplatTrainee):
             parameter.copy_(self.average[name])
         return ("the model is the mean of its last states",)
 
+    def keep(self, rows: Tensor) -> None:
+        """Keep these Gaussians only."""
+        super().keep(rows)
+        self.average = {name: mean[rows] for name, mean in self.average.items()}
+
     def state(self) -> State:
         """That of splats, and the running means."""
         state = super().state()

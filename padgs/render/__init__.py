@@ -24,7 +24,7 @@ BACKENDS = {
     "cuda": "padgs.render.backends.cuda:rasterize",
 }
 
-__all__ = ["BACKENDS", "RenderOptions", "Rendering", "render", "resolve_backend"]
+__all__ = ["BACKENDS", "RenderOptions", "Rendering", "render", "request_of", "resolve_backend"]
 
 
 def render(
@@ -56,6 +56,26 @@ def render(
     Raises:
         ValueError: unknown backend, or inputs that break the contract.
     """
+    request = request_of(gaussians, view, options, background, probe, absolute_probe, check_values=check_values)
+    rasterize: Backend = lookup(BACKENDS, resolve_backend(backend, gaussians.means), "backend")
+    return rasterize_cubemap(rasterize, request) if options.cubemap else rasterize(request)
+
+
+def request_of(
+    gaussians: Gaussians,
+    view: View,
+    options: RenderOptions,
+    background: Tensor | None = None,
+    probe: Tensor | None = None,
+    absolute_probe: Tensor | None = None,
+    *,
+    check_values: bool = False,
+) -> Request:
+    """What a backend is asked for, from the arguments of `render`.
+
+    Raises:
+        ValueError: they break the contract.
+    """
     means = gaussians.means
     cam_from_world = view.cam_from_world.to(device=means.device, dtype=means.dtype)
     if background is None:
@@ -65,8 +85,7 @@ def render(
     if options.pixel_bias:
         bias = 2 * options.pixel_bias / means.new_tensor([view.camera.width, view.camera.height])
         request = replace(request, probe=bias.expand(len(means), 2) if probe is None else probe + bias)
-    rasterize: Backend = lookup(BACKENDS, resolve_backend(backend, means), "backend")
-    return rasterize_cubemap(rasterize, request) if options.cubemap else rasterize(request)
+    return request
 
 
 def resolve_backend(backend: str, means: Tensor) -> str:

@@ -142,6 +142,16 @@ class Rendering:
     counters: Mapping[str, int] = field(default_factory=dict)  # gaussians, visible, instances, evaluated pairs, ...
 
 
+@dataclass(frozen=True)
+class Removals:
+    """What removing each of N Gaussians alone does to one view, see `padgs.render.leave_one_out`."""
+
+    error: Tensor  # [N] float64, change of the mean square error, weighted by pixels; < 0: better without it
+    change: Tensor  # [N] float64 >= 0, mean square change of the image by the same weights
+    contribution: Tensor  # [N] float64 in [0, 1], mean of alpha T by the same weights
+    peak: Tensor  # [N] in [0, 1], largest alpha T of any pixel
+
+
 Backend = Callable[[Request], Rendering]  # every entry of `padgs.render.BACKENDS`
 
 

@@ -38,6 +38,15 @@ def exists(folder: Path) -> bool:
     return (folder / MANIFEST).exists()
 
 
+def digest(folder: Path) -> str:
+    """SHA-256 of the tensors of a checkpoint.
+
+    Raises:
+        CheckpointError: it cannot be read.
+    """
+    return _manifest(folder)["sha256"]
+
+
 def save(state: State, folder: Path, run: Mapping[str, str] | None = None) -> None:
     """Write a checkpoint, replacing the one in the folder, which stays whole until the new one is.
 

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable
 from types import FrameType
 
+INTERRUPTED = 130  # exit code of a command that a signal ended
 SIGNALS = (signal.SIGINT, signal.SIGTERM)  # SIGTERM is what cluster schedulers send before they kill
 
 

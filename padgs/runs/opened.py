@@ -59,6 +59,11 @@ class OpenedRun:
     method: Method  # as its last checkpoint left it
     result: Result | None  # what `result.json` says; None where the run is not finished
 
+    @property
+    def files(self) -> RunFolder:
+        """The files of the run."""
+        return RunFolder(self.folder)
+
     @cached_property
     def scene(self) -> Scene:
         """The scene that it was trained on, loaded when first asked for.

@@ -8,8 +8,9 @@ from functools import reduce
 import torch
 from torch import Tensor
 
+from padgs.learning.rows import keep_rows
 from padgs.learning.schedule import Constant, LogLinear, ParameterGroup, scaled
-from padgs.learning.trainee import Drawing, Size, State
+from padgs.learning.trainee import Drawing, Parts, Size, State
 from padgs.render import Rendering, RenderOptions, render
 from padgs.render.config import RenderConfig
 from padgs.render.low_pass import LowPass, low_pass_of, widened
@@ -116,6 +117,16 @@ class SplatTrainee:
     def counts(self) -> dict[str, int]:
         """Number of Gaussians."""
         return {"gaussians": len(self.splats)}
+
+    def parts(self, view: View) -> Parts:
+        """All Gaussians; each is a row."""
+        slots = torch.arange(len(self.splats), device=self.splats.means.device)
+        return Parts(self.splats.gaussians(view), slots, 1, self.render_options(view))
+
+    def keep(self, rows: Tensor) -> None:
+        """Keep these Gaussians only."""
+        keep_rows(self.splats.rows(), None, rows)
+        self.densifier.statistics = {name: values[rows] for name, values in self.densifier.statistics.items()}
 
     @torch.no_grad()
     def render(self, view: View) -> Rendering:

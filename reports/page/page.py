@@ -40,7 +40,7 @@ def html(gathered: Gathered) -> str:
         problems=[*gathered.left_out, *refused],
         tables=[_table(table) for table in tables],
         maps=[_chart(chart) for chart in maps],
-        charts=[_chart(chart) for chart in made["chart"] or ()],
+        charts=[_chart(chart) for name in ("chart", "need_chart") for chart in made[name] or ()],
         sweeps=[_chart(chart) for chart in made["sweep"] or ()],
         pictures=pictures,
         data=_script(json.dumps({"images": pictures.images, "scenes": pictures.scenes})),

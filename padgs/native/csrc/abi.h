@@ -17,6 +17,7 @@ constexpr int kTile = 16;        // pixels: height of a tile, and its width time
 constexpr int kMaxLevel = 4;     // tiles are up to kTile 2^kMaxLevel pixels wide, near the poles
 constexpr int kMoments = 16;     // floats that backward blending leaves for each (Gaussian, tile) instance
 constexpr int kAbsoluteMoment = 14;
+constexpr int kRemoval = 4;      // floats for each instance: changes of error and image, sum and largest contribution
 constexpr float kAlphaMin = 1.0f / 255.0f;
 constexpr float kAlphaMax = 0.99f;
 constexpr float kTransmittanceMin = 1e-4f;
@@ -117,6 +118,12 @@ struct BlendGradientArguments {
   float *moments;                                             // [I, kMoments] by slot
   float *grad_rays;                                           // [H, 3, padded W] or null
   int32_t absolute;  // 1: also sum what each pixel alone pulls at the mean, into moment kAbsoluteMoment; `ray` only
+};
+
+struct LeaveOneOutArguments {
+  BlendArguments forward;
+  const float *target, *weight;  // [H,W,3], and [H,W] of the squared error of each pixel
+  float *removals;               // [I, kRemoval] by slot
 };
 
 // One network w2 relu(w1 x + b1) + b2; w1 [hidden, I], w2 [outputs, hidden].

@@ -13,11 +13,20 @@ import torch
 from torch import Tensor
 
 from padgs.native import cpu
-from padgs.native.abi import MOMENTS, BlendArguments, BlendGradientArguments, Gradients, Inputs, pointer
+from padgs.native.abi import (
+    MOMENTS,
+    REMOVAL,
+    BlendArguments,
+    BlendGradientArguments,
+    Gradients,
+    Inputs,
+    LeaveOneOutArguments,
+    pointer,
+)
 from padgs.render.backends.cpu_tiles import Projected, Strip
 from padgs.render.backends.native import NativeImage, Pixels, Upstream, rasterize_as
 from padgs.render.backends.native_camera import native_camera, native_rays
-from padgs.render.contract import Rendering, Request
+from padgs.render.contract import Removals, Rendering, Request
 from padgs.render.published_bounds import check_memory
 
 
@@ -28,13 +37,32 @@ def rasterize(request: Request) -> Rendering:
         ValueError: tensors that the library cannot take, or a projection that it does not know.
         OSError: the library was not built.
     """
-    means = request.gaussians.means
+    _check(request.gaussians.means)
+    return rasterize_as(_Drawing(request), request)
+
+
+def _check(means: Tensor) -> None:
     if means.dtype != torch.float32 or means.device.type != "cpu":
         raise ValueError(
             f"backend cpu takes float32 tensors on the CPU, got {means.dtype} on {means.device}; convert them, or use "
             "backend=torch"
         )
-    return rasterize_as(_Drawing(request), request)
+
+
+def leave_one_out(request: Request, target: Tensor, weight: Tensor) -> Removals:
+    """Score on the CPU; sorted blending only.
+
+    Raises:
+        ValueError, OSError: as `rasterize` does.
+    """
+    _check(request.gaussians.means)
+    attributes = [tensor.contiguous() for tensor in vars(request.gaussians).values()]
+    probe = None if request.probe is None else request.probe.contiguous()
+    pose, background = request.cam_from_world.contiguous(), request.background.contiguous()
+    drawing = _Drawing(request)
+    inputs = Inputs(len(request.gaussians), *map(pointer, (*attributes, probe)))
+    pixels, _ = drawing.draw(inputs, pose, background, differentiated=False)
+    return drawing.removals(pixels, background, target, weight)
 
 
 @dataclass
@@ -95,6 +123,19 @@ class _Drawing(NativeImage):
             cpu.library().padgs_blend_backward(ctypes.byref(arguments))
             cpu.library().padgs_sum_moments(pointer(moments), pointer(strip.slot_start), count, pointer(totals))
         return totals
+
+    def removals(self, pixels: Pixels, background: Tensor, target: Tensor, weight: Tensor) -> Removals:
+        count = len(self._projected.boxes)
+        sums, peak = torch.zeros(count, REMOVAL - 1, dtype=torch.float64), torch.zeros(count)
+        for strip in self._projected.strips():
+            forward = self._blend_arguments(strip, background, pixels, None)
+            found = torch.empty(len(strip.instances), REMOVAL)
+            arguments = LeaveOneOutArguments(forward, *map(pointer, (target, weight, found)))
+            cpu.library().padgs_leave_one_out(ctypes.byref(arguments))
+            owner = torch.repeat_interleave(torch.arange(count), strip.slot_start.diff())
+            sums.index_add_(0, owner, found[:, :-1].double())
+            peak.scatter_reduce_(0, owner, found[:, -1], "amax")
+        return Removals(*sums.unbind(-1), peak)
 
     def project_backward(
         self, inputs: Inputs, pose: Tensor, moments: Tensor, gradients: list[Tensor | None], *, needs_pose: bool

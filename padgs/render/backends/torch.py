@@ -15,6 +15,7 @@ from padgs.render.contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Rende
 from padgs.render.hybrid import hybrid_weights
 from padgs.render.projection import Footprints, project
 from padgs.render.published_bounds import check_memory, instances
+from padgs.sphere.camera import Camera
 
 PAIRS_PER_BLOCK = 1 << 21  # (pixel, Gaussian) pairs held at once
 
@@ -27,13 +28,11 @@ def rasterize(request: Request) -> Rendering:
     order = order[footprints.visible[order]]
     if options.memory_cap is not None and footprints.boxes is not None:
         check_memory(instances(footprints.boxes[order], camera.width, camera.height), options)
-    pixels = torch.arange(camera.height * camera.width, device=background.device)
-    blocks = pixels.split(max(1, PAIRS_PER_BLOCK // max(1, len(order))))
     parts = []
-    for block in blocks:
-        rows, columns = torch.div(block, camera.width, rounding_mode="floor"), block % camera.width
+    places = blocks(camera, len(order), background.device)
+    for rows, columns in places:
         arguments = (footprints, gaussians.colors, background, order, rows, columns, options, request.absolute_probe)
-        if len(blocks) > 1 and torch.is_grad_enabled():
+        if len(places) > 1 and torch.is_grad_enabled():
             parts.append(checkpoint(_blend, *arguments, use_reentrant=False, preserve_rng_state=False))
         else:
             parts.append(_blend(*arguments))
@@ -41,7 +40,7 @@ def rasterize(request: Request) -> Rendering:
     counters = {
         "gaussians": len(gaussians),
         "visible": len(order),
-        "evaluated": len(pixels) * len(order),
+        "evaluated": camera.height * camera.width * len(order),
         "contributing": sum(contributing),
     }
     size = (camera.height, camera.width)
@@ -52,6 +51,13 @@ def rasterize(request: Request) -> Rendering:
         footprints.visible,
         counters,
     )
+
+
+def blocks(camera: Camera, count: int, device: torch.device | str = "cpu") -> list[tuple[Tensor, Tensor]]:
+    """Rows and columns of all pixels, in blocks small enough to hold each against `count` Gaussians."""
+    pixels = torch.arange(camera.height * camera.width, device=device)
+    size = max(1, PAIRS_PER_BLOCK // max(1, count))
+    return [(torch.div(some, camera.width, rounding_mode="floor"), some % camera.width) for some in pixels.split(size)]
 
 
 def _blend(
@@ -65,15 +71,11 @@ def _blend(
     absolute_probe: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor, int]:
     """Colour [P, 3], transmittance [P] and depth [P] of some pixels, and how many pairs contribute (Eq. 4)."""
-    q, inside = footprints.squared_distance(order, rows, columns)  # [P, K] each
-    if absolute_probe is not None:
-        q = with_absolute_pull(q, footprints.slope(order, rows, columns), absolute_probe[order])
-    alpha = (footprints.opacities[order] * torch.exp(-0.5 * q)).clamp(max=ALPHA_MAX)
-    alpha = torch.where(inside & (alpha.detach() >= ALPHA_MIN), alpha, torch.zeros_like(alpha))
+    alpha = fragments(footprints, order, rows, columns, absolute_probe)
     if options.blending == "hybrid":
         weights, transmittance = hybrid_weights(alpha, footprints.distance(order, rows, columns), options.core_size)
     else:
-        weights, transmittance = _sorted_weights(alpha)
+        weights, transmittance = sorted_weights(alpha)
     color = weights @ colors[order] + transmittance[:, None] * background
     coverage = weights.sum(-1)
     covered = coverage > 0
@@ -81,7 +83,18 @@ def _blend(
     return color, transmittance, depth, int((weights.detach() > 0).sum())
 
 
-def _sorted_weights(alpha: Tensor) -> tuple[Tensor, Tensor]:
+def fragments(
+    footprints: Footprints, order: Tensor, rows: Tensor, columns: Tensor, absolute_probe: Tensor | None = None
+) -> Tensor:
+    """Alpha [P, K] of K Gaussians in some order at some pixels; 0 where nothing is drawn."""
+    q, inside = footprints.squared_distance(order, rows, columns)  # [P, K] each
+    if absolute_probe is not None:
+        q = with_absolute_pull(q, footprints.slope(order, rows, columns), absolute_probe[order])
+    alpha = (footprints.opacities[order] * torch.exp(-0.5 * q)).clamp(max=ALPHA_MAX)
+    return torch.where(inside & (alpha.detach() >= ALPHA_MIN), alpha, torch.zeros_like(alpha))
+
+
+def sorted_weights(alpha: Tensor) -> tuple[Tensor, Tensor]:
     """Weights [P, K] of fragments [P, K] that are in order, and what is left [P]."""
     running = torch.cumprod(1 - alpha.detach(), dim=-1) >= TRANSMITTANCE_MIN
     alpha = torch.where(running, alpha, torch.zeros_like(alpha))

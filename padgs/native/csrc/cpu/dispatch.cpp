@@ -11,6 +11,7 @@ namespace padgs {
   extern const ProjectKernels project_kernels; \
   extern const BlendKernels blend_kernels;    \
   extern const HybridKernels hybrid_kernels;  \
+  extern const LeaveOneOutKernels leave_one_out_kernels; \
   extern const ColorKernels color_kernels;    \
   extern const LossKernels loss_kernels;      \
   extern const DecodeKernels decode_kernels;  \
@@ -27,6 +28,7 @@ struct Kernels {
   const ProjectKernels &project;
   const BlendKernels &blend;
   const HybridKernels &hybrid;
+  const LeaveOneOutKernels &leave_one_out;
   const ColorKernels &colors;
   const LossKernels &loss;
   const DecodeKernels &decode;
@@ -34,8 +36,9 @@ struct Kernels {
 };
 
 #define PADGS_KERNELS(isa)                                                                                  \
-  {#isa,               isa::project_kernels, isa::blend_kernels,  isa::hybrid_kernels,                      \
-   isa::color_kernels, isa::loss_kernels,    isa::decode_kernels, isa::ceiling_kernels}
+  {#isa,                       isa::project_kernels, isa::blend_kernels, isa::hybrid_kernels,                \
+   isa::leave_one_out_kernels, isa::color_kernels,   isa::loss_kernels,  isa::decode_kernels,                \
+   isa::ceiling_kernels}
 
 static Kernels choose() {
 #if PADGS_ISA_COUNT > 1
@@ -65,7 +68,8 @@ using namespace padgs;
 // refuses to talk to a library that was built from other sources.
 PADGS_API int64_t padgs_structure_bytes(int32_t index) {
   const size_t bytes[] = {sizeof(Camera), sizeof(Inputs), sizeof(Gradients), sizeof(BlendGradientArguments),
-                          sizeof(DecodeGradientArguments), sizeof(LossArguments),   sizeof(ColorArguments)};
+                          sizeof(DecodeGradientArguments), sizeof(LossArguments), sizeof(ColorArguments),
+                          sizeof(LeaveOneOutArguments)};
   return index >= 0 && size_t(index) < sizeof(bytes) / sizeof(*bytes) ? int64_t(bytes[index]) : -1;
 }
 
@@ -94,6 +98,9 @@ PADGS_API void padgs_blend_backward(const BlendGradientArguments *args) {
 
 // For `cores` of the same arguments, where no outputs are needed yet.
 PADGS_API int64_t padgs_core_words(const BlendArguments *args) { return kernels().hybrid.core_words(*args); }
+
+// After padgs_blend_forward with the same arguments, sorted.
+PADGS_API void padgs_leave_one_out(const LeaveOneOutArguments *args) { kernels().leave_one_out.run(*args); }
 
 PADGS_API void padgs_colors(const ColorArguments *args) { kernels().colors.run(*args); }
 

@@ -19,6 +19,10 @@ struct HybridKernels : BlendKernels {
   int64_t (*core_words)(const BlendArguments &);  // the most that forward can leave to backward
 };
 
+struct LeaveOneOutKernels {
+  void (*run)(const LeaveOneOutArguments &);  // sorted blending only
+};
+
 struct ColorKernels {
   void (*run)(const ColorArguments &);
 };

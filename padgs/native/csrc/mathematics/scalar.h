@@ -18,6 +18,7 @@ namespace padgs {
 constexpr float kPi = 3.14159265358979323846f;
 
 PADGS_HD float root(float x) { return sqrtf(x); }
+PADGS_HD float reciprocal(float x) { return 1.0f / x; }
 PADGS_HD float arctangent2(float y, float x) { return atan2f(y, x); }
 PADGS_HD float logarithm2(float x) { return log2f(x); }
 PADGS_HD float smaller(float a, float b) { return fminf(a, b); }

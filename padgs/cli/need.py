@@ -1,0 +1,48 @@
+"""`padgs need`: how many Gaussians does the scene of a run need?"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from padgs.cli.refusing import refusing
+
+
+def need(
+    run: Annotated[str, typer.Argument(help="folder of a finished run, as padgs-run names it at its end")],
+    epsilon: Annotated[float, typer.Option(help="dB that the kept model may lose: 0.05, 0.1, 0.25, 0.5, 1")] = 0.1,
+    data: Annotated[str, typer.Option(help="where the data set is now, if not where it was")] = "",
+    device: Annotated[str, typer.Option(help="auto, cpu or cuda")] = "auto",
+) -> None:
+    """Find the smallest model as good as a trained one, for several losses; keep one as a run of its own."""
+    from rich.console import Console
+
+    from padgs.need.outcome import need as told
+    from padgs.need.outcome import write_pruned
+    from padgs.need.search import EPSILONS
+    from padgs.need.session import Search
+    from padgs.need.summary import show
+    from padgs.runs.interrupt import INTERRUPTED, Interrupted
+    from padgs.runs.opened import load_run
+
+    console = Console(highlight=False, soft_wrap=True)
+    try:
+        with refusing(OSError, RuntimeError, ValueError):
+            if epsilon not in EPSILONS:
+                known = ", ".join(f"{known:g}" for known in EPSILONS)
+                rule = "must be > 0" if not epsilon > 0 else "is none of those that are searched for"
+                raise ValueError(f"--epsilon is {epsilon:g}; it {rule}: {known}")
+            opened = load_run(run, data_path=data or None, device=device)
+            if opened.result is None or not opened.result.ok:
+                state = "not finished" if opened.result is None else f"of status {opened.result.status}"
+                raise ValueError(f"{run} is {state}; a need is that of a run that ended well, so start it again first")
+            with opened.files.locked():
+                search = Search(opened, console.print)
+                search.complete()
+                folder = write_pruned(search, epsilon)
+            show(told(search), console)
+            console.print(str(folder), style="bold")
+    except Interrupted as interrupted:  # outside of `refusing`, to which Exit is an error
+        console.print(str(interrupted))
+        raise typer.Exit(INTERRUPTED) from interrupted

@@ -1,0 +1,126 @@
+"""Which model to make next, and what the models made so far say. Pure functions of a list of steps.
+
+The first step leaves out what no training view shows. Each other one refines a model without the calibration views, for
+always as many iterations, after it took rows from it: three tenths at a time, until even the largest loss asked for is
+exceeded; then, for each loss, so many that it is half-way (in log N) between the smallest model that is good enough and
+the next smaller one.
+
+A model that was refined forgets what the run knew of the calibration views, and gains what any training on gains. So it
+is compared with one that was refined as often and lost nothing, its control; these are steps, too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from padgs.need.calibration import QUALITY, differences, objections
+from padgs.results import Scores
+
+EPSILONS = (0.05, 0.1, 0.25, 0.5, 1.0)  # dB
+KEPT = 0.7  # of the rows, in a step down; with more gone at once their removals no longer add up
+CLOSE = 1.2  # two sizes this close are told apart no further
+FEWEST_ROWS = 10
+SLOPE = 0.1  # dB per doubling, from which on more Gaussians are worth having
+HALF_A_DOUBLING = 2**-0.5
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A model to be made: from that of step `parent`, or for the first from the run's own, with so many rows or all."""
+
+    kind: str  # waste | control | prune
+    parent: int | None
+    rows: int | None = None
+
+
+@dataclass(frozen=True)
+class Step:
+    """A model that was made, and measured."""
+
+    kind: str
+    parent: int | None
+    depth: int  # how often it was refined since the run
+    rows: int  # Gaussians, or anchors
+    blended: int  # Gaussians that contribute to any training view
+    bytes: int
+    frame_ms: float  # smallest of some calibration views
+    marks: Scores  # of the calibration views
+    test: dict[str, float | None] = field(default_factory=dict)  # metric -> mean over the test views; decides nothing
+    seconds: float = 0.0  # to make and measure it
+    cpu_seconds: float = 0.0
+
+
+def control(steps: Sequence[Step], depth: int) -> int | None:
+    """The step that was refined so often and lost nothing, if it was made."""
+    return next((n for n, step in enumerate(steps) if step.kind != "prune" and step.depth == depth), None)
+
+
+def models(steps: Sequence[Step]) -> list[int]:
+    """The first step and all that rows were taken from, from large to small."""
+    return sorted((n for n, s in enumerate(steps) if s.kind != "control"), key=lambda number: -steps[number].rows)
+
+
+def against(steps: Sequence[Step], number: int, epsilon: float) -> tuple[str, ...]:
+    """Why a step is not as good as its control up to epsilon; nothing where it is."""
+    other = control(steps, steps[number].depth)
+    assert other is not None, "controls are made first"
+    return objections(steps[number].marks, steps[other].marks, epsilon)
+
+
+def loss(steps: Sequence[Step], number: int) -> float:
+    """Mean WS-PSNR, dB, that a step lost on the calibration views against its control."""
+    other = control(steps, steps[number].depth)
+    assert other is not None, "controls are made first"
+    losses = differences(steps[other].marks, steps[number].marks, QUALITY)
+    return math.fsum(losses) / len(losses)
+
+
+def smallest(steps: Sequence[Step], epsilon: float) -> int:
+    """The smallest model as good as its control up to epsilon; of several steps at least the first."""
+    return [number for number in models(steps) if not against(steps, number, epsilon)][-1]
+
+
+def plan(steps: Sequence[Step], epsilons: Sequence[float] = EPSILONS) -> Plan | None:
+    """What to make next; None where all is known."""
+    if not steps:
+        return Plan("waste", None)
+    wanted = _pruned(steps, epsilons)
+    if wanted is None or wanted.parent is None:
+        return wanted
+    depth = steps[wanted.parent].depth
+    if control(steps, depth + 1) is None:
+        return Plan("control", control(steps, depth))
+    return wanted
+
+
+def _pruned(steps: Sequence[Step], epsilons: Sequence[float]) -> Plan | None:
+    last = models(steps)[-1]
+    down = math.ceil(KEPT * steps[last].rows)
+    if smallest(steps, max(epsilons)) == last and FEWEST_ROWS <= down < steps[last].rows:
+        return Plan("prune", last, down)
+    for epsilon in sorted(epsilons, reverse=True):
+        enough = smallest(steps, epsilon)
+        rows = steps[enough].rows
+        below = max((steps[n].rows for n in models(steps) if steps[n].rows < rows), default=rows)
+        middle = round(math.sqrt(rows * below))
+        if rows > CLOSE * below and below < middle < rows:
+            return Plan("prune", enough, middle)
+    return None
+
+
+def knee(steps: Sequence[Step]) -> int | None:
+    """The largest model below which quality falls by more than 0.1 dB per halving; None where it never does.
+
+    Slopes are taken over at least half a doubling: over less they are noise.
+    """
+    order = models(steps)
+    for number in order:
+        rows = steps[number].rows
+        lower = next((n for n in order if steps[n].rows <= HALF_A_DOUBLING * rows), None)
+        if lower is not None:
+            fall = loss(steps, lower) - loss(steps, number)
+            if fall / math.log2(rows / steps[lower].rows) > SLOPE:
+                return number
+    return None

@@ -1,0 +1,159 @@
+"""The search for the smallest model of a run, step after step of `padgs.need.search`, resumable at any iteration."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import cycle, islice
+
+import torch
+
+from padgs.clock import timed
+from padgs.learning.budget import Budget
+from padgs.learning.loop import Trainer
+from padgs.learning.trainee import Prunable, State
+from padgs.need import refine
+from padgs.need.calibration import RULES, calibration_split
+from padgs.need.refine import Refining
+from padgs.need.search import Plan, Step, loss, plan
+from padgs.need.steps import StepsFolder
+from padgs.need.worth import most_wanted, worth
+from padgs.runs import checkpoint
+from padgs.runs.interrupt import Interrupt, Interrupted
+from padgs.runs.opened import OpenedRun
+from padgs.scene import View
+from padgs.scoring.evaluate import evaluate
+
+FOLDER = "need"  # in that of the run
+FRAMES = 10  # timed; the smallest time counts, since other programs only add to it
+WITHOUT_PERCEPTION = replace(RULES, lpips="none")  # for test views, which decide nothing
+
+
+class Search:
+    """The steps of a run, those that were made before included.
+
+    Attributes:
+        run: whose model is looked at.
+        calibration: training views that are measured on.
+        row: what a row of the model is called, gaussians or anchors.
+        rows: how many the model of the run has.
+        steps, folder: what was made so far, and where it is.
+    """
+
+    def __init__(self, run: OpenedRun, say: Callable[[str], None] = lambda text: None) -> None:
+        """Prepare; nothing is drawn yet.
+
+        Raises:
+            ValueError: the model has no Gaussians that could be left out, or the scene too few training views.
+            CheckpointError: steps of an earlier start are damaged, or of another model.
+        """
+        self.run, self._say = run, say
+        self.calibration, self._views = calibration_split(run.scene.train)
+        self._model = self._resumed()
+        self.row, self.rows = next(iter(self._model.counts().items()))
+        self.folder = StepsFolder(run.folder / FOLDER, checkpoint.digest(run.files.checkpoint))
+        self.steps = self.folder.steps()
+
+    def complete(self) -> None:
+        """Make all steps that are missing.
+
+        Raises:
+            Interrupted: stopped from outside; starting again goes on, to the same result bit by bit (on the CPU).
+            Failure: a refinement failed.
+        """
+        if self.steps:
+            self._say(f"{len(self.steps)} steps were made before")
+        with Interrupt() as stop:
+            while (wanted := plan(self.steps)) is not None:
+                step, model = self._make(wanted, stop)
+                self.folder.add(len(self.steps), step, model)
+                self.steps.append(step)
+                self._say(
+                    f"{len(self.steps):3d} {step.kind:7s} {step.rows:8d} {self.row}, {step.blended} Gaussians blended, "
+                    f"{loss(self.steps, len(self.steps) - 1):5.2f} dB lost, {step.seconds:.1f} s"
+                )
+                if stop.requested:
+                    raise Interrupted(f"stopped after step {len(self.steps)}; nothing is lost, start again to go on")
+
+    def kept(self, number: int) -> Prunable:
+        """The model of a step, refined once more on all training views if it was refined without some.
+
+        Raises:
+            Interrupted, Failure: as `complete` does.
+        """
+        model = self._model_of(number)
+        if self.steps[number].depth > 0:
+            with Interrupt() as stop:
+                self._refine(model, self.run.scene.train, f"kept {number}", stop)
+        return model
+
+    def _model_of(self, number: int) -> Prunable:
+        model, state = self._resumed(), self.folder.state(number, self._device)
+        model.load_state(State(state.tensors, state.values["model"]))
+        return model
+
+    @property
+    def _device(self) -> torch.device:
+        return self.run.scene.points.device
+
+    @property
+    def _schedule(self) -> int:
+        """Iterations of the run's schedule; those of a budget of seconds are known afterwards."""
+        return self.run.method.state().values.get("schedule", self.run.config.train.iterations)
+
+    def _resumed(self) -> Prunable:
+        """The model of the run."""
+        model = self.run.method.resumed(self.run.scene, self._schedule)
+        if not isinstance(model, Prunable):
+            raise ValueError(
+                f"{self.run.config.method} has no Gaussians that could be left out; take a method that has"
+            )
+        return model
+
+    def _make(self, wanted: Plan, stop: Interrupt) -> tuple[Step, State]:
+        started = time.perf_counter(), time.process_time()
+        model = self._model if wanted.parent is None else self._model_of(wanted.parent)
+        if wanted.kind == "waste":
+            shown = worth(model, self.run.scene.train).peak > 0
+            model.keep(shown)
+        else:
+            if wanted.rows is not None:
+                model.keep(most_wanted(worth(model, self.run.scene.train), wanted.rows))
+            self._refine(model, self._views, f"step {len(self.steps)}", stop)
+        step = self._measured(model, wanted)
+        seconds, cpu_seconds = time.perf_counter() - started[0], time.process_time() - started[1]
+        return replace(step, seconds=seconds, cpu_seconds=cpu_seconds), model.state()
+
+    def _refine(self, model: Prunable, views: tuple[View, ...], what: str, stop: Interrupt) -> None:
+        """Train a model a little on some views; `what` names this refinement among those of the search."""
+        config = self.run.config
+        count = max(len(views), round(refine.SHARE * self._schedule))
+        refining = Refining(model, config.train, self._schedule, count)
+        scene, seed = replace(self.run.scene, train=views), config.seed + len(self.steps)
+        torch.manual_seed(seed)
+        trainer = Trainer(refining, scene, Budget(count), config.train, seed)
+        if (begun := self.folder.begun(what, self._device)) is not None:
+            trainer.load_state(begun)
+        for record in trainer.records():
+            if stop.requested and record.iteration < count:
+                self.folder.begin(what, trainer.state())
+                raise Interrupted(f"stopped within {what}; nothing is lost, start again to go on")
+
+    def _measured(self, model: Prunable, wanted: Plan) -> Step:
+        scene = self.run.scene
+        marks = replace(evaluate(model.render, self.calibration, RULES), protocol={}, notes=())
+        test = evaluate(model.render, scene.test, WITHOUT_PERCEPTION).metrics if scene.test else {}
+        views = islice(cycle(self.calibration), FRAMES)
+        times = [timed(lambda view=view: model.render(view), self._device)[1] for view in views]
+        return Step(
+            kind=wanted.kind,
+            parent=wanted.parent,
+            depth=0 if wanted.parent is None else self.steps[wanted.parent].depth + 1,
+            rows=next(iter(model.counts().values())),
+            blended=worth(model, scene.train).blended,
+            bytes=model.size().bytes,
+            frame_ms=1000 * min(times),
+            marks=marks,
+            test=test,
+        )

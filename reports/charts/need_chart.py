@@ -1,0 +1,79 @@
+"""The picture of a need: quality over the Gaussians that are blended, over bytes, and over time per frame."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from pandas import DataFrame
+
+from reports.charts.drawing import MARKERS, Chart, Tips, dress, figure, lay_out, png, styled, svg
+from reports.charts.palette import INK, color_of
+from reports.conditions import footnotes, refuse_mixture
+from reports.frame import by_conditions
+from reports.gathered import Gathered
+from reports.needs import STATED, Curve, curves, searched
+
+PANELS = (("blended", "Gaussians blended", 1.0), ("bytes", "model, MB", 1e-6), ("frame_ms", "ms per frame", 1.0))
+DOUBLINGS = 1.5  # ratio from which on sizes stand on a logarithmic axis
+
+
+def charts(gathered: Gathered) -> list[Chart]:
+    """A picture of each scene that something was searched on.
+
+    Raises:
+        ReportError: results that must not stand together.
+    """
+    found = []
+    for title, own in by_conditions(searched(gathered), "resolution", "length").items():
+        refuse_mixture(own, gathered.request, title, ("protocol", "data"))
+        words = "_".join(str(own[column].iloc[0]) for column in ("scene", "resolution", "length"))
+        name = "need_" + words.replace(" ", "-")
+        found.append(_chart(name, title, own, footnotes({title: own}, gathered.request.protocol)))
+    return found
+
+
+@styled
+def _chart(name: str, title: str, runs: DataFrame, notes: list[str]) -> Chart:
+    found = curves(runs)
+    made, axes = figure(len(PANELS), 1, 3.6, 3.4)
+    tips = Tips()
+    for panel, (quantity, words, unit) in zip(axes.flat, PANELS, strict=True):
+        for curve in found:
+            _draw(panel, curve, quantity, unit, tips, [one.preset for one in found])
+        dress(panel.xaxis, [v * unit for one in found for v in one.values(quantity)], log_from=DOUBLINGS)
+        panel.set_xlabel(words)
+    axes[0, 0].set_ylabel("WS-PSNR of test views, dB ↑")
+    made.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    what = f"{title}\nsmaller models of the same run; ring: what is needed for {STATED} dB, labels: for more"
+    lay_out(made, what)
+    return Chart(name, what, svg(made, name, tips), png(made), tuple(notes), _numbers(name, found))
+
+
+def _draw(panel: Any, curve: Curve, quantity: str, unit: float, tips: Tips, presets: list[str]) -> None:
+    color = color_of(curve.preset, presets)
+    xs = [value * unit for value in curve.values(quantity)]
+    there = sorted((x, y) for x, y in zip(xs, curve.quality, strict=True) if math.isfinite(x) and math.isfinite(y))
+    panel.plot(*zip(*there, strict=True), color=color, linewidth=1.2, label=curve.title)
+    for step, x, y in zip(curve.steps, xs, curve.quality, strict=True):
+        text = f"{curve.title}\n{step['blended']} Gaussians, {step['bytes'] / 1e6:.2f} MB, {step['frame_ms']:.1f} ms"
+        text += f"\n{y:.2f} dB; lost {step['loss']:.2f} dB of calibration views"
+        panel.plot([x], [y], MARKERS[0], color=color, markersize=4, gid=tips.add(text))
+        reached = [epsilon for epsilon, at in curve.needs.items() if at is step]
+        if STATED in reached:
+            panel.plot([x], [y], MARKERS[0], markersize=9, fillstyle="none", color=INK[0], markeredgewidth=1)
+        if further := [epsilon for epsilon in reached if float(epsilon) > float(STATED)]:
+            panel.annotate(
+                f"{further[-1]} dB", (x, y), xytext=(4, -9), textcoords="offset points", fontsize=7, color=color
+            )
+
+
+def _numbers(name: str, found: list[Curve]) -> DataFrame:
+    quantities = ("rows", "blended", "bytes", "frame_ms", "loss", "ws_psnr", "test_ws_psnr", "lpips")
+    rows = [
+        {"chart": name, "curve": curve.title, "preset": curve.preset, **{q: step[q] for q in quantities}}
+        | {"needed for": " ".join(epsilon for epsilon, at in curve.needs.items() if at is step)}
+        for curve in found
+        for step in curve.steps
+    ]
+    return DataFrame(rows, dtype=object)

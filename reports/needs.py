@@ -1,0 +1,110 @@
+"""What `padgs need` found of runs: a curve of quality over size each, with the need for each loss on it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pandas import DataFrame
+
+from reports import methods
+from reports.gathered import Gathered
+from reports.settings import settings
+
+EPSILONS = ("0.05", "0.1", "0.25", "0.5", "1")  # dB, as results name them
+STATED = "0.1"  # of the need that is put into one number
+
+
+@dataclass(frozen=True)
+class Curve:
+    """The sizes of one run's model, from large to small."""
+
+    title: str
+    preset: str
+    steps: tuple[Mapping[str, Any], ...]  # of `Result.need`, controls left out
+    needs: Mapping[str, Mapping[str, Any]]  # epsilon -> the smallest step that loses at most so much
+    knee: Mapping[str, Any] | None
+    found: Mapping[str, Any]  # all of `Result.need`
+
+    def values(self, name: str) -> list[float]:
+        """A number of all steps; NaN where one has none."""
+        return [np.nan if step[name] is None else step[name] for step in self.steps]
+
+    @property
+    def quality(self) -> list[float]:
+        """WS-PSNR, dB, of all steps; see `quality_of`."""
+        return [self.quality_of(step) for step in self.steps]
+
+    def quality_of(self, step: Mapping[str, Any]) -> float:
+        """What the whole model shows of the test views, which decide nothing, less what was lost against the control.
+
+        Both were trained on with fewer views than the whole model. Of the calibration views where there are no others.
+        """
+        steps = self.found["steps"]
+        control = next(other for other in steps if other["kind"] != "prune" and other["depth"] == step["depth"])
+        if step["test_ws_psnr"] is None:
+            return steps[0]["ws_psnr"] - step["loss"]
+        return steps[0]["test_ws_psnr"] - (control["test_ws_psnr"] - step["test_ws_psnr"])
+
+
+def searched(gathered: Gathered) -> DataFrame:
+    """The runs that `padgs need` made."""
+    runs = gathered.asked_for
+    return runs.loc[runs["need"].map(bool)]
+
+
+def curves(runs: DataFrame) -> list[Curve]:
+    """A curve for each run of one scene, in the order of the methods and seeds."""
+    found = []
+    for setting in settings(runs):
+        for run in setting.runs.sort_values("seed").itertuples():
+            need: Any = run.need
+            steps = need["steps"]
+            rows = sorted((s for s in steps if s["kind"] != "control"), key=lambda step: -step["blended"])
+            title = methods.title(setting.preset) + (f", seed {run.seed}" if len(setting.runs) > 1 else "")
+            needs = {epsilon: steps[number] for epsilon, number in need["needs"].items()}
+            knee = None if need["knee"] is None else steps[need["knee"]]
+            found.append(Curve(title, setting.preset, tuple(rows), needs, knee, need))
+    return found
+
+
+def gain(ours: Curve, other: Curve) -> float | None:
+    """Mean of our quality minus the other's at equal numbers of Gaussians, dB; None where no number is shared.
+
+    Both are taken over log2 N, straight between the steps, where both have some (Bjontegaard's way without his cubic).
+    """
+    return _mean_difference(*(_points(curve.values("blended"), curve.quality) for curve in (ours, other)))
+
+
+def ratio(ours: Curve, other: Curve) -> float | None:
+    """Geometric mean of our number of Gaussians over the other's at equal quality; None where no quality is shared.
+
+    Where more Gaussians are no better, the fewer are taken.
+    """
+    points = []
+    for curve in (ours, other):
+        sizes, qualities = _points(curve.values("blended"), curve.quality)
+        best = np.maximum.accumulate(qualities)
+        first = np.concatenate(([True], np.diff(best) > 0))
+        points.append((best[first], sizes[first]))
+    difference = _mean_difference(*points)
+    return None if difference is None else 2.0**difference
+
+
+def _points(sizes: Sequence[float], qualities: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+    """From small to large: log2 of the sizes, and the qualities."""
+    order = np.argsort(sizes, kind="stable")
+    return np.log2(np.asarray(sizes, dtype=float))[order], np.asarray(qualities, dtype=float)[order]
+
+
+def _mean_difference(ours: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray]) -> float | None:
+    """Mean of ours minus the other over the range of x that both (x ascending, y) have; exact for straight pieces."""
+    low, high = max(ours[0][0], other[0][0]), min(ours[0][-1], other[0][-1])
+    if not low < high:
+        return None
+    inner = [x for curve in (ours, other) for x in curve[0] if low < x < high]
+    at = np.unique([low, *inner, high])
+    difference = np.interp(at, *ours) - np.interp(at, *other)
+    return float(np.sum((difference[1:] + difference[:-1]) / 2 * np.diff(at)) / (high - low))

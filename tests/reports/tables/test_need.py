@@ -1,0 +1,79 @@
+"""The table and the chart of what `padgs need` found, on searches that are made up."""
+
+import pytest
+from made_up import gathered, small
+
+from reports.charts.need_chart import charts
+from reports.needs import curves, gain, ratio, searched
+from reports.tables.need import need
+from reports.writers import markdown
+
+SIZES = (8000, 4000, 2000, 1000)
+
+
+def found(best: float, *, rows: str = "gaussians", each: int = 1) -> dict:
+    """A search: quality falls by 0.05 dB, 0.15 and 0.45 with each halving; the need for 0.1 dB is 4000."""
+    lost = (0.0, 0.05, 0.2, 0.65)
+    steps = [
+        {
+            "kind": kind,
+            "parent": None,
+            "depth": depth,
+            "rows": size // each,
+            "blended": size,
+            "bytes": 100 * size,
+            "frame_ms": size / 1000,
+            "seconds": 2.0,
+            "cpu_seconds": 1.0,
+            "loss": loss,
+            "ws_psnr": best + 1 - loss,
+            "lpips": None,
+            "test_ws_psnr": best - loss,
+            "objections": {},
+        }
+        for kind, depth, size, loss in [
+            ("waste", 0, SIZES[0], lost[0]),
+            ("control", 1, SIZES[0], 0.0),
+            *(("prune", 1, SIZES[n], lost[n]) for n in (1, 2, 3)),
+        ]
+    ]
+    needs = {"0.05": 0, "0.1": 2, "0.25": 3, "0.5": 3, "1": 4}
+    own = {"row": rows, "rows": 10_000 // each, "waste": 2000 // each, "needs": needs, "knee": 2, "steps": steps}
+    return own | {"calibration": ["a", "b", "c"], "seconds": 10.0, "cpu_seconds": 5.0}
+
+
+def runs() -> list:
+    made = [
+        small(30.0, method=method, experiments=("need",), need=found(best, each=each))
+        for method, best, each in (("omnigs", 30.0, 1), ("padgs", 29.0, 10))
+    ]
+    return [*made, small(31.0, method="odgs")]
+
+
+def test_a_row_for_each_search_with_its_needs():
+    text = markdown.text(need(gathered(runs())))
+    row = next(line for line in text.splitlines() if line.startswith("| OmniGS"))
+    assert [cell.strip("* ") for cell in row.split("|")][2:8] == ["8000", *("8000", "4000", "2000", "2000", "1000")][:6]
+    assert "| 0.40 |" in row and "ODGS" not in text
+    assert need(gathered(runs()[2:])).blocks == () and charts(gathered(runs()[2:])) == []
+
+
+def test_curves_are_compared_where_both_are():
+    ours, other = curves(searched(gathered(runs())))
+    assert gain(ours, other) == pytest.approx(1.0) and gain(ours, ours) == 0
+    assert ratio(ours, ours) == 1 and ratio(ours, other) is None, "they share no quality"
+    halved = [small(30.0, method="odgs", need=found(30.0)), small(30.0, method="omnigs", need=found(30.0))]
+    for step in halved[0].need["steps"]:
+        step["blended"] //= 2
+    first, second = curves(searched(gathered(halved)))
+    assert {first.preset: ratio(first, second), second.preset: ratio(second, first)} == pytest.approx(
+        {"odgs": 0.5, "omnigs": 2.0}
+    )
+
+
+def test_the_chart_has_a_point_for_each_size_and_all_numbers():
+    (chart,) = charts(gathered(runs()))
+    assert chart.name == "need_synthetic-room_512x256_1500-iterations" and chart.png.startswith(b"\x89PNG")
+    assert chart.numbers is not None and len(chart.numbers) == 2 * len(SIZES)
+    assert list(chart.numbers["needed for"])[:4] == ["0.05", "0.1", "0.25 0.5", "1"]
+    assert "4000 Gaussians" in chart.svg and "lost 0.65 dB" in chart.svg
