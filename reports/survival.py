@@ -51,7 +51,7 @@ class Survivor:
             reference = above.get(
                 run["seed"], above.mean()
             )  # a seed that was not run at rest has the mean of the others
-            share = (run[QUALITY] - run[ONE_COLOR]) / reference if run["ok"] else 0.0
+            share = (run[QUALITY] - run[ONE_COLOR]) / reference if bool(run["ok"]) else 0.0
             kept.append(min(max(share, 0.0), 1.0))
         return spread(kept, " ".join(runs.loc[~runs["ok"], "status"].unique()))
 
