@@ -59,11 +59,11 @@ def curves(runs: DataFrame) -> list[Curve]:
     """A curve for each run of one scene, in the order of the methods and seeds."""
     found = []
     for setting in settings(runs):
-        for run in setting.runs.sort_values("seed").itertuples():
-            need: Any = run.need
+        ordered = setting.runs.sort_values("seed")
+        for seed, need in zip(ordered["seed"], ordered["need"], strict=True):
             steps = need["steps"]
             rows = sorted((s for s in steps if s["kind"] != "control"), key=lambda step: -step["blended"])
-            title = methods.title(setting.preset) + (f", seed {run.seed}" if len(setting.runs) > 1 else "")
+            title = methods.title(setting.preset) + (f", seed {seed}" if len(setting.runs) > 1 else "")
             needs = {epsilon: steps[number] for epsilon, number in need["needs"].items()}
             knee = None if need["knee"] is None else steps[need["knee"]]
             found.append(Curve(title, setting.preset, tuple(rows), needs, knee, need))

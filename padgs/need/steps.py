@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -30,8 +31,9 @@ class StepsFolder:
         """
         found = []
         while checkpoint.exists(self._folder(len(found))):
-            values = dict(self.state(len(found)).values[STEP])
-            found.append(Step(**values | {"marks": Scores(**values["marks"] | {"notes": ()})}))
+            values: dict[str, Any] = dict(self.state(len(found)).values[STEP])
+            values["marks"] = Scores(**values["marks"] | {"notes": ()})
+            found.append(Step(**values))
         return found
 
     def state(self, number: int, device: torch.device | str = "cpu") -> State:

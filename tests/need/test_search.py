@@ -15,7 +15,7 @@ BANDS = ("equator", "middle", "high", "pole", "zenith", "nadir")
 
 def marks(*views: float, lpips: float = 0.1, **bands: float) -> Scores:
     """Of views with these WS-PSNRs; bands as they are, unless they say otherwise."""
-    each = {
+    each: dict[str, dict[str, float | None]] = {
         str(number): {"ws_psnr": value, "ws_lpips_alex": lpips}
         | {f"ws_psnr_{band}": value + bands.get(band, 0.0) for band in BANDS}
         for number, value in enumerate(views)
@@ -99,4 +99,5 @@ def test_calibration_views_are_spread_evenly_and_too_few_are_refused():
 def test_a_step_survives_json():
     step = Step("prune", 0, 1, 700, 700, 0, 1.0, marks(28.9))
     values = asdict(step)
-    assert Step(**values | {"marks": Scores(**values["marks"])}) == step
+    values["marks"] = Scores(**values["marks"])
+    assert Step(**values) == step
