@@ -48,9 +48,7 @@ class Survivor:
         above = (self.rest[QUALITY] - self.rest[ONE_COLOR]).set_axis(self.rest["seed"])
         kept = []
         for _, run in runs.iterrows():
-            reference = above.get(
-                run["seed"], above.mean()
-            )  # a seed that was not run at rest has the mean of the others
+            reference = above.get(run["seed"], above.mean())  # a seed not run at rest has the mean of the others
             share = (run[QUALITY] - run[ONE_COLOR]) / reference if bool(run["ok"]) else 0.0
             kept.append(min(max(share, 0.0), 1.0))
         return spread(kept, " ".join(runs.loc[~runs["ok"], "status"].unique()))
