@@ -41,6 +41,8 @@ class EgoNeRFMethod(Method):
     TRAIN = TrainOptions(weight="uniform", learning_rates="published")
 
     def _start(self, scene: Scene, iterations: int) -> EgoNeRFTrainee:
+        if self._gaussians is not None:
+            raise ValueError(f"budget.gaussians is {self._gaussians}, but EgoNeRF has no Gaussians; leave it out")
         return EgoNeRFTrainee(EgoNeRF.from_scene(scene, self.options, self.seed), self.options, iterations)
 
     def _blank(self, state: State) -> EgoNeRFTrainee:

@@ -145,8 +145,8 @@ def _marks(result: Result) -> Iterator[tuple[str, float | None]]:
 
 def _length(result: Result) -> str:
     """How long a run was asked to be: iterations, or time."""
-    budget = result.config.get("budget")
-    if budget is None:
+    budget = result.config.get("budget", {})
+    if "seconds" not in budget:
         return f"{result.iterations} iterations"
     return f"{budget['seconds']:g} s{' of CPU time' if budget['clock'] == 'cpu' else ''}"
 

@@ -56,6 +56,11 @@ class PaDGSMethod(Method):
         super().load_state(state)
 
     def _start(self, scene: Scene, iterations: int) -> AnchorTrainee:
+        if self._gaussians is not None:
+            raise ValueError(
+                f"budget.gaussians is {self._gaussians}, but anchors decode Gaussians anew for every view; limit "
+                "them by method.max_anchors and method.voxel_pixels, or prune a trained run by padgs need"
+            )
         extent = self.options.extent_of(scene)
         extent /= scene.unit if self.options.offset_rate_unit == "scene" else 1.0
         return self._trainee_of(PaDGS.from_scene(scene, self.options, seed=self.seed), extent, iterations)

@@ -1,4 +1,4 @@
-"""How long a method may train: for so many iterations, or for so much time."""
+"""What training may take: so many iterations or so much time, and Gaussians."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CLOCKS: dict[str, Callable[[], float]] = {
 
 @dataclass(frozen=True)
 class Budget:
-    """How long a method may train; evaluation and files are never counted.
+    """How long a method may train, evaluation and files never counted, and how large its model may become.
 
     In a budget of `seconds` the schedule follows the clock: a step after half of the time is a step at half of the
     schedule, so growth, decay and the last iteration come when they should, whatever a step costs.
@@ -27,9 +27,11 @@ class Budget:
     max_seconds: float | None = None  # on the wall clock, after which the run ends as it is
     seconds: float | None = None
     clock: str = "wall"  # that `seconds` are counted on: a name of CLOCKS
+    gaussians: int | None = None  # that the model grows to; None: as many as thresholds give
 
     def __post_init__(self) -> None:
         check(self, "at least 1", lambda count: count >= 1, "iterations")
+        check(self, "at least 1 Gaussian, or none for no target", lambda n: n is None or n >= 1, "gaussians")
         check(self, "> 0 and finite, or none", lambda s: s is None or 0 < s < math.inf, "max_seconds", "seconds")
         check_known(self, clock=CLOCKS)
 

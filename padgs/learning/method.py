@@ -58,6 +58,7 @@ class Method(ABC):
         self._trainee: Trainee | None = None
         self._trainer: Trainer | None = None
         self._loaded: State | None = None
+        self._gaussians: int | None = None  # of the budget of `fit`
         self._refuse_impossible()
 
     def fit(self, scene: Scene, budget: Budget, *, stage: Stage = nullcontext) -> Iterator[Record]:
@@ -74,6 +75,7 @@ class Method(ABC):
         """
         if not scene.train:
             raise ValueError(f"scene {scene.name!r} has no training view; mend its split")
+        self._gaussians = budget.gaussians
         spent = {"seconds": 0.0, "cpu_seconds": 0.0}
         if budget.seconds is not None:
             if self._loaded is None:

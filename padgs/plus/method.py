@@ -18,7 +18,7 @@ from padgs.plus.sky import far_gaussians
 from padgs.plus.trainee import PlusTrainee
 from padgs.render.config import RenderConfig
 from padgs.scene import Scene, View
-from padgs.splats.method import SplatMethod
+from padgs.splats.method import SplatMethod, fewest
 from padgs.splats.model import Splats
 from padgs.splats.trainee import SplatTrainee
 
@@ -38,13 +38,12 @@ class PlusMethod(SplatMethod):
 
     def _start(self, scene: Scene, iterations: int) -> SplatTrainee:
         options, pixels = self.options, independent_pixels(scene.train[0])
-        start, limit = (
-            _fewest(options.max_gaussians, share, pixels) for share in (options.start_share, options.limit_share)
-        )
+        start, limit = (_within(share, pixels) for share in (options.start_share, options.limit_share))
+        limit = fewest(options.max_gaussians, limit if self._gaussians is None else self._gaussians)
         splats = Splats.from_scene(
             scene,
             degree=options.sh_degree,
-            max_gaussians=start,
+            max_gaussians=fewest(start, limit),
             opacity=options.initial_opacity,
             scale=options.initial_scale,
             generator=torch.Generator().manual_seed(self.seed),
@@ -57,7 +56,6 @@ class PlusMethod(SplatMethod):
         return self._trainee_of(splats, options.extent_of(scene), iterations, scene.train, limit=limit)
 
 
-def _fewest(most: int | None, share: float | None, pixels: float) -> int | None:
-    """The smaller one of a number and a share of the pixels; None where neither is a limit."""
-    limits = (most, None if share is None else max(1, round(share * pixels)))
-    return min((limit for limit in limits if limit is not None), default=None)
+def _within(share: float | None, pixels: float) -> int | None:
+    """A share of the pixels as a number; None, which is no limit, stays."""
+    return None if share is None else max(1, round(share * pixels))

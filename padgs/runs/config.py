@@ -64,13 +64,20 @@ class TrainConfig(TrainOptions):
 
 @dataclass(frozen=True)
 class BudgetOptions:
-    """The `budget` group: what a run may spend, instead of `train.iterations`."""
+    """The `budget` group: what a run may spend instead of what `train.iterations` and thresholds of growth say."""
 
     seconds: float | None = None  # of training: schedules follow the clock, and the run ends on time
     clock: str = "wall"  # wall | cpu: cpu counts what the process itself takes, whatever else the machine does
 
+    gaussians: int | None = None  # that the model grows to: those that are pulled hardest multiply, up to so many
+
     def __post_init__(self) -> None:
-        Budget(1, seconds=self.seconds, clock=self.clock)
+        Budget(1, **asdict(self))
+
+    def asked(self) -> dict[str, Any]:
+        """What is asked for, by key."""
+        time = {} if self.seconds is None else {"seconds": self.seconds, "clock": self.clock}
+        return time if self.gaussians is None else {**time, "gaussians": self.gaussians}
 
 
 @dataclass(frozen=True)
@@ -145,7 +152,7 @@ class RunConfig(Settings):
     @property
     def time(self) -> Budget:
         """How long the method may train."""
-        return Budget(self.training.iterations, self.training.max_seconds, self.budget.seconds, self.budget.clock)
+        return Budget(self.training.iterations, self.training.max_seconds, **asdict(self.budget))
 
     @property
     def row(self) -> str:
@@ -160,11 +167,11 @@ class RunConfig(Settings):
     def values(self) -> dict[str, Any]:
         """The configuration of a run as plain values in the shape of the YAML files, defaults included.
 
-        Stress, and a budget in seconds, are there only if there are any: ids of runs without are what they were before.
+        Stress and a budget are there only if there are any: ids of runs without are what they were before.
         """
         stress = {"stress": asdict(self.stress)} if self.stress.title else {}
         return {
-            **({} if self.budget.seconds is None else {"budget": asdict(self.budget)}),
+            **({"budget": budget} if (budget := self.budget.asked()) else {}),
             "data": asdict(self.data),
             "method": {"name": self.method, **asdict(self.options)},
             "render": asdict(self.render),

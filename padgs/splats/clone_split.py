@@ -98,6 +98,7 @@ class CloneSplit:
         options: CloneSplitOptions,
         *,
         extent: float,
+        target: int | None = None,
         drawn_opacities: Callable[[], Tensor] | None = None,
         seed: int = 0,
     ) -> None:
@@ -107,11 +108,14 @@ class CloneSplit:
             splats: the model.
             options: iterations are those of the run.
             extent: the length that sizes are compared with, in world units.
+            target: as many Gaussians as there shall be after the last round, in equal steps, those that are pulled
+                hardest; None: as many as thresholds give.
             drawn_opacities: of the model as it is then, [N] in [0, 1], at most its own, where a filter lowers them.
             seed: of all that is random.
         """
         self._drawn_opacities = drawn_opacities or (lambda: torch.sigmoid(splats.opacity_logits))
         self.splats, self.options, self.extent = splats, options, extent + options.extent_margin
+        self._target = target
         self.generator = torch.Generator().manual_seed(seed)
         self.statistics = self._empty()
 
@@ -148,7 +152,7 @@ class CloneSplit:
         events = []
         begin = 0 if options.released_start else options.densify_from
         if iteration > begin and iteration % options.densify_every == 0 and grows():
-            cloned, split, left_out = self._multiply(optimizer)
+            cloned, split, left_out = self._multiply(optimizer, iteration)
             self._decay_opacities(optimizer)
             pruned = self._prune(optimizer, iteration)
             self.statistics = self._empty()
@@ -161,7 +165,7 @@ class CloneSplit:
             events.append("reset opacities")
         return tuple(events)
 
-    def _multiply(self, optimizer: torch.optim.Adam) -> tuple[int, int, int]:
+    def _multiply(self, optimizer: torch.optim.Adam, iteration: int) -> tuple[int, int, int]:
         """Clone and split; returns how many of each, and how many had to be left out.
 
         Each adds one Gaussian to the count, within `max_gaussians`.
@@ -169,12 +173,9 @@ class CloneSplit:
         rows = self.splats.rows()
         seen = self.statistics["seen"].clamp(min=1)
         mean_gradient = self.statistics["gradient"] / seen
-        threshold = self.options.gradient_threshold
-        if self.options.polar_threshold is not None:
-            threshold += (self.options.polar_threshold - threshold) * self.statistics["polar"] / seen
-        chosen = mean_gradient >= threshold
-        if self.options.signal == "space_absolute":  # those above the quantile that leaves as many: 1 - (chosen / all)
-            chosen |= _largest(self.statistics["absolute"] / seen, int(chosen.sum()))
+        chosen = self._above_threshold(mean_gradient, seen)
+        if self._target is not None:
+            chosen = self._on_the_way(mean_gradient, seen, iteration)
         candidate_count = int(chosen.sum())
         if self.options.max_gaussians is not None:
             room = max(0, self.options.max_gaussians - len(chosen))
@@ -190,6 +191,30 @@ class CloneSplit:
         keep_rows(rows, optimizer, ~replaced)
         cloned, split = len(clones["means"]), len(pieces["means"]) // PIECES
         return cloned, split, candidate_count - cloned - split
+
+    def _above_threshold(self, mean_gradient: Tensor, seen: Tensor) -> Tensor:
+        """Which Gaussians [N] are pulled hard enough; `seen` [N] views are what means are over."""
+        threshold = self.options.gradient_threshold
+        if self.options.polar_threshold is not None:
+            threshold += (self.options.polar_threshold - threshold) * self.statistics["polar"] / seen
+        chosen = mean_gradient >= threshold
+        if self.options.signal == "space_absolute":  # those above the quantile that leaves as many: 1 - (chosen / all)
+            chosen |= _largest(self.statistics["absolute"] / seen, int(chosen.sum()))
+        return chosen
+
+    def _on_the_way(self, mean_gradient: Tensor, seen: Tensor, iteration: int) -> Tensor:
+        """Which Gaussians [N] multiply in this round towards the target: those that are pulled hardest.
+
+        With absolute pulls half of them are the first by these.
+        """
+        assert self._target is not None
+        rounds = 1 + (self.options.densify_until - 1 - iteration) // self.options.densify_every  # with this one
+        count = max(0, self._target - len(seen)) // rounds
+        if self.options.signal != "space_absolute":
+            return _largest(mean_gradient, count)
+        chosen = _largest(mean_gradient, count // 2)
+        absolute = (self.statistics["absolute"] / seen).masked_fill(chosen, -1.0)
+        return chosen | _largest(absolute, count - int(chosen.sum()))
 
     def _pieces(self, split: Tensor) -> dict[str, Tensor]:
         """What takes the place of the Gaussians marked in split [N]: smaller ones, at random places inside them."""

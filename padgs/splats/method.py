@@ -46,6 +46,11 @@ def refuse_polar_threshold(options: SplatOptions, why: str) -> None:
         raise ValueError(f"method.polar_threshold is {options.polar_threshold}, but {why}; set it to null")
 
 
+def fewest(*limits: int | None) -> int | None:
+    """The smallest of some numbers; None, which is no limit, where there is none."""
+    return min((limit for limit in limits if limit is not None), default=None)
+
+
 class SplatMethod(Method):
     """See `padgs.learning.method.Method`; a subclass says which options, and how it is drawn."""
 
@@ -64,9 +69,8 @@ class SplatMethod(Method):
     def _start(self, scene: Scene, iterations: int) -> SplatTrainee:
         options = self.options
         generator = torch.Generator().manual_seed(self.seed)
-        splats = Splats.from_scene(
-            scene, degree=options.sh_degree, max_gaussians=options.max_gaussians, generator=generator
-        )
+        most = fewest(options.max_gaussians, self._gaussians)
+        splats = Splats.from_scene(scene, degree=options.sh_degree, max_gaussians=most, generator=generator)
         return self._trainee_of(splats, options.extent_of(scene), iterations, scene.train)
 
     def _blank(self, state: State) -> SplatTrainee:
@@ -86,6 +90,7 @@ class SplatMethod(Method):
             extent=extent,
             iterations=iterations,
             views=views,
+            target=self._gaussians,
             seed=self.seed,
             **more,
         )

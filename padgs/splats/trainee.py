@@ -40,16 +40,22 @@ class SplatTrainee:
         extent: float,
         iterations: int,
         views: Sequence[View] = (),
+        target: int | None = None,
         seed: int = 0,
     ) -> None:
         """Wrap splats; `extent` is the scene's, `options` are those of a published run (see `for_run`).
 
-        `views` are those of the training; without them there can be none.
+        `views` are those of the training; without them there can be none. `target` is as `CloneSplit` has it.
         """
         self.splats, self.iterations = splats, iterations
         self._config, self._views, self._extent = config, views, extent
         self.densifier = CloneSplit(
-            splats, options.for_run(iterations), extent=extent, drawn_opacities=self._drawn_opacities, seed=seed
+            splats,
+            options.for_run(iterations),
+            extent=extent,
+            target=target,
+            drawn_opacities=self._drawn_opacities,
+            seed=seed,
         )
         self._drawn: View | None = None  # the view of the last drawing
 

@@ -8,8 +8,8 @@ from states import assert_same_but_time
 from tiny_scene import tiny_scene
 from torch import Tensor, nn
 
+from padgs import stopwatch
 from padgs.gaussians import Gaussians
-from padgs.learning import loop
 from padgs.learning.budget import Budget
 from padgs.learning.failure import Failure
 from padgs.learning.loop import Trainer, TrainOptions
@@ -301,7 +301,7 @@ class Clock:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, first: float = TICK, growth: float = 1.0) -> None:
         self.now, self._step, self._growth = 0.0, first, growth
         for name in ("perf_counter", "process_time"):
-            monkeypatch.setattr(loop.time, name, lambda: self.now)
+            monkeypatch.setattr(stopwatch.time, name, lambda: self.now)
 
     def tick(self) -> None:
         self.now, self._step = self.now + self._step, self._step * self._growth

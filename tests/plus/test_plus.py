@@ -9,7 +9,7 @@ import torch
 from states import assert_same_but_time
 from tiny_scene import HEIGHT, WIDTH, tiny_scene
 
-from padgs.learning import loop
+from padgs import stopwatch
 from padgs.learning.budget import Budget
 from padgs.learning.loop import Record
 from padgs.plus.method import PlusMethod, independent_pixels
@@ -39,6 +39,15 @@ def test_growth_has_as_many_rounds_in_a_run_of_any_length(iterations):
     assert rounds[-1] == pytest.approx(GROWN * iterations, abs=ROUNDS / 2)
 
 
+@pytest.mark.parametrize("points", [40, 20])
+@pytest.mark.parametrize("units", [1.0, 100.0])
+def test_a_budget_of_gaussians_is_met_whatever_the_points_and_units(points, units):
+    scene = in_other_units(tiny_scene(), units)
+    scene = replace(scene, points=scene.points[:points], point_colors=scene.point_colors[:points])
+    records = list(PlusMethod(PlusOptions(start_share=None)).fit(scene, Budget(64, gaussians=150)))
+    assert 135 <= records[-1].counts["gaussians"] <= 150
+
+
 def test_the_threshold_of_growth_falls_with_the_length_of_a_run_and_then_stays():
     found = [PlusOptions().for_run(iterations).gradient_threshold for iterations in (125, 500, 2000, 30_000)]
     assert found == pytest.approx([2e-4, 1e-4, 5e-5, 5e-5])
@@ -47,8 +56,8 @@ def test_the_threshold_of_growth_falls_with_the_length_of_a_run_and_then_stays()
 def test_a_run_of_seconds_rehearses_ends_on_time_and_resumes_bit_identically(monkeypatch):
     def fitted(method: PlusMethod) -> Iterator[Record]:
         ticks = count()
-        monkeypatch.setattr(loop.time, "perf_counter", lambda: next(ticks) / 64)  # so each step takes as long
-        monkeypatch.setattr(loop.time, "process_time", lambda: 0.0)
+        monkeypatch.setattr(stopwatch.time, "perf_counter", lambda: next(ticks) / 64)  # so each step takes as long
+        monkeypatch.setattr(stopwatch.time, "process_time", lambda: 0.0)
         return method.fit(tiny_scene(), Budget(1, seconds=60 / 64))
 
     torch.manual_seed(5)

@@ -175,6 +175,26 @@ def test_opacity_reset_makes_all_nearly_transparent():
     assert optimizer.state[grown.splats.means]["exp_avg_sq"].abs().sum() > 0
 
 
+@pytest.mark.parametrize("signal", ["space", "space_absolute"])
+def test_towards_a_target_those_that_are_pulled_hardest_multiply_in_equal_steps(signal):
+    count, target = 20, 50
+    grown, optimizer = densifier([SMALL] * count, densify_until=3 * EVERY + 1, signal=signal, gradient_threshold=1.0)
+    grown = CloneSplit(grown.splats, grown.options, extent=1.0, target=target)
+    found = []
+    for turn in range(1, 4):
+        now = len(grown.splats)
+        pulls = torch.arange(now, dtype=torch.float32)[:, None].repeat(1, 4)
+        if signal == "space_absolute":
+            pulls[:, 3] = -pulls[:, 3].flip(0)  # by these the first ones are pulled least, too, but none is 0
+            pulls[:, 3] += now
+        grown.observe(pulls if signal == "space_absolute" else pulls[:, :3], torch.ones(now, dtype=torch.bool), 1)
+        before = grown.splats.means.detach().clone()
+        assert grown.adapt(turn * EVERY, optimizer)[0].startswith("cloned 10,")
+        found.append(len(grown.splats))
+        assert torch.equal(grown.splats.means[now:].sort(0).values, before[-10:].sort(0).values)
+    assert found == [30, 40, 50]
+
+
 def test_clones_may_be_samples_of_their_gaussian():
     """Means N(mean, Sigma), everything else as it was (GOF's way to clone)."""
     count = 4000
