@@ -6,6 +6,7 @@ Whoever trains one (`padgs.runs`) knows nothing else of it.
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import nullcontext
@@ -120,7 +121,8 @@ class Method(ABC):
 
     def drawn_with(self, render: RenderConfig) -> Method:
         """A copy of the trained method that draws in another way."""
-        other = type(self)(self.options, render, self.train_options, self.seed)
+        other = copy.copy(self)  # not made anew: it need not be able to train, or to draw panoramas
+        other.render_config = render
         other.load_state(self.state())
         return other
 

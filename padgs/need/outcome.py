@@ -14,7 +14,7 @@ from padgs.need.search import EPSILONS, against, knee, loss, smallest
 from padgs.need.session import Search
 from padgs.results import Result
 from padgs.runs.folder import PROGRESS, Progress, RunFolder
-from padgs.runs.identity import config_hash
+from padgs.runs.identity import config_hash, identity
 from padgs.runs.scoring import frame_times, scores
 
 ADAM = "adam/"  # moments of the run's own rows, which a pruned model does not have
@@ -64,7 +64,8 @@ def write_pruned(search: Search, epsilon: float) -> Path:
     assert run.result is not None, "only of a finished run"
     variant = ", ".join(filter(None, (run.config.variant, f"need {epsilon:g} dB")))
     values = {**run.result.config, "variant": variant}
-    folder = RunFolder(run.folder.with_name(f"{run.folder.name}_need-{epsilon:g}"))
+    path = run.folder.with_name(f"{run.folder.name}_need-{epsilon:g}")
+    folder = RunFolder(path, identity(values, run.result.fingerprint))
     trained, model = run.method.state(), search.kept(number)
     of_model = model.state()
     kept = {n: t for n, t in trained.tensors.items() if not n.startswith((MODEL, ADAM))}

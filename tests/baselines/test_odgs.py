@@ -62,7 +62,7 @@ def test_the_release_differs_by_its_quirks_only(padgs_root):
     odgs, release = composed("method=odgs"), composed("method=odgs_release")
     quirks = {"sh_degree": 0, "extent_margin": 100.0, "prune_by_extent": True, "min_extent": 0.0, "max_gaussians": None}
     assert release.options == replace(odgs.options, **quirks)
-    assert release.render == replace(composed("render=released").render, pixel_bias=0.5)
+    assert release.render == replace(composed("method=padgs", "render=released").render, pixel_bias=0.5)
     assert release.train == odgs.train
 
 

@@ -151,7 +151,7 @@ def test_released_bugs_are_off_unless_asked_for(root, monkeypatch):
     monkeypatch.setenv("PADGS_ROOT", str(root))
     described, released = (composed(f"method={name}") for name in ("omnigs", "omnigs_release"))
     assert not any((described.options.released_start, described.options.released_reset))
-    assert described.render == RenderConfig() and released.render == composed("render=released").render
+    assert described.render == RenderConfig() and released.render == composed("method=padgs", "render=released").render
     quirks = {
         "released_start": True,
         "released_reset": True,

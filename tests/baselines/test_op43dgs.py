@@ -52,7 +52,7 @@ def scene_of(distance: float) -> Scene:
 
 def test_the_release_differs_by_its_quirks_only():
     described, release = composed("method=op43dgs"), composed("method=op43dgs_release")
-    published = replace(composed("render=released").render, projection="tangent", low_pass_kind="fixed")
+    published = replace(composed("method=padgs", "render=released").render, projection="tangent", low_pass_kind="fixed")
     assert release.render == replace(published, memory_cap=24 * 2**30)
     assert release.options == replace(described.options, prune_by_extent=True, min_extent=0.0, max_gaussians=None)
     assert release.train == described.train

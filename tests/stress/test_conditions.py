@@ -119,9 +119,10 @@ def test_training_is_changed_and_its_configuration_is_not():
 
 
 def test_a_run_without_stress_is_the_run_that_it_was_before_there_was_any():
-    plain, level_zero = composed(), composed("stress.condition=pose_noise", "stress.level=0")
+    plain = composed("method=padgs")
+    level_zero = composed("method=padgs", "stress.condition=pose_noise", "stress.level=0")
     assert "stress" not in plain.values() and level_zero.values() == plain.values()
-    stress = composed("stress.condition=pose_noise", "stress.level=2")
+    stress = composed("method=padgs", "stress.condition=pose_noise", "stress.level=2")
     assert stress.row == "pose_noise 2" and stress.variant == ""
     assert run_id(stress.values(), "room", "f").startswith("room_padgs_pose-noise-2_")
     assert config_from_values(stress.values()).stress == stress.stress

@@ -63,7 +63,7 @@ def test_a_method_that_never_finishes_does_not_empty_the_chart():
 
 def test_lengths_are_not_mixed_in_a_mean_over_scenes():
     runs = [replace(r, iterations=7000) if r.scene == "bar" else r for r in data_set("roam360")]
-    with pytest.raises(ReportError, match="roam360, OmniGS, corrected: results differ in iterations"):
+    with pytest.raises(ReportError, match="roam360, OmniGS, corrected: results differ in length"):
         trade_offs(gathered(runs))
 
 
