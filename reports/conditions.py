@@ -19,6 +19,7 @@ OF_A_POINT = ("data",)  # the folder of the data is no part of a setting
 OF_A_CHART = ("protocol", "resolution", "learning_rates", "data", "machine")
 OF_A_MEAN = (*OF_A_DATA_SET, "machine")  # of one setting over the scenes of a data set
 OF_TIMES = (*CONDITIONS, "machine")
+OF_PARTS = tuple(what for what in OF_TIMES if what != "learning_rates")  # which may be what a method is without
 PUBLISHED_LENGTHS = {"egonerf": 100_000}  # iterations; of the others 30 000, which tables of the paper have
 PUBLISHED_WIDTH = 1920  # pixels; the narrowest panoramas of the paper
 PUBLISHED_PIXELS = {  # preset -> what of it means something else in narrower panoramas

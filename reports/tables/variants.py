@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from pandas import DataFrame
 
 from reports import methods, published
-from reports.conditions import OF_TIMES, footnotes, refuse_mixture
+from reports.conditions import OF_PARTS, OF_TIMES, footnotes, refuse_mixture
 from reports.frame import by_place
 from reports.gathered import Gathered
 from reports.measures import PAPER_METRICS, costs, marks
@@ -37,7 +37,7 @@ WITHOUT = {  # variant (conf/without) -> title
             "start": "all points to begin with",
             "opacity": "initial opacity of 3DGS",
             "scale": "initial scale of 3DGS",
-            "threshold": "half the threshold",
+            "threshold": "twice the threshold",
             "limit": "no limit",
             "average": "the last state",
             "sky": "no sky",
@@ -134,17 +134,23 @@ def plus_ablation(gathered: Gathered) -> Table:
         ReportError: results that must not stand together.
     """
     title = "padgs+ without each of its parts"
-    return _changes(gathered, "plus_ablation", title, {"padgs_plus": WITHOUT}, "PSNR beside the complete method")
+    change = "PSNR beside the complete method"
+    return _changes(gathered, "plus_ablation", title, {"padgs_plus": WITHOUT}, change, OF_PARTS)
 
 
 def _changes(
-    gathered: Gathered, name: str, title: str, variants: Mapping[str, Mapping[str, str]], change: str
+    gathered: Gathered,
+    name: str,
+    title: str,
+    variants: Mapping[str, Mapping[str, str]],
+    change: str,
+    conditions: Sequence[str] = OF_TIMES,
 ) -> Table:
     """A block for each scene and method of `variants`: a row for each of its variants, beside the first."""
     measures, psnr = (*marks(gathered.request.protocol), *COSTS), PAPER_METRICS.index("psnr")
     blocks, runs_of = [], {}
     for place, own in by_place(_runs(gathered, name, *variants.values())).items():
-        refuse_mixture(own, gathered.request, place.title, OF_TIMES)
+        refuse_mixture(own, gathered.request, place.title, conditions)
         for method, titles in variants.items():
             cells = of_each(own, "variant", titles, place.title, measures)
             unchanged = cells[next(iter(titles))][psnr]
