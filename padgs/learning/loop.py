@@ -11,7 +11,7 @@ import copy
 import math
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar
 
 import torch
@@ -108,8 +108,7 @@ class Trainer:
         self.start = next(iter(trainee.counts().values()))
         self._trainee, self._scene, self._budget, self._options, self._stage = trainee, scene, budget, options, stage
         self._views_each = views_each
-        pace = Pace.of(options.learning_rates, budget.iterations)
-        self._optimiser = Optimiser(trainee.groups(), pace, options.check_every, **self.ADAM)
+        self._optimiser = Optimiser(trainee.groups(), self._pace(1, 1), options.check_every, **self.ADAM)
         self._targets = Targets(scene.train, options.weight, self._optimiser.device)
         self._views = ViewOrder(scene, seed)
         self._order: Order = self._views
@@ -153,11 +152,17 @@ class Trainer:
         """Seconds of training so far, on the clock of the budget."""
         return self.seconds if self._budget.clock == "wall" else self.cpu_seconds
 
+    def _pace(self, iteration: int, moment: int) -> Pace:
+        """Of the learning rates: what fits as many steps as the run will have, if it goes on as it went so far."""
+        length = self._budget.iterations
+        return replace(Pace.of(self._options.learning_rates, round(length * iteration / moment)), iterations=length)
+
     def _step(self, iteration: int, moment: int) -> tuple[float | Tensor, dict[str, int], tuple[str, ...]]:
         """One iteration. Returns loss (a mean over its views), counts and events of its record."""
         trainee, optimiser, stage = self._trainee, self._optimiser, self._stage
         losses, drawn = zip(*(self._pull(iteration, moment) for _ in range(self._views_each)), strict=True)
         optimiser.check(iteration)
+        optimiser.pace = self._pace(iteration, moment)
         with stage("optimiser"):
             optimiser.step(moment)
         with stage("adapt"), torch.no_grad():

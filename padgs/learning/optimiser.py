@@ -20,6 +20,7 @@ class Optimiser:
 
     Attributes:
         adam: what densification changes rows of.
+        pace: of the learning rates.
         silent: group -> whether it should have learned when all was last checked, and its gradients were exactly 0.
     """
 
@@ -32,7 +33,7 @@ class Optimiser:
             check_every: iterations between checks of all gradients and parameters for values that are not finite.
             adam: betas and eps.
         """
-        self._groups, self._pace, self._check_every = groups, pace, check_every
+        self._groups, self.pace, self._check_every = groups, pace, check_every
         parameters = [{"params": list(group.parameters), "name": group.name} for group in groups]
         self.silent: dict[str, bool] = {}
         self.adam = torch.optim.Adam(parameters, fused=True, **adam)  # fused: 2 to 3 times faster on CPUs
@@ -56,7 +57,7 @@ class Optimiser:
         The graph must be gone by now if rows of its leaves come and go afterwards.
         """
         for group, settings in zip(self._groups, self.adam.param_groups, strict=True):
-            settings["lr"] = group.learning_rate(iteration) * (self._pace(iteration) if group.paced else 1.0)
+            settings["lr"] = group.learning_rate(iteration) * (self.pace(iteration) if group.paced else 1.0)
         self.adam.step()
         self.adam.zero_grad(set_to_none=True)
 

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from padgs import stopwatch
 from padgs.gaussians import Gaussians
+from padgs.learning import schedule as schedules
 from padgs.learning.budget import Budget
 from padgs.learning.failure import Failure
 from padgs.learning.loop import Trainer, TrainOptions
@@ -328,6 +329,7 @@ class Timed(Flat):
 def test_a_budget_of_seconds_ends_on_time_and_goes_once_through_the_whole_schedule(
     monkeypatch, schedule, growth, clock
 ):
+    monkeypatch.setattr(schedules, "FASTEST", 1e9)
     seconds = 100 * TICK if growth == 1 else 40 * TICK
     trainee = Timed(Clock(monkeypatch, growth=growth))
     run = Trainer(trainee, tiny_scene(), Budget(schedule, seconds=seconds, clock=clock), seed=3)
@@ -336,6 +338,8 @@ def test_a_budget_of_seconds_ends_on_time_and_goes_once_through_the_whole_schedu
     assert trainee.moments == list(range(1, schedule + 1))
     for record in records:
         assert record.progress == pytest.approx(record.seconds / seconds, abs=0.05 + 1 / schedule)
+    fitting = schedules.Pace.of("run", len(records)).factor
+    assert run._optimiser.pace.factor == pytest.approx(fitting, rel=0.05), "rates fit the steps that were taken"
     assert [record.progress == 1 for record in records] == [False] * (len(records) - 1) + [True]
 
 
