@@ -117,8 +117,8 @@ def test_a_folder_that_cannot_be_written_is_a_clear_error(start, tmp_path):
     ("argument", "message"),
     [
         ("train.iteration=5", "unknown key train.iteration; known: train.lambda_l1"),
-        ("sede=5", "unknown key sede; known: data, render"),
-        ("method=foo", "Available options in 'method'"),
+        pytest.param("sede=5", "unknown key sede; known: data, render", marks=pytest.mark.slow),  # a process each
+        pytest.param("method=foo", "Available options in 'method'", marks=pytest.mark.slow),
         ("+experiment=foo", "Available options in 'experiment'"),
         ("data.path=/no/such/folder", "/no/such/folder"),
     ],

@@ -34,7 +34,10 @@ def state_of(search: Search, number: int) -> State:
     return search.folder.state(number)
 
 
-@pytest.mark.parametrize("method", METHODS)
+SLOW = [pytest.param(method, marks=pytest.mark.slow) for method in METHODS[:1]]  # explicit ones take 16 s
+
+
+@pytest.mark.parametrize("method", [*SLOW, *METHODS[1:]])
 def test_a_search_interrupted_everywhere_ends_as_if_nothing_had_happened(opened, method, tmp_path, monkeypatch):
     whole = Search(opened(method))
     whole.complete()
