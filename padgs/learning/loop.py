@@ -74,7 +74,9 @@ class Trainer:
 
     Attributes:
         iteration, seconds, cpu_seconds: steps that were taken, and what they took.
-        moment: iteration of the schedule that the last step stood for; another one in budgets of seconds only.
+        schedule: iterations that the schedule is written for.
+        moment: the one of them that the last step stood for; not `iteration` in budgets of seconds only.
+        step_seconds: what the last step took, on the clock of the budget.
         start: how many Gaussians, anchors or other parts the trainee had at the beginning.
 
     Between two records `state` holds all that continuing bit-identically needs (on the CPU); `load_state` goes back
