@@ -79,7 +79,7 @@ class RayTrainer(Trainer):
             extra = tracer.regularisation(moment)
             if extra is not None:
                 extra.backward()
-        optimiser.check(iteration)
+        optimiser.check(iteration, moment)
         with self._stage("optimiser"):
             optimiser.step(moment)
         events = (tracer.summary(),) if iteration == 1 else ()

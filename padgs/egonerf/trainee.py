@@ -134,7 +134,7 @@ class EgoNeRFTrainee:
         return 0 < iteration <= self._options.environment_pretraining
 
     def _decaying(self, rate: float) -> Callable[[int], float]:
-        """Learning rate by iteration, from `rate` on once all learn."""
+        """Learning rate by iteration: 0 while the environment learns alone, from `rate` on once all learn."""
         alone = self._options.environment_pretraining
         fall = LogLinear(rate, rate * self._options.rate_decay, self._iterations - alone)
-        return lambda iteration: fall(iteration - alone)
+        return lambda iteration: 0.0 if self._pretrains(iteration) else fall(iteration - alone)

@@ -163,7 +163,7 @@ class Trainer:
         """One iteration. Returns loss (a mean over its views), counts and events of its record."""
         trainee, optimiser, stage = self._trainee, self._optimiser, self._stage
         losses, drawn = zip(*(self._pull(iteration, moment) for _ in range(self._views_each)), strict=True)
-        optimiser.check(iteration)
+        optimiser.check(iteration, moment)
         optimiser.pace = self._pace(iteration, moment)
         with stage("optimiser"):
             optimiser.step(moment)

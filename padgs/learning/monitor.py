@@ -9,7 +9,7 @@ have no gradient.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from torch import Tensor
@@ -50,8 +50,7 @@ class Monitor:
         self._iterations, self._start, self._most = iterations, parts, MORE * max(parts, pixels)
         self._smoothed = max(SMOOTHED, SMOOTHED_SHARE * iterations)
         self.moment: int | None = None
-        self.state: dict[str, Any] = {"sum": 0.0, "weight": 0.0, "seen": 0, "best": None, "largest": None}
-        self.state |= {"since": {}, "pulled": []}
+        self.state: dict[str, Any] = {"sum": 0.0, "weight": 0.0, "seen": 0, "best": None, "largest": None, "since": {}}
 
     def loss(self, value: float, iteration: int) -> None:
         """Take in the loss of an iteration.
@@ -127,19 +126,15 @@ class Monitor:
                 f"{ADVICE}",
             )
 
-    def gradients(self, silent: Mapping[str, bool], iteration: int) -> None:
-        """Take in of each group of parameters whether all its gradients are exactly 0.
-
-        A group that never had another one waits for its time: degrees of the spherical harmonics, or grids that learn
-        after the environment.
+    def gradients(self, without: Sequence[str], iteration: int) -> None:
+        """Take in the names of the groups of parameters all of whose gradients are exactly 0.
 
         Raises:
             Failure: silent.
         """
-        pulled = self.state["pulled"]
-        pulled += [name for name, none in silent.items() if not none and name not in pulled]
-        for name in pulled:
-            if since := self._lasting(GRADIENT + name, silent[name], iteration, SILENT):
+        known = {sign.removeprefix(GRADIENT) for sign in self.state["since"] if sign.startswith(GRADIENT)}
+        for name in sorted({*without, *known}):
+            if since := self._lasting(GRADIENT + name, name in without, iteration, SILENT):
                 raise Failure(
                     "silent", f"the {GRADIENT}{name} is exactly 0 at iteration {iteration}, and since {since}; {ADVICE}"
                 )
