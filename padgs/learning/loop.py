@@ -246,7 +246,8 @@ class Trainer:
         self._trainee.load_state(state.of_model())
         self._optimiser.load(state)
         torch.set_rng_state(state.tensors["random/torch"].cpu())
-        for name in self.PROGRESS:
-            setattr(self, name, state.values[name])
+        before = {"moment": state.values["iteration"], "schedule": self.schedule, "step_seconds": 0.0}
+        for name in self.PROGRESS:  # checkpoints from before there were budgets of seconds have three of them less
+            setattr(self, name, {**before, **state.values}[name])
         if self._monitor is not None and "monitor" in state.values:  # not in checkpoints from before there was one
             self._monitor.state = copy.deepcopy(state.values["monitor"])

@@ -107,6 +107,8 @@ class Session:
         folder.prepare(config.values())
         method = build(config)
         progress = folder.resume(method, self.scene.points.device)
+        if progress.iteration and not progress.share:  # a checkpoint from before there were budgets of seconds
+            progress = replace(progress, share=progress.iteration / config.training.iterations)
         if progress.iteration:
             trust = "" if checkpoint.names_its_run(folder.checkpoint) else UNNAMED
             self._say(f"resuming after iteration {progress.iteration}{trust}")
