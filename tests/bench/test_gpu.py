@@ -30,7 +30,7 @@ def test_the_report_says_what_was_measured(report: dict):
     for label in ("ours", "published", "hybrid"):
         part = size[label]
         assert part["backend"] == "cpu"
-        assert part["frame"]["median"] > 0 and part["iteration"]["median"] > 0
+        assert 0 < part["frame"]["min"] < part["iteration"]["min"]  # of medians one may have been disturbed
         assert part["graph"] is None and set(part["decode"]) == {"float32", "bfloat16", "float16"}
         assert part["counters"]["contributing"] > 0 and part["stages"] == {}  # no call went to libpadgs_cuda
     assert size["published"]["counters"]["instances"] > size["ours"]["counters"]["instances"]
