@@ -26,7 +26,7 @@ from padgs.scene import Scene, View
 from padgs.sphere.camera import Panorama
 
 REHEARSED = 0.02  # share of a budget of seconds after which the speed of a method is known
-GROWN = 0.6  # of the speed at the beginning, as models have grown; over a run, within a third of what was measured
+SLOWER = 0.6  # of the speed at the beginning, as models grow; where first steps are slow, runs take up to 4 times as many
 
 
 class Method(ABC):
@@ -183,7 +183,7 @@ class Method(ABC):
                 break
         torch.set_rng_state(random)
         each = (trainer.spent - first) / (trainer.iteration - 1)
-        length = max(2, round(GROWN * (budget.seconds - trainer.spent) / each))
+        length = max(2, round(SLOWER * (budget.seconds - trainer.spent) / each))
         return length, {"seconds": trainer.seconds, "cpu_seconds": trainer.cpu_seconds}
 
     def _trained_by(self, trainee: Trainee, scene: Scene, budget: Budget, stage: Stage) -> Trainer:
