@@ -26,7 +26,7 @@ from padgs.scene import Scene, View
 from padgs.sphere.camera import Panorama
 
 REHEARSED = 0.02  # share of a budget of seconds after which the speed of a method is known
-SLOWER = 0.6  # of the speed at the beginning, as models grow; where first steps are slow, runs take up to 4 times as many
+SLOWER = 0.6  # of the speed at the beginning, as models grow; where first steps are slow, a run may do 4 times as many
 
 
 class Method(ABC):
