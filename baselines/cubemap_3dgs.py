@@ -48,6 +48,7 @@ class Cubemap3DGSMethod(SplatMethod):
     """See `padgs.learning.method.Method`."""
 
     TRAINEE = CutTrainee
+    CUT_FINENESS = FINENESS
     RENDER = RenderConfig(projection="pinhole", cubemap=True)
     _views_each = 1  # training views of an iteration; of the scene of `fit`
 

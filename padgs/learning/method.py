@@ -34,11 +34,13 @@ class Method(ABC):
 
     Attributes:
         Options: a dataclass with a default for every field, what `method` holds in the configuration.
+        CUT_FINENESS: how much finer than in a panorama it takes the pixels of any other view to be.
         RENDER, TRAIN: how the method is drawn and trained unless the configuration says otherwise.
         options, render_config, train_options, seed: as constructed.
     """
 
     Options: ClassVar[type]
+    CUT_FINENESS: ClassVar[float] = 1.0
     RENDER: ClassVar[RenderConfig] = RenderConfig()
     TRAIN: ClassVar[TrainOptions] = TrainOptions()
 

@@ -12,11 +12,9 @@ import torch
 from omegaconf import OmegaConf
 from yaml import YAMLError
 
-from baselines.cubemap_3dgs import Cubemap3DGSMethod
 from padgs import results
 from padgs.film.paths import between
 from padgs.learning.method import Method
-from padgs.render.cubemap import FINENESS
 from padgs.results import Result, Scores
 from padgs.runs import checkpoint
 from padgs.runs.config import RunConfig, config_from_values
@@ -130,8 +128,8 @@ class OpenedRun:
                 memory_cap=None,
             )
         finer = max(1.0, camera.focal / trained.focal)
-        if isinstance(self.method, Cubemap3DGSMethod) and not isinstance(camera, Panorama):
-            finer /= FINENESS  # which it assumes of every view that is no panorama
+        if not isinstance(camera, Panorama):
+            finer /= self.method.CUT_FINENESS
         ways = replace(ways, low_pass=ways.low_pass if ways.low_pass_kind == "fixed" else ways.low_pass * finer**2)
         return self.method if ways == self.config.render else self.method.drawn_with(ways)
 
