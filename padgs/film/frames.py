@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -88,15 +89,14 @@ def _film(place: Path, view: View, fps: float) -> Iterator[Put]:
     if view.width % 2 or view.height % 2:
         raise ValueError(f"frames are {view.width}x{view.height}; H.264 takes even sides only, or name a folder")
     try:
-        import imageio.v3 as imageio
-
-        place.parent.mkdir(parents=True, exist_ok=True)
-        film = imageio.imopen(place, "w", plugin="pyav")
+        import av
     except ImportError as error:
         raise ValueError(
-            f"writing {place} needs imageio and PyAV: pip install 'padgs[video]'; a folder for PNGs needs neither"
+            f"writing {place} needs PyAV: pip install 'padgs[video]'; a folder for PNGs does not"
         ) from error
-    with film:
-        film.init_video_stream("libx264", fps=fps, pixel_format="yuv420p")  # type: ignore[attr-defined]
-        film._video_stream.options = {"crf": "18"}  # type: ignore[attr-defined]
-        yield film.write_frame  # type: ignore[attr-defined]
+    place.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(place), "w") as film:
+        stream = film.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000), options={"crf": "18"})
+        stream.width, stream.height, stream.pix_fmt = view.width, view.height, "yuv420p"
+        yield lambda frame: film.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        film.mux(stream.encode())  # what the encoder still holds back
