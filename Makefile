@@ -4,6 +4,9 @@ BIN := .venv/bin
 SOURCES := pyproject.toml constraints.txt requirements-nodeps.txt CMakeLists.txt $(wildcard padgs/native/csrc/* padgs/native/csrc/*/*)
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
+# Where nothing may be kept, every process compiles torch anew: four seconds of each.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: run test test-all lint bench
 
 run: .venv/installed ## padgs-run, with ARGS="..." for it

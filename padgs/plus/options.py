@@ -27,7 +27,7 @@ class PlusOptions(SplatOptions):
     gradient_threshold: float = 5e-5  # SPaGS's, in runs of `LONG` iterations or more; see `for_run`
     sample_clones: bool = True
     min_opacity: float = 0.05  # what is fainter when a round ends was not needed
-    start_share: float | None = 0.29  # points to begin with, per independent pixel of a view; None: all that there are
+    start_share: float | None = 0.6  # points to begin with, per independent pixel of a view; None: all that there are
     limit_share: float | None = 2.6  # ... and Gaussians at most, sky included: a guard on memory and time
     initial_opacity: float = 0.5  # 0.1 hides what lies in front until opacities have grown
     initial_scale: float = 0.6  # times the distance of the nearest points; 1 is 3DGS's, whose Gaussians overlap

@@ -41,10 +41,23 @@ PADGS_INLINE Vec splat(float x) { Vec r; PADGS_EACH_PART r.p[i] = x - Part{}; re
 PADGS_INLINE VecI splat_int(int32_t x) { VecI r; PADGS_EACH_PART r.p[i] = x - PartI{}; return r; }
 PADGS_INLINE Vec zero() { Vec r; PADGS_EACH_PART r.p[i] = Part{}; return r; }
 PADGS_INLINE VecI zero_int() { VecI r; PADGS_EACH_PART r.p[i] = PartI{}; return r; }
-PADGS_INLINE Vec load(const float *from) { Vec r; std::memcpy(&r, from, sizeof r); return r; }
-PADGS_INLINE VecI load_int(const int32_t *from) { VecI r; std::memcpy(&r, from, sizeof r); return r; }
-PADGS_INLINE void store(float *to, Vec v) { std::memcpy(to, &v, sizeof v); }
-PADGS_INLINE void store_int(int32_t *to, VecI v) { std::memcpy(to, &v, sizeof v); }
+
+// Register by register: GCC copies a whole Vec of two AVX2 registers by way of the stack, in pieces that its next load
+// has to wait for.
+#define PADGS_LANES(from) ((from) + i * (kLanes / kParts))
+PADGS_INLINE Vec load(const float *from) {
+  Vec r;
+  PADGS_EACH_PART std::memcpy(&r.p[i], PADGS_LANES(from), kPartBytes);
+  return r;
+}
+PADGS_INLINE VecI load_int(const int32_t *from) {
+  VecI r;
+  PADGS_EACH_PART std::memcpy(&r.p[i], PADGS_LANES(from), kPartBytes);
+  return r;
+}
+PADGS_INLINE void store(float *to, Vec v) { PADGS_EACH_PART std::memcpy(PADGS_LANES(to), &v.p[i], kPartBytes); }
+PADGS_INLINE void store_int(int32_t *to, VecI v) { PADGS_EACH_PART std::memcpy(PADGS_LANES(to), &v.p[i], kPartBytes); }
+#undef PADGS_LANES
 
 alignas(64) static const float kIota[kLanes] = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
 PADGS_INLINE Vec iota() { return load(kIota); }
