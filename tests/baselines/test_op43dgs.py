@@ -64,6 +64,7 @@ def run(setting: str, scene: Scene, folder, monkeypatch, *overrides: str) -> res
     return session.Session(composed(f"method={setting}", *tiny, *overrides), Console(file=io.StringIO())).run()
 
 
+@pytest.mark.slow
 def test_far_away_the_release_ends_as_oom_with_the_numbers(tmp_path, monkeypatch):
     """The same picture, a hundred times as far and as large. What the corrected method needs is in its own tests."""
     near, far, cap = scene_of(1), scene_of(100), "render.memory_cap=60000"

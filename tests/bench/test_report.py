@@ -30,6 +30,7 @@ def bench(tmp_path_factory):
     return json.loads((folder / "bench.json").read_text()), (folder / "bench.png").read_bytes(), done.output
 
 
+@pytest.mark.slow
 def test_every_stage_took_time(bench):
     size = bench[0]["sizes"]["quick"]
     assert list(size["stages"]) == list(STAGES)
@@ -38,6 +39,7 @@ def test_every_stage_took_time(bench):
             assert 0 < timing[clock]["min"] <= timing[clock]["median"] <= timing[clock]["p95"], name
 
 
+@pytest.mark.slow
 def test_the_stages_are_the_whole(bench):
     size = bench[0]["sizes"]["quick"]
     parts = sum(timing["cpu"]["min"] for name, timing in size["stages"].items() if name != "adapt")
@@ -46,6 +48,7 @@ def test_the_stages_are_the_whole(bench):
     assert size["stage_sum"]["cpu"]["min"] > 0 and size["iteration"]["cpu"]["min"] > 0
 
 
+@pytest.mark.slow
 def test_ceilings_and_floors(bench):
     report = bench[0]
     for ceiling in report["ceilings"].values():
@@ -59,6 +62,7 @@ def test_ceilings_and_floors(bench):
     assert report["sizes"]["quick"]["floor"] < report["sizes"]["quick"]["stage_sum"]["cpu"]["min"]
 
 
+@pytest.mark.slow
 def test_counters_are_those_of_the_workload(bench):
     counters, size = bench[0]["sizes"]["quick"]["counters"], SIZES["quick"]
     assert counters["gaussians"] == pytest.approx(size.gaussians, rel=0.05)
@@ -67,6 +71,7 @@ def test_counters_are_those_of_the_workload(bench):
     assert counters["evaluated_per_pixel"] == counters["evaluated"] / (size.width * size.height)
 
 
+@pytest.mark.slow
 def test_ratios_are_of_the_same_work(bench):
     ratios = bench[0]["ratios"]
     in_torch, of_erp = {"torch_renderer", "torch_decode", "torch_loss"}, {"tangent", "ray", "hybrid", "decode"}
@@ -79,6 +84,7 @@ def test_ratios_are_of_the_same_work(bench):
     assert ratios["ray"]["evaluated"] == ratios["hybrid"]["evaluated"] > 0.5
 
 
+@pytest.mark.slow
 def test_noise_is_judged_and_said(bench):
     report, _, text = bench
     assert report["noisy"] == (report["noise"]["worst"] > 0.25)
@@ -87,6 +93,7 @@ def test_noise_is_judged_and_said(bench):
     assert "tiles per Gaussian, mean" in text
 
 
+@pytest.mark.slow
 def test_the_picture_is_a_picture(bench):
     assert bench[1].startswith(b"\x89PNG")
     assert len(bench[1]) > 20_000

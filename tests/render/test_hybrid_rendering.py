@@ -362,6 +362,7 @@ print(cpu.library().padgs_isa().decode(), end="")
 
 
 @needs_native
+@pytest.mark.slow  # a process each
 def test_every_instruction_set_draws_the_same(tmp_path: Path, generator: torch.Generator):
     torch.save(vars(mixture(10, generator, ("ordinary", "seam")).to(torch.float32)), tmp_path / "in.pt")
     root = str(Path(__file__).resolve().parents[2])

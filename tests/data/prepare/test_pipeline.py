@@ -80,6 +80,7 @@ def test_progress_counts_up_to_all(prepared):
     assert last == {"features": (VIEWS,) * 2, "matches": (pairs,) * 2, "poses": (VIEWS,) * 2, "result": (1, 1)}
 
 
+@pytest.mark.slow
 def test_an_interrupted_call_goes_on_and_ends_the_same(scene, prepared, tmp_path):
     """On one thread: with several, how busy the machine is may decide the last bits of poses."""
     out = tmp_path / "done"
