@@ -12,7 +12,7 @@ import json
 import math
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
@@ -43,6 +43,7 @@ OF_THE_MACHINE = ("run", "render.max_instances", "data.cache_bytes", "data.read_
 DECIDE_NOTHING = (*OF_THE_MACHINE, "data.path", "protocol", "train.monitor")
 # What is no more than a name, even in a command line or a path; `@` parts an experiment from its scale.
 PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*(@[A-Za-z0-9._-]+)?")
+BY_ITSELF = "by_itself"  # among experiments: a command without any asked for the run as well
 HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "lpips": False, "seam": False}  # of every metric with the word in it
 
 
@@ -89,7 +90,7 @@ class Result:
     peak_memory_bytes: int = 0  # of the process, while training
     peak_device_memory_bytes: int | None = None  # of torch's tensors on the GPU, while training; None on the CPU
     config: dict[str, Any] = field(default_factory=dict)  # the resolved configuration
-    experiments: tuple[str, ...] = ()  # experiments and sweeps that it belongs to, sorted
+    experiments: tuple[str, ...] = ()  # experiments and sweeps that it belongs to, sorted; see `joined`
     need: dict[str, Any] = field(default_factory=dict)  # of a pruned model: what `padgs need` found, see `padgs.need`
 
     def __post_init__(self) -> None:
@@ -101,6 +102,16 @@ class Result:
     def ok(self) -> bool:
         """Whether the scores count."""
         return self.status == "ok"
+
+
+def joined(first: Iterable[str], second: Iterable[str]) -> tuple[str, ...]:
+    """The experiments of a run that two commands asked for; none of a run that was asked for by itself alone.
+
+    >>> joined(("tau",), ("table1",)), joined((), ("tau",)), joined((), ())
+    (('table1', 'tau'), ('by_itself', 'tau'), ())
+    """
+    names = {*(tuple(first) or (BY_ITSELF,)), *(tuple(second) or (BY_ITSELF,))}
+    return () if names == {BY_ITSELF} else tuple(sorted(names))
 
 
 def write(result: Result, folder: Path) -> Path:

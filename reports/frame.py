@@ -16,7 +16,7 @@ from typing import Any
 import pandas as pd
 from pandas import DataFrame
 
-from padgs.results import DECIDE_NOTHING, Result, Scores, picture_name
+from padgs.results import BY_ITSELF, DECIDE_NOTHING, Result, Scores, picture_name
 from reports.images_seen import images_seen
 from reports.learning_rates import law
 from reports.scenes import Place
@@ -91,9 +91,10 @@ FACTS: Mapping[str, Callable[[Result], Any]] = {
         name: attrgetter(name)
         for name in (
             *("run", "ok", "status", "method", "preset", "variant", "dataset", "scene", "seed", "iterations"),
-            *("experiments", "code_version", "finished", "need"),
+            *("code_version", "finished", "need"),
         )
     },
+    "experiments": lambda result: result.experiments or (BY_ITSELF,),
     "place": lambda result: Place(result.dataset, result.scene),
     "resolution": lambda result: f"{result.width}x{result.height}",
     "data": lambda result: result.fingerprint[:10],

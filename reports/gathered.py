@@ -9,6 +9,7 @@ from typing import Any
 
 from pandas import DataFrame
 
+from padgs.results import BY_ITSELF
 from reports import REPORTS
 from reports.measures import marks
 from reports.request import Request, admitted
@@ -42,7 +43,7 @@ class Gathered:
 
     def chosen(self, name: str) -> DataFrame:
         """The runs for a report: those of the experiment asked for; else, scene by scene, those of the report's own
-        experiments, or those of none; all, if that leaves nothing.
+        experiments, or those that were asked for by themselves; all, if that leaves nothing.
 
         A folder may hold sweeps and trials beside the runs of a table; without the choice they would compete for its
         cells.
@@ -51,7 +52,7 @@ class Gathered:
         if self.request.experiment:
             return runs
         own = self.of_experiments(*REPORTS[name].experiments)
-        free = runs.loc[~runs["place"].isin(own["place"]) & (runs["experiments"].map(len) == 0)]
+        free = runs.loc[~runs["place"].isin(own["place"]) & (runs["experiments"].map(lambda of: BY_ITSELF in of))]
         return runs.loc[[*own.index, *free.index]] if len(own) + len(free) else runs
 
     def of_experiments(self, *names: str) -> DataFrame:

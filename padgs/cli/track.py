@@ -24,7 +24,7 @@ def track(
         show(f"left out: {error}")
     trackers: dict[str, Tracker] = {}
     for result in found:
-        experiment = " ".join(result.experiments)
+        experiment = " ".join(name for name in result.experiments if name != results.BY_ITSELF)
         if experiment not in trackers:
             trackers[experiment] = Tracker(TrackingOptions(uri=uri or None), Path(runs), experiment, show)
         trackers[experiment].update(Path(runs) / result.run)

@@ -12,7 +12,7 @@ import torch
 from rich.console import Console
 
 from baselines import METHODS
-from padgs import clock, data
+from padgs import clock, data, results
 from padgs.learning.failure import Failure
 from padgs.learning.loop import Record
 from padgs.learning.method import Method
@@ -182,8 +182,11 @@ class Session:
 
     def _is_missing(self, result: Result) -> bool:
         """Whether there is anything left to do about a finished run."""
-        unknown = {*self.config.labels.experiments} - {*result.experiments}
-        return self._is_retried(result) or bool(self._unscored(result)) or bool(unknown)
+        return self._is_retried(result) or bool(self._unscored(result)) or self._serving(result) != result.experiments
+
+    def _serving(self, result: Result) -> tuple[str, ...]:
+        """The experiments of a finished run, and who asks for it now."""
+        return results.joined(result.experiments, self.config.labels.experiments)
 
     def _is_retried(self, result: Result) -> bool:
         return not result.ok and self.config.retry == "failed"
@@ -198,8 +201,7 @@ class Session:
 
     def _completed(self, result: Result) -> Result:
         """A finished run with marks under the rules that it lacks; it may serve several experiments."""
-        experiments = tuple(sorted({*result.experiments, *self.config.labels.experiments}))
-        complete = replace(result, experiments=experiments)
+        complete = replace(result, experiments=self._serving(result))
         if unscored := self._unscored(result):
             self._say("finished before; only the new protocol is missing")
             if not checkpoint.exists(self.folder.checkpoint):  # an untrained method would be scored

@@ -25,6 +25,9 @@ from padgs.runs.interrupt import Interrupted
 from padgs.runs.lock import RunBusy
 from padgs.runs.scoring import probe
 from padgs.runs.session import Session, build, scene_of
+from reports import store
+from reports.frame import frame
+from reports.gathered import Gathered
 
 ITERATIONS = 12
 SMALL = ("method=padgs", "protocol=paper", "protocol.paper.lpips=none", "render.backend=torch")
@@ -295,6 +298,15 @@ def test_a_finished_run_learns_which_other_experiments_want_it(config, monkeypat
     assert again.experiments == ("table1", "table4") and first.experiments == ("table1",)
     assert replace(again, experiments=first.experiments) == first
     assert results.read(folder_of(config).path / "result.json") == again
+
+
+def test_a_run_of_a_sweep_that_is_asked_for_by_itself_stands_in_tables(config):
+    run(replace(config, labels=Labels("padgs", ("tau",))))
+    for seed in range(2):
+        run(replace(config, labels=Labels("padgs"), seed=seed))
+    found, _ = store.read(Path(config.run.folder))
+    rows = Gathered(frame(found)).chosen("methods")
+    assert sorted(rows["seed"]) == [0, 1] and set(rows["experiments"]) == {("by_itself",), ("by_itself", "tau")}
 
 
 def test_an_error_of_ours_is_no_result(config, monkeypatch):
