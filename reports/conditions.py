@@ -8,8 +8,8 @@ import pandas as pd
 from pandas import DataFrame
 
 from reports.methods import name, title
+from reports.mixtures import Mixture
 from reports.request import Request
-from reports.tables.table import ReportError
 
 # Columns of the frame; the protocol's are its rules.
 CONDITIONS = ("protocol", "resolution", "length", "learning_rates", "data")
@@ -32,7 +32,7 @@ def refuse_mixture(runs: DataFrame, request: Request, where: str, conditions: It
     """Runs of one block must have been made and scored alike.
 
     Raises:
-        ReportError: they were not, and the request does not say that this is meant.
+        Mixture: they were not, and the request does not say that this is meant.
     """
     for what in () if request.mix else conditions:
         values = _values(runs, what, request.protocol).drop_duplicates()
@@ -40,9 +40,9 @@ def refuse_mixture(runs: DataFrame, request: Request, where: str, conditions: It
             examples = "; ".join(
                 f"{value} in {run}" for value, run in zip(values, runs["run"][values.index], strict=True)
             )
-            raise ReportError(
-                f"{where}: results differ in {what} ({examples}); choose with --where, or say --mix if this is meant"
-            )
+            told = f"{where}: results differ in {what} ({examples})"
+            column = _column(what, request.protocol)
+            raise Mixture(told, "choose with --where, or say --mix if this is meant", runs, [column])
 
 
 def footnotes(blocks: Mapping[str, DataFrame], protocol: str) -> list[str]:
@@ -76,5 +76,9 @@ def _sentence(runs: DataFrame, protocol: str) -> str:
 
 def _values(runs: DataFrame, what: str, protocol: str) -> pd.Series:
     """A condition of each run; one that was never scored under a protocol contradicts none of its rules."""
-    column = f"{protocol} rules" if what == "protocol" else what
+    column = _column(what, protocol)
     return runs[column].dropna() if column in runs else pd.Series(dtype=object)
+
+
+def _column(what: str, protocol: str) -> str:
+    return f"{protocol} rules" if what == "protocol" else what

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from typing import Any
 
@@ -12,7 +12,8 @@ from pandas import DataFrame
 from padgs.results import BY_ITSELF
 from reports import REPORTS
 from reports.measures import marks
-from reports.request import Request, admitted
+from reports.mixtures import Mixture, apart
+from reports.request import Request, admitted, experiment_of
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,7 @@ class Gathered:
     runs: DataFrame  # as `frame` makes it
     request: Request = Request()
     left_out: Sequence[str] = ()  # why which result files could not be used
+    warnings: list[str] = field(default_factory=list)  # of the reports made so far: which runs stand apart in them
     _made: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -35,11 +37,27 @@ class Gathered:
         return admitted(self.runs, self.request)
 
     def report(self, name: str) -> Any:
-        """What the function of an entry of `REPORTS` makes of this."""
+        """What the function of an entry of `REPORTS` makes of this; what must not stand together stands apart in it, in
+        blocks, rows and charts of its own, unless the request is strict.
+        """
         if name not in self._made:
             module, _, function = REPORTS[name].function.partition(":")
-            self._made[name] = getattr(import_module(module), function)(self)
+            self._made[name] = self._apart(name, getattr(import_module(module), function))
         return self._made[name]
+
+    def _apart(self, name: str, function: Callable[[Gathered], Any]) -> Any:
+        gathered, told = self, dict[str, None]()
+        while True:
+            try:
+                made = function(gathered)
+            except Mixture as mixture:
+                if self.request.strict or mixture.what in told:
+                    raise
+                told[mixture.what] = None
+                gathered = replace(gathered, runs=apart(gathered.runs, mixture), _made={})
+                continue
+            self.warnings.extend(f"{name}: {what}, so they stand apart; --where chooses" for what in told)
+            return made
 
     def chosen(self, name: str) -> DataFrame:
         """The runs for a report: those of the experiment asked for; else, scene by scene, those of the report's own
@@ -68,12 +86,3 @@ def of_a_table(experiment: str) -> bool:
     (True, False)
     """
     return any(experiment_of(experiment) in report.experiments for report in REPORTS.values())
-
-
-def experiment_of(name: str) -> str:
-    """The experiment without the scale that it was run at.
-
-    >>> experiment_of("tau@cpu")
-    'tau'
-    """
-    return name.partition("@")[0]

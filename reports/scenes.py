@@ -15,6 +15,7 @@ class Place:
 
     dataset: str
     scene: str
+    apart: str = ""  # what sets its runs apart from others of the scene, with which they must not stand together
 
     @property
     def published(self) -> bool:
@@ -30,13 +31,23 @@ class Place:
     def title(self) -> str:
         """What stands over its rows: nobody shall take a stand-in for a scene of the paper."""
         if self.published:
-            return published.scene_title(self.dataset, self.scene)
+            return self.heading
         if self.dataset == "synthetic":
-            return f"{self.scene} (built in, generated; no scene of the paper)"
-        return f"{self.scene} (a capture that is no scene of the paper)"
+            return f"{self.label} (built in, generated; no scene of the paper)"
+        return f"{self.label} (a capture that is no scene of the paper)"
 
     @property
-    def rank(self) -> tuple[int, str, str]:
+    def heading(self) -> str:
+        """The same without a word on where it is from, for tables that have such scenes as well."""
+        return ", ".join(filter(None, (published.scene_title(self.dataset, self.scene), self.apart)))
+
+    @property
+    def label(self) -> str:
+        """Its name, and what sets its runs apart."""
+        return ", ".join(filter(None, (self.scene, self.apart)))
+
+    @property
+    def rank(self) -> tuple[int, str, str, str]:
         """Scenes of the paper stand first, otherwise in the order of their names."""
         order = list(published.DATASETS)
-        return (order.index(self.dataset) if self.published else len(order), self.dataset, self.scene)
+        return (order.index(self.dataset) if self.published else len(order), self.dataset, self.scene, self.apart)

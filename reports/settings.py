@@ -10,6 +10,7 @@ from pandas import DataFrame
 
 from reports import methods
 from reports.frame import CONFIG, decides, grouped
+from reports.mixtures import Mixture
 from reports.tables.table import ReportError
 
 
@@ -44,14 +45,15 @@ def settings(runs: DataFrame) -> list[Setting]:
     return found
 
 
-def one_setting(runs: DataFrame, where: str) -> DataFrame:
-    """The runs of one cell, sorted by seed.
+def one_setting(runs: DataFrame, where: str, apart_in: str = "place") -> DataFrame:
+    """The runs of one cell, sorted by seed; `apart_in`: see `Mixture`.
 
     Raises:
-        ReportError: they differ in more than the seed, so that their mean would mean nothing; or not even in that.
+        Mixture: they differ in more than the seed, so that their mean would mean nothing.
+        ReportError: not even in that.
     """
     ordered = runs.sort_values("seed", kind="stable")
-    refuse_differences(ordered, where)
+    refuse_differences(ordered, where, apart_in)
     for _, same in grouped(ordered, "seed"):
         if len(same) > 1:
             first, second, *_ = same["run"]
@@ -59,19 +61,19 @@ def one_setting(runs: DataFrame, where: str) -> DataFrame:
     return ordered
 
 
-def refuse_differences(runs: DataFrame, where: str) -> None:
-    """Runs must differ in nothing but the seed, and what no number depends on.
+def refuse_differences(runs: DataFrame, where: str, apart_in: str = "place") -> None:
+    """Runs must differ in nothing but the seed, and what no number depends on; `apart_in`: see `Mixture`.
 
     Raises:
-        ReportError: they differ in more.
+        Mixture: they differ in more.
     """
-    for other in range(1, len(runs)) if differing(runs) else ():
+    every = differing(runs)
+    for other in range(1, len(runs)) if every else ():
         two = runs.iloc[[0, other]]
         if keys := differing(two):
-            raise ReportError(
-                f"{where}: runs {' and '.join(two['run'])} differ in {', '.join(keys)}; "
-                f"choose one with --where {keys[0]}=..."
-            )
+            told = f"{where}: runs {' and '.join(two['run'])} differ in {', '.join(keys)}"
+            columns = [CONFIG + key for key in every]
+            raise Mixture(told, f"choose one with --where {keys[0]}=...", runs, columns, apart_in)
 
 
 def differing(runs: DataFrame) -> list[str]:

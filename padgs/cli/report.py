@@ -31,7 +31,9 @@ def report(
     collect: Annotated[
         bool, typer.Option(help="add the runs to OUT/results.jsonl first, and report on all in it")
     ] = False,
-    strict: Annotated[bool, typer.Option(help="exit code 1 if a result file cannot be used")] = False,
+    strict: Annotated[
+        bool, typer.Option(help="exit code 1 if a result file cannot be used, or results must not stand together")
+    ] = False,
 ) -> None:
     """Make tables (Markdown, LaTeX, CSV), charts (SVG, PNG, CSV) and a page (HTML) from result files."""
     if what not in (*REPORTS, ALL):
@@ -45,7 +47,7 @@ def report(
     from reports.gathered import Gathered
     from reports.request import Request
 
-    request = Request(protocol, mix, tuple(metric or ()), experiment, dict(map(_pair, where or [])))
+    request = Request(protocol, mix, strict, tuple(metric or ()), experiment, dict(map(_pair, where or [])))
     found, broken = store.read(source)
     if collect:
         with _writing_to(target):
@@ -55,12 +57,13 @@ def report(
         show(f"left out: {error}", sys.stderr)
     gathered = Gathered(frame(found), request, tuple(map(str, broken)))
     refused = 0
-    for name in REPORTS if what == ALL else [what]:
+    single = what != ALL
+    for name in [what] if single else REPORTS:
         try:
             texts = dict(files(gathered.report(name)))
         except ReportError as error:
             refused += 1
-            show(f"error: {name}: {error}", sys.stderr)
+            show(f"{'error' if single or strict else 'left out'}: {name}: {error}", sys.stderr)
             continue
         if what == name and not texts:
             raise ReportError(f"nothing to show for {name}; no run or experiment in {source} is of that kind")
@@ -71,7 +74,9 @@ def report(
         if what == name and f"{name}.md" in texts:
             show(texts[f"{name}.md"].decode())
     print(f"{len(found)} results, {len(broken)} left out; see {target}", file=sys.stderr)
-    if refused or (strict and broken):
+    for warning in gathered.warnings:
+        show(f"warning: {warning}", sys.stderr)
+    if (refused and (single or strict)) or (strict and broken):
         raise typer.Exit(1)
 
 

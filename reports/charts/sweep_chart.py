@@ -35,7 +35,7 @@ def chart(sweep: Sweep) -> Chart:
     handles, labels = axes[0, 0].get_legend_handles_labels()
     if handles:
         made.legend(handles, labels, loc="outside lower center", ncols=3)
-    title = f"Sweep {sweep.name}: mean and standard deviation over seeds"
+    title = f"{sweep.title}: mean and standard deviation over seeds"
     lay_out(made, title)
     return Chart(sweep.file_name, title, svg(made, sweep.file_name, tips), png(made), sweep.notes, sweep.numbers)
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from pandas import DataFrame
 
+from padgs.results import BY_ITSELF
 from reports import methods
 from reports.conditions import OF_A_POINT, OF_A_SWEEP, footnotes, refuse_mixture
 from reports.frame import by_place, grouped
@@ -19,6 +20,7 @@ from reports.settings import Setting, is_number, settings, sort_key
 from reports.tables.cells import over_seeds
 from reports.tables.table import Cell
 
+SWEPT_AT_ONCE = 2  # keys; what was run by itself and differs in more is no sweep
 COSTS_SHOWN = ("gaussians", "train_seconds", "frame_ms")
 
 
@@ -35,7 +37,7 @@ class Line:
     @property
     def title(self) -> str:
         """What tells this curve from the others."""
-        return ", ".join(part for part in (self.place.scene, methods.title(self.preset), self.fixed) if part)
+        return ", ".join(part for part in (self.place.label, methods.title(self.preset), self.fixed) if part)
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,11 @@ class Sweep:
         return keys.pop() if len(keys) == 1 else ""
 
     @property
+    def title(self) -> str:
+        """What was swept, as the command named it."""
+        return "Sweep without a name" if self.name == BY_ITSELF else f"Sweep {self.name}"
+
+    @property
     def file_name(self) -> str:
         """The name without what files should not have in theirs."""
         return f"sweep_{self.name.replace('@', '_')}"
@@ -63,7 +70,7 @@ class Sweep:
         """A row for each quantity of each point, all digits."""
         rows = []
         for line in self.lines:
-            where = {"sweep": self.name, "dataset": line.place.dataset, "scene": line.place.scene}
+            where = {"sweep": self.name, "dataset": line.place.dataset, "scene": line.place.label}
             where |= {"preset": line.preset, "line": line.fixed, "key": line.key}
             for x, cells in line.points:
                 for measure, cell in zip(self.measures, cells, strict=True):
@@ -72,20 +79,22 @@ class Sweep:
 
 
 def sweeps(gathered: Gathered) -> list[Sweep]:
-    """Each sweep in which a preset was run on a scene in more than one setting; an experiment of a table, if asked for.
+    """Each sweep in which a preset was run on a scene in more than one setting, and those made without any name; an
+    experiment of a table, if asked for.
 
     Raises:
         ReportError: a metric that nobody knows, or results that must not stand together.
     """
     request, runs = gathered.request, gathered.asked_for
     measures = _measures(request, runs)
-    names = sorted(name for name in runs["experiments"].explode().dropna().unique() if not of_a_table(name))
+    known = sorted(runs["experiments"].explode().dropna().unique())
+    names = [name for name in known if (request.means(name) if request.experiment else not of_a_table(name))]
     found = []
-    for name in [request.experiment] if request.experiment else names:
+    for name in names:
         own = runs.loc[[name in of for of in runs["experiments"]]]
         lines, drawn = [], {}
         for place, there in by_place(own).items():
-            curves = list(_curves(there))
+            curves = list(_curves(there, SWEPT_AT_ONCE if name == BY_ITSELF else None))
             if not curves:
                 continue
             refuse_mixture(there, request, f"{name}, {place.title}", OF_A_SWEEP)
@@ -106,13 +115,17 @@ def _measures(request: Request, runs: DataFrame) -> tuple[Measure, ...]:
     return (*marks(request.protocol), *costs(*COSTS_SHOWN))
 
 
-def _curves(runs: DataFrame) -> Iterator[tuple[str, str, str, list[tuple[Any, Setting]]]]:
-    """Preset, what is fixed, key along x and points of each curve of a scene; none for a preset in a single setting."""
+def _curves(runs: DataFrame, most_keys: int | None) -> Iterator[tuple[str, str, str, list[tuple[Any, Setting]]]]:
+    """Preset, what is fixed, key along x and points of each curve of a scene; none for a preset in a single setting, or
+    whose settings differ in more keys than these.
+    """
     for (preset, variant), own in grouped(runs, "preset", "variant"):
         found = settings(own)
         if len(found) < 2:
             continue
         keys = list(found[0].changed)
+        if most_keys is not None and len(keys) > most_keys:
+            continue
         numeric = [key for key in keys if all(is_number(setting.changed[key]) for setting in found)]
         if len(keys) > 2 or not numeric:
             yield preset, variant, "", [(_words(setting, keys), setting) for setting in found]

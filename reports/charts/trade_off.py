@@ -111,7 +111,7 @@ def trade_offs(gathered: Gathered) -> list[TradeOff]:
     runs = gathered.chosen("chart")
     groups: dict[str, dict[Place, DataFrame]] = {}
     for place, own in by_place(runs.loc[runs["variant"] == ""]).items():
-        name = place.dataset if place.published else place.scene
+        name = place.dataset if place.published and not place.apart else place.label
         if name in groups and not place.published:  # scenes of two data sets, or a scene called like a data set
             name = f"{name}_{place.dataset or 'capture'}"
         groups.setdefault(name, {})[place] = own

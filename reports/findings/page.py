@@ -12,7 +12,8 @@ from reports import published
 from reports.conditions import footnotes
 from reports.findings.claims import CLAIMS
 from reports.findings.judging import Claim, Judgement, Line, Verdict, in_the_paper, judge
-from reports.gathered import Gathered, experiment_of, of_a_table
+from reports.gathered import Gathered, of_a_table
+from reports.request import experiment_of
 from reports.tables.ranking import CONFIDENCE
 from reports.tables.table import MISSING
 

@@ -37,7 +37,7 @@ def html(gathered: Gathered) -> str:
     pictures = album(gathered)
     return environment.get_template("page.html.j2").render(
         facts=_facts(gathered.runs),
-        problems=[*gathered.left_out, *refused],
+        problems=[*gathered.left_out, *refused, *gathered.warnings],
         tables=[_table(table) for table in tables],
         maps=[_chart(chart) for chart in maps],
         charts=[_chart(chart) for name in ("chart", "need_chart") for chart in made[name] or ()],

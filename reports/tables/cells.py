@@ -27,12 +27,12 @@ def of_each(
     `unranked` values are only shown.
 
     Raises:
-        ReportError: runs of one value differ in more than the seed.
+        Mixture: runs of one value differ in more than the seed.
     """
     own = {value: runs.loc[runs[column] == value] for value in titles}
-    cells = {
-        value: over_seeds(one_setting(own[value], f"{where}, {title}"), measures) for value, title in titles.items()
-    }
+    apart_in = column if column == "preset" else "place"  # rows of a variant have titles of their own
+    alike = {value: one_setting(own[value], f"{where}, {title}", apart_in) for value, title in titles.items()}
+    cells = {value: over_seeds(runs, measures) for value, runs in alike.items()}
     return {value: only_shown(row) if value in unranked else row for value, row in cells.items()}
 
 

@@ -59,12 +59,13 @@ class Comparison:
                     blocks.append(self._scene(place, own, measures, paper, aside[-1]))
             if dataset not in self.tables:
                 continue
-            own = runs.loc[runs["dataset"] == dataset]
+            own = runs.loc[[(place.dataset, place.apart) == (dataset, "") for place in runs["place"]]]
             refuse_mixture(own, request, published.TITLES[dataset], [what for what in self.alike if what != "data"])
             scenes = published.scenes(paper or published.load(), published.DATASETS[dataset])
             aside.append(unranked(own))
             blocks.append(self._average(dataset, scenes, own, measures, paper, aside[-1]))
-            not_run = [scene for scene in scenes if Place(dataset, scene) not in found]
+            run = {(place.dataset, place.scene) for place in found}
+            not_run = [scene for scene in scenes if (dataset, scene) not in run]
             if not_run:
                 notes.append(f"{published.TITLES[dataset]}, not run: {', '.join(not_run)}.")
         notes += footnotes({place.title: own for place, own in found.items()}, request.protocol)

@@ -83,7 +83,7 @@ def table3(gathered: Gathered) -> Table:
     runs = _runs(gathered, "table3", PARTS)
     blocks, runs_of = [], {}
     for place, own in {**dict.fromkeys(PAPER_SCENES, runs.iloc[:0]), **by_place(runs)}.items():
-        title = published.scene_title(place.dataset, place.scene)
+        title = place.heading
         refuse_mixture(own, gathered.request, title)
         rows = []
         for variant, ours in of_each(own, "variant", PARTS, title, measures).items():

@@ -3,7 +3,7 @@ import sys
 from dataclasses import replace
 
 import pytest
-from made_up import compared, result, swept, write
+from made_up import compared, result, small, swept, write
 from typer.testing import CliRunner
 
 from padgs import results
@@ -72,7 +72,7 @@ def test_a_terminal_obeys_nothing_in_a_name(tmp_path):
         (["sweep", "--metric", "x"], "unknown metric 'x'; known under protocol paper: psnr, ssim"),
         (["sweep"], "nothing to show for sweep"),
         (["runs", "--protocol", "x"], "unknown protocol 'x'; known: paper, sphere"),
-        (["html", "--experiment", "x"], "unknown experiment 'x'; known: none"),
+        (["html", "--experiment", "x"], "unknown experiment 'x'; known: by_itself"),
     ],
 )
 def test_what_is_wrong_is_said(runs, arguments, message):
@@ -114,9 +114,33 @@ def test_everything_at_once(tmp_path):
 def test_what_is_refused_does_not_keep_the_rest_back(tmp_path):
     first, *others = compared(["synthetic-room"], seeds=1)
     write([replace(first, machine={"gpu": "H200"}), *others], tmp_path / "runs")
-    done = report("all", tmp_path / "runs", "--out", tmp_path / "out")
+    done = report("all", tmp_path / "runs", "--out", tmp_path / "out", "--strict")
     assert done.exit_code == 1 and "error: table4: " in done.output and "differ in machine" in done.output
     assert (tmp_path / "out" / "table1.md").exists() and not (tmp_path / "out" / "table4.md").exists()
+
+
+def test_trials_of_all_kinds_stand_in_blocks_and_rows_of_their_own(tmp_path):
+    first, *others = compared(["synthetic-room"], seeds=1)
+    longer = small(24.0, method="omnigs", iterations=7, experiments=("all_methods@cpu",))
+    tau = replace(others[-1], run="tau", config={**others[-1].config, "method": {"tau": 0.5}})
+    write([replace(first, machine={"gpu": "H200"}), *others, longer, tau], tmp_path / "runs")
+    done = report("table4", tmp_path / "runs", "--out", tmp_path / "out")
+    assert done.exit_code == 0 and "warning: table4: synthetic-room" in done.output
+    for words in ("synthetic-room, 1500 iterations, H200", "synthetic-room, 7 iterations", "PaD-GS, tau 0.5"):
+        assert words in done.output
+
+
+def test_runs_without_an_experiment_are_a_sweep_where_they_differ_in_a_key(tmp_path):
+    write([replace(one, experiments=()) for one in swept(scenes=["synthetic-room"], seeds=1)], tmp_path / "runs")
+    assert report("sweep", tmp_path / "runs", "--metric", "psnr").exit_code == 0
+    assert "tau" in (tmp_path / "runs" / "reports" / "sweep_by_itself.csv").read_text()
+
+
+def test_an_experiment_is_known_without_its_scale_and_where_says_what_there_is(tmp_path):
+    write(compared(["synthetic-room"], seeds=1), tmp_path / "runs")
+    assert report("runs", tmp_path / "runs", "--experiment", "all_methods").exit_code == 0
+    done = report("runs", tmp_path / "runs", "--where", "method.tau=0.5")
+    assert done.exit_code == 1 and "no run has method.tau=0.5; runs have 0.9" in done.output
 
 
 def test_edited_files_and_those_of_another_version_are_left_out_and_named(tmp_path):

@@ -52,7 +52,7 @@ def test_runs_without_pictures_give_a_page_without_them():
 
 def test_a_refused_table_is_named_and_the_others_are_there():
     first, *others = data_set("roam360")
-    html = page.html(gathered([replace(first, machine={"gpu": "H200"}), *others]))
+    html = page.html(gathered([replace(first, machine={"gpu": "H200"}), *others], strict=True))
     assert "differ in machine" in html and 'id="table1"' in html and 'id="table4"' not in html
 
 

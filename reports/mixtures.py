@@ -1,0 +1,57 @@
+"""Runs that must not stand together: the refusal, and the frame in which they stand apart."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import pandas as pd
+from pandas import DataFrame
+
+from reports.frame import CONFIG
+from reports.scenes import Place
+from reports.tables.table import ReportError
+
+WORDED = {"learning_rates": "learning rates ", "data": "data "}  # columns whose values do not say what they are
+
+
+class Mixture(ReportError):
+    """A table that must not be made, because runs differ in what they should share."""
+
+    def __init__(
+        self, what: str, advice: str, runs: DataFrame, columns: Sequence[str], apart_in: str = "place"
+    ) -> None:
+        """Of these runs, which differ in these columns; `apart_in` is the column that could set them apart: place, for
+        blocks of their own, or preset, for rows.
+        """
+        super().__init__(f"{what}; {advice}")
+        self.what, self.runs, self.columns, self.apart_in = what, runs, list(columns), apart_in
+
+
+def apart(runs: DataFrame, mixture: Mixture) -> DataFrame:
+    """All runs, those of a mixture with what they differ in behind the name of their scene or preset."""
+    own = runs.loc[mixture.runs.index]
+    words = [[_words(column, value) for value in _known(own[column])] for column in mixture.columns]
+    said = [", ".join(of) for of in zip(*words, strict=True)]
+    names = [_with(name, words) for name, words in zip(own[mixture.apart_in], said, strict=True)]
+    found = runs.copy()
+    found.loc[own.index, mixture.apart_in] = pd.Series(names, index=own.index, dtype=object)
+    return found
+
+
+def _known(values: pd.Series) -> pd.Series:
+    """Who says nothing contradicts none: the most frequent value stands for it."""
+    return values.where(values.notna(), values.mode().iloc[0])
+
+
+def _words(column: str, value: Any) -> str:
+    if column.startswith(CONFIG):
+        return f"{column.rpartition('.')[2]} {value}"
+    return f"{WORDED.get(column, '')}{value}"
+
+
+def _with(name: Place | str, words: str) -> Place | str:
+    if isinstance(name, Place):
+        return replace(name, apart=", ".join(filter(None, (name.apart, words))))
+    return f"{name}_{words}"
