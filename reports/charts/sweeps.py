@@ -112,7 +112,8 @@ def sweeps(gathered: Gathered) -> list[Sweep]:
 def _measures(request: Request, runs: DataFrame) -> tuple[Measure, ...]:
     if request.metrics:
         return tuple(quantity(name, request.protocol, runs) for name in request.metrics)
-    return (*marks(request.protocol), *costs(*COSTS_SHOWN))
+    usual = (*marks(request.protocol), *costs(*COSTS_SHOWN))
+    return tuple(measure for measure in usual if measure.name in runs and runs[measure.name].notna().any())
 
 
 def _curves(runs: DataFrame, most_keys: int | None) -> Iterator[tuple[str, str, str, list[tuple[Any, Setting]]]]:

@@ -40,7 +40,7 @@ if (data.scenes.length) {
     list.replaceChildren(...titles.map((title, index) => new Option(title, index)));
     list.selectedIndex = Math.max(0, titles.findIndex((title) => name(title) === name(before ?? "")));
   };
-  const name = (title) => title.replace(/ \([\d.]+ dB\)$/, ""); // the mark behind a method differs from view to view
+  const name = (title) => title.replace(/, PSNR [\d.]+ dB$/, ""); // the mark behind a method differs from view to view
 
   const scene = () => data.scenes[select.scene.selectedIndex];
   const view = () => scene().views[select.view.selectedIndex];

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from reports import REPORTS
 from reports.charts.drawing import Chart
 from reports.gathered import Gathered
 from reports.page.pictures import album
+from reports.tables.beside_paper import OF_THE_PAPER
 from reports.tables.ranking import BEST, emphasis
 from reports.tables.table import Block, Cell, ReportError, Table
 
@@ -32,7 +34,7 @@ def html(gathered: Gathered) -> str:
     refused: list[str] = []
     made = {name: _attempt(gathered, name, refused) for name in REPORTS if name != "html"}
     parts = [part for report in made.values() for part in (report if isinstance(report, list) else [report])]
-    tables = [part for part in parts if isinstance(part, Table) and part.blocks]
+    tables = [table for part in parts if isinstance(part, Table) and (table := _measured(part)).blocks]
     maps = [part for part in made["stability"] or () if isinstance(part, Chart)]
     pictures = album(gathered)
     return environment.get_template("page.html.j2").render(
@@ -66,12 +68,21 @@ def _facts(runs: DataFrame) -> list[tuple[str, str]]:
     return [*facts, ("Last run", max(runs["finished"], default="none"))]
 
 
+def _measured(table: Table) -> Table:
+    """A table without the blocks in which nothing but published numbers stand: of data sets that were not run."""
+    ours = [index for index, column in enumerate(table.columns) if column.title not in OF_THE_PAPER]
+    blocks = (
+        block for block in table.blocks if any(row.cells[index] != Cell() for row in block.rows for index in ours)
+    )
+    return replace(table, blocks=tuple(blocks))
+
+
 def _table(table: Table) -> dict[str, Any]:
     return {
         "name": table.name,
         "title": table.title,
         "corner": table.corner,
-        "blocks": [_block(table.alone(block)) for block in table.blocks],
+        "blocks": [_block(table.alone(block, every=True)) for block in table.blocks],
         "notes": table.notes,
     }
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -45,7 +46,8 @@ def album(gathered: Gathered) -> Album:
     methods, parts = gathered.chosen("table1"), gathered.chosen("table3")
     own = pd.concat([methods, parts.loc[parts["variant"] != ""]]).drop_duplicates("run")
     own = own.loc[own["pictures"].map(_files).map(len) > 0]
-    groups = {place: settings(runs) for place, runs in by_place(own).items()}
+    groups = {place: _best_first(settings(runs)) for place, runs in by_place(own).items()}
+    groups = dict(sorted(groups.items(), key=lambda group: bool(group[0].dataset)))  # one's own captures, then others
     views = min(VIEWS, max(1, MOST_FILES // max(1, sum(map(len, groups.values())))))
     made, opened = Album(), 0
     for place, shown in groups.items():
@@ -58,6 +60,16 @@ def album(gathered: Gathered) -> Album:
         if pictured:
             made.scenes.append({"title": place.title, "views": pictured})
     return made
+
+
+def _best_first(shown: Sequence[Setting]) -> list[Setting]:
+    """By the mean PSNR of all views and seeds; those without any at the end."""
+
+    def mean(setting: Setting) -> float:
+        known = [psnr for views in setting.runs["view_psnr"] for psnr in views.values()]
+        return sum(known) / len(known) if known else -math.inf
+
+    return sorted(shown, key=mean, reverse=True)
 
 
 def _view(made: Album, shown: Sequence[Setting], name: str) -> dict[str, Any]:
@@ -78,7 +90,7 @@ def _view(made: Album, shown: Sequence[Setting], name: str) -> dict[str, Any]:
             view["truth"] = made.add(truth)
         images = {"render": made.add(render), "error": made.add(error, WIDTH // 2)}
         psnr = run["view_psnr"].get(name)
-        mark = "" if psnr is None else f" ({psnr:.2f} dB)"
+        mark = "" if psnr is None else f", PSNR {psnr:.2f} dB"
         view["methods"].append({"title": f"{setting.title}{mark}", **images})
     return view
 

@@ -8,6 +8,8 @@ from reports.measures import Measure
 from reports.published import Published
 from reports.tables.table import Cell, Column
 
+OF_THE_PAPER = ("paper", "Δ")  # titles of the columns that the paper's numbers bring along
+
 
 def columns(measures: Iterable[Measure]) -> tuple[Column, ...]:
     """The column of each measure, with those of the paper's number and of the difference where it has them."""
@@ -17,9 +19,9 @@ def columns(measures: Iterable[Measure]) -> tuple[Column, ...]:
         found.append(ours)
         if measure.published:
             decimals = ours.decimals if measure.difference else min(ours.decimals, 2)
-            found.append(Column("paper", decimals, ours.higher_is_better, group=ours.group, optional=True))
+            found.append(Column(OF_THE_PAPER[0], decimals, ours.higher_is_better, group=ours.group, optional=True))
         if measure.difference:
-            found.append(Column("Δ", ours.decimals, signed=True, group=ours.group, optional=True))
+            found.append(Column(OF_THE_PAPER[1], ours.decimals, signed=True, group=ours.group, optional=True))
     return tuple(found)
 
 

@@ -108,12 +108,12 @@ class Table:
     blocks: tuple[Block, ...]
     notes: tuple[str, ...] = field(default=())
 
-    def alone(self, block: Block) -> Table:
-        """One block as a table of its own, without the optional columns that it has nothing in."""
+    def alone(self, block: Block, *, every: bool = False) -> Table:
+        """One block as a table of its own, without the optional columns (or `every` column) that it has nothing in."""
         kept = [
             index
             for index, column in enumerate(self.columns)
-            if not column.optional or any(row.cells[index] != Cell() for row in block.rows)
+            if not (column.optional or every) or any(row.cells[index] != Cell() for row in block.rows)
         ]
         rows = tuple(Row(row.title, tuple(row.cells[index] for index in kept)) for row in block.rows)
         columns = block.reads([self.columns[index] for index in kept])

@@ -15,22 +15,44 @@ SYMBOLS |= {"τ": r"$\tau$", "√": r"$\surd$"}
 
 
 LINES_OF_A_PAGE = 55
+COLUMNS_OF_A_PAGE = 12  # upright
 
 
 def text(table: Table) -> str:
-    """A `table`, made as narrow as the line, or a `longtable` where a page is too short; needs the packages named."""
-    body = [line for block in table.blocks for line in _block(block, table)]
-    whole = _longtable if len(body) > LINES_OF_A_PAGE else _float
-    return "\n".join(whole(table, body)) + "\n"
+    """A `table` for each page that it takes, made as narrow as the line, turned where it is wide; needs the packages
+    named.
+    """
+    pages = _pages([_block(block, table) for block in table.blocks])
+    wide = len(table.columns) > COLUMNS_OF_A_PAGE
+    packages = "booktabs, graphicx, pdflscape" if wide else "booktabs, graphicx"
+    lines = [line for number, page in enumerate(pages) for line in _float(table, page, number, len(pages), wide)]
+    return "\n".join([f"% needs \\usepackage{{{packages}}}", *lines]) + "\n"
 
 
-def _float(table: Table, body: list[str]) -> list[str]:
-    notes = " ".join(escaped(note) for note in table.notes)
-    return [
-        "% needs \\usepackage{booktabs, graphicx}",
-        r"\begin{table}",
+def _pages(blocks: list[list[str]]) -> list[list[str]]:
+    """The lines of each page; a block is cut only if it is longer than that."""
+    pages: list[list[str]] = [[]]
+    for block in blocks:
+        parts = [block[start : start + LINES_OF_A_PAGE] for start in range(0, len(block), LINES_OF_A_PAGE)]
+        for part in parts:
+            if pages[-1] and len(pages[-1]) + len(part) > LINES_OF_A_PAGE:
+                pages.append([])
+            pages[-1] += part
+    return pages
+
+
+def _float(table: Table, body: list[str], page: int, pages: int, wide: bool) -> list[str]:
+    last = page == pages - 1
+    notes = " ".join(escaped(note) for note in table.notes) if last else ""
+    caption = (
+        _caption(table)
+        if page == 0
+        else f"\\addtocounter{{table}}{{-1}}\\caption[]{{{escaped(table.title)}, continued}}"
+    )
+    lines = [
+        r"\begin{table}" if pages == 1 else r"\begin{table}[p]",
         r"  \centering",
-        f"  {_caption(table)}",
+        f"  {caption}",
         r"  \resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%",
         f"  \\begin{{tabular}}{{l{'r' * len(table.columns)}}}",
         r"    \toprule",
@@ -38,26 +60,15 @@ def _float(table: Table, body: list[str]) -> list[str]:
         *body,
         r"    \bottomrule",
         r"  \end{tabular}}",
-        f"  \\par\\smallskip\\begin{{minipage}}{{\\linewidth}}\\footnotesize {notes}\\end{{minipage}}",
+        *(
+            [f"  \\par\\smallskip\\begin{{minipage}}{{\\linewidth}}\\footnotesize {notes}\\end{{minipage}}"]
+            if last
+            else []
+        ),
         r"\end{table}",
+        *([] if last else [r"\clearpage"]),
     ]
-
-
-def _longtable(table: Table, body: list[str]) -> list[str]:
-    return [
-        "% needs \\usepackage{booktabs, longtable}",
-        r"\begingroup\scriptsize\setlength{\tabcolsep}{2pt}",
-        f"\\begin{{longtable}}{{l{'r' * len(table.columns)}}}",
-        f"  {_caption(table)} \\\\",
-        r"    \toprule",
-        *_headings(table),
-        r"    \endhead",
-        *body,
-        r"    \bottomrule",
-        r"\end{longtable}",
-        *(f"\\noindent {escaped(note)}\\par" for note in table.notes),
-        r"\endgroup",
-    ]
+    return [r"\begin{landscape}", *lines, r"\end{landscape}"] if wide else lines
 
 
 def _caption(table: Table) -> str:

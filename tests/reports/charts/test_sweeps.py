@@ -103,3 +103,12 @@ def test_runs_on_other_data_are_no_other_seed_of_a_point():
     first, *others = swept("tau")
     with pytest.raises(ReportError, match="tau@cpu, .*tau 0.0: results differ in data"):
         sweeps(gathered([first, replace(first, fingerprint="other", run="other"), *others]))
+
+
+def test_there_is_no_panel_for_what_nobody_measured():
+    def without(one):
+        marks = {key: value for key, value in one.scores["paper"].metrics.items() if "lpips" not in key}
+        return replace(one, scores={"paper": replace(one.scores["paper"], metrics=marks)})
+
+    (sweep,) = sweeps(gathered([without(one) for one in swept(seeds=1)]))
+    assert [measure.name for measure in sweep.measures if "/" in measure.name] == ["paper/psnr", "paper/ssim"]

@@ -109,11 +109,15 @@ class Browser:
                 time.sleep(0.03)
         self._mouse("mouseReleased", x + right, y + down)
 
+    def size(self, width: int, height: int) -> None:
+        """Give the window a size in pixels, that of a phone's where it is narrow."""
+        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 600}
+        self._call("Emulation.setDeviceMetricsOverride", **size)
+
     def screenshot(self, path: Path, height: int | None = None) -> None:
         """What is seen, or a window of another height from the top of the page, as PNG."""
         if height is not None:
-            size = {"width": 1400, "height": height, "deviceScaleFactor": 1, "mobile": False}
-            self._call("Emulation.setDeviceMetricsOverride", **size)
+            self.size(1400, height)
             time.sleep(1.0)
         path.write_bytes(base64.b64decode(self._call("Page.captureScreenshot", format="png")["data"]))
 
