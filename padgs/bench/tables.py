@@ -11,11 +11,11 @@ from rich.table import Table
 from padgs.bench.goals import REFERENCE_FMA
 from padgs.bench.stages import STAGES
 
-WHOLE = {
-    "iteration": "iteration, undisturbed",
-    "iteration_1_thread": "iteration 1 thread",
-    "frame": "frame",
-    "render": "draw fixed Gaussians, and back",
+WHOLE = {  # key of a size -> name, meaning
+    "iteration": ("iteration", "undisturbed"),
+    "iteration_1_thread": ("on 1 thread", "the same iteration"),
+    "frame": ("frame", "decoded and drawn without gradients"),
+    "render": ("draw and back", "fixed Gaussians, and their gradients"),
 }
 
 
@@ -31,6 +31,7 @@ def lines(report: dict[str, Any]) -> Iterator[Table | str]:
     )
     for name, size in report["sizes"].items():
         yield _stages(name, size)
+        yield _legend(size)
         yield _counters(size)
     yield _ratios(report)
     yield _bounds(report["bounds"])
@@ -45,16 +46,22 @@ def _stages(name: str, size: dict[str, Any]) -> Table:
         f"{name}: one training iteration, {size['width']}x{size['height']}, ms",
         *("stage", "CPU min", "CPU median", "wall min", "wall median", "floor", "of ceiling", "bound by"),
     )
+    table.collapse_padding, table.columns[0].no_wrap, table.columns[-1].min_width = True, True, 10
     for stage, timing in size["stages"].items():
         floor = (
             [f"{timing['floor'] * 1e3:.3f}", f"{timing['fraction']:.0%}", timing["bound"]] if "floor" in timing else []
         )
-        table.add_row(f"{stage.replace('_', ' ')} [dim]{STAGES[stage]}[/dim]", *_times(timing), *floor)
+        table.add_row(stage.replace("_", " "), *_times(timing), *floor)
     table.add_section()
-    table.add_row("all stages but adapt", *_times(size["stage_sum"]), f"{size['floor'] * 1e3:.3f}")
-    for key, meaning in WHOLE.items():
-        table.add_row(meaning, *_times(size[key]))
+    table.add_row("all but adapt", *_times(size["stage_sum"]), f"{size['floor'] * 1e3:.3f}")
+    for key, (title, _) in WHOLE.items():
+        table.add_row(title, *_times(size[key]))
     return table
+
+
+def _legend(size: dict[str, Any]) -> str:
+    stages = [(stage.replace("_", " "), STAGES[stage]) for stage in size["stages"]]
+    return "".join(f"  [dim]{title}: {meaning}[/dim]\n" for title, meaning in (*stages, *WHOLE.values()))
 
 
 def _counters(size: dict[str, Any]) -> str:

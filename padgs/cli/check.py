@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
@@ -11,19 +13,21 @@ from padgs.cli.refusing import refusing, show
 if TYPE_CHECKING:
     from padgs.data.check.report import Report
 
+BESIDE = "check.png"
+
 
 @refusing(ValueError, OSError)
 def check(
     path: Annotated[str, typer.Argument(help="folder with panoramas and poses, or the file that describes them")],
     format: Annotated[str, typer.Option(help="auto, or the format's name")] = "auto",
-    overlay: Annotated[str, typer.Option(help="picture of the points on a panorama; '' for none")] = "check.png",
+    overlay: Annotated[
+        str, typer.Option(help="where the picture of the points on a panorama goes: beside the data; '' for none")
+    ] = BESIDE,
     mask: Annotated[str, typer.Option(help="auto, none, rows:959/1024, or a file or folder")] = "auto",
     images: Annotated[str, typer.Option(help="image folder, if not the usual one")] = "",
     split: Annotated[str, typer.Option(help="auto, files, every or all")] = "auto",
 ) -> None:
     """Look a data set through and list what is wrong with it. Exit code 1 if anything is."""
-    from pathlib import Path
-
     from rich.console import Console
 
     from padgs.data.check.report import check as look_through
@@ -34,10 +38,16 @@ def check(
             Path(path),
             format=format,
             options=DataOptions(mask=mask, images=images or None, split=split),
-            overlay=Path(overlay) if overlay else None,
+            overlay=picture_place(Path(path)) if overlay == BESIDE else Path(overlay) if overlay else None,
             progress=lambda done, total: status.update(f"looking at image {done} of {total}"),
         )
     end_with(report)
+
+
+def picture_place(data: Path) -> Path:
+    """Where the picture of a data set goes if nobody says: into its folder, or here if that is read-only."""
+    folder = data if data.is_dir() else data.parent
+    return (folder if os.access(folder, os.W_OK) else Path()) / BESIDE
 
 
 def end_with(report: Report) -> NoReturn:

@@ -8,13 +8,15 @@ import typer
 
 from padgs.cli.refusing import refusing, show
 
+FORMATS = "colmap, nerfstudio (or transforms), openmvg, opensfm, roam360, ricoh360, omniblender, released"
+
 
 @refusing(ValueError, OSError)
 def convert(
     source: Annotated[str, typer.Argument(help="folder with panoramas and poses, or the file that describes them")],
     destination: Annotated[str, typer.Argument(help="a folder that does not exist yet")],
-    to: Annotated[str, typer.Option(help="the format to write")],
-    format: Annotated[str, typer.Option(help="format of the source: auto, or its name")] = "auto",
+    to: Annotated[str, typer.Option(help=f"the format to write: {FORMATS}")],
+    format: Annotated[str, typer.Option(help="format of the source: auto, or one of these")] = "auto",
     width: Annotated[int, typer.Option(help="reduce the panoramas to this width; 0 copies them as they are")] = 0,
     points: Annotated[str, typer.Option(help="auto, random, or a PLY file in the source's folder")] = "auto",
     mask: Annotated[str, typer.Option(help="auto, none, rows:959/1024, or a file or folder")] = "auto",

@@ -21,6 +21,7 @@ from padgs.scene import Scene
 LOADERS = {
     "colmap": "padgs.data.formats.colmap:read",
     "transforms": "padgs.data.formats.transforms:read",
+    "nerfstudio": "padgs.data.formats.transforms:read",  # the same, by the name of the program
     "openmvg": "padgs.data.formats.openmvg:read",
     "opensfm": "padgs.data.formats.opensfm:read",
     "roam360": "padgs.data.formats.roam360:read",

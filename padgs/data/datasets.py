@@ -107,6 +107,11 @@ def refuse_missing(path: Path, dataset: str | None) -> None:
             f"there is no {path.absolute()}, and {path.name!r} is no scene of {known.title}; "
             f"its scenes: {', '.join(known.scenes)}"
         )
+    if not path.parent.exists():  # the same words for all scenes, which a multirun says once
+        raise DataError(
+            f"{known.title} is not there. Get it from {known.source}, and put it into {path.parent.absolute()}, so "
+            f"that the folder of each scene holds {known.holds}; or set data.path to a scene where it is"
+        )
     raise DataError(
         f"the scene {path.name!r} of {known.title} is not there. Get it from {known.source}, and put it into "
         f"{path.absolute()}, so that this folder holds {known.holds}; or set data.path to where it is"

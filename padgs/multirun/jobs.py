@@ -100,7 +100,7 @@ class Multirun:
                 self._end(index, replace(self.states[index], status=status, reason=reason))
             waiting += [index for index in left if index not in lost]
             self._track()
-            if self._in_process and waiting:
+            if self._in_process and waiting and any(self.states[index].status != REFUSED for index in batch):
                 self._say(self.look().line())
 
     def look(self) -> Overview:

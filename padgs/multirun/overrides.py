@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -65,6 +66,8 @@ def conflict(arguments: Sequence[str]) -> str | None:
     'seed is set twice, by seed=1 and ++seed=2; keep one of them'
     >>> conflict(["+sweep=tau,seeds"])
     '+sweep=tau,seeds: one sweep at a time, because each says itself what is swept'
+    >>> conflict(["seed=0,1"])
+    'seed=0,1 is a list of runs, which needs -m: padgs-run -m seed=0,1'
     >>> conflict(["protocol=null"])
     'protocol=null: protocol is a group of settings, chosen by name, e.g. protocol=both'
     """
@@ -82,6 +85,10 @@ def conflict(arguments: Sequence[str]) -> str | None:
             known = sorted(path.stem for path in (root() / "conf" / key).glob("*.yaml"))
             return f"{argument}: {key} is a group of settings, chosen by name, e.g. {key}={known[0]}"
         settings[key] = argument
+    if not {"-m", "--multirun", "experiment", "sweep"} & {*arguments, *settings}:
+        for argument in settings.values():
+            if re.fullmatch(r"[^\[{('\"]*,.*", argument.partition("=")[2]):
+                return f"{argument} is a list of runs, which needs -m: padgs-run -m {shlex.join(arguments)}"
     return None
 
 

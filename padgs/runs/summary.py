@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from rich.box import SIMPLE_HEAD
@@ -14,8 +15,15 @@ from padgs.runs.config import RunConfig
 from padgs.runs.live import clock, compact
 from padgs.runs.terminal import printable, say
 from padgs.scene import Scene
+from padgs.scoring.metrics import BANDS
 
 MISSING = "–"
+MEANINGS = {  # word of a metric -> what it says, with an arrow towards the better end
+    "psnr": "↑ dB",
+    "ssim": "↑ likeness of structure",
+    "lpips": "↓ perceptual distance",
+    "seam": "error at ±180° over elsewhere, best 1",
+}
 
 
 def introduce(config: RunConfig, scene: Scene, folder: Path, console: Console) -> None:
@@ -52,14 +60,28 @@ def show_result(result: Result, folder: Path, console: Console) -> None:
 
 
 def marks(result: Result) -> Table:
-    """One row per metric, one column per protocol."""
+    """One row per metric, one column per protocol, and what the metric says."""
     table = Table("metric", box=SIMPLE_HEAD)
     for protocol in result.scores:
         table.add_column(protocol, justify="right")
+    table.add_column(style="dim")
     for metric in dict.fromkeys(name for scores in result.scores.values() for name in scores.metrics):
         values = [scores.metrics.get(metric) for scores in result.scores.values()]
-        table.add_row(metric, *(number(metric, value) for value in values))
+        table.add_row(metric, *(number(metric, value) for value in values), meaning(metric))
     return table
+
+
+def meaning(metric: str) -> str:
+    """What a metric says, in a line, with an arrow towards its better end.
+
+    >>> meaning("ws_psnr_pole"), meaning("lpips_vgg_01")
+    ('↑ dB, 75 to 90° up and down', '↓ perceptual distance')
+    """
+    words = metric.split("_")
+    quantity = next((text for word, text in MEANINGS.items() if word in words), "")
+    band = BANDS.get(words[-1])
+    where = _where(band) if band else "by solid angle" if words[0] == "ws" else ""
+    return ", ".join(filter(None, (quantity, where)))
 
 
 def number(metric: str, value: float | None) -> str:
@@ -71,3 +93,11 @@ def number(metric: str, value: float | None) -> str:
     if value is None:
         return MISSING
     return f"{value:.2f}" if "psnr" in metric else f"{value:.3f}"
+
+
+def _where(band: Sequence[tuple[int, int]]) -> str:
+    first, last = band[-1]
+    if first == -last:
+        return f"within {last}° of the horizon"
+    low, high = sorted((abs(first), abs(last)))
+    return f"{low} to {high}° {'up and down' if len(band) > 1 else 'up' if last < 0 else 'down'}"

@@ -128,7 +128,8 @@ class Refuses(Start):
 
 def test_what_is_wrong_with_all_jobs_is_said_once(tmp_path, capsys):
     for target in (IN_PROCESS, ELSEWHERE):
-        assert Refuses(tmp_path, 1, target).counts() == {"refused": 3}
+        start = Refuses(tmp_path, 1, target)
+        assert start.counts() == {"refused": 3} and start.out.getvalue().count("\n") == 1
         assert capsys.readouterr().err == "error: the data set is not there\n"
 
 

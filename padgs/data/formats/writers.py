@@ -186,6 +186,7 @@ def write_released(content: Content, folder: Path) -> None:
 WRITERS: dict[str, Callable[[Content, Path], None]] = {
     "colmap": write_colmap,
     "transforms": write_transforms,
+    "nerfstudio": write_transforms,
     "openmvg": write_openmvg,
     "opensfm": write_opensfm,
     "roam360": write_roam360,

@@ -13,7 +13,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -37,6 +37,7 @@ from padgs.data.prepare.sources import Source, find_source
 from padgs.data.prepare.video import extract_frames, is_video
 from padgs.data.trajectory import gravity
 
+STATEMENT = "prepare.json"  # at the destination: what came out, of what
 STEPS = ("frames", "images", "views", "features", "matches", "poses", "result")
 LEVEL_AGREEMENT = 0.9  # length of the mean of the cameras' up directions from which they have a common one
 _REMEDIES = "take them closer together, hide what moves with the camera in a mask (--mask), or try --accurate"
@@ -88,8 +89,8 @@ def prepare(
 
     Args:
         source: a folder of 2:1 panoramas (subfolders included), or a stitched 360-degree video.
-        destination: a folder that does not exist yet, or is empty. It gets images/, sparse/0 (COLMAP, camera
-            EQUIRECTANGULAR), masks if there are any, and prepare.json.
+        destination: a folder that does not exist yet, or is empty, or what the same call has made. It gets images/,
+            sparse/0 (COLMAP, camera EQUIRECTANGULAR), masks if there are any, and prepare.json.
         options: see PrepareOptions. The same options, input and machine give the same result.
         progress: called with (step, done, in all).
 
@@ -98,7 +99,12 @@ def prepare(
             stays in the hidden folder beside the destination; nothing is at the destination.
     """
     if destination.exists() and (not destination.is_dir() or any(destination.iterdir())):
-        raise DataError(f"{destination} exists; nothing is overwritten: remove it or choose another place")
+        if finished := _finished(source, destination, options):
+            return finished
+        raise DataError(
+            f"{destination} exists, and is not what these options make of {source}; nothing is overwritten: remove it "
+            "or choose another place"
+        )
     work = destination.absolute().with_name(f".{destination.name}.prepare")
     try:
         return _Job(source, destination.absolute(), work, options, progress).run()
@@ -111,6 +117,29 @@ def prepare(
             shutil.rmtree(work, ignore_errors=True)  # nothing in it that would be worth going on from
 
 
+def _finished(source: Path, destination: Path, options: PrepareOptions) -> Prepared | None:
+    """What an earlier call made of the same input with the same options."""
+    try:
+        stated = json.loads((destination / STATEMENT).read_text(encoding="utf-8"))
+        if stated["input"] != _digest(_fingerprint(source, options), options):
+            return None
+        known = {field.name: stated[field.name] for field in fields(Prepared) if field.name != "folder"}
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    lists = {name: tuple(known[name]) for name in ("registered", "unregistered", "notes")}
+    return Prepared(destination, **known | lists | {"seconds": {}})
+
+
+def _fingerprint(source: Path, options: PrepareOptions) -> str:
+    return _file_digest(source) if is_video(source) else find_source(source, options.mask).fingerprint
+
+
+def _digest(fingerprint: str, options: PrepareOptions) -> str:
+    """Of an input and all that decides what becomes of it."""
+    wanted = {key: value for key, value in asdict(options).items() if key != "threads"}
+    return hashlib.sha256(json.dumps([fingerprint, wanted], sort_keys=True).encode()).hexdigest()
+
+
 class _Job:
     """One preparation in its working folder."""
 
@@ -120,6 +149,7 @@ class _Job:
         self.destination, self.work, self.options, self.progress = destination, work, options, progress
         self.threads = options.threads or min(8, os.cpu_count() or 1)
         self.seconds: dict[str, float] = {}
+        self.input = None  # digest of what was given, a video or images
         if is_video(source):
             self._open("video", _file_digest(source))
             self._once("frames", partial(self._extract_frames, source))
@@ -237,8 +267,8 @@ class _Job:
         partial_folder = _empty(self.work / "out")
         self._copy_images(frames, partial_folder)
         write_colmap(Content(frames, cloud, tracks, {}), partial_folder)
-        stated = {**asdict(result), "folder": ".", "options": asdict(self.options)}
-        (partial_folder / "prepare.json").write_text(json.dumps(stated, indent=2, ensure_ascii=False), encoding="utf-8")
+        stated = {**asdict(result), "folder": ".", "options": asdict(self.options), "input": self.input}
+        (partial_folder / STATEMENT).write_text(json.dumps(stated, indent=2, ensure_ascii=False), encoding="utf-8")
         if self.destination.exists():
             self.destination.rmdir()
         partial_folder.rename(self.destination)
@@ -278,8 +308,8 @@ class _Job:
 
     def _open(self, of: str, fingerprint: str, keep: tuple[str, ...] = ()) -> None:
         """Keep the working folder of the same input and options; start over, but for `keep`, with any other."""
-        wanted = {key: value for key, value in asdict(self.options).items() if key != "threads"}
-        stated = hashlib.sha256(json.dumps([fingerprint, wanted], sort_keys=True).encode()).hexdigest()
+        stated = _digest(fingerprint, self.options)
+        self.input = self.input or stated
         marker = self.work / f"{of}.sha256"
         if not (marker.is_file() and marker.read_text() == stated):
             for path in self.work.iterdir() if self.work.is_dir() else ():

@@ -122,13 +122,16 @@ def test_a_wrong_convention_in_a_transforms_file(world: World, tmp_path: Path) -
     assert report.colour_correlation is not None and report.colour_correlation < 0.5
 
 
-def test_the_command(world: World, tmp_path: Path) -> None:
+def test_the_command(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "ma scène"
     write_colmap_text(world, folder)
     run = CliRunner().invoke
     good = run(app, ["check", str(folder), "--overlay", str(tmp_path / "look.png")])
     assert good.exit_code == 0 and "ready for training" in good.output and "4 train, 2 test" in good.output
     assert (tmp_path / "look.png").is_file()
+    monkeypatch.chdir(tmp_path)
+    assert run(app, ["check", str(folder)]).exit_code == 0
+    assert (folder / "check.png").is_file() and not (tmp_path / "check.png").exists()
     (folder / "images/pano_02.png").unlink()
     bad = run(app, ["check", str(folder), "--overlay", ""])
     assert (

@@ -1,6 +1,7 @@
 """Write, read, compare: every format into every other, and nothing half-written."""
 
 import errno
+import re
 import shutil
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import torch
 from fixtures import WRITERS, World, write_cloud
 from PIL import Image
 
+from padgs.cli.convert import FORMATS
 from padgs.data import DataError, DataOptions, load, read
 from padgs.data.formats import writers
 from padgs.data.formats.convert import convert
@@ -28,6 +30,13 @@ def test_round_trip(source: str, to: str, world: World, tmp_path: Path) -> None:
     scene, truth = load(tmp_path / "out put"), load(tmp_path / "in")
     assert scene.notes[0].startswith(f"format: {to}")
     _same(scene, truth, world, pixels=not (source == "roam360" and to == "ricoh360"))
+
+
+def test_help_lists_the_formats_and_nerfstudio_is_one(world: World, tmp_path: Path) -> None:
+    assert set(re.findall(r"\w+", FORMATS)) - {"or"} == writers.WRITERS.keys()
+    WRITERS["colmap"](world, tmp_path / "in")
+    convert(tmp_path / "in", tmp_path / "out", "nerfstudio")
+    assert load(tmp_path / "out", "nerfstudio").notes == load(tmp_path / "out", "transforms").notes
 
 
 def test_nothing_is_lost_in_a_chain_through_all(world: World, tmp_path: Path) -> None:

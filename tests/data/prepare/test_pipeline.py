@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -47,6 +48,15 @@ def differences(folder, reference):
     exact = torch.stack([reference[frame.name] for frame in frames])
     _, left = align(exact, found)
     return left.distance, left.degrees, path_length(exact)
+
+
+def test_what_is_finished_is_not_done_again(scene, prepared):
+    result, out, _ = prepared
+    written = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
+    again = prepare(scene[1], out, PrepareOptions(threads=2))
+    assert again == replace(result, seconds={}) and written == {p: p.stat().st_mtime_ns for p in out.rglob("*")}
+    with pytest.raises(DataError, match="not what these options make of"):
+        prepare(scene[1], out, PrepareOptions(level=False))
 
 
 def test_exact_poses_are_found(scene, prepared):
