@@ -1,0 +1,38 @@
+"""A method outside of padgs: explicit Gaussians that start thinner, as an example to change."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+
+from padgs.render.config import RenderConfig
+from padgs.scene import Scene
+from padgs.splats.method import SplatMethod, SplatOptions
+from padgs.splats.trainee import SplatTrainee
+
+
+@dataclass(frozen=True)
+class MyOptions(SplatOptions):
+    """The keys of `method=my_method`: those of all explicit Gaussians, and one more."""
+
+    thinner: float = 2.0  # factor by which Gaussians are thinner at the start than their neighbours are apart
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 < self.thinner < math.inf:
+            raise ValueError(f"method.thinner is {self.thinner}; it must be > 0 and finite")
+
+
+class MyMethod(SplatMethod):
+    """See `padgs.learning.method.Method` for what a method may say, and `padgs.splats.method` for this kind."""
+
+    Options = MyOptions
+    RENDER = RenderConfig(projection="ray")
+
+    def _start(self, scene: Scene, iterations: int) -> SplatTrainee:
+        trainee = super()._start(scene, iterations)
+        with torch.no_grad():
+            trainee.splats.log_scales -= math.log(self.options.thinner)
+        return trainee
