@@ -1,4 +1,6 @@
-"""Every command in README and docs/cluster.md is understood by the program it names; the quick ones are run."""
+"""Every command in README and in the docs that walk through commands is understood by the program it names; the quick
+ones are run.
+"""
 
 import os
 import re
@@ -16,7 +18,7 @@ from padgs.multirun.launchers import missing_plugin
 
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text()
-TEXT = README + (ROOT / "docs" / "cluster.md").read_text()
+TEXT = README + "".join((ROOT / "docs" / name).read_text() for name in ("cluster.md", "your_photographs.md"))
 COMMANDS = [
     line for block in re.findall(r"```sh\n(.*?)```", TEXT, re.DOTALL) for line in block.splitlines() if line.strip()
 ]

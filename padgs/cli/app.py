@@ -18,7 +18,7 @@ from padgs.cli.report import report
 from padgs.cli.track import track
 from padgs.cli.view import view
 
-app = typer.Typer(no_args_is_help=True, add_completion=False)
+app = typer.Typer(no_args_is_help=True)
 
 
 def show_version(asked: bool) -> None:

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Sequence
 from datetime import datetime
 
+import padgs
 from padgs.runs.interrupt import INTERRUPTED
 
 
@@ -28,22 +29,36 @@ def main() -> None:
 
 def _run(arguments: Sequence[str]) -> int:
     """Exit code. What takes a second to import is imported here, so that Ctrl-C is answered from the beginning."""
+    if "--version" in arguments:
+        print(f"padgs {padgs.__version__}")
+        return 0
     import hydra
+    from hydra.errors import HydraException
 
     from padgs.multirun import job, sweeper
     from padgs.multirun.board import FOLDER, OK
     from padgs.multirun.choices import register_choices
     from padgs.multirun.launchers import missing_plugin
+    from padgs.multirun.manual import manual
     from padgs.multirun.overrides import conflict, lenient, options_first, root
 
+    if {"--help", "-h"} & {*arguments}:
+        try:
+            print(manual(arguments))
+        except HydraException as error:
+            job.complain(str(error))
+            return 1
+        return 0
     os.environ.setdefault("PADGS_ROOT", str(root()))
     if problem := conflict(arguments) or missing_plugin(arguments):
         job.complain(problem)
         return 1
     register_choices()
     sweeper.register()
+    completing = {"-sc", "--shell_completion"} & {*arguments}
     start = f"{datetime.now():%Y%m%d-%H%M%S}-{os.getpid()}"
-    sys.argv[1:] = [*options_first(lenient(arguments)), f"hydra.sweep.dir=${{run.folder}}/{FOLDER}/{start}"]
+    if not completing:
+        sys.argv[1:] = [*options_first(lenient(arguments)), f"hydra.sweep.dir=${{run.folder}}/{FOLDER}/{start}"]
     hydra.main(version_base="1.3", config_path=str(root() / "conf"), config_name="config")(job.only_job)()
     return 0 if {*job.ENDS, *sweeper.ENDS} <= {OK} else 1
 

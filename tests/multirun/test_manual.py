@@ -1,0 +1,30 @@
+import os
+import subprocess
+import sys
+
+import pytest
+from typer.testing import CliRunner
+
+from padgs.cli.app import app
+from padgs.multirun.manual import manual
+
+
+def test_every_key_stands_there_with_the_default_of_the_method_and_its_meaning(root, monkeypatch):
+    monkeypatch.setenv("PADGS_ROOT", str(root))
+    lines = manual(["--help", "method=padgs"], 100).splitlines()
+    said = {line.split("=")[0].strip(): line for line in lines if line.startswith("  ") and "=" in line}
+    assert "train.iterations=1500" in said["train.iterations"] and "omnigs_release" in "".join(lines)
+    assert "method.tau=0.9" in said["method.tau"] and "Eq. 15; 0 turns opacity modulation off" in said["method.tau"]
+    assert "pixels; the height is half of it" in said["data.generator.width"] and max(map(len, lines)) <= 100
+    assert "render.projection=ray" in manual(["--help"]), "padgs+ is drawn by rays"
+
+
+@pytest.mark.slow
+def test_both_programs_complete(root):
+    line = "padgs-run method=omn"
+    environment = os.environ | {"COMP_LINE": line, "COMP_POINT": str(len(line)), "PYTHONPATH": str(root)}
+    command = [sys.executable, "-W", "ignore", "-m", "padgs.multirun.run", "-sc", "query=bash"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert done.stdout.split() == ["method=omnigs", "method=omnigs_release"]
+    asked = {"_PADGS_COMPLETE": "complete_bash", "COMP_WORDS": "padgs con", "COMP_CWORD": "1"}
+    assert "convert" in CliRunner().invoke(app, [], env=asked, prog_name="padgs").output
