@@ -13,10 +13,10 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TextIO
 
+from padgs.multirun.finished import FOLDER as FOLDER
 from padgs.results import STATUSES, replace_file
 from padgs.runs.session import Watch
 
-FOLDER = ".multirun"  # in run.folder
 WAITING, RUNNING, OK = "waiting", "running", "ok"
 # Ends of a job beside the statuses of results, without any:
 REFUSED = "refused"  # the configuration or the data cannot be used; there is no run

@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import Any
 
 from padgs import results
-from padgs.multirun.board import FOLDER
 from padgs.multirun.overrides import root
 
+FOLDER = ".multirun"  # in run.folder
 FILE_NAME = "finished.jsonl"
 # Settings that a job is not recognised by. The rules of scoring decide nothing about training, but whether it is done;
 # and where the data lie says whose files are looked at.
@@ -41,10 +41,13 @@ class FinishedJobs:
 
     def status(self, overrides: Sequence[str]) -> str | None:
         """The status of a job's result; None where it must be looked at."""
-        entry = self._known.get(key(overrides))
-        if entry is None or (written := _written(self._runs / entry["run"])) is None or entry["written"] != written:
-            return None
-        return entry["status"] if entry["data"] is None or entry["signature"] == signature(entry["data"]) else None
+        entry = self._entry(overrides)
+        return None if entry is None else entry["status"]
+
+    def run(self, overrides: Sequence[str]) -> Path | None:
+        """The folder of a job's run; None where it must be looked at."""
+        entry = self._entry(overrides)
+        return None if entry is None else self._runs / entry["run"]
 
     def add(self, overrides: Sequence[str], run: str, status: str, data: str | None) -> None:
         """Remember a job that has ended with a result; a disk that is full loses only this."""
@@ -55,6 +58,26 @@ class FinishedJobs:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             with self._path.open("a") as file:
                 file.write(json.dumps(entry) + "\n")
+
+    def _entry(self, overrides: Sequence[str]) -> dict[str, Any] | None:
+        entry = self._known.get(key(overrides))
+        if entry is None or (written := _written(self._runs / entry["run"])) is None or entry["written"] != written:
+            return None
+        return entry if entry["data"] is None or entry["signature"] == signature(entry["data"]) else None
+
+
+def only_run(arguments: Sequence[str]) -> Path | None:
+    """The folder of the run that a command line asks for, if it is one that is known to have ended well."""
+    if any(text.startswith(("-", "tracking")) and text != "tracking=none" for text in arguments):
+        return None  # options change what is asked for; and a tracker may want to hear of an old run
+    known = FinishedJobs(folder_of(arguments))
+    return known.run(arguments) if known.status(arguments) == "ok" else None
+
+
+def folder_of(arguments: Sequence[str]) -> Path:
+    """Where a command line has its runs: what it says of `run.folder`, or that key's default."""
+    given = [text.partition("=")[2] for text in arguments if re.match(r"\+*run\.folder=", text)]
+    return Path(given[-1] if given else "runs")
 
 
 def key(overrides: Sequence[str]) -> str:

@@ -16,6 +16,7 @@ from rich.console import Console
 
 from padgs.multirun.board import CRASHED, ELSEWHERE, REFUSED, STOPPED, Board, BoardEntry
 from padgs.multirun.composition import typed_config
+from padgs.multirun.finished import FinishedJobs
 from padgs.runs.checkpoint import CheckpointError
 from padgs.runs.folder import RunFolderError
 from padgs.runs.interrupt import Interrupted
@@ -25,6 +26,7 @@ from padgs.runs.terminal import say
 from padgs.tracking.tracker import SECONDS_BETWEEN_LOOKS, Tracker
 
 EXPECTED = (ValueError, OSError, CheckpointError, RunFolderError, RunBusy)  # a traceback would only hide what they say
+ARGUMENTS: list[str] = []  # of the command line, by which a finished run is known again
 ENDS: list[str] = []  # how the job ended that was this process's only one; Hydra's main returns nothing
 
 
@@ -37,6 +39,8 @@ def only_job(composed: DictConfig) -> None:
         session = Session(config, console, TrackedRun(tracker))
         ENDS.append(session.run().status)
         tracker.update(session.folder.path)
+        data = None if config.data.path is None else str(Path(config.data.path).absolute())
+        FinishedJobs(Path(config.run.folder)).add(ARGUMENTS, session.folder.path.name, ENDS[-1], data)
     except EXPECTED as error:
         if os.environ.get("HYDRA_FULL_ERROR"):
             raise

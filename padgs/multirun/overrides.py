@@ -7,10 +7,10 @@ import re
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from hydra.core.config_loader import ConfigLoader
-from hydra.core.override_parser.overrides_parser import OverridesParser
+if TYPE_CHECKING:
+    from hydra.core.config_loader import ConfigLoader
 
 
 def root() -> Path:
@@ -100,6 +100,8 @@ def expand(params: Mapping[str, Any], arguments: Sequence[str], loader: ConfigLo
         arguments: of the command line; a key that is there replaces the same key of `params`.
         loader: knows the choices of groups, for `glob(...)`.
     """
+    from hydra.core.override_parser.overrides_parser import OverridesParser  # not to recognise a finished run
+
     swept = lenient([f"{key}={values}" for key, values in params.items() if values is not None])
     choices: dict[str, list[str]] = {}
     for override in OverridesParser.create(config_loader=loader).parse_overrides([*swept, *arguments]):

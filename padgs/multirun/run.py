@@ -9,8 +9,13 @@ import sys
 from collections.abc import Sequence
 from datetime import datetime
 
+from rich.console import Console
+
 import padgs
+from padgs import results
+from padgs.multirun.finished import only_run
 from padgs.runs.interrupt import INTERRUPTED
+from padgs.runs.summary import show_result
 
 
 def main() -> None:
@@ -31,6 +36,11 @@ def _run(arguments: Sequence[str]) -> int:
     """Exit code. What takes a second to import is imported here, so that Ctrl-C is answered from the beginning."""
     if "--version" in arguments:
         print(f"padgs {padgs.__version__}")
+        return 0
+    if folder := only_run(arguments):
+        console = Console()
+        console.print("finished before, nothing to do")
+        show_result(results.read(folder / results.FILE_NAME), folder, console)
         return 0
     import hydra
     from hydra.errors import HydraException
@@ -56,6 +66,7 @@ def _run(arguments: Sequence[str]) -> int:
     register_choices()
     sweeper.register()
     completing = {"-sc", "--shell_completion"} & {*arguments}
+    job.ARGUMENTS[:] = arguments
     start = f"{datetime.now():%Y%m%d-%H%M%S}-{os.getpid()}"
     if not completing:
         sys.argv[1:] = [*options_first(lenient(arguments)), f"hydra.sweep.dir=${{run.folder}}/{FOLDER}/{start}"]

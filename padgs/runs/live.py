@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from rich.console import Console, RenderableType
 from rich.live import Live
 from rich.text import Text
 
-from padgs.learning.loop import Record
+if TYPE_CHECKING:
+    from padgs.learning.loop import Record
 
 REDRAWS_PER_SECOND = 5
 SECONDS_BETWEEN_LINES = 10.0  # where there is no terminal

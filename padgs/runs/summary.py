@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -11,11 +12,13 @@ from rich.table import Table
 from rich.text import Text
 
 from padgs.results import Result
-from padgs.runs.config import RunConfig
 from padgs.runs.live import clock, compact
 from padgs.runs.terminal import printable, say
-from padgs.scene import Scene
-from padgs.scoring.metrics import BANDS
+from padgs.scoring.bands import BANDS
+
+if TYPE_CHECKING:
+    from padgs.runs.config import RunConfig
+    from padgs.scene import Scene
 
 MISSING = "–"
 MEANINGS = {  # word of a metric -> what it says, with an arrow towards the better end

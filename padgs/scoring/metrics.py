@@ -18,20 +18,13 @@ import torch
 from torch import Tensor
 
 from padgs.learning.loss import ssim_map
+from padgs.scoring.bands import BANDS
 from padgs.sphere.distortion import solid_angle_weight
 from padgs.sphere.panorama import row_latitudes
 
 Metric = Callable[[Tensor, Tensor, Tensor | None], Tensor]
 
 WINDOW_RADIUS = 5  # of the 11 x 11 window of SSIM
-BANDS = {  # degrees of latitude, [from, to); down is positive
-    "equator": ((-30, 30),),
-    "middle": ((-60, -30), (30, 60)),
-    "high": ((-75, -60), (60, 75)),
-    "pole": ((-90, -75), (75, 90)),
-    "zenith": ((-90, -75),),
-    "nadir": ((75, 90),),
-}
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:

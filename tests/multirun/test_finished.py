@@ -1,4 +1,6 @@
 import json
+import subprocess
+import sys
 
 import pytest
 
@@ -63,3 +65,15 @@ def test_a_cut_line_costs_only_its_own_job(runs):
     path = runs / ".multirun" / "finished.jsonl"
     path.write_text('{"job": "cut\n' + path.read_text() + json.dumps(["no", "entry"]))
     assert FinishedJobs(runs).status(JOB) == "ok"
+
+
+def test_the_only_run_of_a_command_is_known_without_loading_anything(runs):
+    command = ["+experiment=smoke", f"run.folder={runs}"]
+    assert finished.only_run(command) is None
+    FinishedJobs(runs).add(command, "room_padgs_1", "ok", None)
+    assert finished.only_run(command) == runs / "room_padgs_1"
+    assert finished.only_run([*command, "--cfg"]) is None and finished.only_run([*command, "seed=1"]) is None
+    FinishedJobs(runs).add(command, "room_padgs_1", "nan", None)
+    assert finished.only_run(command) is None, "a failed one is looked at: retry=failed may start it again"
+    code = "import sys, padgs.multirun.run; assert not {'torch', 'hydra', 'numpy'} & set(sys.modules), 'slow'"
+    subprocess.run([sys.executable, "-c", code], check=True)

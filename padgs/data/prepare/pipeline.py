@@ -123,11 +123,12 @@ def _finished(source: Path, destination: Path, options: PrepareOptions) -> Prepa
         stated = json.loads((destination / STATEMENT).read_text(encoding="utf-8"))
         if stated["input"] != _digest(_fingerprint(source, options), options):
             return None
-        known = {field.name: stated[field.name] for field in fields(Prepared) if field.name != "folder"}
+        known: dict[str, Any] = {field.name: stated[field.name] for field in fields(Prepared) if field.name != "folder"}
     except (OSError, ValueError, KeyError, TypeError):
         return None
     lists = {name: tuple(known[name]) for name in ("registered", "unregistered", "notes")}
-    return Prepared(destination, **known | lists | {"seconds": {}})
+    known |= {**lists, "seconds": {}}
+    return Prepared(destination, **known)
 
 
 def _fingerprint(source: Path, options: PrepareOptions) -> str:
