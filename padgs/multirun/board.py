@@ -13,7 +13,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TextIO
 
-from padgs.multirun.finished import FOLDER as FOLDER
 from padgs.results import STATUSES, replace_file
 from padgs.runs.session import Watch
 

@@ -23,7 +23,7 @@ padgs-run --cfg job           the configuration, not run
 padgs-run --help method=NAME  this text, with the keys of that method
 padgs-run --version           and stop; --hydra-help says what else Hydra understands
 """
-CHOSEN = ("method", "experiment", "sweep", "data", "protocol", "render", "scale", "stress", "launcher", "tracking")
+CHOSEN = ("method", "experiment", "sweep", "data", "protocol", "render", "scale", "launcher", "tracking")
 COMMENTED = re.compile(r"^    (\w+): .*?  # (.*(?:\n +# .*)*)$", re.MULTILINE)  # a field, and the comment beside it
 ADDED = ("experiment", "sweep", "scale")  # groups that only a + brings in
 

@@ -13,7 +13,7 @@ from rich.console import Console
 
 import padgs
 from padgs import results
-from padgs.multirun.finished import only_run
+from padgs.multirun.finished import FOLDER, only_run
 from padgs.runs.interrupt import INTERRUPTED
 from padgs.runs.summary import show_result
 
@@ -46,7 +46,7 @@ def _run(arguments: Sequence[str]) -> int:
     from hydra.errors import HydraException
 
     from padgs.multirun import job, sweeper
-    from padgs.multirun.board import FOLDER, OK
+    from padgs.multirun.board import OK
     from padgs.multirun.choices import register_choices
     from padgs.multirun.launchers import missing_plugin
     from padgs.multirun.manual import manual

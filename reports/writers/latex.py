@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import groupby
 
 from reports.tables.ranking import BEST, emphasis
@@ -14,45 +15,49 @@ SYMBOLS |= {"†": r"\dag{}"}
 SYMBOLS |= {"τ": r"$\tau$", "√": r"$\surd$"}
 
 
-LINES_OF_A_PAGE = 55
+LINES_OF_A_PAGE = 40
 COLUMNS_OF_A_PAGE = 12  # upright
 
 
 def text(table: Table) -> str:
     """A `table` for each page that it takes, made as narrow as the line, turned where it is wide; needs the packages
-    named.
+    named. Notes are below it, or after the last one.
     """
     pages = _pages([_block(block, table) for block in table.blocks])
-    wide = len(table.columns) > COLUMNS_OF_A_PAGE
-    packages = "booktabs, graphicx, pdflscape" if wide else "booktabs, graphicx"
-    lines = [line for number, page in enumerate(pages) for line in _float(table, page, number, len(pages), wide)]
-    return "\n".join([f"% needs \\usepackage{{{packages}}}", *lines]) + "\n"
+    wide, alone = len(table.columns) > COLUMNS_OF_A_PAGE, len(pages) == 1
+    lines = [f"% needs \\usepackage{{booktabs, graphicx{', pdflscape' if wide else ''}}}"]
+    for number, page in enumerate(pages):
+        made = _float(table, page, number, table.notes if alone else ())
+        lines += (
+            [r"\begin{landscape}", *made, r"\end{landscape}"] if wide else made if alone else [*made, r"\clearpage"]
+        )
+    if not alone:
+        lines += [
+            r"\begingroup\scriptsize",
+            *(f"\\noindent {escaped(note)}\\par" for note in table.notes),
+            r"\endgroup",
+        ]
+    return "\n".join(lines) + "\n"
 
 
 def _pages(blocks: list[list[str]]) -> list[list[str]]:
     """The lines of each page; a block is cut only if it is longer than that."""
     pages: list[list[str]] = [[]]
     for block in blocks:
-        parts = [block[start : start + LINES_OF_A_PAGE] for start in range(0, len(block), LINES_OF_A_PAGE)]
-        for part in parts:
+        for start in range(0, len(block), LINES_OF_A_PAGE):
+            part = block[start : start + LINES_OF_A_PAGE]
             if pages[-1] and len(pages[-1]) + len(part) > LINES_OF_A_PAGE:
                 pages.append([])
             pages[-1] += part
     return pages
 
 
-def _float(table: Table, body: list[str], page: int, pages: int, wide: bool) -> list[str]:
-    last = page == pages - 1
-    notes = " ".join(escaped(note) for note in table.notes) if last else ""
-    caption = (
-        _caption(table)
-        if page == 0
-        else f"\\addtocounter{{table}}{{-1}}\\caption[]{{{escaped(table.title)}, continued}}"
-    )
-    lines = [
-        r"\begin{table}" if pages == 1 else r"\begin{table}[p]",
+def _float(table: Table, body: list[str], page: int, notes: Sequence[str]) -> list[str]:
+    words = " ".join(map(escaped, notes))
+    return [
+        r"\begin{table}",
         r"  \centering",
-        f"  {caption}",
+        f"  {_continued(table) if page else _caption(table)}",
         r"  \resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%",
         f"  \\begin{{tabular}}{{l{'r' * len(table.columns)}}}",
         r"    \toprule",
@@ -61,14 +66,16 @@ def _float(table: Table, body: list[str], page: int, pages: int, wide: bool) -> 
         r"    \bottomrule",
         r"  \end{tabular}}",
         *(
-            [f"  \\par\\smallskip\\begin{{minipage}}{{\\linewidth}}\\footnotesize {notes}\\end{{minipage}}"]
-            if last
+            [f"  \\par\\smallskip\\begin{{minipage}}{{\\linewidth}}\\footnotesize {words}\\end{{minipage}}"]
+            if notes
             else []
         ),
         r"\end{table}",
-        *([] if last else [r"\clearpage"]),
     ]
-    return [r"\begin{landscape}", *lines, r"\end{landscape}"] if wide else lines
+
+
+def _continued(table: Table) -> str:
+    return f"\\addtocounter{{table}}{{-1}}\\caption[]{{{escaped(table.title)}, continued}}"
 
 
 def _caption(table: Table) -> str:
