@@ -20,7 +20,11 @@ from types import UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
 SCHEMA = 2
-ADDED = {"peak_device_memory_bytes", "need"}  # to the schema since: files without them are read, with the default
+ADDED = {
+    "peak_device_memory_bytes",
+    "need",
+    "ended",
+}  # to the schema since: files without them are read, with the default
 FILE_NAME = "result.json"
 LOG_NAME, CONFIG_NAME = "log.jsonl", "config.yaml"
 PICTURES = "renders"  # folder of truth | render | error of each test view, in one picture
@@ -83,6 +87,7 @@ class Result:
     fingerprint: str  # of the data
     finished: str  # UTC, ISO 8601
     reason: str = ""  # why a run failed
+    ended: str = ""  # why a run that ended well left out a part of its schedule, see `padgs.learning.stopping`
     scores: dict[str, Scores] = field(default_factory=dict)  # protocol -> marks
     timing: dict[str, float] = field(default_factory=dict)  # train_seconds, render_ms_median, render_ms_p95, ...
     counts: dict[str, int] = field(default_factory=dict)  # anchors, gaussians, ...

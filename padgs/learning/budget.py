@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from padgs.checks import check, check_known
 
+STOPS = ("end", "auto")
 CLOCKS: dict[str, Callable[[], float]] = {
     "wall": time.perf_counter,
     "cpu": time.process_time,  # of all threads of the process, which other programs change less
@@ -28,12 +29,13 @@ class Budget:
     seconds: float | None = None
     clock: str = "wall"  # that `seconds` are counted on: a name of CLOCKS
     gaussians: int | None = None  # that the model grows to; None: as many as thresholds give
+    stop: str = "end"  # of the schedule | auto: as soon as nothing is gained, see `padgs.learning.stopping`
 
     def __post_init__(self) -> None:
         check(self, "at least 1", lambda count: count >= 1, "iterations")
         check(self, "at least 1 Gaussian, or none for no target", lambda n: n is None or n >= 1, "gaussians")
         check(self, "> 0 and finite, or none", lambda s: s is None or 0 < s < math.inf, "max_seconds", "seconds")
-        check_known(self, clock=CLOCKS)
+        check_known(self, clock=CLOCKS, stop=STOPS)
 
     def __str__(self) -> str:
         """How people say it.
@@ -45,19 +47,21 @@ class Budget:
             return f"{self.iterations} iterations"
         return f"{self.seconds:g} s{' of CPU time' if self.clock == 'cpu' else ''}"
 
-    def moment(self, last: int, spent: float, step: float) -> int:
+    def moment(self, last: int, spent: float, step: float, skipped: int = 0) -> int:
         """The iteration of the schedule that the next step stands for; `iterations` for the last one.
 
         Args:
             last: that of the step before, 0 for none.
             spent: seconds of training so far.
             step: seconds that the next step will take, as far as anybody knows.
+            skipped: iterations of the schedule that no time was spent on.
 
         >>> Budget(100).moment(6, spent=50.0, step=1.0), Budget(100, seconds=10.0).moment(6, spent=4.0, step=1.0)
         (7, 50)
         """
         if self.seconds is None:
             return last + 1
+        spent += skipped / self.iterations * self.seconds
         if spent + 1.5 * step >= self.seconds:  # one more would end more than half a step too late
             return self.iterations
         return min(max(last, round(self.iterations * (spent + step) / self.seconds), 1), self.iterations - 1)

@@ -25,6 +25,7 @@ from padgs.learning.monitor import Monitor
 from padgs.learning.optimiser import Optimiser
 from padgs.learning.order import Order, ViewOrder
 from padgs.learning.schedule import LEARNING_RATES, Pace
+from padgs.learning.stopping import FADE, GAIN, PATIENCE, Plateau, quality, set_apart
 from padgs.learning.targets import Targets
 from padgs.learning.trainee import MODEL, State, Trainee
 from padgs.scene import Scene
@@ -78,13 +79,17 @@ class Trainer:
         moment: the one of them that the last step stood for; not `iteration` in budgets of seconds only.
         step_seconds: what the last step took, on the clock of the budget.
         start: how many Gaussians, anchors or other parts the trainee had at the beginning.
+        skipped, ended: iterations of the schedule that were left out by `stop`, and why; 0 and empty without.
 
     Between two records `state` holds all that continuing bit-identically needs (on the CPU); `load_state` goes back
     there. A resumed run goes on counting its training time.
     """
 
     ADAM: ClassVar[dict[str, Any]] = {"betas": (0.9, 0.999), "eps": 1e-15}  # of 3DGS: single Gaussians pull tiny
-    PROGRESS = ("iteration", "moment", "schedule", "seconds", "cpu_seconds", "step_seconds", "start")
+    PROGRESS = (
+        *("iteration", "moment", "schedule", "seconds", "cpu_seconds", "step_seconds", "start"),
+        *("skipped", "ended"),
+    )
 
     def __init__(
         self,
@@ -103,8 +108,12 @@ class Trainer:
             trainee, scene, budget, options, seed: what is trained, on what, for how long and how.
             views_each: views that an iteration draws one after the other, before Adam steps on the sum of their losses.
             stage: for whoever wants to know what an iteration spends its time on.
+
+        Raises:
+            ValueError: the run is to stop by itself, but has too few views to set some apart.
         """
-        self.iteration = self.moment = 0
+        self.iteration = self.moment = self.skipped = 0
+        self.ended = ""
         self.schedule = budget.iterations
         self.seconds = self.cpu_seconds = self.step_seconds = 0.0
         self.start = next(iter(trainee.counts().values()))
@@ -112,7 +121,10 @@ class Trainer:
         self._views_each = views_each
         self._optimiser = Optimiser(trainee.groups(), self._pace(1, 1), options.check_every, **self.ADAM)
         self._targets = Targets(scene.train, options.weight, self._optimiser.device)
-        self._views = ViewOrder(scene, seed)
+        apart = set_apart(scene.train) if budget.stop == "auto" else ()
+        self._calibration = [scene.train[number] for number in apart]
+        self._plateau = Plateau(budget.iterations)
+        self._views = ViewOrder(scene, seed, apart)
         self._order: Order = self._views
         pixels = sum(view.width * view.height for view in scene.train)
         self._monitor = Monitor(budget.iterations, max(trainee.counts().values()), pixels) if options.monitor else None
@@ -130,7 +142,7 @@ class Trainer:
         budget, limit = self._budget, self._budget.max_seconds
         while self.moment < budget.iterations and (limit is None or self.seconds < limit):
             lap, iteration = Lap(), self.iteration + 1
-            moment = budget.moment(self.moment, self.spent, self.step_seconds)
+            moment = budget.moment(self.moment, self.spent, self.step_seconds, self.skipped)
             if self._monitor is not None:
                 self._monitor.moment = moment
             try:
@@ -143,11 +155,37 @@ class Trainer:
             if moment == budget.iterations:
                 self._optimiser.refuse_non_finite(self._optimiser.parameters(), iteration)
             self.iteration, self.moment, before = iteration, moment, self.spent
+            events += self._stopped_by_itself()
             wall, cpu = lap.seconds(self.seconds / self.cpu_seconds if self.cpu_seconds else 1.0)
             self.seconds, self.cpu_seconds = self.seconds + wall, self.cpu_seconds + cpu
             self.step_seconds = self.spent - before
             progress = moment / budget.iterations
             yield Record(iteration, progress, loss, self.seconds, self.cpu_seconds, counts, events)
+
+    def stop(self, why: str) -> bool:
+        """Leave out the schedule up to its last `FADE`, between two records; returns whether anything was left.
+
+        What would have come at moments that are left out does not come.
+        """
+        until = round((1 - FADE) * self._budget.iterations)
+        if self.moment >= until:
+            return False
+        self.skipped, self.moment, self.ended = until - self.moment, until, why
+        self._views.take_all()
+        if self._monitor is not None:
+            self._monitor.forget()
+        return True
+
+    def _stopped_by_itself(self) -> tuple[str, ...]:
+        """Stop where the views set apart say so; when rates fade at the latest, these are trained on."""
+        if self.moment >= round((1 - FADE) * self._budget.iterations):
+            self._views.take_all()
+        elif self._calibration and self._plateau.is_due(self.moment):
+            value = quality(self._trainee.render, self._calibration)
+            if self._plateau.reached(value, self.moment):
+                self.stop(f"less than {GAIN} dB were gained within {PATIENCE:.0%} of the schedule")
+                return (f"stopping: {self.ended}",)
+        return ()
 
     @property
     def spent(self) -> float:
@@ -155,9 +193,13 @@ class Trainer:
         return self.seconds if self._budget.clock == "wall" else self.cpu_seconds
 
     def _pace(self, iteration: int, moment: int) -> Pace:
-        """Of the learning rates: what fits as many steps as the run will have, if it goes on as it went so far."""
+        """Of the learning rates: what fits as many steps as the run will have, if it goes on as it went so far.
+
+        What is left out of the schedule counts as done, so that rates do not rise when a run is stopped.
+        """
         length = self._budget.iterations
-        return replace(Pace.of(self._options.learning_rates, round(length * iteration / moment)), iterations=length)
+        steps = round(length * iteration / (moment - self.skipped))
+        return replace(Pace.of(self._options.learning_rates, steps), iterations=length)
 
     def _step(self, iteration: int, moment: int) -> tuple[float | Tensor, dict[str, int], tuple[str, ...]]:
         """One iteration. Returns loss (a mean over its views), counts and events of its record."""
@@ -234,6 +276,8 @@ class Trainer:
         values = {"model": model.values, **{name: getattr(self, name) for name in self.PROGRESS}, **order.values}
         if self._monitor is not None:
             values["monitor"] = copy.deepcopy(self._monitor.state)
+        if self._calibration:
+            values["plateau"] = copy.deepcopy(self._plateau.state)
         return State({name: tensor.detach().clone() for name, tensor in tensors.items()}, values)
 
     def load_state(self, state: State) -> None:
@@ -247,7 +291,10 @@ class Trainer:
         self._optimiser.load(state)
         torch.set_rng_state(state.tensors["random/torch"].cpu())
         before = {"moment": state.values["iteration"], "schedule": self.schedule, "step_seconds": 0.0}
-        for name in self.PROGRESS:  # checkpoints from before there were budgets of seconds have three of them less
+        before |= {"skipped": 0, "ended": ""}
+        for name in self.PROGRESS:  # older checkpoints have some of them less
             setattr(self, name, {**before, **state.values}[name])
         if self._monitor is not None and "monitor" in state.values:  # not in checkpoints from before there was one
             self._monitor.state = copy.deepcopy(state.values["monitor"])
+        if self._calibration:
+            self._plateau.state = copy.deepcopy(state.values["plateau"])

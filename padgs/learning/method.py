@@ -95,6 +95,16 @@ class Method(ABC):
             self._loaded = None
         return self._trainer.records()
 
+    def stop(self, why: str) -> bool:
+        """End the training of `fit` soon, between two of its records; see `Trainer.stop`."""
+        assert self._trainer is not None, "only what is trained can be stopped"
+        return self._trainer.stop(why)
+
+    @property
+    def ended(self) -> str:
+        """Why training left out a part of its schedule; empty where it did not."""
+        return self.state().values.get("ended", "") if self._trainer is None else self._trainer.ended
+
     def render(self, view: View) -> Rendering:
         """Render a view without gradients."""
         return self.trainee.render(view)
@@ -179,7 +189,7 @@ class Method(ABC):
         """
         assert budget.seconds is not None
         random, first = torch.get_rng_state(), 0.0
-        short = replace(budget, iterations=PUBLISHED_ITERATIONS, seconds=None)
+        short = replace(budget, iterations=PUBLISHED_ITERATIONS, seconds=None, gaussians=None, stop="end")
         one = replace(scene, train=scene.train[:1])
         trainer = self._trained_by(self._start(scene, short.iterations), one, short, nullcontext)
         for record in trainer.records():

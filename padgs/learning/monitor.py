@@ -52,6 +52,10 @@ class Monitor:
         self.moment: int | None = None
         self.state: dict[str, Any] = {"sum": 0.0, "weight": 0.0, "seen": 0, "best": None, "largest": None, "since": {}}
 
+    def forget(self) -> None:
+        """Signs begin anew, as the schedule has jumped and how long they lasted means nothing."""
+        self.state["since"] = {}
+
     def loss(self, value: float, iteration: int) -> None:
         """Take in the loss of an iteration.
 

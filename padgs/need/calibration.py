@@ -7,12 +7,12 @@ from collections.abc import Sequence
 
 from scipy.stats import t
 
+from padgs.learning.stopping import set_apart
 from padgs.results import Scores
 from padgs.scene import View
 from padgs.scoring.metrics import BANDS
 from padgs.scoring.protocols import PROTOCOLS
 
-EVERY, FEWEST = 8, 3  # one training view of so many, but so many at least; and as many must be left to refine on
 RULES = PROTOCOLS["sphere"]
 QUALITY, PERCEPTION = "ws_psnr", RULES.lpips_name
 CONFIDENCE = 0.95
@@ -26,15 +26,9 @@ def calibration_split(views: Sequence[View]) -> tuple[tuple[View, ...], tuple[Vi
     Raises:
         ValueError: there are too few for both.
     """
-    count = max(FEWEST, len(views) // EVERY)
-    if len(views) < count + FEWEST:
-        raise ValueError(
-            f"{len(views)} training views leave no calibration views: {FEWEST} are measured on and as many trained on; "
-            f"it takes {2 * FEWEST}"
-        )
-    apart = {int((number + 0.5) * len(views) / count) for number in range(count)}
-    chosen = tuple(view for number, view in enumerate(views) if number in apart)
-    return chosen, tuple(view for number, view in enumerate(views) if number not in apart)
+    apart = set_apart(views)
+    left = tuple(view for number, view in enumerate(views) if number not in apart)
+    return tuple(views[number] for number in apart), left
 
 
 def objections(candidate: Scores, reference: Scores, epsilon: float) -> tuple[str, ...]:

@@ -70,6 +70,7 @@ class BudgetOptions:
     clock: str = "wall"  # wall | cpu: cpu counts what the process itself takes, whatever else the machine does
 
     gaussians: int | None = None  # that the model grows to: those that are pulled hardest multiply, up to so many
+    stop: str = "end"  # of the schedule | auto: as soon as views that are set apart gain nothing any more
 
     def __post_init__(self) -> None:
         Budget(1, **asdict(self))
@@ -77,7 +78,9 @@ class BudgetOptions:
     def asked(self) -> dict[str, Any]:
         """What is asked for, by key."""
         time = {} if self.seconds is None else {"seconds": self.seconds, "clock": self.clock}
-        return time if self.gaussians is None else {**time, "gaussians": self.gaussians}
+        rest = {"gaussians": self.gaussians, "stop": self.stop}
+        usual = asdict(BudgetOptions())
+        return {**time, **{name: value for name, value in rest.items() if value != usual[name]}}
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,7 @@
-"""The folder of one run: config.yaml, log.jsonl, checkpoint/, renders/, and at the very end result.json."""
+"""The folder of one run: config.yaml, log.jsonl, checkpoint/, renders/, and at the very end result.json.
+
+Whoever puts a file `stop` there asks the run to end well, now.
+"""
 
 from __future__ import annotations
 
@@ -51,6 +54,7 @@ class RunFolder:
         self.path, self._run = path, run
         self.checkpoint = path / "checkpoint"
         self.renders = path / results.PICTURES
+        self.stop = path / "stop"
         self._log = path / results.LOG_NAME
 
     def prepare(self, values: Mapping[str, Any]) -> None:

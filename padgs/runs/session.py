@@ -23,7 +23,7 @@ from padgs.runs.config import RunConfig
 from padgs.runs.device import chosen
 from padgs.runs.folder import Progress, RunFolder, RunFolderError
 from padgs.runs.identity import identity, run_id
-from padgs.runs.interrupt import Interrupt, Interrupted
+from padgs.runs.interrupt import ENOUGH, Interrupt, Interrupted
 from padgs.runs.live import LiveLine
 from padgs.runs.scoring import frame_times, probe, same_rules, scores
 from padgs.runs.summary import introduce, show_result
@@ -32,6 +32,7 @@ from padgs.scene import Scene
 from padgs.scoring.protocols import Protocol
 from padgs.stopwatch import notice_stops
 
+ASKED = "asked to stop and score"
 UNNAMED = "; the checkpoint is of an earlier version and does not say of which run, so its place is trusted"
 
 
@@ -117,13 +118,15 @@ class Session:
             saved, saved_iteration = time.monotonic(), progress.iteration
             with (
                 Interrupt(self.watch.stop_requested) as stop,
+                Interrupt(folder.stop.exists, ENOUGH) as enough,
                 LiveLine(self.console) as line,
             ):
                 for record in method.fit(self.scene, config.time):
                     progress = Progress(record.iteration, record.seconds, record.cpu_seconds, record.progress)
                     line.update(record, self._logged(record, method))
                     stopping = stop.requested
-                    if stopping or self._is_due(record, saved):
+                    ending = enough.requested and not method.ended and method.stop(ASKED)
+                    if stopping or ending or self._is_due(record, saved):
                         folder.save(method, progress)
                         self.watch.saved(folder.path)
                         saved, saved_iteration = time.monotonic(), record.iteration
@@ -131,6 +134,7 @@ class Session:
                         raise Interrupted(f"stopped after iteration {record.iteration}, the checkpoint is written")
                 if saved_iteration != progress.iteration:
                     folder.save(method, progress)
+            folder.stop.unlink(missing_ok=True)
             result = replace(result, **self._trained(method, progress))
             if self.scene.test:
                 result = outcome.judged(replace(result, **self._tested(method, progress)))
@@ -142,6 +146,9 @@ class Session:
             what = {"status": outcome.status(error), "reason": outcome.reason(error)}
             result = replace(result, **what, **outcome.peak_memory(self.scene))
         finished = datetime.now(timezone.utc).isoformat(timespec="seconds")
+        if result.ended == ASKED:  # no configuration says so: it must not be taken for a seed of what ran to its end
+            words = (config.row, f"stopped after {progress.iteration} iterations")
+            result = replace(result, variant=", ".join(filter(None, words)))
         asked = progress.iteration if config.budget.seconds is not None else result.iterations
         return folder.finish(replace(result, iterations=asked, iterations_done=progress.iteration, finished=finished))
 
@@ -170,6 +177,7 @@ class Session:
             "status": "ok" if progress.share == 1 else "timeout",
             "counts": {**size.counts, "parameters": size.parameters, **start},
             "model_bytes": size.bytes,
+            "ended": method.ended,
             "timing": _training_time(progress),
             **outcome.peak_memory(self.scene),  # of training; scoring has networks of its own
         }

@@ -45,6 +45,8 @@ def show_result(result: Result, folder: Path, console: Console) -> None:
     if not result.ok:
         reason = printable(result.reason) or "stopped early"
         console.print(Text.assemble((result.status, "bold red"), f": {reason}"), soft_wrap=True)
+    if result.ended:
+        say(console, f"stopped early, after {result.iterations_done} iterations: {printable(result.ended)}", "yellow")
     if result.scores:
         console.print(marks(result))
     for note in dict.fromkeys(note for scores in result.scores.values() for note in scores.notes):

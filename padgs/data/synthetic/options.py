@@ -7,7 +7,10 @@ from dataclasses import dataclass
 
 from padgs.data.errors import DataError
 
-SCENES = ("room", "two_rooms", "outdoor", "pole_torture", "bare_room", "near_clutter", "glossy")
+SCENES = (
+    *("room", "two_rooms", "outdoor", "pole_torture", "bare_room", "near_clutter", "glossy"),
+    *("white_room", "checker_room"),
+)
 PATHS = ("roaming", "cross", "line")
 HEADINGS = ("path", "fixed", "random")
 

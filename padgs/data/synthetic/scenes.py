@@ -2,7 +2,7 @@
 
 room, two_rooms (a door between them), outdoor (far ring and sky), pole_torture (Siemens stars and rods at both poles),
 bare_room (posters on a tenth of the walls), near_clutter (objects 5-30 cm from the path), glossy (mirror-like
-materials, so colours depend on the view).
+materials, so colours depend on the view); white_room and checker_room, whose complexity is known.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from padgs.data.synthetic.light import Light
 from padgs.data.synthetic.options import SyntheticOptions
 from padgs.data.synthetic.outdoor import outdoor
 from padgs.data.synthetic.paths import Walk
+from padgs.data.synthetic.plain_rooms import checker_room, white_room
 from padgs.data.synthetic.shapes import Box, Material, Rod, Room, Shape
 from padgs.data.synthetic.textures import Array, Texture, scaled
 from padgs.data.synthetic.world import World
@@ -197,4 +198,6 @@ BLUEPRINTS: dict[str, Blueprint] = {
     "bare_room": Blueprint(Walk((-0.1, -0.1), (1.4, 1.15)), "roaming", 3, bare_room),
     "near_clutter": Blueprint(Walk((-0.1, -0.1), (1.4, 1.15)), "line", 40, near_clutter),
     "glossy": Blueprint(Walk((-0.1, -0.1), (1.4, 1.15)), "roaming", 8, glossy),
+    "white_room": Blueprint(Walk((-0.1, -0.1), (1.4, 1.15)), "roaming", 0, white_room),
+    "checker_room": Blueprint(Walk((-0.1, -0.1), (1.4, 1.15)), "roaming", 0, checker_room),
 }
