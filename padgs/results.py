@@ -20,11 +20,7 @@ from types import UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
 SCHEMA = 2
-ADDED = {
-    "peak_device_memory_bytes",
-    "need",
-    "ended",
-}  # to the schema since: files without them are read, with the default
+ADDED = {"peak_device_memory_bytes", "need", "ended"}  # since then: files without are read, with the default
 FILE_NAME = "result.json"
 LOG_NAME, CONFIG_NAME = "log.jsonl", "config.yaml"
 PICTURES = "renders"  # folder of truth | render | error of each test view, in one picture
