@@ -24,7 +24,7 @@ from padgs.runs.identity import Labels
 from padgs.runs.interrupt import Interrupted
 from padgs.runs.lock import RunBusy
 from padgs.runs.scoring import probe
-from padgs.runs.session import Session, build, scene_of
+from padgs.runs.session import Session, Watch, build, scene_of
 from reports import store
 from reports.frame import frame
 from reports.gathered import Gathered
@@ -103,6 +103,33 @@ def test_the_log_has_losses_and_the_held_out_view(config):
     folder_of(config).resume(method)
     last = probe(method, scene_of(config, torch.device("cpu")).test[0])
     assert last == {name: probed[-1][name] for name in ("psnr", "polar_transmittance")}
+
+
+@pytest.mark.parametrize("how", ["file", "signal"])
+def test_a_run_that_is_asked_to_stop_and_score_fades_and_ends_well(config, how):
+    """The last two of twelve iterations are what it fades in."""
+
+    class Asking(Watch):
+        looks = 0
+
+        def started(self, folder: Path) -> None:
+            self.folder = folder
+
+        def stop_requested(self) -> bool:  # looked at once an iteration
+            self.looks += 1
+            if self.looks == 4 and how == "file":
+                (self.folder / "stop").touch()
+            elif self.looks == 4:
+                os.kill(os.getpid(), signal.SIGUSR1)
+                os.kill(os.getpid(), signal.SIGUSR1)  # which changes nothing
+            return False
+
+    said = io.StringIO()
+    result = Session(config, Console(file=said, width=200), Asking()).run()
+    assert result.status == "ok" and result.ended == "asked to stop and score"
+    assert result.iterations_done == 6 and result.variant == "stopped after 6 iterations"
+    assert result.scores["paper"].metrics["psnr"] is not None and "after 6 iterations: asked" in said.getvalue()
+    assert not (folder_of(config).path / "stop").exists(), "it would stop the next start, too"
 
 
 def test_a_finished_run_is_shown_and_not_repeated(config, monkeypatch):
