@@ -28,14 +28,20 @@ class Budget:
     max_seconds: float | None = None  # on the wall clock, after which the run ends as it is
     seconds: float | None = None
     clock: str = "wall"  # that `seconds` are counted on: a name of CLOCKS
-    gaussians: int | None = None  # that the model grows to; None: as many as thresholds give
+    gaussians: int | str | None = None  # that the model grows to; None: as many as thresholds give; auto: as needed
     stop: str = "end"  # of the schedule | auto: as soon as nothing is gained, see `padgs.learning.stopping`
 
     def __post_init__(self) -> None:
         check(self, "at least 1", lambda count: count >= 1, "iterations")
-        check(self, "at least 1 Gaussian, or none for no target", lambda n: n is None or n >= 1, "gaussians")
+        rule = "at least 1 Gaussian, auto for as many as needed, or none for no target"
+        check(self, rule, lambda n: n in (None, "auto") or isinstance(n, int) and n >= 1, "gaussians")
         check(self, "> 0 and finite, or none", lambda s: s is None or 0 < s < math.inf, "max_seconds", "seconds")
         check_known(self, clock=CLOCKS, stop=STOPS)
+        if self.gaussians == "auto" and self.stop != "auto":
+            raise ValueError(
+                f"gaussians is auto, which takes the views that stop=auto sets apart, but stop is {self.stop}; "
+                "take both (budget=auto) or none"
+            )
 
     def __str__(self) -> str:
         """How people say it.

@@ -182,7 +182,7 @@ class Trainer:
             self._views.take_all()
         elif self._calibration and self._plateau.is_due(self.moment):
             value = quality(self._trainee.render, self._calibration)
-            if self._plateau.reached(value, self.moment):
+            if self._plateau.reached(value, max(self._trainee.counts().values()), self.moment):
                 self.stop(f"less than {GAIN} dB were gained within {PATIENCE:.0%} of the schedule")
                 return (f"stopping: {self.ended}",)
         return ()

@@ -61,7 +61,7 @@ class Method(ABC):
         self._trainee: Trainee | None = None
         self._trainer: Trainer | None = None
         self._loaded: State | None = None
-        self._gaussians: int | None = None  # of the budget of `fit`
+        self._gaussians: int | str | None = None  # of the budget of `fit`
         self._refuse_impossible()
 
     def fit(self, scene: Scene, budget: Budget, *, stage: Stage = nullcontext) -> Iterator[Record]:

@@ -60,16 +60,19 @@ class Plateau:
     def __init__(self, iterations: int) -> None:
         """Nothing was measured yet; `iterations` are those of the schedule."""
         self._every = max(1, round(EVERY * iterations))
-        self.state: dict[str, Any] = {"next": self._every, "averages": []}
+        self.state: dict[str, Any] = {"next": self._every, "averages": [], "parts": []}
 
     def is_due(self, moment: int) -> bool:
         """Whether it is time to measure, at an iteration of the schedule."""
         return moment >= self.state["next"]
 
-    def reached(self, value: float, moment: int) -> bool:
-        """Take in what was measured, dB; whether the average gained next to nothing lately."""
-        averages, span = self.state["averages"], round(PATIENCE / EVERY)
-        averages.append(averages[-1] + (value - averages[-1]) / span if averages else value)
-        self.state["next"] = moment + self._every
-        self.state["averages"] = averages[-span - 1 :]
-        return len(averages) > span and averages[-1] - averages[-span - 1] < GAIN
+    def reached(self, value: float, parts: int, moment: int) -> bool:
+        """Take in what was measured, dB, of a model of so many parts; whether the average gains next to nothing.
+
+        Not while the model grows: what has just multiplied is worse before it is better.
+        """
+        span = round(PATIENCE / EVERY)
+        averages, counts = self.state["averages"][-span:], [*self.state["parts"][-span:], parts]
+        averages = [*averages, averages[-1] + (value - averages[-1]) / span if averages else value]
+        self.state = {"next": moment + self._every, "averages": averages, "parts": counts}
+        return len(averages) > span and parts <= counts[0] and averages[-1] - averages[0] < GAIN

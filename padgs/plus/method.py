@@ -39,7 +39,7 @@ class PlusMethod(SplatMethod):
     def _start(self, scene: Scene, iterations: int) -> SplatTrainee:
         options, pixels = self.options, independent_pixels(scene.train[0])
         start, limit = (_within(share, pixels) for share in (options.start_share, options.limit_share))
-        limit = fewest(options.max_gaussians, limit if self._gaussians is None else self._gaussians)
+        limit = fewest(options.max_gaussians, limit if self._target is None else self._target)
         splats = Splats.from_scene(
             scene,
             degree=options.sh_degree,

@@ -69,7 +69,9 @@ class BudgetOptions:
     seconds: float | None = None  # of training: schedules follow the clock, and the run ends on time
     clock: str = "wall"  # wall | cpu: cpu counts what the process itself takes, whatever else the machine does
 
-    gaussians: int | None = None  # that the model grows to: those that are pulled hardest multiply, up to so many
+    # That the model grows to: those that are pulled hardest multiply, up to so many. auto: only where errors are seen,
+    # and only while more are worth having; takes stop=auto.
+    gaussians: int | str | None = None
     stop: str = "end"  # of the schedule | auto: as soon as views that are set apart gain nothing any more
 
     def __post_init__(self) -> None:

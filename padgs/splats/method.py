@@ -16,10 +16,12 @@ from padgs.checks import check
 from padgs.learning.extent import ExtentOptions
 from padgs.learning.loop import TrainOptions
 from padgs.learning.method import Method
+from padgs.learning.stopping import set_apart
 from padgs.learning.trainee import State
 from padgs.scene import Scene, View
 from padgs.sphere.harmonics import MAX_DEGREE
 from padgs.splats.clone_split import CloneSplitOptions
+from padgs.splats.governor import AUTO
 from padgs.splats.model import Splats
 from padgs.splats.trainee import SplatTrainee
 
@@ -69,9 +71,14 @@ class SplatMethod(Method):
     def _start(self, scene: Scene, iterations: int) -> SplatTrainee:
         options = self.options
         generator = torch.Generator().manual_seed(self.seed)
-        most = fewest(options.max_gaussians, self._gaussians)
+        most = fewest(options.max_gaussians, self._target)
         splats = Splats.from_scene(scene, degree=options.sh_degree, max_gaussians=most, generator=generator)
         return self._trainee_of(splats, options.extent_of(scene), iterations, scene.train)
+
+    @property
+    def _target(self) -> int | None:
+        """As many Gaussians as the budget asks for, if it names a number."""
+        return self._gaussians if isinstance(self._gaussians, int) else None
 
     def _blank(self, state: State) -> SplatTrainee:
         stored = state.of_model()
@@ -90,7 +97,8 @@ class SplatMethod(Method):
             extent=extent,
             iterations=iterations,
             views=views,
-            target=self._gaussians,
+            target=self._target,
             seed=self.seed,
+            calibration=[views[number] for number in set_apart(views)] if views and self._gaussians == AUTO else (),
             **more,
         )

@@ -17,6 +17,7 @@ from padgs.render.low_pass import LowPass, low_pass_of, widened
 from padgs.scene import View
 from padgs.sphere.panorama import longitude_latitude
 from padgs.splats.clone_split import MIN_DENSIFY_EVERY, CloneSplit, CloneSplitOptions
+from padgs.splats.governor import Governor
 from padgs.splats.model import Splats
 from padgs.splats.probes import render_probed
 
@@ -42,10 +43,12 @@ class SplatTrainee:
         views: Sequence[View] = (),
         target: int | None = None,
         seed: int = 0,
+        calibration: Sequence[View] = (),
     ) -> None:
         """Wrap splats; `extent` is the scene's, `options` are those of a published run (see `for_run`).
 
         `views` are those of the training; without them there can be none. `target` is as `CloneSplit` has it.
+        With some `calibration` views among them, growth is that of a `Governor`.
         """
         self.splats, self.iterations = splats, iterations
         self._config, self._views, self._extent = config, views, extent
@@ -55,8 +58,12 @@ class SplatTrainee:
             extent=extent,
             target=target,
             drawn_opacities=self._drawn_opacities,
+            candidates=self._candidates if calibration else None,
             seed=seed,
         )
+        apart = {view.name for view in calibration}
+        others = [view for view in views if view.name not in apart]
+        self._governor = Governor(others, calibration, config.backend) if calibration else None
         self._drawn: View | None = None  # the view of the last drawing
 
     def groups(self, means_speed: float = 1.0) -> list[ParameterGroup]:
@@ -116,6 +123,10 @@ class SplatTrainee:
         views = int(self.densifier.statistics["seen"].max())  # some Gaussian is seen by all
         return 2 * views >= min(self.densifier.options.densify_every, MIN_DENSIFY_EVERY)
 
+    def _candidates(self) -> Tensor:
+        assert self._governor is not None, "asked for only where there is one"
+        return self._governor.candidates(self.splats, self.render_options(self._views[0]))
+
     def degree_at(self, iteration: int) -> int:
         """The SH degree that is in use by then, if the model has it."""
         return iteration // scaled(DEGREE_EVERY, self.iterations)
@@ -155,6 +166,8 @@ class SplatTrainee:
             "extent": self._extent,
             "iterations": self.iterations,
         }
+        if self._governor is not None:
+            values["governor"] = dict(self._governor.state)
         return State(tensors, values)
 
     def load_state(self, state: State) -> None:
@@ -168,6 +181,8 @@ class SplatTrainee:
         device = self.splats.means.device
         self.densifier.statistics = {n: t.to(device, copy=True) for n, t in state.under("statistics/").items()}
         self.densifier.generator.set_state(state.tensors["random/pieces"].cpu())
+        if self._governor is not None:
+            self._governor.state = dict(state.values["governor"])
 
     @torch.no_grad()
     def _drawn_opacities(self) -> Tensor:

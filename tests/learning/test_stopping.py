@@ -53,15 +53,17 @@ def trainer(scene, stop: str = "auto") -> Trainer:
 
 def test_a_plateau_is_where_the_average_gains_nothing_and_not_before():
     rising, flat = Plateau(100), Plateau(100)
-    assert not any(rising.reached(20 + 0.1 * moment, moment) for moment in range(1, 101))
+    assert not any(rising.reached(20 + 0.1 * moment, 1, moment) for moment in range(1, 101))
     values = [20 + min(moment, 40) for moment in range(1, 101)]
-    first = next(moment for moment, value in enumerate(values, 1) if flat.reached(value, moment))
+    first = next(moment for moment, value in enumerate(values, 1) if flat.reached(value, 1, moment))
     assert 45 < first < 75
     assert not flat.is_due(first) and flat.is_due(first + 1)
+    growing = Plateau(100)
+    assert not any(growing.reached(20.0, parts, parts) for parts in range(1, 101))
 
 
 def test_views_set_apart_come_back_when_rates_fade(scene, monkeypatch):
-    monkeypatch.setattr(Plateau, "reached", lambda self, value, moment: moment > 49)
+    monkeypatch.setattr(Plateau, "reached", lambda self, value, parts, moment: moment > 49)
     run = trainer(scene)
     apart = {scene.train[number].name for number in set_apart(scene.train)}
     records = list(run.records())
@@ -87,7 +89,7 @@ def test_rates_never_rise_when_a_run_is_stopped(scene):
 
 @pytest.mark.parametrize("at", [30, 50, 60])
 def test_a_stopped_run_resumes_to_the_same(scene, monkeypatch, at):
-    monkeypatch.setattr(Plateau, "reached", lambda self, value, moment: moment > 49)
+    monkeypatch.setattr(Plateau, "reached", lambda self, value, parts, moment: moment > 49)
     whole = trainer(scene)
     expected = [record.loss for record in whole.records()]
     first = trainer(scene)

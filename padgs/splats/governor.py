@@ -1,0 +1,74 @@
+"""Growth by need: more Gaussians only where errors are seen, and only as long as they are worth having."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from padgs.learning.stopping import quality
+from padgs.learning.targets import image_of, weight_of
+from padgs.render import RenderOptions, render
+from padgs.scene import View
+from padgs.splats.model import Splats
+
+AUTO = "auto"  # of `budget.gaussians`
+SLOPE = 0.1  # dB per doubling, below which more Gaussians are not worth having
+NOTICEABLE = 0.1  # doublings, below which a slope is noise
+ERROR = 0.02  # mean absolute error, colours in [0, 1], that is worth a Gaussian more
+SEEN = 2  # views that must show it: what one view alone shows may be a floater, which more Gaussians only fit
+LOOKED_AT = 8  # training views at most that errors are looked for in
+
+
+class Governor:
+    """Of one model.
+
+    `state` holds all that it remembers, as JSON can.
+    """
+
+    def __init__(self, views: Sequence[View], calibration: Sequence[View], backend: str) -> None:
+        """Look for errors in some of the training `views`, and measure on the `calibration` views."""
+        self._views, self._calibration, self._backend = (
+            views[:: math.ceil(len(views) / LOOKED_AT)],
+            calibration,
+            backend,
+        )
+        self.state: dict[str, Any] = {"count": None, "quality": None, "enough": False}
+
+    def candidates(self, splats: Splats, options: RenderOptions) -> Tensor:
+        """Which Gaussians [N] may multiply in a round that is due; none once they gained too little.
+
+        What was gained since the last round is what training gained, too, so growth ends late rather than early.
+        """
+        value = quality(lambda view: self._drawn(splats, view, options), self._calibration)
+        count, before, last = len(splats), self.state["quality"], self.state["count"]
+        if before is not None and abs(doublings := math.log2(count / last)) > NOTICEABLE:
+            self.state["enough"] |= value - before < SLOPE * doublings
+        self.state |= {"count": count, "quality": value}
+        if self.state["enough"]:
+            return torch.zeros(count, dtype=torch.bool, device=splats.means.device)
+        return torch.stack([self._errors(splats, view, options) > ERROR for view in self._views]).sum(0) >= SEEN
+
+    def _drawn(self, splats: Splats, view: View, options: RenderOptions) -> Any:
+        return render(splats.gaussians(view), view, options, backend=self._backend)
+
+    @torch.no_grad()
+    def _errors(self, splats: Splats, view: View, options: RenderOptions) -> Tensor:
+        """Mean absolute error [N] of the pixels that a view shows each Gaussian in, by what it contributes; else 0.
+
+        A pixel is a sum of contributions times colours, so the gradient of a weighted sum of pixels by a colour is the
+        sum of the contributions times the weights: in one channel the errors, in another one 1.
+        """
+        gaussians = splats.gaussians(view)
+        colors = gaussians.colors.requires_grad_()
+        with torch.enable_grad():
+            image = render(replace(gaussians, colors=colors), view, options, backend=self._backend).image
+        error = (image.detach().clamp(0, 1) - image_of(view, image.device)).abs().mean(-1)
+        weight = weight_of(view, "solid_angle", image.device).expand_as(error)
+        weights = torch.stack((error * weight, weight, torch.zeros_like(weight)), dim=-1)
+        (sums,) = torch.autograd.grad(image, colors, weights)
+        return sums[:, 0] / sums[:, 1].clamp(min=torch.finfo(sums.dtype).tiny)
