@@ -18,6 +18,7 @@ from padgs.splats.model import Splats
 
 AUTO = "auto"  # of `budget.gaussians`
 SLOPE = 0.1  # dB per doubling, below which more Gaussians are not worth having
+BACK = 2  # rounds that gains are taken over: after one alone the model may not have recovered from its growth
 NOTICEABLE = 0.1  # doublings, below which a slope is noise
 ERROR = 0.02  # mean absolute error, colours in [0, 1], that is worth a Gaussian more
 SEEN = 2  # views that must show it: what one view alone shows may be a floater, which more Gaussians only fit
@@ -37,18 +38,18 @@ class Governor:
             calibration,
             backend,
         )
-        self.state: dict[str, Any] = {"count": None, "quality": None, "enough": False}
+        self.state: dict[str, Any] = {"rounds": [], "enough": False}
 
     def candidates(self, splats: Splats, options: RenderOptions) -> Tensor:
         """Which Gaussians [N] may multiply in a round that is due; none once they gained too little.
 
-        What was gained since the last round is what training gained, too, so growth ends late rather than early.
+        What was gained lately is what training gained, too, so growth ends late rather than early.
         """
         value = quality(lambda view: self._drawn(splats, view, options), self._calibration)
-        count, before, last = len(splats), self.state["quality"], self.state["count"]
-        if before is not None and abs(doublings := math.log2(count / last)) > NOTICEABLE:
-            self.state["enough"] |= value - before < SLOPE * doublings
-        self.state |= {"count": count, "quality": value}
+        count, rounds = len(splats), self.state["rounds"]
+        if len(rounds) == BACK and (doublings := math.log2(count / rounds[0][0])) > NOTICEABLE:
+            self.state["enough"] |= value - rounds[0][1] < SLOPE * doublings
+        self.state["rounds"] = [*rounds, [count, value]][-BACK:]
         if self.state["enough"]:
             return torch.zeros(count, dtype=torch.bool, device=splats.means.device)
         return torch.stack([self._errors(splats, view, options) > ERROR for view in self._views]).sum(0) >= SEEN
