@@ -1,0 +1,42 @@
+"""What `budget=auto` takes of rooms of known complexity: more for more, and the same whatever points and units."""
+
+import pytest
+import torch
+
+from padgs.multirun.composition import composing, configuration
+from padgs.runs.session import build, scene_of
+
+SMALL = ("width=128", "train_views=24", "test_views=2", "samples=4")
+OBJECTS = ("scene=white_room", "objects=16")
+
+
+@pytest.fixture(scope="module")
+def taken(tmp_path_factory):
+    """Of keys of the generator: as many Gaussians as such a room took."""
+    known = {}
+
+    def count(*keys: str) -> int:
+        if keys not in known:
+            generator = [f"data.generator.{key}" for key in (*SMALL, *keys)]
+            with pytest.MonkeyPatch.context() as patch, composing():
+                patch.setenv("PADGS_CACHE", str(tmp_path_factory.getbasetemp() / "rooms"))
+                config = configuration([*generator, "budget=auto", "train.iterations=600", "tracking=none"])
+                torch.manual_seed(config.seed)
+                method, scene = build(config), scene_of(config, torch.device("cpu"))
+                known[keys] = [record.counts["gaussians"] for record in method.fit(scene, config.time)][-1]
+        return known[keys]
+
+    return count
+
+
+@pytest.mark.slow
+def test_more_objects_and_finer_checkers_take_more(taken):
+    assert 1.2 * taken("scene=white_room") < taken(*OBJECTS)
+    tiles = [taken("scene=checker_room", f"texture_frequency={frequency}") for frequency in (0.25, 0.5)]
+    assert 1.2 * taken("scene=white_room") < tiles[0] < tiles[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("change", ["points=10000", "points=40000", "world_scale=0.1", "world_scale=10"])
+def test_points_and_units_change_it_by_a_seventh_at_most(taken, change):
+    assert taken(*OBJECTS, change) == pytest.approx(taken(*OBJECTS), rel=0.15)
