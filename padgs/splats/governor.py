@@ -12,7 +12,7 @@ from torch import Tensor
 
 from padgs.learning.stopping import quality
 from padgs.learning.targets import image_of, weight_of
-from padgs.render import RenderOptions, render
+from padgs.render import Rendering, RenderOptions, render
 from padgs.scene import View
 from padgs.splats.model import Splats
 
@@ -33,11 +33,8 @@ class Governor:
 
     def __init__(self, views: Sequence[View], calibration: Sequence[View], backend: str) -> None:
         """Look for errors in some of the training `views`, and measure on the `calibration` views."""
-        self._views, self._calibration, self._backend = (
-            views[:: math.ceil(len(views) / LOOKED_AT)],
-            calibration,
-            backend,
-        )
+        self._views = views[:: math.ceil(len(views) / LOOKED_AT)]
+        self._calibration, self._backend = calibration, backend
         self.state: dict[str, Any] = {"rounds": [], "enough": False}
 
     def candidates(self, splats: Splats, options: RenderOptions) -> Tensor:
@@ -54,7 +51,7 @@ class Governor:
             return torch.zeros(count, dtype=torch.bool, device=splats.means.device)
         return torch.stack([self._errors(splats, view, options) > ERROR for view in self._views]).sum(0) >= SEEN
 
-    def _drawn(self, splats: Splats, view: View, options: RenderOptions) -> Any:
+    def _drawn(self, splats: Splats, view: View, options: RenderOptions) -> Rendering:
         return render(splats.gaussians(view), view, options, backend=self._backend)
 
     @torch.no_grad()
