@@ -154,6 +154,13 @@ def test_growth_by_need_resumes_bit_identically():
     assert_same_but_time(resumed.state(), whole.state())
 
 
+def test_growth_by_need_rehearses_a_budget_of_seconds():
+    tiny = tiny_scene()
+    scene = replace(tiny, train=(*tiny.train, *tiny.test))
+    records = PlusMethod(OPTIONS).fit(scene, Budget(1, seconds=2.0, clock="cpu", gaussians="auto", stop="auto"))
+    assert next(iter(records)).progress < 1
+
+
 def test_the_end_is_the_mean_of_the_last_states():
     states = {}
     for share in (0.0, 0.1):
