@@ -59,7 +59,9 @@ def test_without_arguments_all_values_are_the_defaults_of_the_dataclasses():
     assert config.data.path is None and config.data.generator == {"scene": "room"}
 
 
-@pytest.mark.parametrize("choice", [*files("data", "method", "render", "train", "protocol", "tracking", "budget"), *registered()])
+@pytest.mark.parametrize(
+    "choice", [*files("data", "method", "render", "train", "protocol", "tracking", "budget"), *registered()]
+)
 def test_every_choice_composes(choice):
     composed(*(["method=padgs"] if choice.startswith("render=") else []), choice)  # padgs_plus takes rays only
 

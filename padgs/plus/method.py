@@ -18,9 +18,12 @@ from padgs.plus.sky import far_gaussians
 from padgs.plus.trainee import PlusTrainee
 from padgs.render.config import RenderConfig
 from padgs.scene import Scene, View
+from padgs.splats.governor import AUTO
 from padgs.splats.method import SplatMethod, fewest
 from padgs.splats.model import Splats
 from padgs.splats.trainee import SplatTrainee
+
+START_BY_NEED = 0.29  # `start_share` at most, where growth is by need: it adds what is needed, and takes little away
 
 
 def independent_pixels(view: View) -> float:
@@ -39,6 +42,8 @@ class PlusMethod(SplatMethod):
     def _start(self, scene: Scene, iterations: int) -> SplatTrainee:
         options, pixels = self.options, independent_pixels(scene.train[0])
         start, limit = (_within(share, pixels) for share in (options.start_share, options.limit_share))
+        if self._gaussians == AUTO:
+            start = fewest(start, _within(START_BY_NEED, pixels))
         limit = fewest(options.max_gaussians, limit if self._target is None else self._target)
         splats = Splats.from_scene(
             scene,
