@@ -123,7 +123,7 @@ class Trainer:
         self._targets = Targets(scene.train, options.weight, self._optimiser.device)
         apart = set_apart(scene.train) if budget.stop == "auto" else ()
         self._calibration = [scene.train[number] for number in apart]
-        self._plateau = Plateau(budget.iterations)
+        self._plateau, self._fade = Plateau(budget.iterations), round((1 - FADE) * budget.iterations)
         self._views = ViewOrder(scene, seed, apart)
         self._order: Order = self._views
         pixels = sum(view.width * view.height for view in scene.train)
@@ -167,10 +167,9 @@ class Trainer:
 
         What would have come at moments that are left out does not come.
         """
-        until = round((1 - FADE) * self._budget.iterations)
-        if self.moment >= until:
+        if self.moment >= self._fade:
             return False
-        self.skipped, self.moment, self.ended = until - self.moment, until, why
+        self.skipped, self.moment, self.ended = self._fade - self.moment, self._fade, why
         self._views.take_all()
         if self._monitor is not None:
             self._monitor.forget()
@@ -178,7 +177,7 @@ class Trainer:
 
     def _stopped_by_itself(self) -> tuple[str, ...]:
         """Stop where the views set apart say so; when rates fade at the latest, these are trained on."""
-        if self.moment >= round((1 - FADE) * self._budget.iterations):
+        if self.moment >= self._fade:
             self._views.take_all()
         elif self._calibration and self._plateau.is_due(self.moment):
             value = quality(self._trainee.render, self._calibration)

@@ -11,10 +11,12 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from padgs.learning.targets import image_of, weight_of
 from padgs.render import Rendering
 from padgs.scene import View
+from padgs.sphere.camera import Panorama
 
 APART, FEWEST = 8, 3  # one training view of so many is set apart, but so many at least; and as many must be left
 FADE = 0.15  # share of the schedule, at its end, that a stopped run still goes through
@@ -39,14 +41,19 @@ def set_apart(views: Sequence[View]) -> tuple[int, ...]:
     return tuple(int((number + 0.5) * len(views) / count) for number in range(count))
 
 
+def even_weight(view: View, device: torch.device) -> Tensor:
+    """Weight [H, W] or [H, 1] of pixels: all directions of a panorama count alike, and all pixels of other views."""
+    return weight_of(view, "solid_angle" if isinstance(view.camera, Panorama) else "uniform", device)
+
+
 @torch.no_grad()
 def quality(render: Callable[[View], Rendering], views: Sequence[View]) -> float:
-    """Mean WS-PSNR of some views, dB, at most 100."""
+    """Mean WS-PSNR of some views, dB, at most 100; plain PSNR of views that are no panoramas."""
     total = 0.0
     for view in views:
         image = render(view).image.clamp(0, 1)
         error = (image - image_of(view, image.device)).square().mean(-1)
-        weight = weight_of(view, "solid_angle", image.device).expand_as(error)
+        weight = even_weight(view, image.device).expand_as(error)
         total -= 10 * math.log10(max(BEST, ((error * weight).sum() / weight.sum()).item()))
     return total / len(views)
 

@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from padgs.learning.stopping import quality
-from padgs.learning.targets import image_of, weight_of
+from padgs.learning.stopping import even_weight, quality
+from padgs.learning.targets import image_of
 from padgs.render import Rendering, RenderOptions, render
 from padgs.scene import View
 from padgs.splats.model import Splats
@@ -31,10 +31,10 @@ class Governor:
     `state` holds all that it remembers, as JSON can.
     """
 
-    def __init__(self, views: Sequence[View], calibration: Sequence[View], backend: str) -> None:
-        """Look for errors in some of the training `views`, and measure on the `calibration` views."""
+    def __init__(self, views: Sequence[View], judges: Sequence[View], backend: str) -> None:
+        """Look for errors in some of the training `views`, and measure on the `judges`, which are others."""
         self._views = views[:: math.ceil(len(views) / LOOKED_AT)]
-        self._calibration, self._backend = calibration, backend
+        self._judges, self._backend = judges, backend
         self.state: dict[str, Any] = {"rounds": [], "enough": False}
 
     def candidates(self, splats: Splats, options: RenderOptions) -> Tensor:
@@ -42,7 +42,7 @@ class Governor:
 
         What was gained lately is what training gained, too, so growth ends late rather than early.
         """
-        value = quality(lambda view: self._drawn(splats, view, options), self._calibration)
+        value = quality(lambda view: self._drawn(splats, view, options), self._judges)
         count, rounds = len(splats), self.state["rounds"]
         if len(rounds) == BACK and (doublings := math.log2(count / rounds[0][0])) > NOTICEABLE:
             self.state["enough"] |= value - rounds[0][1] < SLOPE * doublings
@@ -66,7 +66,7 @@ class Governor:
         with torch.enable_grad():
             image = render(replace(gaussians, colors=colors), view, options, backend=self._backend).image
         error = (image.detach().clamp(0, 1) - image_of(view, image.device)).abs().mean(-1)
-        weight = weight_of(view, "solid_angle", image.device).expand_as(error)
+        weight = even_weight(view, image.device).expand_as(error)
         weights = torch.stack((error * weight, weight, torch.zeros_like(weight)), dim=-1)
         (sums,) = torch.autograd.grad(image, colors, weights)
         return sums[:, 0] / sums[:, 1].clamp(min=torch.finfo(sums.dtype).tiny)

@@ -99,6 +99,6 @@ class SplatMethod(Method):
             views=views,
             target=self._target,
             seed=self.seed,
-            calibration=[views[number] for number in set_apart(views)] if views and self._gaussians == AUTO else (),
+            judges=[views[number] for number in set_apart(views)] if views and self._gaussians == AUTO else (),
             **more,
         )

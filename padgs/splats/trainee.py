@@ -43,12 +43,12 @@ class SplatTrainee:
         views: Sequence[View] = (),
         target: int | None = None,
         seed: int = 0,
-        calibration: Sequence[View] = (),
+        judges: Sequence[View] = (),
     ) -> None:
         """Wrap splats; `extent` is the scene's, `options` are those of a published run (see `for_run`).
 
         `views` are those of the training; without them there can be none. `target` is as `CloneSplit` has it.
-        With some `calibration` views among them, growth is that of a `Governor`.
+        With some of the views as `judges`, growth is that of a `Governor`.
         """
         self.splats, self.iterations = splats, iterations
         self._config, self._views, self._extent = config, views, extent
@@ -58,12 +58,12 @@ class SplatTrainee:
             extent=extent,
             target=target,
             drawn_opacities=self._drawn_opacities,
-            candidates=self._candidates if calibration else None,
+            candidates=self._candidates if judges else None,
             seed=seed,
         )
-        apart = {view.name for view in calibration}
+        apart = {view.name for view in judges}
         others = [view for view in views if view.name not in apart]
-        self._governor = Governor(others, calibration, config.backend) if calibration else None
+        self._governor = Governor(others, judges, config.backend) if judges else None
         self._drawn: View | None = None  # the view of the last drawing
 
     def groups(self, means_speed: float = 1.0) -> list[ParameterGroup]:

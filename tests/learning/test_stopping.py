@@ -6,9 +6,11 @@ from states import assert_same_but_time
 from tiny_scene import HEIGHT, WIDTH, tiny_scene
 from torch import Tensor
 
+from baselines import METHODS
 from padgs.learning.budget import Budget
 from padgs.learning.loop import Trainer
 from padgs.learning.stopping import FADE, Plateau, quality, set_apart
+from padgs.registry import lookup
 from padgs.render import Rendering
 from padgs.render.config import RenderConfig
 from padgs.scene import View
@@ -122,3 +124,16 @@ def test_too_few_views_to_set_any_apart_are_refused():
         Trainer(Counted(tiny_scene()), tiny_scene(), Budget(10, stop="auto"))
     with pytest.raises(ValueError, match="unknown stop 'never'; known: end, auto"):
         Budget(10, stop="never")
+
+
+@pytest.mark.parametrize("name", ["egonerf", "sc_omnigs"])
+def test_methods_that_views_set_apart_say_nothing_of_refuse_to_stop_by_themselves(name, scene):
+    with pytest.raises(ValueError, match="budget.stop is auto.*set it to end"):
+        lookup(METHODS, name, "method")().fit(scene, Budget(10, stop="auto"))
+
+
+@pytest.mark.parametrize("name", ["omnigs", "cubemap_3dgs"])
+def test_other_explicit_methods_grow_by_need_too(name, scene):
+    method = lookup(METHODS, name, "method")()
+    assert len(list(method.fit(scene, Budget(3, gaussians="auto", stop="auto")))) == 3
+    assert method.trainee.state().values["governor"] == {"rounds": [], "enough": False}
