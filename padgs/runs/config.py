@@ -69,9 +69,7 @@ class BudgetOptions:
     seconds: float | None = None  # of training: schedules follow the clock, and the run ends on time
     clock: str = "wall"  # wall | cpu: cpu counts what the process itself takes, whatever else the machine does
 
-    # That the model grows to: those that are pulled hardest multiply, up to so many. auto: only where errors are seen,
-    # and only while more are worth having; takes stop=auto.
-    gaussians: int | str | None = None
+    gaussians: int | str | None = None  # that the model grows to, by the hardest pulled; auto: no more than needed
     stop: str = "end"  # of the schedule | auto: as soon as views that are set apart gain nothing any more
 
     def __post_init__(self) -> None:
