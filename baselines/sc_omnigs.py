@@ -17,7 +17,7 @@ from torch import Tensor
 
 from padgs.calibration.align import Difference, Similarity, align
 from padgs.calibration.camera_map import CameraMap
-from padgs.calibration.poses import PoseRates, PoseRefinement
+from padgs.learning.views.poses import PoseRates, PoseRefinement
 from padgs.calibration.splats import CalibratedMethod, Calibration
 from padgs.checks import check
 from padgs.learning.loop import TrainOptions
@@ -144,6 +144,13 @@ class SCOmniGSMethod(CalibratedMethod):
         """Become the method that `state` was taken of, ready to render and to go on."""
         self._photography = None
         super().load_state(state)
+
+    def _refuse_impossible(self) -> None:
+        super()._refuse_impossible()
+        if self.train_options.poses == "learned":
+            raise ValueError(
+                "train.poses is learned, but sc_omnigs learns poses by itself; leave it at given, or take omnigs"
+            )
 
     def _as_given(self, scene: Scene) -> SelfCalibration:
         sizes = {(view.width, view.height) for view in scene.train}

@@ -1,0 +1,49 @@
+"""Exposures that learn: a gain and an offset of each colour channel for each training view, optimised with the model.
+
+As the per-image colours of URF (Rematas et al. 2022) and of the released 3DGS, but diagonal. They are relative: the mean of
+the log-gains and of the offsets over all views is 0, so that views without one, the held-out ones, have the mean one.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from padgs.learning.schedule import LogLinear, ParameterGroup
+
+RATE, RATE_END = 1e-2, 1e-4  # published iterations; of log-gains, and of offsets in colours from 0 to 1
+
+
+class Exposures(nn.Module):
+    """Of V views, by their numbers; see `padgs.learning.views.corrections.Corrections`.
+
+    Each view has parameters of its own, so that the optimiser's moments of a view rest while other views are drawn.
+
+    Attributes:
+        log_gains, offsets: V times [3], of the colour channels.
+    """
+
+    def __init__(self, views: int) -> None:
+        """No correction yet."""
+        super().__init__()
+        self.log_gains, self.offsets = (nn.ParameterList([torch.zeros(3) for _ in range(views)]) for _ in range(2))
+
+    def groups(self, iterations: int) -> list[ParameterGroup]:
+        """Learning rates for a run of `iterations`."""
+        rate = LogLinear(RATE, RATE_END, iterations)
+        return [
+            ParameterGroup("exposure_log_gains", tuple(self.log_gains), rate),
+            ParameterGroup("exposure_offsets", tuple(self.offsets), rate),
+        ]
+
+    def exposed(self, image: Tensor, index: int) -> Tensor:
+        """An image [H, W, 3] as view `index` would show it; differentiable."""
+        return image * self.log_gains[index].exp() + self.offsets[index]
+
+    @torch.no_grad()
+    def centre(self) -> None:
+        """Take the mean out again; called after each step."""
+        for of_views in (self.log_gains, self.offsets):
+            mean = torch.stack(list(of_views)).mean(0)
+            for own in of_views:
+                own -= mean
