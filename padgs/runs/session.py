@@ -119,7 +119,7 @@ class Session:
                 Interrupt(self.watch.stop_requested) as stop,
                 LiveLine(self.console) as line,
             ):
-                for record in method.fit(self.scene, config.time):
+                for record in method.fit(self.scene, config.stress.budget(config.time, self.scene)):
                     progress = Progress(record.iteration, record.seconds, record.cpu_seconds, record.progress)
                     line.update(record, self._logged(record, method))
                     stopping = stop.requested
