@@ -17,7 +17,6 @@ from torch import Tensor
 
 from padgs.calibration.align import Difference, Similarity, align
 from padgs.calibration.camera_map import CameraMap
-from padgs.learning.views.poses import PoseRates, PoseRefinement
 from padgs.calibration.splats import CalibratedMethod, Calibration
 from padgs.checks import check
 from padgs.learning.loop import TrainOptions
@@ -25,6 +24,7 @@ from padgs.learning.loss import pixel_weight
 from padgs.learning.schedule import Constant, ParameterGroup
 from padgs.learning.targets import Target
 from padgs.learning.trainee import Drawing, State
+from padgs.learning.views.poses import PoseRates, PoseRefinement
 from padgs.render import Rendering
 from padgs.scene import Scene, View
 from padgs.sphere.panorama import sample_pixels

@@ -1,4 +1,4 @@
-"""Kill `padgs-run` and `padgs report` at random moments, again and again, and see that every end is bit by bit the same.
+"""Kill `padgs-run` and `padgs report` at random moments, again and again; every end must be the same, bit by bit.
 
     python tests/kills.py 100 --seed 7
 

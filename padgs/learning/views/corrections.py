@@ -9,8 +9,8 @@ from padgs.learning.views.exposure import Exposures
 from padgs.learning.views.poses import SMALL, PoseRefinement
 from padgs.scene import Scene, View
 
-EXPOSURES = ("given", "learned")
-POSES = ("given", "learned")
+GIVEN, LEARNED = "given", "learned"
+CHOICES = (GIVEN, LEARNED)  # of exposures, and of poses
 
 
 class Corrections(nn.Module):

@@ -1,7 +1,7 @@
-"""Exposures that learn: a gain and an offset of each colour channel for each training view, optimised with the model.
+"""Exposures that learn: gain and offset of each colour channel for each training view, optimised with the model.
 
-As the per-image colours of URF (Rematas et al. 2022) and of the released 3DGS, but diagonal. They are relative: the mean of
-the log-gains and of the offsets over all views is 0, so that views without one, the held-out ones, have the mean one.
+As the affine colours per image of URF (Rematas et al. 2022), but diagonal. They are relative: log-gains and offsets have
+a mean of 0 over all views, so that views without any, the held-out ones, have the mean exposure.
 """
 
 from __future__ import annotations
