@@ -27,7 +27,7 @@ from padgs.learning.order import Order, ViewOrder
 from padgs.learning.schedule import LEARNING_RATES, Pace
 from padgs.learning.targets import Targets
 from padgs.learning.trainee import MODEL, State, Trainee
-from padgs.learning.views.corrections import EXPOSURES, POSES, Corrections
+from padgs.learning.views.corrections import CHOICES, GIVEN, LEARNED, Corrections
 from padgs.scene import Scene
 from padgs.stopwatch import Lap
 
@@ -60,12 +60,12 @@ class TrainOptions:
     learning_rates: str | float = "run"
     check_every: int = 50  # iterations between checks of all gradients and parameters; the loss is checked at each
     monitor: bool = True  # end a run that diverges, explodes, collapses or falls silent: see `padgs.learning.monitor`
-    exposures: str = "given"  # learned: a gain and offset of each training view; test views have the mean one
-    poses: str = "given"  # learned: a small correction of each training view; test views stay where they are
+    exposures: str = GIVEN  # learned: a gain and offset of each training view; test views have the mean one
+    poses: str = GIVEN  # learned: a small correction of each training view; test views stay where they are
 
     def __post_init__(self) -> None:
         check(self, "in [0, 1]", lambda share: 0 <= share <= 1, "lambda_l1")
-        check_known(self, weight=ROW_WEIGHTS, normalisation=NORMALISATIONS, exposures=EXPOSURES, poses=POSES)
+        check_known(self, weight=ROW_WEIGHTS, normalisation=NORMALISATIONS, exposures=CHOICES, poses=CHOICES)
         if isinstance(self.learning_rates, str):
             check_known(self, learning_rates=LEARNING_RATES)
         else:
@@ -114,9 +114,8 @@ class Trainer:
         self.start = next(iter(trainee.counts().values()))
         self._trainee, self._scene, self._budget, self._options, self._stage = trainee, scene, budget, options, stage
         self._views_each = views_each
-        self._corrections = Corrections(
-            scene, exposures=options.exposures == "learned", poses=options.poses == "learned"
-        )
+        learned = {name: getattr(options, name) == LEARNED for name in ("exposures", "poses")}
+        self._corrections = Corrections(scene, **learned)
         groups = trainee.groups()
         self._corrections.to(groups[0].parameters[0].device)
         groups = [*groups, *self._corrections.groups(budget.iterations)]
