@@ -75,6 +75,8 @@ def content(folder: Path) -> dict[str, object]:
         name = str(path.relative_to(folder))
         if not path.is_file() or "multirun" in name or path.suffix == ".lock" or path.parent.name == "checkpoint":
             continue
+        if path.name.startswith("."):  # what a kill left half-written beside the file it was to become
+            continue
         if path.name == "log.jsonl":
             found[name] = TIMES.sub("", path.read_text())
         elif path.name == results.FILE_NAME:

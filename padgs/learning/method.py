@@ -161,7 +161,7 @@ class Method(ABC):
         """Refuse what no scene could be trained or drawn with; subclasses know more."""
         check_camera(Panorama(8, 4), self.render_config.options(scene_unit=1.0))
 
-    def refuse_budget(self, budget: Budget) -> None:
+    def refuse_budget(self, budget: Budget) -> None:  # noqa: B027 - most can train with any
         """Refuse what cannot be trained for so long, or so large, on any scene; subclasses know more.
 
         Raises:

@@ -1,7 +1,7 @@
 """Exposures that learn: gain and offset of each colour channel for each training view, optimised with the model.
 
-As the affine colours per image of URF (Rematas et al. 2022), but diagonal. They are relative: log-gains and offsets have
-a mean of 0 over all views, so that views without any, the held-out ones, have the mean exposure.
+As the affine colours per image of URF (Rematas et al. 2022), but diagonal. They are relative: log-gains and offsets
+have a mean of 0 over all views, so that views without any, the held-out ones, have the mean exposure.
 """
 
 from __future__ import annotations
