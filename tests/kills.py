@@ -116,7 +116,8 @@ def hammered(kills: int, seed: int, place: Path) -> Counter[str]:
         work.finish(folder)
         if (there := content(folder)) != expected[work.name]:
             names = [n for n in {*there, *expected[work.name]} if there.get(n) != expected[work.name].get(n)]
-            raise AssertionError(f"{work.name} in {folder} differs in {', '.join(sorted(names))}")
+            said = (folder.parent / f"{folder.name}.said").read_text()[-4000:]
+            raise AssertionError(f"{work.name} in {folder} differs in {', '.join(sorted(names))}; it said: {said}")
         shutil.rmtree(folder)
         counts[f"{work.name} ended alike"] += 1
 
@@ -141,10 +142,11 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
     torch.set_num_threads(1)
-    with tempfile.TemporaryDirectory() as folder:
-        os.environ["PADGS_CACHE"] = f"{folder}/cache"
-        for name, count in sorted(hammered(asked.kills, asked.seed, Path(folder)).items()):
-            print(f"{name}: {count}")
+    folder = tempfile.mkdtemp(prefix="padgs-kills-")  # stays where something differs
+    os.environ["PADGS_CACHE"] = f"{folder}/cache"
+    for name, count in sorted(hammered(asked.kills, asked.seed, Path(folder)).items()):
+        print(f"{name}: {count}")
+    shutil.rmtree(folder)
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ class Corrections(nn.Module):
 
     def groups(self, iterations: int) -> list[ParameterGroup]:
         """All parameters, with their learning rates in a run of `iterations`."""
-        exposures = [] if self.exposures is None else self.exposures.groups(iterations)
+        exposures = [] if self.exposures is None else self.exposures.groups()
         return exposures + ([] if self.poses is None else self.poses.groups(SMALL, iterations))
 
     def posed(self, view: View) -> View:

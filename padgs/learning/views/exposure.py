@@ -9,9 +9,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from padgs.learning.schedule import LogLinear, ParameterGroup
+from padgs.learning.schedule import Constant, ParameterGroup
 
-RATE, RATE_END = 1e-2, 1e-4  # published iterations; of log-gains, and of offsets in colours from 0 to 1
+RATE = 3e-3  # of log-gains; they follow the model to the end, for what is frozen early is wrong
+OFFSET_RATE = RATE / 5  # of offsets, in colours from 0 to 1
 
 
 class Exposures(nn.Module):
@@ -28,12 +29,11 @@ class Exposures(nn.Module):
         super().__init__()
         self.log_gains, self.offsets = (nn.ParameterList([torch.zeros(3) for _ in range(views)]) for _ in range(2))
 
-    def groups(self, iterations: int) -> list[ParameterGroup]:
-        """Learning rates for a run of `iterations`."""
-        rate = LogLinear(RATE, RATE_END, iterations)
+    def groups(self) -> list[ParameterGroup]:
+        """Learning rates, the same in all of a run."""
         return [
-            ParameterGroup("exposure_log_gains", tuple(self.log_gains), rate),
-            ParameterGroup("exposure_offsets", tuple(self.offsets), rate),
+            ParameterGroup("exposure_log_gains", tuple(self.log_gains), Constant(RATE)),
+            ParameterGroup("exposure_offsets", tuple(self.offsets), Constant(OFFSET_RATE)),
         ]
 
     def exposed(self, image: Tensor, index: int) -> Tensor:
