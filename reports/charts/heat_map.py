@@ -77,9 +77,9 @@ def _worst_picture(runs: DataFrame) -> str | None:
     """Where the picture of the view with the lowest PSNR is, of all runs of a cell; None where there is none."""
     shown = [
         (psnr, path)
-        for _, run in runs.iterrows()
-        for name, psnr in run["view_psnr"].items()
-        if run["pictures"] is not None and psnr is not None and (path := run["pictures"] / name).is_file()
+        for folder, psnrs in zip(runs["pictures"], runs["view_psnr"], strict=True)
+        for name, psnr in psnrs.items()
+        if folder is not None and (path := folder / name).is_file()
     ]
     return min(shown)[1].resolve().as_uri() if shown else None
 

@@ -1,19 +1,25 @@
 """What training learns of its views, in whole methods."""
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 from composed import composed
 from states import assert_same_but_time
-from tiny_scene import tiny_scene
+from tiny_scene import tiny_scene, truth
+from torch import nn
 
 from baselines.omnigs import OmniGSMethod
 from padgs.learning.budget import Budget
-from padgs.learning.loop import TrainOptions
-from padgs.scene import Scene
-from padgs.scoring.metrics import psnr
+from padgs.learning.loop import Trainer, TrainOptions
+from padgs.learning.schedule import Constant, ParameterGroup
+from padgs.learning.trainee import Drawing
+from padgs.learning.views.corrections import Corrections
+from padgs.render import RenderOptions, render
+from padgs.scene import Scene, View
 from padgs.stress.options import StressOptions
+from padgs.stress.pictures import repainted
 
 GIVEN = TrainOptions(weight="uniform")
 LEARNING = replace(GIVEN, exposures="learned", poses="learned")
@@ -34,23 +40,67 @@ def trained(scene: Scene, train: TrainOptions, iterations: int = 150) -> OmniGSM
     return method
 
 
-def quality(method: OmniGSMethod) -> float:
-    view = tiny_scene().test[0]
-    return float(psnr(method.render(view).image, view.image()))
+class Truth:
+    """A trainee that knows the scene and learns nothing, so that only corrections of views are left to learn."""
+
+    def __init__(self) -> None:
+        self.unused = nn.Parameter(torch.zeros(1))
+
+    def groups(self) -> list[ParameterGroup]:
+        return [ParameterGroup("unused", (self.unused,), Constant(0.0))]
+
+    def draw(self, view: View) -> Drawing:
+        probe = torch.zeros(8, 2, requires_grad=True)
+        rendering = render(truth(), view, RenderOptions(), probe=probe)
+        return Drawing(rendering, probe, truth(), torch.arange(8))
+
+    def observe(self, drawing: Drawing, iteration: int) -> None: ...
+
+    def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
+        return ()
+
+    def counts(self) -> dict[str, int]:
+        return {"gaussians": 8}
 
 
-@pytest.mark.parametrize(("condition", "part"), [("exposure", "exposures"), ("pose_noise", "poses")])
-def test_learning_what_is_wrong_with_the_views_saves_the_model(condition, part):
-    scene = stressed(condition)
-    given, learned = (quality(trained(scene, replace(GIVEN, **{part: how}))) for how in ("given", "learned"))
-    assert learned > given + 1
+def corrected(scene: Scene, train: TrainOptions, iterations: int = 250) -> Corrections:
+    run = Trainer(Truth(), scene, Budget(iterations), train, seed=0)
+    list(run.records())
+    return run._corrections
+
+
+def test_exposures_that_differ_are_found_but_for_their_mean():
+    stops = torch.tensor([-0.3, 0.1, 0.2, 0.0, -0.2])
+    views = tuple(
+        repainted(view, lambda pixels, stop=stop: (pixels * 2**stop).clamp(0, 255).to(torch.uint8))
+        for view, stop in zip(tiny_scene().train, stops, strict=True)
+    )
+    scene = replace(tiny_scene(), train=views)
+    exposures = corrected(scene, replace(GIVEN, exposures="learned")).exposures
+    found = torch.stack(list(exposures.log_gains)).mean(1) / math.log(2)
+    torch.testing.assert_close(found, stops - stops.mean(), atol=0.1, rtol=0)
+
+
+def test_poses_that_are_off_are_mended():
+    exact = torch.stack([view.center for view in tiny_scene().train])
+    scene = stressed("pose_noise")
+    poses = corrected(scene, replace(GIVEN, poses="learned")).poses
+
+    def off(centers: torch.Tensor) -> float:
+        """How far centres are off, but for their mean."""
+        moved = centers - exact
+        return (moved - moved.mean(0)).norm(dim=1).mean().item()
+
+    found = poses.poses()
+    before = off(torch.stack([view.center for view in scene.train]))
+    assert off(-(found[:, :3, :3].mT @ found[:, :3, 3:])[..., 0]) < 0.5 * before
 
 
 def test_held_out_views_have_the_mean_exposure():
     state = trained(stressed("exposure"), LEARNING, 10).state()
     for name in ("log_gains", "offsets"):
         own = torch.stack(list(state.under(f"views/exposures.{name}.").values()))
-        assert own.abs().max() > 0.01 and own.mean(0).abs().max() < 1e-6
+        assert own.abs().max() > 1e-3 and own.mean(0).abs().max() < 1e-6
 
 
 def test_going_on_changes_nothing():
