@@ -27,7 +27,7 @@ from padgs.tracking.tracker import TrackingOptions
 
 RETRIES = ("none", "failed")
 IMAGES_ON = ("device", "cpu")
-LATER = {"exposures": "given", "poses": "given"}  # keys of `train` that older runs do not have, with what those did
+LATER = ("exposures", "poses")  # keys of `train` that older runs do not have; they did what is the default
 
 
 @dataclass(frozen=True)
@@ -171,7 +171,8 @@ class RunConfig(Settings):
         Stress, a budget and what is learned of views are there only if there are any: ids of runs without are what they
         were before.
         """
-        train = {key: value for key, value in asdict(self.train).items() if key not in LATER or value != LATER[key]}
+        usual = asdict(TrainConfig())
+        train = {key: value for key, value in asdict(self.train).items() if key not in LATER or value != usual[key]}
         stress = {"stress": asdict(self.stress)} if self.stress.title else {}
         return {
             **({"budget": budget} if (budget := self.budget.asked()) else {}),
