@@ -40,9 +40,14 @@ class EgoNeRFMethod(Method):
     Options = EgoNeRFMethodOptions
     TRAIN = TrainOptions(weight="uniform", learning_rates="published")
 
+    def refuse_budget(self, budget: Budget) -> None:
+        """There are no Gaussians, and a pretraining that must end."""
+        if budget.gaussians is not None:
+            raise ValueError(f"budget.gaussians is {budget.gaussians}, but EgoNeRF has no Gaussians; leave it out")
+        if budget.seconds is None:  # else the length is known when it is rehearsed
+            self.options.refuse_length(budget.iterations)
+
     def _start(self, scene: Scene, iterations: int) -> EgoNeRFTrainee:
-        if self._gaussians is not None:
-            raise ValueError(f"budget.gaussians is {self._gaussians}, but EgoNeRF has no Gaussians; leave it out")
         return EgoNeRFTrainee(EgoNeRF.from_scene(scene, self.options, self.seed), self.options, iterations)
 
     def _blank(self, state: State) -> EgoNeRFTrainee:

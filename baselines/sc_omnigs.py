@@ -17,7 +17,6 @@ from torch import Tensor
 
 from padgs.calibration.align import Difference, Similarity, align
 from padgs.calibration.camera_map import CameraMap
-from padgs.calibration.poses import PoseRates, PoseRefinement
 from padgs.calibration.splats import CalibratedMethod, Calibration
 from padgs.checks import check
 from padgs.learning.loop import TrainOptions
@@ -25,6 +24,7 @@ from padgs.learning.loss import pixel_weight
 from padgs.learning.schedule import Constant, ParameterGroup
 from padgs.learning.targets import Target
 from padgs.learning.trainee import Drawing, State
+from padgs.learning.views.poses import PoseRates, PoseRefinement
 from padgs.render import Rendering
 from padgs.scene import Scene, View
 from padgs.sphere.panorama import sample_pixels
@@ -144,6 +144,13 @@ class SCOmniGSMethod(CalibratedMethod):
         """Become the method that `state` was taken of, ready to render and to go on."""
         self._photography = None
         super().load_state(state)
+
+    def _refuse_impossible(self) -> None:
+        super()._refuse_impossible()
+        if self.train_options.poses == "learned":
+            raise ValueError(
+                "train.poses is learned, but sc_omnigs learns poses by itself; leave it at given, or take omnigs"
+            )
 
     def _as_given(self, scene: Scene) -> SelfCalibration:
         sizes = {(view.width, view.height) for view in scene.train}

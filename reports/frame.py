@@ -161,10 +161,10 @@ def _learning_rates(result: Result) -> Any:
 
 
 def _view_psnr(scores: Mapping[str, Scores]) -> dict[str, float]:
-    """File name of a picture -> PSNR of the view, by the first protocol that has one."""
+    """File name of a picture -> PSNR of the view, by the first protocol that has one; weighted, if it has no other."""
     found: dict[str, float] = {}
     for view, numbers in (pair for one in scores.values() for pair in one.views.items()):
-        if (psnr := numbers.get("psnr")) is not None:
+        if (psnr := numbers.get("psnr", numbers.get("ws_psnr"))) is not None:
             found.setdefault(picture_name(view), psnr)
     return found
 

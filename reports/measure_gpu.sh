@@ -29,7 +29,7 @@ build() {
 bench() {
   full=--full
   if [ "${FULL:-1}" = 0 ]; then full=--no-full; fi
-  $python -c 'from padgs.cli.app import app; app()' bench --device cuda $full --out "$out"
+  $python -c 'from padgs.cli.app import main; main()' bench --device cuda $full --out "$out"
 }
 tests() { $python -m pytest -q -m cuda tests/render --junitxml="$out/tests.xml"; }
 sanitizer() {

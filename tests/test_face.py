@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 import padgs
-from padgs.cli.app import app
+from padgs.cli.commands import app
 
 
 def test_everything_offered_is_there():

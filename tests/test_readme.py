@@ -13,7 +13,7 @@ import pytest
 from composed import first_and_last_job
 from typer.main import get_command
 
-from padgs.cli.app import app
+from padgs.cli.commands import app
 from padgs.multirun.launchers import missing_plugin
 
 ROOT = Path(__file__).resolve().parent.parent

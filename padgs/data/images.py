@@ -92,10 +92,11 @@ def _decode(file: BytesIO, path: Path, mode: str) -> NDArray[np.uint8]:
             image.load()
             transparent = mode == "RGB" and "A" in image.getbands() and np.asarray(image.getchannel("A")).min() < 255
             pixels = np.array(_eight_bit(image).convert(mode))
-            if _misses_pixels(image, file.getvalue(), pixels):
-                raise DataError(f"{path} is cut short, although it has an end marker; copy it again or remove it")
+            cut = _misses_pixels(image, file.getvalue(), pixels)
     except (OSError, SyntaxError, ValueError) as error:
         raise DataError(f"{path} is cut short or damaged ({error}); copy it again or remove it") from error
+    if cut:
+        raise DataError(f"{path} is cut short, although it has an end marker; copy it again or remove it")
     if transparent:
         raise DataError(
             f"{path} has transparent pixels; save it without alpha and say which pixels to ignore in a mask "

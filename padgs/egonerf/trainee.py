@@ -39,6 +39,14 @@ class EgoNeRFTraining:
         check(self, "> 0", lambda rate: rate > 0, *rates)
         check(self, ">= 0", lambda weight: weight >= 0, "density_variation", "appearance_variation")
 
+    def refuse_length(self, iterations: int) -> None:
+        """Raise ValueError where pretraining leaves no iteration for the rest."""
+        if self.environment_pretraining >= iterations:
+            raise ValueError(
+                f"environment_pretraining is {self.environment_pretraining} of {iterations} iterations, which leaves "
+                "none for the grids; train longer, or lower it"
+            )
+
 
 class EgoNeRFTrainee:
     """An EgoNeRF with the schedule of a run, as `padgs.egonerf.ray_trainer` wants it."""
@@ -50,12 +58,8 @@ class EgoNeRFTrainee:
             ValueError: pretraining leaves no iteration for the rest, or there is no environment to be trained.
         """
         self.model, self._options, self._iterations = model, options, iterations
+        options.refuse_length(iterations)
         alone = options.environment_pretraining
-        if alone >= iterations:
-            raise ValueError(
-                f"environment_pretraining is {alone} of {iterations} iterations, which leaves none for the grids; "
-                "train longer, or lower it"
-            )
         if alone and model.environment is None:
             raise ValueError(
                 f"environment_pretraining is {alone}, but {model.kind}s there is no environment; set "

@@ -28,9 +28,11 @@ from padgs.learning.schedule import LEARNING_RATES, Pace
 from padgs.learning.stopping import FADE, GAIN, PATIENCE, Plateau, quality, set_apart
 from padgs.learning.targets import Targets
 from padgs.learning.trainee import MODEL, State, Trainee
+from padgs.learning.views.corrections import CHOICES, GIVEN, LEARNED, Corrections
 from padgs.scene import Scene
 from padgs.stopwatch import Lap
 
+VIEWS = "views/"  # prefix of the corrections of views in the state of a trainer
 Stage = Callable[[str], AbstractContextManager[object]]  # entered with the name of each part of an iteration
 
 
@@ -59,10 +61,12 @@ class TrainOptions:
     learning_rates: str | float = "run"
     check_every: int = 50  # iterations between checks of all gradients and parameters; the loss is checked at each
     monitor: bool = True  # end a run that diverges, explodes, collapses or falls silent: see `padgs.learning.monitor`
+    exposures: str = GIVEN  # learned: a gain and offset of each training view; test views have the mean one
+    poses: str = GIVEN  # learned: a small correction of each training view; test views stay where they are
 
     def __post_init__(self) -> None:
         check(self, "in [0, 1]", lambda share: 0 <= share <= 1, "lambda_l1")
-        check_known(self, weight=ROW_WEIGHTS, normalisation=NORMALISATIONS)
+        check_known(self, weight=ROW_WEIGHTS, normalisation=NORMALISATIONS, exposures=CHOICES, poses=CHOICES)
         if isinstance(self.learning_rates, str):
             check_known(self, learning_rates=LEARNING_RATES)
         else:
@@ -119,7 +123,12 @@ class Trainer:
         self.start = next(iter(trainee.counts().values()))
         self._trainee, self._scene, self._budget, self._options, self._stage = trainee, scene, budget, options, stage
         self._views_each = views_each
-        self._optimiser = Optimiser(trainee.groups(), self._pace(1, 1), options.check_every, **self.ADAM)
+        learned = {name: getattr(options, name) == LEARNED for name in ("exposures", "poses")}
+        self._corrections = Corrections(scene, **learned)
+        groups = trainee.groups()
+        self._corrections.to(groups[0].parameters[0].device)
+        groups = [*groups, *self._corrections.groups(budget.iterations)]
+        self._optimiser = Optimiser(groups, self._pace(1, 1), options.check_every, **self.ADAM)
         self._targets = Targets(scene.train, options.weight, self._optimiser.device)
         apart = set_apart(scene.train) if budget.stop == "auto" else ()
         self._calibration = [scene.train[number] for number in apart]
@@ -208,6 +217,7 @@ class Trainer:
         optimiser.pace = self._pace(iteration, moment)
         with stage("optimiser"):
             optimiser.step(moment)
+            self._corrections.centre()
         with stage("adapt"), torch.no_grad():
             passed = range(self.moment + 1, moment + 1)  # all that comes at a moment of the schedule comes once
             events = tuple(event for one in passed for event in trainee.adapt(one, optimiser.adam))
@@ -231,8 +241,8 @@ class Trainer:
             self._scene.train[self._views.upcoming()].prefetch()
             target = self._targets[index]
         with stage("draw"):
-            drawing = trainee.draw(self._scene.train[index])
-            image = drawing.rendering.image
+            drawing = trainee.draw(self._corrections.posed(self._scene.train[index]))
+            image = self._corrections.exposed(drawing.rendering.image, index)
         if len(drawing.gaussians) == 0:
             optimiser.refuse_non_finite(optimiser.parameters(), iteration)  # a NaN shows nothing either
             raise Failure("collapsed", f"no Gaussian is left to draw at iteration {iteration}")
@@ -271,6 +281,7 @@ class Trainer:
         """Copies of model, optimiser, statistics, random state and data order; to be taken between two records."""
         model, order = self._trainee.state(), self._order.state()
         tensors = {f"{MODEL}{name}": tensor for name, tensor in model.tensors.items()}
+        tensors |= {f"{VIEWS}{name}": tensor for name, tensor in self._corrections.state_dict().items()}
         tensors |= self._optimiser.tensors() | {"random/torch": torch.get_rng_state()} | order.tensors
         values = {"model": model.values, **{name: getattr(self, name) for name in self.PROGRESS}, **order.values}
         if self._monitor is not None:
@@ -287,6 +298,7 @@ class Trainer:
         """
         self._order.load(state)
         self._trainee.load_state(state.of_model())
+        self._corrections.load_state_dict(state.under(VIEWS))
         self._optimiser.load(state)
         torch.set_rng_state(state.tensors["random/torch"].cpu())
         before = {"moment": state.values["iteration"], "schedule": self.schedule, "step_seconds": 0.0}

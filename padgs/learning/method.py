@@ -78,6 +78,7 @@ class Method(ABC):
         """
         if not scene.train:
             raise ValueError(f"scene {scene.name!r} has no training view; mend its split")
+        self.refuse_budget(budget)
         self._gaussians = budget.gaussians
         spent = {"seconds": 0.0, "cpu_seconds": 0.0}
         if budget.seconds is not None:
@@ -169,6 +170,13 @@ class Method(ABC):
     def _refuse_impossible(self) -> None:
         """Refuse what no scene could be trained or drawn with; subclasses know more."""
         check_camera(Panorama(8, 4), self.render_config.options(scene_unit=1.0))
+
+    def refuse_budget(self, budget: Budget) -> None:  # noqa: B027 - most can train with any
+        """Refuse what cannot be trained for so long, or so large, on any scene; subclasses know more.
+
+        Raises:
+            ValueError: this budget is nothing for these options.
+        """
 
     @abstractmethod
     def _start(self, scene: Scene, iterations: int) -> Trainee:

@@ -104,6 +104,12 @@ class Search:
 
     def _resumed(self) -> Prunable:
         """The model of the run."""
+        train = self.run.config.train
+        if "learned" in (train.exposures, train.poses):
+            raise ValueError(
+                f"the run has train.exposures={train.exposures} and train.poses={train.poses}, so photographs cannot "
+                "be compared with what its model shows; take a run with both given"
+            )
         model = self.run.method.resumed(self.run.scene, self._schedule)
         if not isinstance(model, Prunable):
             raise ValueError(

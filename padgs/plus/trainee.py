@@ -49,7 +49,7 @@ class PlusTrainee(SplatTrainee):
         if self.options.size_weight == 0:
             return drawing
         means = drawing.gaussians.means.detach()
-        distances = (means - view.center.to(means)).norm(dim=-1).clamp(min=self.render_options(view).near)
+        distances = (means - view.center.detach().to(means)).norm(dim=-1).clamp(min=self.render_options(view).near)
         size = (drawing.gaussians.scales / distances[:, None]).mean()
         return replace(drawing, penalty=self.options.size_weight * size)
 

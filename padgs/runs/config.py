@@ -27,6 +27,7 @@ from padgs.tracking.tracker import TrackingOptions
 
 RETRIES = ("none", "failed")
 IMAGES_ON = ("device", "cpu")
+LATER = ("exposures", "poses")  # keys of `train` that older runs do not have; they did what is the default
 
 
 @dataclass(frozen=True)
@@ -170,15 +171,18 @@ class RunConfig(Settings):
     def values(self) -> dict[str, Any]:
         """The configuration of a run as plain values in the shape of the YAML files, defaults included.
 
-        Stress and a budget are there only if there are any: ids of runs without are what they were before.
+        Stress, a budget and what is learned of views are there only if there are any: ids of runs without are what they
+        were before.
         """
+        usual = asdict(TrainConfig())
+        train = {key: value for key, value in asdict(self.train).items() if key not in LATER or value != usual[key]}
         stress = {"stress": asdict(self.stress)} if self.stress.title else {}
         return {
             **({"budget": budget} if (budget := self.budget.asked()) else {}),
             "data": asdict(self.data),
             "method": {"name": self.method, **asdict(self.options)},
             "render": asdict(self.render),
-            "train": asdict(self.train),
+            "train": train,
             "protocol": {name: asdict(protocol) for name, protocol in self.protocols.items()},
             "run": asdict(self.run),
             **stress,
@@ -208,13 +212,15 @@ def config_from_values(values: Mapping[str, Any], labels: Labels = Labels()) -> 
     try:
         kind = lookup(METHODS, name, "method")
         options = typed(kind.Options, method, "method")
-        kind(options, settings.render, settings.train, settings.seed)  # refuses what goes together in no scene
+        made = kind(options, settings.render, settings.train, settings.seed)  # refuses what goes together in no scene
         rules = {key: _protocol(key, _group(protocols, key, "protocol.")) for key in protocols}
+        config = RunConfig(**vars(settings), method=name, options=options, protocols=rules, labels=labels)
+        made.refuse_budget(config.time)
     except ValueError as error:
         raise ConfigError(str(error)) from error
     if not rules:
         raise ConfigError(f"protocol is empty; name at least one of {', '.join(PROTOCOLS)}")
-    return RunConfig(**vars(settings), method=name, options=options, protocols=rules, labels=labels)
+    return config
 
 
 def _group(values: Mapping[str, Any], key: str, where: str = "") -> Mapping[str, Any]:

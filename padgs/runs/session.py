@@ -121,7 +121,7 @@ class Session:
                 Interrupt(folder.stop.exists, ENOUGH) as enough,
                 LiveLine(self.console) as line,
             ):
-                for record in method.fit(self.scene, config.time):
+                for record in method.fit(self.scene, config.stress.budget(config.time, self.scene)):
                     progress = Progress(record.iteration, record.seconds, record.cpu_seconds, record.progress)
                     line.update(record, self._logged(record, method))
                     stopping = stop.requested

@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from padgs.learning.budget import Budget
 from padgs.learning.schedule import Pace
 from padgs.scene import Scene
 from padgs.stress import clouds, pictures, worlds
@@ -20,13 +21,14 @@ T = TypeVar("T", bound=Any)
 class Condition:
     """One way in which a capture or its training is out of the ordinary.
 
-    Exactly one of `scene` and `training` is what it does, given the value of a level.
+    Exactly one of `scene`, `training` and `budget` is what it does, given the value of a level.
     """
 
     what: str  # with {} for the value of the level
     levels: tuple[Any, Any, Any]
     scene: Callable[[Scene, Any, np.random.Generator], Scene] | None = None
     training: Callable[[Any, Any], Any] | None = None  # (a `TrainConfig`, value) -> another one
+    budget: Callable[[Budget, Scene, Any], Budget] | None = None
 
     def says(self, level: int) -> str:
         """What it is at a level from 1 to 3."""
@@ -44,11 +46,18 @@ def faster(train: T, factor: float) -> T:
     return replace(train, learning_rates=factor * Pace.of(train.learning_rates, train.iterations).factor)
 
 
+def capped(budget: Budget, scene: Scene, share: float) -> Budget:
+    """The same budget, for a model of at most that share of the pixels of a training view."""
+    view = scene.train[0]
+    return replace(budget, gaussians=max(1, round(share * view.width * view.height)))
+
+
 CONDITIONS: Mapping[str, Condition] = {
     "world_rotation": Condition("the world is turned by {} degrees about a tilted axis", (15, 45, 90), worlds.turned),
     "seam": Condition("all cameras turn about their vertical by {} degrees", (90, 180, None), pictures.rolled),
     "pitch": Condition("all cameras look down by {} degrees", (30, 60, 90), pictures.pitched),
     "world_scale": Condition("all lengths are {} times what they were", (0.1, 10, 100), worlds.scaled),
+    "world_offset": Condition("the world is {:g} units away from its origin", (1e2, 1e4, 1e6), worlds.moved_away),
     "near_points": Condition("{:.0%} of the points hang before the cameras", (0.01, 0.05, 0.1), clouds.in_the_face),
     "few_points": Condition("{:.1%} of the points are left", (0.1, 0.01, 0.001), clouds.sparse),
     "random_points": Condition("the points are random: {}", ("box", "sphere", "shell"), clouds.made_up),
@@ -60,6 +69,7 @@ CONDITIONS: Mapping[str, Condition] = {
     "exposure": Condition("training views are up to {} stops off", (0.25, 0.5, 1.0), pictures.exposed),
     "nadir": Condition("somebody hides the lowest {:.0%} of the rows", (0.03, 0.06, 0.15), pictures.accompanied),
     "resolution": Condition("training views have 1/{} of the pixels on a side", (2, 4, 8), pictures.shrunk),
+    "capacity": Condition("there may be {:.0%} as many Gaussians as pixels of a view", (0.5, 0.2, 0.05), budget=capped),
     "schedule": Condition("training is {} times as long", (2, 4, 8), training=longer),
     "learning_rates": Condition("all learning rates are {} times as large", (3, 10, 30), training=faster),
     "jpeg": Condition("training views are JPEGs of quality {}", (90, 70, 40), pictures.compressed),

@@ -9,6 +9,7 @@ from typing import TypeVar
 import numpy as np
 
 from padgs.checks import check_known
+from padgs.learning.budget import Budget
 from padgs.scene import Scene
 from padgs.stress.conditions import CONDITIONS, LEVELS, Condition
 
@@ -60,3 +61,10 @@ class StressOptions:
         if condition is None or condition.training is None:
             return train
         return condition.training(train, condition.levels[self.level - 1])
+
+    def budget(self, budget: Budget, scene: Scene) -> Budget:
+        """What training may take under the condition."""
+        condition = self._condition
+        if condition is None or condition.budget is None:
+            return budget
+        return condition.budget(budget, scene, condition.levels[self.level - 1])

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from padgs.scene import Scene, View
 
+DIAGONAL = (math.sqrt(0.5), math.sqrt(0.5), 0.0)  # along the ground, where north and east are
 TILTING_AXIS = (math.sqrt(0.5), math.sqrt(0.5), 0.0)  # a turn about it puts neither z nor y where it was
 
 
@@ -42,6 +43,19 @@ def scaled(scene: Scene, factor: float, random: np.random.Generator) -> Scene:
         return replace(view, cam_from_world=moved, load_depth=None if load is None else lambda: load() * factor)
 
     return replace(of_all(scene, pose), points=scene.points * factor)
+
+
+def moved_away(scene: Scene, units: float, random: np.random.Generator) -> Scene:
+    """The whole world so many units of the scene away from the origin, as georeferenced captures are."""
+    offset = units * scene.unit * torch.tensor(DIAGONAL, dtype=torch.float64)
+
+    def pose(view: View) -> View:
+        moved = view.cam_from_world.clone()
+        moved[:3, 3] -= moved[:3, :3] @ offset.to(moved)
+        return replace(view, cam_from_world=moved)
+
+    points = scene.points.double() + offset.to(scene.points.device)
+    return replace(of_all(scene, pose), points=points.to(scene.points.dtype))
 
 
 def shaken(scene: Scene, share: float, random: np.random.Generator) -> Scene:

@@ -35,12 +35,14 @@ def chart(title: str, survivors: Sequence[Survivor]) -> Chart:
     stresses = in_order(survivors)
     made, axes = figure(1, 1, LABELS[0] + WIDTH * len(stresses), LABELS[1] + HEIGHT * len(survivors))
     own, tips = axes[0][0], Tips()
-    rows = []
+    rows, pictured = [], False
     for row, one in enumerate(survivors):
         for column, stress in enumerate(stresses):
             cell = one.retention.get(stress)
             if cell is not None:
-                _draw(own, column, row, cell, tips.add(_said(one, stress, cell)))
+                picture = _worst_picture(one.runs[stress])
+                pictured = pictured or picture is not None
+                _draw(own, column, row, cell, tips.add(_said(one, stress, cell)), picture)
                 rows.append(
                     {"scene": title, "preset": one.preset, "condition": stress[0], "level": stress[1], **cell.numbers}
                 )
@@ -63,17 +65,34 @@ def chart(title: str, survivors: Sequence[Survivor]) -> Chart:
     lay_out(made, f"What methods keep under stress\n{title}")
     first = survivors[0].rest.iloc[0]
     name = re.sub(r"[^A-Za-z0-9.-]+", "-", f"stability-{first['place'].scene}-{first['resolution']}")
-    note = "Each cell: what is left of the distance to one colour, of the method's own without stress."
-    return Chart(name, title, svg(made, name, tips), png(made), (note,), DataFrame(rows))
+    notes = ("Each cell: what is left of the distance to one colour, of the method's own without stress.",)
+    if pictured:
+        notes += (
+            "A cell opens the picture of its worst view, truth | render | error, where the run's folder has one.",
+        )
+    return Chart(name, title, svg(made, name, tips), png(made), notes, DataFrame(rows))
 
 
-def _draw(axes: Any, column: int, row: int, cell: Cell, tip: str) -> None:
+def _worst_picture(runs: DataFrame) -> str | None:
+    """Where the picture of the view with the lowest PSNR is, of all runs of a cell; None where there is none."""
+    shown = [
+        (psnr, path)
+        for folder, psnrs in zip(runs["pictures"], runs["view_psnr"], strict=True)
+        for name, psnr in psnrs.items()
+        if folder is not None and (path := folder / name).is_file()
+    ]
+    return min(shown)[1].resolve().as_uri() if shown else None
+
+
+def _draw(axes: Any, column: int, row: int, cell: Cell, tip: str, url: str | None) -> None:
     import matplotlib
     from matplotlib.patches import Rectangle
 
     value = cell.value or 0.0
     color = matplotlib.colormaps[COLORS](value)
-    axes.add_patch(Rectangle((column + 0.03, row + 0.04), 0.94, 0.92, facecolor=color, edgecolor="none", gid=tip))
+    axes.add_patch(
+        Rectangle((column + 0.03, row + 0.04), 0.94, 0.92, facecolor=color, edgecolor="none", gid=tip, url=url)
+    )
     letters = "".join(GLYPHS[status] for status in cell.status.split())
     axes.text(
         column + 0.5,
@@ -84,6 +103,7 @@ def _draw(axes: Any, column: int, row: int, cell: Cell, tip: str) -> None:
         fontsize=8,
         fontweight="bold" if letters else "normal",
         color=DARK if value > 0.55 else LIGHT,
+        url=url,
     )
 
 

@@ -8,12 +8,12 @@ from tiny_scene import HEIGHT, WIDTH, tiny_scene
 from baselines.omnigs import OmniGSMethod
 from baselines.sc_omnigs import SCOmniGSMethod, SCOmniGSOptions, aligned, carried
 from padgs.calibration.align import Similarity, align
-from padgs.calibration.poses import PoseRates
 from padgs.data.synthetic import SyntheticOptions, SyntheticTruth, generate
 from padgs.gaussians import rotation_matrices
 from padgs.learning.budget import Budget
 from padgs.learning.loop import TrainOptions
 from padgs.learning.targets import Targets
+from padgs.learning.views.poses import PoseRates
 from padgs.render.config import RenderConfig
 from padgs.scene import Scene
 from padgs.scoring.metrics import psnr

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from padgs.bench import gpu
 from padgs.bench.workload import OPTIONS, SIZES, build
-from padgs.cli.app import app
+from padgs.cli.commands import app
 from padgs.native import cpu
 from padgs.native.watch import Watchable
 

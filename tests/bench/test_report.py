@@ -12,7 +12,7 @@ from padgs.bench.picture import stacked_bars
 from padgs.bench.report import QUICK, BenchOptions
 from padgs.bench.stages import STAGES
 from padgs.bench.workload import SIGMA, SIZES, Size, build
-from padgs.cli.app import app
+from padgs.cli.commands import app
 from padgs.native import cpu
 
 needs_library = pytest.mark.skipif(not cpu.available(), reason="the native library is not built")

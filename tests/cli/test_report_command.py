@@ -7,7 +7,7 @@ from made_up import compared, result, small, swept, write
 from typer.testing import CliRunner
 
 from padgs import results
-from padgs.cli.app import app
+from padgs.cli.commands import app
 from reports import REPORTS
 
 
@@ -91,7 +91,7 @@ def test_reports_need_no_torch(root):
 
 
 def test_help_is_quick(root):
-    code = "import sys, padgs.cli.app; sys.exit('torch' in sys.modules or 'hydra' in sys.modules)"
+    code = "import sys, padgs.cli.commands; sys.exit('torch' in sys.modules or 'hydra' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], cwd=root).returncode == 0
 
 

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 import padgs
 from baselines.sc_omnigs import aligned, carried
-from padgs.cli.app import app
+from padgs.cli.commands import app
 from padgs.data.ply import read_ply
 from padgs.export.explicit import exported
 from padgs.export.splat_file import read_splats

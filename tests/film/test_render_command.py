@@ -8,7 +8,7 @@ from PIL import Image
 from tiny_run import tiny_run
 from typer.testing import CliRunner
 
-from padgs.cli.app import app
+from padgs.cli.commands import app
 
 try:
     import imageio.plugins.pyav

@@ -5,7 +5,7 @@ import sys
 import pytest
 from typer.testing import CliRunner
 
-from padgs.cli.app import app
+from padgs.cli.commands import app
 from padgs.multirun.manual import manual
 
 

@@ -9,7 +9,7 @@ from states import assert_same_but_time
 from typer.testing import CliRunner
 
 import padgs
-from padgs.cli.app import app
+from padgs.cli.commands import app
 from padgs.learning.trainee import State
 from padgs.need import session
 from padgs.need.outcome import need, write_pruned

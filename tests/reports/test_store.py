@@ -5,7 +5,7 @@ from made_up import compared, small, write
 from typer.testing import CliRunner
 
 from padgs import results
-from padgs.cli.app import app
+from padgs.cli.commands import app
 from padgs.results import ResultError
 from reports import store
 

@@ -5,7 +5,7 @@ import pytest
 from typer.testing import CliRunner
 
 from padgs import results
-from padgs.cli.app import app
+from padgs.cli.commands import app
 from padgs.results import Result, Scores
 from padgs.tracking.mlflow_mirror import batches
 from padgs.tracking.tracker import Tracker, TrackingOptions

@@ -10,7 +10,7 @@ from tiny_run import tiny_run
 from typer.testing import CliRunner
 
 import padgs
-from padgs.cli.app import app
+from padgs.cli.commands import app
 from padgs.viewer.page import BOTH
 from padgs.viewer.server import box_of, serving
 

@@ -3,9 +3,12 @@ from dataclasses import replace
 import pytest
 from made_up import failed, gathered, of_experiment
 
-from padgs.results import STATUSES, Scores
+from padgs.results import STATUSES, Scores, picture_name
 from reports.charts.heat_map import GLYPHS
+from reports.frame import frame
+from reports.gathered import Gathered
 from reports.page import page
+from reports.store import Run
 from reports.tables.stability import stability
 from reports.tables.table import ReportError
 from reports.writers import latex, markdown
@@ -103,3 +106,16 @@ def test_it_is_written_and_stands_on_the_page():
 def test_without_such_runs_there_is_nothing():
     (table,) = stability(gathered([failed("", "oom")]))
     assert table.blocks == ()
+
+
+def test_a_cell_opens_the_picture_of_its_worst_view(tmp_path):
+    made = run("omnigs", 16.0, "pose_noise", 2)
+    views = {name: {**made.scores["stability"].metrics, "ws_psnr": value} for name, value in (("a", 17.0), ("b", 15.0))}
+    made = replace(made, scores={"stability": replace(made.scores["stability"], views=views)})
+    for name in views:
+        (tmp_path / picture_name(name)).touch()
+    shown = [Run(run("omnigs", 22.0)), Run(made, pictures=tmp_path)]
+    _, chart = stability(Gathered(frame(shown)))
+    assert (tmp_path / picture_name("b")).resolve().as_uri() in chart.svg
+    assert (tmp_path / picture_name("a")).resolve().as_uri() not in chart.svg
+    assert "opens the picture" in chart.notes[1] and "file:" not in stability(gathered(runs()))[1].svg

@@ -32,6 +32,9 @@ class PoseRates:
                 raise ValueError(f"poses.{field.name} is {getattr(self, field.name)}; a learning rate must be > 0")
 
 
+SMALL = PoseRates(rotation=1e-3, rotation_end=1e-5, translation=2e-3, translation_end=2e-5)  # harmless to exact poses
+
+
 class PoseRefinement(nn.Module):
     """Corrections of the poses of named views.
 
@@ -88,6 +91,28 @@ class PoseRefinement(nn.Module):
         return replace(view, cam_from_world=self._pose(self.names.index(view.name)))
 
     @torch.no_grad()
+    def centre(self) -> None:
+        """Take out what all corrections have in common: to first order, a similarity of the whole world.
+
+        Then the world stays the given one, and held-out views stand in it where they are said to.
+        """
+        rotations = self.given[:, :3, :3]
+        beside = -(rotations.mT @ self.given[:, :3, 3:])[..., 0]
+        beside = beside - beside.mean(0)  # the centres, from their middle
+        quaternions, shifts = (torch.stack(list(own)).double() for own in (self.quaternions, self.shifts))
+        real, imaginary = quaternions.split((1, 3), dim=-1)
+        turn = -2 * _each(rotations.mT, imaginary / real).mean(0)  # of the world, radians
+        moves = -self.unit * _each(rotations.mT, shifts) - torch.linalg.cross(turn.expand_as(beside), beside)
+        moves = moves - moves.mean(0)
+        growth = (moves * beside).sum() / beside.square().sum().clamp(min=torch.finfo(beside.dtype).tiny)
+        imaginary = imaginary + 0.5 * real * _each(rotations, turn)
+        shifts = -_each(rotations, moves - growth * beside) / self.unit
+        for mine, new in zip(self.quaternions, torch.cat((real, imaginary), dim=-1), strict=True):
+            mine.copy_(new)
+        for mine, new in zip(self.shifts, shifts, strict=True):
+            mine.copy_(new)
+
+    @torch.no_grad()
     def poses(self) -> Tensor:
         """All corrected poses, cam_from_world [V, 4, 4] float64."""
         return torch.stack([self._pose(index) for index in range(len(self.names))])
@@ -97,3 +122,8 @@ class PoseRefinement(nn.Module):
         upper = turn @ given[:3]
         shift = self.unit * self.shifts[index].double()
         return torch.cat((torch.cat((upper[:, :3], upper[:, 3:] + shift[:, None]), dim=1), given[3:]))
+
+
+def _each(rotations: Tensor, vectors: Tensor) -> Tensor:
+    """Rotations [V, 3, 3] times vectors [V, 3] or [3]."""
+    return (rotations @ vectors[..., None])[..., 0]

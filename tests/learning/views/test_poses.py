@@ -5,7 +5,8 @@ import pytest
 import torch
 from tiny_scene import tiny_scene, truth
 
-from padgs.calibration.poses import PoseRefinement
+from padgs.calibration.align import align
+from padgs.learning.views.poses import PoseRefinement
 from padgs.render import RenderOptions, render
 
 VIEWS = tiny_scene().train
@@ -80,6 +81,28 @@ def test_gradients_of_a_pose_are_those_of_differences(projection):
                     parameter[k] -= step
             assert parameter.grad[k].item() == pytest.approx((sides[0] - sides[1]) / 2e-6, rel=1e-4, abs=1e-4)
     assert poses.quaternions[0].grad is None, "other views rest"
+
+
+def test_what_all_corrections_share_is_taken_out():
+    """A small similarity of the world, as corrections of its cameras, is gone; what single cameras did is left."""
+    turn, growth, move = torch.tensor([0.002, -0.003, 0.001], dtype=torch.float64), 0.002, torch.tensor([0.01, 0, 0.02])
+    poses = refinement().double()
+    middle = torch.stack([view.center for view in VIEWS]).mean(0)
+    for view, quaternion, shift in zip(VIEWS, poses.quaternions, poses.shifts, strict=True):
+        rotation = view.cam_from_world[:3, :3]
+        moved = move + growth * (view.center - middle) + torch.linalg.cross(turn, view.center - middle)
+        with torch.no_grad():
+            quaternion[1:] = -0.5 * rotation @ turn
+            shift.copy_(-rotation @ moved / 2.0)
+    assert align(poses.poses(), poses.given)[1].distance.max() < 1e-4, "it is one"
+    poses.centre()
+    torch.testing.assert_close(poses.poses(), poses.given, atol=1e-8, rtol=0)
+    with torch.no_grad():
+        poses.shifts[1].add_(0.1)
+        poses.quaternions[2][1:] += 0.01
+    poses.centre()
+    world, left = align(poses.poses(), poses.given)
+    assert abs(world.scale - 1) < 1e-3 and (world.rotation - torch.eye(3)).norm() < 1e-3 and left.distance.max() > 0.1
 
 
 def test_names_decide():

@@ -1,0 +1,39 @@
+"""The commands of `padgs`: everything beside running. One file per command, which imports what is slow when called."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+import padgs
+from padgs.cli.bench import bench
+from padgs.cli.check import check
+from padgs.cli.convert import convert
+from padgs.cli.export import export
+from padgs.cli.need import need
+from padgs.cli.prepare import prepare
+from padgs.cli.render import render
+from padgs.cli.report import report
+from padgs.cli.track import track
+from padgs.cli.view import view
+
+app = typer.Typer(no_args_is_help=True)
+
+
+def show_version(asked: bool) -> None:
+    """Print the version and stop, if that is asked."""
+    if asked:
+        typer.echo(f"padgs {padgs.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def commands(
+    version: Annotated[bool, typer.Option("--version", callback=show_version, is_eager=True, help="and stop")] = False,
+) -> None:
+    """Panoramic Gaussian splatting, measured fairly."""
+
+
+for command in (bench, check, convert, export, need, prepare, render, report, track, view):
+    app.command()(command)
