@@ -41,9 +41,14 @@ class EgoNeRFMethod(Method):
     TRAIN = TrainOptions(weight="uniform", learning_rates="published")
 
     def refuse_budget(self, budget: Budget) -> None:
-        """There are no Gaussians, and a pretraining that must end."""
+        """There are no Gaussians and no views, and a pretraining that must end."""
+        super().refuse_budget(budget)
         if budget.gaussians is not None:
             raise ValueError(f"budget.gaussians is {budget.gaussians}, but EgoNeRF has no Gaussians; leave it out")
+        if budget.stop == "auto":
+            raise ValueError(
+                "budget.stop is auto, which sets whole views apart, but rays are drawn from all views; set it to end"
+            )
         if budget.seconds is None:  # else the length is known when it is rehearsed
             self.options.refuse_length(budget.iterations)
 

@@ -55,12 +55,16 @@ class PaDGSMethod(Method):
         self._scene_unit = state.values["scene_unit"]
         super().load_state(state)
 
-    def _start(self, scene: Scene, iterations: int) -> AnchorTrainee:
-        if self._gaussians is not None:
+    def refuse_budget(self, budget: Budget) -> None:
+        """Anchors show another number of Gaussians in each view."""
+        super().refuse_budget(budget)
+        if budget.gaussians is not None:
             raise ValueError(
-                f"budget.gaussians is {self._gaussians}, but anchors decode Gaussians anew for every view; limit "
+                f"budget.gaussians is {budget.gaussians}, but anchors decode Gaussians anew for every view; limit "
                 "them by method.max_anchors and method.voxel_pixels, or prune a trained run by padgs need"
             )
+
+    def _start(self, scene: Scene, iterations: int) -> AnchorTrainee:
         extent = self.options.extent_of(scene)
         extent /= scene.unit if self.options.offset_rate_unit == "scene" else 1.0
         return self._trainee_of(PaDGS.from_scene(scene, self.options, seed=self.seed), extent, iterations)

@@ -146,7 +146,6 @@ class PaDGS(nn.Module):
         return (self.positions[:, None] + reach * self.offsets).view(-1, 3)
 
     @torch.no_grad()
-    @torch.no_grad()
     def seen_from(self, view: View) -> tuple[Tensor, Tensor, Tensor]:
         """Anchors as a camera sees them; constants of the view, so without gradient.
 

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import nullcontext
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
 from torch import nn
 
-from padgs.learning.budget import Budget
-from padgs.learning.loop import Record, Stage
 from padgs.learning.schedule import ParameterGroup
 from padgs.learning.trainee import Drawing, Parts, Size, State
 from padgs.scene import Scene, View
@@ -111,18 +108,7 @@ class CalibratedMethod(SplatMethod):
     def _as_stored(self, values: Mapping[str, Any]) -> Calibration:
         """A calibration of the shape that `Calibration.values` tells; its tensors are loaded afterwards."""
 
-    def fit(self, scene: Scene, budget: Budget, *, stage: Stage = nullcontext) -> Iterator[Record]:
-        """See `Method.fit`.
-
-        Raises:
-            ValueError: also where the run is to stop by itself.
-        """
-        if budget.stop == "auto":
-            raise ValueError(
-                "budget.stop is auto, which measures on views that are set apart, but cameras learn along here, and "
-                "those of such views do not; set it to end"
-            )
-        return super().fit(scene, budget, stage=stage)
+    _views_learn = True
 
     def _start(self, scene: Scene, iterations: int) -> SplatTrainee:
         self._calibration = self._as_given(scene)

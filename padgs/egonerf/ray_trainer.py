@@ -47,12 +47,8 @@ class RayTrainer(Trainer):
             stage: as of any trainer.
 
         Raises:
-            ValueError: the pixels of a view cannot be used, or the run is to stop by itself.
+            ValueError: the pixels of a view cannot be used.
         """
-        if budget.stop == "auto":
-            raise ValueError(
-                "budget.stop is auto, which sets whole views apart, but rays are drawn from all views; set it to end"
-            )
         # Rays are all that it draws, so of a trainee it has what does not depend on views.
         super().__init__(cast(Trainee, trainee), scene, budget, options, seed, stage=stage)
         self._tracer, self._rays = trainee, rays

@@ -19,6 +19,7 @@ from padgs.learning.budget import Budget
 from padgs.learning.loop import Record, Stage, Trainer, TrainOptions
 from padgs.learning.schedule import PUBLISHED_ITERATIONS
 from padgs.learning.trainee import Size, State, Trainee
+from padgs.learning.views.corrections import LEARNED
 from padgs.render import Rendering
 from padgs.render.config import RenderConfig
 from padgs.render.contract import check_camera
@@ -171,12 +172,22 @@ class Method(ABC):
         """Refuse what no scene could be trained or drawn with; subclasses know more."""
         check_camera(Panorama(8, 4), self.render_config.options(scene_unit=1.0))
 
-    def refuse_budget(self, budget: Budget) -> None:  # noqa: B027 - most can train with any
+    def refuse_budget(self, budget: Budget) -> None:
         """Refuse what cannot be trained for so long, or so large, on any scene; subclasses know more.
 
         Raises:
             ValueError: this budget is nothing for these options.
         """
+        if budget.stop == "auto" and self._views_learn:
+            raise ValueError(
+                "budget.stop is auto, which measures on views that are set apart, but exposures or cameras learn along "
+                "here, and those of such views do not; set it to end"
+            )
+
+    @property
+    def _views_learn(self) -> bool:
+        """Whether something of single views is learned, which views without gradients then lack."""
+        return LEARNED in (self.train_options.exposures, self.train_options.poses)
 
     @abstractmethod
     def _start(self, scene: Scene, iterations: int) -> Trainee:
