@@ -108,7 +108,9 @@ class CalibratedMethod(SplatMethod):
     def _as_stored(self, values: Mapping[str, Any]) -> Calibration:
         """A calibration of the shape that `Calibration.values` tells; its tensors are loaded afterwards."""
 
-    _views_learn = True
+    @property
+    def _views_learn(self) -> bool:
+        return True
 
     def _start(self, scene: Scene, iterations: int) -> SplatTrainee:
         self._calibration = self._as_given(scene)
