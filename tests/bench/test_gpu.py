@@ -25,6 +25,7 @@ def report() -> dict:
 
 
 @needs_native
+@pytest.mark.slow
 def test_the_report_says_what_was_measured(report: dict):
     size = report["sizes"]["quick"]
     for label in ("ours", "published", "hybrid"):

@@ -99,6 +99,7 @@ def test_the_ablation_is_one_command_and_its_table_another(start, tmp_path, cach
     assert {path.name for path in tmp_path.iterdir()} == {"runs"}, "Hydra left something behind"
 
 
+@pytest.mark.slow  # five processes
 def test_a_missing_data_set_says_where_to_get_it_and_where_to_put_it(start, tmp_path):
     code, _, error = finish(start("+experiment=ablation_bar"))
     assert code == 1
@@ -106,21 +107,26 @@ def test_a_missing_data_set_says_where_to_get_it_and_where_to_put_it(start, tmp_
     assert error.count("error:") == 1 and "Traceback" not in error
 
 
-def test_a_folder_that_cannot_be_written_is_a_clear_error(start, tmp_path):
+@pytest.mark.parametrize("arguments", [[], pytest.param(["+sweep=seeds"], marks=pytest.mark.slow)])
+def test_a_folder_that_cannot_be_written_is_a_clear_error(start, tmp_path, arguments):
     (tmp_path / "runs").write_text("a file where the folder should be")
-    for arguments in ([], ["+sweep=seeds"]):
-        code, _, error = finish(start(*TINY, *arguments))
-        assert code == 1 and "cannot write run folder runs/" in error and "Traceback" not in error
+    code, _, error = finish(start(*TINY, *arguments))
+    assert code == 1 and "cannot write run folder runs/" in error and "Traceback" not in error
 
 
 @pytest.mark.parametrize(
     ("argument", "message"),
     [
         ("train.iteration=5", "unknown key train.iteration; known: train.lambda_l1"),
-        pytest.param("sede=5", "unknown key sede; known: data, render", marks=pytest.mark.slow),  # a process each
-        pytest.param("method=foo", "Available options in 'method'", marks=pytest.mark.slow),
-        ("+experiment=foo", "Available options in 'experiment'"),
-        ("data.path=/no/such/folder", "/no/such/folder"),
+        *(
+            pytest.param(argument, message, marks=pytest.mark.slow)  # a process each
+            for argument, message in (
+                ("sede=5", "unknown key sede; known: data, render"),
+                ("method=foo", "Available options in 'method'"),
+                ("+experiment=foo", "Available options in 'experiment'"),
+                ("data.path=/no/such/folder", "/no/such/folder"),
+            )
+        ),
     ],
 )
 def test_what_is_unknown_is_named_with_what_is_known(start, argument, message):

@@ -94,6 +94,7 @@ def test_a_non_finite_gaussian_is_rejected_or_not_drawn(name: str, bad: float, p
     assert torch.isfinite(rendering.image).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("projection", "lens"), [setup for setup in SETUPS if setup[0] in ("erp", "pinhole")])
 @pytest.mark.parametrize(("backend", "dtype"), ENGINES_IN_FLOAT32)
 def test_long_oblique_needles_are_drawn_in_float32_as_in_float64(projection, lens, backend, dtype):
