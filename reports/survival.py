@@ -8,6 +8,7 @@ that failed keeps nothing.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -52,6 +53,12 @@ class Survivor:
             share = (run[QUALITY] - run[ONE_COLOR]) / reference if bool(run["ok"]) else 0.0
             kept.append(min(max(share, 0.0), 1.0))
         return spread(kept, " ".join(runs.loc[~runs["ok"], "status"].unique()))
+
+    @property
+    def place(self) -> str:
+        """Scene and resolution, as a part of file names."""
+        first = self.rest.iloc[0]
+        return re.sub(r"[^A-Za-z0-9.-]+", "-", f"{first['place'].scene}-{first['resolution']}")
 
     @property
     def conditions(self) -> list[str]:

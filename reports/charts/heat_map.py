@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -63,8 +62,7 @@ def chart(title: str, survivors: Sequence[Survivor]) -> Chart:
     letters = ", ".join(f"{letter} {status}" for status, letter in GLYPHS.items() if status in seen)
     own.set_xlabel(f"1: keeps everything, 0: one colour{f'; {letters}' if letters else ''}", fontsize=8)
     lay_out(made, f"What methods keep under stress\n{title}")
-    first = survivors[0].rest.iloc[0]
-    name = re.sub(r"[^A-Za-z0-9.-]+", "-", f"stability-{first['place'].scene}-{first['resolution']}")
+    name = f"stability-{survivors[0].place}"
     notes = ("Each cell: what is left of the distance to one colour, of the method's own without stress.",)
     if pictured:
         notes += (

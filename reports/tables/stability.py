@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from reports import methods
-from reports.charts import heat_map
+from reports.charts import heat_map, survival_chart
 from reports.charts.drawing import Chart
 from reports.conditions import footnotes
 from reports.gathered import Gathered
@@ -32,7 +32,7 @@ NOTES = (
 
 
 def stability(gathered: Gathered) -> list[Table | Chart]:
-    """A table with three blocks for each scene, and a heat map of each.
+    """A table with three blocks for each scene, and of each a heat map and a chart of speed, accuracy and stability.
 
     Raises:
         ReportError: results that must not stand together.
@@ -54,7 +54,7 @@ def stability(gathered: Gathered) -> list[Table | Chart]:
         tuple(blocks),
         (*footnotes(runs_of, "stability"), *NOTES),
     )
-    return [table, *(heat_map.chart(title, those) for title, those in found.items())]
+    return [table, *(draw(*one) for one in found.items() for draw in (heat_map.chart, survival_chart.chart))]
 
 
 def _scores(columns: Sequence[Survivor | None]) -> tuple[Row, ...]:

@@ -51,7 +51,7 @@ def cells(table, title: str) -> dict[str, dict[str, str]]:
 
 
 def test_what_is_kept_is_the_share_above_one_colour():
-    table, _ = stability(gathered(runs()))
+    table, *_ = stability(gathered(runs()))
     kept = cells(table, "Retention")
     assert kept["pose_noise 1"] == {"PaD-GS": "0.52", "OmniGS, corrected": "0.90"}
     assert kept["pose_noise 2"] == {"PaD-GS": "–", "OmniGS, corrected": "0.40"}
@@ -61,7 +61,7 @@ def test_what_is_kept_is_the_share_above_one_colour():
 
 
 def test_scores_and_where_it_breaks():
-    table, _ = stability(gathered(runs()))
+    table, *_ = stability(gathered(runs()))
     scores, breaks = cells(table, "synthetic-room"), cells(table, "Breaks at level")
     # OmniGS: pose noise keeps (0.9 + 0.4) / 2, the seam (0 + 1) / 2; the worst quarter of two conditions is one
     omnigs = {row: of["OmniGS, corrected"] for row, of in scores.items()}
@@ -77,7 +77,7 @@ def test_scores_and_where_it_breaks():
 def test_seeds_are_compared_with_their_own():
     first, *others = runs(seed=1)
     lower = replace(first, scores={"stability": Scores(RULES, {"ws_psnr": 17.0, "ws_psnr_one_color": 12.0}, {})})
-    table, _ = stability(gathered([*runs(), lower, *others]))
+    table, *_ = stability(gathered([*runs(), lower, *others]))
     assert cells(table, "Retention")["pose_noise 2"]["OmniGS, corrected"] == "0.60 ± 0.28"  # 4 of 10, and 4 of 5
 
 
@@ -93,11 +93,13 @@ def test_every_outcome_has_a_letter_of_its_own():
 
 
 def test_it_is_written_and_stands_on_the_page():
-    table, chart = stability(gathered(runs()))
+    table, chart, survival = stability(gathered(runs()))
     assert chart.name == "stability-synthetic-room-512x256"
     assert "pose_noise 2: keeps 0.40; WS-PSNR 16.00 dB, 22.00 without" in chart.svg and ">V<" in chart.svg
     assert "V diverged" in chart.svg and "exploded" not in chart.svg and chart.png.startswith(b"\x89PNG")
     assert chart.numbers is not None and len(chart.numbers) == 6
+    assert survival.numbers is not None and survival.name == "survival-synthetic-room-512x256"
+    assert dict(survival.numbers.set_index("preset")["score"])["omnigs"] == pytest.approx(0.575)
     assert "| 0.00 [DIVERGED] |" in markdown.text(table) and "DIVERGED" in latex.text(table)
     html = page.html(gathered(runs()))
     assert 'id="stability"' in html and 'id="heat_maps"' in html
@@ -115,7 +117,7 @@ def test_a_cell_opens_the_picture_of_its_worst_view(tmp_path):
     for name in views:
         (tmp_path / picture_name(name)).touch()
     shown = [Run(run("omnigs", 22.0)), Run(made, pictures=tmp_path)]
-    _, chart = stability(Gathered(frame(shown)))
+    _, chart, _ = stability(Gathered(frame(shown)))
     assert (tmp_path / picture_name("b")).resolve().as_uri() in chart.svg
     assert (tmp_path / picture_name("a")).resolve().as_uri() not in chart.svg
     assert "opens the picture" in chart.notes[1] and "file:" not in stability(gathered(runs()))[1].svg
