@@ -20,6 +20,7 @@ from padgs.data.store import ImageStore, StoredImage
 from padgs.sphere.panorama import row_latitudes
 
 SCENE_MASKS = ("mask.png", "mask.jpg", "mask.bmp")
+PREVIEW = "mask_preview.jpg"  # beside them, of `padgs.data.prepare.nadir`
 LEAST = 0.01  # of the sphere must be seen; from less nothing is learned, and no metric has a value
 _ROWS = re.compile(r"rows:(\d+)/(\d+)")
 
