@@ -16,10 +16,21 @@ from padgs import results
 from padgs.learning.budget import Budget
 from padgs.learning.loop import TrainOptions
 from padgs.multirun.composition import composing, configuration
+from padgs.registry import lookup
 from padgs.runs import checkpoint
 from padgs.runs.interrupt import Interrupted
 from padgs.runs.session import Session, Watch
 from padgs.runs.typed import ConfigError
+
+SMALL_GRIDS = {"radial_nodes": 8, "polar_nodes": 8, "azimuth_nodes": 16, "density_components": 2}
+SMALL_GRIDS |= {
+    "appearance_components": 2,
+    "features": 4,
+    "hidden": 8,
+    "coarse_samples": 8,
+    "fine_samples": 8,
+    "rays": 64,
+}
 
 
 @pytest.fixture(scope="module")
@@ -132,8 +143,9 @@ def test_what_the_model_cannot_do_is_a_rejected_run(base, tmp_path, setting, mes
 
 @pytest.mark.parametrize("name", ["padgs", "padgs_plus", "seam360gs", "egonerf", "cubemap_3dgs"])
 def test_every_family_begins_with_the_very_model(name):
-    scene, kind = tiny_scene(), METHODS[name]
-    first, second = kind(), kind()
+    scene, kind = tiny_scene(), lookup(METHODS, name, "method")
+    options = kind.Options(**(SMALL_GRIDS if name == "egonerf" else {}))
+    first, second = kind(options), kind(options)
     list(first.fit(scene, Budget(4)))
     second.begin_with(first.state())
     records = second.fit(scene, Budget(4))
@@ -143,12 +155,13 @@ def test_every_family_begins_with_the_very_model(name):
 
 
 def test_exposures_that_both_learn_are_taken_over():
-    scene, learned = tiny_scene(), replace(METHODS["omnigs"].TRAIN, exposures="learned")
-    first = METHODS["omnigs"](train=learned)
+    scene, learned = tiny_scene(), TrainOptions(weight="uniform", exposures="learned")
+    kind = lookup(METHODS, "omnigs", "method")
+    first = kind(train=learned)
     list(first.fit(scene, Budget(10)))
     gains = first.state().under("views/")["exposures.log_gains.0"]
     for train, expected in ((learned, gains), (TrainOptions(weight="uniform"), None)):
-        second = METHODS["omnigs"](train=train)
+        second = kind(train=train)
         second.begin_with(first.state())
         second.fit(scene, Budget(10))
         taken = second.state().under("views/").get("exposures.log_gains.0")
