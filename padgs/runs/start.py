@@ -1,7 +1,7 @@
 """Going on: a run that begins with the model of a finished one, in place of the points of its scene.
 
 It has a schedule of its own, of `train.iterations` or `budget.seconds`, and does all of it: learning rates rise again,
-and the model grows again where its method says so. docs/going_on.md has the reasons and the numbers.
+and the model grows again where its method says so. docs/your_photographs.md says when that is worth it.
 """
 
 from __future__ import annotations
