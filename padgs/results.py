@@ -40,7 +40,7 @@ STATUSES = {
 # read is said by the fingerprint of the data; scoring comes after training; a monitor changes no number, but may end a
 # run. `data.device` is in files of old runs only.
 OF_THE_MACHINE = ("run", "render.max_instances", "data.cache_bytes", "data.read_ahead", "data.device")
-DECIDE_NOTHING = (*OF_THE_MACHINE, "data.path", "protocol", "train.monitor")
+DECIDE_NOTHING = (*OF_THE_MACHINE, "data.path", "init.run", "protocol", "train.monitor")
 # What is no more than a name, even in a command line or a path; `@` parts an experiment from its scale.
 PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*(@[A-Za-z0-9._-]+)?")
 BY_ITSELF = "by_itself"  # among experiments: a command without any asked for the run as well

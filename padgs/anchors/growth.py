@@ -107,7 +107,11 @@ class Growth:
     def __init__(self, model: PaDGS, options: GrowthOptions, *, seed: int = 0) -> None:
         self.model, self.options = model, options
         self.generator = torch.Generator().manual_seed(seed)
-        self.statistics = self._empty(len(model))
+        self.forget()
+
+    def forget(self) -> None:
+        """Start anew with empty statistics, of as many anchors as there are now."""
+        self.statistics = self._empty(len(self.model))
 
     def observe(self, raw_opacities: Tensor, slots: Tensor, gradient: Tensor, visible: Tensor, iteration: int) -> None:
         """Add one view to the statistics.

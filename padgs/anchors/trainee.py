@@ -148,8 +148,13 @@ class AnchorTrainee:
 
     def load_state(self, state: State) -> None:
         """Become what `state` was taken of, whatever the number of anchors."""
-        self.model.load(state.tensors)
-        self.model.voxel_size, self.model.unit = state.values["voxel_size"], state.values["unit"]
+        self.load_model(state)
         for name in self.growth.statistics:
             self.growth.statistics[name] = state.tensors[f"growth/{name}"].to(self.model.positions.device, copy=True)
         self.growth.generator.set_state(state.tensors["random/growth"].cpu())
+
+    def load_model(self, state: State) -> None:
+        """Take the anchors and networks alone, whose growth begins anew."""
+        self.model.load(state.tensors)
+        self.model.voxel_size, self.model.unit = state.values["voxel_size"], state.values["unit"]
+        self.growth.forget()

@@ -88,9 +88,9 @@ class CalibratedTrainee(SplatTrainee):
         tensors = {PREFIX + name: tensor for name, tensor in self.calibration.state_dict().items()}
         return State(state.tensors | tensors, state.values | {"calibration": self.calibration.values()})
 
-    def load_state(self, state: State) -> None:
-        """Become the model that `state` was taken of."""
-        super().load_state(state)
+    def load_model(self, state: State) -> None:
+        """Take the splats and the calibration alone."""
+        super().load_model(state)
         self.calibration.load_state_dict(state.under(PREFIX))
 
 

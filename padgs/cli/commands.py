@@ -11,6 +11,7 @@ from padgs.cli.bench import bench
 from padgs.cli.check import check
 from padgs.cli.convert import convert
 from padgs.cli.export import export
+from padgs.cli.mask import mask
 from padgs.cli.need import need
 from padgs.cli.prepare import prepare
 from padgs.cli.render import render
@@ -35,5 +36,5 @@ def commands(
     """Panoramic Gaussian splatting, measured fairly."""
 
 
-for command in (bench, check, convert, export, need, prepare, render, report, track, view):
+for command in (bench, check, convert, export, mask, need, prepare, render, report, track, view):
     app.command()(command)

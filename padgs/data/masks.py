@@ -20,6 +20,7 @@ from padgs.data.store import ImageStore, StoredImage
 from padgs.sphere.panorama import row_latitudes
 
 SCENE_MASKS = ("mask.png", "mask.jpg", "mask.bmp")
+PREVIEW = "mask_preview.jpg"  # beside them, of `padgs.data.prepare.nadir`
 LEAST = 0.01  # of the sphere must be seen; from less nothing is learned, and no metric has a value
 _ROWS = re.compile(r"rows:(\d+)/(\d+)")
 
@@ -41,7 +42,7 @@ class Mask:
         return rows.expand(-1, 2 * len(rows)).clone() if weight is None else weight * rows
 
 
-def row_weights(keep: int, of: int, height: int) -> Tensor:
+def row_weights(keep: float, of: float, height: int) -> Tensor:
     """Weights [height, 1] of the rule "only the first `keep` of `of` rows count", at any height.
 
     A row that the border cuts counts by its share, so that reducing the image and its mask agree.

@@ -132,6 +132,10 @@ class EgoNeRFTrainee:
 
     def load_state(self, state: State) -> None:
         """Take the parameters of a model of the same size and place."""
+        self.load_model(state)
+
+    def load_model(self, state: State) -> None:
+        """The same, as nothing else is noted."""
         self.model.load_state_dict(state.tensors)
 
     def _pretrains(self, iteration: int) -> bool:

@@ -277,6 +277,10 @@ class Trainer:
             return loss.item()
         return loss.detach()
 
+    def take_corrections(self, state: State) -> None:
+        """Begin with the corrections of views of another training on this scene, as far as both learn them."""
+        self._corrections.load_state_dict(state.under(VIEWS), strict=False)
+
     def state(self) -> State:
         """Copies of model, optimiser, statistics, random state and data order; to be taken between two records."""
         model, order = self._trainee.state(), self._order.state()

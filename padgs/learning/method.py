@@ -16,6 +16,7 @@ from typing import Any, ClassVar
 import torch
 
 from padgs.learning.budget import Budget
+from padgs.learning.failure import is_out_of_memory
 from padgs.learning.loop import Record, Stage, Trainer, TrainOptions
 from padgs.learning.schedule import PUBLISHED_ITERATIONS
 from padgs.learning.trainee import Size, State, Trainee
@@ -62,6 +63,7 @@ class Method(ABC):
         self._trainee: Trainee | None = None
         self._trainer: Trainer | None = None
         self._loaded: State | None = None
+        self._given: State | None = None  # whose model `fit` begins with
         self._gaussians: int | str | None = None  # of the budget of `fit`
         self._refuse_impossible()
 
@@ -88,14 +90,24 @@ class Method(ABC):
             else:
                 length = self._loaded.values["schedule"]
             budget = replace(budget, iterations=length)
-        self._trainee = self._start(scene, budget.iterations)
+        self._trainee = self._begun(scene, budget.iterations)
         self._trainer = self._trained_by(self._trainee, scene, budget, stage)
         self._trainer.seconds += spent["seconds"]
         self._trainer.cpu_seconds += spent["cpu_seconds"]
+        if self._given is not None:
+            self._trainer.take_corrections(self._given)
         if self._loaded is not None:
             self._trainer.load_state(self._loaded)
             self._loaded = None
         return self._trainer.records()
+
+    def begin_with(self, state: State) -> None:
+        """Have `fit` begin with the model of another training on this scene, in place of the point cloud.
+
+        Nothing else goes on: the schedule, the optimiser and what was noted for growth begin anew. Corrections of views
+        are taken over where both trainings learn them.
+        """
+        self._given = state
 
     def stop(self, why: str) -> bool:
         """End the training of `fit` soon, between two of its records; see `Trainer.stop`."""
@@ -201,6 +213,31 @@ class Method(ABC):
     def _blank(self, state: State) -> Trainee:
         """A trainee that can load the model of this state, to be looked at; `fit` makes another one."""
 
+    def _begun(self, scene: Scene, iterations: int) -> Trainee:
+        """What is trained on a scene, with the model of another training if there is one to begin with.
+
+        Raises:
+            ValueError: as `_start` does, or that model is nothing for the options or the budget.
+        """
+        trainee = self._start(scene, iterations)
+        if self._given is None:
+            return trainee
+        try:
+            trainee.load_model(self._given.of_model())
+        except (LookupError, TypeError, ValueError, RuntimeError) as error:
+            if is_out_of_memory(error):
+                raise
+            raise ValueError(
+                f"the model to begin with is nothing for these options ({error}); give those that it was trained with"
+            ) from error
+        count = next(iter(trainee.counts().values()))
+        if isinstance(self._gaussians, int) and count > self._gaussians:
+            raise ValueError(
+                f"budget.gaussians is {self._gaussians}, but the model to begin with has {count} already; ask for as "
+                "many or more, or take some away by padgs need"
+            )
+        return trainee
+
     def _rehearsed(self, scene: Scene, budget: Budget) -> tuple[int, dict[str, float]]:
         """How many iterations a budget of seconds should do, and what it took to find out.
 
@@ -210,7 +247,7 @@ class Method(ABC):
         random, first = torch.get_rng_state(), 0.0
         short = replace(budget, iterations=PUBLISHED_ITERATIONS, seconds=None, gaussians=None, stop="end")
         one = replace(scene, train=scene.train[:1])
-        trainer = self._trained_by(self._start(scene, short.iterations), one, short, nullcontext)
+        trainer = self._trained_by(self._begun(scene, short.iterations), one, short, nullcontext)
         for record in trainer.records():
             if record.iteration == 1:  # which does what is done but once
                 first = trainer.spent

@@ -108,6 +108,10 @@ class Trainee(Protocol):
         """Become the model that `state` was taken of."""
         ...
 
+    def load_model(self, state: State) -> None:
+        """Take the parameters alone, with nothing noted of their training: for another run that begins with them."""
+        ...
+
 
 @dataclass(frozen=True)
 class Parts:

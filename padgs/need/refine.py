@@ -66,3 +66,7 @@ class Refining:
     def load_state(self, state: State) -> None:
         """Of the model."""
         self._model.load_state(state)
+
+    def load_model(self, state: State) -> None:
+        """Of the model."""
+        self._model.load_model(state)

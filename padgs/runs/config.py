@@ -20,6 +20,7 @@ from padgs.registry import lookup
 from padgs.render.config import RenderConfig
 from padgs.runs.device import DEVICES
 from padgs.runs.identity import Labels
+from padgs.runs.start import Start
 from padgs.runs.typed import ConfigError, typed
 from padgs.scoring.protocols import PROTOCOLS, Protocol, protocol_from_options
 from padgs.stress.options import StressOptions
@@ -27,6 +28,7 @@ from padgs.tracking.tracker import TrackingOptions
 
 RETRIES = ("none", "failed")
 IMAGES_ON = ("device", "cpu")
+CONTINUED = "continued"  # the word for runs with `init` in tables
 LATER = ("exposures", "poses")  # keys of `train` that older runs do not have; they did what is the default
 
 
@@ -131,6 +133,7 @@ class Settings:
     tracking: TrackingOptions = TrackingOptions()
     variant: str = ""  # name of this setting within an experiment, such as a row of the ablation
     seed: int = 0
+    init: Start | None = None  # folder of a finished run of the method and scene: training begins with its model
     retry: str = "none"  # which finished runs are done again: a name of RETRIES
 
     def __post_init__(self) -> None:
@@ -160,8 +163,8 @@ class RunConfig(Settings):
 
     @property
     def row(self) -> str:
-        """What sets the run apart within an experiment: its variant, and what it is stressed by."""
-        return ", ".join(filter(None, (self.variant, self.stress.title)))
+        """What sets the run apart within an experiment: its variant, what it is stressed by, and begins with."""
+        return ", ".join(filter(None, (self.variant, self.stress.title, CONTINUED if self.init else "")))
 
     @property
     def training(self) -> TrainConfig:
@@ -171,8 +174,8 @@ class RunConfig(Settings):
     def values(self) -> dict[str, Any]:
         """The configuration of a run as plain values in the shape of the YAML files, defaults included.
 
-        Stress, a budget and what is learned of views are there only if there are any: ids of runs without are what they
-        were before.
+        Stress, a budget, what is learned of views and what the run begins with are there only if there are any: ids of
+        runs without are what they were before.
         """
         usual = asdict(TrainConfig())
         train = {key: value for key, value in asdict(self.train).items() if key not in LATER or value != usual[key]}
@@ -186,6 +189,7 @@ class RunConfig(Settings):
             "protocol": {name: asdict(protocol) for name, protocol in self.protocols.items()},
             "run": asdict(self.run),
             **stress,
+            **({} if self.init is None else {"init": asdict(self.init)}),
             "variant": self.variant,
             "seed": self.seed,
         }
@@ -205,9 +209,11 @@ def config_from_values(values: Mapping[str, Any], labels: Labels = Labels()) -> 
             "data.device is no key any more: run.device says where a run trains and keeps its panoramas; "
             "run.images_on=cpu keeps them in main memory while it trains on a GPU"
         )
+    name = str(_group(values, "method").get("name", "padgs_plus"))
+    if isinstance(values.get("init"), str):  # on command lines; in files of runs it is what `Start.of` made of that
+        values = {**values, "init": asdict(Start.of(values["init"], name))}
     settings = typed(Settings, {key: value for key, value in values.items() if key not in ("method", "protocol")})
-    method = dict(_group(values, "method"))
-    name = str(method.pop("name", "padgs_plus"))
+    method = {key: value for key, value in _group(values, "method").items() if key != "name"}
     protocols = _group(values, "protocol")
     try:
         kind = lookup(METHODS, name, "method")

@@ -103,11 +103,14 @@ class Session:
         Raises:
             Interrupted: it was stopped from outside; the checkpoint was written.
             CheckpointError, RunFolderError: nothing can be read or written.
+            ConfigError: what it shall begin with is no run on this scene.
         """
         config, folder = self.config, self.folder
+        method, device = build(config), self.scene.points.device
+        if config.init is not None and not checkpoint.exists(folder.checkpoint):
+            method.begin_with(config.init.state(self.scene.fingerprint, self._fingerprint_at, device))
         folder.prepare(config.values())
-        method = build(config)
-        progress = folder.resume(method, self.scene.points.device)
+        progress = folder.resume(method, device)
         if progress.iteration and not progress.share:  # a checkpoint from before there were budgets of seconds
             progress = replace(progress, share=progress.iteration / config.training.iterations)
         if progress.iteration:
@@ -151,6 +154,11 @@ class Session:
             result = replace(result, variant=", ".join(filter(None, words)))
         asked = progress.iteration if config.budget.seconds is not None else result.iterations
         return folder.finish(replace(result, iterations=asked, iterations_done=progress.iteration, finished=finished))
+
+    def _fingerprint_at(self, width: int | None) -> str:
+        """The fingerprint of the scene at another width."""
+        data = replace(self.config.data, width=width)
+        return scene_of(replace(self.config, data=data), self.scene.points.device).fingerprint
 
     def _logged(self, record: Record, method: Method) -> float | None:
         """Log an iteration where that is due; PSNR of the held-out view where it was measured."""

@@ -140,6 +140,10 @@ class CloneSplit:
                 assert cos_latitudes is not None, "polar_threshold needs the latitudes"
                 self.statistics["polar"] += torch.where(visible, 1 - cos_latitudes, 0.0)
 
+    def forget(self) -> None:
+        """Start anew with empty statistics, of as many Gaussians as there are now."""
+        self.statistics = self._empty()
+
     @torch.no_grad()
     def adapt(
         self, iteration: int, optimizer: torch.optim.Adam, *, grows: Callable[[], bool] = lambda: True
@@ -157,7 +161,7 @@ class CloneSplit:
             cloned, split, left_out = self._multiply(optimizer, iteration)
             self._decay_opacities(optimizer)
             pruned = self._prune(optimizer, iteration)
-            self.statistics = self._empty()
+            self.forget()
             events.append(f"cloned {cloned}, split {split}, pruned {pruned} Gaussians")
             if left_out:
                 total = cloned + split + left_out

@@ -176,13 +176,22 @@ class SplatTrainee:
         Raises:
             ValueError: the state is of a model with other options.
         """
-        self.splats.load(state.under("splats/"))
-        self.splats.active_degree = state.values["active_degree"]
+        self.load_model(state)
         device = self.splats.means.device
         self.densifier.statistics = {n: t.to(device, copy=True) for n, t in state.under("statistics/").items()}
         self.densifier.generator.set_state(state.tensors["random/pieces"].cpu())
         if self._governor is not None:
             self._governor.state = dict(state.values["governor"])
+
+    def load_model(self, state: State) -> None:
+        """Take the splats alone, whose densification begins anew.
+
+        Raises:
+            ValueError: the state is of a model with other options.
+        """
+        self.splats.load(state.under("splats/"))
+        self.splats.active_degree = state.values["active_degree"]
+        self.densifier.forget()
 
     @torch.no_grad()
     def _drawn_opacities(self) -> Tensor:

@@ -14,8 +14,10 @@ import padgs.data
 from padgs.data.assemble import assemble
 from padgs.data.capture import Capture
 from padgs.data.check.conventions import VIEWS, colour_fit, known_conventions, reprojection_error, track_fit
+from padgs.data.check.exposures import exposure_gains
 from padgs.data.check.overlay import draw_overlay
 from padgs.data.errors import DataError, listed
+from padgs.data.fisheye import refuse_dual_fisheye
 from padgs.data.images import decode, inspect
 from padgs.data.options import DataOptions
 from padgs.data.resize import area_resize
@@ -27,6 +29,8 @@ REPROJECTION_LIMIT = 1 / 500  # of the width, on the median: 4 pixels of 2048
 BETTER = 0.1  # by how much the correlation under another convention must exceed the stated one's
 FITS = 0.3  # correlation from which points and pictures can be said to agree
 SAME_PLACE = 0.01  # of the median depth: a test view as near as this to a training view tests memory
+UNEVEN = 0.1  # stops, standard deviation of the views' gains from which it is worth learning them
+EXPOSURES = 40  # views at most that they are measured in
 FAR_AWAY = 1e5  # coordinates larger than this many median depths lose digits in float32
 
 
@@ -49,6 +53,7 @@ class Report:
     reprojection_median: float | None = None  # pixels
     reprojection_95: float | None = None  # pixels
     colour_correlation: float | None = None  # of the points with the pictures, as stated
+    exposure_spread: float | None = None  # stops, standard deviation of the gains of the training views
     masked: dict[str, float] = field(default_factory=dict)  # view -> share of its pixels (by weight) that is ignored
     notes: list[str] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
@@ -115,7 +120,7 @@ def _check_images(capture: Capture, report: Report, progress: Callable[[int, int
         if frame.image.is_file():  # absent ones are reported together
             try:
                 inspect(frame.image)
-                decode(frame.image)
+                refuse_dual_fisheye(decode(frame.image), frame.image)
             except DataError as error:
                 report.problems.append(str(error))
         progress(done + 1, len(capture.frames))
@@ -198,7 +203,11 @@ def _check_fit(capture: Capture, scene: Scene, report: Report) -> None:
             best = max(fits, key=lambda fit: fit.score)
             if -best.score <= limit:
                 report.suggestion = best.convention.words
-    if not report.coloured or any("random ones" in note for note in scene.notes):
+    if any("random ones" in note for note in scene.notes):
+        return
+    if report.suggestion is None:
+        _check_exposures(scene, report)
+    if not report.coloured:
         return
     views = (*scene.train, *scene.test)
     views = views[:: max(1, len(views) // VIEWS)][:VIEWS]
@@ -216,6 +225,21 @@ def _check_fit(capture: Capture, scene: Scene, report: Report) -> None:
         report.notes.append(
             f"the colours of points and panoramas correlate by only {stated.score:.2f}, and by no more in any other "
             "known convention; look at the overlay"
+        )
+
+
+def _check_exposures(scene: Scene, report: Report) -> None:
+    """Gains of the training views."""
+    views = scene.train[:: -(-len(scene.train) // EXPOSURES)]
+    if len(views) < 2:
+        return
+    gains = exposure_gains(torch.stack([view.cam_from_world for view in views]), _small(views), scene.points)
+    report.exposure_spread = gains.std().item()
+    if report.exposure_spread >= UNEVEN:
+        dark, bright = (views[int(index)].name for index in (gains.argmin(), gains.argmax()))
+        report.notes.append(
+            f"the views are exposed differently, from {gains.min():+.2f} stops ({dark}) to {gains.max():+.2f} "
+            f"({bright}); train with train.exposures=learned, or fix the exposure when you take them again"
         )
 
 

@@ -11,9 +11,12 @@ import torch
 from padgs.data.assemble import image_folder, image_names, refuse_clashes
 from padgs.data.capture import Capture, Frame
 from padgs.data.errors import DataError
-from padgs.data.images import ImageFile, inspect
-from padgs.data.masks import SCENE_MASKS, Mask, find_masks
+from padgs.data.fisheye import refuse_dual_fisheye
+from padgs.data.images import ImageFile, decode, inspect
+from padgs.data.masks import PREVIEW, SCENE_MASKS, Mask, find_masks
 from padgs.data.store import ImageStore
+
+LOOKED_AT = 3  # images that are decoded before any work is done; those of one camera are alike
 
 
 @dataclass(frozen=True)
@@ -41,17 +44,18 @@ def find_source(path: Path, mask: str) -> Source:
     if not path.is_dir():
         raise DataError(f"{path} is not a folder; give a folder of panoramas, or a video file")
     folder = image_folder(path, None)
-    base = folder.parent if folder.name == "images" else folder  # where masks are looked for
-    names = [name for name in image_names(folder) if name not in SCENE_MASKS and not name.startswith("masks/")]
+    names = panoramas(folder)
     if len(names) < 2:
         raise DataError(f"{folder} holds {len(names)} images; structure from motion needs at least two")
     refuse_clashes(names)
     images = {name: inspect(folder / name) for name in names}
+    for name in names[:: -(-len(names) // LOOKED_AT)]:
+        refuse_dual_fisheye(decode(folder / name), folder / name)
     nowhere = torch.eye(4, dtype=torch.float64)
     frames = tuple(Frame(name, image.path, nowhere, image.width, image.height) for name, image in images.items())
     if Path(mask).exists():  # relative to where one stands, not to the images
         mask = str(Path(mask).absolute())
-    capture = Capture(format="images", folder=base, image_folder=folder, frames=frames, cloud=None)
+    capture = Capture(format="images", folder=mask_folder(path), image_folder=folder, frames=frames, cloud=None)
     sizes = [(image.width, image.height) for image in images.values()]
     masks, digests, notes = find_masks(capture, mask, list(images.values()), sizes, ImageStore())
     digest = hashlib.sha256()
@@ -64,3 +68,14 @@ def find_source(path: Path, mask: str) -> Source:
         fingerprint=digest.hexdigest(),
         notes=tuple(notes),
     )
+
+
+def panoramas(folder: Path) -> list[str]:
+    """The images below a folder, relative to it, sorted, without the masks among them."""
+    of_masks = (*SCENE_MASKS, PREVIEW)
+    return [name for name in image_names(folder) if name not in of_masks and not name.startswith("masks/")]
+
+
+def mask_folder(path: Path) -> Path:
+    """Where masks of a folder of panoramas are looked for: there, or beside it if it is called images."""
+    return path.parent if path.name == "images" and image_folder(path, None) == path else path

@@ -32,6 +32,8 @@ def test_sound_data_sets_pass(name: str, world: World, tmp_path: Path) -> None:
     assert report.resolution == "64x32"
     if name not in ("openmvg", "omniblender"):  # no colours, no points
         assert report.colour_correlation is not None and report.colour_correlation > 0.9
+    if name != "omniblender":
+        assert report.exposure_spread is not None and report.exposure_spread < 0.05
     if name in ("colmap", "openmvg"):
         assert report.reprojection_95 is not None and report.reprojection_95 < 1e-9
     with Image.open(tmp_path / "look.png") as picture:
