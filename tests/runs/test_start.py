@@ -64,6 +64,7 @@ def test_it_begins_with_the_model_at_another_width_too(base, tmp_path):
     assert run.config.init is not None and run.config.init.run == str(base), "the file of the run says so"
 
 
+@pytest.mark.slow
 def test_it_is_known_by_the_checkpoint_wherever_that_is(base, tmp_path):
     shutil.copytree(base, tmp_path / "moved")
     names = [session(tmp_path, *more).folder.path.name for more in ((f"init={base}",), (f"init={tmp_path}/moved",), ())]
@@ -115,6 +116,7 @@ def _failed(run):
     results.write(replace(results.read(run / "result.json"), status="nan", reason="why"), run)
 
 
+@pytest.mark.slow
 def test_other_data_and_another_checkpoint_are_refused_before_training(base, tmp_path):
     other = session(tmp_path / "runs", f"init={base}", "data.generator.points=100")
     with pytest.raises(ConfigError, match="trained on other data: .* only data.width may differ"):
