@@ -12,7 +12,7 @@ import padgs
 from padgs.cli.commands import app
 from padgs.learning.trainee import State
 from padgs.need import session
-from padgs.need.outcome import need, write_pruned
+from padgs.need.outcome import keep, need
 from padgs.need.search import smallest
 from padgs.need.session import Search
 from padgs.need.worth import most_wanted, worth
@@ -40,7 +40,7 @@ SLOW = [pytest.param(method, marks=pytest.mark.slow) for method in METHODS[:1]] 
 @pytest.mark.parametrize("method", [*SLOW, *METHODS[1:]])
 def test_a_search_interrupted_everywhere_ends_as_if_nothing_had_happened(opened, method, tmp_path, monkeypatch):
     whole = Search(opened(method))
-    whole.complete()
+    whole.complete(1.0)
     assert len(whole.steps) >= 3 and whole.row == ("anchors" if method == "method=padgs" else "gaussians")
     shutil.rmtree(whole.folder.path)
 
@@ -59,7 +59,7 @@ def test_a_search_interrupted_everywhere_ends_as_if_nothing_had_happened(opened,
     while True:
         again = Search(opened(method))
         try:
-            again.complete()
+            again.complete(1.0)
             break
         except Interrupted as interrupted:
             stops += 1
@@ -76,16 +76,17 @@ def test_the_pruned_model_is_a_run_that_opens_and_has_the_whole_front(opened, me
     run = opened(method)
     before = run.method.state()
     search = Search(run)
-    search.complete()
-    folder = write_pruned(search, 1.0)
+    result = keep(search, 1.0)
     assert_same_but_time(run.method.state(), before)
-    pruned = padgs.load_run(folder, device="cpu")
-    kept = search.steps[smallest(search.steps, 1.0)]
+    pruned = padgs.load_run(run.folder.with_name(result.run), device="cpu")
+    kept = search.steps[search.complete(1.0)]
     assert next(iter(pruned.method.size().counts.values())) == kept.rows < search.rows
-    assert pruned.result is not None and pruned.result.need == json.loads(json.dumps(need(search)))
-    assert pruned.result.model_bytes == kept.bytes and pruned.config.variant == "need 1 dB"
+    assert kept.rows == search.steps[smallest(search.steps, 1.0)].rows
+    assert pruned.result == result and result.need.items() >= json.loads(json.dumps(need(search))).items()
+    assert result.model_bytes == kept.bytes and pruned.config.variant == "need 1 dB"
+    assert keep(Search(opened(method)), 1.0) == result, "what was kept before stays"
     assert pruned.score("sphere").metrics == pytest.approx(pruned.scores["sphere"].metrics, nan_ok=True)
-    told = pruned.result.need
+    told = result.need
     assert [step["kind"] for step in told["steps"]][:3] == ["waste", "control", "prune"]
     assert told["needs"]["1"] is not None and told["steps"][0]["loss"] == 0
 
@@ -118,7 +119,7 @@ def test_the_rows_that_are_kept_are_those_whose_removal_changes_most(opened):
 
 def test_steps_of_another_model_are_refused(opened):
     search = Search(opened("method=omnigs"))
-    search.complete()
+    search.complete(1.0)
     search.folder._of = "another"
     with pytest.raises(CheckpointError, match="is of another model than the run has now; delete"):
         search.folder.steps()
