@@ -14,10 +14,10 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from rich.console import Console
 
+from padgs.learning.stopping import set_apart
 from padgs.multirun.board import CRASHED, ELSEWHERE, REFUSED, STOPPED, Board, BoardEntry
 from padgs.multirun.composition import typed_config
 from padgs.multirun.finished import FinishedJobs
-from padgs.learning.stopping import set_apart
 from padgs.need import STATED
 from padgs.results import Result
 from padgs.runs.checkpoint import CheckpointError
@@ -41,7 +41,7 @@ def only_job(composed: DictConfig) -> None:
         config, console = typed_config(composed, HydraConfig.get().runtime.choices), Console()
         dimly = partial(say, console, style="dim")
         tracker = Tracker(config.tracking, Path(config.run.folder), " ".join(config.labels.experiments), dimly)
-        result = _done(config, console, TrackedRun(tracker))
+        result = done(config, console, TrackedRun(tracker))
         ENDS.append(result.status)
         tracker.update(Path(config.run.folder) / result.run)
         data = None if config.data.path is None else str(Path(config.data.path).absolute())
@@ -70,7 +70,7 @@ def job_of_many(composed: DictConfig) -> str:
                 raise Interrupted("not started")
             config = typed_config(composed, hydra.runtime.choices)
             entry.data = None if config.data.path is None else str(Path(config.data.path).absolute())
-            result = _done(config, console, entry)
+            result = done(config, console, entry)
             return entry.end(result.status, result.reason)
         except KeyboardInterrupt as error:
             entry.end(STOPPED, str(error))
@@ -84,7 +84,7 @@ def job_of_many(composed: DictConfig) -> str:
             return entry.end(CRASHED, f"{type(error).__name__}: {error}")
 
 
-def _done(config: RunConfig, console: Console, watch: Watch) -> Result:
+def done(config: RunConfig, console: Console, watch: Watch) -> Result:
     """Do what is missing of a run, and of the search for what its scene needs, if that is asked for."""
     session = Session(config, console, watch)
     if config.need == "on":
