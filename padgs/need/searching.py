@@ -10,6 +10,7 @@ from padgs.need.outcome import keep
 from padgs.need.session import Search
 from padgs.need.summary import show
 from padgs.runs.opened import OpenedRun
+from padgs.runs.terminal import say
 
 
 def search(run: OpenedRun, epsilon: float, console: Console, asked: Callable[[], bool] = lambda: False) -> None:
@@ -29,4 +30,4 @@ def search(run: OpenedRun, epsilon: float, console: Console, asked: Callable[[],
     with run.files.locked():
         kept = keep(Search(run, console.print, asked), epsilon)
     show(kept.need, console)
-    console.print(str(run.folder.with_name(kept.run)), style="bold")
+    say(console, run.folder.with_name(kept.run), "bold")

@@ -23,6 +23,7 @@ from padgs.splats.trainee import SplatTrainee
 
 Model = Splats | PaDGS
 WHOLE, HALF, BYTE = ".float32.npz", ".float16.npz", ".8bit.npz"  # endings of our own
+OTHERS = (".compressed.ply", ".spz")  # of CONVERTED; without a GPU .sog takes minutes, and is larger than .spz
 CHUNK = 256  # rows that share their extremes
 POSITIONS = ("means", "positions")
 CURVE_BITS = 10  # for each axis of the curve that puts neighbours side by side
@@ -31,8 +32,8 @@ LOWEST, STEP, ORDERED = "/lowest", "/step", "/codes"  # of a tensor's name, the 
 
 def endings(model: Model) -> tuple[str, ...]:
     """Of the files that a model can be written to here; the first is exact."""
-    others = CONVERTED if isinstance(model, Splats) and shutil.which(CONVERTER) else ()
-    return (WHOLE, HALF, BYTE, *(ending for ending in others if ending != ".html"))
+    others = OTHERS if isinstance(model, Splats) and shutil.which(CONVERTER) else ()
+    return (WHOLE, HALF, BYTE, *others)
 
 
 def model_of(trainee: Prunable) -> Model:

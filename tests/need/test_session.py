@@ -179,13 +179,14 @@ def test_a_need_changes_nothing_of_the_run_and_is_told_at_its_end(settings, tmp_
     with composing():
         config = configuration(settings)
         assert config.values() == configuration([*settings, "need=off"]).values()
-    result = job.done(config, Console(), Watch())
+    result = job.done(config, Console(width=400), Watch())
     told = capsys.readouterr().out
     assert "0.1 dB" in told and f"{result.run}_need-0.1" in told
     kept = read(tmp_path / f"{result.run}_need-0.1" / "result.json")
     assert kept.need["needs"]["0.1"] is not None and kept.experiments == ("need",) and not result.need
 
 
+@pytest.mark.slow
 def test_the_lowest_degree_that_is_good_enough_is_kept(opened, monkeypatch):
     run = opened("method=omnigs")
     monkeypatch.setattr("padgs.need.search.objections", lambda candidate, reference, epsilon: ())
