@@ -52,6 +52,10 @@ class EgoNeRFMethod(Method):
         if budget.seconds is None:  # else the length is known when it is rehearsed
             self.options.refuse_length(budget.iterations)
 
+    def refuse_search(self) -> None:
+        """There is nothing to leave out."""
+        raise ValueError("egonerf has no Gaussians that could be left out, as need does; take a method that has")
+
     def _start(self, scene: Scene, iterations: int) -> EgoNeRFTrainee:
         return EgoNeRFTrainee(EgoNeRF.from_scene(scene, self.options, self.seed), self.options, iterations)
 

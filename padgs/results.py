@@ -23,6 +23,7 @@ SCHEMA = 2
 ADDED = {"peak_device_memory_bytes", "need", "ended"}  # since then: files without are read, with the default
 FILE_NAME = "result.json"
 LOG_NAME, CONFIG_NAME = "log.jsonl", "config.yaml"
+NEED_PICTURE = "need.png"  # truth | whole model | smallest for 0.1 dB | for 1 dB, of a test view, beside the result
 PICTURES = "renders"  # folder of truth | render | error of each test view, in one picture
 STATUSES = {
     "ok": "trained to the end and evaluated",

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pandas import DataFrame
 
+from padgs.results import NEED_PICTURE
 from reports import methods
 from reports.gathered import Gathered
 from reports.settings import settings
@@ -27,10 +29,24 @@ class Curve:
     needs: Mapping[str, Mapping[str, Any]]  # epsilon -> the smallest step that loses at most so much
     knee: Mapping[str, Any] | None
     found: Mapping[str, Any]  # all of `Result.need`
+    picture: Path | None = None  # as `padgs.results.NEED_PICTURE` says, if there is one
 
     def values(self, name: str) -> list[float]:
         """A number of all steps; NaN where one has none."""
         return [np.nan if step[name] is None else step[name] for step in self.steps]
+
+    @property
+    def degree(self) -> int | None:
+        """Of the harmonics that are enough for `STATED`; None where that was not searched, or there are none."""
+        steps = self.found.get("degrees", {}).get(STATED) or [{"degree": None, "objections": {STATED: ()}}]
+        return [step["degree"] for step in steps if not step["objections"][STATED]][-1]
+
+    @property
+    def file(self) -> Mapping[str, Any] | None:
+        """The smallest good file of the model that was kept, if that is the one for `STATED`."""
+        if f"{self.found.get('kept', {}).get('epsilon')}" != STATED:
+            return None
+        return next(file for file in self.found["files"] if file["kept"])
 
     @property
     def quality(self) -> list[float]:
@@ -60,13 +76,15 @@ def curves(runs: DataFrame) -> list[Curve]:
     found = []
     for setting in settings(runs):
         ordered = setting.runs.sort_values("seed")
-        for seed, need in zip(ordered["seed"], ordered["need"], strict=True):
+        for seed, need, renders in zip(ordered["seed"], ordered["need"], ordered["pictures"], strict=True):
             steps = need["steps"]
             rows = sorted((s for s in steps if s["kind"] != "control"), key=lambda step: -step["blended"])
             title = methods.title(setting.preset) + (f", seed {seed}" if len(setting.runs) > 1 else "")
             needs = {epsilon: steps[number] for epsilon, number in need["needs"].items()}
             knee = None if need["knee"] is None else steps[need["knee"]]
-            found.append(Curve(title, setting.preset, tuple(rows), needs, knee, need))
+            picture = None if renders is None else renders.with_name(NEED_PICTURE)
+            there = picture if picture is not None and picture.is_file() else None
+            found.append(Curve(title, setting.preset, tuple(rows), needs, knee, need, there))
     return found
 
 

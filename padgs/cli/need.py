@@ -7,22 +7,20 @@ from typing import Annotated
 import typer
 
 from padgs.cli.refusing import refusing
+from padgs.need import STATED
 
 
 def need(
     run: Annotated[str, typer.Argument(help="folder of a finished run, as padgs-run names it at its end")],
-    epsilon: Annotated[float, typer.Option(help="dB that the kept model may lose: 0.05, 0.1, 0.25, 0.5, 1")] = 0.1,
+    epsilon: Annotated[float, typer.Option(help="dB that the kept model may lose: 0.05, 0.1, 0.25, 0.5, 1")] = STATED,
     data: Annotated[str, typer.Option(help="where the data set is now, if not where it was")] = "",
     device: Annotated[str, typer.Option(help="auto, cpu or cuda")] = "auto",
 ) -> None:
     """Find the smallest model as good as a trained one, for several losses; keep one as a run of its own."""
     from rich.console import Console
 
-    from padgs.need.outcome import need as told
-    from padgs.need.outcome import write_pruned
     from padgs.need.search import EPSILONS
-    from padgs.need.session import Search
-    from padgs.need.summary import show
+    from padgs.need.searching import search
     from padgs.runs.interrupt import INTERRUPTED, Interrupted
     from padgs.runs.opened import load_run
 
@@ -37,12 +35,7 @@ def need(
             if opened.result is None or not opened.result.ok:
                 state = "not finished" if opened.result is None else f"of status {opened.result.status}"
                 raise ValueError(f"{run} is {state}; a need is that of a run that ended well, so start it again first")
-            with opened.files.locked():
-                search = Search(opened, console.print)
-                search.complete()
-                folder = write_pruned(search, epsilon)
-            show(told(search), console)
-            console.print(str(folder), style="bold")
+            search(opened, epsilon, console)
     except Interrupted as interrupted:  # outside of `refusing`, to which Exit is an error
         console.print(str(interrupted))
         raise typer.Exit(INTERRUPTED) from interrupted

@@ -43,10 +43,14 @@ def write_splats(path: Path, splats: Splats, comments: Sequence[str] = ()) -> No
     with tempfile.TemporaryDirectory() as folder:
         plain = Path(folder) / "splats.ply"
         _write_ply(plain, splats, comments)
-        command = [CONVERTER, "--quiet", "--overwrite", "--gpu", "cpu", str(plain), str(path.resolve())]
-        done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        _convert(plain, path)
+
+
+def _convert(source: Path, target: Path) -> None:
+    command = [CONVERTER, "--quiet", "--overwrite", "--gpu", "cpu", str(source.resolve()), str(target.resolve())]
+    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     if done.returncode:
-        raise ValueError(f"{CONVERTER} could not write {path}: {done.stdout.strip()[-500:]}")
+        raise ValueError(f"{CONVERTER} could not make {target} of {source}: {done.stdout.strip()[-500:]}")
 
 
 def refuse_impossible(path: Path) -> None:
@@ -65,11 +69,18 @@ def refuse_impossible(path: Path) -> None:
 
 
 def read_splats(path: Path, *, unit: float = 1.0) -> Splats:
-    """The Gaussians of a PLY; `unit` is the scene's unit of length, which the file does not say.
+    """The Gaussians of a file; `unit` is the scene's unit of length, which the file does not say.
 
     Raises:
         DataError: no readable PLY, or not one of Gaussians.
+        ValueError: one of `CONVERTED`, but the converter is not installed or fails.
     """
+    if path.name.endswith(CONVERTED):
+        refuse_impossible(path)
+        with tempfile.TemporaryDirectory() as folder:
+            plain = Path(folder) / "splats.ply"
+            _convert(path, plain)
+            return read_splats(plain, unit=unit)
     vertex, names = read_vertices(path)
     rest = 0
     while f"f_rest_{rest}" in names:

@@ -196,6 +196,18 @@ class Method(ABC):
                 "here, and those of such views do not; set it to end"
             )
 
+    def refuse_search(self) -> None:
+        """Refuse the search for the smallest model (`padgs.need`) on any scene; subclasses know more.
+
+        Raises:
+            ValueError: with these options there is nothing to search.
+        """
+        if self._views_learn:
+            raise ValueError(
+                "need compares pictures with photographs, but exposures or cameras learn along here; take a method "
+                "that does not calibrate, with train.exposures=given and train.poses=given"
+            )
+
     @property
     def _views_learn(self) -> bool:
         """Whether something of single views is learned, which views without gradients then lack."""

@@ -68,8 +68,8 @@ class FinishedJobs:
 
 def only_run(arguments: Sequence[str]) -> Path | None:
     """The folder of the run that a command line asks for, if it is one that is known to have ended well."""
-    if any(text.startswith(("-", "tracking")) and text != "tracking=none" for text in arguments):
-        return None  # options change what is asked for; and a tracker may want to hear of an old run
+    if any(text.startswith(("-", "tracking", "need")) and text != "tracking=none" for text in arguments):
+        return None  # options change what is asked for; a tracker may want to hear of an old run; needs are told again
     known = FinishedJobs(folder_of(arguments))
     return known.run(arguments) if known.status(arguments) == "ok" else None
 

@@ -14,13 +14,18 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from rich.console import Console
 
+from padgs.learning.stopping import set_apart
 from padgs.multirun.board import CRASHED, ELSEWHERE, REFUSED, STOPPED, Board, BoardEntry
 from padgs.multirun.composition import typed_config
 from padgs.multirun.finished import FinishedJobs
+from padgs.need import STATED
+from padgs.results import Result
 from padgs.runs.checkpoint import CheckpointError
+from padgs.runs.config import RunConfig
 from padgs.runs.folder import RunFolderError
 from padgs.runs.interrupt import Interrupted
 from padgs.runs.lock import RunBusy
+from padgs.runs.opened import load_run
 from padgs.runs.session import Session, Watch
 from padgs.runs.terminal import say
 from padgs.tracking.tracker import SECONDS_BETWEEN_LOOKS, Tracker
@@ -36,11 +41,11 @@ def only_job(composed: DictConfig) -> None:
         config, console = typed_config(composed, HydraConfig.get().runtime.choices), Console()
         dimly = partial(say, console, style="dim")
         tracker = Tracker(config.tracking, Path(config.run.folder), " ".join(config.labels.experiments), dimly)
-        session = Session(config, console, TrackedRun(tracker))
-        ENDS.append(session.run().status)
-        tracker.update(session.folder.path)
+        result = done(config, console, TrackedRun(tracker))
+        ENDS.append(result.status)
+        tracker.update(Path(config.run.folder) / result.run)
         data = None if config.data.path is None else str(Path(config.data.path).absolute())
-        FinishedJobs(Path(config.run.folder)).add(ARGUMENTS, session.folder.path.name, ENDS[-1], data)
+        FinishedJobs(Path(config.run.folder)).add(ARGUMENTS, result.run, result.status, data)
     except EXPECTED as error:
         if os.environ.get("HYDRA_FULL_ERROR"):
             raise
@@ -65,7 +70,7 @@ def job_of_many(composed: DictConfig) -> str:
                 raise Interrupted("not started")
             config = typed_config(composed, hydra.runtime.choices)
             entry.data = None if config.data.path is None else str(Path(config.data.path).absolute())
-            result = Session(config, console, entry).run()
+            result = done(config, console, entry)
             return entry.end(result.status, result.reason)
         except KeyboardInterrupt as error:
             entry.end(STOPPED, str(error))
@@ -77,6 +82,20 @@ def job_of_many(composed: DictConfig) -> str:
         except Exception as error:
             say(console, traceback.format_exc())
             return entry.end(CRASHED, f"{type(error).__name__}: {error}")
+
+
+def done(config: RunConfig, console: Console, watch: Watch) -> Result:
+    """Do what is missing of a run, and of the search for what its scene needs, if that is asked for."""
+    session = Session(config, console, watch)
+    if config.need == "on":
+        set_apart(session.scene.train)  # refuses too few views before hours of training
+    result = session.run()
+    if config.need == "on" and result.ok:
+        from padgs.need.searching import search  # scipy.stats, which other runs need not wait for
+
+        run = load_run(session.folder.path, data_path=config.data.path, device=config.run.device)
+        search(run, STATED, console, watch.stop_requested)
+    return result
 
 
 def complain(message: str) -> None:

@@ -3,89 +3,117 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
+from PIL import Image
+
 from padgs.learning.trainee import MODEL, State
+from padgs.need import STATED
 from padgs.need.calibration import PERCEPTION, QUALITY
-from padgs.need.search import EPSILONS, against, knee, loss, smallest
+from padgs.need.files import files
+from padgs.need.search import EPSILONS, Step, against, degrees, knee, loss, smallest
 from padgs.need.session import Search
-from padgs.results import Result
+from padgs.results import NEED_PICTURE, Result
 from padgs.runs.folder import PROGRESS, Progress, RunFolder
 from padgs.runs.identity import config_hash, identity
 from padgs.runs.scoring import frame_times, scores
+from padgs.runs.session import build
+from padgs.scoring.pictures import eight_bit
 
 ADAM = "adam/"  # moments of the run's own rows, which a pruned model does not have
 EXPERIMENT = "need"
+PICTURED = (STATED, 1.0)  # dB
 
 
 def need(search: Search) -> dict[str, Any]:
-    """What a finished search found, as JSON can hold it, for `Result.need`.
+    """What the steps of a finished search say, as JSON can hold it, for `Result.need`.
 
     Returns:
         row: gaussians or anchors; rows: of the run's own model; waste: of them shown nowhere; needs: epsilon -> number
         of the smallest step; knee: number of a step, or None; steps: from the first to the last, with what each lost
-        against its control, and what stands against it at each epsilon; calibration: names of views; seconds,
-        cpu_seconds: of all steps.
+        against its control, and what stands against it at each epsilon; degrees: epsilon -> the same of the steps that
+        took harmonics from the smallest; calibration: names of views; seconds, cpu_seconds: of all steps.
     """
-    steps, told = search.steps, []
-    for number, step in enumerate(steps):
-        numbers = {name: value for name, value in asdict(step).items() if name not in ("marks", "test")}
-        numbers |= {"loss": loss(steps, number), "ws_psnr": step.marks.metrics[QUALITY]}
-        numbers |= {"lpips": step.marks.metrics.get(str(PERCEPTION)), "test_ws_psnr": step.test.get(QUALITY)}
-        numbers["objections"] = {f"{epsilon:g}": list(against(steps, number, epsilon)) for epsilon in EPSILONS}
-        told.append(numbers)
+    steps = search.steps
+    sizes = [number for number, step in enumerate(steps) if step.kind != "degree"]  # these come first
+    needs = {f"{epsilon:g}": smallest(steps, epsilon) for epsilon in EPSILONS}
     return {
         "row": search.row,
         "rows": search.rows,
         "waste": search.rows - steps[0].rows,
-        "needs": {f"{epsilon:g}": smallest(steps, epsilon) for epsilon in EPSILONS},
+        "needs": needs,
         "knee": knee(steps),
-        "steps": told,
+        "steps": [_told(steps, number) for number in sizes],
+        "degrees": {
+            name: [_told(steps, n) for n in made] for name, at in needs.items() if (made := degrees(steps, at))
+        },
         "calibration": [view.name for view in search.calibration],
         "seconds": math.fsum(step.seconds for step in steps),
         "cpu_seconds": math.fsum(step.cpu_seconds for step in steps),
     }
 
 
-def write_pruned(search: Search, epsilon: float) -> Path:
-    """Write the smallest model that loses at most epsilon as a run beside the searched one; returns its folder.
+def _told(steps: Sequence[Step], number: int) -> dict[str, Any]:
+    step = steps[number]
+    numbers = {name: value for name, value in asdict(step).items() if name not in ("marks", "test")}
+    numbers |= {"loss": loss(steps, number), "ws_psnr": step.marks.metrics[QUALITY]}
+    numbers |= {"lpips": step.marks.metrics.get(str(PERCEPTION)), "test_ws_psnr": step.test.get(QUALITY)}
+    return numbers | {"objections": {f"{epsilon:g}": list(against(steps, number, epsilon)) for epsilon in EPSILONS}}
 
-    It has seen the calibration views again. Its training time is that of the run and of the search; its protocols are
-    the run's.
+
+def keep(search: Search, epsilon: float) -> Result:
+    """Make all steps, and keep what is needed for losing at most epsilon dB as a run beside the searched one.
+
+    That is the smallest model with as few harmonics as it takes, refined once more on all training views, and the
+    smallest file that it can be kept in. Its training time is that of the run and of the search; its protocols are the
+    run's. What was kept before stays.
 
     Raises:
+        Interrupted, Failure: as `Search.complete` does.
         RunFolderError, CheckpointError: it cannot be written.
         RunBusy: another process writes it.
     """
-    run, number = search.run, smallest(search.steps, epsilon)
+    number, run = search.complete(epsilon), search.run
     assert run.result is not None, "only of a finished run"
+    found, step = need(search), search.steps[number]
+    found["kept"] = {"epsilon": epsilon, "degree": step.degree, "loss": loss(search.steps, number)}
     variant = ", ".join(filter(None, (run.config.variant, f"need {epsilon:g} dB")))
-    values = {**run.result.config, "variant": variant}
+    values, options = {**run.result.config, "variant": variant}, run.config.options
+    if step.degree is not None:
+        values["method"] = {**values["method"], "sh_degree": step.degree}
+        options = replace(options, sh_degree=step.degree)
     path = run.folder.with_name(f"{run.folder.name}_need-{epsilon:g}")
     folder = RunFolder(path, identity(values, run.result.fingerprint))
+    before = folder.result()
+    if before is not None and "files" in before.need and before.need["seconds"] == found["seconds"]:  # the same steps
+        return before
     trained, model = run.method.state(), search.kept(number)
-    of_model = model.state()
+    of_model, method = model.state(), build(replace(run.config, options=options))
     kept = {n: t for n, t in trained.tensors.items() if not n.startswith((MODEL, ADAM))}
     tensors = kept | {f"{MODEL}{name}": tensor for name, tensor in of_model.tensors.items()}
-    run.method.load_state(State(tensors, {**trained.values, "model": of_model.values}))
-    size, found = model.size(), need(search)
+    method.load_state(State(tensors, {**trained.values, "model": of_model.values}))
+    size = model.size()
     with folder.locked():
         folder.prepare(values)
-        folder.save(run.method, Progress(**trained.values[PROGRESS]))
+        folder.save(method, Progress(**trained.values[PROGRESS]))
         scene, timing = run.scene, dict(run.result.timing)
         for name in {"train_seconds", "cpu_seconds"} & timing.keys():
             timing[name] += found[name.removeprefix("train_")]
         tested = {}
         if scene.test:
-            timing |= frame_times(run.method, scene)
-            tested = {"scores": scores(run.method, scene, run.config.protocols, folder.save_picture)}
+            timing |= frame_times(method, scene)
+            tested = {"scores": scores(method, scene, run.config.protocols, folder.save_picture)}
+            _side_by_side(search, path / NEED_PICTURE)
         start = {name: run.result.counts[name] for name in ("start",) if name in run.result.counts}
         made: Result = replace(
             run.result,
-            run=folder.path.name,
+            run=path.name,
             variant=variant,
             counts={**size.counts, "parameters": size.parameters, **start},
             model_bytes=size.bytes,
@@ -94,9 +122,16 @@ def write_pruned(search: Search, epsilon: float) -> Path:
             config_hash=config_hash(values),
             experiments=(EXPERIMENT,),
             finished=datetime.now(timezone.utc).isoformat(timespec="seconds"),
-            need=found,
+            need={**found, "files": files(search, model, path, epsilon)},
             **tested,
         )
-        folder.finish(made)
-    run.method.load_state(trained)
-    return folder.path
+        return folder.finish(made)
+
+
+@torch.no_grad()
+def _side_by_side(search: Search, path: Path) -> None:
+    """The middle test view: its photograph, the run's model, and what is left of that for two losses."""
+    view = search.run.scene.test[len(search.run.scene.test) // 2]
+    steps = (search.model_of(smallest(search.steps, epsilon)) for epsilon in PICTURED)
+    images = [view.image(), *(model.render(view).image for model in (search.run.method, *steps))]
+    Image.fromarray(np.concatenate([eight_bit(image) for image in images], axis=1)).save(path)

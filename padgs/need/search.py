@@ -7,6 +7,9 @@ the next smaller one.
 
 A model that was refined forgets what the run knew of the calibration views, and gains what any training on gains. So it
 is compared with one that was refined as often and lost nothing, its control; these are steps, too.
+
+Then, for one loss, harmonics: the model that was kept is refined with all of its degrees, and with one less each time
+until it is no longer as good as with all.
 """
 
 from __future__ import annotations
@@ -30,9 +33,10 @@ HALF_A_DOUBLING = 2**-0.5
 class Plan:
     """A model to be made: from that of step `parent`, or for the first from the run's own, with so many rows or all."""
 
-    kind: str  # waste | control | prune
+    kind: str  # waste | control | prune | degree
     parent: int | None
     rows: int | None = None
+    degree: int | None = None  # highest of the harmonics, or None for those that there are
 
 
 @dataclass(frozen=True)
@@ -50,31 +54,43 @@ class Step:
     test: dict[str, float | None] = field(default_factory=dict)  # metric -> mean over the test views; decides nothing
     seconds: float = 0.0  # to make and measure it
     cpu_seconds: float = 0.0
+    degree: int | None = None  # of steps of that kind
 
 
 def control(steps: Sequence[Step], depth: int) -> int | None:
     """The step that was refined so often and lost nothing, if it was made."""
-    return next((n for n, step in enumerate(steps) if step.kind != "prune" and step.depth == depth), None)
+    return next((n for n, s in enumerate(steps) if s.kind in ("waste", "control") and s.depth == depth), None)
 
 
 def models(steps: Sequence[Step]) -> list[int]:
     """The first step and all that rows were taken from, from large to small."""
-    return sorted((n for n, s in enumerate(steps) if s.kind != "control"), key=lambda number: -steps[number].rows)
+    return sorted((n for n, s in enumerate(steps) if s.kind in ("waste", "prune")), key=lambda n: -steps[n].rows)
+
+
+def degrees(steps: Sequence[Step], parent: int) -> list[int]:
+    """The steps that harmonics were taken from a model in, from all of them to few."""
+    return [number for number, step in enumerate(steps) if step.kind == "degree" and step.parent == parent]
 
 
 def against(steps: Sequence[Step], number: int, epsilon: float) -> tuple[str, ...]:
     """Why a step is not as good as its control up to epsilon; nothing where it is."""
-    other = control(steps, steps[number].depth)
-    assert other is not None, "controls are made first"
-    return objections(steps[number].marks, steps[other].marks, epsilon)
+    return objections(steps[number].marks, _beside(steps, number).marks, epsilon)
 
 
 def loss(steps: Sequence[Step], number: int) -> float:
     """Mean WS-PSNR, dB, that a step lost on the calibration views against its control."""
-    other = control(steps, steps[number].depth)
-    assert other is not None, "controls are made first"
-    losses = differences(steps[other].marks, steps[number].marks, QUALITY)
+    losses = differences(_beside(steps, number).marks, steps[number].marks, QUALITY)
     return math.fsum(losses) / len(losses)
+
+
+def _beside(steps: Sequence[Step], number: int) -> Step:
+    """What a step is compared with: its control, or the same model with all of its harmonics."""
+    step = steps[number]
+    if step.kind == "degree" and step.parent is not None:
+        return steps[degrees(steps, step.parent)[0]]
+    other = control(steps, step.depth)
+    assert other is not None, "controls are made first"
+    return steps[other]
 
 
 def smallest(steps: Sequence[Step], epsilon: float) -> int:
@@ -93,6 +109,21 @@ def plan(steps: Sequence[Step], epsilons: Sequence[float] = EPSILONS) -> Plan | 
     if control(steps, depth + 1) is None:
         return Plan("control", control(steps, depth))
     return wanted
+
+
+def plan_degree(steps: Sequence[Step], parent: int, degree: int, epsilon: float) -> Plan | None:
+    """What to make next of a model that has harmonics up to a degree; None where the lowest good one is known."""
+    made = degrees(steps, parent)
+    lower = degree - len(made)
+    if lower < 0 or made and against(steps, made[-1], epsilon):
+        return None
+    return None if degree == 0 else Plan("degree", parent, degree=lower)
+
+
+def narrowest(steps: Sequence[Step], parent: int, epsilon: float) -> int:
+    """The step of the lowest degree that is as good as all up to epsilon; `parent` itself where that takes all."""
+    good = [number for number in degrees(steps, parent) if not against(steps, number, epsilon)]
+    return good[-1] if len(good) > 1 else parent
 
 
 def _pruned(steps: Sequence[Step], epsilons: Sequence[float]) -> Plan | None:

@@ -16,14 +16,16 @@ from padgs.learning.trainee import Prunable, State
 from padgs.need import refine
 from padgs.need.calibration import RULES, calibration_split
 from padgs.need.refine import Refining
-from padgs.need.search import Plan, Step, loss, plan
+from padgs.need.search import Plan, Step, loss, narrowest, plan, plan_degree, smallest
 from padgs.need.steps import StepsFolder
 from padgs.need.worth import most_wanted, worth
+from padgs.results import Scores
 from padgs.runs import checkpoint
 from padgs.runs.interrupt import Interrupt, Interrupted
 from padgs.runs.opened import OpenedRun
 from padgs.scene import View
 from padgs.scoring.evaluate import evaluate
+from padgs.splats.trainee import SplatTrainee
 
 FOLDER = "need"  # in that of the run
 FRAMES = 10  # timed; the smallest time counts, since other programs only add to it
@@ -41,22 +43,34 @@ class Search:
         steps, folder: what was made so far, and where it is.
     """
 
-    def __init__(self, run: OpenedRun, say: Callable[[str], None] = lambda text: None) -> None:
+    def __init__(
+        self,
+        run: OpenedRun,
+        say: Callable[[str], None] = lambda text: None,
+        asked: Callable[[], bool] = lambda: False,
+    ) -> None:
         """Prepare; nothing is drawn yet.
+
+        Args:
+            run: whose model is looked at.
+            say: is told of each step.
+            asked: whether to stop, besides signals.
 
         Raises:
             ValueError: the model has no Gaussians that could be left out, or the scene too few training views.
             CheckpointError: steps of an earlier start are damaged, or of another model.
         """
-        self.run, self._say = run, say
+        self.run, self._say, self._asked = run, say, asked
         self.calibration, self._views = calibration_split(run.scene.train)
         self._model = self._resumed()
         self.row, self.rows = next(iter(self._model.counts().items()))
         self.folder = StepsFolder(run.folder / FOLDER, checkpoint.digest(run.files.checkpoint))
         self.steps = self.folder.steps()
 
-    def complete(self) -> None:
-        """Make all steps that are missing.
+    def complete(self, epsilon: float) -> int:
+        """Make all steps that are missing; returns the one to keep.
+
+        That is the smallest model as good as its control up to epsilon, with as few harmonics as are as good as all.
 
         Raises:
             Interrupted: stopped from outside; starting again goes on, to the same result bit by bit (on the CPU).
@@ -64,13 +78,22 @@ class Search:
         """
         if self.steps:
             self._say(f"{len(self.steps)} steps were made before")
-        with Interrupt() as stop:
-            while (wanted := plan(self.steps)) is not None:
+        self._make_all(lambda: plan(self.steps))
+        number = smallest(self.steps, epsilon)
+        if isinstance(self._model, SplatTrainee):
+            degree = self._model.splats.degree
+            self._make_all(lambda: plan_degree(self.steps, number, degree, epsilon))
+        return narrowest(self.steps, number, epsilon)
+
+    def _make_all(self, following: Callable[[], Plan | None]) -> None:
+        with Interrupt(self._asked) as stop:
+            while (wanted := following()) is not None:
                 step, model = self._make(wanted, stop)
                 self.folder.add(len(self.steps), step, model)
                 self.steps.append(step)
+                kind = step.kind if step.degree is None else f"{step.kind} {step.degree}"
                 self._say(
-                    f"{len(self.steps):3d} {step.kind:7s} {step.rows:8d} {self.row}, {step.blended} Gaussians blended, "
+                    f"{len(self.steps):3d} {kind:8s} {step.rows:8d} {self.row}, {step.blended} Gaussians blended, "
                     f"{loss(self.steps, len(self.steps) - 1):5.2f} dB lost, {step.seconds:.1f} s"
                 )
                 if stop.requested:
@@ -82,14 +105,17 @@ class Search:
         Raises:
             Interrupted, Failure: as `complete` does.
         """
-        model = self._model_of(number)
+        model = self.model_of(number)
         if self.steps[number].depth > 0:
-            with Interrupt() as stop:
+            with Interrupt(self._asked) as stop:
                 self._refine(model, self.run.scene.train, f"kept {number}", stop)
         return model
 
-    def _model_of(self, number: int) -> Prunable:
+    def model_of(self, number: int) -> Prunable:
+        """The model of a step."""
         model, state = self._resumed(), self.folder.state(number, self._device)
+        if isinstance(model, SplatTrainee) and (degree := self.steps[number].degree) is not None:
+            model.truncate(degree)
         model.load_state(State(state.tensors, state.values["model"]))
         return model
 
@@ -104,12 +130,7 @@ class Search:
 
     def _resumed(self) -> Prunable:
         """The model of the run."""
-        train = self.run.config.train
-        if "learned" in (train.exposures, train.poses):
-            raise ValueError(
-                f"the run has train.exposures={train.exposures} and train.poses={train.poses}, so photographs cannot "
-                "be compared with what its model shows; take a run with both given"
-            )
+        self.run.method.refuse_search()
         model = self.run.method.resumed(self.run.scene, self._schedule)
         if not isinstance(model, Prunable):
             raise ValueError(
@@ -119,11 +140,13 @@ class Search:
 
     def _make(self, wanted: Plan, stop: Interrupt) -> tuple[Step, State]:
         started = time.perf_counter(), time.process_time()
-        model = self._model if wanted.parent is None else self._model_of(wanted.parent)
+        model = self._model if wanted.parent is None else self.model_of(wanted.parent)
         if wanted.kind == "waste":
             shown = worth(model, self.run.scene.train).peak > 0
             model.keep(shown)
         else:
+            if isinstance(model, SplatTrainee) and wanted.degree is not None:
+                model.truncate(wanted.degree)
             if wanted.rows is not None:
                 model.keep(most_wanted(worth(model, self.run.scene.train), wanted.rows))
             self._refine(model, self._views, f"step {len(self.steps)}", stop)
@@ -146,10 +169,15 @@ class Search:
                 self.folder.begin(what, trainer.state())
                 raise Interrupted(f"stopped within {what}; nothing is lost, start again to go on")
 
+    def scored(self, model: Prunable) -> tuple[Scores, dict[str, float | None]]:
+        """Marks of the calibration views, and means of the test views, which decide nothing."""
+        test = self.run.scene.test
+        marks = replace(evaluate(model.render, self.calibration, RULES), protocol={}, notes=())
+        return marks, evaluate(model.render, test, WITHOUT_PERCEPTION).metrics if test else {}
+
     def _measured(self, model: Prunable, wanted: Plan) -> Step:
         scene = self.run.scene
-        marks = replace(evaluate(model.render, self.calibration, RULES), protocol={}, notes=())
-        test = evaluate(model.render, scene.test, WITHOUT_PERCEPTION).metrics if scene.test else {}
+        marks, test = self.scored(model)
         views = islice(cycle(self.calibration), FRAMES)
         times = [timed(lambda view=view: model.render(view), self._device)[1] for view in views]
         return Step(
@@ -162,4 +190,5 @@ class Search:
             frame_ms=1000 * min(times),
             marks=marks,
             test=test,
+            degree=wanted.degree,
         )

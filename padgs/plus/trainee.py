@@ -77,6 +77,12 @@ class PlusTrainee(SplatTrainee):
         super().keep(rows)
         self.average = {name: mean[rows] for name, mean in self.average.items()}
 
+    def truncate(self, degree: int) -> None:
+        """Leave out the harmonics above a degree."""
+        super().truncate(degree)
+        if self.average:
+            self.average["sh_rest"] = self.average["sh_rest"][:, : self.splats.sh_rest.shape[1]]
+
     def state(self) -> State:
         """That of splats, and the running means."""
         state = super().state()

@@ -27,6 +27,7 @@ from padgs.stress.options import StressOptions
 from padgs.tracking.tracker import TrackingOptions
 
 RETRIES = ("none", "failed")
+NEEDS = ("off", "on")
 IMAGES_ON = ("device", "cpu")
 CONTINUED = "continued"  # the word for runs with `init` in tables
 LATER = ("exposures", "poses")  # keys of `train` that older runs do not have; they did what is the default
@@ -135,10 +136,12 @@ class Settings:
     seed: int = 0
     init: Start | None = None  # folder of a finished run of the method and scene: training begins with its model
     retry: str = "none"  # which finished runs are done again: a name of RETRIES
+    need: str = "off"  # on: a run that ended well is searched for its smallest model, as padgs need does
 
     def __post_init__(self) -> None:
         if self.retry not in RETRIES:
             raise ConfigError(f"unknown retry {self.retry!r}; known: {', '.join(RETRIES)}")
+        check_known(self, need=NEEDS)
         check(self, "in [0, 2^63)", lambda seed: 0 <= seed < 2**63, "seed")
 
 
@@ -222,6 +225,8 @@ def config_from_values(values: Mapping[str, Any], labels: Labels = Labels()) -> 
         rules = {key: _protocol(key, _group(protocols, key, "protocol.")) for key in protocols}
         config = RunConfig(**vars(settings), method=name, options=options, protocols=rules, labels=labels)
         made.refuse_budget(config.time)
+        if config.need == "on":
+            made.refuse_search()
     except ValueError as error:
         raise ConfigError(str(error)) from error
     if not rules:

@@ -105,6 +105,11 @@ class Splats(nn.Module):
         """All parameters; each has one row per Gaussian."""
         return dict(self.named_parameters())
 
+    def truncate(self, degree: int) -> None:
+        """Leave out the harmonics above a degree; no optimiser may hold them."""
+        self.degree, self.active_degree = degree, min(degree, self.active_degree)
+        self.sh_rest.data, self.sh_rest.grad = self.sh_rest.data[:, : (degree + 1) ** 2 - 1].contiguous(), None
+
     def load(self, tensors: Mapping[str, Tensor]) -> None:
         """Take over what `state_dict` of another model gave; the number of Gaussians may differ.
 

@@ -145,6 +145,10 @@ class SplatTrainee:
         keep_rows(self.splats.rows(), None, rows)
         self.densifier.statistics = {name: values[rows] for name, values in self.densifier.statistics.items()}
 
+    def truncate(self, degree: int) -> None:
+        """Leave out the harmonics above a degree; of all that has them, but no optimiser."""
+        self.splats.truncate(degree)
+
     @torch.no_grad()
     def render(self, view: View) -> Rendering:
         """Render a view without gradients."""

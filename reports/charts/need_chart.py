@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 from pandas import DataFrame
+from PIL import Image
 
 from reports.charts.drawing import MARKERS, Chart, Tips, dress, figure, lay_out, png, styled, svg
 from reports.charts.palette import INK, color_of
@@ -15,6 +16,8 @@ from reports.gathered import Gathered
 from reports.needs import STATED, Curve, curves, searched
 
 PANELS = (("blended", "Gaussians blended", 1.0), ("bytes", "model, MB", 1e-6), ("frame_ms", "ms per frame", 1.0))
+PICTURED = (STATED, "1")  # dB, as `padgs.results.NEED_PICTURE` has them
+WIDTH = 512  # pixels of a picture at most
 DOUBLINGS = 1.5  # ratio from which on sizes stand on a logarithmic axis
 
 
@@ -29,7 +32,10 @@ def charts(gathered: Gathered) -> list[Chart]:
         refuse_mixture(own, gathered.request, title, ("protocol", "data"))
         words = "_".join(str(own[column].iloc[0]) for column in ("scene", "resolution", "length"))
         name = "need_" + words.replace(" ", "-")
-        found.append(_chart(name, title, own, footnotes({title: own}, gathered.request.protocol)))
+        notes = footnotes({title: own}, gathered.request.protocol)
+        found.append(_chart(name, title, own, notes))
+        if pictured := [curve for curve in curves(own) if curve.picture is not None]:
+            found.append(_pictures(f"{name}_pictures", title, pictured, notes))
     return found
 
 
@@ -48,6 +54,28 @@ def _chart(name: str, title: str, runs: DataFrame, notes: list[str]) -> Chart:
     what = f"{title}\nsmaller models of the same run; ring: what is needed for {STATED} dB, labels: for more"
     lay_out(made, what)
     return Chart(name, what, svg(made, name, tips), png(made), tuple(notes), _numbers(name, found))
+
+
+@styled
+def _pictures(name: str, title: str, found: list[Curve], notes: list[str]) -> Chart:
+    """A test view of each run: as photographed, of the whole model, and of the smallest for two losses."""
+    made, axes = figure(4, len(found), 3.6, 2.2)
+    for row, curve in zip(axes, found, strict=True):
+        assert curve.picture is not None, "chosen by it"
+        with Image.open(curve.picture) as image:
+            width = image.width // 4
+            parts = [image.crop((n * width, 0, (n + 1) * width, image.height)) for n in range(4)]
+        whole, steps = curve.found["steps"][0], [curve.needs[epsilon] for epsilon in PICTURED]
+        words = [curve.title, f"all: {whole['blended']} Gaussians"]
+        words += [f"{epsilon} dB: {step['blended']}" for epsilon, step in zip(PICTURED, steps, strict=True)]
+        for panel, part, text in zip(row, parts, words, strict=True):
+            part.thumbnail((WIDTH, WIDTH))
+            panel.imshow(part)
+            panel.set_title(text)
+            panel.set_axis_off()
+    what = f"{title}\na test view: photograph, whole model, and the smallest that lose {' and '.join(PICTURED)} dB"
+    lay_out(made, what)
+    return Chart(name, what, svg(made, name, Tips()), png(made), tuple(notes))
 
 
 def _draw(panel: Any, curve: Curve, quantity: str, unit: float, tips: Tips, presets: list[str]) -> None:

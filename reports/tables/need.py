@@ -19,6 +19,8 @@ COLUMNS: dict[Column, Callable[[Curve, Curve], float | None]] = {
     Column(f"share for {STATED} dB", 2, False): lambda own, _: own.needs[STATED]["rows"] / own.found["rows"],
     Column("knee", 0): lambda own, _: None if own.knee is None else own.knee["blended"],
     Column(f"MB for {STATED} dB", 2, False): lambda own, _: own.needs[STATED]["bytes"] / 1e6,
+    Column(f"degree for {STATED} dB", 0, False): lambda own, _: own.degree,
+    Column(f"MB of its file, {STATED} dB", 2, False): lambda own, _: own.file and own.file["bytes"] / 1e6,
     Column(f"ms for {STATED} dB", 1, False): lambda own, _: own.needs[STATED]["frame_ms"],
     Column(f"WS-PSNR for {STATED} dB", 2, True): lambda own, _: own.quality_of(own.needs[STATED]),
     Column("WS-PSNR of all", 2, True): lambda own, _: own.quality_of(own.found["steps"][0]),
@@ -30,7 +32,9 @@ NOTES = (
     "Needed: the smallest model as good as one that was refined as often and lost nothing, on views taken from the "
     "training: WS-PSNR by at most so many dB with 95 % confidence, each latitude band by twice and each view by five "
     "times that, LPIPS by 0.005. WS-PSNR: of the test views, which decide nothing, less what was lost there against a "
-    "model refined as often. Not searched: offsets an anchor, features, degree of the harmonics.",
+    "model refined as often. Not searched: offsets an anchor, features.",
+    "Degree and file: of the model for that need, with as few harmonics and as small a file as lose no more against it "
+    "with all of them and in full; the file was written, read back and measured.",
     "Knee: the largest model below which a halving costs more than 0.1 dB. Beside the first: means over what both "
     "curves share.",
 )

@@ -26,6 +26,12 @@ SETTINGS = (
 
 
 @pytest.fixture(scope="session")
+def settings():
+    """Of a run on which a search takes a second or two."""
+    return SETTINGS
+
+
+@pytest.fixture(scope="session")
 def trained(tmp_path_factory):
     """Of a method and more settings: the folder of a finished run."""
     found = {}

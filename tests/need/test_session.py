@@ -5,19 +5,25 @@ import shutil
 
 import pytest
 import torch
+from rich.console import Console
 from states import assert_same_but_time
 from typer.testing import CliRunner
 
 import padgs
 from padgs.cli.commands import app
 from padgs.learning.trainee import State
-from padgs.need import session
-from padgs.need.outcome import need, write_pruned
+from padgs.multirun import job
+from padgs.multirun.composition import composing, configuration
+from padgs.need import session, tiers
+from padgs.need.outcome import keep, need
 from padgs.need.search import smallest
 from padgs.need.session import Search
 from padgs.need.worth import most_wanted, worth
+from padgs.results import read
 from padgs.runs.checkpoint import CheckpointError
 from padgs.runs.interrupt import Interrupted
+from padgs.runs.session import Watch
+from padgs.runs.typed import ConfigError
 
 METHODS = ("method=omnigs", "method=padgs")
 
@@ -40,7 +46,7 @@ SLOW = [pytest.param(method, marks=pytest.mark.slow) for method in METHODS[:1]] 
 @pytest.mark.parametrize("method", [*SLOW, *METHODS[1:]])
 def test_a_search_interrupted_everywhere_ends_as_if_nothing_had_happened(opened, method, tmp_path, monkeypatch):
     whole = Search(opened(method))
-    whole.complete()
+    whole.complete(1.0)
     assert len(whole.steps) >= 3 and whole.row == ("anchors" if method == "method=padgs" else "gaussians")
     shutil.rmtree(whole.folder.path)
 
@@ -59,7 +65,7 @@ def test_a_search_interrupted_everywhere_ends_as_if_nothing_had_happened(opened,
     while True:
         again = Search(opened(method))
         try:
-            again.complete()
+            again.complete(1.0)
             break
         except Interrupted as interrupted:
             stops += 1
@@ -76,16 +82,17 @@ def test_the_pruned_model_is_a_run_that_opens_and_has_the_whole_front(opened, me
     run = opened(method)
     before = run.method.state()
     search = Search(run)
-    search.complete()
-    folder = write_pruned(search, 1.0)
+    result = keep(search, 1.0)
     assert_same_but_time(run.method.state(), before)
-    pruned = padgs.load_run(folder, device="cpu")
-    kept = search.steps[smallest(search.steps, 1.0)]
+    pruned = padgs.load_run(run.folder.with_name(result.run), device="cpu")
+    kept = search.steps[search.complete(1.0)]
     assert next(iter(pruned.method.size().counts.values())) == kept.rows < search.rows
-    assert pruned.result is not None and pruned.result.need == json.loads(json.dumps(need(search)))
-    assert pruned.result.model_bytes == kept.bytes and pruned.config.variant == "need 1 dB"
+    assert kept.rows == search.steps[smallest(search.steps, 1.0)].rows
+    assert pruned.result == result and result.need.items() >= json.loads(json.dumps(need(search))).items()
+    assert result.model_bytes == kept.bytes and pruned.config.variant == "need 1 dB"
+    assert keep(Search(opened(method)), 1.0) == result, "what was kept before stays"
     assert pruned.score("sphere").metrics == pytest.approx(pruned.scores["sphere"].metrics, nan_ok=True)
-    told = pruned.result.need
+    told = result.need
     assert [step["kind"] for step in told["steps"]][:3] == ["waste", "control", "prune"]
     assert told["needs"]["1"] is not None and told["steps"][0]["loss"] == 0
 
@@ -118,7 +125,7 @@ def test_the_rows_that_are_kept_are_those_whose_removal_changes_most(opened):
 
 def test_steps_of_another_model_are_refused(opened):
     search = Search(opened("method=omnigs"))
-    search.complete()
+    search.complete(1.0)
     search.folder._of = "another"
     with pytest.raises(CheckpointError, match="is of another model than the run has now; delete"):
         search.folder.steps()
@@ -150,14 +157,58 @@ def test_what_cannot_be_searched_is_refused_with_a_way_out(opened, tmp_path):
 @pytest.mark.parametrize(
     ("settings", "why"),
     [
-        pytest.param(
-            ("method=egonerf_small",),
-            "egonerf has no Gaussians that could be left out",
-            marks=pytest.mark.slow,  # its scoring takes seconds
-        ),
-        (("method=sc_omnigs",), "its cameras learn along"),
-        (("method=omnigs", "data.generator.train_views=5"), "5 training views leave no calibration views"),
+        (("method=egonerf_small",), "egonerf has no Gaussians that could be left out"),
+        (("method=sc_omnigs",), "cameras learn along here"),
+        (("train.exposures=learned",), "exposures or cameras learn along here"),
+        (("need=yes",), "known: off, on"),
     ],
 )
-def test_runs_without_gaussians_views_or_known_cameras_are_refused(opened, settings, why):
-    assert why in refused(opened(*settings, "train.iterations=2").folder)
+def test_runs_without_gaussians_or_known_cameras_are_refused_before_they_start(settings, why):
+    with composing(), pytest.raises(ConfigError, match=why):
+        configuration(["need=on", *settings])
+
+
+def test_runs_with_too_few_views_are_refused(opened):
+    folder = opened("method=omnigs", "data.generator.train_views=5", "train.iterations=2").folder
+    assert "5 training views leave no calibration views" in refused(folder)
+
+
+def test_a_need_changes_nothing_of_the_run_and_is_told_at_its_end(settings, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("PADGS_CACHE", str(tmp_path / "cache"))
+    settings = (*settings, "method=omnigs", "need=on", f"run.folder={tmp_path}")
+    with composing():
+        config = configuration(settings)
+        assert config.values() == configuration([*settings, "need=off"]).values()
+    result = job.done(config, Console(width=400), Watch())
+    told = capsys.readouterr().out
+    assert "0.1 dB" in told and f"{result.run}_need-0.1" in told
+    kept = read(tmp_path / f"{result.run}_need-0.1" / "result.json")
+    assert kept.need["needs"]["0.1"] is not None and kept.experiments == ("need",) and not result.need
+
+
+@pytest.mark.slow
+def test_the_lowest_degree_that_is_good_enough_is_kept(opened, monkeypatch):
+    run = opened("method=omnigs")
+    monkeypatch.setattr("padgs.need.search.objections", lambda candidate, reference, epsilon: ())
+    search = Search(run)
+    result = keep(search, 1.0)
+    smallest_degree = search.steps[search.complete(1.0)]
+    assert smallest_degree.degree == 0 and result.config["method"]["sh_degree"] == 0
+    pruned = padgs.load_run(run.folder.with_name(result.run), device="cpu")
+    assert pruned.method.trainee.splats.sh_rest.shape[1] == 0 and pruned.result == result
+    assert [step["degree"] for step in result.need["degrees"]["1"]] == [3, 2, 1, 0]
+
+
+def test_the_smallest_good_file_stays_and_shows_what_is_said_of_it(opened):
+    run = opened("method=padgs")
+    search = Search(run)
+    result = keep(search, 1.0)
+    (file,) = (file for file in result.need["files"] if file["kept"])
+    exact, half, byte = result.need["files"][:3]
+    assert byte["bytes"] < half["bytes"] < exact["bytes"] and exact["loss"] == 0
+    folder = run.folder.with_name(result.run)
+    assert [path.name for path in folder.glob("model.*")] == [file["file"]]
+    model = padgs.load_run(folder, device="cpu").method.trainee
+    tiers.read(folder / file["file"], tiers.model_of(model))
+    assert search.scored(model)[1]["ws_psnr"] == pytest.approx(file["test_ws_psnr"], abs=1e-6)
+    assert (folder / file["file"]).stat().st_size == file["bytes"]

@@ -1,7 +1,10 @@
 """The table and the chart of what `padgs need` found, on searches that are made up."""
 
+from dataclasses import replace
+
 import pytest
 from made_up import gathered, small
+from PIL import Image
 
 from reports.charts.need_chart import charts
 from reports.needs import curves, gain, ratio, searched
@@ -77,3 +80,24 @@ def test_the_chart_has_a_point_for_each_size_and_all_numbers():
     assert chart.numbers is not None and len(chart.numbers) == 2 * len(SIZES)
     assert list(chart.numbers["needed for"])[:4] == ["0.05", "0.1", "0.25 0.5", "1"]
     assert "4000 Gaussians" in chart.svg and "lost 0.65 dB" in chart.svg
+
+
+def test_a_test_view_is_shown_at_each_size_where_there_is_a_picture_of_it(tmp_path):
+    found = gathered(runs())
+    assert len(charts(found)) == 1
+    Image.new("RGB", (4 * 32, 16), "red").save(tmp_path / "need.png")
+    found.runs["pictures"] = [tmp_path / "renders"] * len(found.runs)
+    _, pictures = charts(found)
+    assert pictures.name.endswith("_pictures") and "all: 8000 Gaussians" in pictures.svg
+    assert "0.1 dB: 4000" in pictures.svg and "1 dB: 1000" in pictures.svg
+
+
+def test_degree_and_file_are_those_for_a_tenth_of_a_decibel():
+    (old,) = curves(searched(gathered(runs()[:1])))
+    assert old.degree is None and old.file is None
+    steps = [{"degree": 2, "objections": {"0.1": []}}, {"degree": 1, "objections": {"0.1": ["a view falls"]}}]
+    files = [{"file": "a", "bytes": 5, "kept": False}, {"file": "b", "bytes": 4, "kept": True}]
+    run = runs()[0]
+    more = {"degrees": {"0.1": steps}, "kept": {"epsilon": 0.1}, "files": files}
+    (curve,) = curves(searched(gathered([replace(run, need=run.need | more)])))
+    assert curve.degree == 2 and curve.file == files[1]
