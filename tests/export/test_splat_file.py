@@ -72,5 +72,5 @@ def test_a_converter_that_fails_is_quoted(tmp_path, generator, monkeypatch):
     (tmp_path / splat_file.CONVERTER).write_text("#!/bin/sh\necho no room left\nexit 3\n")
     (tmp_path / splat_file.CONVERTER).chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
-    with pytest.raises(ValueError, match="could not write .*: no room left"):
+    with pytest.raises(ValueError, match="could not make .*: no room left"):
         write_splats(tmp_path / "a.spz", random_splats(0, generator))
