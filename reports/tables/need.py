@@ -20,7 +20,9 @@ COLUMNS: dict[Column, Callable[[Curve, Curve], float | None]] = {
     Column("knee", 0): lambda own, _: None if own.knee is None else own.knee["blended"],
     Column(f"MB for {STATED} dB", 2, False): lambda own, _: own.needs[STATED]["bytes"] / 1e6,
     Column(f"degree for {STATED} dB", 0, False): lambda own, _: own.degree,
-    Column(f"MB of its file, {STATED} dB", 2, False): lambda own, _: None if own.file is None else own.file["bytes"] / 1e6,
+    Column(f"MB of its file, {STATED} dB", 2, False): lambda own, _: (
+        None if own.file is None else own.file["bytes"] / 1e6
+    ),
     Column(f"ms for {STATED} dB", 1, False): lambda own, _: own.needs[STATED]["frame_ms"],
     Column(f"WS-PSNR for {STATED} dB", 2, True): lambda own, _: own.quality_of(own.needs[STATED]),
     Column("WS-PSNR of all", 2, True): lambda own, _: own.quality_of(own.found["steps"][0]),
