@@ -82,6 +82,7 @@ def test_what_trains_has_poses_and_panoramas_on_the_device():
         assert not waits  # nothing is uploaded any more
 
 
+@pytest.mark.slow
 def test_what_is_measured_is_kept_as_it_comes(monkeypatch: pytest.MonkeyPatch):
     timing = {"frame": {"median": 1.0}, "iteration": {"median": 1.0}}
     monkeypatch.setattr(gpu, "_measure", lambda *_: timing)
