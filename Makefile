@@ -13,8 +13,9 @@ run: .venv/installed ## padgs-run, with ARGS="..." for it
 	$(BIN)/padgs-run $(ARGS)
 
 # Most tests work on tiny tensors, where a second thread costs more than it does; those about threads set their number.
+# Two files at a time, one on each core of a small machine.
 test: .venv/installed-dev ## minutes
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
 
 test-all: .venv/installed-dev ## the slow ones too
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not cuda" $(ARGS)
