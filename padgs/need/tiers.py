@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from padgs.anchors.model import PaDGS
+from padgs.anchors.trainee import AnchorTrainee
 from padgs.export.splat_file import CONVERTED, CONVERTER, read_splats, write_splats
 from padgs.learning.trainee import Prunable
 from padgs.splats.model import Splats
@@ -37,8 +38,17 @@ def endings(model: Model) -> tuple[str, ...]:
 
 
 def model_of(trainee: Prunable) -> Model:
-    """What of a trainee is stored."""
-    return trainee.splats if isinstance(trainee, SplatTrainee) else trainee.model  # type: ignore[attr-defined]
+    """What of a trainee is stored.
+
+    Raises:
+        TypeError: it is of a kind that has no files here.
+    """
+    match trainee:
+        case SplatTrainee():
+            return trainee.splats
+        case AnchorTrainee():
+            return trainee.model
+    raise TypeError(f"{type(trainee).__name__} has no files to compare: those of splats and of anchors have")
 
 
 def write(path: Path, model: Model) -> None:

@@ -16,13 +16,13 @@ from torch import Tensor
 
 from padgs.scene import Scene, View
 
-DIAGONAL = (math.sqrt(0.5), math.sqrt(0.5), 0.0)  # along the ground, where north and east are
-TILTING_AXIS = (math.sqrt(0.5), math.sqrt(0.5), 0.0)  # a turn about it puts neither z nor y where it was
+# along the ground, where north and east are; a turn about it puts neither z nor y where it was
+DIAGONAL = (math.sqrt(0.5), math.sqrt(0.5), 0.0)
 
 
 def turned(scene: Scene, degrees: float, random: np.random.Generator) -> Scene:
     """The whole world, cameras included, in a frame that is turned; the images stay what they are."""
-    world = torch.from_numpy(Rotation.from_rotvec(degrees * np.array(TILTING_AXIS), degrees=True).as_matrix())
+    world = torch.from_numpy(Rotation.from_rotvec(degrees * np.array(DIAGONAL), degrees=True).as_matrix())
     points = (scene.points.double() @ world.T.to(scene.points.device)).float()
 
     def pose(view: View) -> View:

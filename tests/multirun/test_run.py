@@ -20,12 +20,20 @@ from padgs.runs import checkpoint
 
 ROOT = Path(__file__).resolve().parents[2]
 TINY = [*SMALLEST, "train.iterations=300", "run.checkpoint_every=10", "run.probe_every=50", "tracking=none"]
+ANNOUNCED = """
+from padgs.multirun import run
+begin = run._run
+def announce(arguments):  # inside of what answers Ctrl-C: a signal sent on this word is never too early
+    print("begun", flush=True)
+    return begin(arguments)
+run._run = announce
+run.main()
+"""
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.2, 1.0])
 def test_ctrl_c_is_answered_while_the_program_starts(delay):
-    start = "import padgs.multirun.run as run; print('begun', flush=True); run.main()"
-    command = [sys.executable, "-c", start, *TINY]
+    command = [sys.executable, "-c", ANNOUNCED, *TINY]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT)
     assert process.stdout is not None and process.stdout.readline() == "begun\n"
     time.sleep(delay)
