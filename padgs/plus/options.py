@@ -32,7 +32,10 @@ class PlusOptions(SplatOptions):
     initial_opacity: float = 0.5  # 0.1 hides what lies in front until opacities have grown
     initial_scale: float = 0.6  # times the distance of the nearest points; 1 is 3DGS's, whose Gaussians overlap
     means_speed: float = 2.0  # learning rate of the means, beside that of 3DGS
-    size_weight: float = 0.2  # in the loss, of the mean angular size: half of the pairs of a frame, at no loss
+    size_weight: float = 0.05  # in the loss, of the mean angular size: what is large costs pairs in every frame
+    smoothness_weight: float = (
+        0.12  # in the loss, of the roughness of surfaces: what few views leave open is mostly flat
+    )
     average_share: float = 0.04  # of the run: parameters are averaged over about so much of its end; 0: not
     sky_share: float = 0.5  # directions, per point to begin with, that get a far Gaussian if no point is there
 
@@ -41,7 +44,7 @@ class PlusOptions(SplatOptions):
         check(self, "an opacity below 1", lambda opacity: 0 < opacity < 1, "initial_opacity")
         check(self, "> 0 and finite", lambda factor: 0 < factor < math.inf, "initial_scale", "means_speed")
         off = "at least 0, which switches it off"
-        check(self, off, lambda value: 0 <= value < math.inf, "size_weight", "sky_share")
+        check(self, off, lambda value: 0 <= value < math.inf, "size_weight", "smoothness_weight", "sky_share")
         check(self, "a share of the run in [0, 0.1]", lambda share: 0 <= share <= 0.1, "average_share")
         for name in ("start_share", "limit_share"):
             check(self, "> 0, or none for no limit", lambda share: share is None or share > 0, name)

@@ -8,9 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from padgs.gaussians import Gaussians
 from padgs.learning.schedule import ParameterGroup
 from padgs.learning.trainee import Drawing, State
 from padgs.plus.options import PlusOptions
+from padgs.plus.smoothness import roughness
 from padgs.render.config import RenderConfig
 from padgs.scene import View
 from padgs.splats.model import Splats
@@ -19,6 +21,13 @@ from padgs.splats.trainee import SplatTrainee
 DEGREE_SHARE = 0.1  # of the run, after which the next SH degree comes into use
 AVERAGED_FROM = 0.9  # share of the run after which parameters are averaged
 AVERAGE = "average/"  # of its tensors in a state
+
+
+def mean_angular_size(gaussians: Gaussians, view: View, *, near: float) -> Tensor:
+    """Mean over Gaussians and axes of scale / distance, differentiable by the scales; no distance is below `near`."""
+    means = gaussians.means.detach()
+    distances = (means - view.center.detach().to(means)).norm(dim=-1).clamp(min=near)
+    return (gaussians.scales / distances[:, None]).mean()
 
 
 class PlusTrainee(SplatTrainee):
@@ -44,14 +53,19 @@ class PlusTrainee(SplatTrainee):
         return int(iteration / (DEGREE_SHARE * self.iterations))
 
     def draw(self, view: View, probe: Tensor | None = None) -> Drawing:
-        """Render all Gaussians, differentiably; the penalty is their mean size as the view sees them."""
+        """Render all Gaussians, differentiably; large ones and rough surfaces are penalised, as the view sees them."""
         drawing = super().draw(view, probe)
-        if self.options.size_weight == 0:
-            return drawing
-        means = drawing.gaussians.means.detach()
-        distances = (means - view.center.detach().to(means)).norm(dim=-1).clamp(min=self.render_options(view).near)
-        size = (drawing.gaussians.scales / distances[:, None]).mean()
-        return replace(drawing, penalty=self.options.size_weight * size)
+        sizes, smoothness, near = (
+            self.options.size_weight,
+            self.options.smoothness_weight,
+            self.render_options(view).near,
+        )
+        penalties = []
+        if sizes > 0:
+            penalties.append(sizes * mean_angular_size(drawing.gaussians, view, near=near))
+        if smoothness > 0:
+            penalties.append(smoothness * roughness(drawing.rendering, view.camera, near=near))
+        return replace(drawing, penalty=sum(penalties)) if penalties else drawing
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
         """Densify, average, and bring the next SH degree into use, where it is time to."""

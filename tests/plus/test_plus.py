@@ -14,6 +14,7 @@ from padgs.learning.budget import Budget
 from padgs.learning.loop import Record
 from padgs.plus.method import PlusMethod, independent_pixels
 from padgs.plus.options import GROWN, ROUNDS, PlusOptions
+from padgs.plus.smoothness import roughness
 from padgs.scene import Scene
 from padgs.sphere.distortion import solid_angle_weight
 from padgs.splats.method import SplatMethod
@@ -106,7 +107,7 @@ def test_it_starts_with_a_share_of_the_pixels_and_stays_below_another():
 
 
 def test_the_penalty_is_the_mean_size_as_the_view_sees_it():
-    method, scene = PlusMethod(replace(OPTIONS, size_weight=0.7)), tiny_scene()
+    method, scene = PlusMethod(replace(OPTIONS, size_weight=0.7, smoothness_weight=0.0)), tiny_scene()
     next(method.fit(scene, Budget(10)))
     drawing = method.trainee.draw(scene.train[1])
     splats, centre = method.trainee.splats, scene.train[1].center
@@ -114,6 +115,17 @@ def test_the_penalty_is_the_mean_size_as_the_view_sees_it():
     assert drawing.penalty.item() == pytest.approx(0.7 * angles.mean().item())
     (gradient,) = torch.autograd.grad(drawing.penalty, splats.means, allow_unused=True)
     assert gradient is None or not gradient.any()  # it shall not push Gaussians away
+
+
+def test_the_penalty_asks_for_smooth_surfaces_of_what_is_drawn():
+    method, scene = PlusMethod(replace(OPTIONS, size_weight=0.0, smoothness_weight=0.3)), tiny_scene()
+    next(method.fit(scene, Budget(10)))
+    view = scene.train[1]
+    drawing = method.trainee.draw(view)
+    rough = roughness(drawing.rendering, view.camera, near=method.trainee.render_options(view).near)
+    assert drawing.penalty.item() == pytest.approx(0.3 * rough.item()) and rough > 0
+    drawing.penalty.backward()
+    assert method.trainee.splats.means.grad.any() and method.trainee.splats.log_scales.grad.any()
 
 
 def test_degrees_come_each_tenth_and_means_are_faster_than_those_of_3dgs():
