@@ -23,6 +23,7 @@ SMOOTHED = 20  # iterations that the loss is averaged over, at least; or the sha
 SMOOTHED_SHARE = 0.02
 FIRST = 5  # iterations that are no best loss yet: single views are easy
 WORSE = 1.5  # times the best average loss
+FALLING = 0.9  # times the highest average since then: what comes down to that recovers, as after a reset
 FEWER = 0.01  # of the parts of the model at the start
 FLATTER = 0.01  # of the variance of the photograph
 FAINTEST = 0.05  # mean opacity of a picture
@@ -50,7 +51,15 @@ class Monitor:
         self._iterations, self._start, self._most = iterations, parts, MORE * max(parts, pixels)
         self._smoothed = max(SMOOTHED, SMOOTHED_SHARE * iterations)
         self.moment: int | None = None
-        self.state: dict[str, Any] = {"sum": 0.0, "weight": 0.0, "seen": 0, "best": None, "largest": None, "since": {}}
+        self.state: dict[str, Any] = {
+            "sum": 0.0,
+            "weight": 0.0,
+            "seen": 0,
+            "best": None,
+            "largest": None,
+            "since": {},
+            "highest": 0.0,
+        }
 
     def forget(self) -> None:
         """Signs begin anew, as the schedule has jumped and how long they lasted means nothing."""
@@ -71,7 +80,13 @@ class Monitor:
         if iteration >= FIRST:
             state["best"] = average if state["best"] is None else min(average, state["best"])
         best = state["best"]
-        if since := self._lasting("diverged", best is not None and average > WORSE * best, iteration):
+        high = best is not None and average > WORSE * best
+        highest = max(average, state.get("highest", 0.0)) if high else 0.0  # checkpoints of before have none
+        if average < FALLING * highest:
+            state["since"].pop("diverged", None)
+            highest = average
+        state["highest"] = highest
+        if since := self._lasting("diverged", high, iteration):
             raise Failure(
                 "diverged",
                 f"the loss at iteration {iteration} is {average:.4g}, and since iteration {since} more than {WORSE} "

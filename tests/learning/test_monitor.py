@@ -56,6 +56,7 @@ def test_a_loss_that_rises_and_stays_has_diverged():
     [
         lambda i: 0.3 * 0.995**i + 0.05,  # falls
         lambda i: 0.05 + 0.2 * 0.9 ** (i % 100),  # opacities are reset every 100 iterations
+        lambda i: 0.05 + (0.0 if i < 500 else 0.2 * 0.995 ** (i - 500)),  # ... and come back slowly after one
         lambda i: 0.1 + 0.08 * (i % 3),  # views differ
         lambda i: 0.01 if i == 1 else 0.2,  # the first view is an easy one
         lambda i: 0.1 if i < 800 or i > 860 else 0.3,  # recovers
