@@ -34,6 +34,7 @@ WITHOUT = {  # variant (conf/without) -> title
             "rates": "published rates",
             "speed": "means at the rate of 3DGS",
             "size": "no weight of the size",
+            "smoothness": "no weight of the roughness",
             "start": "all points to begin with",
             "opacity": "initial opacity of 3DGS",
             "scale": "initial scale of 3DGS",

@@ -3,10 +3,11 @@ from pathlib import Path
 
 import pytest
 from made_up import RULES, failed, gathered, result, small
+from omegaconf import OmegaConf
 
 from padgs.results import Scores
 from reports.tables.table import MISSING, ReportError
-from reports.tables.variants import QUIRKS, RUNGS, ladder, quirks, table3
+from reports.tables.variants import PARTS, QUIRKS, RUNGS, WITHOUT, ladder, quirks, table3
 from reports.writers import markdown
 
 FOUR = [
@@ -23,6 +24,15 @@ def lines(results, **request) -> list[list[str]]:
     block = text.split("### ")[1]
     assert block.startswith("360Roam, bar")
     return [[cell.strip() for cell in line.split("|")[1:-1]] for line in block.splitlines() if line.startswith("|")][2:]
+
+
+@pytest.mark.parametrize(
+    "folder, titles",
+    [("ablation", {**PARTS, **RUNGS}), ("without", WITHOUT), ("quirk", {v: "" for of in QUIRKS.values() for v in of})],
+)
+def test_each_variant_that_can_be_run_has_a_row(root, folder, titles):
+    files = (root / "conf" / folder).glob("*.yaml")
+    assert {OmegaConf.load(file).get("variant") for file in files} == set(titles)
 
 
 def test_published_numbers_stand_beside_ours_with_the_difference():
