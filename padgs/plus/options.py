@@ -33,9 +33,7 @@ class PlusOptions(SplatOptions):
     initial_scale: float = 0.6  # times the distance of the nearest points; 1 is 3DGS's, whose Gaussians overlap
     means_speed: float = 2.0  # learning rate of the means, beside that of 3DGS
     size_weight: float = 0.05  # in the loss, of the mean angular size: what is large costs pairs in every frame
-    smoothness_weight: float = (
-        0.12  # in the loss, of the roughness of surfaces: what few views leave open is mostly flat
-    )
+    smoothness_weight: float = 0.12  # in the loss, of the roughness of surfaces, which few views leave open
     average_share: float = 0.04  # of the run: parameters are averaged over about so much of its end; 0: not
     sky_share: float = 0.5  # directions, per point to begin with, that get a far Gaussian if no point is there
 

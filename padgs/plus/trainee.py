@@ -54,17 +54,12 @@ class PlusTrainee(SplatTrainee):
 
     def draw(self, view: View, probe: Tensor | None = None) -> Drawing:
         """Render all Gaussians, differentiably; large ones and rough surfaces are penalised, as the view sees them."""
-        drawing = super().draw(view, probe)
-        sizes, smoothness, near = (
-            self.options.size_weight,
-            self.options.smoothness_weight,
-            self.render_options(view).near,
-        )
-        penalties = []
-        if sizes > 0:
-            penalties.append(sizes * mean_angular_size(drawing.gaussians, view, near=near))
-        if smoothness > 0:
-            penalties.append(smoothness * roughness(drawing.rendering, view.camera, near=near))
+        drawing, options = super().draw(view, probe), self.options
+        near, penalties = self.render_options(view).near, []
+        if options.size_weight > 0:
+            penalties.append(options.size_weight * mean_angular_size(drawing.gaussians, view, near=near))
+        if options.smoothness_weight > 0:
+            penalties.append(options.smoothness_weight * roughness(drawing.rendering, view.camera, near=near))
         return replace(drawing, penalty=sum(penalties)) if penalties else drawing
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
