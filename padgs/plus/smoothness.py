@@ -31,12 +31,12 @@ def roughness(rendering: Rendering, camera: Camera, *, near: float) -> Tensor:
     """
     depth = rendering.depth
     grey, opacity = rendering.image.detach().mean(-1), 1 - rendering.transmittance.detach()
-    shown = (grey, opacity, 1 / depth.clamp(min=near))
-    rows, around = depth.new_ones(len(depth)), shown
+    inverse, rows = 1 / depth.clamp(min=near), depth.new_ones(len(depth))
+    down = _bends(grey, opacity, inverse, 0)
     if isinstance(camera, Panorama):
         rows = solid_angle_weight(len(depth), dtype=depth.dtype, device=depth.device)
-        around = tuple(torch.cat((values[:, -1:], values, values[:, :1]), dim=1) for values in shown)
-    return _mean(_bends(*shown, 0), rows[1:-1]) + _mean(_bends(*around, 1), rows)
+        grey, opacity, inverse = (torch.cat((v[:, -1:], v, v[:, :1]), dim=1) for v in (grey, opacity, inverse))
+    return _mean(down, rows[1:-1]) + _mean(_bends(grey, opacity, inverse, 1), rows)
 
 
 def _bends(grey: Tensor, opacity: Tensor, inverse: Tensor, axis: int) -> Tensor:
