@@ -7,15 +7,15 @@ from importlib.metadata import entry_points
 
 METHODS = {
     "padgs": "padgs.anchors.method:PaDGSMethod",
-    "omnigs": "baselines.omnigs:OmniGSMethod",
-    "odgs": "baselines.odgs:ODGSMethod",
-    "op43dgs": "baselines.op43dgs:OP43DGSMethod",
-    "spags": "baselines.spags:SPaGSMethod",
-    "cubemap_3dgs": "baselines.cubemap_3dgs:Cubemap3DGSMethod",
-    "crops_3dgs": "baselines.crops_3dgs:Crops3DGSMethod",
-    "egonerf": "baselines.egonerf:EgoNeRFMethod",
-    "sc_omnigs": "baselines.sc_omnigs:SCOmniGSMethod",
-    "seam360gs": "baselines.seam360gs:Seam360GSMethod",
+    "omnigs": "padgs.baselines.omnigs:OmniGSMethod",
+    "odgs": "padgs.baselines.odgs:ODGSMethod",
+    "op43dgs": "padgs.baselines.op43dgs:OP43DGSMethod",
+    "spags": "padgs.baselines.spags:SPaGSMethod",
+    "cubemap_3dgs": "padgs.baselines.cubemap_3dgs:Cubemap3DGSMethod",
+    "crops_3dgs": "padgs.baselines.crops_3dgs:Crops3DGSMethod",
+    "egonerf": "padgs.baselines.egonerf:EgoNeRFMethod",
+    "sc_omnigs": "padgs.baselines.sc_omnigs:SCOmniGSMethod",
+    "seam360gs": "padgs.baselines.seam360gs:Seam360GSMethod",
     "padgs_plus": "padgs.plus.method:PlusMethod",
 }
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from baselines.cubemap_3dgs import Cubemap3DGSMethod
+from padgs.baselines.cubemap_3dgs import Cubemap3DGSMethod
 from padgs.data.perspectives import looking_at, square_lens
 from padgs.render.cubemap import FINENESS
 from padgs.sphere.camera import Panorama, Pinhole

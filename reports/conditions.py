@@ -7,9 +7,9 @@ from collections.abc import Iterable, Mapping
 import pandas as pd
 from pandas import DataFrame
 
-from reports.methods import name, title
-from reports.mixtures import Mixture
-from reports.request import Request
+from padgs.reports.methods import name, title
+from padgs.reports.mixtures import Mixture
+from padgs.reports.request import Request
 
 # Columns of the frame; the protocol's are its rules.
 CONDITIONS = ("protocol", "resolution", "length", "learning_rates", "data")

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from padgs.reports.charts.drawing import Chart
+from padgs.reports.findings.page import Page
+from padgs.reports.tables.table import Table
+from padgs.reports.writers import csv_text, latex, markdown
 from padgs.results import file_name
-from reports.charts.drawing import Chart
-from reports.findings.page import Page
-from reports.tables.table import Table
-from reports.writers import csv_text, latex, markdown
 
 WRITERS = {"md": markdown.text, "tex": latex.text, "csv": csv_text.text}
 

@@ -16,11 +16,11 @@ from typing import Any
 import pandas as pd
 from pandas import DataFrame
 
+from padgs.reports.images_seen import images_seen
+from padgs.reports.learning_rates import law
+from padgs.reports.scenes import Place
+from padgs.reports.store import Run
 from padgs.results import BY_ITSELF, DECIDE_NOTHING, Result, Scores, picture_name
-from reports.images_seen import images_seen
-from reports.learning_rates import law
-from reports.scenes import Place
-from reports.store import Run
 
 CONFIG = "config."  # and the dotted key
 NO_SETTING = ("seed", *DECIDE_NOTHING)  # a section stands for all in it

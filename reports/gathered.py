@@ -9,11 +9,11 @@ from typing import Any
 
 from pandas import DataFrame
 
+from padgs.reports import REPORTS
+from padgs.reports.measures import marks
+from padgs.reports.mixtures import Mixture, apart
+from padgs.reports.request import Request, admitted, experiment_of
 from padgs.results import BY_ITSELF
-from reports import REPORTS
-from reports.measures import marks
-from reports.mixtures import Mixture, apart
-from reports.request import Request, admitted, experiment_of
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ from typing import Any
 
 from pandas import DataFrame
 
+from padgs.reports import published
+from padgs.reports.tables.table import Column, ReportError
 from padgs.results import higher_is_better
-from reports import published
-from reports.tables.table import Column, ReportError
 
 PAPER_METRICS = ("ssim", "psnr", "lpips")  # the order of the paper's tables
 PROTOCOL_METRICS = {  # protocol -> the metric that stands for each of PAPER_METRICS

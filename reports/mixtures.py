@@ -9,9 +9,9 @@ from typing import Any
 import pandas as pd
 from pandas import DataFrame
 
-from reports.frame import CONFIG
-from reports.scenes import Place
-from reports.tables.table import ReportError
+from padgs.reports.frame import CONFIG
+from padgs.reports.scenes import Place
+from padgs.reports.tables.table import ReportError
 
 WORDED = {"learning_rates": "learning rates ", "data": "data "}  # columns whose values do not say what they are
 

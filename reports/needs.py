@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from pandas import DataFrame
 
+from padgs.reports import methods
+from padgs.reports.gathered import Gathered
+from padgs.reports.settings import settings
 from padgs.results import NEED_PICTURE
-from reports import methods
-from reports.gathered import Gathered
-from reports.settings import settings
 
 EPSILONS = ("0.05", "0.1", "0.25", "0.5", "1")  # dB, as results name them
 STATED = "0.1"  # of the need that is put into one number

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 from pandas import DataFrame
 
-from reports.frame import CONFIG
-from reports.tables.table import ReportError
+from padgs.reports.frame import CONFIG
+from padgs.reports.tables.table import ReportError
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from reports import published
+from padgs.reports import published
 
 OUTDOOR_WORDS = ("outdoor", "garden")  # what a scene outside the data sets is called if it belongs to Table 2
 

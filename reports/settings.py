@@ -8,10 +8,10 @@ from typing import Any
 
 from pandas import DataFrame
 
-from reports import methods
-from reports.frame import CONFIG, decides, grouped
-from reports.mixtures import Mixture
-from reports.tables.table import ReportError
+from padgs.reports import methods
+from padgs.reports.frame import CONFIG, decides, grouped
+from padgs.reports.mixtures import Mixture
+from padgs.reports.tables.table import ReportError
 
 
 @dataclass(frozen=True)

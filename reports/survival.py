@@ -16,13 +16,13 @@ from functools import cached_property
 import pandas as pd
 from pandas import DataFrame
 
-from reports import methods
-from reports.conditions import refuse_mixture
-from reports.frame import CONFIG, by_conditions, grouped
-from reports.gathered import Gathered
-from reports.settings import one_setting, refuse_differences
-from reports.tables.cells import spread
-from reports.tables.table import Cell
+from padgs.reports import methods
+from padgs.reports.conditions import refuse_mixture
+from padgs.reports.frame import CONFIG, by_conditions, grouped
+from padgs.reports.gathered import Gathered
+from padgs.reports.settings import one_setting, refuse_differences
+from padgs.reports.tables.cells import spread
+from padgs.reports.tables.table import Cell
 
 CONDITION, LEVEL = f"{CONFIG}stress.condition", f"{CONFIG}stress.level"
 QUALITY, ONE_COLOR = "stability/ws_psnr", "stability/ws_psnr_one_color"

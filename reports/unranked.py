@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 from pandas import DataFrame
 
-from reports.frame import CONFIG
-from reports.methods import title
-from reports.tables.table import UNRANKED
+from padgs.reports.frame import CONFIG
+from padgs.reports.methods import title
+from padgs.reports.tables.table import UNRANKED
 
 ENOUGH = 0.5  # of the images that another method of the block has seen
 MENDS = {  # method -> keys of data.generator that make what it mends; in photographs it is of unknown size

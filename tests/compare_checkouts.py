@@ -72,7 +72,7 @@ def differences(old: Path, new: Path) -> list[str]:
 
 def main(old: Path, new: Path, folder: Path) -> int:
     """Print a line for each method; the exit code."""
-    names = [old / ".venv/bin/python", "-c", "from baselines import METHODS; print(*METHODS)"]
+    names = [old / ".venv/bin/python", "-c", "from padgs.baselines import METHODS; print(*METHODS)"]
     own = subprocess.run(list(map(str, names)), cwd=old, capture_output=True, text=True, check=True).stdout.split()
     methods, wrong = {*own, *(path.stem for path in (old / "conf/method").glob("*.yaml"))}, 0
     for method in sorted(methods):

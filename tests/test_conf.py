@@ -8,10 +8,10 @@ import pytest
 from composed import composed, expanded, first_and_last_job, jobs
 from hydra.errors import HydraException
 
-from baselines import METHODS
 from padgs.anchors.growth import PUBLISHED_THRESHOLD
 from padgs.anchors.method import PaDGSMethodOptions
 from padgs.anchors.model import PaDGSOptions
+from padgs.baselines import METHODS
 from padgs.data.datasets import DATASETS
 from padgs.data.synthetic.options import SyntheticOptions
 from padgs.learning.loop import TrainOptions
@@ -23,11 +23,11 @@ from padgs.plus.method import PlusMethod
 from padgs.plus.options import PlusOptions
 from padgs.registry import lookup
 from padgs.render.config import RenderConfig
+from padgs.reports.unranked import MENDS
 from padgs.runs.config import RunOptions, TrainConfig
 from padgs.runs.typed import ConfigError
 from padgs.scoring.protocols import PROTOCOLS, ROAM_360_BOTTOM_CROP
 from padgs.stress.conditions import CONDITIONS
-from reports.unranked import MENDS
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))

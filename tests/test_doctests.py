@@ -6,11 +6,11 @@ from importlib import import_module
 
 import pytest
 
-PACKAGES = ("padgs", "baselines", "reports")
+import padgs
+
 MODULES = sorted(
     module.name
-    for package in PACKAGES
-    for module in pkgutil.walk_packages(import_module(package).__path__, f"{package}.")
+    for module in pkgutil.walk_packages(padgs.__path__, "padgs.")
     if not module.name.split(".")[-1].startswith("lib")  # the native libraries lie beside the modules that load them
 )
 

@@ -3,7 +3,7 @@ import sys
 
 import pytest
 
-from baselines import METHODS
+from padgs.baselines import METHODS
 from padgs.data import LOADERS
 from padgs.registry import lookup
 from padgs.render import BACKENDS

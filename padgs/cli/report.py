@@ -12,8 +12,8 @@ import typer
 
 from padgs import results
 from padgs.cli.refusing import refusing, show
-from reports import REPORTS, store
-from reports.tables.table import ReportError
+from padgs.reports import REPORTS, store
+from padgs.reports.tables.table import ReportError
 
 ALL = "all"
 
@@ -42,10 +42,10 @@ def report(
     if not source.exists():
         raise ReportError(f"there is no folder {source}; give the folder of the runs after the name of the report")
     target = Path(out) if out else (source if source.is_dir() else source.parent) / "reports"
-    from reports.files import files  # pandas, which other commands need not wait for
-    from reports.frame import frame
-    from reports.gathered import Gathered
-    from reports.request import Request
+    from padgs.reports.files import files  # pandas, which other commands need not wait for
+    from padgs.reports.frame import frame
+    from padgs.reports.gathered import Gathered
+    from padgs.reports.request import Request
 
     request = Request(protocol, mix, strict, tuple(metric or ()), experiment, dict(map(_pair, where or [])))
     found, broken = store.read(source)

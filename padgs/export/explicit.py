@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import torch
 
 import padgs
-from baselines.sc_omnigs import SCOmniGSMethod, aligned
 from padgs.anchors.trainee import AnchorTrainee
+from padgs.baselines.sc_omnigs import SCOmniGSMethod, aligned
 from padgs.data.capture import Cloud
 from padgs.data.trajectory import gravity
 from padgs.export.bake import baked, cameras_around, teach

@@ -8,7 +8,7 @@ from typing import Any
 
 from hydra.core.config_store import ConfigStore
 
-from baselines import METHODS
+from padgs.baselines import METHODS
 from padgs.data.datasets import DATASETS
 from padgs.data.synthetic.options import SCENES
 from padgs.learning.loop import TrainOptions

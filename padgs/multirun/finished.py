@@ -101,7 +101,7 @@ def signature(folder: str) -> str:
 def _sources() -> str:
     digest = hashlib.sha256()
     package = Path(__file__).resolve().parent.parent
-    for folder in (package, package.parent / "baselines", root() / "conf", root() / "sweeps"):
+    for folder in (package, package / "baselines", root() / "conf", root() / "sweeps"):
         for path in sorted(folder.rglob("*")):
             if path.suffix in (".py", ".yaml"):
                 digest.update(path.read_bytes())

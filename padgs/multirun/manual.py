@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from typing import Any
 
-from baselines import METHODS
+from padgs.baselines import METHODS
 from padgs.data.synthetic.options import SyntheticOptions
 from padgs.multirun.composition import composing, configuration
 from padgs.multirun.overrides import root

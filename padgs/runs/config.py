@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
-from baselines import METHODS
+from padgs.baselines import METHODS
 from padgs.checks import check, check_known
 from padgs.data import LOADERS
 from padgs.data.datasets import DATASETS

@@ -11,8 +11,8 @@ from typing import Any
 import torch
 from rich.console import Console
 
-from baselines import METHODS
 from padgs import clock, data, results
+from padgs.baselines import METHODS
 from padgs.learning.failure import Failure
 from padgs.learning.loop import Record
 from padgs.learning.method import Method

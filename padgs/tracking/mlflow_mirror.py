@@ -11,13 +11,13 @@ import pandas
 from omegaconf import OmegaConf
 
 from padgs import results
+from padgs.reports.frame import frame
+from padgs.reports.gathered import Gathered
+from padgs.reports.request import Request
+from padgs.reports.store import Run
+from padgs.reports.tables.runs import runs
+from padgs.reports.writers import csv_text, markdown
 from padgs.results import Result
-from reports.frame import frame
-from reports.gathered import Gathered
-from reports.request import Request
-from reports.store import Run
-from reports.tables.runs import runs
-from reports.writers import csv_text, markdown
 
 RUN, PARENT, MULTIRUN, LOGGED = "padgs.run", "mlflow.parentRunId", "padgs.multirun", "padgs.logged_iteration"  # tags
 MOST_PARAMS, MOST_METRICS = 100, 1000  # in one batch, as mlflow's servers allow

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from reports.charts.palette import BEYOND
+from padgs.reports.charts.palette import BEYOND
 
 FENCE = 1.5  # interquartile ranges
 PAD, MARGIN = 0.1, 0.14  # of the window: free on both sides; and beyond that, where something lies outside

@@ -14,7 +14,7 @@ from typing import Any, ParamSpec, TypeVar
 
 from pandas import DataFrame
 
-from reports.charts.palette import GRID, INK, PAPER, dark_rules
+from padgs.reports.charts.palette import GRID, INK, PAPER, dark_rules
 
 P = ParamSpec("P")
 T = TypeVar("T")

@@ -7,10 +7,10 @@ from typing import Any
 
 from pandas import DataFrame
 
-from reports import methods
-from reports.charts.drawing import Chart, Tips, figure, lay_out, png, styled, svg
-from reports.survival import QUALITY, Stress, Survivor, in_order
-from reports.tables.table import Cell
+from padgs.reports import methods
+from padgs.reports.charts.drawing import Chart, Tips, figure, lay_out, png, styled, svg
+from padgs.reports.survival import QUALITY, Stress, Survivor, in_order
+from padgs.reports.tables.table import Cell
 
 GLYPHS = {  # outcome -> its letter
     "oom": "M",

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from reports.charts.labels import BESIDE, Named, place
-from reports.charts.palette import INK, SOFT
+from padgs.reports.charts.labels import BESIDE, Named, place
+from padgs.reports.charts.palette import INK, SOFT
 
 STEP = 5.0  # pixels between two points of a line that names avoid
 EDGE = 2.0  # pixels that names keep from the axes' edge

@@ -8,12 +8,12 @@ from typing import Any
 from pandas import DataFrame
 from PIL import Image
 
-from reports.charts.drawing import MARKERS, Chart, Tips, dress, figure, lay_out, png, styled, svg
-from reports.charts.palette import INK, color_of
-from reports.conditions import footnotes, refuse_mixture
-from reports.frame import by_conditions
-from reports.gathered import Gathered
-from reports.needs import STATED, Curve, curves, searched
+from padgs.reports.charts.drawing import MARKERS, Chart, Tips, dress, figure, lay_out, png, styled, svg
+from padgs.reports.charts.palette import INK, color_of
+from padgs.reports.conditions import footnotes, refuse_mixture
+from padgs.reports.frame import by_conditions
+from padgs.reports.gathered import Gathered
+from padgs.reports.needs import STATED, Curve, curves, searched
 
 PANELS = (("blended", "Gaussians blended", 1.0), ("bytes", "model, MB", 1e-6), ("frame_ms", "ms per frame", 1.0))
 PICTURED = (STATED, "1")  # dB, as `padgs.results.NEED_PICTURE` has them

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from reports.methods import method_of
+from padgs.reports.methods import method_of
 
 # Okabe and Ito's colours first, which colour-blind readers can tell apart; where one is lost on black, a lighter one of
 # the same hue stands for it there. Ours are the only pinks, published or plus.

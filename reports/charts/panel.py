@@ -8,14 +8,14 @@ from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
-from reports import methods
-from reports.charts import names
-from reports.charts.axis import Axis
-from reports.charts.drawing import Tips
-from reports.charts.names import Line, Name
-from reports.charts.palette import ALPHA, INK, PAPER, SOFT, color_of, weight_of
-from reports.charts.trade_off import Point, TradeOff, pareto
-from reports.measures import Measure
+from padgs.reports import methods
+from padgs.reports.charts import names
+from padgs.reports.charts.axis import Axis
+from padgs.reports.charts.drawing import Tips
+from padgs.reports.charts.names import Line, Name
+from padgs.reports.charts.palette import ALPHA, INK, PAPER, SOFT, color_of, weight_of
+from padgs.reports.charts.trade_off import Point, TradeOff, pareto
+from padgs.reports.measures import Measure
 
 SMALLEST = 25.0  # points^2 of a mark that would be too small to see
 FIXED = 30.0  # points^2 of a mark whose area says nothing: a released program, a method without Gaussians

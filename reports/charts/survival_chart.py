@@ -7,14 +7,14 @@ from collections.abc import Sequence
 
 from pandas import DataFrame
 
-from reports import methods
-from reports.charts import names
-from reports.charts.axis import Axis
-from reports.charts.drawing import Chart, Tips, figure, lay_out, png, styled, svg
-from reports.charts.heat_map import COLORS
-from reports.charts.names import Name
-from reports.charts.palette import INK, weight_of
-from reports.survival import QUALITY, Survivor
+from padgs.reports import methods
+from padgs.reports.charts import names
+from padgs.reports.charts.axis import Axis
+from padgs.reports.charts.drawing import Chart, Tips, figure, lay_out, png, styled, svg
+from padgs.reports.charts.heat_map import COLORS
+from padgs.reports.charts.names import Name
+from padgs.reports.charts.palette import INK, weight_of
+from padgs.reports.survival import QUALITY, Survivor
 
 AREA = 160.0  # points^2 of a mark
 SIZE = (5.6, 4.4)  # inches

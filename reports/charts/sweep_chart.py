@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from reports.charts.drawing import MARKERS, Chart, Tips, dress, figure, lay_out, png, styled, svg
-from reports.charts.palette import COLORS, SOFT
-from reports.charts.sweeps import Line, Sweep, sweeps
-from reports.gathered import Gathered
-from reports.measures import Measure
+from padgs.reports.charts.drawing import MARKERS, Chart, Tips, dress, figure, lay_out, png, styled, svg
+from padgs.reports.charts.palette import COLORS, SOFT
+from padgs.reports.charts.sweeps import Line, Sweep, sweeps
+from padgs.reports.gathered import Gathered
+from padgs.reports.measures import Measure
 
 COLUMNS = 3
 LOGARITHMIC = 20  # from this ratio of the largest to the smallest value on

@@ -8,17 +8,17 @@ from typing import Any
 
 from pandas import DataFrame
 
+from padgs.reports import methods
+from padgs.reports.conditions import OF_A_POINT, OF_A_SWEEP, footnotes, refuse_mixture
+from padgs.reports.frame import by_place, grouped
+from padgs.reports.gathered import Gathered, of_a_table
+from padgs.reports.measures import Measure, costs, marks, quantity
+from padgs.reports.request import Request
+from padgs.reports.scenes import Place
+from padgs.reports.settings import Setting, is_number, settings, sort_key
+from padgs.reports.tables.cells import over_seeds
+from padgs.reports.tables.table import Cell
 from padgs.results import BY_ITSELF
-from reports import methods
-from reports.conditions import OF_A_POINT, OF_A_SWEEP, footnotes, refuse_mixture
-from reports.frame import by_place, grouped
-from reports.gathered import Gathered, of_a_table
-from reports.measures import Measure, costs, marks, quantity
-from reports.request import Request
-from reports.scenes import Place
-from reports.settings import Setting, is_number, settings, sort_key
-from reports.tables.cells import over_seeds
-from reports.tables.table import Cell
 
 SWEPT_AT_ONCE = 2  # keys; what was run by itself and differs in more is no sweep
 COSTS_SHOWN = ("gaussians", "train_seconds", "frame_ms")

@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from reports import methods
-from reports.charts import names
-from reports.charts.axis import Axis
-from reports.charts.drawing import Chart, Tips, figure, lay_out, png, styled, svg
-from reports.charts.names import Name
-from reports.charts.palette import ALPHA, color_of, weight_of
-from reports.charts.trade_off import TradeOff
-from reports.frame import by_place
-from reports.settings import settings
+from padgs.reports import methods
+from padgs.reports.charts import names
+from padgs.reports.charts.axis import Axis
+from padgs.reports.charts.drawing import Chart, Tips, figure, lay_out, png, styled, svg
+from padgs.reports.charts.names import Name
+from padgs.reports.charts.palette import ALPHA, color_of, weight_of
+from padgs.reports.charts.trade_off import TradeOff
+from padgs.reports.frame import by_place
+from padgs.reports.settings import settings
 
 WIDE, NARROW = (10.6, 4.2), (3.7, 4.2)  # inches
 LOOKS: dict[str, dict[str, Any]] = {  # of lines, by the role of their preset

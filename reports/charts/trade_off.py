@@ -10,17 +10,17 @@ from functools import cached_property
 import pandas as pd
 from pandas import DataFrame
 
-from reports import methods, published
-from reports.conditions import OF_A_CHART, OF_A_MEAN, footnotes, refuse_mixture
-from reports.frame import by_place
-from reports.gathered import Gathered
-from reports.measures import Measure, costs, mark
-from reports.request import Request
-from reports.scenes import Place
-from reports.settings import Setting, settings
-from reports.tables.cells import over_scenes
-from reports.tables.table import Cell
-from reports.unranked import unranked
+from padgs.reports import methods, published
+from padgs.reports.conditions import OF_A_CHART, OF_A_MEAN, footnotes, refuse_mixture
+from padgs.reports.frame import by_place
+from padgs.reports.gathered import Gathered
+from padgs.reports.measures import Measure, costs, mark
+from padgs.reports.request import Request
+from padgs.reports.scenes import Place
+from padgs.reports.settings import Setting, settings
+from padgs.reports.tables.cells import over_scenes
+from padgs.reports.tables.table import Cell
+from padgs.reports.unranked import unranked
 
 COSTS = costs("frame_ms", "train_seconds", "cpu_seconds", "gaussians", "megabytes")
 QUALITIES = (
@@ -80,7 +80,7 @@ class TradeOff:
 
     @cached_property
     def unranked(self) -> Collection[str]:
-        """Presets that are shown but compete with none, see `reports.unranked`."""
+        """Presets that are shown but compete with none, see `padgs.reports.unranked`."""
         return unranked(self.runs)
 
     def corrected(self, point: Point) -> Point | None:

@@ -7,14 +7,14 @@ from collections.abc import Sequence
 from textwrap import fill
 from typing import Any
 
-from reports.charts import time_chart
-from reports.charts.axis import Axis
-from reports.charts.drawing import Chart, Tips, figure, lay_out, png, styled, svg
-from reports.charts.palette import ALPHA, SOFT
-from reports.charts.panel import ARROW, FIXED, Panel, area
-from reports.charts.trade_off import TradeOff, trade_offs
-from reports.gathered import Gathered
-from reports.measures import COSTS
+from padgs.reports.charts import time_chart
+from padgs.reports.charts.axis import Axis
+from padgs.reports.charts.drawing import Chart, Tips, figure, lay_out, png, styled, svg
+from padgs.reports.charts.palette import ALPHA, SOFT
+from padgs.reports.charts.panel import ARROW, FIXED, Panel, area
+from padgs.reports.charts.trade_off import TradeOff, trade_offs
+from padgs.reports.gathered import Gathered
+from padgs.reports.measures import COSTS
 
 PANELS = (("train_seconds", "training time", "s"), ("frame_ms", "time per frame", "ms"))  # cost, words, unit
 ON_CPU = ("cpu_seconds", "training time on the CPU", "s")  # in place of the first, where it is known of all

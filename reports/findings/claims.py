@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from reports import OF_ALL_METHODS, REPORTS, methods
-from reports.findings.judging import Claim, Side, Verdict
-from reports.measures import PAPER_METRICS, PROTOCOL_METRICS
-from reports.published import TITLES
+from padgs.reports import OF_ALL_METHODS, REPORTS, methods
+from padgs.reports.findings.judging import Claim, Side, Verdict
+from padgs.reports.measures import PAPER_METRICS, PROTOCOL_METRICS
+from padgs.reports.published import TITLES
 
 ORDER = (*REPORTS["order"].experiments, *REPORTS["table4"].experiments)
 ABLATION = REPORTS["table3"].experiments

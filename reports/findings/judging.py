@@ -14,16 +14,16 @@ from statistics import fmean
 
 from pandas import DataFrame
 
+from padgs.reports.conditions import refuse_mixture
+from padgs.reports.frame import CONFIG, grouped
+from padgs.reports.gathered import Gathered
+from padgs.reports.measures import COSTS, Measure, mark
+from padgs.reports.published import DATASETS, Key, Published, scene_title
+from padgs.reports.settings import Setting, one_setting, settings
+from padgs.reports.tables.cells import spread
+from padgs.reports.tables.ranking import pooled_variance, quantile
+from padgs.reports.tables.table import Cell
 from padgs.results import higher_is_better
-from reports.conditions import refuse_mixture
-from reports.frame import CONFIG, grouped
-from reports.gathered import Gathered
-from reports.measures import COSTS, Measure, mark
-from reports.published import DATASETS, Key, Published, scene_title
-from reports.settings import Setting, one_setting, settings
-from reports.tables.cells import spread
-from reports.tables.ranking import pooled_variance, quantile
-from reports.tables.table import Cell
 
 
 class Verdict(Enum):

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 
 from pandas import DataFrame, Series
 
-from reports import published
-from reports.conditions import footnotes
-from reports.findings.claims import CLAIMS
-from reports.findings.judging import Claim, Judgement, Line, Verdict, in_the_paper, judge
-from reports.gathered import Gathered, of_a_table
-from reports.request import experiment_of
-from reports.tables.ranking import CONFIDENCE
-from reports.tables.table import MISSING
+from padgs.reports import published
+from padgs.reports.conditions import footnotes
+from padgs.reports.findings.claims import CLAIMS
+from padgs.reports.findings.judging import Claim, Judgement, Line, Verdict, in_the_paper, judge
+from padgs.reports.gathered import Gathered, of_a_table
+from padgs.reports.request import experiment_of
+from padgs.reports.tables.ranking import CONFIDENCE
+from padgs.reports.tables.table import MISSING
 
 INTRODUCTION = f"""# Findings
 

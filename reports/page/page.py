@@ -10,13 +10,13 @@ from typing import Any
 
 from pandas import DataFrame
 
-from reports import REPORTS
-from reports.charts.drawing import Chart
-from reports.gathered import Gathered
-from reports.page.pictures import album
-from reports.tables.beside_paper import OF_THE_PAPER
-from reports.tables.ranking import BEST, emphasis
-from reports.tables.table import Block, Cell, ReportError, Table
+from padgs.reports import REPORTS
+from padgs.reports.charts.drawing import Chart
+from padgs.reports.gathered import Gathered
+from padgs.reports.page.pictures import album
+from padgs.reports.tables.beside_paper import OF_THE_PAPER
+from padgs.reports.tables.ranking import BEST, emphasis
+from padgs.reports.tables.table import Block, Cell, ReportError, Table
 
 HERE = Path(__file__).resolve().parent
 SCRIPTS = ("pannellum.js", "tablesort.min.js", "tablesort.number.min.js", "img-comparison-slider.js")

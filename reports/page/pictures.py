@@ -13,9 +13,9 @@ from typing import Any
 import pandas as pd
 from PIL import Image
 
-from reports.frame import by_place
-from reports.gathered import Gathered
-from reports.settings import Setting, settings
+from padgs.reports.frame import by_place
+from padgs.reports.gathered import Gathered
+from padgs.reports.settings import Setting, settings
 
 WIDTH = 1024  # pixels of an embedded panorama at most
 QUALITY = 80  # of JPEG

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from reports.measures import Measure
-from reports.published import Published
-from reports.tables.table import Cell, Column
+from padgs.reports.measures import Measure
+from padgs.reports.published import Published
+from padgs.reports.tables.table import Cell, Column
 
 OF_THE_PAPER = ("paper", "Δ")  # titles of the columns that the paper's numbers bring along
 

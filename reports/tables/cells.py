@@ -10,9 +10,9 @@ from dataclasses import replace
 import numpy as np
 from pandas import DataFrame
 
-from reports.measures import Measure
-from reports.settings import one_setting
-from reports.tables.table import Cell
+from padgs.reports.measures import Measure
+from padgs.reports.settings import one_setting
+from padgs.reports.tables.table import Cell
 
 
 def of_each(

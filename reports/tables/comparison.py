@@ -7,18 +7,18 @@ from dataclasses import dataclass
 
 from pandas import DataFrame
 
-from reports import methods, published
-from reports.conditions import CONDITIONS, footnotes, refuse_mixture
-from reports.frame import by_place
-from reports.gathered import Gathered
-from reports.measures import Measure, alone
-from reports.published import Key, Published
-from reports.scenes import Place
-from reports.tables import beside_paper
-from reports.tables.cells import of_each, only_shown, over_scenes
-from reports.tables.table import Block, Cell, Row, Table
-from reports.unranked import Reason, unranked
-from reports.unranked import notes as notes_on
+from padgs.reports import methods, published
+from padgs.reports.conditions import CONDITIONS, footnotes, refuse_mixture
+from padgs.reports.frame import by_place
+from padgs.reports.gathered import Gathered
+from padgs.reports.measures import Measure, alone
+from padgs.reports.published import Key, Published
+from padgs.reports.scenes import Place
+from padgs.reports.tables import beside_paper
+from padgs.reports.tables.cells import of_each, only_shown, over_scenes
+from padgs.reports.tables.table import Block, Cell, Row, Table
+from padgs.reports.unranked import Reason, unranked
+from padgs.reports.unranked import notes as notes_on
 
 Measures = Sequence[Measure]
 Numbers = Mapping[Key, Published]  # of the paper; none under a protocol that is not its own

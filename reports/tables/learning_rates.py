@@ -8,16 +8,16 @@ from typing import Any
 
 from pandas import DataFrame
 
-from reports import methods
-from reports.conditions import footnotes, refuse_mixture
-from reports.frame import by_conditions, grouped
-from reports.gathered import Gathered
-from reports.learning_rates import LARGEST, PUBLISHED_ITERATIONS, law
-from reports.measures import mark
-from reports.settings import one_setting
-from reports.tables.cells import over_pairs, over_seeds
-from reports.tables.ranking import NOTE
-from reports.tables.table import Block, Cell, Column, Row, Table
+from padgs.reports import methods
+from padgs.reports.conditions import footnotes, refuse_mixture
+from padgs.reports.frame import by_conditions, grouped
+from padgs.reports.gathered import Gathered
+from padgs.reports.learning_rates import LARGEST, PUBLISHED_ITERATIONS, law
+from padgs.reports.measures import mark
+from padgs.reports.settings import one_setting
+from padgs.reports.tables.cells import over_pairs, over_seeds
+from padgs.reports.tables.ranking import NOTE
+from padgs.reports.tables.table import Block, Cell, Column, Row, Table
 
 RATES = "config.train.learning_rates"  # published, run, or a factor
 FACTOR = "factor"

@@ -9,15 +9,15 @@ from collections.abc import Mapping
 import pandas as pd
 from pandas import DataFrame
 
-from reports import methods
-from reports.conditions import footnotes, refuse_mixture
-from reports.frame import by_conditions, grouped
-from reports.gathered import Gathered
-from reports.measures import mark
-from reports.settings import one_setting
-from reports.tables.cells import over_seeds
-from reports.tables.ranking import NOTE, better_rows
-from reports.tables.table import Block, Cell, Column, Row, Table
+from padgs.reports import methods
+from padgs.reports.conditions import footnotes, refuse_mixture
+from padgs.reports.frame import by_conditions, grouped
+from padgs.reports.gathered import Gathered
+from padgs.reports.measures import mark
+from padgs.reports.settings import one_setting
+from padgs.reports.tables.cells import over_seeds
+from padgs.reports.tables.ranking import NOTE, better_rows
+from padgs.reports.tables.table import Block, Cell, Column, Row, Table
 
 RATES = "config.train.learning_rates"  # absent in runs from before there was a choice
 TITLES = {"published": "published rates", "run": "rates for the run"}  # value of RATES -> title

@@ -7,14 +7,14 @@ from dataclasses import replace
 
 from pandas import DataFrame
 
-from reports.conditions import OF_TIMES, footnotes, refuse_mixture
-from reports.frame import CONFIG, by_conditions
-from reports.gathered import Gathered
-from reports.measures import costs, mark
-from reports.settings import one_setting
-from reports.tables.cells import over_seeds, spread
-from reports.tables.ranking import NOTE
-from reports.tables.table import Block, Cell, Row, Table
+from padgs.reports.conditions import OF_TIMES, footnotes, refuse_mixture
+from padgs.reports.frame import CONFIG, by_conditions
+from padgs.reports.gathered import Gathered
+from padgs.reports.measures import costs, mark
+from padgs.reports.settings import one_setting
+from padgs.reports.tables.cells import over_seeds, spread
+from padgs.reports.tables.ranking import NOTE
+from padgs.reports.tables.table import Block, Cell, Row, Table
 
 TAU = "method.tau"
 VOXELS = {"padgs_small": "one anchor per 3 px", "padgs": "voxel of the paper"}

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from reports.conditions import footnotes, refuse_mixture
-from reports.frame import by_conditions
-from reports.gathered import Gathered
-from reports.needs import EPSILONS, STATED, Curve, curves, gain, ratio, searched
-from reports.tables.table import Block, Cell, Column, Row, Table
+from padgs.reports.conditions import footnotes, refuse_mixture
+from padgs.reports.frame import by_conditions
+from padgs.reports.gathered import Gathered
+from padgs.reports.needs import EPSILONS, STATED, Curve, curves, gain, ratio, searched
+from padgs.reports.tables.table import Block, Cell, Column, Row, Table
 
 COLUMNS: dict[Column, Callable[[Curve, Curve], float | None]] = {
     Column("Gaussians blended", 0): lambda own, _: own.found["steps"][0]["blended"],

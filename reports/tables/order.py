@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from pandas import DataFrame
 
-from reports import REPORTS
-from reports.conditions import OF_TIMES, footnotes, refuse_mixture
-from reports.frame import by_conditions
-from reports.gathered import Gathered
-from reports.measures import costs, mark
-from reports.settings import one_setting, settings
-from reports.tables.cells import over_seeds
-from reports.tables.ranking import NOTE, places
-from reports.tables.table import Block, Cell, Column, Row, Table
+from padgs.reports import REPORTS
+from padgs.reports.conditions import OF_TIMES, footnotes, refuse_mixture
+from padgs.reports.frame import by_conditions
+from padgs.reports.gathered import Gathered
+from padgs.reports.measures import costs, mark
+from padgs.reports.settings import one_setting, settings
+from padgs.reports.tables.cells import over_seeds
+from padgs.reports.tables.ranking import NOTE, places
+from padgs.reports.tables.table import Block, Cell, Column, Row, Table
 
 QUALITY = mark("sphere", "ws_psnr")
 MEASURES = (

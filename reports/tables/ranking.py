@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping
 
 from scipy.special import stdtrit
 
-from reports.tables.table import Block, Cell, Column, shown
+from padgs.reports.tables.table import Block, Cell, Column, shown
 
 BEST, SECOND = "best", "second"
 CONFIDENCE = 0.95

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from reports.conditions import footnotes
-from reports.frame import grouped
-from reports.gathered import Gathered
-from reports.measures import costs, gpu_memory, mark
-from reports.published import scene_title
-from reports.tables.cells import over_seeds
-from reports.tables.table import Block, Row, Table
+from padgs.reports.conditions import footnotes
+from padgs.reports.frame import grouped
+from padgs.reports.gathered import Gathered
+from padgs.reports.measures import costs, gpu_memory, mark
+from padgs.reports.published import scene_title
+from padgs.reports.tables.cells import over_seeds
+from padgs.reports.tables.table import Block, Row, Table
 
 MARKS = {
     "paper": ("psnr", "ssim", "lpips_vgg_01"),

@@ -5,16 +5,16 @@ from __future__ import annotations
 import pandas as pd
 from pandas import DataFrame
 
-from reports import methods as names
-from reports.conditions import CONDITIONS, OF_TIMES, footnotes, refuse_mixture
-from reports.frame import by_conditions, by_place
-from reports.gathered import Gathered
-from reports.measures import Measure, costs, gpu_memory, known_costs, mark
-from reports.tables.cells import of_each
-from reports.tables.ranking import NOTE
-from reports.tables.table import Block, Row, Table
-from reports.unranked import notes as notes_on
-from reports.unranked import unranked
+from padgs.reports import methods as names
+from padgs.reports.conditions import CONDITIONS, OF_TIMES, footnotes, refuse_mixture
+from padgs.reports.frame import by_conditions, by_place
+from padgs.reports.gathered import Gathered
+from padgs.reports.measures import Measure, costs, gpu_memory, known_costs, mark
+from padgs.reports.tables.cells import of_each
+from padgs.reports.tables.ranking import NOTE
+from padgs.reports.tables.table import Block, Row, Table
+from padgs.reports.unranked import notes as notes_on
+from padgs.reports.unranked import unranked
 
 MARKS = {
     "paper": ("psnr", "ssim", "lpips_vgg_01"),

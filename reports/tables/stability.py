@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from reports import methods
-from reports.charts import heat_map, survival_chart
-from reports.charts.drawing import Chart
-from reports.conditions import footnotes
-from reports.gathered import Gathered
-from reports.survival import HALF, QUALITY, Survivor, in_order, survivors
-from reports.tables.cells import spread
-from reports.tables.table import Block, Cell, Column, Row, Table
+from padgs.reports import methods
+from padgs.reports.charts import heat_map, survival_chart
+from padgs.reports.charts.drawing import Chart
+from padgs.reports.conditions import footnotes
+from padgs.reports.gathered import Gathered
+from padgs.reports.survival import HALF, QUALITY, Survivor, in_order, survivors
+from padgs.reports.tables.cells import spread
+from padgs.reports.tables.table import Block, Cell, Column, Row, Table
 
 UNSTRESSED = {  # title -> column of the frame, or of the one that is subtracted from the other
     "WS-PSNR, dB": (QUALITY,),

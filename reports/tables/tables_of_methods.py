@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from reports.conditions import OF_TIMES
-from reports.gathered import Gathered
-from reports.measures import costs, gpu_memory, marks
-from reports.tables.comparison import Comparison
-from reports.tables.ranking import NOTE
-from reports.tables.table import Table
+from padgs.reports.conditions import OF_TIMES
+from padgs.reports.gathered import Gathered
+from padgs.reports.measures import costs, gpu_memory, marks
+from padgs.reports.tables.comparison import Comparison
+from padgs.reports.tables.ranking import NOTE
+from padgs.reports.tables.table import Table
 
 
 def table1(gathered: Gathered) -> Table:

@@ -6,16 +6,16 @@ from collections.abc import Mapping, Sequence
 
 from pandas import DataFrame
 
-from reports import methods, published
-from reports.conditions import OF_PARTS, OF_TIMES, footnotes, refuse_mixture
-from reports.frame import by_place
-from reports.gathered import Gathered
-from reports.measures import PAPER_METRICS, costs, marks
-from reports.scenes import Place
-from reports.tables import beside_paper
-from reports.tables.cells import of_each
-from reports.tables.ranking import NOTE
-from reports.tables.table import Block, Column, Row, Table
+from padgs.reports import methods, published
+from padgs.reports.conditions import OF_PARTS, OF_TIMES, footnotes, refuse_mixture
+from padgs.reports.frame import by_place
+from padgs.reports.gathered import Gathered
+from padgs.reports.measures import PAPER_METRICS, costs, marks
+from padgs.reports.scenes import Place
+from padgs.reports.tables import beside_paper
+from padgs.reports.tables.cells import of_each
+from padgs.reports.tables.ranking import NOTE
+from padgs.reports.tables.table import Block, Column, Row, Table
 
 PARTS = {  # variant (conf/ablation) -> title
     "baseline": "Baseline",

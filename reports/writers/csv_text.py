@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pandas import DataFrame
 
-from reports.tables.ranking import emphasis
-from reports.tables.table import Table
+from padgs.reports.tables.ranking import emphasis
+from padgs.reports.tables.table import Table
 
 
 def text(table: Table) -> str:

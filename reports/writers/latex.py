@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import groupby
 
-from reports.tables.ranking import BEST, emphasis
-from reports.tables.table import Block, Table
+from padgs.reports.tables.ranking import BEST, emphasis
+from padgs.reports.tables.table import Block, Table
 
 SPECIAL = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
 SPECIAL |= {character: f"\\{character}" for character in "&%$#_{}"}

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from reports.tables.ranking import BEST, emphasis
-from reports.tables.table import Block, Table
+from padgs.reports.tables.ranking import BEST, emphasis
+from padgs.reports.tables.table import Block, Table
 
 
 def text(table: Table) -> str:

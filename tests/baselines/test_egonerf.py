@@ -5,7 +5,7 @@ import torch
 from composed import composed
 from tiny_scene import tiny_scene
 
-from baselines.egonerf import EgoNeRFMethod, EgoNeRFMethodOptions
+from padgs.baselines.egonerf import EgoNeRFMethod, EgoNeRFMethodOptions
 from padgs.data.synthetic import SyntheticOptions, generate
 from padgs.egonerf.model import EgoNeRF
 from padgs.egonerf.trainee import EgoNeRFTrainee

@@ -13,7 +13,7 @@ import torch
 from composed import composed
 from states import assert_same_but_time
 
-from baselines import METHODS
+from padgs.baselines import METHODS
 from padgs.data.synthetic import SCENES, SyntheticOptions, generate
 from padgs.learning.budget import Budget
 from padgs.learning.loop import Record

@@ -8,7 +8,7 @@ import torch
 from composed import composed
 from torch import Tensor
 
-from baselines.odgs import ODGSOptions
+from padgs.baselines.odgs import ODGSOptions
 from padgs.gaussians import Gaussians
 from padgs.render import RenderOptions, render
 from padgs.scene import View

@@ -6,8 +6,8 @@ from composed import composed
 from states import assert_same_but_time
 from tiny_scene import tiny_scene
 
-from baselines import METHODS
-from baselines.omnigs import OmniGSMethod
+from padgs.baselines import METHODS
+from padgs.baselines.omnigs import OmniGSMethod
 from padgs.learning.budget import Budget
 from padgs.learning.failure import Failure
 from padgs.learning.trainee import State

@@ -10,8 +10,8 @@ from composed import composed
 from rich.console import Console
 from tiny_scene import tiny_scene
 
-from baselines.op43dgs import OP43DGSMethod
 from padgs import results
+from padgs.baselines.op43dgs import OP43DGSMethod
 from padgs.learning.budget import Budget
 from padgs.runs import session
 from padgs.scene import Scene, View

@@ -8,7 +8,7 @@ from configparser import ConfigParser
 import pytest
 
 import padgs
-from baselines import METHODS, outside
+from padgs.baselines import METHODS, outside
 
 
 @pytest.fixture
@@ -44,6 +44,6 @@ def test_it_keeps_the_promises_that_its_own_tests_state(installed, tmp_path):
 
 
 def test_a_name_of_ours_is_refused(installed, monkeypatch):
-    monkeypatch.setitem(METHODS, "my_method", "baselines.omnigs:OmniGSMethod")
+    monkeypatch.setitem(METHODS, "my_method", "padgs.baselines.omnigs:OmniGSMethod")
     with pytest.raises(ValueError, match="my_method:MyMethod is called my_method, as a method of padgs is"):
         outside()

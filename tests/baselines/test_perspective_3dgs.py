@@ -10,9 +10,9 @@ import torch
 from composed import composed
 from tiny_scene import tiny_scene
 
-from baselines import METHODS
-from baselines.crops_3dgs import NARROWEST, Crops3DGSMethod, Crops3DGSOptions
-from baselines.cubemap_3dgs import Cubemap3DGSMethod
+from padgs.baselines import METHODS
+from padgs.baselines.crops_3dgs import NARROWEST, Crops3DGSMethod, Crops3DGSOptions
+from padgs.baselines.cubemap_3dgs import Cubemap3DGSMethod
 from padgs.data.perspectives import solid_angle
 from padgs.learning.budget import Budget
 from padgs.learning.loop import TrainOptions

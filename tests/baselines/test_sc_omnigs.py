@@ -5,8 +5,8 @@ import pytest
 import torch
 from tiny_scene import HEIGHT, WIDTH, tiny_scene
 
-from baselines.omnigs import OmniGSMethod
-from baselines.sc_omnigs import SCOmniGSMethod, SCOmniGSOptions, aligned, carried
+from padgs.baselines.omnigs import OmniGSMethod
+from padgs.baselines.sc_omnigs import SCOmniGSMethod, SCOmniGSOptions, aligned, carried
 from padgs.calibration.align import Similarity, align
 from padgs.data.synthetic import SyntheticOptions, SyntheticTruth, generate
 from padgs.gaussians import rotation_matrices

@@ -4,7 +4,7 @@ import pytest
 import torch
 from tiny_scene import tiny_scene, truth
 
-from baselines.seam360gs import Seam360GSMethod, Seam360GSOptions
+from padgs.baselines.seam360gs import Seam360GSMethod, Seam360GSOptions
 from padgs.calibration.dual_lens import DualLens
 from padgs.data.synthetic import SyntheticOptions, SyntheticTruth, generate
 from padgs.learning.budget import Budget

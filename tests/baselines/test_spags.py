@@ -9,8 +9,8 @@ import torch
 from composed import composed
 from tiny_scene import tiny_scene
 
-from baselines import METHODS
-from baselines.spags import SPaGSMethod, SPaGSOptions
+from padgs.baselines import METHODS
+from padgs.baselines.spags import SPaGSMethod, SPaGSOptions
 from padgs.gaussians import Gaussians, rotation_matrices
 from padgs.learning.budget import Budget
 from padgs.native import cpu

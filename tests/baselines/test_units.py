@@ -6,7 +6,7 @@ import pytest
 import torch
 from tiny_scene import tiny_scene
 
-from baselines import METHODS
+from padgs.baselines import METHODS
 from padgs.learning.budget import Budget
 from padgs.registry import lookup
 from padgs.scene import Scene, View

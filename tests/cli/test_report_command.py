@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from padgs import results
 from padgs.cli.commands import app
-from reports import REPORTS
+from padgs.reports import REPORTS
 
 
 @pytest.fixture
@@ -86,7 +86,7 @@ def test_a_folder_that_is_not_there(tmp_path):
 
 
 def test_reports_need_no_torch(root):
-    code = "import sys, reports.files; sys.exit('torch' in sys.modules)"
+    code = "import sys, padgs.reports.files; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], cwd=root).returncode == 0
 
 

@@ -7,7 +7,7 @@ from tiny_run import tiny_run
 from typer.testing import CliRunner
 
 import padgs
-from baselines.sc_omnigs import aligned, carried
+from padgs.baselines.sc_omnigs import aligned, carried
 from padgs.cli.commands import app
 from padgs.data.ply import read_ply
 from padgs.export.explicit import exported

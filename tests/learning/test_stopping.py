@@ -6,7 +6,7 @@ from states import assert_same_but_time
 from tiny_scene import HEIGHT, WIDTH, tiny_scene
 from torch import Tensor
 
-from baselines import METHODS
+from padgs.baselines import METHODS
 from padgs.learning.budget import Budget
 from padgs.learning.loop import Trainer
 from padgs.learning.stopping import FADE, Plateau, quality, set_apart

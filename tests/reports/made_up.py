@@ -9,13 +9,13 @@ import numpy as np
 from PIL import Image
 
 from padgs import results
+from padgs.reports import published
+from padgs.reports.charts.panel import Panel
+from padgs.reports.frame import frame
+from padgs.reports.gathered import Gathered
+from padgs.reports.request import Request
+from padgs.reports.store import Run
 from padgs.results import Result, Scores
-from reports import published
-from reports.charts.panel import Panel
-from reports.frame import frame
-from reports.gathered import Gathered
-from reports.request import Request
-from reports.store import Run
 
 RULES = {"name": "paper", "lpips": "vgg", "lpips_inputs": "01", "bottom_crop": 0.0}
 

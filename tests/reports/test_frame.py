@@ -5,8 +5,8 @@ import pandas as pd
 import pytest
 from made_up import failed, result, small
 
-from reports.frame import by_place, frame
-from reports.store import Run
+from padgs.reports.frame import by_place, frame
+from padgs.reports.store import Run
 
 
 def test_a_row_a_run_with_its_numbers_conditions_and_keys():

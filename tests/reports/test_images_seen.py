@@ -2,7 +2,7 @@
 
 from made_up import result
 
-from reports.images_seen import images_seen
+from padgs.reports.images_seen import images_seen
 
 
 def test_rays_count_as_pixels_and_all_else_as_whole_panoramas():

@@ -6,16 +6,16 @@ from pathlib import Path
 import pytest
 from made_up import assert_apart
 
-from reports import REPORTS, store
-from reports.charts import sweeps, trade_off, trade_off_chart
-from reports.charts.drawing import Chart
-from reports.files import files
-from reports.frame import frame
-from reports.gathered import Gathered
-from reports.methods import short
-from reports.writers import csv_text
+from padgs.reports import REPORTS, store
+from padgs.reports.charts import sweeps, trade_off, trade_off_chart
+from padgs.reports.charts.drawing import Chart
+from padgs.reports.files import files
+from padgs.reports.frame import frame
+from padgs.reports.gathered import Gathered
+from padgs.reports.methods import short
+from padgs.reports.writers import csv_text
 
-TABLES = [name for name, report in REPORTS.items() if report.function.startswith("reports.tables.")]
+TABLES = [name for name, report in REPORTS.items() if report.function.startswith("padgs.reports.tables.")]
 
 
 @pytest.fixture(scope="module")

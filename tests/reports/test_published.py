@@ -2,8 +2,8 @@ import csv
 
 import pytest
 
-from reports import published
-from reports.published import Key, load
+from padgs.reports import published
+from padgs.reports.published import Key, load
 
 
 def test_a_number_of_each_table():

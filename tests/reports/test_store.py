@@ -6,8 +6,8 @@ from typer.testing import CliRunner
 
 from padgs import results
 from padgs.cli.commands import app
+from padgs.reports import store
 from padgs.results import ResultError
-from reports import store
 
 
 def report(*arguments, code: int = 0):

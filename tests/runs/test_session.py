@@ -17,6 +17,9 @@ from tiny_scene import HEIGHT, WIDTH, tiny_scene
 from padgs import results
 from padgs.anchors.method import PaDGSMethod
 from padgs.learning.failure import Failure
+from padgs.reports import store
+from padgs.reports.frame import frame
+from padgs.reports.gathered import Gathered
 from padgs.runs import checkpoint, session
 from padgs.runs.checkpoint import CheckpointError
 from padgs.runs.folder import RunFolder, RunFolderError
@@ -25,9 +28,6 @@ from padgs.runs.interrupt import Interrupted
 from padgs.runs.lock import RunBusy
 from padgs.runs.scoring import probe
 from padgs.runs.session import Session, Watch, build, scene_of
-from reports import store
-from reports.frame import frame
-from reports.gathered import Gathered
 
 ITERATIONS = 12
 SMALL = ("method=padgs", "protocol=paper", "protocol.paper.lpips=none", "render.backend=torch")

@@ -11,8 +11,8 @@ from tiny_run import SETTINGS, tiny_run
 from tiny_scene import tiny_scene
 
 import padgs
-from baselines import METHODS
 from padgs import results
+from padgs.baselines import METHODS
 from padgs.learning.budget import Budget
 from padgs.learning.loop import TrainOptions
 from padgs.multirun.composition import composing, configuration

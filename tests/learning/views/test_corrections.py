@@ -10,7 +10,7 @@ from states import assert_same_but_time
 from tiny_scene import tiny_scene, truth
 from torch import nn
 
-from baselines.omnigs import OmniGSMethod
+from padgs.baselines.omnigs import OmniGSMethod
 from padgs.learning.budget import Budget
 from padgs.learning.loop import Trainer, TrainOptions
 from padgs.learning.schedule import Constant, ParameterGroup

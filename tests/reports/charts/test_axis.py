@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from reports.charts.axis import Axis, window
+from padgs.reports.charts.axis import Axis, window
 
 values = st.lists(st.floats(0.01, 1e4), min_size=1, max_size=20)
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from reports.charts.labels import Named, place
+from padgs.reports.charts.labels import Named, place
 
 INSIDE = (50.0, 40.0, 500.0, 360.0)
 

@@ -3,13 +3,13 @@ import re
 import pytest
 from made_up import compared, small, swept, write
 
-import baselines
-from reports import store
-from reports.charts import sweep_chart, trade_off_chart
-from reports.charts.palette import BEYOND, FAMILIES, GRID, INK, OTHERS, PAPER, SOFT, color_of, dark_rules
-from reports.frame import frame
-from reports.gathered import Gathered
-from reports.methods import method_of
+from padgs import baselines
+from padgs.reports import store
+from padgs.reports.charts import sweep_chart, trade_off_chart
+from padgs.reports.charts.palette import BEYOND, FAMILIES, GRID, INK, OTHERS, PAPER, SOFT, color_of, dark_rules
+from padgs.reports.frame import frame
+from padgs.reports.gathered import Gathered
+from padgs.reports.methods import method_of
 
 
 def contrast(one: str, other: str) -> float:

@@ -5,10 +5,10 @@ from dataclasses import replace
 import pytest
 from made_up import compared, gathered, small, swept
 
-from reports.charts import sweep_chart
-from reports.charts.sweeps import sweeps
-from reports.tables.table import ReportError
-from reports.writers import csv_text
+from padgs.reports.charts import sweep_chart
+from padgs.reports.charts.sweeps import sweeps
+from padgs.reports.tables.table import ReportError
+from padgs.reports.writers import csv_text
 
 
 def rows(sweep) -> list[dict[str, str]]:

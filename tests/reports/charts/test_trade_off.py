@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 from made_up import METHODS, compared, data_set, gathered, small
 
-from reports.charts.trade_off import pareto, trade_offs
-from reports.tables.table import ReportError
-from reports.writers import csv_text
+from padgs.reports.charts.trade_off import pareto, trade_offs
+from padgs.reports.tables.table import ReportError
+from padgs.reports.writers import csv_text
 
 
 def numbers(chart) -> dict[tuple[str, str], float]:

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from made_up import assert_apart, compared, gathered, small, write
 
-from reports import store
-from reports.charts import time_chart
-from reports.charts.trade_off import trade_offs
-from reports.charts.trade_off_chart import LARGEST, NARROW, WIDE, charts, drawn
-from reports.frame import frame
-from reports.gathered import Gathered
-from reports.methods import short
+from padgs.reports import store
+from padgs.reports.charts import time_chart
+from padgs.reports.charts.trade_off import trade_offs
+from padgs.reports.charts.trade_off_chart import LARGEST, NARROW, WIDE, charts, drawn
+from padgs.reports.frame import frame
+from padgs.reports.gathered import Gathered
+from padgs.reports.methods import short
 
 
 def one(runs):

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from made_up import gathered, of_experiment
 from scipy.stats import ttest_1samp
 
-from reports import published
-from reports.findings.judging import Claim, Side, Verdict, in_the_paper, judge
-from reports.methods import title
+from padgs.reports import published
+from padgs.reports.findings.judging import Claim, Side, Verdict, in_the_paper, judge
+from padgs.reports.methods import title
 
 PADGS = Side(("padgs",), published=("padgs",))
 RIVALS = Side(("omnigs", "spags"), published=("omnigs", "spags"))

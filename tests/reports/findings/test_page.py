@@ -3,10 +3,10 @@ from itertools import product
 import pytest
 from made_up import gathered, of_experiment
 
-from reports import published
-from reports.findings.claims import CLAIMS
-from reports.findings.judging import Verdict, in_the_paper, judge
-from reports.findings.page import findings
+from padgs.reports import published
+from padgs.reports.findings.claims import CLAIMS
+from padgs.reports.findings.judging import Verdict, in_the_paper, judge
+from padgs.reports.findings.page import findings
 
 
 def rows(page) -> list[list[str]]:

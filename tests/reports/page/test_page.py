@@ -6,11 +6,11 @@ import pytest
 from chromium import PROGRAM, Browser
 from made_up import compared, data_set, failed, gathered, small, swept, write
 
-from reports import store
-from reports.frame import frame
-from reports.gathered import Gathered
-from reports.page import page, pictures
-from reports.request import Request
+from padgs.reports import store
+from padgs.reports.frame import frame
+from padgs.reports.gathered import Gathered
+from padgs.reports.page import page, pictures
+from padgs.reports.request import Request
 
 
 @pytest.fixture(scope="module")

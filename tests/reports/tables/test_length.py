@@ -1,8 +1,8 @@
 import pytest
 from made_up import gathered, of_experiment
 
-from reports.methods import title
-from reports.tables.length import length
+from padgs.reports.methods import title
+from padgs.reports.tables.length import length
 
 FINAL = {"omnigs": 27.0, "odgs": 28.0, "spags": 29.0, "op43dgs": 26.0}
 SHORT = {"omnigs": 24.0, "odgs": 23.0, "spags": 22.0, "op43dgs": 25.0}  # the reverse

@@ -3,9 +3,9 @@ from dataclasses import replace
 import pytest
 from made_up import RULES, gathered, of_experiment
 
+from padgs.reports.tables.modulation import EFFECTS, modulation
+from padgs.reports.writers import csv_text, latex, markdown
 from padgs.results import Scores
-from reports.tables.modulation import EFFECTS, modulation
-from reports.writers import csv_text, latex, markdown
 
 VOXEL, TAU, BOTH = 2.0, -2.6, 0.3  # dB
 

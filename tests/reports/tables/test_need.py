@@ -6,10 +6,10 @@ import pytest
 from made_up import gathered, small
 from PIL import Image
 
-from reports.charts.need_chart import charts
-from reports.needs import curves, gain, ratio, searched
-from reports.tables.need import need
-from reports.writers import markdown
+from padgs.reports.charts.need_chart import charts
+from padgs.reports.needs import curves, gain, ratio, searched
+from padgs.reports.tables.need import need
+from padgs.reports.writers import markdown
 
 SIZES = (8000, 4000, 2000, 1000)
 

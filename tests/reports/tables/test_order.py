@@ -2,8 +2,8 @@ from dataclasses import replace
 
 from made_up import gathered, of_experiment
 
-from reports.methods import title
-from reports.tables.order import order
+from padgs.reports.methods import title
+from padgs.reports.tables.order import order
 
 QUALITY = {"omnigs": 25.0, "odgs": 25.05, "spags_sorted": 27.0, "op43dgs": 24.0}
 

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import ttest_ind_from_stats
 
-from reports.tables.ranking import (
+from padgs.reports.tables.ranking import (
     BEST,
     CONFIDENCE,
     SECOND,
@@ -15,7 +15,7 @@ from reports.tables.ranking import (
     pooled_variance,
     quantile,
 )
-from reports.tables.table import Block, Cell, Column, Row, shown
+from padgs.reports.tables.table import Block, Cell, Column, Row, shown
 
 PSNR, LPIPS, COUNT = Column("PSNR", 2, True), Column("LPIPS", 3, False), Column("Gaussians", 0)
 

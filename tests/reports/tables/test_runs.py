@@ -2,8 +2,8 @@ from dataclasses import replace
 
 from made_up import failed, gathered, result
 
-from reports.tables.runs import runs
-from reports.writers import markdown
+from padgs.reports.tables.runs import runs
+from padgs.reports.writers import markdown
 
 
 def test_a_line_per_run_and_a_block_per_scene():

@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 from made_up import compared, gathered, small
 
-from reports.tables.ranking import BEST, SECOND, emphasis
-from reports.tables.side_by_side import equal_time, methods
-from reports.tables.table import ReportError, Table
-from reports.tables.tables_of_methods import table1, table4
-from reports.writers import markdown
+from padgs.reports.tables.ranking import BEST, SECOND, emphasis
+from padgs.reports.tables.side_by_side import equal_time, methods
+from padgs.reports.tables.table import ReportError, Table
+from padgs.reports.tables.tables_of_methods import table1, table4
+from padgs.reports.writers import markdown
 
 
 def columns(table: Table) -> list[str]:

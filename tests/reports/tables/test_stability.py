@@ -3,15 +3,15 @@ from dataclasses import replace
 import pytest
 from made_up import failed, gathered, of_experiment
 
+from padgs.reports.charts.heat_map import GLYPHS
+from padgs.reports.frame import frame
+from padgs.reports.gathered import Gathered
+from padgs.reports.page import page
+from padgs.reports.store import Run
+from padgs.reports.tables.stability import stability
+from padgs.reports.tables.table import ReportError
+from padgs.reports.writers import latex, markdown
 from padgs.results import STATUSES, Scores, picture_name
-from reports.charts.heat_map import GLYPHS
-from reports.frame import frame
-from reports.gathered import Gathered
-from reports.page import page
-from reports.store import Run
-from reports.tables.stability import stability
-from reports.tables.table import ReportError
-from reports.writers import latex, markdown
 
 RULES = {"name": "stability", "lpips": "none", "lpips_inputs": "11", "bottom_crop": 0.0}
 ONE_COLOR = 12.0

@@ -5,10 +5,10 @@ from dataclasses import replace
 import pytest
 from made_up import data_set, failed, gathered, result
 
-from reports.tables.runs import runs
-from reports.tables.table import MISSING, ReportError, Table
-from reports.tables.tables_of_methods import table1, table2, table4
-from reports.writers import csv_text, markdown
+from padgs.reports.tables.runs import runs
+from padgs.reports.tables.table import MISSING, ReportError, Table
+from padgs.reports.tables.tables_of_methods import table1, table2, table4
+from padgs.reports.writers import csv_text, markdown
 
 COSTS = {  # what data_set has, and the paper: group, column -> value
     ("training h", "training"): 1.0,

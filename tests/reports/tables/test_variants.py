@@ -5,10 +5,10 @@ import pytest
 from made_up import RULES, failed, gathered, result, small
 from omegaconf import OmegaConf
 
+from padgs.reports.tables.table import MISSING, ReportError
+from padgs.reports.tables.variants import PARTS, QUIRKS, RUNGS, WITHOUT, ladder, quirks, table3
+from padgs.reports.writers import markdown
 from padgs.results import Scores
-from reports.tables.table import MISSING, ReportError
-from reports.tables.variants import PARTS, QUIRKS, RUNGS, WITHOUT, ladder, quirks, table3
-from reports.writers import markdown
 
 FOUR = [
     result("baseline", psnr=22.30, ssim=0.786, lpips=0.257),

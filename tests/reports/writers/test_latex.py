@@ -5,10 +5,10 @@ import subprocess
 import pytest
 from made_up import data_set, failed, gathered, result
 
-from reports.tables.runs import runs
-from reports.tables.tables_of_methods import table1, table2, table4
-from reports.tables.variants import table3
-from reports.writers import latex
+from padgs.reports.tables.runs import runs
+from padgs.reports.tables.tables_of_methods import table1, table2, table4
+from padgs.reports.tables.variants import table3
+from padgs.reports.writers import latex
 
 ABLATION = [result("full"), failed("baseline", "oom")]
 
