@@ -23,6 +23,7 @@ from padgs.splats.method import SplatMethod, fewest
 from padgs.splats.model import Splats
 from padgs.splats.trainee import SplatTrainee
 
+PIXEL = 0.1  # square pixels; a pixel is the mean over a square, whose variance is 1/12
 START_BY_NEED = 0.29  # `start_share` at most, where growth is by need: it adds what is needed, and takes little away
 
 
@@ -36,7 +37,7 @@ class PlusMethod(SplatMethod):
 
     Options = PlusOptions
     TRAINEE = PlusTrainee
-    RENDER = RenderConfig(projection="ray", low_pass=0.2, near=0.05)
+    RENDER = RenderConfig(projection="ray", low_pass=PIXEL, near=0.05)
     TRAIN = TrainOptions(weight="solid_angle")
 
     def _start(self, scene: Scene, iterations: int) -> SplatTrainee:

@@ -30,6 +30,7 @@ WITHOUT = {  # variant (conf/without) -> title
         f"without_{part}": title
         for part, title in {
             "rays": "tangent planes for rays",
+            "filter": "twice the filter",
             "weight": "no solid-angle weight",
             "rates": "published rates",
             "speed": "means at the rate of 3DGS",
