@@ -18,15 +18,14 @@ def view(
     host: Annotated[str, typer.Option(help="0.0.0.0 shows it to the whole network, without a password")] = "127.0.0.1",
     data: DataPath = None,
 ) -> None:
-    """Walk through a run in the browser, drawn here by the run's own renderer. Ctrl-C ends it."""
-    from threading import Event
+    """Walk through a run in the browser, drawn here by the run's own renderer; one in training is followed."""
+    from padgs.viewer.process import await_checkpoint, serve
 
-    from padgs.viewer.server import serving
-
-    runs = [opened(folder, data) for folder in (run, beside) if folder]
-    with serving(runs, host=host, port=port) as server:
-        print(f"{server.address}  (Ctrl-C ends it)", flush=True)
-        try:
-            Event().wait()
-        except KeyboardInterrupt:
-            print()
+    runs = []
+    try:
+        for folder in (run, beside) if beside else (run,):
+            await_checkpoint(folder)
+            runs.append(opened(folder, data))
+        serve(runs, host=host, port=port)
+    except KeyboardInterrupt:
+        print()

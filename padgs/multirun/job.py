@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 import traceback
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from functools import partial
 from pathlib import Path
 
@@ -29,6 +29,7 @@ from padgs.runs.opened import load_run
 from padgs.runs.session import Session, Watch
 from padgs.runs.terminal import say
 from padgs.tracking.tracker import SECONDS_BETWEEN_LOOKS, Tracker
+from padgs.viewer.process import shown
 
 EXPECTED = (ValueError, OSError, CheckpointError, RunFolderError, RunBusy)  # a traceback would only hide what they say
 ARGUMENTS: list[str] = []  # of the command line, by which a finished run is known again
@@ -89,7 +90,8 @@ def done(config: RunConfig, console: Console, watch: Watch) -> Result:
     session = Session(config, console, watch)
     if config.need == "on":
         set_apart(session.scene.train)  # refuses too few views before hours of training
-    result = session.run()
+    with shown(session.folder.path, config.data.path) if config.run.view else nullcontext():
+        result = session.run()
     if config.need == "on" and result.ok:
         from padgs.need.searching import search  # scipy.stats, which other runs need not wait for
 

@@ -29,6 +29,7 @@ from padgs.tracking.tracker import TrackingOptions
 RETRIES = ("none", "failed")
 NEEDS = ("off", "on")
 IMAGES_ON = ("device", "cpu")
+WATCHED = 5.0  # seconds between checkpoints at most, where somebody watches
 CONTINUED = "continued"  # the word for runs with `init` in tables
 LATER = ("exposures", "poses")  # keys of `train` that older runs do not have; they did what is the default
 
@@ -100,6 +101,7 @@ class RunOptions:
     probe_every: int = 100  # iterations between renders of one test view, the held-out PSNR of the live line
     checkpoint_every: int | None = None  # iterations between checkpoints; null = only by time
     checkpoint_seconds: float = 60.0  # between checkpoints, if not sooner by iterations
+    view: bool = False  # show the run in the browser while it trains, a checkpoint every few seconds
     pictures: bool = True  # save truth | render | error of each test view
 
     def __post_init__(self) -> None:
@@ -111,6 +113,11 @@ class RunOptions:
             if value is not None and value < 1:
                 raise ValueError(f"{name} is {value}; it must be at least 1")
         check(self, ">= 0", lambda seconds: seconds >= 0, "checkpoint_seconds")
+
+    @property
+    def seconds_between_checkpoints(self) -> float:
+        """As `checkpoint_seconds`, unless somebody watches."""
+        return min(self.checkpoint_seconds, WATCHED) if self.view else self.checkpoint_seconds
 
     @property
     def threads_per_job(self) -> int | None:

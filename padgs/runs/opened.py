@@ -19,7 +19,7 @@ from padgs.results import Result, Scores
 from padgs.runs import checkpoint
 from padgs.runs.config import RunConfig, config_from_values
 from padgs.runs.device import chosen
-from padgs.runs.folder import RunFolder, RunFolderError
+from padgs.runs.folder import PROGRESS, Progress, RunFolder, RunFolderError
 from padgs.runs.identity import config_hash
 from padgs.runs.scoring import scores
 from padgs.runs.session import build, scene_of
@@ -56,6 +56,8 @@ class OpenedRun:
     config: RunConfig
     method: Method  # as its last checkpoint left it
     result: Result | None  # what `result.json` says; None where the run is not finished
+    iteration: int  # after which its last checkpoint was written
+    digest: str  # of that checkpoint
 
     @property
     def files(self) -> RunFolder:
@@ -75,6 +77,19 @@ class OpenedRun:
     def scores(self) -> dict[str, Scores]:
         """Protocol -> the marks of the test views, as `result.json` has them; empty where the run is not finished."""
         return self.result.scores if self.result is not None else {}
+
+    def renewed(self) -> OpenedRun | None:
+        """The run as training has left it since, on the same scene; None where there is no newer checkpoint.
+
+        Raises:
+            CheckpointError: its checkpoint cannot be read, perhaps because the next one takes its place right now.
+        """
+        if checkpoint.digest(self.files.checkpoint) == self.digest:
+            return None
+        run = load_run(self.folder, data_path=self.config.data.path, device=self.config.run.device)
+        if "scene" in self.__dict__:  # loaded already
+            run.scene = self.scene
+        return run
 
     def render(self, view: View) -> Picture:
         """What it shows of a view: one of its scene, or the same camera elsewhere, `view.at(cam_from_world)`."""
@@ -164,7 +179,9 @@ def load_run(folder: str | Path, *, data_path: str | Path | None = None, device:
         raise RunFolderError(f"{settings} is no configuration that padgs-run wrote ({error}); put that back") from error
     config = config_from_values(values)
     method = build(config)
+    digest = checkpoint.digest(files.checkpoint)
     state = checkpoint.load(files.checkpoint, chosen(device, config.render), run)
     with checkpoint.understood(files.checkpoint):
         method.load_state(state)
-    return OpenedRun(files.path, config, method, files.result())
+        iteration = Progress(**state.values[PROGRESS]).iteration
+    return OpenedRun(files.path, config, method, files.result(), iteration, digest)

@@ -175,7 +175,7 @@ class Session:
         every = self.config.run.checkpoint_every
         if every is not None and record.iteration % every == 0:
             return True
-        return time.monotonic() - saved > self.config.run.checkpoint_seconds
+        return time.monotonic() - saved > self.config.run.seconds_between_checkpoints
 
     def _trained(self, method: Method, progress: Progress) -> dict[str, Any]:
         """The fields of a result about a trained method."""

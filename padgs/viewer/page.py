@@ -71,6 +71,9 @@ class Page:
         self._width = gui.add_dropdown("pixels across", WIDTHS, initial_value="1024")
         self._goal = gui.add_dropdown("go to", ("", *self._views))
         self._frusta_shown = gui.add_checkbox("cameras", initial_value=False)
+        if any(gallery.run.result is None for gallery in galleries):
+            follow = gui.add_checkbox("follow training", initial_value=any(gallery.follows for gallery in galleries))
+            follow.on_update(lambda _: self._follow(follow.value))
         with gui.add_folder("crop", expand_by_default=False):
             able = all(gallery.crops for gallery in galleries)
             self._crop = gui.add_checkbox("crop", initial_value=False, disabled=not able)
@@ -81,17 +84,21 @@ class Page:
             )
         self._frusta = [self._frustum(view) for view in self._views.values()]
         for control in (self._camera, self._layer, self._which, self._fov, self._width, self._frusta_shown):
-            control.on_update(self._change)
+            control.on_update(self.renew)
         for control in (self._crop, self._low, self._high):
-            control.on_update(self._change)
+            control.on_update(self.renew)
         self._goal.on_update(lambda _: self.go_to(self._views[self._goal.value]) if self._goal.value else None)
-        client.camera.on_update(self._change)
+        client.camera.on_update(self.renew)
         client.camera.near, client.camera.far = 1e-3 * scene.unit, 1e3 * scene.unit
 
     def start(self) -> None:
         """Draw, in a thread of its own, whatever is asked for next."""
         self._changed.set()
         self._thread.start()
+
+    def renew(self, _: object = None) -> None:
+        """Draw again: something has changed."""
+        self._changed.set()
 
     def leave(self) -> None:
         """Stop drawing; returns when it has stopped."""
@@ -119,8 +126,9 @@ class Page:
         shown = self._galleries if self._which.value == BOTH else (self._named[self._which.value],)
         return Asked(look, torch.from_numpy(pose), width, height, shown)
 
-    def _change(self, _: object) -> None:
-        self._changed.set()
+    def _follow(self, follows: bool) -> None:
+        for gallery in self._galleries:  # of all pages
+            gallery.follows = follows
 
     def _frustum(self, view: View) -> Any:
         frustum = self._client.scene.add_camera_frustum(
@@ -172,5 +180,5 @@ class Page:
             facts = f"{1000 * seconds:.0f} ms, {picture.shape[1]}x{picture.shape[0]}"
             if asked.look.layer == "error":
                 facts += f"; error of {asked.galleries[0].nearest(asked.cam_from_world).name}"
-            self._facts.content = "  \n".join((*(gallery.counts for gallery in asked.galleries), facts))
+            self._facts.content = "  \n".join((*(gallery.facts for gallery in asked.galleries), facts))
         return seconds

@@ -11,6 +11,8 @@ from torch import Tensor
 
 from padgs.anchors.trainee import AnchorTrainee
 from padgs.learning.method import Method
+from padgs.runs.checkpoint import CheckpointError
+from padgs.runs.folder import RunFolderError
 from padgs.runs.opened import OpenedRun
 from padgs.scene import View
 from padgs.scoring.pictures import depth_picture, eight_bit, error_picture
@@ -34,21 +36,41 @@ class Look:
 
 
 class Gallery:
-    """The pictures of one run.
+    """The pictures of one run, finished or in training.
 
     Attributes:
         run: whose.
-        counts: what it consists of, for people.
-        crops: whether what it has learned has places, so that it can be cropped.
+        follows: whether `follow` takes over what training makes of it.
     """
 
     def __init__(self, run: OpenedRun) -> None:
         """Prepare; nothing is drawn yet."""
-        self.run = run
-        self.counts = ", ".join(f"{count} {name}" for name, count in run.method.size().counts.items())
-        self.crops = isinstance(run.method.trainee, (SplatTrainee, AnchorTrainee))
+        self.run, self.follows = run, run.result is None
         self._method = lru_cache(maxsize=2)(self._prepared)
         self._error = lru_cache(maxsize=8)(self._error_of)
+
+    @property
+    def crops(self) -> bool:
+        """Whether what the run has learned has places, so that it can be cropped."""
+        return isinstance(self.run.method.trainee, (SplatTrainee, AnchorTrainee))
+
+    @property
+    def facts(self) -> str:
+        """What the run consists of, and how far it is, for people."""
+        counts = ", ".join(f"{count} {name}" for name, count in self.run.method.size().counts.items())
+        return counts if self.run.result is not None else f"{counts} after {self.run.iteration} iterations"
+
+    def follow(self) -> bool:
+        """Show what training has come to since; whether there is anything new."""
+        try:
+            run = self.run.renewed() if self.follows else None
+        except (CheckpointError, RunFolderError):  # the next one takes its place right now, or the run starts again
+            return False
+        if run is not None:
+            self.run = run
+            self._method.cache_clear()
+            self._error.cache_clear()
+        return run is not None
 
     def picture(self, look: Look, cam_from_world: Tensor, width: int, height: int, share: float = 1.0) -> np.ndarray:
         """The picture [h, w, 3] uint8, of the shape that is asked for.

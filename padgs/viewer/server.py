@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, field
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,8 @@ from padgs.data.trajectory import gravity
 from padgs.runs.opened import OpenedRun
 from padgs.viewer.page import Page
 from padgs.viewer.picture import Box, Gallery
+
+EVERY = 1.0  # seconds between two looks at whether there is a newer checkpoint
 
 
 @dataclass(frozen=True)
@@ -30,6 +33,8 @@ class Serving:
 def serving(runs: Sequence[OpenedRun], *, host: str = "127.0.0.1", port: int = 8080) -> Iterator[Serving]:
     """Serve one run, or two to compare, to any number of browsers, which change nothing; until the context ends.
 
+    A run in training is shown as its last checkpoint has it, and followed.
+
     Args:
         runs: of one scene, the first one's.
         host: 127.0.0.1 is this machine alone.
@@ -39,10 +44,7 @@ def serving(runs: Sequence[OpenedRun], *, host: str = "127.0.0.1", port: int = 8
         ValueError: the extra `view` is not installed.
         OSError: the address cannot be served.
     """
-    try:
-        import viser
-    except ImportError as error:
-        raise ValueError("the viewer needs viser: pip install 'padgs[view]'") from error
+    viser = the_viser()
     warnings.filterwarnings("ignore", message="Queued .* on a closed connection")  # a page left while it was drawn for
     galleries, scene = [Gallery(run) for run in runs], runs[0].scene
     with redirect_stdout(None):  # it draws a box around addresses, whatever `verbose` says
@@ -68,13 +70,41 @@ def serving(runs: Sequence[OpenedRun], *, host: str = "127.0.0.1", port: int = 8
         if page := found.pages.pop(client.client_id, None):
             page.leave()
 
+    ended = threading.Event()
+    follower = threading.Thread(target=_follow, args=(galleries, found, drawing, ended), daemon=True, name="padgs view")
+    follower.start()
     try:
         yield found
     finally:
+        ended.set()
+        follower.join()
         for page in list(found.pages.values()):
             page.leave()
         with redirect_stdout(None):
             server.stop()
+
+
+def the_viser() -> ModuleType:
+    """The package that serves.
+
+    Raises:
+        ValueError: it is not installed.
+    """
+    try:
+        import viser
+    except ImportError as error:
+        raise ValueError("the viewer needs viser: pip install 'padgs[view]'") from error
+    return viser
+
+
+def _follow(galleries: Sequence[Gallery], serving: Serving, drawing: threading.Lock, ended: threading.Event) -> None:
+    """Until the end, let pages draw again whenever training has come further."""
+    while not ended.wait(EVERY):
+        with drawing:
+            news = [gallery.follow() for gallery in galleries]
+        if any(news):
+            for page in list(serving.pages.values()):
+                page.renew()
 
 
 def box_of(points: torch.Tensor) -> Box:

@@ -1,0 +1,60 @@
+"""A process that serves a page: of `padgs view`, or beside a run in training, which keeps its thread and its memory."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing import get_context, parent_process
+from pathlib import Path
+
+from padgs import results
+from padgs.runs import checkpoint
+from padgs.runs.folder import RunFolder
+from padgs.runs.opened import OpenedRun, load_run
+from padgs.viewer.server import serving, the_viser
+
+LOOKS = 0.5  # seconds between two looks at whether something is there, or still there
+
+
+def await_checkpoint(folder: str | Path) -> None:
+    """Return when a run has its first checkpoint, or at once where the folder is none of a run: opening it says so."""
+    files = RunFolder(Path(folder))
+    while (files.path / results.CONFIG_NAME).is_file() and not checkpoint.exists(files.checkpoint):
+        time.sleep(LOOKS)
+
+
+def serve(runs: list[OpenedRun], *, host: str = "127.0.0.1", port: int = 8080) -> None:
+    """Serve one run, or two to compare, and say where, until the process that started this one, if any, is gone.
+
+    Raises:
+        ValueError, OSError, KeyboardInterrupt: as `padgs.viewer.server.serving` does, and Ctrl-C.
+    """
+    with serving(runs, host=host, port=port) as server:
+        print(f"{server.address}  (Ctrl-C ends it)", flush=True)
+        while (parent := parent_process()) is None or parent.is_alive():
+            time.sleep(LOOKS)
+
+
+@contextmanager
+def shown(folder: Path, data_path: str | None) -> Iterator[None]:
+    """Serve a run in training while the context lasts, from its first checkpoint on.
+
+    Raises:
+        ValueError: the extra `view` is not installed.
+    """
+    the_viser()
+    process = get_context("spawn").Process(target=_show, args=(folder, data_path), daemon=True)
+    process.start()
+    try:
+        yield
+    finally:
+        process.terminate()
+        process.join()
+
+
+def _show(folder: Path, data_path: str | None) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the training's, which ends this process in its time
+    await_checkpoint(folder)
+    serve([load_run(folder, data_path=data_path)])

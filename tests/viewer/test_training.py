@@ -1,0 +1,138 @@
+"""Runs that are still in training: followed from checkpoint to checkpoint, and served beside their training."""
+
+import json
+import shutil
+import sys
+import threading
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from urllib.request import urlopen
+
+import numpy as np
+import pytest
+from tiny_run import tiny_run
+
+import padgs
+from padgs import results
+from padgs.learning.trainee import State
+from padgs.runs import checkpoint
+from padgs.runs.config import WATCHED, RunOptions
+from padgs.viewer import server
+from padgs.viewer.picture import Gallery, Look
+from padgs.viewer.process import await_checkpoint, shown
+
+try:
+    import viser
+except ImportError:
+    viser = None
+WITH_VISER = pytest.mark.skipif(viser is None, reason="the extra `view` is not installed")
+
+
+@pytest.fixture
+def folder(tmp_path_factory, tmp_path) -> Path:
+    """Of a run that has not come to its end."""
+    training = tmp_path / "training"
+    shutil.copytree(tiny_run(tmp_path_factory), training)
+    (training / results.FILE_NAME).unlink()
+    return training
+
+
+def train_on(folder: Path) -> None:
+    """Write the next checkpoint: everything a little nearer, ten iterations later."""
+    place = folder / "checkpoint"
+    before, run = checkpoint.load(place), json.loads((place / checkpoint.MANIFEST).read_text())["run"]
+    tensors = {name: 0.9 * tensor if name.endswith("means") else tensor for name, tensor in before.tensors.items()}
+    progress = before.values["progress"]
+    progress = {**progress, "iteration": progress["iteration"] + 10}
+    checkpoint.save(State(tensors, {**before.values, "progress": progress}), place, run)
+
+
+def test_a_run_in_training_is_followed_until_told_not_to(folder):
+    gallery = Gallery(padgs.load_run(folder, device="cpu"))
+    scene, pose = gallery.run.scene, gallery.run.scene.train[0].cam_from_world
+
+    def picture() -> np.ndarray:
+        return gallery.picture(Look("panorama"), pose, 32, 16)
+
+    first = picture()
+    assert "after 30 iterations" in gallery.facts and not gallery.follow()
+    train_on(folder)
+    assert gallery.follow() and "after 40 iterations" in gallery.facts
+    assert not np.array_equal(picture(), first)
+    assert gallery.run.scene is scene, "the scene is not loaded again"
+    gallery.follows = False
+    train_on(folder)
+    assert not gallery.follow() and "after 40 iterations" in gallery.facts
+    gallery.follows = True
+    assert gallery.follow() and "after 50 iterations" in gallery.facts
+    (folder / "checkpoint" / checkpoint.MANIFEST).write_text("{")
+    assert not gallery.follow() and picture().std() > 0, "what cannot be read yet changes nothing"
+
+
+def test_a_finished_run_is_not_followed(tmp_path_factory):
+    gallery = Gallery(padgs.load_run(tiny_run(tmp_path_factory), device="cpu"))
+    assert not gallery.follows and "iterations" not in gallery.facts
+
+
+@dataclass
+class Renewed:
+    """A page that only notes that it shall draw again."""
+
+    asked: threading.Event = field(default_factory=threading.Event)
+
+    def renew(self) -> None:
+        self.asked.set()
+
+    def leave(self) -> None:
+        """Nothing to end."""
+
+
+@WITH_VISER
+def test_pages_draw_again_when_training_has_come_further(folder, monkeypatch):
+    monkeypatch.setattr(server, "EVERY", 0.05)
+    page = Renewed()
+    with server.serving([padgs.load_run(folder, device="cpu")], port=8440) as serving:
+        serving.pages[-1] = page
+        assert not page.asked.wait(0.3)
+        train_on(folder)
+        assert page.asked.wait(30)
+
+
+def test_the_first_checkpoint_is_waited_for(folder, tmp_path):
+    await_checkpoint(folder)
+    await_checkpoint(tmp_path / "nothing")
+    moved = (folder / "checkpoint").rename(tmp_path / "elsewhere")
+    waiting = threading.Thread(target=await_checkpoint, args=(folder,), daemon=True)
+    waiting.start()
+    waiting.join(0.2)
+    assert waiting.is_alive()
+    moved.rename(folder / "checkpoint")
+    waiting.join(30)
+    assert not waiting.is_alive()
+
+
+@WITH_VISER
+def test_a_run_is_shown_beside_its_training_and_no_longer(folder, capfd):
+    with shown(folder, None):
+        said, end = "", time.monotonic() + 60
+        while "http" not in said:
+            assert time.monotonic() < end, "no address was said"
+            said += capfd.readouterr().out
+            time.sleep(0.1)
+        address = next(word for word in said.split() if word.startswith("http"))
+        assert b"<html" in urlopen(address, timeout=20).read()[:500]
+    with pytest.raises(OSError, match="refused"):
+        urlopen(address, timeout=5)
+
+
+def test_without_viser_no_training_begins(folder, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(ValueError, match=r"pip install 'padgs\[view\]'"), shown(folder, None):
+        raise AssertionError("it began")
+
+
+def test_who_watches_sees_something_every_few_seconds():
+    assert RunOptions().seconds_between_checkpoints == 60
+    assert RunOptions(view=True).seconds_between_checkpoints == WATCHED
+    assert RunOptions(view=True, checkpoint_seconds=1).seconds_between_checkpoints == 1
