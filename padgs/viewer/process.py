@@ -19,9 +19,14 @@ LOOKS = 0.5  # seconds between two looks at whether something is there, or still
 
 
 def await_checkpoint(folder: str | Path) -> None:
-    """Return when a run has its first checkpoint, or at once where the folder is none of a run: opening it says so."""
-    files = RunFolder(Path(folder))
-    while (files.path / results.CONFIG_NAME).is_file() and not checkpoint.exists(files.checkpoint):
+    """Return when a run has its first checkpoint, or can have none any more: opening it then says what is wrong."""
+    files, said = RunFolder(Path(folder)), False
+    while not checkpoint.exists(files.checkpoint) and _is_wanted():
+        if not (files.path / results.CONFIG_NAME).is_file() or (files.path / results.FILE_NAME).exists():
+            return
+        if not said:
+            print(f"waiting for the first checkpoint of {folder}  (Ctrl-C ends it)", flush=True)
+        said = True
         time.sleep(LOOKS)
 
 
@@ -33,8 +38,13 @@ def serve(runs: list[OpenedRun], *, host: str = "127.0.0.1", port: int = 8080) -
     """
     with serving(runs, host=host, port=port) as server:
         print(f"{server.address}  (Ctrl-C ends it)", flush=True)
-        while (parent := parent_process()) is None or parent.is_alive():
+        while _is_wanted():
             time.sleep(LOOKS)
+
+
+def _is_wanted() -> bool:
+    """Whether the process that started this one is still there, if one of ours did."""
+    return (parent := parent_process()) is None or parent.is_alive()
 
 
 @contextmanager

@@ -99,9 +99,10 @@ def test_pages_draw_again_when_training_has_come_further(folder, monkeypatch):
         assert page.asked.wait(30)
 
 
-def test_the_first_checkpoint_is_waited_for(folder, tmp_path):
+def test_the_first_checkpoint_is_waited_for(folder, tmp_path, capsys):
     await_checkpoint(folder)
     await_checkpoint(tmp_path / "nothing")
+    assert not capsys.readouterr().out
     moved = (folder / "checkpoint").rename(tmp_path / "elsewhere")
     waiting = threading.Thread(target=await_checkpoint, args=(folder,), daemon=True)
     waiting.start()
@@ -110,6 +111,13 @@ def test_the_first_checkpoint_is_waited_for(folder, tmp_path):
     moved.rename(folder / "checkpoint")
     waiting.join(30)
     assert not waiting.is_alive()
+    assert capsys.readouterr().out.count("waiting for the first checkpoint") == 1
+
+
+def test_a_run_that_failed_before_its_first_checkpoint_is_not_waited_for(folder):
+    shutil.rmtree(folder / "checkpoint")
+    (folder / results.FILE_NAME).write_text("{}")
+    await_checkpoint(folder)
 
 
 @WITH_VISER
