@@ -13,7 +13,7 @@ from padgs import results
 from padgs.runs import checkpoint
 from padgs.runs.folder import RunFolder
 from padgs.runs.opened import OpenedRun, load_run
-from padgs.viewer.server import serving, the_viser
+from padgs.viewer.server import serving, viser_module
 
 LOOKS = 0.5  # seconds between two looks at whether something is there, or still there
 
@@ -54,9 +54,13 @@ def shown(folder: Path, data_path: str | None) -> Iterator[None]:
     Raises:
         ValueError: the extra `view` is not installed.
     """
-    the_viser()
+    viser_module()
     process = get_context("spawn").Process(target=_show, args=(folder, data_path), daemon=True)
-    process.start()
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the training, which ends the process
+    try:
+        process.start()  # inherits that
+    finally:
+        signal.signal(signal.SIGINT, handler)
     try:
         yield
     finally:
@@ -65,6 +69,5 @@ def shown(folder: Path, data_path: str | None) -> Iterator[None]:
 
 
 def _show(folder: Path, data_path: str | None) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the training's, which ends this process in its time
     await_checkpoint(folder)
     serve([load_run(folder, data_path=data_path)])

@@ -44,7 +44,7 @@ def serving(runs: Sequence[OpenedRun], *, host: str = "127.0.0.1", port: int = 8
         ValueError: the extra `view` is not installed.
         OSError: the address cannot be served.
     """
-    viser = the_viser()
+    viser = viser_module()
     warnings.filterwarnings("ignore", message="Queued .* on a closed connection")  # a page left while it was drawn for
     galleries, scene = [Gallery(run) for run in runs], runs[0].scene
     with redirect_stdout(None):  # it draws a box around addresses, whatever `verbose` says
@@ -84,7 +84,7 @@ def serving(runs: Sequence[OpenedRun], *, host: str = "127.0.0.1", port: int = 8
             server.stop()
 
 
-def the_viser() -> ModuleType:
+def viser_module() -> ModuleType:
     """The package that serves.
 
     Raises:

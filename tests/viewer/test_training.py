@@ -117,7 +117,10 @@ def test_the_first_checkpoint_is_waited_for(folder, tmp_path, capsys):
 def test_a_run_that_failed_before_its_first_checkpoint_is_not_waited_for(folder):
     shutil.rmtree(folder / "checkpoint")
     (folder / results.FILE_NAME).write_text("{}")
-    await_checkpoint(folder)
+    waiting = threading.Thread(target=await_checkpoint, args=(folder,), daemon=True)
+    waiting.start()
+    waiting.join(30)
+    assert not waiting.is_alive()
 
 
 @WITH_VISER
