@@ -45,7 +45,7 @@ class Gallery:
 
     def __init__(self, run: OpenedRun) -> None:
         """Prepare; nothing is drawn yet."""
-        self.run, self.follows = run, run.result is None
+        self.run, self.follows, self._trouble = run, run.result is None, ""
         self._method = lru_cache(maxsize=2)(self._prepared)
         self._error = lru_cache(maxsize=8)(self._error_of)
 
@@ -58,19 +58,22 @@ class Gallery:
     def facts(self) -> str:
         """What the run consists of, and how far it is, for people."""
         counts = ", ".join(f"{count} {name}" for name, count in self.run.method.size().counts.items())
-        return counts if self.run.result is not None else f"{counts} after {self.run.iteration} iterations"
+        facts = counts if self.run.result is not None else f"{counts} after {self.run.iteration} iterations"
+        return f"{facts}; not followed: {self._trouble}" if self._trouble else facts
 
     def follow(self) -> bool:
-        """Show what training has come to since; whether there is anything new."""
+        """Show what training has come to since, or why that cannot be shown; whether there is anything new."""
+        trouble, run = "", None
         try:
             run = self.run.renewed() if self.follows else None
-        except (CheckpointError, RunFolderError):  # the next one takes its place right now, or the run starts again
-            return False
+        except (CheckpointError, RunFolderError) as error:  # for a moment only, where the next one takes its place
+            trouble = str(error)
+        changed, self._trouble = trouble != self._trouble, trouble
         if run is not None:
             self.run = run
             self._method.cache_clear()
             self._error.cache_clear()
-        return run is not None
+        return changed or run is not None
 
     def picture(self, look: Look, cam_from_world: Tensor, width: int, height: int, share: float = 1.0) -> np.ndarray:
         """The picture [h, w, 3] uint8, of the shape that is asked for.

@@ -67,7 +67,10 @@ def test_a_run_in_training_is_followed_until_told_not_to(folder):
     gallery.follows = True
     assert gallery.follow() and "after 50 iterations" in gallery.facts
     (folder / "checkpoint" / checkpoint.MANIFEST).write_text("{")
-    assert not gallery.follow() and picture().std() > 0, "what cannot be read yet changes nothing"
+    assert gallery.follow() and "not followed" in gallery.facts and not gallery.follow()
+    assert "after 50 iterations" in gallery.facts and picture().std() > 0, "what cannot be read changes no picture"
+    gallery.follows = False
+    assert gallery.follow() and "not followed" not in gallery.facts
 
 
 def test_a_finished_run_is_not_followed(tmp_path_factory):
