@@ -13,12 +13,12 @@ from padgs.clock import timed
 from padgs.learning.budget import Budget
 from padgs.learning.loop import Trainer
 from padgs.learning.trainee import Prunable, State
+from padgs.learning.worth import most_wanted, worth
 from padgs.need import refine
 from padgs.need.calibration import RULES, calibration_split
 from padgs.need.refine import Refining
 from padgs.need.search import Plan, Step, loss, narrowest, plan, plan_degree, smallest
 from padgs.need.steps import StepsFolder
-from padgs.need.worth import most_wanted, worth
 from padgs.results import Scores
 from padgs.runs import checkpoint
 from padgs.runs.interrupt import Interrupt, Interrupted

@@ -1,9 +1,9 @@
 """padgs_plus: what one gets when the measured facts of this project decide.
 
-Explicit Gaussians, drawn exactly along each ray, that start few, grow in eight rounds by the pull in space, and are
-kept small as seen from the cameras. No constant is in world units, counts follow the pixels of the images, and
-latitude is nowhere a special case. docs/plus.md has the reason for each part; each is an option with a value that takes
-it away (`+experiment=plus_ablation`).
+Explicit Gaussians, drawn exactly along each ray, that start few, grow in eight rounds by the pull in space, are halved
+in a ninth, and are kept small as seen from the cameras. No constant is in world units, counts follow the pixels of the
+images, and latitude is nowhere a special case. docs/plus.md has the reason for each part; each is an option with a
+value that takes it away (`+experiment=plus_ablation`).
 """
 
 from __future__ import annotations
@@ -39,6 +39,12 @@ class PlusMethod(SplatMethod):
     TRAINEE = PlusTrainee
     RENDER = RenderConfig(projection="ray", low_pass=PIXEL, near=0.05)
     TRAIN = TrainOptions(weight="solid_angle")
+
+    @property
+    def _target(self) -> int | None:
+        """As many Gaussians to grow as leave those that the budget asks for, if it names a number."""
+        asked = super()._target
+        return None if asked is None else int(asked / self.options.keep_share)
 
     def _start(self, scene: Scene, iterations: int) -> SplatTrainee:
         options, pixels = self.options, independent_pixels(scene.train[0])

@@ -15,7 +15,12 @@ SCHEDULE = (  # options of 3DGS that mean nothing here
     *("reset_every", "reset_opacity", "released_start", "released_reset"),
 )
 LONG = 2000  # iterations from which on the threshold of growth does not fall any more
-GROWN = 0.5  # share of the run after which nothing grows any more
+GROWN = 0.4  # share of the run after which nothing grows any more
+
+
+def between_rounds(iterations: int) -> int:
+    """Iterations from one round to the next, in a run of so many."""
+    return max(1, round(GROWN * iterations / ROUNDS))
 
 
 @dataclass(frozen=True)
@@ -29,6 +34,7 @@ class PlusOptions(SplatOptions):
     min_opacity: float = 0.05  # what is fainter when a round ends was not needed
     start_share: float | None = 0.6  # points to begin with, per independent pixel of a view; None: all that there are
     limit_share: float | None = 2.6  # ... and Gaussians at most, sky included: a guard on memory and time
+    keep_share: float = 0.5  # of what has grown, a round later: those that the training views would miss most
     initial_opacity: float = 0.5  # 0.1 hides what lies in front until opacities have grown
     initial_scale: float = 0.6  # times the distance of the nearest points; 1 is 3DGS's, whose Gaussians overlap
     means_speed: float = 2.0  # learning rate of the means, beside that of 3DGS
@@ -41,6 +47,7 @@ class PlusOptions(SplatOptions):
         super().__post_init__()
         check(self, "an opacity below 1", lambda opacity: 0 < opacity < 1, "initial_opacity")
         check(self, "> 0 and finite", lambda factor: 0 < factor < math.inf, "initial_scale", "means_speed")
+        check(self, "a share in (0, 1]; 1 keeps all", lambda share: 0 < share <= 1, "keep_share")
         off = "at least 0, which switches it off"
         check(self, off, lambda value: 0 <= value < math.inf, "size_weight", "smoothness_weight", "sky_share")
         check(self, "a share of the run in [0, 0.1]", lambda share: 0 <= share <= 0.1, "average_share")
@@ -59,7 +66,7 @@ class PlusOptions(SplatOptions):
         The threshold is higher in short runs, by the square root of what they are shorter: what grows must be fitted,
         and each Gaussian makes every later iteration slower.
         """
-        every = max(1, round(GROWN * iterations / ROUNDS))
+        every = between_rounds(iterations)
         plain = CloneSplitOptions(**{field.name: getattr(self, field.name) for field in fields(CloneSplitOptions)})
         until = ROUNDS * every + 1
         threshold = self.gradient_threshold * max(1.0, math.sqrt(LONG / iterations))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -9,9 +10,11 @@ import torch
 from torch import Tensor
 
 from padgs.gaussians import Gaussians
+from padgs.learning.rows import keep_rows
 from padgs.learning.schedule import ParameterGroup
 from padgs.learning.trainee import Drawing, State
-from padgs.plus.options import PlusOptions
+from padgs.learning.worth import most_wanted, worth
+from padgs.plus.options import ROUNDS, PlusOptions, between_rounds
 from padgs.plus.smoothness import roughness
 from padgs.render.config import RenderConfig
 from padgs.scene import View
@@ -63,11 +66,22 @@ class PlusTrainee(SplatTrainee):
         return replace(drawing, penalty=sum(penalties)) if penalties else drawing
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
-        """Densify, average, and bring the next SH degree into use, where it is time to."""
+        """Densify, choose whom to keep, average, and bring the next SH degree into use, where it is time to."""
         events = super().adapt(iteration, optimizer)
+        if iteration == (ROUNDS + 1) * between_rounds(self.iterations) and self.options.keep_share < 1:
+            events += self._chosen(optimizer)
         if iteration > AVERAGED_FROM * self.iterations and self.options.average_share > 0:
             events += self._averaged(iteration)
         return events
+
+    def _chosen(self, optimizer: torch.optim.Adam) -> tuple[str, ...]:
+        """Keep those that the training views would miss most, by as many views as lie between two rounds."""
+        grown, step = len(self.splats), math.ceil(len(self._views) / between_rounds(self.iterations))
+        kept = max(1, int(self.options.keep_share * grown))
+        rows = most_wanted(worth(self, self._views[::step]), kept)
+        keep_rows(self.splats.rows(), optimizer, rows)
+        self.densifier.forget()
+        return (f"kept {kept} of {grown} Gaussians, those that the training views would miss most",)
 
     def _averaged(self, iteration: int) -> tuple[str, ...]:
         """Note the parameters; at the end of the run their mean takes their place."""

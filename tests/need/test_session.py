@@ -12,13 +12,13 @@ from typer.testing import CliRunner
 import padgs
 from padgs.cli.commands import app
 from padgs.learning.trainee import State
+from padgs.learning.worth import most_wanted, worth
 from padgs.multirun import job
 from padgs.multirun.composition import composing, configuration
 from padgs.need import session, tiers
 from padgs.need.outcome import keep, need
 from padgs.need.search import smallest
 from padgs.need.session import Search
-from padgs.need.worth import most_wanted, worth
 from padgs.results import read
 from padgs.runs.checkpoint import CheckpointError
 from padgs.runs.interrupt import Interrupted

@@ -12,8 +12,9 @@ from tiny_scene import HEIGHT, WIDTH, tiny_scene
 from padgs import stopwatch
 from padgs.learning.budget import Budget
 from padgs.learning.loop import Record
+from padgs.learning.worth import worth
 from padgs.plus.method import PlusMethod, independent_pixels
-from padgs.plus.options import GROWN, ROUNDS, PlusOptions
+from padgs.plus.options import GROWN, ROUNDS, PlusOptions, between_rounds
 from padgs.plus.smoothness import roughness
 from padgs.scene import Scene
 from padgs.sphere.distortion import solid_angle_weight
@@ -52,6 +53,20 @@ def test_a_budget_of_gaussians_is_met_whatever_the_points_and_units(points, unit
 def test_the_threshold_of_growth_falls_with_the_length_of_a_run_and_then_stays():
     found = [PlusOptions().for_run(iterations).gradient_threshold for iterations in (125, 500, 2000, 30_000)]
     assert found == pytest.approx([2e-4, 1e-4, 5e-5, 5e-5])
+
+
+def test_half_of_what_has_grown_is_kept_a_round_later_and_it_is_what_the_views_would_miss():
+    trained, tiny = {}, tiny_scene()
+    for share in (1.0, 0.5):
+        method = PlusMethod(replace(OPTIONS, keep_share=share))
+        for record in islice(method.fit(tiny, Budget(100)), 9 * between_rounds(100)):
+            before = record.counts["gaussians"]
+        trained[share] = method
+    whole, halved = (trained[share].trainee.splats.means for share in (1.0, 0.5))
+    assert len(whole) > before == len(halved) == len(whole) // 2
+    change = worth(trained[1.0].trainee, tiny.train).change
+    kept = torch.isin(whole[:, 0], halved[:, 0])
+    assert kept.sum() == len(halved) and change[kept].min() >= change[~kept].max()
 
 
 def test_a_run_of_seconds_rehearses_ends_on_time_and_resumes_bit_identically(monkeypatch):
