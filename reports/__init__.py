@@ -41,6 +41,7 @@ REPORTS: Mapping[str, Report] = {
     "need_chart": Report("padgs.reports.charts.need_chart:charts", ("need",)),
     "runs": Report("padgs.reports.tables.runs:runs"),
     "chart": Report("padgs.reports.charts.trade_off_chart:charts", ("pareto", *OF_AN_ORDER, *OF_ALL_METHODS)),
+    "gallery": Report("padgs.reports.charts.gallery:charts", ("equal_time", *OF_AN_ORDER, *OF_ALL_METHODS)),
     "sweep": Report("padgs.reports.charts.sweep_chart:charts"),
     "findings": Report("padgs.reports.findings.page:findings"),
     "html": Report("padgs.reports.page.page:html"),

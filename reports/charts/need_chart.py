@@ -6,7 +6,6 @@ import math
 from typing import Any
 
 from pandas import DataFrame
-from PIL import Image
 
 from padgs.reports.charts.drawing import MARKERS, Chart, Tips, dress, figure, lay_out, png, styled, svg
 from padgs.reports.charts.palette import INK, color_of
@@ -14,6 +13,7 @@ from padgs.reports.conditions import footnotes, refuse_mixture
 from padgs.reports.frame import by_conditions
 from padgs.reports.gathered import Gathered
 from padgs.reports.needs import STATED, Curve, curves, searched
+from padgs.reports.pictures import split
 
 PANELS = (("blended", "Gaussians blended", 1.0), ("bytes", "model, MB", 1e-6), ("frame_ms", "ms per frame", 1.0))
 PICTURED = (STATED, "1")  # dB, as `padgs.results.NEED_PICTURE` has them
@@ -62,9 +62,7 @@ def _pictures(name: str, title: str, found: list[Curve], notes: list[str]) -> Ch
     made, axes = figure(4, len(found), 3.6, 2.2)
     for row, curve in zip(axes, found, strict=True):
         assert curve.picture is not None, "chosen by it"
-        with Image.open(curve.picture) as image:
-            width = image.width // 4
-            parts = [image.crop((n * width, 0, (n + 1) * width, image.height)) for n in range(4)]
+        parts = split(curve.picture, 4)
         whole, steps = curve.found["steps"][0], [curve.needs[epsilon] for epsilon in PICTURED]
         words = [curve.title, f"all: {whole['blended']} Gaussians"]
         words += [f"{epsilon} dB: {step['blended']}" for epsilon, step in zip(PICTURED, steps, strict=True)]

@@ -15,6 +15,7 @@ from PIL import Image
 
 from padgs.reports.frame import by_place
 from padgs.reports.gathered import Gathered
+from padgs.reports.pictures import picture_names, split
 from padgs.reports.settings import Setting, settings
 
 WIDTH = 1024  # pixels of an embedded panorama at most
@@ -45,13 +46,13 @@ def album(gathered: Gathered) -> Album:
     """Each setting of the methods, and the rows of ablations, on a few views of each scene; one seed is enough."""
     methods, parts = gathered.chosen("table1"), gathered.chosen("table3")
     own = pd.concat([methods, parts.loc[parts["variant"] != ""]]).drop_duplicates("run")
-    own = own.loc[own["pictures"].map(_files).map(len) > 0]
+    own = own.loc[own["pictures"].map(picture_names).map(len) > 0]
     groups = {place: _best_first(settings(runs)) for place, runs in by_place(own).items()}
     groups = dict(sorted(groups.items(), key=lambda group: bool(group[0].dataset)))  # one's own captures, then others
     views = min(VIEWS, max(1, MOST_FILES // max(1, sum(map(len, groups.values())))))
     made, opened = Album(), 0
     for place, shown in groups.items():
-        names = _spread(_files(shown[0].runs["pictures"].iloc[0]), views)
+        names = _spread(picture_names(shown[0].runs["pictures"].iloc[0]), views)
         opened += len(shown) * len(names)
         if opened > MOST_FILES:
             made.left_out.append(place.title)
@@ -80,12 +81,9 @@ def _view(made: Album, shown: Sequence[Setting], name: str) -> dict[str, Any]:
             continue
         run = runs.iloc[0]
         try:
-            with Image.open(run["pictures"] / name) as picture:
-                picture.load()
+            truth, render, error = split(run["pictures"] / name, 3)
         except OSError:
             continue  # a picture that a kill has cut: the numbers do not depend on it
-        width, height = picture.width // 3, picture.height
-        truth, render, error = (picture.crop((i * width, 0, (i + 1) * width, height)) for i in range(3))
         if view["truth"] is None:
             view["truth"] = made.add(truth)
         images = {"render": made.add(render), "error": made.add(error, WIDTH // 2)}
@@ -93,10 +91,6 @@ def _view(made: Album, shown: Sequence[Setting], name: str) -> dict[str, Any]:
         mark = "" if psnr is None else f", PSNR {psnr:.2f} dB"
         view["methods"].append({"title": f"{setting.title}{mark}", **images})
     return view
-
-
-def _files(folder: Path | None) -> list[str]:
-    return [] if folder is None else sorted(path.name for path in folder.glob("*.png"))
 
 
 def _spread(names: Sequence[str], count: int) -> list[str]:
