@@ -102,6 +102,10 @@ class BlendGradientInputs(ctypes.Structure):
     ]
 
 
+class RemovalInputs(ctypes.Structure):
+    _fields_ = [("forward", BlendInputs), *fields(Pointer, "target", "weight", "removals")]
+
+
 class DeviceLossArguments(ctypes.Structure):
     _fields_ = [("loss", LossArguments), *fields(Pointer, "total", "block_sums")]
 
@@ -122,6 +126,7 @@ STRUCTURES = (
     BinArguments,
     BlendInputs,
     BlendGradientInputs,
+    RemovalInputs,
     DeviceLossArguments,
     DeviceDecodeArguments,
     DeviceDecodeGradientArguments,
@@ -140,6 +145,7 @@ SIGNATURES: dict[str, tuple[list, Any]] = {
     "padgs_cuda_bin": ([Pointer, Pointer, Int32], Int32),
     "padgs_cuda_blend": ([Pointer, Pointer], Int32),
     "padgs_cuda_blend_backward": ([Pointer, Pointer], Int32),
+    "padgs_cuda_leave_one_out": ([Pointer, Pointer], Int32),
     "padgs_cuda_project_backward": ([Pointer, Pointer], Int32),
     "padgs_cuda_decode_place": ([Pointer, Pointer], Int32),
     "padgs_cuda_decode_take_back": ([Pointer, Pointer], Int32),

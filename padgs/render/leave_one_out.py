@@ -29,6 +29,7 @@ Backend = Callable[[Request, Tensor, Tensor], Removals]  # target [H, W, 3], wei
 BACKENDS = {
     "torch": "padgs.render.leave_one_out:define",
     "cpu": "padgs.render.backends.cpu:leave_one_out",
+    "cuda": "padgs.render.backends.cuda:leave_one_out",
 }
 
 
@@ -44,7 +45,7 @@ def leave_one_out(
 ) -> Removals:
     """Score N Gaussians by one view, drawn before black.
 
-    The GPU has no such pass yet: what is there is scored on the CPU. Hybrid blending, where who is in order depends on
+    Hybrid blending, where who is in order depends on
     who is there, is scored as if it were sorted, and a cubemap as the panorama that its faces make, by rays; these
     changes are estimates.
 
@@ -54,14 +55,15 @@ def leave_one_out(
         target: [H, W, 3], what it should look like.
         weight: [H, W] or [H, 1] of the pixels, >= 0 and not 0 everywhere; only ratios matter.
         options: how it is drawn.
-        backend: torch, cpu, or auto: cpu where that can draw these tensors.
+        backend: torch, cpu, cuda, or auto, as for `padgs.render.render`; what is on a GPU without a library for it is
+            scored on the CPU.
 
     Raises:
         ValueError: unknown backend, or inputs that break the contract.
     """
-    if gaussians.means.device.type != "cpu":
-        device = gaussians.means.device
-        found = leave_one_out(gaussians.to("cpu"), view, target.cpu(), weight.cpu(), options, backend="auto")
+    device, resolved = gaussians.means.device, resolve_backend(backend, gaussians.means)
+    if backend == "auto" and resolved == "torch" and device.type != "cpu":
+        found = leave_one_out(gaussians.to("cpu"), view, target.cpu(), weight.cpu(), options)
         return Removals(*(tensor.to(device) for tensor in vars(found).values()))
     if options.blending == "hybrid":
         options = replace(options, blending="sorted", core_size=CORE_SIZE)
@@ -70,7 +72,7 @@ def leave_one_out(
     request = request_of(gaussians, view, options)
     weight = weight.to(target).expand(target.shape[:2])
     weight = (weight / weight.double().sum()).to(target).contiguous()
-    score: Backend = lookup(BACKENDS, resolve_backend(backend, gaussians.means), "backend")
+    score: Backend = lookup(BACKENDS, resolved, "backend")
     found = score(request, target.contiguous(), weight)
     return replace(found, error=found.error / 3, change=found.change / 3)  # means over channels
 

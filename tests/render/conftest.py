@@ -12,6 +12,7 @@ QUICK = {
     "test_cuda_tiles",
     "test_golden",
     "test_hybrid_rendering",
+    "test_leave_one_out",
     "test_near_cull",
     "test_parity",
 }

@@ -1,5 +1,6 @@
 """What a Gaussian's removal is said to do, against what it does."""
 
+import cuda_engine
 import pytest
 import torch
 from render_cases import (
@@ -78,16 +79,18 @@ def test_every_single_removal_does_what_was_said(projection, lens, backend):
     assert max(map(abs, true)) > 5e-4, "or the test sees nothing"
 
 
-@needs_native
 @each_setup
-def test_native_agrees_with_the_definition(projection, lens):
+@pytest.mark.parametrize(
+    "backend", [pytest.param("cpu", marks=needs_native), pytest.param("cuda", marks=cuda_engine.marks())]
+)
+def test_native_agrees_with_the_definition(projection, lens, backend):
     generator = torch.Generator().manual_seed(1)
     gaussians = mixture(20, generator).to(torch.float32)
     view = view_of(camera_of(lens, 70, 44), random_pose(generator))
     target, weight = torch.rand(44, 70, 3, generator=generator), torch.rand(44, 70, generator=generator)
     options = RenderOptions(projection=projection, near=0.001, max_instances=400)  # in strips, too
     native, defined = (
-        leave_one_out(gaussians, view, target, weight, options, backend=backend) for backend in ("cpu", "torch")
+        leave_one_out(gaussians, view, target, weight, options, backend=name) for name in (backend, "torch")
     )
     assert torch.allclose(native.error, defined.error, rtol=1e-3, atol=3e-6)
     assert torch.allclose(native.change, defined.change, rtol=1e-3, atol=3e-6)

@@ -24,7 +24,7 @@ from padgs.native.abi import (
     pointer,
 )
 from padgs.render.backends.cpu_tiles import Projected, Strip
-from padgs.render.backends.native import NativeImage, Pixels, Upstream, rasterize_as
+from padgs.render.backends.native import NativeImage, Pixels, Upstream, rasterize_as, score_as
 from padgs.render.backends.native_camera import native_camera, native_rays
 from padgs.render.contract import Removals, Rendering, Request
 from padgs.render.published_bounds import check_memory
@@ -56,13 +56,7 @@ def leave_one_out(request: Request, target: Tensor, weight: Tensor) -> Removals:
         ValueError, OSError: as `rasterize` does.
     """
     _check(request.gaussians.means)
-    attributes = [tensor.contiguous() for tensor in vars(request.gaussians).values()]
-    probe = None if request.probe is None else request.probe.contiguous()
-    pose, background = request.cam_from_world.contiguous(), request.background.contiguous()
-    drawing = _Drawing(request)
-    inputs = Inputs(len(request.gaussians), *map(pointer, (*attributes, probe)))
-    pixels, _ = drawing.draw(inputs, pose, background, differentiated=False)
-    return drawing.removals(pixels, background, target, weight)
+    return score_as(_Drawing(request), request, target, weight)
 
 
 @dataclass

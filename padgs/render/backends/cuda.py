@@ -14,11 +14,11 @@ import torch
 from torch import Tensor
 
 from padgs.native import cuda
-from padgs.native.abi import MOMENTS, Gradients, Inputs, pointer
+from padgs.native.abi import MOMENTS, REMOVAL, Gradients, Inputs, pointer
 from padgs.render.backends.cuda_tiles import MAX_INSTANCES, DeviceProjected, DeviceStrip, Reading
-from padgs.render.backends.native import NativeImage, Pixels, Upstream, rasterize_as
+from padgs.render.backends.native import NativeImage, Pixels, Upstream, rasterize_as, score_as
 from padgs.render.backends.native_camera import NativeRays, native_camera, native_rays
-from padgs.render.contract import Rendering, RenderOptions, Request
+from padgs.render.contract import Removals, Rendering, RenderOptions, Request
 from padgs.render.published_bounds import check_memory
 from padgs.sphere.camera import Camera
 
@@ -54,6 +54,16 @@ def check(means: Tensor) -> None:
             f"backend cuda takes float32 tensors on a GPU, got {means.dtype} on {means.device}{missing}; convert them, "
             "or use backend=auto"
         )
+
+
+def leave_one_out(request: Request, target: Tensor, weight: Tensor) -> Removals:
+    """Score on the GPU that holds the tensors; sorted blending only.
+
+    Raises:
+        ValueError, OSError, RuntimeError: as `rasterize` does.
+    """
+    check(request.gaussians.means)
+    return score_as(_Drawing(request), request, target, weight)
 
 
 class Counters(Mapping[str, int]):
@@ -150,6 +160,24 @@ class _Drawing(NativeImage):
             )
             cuda.call("padgs_cuda_blend_backward", projected.queue, arguments)
         return totals
+
+    def removals(self, pixels: Pixels, background: Tensor, target: Tensor, weight: Tensor) -> Removals:
+        projected, outputs, device = self._projected, Outputs(*pixels, *self._kept), background.device
+        sums = torch.zeros(len(projected.order), REMOVAL - 1, dtype=torch.float64, device=device)
+        peak = torch.zeros(len(projected.order), device=device)
+        drawn = projected.order[: projected.visible].long()
+        for strip in projected.strips():
+            found = FLOATS(strip.instances, REMOVAL, device=device)
+            forward = _blend_inputs(projected, strip, self.rays, background, outputs, None)
+            arguments = cuda.RemovalInputs(forward, *map(pointer, (target, weight, found)))
+            cuda.call("padgs_cuda_leave_one_out", projected.queue, arguments)
+            starts = strip.slot_start[: projected.visible + 1].long()
+            # Not by atomic additions, whose order differs from time to time; a Gaussian is in `drawn` once.
+            of_slots = functools.partial(torch.segment_reduce, offsets=starts, axis=0, initial=0, unsafe=True)
+            sums[drawn] += of_slots(found[:, :-1].double(), "sum")
+            peak[drawn] = torch.maximum(peak[drawn], of_slots(found[:, -1].contiguous(), "max"))
+        error, change, contribution = sums.unbind(-1)
+        return Removals(error, change, contribution, peak)
 
     def project_backward(
         self, inputs: Inputs, pose: Tensor, moments: Tensor, gradients: list[Tensor | None], *, needs_pose: bool

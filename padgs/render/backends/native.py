@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 
 from padgs.native.abi import ABSOLUTE_MOMENT, Inputs, pointer
 from padgs.render.backends.native_camera import NativeRays
-from padgs.render.contract import Rendering, Request
+from padgs.render.contract import Removals, Rendering, Request
 from padgs.sphere.camera import RayTable
 
 Pixels = tuple[Tensor, Tensor, Tensor]  # image [H, W, 3], transmittance [H, W], depth [H, W]
@@ -58,6 +58,10 @@ class NativeImage(ABC):
     ) -> Tensor | None:
         """Fill the gradients of means, quats, scales, opacities, colors and probe; returns that of the pose, [12]."""
 
+    @abstractmethod
+    def removals(self, pixels: Pixels, background: Tensor, target: Tensor, weight: Tensor) -> Removals:
+        """What each Gaussian's removal does to the pixels of sorted blending; `weight` [H, W] sums to 1."""
+
 
 class Leaves(NamedTuple):
     """What an image can be differentiated by, in the order in which autograd sees it; or one flag for each of them."""
@@ -87,6 +91,16 @@ def rasterize_as(drawing: NativeImage, request: Request) -> Rendering:
     grad_enabled = torch.is_grad_enabled()  # never inside
     image, transmittance, depth, visible = _Rasterize.apply(drawing, grad_enabled, *leaves)
     return Rendering(image, transmittance, depth, visible, drawing.counters)
+
+
+def score_as(drawing: NativeImage, request: Request, target: Tensor, weight: Tensor) -> Removals:
+    """Draw what is requested, and score each Gaussian by it; no gradients."""
+    attributes = [tensor.contiguous() for tensor in vars(request.gaussians).values()]
+    probe = None if request.probe is None else request.probe.contiguous()
+    pose, background = request.cam_from_world.contiguous(), request.background.contiguous()
+    inputs = Inputs(len(request.gaussians), *map(pointer, (*attributes, probe)))
+    pixels, _ = drawing.draw(inputs, pose, background, differentiated=False)
+    return drawing.removals(pixels, background, target, weight)
 
 
 class _Rasterize(torch.autograd.Function):

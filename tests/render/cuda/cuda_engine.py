@@ -21,7 +21,8 @@ from padgs.gaussians import Gaussians
 from padgs.native import cuda, loading
 from padgs.render import BACKENDS, Rendering
 from padgs.render.backends import cuda as cuda_backend
-from padgs.render.contract import Request
+from padgs.render.contract import Removals, Request
+from padgs.render.leave_one_out import BACKENDS as SCORERS
 from padgs.sphere.camera import RayTable
 
 HERE = Path(__file__).parent
@@ -66,20 +67,32 @@ def compiled(name: str, sources: list[Path], *more: str) -> ctypes.CDLL:
     return ctypes.CDLL(str(target))
 
 
-def rasterize_on_gpu(request: Request) -> Rendering:
-    """`cuda_backend.rasterize` for tensors on the CPU; gradients find their way back."""
+def on_gpu(request: Request) -> Request:
+    """The same, differentiably."""
     tensors = {name: value.cuda() for name, value in vars(request).items() if isinstance(value, torch.Tensor)}
     gaussians = Gaussians(**{name: value.cuda() for name, value in vars(request.gaussians).items()})
     camera = request.camera
     if isinstance(camera, RayTable):
         camera = RayTable(camera.table.cuda(), camera.focal)
-    drawn = cuda_backend.rasterize(replace(request, gaussians=gaussians, camera=camera, **tensors))
+    return replace(request, gaussians=gaussians, camera=camera, **tensors)
+
+
+def rasterize_on_gpu(request: Request) -> Rendering:
+    """`cuda_backend.rasterize` for tensors on the CPU; gradients find their way back."""
+    drawn = cuda_backend.rasterize(on_gpu(request))
     tensors = {name: getattr(drawn, name).cpu() for name in ("image", "transmittance", "depth", "visible")}
     return replace(drawn, **tensors)
 
 
+def leave_one_out_on_gpu(request: Request, target: torch.Tensor, weight: torch.Tensor) -> Removals:
+    """`cuda_backend.leave_one_out` for tensors on the CPU."""
+    found = cuda_backend.leave_one_out(on_gpu(request), target.cuda(), weight.cuda())
+    return Removals(*(tensor.cpu() for tensor in vars(found).values()))
+
+
 if ON_GPU:
     BACKENDS["cuda"] = "cuda_engine:rasterize_on_gpu"
+    SCORERS["cuda"] = "cuda_engine:leave_one_out_on_gpu"
 else:
     cuda.library = emulated_library
 

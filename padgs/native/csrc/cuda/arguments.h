@@ -84,6 +84,13 @@ struct BlendGradientInputs {
   int32_t absolute;  // as in BlendGradientArguments
 };
 
+// After forward; sorted blending only. The instances are those of `forward`.
+struct RemovalInputs {
+  BlendInputs forward;
+  const float *target, *weight;  // [H,W,3], and [H,W] of the squared error of each pixel
+  float *removals;               // [I, kRemoval] by slot
+};
+
 // Of the structures of decoding, the networks are not used: their outputs are here.
 struct DeviceDecodeArguments {
   DecodeArguments decode;

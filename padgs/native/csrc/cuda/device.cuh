@@ -75,9 +75,10 @@ __device__ T warp_sum(T value) {
   for (int step = kWarp / 2; step; step /= 2) value += __shfl_xor_sync(kAllLanes, value, step);
   return value;
 }
-__device__ inline int warp_max(int value) {
+template <class T>
+__device__ T warp_max(T value) {
   for (int step = kWarp / 2; step; step /= 2) {
-    const int other = __shfl_xor_sync(kAllLanes, value, step);
+    const T other = __shfl_xor_sync(kAllLanes, value, step);
     value = other > value ? other : value;
   }
   return value;

@@ -21,6 +21,7 @@ PADGS_API int64_t padgs_cuda_structure_bytes(int32_t index) {
                           sizeof(BinArguments),
                           sizeof(BlendInputs),
                           sizeof(BlendGradientInputs),
+                          sizeof(RemovalInputs),
                           sizeof(DeviceLossArguments),
                           sizeof(DeviceDecodeArguments),
                           sizeof(DeviceDecodeGradientArguments)};
