@@ -16,13 +16,18 @@ def export(
     to: Annotated[str, typer.Option(help="file to write; .ply, .compressed.ply, .spz, .sog or .html")] = "",
     points: Annotated[bool, typer.Option("--points", help="only centres of opaque Gaussians, coloured")] = False,
     upright: Annotated[bool, typer.Option("--upright", help="turn -y up, as viewers expect; .html always is")] = False,
+    smooth: Annotated[
+        bool, typer.Option("--smooth", help="as wide as photographs saw them, for viewers; .html always is")
+    ] = False,
     lessons: Annotated[int, typer.Option(help="iterations of PaD-GS's baked anchors on own pictures")] = 300,
     data: DataPath = None,
 ) -> None:
     """Write a run's Gaussians, by default into its folder as splats.ply (--points: points.ply).
 
     Those of PaD-GS, which differ from view to view, are baked into ones that do not; what that costs is measured, said
-    and written into the file. All but .ply is made by splat-transform (npm install -g @playcanvas/splat-transform).
+    and written into the file. Viewers that come nearer than the cameras were, or have smaller pixels, show sharp ones as
+    needles; --smooth writes none thinner than a pixel of the nearest photograph. All but .ply is made by splat-transform
+    (npm install -g @playcanvas/splat-transform).
     """
     from pathlib import Path
 
@@ -41,6 +46,7 @@ def export(
             opened(run, data),
             lessons=lessons,
             stand_up=upright or path.suffix == ".html",
+            smooth=smooth or path.suffix == ".html",
             progress=lambda done: status.update(f"lesson {done} of {lessons}"),
         )
         status.update(f"writing {path}")

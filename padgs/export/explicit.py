@@ -21,6 +21,7 @@ from padgs.scoring.evaluate import evaluate
 from padgs.scoring.protocols import PROTOCOLS
 from padgs.sphere import harmonics
 from padgs.splats.model import Splats
+from padgs.splats.nearest import cameras_of, smoothed
 from padgs.splats.trainee import SplatTrainee
 
 LESSONS = 300
@@ -40,6 +41,7 @@ def exported(
     *,
     lessons: int = LESSONS,
     stand_up: bool = False,
+    smooth: bool = False,
     progress: Callable[[int], None] = lambda done: None,
 ) -> Exported:
     """The explicit Gaussians of a run, in the world of its scene.
@@ -48,6 +50,8 @@ def exported(
         run: any but EgoNeRF's.
         lessons: iterations that baked anchors learn from their own pictures.
         stand_up: turn the world so that the cameras' up is -y, as viewers expect it.
+        smooth: make Gaussians as wide as the finest training view drew them, where a filter in 3D did
+            (`padgs.splats.nearest`): viewers, which have no such filter, show those of sharp models as needles.
         progress: called with the number of lessons that are over.
 
     Raises:
@@ -62,6 +66,9 @@ def exported(
         if isinstance(run.method, SCOmniGSMethod):  # it trained in the world of its refined poses
             splats = moved(splats, aligned(run.method.trainee.calibration.poses)[0].inverse())
         notes.append("Gaussians as trained")
+        if smooth and config.resolved_low_pass_kind == "solid":
+            splats = smoothed(splats, cameras_of(run.scene.train), config.low_pass)
+            notes[-1] = "Gaussians as trained, each as wide as the finest training view drew it"
     elif isinstance(trainee, AnchorTrainee):
         splats, loss = _baked(run, lessons, progress)
         notes.append(loss)

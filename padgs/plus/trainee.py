@@ -19,11 +19,13 @@ from padgs.plus.smoothness import roughness
 from padgs.render.config import RenderConfig
 from padgs.scene import View
 from padgs.splats.model import Splats
+from padgs.splats.nearest import cameras_of, finest_pixels, no_finer
 from padgs.splats.trainee import SplatTrainee
 
 DEGREE_SHARE = 0.1  # of the run, after which the next SH degree comes into use
 AVERAGED_FROM = 0.9  # share of the run after which parameters are averaged
 AVERAGE = "average/"  # of its tensors in a state
+CAMERAS = "cameras"  # of the training views, in a state
 
 
 def mean_angular_size(gaussians: Gaussians, view: View, *, near: float) -> Tensor:
@@ -46,6 +48,8 @@ class PlusTrainee(SplatTrainee):
         """Arguments as for `SplatTrainee`; `limit`: as many Gaussians as there may be."""
         super().__init__(splats, replace(options, max_gaussians=limit), config, **kwargs)
         self.options, self.average = options, dict[str, Tensor]()
+        self._cameras = cameras_of(self._views)
+        self._pixels: Tensor | None = None  # of the finest camera at each Gaussian, until they change
 
     def groups(self, means_speed: float = 1.0) -> list[ParameterGroup]:
         """Those of 3DGS, the means faster."""
@@ -67,7 +71,7 @@ class PlusTrainee(SplatTrainee):
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
         """Densify, choose whom to keep, average, and bring the next SH degree into use, where it is time to."""
-        events = super().adapt(iteration, optimizer)
+        events, self._pixels = super().adapt(iteration, optimizer), None
         if iteration == (ROUNDS + 1) * between_rounds(self.iterations) and self.options.keep_share < 1:
             events += self._chosen(optimizer)
         if iteration > AVERAGED_FROM * self.iterations and self.options.average_share > 0:
@@ -95,9 +99,19 @@ class PlusTrainee(SplatTrainee):
             parameter.copy_(self.average[name])
         return ("the model is the mean of its last states",)
 
+    def _shown(self, view: View) -> Gaussians:
+        """No finer than the training views have seen them."""
+        gaussians = super()._shown(view)
+        if self._config.resolved_low_pass_kind != "solid":
+            return gaussians
+        if self._pixels is None:
+            self._pixels = finest_pixels(gaussians.means, self._cameras)
+        return no_finer(gaussians, view, self._pixels, self._config.low_pass)
+
     def keep(self, rows: Tensor) -> None:
         """Keep these Gaussians only."""
         super().keep(rows)
+        self._pixels = None
         self.average = {name: mean[rows] for name, mean in self.average.items()}
 
     def truncate(self, degree: int) -> None:
@@ -109,10 +123,17 @@ class PlusTrainee(SplatTrainee):
     def state(self) -> State:
         """That of splats, and the running means."""
         state = super().state()
-        return State(state.tensors | {AVERAGE + name: mean for name, mean in self.average.items()}, state.values)
+        averages = {AVERAGE + name: mean for name, mean in self.average.items()}
+        return State(state.tensors | averages | {CAMERAS: self._cameras}, state.values)
 
     def load_state(self, state: State) -> None:
         """Become the model that `state` was taken of."""
         super().load_state(state)
         device = self.splats.means.device
         self.average = {name: mean.to(device, copy=True) for name, mean in state.under(AVERAGE).items()}
+        self._cameras = state.tensors.get(CAMERAS, self._cameras)  # older checkpoints have none
+
+    def load_model(self, state: State) -> None:
+        """Take the splats alone."""
+        super().load_model(state)
+        self._pixels = None

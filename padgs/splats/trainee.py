@@ -8,6 +8,7 @@ from functools import reduce
 import torch
 from torch import Tensor
 
+from padgs.gaussians import Gaussians
 from padgs.learning.rows import keep_rows
 from padgs.learning.schedule import Constant, LogLinear, ParameterGroup, scaled
 from padgs.learning.trainee import Drawing, Parts, Size, State
@@ -138,7 +139,7 @@ class SplatTrainee:
     def parts(self, view: View) -> Parts:
         """All Gaussians; each is a row."""
         slots = torch.arange(len(self.splats), device=self.splats.means.device)
-        return Parts(self.splats.gaussians(view), slots, 1, self.render_options(view))
+        return Parts(self._shown(view), slots, 1, self.render_options(view))
 
     def keep(self, rows: Tensor) -> None:
         """Keep these Gaussians only."""
@@ -152,7 +153,11 @@ class SplatTrainee:
     @torch.no_grad()
     def render(self, view: View) -> Rendering:
         """Render a view without gradients."""
-        return render(self.splats.gaussians(view), view, self.render_options(view), backend=self._config.backend)
+        return render(self._shown(view), view, self.render_options(view), backend=self._config.backend)
+
+    def _shown(self, view: View) -> Gaussians:
+        """All Gaussians as a finished model shows them."""
+        return self.splats.gaussians(view)
 
     def size(self) -> Size:
         """Counts and bytes of the model."""

@@ -1,0 +1,67 @@
+"""No picture finer than the photographs: what nobody has seen from so near keeps the width of a pixel that did see it.
+
+A filter of a pixel follows the camera that looks, so a camera nearer than all that were trained on, or one with smaller
+pixels, would show Gaussians thinner than anything has ever asked of them: needles. They stay as wide as the filter of
+the training view makes them that has the finest pixel there. That is the 3D smoothing filter of Mip-Splatting, for a
+filter that every training view already applies: in training it changes nothing.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from padgs.gaussians import Gaussians
+from padgs.scene import View
+from padgs.splats.model import Splats
+
+
+def cameras_of(views: Sequence[View]) -> Tensor:
+    """Centre, world units, and pixels per radian of each view, [V, 4] float64."""
+    rows = [torch.cat((view.center.double().cpu(), torch.tensor([view.camera.focal]).double())) for view in views]
+    return torch.stack(rows) if rows else torch.zeros(0, 4, dtype=torch.float64)
+
+
+@torch.no_grad()
+def finest_pixels(means: Tensor, cameras: Tensor) -> Tensor:
+    """World units [N] that a pixel covers at each of the means [N, 3], in the camera of [V, 4] that is finest there.
+
+    0 where there is no camera.
+    """
+    if not len(cameras):
+        return torch.zeros_like(means[:, 0])
+    cameras = cameras.to(means)
+    distances = torch.cdist(means, cameras[:, :3], compute_mode="donot_use_mm_for_euclid_dist")
+    return (distances / cameras[:, 3]).amin(1)
+
+
+def no_finer(gaussians: Gaussians, view: View, pixels: Tensor, variance: float) -> Gaussians:
+    """Gaussians that a filter of `variance` square pixels of the view makes as wide as one of `pixels` [N] would.
+
+    scale^2 + variance (pixel^2 - p^2) where the view's own pixel p, world units there, is smaller; the opacity falls as
+    the volume grows. With the low-pass `solid` of the view on top, that of the larger pixel comes out.
+    """
+    own = (gaussians.means - view.center.to(gaussians.means)).norm(dim=-1) / view.camera.focal
+    wide, share = _wider(gaussians.scales, variance * (pixels * pixels - own * own).clamp(min=0))
+    return replace(gaussians, scales=wide, opacities=gaussians.opacities * share)
+
+
+@torch.no_grad()
+def smoothed(splats: Splats, cameras: Tensor, variance: float) -> Splats:
+    """Splats for programs that know no such filter: as wide as it makes them in the finest of the cameras [V, 4]."""
+    pixels = finest_pixels(splats.means, cameras)
+    wide, share = _wider(splats.log_scales.exp(), variance * pixels * pixels)
+    new = copy.deepcopy(splats)
+    opacity_logits = torch.logit(torch.sigmoid(splats.opacity_logits) * share, eps=1e-6)
+    new.load(splats.rows() | {"log_scales": wide.log(), "opacity_logits": opacity_logits})
+    return new
+
+
+def _wider(scales: Tensor, missing: Tensor) -> tuple[Tensor, Tensor]:
+    """Scales [N, 3] with a variance [N] more each way, and the share [N] of the new volume that there was before."""
+    wide = torch.sqrt(scales * scales + missing[:, None])
+    return wide, (scales / wide).prod(-1)
