@@ -25,9 +25,9 @@ def export(
     """Write a run's Gaussians, by default into its folder as splats.ply (--points: points.ply).
 
     Those of PaD-GS, which differ from view to view, are baked into ones that do not; what that costs is measured, said
-    and written into the file. Viewers that come nearer than the cameras were, or have smaller pixels, show sharp ones as
-    needles; --smooth writes none thinner than a pixel of the nearest photograph. All but .ply is made by splat-transform
-    (npm install -g @playcanvas/splat-transform).
+    and written into the file. Viewers that come nearer than the cameras were, or have smaller pixels, show sharp ones
+    as needles; --smooth writes none thinner than a pixel of the nearest photograph. All but .ply is made by
+    splat-transform (npm install -g @playcanvas/splat-transform).
     """
     from pathlib import Path
 
@@ -55,7 +55,7 @@ def export(
             write_ply(path, cloud)
             what = f"{len(cloud.points)} points"
         else:
-            write_splats(path, found.splats, found.notes)
+            write_splats(path, found.splats, found.notes, begin=found.begin)
             what = f"{len(found.splats)} Gaussians"
     print("\n".join(f"  {note}" for note in found.notes))
     print(f"{path}: {what}, {path.stat().st_size / 1e6:.1f} MB")

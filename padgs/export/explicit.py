@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
+from torch import Tensor
 
 import padgs
 from padgs.anchors.trainee import AnchorTrainee
@@ -34,6 +35,7 @@ class Exported:
 
     splats: Splats
     notes: tuple[str, ...]  # lines of ASCII
+    begin: Tensor  # [2, 3] where a viewer may begin, and what it looks at: those of the camera in the middle of all
 
 
 def exported(
@@ -79,11 +81,21 @@ def exported(
     kind = f"{config.low_pass:g} in {config.resolved_low_pass_kind}"
     notes.append(f"trained with projection {config.projection} and a low-pass of {kind}; viewers have others")
     notes.append("axes and units of the scene; its cameras look along z, x is right, y down")
+    begin = _middle(run.scene.train, run.scene.unit)
     if stand_up:
         up = torch.tensor(gravity(torch.stack([view.cam_from_world for view in run.scene.train])).up)
-        splats = moved(splats, upright(up))
+        turn = upright(up)
+        splats, begin = moved(splats, turn), turn(begin)
         notes[-1] = "units of the scene, turned so that -y is up"
-    return Exported(splats, tuple(notes))
+    return Exported(splats, tuple(notes), begin)
+
+
+def _middle(views: Sequence[View], unit: float) -> Tensor:
+    """Centre [3] of the view nearest to the middle of all, and a point before it, one `unit` away."""
+    centres = torch.stack([view.center.double() for view in views])
+    number = int((centres - centres.mean(0)).norm(dim=-1).argmin())
+    ahead = views[number].cam_from_world[2, :3].double()
+    return torch.stack((centres[number], centres[number] + unit * ahead))
 
 
 def _baked(run: OpenedRun, lessons: int, progress: Callable[[int], None]) -> tuple[Splats, str]:

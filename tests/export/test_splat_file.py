@@ -1,3 +1,4 @@
+import json
 import shutil
 
 import pytest
@@ -66,6 +67,17 @@ def test_a_converted_file_holds_the_same_gaussians(tmp_path, generator):
     nearest = torch.cdist(splats.means, back.means).min(dim=1)
     assert nearest.values.max() < 1e-3
     assert torch.allclose(back.log_scales[nearest.indices], splats.log_scales, atol=0.05)
+
+
+def test_a_page_begins_where_a_photograph_was_taken(tmp_path, generator, monkeypatch):
+    script = "#!/bin/sh\nwhile [ $# -gt 2 ]; do [ $1 = --viewer-settings ] && found=$2; shift; done\ncp $found $2\n"
+    (tmp_path / splat_file.CONVERTER).write_text(script)
+    (tmp_path / splat_file.CONVERTER).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    begin = torch.tensor([[1.0, 2.0, 3.0], [1.0, 2.0, 4.0]])
+    write_splats(tmp_path / "a.html", random_splats(0, generator), begin=begin)
+    camera = json.loads((tmp_path / "a.html").read_text())["camera"]
+    assert (camera["position"], camera["target"]) == ([-1, -2, 3], [-1, -2, 4]), "its y is up, and its x is left"
 
 
 def test_a_converter_that_fails_is_quoted(tmp_path, generator, monkeypatch):
