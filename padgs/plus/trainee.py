@@ -71,11 +71,12 @@ class PlusTrainee(SplatTrainee):
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
         """Densify, choose whom to keep, average, and bring the next SH degree into use, where it is time to."""
-        events, self._pixels = super().adapt(iteration, optimizer), None
+        events = super().adapt(iteration, optimizer)
         if iteration == (ROUNDS + 1) * between_rounds(self.iterations) and self.options.keep_share < 1:
             events += self._chosen(optimizer)
         if iteration > AVERAGED_FROM * self.iterations and self.options.average_share > 0:
             events += self._averaged(iteration)
+        self._pixels = None
         return events
 
     def _chosen(self, optimizer: torch.optim.Adam) -> tuple[str, ...]:

@@ -35,13 +35,13 @@ def charts(gathered: Gathered) -> list[Chart]:
         if shared:
             words = "_".join(str(own[column].iloc[0]) for column in ("scene", "resolution", "length"))
             notes = footnotes({where: own}, gathered.request.protocol)
-            found.append(_sheet(f"gallery_{words.replace(' ', '-')}", where, own, shared[len(shared) // 2], notes))
+            found += _sheet(f"gallery_{words.replace(' ', '-')}", where, own, shared[len(shared) // 2], notes)
     return found
 
 
 @styled
-def _sheet(name: str, where: str, runs: DataFrame, view: str, notes: Sequence[str]) -> Chart:
-    """The photograph, and what each run makes of it, the best of this view first."""
+def _sheet(name: str, where: str, runs: DataFrame, view: str, notes: Sequence[str]) -> list[Chart]:
+    """The photograph, and what each run makes of it, the best of this view first; nothing if none can be read."""
     shown: list[tuple[float, str, Image.Image]] = []  # higher numbers first
     for _, run in runs.iterrows():
         try:
@@ -52,6 +52,8 @@ def _sheet(name: str, where: str, runs: DataFrame, view: str, notes: Sequence[st
             shown.append((math.inf, "photograph", photograph))
         psnr, title = run["view_psnr"].get(view), methods.title(run["preset"])
         shown.append((-math.inf, title, drawn) if psnr is None else (psnr, f"{title}: {psnr:.2f} dB", drawn))
+    if not shown:
+        return []
     shown.sort(key=lambda one: -one[0])
     made, axes = figure(COLUMNS, math.ceil(len(shown) / COLUMNS), 3.9, 2.2)
     for panel in axes.flat:
@@ -62,4 +64,4 @@ def _sheet(name: str, where: str, runs: DataFrame, view: str, notes: Sequence[st
         panel.set_title(words)
     what = f"{where}\ntest view {Path(view).stem}, with the PSNR of this view"
     lay_out(made, what)
-    return Chart(name, what, svg(made, name, Tips()), png(made), tuple(notes))
+    return [Chart(name, what, svg(made, name, Tips()), png(made), tuple(notes))]

@@ -32,7 +32,7 @@ def html(gathered: Gathered) -> str:
         loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     refused: list[str] = []
-    made = {name: _attempt(gathered, name, refused) for name in REPORTS if name != "html"}
+    made = {name: _attempt(gathered, name, refused) for name in REPORTS if name not in ("html", "gallery")}
     parts = [part for report in made.values() for part in (report if isinstance(report, list) else [report])]
     tables = [table for part in parts if isinstance(part, Table) and (table := _measured(part)).blocks]
     maps = [part for part in made["stability"] or () if isinstance(part, Chart)]

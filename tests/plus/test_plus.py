@@ -62,6 +62,7 @@ def test_half_of_what_has_grown_is_kept_a_round_later_and_it_is_what_the_views_w
         for record in islice(method.fit(tiny, Budget(100)), 9 * between_rounds(100)):
             before = record.counts["gaussians"]
         trained[share] = method
+        assert method.render(tiny.test[0]).image.isfinite().all(), "at once"
     whole, halved = (trained[share].trainee.splats.means for share in (1.0, 0.5))
     assert len(whole) > before == len(halved) == len(whole) // 2
     change = worth(trained[1.0].trainee, tiny.train).change

@@ -40,5 +40,9 @@ def test_what_left_no_picture_is_left_out(tmp_path):
     broken = tmp_path / first.run / "renders" / "view1.png"
     broken.write_bytes(broken.read_bytes()[:300])
     (sheet,) = sheets(tmp_path)
+    assert sheets(write([replace(first, run="other")], tmp_path / "other", pictures=True))
+    for picture in (tmp_path / "other").rglob("*.png"):
+        picture.write_bytes(b"cut")
+    assert sheets(tmp_path / "other") == []
     assert sheet.svg.count("<image") == 2 and "EgoNeRF" not in sheet.svg
-    assert gallery.charts(Gathered(frame(store.read(write([first], tmp_path / "other"))[0]))) == []
+    assert gallery.charts(Gathered(frame(store.read(write([first], tmp_path / "none"))[0]))) == []
