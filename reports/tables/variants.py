@@ -41,6 +41,7 @@ WITHOUT = {  # variant (conf/without) -> title
             "scale": "initial scale of 3DGS",
             "threshold": "twice the threshold",
             "limit": "no limit",
+            "selection": "all that has grown",
             "average": "the last state",
             "sky": "no sky",
         }.items()
