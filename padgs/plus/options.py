@@ -33,7 +33,7 @@ class PlusOptions(SplatOptions):
     sample_clones: bool = True
     min_opacity: float = 0.05  # what is fainter when a round ends was not needed
     start_share: float | None = 0.6  # points to begin with, per independent pixel of a view; None: all that there are
-    limit_share: float | None = 2.6  # ... and Gaussians at most, sky included: a guard on memory and time
+    limit_share: float | None = 2.6  # ... and Gaussians at most while it grows: a guard on memory and time
     keep_share: float = 0.5  # of what has grown, a round later: those that the training views would miss most
     initial_opacity: float = 0.5  # 0.1 hides what lies in front until opacities have grown
     initial_scale: float = 0.6  # times the distance of the nearest points; 1 is 3DGS's, whose Gaussians overlap

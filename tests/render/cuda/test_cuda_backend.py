@@ -69,7 +69,7 @@ def test_long_lists_are_drawn_like_short_ones(projection: str, blending: str, ge
             assert (gradients[name] - gradient).norm() < 5e-3 * gradient.norm(), name
 
 
-def test_removals_are_scored_along_long_lists_whichever_thread_runs_first(generator, monkeypatch):
+def test_removals_are_scored_in_many_batches_whichever_thread_runs_first(generator, monkeypatch):
     gaussians, options = crowd(1200, generator), RenderOptions("ray", low_pass=0.1)
     gaussians = Gaussians(**{name: tensor.float() for name, tensor in vars(gaussians).items()})
     view, target, weight = view_of(camera_of("panorama", 72, 36)), torch.rand(36, 72, 3), torch.rand(36, 72)
