@@ -72,12 +72,17 @@ class PlusTrainee(SplatTrainee):
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
         """Densify, choose whom to keep, average, and bring the next SH degree into use, where it is time to."""
         events = super().adapt(iteration, optimizer)
-        if iteration == (ROUNDS + 1) * between_rounds(self.iterations) and self.options.keep_share < 1:
+        if iteration == (ROUNDS + 1) * between_rounds(self.iterations) and self._grew_too_many:
             events += self._chosen(optimizer)
         if iteration > AVERAGED_FROM * self.iterations and self.options.average_share > 0:
             events += self._averaged(iteration)
         self._pixels = None
         return events
+
+    @property
+    def _grew_too_many(self) -> bool:
+        """Whether some are taken away after growth; not after that by need, which has added no more than is needed."""
+        return self.options.keep_share < 1 and self._governor is None
 
     def _chosen(self, optimizer: torch.optim.Adam) -> tuple[str, ...]:
         """Keep those that the training views would miss most, by as many views as lie between two rounds."""

@@ -177,6 +177,7 @@ def test_growth_by_need_resumes_bit_identically():
     records = list(whole.fit(scene, budget))
     first = list(islice(stopped.fit(scene, budget), 13))
     assert first[-1].counts["gaussians"] > first[0].counts["gaussians"], "it grows"
+    assert not any("would miss most" in event for record in records for event in record.events), "and is not halved"
     resumed.load_state(stopped.state())
     assert [record.loss for record in (*first, *resumed.fit(scene, budget))] == [record.loss for record in records]
     assert_same_but_time(resumed.state(), whole.state())
