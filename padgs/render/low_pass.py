@@ -51,8 +51,12 @@ def widened(gaussians: Gaussians, means: Tensor, low_pass: LowPass) -> Gaussians
     """
     if low_pass.widen == 0:
         return gaussians
-    wide = torch.sqrt(gaussians.scales**2 + low_pass.widen * (means * means).sum(-1, keepdim=True))
-    opacities = gaussians.opacities
-    if low_pass.compensate:
-        opacities = opacities * (gaussians.scales / wide).prod(-1)
+    wide, share = wider(gaussians.scales, low_pass.widen * (means * means).sum(-1))
+    opacities = gaussians.opacities * share if low_pass.compensate else gaussians.opacities
     return replace(gaussians, scales=wide, opacities=opacities)
+
+
+def wider(scales: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
+    """Scales [N, 3] with a variance [N] more each way, and the share [N] of the new volume that there was before."""
+    wide = torch.sqrt(scales**2 + variance[:, None])
+    return wide, (scales / wide).prod(-1)

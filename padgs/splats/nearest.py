@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from padgs.gaussians import Gaussians
+from padgs.render.low_pass import wider
 from padgs.scene import View
 from padgs.splats.model import Splats
 
@@ -46,7 +47,7 @@ def no_finer(gaussians: Gaussians, view: View, pixels: Tensor, variance: float) 
     the volume grows. With the low-pass `solid` of the view on top, that of the larger pixel comes out.
     """
     own = (gaussians.means - view.center.to(gaussians.means)).norm(dim=-1) / view.camera.focal
-    wide, share = _wider(gaussians.scales, variance * (pixels * pixels - own * own).clamp(min=0))
+    wide, share = wider(gaussians.scales, variance * (pixels * pixels - own * own).clamp(min=0))
     return replace(gaussians, scales=wide, opacities=gaussians.opacities * share)
 
 
@@ -54,14 +55,8 @@ def no_finer(gaussians: Gaussians, view: View, pixels: Tensor, variance: float) 
 def smoothed(splats: Splats, cameras: Tensor, variance: float) -> Splats:
     """Splats for programs that know no such filter: as wide as it makes them in the finest of the cameras [V, 4]."""
     pixels = finest_pixels(splats.means, cameras)
-    wide, share = _wider(splats.log_scales.exp(), variance * pixels * pixels)
+    wide, share = wider(splats.log_scales.exp(), variance * pixels * pixels)
     new = copy.deepcopy(splats)
     opacity_logits = torch.logit(torch.sigmoid(splats.opacity_logits) * share, eps=1e-6)
     new.load(splats.rows() | {"log_scales": wide.log(), "opacity_logits": opacity_logits})
     return new
-
-
-def _wider(scales: Tensor, missing: Tensor) -> tuple[Tensor, Tensor]:
-    """Scales [N, 3] with a variance [N] more each way, and the share [N] of the new volume that there was before."""
-    wide = torch.sqrt(scales * scales + missing[:, None])
-    return wide, (scales / wide).prod(-1)
