@@ -42,6 +42,7 @@ STATUSES = {
 # run. `data.device` is in files of old runs only.
 OF_THE_MACHINE = ("run", "render.max_instances", "data.cache_bytes", "data.read_ahead", "data.device")
 DECIDE_NOTHING = (*OF_THE_MACHINE, "data.path", "init.run", "protocol", "train.monitor")
+CONFIG_GROUPS = {"budget", "data", "method", "protocol", "render", "run", "stress", "train"}  # sections of settings
 # What is no more than a name, even in a command line or a path; `@` parts an experiment from its scale.
 PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*(@[A-Za-z0-9._-]+)?")
 BY_ITSELF = "by_itself"  # among experiments: a command without any asked for the run as well
@@ -189,7 +190,7 @@ def decoded(document: Mapping[str, Any], where: str) -> Result:
     try:
         result = Result(**document | {key: _DECODERS[key](document[key]) for key in _DECODERS})
         _refuse_other_types(result)
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise ResultError(f"{where}: {error}; delete it and run again") from error
     names = [result.run, result.method, result.preset, *result.experiments, *result.scores]
     for name in (*names, *filter(None, [result.dataset])):
@@ -302,6 +303,16 @@ def _refuse_other_types(result: Result) -> None:
             raise TypeError(f"{name} is {value!r}, which is no {' or '.join(kind.__name__ for kind in kinds)}")
     if not all(isinstance(name, str) for name in result.experiments):
         raise TypeError(f"experiments are {result.experiments!r}; they must be names")
+    for name, count in result.counts.items():
+        if not (isinstance(count, int) and 0 <= count < 2**63):
+            raise TypeError(f"counts.{name} is {count!r}, which is no number of anything")
+    for name in CONFIG_GROUPS & result.config.keys():
+        if not isinstance(result.config[name], dict):
+            raise TypeError(f"config.{name} is {result.config[name]!r}, which is no group of settings")
+    float(result.config.get("budget", {}).get("seconds", 0))
+    rules = [*result.config.get("protocol", {}).values(), *(scores.protocol for scores in result.scores.values())]
+    if odd := [rule for rule in rules if not isinstance(rule, dict)]:
+        raise TypeError(f"the rules of a protocol are {odd[0]!r}; they must be a table")
 
 
 def _digest(content: dict[str, Any]) -> str:

@@ -110,6 +110,11 @@ def test_a_file_from_before_the_memory_of_a_gpu_was_measured_is_read(result, tmp
         ({"config": []}, "config is .., which is no dict"),
         ({"iterations": True}, "iterations is True"),
         ({"timing": 3}, "timing|items"),
+        ({"timing": {"train_seconds": 10**400}}, "int too large"),
+        ({"counts": {"gaussians": "many"}}, "counts.gaussians is 'many'"),
+        ({"config": {"train": []}}, r"config.train is \[\], which is no group"),
+        ({"config": {"budget": {"seconds": "long"}}}, "could not convert"),
+        ({"config": {"protocol": {"sphere": "sphere"}}}, "rules of a protocol are 'sphere'"),
     ],
 )
 def test_files_from_elsewhere_hold_names_and_numbers_where_they_should(result, tmp_path, change, message):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,6 +14,8 @@ from padgs.learning.trainee import Prunable
 from padgs.render.contract import ALPHA_MIN
 from padgs.render.leave_one_out import leave_one_out
 from padgs.scene import View
+
+LEAST = 0.1  # share of the rows that stays in one step, whatever they are worth
 
 
 @dataclass(frozen=True)
@@ -65,3 +68,13 @@ def most_wanted(worth: Worth, count: int) -> Tensor:
     """
     order = torch.argsort(worth.change, descending=True, stable=True)
     return order[:count].sort().values
+
+
+def needed(worth: Worth, psnr: float) -> int:
+    """How many rows stay if as many go as change the views by no less than a PSNR in dB, but at least a tenth of all.
+
+    Their changes are added up, smallest first: what each would change alone, in squares and by solid angle. That says
+    little about groups that stand in for each other (docs/need.md), and nothing where nearly all do; hence the tenth.
+    """
+    changes = worth.change.sort().values.cumsum(0)
+    return max(math.ceil(LEAST * len(changes)), int((changes > 10 ** (-psnr / 10)).sum()))

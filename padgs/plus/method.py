@@ -1,9 +1,9 @@
 """padgs_plus: what one gets when the measured facts of this project decide.
 
-Explicit Gaussians, drawn exactly along each ray, that start few, grow in eight rounds by the pull in space, are halved
-in a ninth, and are kept small as seen from the cameras. No constant is in world units, counts follow the pixels of the
-images, and latitude is nowhere a special case. docs/plus.md has the reason for each part; each is an option with a
-value that takes it away (`+experiment=plus_ablation`).
+Explicit Gaussians, drawn exactly along each ray, that start few, grow in eight rounds by the pull in space, lose in a
+ninth what nobody would see, and are kept small as seen from the cameras. No constant is in world units, counts follow
+the pixels of the images, and latitude is nowhere a special case. docs/plus.md has the reason for each part; each is an
+option with a value that takes it away (`+experiment=plus_ablation`).
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from padgs.splats.method import SplatMethod, fewest
 from padgs.splats.model import Splats
 from padgs.splats.trainee import SplatTrainee
 
+GROWN_PER_KEPT = 2  # Gaussians, where the budget says how many to keep
 PIXEL = 0.1  # square pixels; a pixel is the mean over a square, whose variance is 1/12
 START_BY_NEED = 0.29  # `start_share` at most, where growth is by need: it adds what is needed, and takes little away
 
@@ -42,9 +43,9 @@ class PlusMethod(SplatMethod):
 
     @property
     def _target(self) -> int | None:
-        """As many Gaussians to grow as leave those that the budget asks for, if it names a number."""
+        """As many Gaussians to grow as leave a choice of those that the budget asks for, if it names a number."""
         asked = super()._target
-        return None if asked is None else int(asked / self.options.keep_share)
+        return asked if asked is None or self.options.unseen_psnr is None else GROWN_PER_KEPT * asked
 
     def _start(self, scene: Scene, iterations: int) -> SplatTrainee:
         options, pixels = self.options, independent_pixels(scene.train[0])
@@ -65,7 +66,8 @@ class PlusMethod(SplatMethod):
         if directions > 0:
             sky = far_gaussians(scene, directions, degree=options.sh_degree, opacity=options.initial_opacity)
             splats.load({name: torch.cat((own, sky.rows()[name])) for name, own in splats.rows().items()})
-        return self._trainee_of(splats, options.extent_of(scene), iterations, scene.train, limit=limit)
+        more = {"limit": limit, "asked": super()._target}
+        return self._trainee_of(splats, options.extent_of(scene), iterations, scene.train, **more)
 
 
 def _within(share: float | None, pixels: float) -> int | None:

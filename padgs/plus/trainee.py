@@ -13,7 +13,7 @@ from padgs.gaussians import Gaussians
 from padgs.learning.rows import keep_rows
 from padgs.learning.schedule import ParameterGroup
 from padgs.learning.trainee import Drawing, State
-from padgs.learning.worth import most_wanted, worth
+from padgs.learning.worth import most_wanted, needed, worth
 from padgs.plus.options import ROUNDS, PlusOptions, between_rounds
 from padgs.plus.smoothness import roughness
 from padgs.render.config import RenderConfig
@@ -43,11 +43,18 @@ class PlusTrainee(SplatTrainee):
     """
 
     def __init__(
-        self, splats: Splats, options: PlusOptions, config: RenderConfig, *, limit: int | None = None, **kwargs: Any
+        self,
+        splats: Splats,
+        options: PlusOptions,
+        config: RenderConfig,
+        *,
+        limit: int | None = None,
+        asked: int | None = None,
+        **kwargs: Any,
     ) -> None:
-        """Arguments as for `SplatTrainee`; `limit`: as many Gaussians as there may be."""
+        """Arguments as for `SplatTrainee`; as many Gaussians as `limit` there may be, as `asked` stay after growth."""
         super().__init__(splats, replace(options, max_gaussians=limit), config, **kwargs)
-        self.options, self.average = options, dict[str, Tensor]()
+        self.options, self.average, self._asked = options, dict[str, Tensor](), asked
         self._cameras = cameras_of(self._views)
         self._pixels: Tensor | None = None  # of the finest camera at each Gaussian, until they change
 
@@ -82,14 +89,18 @@ class PlusTrainee(SplatTrainee):
     @property
     def _grew_too_many(self) -> bool:
         """Whether some are taken away after growth; not after that by need, which has added no more than is needed."""
-        return self.options.keep_share < 1 and self._governor is None
+        return self.options.unseen_psnr is not None and self._governor is None
 
     def _chosen(self, optimizer: torch.optim.Adam) -> tuple[str, ...]:
-        """Keep those that the training views would miss most, by as many views as lie between two rounds."""
+        """Keep those without which the training views would change: as many as were asked for, or as it takes.
+
+        They are scored by as many views as lie between two rounds.
+        """
+        assert self.options.unseen_psnr is not None, "asked for only where something goes"
         grown, step = len(self.splats), math.ceil(len(self._views) / between_rounds(self.iterations))
-        kept = max(1, int(self.options.keep_share * grown))
-        rows = most_wanted(worth(self, self._views[::step]), kept)
-        keep_rows(self.splats.rows(), optimizer, rows)
+        found = worth(self, self._views[::step])
+        kept = needed(found, self.options.unseen_psnr) if self._asked is None else min(self._asked, grown)
+        keep_rows(self.splats.rows(), optimizer, most_wanted(found, kept))
         self.densifier.forget()
         return (f"kept {kept} of {grown} Gaussians, those that the training views would miss most",)
 

@@ -3,7 +3,7 @@
 `state.json` names the file of tensors with its size and SHA-256, says which run it is of, and ends with a SHA-256 of
 itself. The tensors are written first, under a new name, and replacing `state.json` is the one step that makes the new
 checkpoint count. So at every moment, whatever is killed or full, the folder holds one complete checkpoint: the old one
-or the new one. Format 1, of earlier versions, names no run and has no digest of itself; it is taken as it is.
+or the new one.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from padgs.learning.failure import is_out_of_memory
 from padgs.learning.trainee import State
 from padgs.results import replace_file
 
-FORMAT, WITHOUT_RUN = 2, 1
+FORMAT = 2
 MANIFEST = "state.json"
 TENSORS = re.compile(r"tensors-[0-9a-f]{16}\.safetensors")
 WAY_OUT = "delete the checkpoint folder to start this run from the beginning"
@@ -91,7 +91,7 @@ def load(folder: Path, device: torch.device | str = "cpu", run: Mapping[str, str
         CheckpointError: a file is missing, truncated, changed, of another format, or of another run.
     """
     manifest = _manifest(folder)
-    for what, wanted in (run or {}).items() if manifest["format"] != WITHOUT_RUN else ():
+    for what, wanted in (run or {}).items():
         if manifest["run"].get(what) != wanted:
             raise CheckpointError(f"{folder} is of a run with another {what}; put the right one there, or {WAY_OUT}")
     path = folder / manifest["tensors"]
@@ -107,15 +107,6 @@ def load(folder: Path, device: torch.device | str = "cpu", run: Mapping[str, str
         # Clones own aligned memory. Views into the file's bytes would not, and products may round differently then.
         loaded = safetensors.torch.load(content)
         return State({name: tensor.to(device, copy=True) for name, tensor in loaded.items()}, manifest["values"])
-
-
-def names_its_run(folder: Path) -> bool:
-    """Whether a checkpoint says which run it is of; those of earlier versions do not.
-
-    Raises:
-        CheckpointError: it cannot be read.
-    """
-    return _manifest(folder)["format"] != WITHOUT_RUN
 
 
 @contextmanager
@@ -138,10 +129,9 @@ def _manifest(folder: Path) -> dict[str, Any]:
     path = folder / MANIFEST
     try:
         known = json.loads(path.read_bytes())
-        if known["format"] not in (FORMAT, WITHOUT_RUN):
+        if known["format"] != FORMAT:
             raise CheckpointError(f"{path} has format {known['format']}, this program reads {FORMAT}; {WAY_OUT}")
-        kinds = {"tensors": str, "bytes": int, "sha256": str, "values": dict}
-        kinds |= {"run": dict, "manifest_sha256": str} if known["format"] == FORMAT else {}
+        kinds = {"tensors": str, "bytes": int, "sha256": str, "values": dict, "run": dict, "manifest_sha256": str}
         for key, kind in kinds.items():
             if not isinstance(known[key], kind):
                 raise TypeError(f"{key} is no {kind.__name__}")
@@ -151,7 +141,7 @@ def _manifest(folder: Path) -> dict[str, Any]:
         raise CheckpointError(f"cannot read {error.filename}: {error.strerror}; {WAY_OUT}") from error
     except (ValueError, LookupError, TypeError, RecursionError) as error:
         raise CheckpointError(f"{path} is damaged ({type(error).__name__}: {error}); {WAY_OUT}") from error
-    if known["format"] == FORMAT and known.pop("manifest_sha256") != _digest(known):
+    if known.pop("manifest_sha256") != _digest(known):
         raise CheckpointError(f"{path} was changed after it was written (SHA-256 differs); {WAY_OUT}")
     return known
 

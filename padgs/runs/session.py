@@ -33,7 +33,6 @@ from padgs.scoring.protocols import Protocol
 from padgs.stopwatch import notice_stops
 
 ASKED = "asked to stop and score"
-UNNAMED = "; the checkpoint is of an earlier version and does not say of which run, so its place is trusted"
 
 
 class Watch:
@@ -114,8 +113,7 @@ class Session:
         if progress.iteration and not progress.share:  # a checkpoint from before there were budgets of seconds
             progress = replace(progress, share=progress.iteration / config.training.iterations)
         if progress.iteration:
-            trust = "" if checkpoint.names_its_run(folder.checkpoint) else UNNAMED
-            self._say(f"resuming after iteration {progress.iteration}{trust}")
+            self._say(f"resuming after iteration {progress.iteration}")
         result = outcome.begun(config, self.scene, folder.path.name)
         try:
             saved, saved_iteration = time.monotonic(), progress.iteration

@@ -12,7 +12,7 @@ from tiny_scene import HEIGHT, WIDTH, tiny_scene
 from padgs import stopwatch
 from padgs.learning.budget import Budget
 from padgs.learning.loop import Record
-from padgs.learning.worth import worth
+from padgs.learning.worth import needed, worth
 from padgs.plus.method import PlusMethod, independent_pixels
 from padgs.plus.options import GROWN, ROUNDS, PlusOptions, between_rounds
 from padgs.plus.smoothness import roughness
@@ -55,19 +55,25 @@ def test_the_threshold_of_growth_falls_with_the_length_of_a_run_and_then_stays()
     assert found == pytest.approx([2e-4, 1e-4, 5e-5, 5e-5])
 
 
-def test_half_of_what_has_grown_is_kept_a_round_later_and_it_is_what_the_views_would_miss():
-    trained, tiny = {}, tiny_scene()
-    for share in (1.0, 0.5):
-        method = PlusMethod(replace(OPTIONS, keep_share=share))
+def test_what_is_kept_after_growth_is_what_the_views_would_miss():
+    trained, tiny = [], tiny_scene()
+    for unseen in (None, 44.0):
+        method = PlusMethod(replace(OPTIONS, unseen_psnr=unseen))
         for record in islice(method.fit(tiny, Budget(100)), 9 * between_rounds(100)):
             before = record.counts["gaussians"]
-        trained[share] = method
+        trained.append(method.trainee)
         assert method.render(tiny.test[0]).image.isfinite().all(), "at once"
-    whole, halved = (trained[share].trainee.splats.means for share in (1.0, 0.5))
-    assert len(whole) > before == len(halved) == len(whole) // 2
-    change = worth(trained[1.0].trainee, tiny.train).change
-    kept = torch.isin(whole[:, 0], halved[:, 0])
-    assert kept.sum() == len(halved) and change[kept].min() >= change[~kept].max()
+    whole, chosen = (trainee.splats.means for trainee in trained)
+    found = worth(trained[0], tiny.train)
+    assert len(whole) > before == len(chosen) == needed(found, 44.0)
+    kept = torch.isin(whole[:, 0], chosen[:, 0])
+    assert kept.sum() == len(chosen) and found.change[kept].min() >= found.change[~kept].max()
+
+
+def test_a_budget_of_gaussians_says_how_many_are_kept():
+    for record in PlusMethod(OPTIONS).fit(tiny_scene(), Budget(100, gaussians=150)):
+        last = record.counts["gaussians"]
+    assert last == 150
 
 
 def test_a_run_of_seconds_rehearses_ends_on_time_and_resumes_bit_identically(monkeypatch):
