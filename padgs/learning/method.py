@@ -165,6 +165,11 @@ class Method(ABC):
         return trainee
 
     @property
+    def is_drawn_no_finer(self) -> bool:
+        """Whether the model is drawn no finer than its training views were by itself, whatever the filter of a view."""
+        return False
+
+    @property
     def start(self) -> int:
         """How many Gaussians, anchors or other parts the model had before the first iteration of `fit`."""
         return self.state().values["start"] if self._trainer is None else self._trainer.start

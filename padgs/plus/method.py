@@ -47,6 +47,11 @@ class PlusMethod(SplatMethod):
         asked = super()._target
         return asked if asked is None or self.options.unseen_psnr is None else GROWN_PER_KEPT * asked
 
+    @property
+    def is_drawn_no_finer(self) -> bool:
+        """See `padgs.splats.nearest`; checkpoints of earlier versions do not know the training views."""
+        return self.trainee.is_drawn_no_finer
+
     def _start(self, scene: Scene, iterations: int) -> SplatTrainee:
         options, pixels = self.options, independent_pixels(scene.train[0])
         start, limit = (_within(share, pixels) for share in (options.start_share, options.limit_share))

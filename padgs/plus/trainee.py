@@ -116,10 +116,15 @@ class PlusTrainee(SplatTrainee):
             parameter.copy_(self.average[name])
         return ("the model is the mean of its last states",)
 
+    @property
+    def is_drawn_no_finer(self) -> bool:
+        """Whether there are training views to be no finer than, and the filter is one in space, which can be widened."""
+        return len(self._cameras) > 0 and self._config.resolved_low_pass_kind == "solid"
+
     def _shown(self, view: View) -> Gaussians:
         """No finer than the training views have seen them."""
         gaussians = super()._shown(view)
-        if self._config.resolved_low_pass_kind != "solid":
+        if not self.is_drawn_no_finer:
             return gaussians
         if self._pixels is None:
             self._pixels = finest_pixels(gaussians.means, self._cameras)

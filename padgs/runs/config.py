@@ -264,3 +264,12 @@ def default_fields() -> dict[str, Any]:
 def method_fields(name: str) -> dict[str, Any]:
     """The keys of `method` with their defaults for one method."""
     return {"name": name, **asdict(lookup(METHODS, name, "method").Options())}
+
+
+def known_to(method: Mapping[str, Any]) -> dict[str, Any]:
+    """The `method` group of a finished run without the keys that its method does not have any more.
+
+    What they decided is in the model.
+    """
+    known = method_fields(str(method.get("name", "padgs_plus")))
+    return {key: value for key, value in method.items() if key in known}

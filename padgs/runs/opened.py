@@ -17,7 +17,7 @@ from padgs.film.paths import between
 from padgs.learning.method import Method
 from padgs.results import Result, Scores
 from padgs.runs import checkpoint
-from padgs.runs.config import RunConfig, config_from_values
+from padgs.runs.config import RunConfig, config_from_values, known_to
 from padgs.runs.device import chosen
 from padgs.runs.folder import PROGRESS, Progress, RunFolder, RunFolderError
 from padgs.runs.identity import config_hash
@@ -125,7 +125,8 @@ class OpenedRun:
         """The method as this camera sees it: the run's own, or a copy that draws what that does not.
 
         Filters keep the angle that they had in training where the camera has finer pixels, as between those Gaussians
-        were never seen; a projection of whole panoramas gives way to `pinhole` for a perspective camera.
+        were never seen, but for a model that sees to that itself; a projection of whole panoramas gives way to
+        `pinhole` for a perspective camera.
         """
         ways, trained = self.config.render, self.scene.train[0].camera
         if isinstance(camera, Pinhole):
@@ -145,7 +146,8 @@ class OpenedRun:
         finer = max(1.0, camera.focal / trained.focal)
         if not isinstance(camera, Panorama):
             finer /= self.method.CUT_FINENESS
-        ways = replace(ways, low_pass=ways.low_pass if ways.low_pass_kind == "fixed" else ways.low_pass * finer**2)
+        if not (ways.low_pass_kind == "fixed" or self.method.is_drawn_no_finer):
+            ways = replace(ways, low_pass=ways.low_pass * finer**2)
         return self.method if ways == self.config.render else self.method.drawn_with(ways)
 
 
@@ -173,6 +175,7 @@ def load_run(folder: str | Path, *, data_path: str | Path | None = None, device:
         values: Any = OmegaConf.to_container(OmegaConf.load(settings))
         run = {"configuration": config_hash(values)}  # the data are not looked at
         values["data"].pop("device", None)  # of runs until run.device decided alone
+        values["method"] = known_to(values["method"])
         values["data"]["path"] = values["data"]["path"] if data_path is None else str(data_path)
         values["run"]["device"] = device
     except (YAMLError, ValueError, LookupError, TypeError, AttributeError) as error:

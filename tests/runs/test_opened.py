@@ -6,11 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from omegaconf import OmegaConf
 from tiny_run import tiny_run
 
 import padgs
 from padgs.results import read
+from padgs.runs import checkpoint
 from padgs.runs.folder import RunFolderError
+from padgs.runs.identity import config_hash
 from padgs.sphere.camera import Panorama, perspective
 from padgs.sphere.panorama import sample
 
@@ -50,12 +53,15 @@ def test_a_path_goes_through_the_training_cameras(folder):
         run.camera_path(1)
 
 
-def test_other_cameras_see_the_same(tmp_path_factory):
-    run = padgs.load_run(tiny_run(tmp_path_factory, "method=spags_sorted"), device="cpu")  # exact for every camera
+@pytest.mark.parametrize("method", ["spags_sorted", "padgs_plus"])  # exact for every camera
+def test_other_cameras_see_the_same(tmp_path_factory, method):
+    run = padgs.load_run(tiny_run(tmp_path_factory, f"method={method}"), device="cpu")
     lens, fine, view = perspective(32, 32, 60.0), Panorama(256, 128), run.scene.train[0]
     seen = run.through(lens).render(replace(view, width=32, height=32, lens=lens)).image
     panorama = run.through(fine).render(replace(view, width=256, height=128)).image
     assert (seen - sample(panorama, lens.rays())).abs().mean() < 0.01 < seen.std()
+    trained = sample(run.method.render(view).image, lens.rays())
+    assert (seen - trained).abs().mean() < 0.25 * trained.std(), "not blurred"
 
 
 def test_what_draws_panoramas_only_draws_other_cameras_by_pinhole(folder):
@@ -73,7 +79,10 @@ def test_a_run_that_is_not_finished_opens_too_and_an_old_key_is_passed_over(fold
     copy = shutil.copytree(folder, tmp_path / "run")
     (copy / "result.json").unlink()
     settings = copy / "config.yaml"
-    settings.write_text(settings.read_text().replace("data:\n", "data:\n  device: cpu\n", 1))
+    old = settings.read_text().replace("data:\n", "data:\n  device: cpu\n", 1)
+    settings.write_text(old.replace("method:\n", "method:\n  some_old_key: 0.5\n", 1))
+    of = {"configuration": config_hash(OmegaConf.to_container(OmegaConf.load(settings)))}
+    checkpoint.save(checkpoint.load(copy / "checkpoint"), copy / "checkpoint", of)
     run = padgs.load_run(copy)
     assert run.result is None and run.scores == {}
     assert run.method.size().counts["gaussians"] > 0
