@@ -13,7 +13,7 @@ Each is imported when it is first used: `padgs.results` must load without torch,
 """
 
 import os
-from importlib import import_module, metadata
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ __all__ = ["Budget", "distortion_map", "draw", "load_run", "load_scene", "make_m
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
-        return metadata.version("padgs")
+        return import_module("importlib.metadata").version("padgs")
     if name not in _HOMES:
         raise AttributeError(
             f"padgs has no {name!r}; it offers {', '.join(_HOMES)}, and its rooms, such as padgs.render"

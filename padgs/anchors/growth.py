@@ -29,7 +29,7 @@ class GrowthOptions:
     statistics_from: int = 500  # statistics are collected after this iteration
     grow_from: int = 1500  # anchors grow and are pruned after this iteration
     grow_until: int = 15_000  # ... and before this one, and statistics are collected no longer either
-    grow_every: int = 100
+    grow_every: int = 100  # iterations between two rounds of growth
     gradient_threshold: float = PUBLISHED_THRESHOLD / 3  # the loss is a mean over 3 channels, the published one a sum
     levels: int = 3  # grids from coarse to fine
     coarsest: int = 16  # cell of the first level, in voxels

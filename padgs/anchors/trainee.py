@@ -26,11 +26,11 @@ class LearningRates(ExtentOptions):
 
     offset_rate: tuple[float, float] = (0.01, 0.0001)  # times the extent of the cameras in `offset_rate_unit`
     offset_rate_unit: str = "world"  # world: as released | scene: Scene.unit, so the world's units do not matter
-    feature_rate: float = 0.0075
-    log_scale_rate: float = 0.007
-    opacity_rate: tuple[float, float] = (0.002, 2e-5)  # the three networks
-    color_rate: tuple[float, float] = (0.008, 5e-5)
-    covariance_rate: tuple[float, float] = (0.004, 0.004)
+    feature_rate: float = 0.0075  # of the features of anchors
+    log_scale_rate: float = 0.007  # of the scales of anchors
+    opacity_rate: tuple[float, float] = (0.002, 2e-5)  # of the network that decodes opacities
+    color_rate: tuple[float, float] = (0.008, 5e-5)  # ... colours
+    covariance_rate: tuple[float, float] = (0.004, 0.004)  # ... scales and rotations
 
     def __post_init__(self) -> None:
         check_known(self, offset_rate_unit=OFFSET_RATE_UNITS)

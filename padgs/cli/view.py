@@ -26,6 +26,9 @@ def view(
         for folder in (run, beside) if beside else (run,):
             await_checkpoint(folder)
             runs.append(opened(folder, data))
+        if beside and runs[0].scene.name != runs[1].scene.name:
+            names = " and ".join(found.scene.name for found in runs)
+            raise ValueError(f"{run} and {beside} are of two scenes, {names}; name two runs of one scene")
         serve(runs, host=host, port=port)
     except KeyboardInterrupt:
         print()

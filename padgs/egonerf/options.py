@@ -38,25 +38,25 @@ class EgoNeRFOptions:
     """The model. All lengths are in `length_unit`; None: the published value for the surroundings."""
 
     radial_nodes: int = 150  # of each chart
-    polar_nodes: int = 172
-    azimuth_nodes: int = 516
+    polar_nodes: int = 172  # ... in polar angle
+    azimuth_nodes: int = 516  # ... in azimuth
     density_components: int = 16  # of each mode
-    appearance_components: int = 48
+    appearance_components: int = 48  # of each mode
     features: int = 27  # what the basis makes of the appearance
     hidden: int = 128  # width of the network's two hidden layers
-    feature_frequencies: int = 2
-    direction_frequencies: int = 2
+    feature_frequencies: int = 2  # of the encoding of features, for the network
+    direction_frequencies: int = 2  # ... of directions
     coarse_samples: int = 128  # of each ray
-    fine_samples: int = 128
+    fine_samples: int = 128  # ... and more where those found something
     min_weight: float = 0.0  # ours: samples that contribute less are not shaded, their share is black
     length_unit: str = "scene"  # ours: Scene.unit, so the world's units do not matter | world: as published
     surroundings: str = "auto"  # indoor | outdoor | auto: as the cloud says, see `surroundings.of_scene`
-    density_shift: float | None = None  # this and the next: see `Constants`
-    distance_scale: float | None = None
-    near: float | None = None
-    far: float | None = None
-    first_radius: float | None = None
-    environment: bool | None = None
+    density_shift: float | None = None  # density = softplus(feature + shift)
+    distance_scale: float | None = None  # optical depth = density x scale x length
+    near: float | None = None  # distance where rays begin
+    far: float | None = None  # ... and end
+    first_radius: float | None = None  # of the radial nodes, and the shortest interval between nodes or samples
+    environment: bool | None = None  # whether a picture of the sphere lies behind everything; else it is black
     environment_height: int = 1920  # its rows; it has twice as many columns
     samples_at_once: int = 1 << 18  # ours: bounds the memory of a pass, in training and rendering
 

@@ -25,12 +25,12 @@ class EgoNeRFTraining:
     rays: int = 4096  # of an iteration
     grid_rate: float = 0.02  # learning rates of Adam at the start
     network_rate: float = 1e-3  # bases and network
-    environment_rate: float = 5e-3
+    environment_rate: float = 5e-3  # of the picture behind everything
     environment_pretraining: int = 0  # iterations that teach it alone, first in the run; outdoor OmniBlender: 10 000
     pretraining_rate: float = 0.02  # of the environment then; no rate falls before they are over
     rate_decay: float = 0.1  # all rates, and the weights of the variation, fall exponentially to this share
     density_variation: float = 0.1  # weight of the total variation of the density planes; 0 for none
-    appearance_variation: float = 0.01
+    appearance_variation: float = 0.01  # ... of the appearance planes
 
     def __post_init__(self) -> None:
         check(self, "at least 1", lambda count: count >= 1, "rays")

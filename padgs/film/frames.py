@@ -46,10 +46,12 @@ def write_film(
         What was written: films, or folders.
 
     Raises:
-        ValueError: the extra `video` is not installed, or sides that H.264 does not take.
+        ValueError: a file of another kind, the extra `video` is not installed, or sides that H.264 does not take.
         OSError: it cannot be written.
     """
     film = to.suffix.lower() == ".mp4"
+    if to.suffix and not film and not to.is_dir():
+        raise ValueError(f"{to} is no .mp4, and films are written as nothing else; a folder for PNGs has no ending")
     places = [to, to.with_name(f"{to.stem}-depth{to.suffix}")] if depth else [to]
     with ExitStack() as stack:
         if film:

@@ -3,7 +3,8 @@
 It looks at numbers that are there anyway: the loss at every iteration (on a GPU where somebody has read it), all else
 where gradients and parameters are checked. A sign must last before it ends a run, for healthy runs show each of them
 for a while: after a reset of opacities nearly nothing is seen and the loss jumps, and colours that are not in use yet
-have no gradient.
+have no gradient. A loss that is still high when the run ends need not have lasted so many iterations: nothing is to
+come that it could recover in.
 """
 
 from __future__ import annotations
@@ -86,7 +87,8 @@ class Monitor:
             state["since"].pop("diverged", None)
             highest = average
         state["highest"] = highest
-        if since := self._lasting("diverged", high, iteration):
+        ends = (iteration if self.moment is None else self.moment) >= self._iterations
+        if since := self._lasting("diverged", high, iteration, least=0 if ends else LEAST):
             raise Failure(
                 "diverged",
                 f"the loss at iteration {iteration} is {average:.4g}, and since iteration {since} more than {WORSE} "
@@ -158,7 +160,9 @@ class Monitor:
                     "silent", f"the {GRADIENT}{name} is exactly 0 at iteration {iteration}, and since {since}; {ADVICE}"
                 )
 
-    def _lasting(self, sign: str, holds: bool, iteration: int, share: float = LASTING) -> int | None:
+    def _lasting(
+        self, sign: str, holds: bool, iteration: int, share: float = LASTING, least: int = LEAST
+    ) -> int | None:
         """Since when a sign has lasted, if that is too long."""
         since = self.state["since"]
         if not holds:
@@ -166,4 +170,4 @@ class Monitor:
             return None
         moment = iteration if self.moment is None else self.moment
         first, began = since.setdefault(sign, [iteration, moment])
-        return first if iteration - first >= LEAST and moment - began >= share * self._iterations else None
+        return first if iteration - first >= least and moment - began >= share * self._iterations else None

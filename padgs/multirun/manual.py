@@ -1,4 +1,4 @@
-"""`padgs-run --help`: every key with its default and its meaning, which is the comment beside the field that it is."""
+"""`padgs-run --help`: every key with its default and its meaning, which is the comment of the field that it is."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ padgs-run --help method=NAME  this text, with the keys of that method
 padgs-run --version           and stop; --hydra-help says what else Hydra understands
 """
 CHOSEN = ("method", "experiment", "sweep", "data", "protocol", "render", "scale", "launcher", "tracking")
-COMMENTED = re.compile(r"^    (\w+): .*?  # (.*(?:\n +# .*)*)$", re.MULTILINE)  # a field, and the comment beside it
+# The comment above a field, its name, and the comment beside it, which may go on below.
+COMMENTED = re.compile(r"^((?:    # .*\n)*)    (\w+): [^#\n]*?(?:  # (.*(?:\n {5,}# .*)*))?$", re.MULTILINE)
 ADDED = ("experiment", "sweep", "scale")  # groups that only a + brings in
 
 
@@ -75,9 +76,10 @@ def keys(options: Any, where: str = "") -> Iterator[tuple[str, Any, str]]:
 
 
 def meanings(kind: type) -> dict[str, str]:
-    """Field -> the comment on its line, in a dataclass or in what it derives from."""
+    """Field -> the comment above it or on its line, in a dataclass or in what it derives from."""
     found: dict[str, str] = {}
     for base in reversed(kind.__mro__[:-1]):
-        for field, comment in COMMENTED.findall(inspect.getsource(base)):
-            found[field] = re.sub(r"\s+#\s+", " ", comment)
+        for above, field, beside in COMMENTED.findall(inspect.getsource(base)):
+            if said := " ".join(re.sub(r"\s*# ", " ", above + beside).split()):
+                found[field] = said
     return found

@@ -7,15 +7,8 @@ import shlex
 import signal
 import sys
 from collections.abc import Sequence
-from datetime import datetime
 
-from rich.console import Console
-
-import padgs
-from padgs import results
-from padgs.multirun.finished import FOLDER, only_run
 from padgs.runs.interrupt import INTERRUPTED
-from padgs.runs.summary import show_result
 
 
 def main() -> None:
@@ -33,15 +26,25 @@ def main() -> None:
 
 
 def _run(arguments: Sequence[str]) -> int:
-    """Exit code. What takes a second to import is imported here, so that Ctrl-C is answered from the beginning."""
+    """Exit code. What takes time to import is imported here, so that Ctrl-C is answered from the beginning."""
+    import padgs
+    from padgs import results
+    from padgs.multirun.finished import FOLDER, only_run
+
     if "--version" in arguments:
         print(f"padgs {padgs.__version__}")
         return 0
     if folder := only_run(arguments):
+        from rich.console import Console
+
+        from padgs.runs.summary import show_result
+
         console = Console()
         console.print("finished before, nothing to do")
         show_result(results.read(folder / results.FILE_NAME), folder, console)
         return 0
+    from datetime import datetime
+
     import hydra
     from hydra.errors import HydraException
 

@@ -118,7 +118,7 @@ class PlusTrainee(SplatTrainee):
 
     @property
     def is_drawn_no_finer(self) -> bool:
-        """Whether there are training views to be no finer than, and the filter is one in space, which can be widened."""
+        """Whether there are training views to be no finer than, and the filter is one in space, which can grow."""
         return len(self._cameras) > 0 and self._config.resolved_low_pass_kind == "solid"
 
     def _shown(self, view: View) -> Gaussians:

@@ -43,7 +43,7 @@ LOW_PASS_KINDS = {  # of each projection, its natural one first; `padgs.render.l
 class RenderOptions:
     """How Gaussians become an image. The defaults are ours; conf/render/released.yaml is the published rasterizer."""
 
-    projection: str = "erp"
+    projection: str = "erp"  # how Gaussians become footprints: a name of `padgs.render.projection.PROJECTIONS`
     near: float = 0.0  # world units; Gaussians whose mean is at most this far away are culled
     near_cull: str = "mean"  # what must be farther than near: the mean, or (ray) all that is drawn of the Gaussian
     low_pass: float = 0.3  # variance of the low-pass filter in square pixels (of a cubemap: of its panorama; of a

@@ -59,7 +59,7 @@ class DataConfig(DataSettings):
 class TrainConfig(TrainOptions):
     """The `train` group: how a method is trained, and for how long."""
 
-    iterations: int = PUBLISHED_ITERATIONS
+    iterations: int = PUBLISHED_ITERATIONS  # of training, one view each; schedules fit themselves to it
     max_seconds: float | None = None  # of training; where they end it, the run has status timeout
 
     def __post_init__(self) -> None:
@@ -140,7 +140,7 @@ class Settings:
     stress: StressOptions = StressOptions()
     tracking: TrackingOptions = TrackingOptions()
     variant: str = ""  # name of this setting within an experiment, such as a row of the ablation
-    seed: int = 0
+    seed: int = 0  # of the order of views and of all that is random in training
     init: Start | None = None  # folder of a finished run of the method and scene: training begins with its model
     retry: str = "none"  # which finished runs are done again: a name of RETRIES
     need: str = "off"  # on: a run that ended well is searched for its smallest model, as padgs need does

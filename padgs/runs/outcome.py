@@ -9,10 +9,11 @@ from padgs.learning.failure import Failure, is_out_of_memory, memory_reason
 from padgs.results import Result
 from padgs.runs.config import RunConfig
 from padgs.runs.identity import config_hash
-from padgs.runs.scoring import STABILITY
+from padgs.runs.scoring import quality_of_one_color
 from padgs.scene import Scene
 
 WRONG_DEPTH = 0.5  # AbsRel
+SOON = 50  # iterations; before that a run may simply not have got anywhere yet
 
 
 def begun(config: RunConfig, scene: Scene, run: str) -> Result:
@@ -59,13 +60,15 @@ def reason(error: Exception) -> str:
     return str(error) if isinstance(error, (Failure, ValueError)) else f"out of memory: {memory_reason(error)}"
 
 
-def judged(result: Result) -> Result:
-    """The result with its status, now that it has marks under the protocol `stability`; without them as it is."""
-    marks = result.scores[STABILITY].metrics if STABILITY in result.scores else {}
-    quality, one_color, depth = (marks.get(name) for name in ("ws_psnr", "ws_psnr_one_color", "depth_error"))
+def judged(result: Result, scene: Scene, iterations: int) -> Result:
+    """The result with its status, now that test views of the scene were scored after so many iterations."""
+    marks: dict[str, float | None] = {}
+    for scores in result.scores.values():
+        marks |= scores.metrics
+    quality, depth = marks.get("ws_psnr"), marks.get("depth_error")
     if not result.ok:
         return result
-    if quality is not None and one_color is not None and quality < one_color:
+    if quality is not None and iterations >= SOON and quality < (one_color := quality_of_one_color(scene)):
         reason = f"WS-PSNR {quality:.2f} dB, and one colour for all would have {one_color:.2f} dB"
         return replace(result, status="diverged", reason=reason)
     if depth is not None and depth > WRONG_DEPTH:

@@ -53,6 +53,11 @@ def stability(method: Method, scene: Scene, protocol: Protocol, on_view: OnView 
     return replace(found, metrics={**found.metrics, "ws_psnr_training": own})
 
 
+def quality_of_one_color(scene: Scene) -> float:
+    """Mean WS-PSNR of the test views if each were of one colour, in dB."""
+    return sum(mean_color(view.image(), view.mask()).item() for view in scene.test) / len(scene.test)
+
+
 def probe(method: Method, view: View) -> dict[str, float]:
     """What one test view says while a method is trained: psnr in dB, of all pixels that its mask lets through; and
     polar_transmittance, the mean share of the background in the rows beyond `POLAR` degrees of latitude (of a tiny

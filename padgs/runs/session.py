@@ -138,7 +138,8 @@ class Session:
             folder.stop.unlink(missing_ok=True)
             result = replace(result, **self._trained(method, progress))
             if self.scene.test:
-                result = outcome.judged(replace(result, **self._tested(method, progress)))
+                scored = replace(result, **self._tested(method, progress))
+                result = outcome.judged(scored, self.scene, progress.iteration)
         except Interrupted:
             raise
         except KeyboardInterrupt as error:
@@ -226,7 +227,7 @@ class Session:
             method = build(self.config)
             self.folder.resume(method, self.scene.points.device)
             marks = {**result.scores, **scores(method, self.scene, unscored, None)}
-            complete = outcome.judged(replace(complete, scores=marks))
+            complete = outcome.judged(replace(complete, scores=marks), self.scene, result.iterations_done)
         return result if complete == result else self.folder.finish(complete)
 
     def _say(self, text: str) -> None:

@@ -34,7 +34,7 @@ class CloneSplitOptions:
 
     densify_from: int = 500  # Gaussians multiply and are pruned after this iteration
     densify_until: int = 15_000  # ... and before this one
-    densify_every: int = 100
+    densify_every: int = 100  # ... in rounds that are so many iterations apart
     # What is compared with the threshold: a name of `padgs.splats.probes.SIGNALS`. With space_absolute as many
     # Gaussians as pass it multiply for their absolute pull, those that are pulled hardest (GOF).
     signal: str = "image"

@@ -123,6 +123,8 @@ class Page:
         pose[:3, :3], pose[:3, 3] = world_from_cam.T, -world_from_cam.T @ camera.position
         width = int(self._width.value)
         height = max(2, round(width / camera.aspect))
+        if height > width:  # of a phone that stands; pixels across are along its longer side
+            width, height = round(width * camera.aspect), width
         shown = self._galleries if self._which.value == BOTH else (self._named[self._which.value],)
         return Asked(look, torch.from_numpy(pose), width, height, shown)
 

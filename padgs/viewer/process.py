@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing import get_context, parent_process
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from padgs.runs.opened import OpenedRun, load_run
 from padgs.viewer.server import serving, viser_module
 
 LOOKS = 0.5  # seconds between two looks at whether something is there, or still there
+PATIENCE = 5.0  # seconds that a server has to end
 
 
 def await_checkpoint(folder: str | Path) -> None:
@@ -36,6 +37,7 @@ def serve(runs: list[OpenedRun], *, host: str = "127.0.0.1", port: int = 8080) -
     Raises:
         ValueError, OSError, KeyboardInterrupt: as `padgs.viewer.server.serving` does, and Ctrl-C.
     """
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # libraries take it for a crash otherwise
     with serving(runs, host=host, port=port) as server:
         print(f"{server.address}  (Ctrl-C ends it)", flush=True)
         while _is_wanted():
@@ -65,9 +67,12 @@ def shown(folder: Path, data_path: str | None) -> Iterator[None]:
         yield
     finally:
         process.terminate()
+        process.join(PATIENCE)
+        process.kill()  # whatever it still waits for
         process.join()
 
 
 def _show(folder: Path, data_path: str | None) -> None:
-    await_checkpoint(folder)
-    serve([load_run(folder, data_path=data_path)])
+    with suppress(KeyboardInterrupt):
+        await_checkpoint(folder)
+        serve([load_run(folder, data_path=data_path)])

@@ -5,8 +5,11 @@ import sys
 import pytest
 from typer.testing import CliRunner
 
+from padgs.baselines import METHODS
 from padgs.cli.commands import app
-from padgs.multirun.manual import manual
+from padgs.multirun.manual import keys, manual
+from padgs.registry import lookup
+from padgs.runs.config import Settings
 
 
 def test_every_key_stands_there_with_the_default_of_the_method_and_its_meaning(root, monkeypatch):
@@ -16,7 +19,15 @@ def test_every_key_stands_there_with_the_default_of_the_method_and_its_meaning(r
     assert "train.iterations=1500" in said["train.iterations"] and "omnigs_release" in "".join(lines)
     assert "method.tau=0.9" in said["method.tau"] and "Eq. 15; 0 turns opacity modulation off" in said["method.tau"]
     assert "pixels; the height is half of it" in said["data.generator.width"] and max(map(len, lines)) <= 100
+    assert "published: made for 30 000" in said["train.learning_rates"], "the comment above it"
     assert "render.projection=ray" in manual(["--help"]), "padgs+ is drawn by rays"
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_no_key_is_without_a_meaning(name):
+    groups = (Settings, lookup(METHODS, name, "method").Options)
+    shown = {key: meaning for kind in groups for key, _, meaning in keys(kind())}
+    assert [key for key, meaning in shown.items() if not meaning] == []
 
 
 @pytest.mark.slow

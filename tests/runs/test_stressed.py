@@ -14,6 +14,7 @@ from tiny_scene import tiny_scene
 from padgs.results import Scores
 from padgs.runs import session
 from padgs.runs.outcome import judged
+from padgs.runs.scoring import quality_of_one_color
 from padgs.runs.session import Session
 from padgs.scene import Scene
 
@@ -68,16 +69,19 @@ def test_wrong_depths_are_degenerate(run, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("marks", "status"),
+    ("better", "depth_error", "iterations", "status"),
     [
-        ({"ws_psnr": 11.9, "ws_psnr_one_color": 12.0}, "diverged"),
-        ({"ws_psnr": 20.0, "ws_psnr_one_color": 12.0, "depth_error": 0.51}, "degenerate"),
-        ({"ws_psnr": 20.0, "ws_psnr_one_color": 12.0, "depth_error": None}, "ok"),
-        ({}, "ok"),
+        (-0.1, None, 50, "diverged"),
+        (-0.1, None, 49, "ok"),  # too soon to say
+        (5.0, 0.51, 50, "degenerate"),
+        (5.0, None, 50, "ok"),
     ],
 )
-def test_results_are_judged_by_what_they_show(marks, status):
-    made = replace(result(), scores={"stability": Scores({}, marks, {})})
-    assert judged(made).status == status
-    assert judged(replace(made, status="timeout")).status == "timeout"
-    assert judged(result()).ok  # under other protocols there is nothing to judge by
+def test_results_are_judged_by_what_they_show(better, depth_error, iterations, status):
+    """Worse than one colour, under any protocol; depths where they are known."""
+    scene = tiny_scene()
+    marks = {"ws_psnr": quality_of_one_color(scene) + better, "depth_error": depth_error}
+    made = replace(result(), scores={"sphere": Scores({}, marks, {})})
+    assert judged(made, scene, iterations).status == status
+    assert judged(replace(made, status="timeout"), scene, iterations).status == "timeout"
+    assert judged(result(), scene, iterations).ok, "without marks"

@@ -16,6 +16,7 @@ from padgs.data.images import ImageFile, decode, inspect
 from padgs.data.masks import PREVIEW, SCENE_MASKS, Mask, find_masks
 from padgs.data.store import ImageStore
 
+UNSTITCHED = (".insp", ".insv", ".360", ".dng")  # what cameras store before their own program has stitched it
 LOOKED_AT = 3  # images that are decoded before any work is done; those of one camera are alike
 
 
@@ -46,7 +47,9 @@ def find_source(path: Path, mask: str) -> Source:
     folder = image_folder(path, None)
     names = panoramas(folder)
     if len(names) < 2:
-        raise DataError(f"{folder} holds {len(names)} images; structure from motion needs at least two")
+        raw = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in UNSTITCHED)
+        advice = f"; {raw[0]} is not stitched yet: export panoramas with the camera's own program" if raw else ""
+        raise DataError(f"{folder} holds {len(names)} images; structure from motion needs at least two{advice}")
     refuse_clashes(names)
     images = {name: inspect(folder / name) for name in names}
     for name in names[:: -(-len(names) // LOOKED_AT)]:

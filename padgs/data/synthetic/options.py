@@ -24,9 +24,9 @@ class SyntheticOptions:
     the truth.
     """
 
-    scene: str = "room"
+    scene: str = "room"  # a name of `padgs.data.synthetic.SCENES`
     width: int = 512  # pixels; the height is half of it
-    train_views: int = 24
+    train_views: int = 24  # along the path
     test_views: int = 6  # spread evenly between the training views along the path
     path: str | None = None  # roaming | cross | line; None = the scene's own
     reach: float | None = None  # metres from the middle of the path to its ends; None = the scene's own
@@ -34,11 +34,11 @@ class SyntheticOptions:
     yaw: float = 0.0  # degrees, added to every heading
     tilt: float = 0.0  # degrees, standard deviation of roll and of pitch per view
     samples: int = 16  # rays per pixel, a square number: stratified and jittered
-    seed: int = 0
+    seed: int = 0  # of the path, the points and the noise
     texture_frequency: float = 1.0  # multiplies the spatial frequency of every pattern
     objects: int | None = None  # number of loose objects besides the furniture; None = the scene's own
     spokes: int = 16  # of the Siemens stars in pole_torture
-    points: int = 20_000
+    points: int = 20_000  # of the cloud, on surfaces that a training view sees
     point_noise: float = 0.002  # standard deviation per axis, relative to the distance from the observing camera
     outliers: float = 0.01  # share of points that are nowhere near a surface
     pose_noise_translation: float = 0.0  # standard deviation per axis, relative to the scene's median depth

@@ -22,9 +22,9 @@ class PoseRates:
     """Learning rates of the poses, log-linear from the first to the last iteration. As published (SC-OmniGS)."""
 
     rotation: float = 1e-2  # of unit quaternions
-    rotation_end: float = 1.6e-4
+    rotation_end: float = 1.6e-4  # ... and of the last iteration
     translation: float = 1e-2  # scene units
-    translation_end: float = 6e-3
+    translation_end: float = 6e-3  # ... and of the last iteration
 
     def __post_init__(self) -> None:
         for field in fields(self):

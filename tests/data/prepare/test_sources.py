@@ -53,7 +53,10 @@ def test_bad_input_is_refused(tmp_path):
     with pytest.raises(DataError, match="is not a folder; give a folder of panoramas, or a video"):
         find_source(tmp_path / "nothing", "auto")
     save(tmp_path / "a.png")
-    with pytest.raises(DataError, match="holds 1 images; structure from motion needs at least two"):
+    with pytest.raises(DataError, match="holds 1 images; structure from motion needs at least two$"):
+        find_source(tmp_path, "auto")
+    (tmp_path / "IMG_1.insp").write_bytes(b"\xff\xd8")
+    with pytest.raises(DataError, match="IMG_1.insp is not stitched yet: export panoramas with the camera's own"):
         find_source(tmp_path, "auto")
     save(tmp_path / "A.png")
     with pytest.raises(DataError, match=r"'A.png' and 'a.png' would share one name"):
