@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 from padgs.checks import check, check_known
 
-STOPS = ("end", "auto")
+AUTO = "auto"  # as many Gaussians, or iterations, as needed
+STOPS = ("end", AUTO)
 CLOCKS: dict[str, Callable[[], float]] = {
     "wall": time.perf_counter,
     "cpu": time.process_time,  # of all threads of the process, which other programs change less
@@ -28,20 +29,15 @@ class Budget:
     max_seconds: float | None = None  # on the wall clock, after which the run ends as it is
     seconds: float | None = None
     clock: str = "wall"  # that `seconds` are counted on: a name of CLOCKS
-    gaussians: int | str | None = None  # that the model grows to; None: as many as thresholds give; auto: as needed
+    gaussians: int | str | None = None  # None: as many as thresholds give; auto: no more than anybody would miss
     stop: str = "end"  # of the schedule | auto: as soon as nothing is gained, see `padgs.learning.stopping`
 
     def __post_init__(self) -> None:
         check(self, "at least 1", lambda count: count >= 1, "iterations")
         rule = "at least 1 Gaussian, auto for as many as needed, or none for no target"
-        check(self, rule, lambda n: n in (None, "auto") or isinstance(n, int) and n >= 1, "gaussians")
+        check(self, rule, lambda n: n in (None, AUTO) or isinstance(n, int) and n >= 1, "gaussians")
         check(self, "> 0 and finite, or none", lambda s: s is None or 0 < s < math.inf, "max_seconds", "seconds")
         check_known(self, clock=CLOCKS, stop=STOPS)
-        if self.gaussians == "auto" and self.stop != "auto":
-            raise ValueError(
-                f"gaussians is auto, which takes the views that stop=auto sets apart, but stop is {self.stop}; "
-                "take both (budget=auto) or none"
-            )
 
     def __str__(self) -> str:
         """How people say it.

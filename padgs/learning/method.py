@@ -200,6 +200,11 @@ class Method(ABC):
                 "budget.stop is auto, which measures on views that are set apart, but exposures or cameras learn along "
                 "here, and those of such views do not; set it to end"
             )
+        if budget.gaussians == "auto" and self._views_learn:
+            raise ValueError(
+                "budget.gaussians is auto, which draws training views without what might go, but exposures or cameras "
+                "learn along here; set it to a number or null"
+            )
 
     def refuse_search(self) -> None:
         """Refuse the search for the smallest model (`padgs.need`) on any scene; subclasses know more.

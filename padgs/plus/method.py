@@ -18,14 +18,12 @@ from padgs.plus.sky import far_gaussians
 from padgs.plus.trainee import PlusTrainee
 from padgs.render.config import RenderConfig
 from padgs.scene import Scene, View
-from padgs.splats.governor import AUTO
 from padgs.splats.method import SplatMethod, fewest
 from padgs.splats.model import Splats
 from padgs.splats.trainee import SplatTrainee
 
 GROWN_PER_KEPT = 2  # Gaussians, where the budget says how many to keep
 PIXEL = 0.1  # square pixels; a pixel is the mean over a square, whose variance is 1/12
-START_BY_NEED = 0.29  # `start_share` at most, where growth is by need: it adds what is needed, and takes little away
 
 
 def independent_pixels(view: View) -> float:
@@ -48,6 +46,10 @@ class PlusMethod(SplatMethod):
         return asked if asked is None or self.options.unseen_psnr is None else GROWN_PER_KEPT * asked
 
     @property
+    def _unseen_psnr(self) -> float | None:
+        return self.options.unseen_psnr or super()._unseen_psnr
+
+    @property
     def is_drawn_no_finer(self) -> bool:
         """See `padgs.splats.nearest`; checkpoints of earlier versions do not know the training views."""
         return self.trainee.is_drawn_no_finer
@@ -55,8 +57,6 @@ class PlusMethod(SplatMethod):
     def _start(self, scene: Scene, iterations: int) -> SplatTrainee:
         options, pixels = self.options, independent_pixels(scene.train[0])
         start, limit = (_within(share, pixels) for share in (options.start_share, options.limit_share))
-        if self._gaussians == AUTO:
-            start = fewest(start, _within(START_BY_NEED, pixels))
         limit = fewest(options.max_gaussians, limit if self._target is None else self._target)
         splats = Splats.from_scene(
             scene,

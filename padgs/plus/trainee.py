@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Any
 
@@ -10,11 +9,9 @@ import torch
 from torch import Tensor
 
 from padgs.gaussians import Gaussians
-from padgs.learning.rows import keep_rows
 from padgs.learning.schedule import ParameterGroup
 from padgs.learning.trainee import Drawing, State
-from padgs.learning.worth import most_wanted, needed, worth
-from padgs.plus.options import ROUNDS, PlusOptions, between_rounds
+from padgs.plus.options import PlusOptions
 from padgs.plus.smoothness import roughness
 from padgs.render.config import RenderConfig
 from padgs.scene import View
@@ -43,18 +40,11 @@ class PlusTrainee(SplatTrainee):
     """
 
     def __init__(
-        self,
-        splats: Splats,
-        options: PlusOptions,
-        config: RenderConfig,
-        *,
-        limit: int | None = None,
-        asked: int | None = None,
-        **kwargs: Any,
+        self, splats: Splats, options: PlusOptions, config: RenderConfig, *, limit: int | None = None, **kwargs: Any
     ) -> None:
-        """Arguments as for `SplatTrainee`; as many Gaussians as `limit` there may be, as `asked` stay after growth."""
+        """Arguments as for `SplatTrainee`; `limit`: as many Gaussians as there may be."""
         super().__init__(splats, replace(options, max_gaussians=limit), config, **kwargs)
-        self.options, self.average, self._asked = options, dict[str, Tensor](), asked
+        self.options, self.average = options, dict[str, Tensor]()
         self._cameras = cameras_of(self._views)
         self._pixels: Tensor | None = None  # of the finest camera at each Gaussian, until they change
 
@@ -77,32 +67,12 @@ class PlusTrainee(SplatTrainee):
         return replace(drawing, penalty=sum(penalties)) if penalties else drawing
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
-        """Densify, choose whom to keep, average, and bring the next SH degree into use, where it is time to."""
+        """Densify, choose whom to keep, bring the next SH degree into use, and average, where it is time to."""
         events = super().adapt(iteration, optimizer)
-        if iteration == (ROUNDS + 1) * between_rounds(self.iterations) and self._grew_too_many:
-            events += self._chosen(optimizer)
         if iteration > AVERAGED_FROM * self.iterations and self.options.average_share > 0:
             events += self._averaged(iteration)
         self._pixels = None
         return events
-
-    @property
-    def _grew_too_many(self) -> bool:
-        """Whether some are taken away after growth; not after that by need, which has added no more than is needed."""
-        return self.options.unseen_psnr is not None and self._governor is None
-
-    def _chosen(self, optimizer: torch.optim.Adam) -> tuple[str, ...]:
-        """Keep those without which the training views would change: as many as were asked for, or as it takes.
-
-        They are scored by as many views as lie between two rounds.
-        """
-        assert self.options.unseen_psnr is not None, "asked for only where something goes"
-        grown, step = len(self.splats), math.ceil(len(self._views) / between_rounds(self.iterations))
-        found = worth(self, self._views[::step])
-        kept = needed(found, self.options.unseen_psnr) if self._asked is None else min(self._asked, grown)
-        keep_rows(self.splats.rows(), optimizer, most_wanted(found, kept))
-        self.densifier.forget()
-        return (f"kept {kept} of {grown} Gaussians, those that the training views would miss most",)
 
     def _averaged(self, iteration: int) -> tuple[str, ...]:
         """Note the parameters; at the end of the run their mean takes their place."""

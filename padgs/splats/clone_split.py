@@ -100,7 +100,6 @@ class CloneSplit:
         extent: float,
         target: int | None = None,
         drawn_opacities: Callable[[], Tensor] | None = None,
-        candidates: Callable[[], Tensor] | None = None,
         seed: int = 0,
     ) -> None:
         """Start with empty statistics.
@@ -112,12 +111,11 @@ class CloneSplit:
             target: as many Gaussians as there shall be after the last round, in equal steps, those that are pulled
                 hardest; None: as many as thresholds give.
             drawn_opacities: of the model as it is then, [N] in [0, 1], at most its own, where a filter lowers them.
-            candidates: [N] bool, who may multiply in a round at all; None: all.
             seed: of all that is random.
         """
         self._drawn_opacities = drawn_opacities or (lambda: torch.sigmoid(splats.opacity_logits))
         self.splats, self.options, self.extent = splats, options, extent + options.extent_margin
-        self._target, self._candidates = target, candidates
+        self._target = target
         self.generator = torch.Generator().manual_seed(seed)
         self.statistics = self._empty()
 
@@ -182,8 +180,6 @@ class CloneSplit:
         chosen = self._above_threshold(mean_gradient, seen)
         if self._target is not None:
             chosen = self._on_the_way(mean_gradient, seen, iteration)
-        if self._candidates is not None:
-            chosen &= self._candidates()
         candidate_count = int(chosen.sum())
         if self.options.max_gaussians is not None:
             room = max(0, self.options.max_gaussians - len(chosen))

@@ -13,17 +13,18 @@ from typing import Any, ClassVar
 import torch
 
 from padgs.checks import check
+from padgs.learning.budget import AUTO
 from padgs.learning.extent import ExtentOptions
 from padgs.learning.loop import TrainOptions
 from padgs.learning.method import Method
-from padgs.learning.stopping import set_apart
 from padgs.learning.trainee import State
 from padgs.scene import Scene, View
 from padgs.sphere.harmonics import MAX_DEGREE
 from padgs.splats.clone_split import CloneSplitOptions
-from padgs.splats.governor import AUTO
 from padgs.splats.model import Splats
 from padgs.splats.trainee import SplatTrainee
+
+UNSEEN_PSNR = 44.0  # dB of views, to themselves without what nobody would see, under budget.gaussians=auto
 
 
 @dataclass(frozen=True)
@@ -80,6 +81,11 @@ class SplatMethod(Method):
         """As many Gaussians as the budget asks for, if it names a number."""
         return self._gaussians if isinstance(self._gaussians, int) else None
 
+    @property
+    def _unseen_psnr(self) -> float | None:
+        """Of what is taken away a round after growth, dB, if anything is."""
+        return UNSEEN_PSNR if self._gaussians == AUTO else None
+
     def _blank(self, state: State) -> SplatTrainee:
         stored = state.of_model()
         values, empty = stored.values, stored.tensors["splats/means"][:0]
@@ -99,6 +105,6 @@ class SplatMethod(Method):
             views=views,
             target=self._target,
             seed=self.seed,
-            judges=[views[number] for number in set_apart(views)] if views and self._gaussians == AUTO else (),
+            unseen_psnr=self._unseen_psnr,
             **more,
         )

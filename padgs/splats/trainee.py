@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import reduce
 
@@ -12,13 +13,13 @@ from padgs.gaussians import Gaussians
 from padgs.learning.rows import keep_rows
 from padgs.learning.schedule import Constant, LogLinear, ParameterGroup, scaled
 from padgs.learning.trainee import Drawing, Parts, Size, State
+from padgs.learning.worth import most_wanted, needed, worth
 from padgs.render import Rendering, RenderOptions, render
 from padgs.render.config import RenderConfig
 from padgs.render.low_pass import LowPass, low_pass_of, widened
 from padgs.scene import View
 from padgs.sphere.panorama import longitude_latitude
 from padgs.splats.clone_split import MIN_DENSIFY_EVERY, CloneSplit, CloneSplitOptions
-from padgs.splats.governor import Governor
 from padgs.splats.model import Splats
 from padgs.splats.probes import render_probed
 
@@ -44,27 +45,34 @@ class SplatTrainee:
         views: Sequence[View] = (),
         target: int | None = None,
         seed: int = 0,
-        judges: Sequence[View] = (),
+        asked: int | None = None,
+        unseen_psnr: float | None = None,
     ) -> None:
-        """Wrap splats; `extent` is the scene's, `options` are those of a published run (see `for_run`).
+        """Wrap splats.
 
-        `views` are those of the training; without them there can be none. `target` is as `CloneSplit` has it.
-        With some of the views as `judges`, growth is that of a `Governor`.
+        Args:
+            splats: the model.
+            options: of a published run, see `for_run`.
+            config: how it is drawn.
+            extent: of the scene, world units.
+            iterations: of the run.
+            views: of the training; without them there can be none.
+            target: as `CloneSplit` has it.
+            seed: of all that is random.
+            asked: as many Gaussians are kept a round after growth, those that the views would miss most.
+            unseen_psnr: dB; ... or as many as it takes for views that change no more than that. None: all are kept.
         """
         self.splats, self.iterations = splats, iterations
         self._config, self._views, self._extent = config, views, extent
+        self._asked, self._unseen_psnr = asked, unseen_psnr
         self.densifier = CloneSplit(
             splats,
             options.for_run(iterations),
             extent=extent,
             target=target,
             drawn_opacities=self._drawn_opacities,
-            candidates=self._candidates if judges else None,
             seed=seed,
         )
-        apart = {view.name for view in judges}
-        others = [view for view in views if view.name not in apart]
-        self._governor = Governor(others, judges, config.backend) if judges else None
         self._drawn: View | None = None  # the view of the last drawing
 
     def groups(self, means_speed: float = 1.0) -> list[ParameterGroup]:
@@ -107,8 +115,11 @@ class SplatTrainee:
         self.densifier.observe(drawing.probe.grad, drawing.rendering.visible, iteration, cos_latitudes)
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
-        """Densify, and bring the next SH degree into use, where it is time to."""
+        """Densify, choose whom to keep, and bring the next SH degree into use, where it is time to."""
         events = self.densifier.adapt(iteration, optimizer, grows=self._has_seen_enough)
+        options = self.densifier.options
+        if self._unseen_psnr is not None and iteration == options.densify_until - 1 + options.densify_every:
+            events += self._chosen(optimizer, self._unseen_psnr)
         degree = min(self.splats.degree, self.degree_at(iteration + 1))
         if degree > self.splats.active_degree:
             self.splats.active_degree = degree
@@ -124,9 +135,14 @@ class SplatTrainee:
         views = int(self.densifier.statistics["seen"].max())  # some Gaussian is seen by all
         return 2 * views >= min(self.densifier.options.densify_every, MIN_DENSIFY_EVERY)
 
-    def _candidates(self) -> Tensor:
-        assert self._governor is not None, "asked for only where there is one"
-        return self._governor.candidates(self.splats, self.render_options(self._views[0]))
+    def _chosen(self, optimizer: torch.optim.Adam, unseen_psnr: float) -> tuple[str, ...]:
+        """Keep those without which the training views would change; scored by as many as lie between two rounds."""
+        grown, step = len(self.splats), math.ceil(len(self._views) / self.densifier.options.densify_every)
+        found = worth(self, self._views[::step])
+        kept = needed(found, unseen_psnr) if self._asked is None else min(self._asked, grown)
+        keep_rows(self.splats.rows(), optimizer, most_wanted(found, kept))
+        self.densifier.forget()
+        return (f"kept {kept} of {grown} Gaussians, those that the training views would miss most",)
 
     def degree_at(self, iteration: int) -> int:
         """The SH degree that is in use by then, if the model has it."""
@@ -175,8 +191,6 @@ class SplatTrainee:
             "extent": self._extent,
             "iterations": self.iterations,
         }
-        if self._governor is not None:
-            values["governor"] = dict(self._governor.state)
         return State(tensors, values)
 
     def load_state(self, state: State) -> None:
@@ -189,8 +203,6 @@ class SplatTrainee:
         device = self.splats.means.device
         self.densifier.statistics = {n: t.to(device, copy=True) for n, t in state.under("statistics/").items()}
         self.densifier.generator.set_state(state.tensors["random/pieces"].cpu())
-        if self._governor is not None:
-            self._governor.state = dict(state.values["governor"])
 
     def load_model(self, state: State) -> None:
         """Take the splats alone, whose densification begins anew.

@@ -130,10 +130,3 @@ def test_too_few_views_to_set_any_apart_are_refused():
 def test_methods_that_views_set_apart_say_nothing_of_refuse_to_stop_by_themselves(name, scene):
     with pytest.raises(ValueError, match="budget.stop is auto.*set it to end"):
         lookup(METHODS, name, "method")().fit(scene, Budget(10, stop="auto"))
-
-
-@pytest.mark.parametrize("name", ["omnigs", "cubemap_3dgs"])
-def test_other_explicit_methods_grow_by_need_too(name, scene):
-    method = lookup(METHODS, name, "method")()
-    assert len(list(method.fit(scene, Budget(3, gaussians="auto", stop="auto")))) == 3
-    assert method.trainee.state().values["governor"] == {"rounds": [], "enough": False}

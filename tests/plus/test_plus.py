@@ -174,28 +174,6 @@ def test_resumed_while_it_averages_it_ends_the_same():
     assert_same_but_time(again.state(), states[1])
 
 
-def test_growth_by_need_resumes_bit_identically():
-    options = replace(OPTIONS, limit_share=0.5)
-    tiny = tiny_scene()
-    scene = replace(tiny, train=(*tiny.train, *tiny.test))
-    budget = Budget(48, gaussians="auto", stop="auto")
-    whole, stopped, resumed = (PlusMethod(options) for _ in range(3))
-    records = list(whole.fit(scene, budget))
-    first = list(islice(stopped.fit(scene, budget), 13))
-    assert first[-1].counts["gaussians"] > first[0].counts["gaussians"], "it grows"
-    assert not any("would miss most" in event for record in records for event in record.events), "and is not halved"
-    resumed.load_state(stopped.state())
-    assert [record.loss for record in (*first, *resumed.fit(scene, budget))] == [record.loss for record in records]
-    assert_same_but_time(resumed.state(), whole.state())
-
-
-def test_growth_by_need_rehearses_a_budget_of_seconds():
-    tiny = tiny_scene()
-    scene = replace(tiny, train=(*tiny.train, *tiny.test))
-    records = PlusMethod(OPTIONS).fit(scene, Budget(1, seconds=2.0, clock="cpu", gaussians="auto", stop="auto"))
-    assert next(iter(records)).progress < 1
-
-
 def test_the_end_is_the_mean_of_the_last_states():
     states = {}
     for share in (0.0, 0.1):
