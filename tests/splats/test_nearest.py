@@ -11,7 +11,7 @@ from padgs.render import render
 from padgs.render.low_pass import LowPass, widened
 from padgs.scene import View
 from padgs.sphere.camera import perspective
-from padgs.splats.nearest import cameras_of, finest_pixels, no_finer
+from padgs.splats.nearest import RESOLVED, cameras_of, finest_pixels, no_finer
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def test_the_filter_of_a_view_on_top_makes_that_of_the_larger_pixel(trained):
         gaussians.means - view.center.float(),
         LowPass(0.0, variance / view.camera.focal**2, compensate=True),
     )
-    wide = torch.sqrt(gaussians.scales**2 + variance * torch.maximum(own, pixels)[:, None] ** 2)
+    wide = torch.sqrt(gaussians.scales**2 + variance * torch.maximum(own, RESOLVED * pixels)[:, None] ** 2)
     torch.testing.assert_close(seen.scales, wide)
     torch.testing.assert_close(seen.opacities, gaussians.opacities * (gaussians.scales / wide).prod(-1))
 
