@@ -29,7 +29,7 @@ class Budget:
     max_seconds: float | None = None  # on the wall clock, after which the run ends as it is
     seconds: float | None = None
     clock: str = "wall"  # that `seconds` are counted on: a name of CLOCKS
-    gaussians: int | str | None = None  # None: as many as thresholds give; auto: no more than anybody would miss
+    gaussians: int | str | None = None  # None: as many as thresholds give; auto: without the least missed
     stop: str = "end"  # of the schedule | auto: as soon as nothing is gained, see `padgs.learning.stopping`
 
     def __post_init__(self) -> None:

@@ -1,9 +1,9 @@
 """padgs_plus: what one gets when the measured facts of this project decide.
 
 Explicit Gaussians, drawn exactly along each ray, that start few, grow in eight rounds by the pull in space, lose in a
-ninth what nobody would see, and are kept small as seen from the cameras. No constant is in world units, counts follow
-the pixels of the images, and latitude is nowhere a special case. docs/plus.md has the reason for each part; each is an
-option with a value that takes it away (`+experiment=plus_ablation`).
+ninth those that are least missed, and are kept small as seen from the cameras. No constant is in world units, counts
+follow the pixels of the images, and latitude is nowhere a special case. docs/plus.md has the reason for each part; each
+is an option with a value that takes it away (`+experiment=plus_ablation`).
 """
 
 from __future__ import annotations

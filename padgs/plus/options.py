@@ -34,7 +34,7 @@ class PlusOptions(SplatOptions):
     min_opacity: float = 0.05  # what is fainter when a round ends was not needed
     start_share: float | None = 0.6  # points to begin with, per independent pixel of a view; None: all that there are
     limit_share: float | None = 2.6  # ... and Gaussians at most while it grows: a guard on memory and time
-    unseen_psnr: float | None = 44.0  # dB of the training views, a round after growth, to those without what goes then
+    unseen_psnr: float | None = 44.0  # dB: a round later the least missed go, by what each alone changes, added up
     initial_opacity: float = 0.5  # 0.1 hides what lies in front until opacities have grown
     initial_scale: float = 0.6  # times the distance of the nearest points; 1 is 3DGS's, whose Gaussians overlap
     means_speed: float = 2.0  # learning rate of the means, beside that of 3DGS

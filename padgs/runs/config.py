@@ -74,7 +74,7 @@ class BudgetOptions:
     seconds: float | None = None  # of training: schedules follow the clock, and the run ends on time
     clock: str = "wall"  # wall | cpu: cpu counts what the process itself takes, whatever else the machine does
 
-    gaussians: int | str | None = None  # that the model has in the end; auto: no more than anybody would miss
+    gaussians: int | str | None = None  # that the model has in the end; auto: the least missed go after growth
     stop: str = "end"  # of the schedule | auto: as soon as views that are set apart gain nothing any more
 
     def __post_init__(self) -> None:

@@ -24,7 +24,7 @@ from padgs.splats.clone_split import CloneSplitOptions
 from padgs.splats.model import Splats
 from padgs.splats.trainee import SplatTrainee
 
-UNSEEN_PSNR = 44.0  # dB of views, to themselves without what nobody would see, under budget.gaussians=auto
+UNSEEN_PSNR = 44.0  # dB, under budget.gaussians=auto; see `padgs.learning.worth.needed`
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class SplatMethod(Method):
 
     @property
     def _unseen_psnr(self) -> float | None:
-        """Of what is taken away a round after growth, dB, if anything is."""
+        """Of the changes, each alone, by what is taken away a round after growth, dB; None if nothing is."""
         return UNSEEN_PSNR if self._gaussians == AUTO else None
 
     def _blank(self, state: State) -> SplatTrainee:

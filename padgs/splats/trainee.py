@@ -60,7 +60,7 @@ class SplatTrainee:
             target: as `CloneSplit` has it.
             seed: of all that is random.
             asked: as many Gaussians are kept a round after growth, those that the views would miss most.
-            unseen_psnr: dB; ... or as many as it takes for views that change no more than that. None: all are kept.
+            unseen_psnr: dB; ... or the others go as `padgs.learning.worth.needed` says. None: all are kept.
         """
         self.splats, self.iterations = splats, iterations
         self._config, self._views, self._extent = config, views, extent
@@ -136,7 +136,7 @@ class SplatTrainee:
         return 2 * views >= min(self.densifier.options.densify_every, MIN_DENSIFY_EVERY)
 
     def _chosen(self, optimizer: torch.optim.Adam, unseen_psnr: float) -> tuple[str, ...]:
-        """Keep those without which the training views would change; scored by as many as lie between two rounds."""
+        """Keep those that the training views would miss most; scored by as many as lie between two rounds."""
         grown, step = len(self.splats), math.ceil(len(self._views) / self.densifier.options.densify_every)
         found = worth(self, self._views[::step])
         kept = needed(found, unseen_psnr) if self._asked is None else min(self._asked, grown)
