@@ -309,7 +309,7 @@ def _refuse_other_types(result: Result) -> None:
     for name in CONFIG_GROUPS & result.config.keys():
         if not isinstance(result.config[name], dict):
             raise TypeError(f"config.{name} is {result.config[name]!r}, which is no group of settings")
-    float(result.config.get("budget", {}).get("seconds", 0))
+    float(result.config.get("budget", {}).get("seconds") or 0)
     rules = [*result.config.get("protocol", {}).values(), *(scores.protocol for scores in result.scores.values())]
     if odd := [rule for rule in rules if not isinstance(rule, dict)]:
         raise TypeError(f"the rules of a protocol are {odd[0]!r}; they must be a table")

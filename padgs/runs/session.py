@@ -110,8 +110,6 @@ class Session:
             method.begin_with(config.init.state(self.scene.fingerprint, self._fingerprint_at, device))
         folder.prepare(config.values())
         progress = folder.resume(method, device)
-        if progress.iteration and not progress.share:  # a checkpoint from before there were budgets of seconds
-            progress = replace(progress, share=progress.iteration / config.training.iterations)
         if progress.iteration:
             self._say(f"resuming after iteration {progress.iteration}")
         result = outcome.begun(config, self.scene, folder.path.name)

@@ -237,27 +237,6 @@ def test_a_checkpoint_of_another_run_is_refused(config, monkeypatch, tmp_path, c
         run(config)
 
 
-@pytest.mark.parametrize("iteration", [7, ITERATIONS])
-def test_a_checkpoint_of_an_earlier_version_is_gone_on_from_but_not_without_a_word(config, monkeypatch, iteration):
-    if iteration < ITERATIONS:
-        with monkeypatch.context() as patch:
-            stop_at(iteration, patch, lambda: os.kill(os.getpid(), signal.SIGINT))
-            with pytest.raises(Interrupted):
-                run(config)
-    else:
-        run(config)
-        (folder_of(config).path / "result.json").unlink()
-    file = folder_of(config).checkpoint / "state.json"
-    manifest = json.loads(file.read_text())
-    values = manifest["values"]
-    del values["moment"], values["schedule"], values["step_seconds"], values["progress"]["share"]
-    file.write_text(
-        json.dumps({key: manifest[key] for key in ("tensors", "bytes", "sha256", "values")} | {"format": 1})
-    )
-    result, said = run(config)
-    assert result.ok and f"resuming after iteration {iteration}; the checkpoint is of an earlier version" in said
-
-
 @pytest.mark.parametrize(
     ("error", "status"),
     [
