@@ -121,10 +121,7 @@ class Page:
         world_from_cam = Rotation.from_quat(np.roll(camera.wxyz, -1)).as_matrix()
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = world_from_cam.T, -world_from_cam.T @ camera.position
-        width = int(self._width.value)
-        height = max(2, round(width / camera.aspect))
-        if height > width:  # of a phone that stands; pixels across are along its longer side
-            width, height = round(width * camera.aspect), width
+        width, height = sides(int(self._width.value), camera.aspect)
         shown = self._galleries if self._which.value == BOTH else (self._named[self._which.value],)
         return Asked(look, torch.from_numpy(pose), width, height, shown)
 
@@ -184,3 +181,13 @@ class Page:
                 facts += f"; error of {asked.galleries[0].nearest(asked.cam_from_world).name}"
             self._facts.content = "  \n".join((*(gallery.facts for gallery in asked.galleries), facts))
         return seconds
+
+
+def sides(longer: int, aspect: float) -> tuple[int, int]:
+    """Width and height of a picture, at least 2, whose longer side is given: a phone may stand.
+
+    >>> sides(1024, 1.6), sides(1024, 0.5)
+    ((1024, 640), (512, 1024))
+    """
+    shorter = max(2, round(longer * min(aspect, 1 / aspect)))
+    return (longer, shorter) if aspect >= 1 else (shorter, longer)

@@ -96,3 +96,9 @@ def test_pictures_are_not_mixed_with_others(folder, tmp_path):
     arguments = (str(folder), "--to", str(tmp_path / "f"), "--seconds", "0.1", "--fps", "20")
     assert render(*arguments).exit_code == 0
     assert "holds pictures already" in render(*arguments).stderr
+
+
+def test_films_of_other_kinds_are_refused_before_anything_is_drawn(folder, tmp_path):
+    said = render(str(folder), "--to", str(tmp_path / "x.avi"))
+    assert said.exit_code == 1 and "x.avi is no .mp4" in " ".join(said.output.split())
+    assert not list(tmp_path.iterdir())
