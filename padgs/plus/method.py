@@ -43,11 +43,11 @@ class PlusMethod(SplatMethod):
     def _target(self) -> int | None:
         """As many Gaussians to grow as leave a choice of those that the budget asks for, if it names a number."""
         asked = super()._target
-        return asked if asked is None or self.options.unseen_psnr is None else GROWN_PER_KEPT * asked
+        return asked if asked is None or self.options.removal_psnr is None else GROWN_PER_KEPT * asked
 
     @property
-    def _unseen_psnr(self) -> float | None:
-        return self.options.unseen_psnr or super()._unseen_psnr
+    def _removal_psnr(self) -> float | None:
+        return self.options.removal_psnr or super()._removal_psnr
 
     @property
     def is_drawn_no_finer(self) -> bool:

@@ -34,7 +34,7 @@ class PlusOptions(SplatOptions):
     min_opacity: float = 0.05  # what is fainter when a round ends was not needed
     start_share: float | None = 0.6  # points to begin with, per independent pixel of a view; None: all that there are
     limit_share: float | None = 2.6  # ... and Gaussians at most while it grows: a guard on memory and time
-    unseen_psnr: float | None = 44.0  # dB: a round later the least missed go, by what each alone changes, added up
+    removal_psnr: float | None = 44.0  # dB: a round later the least missed go, by what each alone changes, added up
     initial_opacity: float = 0.5  # 0.1 hides what lies in front until opacities have grown
     initial_scale: float = 0.6  # times the distance of the nearest points; 1 is 3DGS's, whose Gaussians overlap
     means_speed: float = 2.0  # learning rate of the means, beside that of 3DGS
@@ -47,7 +47,7 @@ class PlusOptions(SplatOptions):
         super().__post_init__()
         check(self, "an opacity below 1", lambda opacity: 0 < opacity < 1, "initial_opacity")
         check(self, "> 0 and finite", lambda factor: 0 < factor < math.inf, "initial_scale", "means_speed")
-        check(self, "> 0 and finite, or none to keep all", lambda p: p is None or 0 < p < math.inf, "unseen_psnr")
+        check(self, "> 0 and finite, or none to keep all", lambda p: p is None or 0 < p < math.inf, "removal_psnr")
         off = "at least 0, which switches it off"
         check(self, off, lambda value: 0 <= value < math.inf, "size_weight", "smoothness_weight", "sky_share")
         check(self, "a share of the run in [0, 0.1]", lambda share: 0 <= share <= 0.1, "average_share")

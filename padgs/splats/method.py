@@ -24,7 +24,7 @@ from padgs.splats.clone_split import CloneSplitOptions
 from padgs.splats.model import Splats
 from padgs.splats.trainee import SplatTrainee
 
-UNSEEN_PSNR = 44.0  # dB, under budget.gaussians=auto; see `padgs.learning.worth.needed`
+REMOVAL_PSNR = 44.0  # dB, under budget.gaussians=auto; see `padgs.learning.worth.needed`
 
 
 @dataclass(frozen=True)
@@ -82,9 +82,9 @@ class SplatMethod(Method):
         return self._gaussians if isinstance(self._gaussians, int) else None
 
     @property
-    def _unseen_psnr(self) -> float | None:
+    def _removal_psnr(self) -> float | None:
         """Of the changes, each alone, by what is taken away a round after growth, dB; None if nothing is."""
-        return UNSEEN_PSNR if self._gaussians == AUTO else None
+        return REMOVAL_PSNR if self._gaussians == AUTO else None
 
     def _blank(self, state: State) -> SplatTrainee:
         stored = state.of_model()
@@ -105,6 +105,6 @@ class SplatMethod(Method):
             views=views,
             target=self._target,
             seed=self.seed,
-            unseen_psnr=self._unseen_psnr,
+            removal_psnr=self._removal_psnr,
             **more,
         )

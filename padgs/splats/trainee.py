@@ -46,7 +46,7 @@ class SplatTrainee:
         target: int | None = None,
         seed: int = 0,
         asked: int | None = None,
-        unseen_psnr: float | None = None,
+        removal_psnr: float | None = None,
     ) -> None:
         """Wrap splats.
 
@@ -60,11 +60,11 @@ class SplatTrainee:
             target: as `CloneSplit` has it.
             seed: of all that is random.
             asked: as many Gaussians are kept a round after growth, those that the views would miss most.
-            unseen_psnr: dB; ... or the others go as `padgs.learning.worth.needed` says. None: all are kept.
+            removal_psnr: dB; ... or the others go as `padgs.learning.worth.needed` says. None: all are kept.
         """
         self.splats, self.iterations = splats, iterations
         self._config, self._views, self._extent = config, views, extent
-        self._asked, self._unseen_psnr = asked, unseen_psnr
+        self._asked, self._removal_psnr = asked, removal_psnr
         self.densifier = CloneSplit(
             splats,
             options.for_run(iterations),
@@ -118,8 +118,8 @@ class SplatTrainee:
         """Densify, choose whom to keep, and bring the next SH degree into use, where it is time to."""
         events = self.densifier.adapt(iteration, optimizer, grows=self._has_seen_enough)
         options = self.densifier.options
-        if self._unseen_psnr is not None and iteration == options.densify_until - 1 + options.densify_every:
-            events += self._chosen(optimizer, self._unseen_psnr)
+        if self._removal_psnr is not None and iteration == options.densify_until - 1 + options.densify_every:
+            events += self._chosen(optimizer, self._removal_psnr)
         degree = min(self.splats.degree, self.degree_at(iteration + 1))
         if degree > self.splats.active_degree:
             self.splats.active_degree = degree
@@ -135,11 +135,11 @@ class SplatTrainee:
         views = int(self.densifier.statistics["seen"].max())  # some Gaussian is seen by all
         return 2 * views >= min(self.densifier.options.densify_every, MIN_DENSIFY_EVERY)
 
-    def _chosen(self, optimizer: torch.optim.Adam, unseen_psnr: float) -> tuple[str, ...]:
+    def _chosen(self, optimizer: torch.optim.Adam, removal_psnr: float) -> tuple[str, ...]:
         """Keep those that the training views would miss most; scored by as many as lie between two rounds."""
         grown, step = len(self.splats), math.ceil(len(self._views) / self.densifier.options.densify_every)
         found = worth(self, self._views[::step])
-        kept = needed(found, unseen_psnr) if self._asked is None else min(self._asked, grown)
+        kept = needed(found, removal_psnr) if self._asked is None else min(self._asked, grown)
         keep_rows(self.splats.rows(), optimizer, most_wanted(found, kept))
         self.densifier.forget()
         return (f"kept {kept} of {grown} Gaussians, those that the training views would miss most",)

@@ -57,8 +57,8 @@ def test_the_threshold_of_growth_falls_with_the_length_of_a_run_and_then_stays()
 
 def test_what_is_kept_after_growth_is_what_the_views_would_miss():
     trained, tiny = [], tiny_scene()
-    for unseen in (None, 44.0):
-        method = PlusMethod(replace(OPTIONS, unseen_psnr=unseen))
+    for psnr in (None, 44.0):
+        method = PlusMethod(replace(OPTIONS, removal_psnr=psnr))
         for record in islice(method.fit(tiny, Budget(100)), 9 * between_rounds(100)):
             before = record.counts["gaussians"]
         trained.append(method.trainee)
