@@ -11,12 +11,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
-from torch import Tensor
 
-from padgs.learning.targets import image_of, weight_of
+from padgs.learning.targets import even_weight, image_of
 from padgs.render import Rendering
 from padgs.scene import View
-from padgs.sphere.camera import Panorama
 
 APART, FEWEST = 8, 3  # one training view of so many is set apart, but so many at least; and as many must be left
 FADE = 0.15  # share of the schedule, at its end, that a stopped run still goes through
@@ -39,11 +37,6 @@ def set_apart(views: Sequence[View]) -> tuple[int, ...]:
             f"it takes {2 * FEWEST}"
         )
     return tuple(int((number + 0.5) * len(views) / count) for number in range(count))
-
-
-def even_weight(view: View, device: torch.device) -> Tensor:
-    """Weight [H, W] or [H, 1] of pixels: all directions of a panorama count alike, and all pixels of other views."""
-    return weight_of(view, "solid_angle" if isinstance(view.camera, Panorama) else "uniform", device)
 
 
 @torch.no_grad()

@@ -11,6 +11,7 @@ from torch import Tensor
 from padgs.learning.loss import TargetMoments, pixel_weight, target_moments
 from padgs.learning.native_loss import fits
 from padgs.scene import View
+from padgs.sphere.camera import Panorama
 
 CACHE_BYTES = 1 << 29  # weights and moments of views beyond this are computed again at every iteration
 
@@ -90,6 +91,11 @@ def weight_of(view: View, weight: str, device: torch.device | str = "cpu") -> Te
         return pixel_weight(weight, view.height, mask, device=device)
     except ValueError as error:
         raise ValueError(f"view {view.name!r}: {error}") from error
+
+
+def even_weight(view: View, device: torch.device) -> Tensor:
+    """Weight [H, W] or [H, 1] of pixels: all directions of a panorama count alike, and all pixels of other views."""
+    return weight_of(view, "solid_angle" if isinstance(view.camera, Panorama) else "uniform", device)
 
 
 def _fitting(view: View, what: str, pixels: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ import math
 import torch
 
 from padgs.learning.loop import TrainOptions
+from padgs.plus.fill import filled
 from padgs.plus.options import PlusOptions
 from padgs.plus.sky import far_gaussians
 from padgs.plus.trainee import PlusTrainee
@@ -58,13 +59,14 @@ class PlusMethod(SplatMethod):
         options, pixels = self.options, independent_pixels(scene.train[0])
         start, limit = (_within(share, pixels) for share in (options.start_share, options.limit_share))
         limit = fewest(options.max_gaussians, limit if self._target is None else self._target)
+        generator = torch.Generator().manual_seed(self.seed)
         splats = Splats.from_scene(
-            scene,
+            filled(scene, round(options.fill_share * pixels), generator=generator),
             degree=options.sh_degree,
             max_gaussians=fewest(start, limit),
             opacity=options.initial_opacity,
             scale=options.initial_scale,
-            generator=torch.Generator().manual_seed(self.seed),
+            generator=generator,
         )
         directions = round(options.sky_share * len(splats))
         directions = directions if limit is None else min(directions, limit - len(splats))

@@ -33,6 +33,7 @@ class PlusOptions(SplatOptions):
     sample_clones: bool = True
     min_opacity: float = 0.05  # what is fainter when a round ends was not needed
     start_share: float | None = 0.6  # points to begin with, per independent pixel of a view; None: all that there are
+    fill_share: float = 0.15  # ... of which so many at least: photographs give what the cloud has not; 0: not
     limit_share: float | None = 2.6  # ... and Gaussians at most while it grows: a guard on memory and time
     removal_psnr: float | None = 44.0  # dB: a round later the least missed go, by what each alone changes, added up
     initial_opacity: float = 0.5  # 0.1 hides what lies in front until opacities have grown
@@ -49,7 +50,8 @@ class PlusOptions(SplatOptions):
         check(self, "> 0 and finite", lambda factor: 0 < factor < math.inf, "initial_scale", "means_speed")
         check(self, "> 0 and finite, or none to keep all", lambda p: p is None or 0 < p < math.inf, "removal_psnr")
         off = "at least 0, which switches it off"
-        check(self, off, lambda value: 0 <= value < math.inf, "size_weight", "smoothness_weight", "sky_share")
+        for name in ("size_weight", "smoothness_weight", "sky_share", "fill_share"):
+            check(self, off, lambda value: 0 <= value < math.inf, name)
         check(self, "a share of the run in [0, 0.1]", lambda share: 0 <= share <= 0.1, "average_share")
         for name in ("start_share", "limit_share"):
             check(self, "> 0, or none for no limit", lambda share: share is None or share > 0, name)

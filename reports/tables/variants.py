@@ -44,6 +44,7 @@ WITHOUT = {  # variant (conf/without) -> title
             "selection": "all that has grown",
             "average": "the last state",
             "sky": "no sky",
+            "fill": "no points from photographs",
         }.items()
     },
 }
