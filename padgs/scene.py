@@ -6,7 +6,7 @@ Transforms are named a_from_b: `cam_from_world` maps world points to the camera 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import torch
@@ -15,6 +15,7 @@ from torch import Tensor
 from padgs.sphere.camera import Camera, Panorama
 
 ONE_PLACE = 1e-6  # units of the scene; a reach up to here is rounding
+FAR = 1000.0  # units of the scene that its cameras may be away from the origin; there float32 has steps of 6e-5 units
 
 
 @dataclass(frozen=True)
@@ -81,6 +82,26 @@ class Scene:
     point_colors: Tensor  # [P, 3] uint8
     fingerprint: str  # hex digest of everything read: images, poses, points, split, masks, size
     notes: tuple[str, ...] = ()  # what the loader decided by itself, for the user to read
+    # [3] float64: what was taken from the world of the data set, which is x + origin; not 0 if that was far away
+    origin: Tensor = field(default_factory=lambda: torch.zeros(3, dtype=torch.float64))
+
+    def centred(self) -> Scene:
+        """The scene with points as float32, and in a world about its cameras if they are more than `FAR` units away
+        from the origin: georeferenced captures are, and float32 would blur them.
+        """
+        middle = torch.stack([view.center for view in self.train]).double().median(0).values
+        distance = middle.norm() / self.unit
+        if not distance > FAR:
+            return replace(self, points=self.points.float())
+        train, test = (
+            tuple(replace(view, cam_from_world=about(middle, view.cam_from_world)) for view in views)
+            for views in (self.train, self.test)
+        )
+        points = (self.points.double() - middle.to(self.points.device)).float()
+        text = ", ".join(f"{number:.10g}" for number in middle.tolist())
+        note = f"world: about ({text}), for the cameras are {distance:.0f} units of the scene away from its origin"
+        origin, notes = self.origin + middle.to(self.origin), (*self.notes, note)
+        return replace(self, train=train, test=test, points=points, origin=origin, notes=notes)
 
     def to(self, device: torch.device | str) -> Scene:
         """The scene with poses and points on a device, where what is made of it will be; pixels come when asked for."""
@@ -114,3 +135,10 @@ class Scene:
         points = self.points[:: max(1, len(self.points) // 20_000)].double()
         medians = [(points - view.center.double()).norm(dim=-1).median() for view in self.train]
         return torch.stack(medians).median().item()
+
+
+def about(origin: Tensor, cam_from_world: Tensor) -> Tensor:
+    """Poses [..., 4, 4] in a world whose origin [3] is there."""
+    poses = cam_from_world.clone()
+    poses[..., :3, 3] += poses[..., :3, :3] @ origin.to(poses)
+    return poses

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from padgs.gaussians import rotation_matrices
-from padgs.scene import Scene, View
+from padgs.scene import FAR, Scene, View, about
 
 H, W = 4, 8
 
@@ -104,3 +104,38 @@ def test_a_changed_scene_measures_itself_anew():
     scene = scene_of([(0, 0, 0)], torch.ones(3, 3))
     assert scene.unit == pytest.approx(math.sqrt(3))
     assert replace(scene, points=2 * scene.points).unit == pytest.approx(2 * math.sqrt(3))
+
+
+UTM = torch.tensor((691_000.5, 5_334_000.25, 520.0), dtype=torch.float64)
+
+
+def test_a_far_world_is_brought_about_its_cameras(generator):
+    centers = [(0.0, 0.0, 0.0), (1.0, 0.5, 0.0), (0.0, -2.0, 1.0)]
+    points = torch.randn(500, 3, generator=generator, dtype=torch.float64)
+    far_away = [tuple((torch.tensor(center).double() + UTM).tolist()) for center in centers]
+    scene = replace(scene_of([(0, 0, 0)], points + UTM), train=tuple(view_at_exactly(*c) for c in far_away)).centred()
+    assert scene.points.dtype == torch.float32 and "world: about (69100" in scene.notes[-1]
+    assert scene.origin.tolist() == pytest.approx(UTM.tolist(), abs=2)
+    shift = scene.origin - UTM
+    torch.testing.assert_close(scene.points, (points - shift).float(), atol=1e-6, rtol=0)
+    for view, center in zip(scene.train, centers, strict=True):
+        torch.testing.assert_close(view.center, torch.tensor(center).double() - shift, atol=1e-8, rtol=0)
+    assert torch.equal(scene.centred().origin, scene.origin), "once is enough"
+
+
+def view_at_exactly(*center: float) -> View:
+    return View("view", pose(torch.tensor(center, dtype=torch.float64), (0.3, -0.5, 0.1, 0.8)), W, H)
+
+
+@pytest.mark.parametrize(("units", "moved"), [(0.9 * FAR, False), (1.1 * FAR, True)])
+def test_a_world_stays_where_it_is_if_it_is_not_far(units, moved):
+    scene = scene_of([(units, 0, 0)], torch.tensor([[units, 1.0, 0], [units, 0, 1.0]], dtype=torch.float64)).centred()
+    assert scene.points.dtype == torch.float32 and bool(scene.origin.any()) == moved == bool(scene.notes)
+
+
+def test_a_pose_about_an_origin_has_its_centre_there():
+    poses = torch.stack([pose(torch.tensor((1.0, 2, 3)), (0.5, 0.5, -0.5, 0.5)), pose(torch.tensor((4.0, 5, 6)))])
+    found = about(torch.tensor((1.0, 1, 1)), poses)
+    assert torch.equal(found[:, :3, :3], poses[:, :3, :3])
+    centers = -(found[:, :3, :3].transpose(1, 2) @ found[:, :3, 3:])[..., 0]
+    torch.testing.assert_close(centers, torch.tensor([[0.0, 1, 2], [3, 4, 5]]).double())

@@ -36,7 +36,7 @@ def render(
     from padgs.film.frames import write_film
     from padgs.film.keyframes import read_path
     from padgs.film.paths import PATHS
-    from padgs.scene import View
+    from padgs.scene import View, about
     from padgs.sphere.camera import Panorama, perspective
 
     if camera not in ("panorama", "perspective"):
@@ -57,7 +57,7 @@ def render(
             poses = PATHS[path](scene, frames or max(2, round(10 * fps)))
         else:
             up = gravity(torch.stack([view.cam_from_world for view in scene.train])).up
-            poses = read_path(Path(path), frames, up)
+            poses = about(scene.origin, read_path(Path(path), frames, up))
         views = [
             View(f"frame {number}", pose.to(trained.cam_from_world), lens.width, lens.height, lens=lens)
             for number, pose in enumerate(poses)

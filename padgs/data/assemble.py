@@ -54,22 +54,23 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
         View(view_name(frame.name), frame.cam_from_world, *size, StoredImage(frame.image, *size, store), mask)
         for frame, size, mask in zip(capture.frames, sizes, masks, strict=True)
     ]
-    digest = hashlib.sha256()
-    for view, image in zip(views, images, strict=True):
-        digest.update(f"{view.name}|{view.width}x{view.height}|{image.digest}|".encode())
-        digest.update(view.cam_from_world.numpy().tobytes())
-    digest.update(f"train{split.train}test{split.test}masks{mask_digests}".encode())
-    digest.update(points.numpy().tobytes())
-    digest.update(colors.numpy().tobytes())
-    return Scene(
+    scene = Scene(
         name=capture.folder.name,
         train=tuple(views[i] for i in split.train),
         test=tuple(views[i] for i in split.test),
         points=points,
         point_colors=colors,
-        fingerprint=digest.hexdigest(),
+        fingerprint="",
         notes=(*notes, *split.notes, *mask_notes, *cloud_notes),
-    )
+    ).centred()
+    digest = hashlib.sha256()
+    for view, image in zip(views, images, strict=True):
+        digest.update(f"{view.name}|{view.width}x{view.height}|{image.digest}|".encode())
+        digest.update(view.cam_from_world.numpy().tobytes())
+    digest.update(f"train{split.train}test{split.test}masks{mask_digests}".encode())
+    digest.update(scene.points.numpy().tobytes())
+    digest.update(colors.numpy().tobytes())
+    return replace(scene, fingerprint=digest.hexdigest())
 
 
 def view_name(frame_name: str) -> str:

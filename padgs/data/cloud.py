@@ -18,7 +18,7 @@ GREY = 128
 
 
 def starting_cloud(capture: Capture, source: str) -> tuple[Tensor, Tensor, tuple[str, ...]]:
-    """Points [P, 3] float32, colours [P, 3] uint8 and notes.
+    """Points [P, 3] float64, colours [P, 3] uint8 and notes.
 
     Args:
         capture: what the format holds.
@@ -51,7 +51,7 @@ def starting_cloud(capture: Capture, source: str) -> tuple[Tensor, Tensor, tuple
     if colors is None:
         colors = torch.full((len(points), 3), GREY, dtype=torch.uint8)
         notes = (*notes, "points: they have no colours; grey is taken")
-    return points.float(), colors, notes
+    return points.double(), colors, notes
 
 
 def random_cloud(cam_from_world: Tensor, count: int = RANDOM_POINTS) -> Cloud:

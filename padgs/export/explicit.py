@@ -27,6 +27,7 @@ from padgs.splats.trainee import SplatTrainee
 
 LESSONS = 300
 OPAQUE = 0.5  # opacity from which on a Gaussian is a point of something
+AXES = "axes and units of the scene; its cameras look along z, x is right, y down"
 
 
 @dataclass(frozen=True)
@@ -80,13 +81,16 @@ def exported(
         )
     kind = f"{config.low_pass:g} in {config.resolved_low_pass_kind}"
     notes.append(f"trained with projection {config.projection} and a low-pass of {kind}; viewers have others")
-    notes.append("axes and units of the scene; its cameras look along z, x is right, y down")
+    notes.append(AXES)
+    if run.scene.origin.any():
+        place = " ".join(f"{number:.10g}" for number in run.scene.origin.tolist())
+        notes.append(f"the origin of this world is at {place} in that of the data set, too far for float32")
     begin = _middle(run.scene.train, run.scene.unit)
     if stand_up:
         up = torch.tensor(gravity(torch.stack([view.cam_from_world for view in run.scene.train])).up)
         turn = upright(up)
         splats, begin = moved(splats, turn), turn(begin)
-        notes[-1] = "units of the scene, turned so that -y is up"
+        notes[notes.index(AXES)] = "units of the scene, turned so that -y is up"
     return Exported(splats, tuple(notes), begin)
 
 

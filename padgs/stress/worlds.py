@@ -46,7 +46,7 @@ def scaled(scene: Scene, factor: float, random: np.random.Generator) -> Scene:
 
 
 def moved_away(scene: Scene, units: float, random: np.random.Generator) -> Scene:
-    """The whole world so many units of the scene away from the origin, as georeferenced captures are."""
+    """The whole world so many units of the scene away from the origin, as georeferenced captures are; float64."""
     offset = units * scene.unit * torch.tensor(DIAGONAL, dtype=torch.float64)
 
     def pose(view: View) -> View:
@@ -54,8 +54,7 @@ def moved_away(scene: Scene, units: float, random: np.random.Generator) -> Scene
         moved[:3, 3] -= moved[:3, :3] @ offset.to(moved)
         return replace(view, cam_from_world=moved)
 
-    points = scene.points.double() + offset.to(scene.points.device)
-    return replace(of_all(scene, pose), points=points.to(scene.points.dtype))
+    return replace(of_all(scene, pose), points=scene.points.double() + offset.to(scene.points.device))
 
 
 def shaken(scene: Scene, share: float, random: np.random.Generator) -> Scene:

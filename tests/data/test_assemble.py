@@ -2,6 +2,7 @@
 
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -45,6 +46,17 @@ def test_the_fingerprint_follows_content_and_not_place(folder: Path) -> None:
     points.write_text(re.sub(r"\n7 \S+ ", "\n7 0.25 ", points.read_text()))
     changed.add(load(folder).fingerprint)
     assert len(changed - {first}) == 4
+
+
+def test_a_georeferenced_capture_is_the_same_scene_elsewhere(world: World, folder: Path, tmp_path: Path) -> None:
+    utm = np.array([691_000.0, 5_334_000.0, 520.0])
+    write_colmap_text(replace(world, centers=world.centers + utm, points=world.points + utm), tmp_path / "utm")
+    near, far = load(folder), load(tmp_path / "utm")
+    assert not near.origin.any() and far.notes[-1].startswith("world: about (")
+    shift = (far.origin - torch.from_numpy(utm)).float()
+    torch.testing.assert_close(far.points + shift, near.points, atol=1e-5, rtol=0)
+    for one, other in zip(near.train, far.train, strict=True):
+        torch.testing.assert_close(other.center + shift, one.center, atol=1e-6, rtol=0)
 
 
 def test_images_and_cameras_of_different_size(folder: Path) -> None:

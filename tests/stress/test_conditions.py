@@ -161,3 +161,13 @@ def test_masks_go_along_with_the_pixels():
     assert turned[:, 8:12].sum() == 0 and turned.sum() == mask.sum()
     assert stressed("resolution", 1, scene).train[0].load_mask().shape == (8, 16)
     assert stressed("pitch", 1, scene).train[0].load_mask().shape == (16, 32)
+
+
+@pytest.mark.parametrize("level", [2, 3])
+def test_a_world_far_away_comes_back_as_loaded_ones_do(level):
+    rest, far = generate(OPTIONS), stressed("world_offset", level)
+    assert far.points.dtype == torch.float64
+    shift = (far.centred().points - rest.points).mean(0)
+    torch.testing.assert_close(far.centred().points - shift, rest.points, atol=1e-4 * rest.unit, rtol=0)
+    for one, other in zip(rest.train, far.centred().train, strict=True):
+        torch.testing.assert_close(other.center - shift, one.center, atol=1e-4 * rest.unit, rtol=0)

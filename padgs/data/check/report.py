@@ -31,7 +31,6 @@ FITS = 0.3  # correlation from which points and pictures can be said to agree
 SAME_PLACE = 0.01  # of the median depth: a test view as near as this to a training view tests memory
 UNEVEN = 0.1  # stops, standard deviation of the views' gains from which it is worth learning them
 EXPOSURES = 40  # views at most that they are measured in
-FAR_AWAY = 1e5  # coordinates larger than this many median depths lose digits in float32
 
 
 @dataclass
@@ -103,7 +102,7 @@ def check(
     report.median_depth = median_depth(poses, scene.points)
     report.masked = {view.name: 1 - mask.mean().item() for view in views if (mask := view.mask()) is not None}
     _check_leaks(scene, capture, report)
-    _check_digits(scene, poses, report)
+    _check_movement(poses, report)
     _check_fit(capture, scene, report)
     if overlay is not None:
         try:
@@ -167,13 +166,7 @@ def _check_leaks(scene: Scene, capture: Capture, report: Report) -> None:
         )
 
 
-def _check_digits(scene: Scene, poses: Tensor, report: Report) -> None:
-    largest = torch.cat((centers(poses), scene.points.double())).abs().median().item()
-    if report.median_depth > 0 and largest > FAR_AWAY * report.median_depth:
-        report.problems.append(
-            f"coordinates are {largest:.3g} while things are {report.median_depth:.3g} away; 32-bit numbers cannot "
-            "hold both: shift the world to the cameras"
-        )
+def _check_movement(poses: Tensor, report: Report) -> None:
     if report.path_length == 0 and len(poses) > 1:
         report.problems.append("all cameras stand at one place; there is nothing to learn depth from")
 
