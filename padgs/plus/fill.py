@@ -60,8 +60,8 @@ def _seen(view: View, cloud: Tensor, count: int, generator: torch.Generator) -> 
     rays = view.camera.rays(dtype=torch.float64).reshape(-1, 3)[pixels]
 
     apart = math.sqrt(4 * math.pi / len(directions))
-    found = KDTree(directions.numpy()).query(rays.numpy(), k=range(1, min(NEIGHBOURS, len(directions)) + 1))
-    angles, neighbours = map(torch.from_numpy, found)  # [count, at most `NEIGHBOURS`]
+    found = KDTree(directions.numpy()).query(rays.numpy(), k=min(NEIGHBOURS, len(directions)))
+    angles, neighbours = (torch.as_tensor(part).reshape(count, -1) for part in found)
     near = (angles < apart).any(-1)
     weights = 1 / angles[near].clamp(min=BESIDE).square()
     inverse_range = (weights * nearness[neighbours[near]]).sum(-1) / weights.sum(-1)
