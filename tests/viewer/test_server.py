@@ -5,7 +5,7 @@ import time
 from urllib.request import urlopen
 
 import pytest
-from chromium import PROGRAM, Browser
+from chromium import in_chromium, visiting
 from tiny_run import tiny_run
 from typer.testing import CliRunner
 
@@ -44,46 +44,41 @@ def test_the_page_is_served_here_only_and_ends(run):
 
 @WITH_VISER
 @pytest.mark.slow
-@pytest.mark.skipif(PROGRAM is None, reason="no Chromium here")
+@in_chromium
 def test_a_browser_shows_all_that_can_be_asked_for(run, tmp_path):
     """Controls are set from here, as the page would; what they do is seen on the page."""
-    browser = Browser(tmp_path)
-    try:
-        with serving([run, run], port=8420) as server:
-            browser.open(server.address)
-            until(lambda: server.pages)
-            (page,) = server.pages.values()
-            page._width.value = "512"
+    with serving([run, run], port=8420) as server, visiting(server.address) as visit:
+        until(lambda: server.pages)
+        (page,) = server.pages.values()
+        page._width.value = "512"
 
-            def shows(*texts: str) -> None:
-                until(lambda: all(text in page._facts.content for text in ("51", *texts)))
-                words = page._facts.content.split()[0]  # how many Gaussians
-                browser.wait(f"document.body.innerText.includes({words!r})")
+        def shows(*texts: str) -> None:
+            until(lambda: all(text in page._facts.content for text in ("51", *texts)))
+            words = page._facts.content.split()[0]  # how many Gaussians
+            visit.wait(f"document.body.innerText.includes({words!r})")
 
-            shows("gaussians", " ms")
-            page._which.value = BOTH
-            until(lambda: len(page.asked().galleries) == 2)
-            shows()
-            page._which.value = next(iter(page._named))
-            page._layer.value = "error"
-            shows("error of")
-            page._layer.value, page._camera.value = "depth", "panorama"
-            page._frusta_shown.value = page._crop.value = True
-            shows()
-            view = run.scene.test[0]
-            page.go_to(view)
-            until(lambda: abs(page.asked().cam_from_world - view.cam_from_world).max() < 1e-6)
-            page._layer.value, page._camera.value = "colours", "perspective"
-            page._fov.value = 60
-            until(lambda: page.asked().look.fov == 60)
-            before = page.asked().cam_from_world
-            browser.drag("canvas", 80, 30)
-            until(lambda: abs(page.asked().cam_from_world - before).max() > 1e-3)
-            browser.screenshot(tmp_path / "page.png")
-            assert (tmp_path / "page.png").stat().st_size > 10_000
-        assert [text for text in browser.complaints if "THREE.Clock" not in text and "WebSocket" not in text] == []
-    finally:
-        browser.close()
+        shows("gaussians", " ms")
+        page._which.value = BOTH
+        until(lambda: len(page.asked().galleries) == 2)
+        shows()
+        page._which.value = next(iter(page._named))
+        page._layer.value = "error"
+        shows("error of")
+        page._layer.value, page._camera.value = "depth", "panorama"
+        page._frusta_shown.value = page._crop.value = True
+        shows()
+        view = run.scene.test[0]
+        page.go_to(view)
+        until(lambda: abs(page.asked().cam_from_world - view.cam_from_world).max() < 1e-6)
+        page._layer.value, page._camera.value = "colours", "perspective"
+        page._fov.value = 60
+        until(lambda: page.asked().look.fov == 60)
+        before = page.asked().cam_from_world
+        visit.drag("canvas[data-engine]", 80, 30)
+        until(lambda: abs(page.asked().cam_from_world - before).max() > 1e-3)
+        visit.page.screenshot(path=tmp_path / "page.png")
+        assert (tmp_path / "page.png").stat().st_size > 10_000
+        assert [text for text in visit.complaints if "THREE.Clock" not in text and "WebSocket" not in text] == []
 
 
 def test_without_viser_the_way_out_is_said(run, monkeypatch):

@@ -3,7 +3,7 @@ import time
 from dataclasses import replace
 
 import pytest
-from chromium import PROGRAM, Browser
+from chromium import in_chromium, visiting
 from made_up import compared, data_set, failed, gathered, small, swept, write
 
 from padgs.reports import store
@@ -87,53 +87,45 @@ def test_a_picture_that_was_cut_is_left_out(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(PROGRAM is None, reason="no Chromium here")
+@in_chromium
 def test_in_a_browser(html, tmp_path):
     (tmp_path / "report.html").write_text(html)
-    browser = Browser(tmp_path / "profile")
-    try:
-        browser.open(tmp_path / "report.html")
-        browser.wait("viewers.length === 2 && viewers.every(viewer => viewer.isLoaded())")
+    with visiting((tmp_path / "report.html").as_uri()) as visit:
+        page = visit.page
+        visit.wait("viewers.length === 2 && viewers.every(viewer => viewer.isLoaded())")
 
         first_cells = "[...document.querySelectorAll('#table1 tbody')].at(-1).querySelectorAll('td:first-child')"
         rows = f"[...{first_cells}].map(cell => cell.textContent)"
-        assert browser.run(rows)[0] == "EgoNeRF"
-        browser.run("[...document.querySelectorAll('#table1 table')].at(-1).id = 'last'")
+        assert page.evaluate(rows)[0] == "EgoNeRF"
         orders = []
         for _ in range(2):
-            browser.click("#last thead tr:last-child th:nth-child(3)")
-            orders.append(browser.run(rows))
+            page.locator("#table1 table").last.locator("thead tr:last-child th:nth-child(3)").click()
+            orders.append(page.evaluate(rows))
         assert {order[0] for order in orders} == {"EgoNeRF", "PaD-GS"} and orders[0] == orders[1][::-1]
 
-        browser.size(390, 844)
-        assert browser.run("document.documentElement.scrollWidth") == 390
-        browser.size(1400, 1000)
+        page.set_viewport_size({"width": 390, "height": 844})
+        assert page.evaluate("document.documentElement.scrollWidth") == 390
+        page.set_viewport_size({"width": 1400, "height": 1000})
 
-        before = browser.run("document.getElementById('slider').value")
-        browser.drag("#slider", 200, 0)
-        assert browser.run("document.getElementById('slider').value") > before + 5
+        before = page.evaluate("document.getElementById('slider').value")
+        visit.drag("#slider", 200, 0)
+        assert page.evaluate("document.getElementById('slider').value") > before + 5
 
         yaws = "viewers.map(viewer => viewer.getYaw())"
-        assert browser.run(yaws) == [0, 0]
-        browser.drag("#panorama-render", -150, 0)
-        browser.wait(f"{yaws}.every(yaw => yaw > 5)")
+        assert page.evaluate(yaws) == [0, 0]
+        visit.drag("#panorama-render", -150, 0)
+        visit.wait(f"{yaws}.every(yaw => yaw > 5)")
         time.sleep(1.5)  # inertia
-        truth, render = browser.run(yaws)
+        truth, render = page.evaluate(yaws)
         assert truth == pytest.approx(render, abs=0.5)
 
-        browser.run("document.getElementById('method').selectedIndex = 5")
-        browser.run("document.getElementById('method').dispatchEvent(new Event('change'))")
-        browser.wait("viewers.every(viewer => viewer.isLoaded())")
-        assert (
-            browser.run("document.querySelector('#slider [slot=second] figcaption').textContent")
-            == "EgoNeRF, PSNR 22.00 dB"
-        )
+        page.select_option("#method", index=5)
+        visit.wait("viewers.every(viewer => viewer.isLoaded())")
+        assert page.locator("#slider [slot=second] figcaption").text_content() == "EgoNeRF, PSNR 22.00 dB"
 
-        browser.point("#charts .tip")
-        browser.wait("!document.getElementById('tip').hidden")
-        assert "ms per frame" in browser.run("document.getElementById('tip').textContent")
+        page.locator("#charts .tip").first.hover(force=True)
+        visit.wait("!document.getElementById('tip').hidden")
+        assert "ms per frame" in page.locator("#tip").text_content()
 
-        assert browser.complaints == []
-        assert {url.partition(":")[0] for url in browser.requests} <= {"file", "blob", "data"}
-    finally:
-        browser.close()
+        assert visit.complaints == []
+        assert {url.partition(":")[0] for url in visit.requests} <= {"file", "blob", "data"}
