@@ -27,9 +27,14 @@ GROWN_PER_KEPT = 2  # Gaussians, where the budget says how many to keep
 PIXEL = 0.1  # square pixels; a pixel is the mean over a square, whose variance is 1/12
 
 
-def independent_pixels(view: View) -> float:
-    """As many pixels of equal solid angle as a panorama shows: W H times the mean cosine of the latitude, 2 / pi."""
-    return 2 * view.width * view.height / math.pi
+FEWEST_PIXELS = 2000.0  # panoramas of less than 80 x 40: many of them together show more than each
+
+
+def counted_pixels(view: View) -> float:
+    """What numbers of Gaussians are shares of: the pixels of equal solid angle that a panorama shows, W H times the
+    mean cosine of the latitude, 2 / pi; at least `FEWEST_PIXELS`.
+    """
+    return max(FEWEST_PIXELS, 2 * view.width * view.height / math.pi)
 
 
 class PlusMethod(SplatMethod):
@@ -56,7 +61,7 @@ class PlusMethod(SplatMethod):
         return self.trainee.is_drawn_no_finer
 
     def _start(self, scene: Scene, iterations: int) -> SplatTrainee:
-        options, pixels = self.options, independent_pixels(scene.train[0])
+        options, pixels = self.options, counted_pixels(scene.train[0])
         start, limit = (_within(share, pixels) for share in (options.start_share, options.limit_share))
         limit = fewest(options.max_gaussians, limit if self._target is None else self._target)
         generator = torch.Generator().manual_seed(self.seed)

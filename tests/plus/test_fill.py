@@ -8,7 +8,7 @@ import torch
 from tiny_scene import tiny_scene
 
 from padgs.plus.fill import filled
-from padgs.plus.method import PlusMethod, independent_pixels
+from padgs.plus.method import PlusMethod, counted_pixels
 from padgs.plus.options import PlusOptions
 from padgs.plus.sky import fibonacci_sphere
 from padgs.scene import Scene
@@ -114,7 +114,7 @@ def test_points_in_a_camera_say_nothing():
 
 def test_padgs_plus_starts_from_what_it_asks_for():
     scene = dome(8)
-    asked = round(PlusOptions().fill_share * independent_pixels(scene.train[0]))
+    asked = round(PlusOptions().fill_share * counted_pixels(scene.train[0]))
     for share, count in ((PlusOptions().fill_share, asked), (0.0, 8)):
         method = PlusMethod(PlusOptions(fill_share=share, sky_share=0.0), seed=0)
         started = len(method._start(scene, 10).splats)

@@ -7,20 +7,20 @@ from itertools import count, islice
 import pytest
 import torch
 from states import assert_same_but_time
-from tiny_scene import HEIGHT, WIDTH, tiny_scene
+from tiny_scene import tiny_scene
 
 from padgs import stopwatch
 from padgs.learning.budget import Budget
 from padgs.learning.loop import Record
 from padgs.learning.worth import needed, worth
-from padgs.plus.method import PlusMethod, independent_pixels
+from padgs.plus.method import FEWEST_PIXELS, PlusMethod, counted_pixels
 from padgs.plus.options import GROWN, ROUNDS, PlusOptions, between_rounds
 from padgs.plus.smoothness import roughness
 from padgs.scene import Scene
 from padgs.sphere.distortion import solid_angle_weight
 from padgs.splats.method import SplatMethod
 
-OPTIONS = PlusOptions(gradient_threshold=1e-6, start_share=None, limit_share=None)
+OPTIONS = PlusOptions(gradient_threshold=1e-6, start_share=None, limit_share=None, fill_share=0.0)
 
 
 def in_other_units(scene: Scene, scale: float) -> Scene:
@@ -105,9 +105,11 @@ def test_options_of_the_schedule_of_3dgs_are_refused_and_not_ignored():
 
 
 def test_pixels_are_counted_by_what_they_see():
-    view = tiny_scene().train[0]
-    weight = solid_angle_weight(HEIGHT).sum().item() * WIDTH  # 1 at the horizon
-    assert independent_pixels(view) == pytest.approx(weight, rel=0.01)
+    tiny = tiny_scene().train[0]
+    view = replace(tiny, width=256, height=128)
+    weight = solid_angle_weight(128).sum().item() * 256  # 1 at the horizon
+    assert counted_pixels(view) == pytest.approx(weight, rel=0.01)
+    assert counted_pixels(tiny) == FEWEST_PIXELS
 
 
 def test_the_units_of_the_world_do_not_matter():
@@ -120,11 +122,11 @@ def test_the_units_of_the_world_do_not_matter():
 
 
 def test_it_starts_with_a_share_of_the_pixels_and_stays_below_another():
-    options = replace(OPTIONS, start_share=0.05, limit_share=0.15, sky_share=0.5)
+    options = replace(OPTIONS, start_share=0.01, limit_share=0.03, sky_share=0.5, fill_share=0.0)
     method = PlusMethod(options)
     counts = [record.counts["gaussians"] for record in method.fit(tiny_scene(), Budget(32))]
-    pixels = independent_pixels(tiny_scene().train[0])
-    assert 0 <= method.start - round(0.05 * pixels) <= 0.025 * pixels + 1 and max(counts) <= round(0.15 * pixels)
+    assert 0 <= method.start - 0.01 * FEWEST_PIXELS <= 0.005 * FEWEST_PIXELS
+    assert max(counts) <= 0.03 * FEWEST_PIXELS
     assert max(counts) > counts[0]
 
 
