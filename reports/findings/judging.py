@@ -112,8 +112,8 @@ def judge(claim: Claim, gathered: Gathered) -> Judgement:
     """Weigh a claim: it holds where a line speaks for it beyond the noise of the seeds, and none against it.
 
     On each scene the longest runs count. The half-width of a line is t s / √n; s, the spread over seeds, and its
-    degrees of freedom are pooled over the lines of the claim, and t is for as many tests as there are rivals, because
-    the best of many is partly lucky.
+    degrees of freedom are pooled over the scenes of the claim, shorter runs included, which more seeds can afford; and
+    t is for as many tests as there are rivals, because the best of many is partly lucky.
 
     Raises:
         ReportError: results that must not stand together.
@@ -123,14 +123,17 @@ def judge(claim: Claim, gathered: Gathered) -> Judgement:
     if claim.dataset:
         runs = runs.loc[runs["dataset"] == claim.dataset]
     lines: list[Line] = []
+    spreads: list[Cell] = []
     used: list[int] = []
-    for where, own in _conditions(runs, claim):
+    for where, own, longest in _conditions(runs, claim):
         refuse_mixture(own, gathered.request, f"{claim.text}, {where}", ("protocol",))
         ours, rivals = _sides(claim, own, where)
         if rivals and (advantages := _advantages(claim, ours, rivals[0].runs)):
-            lines.append(Line(where, len(rivals), rivals[0].title, spread(advantages)))
-            used += [*ours.index, *(index for rival in rivals for index in rival.runs.index)]
-    variance, freedom = pooled_variance([line.advantage for line in lines])
+            spreads.append(spread(advantages))
+            if longest:
+                lines.append(Line(where, len(rivals), rivals[0].title, spreads[-1]))
+                used += [*ours.index, *(index for rival in rivals for index in rival.runs.index)]
+    variance, freedom = pooled_variance(spreads)
     if freedom:
         lines = [
             replace(line, half_width=quantile(freedom, line.rivals) * math.sqrt(variance / line.advantage.count))
@@ -155,18 +158,17 @@ def in_the_paper(claim: Claim, numbers: Mapping[Key, Published]) -> dict[str, fl
     return found
 
 
-def _conditions(runs: DataFrame, claim: Claim) -> Iterator[tuple[str, DataFrame]]:
-    """The longest runs of each scene in which both sides meet, and where that is."""
+def _conditions(runs: DataFrame, claim: Claim) -> Iterator[tuple[str, DataFrame, bool]]:
+    """The runs of each scene and length in which both sides meet, where that is, and whether none is longer."""
     shared = ["resolution", "data", *claim.apart, *(["machine"] if claim.quotient else [])]
     for (place, resolution, *_), own in grouped(runs, "place", *shared) if len(runs) else ():
         ours, others = (set(side.of(own)["length"]) for side in (claim.ours, claim.others))
-        if not ours & others:
-            continue
-        longest = own.loc[own["length"].isin(ours & others), "iterations"].idxmax()
-        length = str(own.at[longest, "length"])
+        both = own.loc[own["length"].isin(ours & others)].sort_values("iterations", kind="stable")
         words = [f"{column.rpartition('.')[2]} {own[column].iloc[0]}" for column in claim.apart]
-        where = ", ".join([place.scene, resolution, length, *words])
-        yield where, own.loc[own["length"] == length]
+        lengths = list(dict.fromkeys(both["length"]))
+        for length in lengths:
+            where = ", ".join([place.scene, resolution, str(length), *words])
+            yield where, own.loc[own["length"] == length], length == lengths[-1]
 
 
 def _sides(claim: Claim, runs: DataFrame, where: str) -> tuple[DataFrame, list[Setting]]:

@@ -27,9 +27,10 @@ makes this page: verdicts and numbers follow from rules (`reports/findings`), on
 
 Every number says by how much the side that the claim favours is better than the best of the others: a difference, or
 for costs a quotient (×). Behind ours stands the half-width of its {CONFIDENCE:.0%} interval: Student's t over pairs of
-runs with the same seed, the spread pooled over the scenes of a claim, corrected for the number of others (Bonferroni).
-A claim *holds* where a scene is beyond its interval on the claim's side and none on the other, *does not hold* where it
-is the reverse, *depends on the scene* where both are, and is a *tie* where none is beyond.
+runs with the same seed, corrected for the number of others (Bonferroni). The longest runs of a scene are shown; the
+spread is pooled over all scenes and lengths of a claim, for shorter runs have more seeds. A claim *holds* where a scene
+is beyond its interval on the claim's side and none on the other, *does not hold* where it is the reverse, *depends on
+the scene* where both are, and is a *tie* where none is beyond.
 """
 
 

@@ -95,6 +95,16 @@ def test_the_longest_runs_of_a_scene_count_and_other_experiments_do_not():
     assert verdict(long, elsewhere) is Verdict.HOLDS
 
 
+def test_one_long_run_is_judged_by_the_spread_of_short_ones():
+    short = [*runs([-1, -1.1, -0.9]), *runs([0] * 3, "omnigs")]
+    long = [*runs([1], iterations=7000), *runs([0], "omnigs", iterations=7000)]
+    assert verdict(long) is Verdict.UNDECIDED
+    (line,) = judge(claim(), gathered([*short, *long])).lines
+    (three,) = judge(claim(), gathered(short)).lines
+    assert "7000" in line.where and line.advantage.value == pytest.approx(1)
+    assert line.half_width == pytest.approx(math.sqrt(3) * three.half_width)
+
+
 def test_sides_are_told_apart_by_keys_and_meet_where_columns_agree():
     made = [
         run
