@@ -45,7 +45,9 @@ class Asked:
 class Page:
     """A client of viser with its controls; `start` draws for it until it leaves."""
 
-    def __init__(self, client: Any, galleries: Sequence[Gallery], box: Box, drawing: threading.Lock) -> None:
+    def __init__(
+        self, client: Any, galleries: Sequence[Gallery], box: Box, drawing: threading.Lock, *, may_stop: bool
+    ) -> None:
         """Lay out the controls.
 
         Args:
@@ -53,6 +55,7 @@ class Page:
             galleries: one run, or two.
             box: what is cropped to at first.
             drawing: held while a picture is drawn: pages share the processor.
+            may_stop: whether it may end training, the only thing that a page can do to a run.
         """
         self._client, self._galleries, self._drawing = client, tuple(galleries), drawing
         self._changed, self._left = threading.Event(), threading.Event()
@@ -74,6 +77,10 @@ class Page:
         if any(gallery.run.result is None for gallery in galleries):
             follow = gui.add_checkbox("follow training", initial_value=any(gallery.follows for gallery in galleries))
             follow.on_update(lambda _: self._follow(follow.value))
+            if may_stop:
+                gui.add_button("stop and score", hint="end training now").on_click(
+                    lambda _: self._ask_whether_to_stop()
+                )
         with gui.add_folder("crop", expand_by_default=False):
             able = all(gallery.crops for gallery in galleries)
             self._crop = gui.add_checkbox("crop", initial_value=False, disabled=not able)
@@ -128,6 +135,15 @@ class Page:
     def _follow(self, follows: bool) -> None:
         for gallery in self._galleries:  # of all pages
             gallery.follows = follows
+
+    def _ask_whether_to_stop(self) -> None:
+        gui = self._client.gui
+        with gui.add_modal("End training now?") as question:
+            gui.add_markdown("It fades out and is scored after fewer iterations than planned.")
+            end, go_on = gui.add_button("end training"), gui.add_button("go on training")
+        end.on_click(lambda _: [gallery.stop() for gallery in self._galleries])
+        for answer in (end, go_on):
+            answer.on_click(lambda _: question.close())
 
     def _frustum(self, view: View) -> Any:
         frustum = self._client.scene.add_camera_frustum(

@@ -61,6 +61,11 @@ class Gallery:
         facts = counts if self.run.result is not None else f"{counts} after {self.run.iteration} iterations"
         return f"{facts}; not followed: {self._trouble}" if self._trouble else facts
 
+    def stop(self) -> None:
+        """Ask a run in training to end now and be scored; nothing to one that is finished."""
+        if self.run.result is None:
+            self.run.files.stop.touch()
+
     def follow(self) -> bool:
         """Show what training has come to since, or why that cannot be shown; whether there is anything new."""
         trouble, run = "", None

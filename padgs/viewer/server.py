@@ -18,6 +18,7 @@ from padgs.runs.opened import OpenedRun
 from padgs.viewer.page import Page
 from padgs.viewer.picture import Box, Gallery
 
+LOCAL = "127.0.0.1"
 EVERY = 1.0  # seconds between two looks at whether there is a newer checkpoint
 
 
@@ -30,14 +31,15 @@ class Serving:
 
 
 @contextmanager
-def serving(runs: Sequence[OpenedRun], *, host: str = "127.0.0.1", port: int = 8080) -> Iterator[Serving]:
-    """Serve one run, or two to compare, to any number of browsers, which change nothing; until the context ends.
+def serving(runs: Sequence[OpenedRun], *, host: str = LOCAL, port: int = 8080) -> Iterator[Serving]:
+    """Serve one run, or two to compare, to any number of browsers, until the context ends. They change nothing, but
+    may end training where only this machine is served.
 
     A run in training is shown as its last checkpoint has it, and followed.
 
     Args:
         runs: of one scene, the first one's.
-        host: 127.0.0.1 is this machine alone.
+        host: `LOCAL` is this machine alone.
         port: the first to try; the next free one is taken.
 
     Raises:
@@ -58,11 +60,11 @@ def serving(runs: Sequence[OpenedRun], *, host: str = "127.0.0.1", port: int = 8
     server.initial_camera.look_at = center + 0.3 * scene.unit * first.cam_from_world[2, :3].cpu().numpy()
     server.initial_camera.up = up
     box, drawing = box_of(scene.points), threading.Lock()
-    found = Serving(f"http://{'localhost' if host == '127.0.0.1' else host}:{server.get_port()}")
+    found = Serving(f"http://{'localhost' if host == LOCAL else host}:{server.get_port()}")
 
     @server.on_client_connect
     def _(client: Any) -> None:
-        page = found.pages[client.client_id] = Page(client, galleries, box, drawing)
+        page = found.pages[client.client_id] = Page(client, galleries, box, drawing, may_stop=host == LOCAL)
         page.start()
 
     @server.on_client_disconnect

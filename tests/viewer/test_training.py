@@ -11,6 +11,7 @@ from urllib.request import urlopen
 
 import numpy as np
 import pytest
+from chromium import in_chromium, visiting
 from tiny_run import tiny_run
 
 import padgs
@@ -76,6 +77,31 @@ def test_a_run_in_training_is_followed_until_told_not_to(folder):
 def test_a_finished_run_is_not_followed(tmp_path_factory):
     gallery = Gallery(padgs.load_run(tiny_run(tmp_path_factory), device="cpu"))
     assert not gallery.follows and "iterations" not in gallery.facts
+    gallery.stop()
+    assert not gallery.run.files.stop.exists(), "nor ended: the next run of that name would end at once"
+
+
+@WITH_VISER
+@pytest.mark.slow
+@in_chromium
+@pytest.mark.parametrize("host", [server.LOCAL, "0.0.0.0"])
+def test_training_is_ended_from_a_page_on_this_machine_only(folder, host):
+    run = padgs.load_run(folder, device="cpu")
+    with server.serving([run], host=host, port=8460) as serving, visiting(serving.address) as visit:
+        visit.wait("document.body.innerText.includes('follow training')")
+        if host != server.LOCAL:
+            visit.page.wait_for_timeout(500)
+            assert "stop and score" not in visit.page.inner_text("body")
+            return
+        for answer in ("go on training", "end training"):
+            assert not (folder / "stop").exists()
+            visit.page.get_by_role("button", name="stop and score").click()
+            visit.page.get_by_role("button", name=answer).click()
+            visit.wait("!document.body.innerText.includes('End training now?')")
+        end = time.monotonic() + 20
+        while not (folder / "stop").exists():
+            assert time.monotonic() < end, "training was not asked to end"
+            time.sleep(0.05)
 
 
 @dataclass
