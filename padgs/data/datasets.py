@@ -100,7 +100,7 @@ def refuse_missing(path: Path, dataset: str | None) -> None:
     likely.sort(key=lambda key: DATASETS[key].title.casefold() != path.parent.name.casefold())  # "center" is in two
     key = dataset or (likely[0] if likely else None)
     if key is None:
-        raise DataError(f"there is no {path.absolute()}; set data.path to a folder with panoramas and their poses")
+        raise DataError(f"there is no {path.absolute()}; give the folder of panoramas and their poses")
     known = lookup_dataset(key)
     if path.name not in known.scenes:
         raise DataError(

@@ -86,7 +86,7 @@ def test_points_from_elsewhere(folder: Path) -> None:
 
 
 def test_nothing_where_a_scene_should_be(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"there is no .*absent; set data.path to a folder"):
+    with pytest.raises(DataError, match=r"there is no .*absent; give the folder of"):
         load(tmp_path / "absent")
     (tmp_path / "photo.jpg").touch()
     with pytest.raises(DataError, match=r"no known format; it holds photo.jpg. Known are .*`padgs prepare IMAGES"):
