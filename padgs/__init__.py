@@ -30,7 +30,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 _HOMES = {
     "load_scene": ("padgs.data", "load"),
     "make_method": ("padgs.multirun.composition", "make_method"),
-    "Budget": ("padgs.learning.loop", "Budget"),
+    "Budget": ("padgs.learning.budget", "Budget"),
     "draw": ("padgs.runs.opened", "draw"),
     "load_run": ("padgs.runs.opened", "load_run"),
     "distortion_map": ("padgs.sphere.distortion", "distortion_map"),

@@ -23,7 +23,10 @@ SCHEMA = 2
 ADDED = {"peak_device_memory_bytes", "need", "ended"}  # since then: files without are read, with the default
 FILE_NAME = "result.json"
 LOG_NAME, CONFIG_NAME = "log.jsonl", "config.yaml"
-NEED_PICTURE = "need.png"  # truth | whole model | smallest for 0.1 dB | for 1 dB, of a test view, beside the result
+NEED_LOSSES = (0.05, 0.1, 0.25, 0.5, 1.0)  # dB, for each of which `padgs need` finds the smallest model
+NEED_STATED = 0.1  # of these, the one that is put into one number, and whose model is kept if no other is asked for
+NEED_PICTURED = (NEED_STATED, 1.0)
+NEED_PICTURE = "need.png"  # truth | whole model | smallest for each of NEED_PICTURED, of a test view, beside the result
 PICTURES = "renders"  # folder of truth | render | error of each test view, in one picture
 STATUSES = {
     "ok": "trained to the end and evaluated",

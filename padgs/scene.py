@@ -116,9 +116,14 @@ class Scene:
 
     @cached_property
     def extent(self) -> float:
-        """What 3DGS measures with, in world units: 1.1 x the largest distance of a training camera from their mean."""
+        """What 3DGS measures with, in world units: 1.1 x `spread`."""
+        return 1.1 * self.spread
+
+    @cached_property
+    def spread(self) -> float:
+        """The largest distance of a training camera from their mean, world units."""
         centers = torch.stack([view.center for view in self.train])
-        return 1.1 * (centers - centers.mean(0)).norm(dim=-1).max().item()
+        return (centers - centers.mean(0)).norm(dim=-1).max().item()
 
     @property
     def stands_still(self) -> bool:

@@ -155,7 +155,7 @@ def _length(result: Result) -> str:
 def _learning_rates(result: Result) -> Any:
     """The choice of `train.learning_rates`, as far as it decides anything; None for methods that have but one."""
     choice = result.config.get("train", {}).get("learning_rates", "published")  # older runs had no choice
-    if result.method == "egonerf":
+    if result.method == "egonerf" or not result.iterations:  # one of seconds that failed before its first
         return None
     return "published" if choice == 1 or (choice == "run" and law(result.iterations) == 1) else choice
 

@@ -13,10 +13,10 @@ from pandas import DataFrame
 from padgs.reports import methods
 from padgs.reports.gathered import Gathered
 from padgs.reports.settings import settings
-from padgs.results import NEED_PICTURE
+from padgs.results import NEED_LOSSES, NEED_PICTURE, NEED_STATED
 
-EPSILONS = ("0.05", "0.1", "0.25", "0.5", "1")  # dB, as results name them
-STATED = "0.1"  # of the need that is put into one number
+EPSILONS = tuple(f"{loss:g}" for loss in NEED_LOSSES)  # dB, as results name them
+STATED = f"{NEED_STATED:g}"
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,6 @@ from padgs.sphere.distortion import OMEGA_AXES, distortion, opacity_factor, pola
 
 OMEGA_INPUTS = ("sin2", "cos")
 DISTANCE_UNITS = ("scene", "world")
-PUBLISHED_VOXEL_SIZES = {"360roam": 0.001, "ricoh360": 0.005}  # units of those data sets' own reconstructions
 TINY = 1e-6  # scene units; keeps directions finite for a camera exactly on an anchor
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import nn
 
+from padgs.learning.budget import Budget
 from padgs.learning.schedule import ParameterGroup
 from padgs.learning.trainee import Drawing, Parts, Size, State
 from padgs.scene import Scene, View
@@ -111,6 +112,15 @@ class CalibratedMethod(SplatMethod):
     @property
     def _views_learn(self) -> bool:
         return True
+
+    def refuse_budget(self, budget: Budget) -> None:
+        """Nobody knows where to draw from what the training views would miss."""
+        super().refuse_budget(budget)
+        if budget.gaussians == "auto":
+            raise ValueError(
+                "budget.gaussians is auto, which draws training views without what might go, but cameras learn along "
+                "here; set it to a number or null"
+            )
 
     def _start(self, scene: Scene, iterations: int) -> SplatTrainee:
         self._calibration = self._as_given(scene)

@@ -19,7 +19,7 @@ def export(
     smooth: Annotated[
         bool, typer.Option("--smooth", help="as wide as photographs saw them, for viewers; .html always is")
     ] = False,
-    lessons: Annotated[int, typer.Option(help="iterations of PaD-GS's baked anchors on own pictures")] = 300,
+    lessons: Annotated[int | None, typer.Option(help="iterations of PaD-GS's baked anchors on own pictures")] = None,
     data: DataPath = None,
 ) -> None:
     """Write a run's Gaussians, by default into its folder as splats.ply (--points: points.ply).
@@ -34,13 +34,15 @@ def export(
     from rich.console import Console
 
     from padgs.data.ply import write_ply
-    from padgs.export.explicit import exported, point_cloud
+    from padgs.export.explicit import LESSONS, exported, point_cloud
     from padgs.export.splat_file import refuse_impossible, write_splats
 
+    lessons = LESSONS if lessons is None else lessons
     path = Path(to) if to else Path(run) / ("points.ply" if points else "splats.ply")
     if points and path.suffixes != [".ply"]:
         raise ValueError(f"{path} is no plain .ply, which point clouds are written as")
     refuse_impossible(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
     with Console().status("opening the run") as status:
         found = exported(
             opened(run, data),

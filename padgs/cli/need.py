@@ -7,19 +7,20 @@ from typing import Annotated
 import typer
 
 from padgs.cli.refusing import refusing
-from padgs.need import STATED
+from padgs.results import NEED_LOSSES, NEED_STATED
+
+KNOWN = ", ".join(f"{loss:g}" for loss in NEED_LOSSES)
 
 
 def need(
     run: Annotated[str, typer.Argument(help="folder of a finished run, as padgs-run names it at its end")],
-    epsilon: Annotated[float, typer.Option(help="dB that the kept model may lose: 0.05, 0.1, 0.25, 0.5, 1")] = STATED,
+    epsilon: Annotated[float, typer.Option(help=f"dB that the kept model may lose: {KNOWN}")] = NEED_STATED,
     data: Annotated[str, typer.Option(help="where the data set is now, if not where it was")] = "",
     device: Annotated[str, typer.Option(help="auto, cpu or cuda")] = "auto",
 ) -> None:
     """Find the smallest model as good as a trained one, for several losses; keep one as a run of its own."""
     from rich.console import Console
 
-    from padgs.need.search import EPSILONS
     from padgs.need.searching import search
     from padgs.runs.interrupt import INTERRUPTED, Interrupted
     from padgs.runs.opened import load_run
@@ -27,10 +28,9 @@ def need(
     console = Console(highlight=False, soft_wrap=True)
     try:
         with refusing(OSError, RuntimeError, ValueError):
-            if epsilon not in EPSILONS:
-                known = ", ".join(f"{known:g}" for known in EPSILONS)
+            if epsilon not in NEED_LOSSES:
                 rule = "must be > 0" if not epsilon > 0 else "is none of those that are searched for"
-                raise ValueError(f"--epsilon is {epsilon:g}; it {rule}: {known}")
+                raise ValueError(f"--epsilon is {epsilon:g}; it {rule}: {KNOWN}")
             opened = load_run(run, data_path=data or None, device=device)
             if opened.result is None or not opened.result.ok:
                 state = "not finished" if opened.result is None else f"of status {opened.result.status}"

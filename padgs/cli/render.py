@@ -18,9 +18,11 @@ def render(
         str, typer.Option(help="cameras, orbit, dolly, or a JSON: keyframes, nerfstudio's path")
     ] = "cameras",
     camera: Annotated[str, typer.Option(help="panorama or perspective")] = "panorama",
-    fov: Annotated[float, typer.Option(help="degrees across a perspective picture")] = 90.0,
+    fov: Annotated[float | None, typer.Option(help="degrees across a perspective picture; 90 if not said")] = None,
     width: Annotated[int, typer.Option(help="pixels; 0: the run's, for a perspective half as many")] = 0,
-    height: Annotated[int, typer.Option(help="pixels of a perspective picture; 0: 9/16 of the width")] = 0,
+    height: Annotated[
+        int | None, typer.Option(help="pixels of a perspective picture; 9/16 of the width if not said")
+    ] = None,
     seconds: Annotated[float | None, typer.Option(help="length; 10 if not said, or what a camera path has")] = None,
     fps: Annotated[float, typer.Option(help="frames per second")] = 30.0,
     depth: Annotated[bool, typer.Option("--depth", help="also write depth, beside the colours")] = False,
@@ -41,6 +43,8 @@ def render(
 
     if camera not in ("panorama", "perspective"):
         raise ValueError(f"unknown camera {camera!r}; known: panorama, perspective")
+    if camera == "panorama" and (fov is not None or height is not None):
+        raise ValueError("--fov and --height are of perspective pictures: add --camera perspective")
     if not (fps > 0 and (seconds is None or seconds > 0)):
         raise ValueError(f"a film of {seconds} seconds at {fps} frames per second has no frame; both must be > 0")
     with Console().status("opening the run") as status:
@@ -51,7 +55,7 @@ def render(
             lens = Panorama(width or trained.width, (width or trained.width) // 2)
         else:
             width = width or trained.width // 2
-            lens = perspective(width, height or 2 * round(width * 9 / 32), fov)
+            lens = perspective(width, height or 2 * round(width * 9 / 32), 90.0 if fov is None else fov)
         frames = None if seconds is None else max(2, round(seconds * fps))
         if path in PATHS:
             poses = PATHS[path](scene, frames or max(2, round(10 * fps)))

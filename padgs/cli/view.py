@@ -14,12 +14,16 @@ from padgs.cli.refusing import refusing
 def view(
     run: Run,
     beside: Annotated[str, typer.Option(help="another run of the same scene, to compare with")] = "",
-    port: Annotated[int, typer.Option(help="the first one to try")] = 8080,
-    host: Annotated[str, typer.Option(help="0.0.0.0 shows it to the whole network, without a password")] = "127.0.0.1",
+    port: Annotated[int | None, typer.Option(help="the first one to try; 8080 if not said")] = None,
+    host: Annotated[
+        str | None,
+        typer.Option(help="0.0.0.0 shows it to the whole network, without a password; else this machine only"),
+    ] = None,
     data: DataPath = None,
 ) -> None:
     """Walk through a run in the browser, drawn here by the run's own renderer; one in training is followed."""
     from padgs.viewer.process import await_checkpoint, serve
+    from padgs.viewer.server import LOCAL, PORT
 
     runs = []
     try:
@@ -29,6 +33,6 @@ def view(
         if beside and runs[0].scene.name != runs[1].scene.name:
             names = " and ".join(found.scene.name for found in runs)
             raise ValueError(f"{run} and {beside} are of two scenes, {names}; name two runs of one scene")
-        serve(runs, host=host, port=port)
+        serve(runs, host=host or LOCAL, port=port or PORT)
     except KeyboardInterrupt:
         print()

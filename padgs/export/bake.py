@@ -17,6 +17,7 @@ from torch import Tensor
 from padgs.anchors.model import PaDGS
 from padgs.gaussians import Gaussians, rotation_matrices
 from padgs.learning.budget import Budget
+from padgs.learning.extent import ExtentOptions
 from padgs.learning.loop import Trainer, TrainOptions
 from padgs.learning.trainee import Drawing
 from padgs.render import Rendering, RenderOptions, render
@@ -166,7 +167,7 @@ def teach(
         progress: called with the number of those that are done.
     """
     lessons = tuple(replace(view, load_pixels=_Picture(show, view), load_mask=None) for view in scene.train)
-    pupil = Pupil(splats, config, scene.extent, steps)
+    pupil = Pupil(splats, config, ExtentOptions().extent_of(scene), steps)
     for record in Trainer(pupil, replace(scene, train=lessons), Budget(steps), LESSON).records():
         progress(record.iteration)
 

@@ -95,10 +95,10 @@ def exported(
 
 
 def _middle(views: Sequence[View], unit: float) -> Tensor:
-    """Centre [3] of the view nearest to the middle of all, and a point before it, one `unit` away."""
-    centres = torch.stack([view.center.double() for view in views])
+    """Centre [3] of the view nearest to the middle of all, and a point before it, one `unit` away; on the CPU."""
+    centres = torch.stack([view.center.double().cpu() for view in views])
     number = int((centres - centres.mean(0)).norm(dim=-1).argmin())
-    ahead = views[number].cam_from_world[2, :3].double()
+    ahead = views[number].cam_from_world[2, :3].double().cpu()
     return torch.stack((centres[number], centres[number] + unit * ahead))
 
 

@@ -138,5 +138,4 @@ def _write_ply(path: Path, splats: Splats, comments: Sequence[str]) -> None:
     table = torch.cat(rows, dim=1).detach().float().cpu().contiguous().numpy()
     names = (*_FIRST, *(f"f_rest_{number}" for number in range(rest.shape[1])), *_LAST)
     vertex = table.view([(name, "<f4") for name in names])[:, 0]
-    path.parent.mkdir(parents=True, exist_ok=True)
     PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<", comments=list(comments)).write(str(path))

@@ -63,7 +63,12 @@ def _keyframe(entry: dict[str, Any], up: Any) -> Tensor:
     if "cam_from_world" in entry:
         return _rigid(np.array(entry["cam_from_world"], dtype=np.float64).reshape(1, 4, 4))
     place, target = (np.array([entry[name]], dtype=np.float64).reshape(1, 3) for name in ("position", "look_at"))
-    return looking(place, target - place, np.array(up, dtype=np.float64))
+    up = np.array(up, dtype=np.float64).reshape(3)
+    if not np.isfinite([*place, *target, up]).all():
+        raise ValueError(f"position, look_at or up is not finite: {place[0]}, {target[0]}, {up}")
+    if (place == target).all() or not up.any():
+        raise ValueError(f"position and look_at are both {place[0]}, or up is 0: neither says where to look")
+    return looking(place, target - place, up / np.linalg.norm(up))
 
 
 def _nerfstudio(cameras: list[dict[str, Any]], transforms: Path) -> Tensor:
@@ -79,6 +84,8 @@ def _nerfstudio(cameras: list[dict[str, Any]], transforms: Path) -> Tensor:
 
 def _rigid(poses: np.ndarray) -> Tensor:
     turns = poses[:, :3, :3]
+    if not np.isfinite(poses).all():
+        raise ValueError("a pose is not finite")
     if not np.allclose(turns @ turns.swapaxes(1, 2), np.eye(3), atol=1e-3) or np.linalg.det(turns).min() < 0:
         raise ValueError("a pose has a 3x3 part that is not a rotation")
     return torch.from_numpy(poses)

@@ -62,7 +62,7 @@ def orbit(scene: Scene, frames: int) -> Tensor:
     angles = 2 * np.pi * np.arange(frames) / frames
     side = np.cross(ahead, up)
     out = np.cos(angles)[:, None] * side - np.sin(angles)[:, None] * ahead
-    radius = scene.extent / 1.1 * ORBIT if not scene.stands_still else ALONE * scene.unit
+    radius = ORBIT * scene.spread if not scene.stands_still else ALONE * scene.unit
     return looking(middle + radius * out, -out, up)
 
 

@@ -200,11 +200,6 @@ class Method(ABC):
                 "budget.stop is auto, which measures on views that are set apart, but exposures or cameras learn along "
                 "here, and those of such views do not; set it to end"
             )
-        if budget.gaussians == "auto" and self._views_learn:
-            raise ValueError(
-                "budget.gaussians is auto, which draws training views without what might go, but exposures or cameras "
-                "learn along here; set it to a number or null"
-            )
 
     def refuse_search(self) -> None:
         """Refuse the search for the smallest model (`padgs.need`) on any scene; subclasses know more.
@@ -267,7 +262,9 @@ class Method(ABC):
         """
         assert budget.seconds is not None
         random, first = torch.get_rng_state(), 0.0
-        short = replace(budget, iterations=PUBLISHED_ITERATIONS, seconds=None, gaussians=None, stop="end")
+        short = replace(
+            budget, iterations=PUBLISHED_ITERATIONS, seconds=None, max_seconds=None, gaussians=None, stop="end"
+        )
         one = replace(scene, train=scene.train[:1])
         trainer = self._trained_by(self._begun(scene, short.iterations), one, short, nullcontext)
         for record in trainer.records():

@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from padgs.learning.method import Method
 from padgs.multirun.choices import register_choices
 from padgs.multirun.overrides import lenient, root
-from padgs.runs.config import RunConfig, config_from_values
+from padgs.runs.config import DEFAULT_METHOD, RunConfig, config_from_values
 from padgs.runs.identity import labels
 from padgs.runs.session import build
 
@@ -53,7 +53,7 @@ def typed_config(composed: DictConfig, choices: Mapping[str, object]) -> RunConf
     return config_from_values(values, labels(choices))
 
 
-def make_method(name: str = "padgs_plus", *settings: str) -> Method:
+def make_method(name: str = DEFAULT_METHOD, *settings: str) -> Method:
     """An untrained method, as `padgs-run method=NAME SETTINGS` would train it.
 
     Args:

@@ -60,6 +60,8 @@ class FinishedJobs:
                 file.write(json.dumps(entry) + "\n")
 
     def _entry(self, overrides: Sequence[str]) -> dict[str, Any] | None:
+        if any(re.match(r"\+*init[.=]", text) for text in overrides):  # that run may have another model by now
+            return None
         entry = self._known.get(key(overrides))
         if entry is None or (written := _written(self._runs / entry["run"])) is None or entry["written"] != written:
             return None

@@ -18,8 +18,7 @@ from padgs.learning.stopping import set_apart
 from padgs.multirun.board import CRASHED, ELSEWHERE, REFUSED, STOPPED, Board, BoardEntry
 from padgs.multirun.composition import typed_config
 from padgs.multirun.finished import FinishedJobs
-from padgs.need import STATED
-from padgs.results import Result
+from padgs.results import NEED_STATED, Result
 from padgs.runs.checkpoint import CheckpointError
 from padgs.runs.config import RunConfig
 from padgs.runs.folder import RunFolderError
@@ -90,13 +89,14 @@ def done(config: RunConfig, console: Console, watch: Watch) -> Result:
     session = Session(config, console, watch)
     if config.need == "on":
         set_apart(session.scene.train)  # refuses too few views before hours of training
-    with shown(session.folder.path, config.data.path) if config.run.view else nullcontext():
+    page = shown(session.folder.path, config.data.path, config.run.device) if config.run.view else nullcontext()
+    with page:
         result = session.run()
     if config.need == "on" and result.ok:
         from padgs.need.searching import search  # scipy.stats, which other runs need not wait for
 
         run = load_run(session.folder.path, data_path=config.data.path, device=config.run.device)
-        search(run, STATED, console, watch.stop_requested)
+        search(run, NEED_STATED, console, watch.stop_requested)
     return result
 
 

@@ -14,12 +14,11 @@ import torch
 from PIL import Image
 
 from padgs.learning.trainee import MODEL, State
-from padgs.need import STATED
 from padgs.need.calibration import PERCEPTION, QUALITY
 from padgs.need.files import files
-from padgs.need.search import EPSILONS, Step, against, degrees, knee, loss, smallest
+from padgs.need.search import Step, against, degrees, knee, loss, smallest
 from padgs.need.session import Search
-from padgs.results import NEED_PICTURE, Result
+from padgs.results import NEED_LOSSES, NEED_PICTURE, NEED_PICTURED, Result
 from padgs.runs.folder import PROGRESS, Progress, RunFolder
 from padgs.runs.identity import config_hash, identity
 from padgs.runs.scoring import frame_times, scores
@@ -28,7 +27,6 @@ from padgs.scoring.pictures import eight_bit
 
 ADAM = "adam/"  # moments of the run's own rows, which a pruned model does not have
 EXPERIMENT = "need"
-PICTURED = (STATED, 1.0)  # dB
 
 
 def need(search: Search) -> dict[str, Any]:
@@ -42,7 +40,7 @@ def need(search: Search) -> dict[str, Any]:
     """
     steps = search.steps
     sizes = [number for number, step in enumerate(steps) if step.kind != "degree"]  # these come first
-    needs = {f"{epsilon:g}": smallest(steps, epsilon) for epsilon in EPSILONS}
+    needs = {f"{epsilon:g}": smallest(steps, epsilon) for epsilon in NEED_LOSSES}
     return {
         "row": search.row,
         "rows": search.rows,
@@ -64,7 +62,7 @@ def _told(steps: Sequence[Step], number: int) -> dict[str, Any]:
     numbers = {name: value for name, value in asdict(step).items() if name not in ("marks", "test")}
     numbers |= {"loss": loss(steps, number), "ws_psnr": step.marks.metrics[QUALITY]}
     numbers |= {"lpips": step.marks.metrics.get(str(PERCEPTION)), "test_ws_psnr": step.test.get(QUALITY)}
-    return numbers | {"objections": {f"{epsilon:g}": list(against(steps, number, epsilon)) for epsilon in EPSILONS}}
+    return numbers | {"objections": {f"{epsilon:g}": list(against(steps, number, epsilon)) for epsilon in NEED_LOSSES}}
 
 
 def keep(search: Search, epsilon: float) -> Result:
@@ -132,6 +130,6 @@ def keep(search: Search, epsilon: float) -> Result:
 def _side_by_side(search: Search, path: Path) -> None:
     """The middle test view: its photograph, the run's model, and what is left of that for two losses."""
     view = search.run.scene.test[len(search.run.scene.test) // 2]
-    steps = (search.model_of(smallest(search.steps, epsilon)) for epsilon in PICTURED)
+    steps = (search.model_of(smallest(search.steps, epsilon)) for epsilon in NEED_PICTURED)
     images = [view.image(), *(model.render(view).image for model in (search.run.method, *steps))]
     Image.fromarray(np.concatenate([eight_bit(image) for image in images], axis=1)).save(path)

@@ -19,9 +19,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from padgs.need.calibration import QUALITY, differences, objections
-from padgs.results import Scores
+from padgs.results import NEED_LOSSES, Scores
 
-EPSILONS = (0.05, 0.1, 0.25, 0.5, 1.0)  # dB
 KEPT = 0.7  # of the rows, in a step down; with more gone at once their removals no longer add up
 CLOSE = 1.2  # two sizes this close are told apart no further
 FEWEST_ROWS = 10
@@ -98,7 +97,7 @@ def smallest(steps: Sequence[Step], epsilon: float) -> int:
     return [number for number in models(steps) if not against(steps, number, epsilon)][-1]
 
 
-def plan(steps: Sequence[Step], epsilons: Sequence[float] = EPSILONS) -> Plan | None:
+def plan(steps: Sequence[Step], epsilons: Sequence[float] = NEED_LOSSES) -> Plan | None:
     """What to make next; None where all is known."""
     if not steps:
         return Plan("waste", None)

@@ -18,7 +18,7 @@ def search(run: OpenedRun, epsilon: float, console: Console, asked: Callable[[],
 
     Args:
         run: a finished one.
-        epsilon: one of `padgs.need.search.EPSILONS`.
+        epsilon: one of `padgs.results.NEED_LOSSES`.
         console: where it is said.
         asked: whether to stop, besides signals.
 

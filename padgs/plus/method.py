@@ -42,7 +42,7 @@ class PlusMethod(SplatMethod):
 
     Options = PlusOptions
     TRAINEE = PlusTrainee
-    RENDER = RenderConfig(projection="ray", low_pass=PIXEL, near=0.05)
+    RENDER = RenderConfig(projection="ray", low_pass=PIXEL)
     TRAIN = TrainOptions(weight="solid_angle")
 
     @property

@@ -46,7 +46,7 @@ class PlusTrainee(SplatTrainee):
         super().__init__(splats, replace(options, max_gaussians=limit), config, **kwargs)
         self.options, self.average = options, dict[str, Tensor]()
         self._cameras = cameras_of(self._views)
-        self._pixels: Tensor | None = None  # of the finest camera at each Gaussian, until they change
+        self._finest: tuple[Tensor, Tensor] | None = None  # means, and the pixel of the finest camera at each
 
     def groups(self, means_speed: float = 1.0) -> list[ParameterGroup]:
         """Those of 3DGS, the means faster."""
@@ -71,7 +71,6 @@ class PlusTrainee(SplatTrainee):
         events = super().adapt(iteration, optimizer)
         if iteration > AVERAGED_FROM * self.iterations and self.options.average_share > 0:
             events += self._averaged(iteration)
-        self._pixels = None
         return events
 
     def _averaged(self, iteration: int) -> tuple[str, ...]:
@@ -96,14 +95,14 @@ class PlusTrainee(SplatTrainee):
         gaussians = super()._shown(view)
         if not self.is_drawn_no_finer:
             return gaussians
-        if self._pixels is None:
-            self._pixels = finest_pixels(gaussians.means, self._cameras)
-        return no_finer(gaussians, view, self._pixels, self._config.low_pass)
+        if self._finest is None or not torch.equal(self._finest[0], gaussians.means):
+            means = gaussians.means.detach().clone()
+            self._finest = means, finest_pixels(means, self._cameras)
+        return no_finer(gaussians, view, self._finest[1], self._config.low_pass)
 
     def keep(self, rows: Tensor) -> None:
         """Keep these Gaussians only."""
         super().keep(rows)
-        self._pixels = None
         self.average = {name: mean[rows] for name, mean in self.average.items()}
 
     def truncate(self, degree: int) -> None:
@@ -124,8 +123,4 @@ class PlusTrainee(SplatTrainee):
         device = self.splats.means.device
         self.average = {name: mean.to(device, copy=True) for name, mean in state.under(AVERAGE).items()}
         self._cameras = state.tensors.get(CAMERAS, self._cameras)  # older checkpoints have none
-
-    def load_model(self, state: State) -> None:
-        """Take the splats alone."""
-        super().load_model(state)
-        self._pixels = None
+        self._finest = None

@@ -26,6 +26,7 @@ from padgs.scoring.protocols import PROTOCOLS, Protocol, protocol_from_options
 from padgs.stress.options import StressOptions
 from padgs.tracking.tracker import TrackingOptions
 
+DEFAULT_METHOD = "padgs_plus"  # as conf/config.yaml says
 RETRIES = ("none", "failed")
 NEEDS = ("off", "on")
 IMAGES_ON = ("device", "cpu")
@@ -219,7 +220,7 @@ def config_from_values(values: Mapping[str, Any], labels: Labels = Labels()) -> 
             "data.device is no key any more: run.device says where a run trains and keeps its panoramas; "
             "run.images_on=cpu keeps them in main memory while it trains on a GPU"
         )
-    name = str(_group(values, "method").get("name", "padgs_plus"))
+    name = str(_group(values, "method").get("name", DEFAULT_METHOD))
     if isinstance(values.get("init"), str):  # on command lines; in files of runs it is what `Start.of` made of that
         values = {**values, "init": asdict(Start.of(values["init"], name))}
     settings = typed(Settings, {key: value for key, value in values.items() if key not in ("method", "protocol")})
@@ -271,5 +272,5 @@ def known_to(method: Mapping[str, Any]) -> dict[str, Any]:
 
     What they decided is in the model.
     """
-    known = method_fields(str(method.get("name", "padgs_plus")))
+    known = method_fields(method["name"])
     return {key: value for key, value in method.items() if key in known}

@@ -82,6 +82,7 @@ class RunFolder:
         """Write result.json; from then on the run is done. Returns what the file says, as any later reader sees it."""
         with self._writing():
             path = results.write(result, self.path)
+            self.stop.unlink(missing_ok=True)  # it has been heard, or came too late
         return results.read(path)
 
     @contextmanager
@@ -103,6 +104,7 @@ class RunFolder:
         with self._writing():
             if result.status not in ("oom", "timeout"):
                 shutil.rmtree(self.checkpoint, ignore_errors=True)
+            self.stop.unlink(missing_ok=True)
             (self.path / results.FILE_NAME).unlink()
 
     def log(self, record: Record, probed: Mapping[str, float]) -> None:

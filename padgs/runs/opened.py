@@ -79,12 +79,13 @@ class OpenedRun:
         return self.result.scores if self.result is not None else {}
 
     def renewed(self) -> OpenedRun | None:
-        """The run as training has left it since, on the same scene; None where there is no newer checkpoint.
+        """The run as training has left it since, on the same scene; None where it has come no further, nor to its end.
 
         Raises:
             CheckpointError: its checkpoint cannot be read, perhaps because the next one takes its place right now.
+            RunFolderError, ResultError, OSError: nor can another file of it.
         """
-        if checkpoint.digest(self.files.checkpoint) == self.digest:
+        if checkpoint.digest(self.files.checkpoint) == self.digest and self.files.result() == self.result:
             return None
         run = load_run(self.folder, data_path=self.config.data.path, device=self.config.run.device)
         if "scene" in self.__dict__:  # loaded already

@@ -133,7 +133,6 @@ class Session:
                         raise Interrupted(f"stopped after iteration {record.iteration}, the checkpoint is written")
                 if saved_iteration != progress.iteration:
                     folder.save(method, progress)
-            folder.stop.unlink(missing_ok=True)
             result = replace(result, **self._trained(method, progress))
             if self.scene.test:
                 scored = replace(result, **self._tested(method, progress))

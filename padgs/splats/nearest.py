@@ -12,6 +12,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import reduce
 
 import torch
 from torch import Tensor
@@ -40,9 +41,8 @@ def finest_pixels(means: Tensor, cameras: Tensor) -> Tensor:
     """
     if not len(cameras):
         return torch.zeros_like(means[:, 0])
-    cameras = cameras.to(means)
-    distances = torch.cdist(means, cameras[:, :3], compute_mode="donot_use_mm_for_euclid_dist")
-    return (distances / cameras[:, 3]).amin(1)
+    each = ((means - camera[:3]).norm(dim=-1) / camera[3] for camera in cameras.to(means))
+    return reduce(torch.minimum, each)  # one after the other: N x V numbers may not fit into memory
 
 
 def no_finer(gaussians: Gaussians, view: View, pixels: Tensor, variance: float) -> Gaussians:

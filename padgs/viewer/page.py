@@ -86,7 +86,7 @@ class Page:
             self._crop = gui.add_checkbox("crop", initial_value=False, disabled=not able)
             step = float(np.ptp(box, axis=0).max() / 200)
             self._low, self._high = (
-                gui.add_vector3(name, tuple(round(c, 3) for c in corner), step=step)
+                gui.add_vector3(name, tuple(float(f"{step * round(c / step):.6g}") for c in corner), step=step)
                 for name, corner in zip(("lowest", "highest"), box, strict=True)
             )
         self._frusta = [self._frustum(view) for view in self._views.values()]

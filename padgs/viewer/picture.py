@@ -11,8 +11,6 @@ from torch import Tensor
 
 from padgs.anchors.trainee import AnchorTrainee
 from padgs.learning.method import Method
-from padgs.runs.checkpoint import CheckpointError
-from padgs.runs.folder import RunFolderError
 from padgs.runs.opened import OpenedRun
 from padgs.scene import View
 from padgs.scoring.pictures import depth_picture, eight_bit, error_picture
@@ -63,15 +61,16 @@ class Gallery:
 
     def stop(self) -> None:
         """Ask a run in training to end now and be scored; nothing to one that is finished."""
-        if self.run.result is None:
-            self.run.files.stop.touch()
+        files = self.run.files
+        if files.result() is None:
+            files.stop.touch()
 
     def follow(self) -> bool:
         """Show what training has come to since, or why that cannot be shown; whether there is anything new."""
         trouble, run = "", None
         try:
             run = self.run.renewed() if self.follows else None
-        except (CheckpointError, RunFolderError) as error:  # for a moment only, where the next one takes its place
+        except Exception as error:  # often for a moment only, where the next checkpoint takes its place
             trouble = str(error)
         changed, self._trouble = trouble != self._trouble, trouble
         if run is not None:

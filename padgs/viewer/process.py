@@ -13,7 +13,7 @@ from padgs import results
 from padgs.runs import checkpoint
 from padgs.runs.folder import RunFolder
 from padgs.runs.opened import OpenedRun, load_run
-from padgs.viewer.server import serving, viser_module
+from padgs.viewer.server import LOCAL, PORT, serving, viser_module
 
 LOOKS = 0.5  # seconds between two looks at whether something is there, or still there
 PATIENCE = 5.0  # seconds that a server has to end
@@ -23,7 +23,8 @@ def await_checkpoint(folder: str | Path) -> None:
     """Return when a run has its first checkpoint, or can have none any more: opening it then says what is wrong."""
     files, said = RunFolder(Path(folder)), False
     while not checkpoint.exists(files.checkpoint) and _is_wanted():
-        if not (files.path / results.CONFIG_NAME).is_file() or (files.path / results.FILE_NAME).exists():
+        begun = parent_process() is not None or (files.path / results.CONFIG_NAME).is_file()
+        if not begun or (files.path / results.FILE_NAME).exists():
             return
         if not said:
             print(f"waiting for the first checkpoint of {folder}  (Ctrl-C ends it)", flush=True)
@@ -31,7 +32,7 @@ def await_checkpoint(folder: str | Path) -> None:
         time.sleep(LOOKS)
 
 
-def serve(runs: list[OpenedRun], *, host: str = "127.0.0.1", port: int = 8080) -> None:
+def serve(runs: list[OpenedRun], *, host: str = LOCAL, port: int = PORT) -> None:
     """Serve one run, or two to compare, and say where, until the process that started this one, if any, is gone.
 
     Raises:
@@ -50,14 +51,14 @@ def _is_wanted() -> bool:
 
 
 @contextmanager
-def shown(folder: Path, data_path: str | None) -> Iterator[None]:
-    """Serve a run in training while the context lasts, from its first checkpoint on.
+def shown(folder: Path, data_path: str | None, device: str) -> Iterator[None]:
+    """Serve a run in training on a device while the context lasts, from its first checkpoint on.
 
     Raises:
         ValueError: the extra `view` is not installed.
     """
     viser_module()
-    process = get_context("spawn").Process(target=_show, args=(folder, data_path), daemon=True)
+    process = get_context("spawn").Process(target=_show, args=(folder, data_path, device), daemon=True)
     handler = signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the training, which ends the process
     try:
         process.start()  # inherits that
@@ -72,7 +73,7 @@ def shown(folder: Path, data_path: str | None) -> Iterator[None]:
         process.join()
 
 
-def _show(folder: Path, data_path: str | None) -> None:
+def _show(folder: Path, data_path: str | None, device: str) -> None:
     with suppress(KeyboardInterrupt):
         await_checkpoint(folder)
-        serve([load_run(folder, data_path=data_path)])
+        serve([load_run(folder, data_path=data_path, device=device)])

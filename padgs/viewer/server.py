@@ -18,7 +18,7 @@ from padgs.runs.opened import OpenedRun
 from padgs.viewer.page import Page
 from padgs.viewer.picture import Box, Gallery
 
-LOCAL = "127.0.0.1"
+LOCAL, PORT = "127.0.0.1", 8080
 EVERY = 1.0  # seconds between two looks at whether there is a newer checkpoint
 
 
@@ -31,7 +31,7 @@ class Serving:
 
 
 @contextmanager
-def serving(runs: Sequence[OpenedRun], *, host: str = LOCAL, port: int = 8080) -> Iterator[Serving]:
+def serving(runs: Sequence[OpenedRun], *, host: str = LOCAL, port: int = PORT) -> Iterator[Serving]:
     """Serve one run, or two to compare, to any number of browsers, until the context ends. They change nothing, but
     may end training where only this machine is served.
 
@@ -49,6 +49,7 @@ def serving(runs: Sequence[OpenedRun], *, host: str = LOCAL, port: int = 8080) -
     viser = viser_module()
     warnings.filterwarnings("ignore", message="Queued .* on a closed connection")  # a page left while it was drawn for
     galleries, scene = [Gallery(run) for run in runs], runs[0].scene
+    local = host in (LOCAL, "localhost")
     with redirect_stdout(None):  # it draws a box around addresses, whatever `verbose` says
         server = viser.ViserServer(host=host, port=port, label=f"padgs: {scene.name}", verbose=False)
     up = np.array(gravity(torch.stack([view.cam_from_world for view in scene.train])).up)
@@ -60,11 +61,11 @@ def serving(runs: Sequence[OpenedRun], *, host: str = LOCAL, port: int = 8080) -
     server.initial_camera.look_at = center + 0.3 * scene.unit * first.cam_from_world[2, :3].cpu().numpy()
     server.initial_camera.up = up
     box, drawing = box_of(scene.points), threading.Lock()
-    found = Serving(f"http://{'localhost' if host == LOCAL else host}:{server.get_port()}")
+    found = Serving(f"http://{'localhost' if local else host}:{server.get_port()}")
 
     @server.on_client_connect
     def _(client: Any) -> None:
-        page = found.pages[client.client_id] = Page(client, galleries, box, drawing, may_stop=host == LOCAL)
+        page = found.pages[client.client_id] = Page(client, galleries, box, drawing, may_stop=local)
         page.start()
 
     @server.on_client_disconnect

@@ -14,9 +14,10 @@ from padgs.reports.frame import by_conditions
 from padgs.reports.gathered import Gathered
 from padgs.reports.needs import STATED, Curve, curves, searched
 from padgs.reports.pictures import split
+from padgs.results import NEED_PICTURED
 
 PANELS = (("blended", "Gaussians blended", 1.0), ("bytes", "model, MB", 1e-6), ("frame_ms", "ms per frame", 1.0))
-PICTURED = (STATED, "1")  # dB, as `padgs.results.NEED_PICTURE` has them
+PICTURED = tuple(f"{loss:g}" for loss in NEED_PICTURED)  # dB
 WIDTH = 512  # pixels of a picture at most
 DOUBLINGS = 1.5  # ratio from which on sizes stand on a logarithmic axis
 

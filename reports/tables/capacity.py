@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numbers
+
 from padgs.reports import methods
 from padgs.reports.conditions import OF_TIMES, footnotes, refuse_mixture
 from padgs.reports.frame import CONFIG, by_conditions
@@ -29,6 +31,9 @@ def capacity(gathered: Gathered) -> Table:
     """
     runs, blocks, runs_of = gathered.of_experiments("capacity"), [], {}
     if len(runs):
+        runs = runs.loc[
+            runs[BUDGET].map(lambda asked: isinstance(asked, numbers.Real) and asked > 0)
+        ]  # not auto or null
         runs = runs.sort_values(BUDGET, kind="stable")
         runs = runs.assign(asked=[f"at most {count:,} Gaussians".replace(",", " ") for count in runs[BUDGET]])
     for title, own in by_conditions(runs, "resolution", "length", "asked").items() if len(runs) else ():

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 from tiny_scene import tiny_scene, truth
@@ -44,6 +46,16 @@ def test_lessons_bring_them_nearer(trained):
     first, done = decibels(trained, splats), []
     teach(splats, trained.render, scene, trained.render_config, 60, done.append)
     assert done == list(range(1, 61)) and decibels(trained, splats) > first + 6
+
+
+def test_cameras_in_one_place_teach_as_well(trained):
+    scene = tiny_scene()
+    options = trained.render_config.options(scene.unit)
+    splats = baked(trained.trainee.model, scene.train, options, "auto", scene.unit)
+    before = splats.means.clone()
+    alone = replace(scene, train=tuple(view.at(scene.train[0].cam_from_world) for view in scene.train))
+    teach(splats, trained.render, alone, trained.render_config, 5)
+    assert not torch.equal(splats.means, before)
 
 
 def test_contributions_are_the_pixels_that_a_gaussian_makes_up():

@@ -76,8 +76,8 @@ def test_refined_poses_do_not_move_the_world(tmp_path_factory):
 
 
 def test_points_and_upright_worlds(splat_run, tmp_path):
-    assert export(str(splat_run), "--points", "--to", str(tmp_path / "p.ply")).exit_code == 0
-    cloud = read_ply(tmp_path / "p.ply")
+    assert export(str(splat_run), "--points", "--to", str(tmp_path / "new" / "p.ply")).exit_code == 0
+    cloud = read_ply(tmp_path / "new" / "p.ply")
     assert len(cloud.points) > 10 and cloud.colors is not None
     assert export(str(splat_run), "--upright", "--to", str(tmp_path / "u.ply")).exit_code == 0
     assert any("-y is up" in line for line in PlyData.read(str(tmp_path / "u.ply")).comments)

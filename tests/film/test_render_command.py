@@ -83,6 +83,7 @@ def test_a_perspective_picture_shows_what_the_panorama_shows_there(folder, tmp_p
     [
         (("--camera", "fisheye"), "unknown camera 'fisheye'; known: panorama, perspective"),
         (("--fps", "0"), "both must be > 0"),
+        (("--height", "9"), "are of perspective pictures: add --camera perspective"),
         (("--path", "spiral"), "there is no path spiral; known: cameras, orbit, dolly"),
         (("--camera", "perspective", "--fov", "180"), "across 180 degrees"),
     ],

@@ -30,6 +30,12 @@ def test_what_decides_nothing_about_results_is_ignored(runs):
         assert FinishedJobs(runs).status([extra, *reversed(JOB)]) == "ok"
 
 
+def test_a_job_that_begins_with_another_run_is_looked_at(runs):
+    job = ["init=runs/other", *JOB]
+    FinishedJobs(runs).add(job, "room_padgs_1", "ok", None)
+    assert FinishedJobs(runs).status(job) is None, "the other may have been trained anew"
+
+
 def test_a_result_that_is_gone_or_was_written_anew_is_looked_at(runs):
     path = runs / "room_padgs_1" / "result.json"
     content = path.read_text()

@@ -7,8 +7,8 @@ from statistics import mean
 import pytest
 
 from padgs.need.calibration import calibration_split, lower_bound, objections
-from padgs.need.search import EPSILONS, Plan, Step, knee, loss, plan, smallest
-from padgs.results import Scores
+from padgs.need.search import Plan, Step, knee, loss, plan, smallest
+from padgs.results import NEED_LOSSES, Scores
 
 BANDS = ("equator", "middle", "high", "pole", "zenith", "nadir")
 
@@ -51,7 +51,7 @@ def test_the_need_for_each_loss_is_found_to_a_sixth():
         return 0.3 * max(0.0, math.log2(5000 / rows)) ** 1.5
 
     steps = searched(lambda rows, depth: 33 - 0.2 * depth - lost(rows))
-    for epsilon in EPSILONS:
+    for epsilon in NEED_LOSSES:
         true = min(rows for rows in range(100, 10_001) if lost(rows) < epsilon)
         found = steps[smallest(steps, epsilon)].rows
         assert true <= found <= 1.2 * true + 1, epsilon
@@ -62,7 +62,7 @@ def test_the_need_for_each_loss_is_found_to_a_sixth():
 def test_a_model_that_needs_nothing_ends_at_a_few_rows_and_one_that_needs_all_keeps_them():
     assert 10 <= searched(lambda rows, depth: 30.0)[-1].rows < 15
     steps = searched(lambda rows, depth: 30.0 - 100 * (rows < 10_000))
-    assert all(steps[smallest(steps, epsilon)].rows == 10_000 for epsilon in EPSILONS)
+    assert all(steps[smallest(steps, epsilon)].rows == 10_000 for epsilon in NEED_LOSSES)
     assert knee(searched(lambda rows, depth: 30.0)) is None
 
 

@@ -99,6 +99,13 @@ def test_a_run_of_seconds_rehearses_ends_on_time_and_resumes_bit_identically(mon
     assert_same_but_time(resumed.state(), whole.state())
 
 
+def test_a_limit_of_seconds_does_not_end_the_rehearsal():
+    method = PlusMethod(OPTIONS)
+    assert not list(method.fit(tiny_scene(), Budget(10, max_seconds=1e-4, seconds=5))), (
+        "but the run, which it counts for"
+    )
+
+
 def test_options_of_the_schedule_of_3dgs_are_refused_and_not_ignored():
     with pytest.raises(ValueError, match="reset_every is 100, but padgs_plus has rounds of growth of its own"):
         PlusOptions(reset_every=100)

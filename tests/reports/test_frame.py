@@ -39,6 +39,11 @@ def test_two_settings_differ_in_more_than_seed_and_folder():
     assert (frame(runs)["setting"].duplicated(keep=False)).tolist() == [True, True, True, True, False]
 
 
+def test_a_run_of_seconds_that_failed_before_its_first_iteration_has_no_learning_rates():
+    own = replace(failed("full", "oom"), iterations=0, config={"train": {"learning_rates": "run"}})
+    assert frame([Run(own)])["learning_rates"].tolist() == [None]
+
+
 def test_without_runs_the_columns_are_there():
     made = frame([])
     assert made.empty and by_place(made) == {}

@@ -5,6 +5,7 @@ from tiny_scene import tiny_scene
 
 from padgs.baselines import METHODS
 from padgs.learning.budget import Budget
+from padgs.multirun.composition import make_method
 from padgs.registry import lookup
 
 
@@ -24,3 +25,10 @@ def test_what_nobody_would_see_goes_once_when_growth_is_over(name):
 def test_cameras_that_learn_along_say_nothing_of_what_would_be_seen():
     with pytest.raises(ValueError, match="budget.gaussians is auto.*set it to a number or null"):
         lookup(METHODS, "sc_omnigs", "method")().refuse_budget(Budget(120, gaussians="auto"))
+
+
+def test_exposures_that_learn_along_do_not_matter_to_what_would_be_seen():
+    method = make_method("omnigs", "train.exposures=learned")
+    method.refuse_budget(Budget(120, gaussians="auto"))
+    with pytest.raises(ValueError, match="budget.stop is auto"):
+        method.refuse_budget(Budget(120, stop="auto"))

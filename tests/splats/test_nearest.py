@@ -76,3 +76,12 @@ def test_a_loaded_model_knows_its_cameras_and_forgets_pixels_with_the_gaussians_
     wider = no_finer(loaded.trainee.splats.gaussians(view), view, pixels, loaded.render_config.low_pass)
     drawn = render(wider, view, loaded.trainee.render_options(view)).image
     assert torch.equal(loaded.render(view).image, drawn)
+
+
+def test_a_model_in_another_order_is_drawn_the_same(trained):
+    view, trainee = close_up(tiny_scene().train[0]), trained.trainee
+    before, stored = trainee.render(view).image, trainee.splats.state_dict()
+    rows = {name: tensor.flip(0) if name in trainee.splats.rows() else tensor for name, tensor in stored.items()}
+    trainee.splats.load(rows)
+    torch.testing.assert_close(trainee.render(view).image, before, atol=1e-5, rtol=0)
+    trainee.splats.load(stored)

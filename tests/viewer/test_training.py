@@ -81,6 +81,14 @@ def test_a_finished_run_is_not_followed(tmp_path_factory):
     assert not gallery.run.files.stop.exists(), "nor ended: the next run of that name would end at once"
 
 
+def test_the_end_of_training_is_seen(folder, tmp_path_factory):
+    gallery = Gallery(padgs.load_run(folder, device="cpu"))
+    shutil.copy(tiny_run(tmp_path_factory) / results.FILE_NAME, folder)
+    gallery.stop()
+    assert not gallery.run.files.stop.exists(), "it has ended, although the page does not say so yet"
+    assert gallery.follow() and "iterations" not in gallery.facts and not gallery.follow()
+
+
 @WITH_VISER
 @pytest.mark.slow
 @in_chromium
@@ -154,7 +162,7 @@ def test_a_run_that_failed_before_its_first_checkpoint_is_not_waited_for(folder)
 
 @WITH_VISER
 def test_a_run_is_shown_beside_its_training_and_no_longer(folder, capfd):
-    with shown(folder, None):
+    with shown(folder, None, "cpu"):
         said, end = "", time.monotonic() + 60
         while "http" not in said:
             assert time.monotonic() < end, "no address was said"
@@ -168,7 +176,7 @@ def test_a_run_is_shown_beside_its_training_and_no_longer(folder, capfd):
 
 def test_without_viser_no_training_begins(folder, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(ValueError, match=r"pip install 'padgs\[view\]'"), shown(folder, None):
+    with pytest.raises(ValueError, match=r"pip install 'padgs\[view\]'"), shown(folder, None, "cpu"):
         raise AssertionError("it began")
 
 

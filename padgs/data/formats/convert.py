@@ -14,6 +14,7 @@ from PIL import Image
 import padgs.data
 from padgs.data.assemble import assemble, view_name
 from padgs.data.capture import Capture, Cloud, Frame, Tracks
+from padgs.data.cloud import starting_cloud
 from padgs.data.errors import DataError
 from padgs.data.formats.writers import WRITERS, Content
 from padgs.data.images import save_png
@@ -65,7 +66,8 @@ def convert(
         partial.mkdir(parents=True)
         content = _write_images(capture, scene, partial, to, progress)
         if options.points != "auto":
-            content = replace(content, cloud=Cloud(scene.points.double(), scene.point_colors), tracks=None)
+            points, colors, _ = starting_cloud(capture, options.points)  # where the poses are: the scene may be centred
+            content = replace(content, cloud=Cloud(points, colors), tracks=None)
         write_masks({view.name: view.mask() for view in (*scene.train, *scene.test)}, partial)
         WRITERS[to](content, partial)
         if destination.exists():

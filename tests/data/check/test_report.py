@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -121,6 +122,18 @@ def test_a_wrong_convention_in_a_transforms_file(world: World, tmp_path: Path) -
     report = check(tmp_path)
     assert report.suggestion is not None and "take (x, -y, -z) for (x, y, z), as from OpenGL" in report.suggestion
     assert report.colour_correlation is not None and report.colour_correlation < 0.5
+
+
+def test_misread_poses_are_told_far_from_the_origin_as_well(world: World, tmp_path: Path) -> None:
+    far = np.array([1e5, -2e5, 3e4])
+    world = replace(world, centers=world.centers + far, points=world.points + far)
+    write_transforms(world, tmp_path)
+    meta = json.loads((tmp_path / "transforms.json").read_text())
+    for i, frame in enumerate(meta["frames"]):
+        frame["transform_matrix"] = (np.linalg.inv(world.world_from_cam(i)) @ np.diag([1, -1, -1, 1])).tolist()
+    (tmp_path / "transforms.json").write_text(json.dumps(meta))
+    suggestion = check(tmp_path).suggestion
+    assert suggestion is not None and "invert them" in suggestion
 
 
 def test_the_command(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

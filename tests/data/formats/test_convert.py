@@ -3,6 +3,7 @@
 import errno
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,17 @@ def test_round_trip(source: str, to: str, world: World, tmp_path: Path) -> None:
     scene, truth = load(tmp_path / "out put"), load(tmp_path / "in")
     assert scene.notes[0].startswith(f"format: {to}")
     _same(scene, truth, world, pixels=not (source == "roam360" and to == "ricoh360"))
+
+
+@pytest.mark.parametrize("points", ["mine.ply", "random"])
+def test_points_stay_with_the_poses_far_from_the_origin(points: str, world: World, tmp_path: Path) -> None:
+    far = np.array([500_000.0, 4_000_000.0, 100.0])
+    WRITERS["colmap"](replace(world, centers=world.centers + far, points=world.points + far), tmp_path / "in")
+    write_cloud(replace(world, points=world.points + far), tmp_path / "in" / "mine.ply")
+    truth = convert(tmp_path / "in", tmp_path / "out", "transforms", options=DataOptions(points=points))
+    scene = load(tmp_path / "out")
+    torch.testing.assert_close(scene.origin, truth.origin)
+    torch.testing.assert_close(scene.points, truth.points, atol=1e-3 if points == "random" else 0.5, rtol=0)
 
 
 def test_help_lists_the_formats_and_nerfstudio_is_one(world: World, tmp_path: Path) -> None:

@@ -30,5 +30,13 @@ def test_a_block_for_each_number_of_gaussians_the_fewest_first():
             assert row.cells[columns.index("Gaussians")].value == count - 0.5
 
 
+def test_runs_without_a_number_are_left_out():
+    odd = of_experiment("capacity", 30.0)
+    odd = [
+        replace(odd, run=f"{asked}", config={**odd.config, "budget": {"gaussians": asked}}) for asked in ("auto", None)
+    ]
+    assert capacity(gathered([*runs(), *odd])) == capacity(gathered(runs()))
+
+
 def test_nothing_was_run():
     assert not capacity(gathered([of_experiment("order", 20.0)])).blocks
