@@ -13,8 +13,7 @@ from padgs.scene import Scene
 class ExtentOptions:
     """Options of such methods. The published extent is that of `Scene.extent`, which may be next to nothing."""
 
-    min_extent: float = 0.1  # units of the scene that it counts as at least, so that cameras that hardly move can place
-    # Gaussians, too; 0: as published
+    min_extent: float = 0.1  # units of the scene it is at least, for cameras that hardly move; 0: as published
 
     def __post_init__(self) -> None:
         check(self, "a length >= 0 in units of the scene", lambda least: 0 <= least < math.inf, "min_extent")

@@ -46,8 +46,8 @@ class RenderOptions:
     projection: str = "erp"  # how Gaussians become footprints: a name of `padgs.render.projection.PROJECTIONS`
     near: float = 0.0  # world units; Gaussians whose mean is at most this far away are culled
     near_cull: str = "mean"  # what must be farther than near: the mean, or (ray) all that is drawn of the Gaussian
-    low_pass: float = 0.3  # variance of the low-pass filter in square pixels (of a cubemap: of its panorama; of a
-    # perspective image: at its centre)
+    # variance of the low-pass filter in square pixels (cubemap: of its panorama; perspective image: at its centre)
+    low_pass: float = 0.3
     low_pass_kind: str = "auto"  # pixels, angular, solid or fixed; auto: the first one of the projection
     pixel_bias: float = 0.0  # erp: pixels right and down of the truth that means are drawn; released ODGS: 0.5
     wrap: bool = True  # erp: continue footprints across the +-180 degree seam; tangent and ray know of no seam

@@ -45,7 +45,7 @@ def stability(gathered: Gathered) -> list[Table | Chart]:
         columns = [by_preset.get(preset) for preset in presets]
         blocks += [Block(title, _scores(columns)), Block(f"Retention, {title}", _retentions(columns))]
         blocks.append(Block(f"Breaks at level, {title}", _breakdowns(columns)))
-        runs_of[title] = gathered.runs.loc[sorted(i for one in those for i in one.rest.index)]
+        runs_of[f"{title}, without stress"] = gathered.runs.loc[sorted(i for one in those for i in one.rest.index)]
     table = Table(
         "stability",
         "What methods keep under stress",
