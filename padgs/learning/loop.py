@@ -26,9 +26,9 @@ from padgs.learning.optimiser import Optimiser
 from padgs.learning.order import Order, ViewOrder
 from padgs.learning.schedule import LEARNING_RATES, Pace
 from padgs.learning.stopping import FADE, GAIN, PATIENCE, Plateau, quality, set_apart
-from padgs.learning.targets import Targets
 from padgs.learning.trainee import MODEL, State, Trainee
 from padgs.learning.views.corrections import CHOICES, GIVEN, LEARNED, Corrections
+from padgs.learning.views.sizes import Sizes
 from padgs.scene import Scene
 from padgs.stopwatch import Lap
 
@@ -104,6 +104,7 @@ class Trainer:
         seed: int = 0,
         *,
         views_each: int = 1,
+        coarse_share: float = 0.0,
         stage: Stage = nullcontext,
     ) -> None:
         """Prepare; nothing is drawn yet.
@@ -111,6 +112,7 @@ class Trainer:
         Args:
             trainee, scene, budget, options, seed: what is trained, on what, for how long and how.
             views_each: views that an iteration draws one after the other, before Adam steps on the sum of their losses.
+            coarse_share: of the run, in which views are smaller than they are, see `padgs.learning.views.sizes`.
             stage: for whoever wants to know what an iteration spends its time on.
 
         Raises:
@@ -129,7 +131,7 @@ class Trainer:
         self._corrections.to(groups[0].parameters[0].device)
         groups = [*groups, *self._corrections.groups(budget.iterations)]
         self._optimiser = Optimiser(groups, self._pace(1, 1), options.check_every, **self.ADAM)
-        self._targets = Targets(scene.train, options.weight, self._optimiser.device)
+        self._sizes = Sizes(scene.train, options.weight, self._optimiser.device, coarse_share)
         apart = set_apart(scene.train) if budget.stop == "auto" else ()
         self._calibration = [scene.train[number] for number in apart]
         self._plateau, self._fade = Plateau(budget.iterations), round((1 - FADE) * budget.iterations)
@@ -239,9 +241,10 @@ class Trainer:
         with stage("target"):
             index = self._views.next()
             self._scene.train[self._views.upcoming()].prefetch()
-            target = self._targets[index]
+            views, targets = self._sizes.at(moment / self.schedule)
+            target = targets[index]
         with stage("draw"):
-            drawing = trainee.draw(self._corrections.posed(self._scene.train[index]))
+            drawing = trainee.draw(self._corrections.posed(views[index]))
             image = self._corrections.exposed(drawing.rendering.image, index)
         if len(drawing.gaussians) == 0:
             optimiser.refuse_non_finite(optimiser.parameters(), iteration)  # a NaN shows nothing either

@@ -12,7 +12,9 @@ import math
 
 import torch
 
-from padgs.learning.loop import TrainOptions
+from padgs.learning.budget import Budget
+from padgs.learning.loop import Stage, Trainer, TrainOptions
+from padgs.learning.trainee import Trainee
 from padgs.plus.fill import filled
 from padgs.plus.options import PlusOptions
 from padgs.plus.sky import far_gaussians
@@ -80,6 +82,10 @@ class PlusMethod(SplatMethod):
             splats.load({name: torch.cat((own, sky.rows()[name])) for name, own in splats.rows().items()})
         more = {"limit": limit, "asked": super()._target}
         return self._trainee_of(splats, options.extent_of(scene), iterations, scene.train, **more)
+
+    def _trained_by(self, trainee: Trainee, scene: Scene, budget: Budget, stage: Stage) -> Trainer:
+        share = self.options.coarse_share
+        return Trainer(trainee, scene, budget, self.train_options, self.seed, coarse_share=share, stage=stage)
 
 
 def _within(share: float | None, pixels: float) -> int | None:

@@ -32,6 +32,7 @@ class PlusOptions(SplatOptions):
     gradient_threshold: float = 5e-5  # SPaGS's, in runs of `LONG` iterations or more; see `for_run`
     sample_clones: bool = True
     min_opacity: float = 0.05  # what is fainter when a round ends was not needed
+    coarse_share: float = 0.3  # of the run, on views that are half as wide if they are large, at first still smaller
     start_share: float | None = 0.6  # points to begin with, per independent pixel of a view; None: all that there are
     fill_share: float = 0.15  # ... of which so many at least: photographs give what the cloud has not; 0: not
     limit_share: float | None = 2.6  # ... and Gaussians at most while it grows: a guard on memory and time
@@ -52,6 +53,7 @@ class PlusOptions(SplatOptions):
         off = "at least 0, which switches it off"
         for name in ("size_weight", "smoothness_weight", "sky_share", "fill_share"):
             check(self, off, lambda value: 0 <= value < math.inf, name)
+        check(self, "a share of the run in [0, 1]", lambda share: 0 <= share <= 1, "coarse_share")
         check(self, "a share of the run in [0, 0.1]", lambda share: 0 <= share <= 0.1, "average_share")
         for name in ("start_share", "limit_share"):
             check(self, "> 0, or none for no limit", lambda share: share is None or share > 0, name)

@@ -45,6 +45,7 @@ WITHOUT = {  # variant (conf/without) -> title
             "average": "the last state",
             "sky": "no sky",
             "fill": "no points from photographs",
+            "coarse": "all views of full size",
         }.items()
     },
 }
