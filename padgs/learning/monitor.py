@@ -60,11 +60,17 @@ class Monitor:
             "largest": None,
             "since": {},
             "highest": 0.0,
+            "first": FIRST,
         }
 
     def forget(self) -> None:
         """Signs begin anew, as the schedule has jumped and how long they lasted means nothing."""
         self.state["since"] = {}
+
+    def begin_anew(self, iteration: int) -> None:
+        """Compare no loss from this iteration on with those before, as the views have another size since."""
+        self.state |= {"sum": 0.0, "weight": 0.0, "best": None, "highest": 0.0, "first": iteration + FIRST}
+        self.state["since"].pop("diverged", None)
 
     def loss(self, value: float, iteration: int) -> None:
         """Take in the loss of an iteration.
@@ -78,11 +84,11 @@ class Monitor:
         state["weight"] += (1 - state["weight"]) * new
         state["seen"] = iteration
         average = state["sum"] / state["weight"]
-        if iteration >= FIRST:
+        if iteration >= state.get("first", FIRST):  # checkpoints of before have none
             state["best"] = average if state["best"] is None else min(average, state["best"])
         best = state["best"]
         high = best is not None and average > WORSE * best
-        highest = max(average, state.get("highest", 0.0)) if high else 0.0  # checkpoints of before have none
+        highest = max(average, state.get("highest", 0.0)) if high else 0.0  # nor that
         if average < FALLING * highest:
             state["since"].pop("diverged", None)
             highest = average

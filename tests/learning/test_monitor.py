@@ -51,6 +51,17 @@ def test_a_loss_that_rises_and_stays_has_diverged():
     assert "the loss at iteration" in str(failure) and "the best, 0.1 " in str(failure)
 
 
+def test_losses_of_views_of_another_size_are_not_compared():
+    watch = monitor()
+    for iteration in range(1, 401):
+        if iteration == 200:
+            watch.begin_anew(iteration)
+        watch.loss(0.1 if iteration < 200 else 0.3, iteration)
+    with pytest.raises(Failure, match="the best, 0.3 "):
+        for iteration in range(401, ITERATIONS):
+            watch.loss(0.6, iteration)
+
+
 @pytest.mark.parametrize(
     "of",
     [

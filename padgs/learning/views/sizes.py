@@ -30,11 +30,16 @@ class Sizes:
             views = [halved(view) for view in views]
             self._levels.append((views, Targets(views, weight, device)))
 
+    def level(self, progress: float) -> int:
+        """How often views are halved in a step after which so much of the run is done, in [0, 1]."""
+        if progress >= self._coarse_share:
+            return 0
+        smallest = len(self._levels) - 1
+        return min(math.ceil(math.log2(self._coarse_share / progress)), smallest) if progress else smallest
+
     def at(self, progress: float) -> tuple[Sequence[View], Targets]:
-        """Those of a step after which so much of the run is done, in (0, 1]."""
-        coarse = self._coarse_share
-        halvings = math.ceil(math.log2(coarse / progress)) if progress < coarse else 0
-        return self._levels[min(halvings, len(self._levels) - 1)]
+        """What such a step draws."""
+        return self._levels[self.level(progress)]
 
 
 def halved(view: View) -> View:

@@ -7,6 +7,7 @@ from states import assert_same_but_time
 from tiny_scene import HEIGHT, WIDTH, tiny_scene, truth
 
 from padgs.learning.budget import Budget
+from padgs.learning.monitor import FIRST
 from padgs.learning.views import sizes
 from padgs.learning.views.sizes import Sizes, halved
 from padgs.plus.method import PlusMethod
@@ -62,6 +63,7 @@ def test_views_double_until_a_share_of_the_run(monkeypatch):
         views, targets = found.at(progress)
         assert targets[0].image.shape == (views[0].height, views[0].width, 3)
     assert sized(0.0, made(32, 16)).at(1e-9)[0][0].width == 32
+    assert found.level(0) == 2
     always = sized(1.0, made(32, 16))
     assert [always.at(progress)[0][0].width for progress in (0.4, 0.9, 1.0)] == [8, 16, 32]
 
@@ -80,6 +82,8 @@ def test_padgs_plus_begins_with_small_views_and_resumes_bit_identically(monkeypa
     plain = method.trainee.draw
     monkeypatch.setattr(method.trainee, "draw", lambda view: drawn.append((view.width, view.height)) or plain(view))
     records = list(whole)
+    monitor = method.state().values["monitor"]
+    assert monitor["first"] == 6 + FIRST, "losses of small views are no measure for those of large ones"
     assert drawn == [(WIDTH // 2, HEIGHT // 2)] * 5 + [(WIDTH, HEIGHT)] * 15
     stopped = PlusMethod(OPTIONS)
     first = list(islice(stopped.fit(tiny_scene(), Budget(20)), 4))
