@@ -19,7 +19,7 @@ def export(
     smooth: Annotated[
         bool, typer.Option("--smooth", help="as wide as photographs saw them, for viewers; .html always is")
     ] = False,
-    lessons: Annotated[int | None, typer.Option(help="iterations of PaD-GS's baked anchors on own pictures")] = None,
+    lessons: Annotated[int | None, typer.Option(help="iterations of PaD-GS's baked anchors; 300 if not said")] = None,
     data: DataPath = None,
 ) -> None:
     """Write a run's Gaussians, by default into its folder as splats.ply (--points: points.ply).

@@ -156,8 +156,7 @@ class Trainer:
             moment = budget.moment(self.moment, self.spent, self.step_seconds, self.skipped)
             if self._monitor is not None:
                 self._monitor.moment = moment
-                if self._sizes.level(moment / self.schedule) != self._sizes.level(self.moment / self.schedule):
-                    self._monitor.begin_anew(iteration)
+                self._monitor.size(self._sizes.halvings(moment / self.schedule), iteration)
             try:
                 loss, counts, events = self._step(iteration, moment)
             except (MemoryError, RuntimeError) as error:

@@ -61,16 +61,20 @@ class Monitor:
             "since": {},
             "highest": 0.0,
             "first": FIRST,
+            "halvings": None,
         }
 
     def forget(self) -> None:
         """Signs begin anew, as the schedule has jumped and how long they lasted means nothing."""
         self.state["since"] = {}
 
-    def begin_anew(self, iteration: int) -> None:
-        """Compare no loss from this iteration on with those before, as the views have another size since."""
-        self.state |= {"sum": 0.0, "weight": 0.0, "best": None, "highest": 0.0, "first": iteration + FIRST}
-        self.state["since"].pop("diverged", None)
+    def size(self, halvings: int, iteration: int) -> None:
+        """Compare no loss from this iteration on with those before, if views were halved more or less often there."""
+        known = self.state.get("halvings", 0)  # checkpoints of before are of full size
+        if known is not None and known != halvings:
+            self.state |= {"sum": 0.0, "weight": 0.0, "best": None, "highest": 0.0, "first": iteration + FIRST}
+            self.state["since"].pop("diverged", None)
+        self.state["halvings"] = halvings
 
     def loss(self, value: float, iteration: int) -> None:
         """Take in the loss of an iteration.

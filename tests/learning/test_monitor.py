@@ -54,8 +54,7 @@ def test_a_loss_that_rises_and_stays_has_diverged():
 def test_losses_of_views_of_another_size_are_not_compared():
     watch = monitor()
     for iteration in range(1, 401):
-        if iteration == 200:
-            watch.begin_anew(iteration)
+        watch.size(1 if iteration < 200 else 0, iteration)
         watch.loss(0.1 if iteration < 200 else 0.3, iteration)
     with pytest.raises(Failure, match="the best, 0.3 "):
         for iteration in range(401, ITERATIONS):

@@ -30,16 +30,15 @@ class Sizes:
             views = [halved(view) for view in views]
             self._levels.append((views, Targets(views, weight, device)))
 
-    def level(self, progress: float) -> int:
-        """How often views are halved in a step after which so much of the run is done, in [0, 1]."""
+    def halvings(self, progress: float) -> int:
+        """How often views are halved in a step after which so much of the run is done, in (0, 1]."""
         if progress >= self._coarse_share:
             return 0
-        smallest = len(self._levels) - 1
-        return min(math.ceil(math.log2(self._coarse_share / progress)), smallest) if progress else smallest
+        return min(math.ceil(math.log2(self._coarse_share / progress)), len(self._levels) - 1)
 
     def at(self, progress: float) -> tuple[Sequence[View], Targets]:
         """What such a step draws."""
-        return self._levels[self.level(progress)]
+        return self._levels[self.halvings(progress)]
 
 
 def halved(view: View) -> View:

@@ -63,7 +63,6 @@ def test_views_double_until_a_share_of_the_run(monkeypatch):
         views, targets = found.at(progress)
         assert targets[0].image.shape == (views[0].height, views[0].width, 3)
     assert sized(0.0, made(32, 16)).at(1e-9)[0][0].width == 32
-    assert found.level(0) == 2
     always = sized(1.0, made(32, 16))
     assert [always.at(progress)[0][0].width for progress in (0.4, 0.9, 1.0)] == [8, 16, 32]
 
@@ -92,3 +91,15 @@ def test_padgs_plus_begins_with_small_views_and_resumes_bit_identically(monkeypa
     rest = list(resumed.fit(tiny_scene(), Budget(20)))
     assert [record.loss for record in (*first, *rest)] == [record.loss for record in records]
     assert_same_but_time(resumed.state(), method.state())
+
+
+def test_a_run_that_is_stopped_while_views_are_small_ends_on_large_ones_and_has_not_diverged(monkeypatch):
+    monkeypatch.setattr(sizes, "LEAST_WIDTH", WIDTH // 2)
+    method, ended = PlusMethod(OPTIONS), 0
+    for record in method.fit(tiny_scene(), Budget(100)):
+        if record.iteration == 10:
+            assert method.state().values["monitor"]["halvings"] == 1
+            assert method.stop("enough")
+            ended = record.iteration
+    monitor = method.state().values["monitor"]
+    assert monitor["halvings"] == 0 and monitor["first"] == ended + 1 + FIRST
