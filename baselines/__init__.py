@@ -18,18 +18,27 @@ METHODS = {
     "seam360gs": "padgs.baselines.seam360gs:Seam360GSMethod",
     "padgs_plus": "padgs.plus.method:PlusMethod",
 }
+OURS = frozenset(METHODS)
+GROUP = "padgs.methods"  # of entry points
 
 
 def outside() -> dict[str, str]:
-    """The methods of other packages, name -> "package.module:class": entry points of the group padgs.methods.
-
-    Raises:
-        ValueError: one has a name of ours.
-    """
-    found = {point.name: point.value for point in entry_points(group="padgs.methods")}
-    if taken := sorted(found.keys() & METHODS.keys()):
-        raise ValueError(f"entry point {found[taken[0]]} is called {taken[0]}, as a method of padgs is; rename it")
-    return found
+    """The methods of other packages, name -> "package.module:class": entry points of the group padgs.methods."""
+    return {point.name: point.value for point in entry_points(group=GROUP)}
 
 
-METHODS |= outside()
+def clash() -> str | None:
+    """What is wrong where another package calls a method as we call one of ours; None if none does."""
+    found = outside()
+    if taken := sorted(found.keys() & OURS):
+        return f"entry point {found[taken[0]]} is called {taken[0]}, as a method of padgs is; rename it"
+    return None
+
+
+def distribution(method: str) -> str:
+    """Name and version of the package that brings a method; empty for one of ours."""
+    points = () if method in OURS else entry_points(group=GROUP, name=method)
+    return " ".join(f"{point.dist.name} {point.dist.version}" for point in points if point.dist)
+
+
+METHODS |= {name: value for name, value in outside().items() if name not in OURS}

@@ -1,5 +1,6 @@
 """Every file in conf/ is used here, so none of them can rot."""
 
+import os
 import re
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import pytest
 from composed import composed, expanded, first_and_last_job, jobs
 from hydra.errors import HydraException
+from omegaconf import OmegaConf
 
 from padgs.anchors.growth import PUBLISHED_THRESHOLD
 from padgs.anchors.method import PaDGSMethodOptions
@@ -16,9 +18,9 @@ from padgs.data.datasets import DATASETS
 from padgs.data.synthetic.options import SyntheticOptions
 from padgs.learning.loop import TrainOptions
 from padgs.multirun.choices import method_choices
-from padgs.multirun.composition import composing
+from padgs.multirun.composition import composing, configuration
 from padgs.multirun.launchers import missing_plugin
-from padgs.multirun.overrides import expand
+from padgs.multirun.overrides import expand, lenient, quoted
 from padgs.plus.method import PlusMethod
 from padgs.plus.options import PlusOptions
 from padgs.registry import lookup
@@ -165,6 +167,29 @@ def test_every_experiment_composes_and_says_how_to_run_it(name):
 def test_unknown_choices_are_answered_with_the_known_ones(choice):
     with pytest.raises(HydraException, match="Available options in '"):
         composed(choice)
+
+
+@pytest.mark.parametrize("name", ['Jürgen\'s "flat" (2), [old]: $5 = 50 %\\', "20240801", "it's"])
+def test_files_and_folders_may_have_any_names(name):
+    config = composed(f"data.path={name}", f"data.images={name}", f"run.folder=~/{name}")
+    assert config.data.path == config.data.images == name
+    assert config.run.folder == os.path.expanduser(f"~/{name}")
+
+
+def test_several_folders_are_several_jobs():
+    with composing() as loader:
+        settings = quoted(["-m", 'data.path=~/flat (1),"a,b", c', "seed=choice(0,1)"])
+        found = {configuration(job).data.path for job in expand({}, lenient(settings[1:]), loader)}
+    assert found == {os.path.expanduser("~/flat (1)"), "a,b", "c"}
+
+
+def test_an_array_of_slurm_is_no_longer_than_it_allows_by_itself():
+    assert OmegaConf.load(CONF / "launcher" / "slurm.yaml").hydra.sweeper.max_batch_size <= 1001
+
+
+def test_a_task_of_ray_has_a_core_for_each_of_its_threads():
+    config = OmegaConf.load(CONF / "launcher" / "ray.yaml")
+    assert config.hydra.launcher.ray.remote.num_cpus == config.run.threads
 
 
 @pytest.mark.parametrize("name", ["none", "local", "slurm", "submitit", "ray"])

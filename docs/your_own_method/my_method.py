@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
+from padgs.checks import check
 from padgs.render.config import RenderConfig
 from padgs.scene import Scene
 from padgs.splats.method import SplatMethod, SplatOptions
@@ -21,8 +22,7 @@ class MyOptions(SplatOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0 < self.thinner < math.inf:
-            raise ValueError(f"method.thinner is {self.thinner}; it must be > 0 and finite")
+        check(self, "> 0 and finite", lambda factor: 0 < factor < math.inf, "thinner")
 
 
 class MyMethod(SplatMethod):

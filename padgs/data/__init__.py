@@ -53,6 +53,12 @@ def load(
         ValueError: unknown format.
     """
     options = replace(options, **fields)  # type: ignore[arg-type]
+    if path is None and options.dataset is not None:
+        scene = lookup_dataset(options.dataset).scenes[0]
+        raise DataError(
+            f"data.dataset is {options.dataset}, but data.path is not set; set it to the folder of a scene, or choose "
+            f"one by name, e.g. +scene={options.dataset}_{scene}"
+        )
     if format == "synthetic" or (path is None and format == "auto"):
         return lookup(LOADERS, "synthetic", "data.format")(path or "", options)
     return assemble(read(path or "", format, options), options)

@@ -7,8 +7,9 @@ from dataclasses import asdict
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
+from rich.console import Console
 
-from padgs.baselines import METHODS
+from padgs.baselines import METHODS, OURS, distribution
 from padgs.data.datasets import DATASETS
 from padgs.data.synthetic.options import SCENES
 from padgs.learning.loop import TrainOptions
@@ -16,15 +17,28 @@ from padgs.multirun.overrides import root
 from padgs.registry import lookup
 from padgs.render.config import RenderConfig
 from padgs.runs.config import default_fields, method_fields
+from padgs.runs.terminal import say
 
 
 def register_choices() -> None:
-    """Tell Hydra the keys and defaults of the dataclasses, so that files and commands only name what differs."""
+    """Tell Hydra the keys and defaults of the dataclasses, so that files and commands only name what differs.
+
+    A method of another package that cannot be had is said once, and from then on there is none of its name.
+    """
     store = ConfigStore.instance()
     store.store(name="fields", node=default_fields())
-    for method in METHODS:
-        store.store(group="fields/method", name=method, node=method_fields(method))
-        for group, node in method_choices(method):
+    for method in [*METHODS]:
+        try:
+            keys, nodes = method_fields(method), [*method_choices(method)]
+        except Exception as error:  # of any kind: that package is not ours
+            if method in OURS:
+                raise
+            del METHODS[method]
+            why = f"{type(error).__name__}: {error}; mend {distribution(method)}, or uninstall it"
+            say(Console(stderr=True), f"method={method} is left out ({why})", "yellow")
+            continue
+        store.store(group="fields/method", name=method, node=keys)
+        for group, node in nodes:
             store.store(group=group, name=method, node=node, package="_global_")
     for name, scene in scene_choices().items():
         store.store(group="scene", name=name, node=scene, package="_global_")

@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from padgs.learning.method import Method
 from padgs.multirun.choices import register_choices
-from padgs.multirun.overrides import lenient, root
+from padgs.multirun.overrides import lenient, quoted, root
 from padgs.runs.config import DEFAULT_METHOD, RunConfig, config_from_values
 from padgs.runs.identity import labels
 from padgs.runs.session import build
@@ -36,7 +36,7 @@ def configuration(settings: Sequence[str]) -> RunConfig:
         ConfigError: an unknown key or name, or a value of the wrong type.
         HydraException: no such choice, or no sentence of Hydra's grammar.
     """
-    config = compose("config", lenient(settings), return_hydra_config=True)
+    config = compose("config", lenient(quoted(settings)), return_hydra_config=True)
     choices = config.hydra.runtime.choices
     with open_dict(config):
         del config["hydra"]

@@ -1,8 +1,9 @@
 """Which jobs are known to be finished, so that skipping hundreds of them takes no composing and no loading of scenes.
 
 `<run.folder>/.multirun/finished.jsonl` has a line for each job that ended with a result. A job is recognised by its
-command-line settings, the configuration files and the program's own sources; its run by the time of its `result.json`,
-and its data by names, sizes and times of all files. Where anything differs, the job is composed and looked at as usual.
+command-line settings, the configuration files and the sources, of the program and of packages that bring methods; its
+run by the time of its `result.json`, and its data by names, sizes and times of all files. Where anything differs, the
+job is composed and looked at as usual.
 """
 
 from __future__ import annotations
@@ -11,13 +12,15 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from padgs import results
+from padgs.baselines import outside
 from padgs.multirun.overrides import root
 
 FOLDER = ".multirun"  # in run.folder
@@ -25,6 +28,8 @@ FILE_NAME = "finished.jsonl"
 # Settings that a job is not recognised by. The rules of scoring decide nothing about training, but whether it is done;
 # and where the data lie says whose files are looked at.
 NOT_PART = (*results.OF_THE_MACHINE, "launcher", "tracking", "retry", "hydra")
+# What lies where `data.path` does not say: another run, which may have another model by now, and files beside the data.
+OTHER_FILES = re.compile(r"\+*(init[.=]|data\.(images|mask|points)=)")
 
 
 class FinishedJobs:
@@ -60,7 +65,7 @@ class FinishedJobs:
                 file.write(json.dumps(entry) + "\n")
 
     def _entry(self, overrides: Sequence[str]) -> dict[str, Any] | None:
-        if any(re.match(r"\+*init[.=]", text) for text in overrides):  # that run may have another model by now
+        if any(OTHER_FILES.match(text) for text in overrides):
             return None
         entry = self._known.get(key(overrides))
         if entry is None or (written := _written(self._runs / entry["run"])) is None or entry["written"] != written:
@@ -79,7 +84,7 @@ def only_run(arguments: Sequence[str]) -> Path | None:
 def folder_of(arguments: Sequence[str]) -> Path:
     """Where a command line has its runs: what it says of `run.folder`, or that key's default."""
     given = [text.partition("=")[2] for text in arguments if re.match(r"\+*run\.folder=", text)]
-    return Path(given[-1] if given else "runs")
+    return Path(os.path.expanduser(given[-1]) if given else "runs")
 
 
 def key(overrides: Sequence[str]) -> str:
@@ -89,13 +94,19 @@ def key(overrides: Sequence[str]) -> str:
 
 
 @cache
-def signature(folder: str) -> str:
-    """Names, sizes and times of all files below a folder."""
+def signature(data: str) -> str:
+    """Names, sizes and times of all files below a folder, or below that of a file; links are followed."""
     digest = hashlib.sha256()
-    for path in sorted(Path(folder).rglob("*")):
+    top = Path(data).parent if Path(data).is_file() else data
+    files, seen = list[Path](), set[str]()
+    for folder, inner, names in os.walk(top, followlinks=True):
+        files += [Path(folder, name) for name in names]
+        if (place := os.path.realpath(folder)) in seen:
+            inner.clear()  # a link that leads back up
+        seen.add(place)
+    for path in sorted(files):
         with suppress(OSError):  # it may be gone by now
-            if path.is_file():
-                digest.update(f"{path}|{path.stat().st_size}|{path.stat().st_mtime_ns}\n".encode())
+            digest.update(f"{path}|{path.stat().st_size}|{path.stat().st_mtime_ns}\n".encode())
     return digest.hexdigest()
 
 
@@ -103,11 +114,18 @@ def signature(folder: str) -> str:
 def _sources() -> str:
     digest = hashlib.sha256()
     package = Path(__file__).resolve().parent.parent
-    for folder in (package, package / "baselines", root() / "conf", root() / "sweeps"):
-        for path in sorted(folder.rglob("*")):
+    for place in (package, package / "baselines", root() / "conf", root() / "sweeps", *_outside_sources()):
+        for path in sorted(place.rglob("*")) if place.is_dir() else [place]:
             if path.suffix in (".py", ".yaml"):
                 digest.update(path.read_bytes())
     return digest.hexdigest()
+
+
+def _outside_sources() -> Iterator[Path]:
+    """The packages that bring methods, folders and single modules, none of which is imported here."""
+    for name in sorted({re.split("[.:]", value)[0] for value in outside().values()}):
+        if spec := find_spec(name):  # else it is left out, as `padgs.multirun.choices` says
+            yield from map(Path, spec.submodule_search_locations or filter(None, [spec.origin]))
 
 
 def _written(run: Path) -> int | None:

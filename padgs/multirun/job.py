@@ -14,6 +14,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from rich.console import Console
 
+from padgs.learning.failure import Failure
 from padgs.learning.stopping import set_apart
 from padgs.multirun.board import CRASHED, ELSEWHERE, REFUSED, STOPPED, Board, BoardEntry
 from padgs.multirun.composition import typed_config
@@ -30,7 +31,8 @@ from padgs.runs.terminal import say
 from padgs.tracking.tracker import SECONDS_BETWEEN_LOOKS, Tracker
 from padgs.viewer.process import shown
 
-EXPECTED = (ValueError, OSError, CheckpointError, RunFolderError, RunBusy)  # a traceback would only hide what they say
+# A traceback would only hide what these say. Failure is one of a search for needs: those of training are results.
+EXPECTED = (ValueError, OSError, Failure, CheckpointError, RunFolderError, RunBusy)
 ARGUMENTS: list[str] = []  # of the command line, by which a finished run is known again
 ENDS: list[str] = []  # how the job ended that was this process's only one; Hydra's main returns nothing
 

@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from padgs import results
-from padgs.multirun.board import CRASHED, ELSEWHERE, KILLED, OK, REFUSED, RUNNING, Board, JobState
+from padgs.multirun.board import CRASHED, ELSEWHERE, KILLED, REFUSED, RUNNING, Board, JobState
 from padgs.multirun.finished import FinishedJobs
 from padgs.multirun.job import complain, in_own_process
 from padgs.multirun.launchers import patient
@@ -25,6 +25,7 @@ from padgs.results import Result, ResultError
 from padgs.runs.folder import RunFolder, cannot_write
 from padgs.runs.identity import labels
 from padgs.runs.interrupt import Interrupt, Interrupted
+from padgs.runs.outcome import RETRIED
 from padgs.runs.terminal import say
 from padgs.runs.typed import typed
 from padgs.tracking.tracker import SECONDS_BETWEEN_LOOKS, Tracker, TrackingOptions
@@ -49,7 +50,7 @@ class Multirun:
         self._console, self._finished = console, FinishedJobs(self.runs)
         statuses = [self._finished.status(job) for job in jobs]
         if config.retry == "failed":
-            statuses = [status if status == OK else None for status in statuses]
+            statuses = [None if status in RETRIED else status for status in statuses]
         self.before = Counter(status for status in statuses if status is not None)
         self.jobs = [list(job) for job, status in zip(jobs, statuses, strict=True) if status is None]
         self.states = {index: JobState() for index in range(len(self.jobs))}
@@ -114,7 +115,7 @@ class Multirun:
         return Overview(self.before, dict(self.states), time.monotonic() - self._began, progress)
 
     def close(self) -> Overview:
-        """Say how it ended; the board stays only where it can tell what went wrong."""
+        """Say how it ended; the board stays only where it can tell what went wrong, or jobs need it."""
         for index, state in self.states.items():
             if state.status == ELSEWHERE and (result := self._result(state)):  # by now it was finished there
                 self._end(index, replace(state, status=result.status))
@@ -122,9 +123,12 @@ class Multirun:
         self._say(seen.line())
         self._track()
         self._tracker.finish([result for state in self.states.values() if (result := self._result(state))])
-        if any(status in results.STATUSES and status != OK for status in seen.counts):
+        if RETRIED & {*seen.counts}:
             self._say("failed runs are kept as they are; retry=failed starts them again")
-        if not self._in_process and {CRASHED, KILLED} & {*seen.counts}:
+        alive = any(self._numbers[index] >= 0 and not state.ended for index, state in self.states.items())
+        if not self._in_process and alive:  # after a second Ctrl-C: `stop` is there, and what submitit starts jobs from
+            self._say(f"jobs may still be running; what they need, and say, is in {self.board.folder}")
+        elif not self._in_process and {CRASHED, KILLED} & {*seen.counts}:
             self._say(f"what crashed jobs said is in {self.board.folder}")
         else:
             shutil.rmtree(self.board.folder, ignore_errors=True)

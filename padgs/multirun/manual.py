@@ -12,6 +12,7 @@ from typing import Any
 
 from padgs.baselines import METHODS
 from padgs.data.synthetic.options import SyntheticOptions
+from padgs.multirun.choices import scene_choices
 from padgs.multirun.composition import composing, configuration
 from padgs.multirun.overrides import root
 from padgs.runs.config import Settings
@@ -23,10 +24,13 @@ padgs-run --cfg job           the configuration, not run
 padgs-run --help method=NAME  this text, with the keys of that method
 padgs-run --version           and stop; --hydra-help says what else Hydra understands
 """
-CHOSEN = ("method", "experiment", "sweep", "data", "protocol", "render", "scale", "launcher", "tracking")
+CHOSEN = (
+    *("method", "experiment", "sweep", "scene", "data", "protocol"),
+    *("render", "budget", "scale", "launcher", "tracking"),
+)
 # The comment above a field, its name, and the comment beside it, which may go on below.
 COMMENTED = re.compile(r"^((?:    # .*\n)*)    (\w+): [^#\n]*?(?:  # (.*(?:\n {5,}# .*)*))?$", re.MULTILINE)
-ADDED = ("experiment", "sweep", "scale")  # groups that only a + brings in
+ADDED = ("experiment", "sweep", "scene", "scale")  # groups that only a + brings in
 
 
 def manual(arguments: Sequence[str], width: int | None = None) -> str:
@@ -53,10 +57,10 @@ def manual(arguments: Sequence[str], width: int | None = None) -> str:
 
 def choices() -> dict[str, list[str]]:
     """Group, with the + that it may need -> the names in it."""
-    found = {}
+    found, made = {}, {"method": METHODS, "scene": scene_choices()}
     for group in CHOSEN:
         folder = root() / ("sweeps" if group == "sweep" else "conf") / group
-        names = {path.stem for path in folder.glob("*.yaml")} | ({*METHODS} if group == "method" else set())
+        names = {path.stem for path in folder.glob("*.yaml")} | {*made.get(group, ())}
         if names:
             found[f"+{group}" if group in ADDED else group] = sorted(names)
     return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 import re
 import shlex
 from collections.abc import Mapping, Sequence
@@ -11,6 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from hydra.core.config_loader import ConfigLoader
+
+# Keys that name files, with what is said of them; what Hydra is to read in it: nothing, null, quotes, groups, calls;
+# one of several names.
+FILES = re.compile(r"(\+*(?:data\.(?:path|images|points|mask)|run\.folder|init)=)(.*)", re.DOTALL)
+GRAMMAR = re.compile(r"|null|(['\"]).*\1|\{.*\}|(choice|glob|shuffle|sort|tag)\(.*\)", re.DOTALL)
+ONE_OF_SEVERAL = re.compile(r"\"[^\"]*\"|'[^']*'|[^,]+")
 
 
 def root() -> Path:
@@ -55,6 +62,43 @@ def lenient(arguments: Sequence[str]) -> list[str]:
     return [forced(argument) for argument in arguments]
 
 
+def quoted(arguments: Sequence[str]) -> list[str]:
+    """Quote names of files, so that they may have any characters; a ~ is the home folder, as a shell would have it.
+
+    Commas part several names in a multirun, and belong to the name elsewhere.
+
+    >>> quoted(["data.path=Flat (2), old", "seed=1"])
+    ['data.path="Flat (2), old"', 'seed=1']
+    >>> quoted(["-m", "data.path=Flat (2),old", "++init=null"])
+    ['-m', 'data.path="Flat (2)","old"', '++init=null']
+    """
+    several = _is_multirun(arguments)
+
+    def in_quotes(argument: str) -> str:
+        found = FILES.fullmatch(argument)
+        if found is None:
+            return argument
+        key, value = found.groups()
+        is_list = several and not GRAMMAR.fullmatch(value)
+        names = [name.strip() for name in ONE_OF_SEVERAL.findall(value)] if is_list else [value]
+        return key + ",".join(map(_quoted, names))
+
+    return [in_quotes(argument) for argument in arguments]
+
+
+def _quoted(name: str) -> str:
+    from hydra.core.override_parser.types import Quote, QuotedString  # not to recognise a finished run
+
+    if GRAMMAR.fullmatch(name):
+        return name
+    return QuotedString(os.path.expanduser(name), Quote.double).with_quotes()
+
+
+def _is_multirun(arguments: Sequence[str]) -> bool:
+    """Whether a command line may start several runs, so that commas part values."""
+    return any(re.match(r"-m$|--multirun$|\+*(experiment|sweep)=", text) for text in arguments)
+
+
 def _groups() -> set[str]:
     return {path.name for path in (root() / "conf").iterdir() if path.is_dir()}
 
@@ -70,6 +114,10 @@ def conflict(arguments: Sequence[str]) -> str | None:
     'seed=0,1 is a list of runs, which needs -m: padgs-run -m seed=0,1'
     >>> conflict(["protocol=null"])
     'protocol=null: protocol is a group of settings, chosen by name, e.g. protocol=both'
+    >>> conflict(["+scene=roam360_bar", "launcher=slurm"])
+    'launcher=slurm launches the jobs of a multirun; for this run: padgs-run -m +scene=roam360_bar launcher=slurm'
+    >>> conflict(["+sweep=tau", "run.jobs=4"])
+    'run.jobs=4 takes a launcher that runs several jobs at a time, e.g. launcher=local'
     """
     settings: dict[str, str] = {}
     for argument in arguments:
@@ -85,10 +133,18 @@ def conflict(arguments: Sequence[str]) -> str | None:
             known = sorted(path.stem for path in (root() / "conf" / key).glob("*.yaml"))
             return f"{argument}: {key} is a group of settings, chosen by name, e.g. {key}={known[0]}"
         settings[key] = argument
-    if not {"-m", "--multirun", "experiment", "sweep"} & {*arguments, *settings}:
+    launcher = settings.get("launcher", "=none").partition("=")[2]
+    jobs = settings.get("run.jobs", "=1").partition("=")[2]
+    if not _is_multirun(arguments):
         for argument in settings.values():
-            if re.fullmatch(r"[^\[{('\"]*,.*", argument.partition("=")[2]):
+            if not FILES.match(argument) and re.fullmatch(r"[^\[{('\"]*,.*", argument.partition("=")[2]):
                 return f"{argument} is a list of runs, which needs -m: padgs-run -m {shlex.join(arguments)}"
+        only_asks = any(argument.startswith("-") for argument in arguments)  # such as --cfg
+        if launcher != "none" and not only_asks:
+            command = f"padgs-run -m {shlex.join(arguments)}"
+            return f"launcher={launcher} launches the jobs of a multirun; for this run: {command}"
+    if jobs != "1" and launcher == "none" and "hydra/launcher" not in settings:
+        return f"run.jobs={jobs} takes a launcher that runs several jobs at a time, e.g. launcher=local"
     return None
 
 

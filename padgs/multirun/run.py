@@ -48,12 +48,13 @@ def _run(arguments: Sequence[str]) -> int:
     import hydra
     from hydra.errors import HydraException
 
+    from padgs.baselines import clash
     from padgs.multirun import job, sweeper
     from padgs.multirun.board import OK
     from padgs.multirun.choices import register_choices
     from padgs.multirun.launchers import missing_plugin
     from padgs.multirun.manual import manual
-    from padgs.multirun.overrides import conflict, lenient, options_first, root
+    from padgs.multirun.overrides import conflict, lenient, options_first, quoted, root
 
     if {"--help", "-h"} & {*arguments}:
         try:
@@ -63,7 +64,7 @@ def _run(arguments: Sequence[str]) -> int:
             return 1
         return 0
     os.environ.setdefault("PADGS_ROOT", str(root()))
-    if problem := conflict(arguments) or missing_plugin(arguments):
+    if problem := conflict(arguments) or missing_plugin(arguments) or clash():
         job.complain(problem)
         return 1
     register_choices()
@@ -72,7 +73,7 @@ def _run(arguments: Sequence[str]) -> int:
     job.ARGUMENTS[:] = arguments
     start = f"{datetime.now():%Y%m%d-%H%M%S}-{os.getpid()}"
     if not completing:
-        sys.argv[1:] = [*options_first(lenient(arguments)), f"hydra.sweep.dir=${{run.folder}}/{FOLDER}/{start}"]
+        sys.argv[1:] = [*options_first(lenient(quoted(arguments))), f"hydra.sweep.dir=${{run.folder}}/{FOLDER}/{start}"]
     hydra.main(version_base="1.3", config_path=str(root() / "conf"), config_name="config")(job.only_job)()
     return 0 if {*job.ENDS, *sweeper.ENDS} <= {OK} else 1
 

@@ -51,11 +51,11 @@ def sweep(self: Any, arguments: list[str]) -> None:
     ENDS.clear()
     try:
         typed(RunOptions, OmegaConf.to_container(self.config.run, resolve=True), "run")  # type: ignore[arg-type]
+        multirun = Multirun(self.config, expand(self.params, arguments, loader), Console())
     except ValueError as error:
         complain(str(error))
         ENDS[REFUSED] += 1
         return
-    multirun = Multirun(self.config, expand(self.params, arguments, loader), Console())
     _refuse_unknown_choices(multirun.jobs, self.config, loader)
     try:
         multirun.run(self.launcher, self.max_batch_size)

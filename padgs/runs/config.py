@@ -106,13 +106,9 @@ class RunOptions:
     pictures: bool = True  # save truth | render | error of each test view
 
     def __post_init__(self) -> None:
-        for name, known in (("device", DEVICES), ("images_on", IMAGES_ON)):
-            if getattr(self, name) not in known:
-                raise ValueError(f"unknown run.{name} {getattr(self, name)!r}; known: {', '.join(known)}")
-        for name in ("jobs", "threads", "log_every", "probe_every", "checkpoint_every"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ValueError(f"{name} is {value}; it must be at least 1")
+        check_known(self, device=DEVICES, images_on=IMAGES_ON)
+        counts = ("jobs", "threads", "log_every", "probe_every", "checkpoint_every")
+        check(self, "at least 1", lambda count: count is None or count >= 1, *counts)
         check(self, ">= 0", lambda seconds: seconds >= 0, "checkpoint_seconds")
 
     @property
@@ -147,9 +143,7 @@ class Settings:
     need: str = "off"  # on: a run that ended well is searched for its smallest model, as padgs need does
 
     def __post_init__(self) -> None:
-        if self.retry not in RETRIES:
-            raise ConfigError(f"unknown retry {self.retry!r}; known: {', '.join(RETRIES)}")
-        check_known(self, need=NEEDS)
+        check_known(self, retry=RETRIES, need=NEEDS)
         check(self, "in [0, 2^63)", lambda seed: 0 <= seed < 2**63, "seed")
 
 

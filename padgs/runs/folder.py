@@ -100,9 +100,9 @@ class RunFolder:
             yield
 
     def forget(self, result: Result) -> None:
-        """Let a failed run start again; where only time or memory ran out, from its checkpoint."""
+        """Let a failed run start again; where only memory ran out, from its checkpoint."""
         with self._writing():
-            if result.status not in ("oom", "timeout"):
+            if result.status != "oom":
                 shutil.rmtree(self.checkpoint, ignore_errors=True)
             self.stop.unlink(missing_ok=True)
             (self.path / results.FILE_NAME).unlink()

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 from padgs import clock
+from padgs.baselines import distribution
 from padgs.learning.failure import Failure, is_out_of_memory, memory_reason
-from padgs.results import Result
+from padgs.results import STATUSES, Result
 from padgs.runs.config import RunConfig
 from padgs.runs.identity import config_hash
 from padgs.runs.scoring import quality_of_one_color
@@ -14,12 +15,14 @@ from padgs.scene import Scene
 
 WRONG_DEPTH = 0.5  # AbsRel
 SOON = 50  # iterations; before that a run may simply not have got anywhere yet
+RETRIED = STATUSES.keys() - {"ok", "timeout"}  # by retry=failed; with more train.max_seconds it would be another run
 
 
 def begun(config: RunConfig, scene: Scene, run: str) -> Result:
     """What is known before the first iteration; status ok, as long as nothing says otherwise."""
     view = (scene.test or scene.train)[0]
     machine = clock.machine(scene.points.device)
+    code = (machine["padgs"], (machine["commit"] or "")[:10], distribution(config.method))
     values = config.values()
     return Result(
         run=run,
@@ -34,7 +37,7 @@ def begun(config: RunConfig, scene: Scene, run: str) -> Result:
         iterations=config.training.iterations,
         iterations_done=0,
         seed=config.seed,
-        code_version=" ".join(part for part in (machine["padgs"], (machine["commit"] or "")[:10]) if part) or "unknown",
+        code_version=" ".join(filter(None, code)) or "unknown",
         machine=machine,
         config_hash=config_hash(values),
         fingerprint=scene.fingerprint,

@@ -89,7 +89,7 @@ class Session:
                     result = None
                 result = self.train() if result is None else self._completed(result)
         else:
-            advice = "" if result.ok else "; it failed, retry=failed starts it again"
+            advice = "; it failed, retry=failed starts it again" if result.status in outcome.RETRIED else ""
             self._say(f"finished before, nothing to do{advice}")
         show_result(result, self.folder.path, self.console)
         return result
@@ -201,7 +201,7 @@ class Session:
         return results.joined(result.experiments, self.config.labels.experiments)
 
     def _is_retried(self, result: Result) -> bool:
-        return not result.ok and self.config.retry == "failed"
+        return result.status in outcome.RETRIED and self.config.retry == "failed"
 
     def _unscored(self, result: Result) -> dict[str, Protocol]:
         """The protocols under whose rules a run that ended well has no marks."""

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from filelock import FileLock
 
+from padgs.checks import check_known
 from padgs.results import Result
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ KINDS = ("mlflow", "none")
 DEFAULT_EXPERIMENT = "padgs"  # of mlflow, for runs of no experiment of ours
 SERVERS = ("http", "databricks")  # how their URIs begin
 SECONDS_BETWEEN_LOOKS = 30.0  # at a run in progress
+PATIENCE = 60.0  # seconds for another process that makes the database
 # A server that does not answer must not hold up anything for minutes, as it does by default.
 # And nobody wants to know about the tables of a new database.
 SETTINGS = {
@@ -42,8 +44,7 @@ class TrackingOptions:
     telemetry: bool = False  # whether mlflow may report its use to its makers
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ValueError(f"unknown tracking.kind {self.kind!r}; known: {', '.join(KINDS)}")
+        check_known(self, kind=KINDS)
 
 
 class Tracker:
@@ -105,7 +106,7 @@ class Tracker:
 
         from padgs.tracking.mlflow_mirror import Mirror
 
-        with FileLock(self._runs / ".mlflow.lock"):  # two processes that make one database destroy it
+        with FileLock(self._runs / ".mlflow.lock", timeout=PATIENCE):  # two processes that make one database destroy it
             client = MlflowClient(self.uri)
             known = client.get_experiment_by_name(self.name)
             # A server has a place for artifacts; beside a database they would land wherever one happens to stand.

@@ -6,9 +6,14 @@ import sys
 from configparser import ConfigParser
 
 import pytest
+from tiny_scene import tiny_scene
 
 import padgs
-from padgs.baselines import METHODS, outside
+from padgs import baselines
+from padgs.baselines import METHODS, clash, distribution, outside
+from padgs.multirun.choices import register_choices
+from padgs.runs.config import config_from_values
+from padgs.runs.outcome import begun
 
 
 @pytest.fixture
@@ -44,6 +49,21 @@ def test_it_keeps_the_promises_that_its_own_tests_state(installed, tmp_path):
 
 
 def test_a_name_of_ours_is_refused(installed, monkeypatch):
-    monkeypatch.setitem(METHODS, "my_method", "padgs.baselines.omnigs:OmniGSMethod")
-    with pytest.raises(ValueError, match="my_method:MyMethod is called my_method, as a method of padgs is"):
-        outside()
+    assert clash() is None
+    monkeypatch.setattr(baselines, "OURS", baselines.OURS | {"my_method"})
+    assert clash() == "entry point my_method:MyMethod is called my_method, as a method of padgs is; rename it"
+
+
+def test_a_method_that_cannot_be_imported_is_said_once_and_left_out(monkeypatch, capsys):
+    monkeypatch.setitem(METHODS, "broken", "no_such_module:Method")
+    for _ in range(2):
+        register_choices()
+    said = capsys.readouterr().err
+    assert said.count("method=broken is left out (ModuleNotFoundError: No module named 'no_such_module'") == 1
+    assert "broken" not in METHODS
+
+
+def test_results_say_which_package_they_are_of(installed):
+    config = config_from_values({"method": {"name": "my_method"}, "protocol": {"paper": {}}})
+    assert begun(config, tiny_scene(), "run").code_version.endswith(" my-method 0.1")
+    assert distribution("padgs") == ""

@@ -30,10 +30,11 @@ def test_what_decides_nothing_about_results_is_ignored(runs):
         assert FinishedJobs(runs).status([extra, *reversed(JOB)]) == "ok"
 
 
-def test_a_job_that_begins_with_another_run_is_looked_at(runs):
-    job = ["init=runs/other", *JOB]
+@pytest.mark.parametrize("setting", ["init=runs/other", "++data.images=/a", "data.mask=/a.png", "data.points=/a.ply"])
+def test_a_job_that_reads_other_files_than_those_of_its_data_is_looked_at(runs, setting):
+    job = [setting, *JOB]
     FinishedJobs(runs).add(job, "room_padgs_1", "ok", None)
-    assert FinishedJobs(runs).status(job) is None, "the other may have been trained anew"
+    assert FinishedJobs(runs).status(job) is None, "they may have changed, or another run been trained anew"
 
 
 def test_a_result_that_is_gone_or_was_written_anew_is_looked_at(runs):
@@ -50,14 +51,20 @@ def test_a_job_whose_result_was_gone_when_it_was_noted_is_looked_at(runs):
     assert FinishedJobs(runs).status(JOB) is None
 
 
-def test_data_that_changed_are_looked_at(runs, tmp_path):
-    data = tmp_path / "data"
-    data.mkdir()
-    (data / "0.png").write_bytes(b"1")
-    FinishedJobs(runs).add(JOB, "room_padgs_1", "ok", str(data))
+@pytest.mark.parametrize("name", ["", "transforms.json"])
+def test_data_that_changed_are_looked_at(runs, tmp_path, name):
+    data, images = tmp_path / "data", tmp_path / "images"
+    for folder in (data, images):
+        folder.mkdir()
+    (data / "transforms.json").write_text("{}")
+    (data / "images").symlink_to(images)
+    (data / "itself").symlink_to(data)
+    (images / "0.png").write_bytes(b"1")
+    finished.signature.cache_clear()
+    FinishedJobs(runs).add(JOB, "room_padgs_1", "ok", str(data / name))
     finished.signature.cache_clear()
     assert FinishedJobs(runs).status(JOB) == "ok"
-    (data / "0.png").write_bytes(b"22")
+    (images / "0.png").write_bytes(b"22")
     finished.signature.cache_clear()
     assert FinishedJobs(runs).status(JOB) is None
 
@@ -67,13 +74,26 @@ def test_other_sources_are_looked_at(runs, monkeypatch):
     assert FinishedJobs(runs).status(JOB) is None
 
 
+def test_other_sources_of_another_package_are_looked_at(runs, tmp_path, monkeypatch):
+    (tmp_path / "plugged_in.py").write_text("RATE = 1")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(finished, "outside", lambda: {"plugged": "plugged_in:Method", "gone": "no_such.x:Method"})
+    finished._sources.cache_clear()
+    FinishedJobs(runs).add(JOB, "room_padgs_1", "ok", None)
+    (tmp_path / "plugged_in.py").write_text("RATE = 2")
+    assert FinishedJobs(runs).status(JOB) == "ok", "a process looks once"
+    finished._sources.cache_clear()
+    assert FinishedJobs(runs).status(JOB) is None and "plugged_in" not in sys.modules
+    finished._sources.cache_clear()
+
+
 def test_a_cut_line_costs_only_its_own_job(runs):
     path = runs / ".multirun" / "finished.jsonl"
     path.write_text('{"job": "cut\n' + path.read_text() + json.dumps(["no", "entry"]))
     assert FinishedJobs(runs).status(JOB) == "ok"
 
 
-def test_the_only_run_of_a_command_is_known_without_loading_anything(runs):
+def test_the_only_run_of_a_command_is_known_without_loading_anything(runs, monkeypatch):
     command = ["+experiment=smoke", f"run.folder={runs}"]
     assert finished.only_run(command) is None
     FinishedJobs(runs).add(command, "room_padgs_1", "ok", None)
@@ -81,5 +101,9 @@ def test_the_only_run_of_a_command_is_known_without_loading_anything(runs):
     assert finished.only_run([*command, "--cfg"]) is None and finished.only_run([*command, "seed=1"]) is None
     FinishedJobs(runs).add(command, "room_padgs_1", "nan", None)
     assert finished.only_run(command) is None, "a failed one is looked at: retry=failed may start it again"
+    home = ["+experiment=smoke", "run.folder=~/runs"]
+    monkeypatch.setenv("HOME", str(runs.parent))
+    FinishedJobs(runs).add(home, "room_padgs_1", "ok", None)
+    assert finished.only_run(home) == runs / "room_padgs_1"
     code = "import sys, padgs.multirun.run; assert not {'torch', 'hydra', 'numpy'} & set(sys.modules), 'slow'"
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -53,9 +53,9 @@ class Start:
         (self.runs / run / "result.json").write_text("{}")
         self.board.write(number, JobState(status, run, 10))
 
-    def counts(self) -> dict[str, int]:
+    def counts(self, batch_size: int | None = None) -> dict[str, int]:
         try:
-            self.multirun.run(self, None)
+            self.multirun.run(self, batch_size)
         finally:
             seen = self.multirun.close()
         return dict(seen.counts)
@@ -76,6 +76,17 @@ def test_only_what_is_missing_is_launched(tmp_path):
     assert more.counts() == {"ok": 3} and more.launched == ["++seed=2"]
 
 
+class InArrays(Start):
+    def launch(self, jobs, initial_job_idx):
+        if len(jobs) > 2:
+            raise RuntimeError("more than an array may have")
+        super().launch(jobs, initial_job_idx)
+
+
+def test_a_launcher_gets_as_many_jobs_at_a_time_as_it_takes(tmp_path):
+    assert InArrays(tmp_path, 1, ELSEWHERE).counts(2) == {"ok": 3}
+
+
 class OneFails(Start):
     def end(self, number, job):
         self.finish(number, job, "nan" if job == "++seed=1" else "ok")
@@ -88,6 +99,18 @@ def test_failed_runs_are_kept_and_retried_only_if_asked(tmp_path, capsys):
     assert kept.counts() == {"ok": 2, "nan": 1} and kept.launched == []
     retried = Start(tmp_path, 3, ELSEWHERE, retry="failed")
     assert retried.counts() == {"ok": 3} and retried.launched == ["++seed=1"]
+
+
+class OneRunsOutOfTime(Start):
+    def end(self, number, job):
+        self.finish(number, job, "timeout" if job == "++seed=1" else "ok")
+
+
+def test_a_run_out_of_time_is_not_retried_because_its_time_is_part_of_what_it_is(tmp_path):
+    first = OneRunsOutOfTime(tmp_path, 1, ELSEWHERE)
+    assert first.counts() == {"ok": 2, "timeout": 1} and "retry=failed" not in first.out.getvalue()
+    again = Start(tmp_path, 2, ELSEWHERE, retry="failed")
+    assert again.counts() == {"ok": 2, "timeout": 1} and again.launched == []
 
 
 class OneKills(Start):
@@ -171,6 +194,23 @@ def test_ctrl_c_lets_running_jobs_stop_by_themselves(tmp_path, monkeypatch):
     assert dict(start.multirun.look().counts) == {"ok": 1, "stopped": 2}
     again = Start(tmp_path, 2, ELSEWHERE)
     assert again.counts() == {"ok": 3} and again.launched == ["++seed=1", "++seed=2"]
+
+
+class InterruptsTwice(Start):
+    def end(self, number, job):
+        self.board.write(number, JobState("running", f"room_{job[-1]}"))
+        raise KeyboardInterrupt
+
+
+def test_a_second_ctrl_c_leaves_jobs_what_they_need(tmp_path):
+    start = InterruptsTwice(tmp_path, 1, ELSEWHERE)
+    with pytest.raises(KeyboardInterrupt):
+        start.counts()
+    assert (start.folder / "00000.json").exists() and str(start.folder) in start.out.getvalue()
+    alone = InterruptsTwice(tmp_path, 2, IN_PROCESS)
+    with pytest.raises(KeyboardInterrupt):
+        alone.counts()
+    assert not alone.folder.exists(), "its only process ends"
 
 
 def test_a_folder_that_cannot_be_written_refuses_all_jobs(tmp_path, capsys):

@@ -21,6 +21,8 @@ def test_every_key_stands_there_with_the_default_of_the_method_and_its_meaning(r
     assert "pixels; the height is half of it" in said["data.generator.width"] and max(map(len, lines)) <= 100
     assert "published: made for 30 000" in said["train.learning_rates"], "the comment above it"
     assert "render.projection=ray" in manual(["--help"]), "padgs+ is drawn by rays"
+    assert "budget=auto, given" in "\n".join(lines)
+    assert all(name in said["+scene"] for name in ("noisy_poses", "omniblender_LOU")), "of files and of data sets"
 
 
 @pytest.mark.parametrize("name", METHODS)

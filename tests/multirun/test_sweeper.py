@@ -5,14 +5,18 @@ import random
 import signal
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
+from omegaconf import OmegaConf
 from processes import SMALLEST, finish
 
 from padgs import results
+from padgs.multirun import sweeper
 
 TINY = [*SMALLEST, "train.iterations=40", "run.checkpoint_every=5", "tracking=none"]
-SWEEP = ["-m", "method.tau=0.0,0.5,0.9,1.0", "seed=0,1,2"]
+SWEEP = ["-m", "method=padgs", "method.tau=0.0,0.5,0.9,1.0", "seed=0,1,2"]
 
 
 def marks(folder: Path) -> dict[str, tuple]:
@@ -20,6 +24,16 @@ def marks(folder: Path) -> dict[str, tuple]:
     found, broken = results.read_all(folder)
     assert not broken
     return {result.run: (result.status, result.scores, result.counts, result.iterations_done) for result in found}
+
+
+def test_a_key_of_tracking_that_is_unknown_is_said_without_a_traceback(tmp_path, capsys):
+    hydra = {"sweep": {"dir": str(tmp_path / "start")}, "launcher": {"_target_": "x.BasicLauncher"}}
+    hydra |= {"runtime": {"choices": {}}}
+    config = {"run": {"folder": str(tmp_path)}, "retry": "none", "tracking": {"knid": "none"}, "hydra": hydra}
+    basic = SimpleNamespace(launcher=Mock(), hydra_context=Mock(), config=OmegaConf.create(config), params={})
+    sweeper.sweep(basic, ["++seed=0,1"])
+    assert capsys.readouterr().err.startswith("error: unknown key tracking.knid; known: tracking.kind")
+    assert dict(sweeper.ENDS) == {"refused": 1}
 
 
 @pytest.mark.slow

@@ -70,9 +70,9 @@ def test_without_the_library_auto_is_the_cpu(monkeypatch):
 
 
 def test_an_unknown_place_is_refused():
-    with pytest.raises(ValueError, match="unknown run.device 'gpu'; known: auto, cpu, cuda"):
+    with pytest.raises(ValueError, match="unknown device 'gpu'; known: auto, cpu, cuda"):
         RunOptions(device="gpu")
-    with pytest.raises(ValueError, match="unknown run.images_on 'gpu'; known: device, cpu"):
+    with pytest.raises(ValueError, match="unknown images_on 'gpu'; known: device, cpu"):
         RunOptions(images_on="gpu")
 
 

@@ -259,7 +259,7 @@ def test_a_failed_run_has_a_result_with_its_status(config, monkeypatch, error, s
     assert again == result and "retry=failed" in said
 
 
-@pytest.mark.parametrize(("status", "starts_at"), [("nan", 0), ("timeout", 5)])
+@pytest.mark.parametrize(("status", "starts_at"), [("nan", 0), ("oom", 5)])
 def test_a_failed_run_is_retried_only_if_asked(config, monkeypatch, status, starts_at):
     config = replace(config, run=replace(config.run, checkpoint_every=5))
 
@@ -327,9 +327,12 @@ def test_an_error_of_ours_is_no_result(config, monkeypatch):
 
 
 def test_time_running_out_is_a_status_and_the_model_is_scored(config):
-    result, _ = run(replace(config, train=replace(config.train, max_seconds=1e-9)))
+    config = replace(config, train=replace(config.train, max_seconds=1e-9), retry="failed")
+    result, _ = run(config)
     assert result.status == "timeout" and result.iterations_done < ITERATIONS
     assert result.scores["paper"].metrics["psnr"] is not None
+    again, said = run(config)
+    assert again == result and "finished before, nothing to do\n" in said, "it would have no more time than before"
 
 
 def test_a_run_folder_that_cannot_be_made_is_a_clear_error(config, tmp_path):

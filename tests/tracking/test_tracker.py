@@ -1,12 +1,15 @@
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+from filelock import FileLock
 from typer.testing import CliRunner
 
 from padgs import results
 from padgs.cli.commands import app
 from padgs.results import Result, Scores
+from padgs.tracking import tracker as tracking
 from padgs.tracking.mlflow_mirror import batches
 from padgs.tracking.tracker import Tracker, TrackingOptions
 
@@ -56,7 +59,7 @@ def test_without_mlflow_one_line_says_so(tmp_path, said, monkeypatch):
 
 
 def test_an_unknown_kind_is_refused():
-    with pytest.raises(ValueError, match="unknown tracking.kind 'wandb'; known: mlflow, none"):
+    with pytest.raises(ValueError, match="unknown kind 'wandb'; known: mlflow, none"):
         TrackingOptions("wandb")
 
 
@@ -113,6 +116,26 @@ def test_a_database_that_is_lost_costs_a_line(tmp_path, said):
     tracker.update(run)
     tracker.update(run)
     assert len(said) == 1 and "padgs track" in said[0]
+
+
+@NEEDS_MLFLOW
+def test_a_lock_that_is_never_free_costs_a_line(tmp_path, said, monkeypatch):
+    pytest.importorskip("mlflow")
+    monkeypatch.setattr(tracking, "PATIENCE", 0.1)
+    with FileLock(tmp_path / ".mlflow.lock"):
+        Tracker(TrackingOptions(), tmp_path, "tau", said.append).update(make_run(tmp_path))
+    assert len(said) == 1 and "Timeout" in said[0]
+
+
+def test_a_folder_of_a_run_is_mirrored_whatever_its_name(tmp_path, monkeypatch):
+    make_run(tmp_path).rename(tmp_path / "the best")
+    mirrored = []
+    fake = SimpleNamespace(name="tau", on=True, update=mirrored.append)
+    monkeypatch.setattr(tracking, "Tracker", lambda *_: fake)
+    done = CliRunner().invoke(app, ["track", str(tmp_path)])
+    assert done.exit_code == 0 and mirrored == [tmp_path / "the best"]
+    done = CliRunner().invoke(app, ["track", str(tmp_path / "rums")])
+    assert done.exit_code == 1 and f"there is no folder {tmp_path / 'rums'}" in done.output
 
 
 @pytest.mark.slow
