@@ -49,7 +49,7 @@ CONFIG_GROUPS = {"budget", "data", "method", "protocol", "render", "run", "stres
 # What is no more than a name, even in a command line or a path; `@` parts an experiment from its scale.
 PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*(@[A-Za-z0-9._-]+)?")
 BY_ITSELF = "by_itself"  # among experiments: a command without any asked for the run as well
-HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "lpips": False, "seam": False}  # of every metric with the word in it
+HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "lpips": False}  # of every metric with the word in it
 
 
 class ResultError(ValueError):
@@ -271,7 +271,7 @@ def picture_name(view: str) -> str:
 def higher_is_better(metric: str) -> bool | None:
     """Which end of a metric is the better one, by the word of `HIGHER_IS_BETTER` in its name; None for others.
 
-    >>> higher_is_better("ws_psnr_pole"), higher_is_better("lpips_vgg_01"), higher_is_better("latitude")
+    >>> higher_is_better("ws_psnr_pole"), higher_is_better("lpips_vgg_01"), higher_is_better("seam")  # best at 1
     (True, False, None)
     """
     return next((HIGHER_IS_BETTER[word] for word in metric.split("_") if word in HIGHER_IS_BETTER), None)

@@ -23,7 +23,7 @@ class Gathered:
     runs: DataFrame  # as `frame` makes it
     request: Request = Request()
     left_out: Sequence[str] = ()  # why which result files could not be used
-    warnings: list[str] = field(default_factory=list)  # of the reports made so far: which runs stand apart in them
+    warnings: list[str] = field(default_factory=list)  # of the reports made so far: what stands apart, or is not there
     _made: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -51,7 +51,7 @@ class Gathered:
             try:
                 made = function(gathered)
             except Mixture as mixture:
-                if self.request.strict or mixture.what in told:
+                if self.request.strict:
                     raise
                 told[mixture.what] = None
                 gathered = replace(gathered, runs=apart(gathered.runs, mixture), _made={})
@@ -77,6 +77,13 @@ class Gathered:
         """The runs of some experiments or sweeps, at whatever scale; none if none was run."""
         runs = self.asked_for
         return runs.loc[[not set(names).isdisjoint(map(experiment_of, of)) for of in runs["experiments"]]]
+
+    def of_methods(self, *names: str) -> DataFrame:
+        """Those of them that are what their preset says and no more: no rows of an ablation, and no runs that were
+        stopped by hand or went on from others, which their `variant` names as well.
+        """
+        runs = self.of_experiments(*names)
+        return runs.loc[runs["variant"] == ""]
 
 
 def of_a_table(experiment: str) -> bool:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import pandas as pd
 from pandas import DataFrame
@@ -30,25 +29,29 @@ class Mixture(ReportError):
 
 
 def apart(runs: DataFrame, mixture: Mixture) -> DataFrame:
-    """All runs, those of a mixture with what they differ in behind the name of their scene or preset."""
+    """All runs, those of a mixture with what they differ in behind the name of their scene or preset.
+
+    Raises:
+        Mixture: that one, if this tells none of them from another.
+    """
     own = runs.loc[mixture.runs.index]
-    words = [[_words(column, value) for value in _known(own[column])] for column in mixture.columns]
-    said = [", ".join(of) for of in zip(*words, strict=True)]
+    said = [", ".join(of) for of in zip(*(_words(column, own[column]) for column in mixture.columns), strict=True)]
     names = [_with(name, words) for name, words in zip(own[mixture.apart_in], said, strict=True)]
+    if len(set(names)) == own[mixture.apart_in].nunique():
+        raise mixture
     found = runs.copy()
     found.loc[own.index, mixture.apart_in] = pd.Series(names, index=own.index, dtype=object)
     return found
 
 
-def _known(values: pd.Series) -> pd.Series:
-    """Who says nothing contradicts none: the most frequent value stands for it."""
-    return values.where(values.notna(), values.mode().iloc[0])
-
-
-def _words(column: str, value: Any) -> str:
+def _words(column: str, values: pd.Series) -> pd.Series:
+    """What is said of each run: that a key is not set; of a condition, who says nothing contradicts none, and the most
+    frequent words stand for it.
+    """
     if column.startswith(CONFIG):
-        return f"{column.rpartition('.')[2]} {value}"
-    return f"{WORDED.get(column, '')}{value}"
+        return values.map(lambda value: f"{column.rpartition('.')[2]} {'not set' if value is None else value}")
+    words = values.map(lambda value: f"{WORDED.get(column, '')}{value}", na_action="ignore")
+    return words.fillna(words.mode().iloc[0])
 
 
 def _with(name: Place | str, words: str) -> Place | str:

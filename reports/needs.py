@@ -8,15 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from pandas import DataFrame
 
-from padgs.reports import methods
+from padgs.reports.frame import CONFIG
 from padgs.reports.gathered import Gathered
 from padgs.reports.settings import settings
 from padgs.results import NEED_LOSSES, NEED_PICTURE, NEED_STATED
 
 EPSILONS = tuple(f"{loss:g}" for loss in NEED_LOSSES)  # dB, as results name them
 STATED = f"{NEED_STATED:g}"
+DEGREE = f"{CONFIG}method.sh_degree"
 
 
 @dataclass(frozen=True)
@@ -44,9 +46,7 @@ class Curve:
     @property
     def file(self) -> Mapping[str, Any] | None:
         """The smallest good file of the model that was kept, if that is the one for `STATED`."""
-        if f"{self.found.get('kept', {}).get('epsilon')}" != STATED:
-            return None
-        return next(file for file in self.found["files"] if file["kept"])
+        return next(file for file in self.found["files"] if file["kept"]) if _is_stated(self.found) else None
 
     @property
     def quality(self) -> list[float]:
@@ -66,25 +66,34 @@ class Curve:
 
 
 def searched(gathered: Gathered) -> DataFrame:
-    """The runs that `padgs need` made."""
+    """The runs that `padgs need` made, one of each search, though it keeps one for each loss that it is asked for: that
+    for `STATED`, if there is one. Each has a setting of its own, that of the run that was searched.
+    """
     runs = gathered.asked_for
-    return runs.loc[runs["need"].map(bool)]
+    runs = runs.loc[runs["need"].map(bool)]
+    degrees = [_trained_degree(run) for _, run in runs.iterrows()]
+    runs = runs.assign(
+        variant="",  # which says what was kept
+        setting=[name.partition("_need-")[0] for name in runs["run"]],  # the searched run
+        **{DEGREE: pd.Series(degrees, index=runs.index, dtype=object)},
+    )
+    stated_first = sorted(runs.index, key=lambda index: not _is_stated(runs.at[index, "need"]))
+    return runs.loc[stated_first].drop_duplicates("setting").sort_index()
 
 
 def curves(runs: DataFrame) -> list[Curve]:
-    """A curve for each run of one scene, in the order of the methods and seeds."""
+    """A curve for each search on one scene, in the order of methods, of what sets their runs apart, and of seeds."""
     found = []
-    for setting in settings(runs):
-        ordered = setting.runs.sort_values("seed")
-        for seed, need, renders in zip(ordered["seed"], ordered["need"], ordered["pictures"], strict=True):
-            steps = need["steps"]
-            rows = sorted((s for s in steps if s["kind"] != "control"), key=lambda step: -step["blended"])
-            title = methods.title(setting.preset) + (f", seed {seed}" if len(setting.runs) > 1 else "")
-            needs = {epsilon: steps[number] for epsilon, number in need["needs"].items()}
-            knee = None if need["knee"] is None else steps[need["knee"]]
-            picture = None if renders is None else renders.with_name(NEED_PICTURE)
-            there = picture if picture is not None and picture.is_file() else None
-            found.append(Curve(title, setting.preset, tuple(rows), needs, knee, need, there))
+    for setting in settings(runs.sort_values("seed", kind="stable")):
+        run, seeds = setting.runs.iloc[0], runs.loc[runs["preset"] == setting.preset, "seed"]
+        steps = run["need"]["steps"]
+        rows = sorted((s for s in steps if s["kind"] != "control"), key=lambda step: -step["blended"])
+        title = setting.title + (f", seed {run['seed']}" if seeds.nunique() > 1 else "")
+        needs = {epsilon: steps[number] for epsilon, number in run["need"]["needs"].items()}
+        knee = None if run["need"]["knee"] is None else steps[run["need"]["knee"]]
+        picture = None if run["pictures"] is None else run["pictures"].with_name(NEED_PICTURE)
+        there = picture if picture is not None and picture.is_file() else None
+        found.append(Curve(title, setting.preset, tuple(rows), needs, knee, run["need"], there))
     return found
 
 
@@ -109,6 +118,19 @@ def ratio(ours: Curve, other: Curve) -> float | None:
         points.append((best[first], sizes[first]))
     difference = _mean_difference(*points)
     return None if difference is None else 2.0**difference
+
+
+def _is_stated(found: Mapping[str, Any]) -> bool:
+    """Whether the model that a search kept is that for `STATED`."""
+    return f"{found.get('kept', {}).get('epsilon')}" == STATED
+
+
+def _trained_degree(run: Any) -> Any:
+    """Of the harmonics of the searched run; the configuration has that of the kept model, which may be less."""
+    found = run["need"]
+    if found.get("kept", {}).get("degree") is None:
+        return run.get(DEGREE)
+    return found["degrees"][f"{found['kept']['epsilon']:g}"][0]["degree"]
 
 
 def _points(sizes: Sequence[float], qualities: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from padgs.reports import published
 
+BUILT_IN = "synthetic"  # data set of the scenes that are generated; their names begin with it
 OUTDOOR_WORDS = ("outdoor", "garden")  # what a scene outside the data sets is called if it belongs to Table 2
 
 
@@ -32,9 +33,18 @@ class Place:
         """What stands over its rows: nobody shall take a stand-in for a scene of the paper."""
         if self.published:
             return self.heading
-        if self.dataset == "synthetic":
-            return f"{self.label} (built in, generated; no scene of the paper)"
-        return f"{self.label} (a capture that is no scene of the paper)"
+        if not self.dataset:
+            return f"{self.label} (a capture that is no scene of the paper)"
+        origin = "built in, generated" if self.dataset == BUILT_IN else f"of {self.dataset}"
+        return f"{self.label} ({origin}; no scene of the paper)"
+
+    @property
+    def stem(self) -> str:
+        """Its label in the names of files, which no other place shares: with the data set, where the scene's own name
+        does not say it.
+        """
+        said = BUILT_IN if self.scene.startswith(f"{BUILT_IN}-") else ""
+        return self.label if self.dataset == said else f"{self.label}_{self.dataset or 'capture'}"
 
     @property
     def heading(self) -> str:

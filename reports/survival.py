@@ -8,9 +8,8 @@ that failed keeps nothing.
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import pandas as pd
@@ -23,10 +22,11 @@ from padgs.reports.gathered import Gathered
 from padgs.reports.settings import one_setting, refuse_differences
 from padgs.reports.tables.cells import spread
 from padgs.reports.tables.table import Cell
+from padgs.results import file_name
 
 CONDITION, LEVEL = f"{CONFIG}stress.condition", f"{CONFIG}stress.level"
 QUALITY, ONE_COLOR = "stability/ws_psnr", "stability/ws_psnr_one_color"
-ALIKE = ("resolution", "learning_rates", "data")  # iterations: a condition may change them
+ALIKE = ("resolution", "learning_rates", "data", "machine")  # iterations: a condition may change them
 HALF = 0.5  # a condition breaks a method where less is kept
 
 Stress = tuple[str, int]  # condition, level
@@ -39,6 +39,7 @@ class Survivor:
     preset: str
     runs: Mapping[Stress, DataFrame]  # under each stress, a run a seed
     rest: DataFrame  # the runs without any
+    lacks: Set[Stress] = frozenset()  # what other methods of the scene were put under, and it was not
 
     @cached_property
     def retention(self) -> dict[Stress, Cell]:
@@ -58,7 +59,7 @@ class Survivor:
     def place(self) -> str:
         """Scene and resolution, as a part of file names."""
         first = self.rest.iloc[0]
-        return re.sub(r"[^A-Za-z0-9.-]+", "-", f"{first['place'].scene}-{first['resolution']}")
+        return file_name(f"{first['place'].stem}-{first['resolution']}")
 
     @property
     def conditions(self) -> list[str]:
@@ -76,30 +77,32 @@ class Survivor:
 
     @property
     def means(self) -> list[float]:
-        """What it keeps under each condition, the mean of the levels; the worst first."""
-        cells = [self.levels(condition).values() for condition in self.conditions]
+        """What it keeps under each condition, the mean of the levels; the worst first. Empty where it lacks any, for
+        means of less say nothing beside means of more.
+        """
+        cells = [self.levels(condition).values() for condition in self.conditions if not self.lacks]
         return sorted(math.fsum(cell.value or 0.0 for cell in of) / len(of) for of in cells)
 
     @property
-    def score(self) -> float:
+    def score(self) -> float | None:
         """The mean of the conditions."""
-        return math.fsum(self.means) / len(self.means)
+        return spread(self.means).value
 
     @property
-    def worst_quartile(self) -> float:
+    def worst_quartile(self) -> float | None:
         """The mean of the worst quarter of the conditions, one at least."""
-        worst = self.means[: max(1, len(self.means) // 4)]
-        return math.fsum(worst) / len(worst)
+        return spread(self.means[: max(1, len(self.means) // 4)]).value
 
     @property
-    def failure_rate(self) -> float:
+    def failure_rate(self) -> float | None:
         """Share of the runs under stress that failed."""
         ok = pd.concat([runs["ok"] for runs in self.runs.values()])
-        return float(1 - ok.mean())
+        return None if self.lacks else float(1 - ok.mean())
 
 
 def survivors(gathered: Gathered) -> dict[str, list[Survivor]]:
-    """The methods of each scene that were run with and without stress, those whose worst quartile keeps most first.
+    """The methods of each scene that were run with and without stress, those whose worst quartile keeps most first, and
+    last those that have none.
 
     Raises:
         ReportError: results that must not stand together.
@@ -107,11 +110,16 @@ def survivors(gathered: Gathered) -> dict[str, list[Survivor]]:
     runs, found = gathered.of_experiments("stress"), {}
     if not {CONDITION, QUALITY, ONE_COLOR} <= {*runs}:
         return found
+    stress = zip(runs[CONDITION], runs[LEVEL], strict=True)
+    named = ["" if condition is None else f"{condition} {level}" for condition, level in stress]
+    runs = runs.loc[runs["variant"] == named]  # another name is that of a run that was stopped by hand, or of a part
     for title, own in by_conditions(runs, "resolution").items():
         refuse_mixture(own, gathered.request, title, ALIKE)
         kept = [one for preset in methods.ordered(own["preset"]) if (one := _survivor(own, preset, title))]
         if kept:
-            found[title] = sorted(kept, key=lambda one: -one.worst_quartile)
+            every = {stress for one in kept for stress in one.runs}
+            kept = [replace(one, lacks=every - one.runs.keys()) for one in kept]
+            found[title] = sorted(kept, key=lambda one: math.inf if one.lacks else -(one.worst_quartile or 0.0))
     return found
 
 

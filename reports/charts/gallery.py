@@ -15,6 +15,7 @@ from padgs.reports.conditions import footnotes, refuse_mixture
 from padgs.reports.frame import by_conditions
 from padgs.reports.gathered import Gathered
 from padgs.reports.pictures import picture_names, split
+from padgs.results import file_name
 
 COLUMNS = 3
 WIDTH = 512  # pixels of a picture at most
@@ -33,9 +34,9 @@ def charts(gathered: Gathered) -> list[Chart]:
         own = own.sort_values("seed", kind="stable").drop_duplicates("preset")
         shared = sorted(set.intersection(*(set(picture_names(folder)) for folder in own["pictures"])))
         if shared:
-            words = "_".join(str(own[column].iloc[0]) for column in ("scene", "resolution", "length"))
+            name = file_name(f"gallery_{own['place'].iloc[0].stem}_{own['resolution'].iloc[0]}_{own['length'].iloc[0]}")
             notes = footnotes({where: own}, gathered.request.protocol)
-            found += _sheet(f"gallery_{words.replace(' ', '-')}", where, own, shared[len(shared) // 2], notes)
+            found += _sheet(name, where, own, shared[len(shared) // 2], notes)
     return found
 
 

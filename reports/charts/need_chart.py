@@ -9,12 +9,12 @@ from pandas import DataFrame
 
 from padgs.reports.charts.drawing import MARKERS, Chart, Tips, dress, figure, lay_out, png, styled, svg
 from padgs.reports.charts.palette import INK, color_of
-from padgs.reports.conditions import footnotes, refuse_mixture
+from padgs.reports.conditions import OF_TIMES, footnotes, refuse_mixture
 from padgs.reports.frame import by_conditions
 from padgs.reports.gathered import Gathered
 from padgs.reports.needs import STATED, Curve, curves, searched
 from padgs.reports.pictures import split
-from padgs.results import NEED_PICTURED
+from padgs.results import NEED_PICTURED, file_name
 
 PANELS = (("blended", "Gaussians blended", 1.0), ("bytes", "model, MB", 1e-6), ("frame_ms", "ms per frame", 1.0))
 PICTURED = tuple(f"{loss:g}" for loss in NEED_PICTURED)  # dB
@@ -30,9 +30,8 @@ def charts(gathered: Gathered) -> list[Chart]:
     """
     found = []
     for title, own in by_conditions(searched(gathered), "resolution", "length").items():
-        refuse_mixture(own, gathered.request, title, ("protocol", "data"))
-        words = "_".join(str(own[column].iloc[0]) for column in ("scene", "resolution", "length"))
-        name = "need_" + words.replace(" ", "-")
+        refuse_mixture(own, gathered.request, title, OF_TIMES)
+        name = file_name(f"need_{own['place'].iloc[0].stem}_{own['resolution'].iloc[0]}_{own['length'].iloc[0]}")
         notes = footnotes({title: own}, gathered.request.protocol)
         found.append(_chart(name, title, own, notes))
         if pictured := [curve for curve in curves(own) if curve.picture is not None]:

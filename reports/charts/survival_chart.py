@@ -15,6 +15,7 @@ from padgs.reports.charts.heat_map import COLORS
 from padgs.reports.charts.names import Name
 from padgs.reports.charts.palette import INK, weight_of
 from padgs.reports.survival import QUALITY, Survivor
+from padgs.reports.tables.table import MISSING
 
 AREA = 160.0  # points^2 of a mark
 SIZE = (5.6, 4.4)  # inches
@@ -22,7 +23,9 @@ SIZE = (5.6, 4.4)  # inches
 
 @styled
 def chart(title: str, survivors: Sequence[Survivor]) -> Chart:
-    """Quality at rest over training time, that of the CPU where it is known of all; the stability score as fill."""
+    """Quality at rest over training time, that of the CPU where it is known of all; the stability score as fill, hollow
+    where there is none.
+    """
     import matplotlib
     from matplotlib.cm import ScalarMappable
 
@@ -37,9 +40,9 @@ def chart(title: str, survivors: Sequence[Survivor]) -> Chart:
     own.set_ylabel("WS-PSNR without stress, dB ↑")
     rows = []
     for one, cost, quality in found:
-        tip = f"{methods.title(one.preset)}\n{quality:.2f} dB in {cost:.1f} s; score {one.score:.2f}"
-        tip += f", worst quartile {one.worst_quartile:.2f}"
-        color = matplotlib.colormaps[COLORS](one.score)
+        tip = f"{methods.title(one.preset)}\n{quality:.2f} dB in {cost:.1f} s; score {_said(one.score)}"
+        tip += f", worst quartile {_said(one.worst_quartile)}"
+        color = "none" if one.score is None else matplotlib.colormaps[COLORS](one.score)
         look = {"s": AREA, "facecolors": [color], "edgecolors": INK[0], "linewidths": 0.8}
         own.scatter(cost, quality, gid=tips.add(tip), zorder=3, **look)
         numbers = {time: cost, "ws_psnr": quality, "score": one.score, "worst_quartile": one.worst_quartile}
@@ -49,7 +52,7 @@ def chart(title: str, survivors: Sequence[Survivor]) -> Chart:
     radius = math.sqrt(AREA) / 2
     named = [
         Name(
-            f"{methods.short(methods.title(one.preset), one.preset)}\n{one.score:.2f}",
+            f"{methods.short(methods.title(one.preset), one.preset)}\n{_said(one.score)}",
             (cost, quality),
             radius,
             weight_of(one.preset, "main"),
@@ -59,3 +62,7 @@ def chart(title: str, survivors: Sequence[Survivor]) -> Chart:
     names.write(own, named, [(cost, quality, radius) for _, cost, quality in found])
     name = f"survival-{survivors[0].place}"
     return Chart(name, title, svg(made, name, tips), png(made), numbers=DataFrame(rows))
+
+
+def _said(share: float | None) -> str:
+    return MISSING if share is None else f"{share:.2f}"

@@ -15,7 +15,6 @@ from padgs.reports.charts.drawing import Chart, Tips, figure, lay_out, png, styl
 from padgs.reports.charts.names import Name
 from padgs.reports.charts.palette import ALPHA, color_of, weight_of
 from padgs.reports.charts.trade_off import TradeOff
-from padgs.reports.frame import by_place
 from padgs.reports.settings import settings
 
 WIDE, NARROW = (10.6, 4.2), (3.7, 4.2)  # inches
@@ -56,18 +55,14 @@ def chart(trade_off: TradeOff) -> Chart | None:
 
 
 def _curves(trade_off: TradeOff) -> list[Curve]:
-    logs: dict[str, list[Any]] = {}
-    presets = {}
-    for setting in (setting for runs in by_place(trade_off.runs).values() for setting in settings(runs)):
-        presets[setting.title] = setting.preset
-        logs.setdefault(setting.title, []).extend(log for log in setting.runs["log"] if log["psnr"])
     found = []
-    for title, own in logs.items():
+    for setting in settings(trade_off.runs):
+        own = [log for log in setting.runs["log"] if log["psnr"]]
         probes = max((len(log["psnr"]) for log in own), default=0)
         complete = [log for log in own if len(log["psnr"]) == probes]  # a run that was cut short would cut the mean
         if complete:
             seconds, psnr = (np.mean([log[name] for log in complete], 0).tolist() for name in ("seconds", "psnr"))
-            found.append(Curve(title, presets[title], seconds, psnr))
+            found.append(Curve(setting.title, setting.preset, seconds, psnr))
     return found
 
 

@@ -17,7 +17,7 @@ from padgs.reports.gathered import Gathered
 from padgs.reports.measures import Measure, costs, mark
 from padgs.reports.request import Request
 from padgs.reports.scenes import Place
-from padgs.reports.settings import Setting, settings
+from padgs.reports.settings import settings
 from padgs.reports.tables.cells import over_scenes
 from padgs.reports.tables.table import Cell
 from padgs.reports.unranked import unranked
@@ -103,7 +103,8 @@ class TradeOff:
 
 
 def trade_offs(gathered: Gathered) -> list[TradeOff]:
-    """A chart for each data set of the paper that was run, and for each other scene.
+    """A chart for each data set of the paper that was run, and for each other scene; a warning where scenes have no
+    mean.
 
     Raises:
         ReportError: results of one chart that were not made, scored and timed alike.
@@ -115,7 +116,7 @@ def trade_offs(gathered: Gathered) -> list[TradeOff]:
         if name in groups and not place.published:  # scenes of two data sets, or a scene called like a data set
             name = f"{name}_{place.dataset or 'capture'}"
         groups.setdefault(name, {})[place] = own
-    found = []
+    found, warnings = [], []
     for name, group in groups.items():
         shown = replace(gathered.request, protocol=_protocol(pd.concat(group.values())))
         for place, own in group.items():
@@ -123,6 +124,9 @@ def trade_offs(gathered: Gathered) -> list[TradeOff]:
         made = _trade_off(name, group, shown)
         if made.points:
             found.append(made)
+        elif len(group) > 1:
+            warnings.append(f"{made.name}: no scene was finished in all settings, so there is no mean; --where chooses")
+    gathered.warnings.extend(warnings)  # at the end: whoever raises a Mixture is called again
     return found
 
 
@@ -146,25 +150,21 @@ def _is_released(preset: str) -> bool:
 
 def _trade_off(name: str, group: Mapping[Place, DataFrame], request: Request) -> TradeOff:
     qualities = tuple(measure for measure in QUALITIES if measure.name.startswith(f"{request.protocol}/"))
-    found: dict[str, list[Setting]] = {}
-    for own in group.values():
-        for setting in settings(own):
-            found.setdefault(setting.title, []).append(setting)
-    runs_of = {title: pd.concat([setting.runs for setting in alike]) for title, alike in found.items()}
-    for title, runs in runs_of.items():
-        refuse_mixture(runs, request, f"{name}, {title}", OF_A_MEAN)
-    runs_of = {title: runs for title, runs in runs_of.items() if runs["ok"].any()}
-    finished = [p for p in group if all((runs["ok"] & (runs["place"] == p)).any() for runs in runs_of.values())]
+    found = settings(pd.concat(group.values()))  # of all scenes: a mean is one of the same setting on each
+    for setting in found:
+        refuse_mixture(setting.runs, request, f"{name}, {setting.title}", OF_A_MEAN)
+    found = [setting for setting in found if setting.runs["ok"].any()]
+    finished = [p for p in group if all((one.runs["ok"] & (one.runs["place"] == p)).any() for one in found)]
     if len(group) == 1:
         finished = list(group)  # who failed there has no point
     first, scenes = next(iter(group)), [place.scene for place in finished]
     points = []
-    for title, runs in runs_of.items():
+    for setting in found if finished else ():
         measures = (*qualities, *COSTS)
-        cells = over_scenes(runs, scenes, measures)
+        cells = over_scenes(setting.runs, scenes, measures)
         if any(cell.value is not None for cell in cells):
             titles = [measure.column.title for measure in measures]
-            points.append(Point(title, runs["preset"].iloc[0], dict(zip(titles, cells, strict=True))))
+            points.append(Point(setting.title, setting.preset, dict(zip(titles, cells, strict=True))))
     what = first.title if len(group) == 1 else published.TITLES[name]
     if len(group) > 1 or first.published:
         what += f", mean over its scenes {', '.join(scenes)}"

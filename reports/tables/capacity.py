@@ -29,7 +29,7 @@ def capacity(gathered: Gathered) -> Table:
     Raises:
         ReportError: results that must not stand together.
     """
-    runs, blocks, runs_of = gathered.of_experiments("capacity"), [], {}
+    runs, blocks, runs_of = gathered.of_methods("capacity"), [], {}
     if len(runs):
         runs = runs.loc[
             runs[BUDGET].map(lambda asked: isinstance(asked, numbers.Real) and asked > 0)

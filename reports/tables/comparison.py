@@ -14,6 +14,7 @@ from padgs.reports.gathered import Gathered
 from padgs.reports.measures import Measure, alone
 from padgs.reports.published import Key, Published
 from padgs.reports.scenes import Place
+from padgs.reports.settings import refuse_differences
 from padgs.reports.tables import beside_paper
 from padgs.reports.tables.cells import of_each, only_shown, over_scenes
 from padgs.reports.tables.table import Block, Cell, Row, Table
@@ -93,7 +94,9 @@ class Comparison:
     ) -> Block:
         rows, place = [], Place(dataset, AVERAGE)
         for preset, title in self._titles(place, own, paper).items():
-            ours = over_scenes(own.loc[own["preset"] == preset], scenes, measures)
+            alike = own.loc[own["preset"] == preset]
+            refuse_differences(alike, f"{published.TITLES[dataset]}, {title}", "preset")
+            ours = over_scenes(alike, scenes, measures)
             ours = only_shown(ours) if preset in aside else ours
             rows.append(self._row(title, preset, place, measures, ours, paper))
         return Block(f"{published.TITLES[dataset]}, average over its {len(scenes)} scenes", tuple(rows))

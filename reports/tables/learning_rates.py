@@ -31,7 +31,8 @@ def learning_rates(gathered: Gathered) -> Table:
     Raises:
         ReportError: results that must not stand together.
     """
-    runs = gathered.of_experiments("learning_rates")
+    runs = gathered.of_methods("learning_rates")
+    runs = runs.loc[runs["iterations"] > 0]  # a run of seconds that failed before its first has no length
     choices = runs[RATES] if RATES in runs else [None] * len(runs)
     runs = runs.assign(**{FACTOR: list(map(_factor, choices, runs["iterations"]))})
     lengths = sorted(runs["iterations"].unique())

@@ -17,11 +17,11 @@ from padgs.reports.tables.ranking import NOTE
 from padgs.reports.tables.table import Block, Cell, Row, Table
 
 TAU = "method.tau"
-VOXELS = {"padgs_small": "one anchor per 3 px", "padgs": "voxel of the paper"}
+VOXELS = {"padgs_small": "one anchor per 3 px", "padgs": "one anchor per 0.1 px"}  # ours for the paper's 0.001
 TAUS = (0.0, 0.9)
 CELLS = {(preset, tau): f"{title}, τ = {tau:g}" for preset, title in VOXELS.items() for tau in TAUS}
 EFFECTS = {  # title -> weight of each of CELLS
-    "voxel of the paper instead of one anchor per 3 px": (-0.5, -0.5, 0.5, 0.5),
+    "one anchor per 0.1 px instead of 3 px": (-0.5, -0.5, 0.5, 0.5),
     "τ = 0.9 instead of 0": (-0.5, 0.5, -0.5, 0.5),
     "both, beyond the sum of the two": (1.0, -1.0, -1.0, 1.0),
 }
@@ -44,7 +44,7 @@ def modulation(gathered: Gathered) -> Table:
     Raises:
         ReportError: results that must not stand together.
     """
-    runs, blocks, runs_of = gathered.of_experiments("modulation"), [], {}
+    runs, blocks, runs_of = gathered.of_methods("modulation"), [], {}
     for title, own in by_conditions(runs, "resolution", "length").items():
         refuse_mixture(own, gathered.request, title, OF_TIMES)
         found = {cell: one_setting(_of_cell(own, *cell), f"{title}, {words}") for cell, words in CELLS.items()}

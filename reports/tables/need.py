@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from padgs.reports.conditions import footnotes, refuse_mixture
+from padgs.reports.conditions import OF_TIMES, footnotes, refuse_mixture
 from padgs.reports.frame import by_conditions
 from padgs.reports.gathered import Gathered
 from padgs.reports.needs import EPSILONS, STATED, Curve, curves, gain, ratio, searched
@@ -16,7 +16,7 @@ COLUMNS: dict[Column, Callable[[Curve, Curve], float | None]] = {
         Column(f"needed for {epsilon} dB", 0, False): lambda own, _, e=epsilon: own.needs[e]["blended"]
         for epsilon in EPSILONS
     },
-    Column(f"share for {STATED} dB", 2, False): lambda own, _: own.needs[STATED]["rows"] / own.found["rows"],
+    Column(f"share for {STATED} dB", 2): lambda own, _: own.needs[STATED]["rows"] / own.found["rows"],
     Column("knee", 0): lambda own, _: None if own.knee is None else own.knee["blended"],
     Column(f"MB for {STATED} dB", 2, False): lambda own, _: own.needs[STATED]["bytes"] / 1e6,
     Column(f"degree for {STATED} dB", 0, False): lambda own, _: own.degree,
@@ -43,14 +43,14 @@ NOTES = (
 
 
 def need(gathered: Gathered) -> Table:
-    """A block for each scene, a row for each run that `padgs need` searched.
+    """A block for each scene, resolution and length, a row for each run that `padgs need` searched.
 
     Raises:
         ReportError: results that must not stand together.
     """
     blocks, runs_of = [], {}
     for title, own in by_conditions(searched(gathered), "resolution", "length").items():
-        refuse_mixture(own, gathered.request, title, ("protocol", "data"))
+        refuse_mixture(own, gathered.request, title, OF_TIMES)
         found = curves(own)
         rows = (Row(one.title, tuple(Cell(of(one, found[0])) for of in COLUMNS.values())) for one in found)
         blocks.append(Block(title, tuple(rows)))

@@ -55,11 +55,14 @@ def better_rows(cells: Mapping[int, Cell], column: Column) -> dict[int, set[int]
     What prints the same is equally good.
     """
     sign = {True: 1.0, False: -1.0, None: math.nan}[column.higher_is_better]
-    numbers = {i: sign * float(shown(cell.value or 0.0, column)) for i, cell in cells.items()}
+    numbers = {i: sign * (cell.value or 0.0) for i, cell in cells.items()}
+    printed = {i: float(shown(number, column)) for i, number in numbers.items()}
     alone = pooled_variance(cells.values())
-    return {
-        i: {j for j in cells if numbers[j] - numbers[i] > _least_difference(cells[i], cells[j], alone)} for i in cells
-    }
+
+    def is_better(i: int, j: int) -> bool:
+        return printed[i] != printed[j] and numbers[j] - numbers[i] > _least_difference(cells[i], cells[j], alone)
+
+    return {i: {j for j in cells if is_better(i, j)} for i in cells}
 
 
 def pooled_variance(cells: Collection[Cell]) -> tuple[float, int]:
@@ -82,11 +85,15 @@ def quantile(freedom: float, tests: int = 1) -> float:
 
 
 def _least_difference(first: Cell, second: Cell, alone: tuple[float, int]) -> float:
-    """By how much two means must differ: Welch's test, with the degrees of freedom after Satterthwaite."""
+    """By how much two means must differ: Welch's test, with the degrees of freedom after Satterthwaite.
+
+    These are for two estimates of variance that know nothing of each other. Of two single runs there is but one.
+    """
     parts = [(c.std**2, c.count - 1) if c.std is not None else alone for c in (first, second)]
     shares = [(variance / c.count, df) for (variance, df), c in zip(parts, (first, second), strict=True)]
     total = sum(share for share, _ in shares)
     if not total:
         return 0.0
-    freedom = total**2 / sum(share**2 / df for share, df in shares if share)
+    single = first.std is None and second.std is None
+    freedom = alone[1] if single else total**2 / sum(share**2 / df for share, df in shares if share)
     return quantile(freedom) * math.sqrt(total)

@@ -6,7 +6,7 @@ import pandas as pd
 from pandas import DataFrame
 
 from padgs.reports import methods as names
-from padgs.reports.conditions import CONDITIONS, OF_TIMES, footnotes, refuse_mixture
+from padgs.reports.conditions import OF_TIMES, footnotes, refuse_mixture
 from padgs.reports.frame import by_conditions, by_place
 from padgs.reports.gathered import Gathered
 from padgs.reports.measures import Measure, costs, gpu_memory, known_costs, mark
@@ -33,7 +33,7 @@ def methods(gathered: Gathered) -> Table:
 
 def equal_time(gathered: Gathered) -> Table:
     """Every method after the same training time, a block for each scene, resolution and time."""
-    found = by_conditions(gathered.of_experiments("equal_time"), "resolution", "length")
+    found = by_conditions(gathered.of_methods("equal_time"), "resolution", "length")
     return _table(gathered, "equal_time", "Every method after the same training time", found, equal_images=False)
 
 
@@ -55,7 +55,7 @@ def _table(
     measures = (*qualities, *_costs(pd.concat(found.values()) if found else DataFrame()))
     blocks, aside = [], []
     for where, own in found.items():
-        refuse_mixture(own, gathered.request, where, CONDITIONS if equal_images else OF_TIMES)
+        refuse_mixture(own, gathered.request, where, OF_TIMES)
         aside.append(unranked(own, equal_images=equal_images))
         titles = {preset: names.title(preset) for preset in names.ordered(own["preset"])}
         cells = of_each(own, "preset", titles, where, measures, aside[-1])

@@ -27,7 +27,8 @@ NOTES = (
     "method and seed have without it, within [0, 1]; 0 for a run that failed. Level 1 is mild, 3 is severe.",
     f"A method breaks at the first level where it keeps less than {HALF:g} or a run fails; – where it does not.",
     "Score: the mean over levels, then conditions. Worst quartile: the mean of the worst quarter of the conditions; "
-    "methods stand in its order, the best first.",
+    "columns stand in its order on the first scene, the best first. Both, and the failure rate, are missing for a "
+    "method that was not put under all that others were put under on the scene.",
 )
 
 

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from made_up import compared, write
+from made_up import compared, small, write
 
 from padgs.reports import store
 from padgs.reports.charts import gallery
@@ -32,6 +32,12 @@ def test_each_scene_has_a_sheet_with_each_method_once_the_best_first(tmp_path):
     titles = ("photograph", "PaD-GS: 26.00 dB", "SPaGS: 25.20 dB", "EgoNeRF: 22.00 dB")
     places = [indoors.index(title) for title in titles]
     assert places == sorted(places)
+
+
+def test_scenes_of_two_data_sets_have_sheets_with_names_of_their_own(tmp_path):
+    runs = [small(25.0, scene="room", dataset=dataset, run=f"of-{dataset}") for dataset in ("", "omniblender")]
+    names = [chart.name for chart in sheets(write(runs, tmp_path, pictures=True))]
+    assert names == [f"gallery_{stem}_512x256_1500-iterations" for stem in ("room", "room_omniblender")]
 
 
 def test_what_left_no_picture_is_left_out(tmp_path):

@@ -9,6 +9,8 @@ from padgs.reports.charts.trade_off import pareto, trade_offs
 from padgs.reports.tables.table import ReportError
 from padgs.reports.writers import csv_text
 
+CHANGED = (("padgs", True), ("omnigs", False))  # method, whether on the scene bar
+
 
 def numbers(chart) -> dict[tuple[str, str], float]:
     lines = csv.DictReader(io.StringIO(csv_text.of_frame(chart.numbers)))
@@ -41,6 +43,15 @@ def test_a_data_set_is_averaged_over_the_scenes_that_all_finished():
     (chart,) = trade_offs(gathered(runs))
     assert "mean over its scenes base, cafe" in chart.title
     assert numbers(chart)["OmniGS, corrected", "PSNR"] == pytest.approx(20 + 5.5)  # scenes 1..10
+
+
+@pytest.mark.parametrize(
+    "change", [{"status": "oom", "scores": {}}, {"config": {"train": {"iterations": 30_000}, "method": {"tau": 0.0}}}]
+)
+def test_where_no_scene_is_finished_in_all_settings_there_is_no_chart_but_a_warning(change):
+    runs = [replace(r, **change) if (r.method, r.scene == "bar") in CHANGED else r for r in data_set("roam360")]
+    of = gathered(runs)
+    assert trade_offs(of) == [] and "chart_roam360: no scene was finished in all settings" in "".join(of.warnings)
 
 
 def test_times_of_two_machines_do_not_share_a_chart():

@@ -30,12 +30,13 @@ def test_a_block_for_each_number_of_gaussians_the_fewest_first():
             assert row.cells[columns.index("Gaussians")].value == count - 0.5
 
 
-def test_runs_without_a_number_are_left_out():
+def test_runs_without_a_number_and_those_that_were_stopped_are_left_out():
     odd = of_experiment("capacity", 30.0)
     odd = [
         replace(odd, run=f"{asked}", config={**odd.config, "budget": {"gaussians": asked}}) for asked in ("auto", None)
     ]
-    assert capacity(gathered([*runs(), *odd])) == capacity(gathered(runs()))
+    stopped = replace(runs()[0], run="stopped", seed=9, variant="stopped after 9 iterations")
+    assert capacity(gathered([*runs(), *odd, stopped])) == capacity(gathered(runs()))
 
 
 def test_nothing_was_run():

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import pytest
 from made_up import gathered, of_experiment
@@ -38,6 +39,14 @@ def test_the_law_loses_what_lies_between_its_factor_and_the_best(best, losses):
     assert [cell.value for cell in lost.rows[0].cells] == pytest.approx(losses)
     assert [cell.std for cell in lost.rows[0].cells] == pytest.approx([0, 0, 0]), "seed by seed"
     assert "× 8.00 after 400, × 4.33 after 1600, × 2.17 after 6400 iterations" in "".join(table.notes)
+
+
+def test_a_run_that_was_stopped_or_failed_before_its_first_iteration_is_no_seed():
+    made = runs(lambda n: 2)
+    stopped = replace(made[0], run="stopped", seed=9, variant="stopped after 9 iterations")
+    rates = {"train": {"learning_rates": "run"}}
+    failed = replace(made[0], run="failed", iterations=0, status="oom", scores={}, config=rates)
+    assert learning_rates(gathered([*made, stopped, failed])) == learning_rates(gathered(made))
 
 
 @pytest.mark.parametrize("iterations", [1, 400, 1600, 6400, 30_000, 100_000])

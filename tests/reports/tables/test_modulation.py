@@ -48,6 +48,11 @@ def test_effects_have_their_sign_and_none_is_the_best():
     assert set(numbers.loc[numbers["row"].isin(EFFECTS), "rank"]) == {""} != set(numbers["rank"])
 
 
+def test_a_run_that_was_stopped_is_no_seed():
+    stopped = replace(runs()[0], run="stopped", seed=9, variant="stopped after 9 iterations")
+    assert modulation(gathered([*runs(), stopped])) == modulation(gathered(runs()))
+
+
 def test_a_missing_setting_has_no_effect_and_the_paper_may_score_without_the_bottom():
     marks = {"psnr": 30.0}
     made = [
@@ -55,8 +60,8 @@ def test_a_missing_setting_has_no_effect_and_the_paper_may_score_without_the_bot
         for run in runs()
     ]
     table = modulation(gathered(made))
-    assert values(table, "PSNR by the paper's protocol")["voxel of the paper, τ = 0.9"][0] == 30
-    assert values(table, "PSNR")["voxel of the paper, τ = 0.9"][0] != 30
+    assert values(table, "PSNR by the paper's protocol")["one anchor per 0.1 px, τ = 0.9"][0] == 30
+    assert values(table, "PSNR")["one anchor per 0.1 px, τ = 0.9"][0] != 30
     assert "without the last 6.3 % of the rows" in "".join(table.notes)
     found = values(modulation(gathered(runs()[2:])), "PSNR")
     assert [found[title][0] for title in EFFECTS] == [None] * 3

@@ -9,6 +9,7 @@ from PIL import Image
 from padgs.reports.charts.need_chart import charts
 from padgs.reports.needs import curves, gain, ratio, searched
 from padgs.reports.tables.need import need
+from padgs.reports.tables.table import ReportError
 from padgs.reports.writers import markdown
 
 SIZES = (8000, 4000, 2000, 1000)
@@ -61,6 +62,36 @@ def test_a_row_for_each_search_with_its_needs():
     assert need(gathered(runs()[2:])).blocks == () and charts(gathered(runs()[2:])) == []
 
 
+def kept(loss: str, degree: int | None = None, tau: float = 0.9, seed: int = 0):
+    """A run that `padgs need` left of another that has four degrees of harmonics."""
+    more = {"kept": {"epsilon": float(loss), "degree": degree}, "degrees": {loss: [{"degree": 3, "objections": {}}]}}
+    more["files"] = [{"file": "a", "bytes": 5, "kept": True}]
+    method = {"tau": tau, "sh_degree": 3 if degree is None else degree}
+    variant, run = f"need {loss} dB", f"room_{tau}_{seed}_need-{loss}"
+    config = {"method": method, "seed": seed, "variant": variant}
+    return replace(small(30.0, run=run, seed=seed, config=config, need=found(30.0) | more), variant=variant)
+
+
+def test_a_search_has_one_row_whatever_it_kept_and_rows_have_names_of_their_own():
+    other, stated = kept("1"), kept("0.1", degree=1)
+    (curve,) = curves(searched(gathered([other, stated])))
+    assert curve.title == "PaD-GS" and curve.file is not None
+    assert len(curves(searched(gathered([other])))) == 1
+    seeds = [curve.title for curve in curves(searched(gathered([kept("0.1", seed=1), stated])))]
+    assert seeds == ["PaD-GS, seed 0", "PaD-GS, seed 1"]
+    settings = [curve.title for curve in curves(searched(gathered([stated, kept("1", tau=0.0), other])))]
+    assert settings == ["PaD-GS, tau 0.0", "PaD-GS, tau 0.9"]
+
+
+def test_a_share_has_no_better_end_and_times_of_two_machines_are_not_compared():
+    assert "share for 0.1 dB" in [column.heading for column in need(gathered(runs())).columns]
+    first, second, _ = runs()
+    elsewhere = gathered([first, replace(second, machine={"gpu": "H200"})])
+    for build in (need, charts):
+        with pytest.raises(ReportError, match="differ in machine"):
+            build(elsewhere)
+
+
 def test_curves_are_compared_where_both_are():
     ours, other = curves(searched(gathered(runs())))
     assert gain(ours, other) == pytest.approx(1.0) and gain(ours, ours) == 0
@@ -80,6 +111,13 @@ def test_the_chart_has_a_point_for_each_size_and_all_numbers():
     assert chart.numbers is not None and len(chart.numbers) == 2 * len(SIZES)
     assert list(chart.numbers["needed for"])[:4] == ["0.05", "0.1", "0.25 0.5", "1"]
     assert "4000 Gaussians" in chart.svg and "lost 0.65 dB" in chart.svg
+
+
+def test_charts_of_scenes_of_two_data_sets_have_names_of_their_own():
+    datasets = ("", "omniblender")
+    made = [small(30.0, scene="room", dataset=one, run=f"of-{one}", need=found(30.0)) for one in datasets]
+    names = [chart.name for chart in charts(gathered(made))]
+    assert names == ["need_room_512x256_1500-iterations", "need_room_omniblender_512x256_1500-iterations"]
 
 
 def test_a_test_view_is_shown_at_each_size_where_there_is_a_picture_of_it(tmp_path):

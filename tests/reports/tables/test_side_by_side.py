@@ -40,6 +40,7 @@ def test_every_method_with_all_that_is_measured():
     table = methods(gathered(compared(seeds=2)))
     assert [block.title.split()[0] for block in table.blocks] == ["synthetic-outdoor", "synthetic-room"]
     assert {"PSNR", "SSIM", "WS-PSNR", "WS-PSNR pole", "seam", "training s", "ms per frame", "MB"} <= {*columns(table)}
+    assert "seam" in [column.heading for column in table.columns], "best at 1: neither more nor less of it is better"
     assert value(table, "synthetic-room", "OmniGS, corrected", "PSNR") == pytest.approx(22 + 0.8 * 3 + 0.05), (
         "mean of two seeds"
     )
@@ -130,9 +131,24 @@ def test_after_each_time_methods_stand_beside_each_other():
 
 def test_times_of_different_machines_do_not_stand_together():
     runs = [trained("padgs", 100, 900), trained("omnigs", 100, 900, machine={"cores": 64, "cpu": "B", "torch": "2"})]
-    with pytest.raises(ReportError, match="differ in machine"):
-        equal_time(gathered(runs))
-    assert equal_time(gathered(runs, mix=True)).blocks
+    for build in (methods, equal_time):
+        with pytest.raises(ReportError, match="differ in machine"):
+            build(gathered(runs))
+        assert build(gathered(runs, mix=True)).blocks
+
+
+def test_a_scene_of_two_data_sets_has_a_block_for_each():
+    runs = [trained("padgs", 100, 900, scene="classroom", dataset=dataset) for dataset in ("", "omniblender")]
+    for build in (methods, equal_time):
+        capture, rendered = (block.title for block in build(gathered(runs)).blocks)
+        assert capture.startswith("classroom (a capture that is no scene of the paper)")
+        assert rendered.startswith("classroom (of omniblender; no scene of the paper)")
+
+
+def test_a_run_that_was_stopped_is_no_seed():
+    runs = [trained("padgs", 100, 900, 25), trained("omnigs", 100, 900, 24)]
+    stopped = replace(runs[0], run="stopped", seed=9, variant="stopped after 90 iterations")
+    assert equal_time(gathered([*runs, stopped])) == equal_time(gathered(runs))
 
 
 def test_seeds_may_differ_in_what_they_did_in_the_time_but_in_no_setting():

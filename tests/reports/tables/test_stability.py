@@ -8,6 +8,7 @@ from padgs.reports.frame import frame
 from padgs.reports.gathered import Gathered
 from padgs.reports.page import page
 from padgs.reports.store import Run
+from padgs.reports.survival import survivors
 from padgs.reports.tables.stability import stability
 from padgs.reports.tables.table import ReportError
 from padgs.reports.writers import latex, markdown
@@ -44,6 +45,11 @@ def runs(seed: int = 0):
     ]
 
 
+def rest():
+    """What `runs` spare PaD-GS."""
+    return [run("padgs", 22.0, "pose_noise", 2), run("padgs", 24.0, "seam", 1)]
+
+
 def cells(table, title: str) -> dict[str, dict[str, str]]:
     (block,) = (block for block in table.blocks if block.title.startswith(title))
     heads = [column.title for column in table.columns]
@@ -61,7 +67,7 @@ def test_what_is_kept_is_the_share_above_one_colour():
 
 
 def test_scores_and_where_it_breaks():
-    table, *_ = stability(gathered(runs()))
+    table, *_ = stability(gathered([*runs(), *rest()]))
     scores, breaks = cells(table, "synthetic-room"), cells(table, "Breaks at level")
     # OmniGS: pose noise keeps (0.9 + 0.4) / 2, the seam (0 + 1) / 2; the worst quarter of two conditions is one
     omnigs = {row: of["OmniGS, corrected"] for row, of in scores.items()}
@@ -72,6 +78,28 @@ def test_scores_and_where_it_breaks():
         "seam": {"PaD-GS": "–", "OmniGS, corrected": "1"},
     }
     assert [column.title for column in table.columns] == ["PaD-GS", "OmniGS, corrected"]
+    assert scores["worst quartile"]["PaD-GS"] == "0.51"  # pose noise keeps (0.52 + 0.5) / 2, the seam 0.57
+
+
+def test_who_was_spared_something_has_no_score_and_stands_last():
+    for spared in (runs(), [*runs(), rest()[0]]):
+        table, _, chart = stability(gathered(spared))
+        assert [column.title for column in table.columns] == ["OmniGS, corrected", "PaD-GS"]
+        scores = cells(table, "synthetic-room")
+        for row in ("stability score", "worst quartile", "failure rate"):
+            assert scores[row]["PaD-GS"] == "–" != scores[row]["OmniGS, corrected"]
+        assert scores["unstressed: WS-PSNR, dB"]["PaD-GS"] == "32.00" and "score –, worst quartile –" in chart.svg
+
+
+def test_a_run_that_was_stopped_is_neither_a_seed_nor_a_reference():
+    names = ("stopped after 9 iterations", "pose_noise 1, stopped after 9 iterations")
+    stopped = [replace(one, run="stopped", seed=9, variant=name) for one, name in zip(runs(), names, strict=False)]
+    assert stability(gathered([*runs(), *stopped]))[0] == stability(gathered(runs()))[0]
+
+
+def test_files_of_scenes_of_two_data_sets_have_names_of_their_own():
+    made = [replace(one, scene="room", dataset=dataset) for dataset in ("", "omniblender") for one in runs()]
+    assert [one.place for one, *_ in survivors(gathered(made)).values()] == ["room-512x256", "room_omniblender-512x256"]
 
 
 def test_seeds_are_compared_with_their_own():

@@ -151,6 +151,14 @@ def test_scenes_of_a_data_set_scored_by_other_rules_are_not_averaged():
         table1(gathered(runs))
 
 
+def test_settings_are_not_mixed_in_an_average():
+    runs = data_set("roam360")
+    runs[1] = replace(runs[1], config={**runs[1].config, "method": {"tau": 0.0}})
+    for build in (table1, table4):
+        with pytest.raises(ReportError, match="360Roam, PaD-GS: runs bar_padgs_0 and .* differ in method.tau"):
+            build(gathered(runs))
+
+
 def test_footnotes_say_who_is_published_with_more_iterations():
     note = "EgoNeRF is published with 100000 iterations"
     assert note in markdown.text(table1(gathered([result("", method="egonerf", preset="egonerf_small")])))
