@@ -13,16 +13,15 @@ from padgs.cli.refusing import refusing, show
 if TYPE_CHECKING:
     from padgs.data.check.report import Report
 
-BESIDE = "check.png"
-
 
 @refusing(ValueError, OSError)
 def check(
     path: Annotated[str, typer.Argument(help="folder with panoramas and poses, or the file that describes them")],
     format: Annotated[str, typer.Option(help="auto, or the format's name")] = "auto",
     overlay: Annotated[
-        str, typer.Option(help="where the picture of the points on a panorama goes: beside the data; '' for none")
-    ] = BESIDE,
+        str | None,
+        typer.Option(help="where the picture of the points on a panorama goes; if not said, beside the data; '': none"),
+    ] = None,
     mask: Annotated[str, typer.Option(help="auto, none, rows:959/1024, or a file or folder")] = "auto",
     images: Annotated[str, typer.Option(help="image folder, if not the usual one")] = "",
     split: Annotated[str, typer.Option(help="auto, files, every or all")] = "auto",
@@ -38,7 +37,7 @@ def check(
             Path(path),
             format=format,
             options=DataOptions(mask=mask, images=images or None, split=split),
-            overlay=picture_place(Path(path)) if overlay == BESIDE else Path(overlay) if overlay else None,
+            overlay=picture_place(Path(path)) if overlay is None else Path(overlay) if overlay else None,
             progress=lambda done, total: status.update(f"looking at image {done} of {total}"),
         )
     end_with(report)
@@ -46,8 +45,10 @@ def check(
 
 def picture_place(data: Path) -> Path:
     """Where the picture of a data set goes if nobody says: into its folder, or here if that is read-only."""
+    from padgs.data.check.overlay import OVERLAY
+
     folder = data if data.is_dir() else data.parent
-    return (folder if os.access(folder, os.W_OK) else Path()) / BESIDE
+    return (folder if os.access(folder, os.W_OK) else Path()) / OVERLAY
 
 
 def end_with(report: Report) -> NoReturn:

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from padgs.cli.opening import DataPath, Run, opened
-from padgs.cli.refusing import refusing
+from padgs.cli.refusing import refusing, show
 
 
 @refusing(ValueError, OSError)
@@ -59,5 +59,5 @@ def export(
         else:
             write_splats(path, found.splats, found.notes, begin=found.begin)
             what = f"{len(found.splats)} Gaussians"
-    print("\n".join(f"  {note}" for note in found.notes))
-    print(f"{path}: {what}, {path.stat().st_size / 1e6:.1f} MB")
+    show("\n".join(f"  {note}" for note in found.notes))
+    show(f"{path}: {what}, {path.stat().st_size / 1e6:.1f} MB")

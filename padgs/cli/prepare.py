@@ -40,7 +40,7 @@ def prepare(
     """Find the poses of panoramas, then check the result. Interrupted, the same command goes on where it stopped."""
     from pathlib import Path
 
-    from padgs.cli.check import end_with
+    from padgs.cli.check import end_with, picture_place
     from padgs.data.check.report import check
     from padgs.data.errors import DataError
     from padgs.data.prepare.pipeline import PrepareOptions
@@ -51,7 +51,7 @@ def prepare(
         with refusing(DataError, OSError), _bars() as tell:
             options = PrepareOptions(accurate, pairs, mask, level, per_second, seed, threads)
             result = find_poses(Path(source), target, options, tell)
-            report = check(target, overlay=target / "check.png")
+            report = check(target, overlay=picture_place(target))
     except KeyboardInterrupt as interrupt:
         print("interrupted; the same command goes on where this stopped")
         raise typer.Exit(130) from interrupt

@@ -34,6 +34,7 @@ def render(
     import torch
     from rich.console import Console
 
+    from padgs.data.formats.transforms import described
     from padgs.data.trajectory import gravity
     from padgs.film.frames import write_film
     from padgs.film.keyframes import read_path
@@ -61,7 +62,9 @@ def render(
             poses = PATHS[path](scene, frames or max(2, round(10 * fps)))
         else:
             up = gravity(torch.stack([view.cam_from_world for view in scene.train])).up
-            poses = about(scene.origin, read_path(Path(path), frames, up))
+            data_set = found.config.data
+            poses = read_path(Path(path), frames, up, described(data_set.path, data_set.format))
+            poses = about(scene.origin, poses)
         views = [
             View(f"frame {number}", pose.to(trained.cam_from_world), lens.width, lens.height, lens=lens)
             for number, pose in enumerate(poses)

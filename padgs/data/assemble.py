@@ -55,7 +55,7 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
         for frame, size, mask in zip(capture.frames, sizes, masks, strict=True)
     ]
     scene = Scene(
-        name=capture.folder.name,
+        name=Path(os.path.abspath(capture.folder)).name,  # of "." as well; not resolved: a link's name is its own
         train=tuple(views[i] for i in split.train),
         test=tuple(views[i] for i in split.test),
         points=points,

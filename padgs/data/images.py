@@ -37,15 +37,16 @@ class ImageFile:
 
 
 def inspect(path: Path, *, mask: bool = False) -> ImageFile:
-    """Check that a file is a usable panorama (or mask: grey is then fine), without decoding it.
+    """Check that a file is a usable panorama (or mask: grey is then fine); decoded where that is needed to know.
 
     Raises:
-        DataError: not there, unreadable, not an image, cut short, turned by EXIF, 16-bit, grey, CMYK or not 2:1.
+        DataError: not there, unreadable, not an image, cut short, turned by EXIF, 16-bit, grey, CMYK, not 2:1 or partly
+            transparent.
     """
     data = read_bytes(path)
     try:
         with Image.open(BytesIO(data)) as image:
-            width, height, mode = image.width, image.height, image.mode
+            width, height, mode, has_alpha = image.width, image.height, image.mode, "A" in image.getbands()
             orientation = 1 if image.format == "PNG" and "exif" not in image.info else image.getexif().get(_ORIENTATION)
             deep = _is_deep(image, data)
     except (UnidentifiedImageError, OSError, SyntaxError, Image.DecompressionBombError) as error:
@@ -61,14 +62,23 @@ def inspect(path: Path, *, mask: bool = False) -> ImageFile:
         raise DataError(f"{path} is grey ({mode}); panoramas must be colour, 3 x 8 bits: convert it or remove it")
     if mode == "CMYK":
         raise DataError(f"{path} is CMYK; convert it to RGB")
+    refuse_other_shapes(width, height, path)
+    if _looks_cut(data) or has_alpha:
+        _decode(BytesIO(data), path, "L" if mask else "RGB")
+    return ImageFile(path, width, height, hashlib.sha256(data).hexdigest())
+
+
+def refuse_other_shapes(width: int, height: int, path: Path) -> None:
+    """Refuse pictures that cannot be panoramas, by their sides in pixels.
+
+    Raises:
+        DataError: they are not 2:1.
+    """
     if width != 2 * height:
         raise DataError(
             f"{path} is {width}x{height}, which is not 2:1; an equirectangular panorama covers 360 x 180 degrees "
             "(a dual-fisheye or cropped image must be stitched or padded first)"
         )
-    if _looks_cut(data):
-        _decode(BytesIO(data), path, "L" if mask else "RGB")
-    return ImageFile(path, width, height, hashlib.sha256(data).hexdigest())
 
 
 def decode(path: Path, mode: str = "RGB") -> NDArray[np.uint8]:
@@ -90,7 +100,7 @@ def _decode(file: BytesIO, path: Path, mode: str) -> NDArray[np.uint8]:
     try:
         with Image.open(file) as image:
             image.load()
-            transparent = mode == "RGB" and "A" in image.getbands() and np.asarray(image.getchannel("A")).min() < 255
+            transparent = "A" in image.getbands() and np.asarray(image.getchannel("A")).min() < 255
             pixels = np.array(_eight_bit(image).convert(mode))
             cut = _misses_pixels(image, file.getvalue(), pixels)
     except (OSError, SyntaxError, ValueError) as error:
@@ -98,10 +108,8 @@ def _decode(file: BytesIO, path: Path, mode: str) -> NDArray[np.uint8]:
     if cut:
         raise DataError(f"{path} is cut short, although it has an end marker; copy it again or remove it")
     if transparent:
-        raise DataError(
-            f"{path} has transparent pixels; save it without alpha and say which pixels to ignore in a mask "
-            "file (data.mask)"
-        )
+        remedy = "say what to ignore in a mask file (data.mask)" if mode == "RGB" else "paint what to ignore black (0)"
+        raise DataError(f"{path} has transparent pixels; save it without alpha, and {remedy}")
     return pixels if mode == "RGB" else pixels[..., None]
 
 

@@ -6,7 +6,7 @@ A mask is one file for the scene, one file per image, the rule that only the fir
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -60,19 +60,20 @@ def find_masks(
 
     Args:
         capture: the frames, and the folder in which masks are looked for.
-        spec: `data.mask`.
+        spec: `data.mask`; see `mask_place`.
         images: the files of the frames.
         sizes: (width, height) of the views.
         store: where decoded masks are kept.
 
     Raises:
-        DataError: a mask of another size than its image, one that hides all but `LEAST`, or an unusable `spec`.
+        DataError: a mask of another size than its image, one that hides all but `LEAST` or has transparent pixels, or
+            an unusable `spec`.
     """
     spec = capture.mask if spec == "auto" else spec
     if spec == "none":
         return [None] * len(images), [], []
     rule = _ROWS.fullmatch(spec)
-    files, note = _mask_files(capture, None if rule or spec == "auto" else capture.folder / spec)
+    files, note = _mask_files(capture, mask_place(spec, capture.folder))
     notes = [note] if note else []
     rows: dict[int, Tensor] = {}  # by height
     if rule:
@@ -109,10 +110,27 @@ def find_masks(
     return masks, digests, notes
 
 
+def mask_place(spec: str, folder: Path) -> Path | None:
+    """The file or folder that `data.mask` names, in the folder of the data set or where one stands; None for a word.
+
+    Raises:
+        DataError: there is one in both.
+    """
+    if spec in ("auto", "none") or _ROWS.fullmatch(spec):
+        return None
+    there, here = folder / spec, Path(spec).absolute()
+    if not here.exists():
+        return there
+    if there.exists() and not there.samefile(here):
+        raise DataError(f"data.mask={spec} is {there} as well as {here}; give the whole path of the one that is meant")
+    return here
+
+
 def _refuse_hidden(weights: Tensor, message: str) -> None:
     """Refuse weights [H, W or 1] that let next to nothing of the sphere through, with how much they hide."""
     area = row_latitudes(len(weights)).cos()
-    shown = ((weights > 0).float().mean(-1) @ area / area.sum()).item()
+    # The mean weight, not the share of pixels that have any: 1 for "use" in place of 255 would hide nearly all.
+    shown = (weights.mean(-1).cpu() @ area / area.sum()).item()
     if shown < LEAST:
         much = f"all but {shown:.2%} of the sphere" if shown else "every pixel"
         raise DataError(message.format(much))
@@ -151,12 +169,17 @@ def _in_folder(folder: Path, name: str) -> Path | None:
     return next((folder / file for file in candidates if (folder / file).is_file()), None)
 
 
-def write_masks(masks: Mapping[str, Tensor | None], folder: Path) -> None:
-    """mask.png if all views (name -> weights) have the same weights, else masks/ with one file per masked view."""
-    present = {name: mask for name, mask in masks.items() if mask is not None}
-    first = next(iter(present.values()), None)
-    if first is not None and len(present) == len(masks) and all(mask.equal(first) for mask in present.values()):
-        save_png(first * 255, folder / "mask.png")
-        return
-    for name, mask in present.items():
-        save_png(mask * 255, folder / "masks" / f"{name}.png")
+def write_masks(masks: Mapping[str, Callable[[], Tensor] | None], folder: Path) -> None:
+    """mask.png if all views (name -> what loads its weights [H, W]) have the same, else masks/, a file per masked view.
+
+    No more than two of them are in memory: all, as float32, would take more than the panoramas.
+    """
+    loaders = {name: load for name, load in masks.items() if load is not None}
+    if loaders and len(loaders) == len(masks):
+        first, *others = loaders.values()
+        mask = first()
+        if all(load().equal(mask) for load in others):
+            save_png(mask * 255, folder / "mask.png")
+            return
+    for name, load in loaders.items():
+        save_png(load() * 255, folder / "masks" / f"{name}.png")

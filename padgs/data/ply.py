@@ -10,6 +10,7 @@ import torch
 
 from padgs.data.capture import Cloud, color_bytes
 from padgs.data.errors import DataError
+from padgs.data.replacing import replacing
 
 _COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 
@@ -64,4 +65,5 @@ def write_ply(path: Path, cloud: Cloud) -> None:
         columns += [*cloud.colors.T.numpy()]
         fields += [(channel, "u1") for channel in _COLORS[0]]
     vertex = np.rec.fromarrays(columns, dtype=fields)
-    PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(path))
+    with replacing(path) as draft:
+        PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(draft))

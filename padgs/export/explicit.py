@@ -35,7 +35,7 @@ class Exported:
     """What is written, and what is to be said of it."""
 
     splats: Splats
-    notes: tuple[str, ...]  # lines of ASCII
+    notes: tuple[str, ...]  # a line each
     begin: Tensor  # [2, 3] where a viewer may begin, and what it looks at: those of the camera in the middle of all
 
 

@@ -1,7 +1,9 @@
 """Explicit Gaussians as files: the PLY of 3DGS, written and read; other formats by way of splat-transform.
 
-A PLY holds per Gaussian x y z, f_dc_0..2, f_rest_0.. (all coefficients of red, then of green, then of blue), opacity (a
-logit), scale_0..2 (logarithms) and rot_0..3 (w, x, y, z), as float32: what `Splats` holds, number for number.
+A PLY holds per Gaussian x y z, nx ny nz (0; the viewer of 3DGS, SIBR, counts on them), f_dc_0..2, f_rest_0.. (all
+coefficients of red, then of green, then of blue), opacity (a logit), scale_0..2 (logarithms) and rot_0..3 (w, x, y, z),
+as float32: what `Splats` holds, number for number. Harmonics have the degree of the model: programs that expect
+degree 3 are to be told (`--sh_degree` of 3DGS), for filled up with zeros small files would be three times as large.
 """
 
 from __future__ import annotations
@@ -20,21 +22,23 @@ from torch import Tensor
 
 from padgs.data.errors import DataError
 from padgs.data.ply import read_vertices
+from padgs.data.replacing import replacing
 from padgs.splats.model import Splats
 
 CONVERTER = "splat-transform"
 CONVERTED = (".compressed.ply", ".sog", ".spz", ".html")  # endings that the converter writes
-_FIRST = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2")
+_PLACE, _NORMAL, _COLOR = ("x", "y", "z"), ("nx", "ny", "nz"), ("f_dc_0", "f_dc_1", "f_dc_2")
 _LAST = ("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
+_NEEDED = (*_PLACE, *_COLOR, *_LAST)
 
 
 def write_splats(path: Path, splats: Splats, comments: Sequence[str] = (), *, begin: Tensor | None = None) -> None:
     """Write Gaussians to a file whose ending says the format.
 
     Args:
-        path: *.ply, or one of `CONVERTED`; a file that is there is replaced.
+        path: *.ply, or one of `CONVERTED`; a file that is there is replaced once the new one is complete.
         splats: what is written, only the harmonics in use.
-        comments: lines of a PLY's header.
+        comments: lines of a PLY's header; what is not ASCII is escaped.
         begin: [2, 3] where the viewer of an .html begins, and what it looks at; None: where it likes.
 
     Raises:
@@ -64,10 +68,11 @@ def _viewer(begin: Tensor) -> dict[str, Any]:
 def _convert(source: Path, target: Path, *more: str) -> None:
     # One round over the harmonics of .sog and .html: 27 000 Gaussians take 26 s, ten rounds 226 s; a second is 0.01 dB.
     how = ["--quiet", "--overwrite", "--gpu", "cpu", "--iterations", "1"]
-    command = [CONVERTER, *how, *more, str(source.resolve()), str(target.resolve())]
-    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    if done.returncode:
-        raise ValueError(f"{CONVERTER} could not make {target} of {source}: {done.stdout.strip()[-500:]}")
+    with replacing(target) as draft:
+        command = [CONVERTER, *how, *more, str(source.resolve()), str(draft.resolve())]
+        done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        if done.returncode:
+            raise ValueError(f"{CONVERTER} could not make {target} of {source}: {done.stdout.strip()[-500:]}")
 
 
 def refuse_impossible(path: Path) -> None:
@@ -102,8 +107,8 @@ def read_splats(path: Path, *, unit: float = 1.0) -> Splats:
     rest = 0
     while f"f_rest_{rest}" in names:
         rest += 1
-    if missing := [name for name in (*_FIRST, *_LAST) if name not in names]:
-        raise DataError(f"{path} has no property {missing[0]}; Gaussians of 3DGS have {', '.join((*_FIRST, *_LAST))}")
+    if missing := [name for name in _NEEDED if name not in names]:
+        raise DataError(f"{path} has no property {missing[0]}; Gaussians of 3DGS have {', '.join(_NEEDED)}")
     degree = round((rest / 3 + 1) ** 0.5) - 1
     if rest != 3 * ((degree + 1) ** 2 - 1) or degree > 3:
         raise DataError(f"{path} has {rest} properties f_rest_*; spherical harmonics have 0, 9, 24 or 45 of them")
@@ -113,7 +118,7 @@ def read_splats(path: Path, *, unit: float = 1.0) -> Splats:
 
     empty = torch.zeros(0, 3)
     splats = Splats(empty, empty, empty, degree=degree, unit=unit)
-    count = len(vertex[_FIRST[0]])
+    count = len(vertex["x"])
     sh_rest = columns(*(f"f_rest_{n}" for n in range(rest))) if rest else torch.zeros(count, 0)
     splats.load(
         {
@@ -134,8 +139,12 @@ def _write_ply(path: Path, splats: Splats, comments: Sequence[str]) -> None:
 
     in_use = (splats.active_degree + 1) ** 2 - 1
     rest = splats.sh_rest[:, :in_use].transpose(1, 2).flatten(1)  # [N, 3 in_use], red first
-    rows = (splats.means, splats.sh_dc, rest, splats.opacity_logits[:, None], splats.log_scales, splats.quats)
+    normals = torch.zeros_like(splats.means)
+    rows = (splats.means, normals, splats.sh_dc, rest, splats.opacity_logits[:, None], splats.log_scales, splats.quats)
     table = torch.cat(rows, dim=1).detach().float().cpu().contiguous().numpy()
-    names = (*_FIRST, *(f"f_rest_{number}" for number in range(rest.shape[1])), *_LAST)
+    names = (*_PLACE, *_NORMAL, *_COLOR, *(f"f_rest_{number}" for number in range(rest.shape[1])), *_LAST)
     vertex = table.view([(name, "<f4") for name in names])[:, 0]
-    PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<", comments=list(comments)).write(str(path))
+    # Comments stand behind the count, which SIBR reads from the third line; names may be of any script, PLY is ASCII.
+    lines = [line.encode("unicode_escape").decode() for line in comments]
+    with replacing(path) as draft:
+        PlyData([PlyElement.describe(vertex, "vertex", comments=lines)], byte_order="<").write(str(draft))

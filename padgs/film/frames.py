@@ -11,6 +11,7 @@ import numpy as np
 from PIL import Image
 from torch import Tensor
 
+from padgs.data.replacing import replacing
 from padgs.film.spherical import mark_spherical
 from padgs.render import Rendering
 from padgs.scene import View
@@ -18,6 +19,8 @@ from padgs.scoring.pictures import depth_picture, eight_bit
 
 Put = Callable[[np.ndarray], None]  # takes the next frame, [H, W, 3] uint8
 DEPTH_STEPS = 1000  # of a 16-bit depth picture, in the unit of the scene
+# What an .mp4 holds and says so: players that are not told take large films to be BT.709, small ones to be BT.601.
+COLOURS = {"colorspace": "bt709", "color_primaries": "bt709", "color_trc": "bt709", "color_range": "tv"}
 
 
 def write_film(
@@ -34,7 +37,7 @@ def write_film(
     """Draw the views and write them, in order.
 
     Args:
-        to: *.mp4, or a folder for PNGs.
+        to: *.mp4, or a folder for PNGs. A film that is there is replaced once the new one is complete.
         views, draw: what is drawn, and who does it.
         fps: frames per second of an .mp4.
         unit: of the scene, which depths are shown and stored in.
@@ -55,7 +58,7 @@ def write_film(
     places = [to, to.with_name(f"{to.stem}-depth{to.suffix}")] if depth else [to]
     with ExitStack() as stack:
         if film:
-            puts = [stack.enter_context(_film(place, views[0], fps)) for place in places]
+            puts = [stack.enter_context(_film(place, views[0], fps, spherical)) for place in places]
         else:
             puts = [_folder(place) for place in places]
         for number, view in enumerate(views):
@@ -64,9 +67,6 @@ def write_film(
             if depth:
                 puts[1](depth_picture(rendering, unit) if film else _sixteen_bit(rendering.depth / unit))
             progress(number + 1)
-    if film and spherical:
-        for place in places:
-            mark_spherical(place)
     return places
 
 
@@ -87,7 +87,7 @@ def _folder(place: Path) -> Put:
 
 
 @contextmanager
-def _film(place: Path, view: View, fps: float) -> Iterator[Put]:
+def _film(place: Path, view: View, fps: float, spherical: bool) -> Iterator[Put]:
     if view.width % 2 or view.height % 2:
         raise ValueError(f"frames are {view.width}x{view.height}; H.264 takes even sides only, or name a folder")
     try:
@@ -97,8 +97,17 @@ def _film(place: Path, view: View, fps: float) -> Iterator[Put]:
             f"writing {place} needs PyAV: pip install 'padgs[video]'; a folder for PNGs does not"
         ) from error
     place.parent.mkdir(parents=True, exist_ok=True)
-    with av.open(str(place), "w") as film:
-        stream = film.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000), options={"crf": "18"})
-        stream.width, stream.height, stream.pix_fmt = view.width, view.height, "yuv420p"
-        yield lambda frame: film.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
-        film.mux(stream.encode())  # what the encoder still holds back
+    with replacing(place) as draft:
+        with av.open(str(draft), "w") as film:
+            options = {"crf": "18", **COLOURS}
+            stream = film.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000), options=options)
+            stream.width, stream.height, stream.pix_fmt = view.width, view.height, "yuv420p"
+
+            def put(frame: np.ndarray) -> None:
+                picture = av.VideoFrame.from_ndarray(frame, format="rgb24")
+                film.mux(stream.encode(picture.reformat(format="yuv420p", dst_colorspace="ITU709")))
+
+            yield put
+            film.mux(stream.encode())  # what the encoder still holds back
+        if spherical:
+            mark_spherical(draft)

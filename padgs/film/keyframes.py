@@ -3,7 +3,7 @@
 Ours: {"keyframes": [{"position": [x, y, z], "look_at": [x, y, z]} or {"cam_from_world": 4 rows of 4}, ...],
 "up": [x, y, z]}, in the scene's world; frames are spread evenly between them. Nerfstudio's has a pose for each frame
 (x right, y up, z backwards), in a world of its own; the file `dataparser_transforms.json` of its run, laid beside it,
-says which.
+says which. That begins at the world before what `transforms.json` names as applied to it; ours is the one after.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class PathError(ValueError):
     """A file of a path that cannot be used; the message says what is wrong where."""
 
 
-def read_path(file: Path, frames: int | None, up: tuple[float, float, float]) -> Tensor:
+def read_path(file: Path, frames: int | None, up: tuple[float, float, float], described: Path | None = None) -> Tensor:
     """The poses of a file, [F, 4, 4] float64 cam_from_world.
 
     Args:
@@ -33,6 +33,7 @@ def read_path(file: Path, frames: int | None, up: tuple[float, float, float]) ->
         frames: how many there shall be, spread evenly; None: those of a camera path as they are, and 30 between two
             keyframes.
         up: what is up for keyframes that look at something, unless the file says so.
+        described: the `transforms.json` of the scene, if it was read from one.
 
     Raises:
         PathError: it cannot be read, or is neither.
@@ -45,7 +46,7 @@ def read_path(file: Path, frames: int | None, up: tuple[float, float, float]) ->
         raise PathError(f"{file} is no readable JSON: {error}") from error
     try:
         if "camera_path" in content:
-            poses = _nerfstudio(content["camera_path"], file.parent / TRANSFORMS)
+            poses = _nerfstudio(content["camera_path"], file.parent / TRANSFORMS, described)
         else:
             poses = torch.cat([_keyframe(entry, content.get("up", up)) for entry in content["keyframes"]])
             frames = frames or 30 * (len(poses) - 1)
@@ -71,15 +72,22 @@ def _keyframe(entry: dict[str, Any], up: Any) -> Tensor:
     return looking(place, target - place, up / np.linalg.norm(up))
 
 
-def _nerfstudio(cameras: list[dict[str, Any]], transforms: Path) -> Tensor:
+def _nerfstudio(cameras: list[dict[str, Any]], transforms: Path, described: Path | None) -> Tensor:
     world_from_cam = np.array([camera["camera_to_world"] for camera in cameras], dtype=np.float64).reshape(-1, 4, 4)
     world_from_cam[:, :3, 1:3] *= -1  # to y down, z forward
-    if transforms.is_file():  # theirs = scale (transform @ ours)
+    if transforms.is_file():  # theirs = scale (transform @ original), and ours = applied_transform @ original
         told = json.loads(transforms.read_text())
-        transform = np.array(told["transform"], dtype=np.float64).reshape(3, 4)
-        world_from_cam[:, :3, 3] = (world_from_cam[:, :3, 3] / told["scale"] - transform[:, 3]) @ transform[:, :3]
-        world_from_cam[:, :3, :3] = transform[:, :3].T @ world_from_cam[:, :3, :3]
+        applied = {} if described is None else json.loads(described.read_text(encoding="utf-8-sig"))
+        to_ours = _homogeneous(applied.get("applied_transform", np.eye(3, 4)))
+        transform = _homogeneous(told["transform"]) @ np.linalg.inv(to_ours)
+        scale = told["scale"] / applied.get("applied_scale", 1.0)
+        world_from_cam[:, :3, 3] = (world_from_cam[:, :3, 3] / scale - transform[:3, 3]) @ transform[:3, :3]
+        world_from_cam[:, :3, :3] = transform[:3, :3].T @ world_from_cam[:, :3, :3]
     return _rigid(np.linalg.inv(world_from_cam))
+
+
+def _homogeneous(rows: Any) -> np.ndarray:
+    return np.vstack((np.array(rows, dtype=np.float64).reshape(3, 4), (0, 0, 0, 1)))
 
 
 def _rigid(poses: np.ndarray) -> Tensor:

@@ -10,6 +10,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
+from padgs.data.natural_order import natural
 from padgs.data.trajectory import gravity
 from padgs.scene import Scene
 
@@ -32,13 +33,14 @@ def between(poses: Tensor, times: Sequence[float] | np.ndarray) -> Tensor:
 
 
 def along_cameras(scene: Scene, frames: int) -> Tensor:
-    """Through the training cameras in their order, at one speed, and smoothly.
+    """Through the training cameras in the order of their names, at one speed, and smoothly.
 
     Raises:
         ValueError: there is one camera only, or all stand in one place.
     """
-    given = torch.stack([view.cam_from_world for view in scene.train])
-    centers = torch.stack([view.center for view in scene.train])
+    views = sorted(scene.train, key=lambda view: natural(view.name))
+    given = torch.stack([view.cam_from_world for view in views])
+    centers = torch.stack([view.center for view in views])
     steps = (centers[1:] - centers[:-1]).norm(dim=-1).cpu().numpy()
     if len(given) < 2 or scene.stands_still:
         raise ValueError(

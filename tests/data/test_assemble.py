@@ -85,6 +85,11 @@ def test_points_from_elsewhere(folder: Path) -> None:
         load(folder, points="absent.ply")
 
 
+def test_the_folder_in_which_one_stands_has_a_name(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    assert load(".").name == load(folder).name == "scene"
+
+
 def test_nothing_where_a_scene_should_be(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"there is no .*absent; give the folder of"):
         load(tmp_path / "absent")

@@ -40,8 +40,12 @@ def test_palettes_and_opaque_alpha_are_colour(tmp_path: Path) -> None:
 def test_transparent_pixels_are_refused(tmp_path: Path) -> None:
     image = Image.fromarray(PIXELS).convert("RGBA")
     image.putpixel((3, 3), (0, 0, 0, 254))
-    with pytest.raises(DataError, match=r"a.png has transparent pixels; .* mask"):
-        decode(_save(tmp_path / "a.png", image))
+    path = _save(tmp_path / "a.png", image)
+    for look in (inspect, decode):
+        with pytest.raises(DataError, match=r"a.png has transparent pixels; .* in a mask file"):
+            look(path)
+    with pytest.raises(DataError, match=r"a.png has transparent pixels; save it without alpha, and paint .* black"):
+        inspect(path, mask=True)
 
 
 @pytest.mark.parametrize("extension", ["jpg", "png"])

@@ -1,5 +1,7 @@
 """Masks weigh pixels, and never touch them."""
 
+import weakref
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +11,7 @@ from fixtures import World, write_colmap_text
 from PIL import Image
 
 from padgs.data import DataError, load
-from padgs.data.masks import row_weights
+from padgs.data.masks import row_weights, write_masks
 
 
 @pytest.fixture
@@ -82,6 +84,39 @@ def test_a_mask_must_show_a_part_of_the_sphere(folder: Path) -> None:
         load(folder, mask="pixel.png")
     with pytest.raises(DataError, match=r"data.mask=rows:1/32 hides all but 0.24% of the sphere of each image; keep"):
         load(folder, mask="rows:1/32")
+    Image.fromarray(np.ones((32, 64), np.uint8)).save(folder / "ones.png")
+    with pytest.raises(DataError, match=r"ones.png hides all but 0.39% of the sphere of pano_00.png; in a mask 255"):
+        load(folder, mask="ones.png")
+
+
+def test_a_mask_may_lie_where_one_stands(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _mask(folder / "desk" / "hands.png")
+    monkeypatch.chdir(folder / "desk")
+    assert load(folder, mask="hands.png").train[0].mask() is not None
+    _mask(folder / "hands.png")
+    with pytest.raises(DataError, match=r"data.mask=hands.png is .*hands.png as well as .*desk/hands.png; give"):
+        load(folder, mask="hands.png")
+    assert load(folder, mask=str(folder / "hands.png")).train[0].mask() is not None
+
+
+def test_masks_are_written_without_all_of_them_in_memory(tmp_path: Path) -> None:
+    made: list[weakref.ref] = []
+    alive: list[int] = []
+
+    def loads(value: float) -> Callable[[], torch.Tensor]:
+        def load() -> torch.Tensor:
+            mask = torch.full((4, 8), value)
+            made.append(weakref.ref(mask))
+            alive.append(sum(known() is not None for known in made))
+            return mask
+
+        return load
+
+    write_masks({name: loads(1.0) for name in "abcd"}, tmp_path / "same")
+    write_masks({name: loads(1.0 if name < "d" else 0.2) for name in "abcd"}, tmp_path / "others")
+    assert max(alive) == 2
+    assert [path.name for path in (tmp_path / "same").iterdir()] == ["mask.png"]
+    assert (np.asarray(Image.open(tmp_path / "others" / "masks" / "d.png")) == 51).all()
 
 
 def test_unusable_masks(folder: Path) -> None:

@@ -80,7 +80,7 @@ def test_points_and_upright_worlds(splat_run, tmp_path):
     cloud = read_ply(tmp_path / "new" / "p.ply")
     assert len(cloud.points) > 10 and cloud.colors is not None
     assert export(str(splat_run), "--upright", "--to", str(tmp_path / "u.ply")).exit_code == 0
-    assert any("-y is up" in line for line in PlyData.read(str(tmp_path / "u.ply")).comments)
+    assert any("-y is up" in line for line in PlyData.read(str(tmp_path / "u.ply"))["vertex"].comments)
     up, plain = read_splats(tmp_path / "u.ply").means, padgs.load_run(splat_run).method.trainee.splats.means
     assert torch.allclose(-up[:, 1], plain[:, 2], atol=1e-4), "z is up in the built-in room"
 
@@ -89,7 +89,7 @@ def test_anchors_are_baked_and_the_loss_is_said_and_written(tmp_path_factory, tm
     folder = tiny_run(tmp_path_factory, "method=padgs_small", "train.iterations=60")
     said = export(str(folder), "--to", str(tmp_path / "a.ply"), "--lessons", "40")
     assert said.exit_code == 0, said.output
-    (line,) = [line for line in PlyData.read(str(tmp_path / "a.ply")).comments if line.startswith("baked")]
+    (line,) = [line for line in PlyData.read(str(tmp_path / "a.ply"))["vertex"].comments if line.startswith("baked")]
     assert line in said.output and "WS-PSNR of the test views" in line
     assert len(read_splats(tmp_path / "a.ply")) > 0
 

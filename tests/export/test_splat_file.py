@@ -21,7 +21,7 @@ def test_what_is_read_is_what_was_written_bit_by_bit(degree, tmp_path, generator
     assert (found.degree, found.active_degree, found.unit) == (degree, degree, splats.unit)
     for name, row in splats.rows().items():
         assert torch.equal(found.rows()[name], row), name
-    assert PlyData.read(str(tmp_path / "a.ply")).comments == ["said of it"]
+    assert PlyData.read(str(tmp_path / "a.ply"))["vertex"].comments == ["said of it"]
 
 
 def test_the_columns_are_those_of_3dgs(tmp_path, generator):
@@ -34,6 +34,16 @@ def test_the_columns_are_those_of_3dgs(tmp_path, generator):
     splats.active_degree = 1
     write_splats(tmp_path / "a.ply", splats)
     assert read_splats(tmp_path / "a.ply").degree == 1, "harmonics that wait are not written"
+
+
+def test_the_header_is_what_the_viewer_of_3dgs_counts_on(tmp_path, generator):
+    """It takes the number of Gaussians from the third line, and rows by position; PLY is ASCII."""
+    splats = random_splats(0, generator)
+    write_splats(tmp_path / "a.ply", splats, ["run flat é"])
+    header = (tmp_path / "a.ply").read_bytes().partition(b"end_header")[0].decode("ascii").splitlines()
+    assert header[2:4] == [f"element vertex {len(splats)}", r"comment run flat \xe9"]
+    first = [line.split()[-1] for line in header[4:13]]
+    assert first == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
 
 
 def test_files_that_are_none_are_refused(tmp_path, generator):
@@ -80,9 +90,13 @@ def test_a_page_begins_where_a_photograph_was_taken(tmp_path, generator, monkeyp
     assert (camera["position"], camera["target"]) == ([-1, -2, 3], [-1, -2, 4]), "its y is up, and its x is left"
 
 
-def test_a_converter_that_fails_is_quoted(tmp_path, generator, monkeypatch):
-    (tmp_path / splat_file.CONVERTER).write_text("#!/bin/sh\necho no room left\nexit 3\n")
+def test_a_converter_that_fails_is_quoted_and_leaves_the_earlier_file(tmp_path, generator, monkeypatch):
+    script = "#!/bin/sh\nwhile [ $# -gt 1 ]; do shift; done\necho half >$1\necho no room left\nexit 3\n"
+    (tmp_path / splat_file.CONVERTER).write_text(script)
     (tmp_path / splat_file.CONVERTER).chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
-    with pytest.raises(ValueError, match="could not make .*: no room left"):
+    (tmp_path / "a.spz").write_text("the earlier one")
+    with pytest.raises(ValueError, match="could not make .*a.spz of .*: no room left"):
         write_splats(tmp_path / "a.spz", random_splats(0, generator))
+    assert (tmp_path / "a.spz").read_text() == "the earlier one"
+    assert {path.name for path in tmp_path.iterdir()} == {"a.spz", splat_file.CONVERTER}

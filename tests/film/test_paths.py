@@ -43,6 +43,12 @@ def test_the_way_through_the_cameras_is_walked_at_one_speed_and_rounds_corners()
     assert PATHS["dolly"](walk([[1, 0, 0]] * 3), 5).isfinite().all()
 
 
+def test_cameras_are_passed_in_the_order_of_their_numbers():
+    scene = walk([[number, 0, 0] for number in range(12)])
+    scene = replace(scene, train=tuple(sorted(scene.train, key=lambda view: view.name)))  # 0, 1, 10, 11, 2, as loaded
+    assert centers(along_cameras(scene, 30))[:, 0].diff().min() > 0
+
+
 def test_between_two_turns_lies_the_half_turn():
     quarter = looking(torch.zeros(2, 3).numpy(), torch.tensor([[0.0, 0, 1], [1, 0, 0]]).numpy(), [0, -1, 0])
     ahead = between(quarter, [0.5])[0, 2, :3]

@@ -13,6 +13,7 @@ from padgs.data.errors import DataError
 from padgs.scene import View
 from padgs.sphere.panorama import project
 
+OVERLAY = "check.png"  # beside the data, where no other place is given
 WIDTH = 2048  # of the picture at most
 
 

@@ -85,6 +85,7 @@ def check(
         return report
     report.format = capture.format
     _check_images(capture, report, progress)
+    damaged = bool(report.problems)
     scene = _assemble(capture, options, report)
     if scene is None:
         return report
@@ -103,6 +104,8 @@ def check(
     report.masked = {view.name: 1 - mask.mean().item() for view in views if (mask := view.mask()) is not None}
     _check_leaks(scene, capture, report)
     _check_movement(poses, report)
+    if damaged:  # nothing can be compared with pixels that cannot be read
+        return report
     _check_fit(capture, scene, report)
     if overlay is not None:
         try:

@@ -68,7 +68,7 @@ def convert(
         if options.points != "auto":
             points, colors, _ = starting_cloud(capture, options.points)  # where the poses are: the scene may be centred
             content = replace(content, cloud=Cloud(points, colors), tracks=None)
-        write_masks({view.name: view.mask() for view in (*scene.train, *scene.test)}, partial)
+        write_masks({view.name: view.load_mask for view in (*scene.train, *scene.test)}, partial)
         WRITERS[to](content, partial)
         if destination.exists():
             destination.rmdir()

@@ -27,6 +27,7 @@ def read(path: Path, options: DataOptions) -> Capture:
     images = image_folder(path, options.images, ("imgs", "images"))
     files = {str(PurePosixPath(name).with_suffix("")): name for name in image_names(images)}
     files.pop("mask", None)
+    mask = path / "imgs" / "mask.png"
     file = path / MODEL / "images.txt"
     frames = []
     for fields in image_lines(file):
@@ -38,13 +39,12 @@ def read(path: Path, options: DataOptions) -> Capture:
         except ValueError as error:
             raise DataError(f"{where}: the pose is not numbers ({error})") from error
         pose = cam_from_world(rotation_from_quaternion(values[:4], where), values[4:], where)
-        frames.append(Frame(name, images / name, pose))
+        frames.append(Frame(name, images / name, pose, mask=mask if mask.is_file() else None))
     cloud = existing_ply(path, ("openMVG/scene.ply", "scene.ply", "pcd.ply"))
     points = path / MODEL / "points3D.txt"
     if cloud is None and points.is_file():
         cloud = _cloud(points)
-    mask = "imgs/mask.png" if (path / "imgs" / "mask.png").is_file() else "auto"
-    return Capture("ricoh360", path, images, tuple(frames), cloud, mask=mask)
+    return Capture("ricoh360", path, images, tuple(frames), cloud)
 
 
 def _cloud(file: Path) -> Cloud | None:

@@ -11,6 +11,7 @@ from pathlib import Path, PurePosixPath
 from padgs.data.capture import Capture, Frame
 from padgs.data.cloud import existing_ply
 from padgs.data.errors import DataError
+from padgs.data.formats.detect import detect
 from padgs.data.formats.json_file import Json, file_in, read_json
 from padgs.data.formats.poses import cam_from_opengl_pose
 from padgs.data.images import EXTENSIONS
@@ -63,6 +64,18 @@ def read(path: Path, options: DataOptions) -> Capture:
         cloud=cloud,
         split=split or None,
     )
+
+
+def described(path: str | None, format: str) -> Path | None:
+    """The `transforms.json` that a scene with this `data.path` and `data.format` is read from; None for another format.
+
+    Raises:
+        DataError: nothing known is there.
+    """
+    if path is None or (detect(Path(path))[0] if format == "auto" else format) not in ("transforms", "nerfstudio"):
+        return None
+    file = file_in(Path(path), FILE)
+    return file if file.is_file() else None
 
 
 def _frame(meta: Json, frame: Json, root: Path) -> Frame:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image
 
+import padgs.data
 from padgs.data.assemble import image_folder
 from padgs.data.errors import DataError, listed
 from padgs.data.images import decode, inspect, save_png
@@ -35,7 +36,7 @@ def write_nadir_mask(path: Path, below: float, *, overwrite: bool = False) -> Na
         overwrite: replace a mask that is there.
 
     Raises:
-        DataError: no such angle, no panoramas or of several sizes, or there is a mask already.
+        DataError: no such angle, no panoramas or of several sizes, or there are masks already.
     """
     if not 0 < below < 90:
         raise DataError(f"{below:g} degrees below the horizon hide nothing, or half of all; give more than 0, up to 89")
@@ -47,6 +48,7 @@ def write_nadir_mask(path: Path, below: float, *, overwrite: bool = False) -> Na
         raise DataError(f"{images} holds no images; give a folder of panoramas, or of a data set")
     if not overwrite and (found := next((place / name for name in SCENE_MASKS if (place / name).exists()), None)):
         raise DataError(f"{found} exists; look at it, and say --overwrite to replace it")
+    _refuse_other_masks(place)
     files = [inspect(images / name) for name in names]
     sizes = sorted({(file.width, file.height) for file in files})
     if len(sizes) > 1:
@@ -66,3 +68,22 @@ def write_nadir_mask(path: Path, below: float, *, overwrite: bool = False) -> Na
     except OSError as error:
         raise DataError(f"cannot write into {place} ({error.strerror or error}); mend its permissions") from error
     return NadirMask(place / SCENE_MASKS[0], place / PREVIEW, len(files))
+
+
+def _refuse_other_masks(folder: Path) -> None:
+    """Refuse a folder with masks of single images: they would not be read beside mask.png, or it beside them."""
+    if (folder / "masks").is_dir():
+        raise DataError(
+            f"{folder / 'masks'} holds masks of single images, which mask.png would put out of use; hide what is below "
+            "the camera in those, or give that folder another name"
+        )
+    try:
+        capture = padgs.data.read(folder)
+    except DataError:  # panoramas alone: nothing names their masks
+        return
+    named = next((frame.mask for frame in capture.frames if frame.mask is not None), None)
+    if named is not None:
+        raise DataError(
+            f"{capture.format} names masks of its own, such as {named}, beside which mask.png would not be read; hide "
+            f"what is below the camera in those, or take them out of {folder} and of what describes it"
+        )

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from itertools import combinations
 
 from padgs.data.errors import DataError
+from padgs.data.natural_order import natural
 
 PAIRS = ("auto", "exhaustive", "sequential")
 EXHAUSTIVE_UP_TO = 80  # images: 3160 pairs
@@ -16,15 +17,16 @@ _ANCHORS = 30  # images spread over the sequence, all matched with each other
 def image_pairs(names: Sequence[str], kind: str = "auto") -> list[tuple[str, str]]:
     """Pairs of names to match, each once.
 
-    `sequential` takes the names in order: every image with the next ten and with those 16, 32, 64, ... further on; to
-    notice that a path returns, 30 images spread over the sequence are also matched with each other.
+    `sequential` takes the names in order, numbers in them by their value: every image with the next ten and with those
+    16, 32, 64, ... further on; to notice that a path returns, 30 images spread over the sequence are also matched with
+    each other.
 
     >>> image_pairs(["a", "b", "c"])
     [('a', 'b'), ('a', 'c'), ('b', 'c')]
     """
     if kind not in PAIRS:
         raise DataError(f"unknown kind of pairs {kind!r}; known: {', '.join(PAIRS)}")
-    names = sorted(names)
+    names = sorted(names, key=natural)
     if kind == "exhaustive" or (kind == "auto" and len(names) <= EXHAUSTIVE_UP_TO):
         return list(combinations(names, 2))
     steps = [*range(1, _NEIGHBOURS + 1), *(2**k for k in range(4, 32) if 2**k < len(names))]

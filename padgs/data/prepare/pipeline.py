@@ -29,7 +29,7 @@ from padgs.data.capture import Cloud, Frame, Tracks
 from padgs.data.errors import DataError, listed
 from padgs.data.formats import colmap
 from padgs.data.formats.writers import Content, write_colmap
-from padgs.data.masks import write_masks
+from padgs.data.masks import mask_place, write_masks
 from padgs.data.options import DataOptions
 from padgs.data.prepare import rig, sfm
 from padgs.data.prepare.pairs import PAIRS, image_pairs
@@ -132,7 +132,14 @@ def _finished(source: Path, destination: Path, options: PrepareOptions) -> Prepa
 
 
 def _fingerprint(source: Path, options: PrepareOptions) -> str:
-    return _file_digest(source) if is_video(source) else find_source(source, options.mask).fingerprint
+    """Of images with their masks; of a video and the files of its mask, since its frames are gone in the end."""
+    if not is_video(source):
+        return find_source(source, options.mask).fingerprint
+    digests, mask = [_file_digest(source)], mask_place(options.mask, Path())
+    if mask is not None:
+        files = sorted(file for file in (mask, *mask.rglob("*")) if file.is_file())
+        digests += [f"{file.relative_to(mask)}:{_file_digest(file)}" for file in files]
+    return "|".join(digests)
 
 
 def _digest(fingerprint: str, options: PrepareOptions) -> str:
@@ -152,7 +159,7 @@ class _Job:
         self.seconds: dict[str, float] = {}
         self.input = None  # digest of what was given, a video or images
         if is_video(source):
-            self._open("video", _file_digest(source))
+            self._open("video", _fingerprint(source, options))
             self._once("frames", partial(self._extract_frames, source))
             source = self.work / "frames"
         with self._step("images"):
@@ -219,9 +226,9 @@ class _Job:
     def _groups(self) -> list[sfm.Group]:
         """Images that share a camera: panoramas of one size, or one view of all panoramas."""
         if self.options.accurate:
-            size = rig.view_size(next(iter(self.source.images.values())).width)
+            lens = rig.view_lens(next(iter(self.source.images.values())).width)
             return [
-                sfm.Group(tuple(rig.view_name(view, short) for short in self.files), size, size, size / 2)
+                sfm.Group(tuple(rig.view_name(view, short) for short in self.files), lens.width, lens.height, lens.fx)
                 for view in range(self.views)
             ]
         by_size: dict[tuple[int, int], list[str]] = {}
@@ -231,7 +238,9 @@ class _Job:
         return [sfm.Group(tuple(names), *size) for size, names in by_size.items()]
 
     def _match(self) -> None:
-        pairs = [[pair] for pair in image_pairs(list(self.files), self.options.pairs)]
+        short = {name: short for short, name in self.files.items()}
+        # Of the names as they were given: ours are in the order of their letters, where 10 comes before 2.
+        pairs = [[(short[a], short[b])] for a, b in image_pairs(list(short), self.options.pairs)]
         if self.options.accurate:
             both = list(product(range(self.views), repeat=2))
             pairs = [[(rig.view_name(i, a), rig.view_name(j, b)) for i, j in both] for [(a, b)] in pairs]
@@ -302,8 +311,7 @@ class _Job:
             target = folder / "images" / frame.name
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(frame.image, target)
-        masks = {view_name(frame.name): self.source.masks.get(frame.name) for frame in frames}
-        write_masks({name: None if mask is None else mask() for name, mask in masks.items()}, folder)
+        write_masks({view_name(frame.name): self.source.masks.get(frame.name) for frame in frames}, folder)
 
     # Bookkeeping.
 

@@ -20,6 +20,8 @@ from padgs.data.capture import Cloud, Frame, Tracks
 from padgs.data.formats.colmap import cloud_of, pycolmap_module
 from padgs.data.formats.poses import rigid
 from padgs.data.images import decode
+from padgs.data.perspectives import looking_at
+from padgs.sphere.camera import Pinhole
 from padgs.sphere.panorama import direction, project, sample
 
 LATITUDES = (-35.0, 0.0, 35.0)  # degrees, positive down
@@ -28,29 +30,16 @@ VIEWS_PER_ROW = 4
 
 def cam_from_pano() -> Tensor:
     """Rotations [12, 3, 3] from the panorama's frame to those of its views; rows are right, down, forward."""
-    rotations = []
-    for row, latitude in enumerate(LATITUDES):
-        for column in range(VIEWS_PER_ROW):
-            # Every other row is turned by half a view, which evens out the overlap.
-            longitude = torch.tensor(math.radians(90 * column + 45 * (row % 2)), dtype=torch.float64)
-            angle = torch.tensor(math.radians(latitude), dtype=torch.float64)
-            forward = direction(longitude, angle)
-            down = direction(longitude, angle + math.pi / 2)
-            rotations.append(torch.stack((torch.linalg.cross(down, forward), down, forward)))
-    return torch.stack(rotations)
+    # Every other row is turned by half a view, which evens out the overlap.
+    longitude = 90.0 * torch.arange(VIEWS_PER_ROW) + 45.0 * (torch.arange(len(LATITUDES)) % 2)[:, None]  # degrees
+    latitude = torch.tensor(LATITUDES)[:, None].expand_as(longitude)
+    return looking_at(direction(longitude.double().deg2rad(), latitude.double().deg2rad()).flatten(0, 1))
 
 
-def view_size(pano_width: int) -> int:
-    """Side in pixels of a view: 90 degrees at the panorama's resolution at its horizon, W / pi, even."""
-    return 2 * round(pano_width / math.pi / 2)
-
-
-def view_rays(size: int) -> Tensor:
-    """Directions [size, size, 3] through the pixel centres of a view, in its own frame, not normalised."""
-    offset = (torch.arange(size, dtype=torch.float64) + 0.5) / (size / 2) - 1
-    return torch.stack(
-        (offset.expand(size, size), offset[:, None].expand(size, size), torch.ones(size, size).double()), dim=-1
-    )
+def view_lens(pano_width: int) -> Pinhole:
+    """The lens of all views: 90 degrees at the resolution of a panorama at its horizon, W / pi pixels; even sides."""
+    size = 2 * round(pano_width / math.pi / 2)
+    return Pinhole(size, size, size / 2, size / 2, size / 2, size / 2)
 
 
 def owned(index: int, rays: Tensor) -> Tensor:
@@ -83,7 +72,7 @@ def render_views(
     for done, (name, path) in enumerate(sorted(images.items())):
         image = torch.from_numpy(decode(path))
         mask = torch.from_numpy(decode(masks[name], "L")) if name in masks else None
-        rays = view_rays(view_size(image.shape[1]))
+        rays = view_lens(image.shape[1]).rays(dtype=torch.float64)
         for index, rotation in enumerate(rotations):
             pano_rays = rays @ rotation  # transposed: from the view's frame to the panorama's
             use = owned(index, pano_rays)
@@ -147,7 +136,7 @@ def panoramas(model: Any, images: dict[str, Path], width: int) -> tuple[tuple[Fr
         with_point = [point for point in image.points2D if point.has_point3D()]
         if with_point:
             pixels = torch.from_numpy(np.array([point.xy for point in with_point]))
-            half = view_size(width) / 2
+            half = view_lens(width).width / 2
             rays = torch.cat((pixels / half - 1, torch.ones(len(pixels), 1, dtype=torch.float64)), dim=1)
             rows = torch.tensor([row_of[point.point3D_id] for point in with_point])
             seen.append((name, rows, project(rays @ rotations[view], width, width // 2)))

@@ -10,6 +10,7 @@ import torch
 
 from padgs.data.assemble import image_folder, image_names, refuse_clashes
 from padgs.data.capture import Capture, Frame
+from padgs.data.check.overlay import OVERLAY
 from padgs.data.errors import DataError
 from padgs.data.fisheye import refuse_dual_fisheye
 from padgs.data.images import ImageFile, decode, inspect
@@ -17,6 +18,7 @@ from padgs.data.masks import PREVIEW, SCENE_MASKS, Mask, find_masks
 from padgs.data.store import ImageStore
 
 UNSTITCHED = (".insp", ".insv", ".360", ".dng")  # what cameras store before their own program has stitched it
+_NOT_YET = "is not stitched yet: export panoramas, or a 2:1 video, with the camera's own program"
 LOOKED_AT = 3  # images that are decoded before any work is done; those of one camera are alike
 
 
@@ -39,16 +41,18 @@ def find_source(path: Path, mask: str) -> Source:
             masks/ beside the images and beside an images/ folder.
 
     Raises:
-        DataError: no folder, fewer than two panoramas, an image that cannot be used, names that differ only in case or
-            extension, a mask that does not fit.
+        DataError: no folder, a file that is not stitched yet, fewer than two panoramas, an image that cannot be used,
+            names that differ only in case or extension, a mask that does not fit.
     """
+    if path.is_file() and path.suffix.lower() in UNSTITCHED:
+        raise DataError(f"{path} {_NOT_YET}")
     if not path.is_dir():
         raise DataError(f"{path} is not a folder; give a folder of panoramas, or a video file")
     folder = image_folder(path, None)
     names = panoramas(folder)
     if len(names) < 2:
         raw = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in UNSTITCHED)
-        advice = f"; {raw[0]} is not stitched yet: export panoramas with the camera's own program" if raw else ""
+        advice = f"; {raw[0]} {_NOT_YET}" if raw else ""
         raise DataError(f"{folder} holds {len(names)} images; structure from motion needs at least two{advice}")
     refuse_clashes(names)
     images = {name: inspect(folder / name) for name in names}
@@ -56,8 +60,6 @@ def find_source(path: Path, mask: str) -> Source:
         refuse_dual_fisheye(decode(folder / name), folder / name)
     nowhere = torch.eye(4, dtype=torch.float64)
     frames = tuple(Frame(name, image.path, nowhere, image.width, image.height) for name, image in images.items())
-    if Path(mask).exists():  # relative to where one stands, not to the images
-        mask = str(Path(mask).absolute())
     capture = Capture(format="images", folder=mask_folder(path), image_folder=folder, frames=frames, cloud=None)
     sizes = [(image.width, image.height) for image in images.values()]
     masks, digests, notes = find_masks(capture, mask, list(images.values()), sizes, ImageStore())
@@ -74,9 +76,9 @@ def find_source(path: Path, mask: str) -> Source:
 
 
 def panoramas(folder: Path) -> list[str]:
-    """The images below a folder, relative to it, sorted, without the masks among them."""
-    of_masks = (*SCENE_MASKS, PREVIEW)
-    return [name for name in image_names(folder) if name not in of_masks and not name.startswith("masks/")]
+    """The images below a folder, relative to it, sorted, without the masks and pictures of ours among them."""
+    others = (*SCENE_MASKS, PREVIEW, OVERLAY)
+    return [name for name in image_names(folder) if name not in others and not name.startswith("masks/")]
 
 
 def mask_folder(path: Path) -> Path:

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from padgs.data.errors import DataError
+from padgs.data.fisheye import refuse_dual_fisheye
+from padgs.data.images import refuse_other_shapes
 
 EXTENSIONS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
 
@@ -35,7 +37,7 @@ def extract_frames(
         Number of frames written.
 
     Raises:
-        DataError: the extra `video` is not installed, or the file cannot be decoded.
+        DataError: the extra `video` is not installed, the file cannot be decoded, or its frames are no panoramas.
     """
     try:
         import imageio.v3 as imageio
@@ -47,6 +49,9 @@ def extract_frames(
 
         def frames() -> Iterator[NDArray[np.uint8]]:
             for index, frame in enumerate(imageio.imiter(video, plugin="pyav")):
+                if index == 0:  # an hour of decoding would tell no more
+                    refuse_other_shapes(frame.shape[1], frame.shape[0], video)
+                    refuse_dual_fisheye(frame, video)
                 progress(index + 1, max(total, index + 1))
                 yield frame
 
@@ -56,6 +61,8 @@ def extract_frames(
             Image.fromarray(best).save(folder / f"frame_{written:05d}.jpg", quality=95, subsampling=0)
     except ImportError as error:
         raise DataError(f"reading {video} needs imageio and PyAV: pip install 'padgs[video]'") from error
+    except DataError:  # no panoramas
+        raise
     except (OSError, ValueError, RuntimeError, StopIteration) as error:
         raise DataError(f"{video} cannot be decoded ({error}); convert it to H.264 in an .mp4 file") from error
     if written == 0:

@@ -5,6 +5,7 @@ import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -64,11 +65,25 @@ def _save(folder: Path, name: str, pixels: np.ndarray) -> None:
 
 
 WIDE = np.zeros((32, 60, 3), np.uint8)
+
+
+def _cut(folder: Path) -> None:
+    """A picture that ends early, although as a whole one does; only its pixels tell."""
+    path, whole = folder / "images/pano_02.png", BytesIO()
+    Image.open(path).save(whole, "JPEG", quality=95)
+    path.write_bytes(whole.getvalue()[: len(whole.getvalue()) // 2] + b"\xff\xd9")
+
+
 BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
     "image missing": (lambda f: (f / "images/pano_02.png").unlink(), "1 of 6 poses have no image in .*: pano_02.png"),
     "image cut": (
         lambda f: (f / "images/pano_02.png").write_bytes(b"\x89PNG\r\n\x1a\n"),
         "pano_02.png is not an image",
+    ),
+    "image cut with an end": (_cut, "pano_02.png is cut short, although it has an end marker"),
+    "image transparent": (
+        lambda f: _save(f, "images/pano_02.png", np.full((32, 64, 4), 9, np.uint8)),
+        "pano_02.png has transparent pixels",
     ),
     "not 2:1": (lambda f: _save(f, "images/pano_03.png", WIDE), "pano_03.png is 60x32, which is not 2:1"),
     "mask of another size": (lambda f: _save(f, "mask.png", WIDE[:30]), "mask.png is 60x30 but pano_00.png is 64x32"),

@@ -10,6 +10,7 @@ import torch
 from fixtures import WRITERS, World, paint, write_transforms
 
 from padgs.data import DataError, load, read
+from padgs.data.formats.transforms import described
 from padgs.scene import Scene
 from padgs.sphere.panorama import rays
 
@@ -116,6 +117,9 @@ def test_several_formats_in_one_folder(world: World, tmp_path: Path) -> None:
     assert note.startswith("format: colmap") and "also there, not used: transforms.json" in note
     assert load(tmp_path / "scene", "transforms").train[0].name == "pano_00"
     assert load(tmp_path / "scene" / "transforms.json").notes[0].startswith("format: transforms")
+    scene = str(tmp_path / "scene")
+    assert described(scene, "auto") is None and described(None, "auto") is None
+    assert described(scene, "nerfstudio") == tmp_path / "scene" / "transforms.json"
 
 
 Change = Callable[[dict[str, Any]], object]

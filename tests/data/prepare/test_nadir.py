@@ -1,10 +1,11 @@
 """The mask over the tripod: where readers look for it, of the right angle, and never over another one."""
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from fixtures import World, write_colmap_text, write_images
+from fixtures import World, write_colmap_text, write_images, write_transforms
 from PIL import Image
 from typer import Typer
 from typer.testing import CliRunner
@@ -37,6 +38,20 @@ def test_a_data_set_is_loaded_with_it(world: World, tmp_path: Path) -> None:
     write_nadir_mask(tmp_path, 60)
     use = load(tmp_path).train[0].mask()
     assert use is not None and use.mean() == pytest.approx(150 / 180, abs=0.01)
+
+
+def test_masks_of_single_images_are_not_put_out_of_use(world: World, tmp_path: Path) -> None:
+    write_transforms(world, tmp_path / "posed")
+    meta = json.loads((tmp_path / "posed" / "transforms.json").read_text())
+    meta["frames"][2]["mask_path"] = "hands/pano_02.png"
+    (tmp_path / "posed" / "transforms.json").write_text(json.dumps(meta))
+    with pytest.raises(DataError, match=r"transforms names masks of its own, such as .*pano_02.png, beside which mask"):
+        write_nadir_mask(tmp_path / "posed", 60)
+    write_images(world, tmp_path / "shoot")
+    (tmp_path / "shoot" / "masks").mkdir()
+    with pytest.raises(DataError, match=r"masks holds masks of single images, which mask.png would put out of use"):
+        write_nadir_mask(tmp_path / "shoot", 60, overwrite=True)
+    assert not list(tmp_path.rglob("mask.png"))
 
 
 def test_nothing_is_overwritten_unasked_and_nonsense_refused(world: World, tmp_path: Path) -> None:

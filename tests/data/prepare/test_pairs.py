@@ -28,6 +28,11 @@ def test_order_of_names_does_not_matter():
     assert image_pairs(NAMES[::-1]) == image_pairs(NAMES)
 
 
+def test_numbers_without_leading_zeros_count_by_their_value():
+    pairs = image_pairs([f"pano{number}.jpg" for number in range(1, 121)], "sequential")
+    assert ("pano9.jpg", "pano10.jpg") in pairs and ("pano10.jpg", "pano100.jpg") not in pairs
+
+
 def test_unknown_kind():
     with pytest.raises(DataError, match="unknown kind of pairs 'all'; known: auto, exhaustive, sequential"):
         image_pairs(NAMES, "all")

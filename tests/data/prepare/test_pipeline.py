@@ -13,6 +13,7 @@ import padgs.data
 from padgs.calibration.align import align
 from padgs.data import DataError
 from padgs.data.check.report import check
+from padgs.data.prepare import pipeline
 from padgs.data.prepare.pipeline import PrepareOptions, prepare, rotation_between
 from padgs.data.synthetic import SyntheticOptions, generate
 from padgs.data.trajectory import gravity, path_length
@@ -130,18 +131,29 @@ def test_other_input_starts_over(scene, tmp_path):
     assert (work / "stale").exists()  # the same input and options: kept
 
 
-def test_masked_pixels_have_no_features_and_the_mask_comes_along(scene, tmp_path):
-    source = tmp_path / "in"
-    shutil.copytree(scene[1], source, ignore=lambda folder, names: [n for n in names if not n.startswith("pano")])
+def test_masked_pixels_have_no_features_and_the_mask_comes_along(scene, tmp_path, monkeypatch):
+    """Of a video: its frames are gone in the end, so that only the file of the mask tells that it is another one."""
+    frames = scene[1].glob("pano*.png")
+    monkeypatch.setattr(
+        pipeline, "extract_frames", lambda video, folder, *_: [shutil.copy(frame, folder) for frame in frames]
+    )
+    video, hands = tmp_path / "tour.mp4", tmp_path / "hands.png"
+    video.write_bytes(b"a film")
     mask = np.full((256, 512), 255, np.uint8)
     mask[160:] = 0
-    Image.fromarray(mask).save(source / "mask.png")
-    result = prepare(source, tmp_path / "out", PrepareOptions(threads=2, level=False))
-    assert "mask: mask.png for every view" in result.notes
+    Image.fromarray(mask).save(hands)
+    options = PrepareOptions(threads=2, level=False, mask=str(hands))
+    result = prepare(video, tmp_path / "out", options)
+    assert "mask: hands.png for every view" in result.notes
     rows = padgs.data.read(tmp_path / "out").tracks().pixels[:, 1]
     assert len(rows) > 300
     assert rows.max() < 161
     assert np.array_equal(np.asarray(Image.open(tmp_path / "out" / "mask.png")), mask)
+    assert prepare(video, tmp_path / "out", options).points == result.points
+    mask[150:] = 0
+    Image.fromarray(mask).save(hands)
+    with pytest.raises(DataError, match="not what these options make of"):
+        prepare(video, tmp_path / "out", options)
 
 
 def test_unrelated_images_are_reported(scene, tmp_path):

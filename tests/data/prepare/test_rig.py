@@ -43,7 +43,7 @@ def test_a_view_shows_what_is_in_its_directions():
 
     image = color(rays(512, 256, dtype=torch.float64))
     for rotation in rig.cam_from_pano():
-        pano_rays = rig.view_rays(rig.view_size(512)) @ rotation
+        pano_rays = rig.view_lens(512).rays(dtype=torch.float64) @ rotation
         difference = (rig.resample(image, pano_rays).int() - color(pano_rays).int()).abs()
         assert difference.max() <= 2
 
@@ -55,9 +55,9 @@ def test_resampling_at_pixel_centres_changes_nothing():
 
 
 def test_views_keep_the_resolution_of_the_horizon():
-    size = rig.view_size(2048)
-    assert size == 652
-    center = rig.view_rays(size)[size // 2, size // 2 - 1 : size // 2 + 1]
+    lens = rig.view_lens(2048)
+    assert lens.width == lens.height == 652
+    center = lens.rays(dtype=torch.float64)[326, 325:327]
     pixels = project(center, 2048, 1024)
     assert (pixels[1, 0] - pixels[0, 0]).item() == pytest.approx(1.0, abs=0.01)
 

@@ -32,31 +32,28 @@ def test_images_masks_and_notes(tmp_path):
     assert find_source(tmp_path, "rows:3/4").masks["b.png"]().mean() == pytest.approx(0.75)
 
 
-def test_a_mask_among_the_images_is_not_an_image(tmp_path):
+def test_masks_and_pictures_of_ours_among_the_images_are_no_images(tmp_path):
     save(tmp_path / "a.png")
     save(tmp_path / "b.png")
     save(tmp_path / "masks" / "a.png", 255)
+    save(tmp_path / "check.png")
     source = find_source(tmp_path, "auto")
     assert list(source.images) == ["a.png", "b.png"]
     assert list(source.masks) == ["a.png"]
 
 
-def test_a_mask_file_is_looked_for_where_one_stands(tmp_path, monkeypatch):
-    save(tmp_path / "in" / "a.png")
-    save(tmp_path / "in" / "b.png")
-    Image.fromarray(np.full((16, 32), 255, np.uint8)).save(tmp_path / "tripod.png")
-    monkeypatch.chdir(tmp_path)
-    assert set(find_source(tmp_path / "in", "tripod.png").masks) == {"a.png", "b.png"}
-
-
 def test_bad_input_is_refused(tmp_path):
     with pytest.raises(DataError, match="is not a folder; give a folder of panoramas, or a video"):
         find_source(tmp_path / "nothing", "auto")
+    (tmp_path / "VID_1.insv").write_bytes(b"a film")
+    with pytest.raises(DataError, match="VID_1.insv is not stitched yet: export panoramas, or a 2:1 video, with the"):
+        find_source(tmp_path / "VID_1.insv", "auto")
+    (tmp_path / "VID_1.insv").unlink()
     save(tmp_path / "a.png")
     with pytest.raises(DataError, match="holds 1 images; structure from motion needs at least two$"):
         find_source(tmp_path, "auto")
     (tmp_path / "IMG_1.insp").write_bytes(b"\xff\xd8")
-    with pytest.raises(DataError, match="IMG_1.insp is not stitched yet: export panoramas with the camera's own"):
+    with pytest.raises(DataError, match="at least two; IMG_1.insp is not stitched yet: export"):
         find_source(tmp_path, "auto")
     save(tmp_path / "A.png")
     with pytest.raises(DataError, match=r"'A.png' and 'a.png' would share one name"):
