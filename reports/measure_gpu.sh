@@ -4,17 +4,17 @@
 #
 #   reports/measure_gpu.sh [STEP...]     all of: build bench tests memcheck synccheck racecheck initcheck
 #
-# A step that is done is not done again, so the same command goes on where it was cut off; $OUT/STEP.state says how each
-# ended, $OUT/STEP.log what it printed (OUT: build/gpu/out). Delete $OUT to start over.
+# A step that is done is not done again, so the same command goes on where it was cut off; build/gpu/out/STEP.state says
+# how each ended, STEP.log what it printed. Delete build/gpu/out to start over.
 #
-# Needs no network: nvcc, cmake, a C++ compiler, and a python3 (PYTHON names another) with torch, numpy, pytest,
+# Needs no network: nvcc, cmake, a C++ compiler, and a python3 (PYTHON names another) with torch, numpy, scipy, pytest,
 # hypothesis, typer and rich. What is missing of the pure-Python ones may lie in the folder wheels/ as wheels. FULL=0
-# leaves out a million Gaussians, LIMIT=900 gives a step so many seconds.
+# leaves out a million Gaussians, LIMIT gives a step so many seconds (540, as machines are lent for ten minutes).
 set -eu
 cd "$(dirname "$0")/.."
 python=${PYTHON:-python3}
 build=$PWD/build/gpu
-out=${OUT:-$build/out}
+out=$build/out
 site=$build/site
 all="build bench tests memcheck synccheck racecheck initcheck"
 mkdir -p "$site" "$out" reports/measured
@@ -22,7 +22,8 @@ export PADGS_LIBRARY_DIR="$build/lib" PYTHONPATH="$PWD:$site" PYTHONUNBUFFERED=1
 
 build() {
   if [ -d wheels ]; then $python -m pip install -q --no-index --no-deps --upgrade --target "$site" wheels/*.whl; fi
-  cmake -S . -B "$build" -DCMAKE_BUILD_TYPE=Release -DPADGS_CUDA=ON && cmake --build "$build" --parallel
+  cmake -S . -B "$build" -DCMAKE_BUILD_TYPE=Release -DPADGS_CUDA=ON
+  cmake --build "$build" --parallel
   mkdir -p "$build/lib"
   find "$build/padgs" -name 'libpadgs_*.so' -exec cp {} "$build/lib" \;
 }
@@ -34,12 +35,13 @@ bench() {
 tests() { $python -m pytest -q -m cuda tests/render --junitxml="$out/tests.xml"; }
 sanitizer() {
   compute-sanitizer --tool "$1" --error-exitcode 99 $python -m pytest -q -x -m cuda -k "not long and not any_size" \
-    tests/render/cuda/test_cuda_backend.py tests/render/cuda/test_cuda_loss.py
+    tests/render/cuda/test_cuda_backend.py tests/render/cuda/test_cuda_decoder.py tests/render/cuda/test_cuda_loss.py
 }
-memcheck() { PYTORCH_NO_CUDA_MEMORY_CACHING=1 sanitizer memcheck; }  # else it sees one large block
+# Without torch's cache of memory, in which it sees one large block that has been written before.
+memcheck() { PYTORCH_NO_CUDA_MEMORY_CACHING=1 sanitizer memcheck; }
 synccheck() { sanitizer synccheck; }
 racecheck() { sanitizer racecheck; }
-initcheck() { sanitizer initcheck; }
+initcheck() { PYTORCH_NO_CUDA_MEMORY_CACHING=1 sanitizer initcheck; }
 
 conclude() {
   $python - "$out" $all <<'END'
@@ -73,7 +75,7 @@ for step in ${*:-$all}; do
   case " $all " in *" $step "*) ;; *) echo "unknown step $step; known: $all" >&2; exit 2 ;; esac
   if [ "$(cat "$out/$step.state" 2>/dev/null)" = ok ]; then continue; fi
   echo "$step ..."
-  if timeout "${LIMIT:-900}" "$0" --only "$step" >"$out/$step.log" 2>&1; then
+  if timeout "${LIMIT:-540}" "$0" --only "$step" >"$out/$step.log" 2>&1; then
     echo ok >"$out/$step.state"
   else
     echo "failed ($?)" >"$out/$step.state"

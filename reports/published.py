@@ -10,6 +10,7 @@ from pathlib import Path
 PROTOCOL = "paper"  # the only one under which ours may stand beside these
 DATASETS = {"roam360": "360roam", "ricoh360": "ricoh360"}  # our names -> theirs
 TITLES = {"roam360": "360Roam", "ricoh360": "Ricoh360"}  # of other data sets the scene says enough
+SCENES = {"center_1": "center1"}  # the paper's names -> those of the folders, where they differ
 MISSING = "missing"
 
 
@@ -40,9 +41,9 @@ def load(path: Path | None = None) -> Mapping[Key, Published]:
     """
     with (path or default_path()).open(newline="") as file:
         return {
-            Key(int(row["table"]), row["dataset"], row["scene"], row["method"], row["metric"]): Published(
-                float(row["value"]) if row["value"] else None, row["status"]
-            )
+            Key(
+                int(row["table"]), row["dataset"], SCENES.get(row["scene"], row["scene"]), row["method"], row["metric"]
+            ): Published(float(row["value"]) if row["value"] else None, row["status"])
             for row in csv.DictReader(file)
         }
 
@@ -54,7 +55,7 @@ def row(numbers: Mapping[Key, Published], table: int, dataset: str, scene: str, 
 
 
 def scenes(numbers: Mapping[Key, Published], dataset: str) -> list[str]:
-    """The scenes of a data set, as the paper calls it, in the paper's order."""
+    """The folders of the scenes of a data set, as the paper calls it, in the paper's order."""
     found = dict.fromkeys(key.scene for key in numbers if key.dataset == dataset and key.table < 3)
     return [scene for scene in found if scene != "average"]
 

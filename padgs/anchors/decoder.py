@@ -121,7 +121,12 @@ def decode_gaussians(
     """
     dtype, library = reduced(precision), LIBRARIES.get(anchors.features.device.type)
     no_reduced_types = dtype is not None and library is cpu
-    if library is None or no_reduced_types or anchors.features.dtype != torch.float32 or not library.available():
+    if (
+        library is None
+        or no_reduced_types
+        or anchors.features.dtype != torch.float32
+        or not library.works_on(anchors.features.device)
+    ):
         return define_gaussians(weights, anchors, precision)
     flat = tuple(tensor for head in weights for tensor in head)
     fused = decode_on_gpu(flat, *anchors, dtype=dtype) if library is cuda else decode_on_cpu(flat, *anchors)

@@ -19,6 +19,7 @@ from padgs.calibration.splats import Calibration
 from padgs.learning.schedule import LogLinear, ParameterGroup
 from padgs.learning.trainee import Drawing
 from padgs.render import Rendering
+from padgs.render.cubemap import SummedCounters
 from padgs.scene import View
 from padgs.sphere.camera import Panorama, RayTable
 from padgs.sphere.lens import axis_direction, bend, check_blend, hemisphere_weight
@@ -127,13 +128,13 @@ class DualLens(Calibration):
 
 def stitched(front: Rendering, back: Rendering, weight: Tensor) -> Rendering:
     """Two renderings of the same Gaussians as one: `weight` [H, W] of the front; equal pixels stay as they are."""
-    weight = weight.to(front.image)
+    weight, visible = weight.to(front.image), front.visible | back.visible
     return Rendering(
         image=torch.lerp(back.image, front.image, weight[..., None]),
         transmittance=torch.lerp(back.transmittance, front.transmittance, weight),
         depth=torch.lerp(back.depth, front.depth, weight),
-        visible=front.visible | back.visible,
-        counters={name: count + back.counters[name] for name, count in front.counters.items()},
+        visible=visible,
+        counters=SummedCounters((front, back), visible),
     )
 
 

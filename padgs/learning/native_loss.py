@@ -20,7 +20,9 @@ from padgs.native.abi import LossArguments, pointer
 def fits(image: Tensor) -> bool:
     """Whether a native loss takes this image: float32, three channels, and the library of its device is there."""
     library = LIBRARIES.get(image.device.type)
-    return library is not None and image.dtype == torch.float32 and image.shape[-1] == 3 and library.available()
+    if library is None or image.dtype != torch.float32 or image.shape[-1] != 3:
+        return False
+    return library.works_on(image.device)
 
 
 def fused_photometric_loss(image: Tensor, target: Tensor, weight: Tensor, lambda_l1: float, total: Tensor) -> Tensor:
@@ -31,7 +33,18 @@ def fused_photometric_loss(image: Tensor, target: Tensor, weight: Tensor, lambda
         weight: [H, W] or [H, 1].
         lambda_l1: lambda of Eq. 16.
         total: what the weighted sum over pixels and channels is divided by, a scalar.
+
+    Raises:
+        ValueError: a target of another shape or type than the image, or tensors on several devices.
     """
+    if (target.shape, target.dtype) != (image.shape, image.dtype):  # memory is all that the library sees of them
+        raise ValueError(
+            f"the target is {target.dtype} of {list(target.shape)}, the image {image.dtype} of {list(image.shape)}; "
+            "give both alike"
+        )
+    devices = {str(tensor.device): None for tensor in (image, target, weight, total)}
+    if len(devices) > 1:
+        raise ValueError(f"image, target, weight and total are on {', '.join(devices)}; bring them to one device")
     return _FusedLoss.apply(image, target, weight, lambda_l1, total, EVALUATIONS[image.device.type])
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import ctypes
 import functools
 
+import torch
+
 from padgs.native.abi import (
     BlendGradientArguments,
     ColorArguments,
@@ -69,3 +71,8 @@ def available() -> bool:
     except OSError:
         return False
     return True
+
+
+def works_on(_: torch.device) -> bool:
+    """Whether the library is there; every CPU can run it."""
+    return available()

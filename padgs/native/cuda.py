@@ -189,6 +189,14 @@ def available() -> bool:
     return True
 
 
+def works_on(device: torch.device) -> bool:
+    """Whether the library is there, and was compiled for this GPU."""
+    try:
+        return available() and queue(device) is not None
+    except RuntimeError:
+        return False
+
+
 def device_type() -> str:
     """Where the library wants its tensors, in torch's words: cuda."""
     return library().padgs_cuda_device_type().decode()

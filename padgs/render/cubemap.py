@@ -9,7 +9,7 @@ baselines, which no resampling removes.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from math import ceil, pi
@@ -90,25 +90,26 @@ def panorama_from_faces(faces: list[Rendering], panorama: Panorama, lens: Pinhol
     covered = coverage > 0
     depth = torch.where(covered, depth, 0) / torch.where(covered, coverage, 1)
     visible = torch.stack([face.visible for face in faces]).any(0)
-    return Rendering(image, (1 - coverage).squeeze(-1), depth.squeeze(-1), visible, _Counters(faces, visible))
+    return Rendering(image, (1 - coverage).squeeze(-1), depth.squeeze(-1), visible, SummedCounters(faces, visible))
 
 
-class _Counters(Mapping[str, int]):
-    """Of six faces; added up, which waits for a GPU, when somebody asks."""
+class SummedCounters(Mapping[str, int]):
+    """Of several drawings of the same Gaussians; added up, which waits for a GPU, when somebody asks."""
 
-    def __init__(self, faces: list[Rendering], visible: Tensor) -> None:
-        self._of_faces, self._visible = [face.counters for face in faces], visible
+    def __init__(self, parts: Sequence[Rendering], visible: Tensor) -> None:
+        """`visible` [N]: which Gaussians can be seen in any of the parts."""
+        self._of_parts, self._visible = [part.counters for part in parts], visible
 
     def __getitem__(self, name: str) -> int:
         if name == "gaussians":
             return len(self._visible)
-        return int(self._visible.sum()) if name == "visible" else sum(counters[name] for counters in self._of_faces)
+        return int(self._visible.sum()) if name == "visible" else sum(counters[name] for counters in self._of_parts)
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._of_faces[0])
+        return iter(self._of_parts[0])
 
     def __len__(self) -> int:
-        return len(self._of_faces[0])
+        return len(self._of_parts[0])
 
 
 @lru_cache(maxsize=16)

@@ -59,7 +59,7 @@ def leave_one_out(
             scored on the CPU.
 
     Raises:
-        ValueError: unknown backend, or inputs that break the contract.
+        ValueError: unknown backend, a target of another size than the view, or inputs that break the contract.
     """
     device, resolved = gaussians.means.device, resolve_backend(backend, gaussians.means)
     if backend == "auto" and resolved == "torch" and device.type != "cpu":
@@ -70,6 +70,12 @@ def leave_one_out(
     if options.cubemap:
         options = replace(options, cubemap=False, face_size=None, projection="ray", low_pass_kind="auto")
     request = request_of(gaussians, view, options)
+    if target.shape != (view.camera.height, view.camera.width, 3):
+        raise ValueError(
+            f"the target has {list(target.shape)} numbers, but a view of {view.camera.width}x{view.camera.height} has "
+            f"[{view.camera.height}, {view.camera.width}, 3]; give it in the size of the view"
+        )
+    target = target.to(gaussians.means)
     weight = weight.to(target).expand(target.shape[:2])
     weight = (weight / weight.double().sum()).to(target).contiguous()
     score: Backend = lookup(BACKENDS, resolved, "backend")

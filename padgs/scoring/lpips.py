@@ -82,7 +82,8 @@ class LPIPS(nn.Module):
             features = functional.max_pool2d(features, convolution.pool, stride=2)
         kernel, bias = getattr(self, f"kernel{index}"), getattr(self, f"bias{index}")
         kernel, bias = kernel.to(features.dtype), bias.to(features.dtype)
-        return functional.conv2d(features, kernel, bias, convolution.stride, convolution.padding).relu_()
+        with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):  # which a GPU takes unless told otherwise
+            return functional.conv2d(features, kernel, bias, convolution.stride, convolution.padding).relu_()
 
 
 def lpips(

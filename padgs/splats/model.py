@@ -139,7 +139,8 @@ class Splats(nn.Module):
             rays = means - center
             directions = rays / torch.sqrt((rays * rays).sum(-1, keepdim=True) + tiny**2)
             values = spherical_harmonics.basis(directions, self.active_degree)[:, 1:]  # [N, K]
-            colors = colors + torch.einsum("nk,nkc->nc", values, self.sh_rest[:, : values.shape[1]])
+            # No einsum, which on a GPU is a tiny matrix product for each Gaussian.
+            colors = colors + (values[..., None] * self.sh_rest[:, : values.shape[1]]).sum(1)
         return colors.clamp(min=0)
 
 

@@ -25,6 +25,8 @@ from padgs.reports.tables.ranking import pooled_variance, quantile
 from padgs.reports.tables.table import Cell
 from padgs.results import higher_is_better
 
+NEGLIGIBLE = 0.5  # dB: what a tie may hide where the paper names no difference
+
 
 class Verdict(Enum):
     """What can be said of a claim."""
@@ -34,7 +36,7 @@ class Verdict(Enum):
     TIE = "tie"
     MIXED = "depends on the scene"
     UNTESTABLE = "not testable here"
-    UNDECIDED = "undecided"  # measured, but with too few seeds for an interval
+    UNDECIDED = "undecided"  # measured, but with too few seeds for an interval that could tell
     UNMEASURED = "not measured yet"
 
 
@@ -108,12 +110,17 @@ class Judgement:
     runs: DataFrame  # of all lines
 
 
-def judge(claim: Claim, gathered: Gathered) -> Judgement:
+def judge(claim: Claim, gathered: Gathered, negligible: float = NEGLIGIBLE) -> Judgement:
     """Weigh a claim: it holds where a line speaks for it beyond the noise of the seeds, and none against it.
 
-    On each scene the longest runs count. The half-width of a line is t s / √n; s, the spread over seeds, and its
-    degrees of freedom are pooled over the scenes of the claim, shorter runs included, which more seeds can afford; and
-    t is for as many tests as there are rivals, because the best of many is partly lucky.
+    On each scene the longest runs count that can be compared. The half-width of a line is t s / √n; s, the spread over
+    seeds, and its degrees of freedom are pooled over the scenes of the claim, shorter runs included, which more seeds
+    can afford; and t is for as many tests as there are rivals on all scenes, because the best of many is partly lucky.
+
+    Args:
+        claim: what is said.
+        gathered: all runs.
+        negligible: an advantage that a tie may hide; where intervals are wider, nothing is decided.
 
     Raises:
         ReportError: results that must not stand together.
@@ -122,24 +129,23 @@ def judge(claim: Claim, gathered: Gathered) -> Judgement:
     runs = runs.loc[[claim.outdoor in (None, place.outdoor) for place in runs["place"]]]
     if claim.dataset:
         runs = runs.loc[runs["dataset"] == claim.dataset]
-    lines: list[Line] = []
+    longest: dict[str, tuple[Line, list[int]]] = {}  # scene and what else is alike -> line, index of its runs
     spreads: list[Cell] = []
-    used: list[int] = []
-    for where, own, longest in _conditions(runs, claim):
+    for scene, length, own in _conditions(runs, claim):
+        where = f"{scene}, {length}"
         refuse_mixture(own, gathered.request, f"{claim.text}, {where}", ("protocol",))
         ours, rivals = _sides(claim, own, where)
-        if rivals and (advantages := _advantages(claim, ours, rivals[0].runs)):
-            spreads.append(spread(advantages))
-            if longest:
-                lines.append(Line(where, len(rivals), rivals[0].title, spreads[-1]))
-                used += [*ours.index, *(index for rival in rivals for index in rival.runs.index)]
+        if rivals:
+            spreads.append(spread(_advantages(claim, ours, rivals[0].runs)))
+            used = [*ours.index, *(index for rival in rivals for index in rival.runs.index)]
+            longest[scene] = Line(where, len(rivals), rivals[0].title, spreads[-1]), used
+    lines = [line for line, _ in longest.values()]
     variance, freedom = pooled_variance(spreads)
     if freedom:
-        lines = [
-            replace(line, half_width=quantile(freedom, line.rivals) * math.sqrt(variance / line.advantage.count))
-            for line in lines
-        ]
-    return Judgement(_verdict(lines, claim), tuple(lines), runs.loc[list(dict.fromkeys(used))])
+        t = quantile(freedom, sum(line.rivals for line in lines))
+        lines = [replace(line, half_width=t * math.sqrt(variance / line.advantage.count)) for line in lines]
+    used = dict.fromkeys(index for _, indices in longest.values() for index in indices)
+    return Judgement(_verdict(lines, claim, negligible), tuple(lines), runs.loc[list(used)])
 
 
 def in_the_paper(claim: Claim, numbers: Mapping[Key, Published]) -> dict[str, float]:
@@ -158,24 +164,24 @@ def in_the_paper(claim: Claim, numbers: Mapping[Key, Published]) -> dict[str, fl
     return found
 
 
-def _conditions(runs: DataFrame, claim: Claim) -> Iterator[tuple[str, DataFrame, bool]]:
-    """The runs of each scene and length in which both sides meet, where that is, and whether none is longer."""
+def _conditions(runs: DataFrame, claim: Claim) -> Iterator[tuple[str, str, DataFrame]]:
+    """A scene with what else is alike, a length at which both sides meet there, shorter ones first, and their runs."""
     shared = ["resolution", "data", *claim.apart, *(["machine"] if claim.quotient else [])]
     for (place, resolution, *_), own in grouped(runs, "place", *shared) if len(runs) else ():
         ours, others = (set(side.of(own)["length"]) for side in (claim.ours, claim.others))
         both = own.loc[own["length"].isin(ours & others)].sort_values("iterations", kind="stable")
         words = [f"{column.rpartition('.')[2]} {own[column].iloc[0]}" for column in claim.apart]
-        lengths = list(dict.fromkeys(both["length"]))
-        for length in lengths:
-            where = ", ".join([place.scene, resolution, str(length), *words])
-            yield where, own.loc[own["length"] == length], length == lengths[-1]
+        for length in dict.fromkeys(both["length"]):
+            yield ", ".join([place.scene, resolution, *words]), str(length), own.loc[own["length"] == length]
 
 
 def _sides(claim: Claim, runs: DataFrame, where: str) -> tuple[DataFrame, list[Setting]]:
-    """The runs of the claim's side, and the settings of the others that have numbers, the best mean first."""
+    """The runs of the claim's side, and the settings of the others that share seeds with it, the best mean first."""
     ours = one_setting(claim.ours.of(runs), f"{claim.text}, {where}")
     others = settings(claim.others.of(runs).drop(index=ours.index, errors="ignore"))
-    known = [(fmean(numbers.values()), made) for made in others if (numbers := _numbers(claim, made.runs))]
+    seeds = _numbers(claim, ours).keys()
+    found = [([n for seed, n in _numbers(claim, made.runs).items() if seed in seeds], made) for made in others]
+    known = [(fmean(numbers), made) for numbers, made in found if numbers]
     known.sort(key=lambda pair: pair[0], reverse=bool(claim.measure.column.higher_is_better))
     return ours, [made for _, made in known]
 
@@ -193,11 +199,13 @@ def _advantages(claim: Claim, ours: DataFrame, others: DataFrame) -> list[float]
     return [claim.advantage(first[seed], second[seed], higher) for seed in sorted(first.keys() & second.keys())]
 
 
-def _verdict(lines: Sequence[Line], claim: Claim) -> Verdict:
+def _verdict(lines: Sequence[Line], claim: Claim, negligible: float) -> Verdict:
     told = [(line.advantage.value or 0.0, line.half_width) for line in lines if line.half_width is not None]
     if not told:
         return Verdict.UNDECIDED if lines else Verdict.UNTESTABLE if claim.dataset else Verdict.UNMEASURED
     right, wrong = any(value > half for value, half in told), any(-value > half for value, half in told)
     if right and wrong:
         return Verdict.MIXED
-    return Verdict.HOLDS if right else Verdict.FAILS if wrong else Verdict.TIE
+    if right or wrong:
+        return Verdict.HOLDS if right else Verdict.FAILS
+    return Verdict.TIE if all(half <= negligible for _, half in told) else Verdict.UNDECIDED

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 from pandas import DataFrame, Series
@@ -11,7 +10,7 @@ from pandas import DataFrame, Series
 from padgs.reports import published
 from padgs.reports.conditions import footnotes
 from padgs.reports.findings.claims import CLAIMS
-from padgs.reports.findings.judging import Claim, Judgement, Line, Verdict, in_the_paper, judge
+from padgs.reports.findings.judging import NEGLIGIBLE, Claim, Judgement, Line, Verdict, in_the_paper, judge
 from padgs.reports.gathered import Gathered, of_a_table
 from padgs.reports.request import experiment_of
 from padgs.reports.tables.ranking import CONFIDENCE
@@ -27,10 +26,14 @@ makes this page: verdicts and numbers follow from rules (`reports/findings`), on
 
 Every number says by how much the side that the claim favours is better than the best of the others: a difference, or
 for costs a quotient (×). Behind ours stands the half-width of its {CONFIDENCE:.0%} interval: Student's t over pairs of
-runs with the same seed, corrected for the number of others (Bonferroni). The longest runs of a scene are shown; the
-spread is pooled over all scenes and lengths of a claim, for shorter runs have more seeds. A claim *holds* where a scene
-is beyond its interval on the claim's side and none on the other, *does not hold* where it is the reverse, *depends on
-the scene* where both are, and is a *tie* where none is beyond.
+runs with the same seed, corrected for the number of others and of scenes (Bonferroni). The longest runs of a scene
+that can be compared are shown; the spread is pooled over all scenes and lengths of a claim, as shorter runs have more
+seeds. A claim *holds* where a scene is beyond its interval on the claim's side and none on the other, *does not hold*
+where it is the reverse, and *depends on the scene* where both are. Where none is beyond, it is a *tie* if no interval
+is wider than the paper's difference ({NEGLIGIBLE:g} dB where it names none), and *undecided* if one is.
+
+Of what the paper says, one thing is no comparison of runs: that OP43DGS runs out of memory outdoors. Its extents grow
+with the distance, as `docs/methods.md` has it with numbers, and a test keeps.
 """
 
 
@@ -54,7 +57,9 @@ def findings(gathered: Gathered) -> Page:
     paper, rows = published.load(), []
     weighed: dict[str, set[int]] = {}  # experiment -> index of its runs that some claim rests on
     for claim in CLAIMS:
-        judgement, theirs = judge(claim, gathered), in_the_paper(claim, paper)
+        theirs = in_the_paper(claim, paper)
+        negligible = min(map(abs, theirs.values()), default=NEGLIGIBLE)
+        judgement = judge(claim, gathered, negligible)
         names = _experiments(claim, judgement)
         for name in names:
             own = judgement.runs.loc[[name in of for of in judgement.runs["experiments"]]]
@@ -64,7 +69,7 @@ def findings(gathered: Gathered) -> Page:
             "<br>".join(f"{where}: {_number(claim, value)}" for where, value in theirs.items()) or MISSING,
             "<br>".join(_line(claim, line) for line in judgement.lines) or MISSING,
             f"**{judgement.verdict.value}**",
-            _reason(claim, judgement, theirs),
+            _reason(claim, judgement, negligible),
             ", ".join(f"`{name}`" for name in names),
         )
         rows.append(f"| {' | '.join(cells)} |")
@@ -85,20 +90,19 @@ def _number(claim: Claim, value: float, half_width: float | None = None) -> str:
 
 
 def _line(claim: Claim, line: Line) -> str:
-    against = f" over {line.against}" if line.rivals > 1 else ""
+    against = "" if line.rivals == 1 and line.against in claim.text else f" over {line.against}"
     return f"{line.where}: {_number(claim, line.advantage.value or 0.0, line.half_width)}{against}"
 
 
-def _reason(claim: Claim, judgement: Judgement, theirs: Mapping[str, float]) -> str:
+def _reason(claim: Claim, judgement: Judgement, negligible: float) -> str:
     """Ours, where there is one for the verdict; else what the numbers themselves say."""
-    widths = [line.half_width for line in judgement.lines if line.half_width is not None]
     if judgement.verdict in claim.reasons:
         return claim.reasons[judgement.verdict]
-    if judgement.verdict is Verdict.UNDECIDED:
+    if judgement.verdict is not Verdict.UNDECIDED:
+        return MISSING
+    if all(line.half_width is None for line in judgement.lines):
         return "Too few seeds for an interval."
-    if judgement.verdict is Verdict.TIE and theirs and min(widths) > max(map(abs, theirs.values())):
-        return "Our intervals are wider than the paper's difference."
-    return MISSING
+    return f"Too few seeds: intervals are wider than {_number(claim, negligible).lstrip('+')}."
 
 
 def _experiments(claim: Claim, judgement: Judgement) -> list[str]:

@@ -21,6 +21,10 @@ MEASURES = (
     mark("sphere", "ws_lpips_alex", "sphere"),
     *costs("gaussians", "cpu_seconds", "frame_ms"),
 )
+AT_MOST = (
+    "At most: when training ends. padgs+ grows to twice as many and keeps those that are missed most; the others never "
+    "have more."
+)
 
 
 def capacity(gathered: Gathered) -> Table:
@@ -43,5 +47,5 @@ def capacity(gathered: Gathered) -> Table:
         blocks.append(Block(title, tuple(Row(titles[preset], tuple(row)) for preset, row in cells.items())))
         runs_of[title] = own
     columns = tuple(measure.column for measure in MEASURES)
-    notes = (*footnotes(runs_of, "sphere"), NOTE)
+    notes = (*footnotes(runs_of, "sphere"), AT_MOST, NOTE)
     return Table("capacity", "Methods with equal numbers of Gaussians", "Method", columns, tuple(blocks), notes)

@@ -17,7 +17,8 @@ case "$*" in
   *"-m pytest"*) echo "tests $TOOL" >> "$CALLS"; test -z "$BROKEN" ;;
   *"bench --device cuda"*)
     echo bench >> "$CALLS"
-    echo '{{"machine": {{"gpu": "Some GPU"}}}}' > "$OUT/bench_gpu.json" ;;
+    for out; do :; done  # the last argument
+    echo '{{"machine": {{"gpu": "Some GPU"}}}}' > "$out/bench_gpu.json" ;;
   *) exec {sys.executable} "$@" ;;
 esac
 """
@@ -33,7 +34,7 @@ def measure(tmp_path: Path):
     programs.mkdir()
     pretended = {
         "python": PYTHON,
-        "cmake": '#!/bin/sh\necho "cmake $1" >> "$CALLS"\n',
+        "cmake": '#!/bin/sh\necho "cmake $1" >> "$CALLS"\ntest "$1" != "$BROKEN"\n',
         "compute-sanitizer": '#!/bin/sh\nexport TOOL=$2\nshift 4\nexec "$@"\n',
     }
     for name, text in pretended.items():
@@ -44,7 +45,7 @@ def measure(tmp_path: Path):
         calls.write_text("")
         environment = {
             **{"PATH": f"{programs}:{os.environ['PATH']}", "PYTHON": str(programs / "python"), "CALLS": str(calls)},
-            **{"OUT": str(tmp_path / "out"), "BROKEN": "", **variables},
+            **{"BROKEN": "", **variables},
         }
         command = [str(tmp_path / "reports" / SCRIPT.name), *steps]
         done = subprocess.run(command, env=environment, capture_output=True, text=True)
@@ -69,6 +70,11 @@ def test_what_fails_is_said_and_tried_again(measure):
     assert "verified: build bench; not verified: tests (failed (1))" in line
     line, calls = measure("tests")
     assert calls == ["tests "] and line.startswith("verified: build bench tests;")
+
+
+def test_a_build_that_could_not_be_configured_is_none(measure):
+    line, calls = measure("build", BROKEN="-S")
+    assert calls == ["cmake -S"] and "not verified: build (failed (1))" in line
 
 
 def test_unknown_steps_list_the_known_ones(measure):

@@ -79,6 +79,18 @@ def test_every_single_removal_does_what_was_said(projection, lens, backend):
     assert max(map(abs, true)) > 5e-4, "or the test sees nothing"
 
 
+@needs_native
+def test_targets_are_taken_in_any_type_and_in_the_size_of_the_view_only():
+    generator = torch.Generator().manual_seed(2)
+    gaussians, view = mixture(3, generator).to(torch.float32), view_of(camera_of("panorama", 16, 8))
+    target, weight = torch.rand(8, 16, 3, generator=generator), torch.ones(8, 16)
+    usual = leave_one_out(gaussians, view, target, weight, SHARP, backend="cpu")
+    doubled = leave_one_out(gaussians, view, target.double(), weight.double(), SHARP, backend="cpu")
+    assert torch.equal(usual.error, doubled.error) and usual.error.any()
+    with pytest.raises(ValueError, match=r"target has \[4, 16, 3\] numbers, but a view of 16x8 has \[8, 16, 3\]"):
+        leave_one_out(gaussians, view, target[:4], weight[:4], SHARP, backend="cpu")
+
+
 @each_setup
 @pytest.mark.parametrize(
     "backend", [pytest.param("cpu", marks=needs_native), pytest.param("cuda", marks=cuda_engine.marks())]

@@ -2,6 +2,7 @@ import csv
 
 import pytest
 
+from padgs.data.datasets import DATASETS
 from padgs.reports import published
 from padgs.reports.published import Key, load
 
@@ -41,3 +42,8 @@ def test_averages_are_those_of_the_scenes():
 def test_it_is_the_file_that_came_with_the_paper(shared):
     with (shared / "paper" / "published.csv").open() as theirs, published.default_path().open() as ours:
         assert list(csv.reader(ours)) == list(csv.reader(theirs))
+
+
+def test_scenes_are_called_as_the_folders_of_the_data_set_are():
+    for ours, theirs in published.DATASETS.items():
+        assert set(published.scenes(load(), theirs)) == set(DATASETS[ours].scenes)

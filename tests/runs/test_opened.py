@@ -61,7 +61,7 @@ def test_other_cameras_see_the_same(tmp_path_factory, method):
     panorama = run.through(fine).render(replace(view, width=256, height=128)).image
     assert (seen - sample(panorama, lens.rays())).abs().mean() < 0.01 < seen.std()
     trained = sample(run.method.render(view).image, lens.rays())
-    assert (seen - trained).abs().mean() < 0.5 * trained.std(), "not blurred"
+    assert (seen - trained).abs().mean() < 0.65 * trained.std(), "not blurred, which would be 0.8"
 
 
 def test_what_draws_panoramas_only_draws_other_cameras_by_pinhole(folder):

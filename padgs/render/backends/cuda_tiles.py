@@ -46,6 +46,7 @@ class DeviceStrip:
         largest = self.tiles if projected.room else max(self.tiles - 1, 1)
         if projected.room:
             sort.keys.fill_(largest)
+            sort.values.zero_()
         arguments = cuda.BinArguments(
             self.table,
             pointer(projected.boxes),
@@ -68,6 +69,7 @@ class Sorter:
         self.keys = torch.empty(count, dtype=torch.int32, device=device)
         self.sorted_keys, self.values = torch.empty_like(self.keys), torch.empty_like(self.keys)
         scratch = cuda.library().padgs_cuda_scratch_bytes(ctypes.byref(queue), max(count, summed, 1))
+        cuda.raise_for(max(-scratch, 0), "padgs_cuda_scratch_bytes")
         self.scratch = torch.empty(max(scratch, 1), dtype=torch.uint8, device=device)
 
     def arguments(self, sorted_values: Tensor, bits: int) -> SortArguments:

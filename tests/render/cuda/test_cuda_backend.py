@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import warnings
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
@@ -282,6 +283,8 @@ def test_a_gpu_that_nothing_was_compiled_for_is_named(monkeypatch: pytest.Monkey
         RuntimeError, match="compiled for compute capabilities 80 90; Tesla T4 has 75. .*ARCHITECTURES=75"
     ):
         cuda.check_device.__wrapped__(0)
+    monkeypatch.setattr(cuda, "check_device", cuda.check_device.__wrapped__)
+    assert not cuda.works_on(torch.device("cuda", 0)), "or there is no way out by backend=torch"
 
 
 @pytest.mark.parametrize(("driver", "built_with"), [(0, 13000), (13000, 13020), (13020, 13000), (0, 0)])
@@ -289,16 +292,24 @@ def test_a_driver_of_the_same_major_version_or_none_at_all_is_taken(driver: int,
     cuda.refuse_old_driver(versions_of(driver, built_with))
 
 
+@pytest.fixture
+def looked_for_anew(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The real library is looked for by the test, and again by whoever comes after it."""
+    found = cuda.available
+    monkeypatch.setattr(cuda, "library", cuda_engine.real_library.__wrapped__)
+    found.cache_clear()
+    package._say_that_native_is_missing.cache_clear()
+    yield
+    found.cache_clear()
+
+
+@pytest.mark.usefixtures("looked_for_anew")
 def test_a_driver_that_is_too_old_means_torch_and_says_so(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(cuda, "opened", lambda *_: None)
     monkeypatch.setattr(cuda, "declared", lambda *_: versions_of(12080, 13000))
-    monkeypatch.setattr(cuda, "library", cuda_engine.real_library.__wrapped__)
-    cuda.available.cache_clear()
-    package._say_that_native_is_missing.cache_clear()
     means = SimpleNamespace(device=torch.device("cuda"), dtype=torch.float32)
     with pytest.warns(UserWarning, match=r"compiled by CUDA 13\.0, and the driver here knows CUDA 12\.8; update"):
         assert package.resolve_backend("auto", means) == "torch"
-    cuda.available.cache_clear()
 
 
 def versions_of(driver: int, built_with: int) -> SimpleNamespace:
@@ -326,12 +337,10 @@ def test_the_default_dtype_of_torch_changes_nothing(lens: str, blending: str, ge
     assert all(torch.equal(gradient, doubled[1][name]) for name, gradient in usual[1].items())
 
 
+@pytest.mark.usefixtures("looked_for_anew")
 def test_without_the_library_auto_means_torch_and_says_so(tmp_path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("PADGS_LIBRARY_DIR", str(tmp_path))
     monkeypatch.setattr(loading, "_package_folders", lambda: [str(tmp_path)])
-    monkeypatch.setattr(cuda, "library", cuda_engine.real_library.__wrapped__)
-    cuda.available.cache_clear()
-    package._say_that_native_is_missing.cache_clear()
     means = SimpleNamespace(device=torch.device("cuda"), dtype=torch.float32)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

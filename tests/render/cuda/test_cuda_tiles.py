@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import ctypes
 import itertools
+from dataclasses import replace
 
 import cuda_engine
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from render_cases import INPUTS, camera_of, identity_pose, mixture, random_pose
+from render_cases import INPUTS, camera_of, gaussians_of, identity_pose, mixture, random_pose
 from torch import Tensor
 
+from padgs.gaussians import Gaussians
 from padgs.native import cuda
 from padgs.native.abi import Inputs, Pointer, fields, pointer
 from padgs.render import RenderOptions
@@ -28,9 +30,8 @@ CPU = torch.device("cpu")
 
 
 def projected(
-    size: tuple[int, int], options: RenderOptions, lens: str, generator: torch.Generator, pose: Tensor
+    size: tuple[int, int], options: RenderOptions, lens: str, gaussians: Gaussians, pose: Tensor
 ) -> DeviceProjected:
-    gaussians = mixture(12, generator)
     inputs = [getattr(gaussians, name).float() for name in INPUTS]
     structure = Inputs(len(gaussians), *map(pointer, inputs), None)
     camera = native_camera(identity_pose(), camera_of(lens, *size), options)
@@ -55,7 +56,7 @@ def pixels_of(box: list[int], size: tuple[int, int]) -> set[tuple[int, int]]:
 )
 def test_each_tile_lists_the_gaussians_whose_boxes_touch_it_front_to_back(size, options, lens, generator):
     pose = random_pose(generator) if lens == "panorama" else identity_pose()
-    view = projected(size, options, lens, generator, pose)
+    view = projected(size, options, lens, mixture(12, generator), pose)
     boxes, depths = view.boxes.tolist(), view.footprints[:, 12]
     drawn = [i for i, box in enumerate(boxes) if box[3] < box[4]]
     assert view.order[: view.visible].tolist() == sorted(drawn, key=lambda i: (depths[i].item(), i))
@@ -78,7 +79,7 @@ def test_each_tile_lists_the_gaussians_whose_boxes_touch_it_front_to_back(size, 
 
 
 def test_slots_of_a_gaussian_are_consecutive_and_everybody_has_one(generator: torch.Generator):
-    view = projected((131, 77), RenderOptions(), "panorama", generator, identity_pose())
+    view = projected((131, 77), RenderOptions(), "panorama", mixture(12, generator), identity_pose())
     (strip,) = view.strips()
     counts = torch.bincount(strip.reaches[:, 0].long(), minlength=len(view.order))
     starts = strip.slot_start.long()
@@ -86,6 +87,17 @@ def test_slots_of_a_gaussian_are_consecutive_and_everybody_has_one(generator: to
     assert torch.equal(torch.sort(strip.slots.long()).values, torch.arange(view.instances))
     owners = torch.repeat_interleave(view.order[: view.visible].long(), starts.diff())
     assert torch.equal(strip.reaches[:, 0].long(), owners)
+
+
+def test_where_nothing_is_listed_no_gaussian_has_a_slot(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch):
+    """One row of tiles is more than a strip holds, and there is nothing below it."""
+    gaussians = gaussians_of("ordinary", 20, generator)
+    above = torch.tensor([0.0, -2.0, 0.3], dtype=torch.float64) + 0.1 * gaussians.means
+    gaussians = replace(gaussians, means=above, scales=0.02 * gaussians.scales)
+    monkeypatch.setattr(torch, "empty", lambda *size, **options: torch.full(size, 7, **options))  # what nobody wrote
+    first, rest = projected((131, 77), RenderOptions(max_instances=5), "panorama", gaussians, identity_pose()).strips()
+    assert first.instances > 5 and rest.instances == 0
+    assert not rest.slot_start.any(), "else the backward pass adds up what lies anywhere"
 
 
 @pytest.mark.parametrize(("device", "current"), [(1, 0), (0, 0), (0, 2)])

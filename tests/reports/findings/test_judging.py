@@ -1,4 +1,6 @@
 import math
+from dataclasses import replace
+from statistics import stdev
 
 import hypothesis
 import pytest
@@ -8,8 +10,9 @@ from made_up import gathered, of_experiment
 from scipy.stats import ttest_1samp
 
 from padgs.reports import published
-from padgs.reports.findings.judging import Claim, Side, Verdict, in_the_paper, judge
+from padgs.reports.findings.judging import NEGLIGIBLE, Claim, Side, Verdict, in_the_paper, judge
 from padgs.reports.methods import title
+from padgs.reports.tables.ranking import quantile
 
 PADGS = Side(("padgs",), published=("padgs",))
 RIVALS = Side(("omnigs", "spags"), published=("omnigs", "spags"))
@@ -41,7 +44,8 @@ def test_one_scene_with_one_rival_is_a_paired_t_test(gains):
     assert line.half_width == pytest.approx((interval.high - interval.low) / 2)
     decided = abs(line.advantage.value) > line.half_width
     right = line.advantage.value > 0
-    assert made.verdict == ((Verdict.HOLDS if right else Verdict.FAILS) if decided else Verdict.TIE)
+    open_or_tie = Verdict.TIE if line.half_width <= NEGLIGIBLE else Verdict.UNDECIDED
+    assert made.verdict == ((Verdict.HOLDS if right else Verdict.FAILS) if decided else open_or_tie)
 
 
 def test_scenes_decide_together_and_may_disagree():
@@ -68,6 +72,23 @@ def test_the_best_rival_counts_and_many_of_them_widen_the_interval():
     assert (line.rivals, line.against) == (2, title("spags")) and line.advantage.value == pytest.approx(0.5)
     assert line.half_width > alone.half_width
     assert judge(claim(), gathered([*made, *runs([0.5] * 3, "odgs")])).lines == (alone,), "no rival of this claim"
+
+
+def test_every_scene_is_a_test_of_its_own():
+    gains, scenes = [1, 1.1, 0.9], ("synthetic-room", "flat")
+    made = [run for scene in scenes for run in (*runs(gains, scene=scene), *runs([0] * 3, "omnigs", scene))]
+    for line in judge(claim(), gathered(made)).lines:
+        assert line.half_width == pytest.approx(quantile(freedom=4, tests=2) * stdev(gains) / math.sqrt(3))
+
+
+def test_what_cannot_be_compared_hides_nothing():
+    made = [*runs([1, 1.1, 0.9]), *runs([0] * 3, "omnigs")]
+    other = of_experiment("order@cpu", 40, preset="spags", seed=7)
+    assert judge(claim(), gathered([*made, other])).lines[0].against == title("omnigs"), "a rival without our seeds"
+    longer = [*runs([1] * 3, iterations=7000), *runs([0] * 3, "omnigs", iterations=7000)]
+    failed = [replace(run, status="oom", scores={}) for run in longer[:3]]
+    (line,) = judge(claim(), gathered([*made, *failed, *longer[3:]])).lines
+    assert "1500" in line.where, "a length that only one side reached"
 
 
 def test_lower_is_better_where_the_metric_says_so():

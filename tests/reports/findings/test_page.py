@@ -5,7 +5,7 @@ from made_up import gathered, of_experiment
 
 from padgs.reports import published
 from padgs.reports.findings.claims import CLAIMS
-from padgs.reports.findings.judging import Verdict, in_the_paper, judge
+from padgs.reports.findings.judging import in_the_paper, judge
 from padgs.reports.findings.page import findings
 
 
@@ -57,5 +57,5 @@ def test_every_number_of_the_paper_that_a_claim_names_is_there():
         found = in_the_paper(claim, published.load())
         missing = [scene for scene in claim.published if "op43dgs" in claim.others.published and scene[1] == "ricoh360"]
         assert len(found) >= len(claim.published) - len(missing), claim.text
-        if claim.published and Verdict.HOLDS not in claim.reasons:
+        if claim.published:
             assert all(value > 0 for value in found.values()), f"the paper does not say: {claim.text}"

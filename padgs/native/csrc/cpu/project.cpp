@@ -97,7 +97,7 @@ void backward_batch(const Camera &camera, const Inputs &in, const float *moments
   if (out.probe) store_items<2>(out.probe, first, in.count, probes);
   if (!pose) return;
   Vec entries[12];
-  pose_gradient(posed, g.camera, entries);
+  pose_gradient(posed, g.camera, on, entries);
   for (int k = 0; k < 12; ++k) pose[k] += sum(entries[k]);
 }
 

@@ -57,10 +57,11 @@ using namespace padgs;
 // Launches with a table of the host's sizes: the number of tiles comes from the caller, who has the table's rows.
 PADGS_API int padgs_cuda_bin(const Queue *queue, const BinArguments *args, int32_t tiles) {
   return on_device(*queue, [&] {
+    // Without an instance too: the backward pass asks each Gaussian where its instances begin and end.
+    launch(count_kernel, blocks_for(args->visible + 1, kThreads), kThreads, *queue, *args);
+    if (const int error = exclusive_sum(*queue, args->sort, args->tiles, args->slot_start, args->visible + 1))
+      return error;
     if (args->sort.count) {
-      launch(count_kernel, blocks_for(args->visible + 1, kThreads), kThreads, *queue, *args);
-      if (const int error = exclusive_sum(*queue, args->sort, args->tiles, args->slot_start, args->visible + 1))
-        return error;
       launch(emit_kernel, blocks_for(args->visible, kThreads), kThreads, *queue, *args);
       if (const int error = sort_pairs(*queue, args->sort)) return error;
     }

@@ -70,7 +70,8 @@ __global__ void __launch_bounds__(kThreads) project_backward_kernel(ProjectGradi
     const PosedGaussian<float> posed = load_posed(args.camera, args.pose, args.in, i, probe);
     float m[kMoments], active = 0;
     for (int k = 0; k < kMoments; ++k) m[k] = args.moments[i * kMoments + k], active += magnitude(m[k]);
-    const InputGradient<float> g = gradient_of(args.camera, posed, m, active > 0 ? 1.0f : 0.0f);
+    const float on = active > 0 ? 1.0f : 0.0f;
+    const InputGradient<float> g = gradient_of(args.camera, posed, m, on);
     const Vec3<float> scale = g.camera.scale;
     float *means = args.out.means + 3 * i, *quats = args.out.quats + 4 * i, *scales = args.out.scales + 3 * i;
     float *colors = args.out.colors + 3 * i;
@@ -80,7 +81,7 @@ __global__ void __launch_bounds__(kThreads) project_backward_kernel(ProjectGradi
     args.out.opacities[i] = g.opacity;
     colors[0] = m[10], colors[1] = m[11], colors[2] = m[12];
     if (args.out.probe) args.out.probe[2 * i] = g.probe.u, args.out.probe[2 * i + 1] = g.probe.v;
-    if (args.out.pose) pose_gradient(posed, g.camera, pose);
+    if (args.out.pose) pose_gradient(posed, g.camera, on, pose);
   }
   if (!args.out.pose) return;
   for (int k = 0; k < 12; ++k) {

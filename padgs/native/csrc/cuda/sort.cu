@@ -47,16 +47,17 @@ int64_t sort_bytes(int64_t count) {
   size_t bytes = 0;
   const uint32_t *keys = nullptr;
   const int32_t *values = nullptr;
-  cub::DeviceRadixSort::SortPairs(nullptr, bytes, keys, (uint32_t *)nullptr, values, (int32_t *)nullptr,
-                                  int32_t(count));
-  return int64_t(bytes);
+  const int error = int(cub::DeviceRadixSort::SortPairs(nullptr, bytes, keys, (uint32_t *)nullptr, values,
+                                                        (int32_t *)nullptr, int32_t(count)));
+  return error ? -error : int64_t(bytes);
 }
 
 int64_t scan_bytes(int64_t count) {
   size_t bytes = 0;
   const uint32_t *in = nullptr;
-  cub::DeviceScan::ExclusiveScan(nullptr, bytes, in, (uint32_t *)nullptr, SaturatingSum(), 0u, int32_t(count));
-  return int64_t(bytes);
+  const int error = int(
+      cub::DeviceScan::ExclusiveScan(nullptr, bytes, in, (uint32_t *)nullptr, SaturatingSum(), 0u, int32_t(count)));
+  return error ? -error : int64_t(bytes);
 }
 
 int sort_pairs(const Queue &queue, const SortArguments &args) {
@@ -79,14 +80,14 @@ int exclusive_sum(const Queue &queue, const SortArguments &scratch, const uint32
 
 using namespace padgs;
 
-// Bytes of scratch for sorting, or summing over, so many items.
+// Bytes of scratch for sorting, or summing over, so many items; the negative of an error.
 PADGS_API int64_t padgs_cuda_scratch_bytes(const Queue *queue, int64_t count) {
-  int64_t sort = -1, scan = -1;
+  int64_t sort = 0, scan = 0;
   const int error = on_device(*queue, [&] {
     sort = sort_bytes(count), scan = scan_bytes(count);
-    return 0;
+    return int(sort < 0 ? -sort : scan < 0 ? -scan : 0);
   });
-  return error ? -1 : sort > scan ? sort : scan;
+  return error ? -error : sort > scan ? sort : scan;
 }
 
 PADGS_API int padgs_cuda_sort(const Queue *queue, const SortArguments *args) {

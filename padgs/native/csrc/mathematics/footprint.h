@@ -224,18 +224,18 @@ PADGS_HD InputGradient<T> gradient_of(const Camera &camera, const PosedGaussian<
 }
 
 // dL/d[R | t], by rows: mean_cam = R mean + t and orientation = R R_q, so
-// dL/dR = grad_mean mean^T + grad_orientation R_q^T.
+// dL/dR = grad_mean mean^T + grad_orientation R_q^T; 0 where `on` is, whatever the Gaussian holds.
 template <class T>
-PADGS_HD void pose_gradient(const PosedGaussian<T> &posed, const CameraGaussianGradient<T> &g, T *pose) {
+PADGS_HD void pose_gradient(const PosedGaussian<T> &posed, const CameraGaussianGradient<T> &g, T on, T *pose) {
   const Mat3<T> local = rotation(posed.unit);
   const Vec3<T> a = g.mean, m = posed.mean;
   const Mat3<T> &o = g.orientation;
   const T rows[3][4] = {{a.x, o.c0.x, o.c1.x, o.c2.x}, {a.y, o.c0.y, o.c1.y, o.c2.y}, {a.z, o.c0.z, o.c1.z, o.c2.z}};
   for (int k = 0; k < 3; ++k) {
     const T *r = rows[k];
-    pose[4 * k] = r[0] * m.x + r[1] * local.c0.x + r[2] * local.c1.x + r[3] * local.c2.x;
-    pose[4 * k + 1] = r[0] * m.y + r[1] * local.c0.y + r[2] * local.c1.y + r[3] * local.c2.y;
-    pose[4 * k + 2] = r[0] * m.z + r[1] * local.c0.z + r[2] * local.c1.z + r[3] * local.c2.z;
+    pose[4 * k] = kept(on, r[0] * m.x + r[1] * local.c0.x + r[2] * local.c1.x + r[3] * local.c2.x);
+    pose[4 * k + 1] = kept(on, r[0] * m.y + r[1] * local.c0.y + r[2] * local.c1.y + r[3] * local.c2.y);
+    pose[4 * k + 2] = kept(on, r[0] * m.z + r[1] * local.c0.z + r[2] * local.c1.z + r[3] * local.c2.z);
     pose[4 * k + 3] = r[0];
   }
 }
