@@ -24,7 +24,7 @@ STATUS = {
     **dict.fromkeys(("omnigs_release", "padgs_release"), "as released"),
     "sc_omnigs": "after the abstract and project page",
     "seam360gs": "after the abstract",
-    "spags_narrow": "sorted, with the filter and loss of padgs+",
+    "spags_narrow": "sorted, narrow filter",
 }
 
 
