@@ -71,7 +71,8 @@ class EgoNeRFMethod(Method):
 
     def _refuse_impossible(self) -> None:
         """Also say so where an option is set that this method would have to ignore."""
-        loss = replace(self.TRAIN, weight=self.train_options.weight, check_every=self.train_options.check_every)
+        train = self.train_options
+        loss = replace(self.TRAIN, weight=train.weight, check_every=train.check_every, monitor=train.monitor)
         if self.render_config.backend not in BACKENDS:
             raise ValueError(
                 f"egonerf has no backend {self.render_config.backend!r}; it casts rays in torch, known: "
@@ -80,7 +81,7 @@ class EgoNeRFMethod(Method):
         rays = RenderConfig(backend=self.render_config.backend)
         for group, given, possible, why in (
             ("render", self.render_config, rays, "casts rays and draws no Gaussians"),
-            ("train", self.train_options, loss, "minimises the squared error"),
+            ("train", train, loss, "minimises the squared error"),
         ):
             for field in fields(possible):
                 if getattr(given, field.name) != getattr(possible, field.name):

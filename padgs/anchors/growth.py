@@ -207,7 +207,7 @@ def find_seeds(model: PaDGS, mean_gradient: Tensor, options: GrowthOptions, gene
     """Places for new anchors: cells without an anchor that hold a Gaussian with a large gradient.
 
     Level by level from coarse to fine, with growing thresholds; at each level a candidate is kept with probability
-    1 - 0.5^(level + 1). Once a level leaves nothing new, the finer ones are not tried.
+    1 - 0.5^(level + 1). If the coarsest level finds none, the finer ones are not tried.
 
     Args:
         model: A anchors with K Gaussians each.

@@ -134,7 +134,8 @@ class Trainer:
         self._sizes = Sizes(scene.train, options.weight, self._optimiser.device, coarse_share)
         apart = set_apart(scene.train) if budget.stop == "auto" else ()
         self._calibration = [scene.train[number] for number in apart]
-        self._plateau, self._fade = Plateau(budget.iterations), round((1 - FADE) * budget.iterations)
+        self._plateau = Plateau(budget.iterations)
+        self._fade = min(round((1 - FADE) * budget.iterations), budget.iterations - 1)  # one step at least ends a run
         self._views = ViewOrder(scene, seed, apart)
         self._order: Order = self._views
         pixels = sum(view.width * view.height for view in scene.train)

@@ -4,7 +4,7 @@ It looks at numbers that are there anyway: the loss at every iteration (on a GPU
 where gradients and parameters are checked. A sign must last before it ends a run, for healthy runs show each of them
 for a while: after a reset of opacities nearly nothing is seen and the loss jumps, and colours that are not in use yet
 have no gradient. A loss that is still high when the run ends need not have lasted so many iterations: nothing is to
-come that it could recover in.
+come that it could recover in. Too many parts end a run at once: no healthy one has them.
 """
 
 from __future__ import annotations
@@ -49,10 +49,11 @@ class Monitor:
             parts: Gaussians, anchors or other parts that the model starts with; the largest of its counts.
             pixels: of all training views.
         """
-        self._iterations, self._start, self._most = iterations, parts, MORE * max(parts, pixels)
+        self._iterations, self._start, self._pixels = iterations, parts, pixels
         self._smoothed = max(SMOOTHED, SMOOTHED_SHARE * iterations)
         self.moment: int | None = None
         self.state: dict[str, Any] = {
+            "start": parts,  # a run that began with another model is resumed from the points of its scene
             "sum": 0.0,
             "weight": 0.0,
             "seen": 0,
@@ -112,16 +113,18 @@ class Monitor:
             Failure: exploded or collapsed.
         """
         name, most = max(counts.items(), key=lambda item: item[1])
-        if most > self._most:
+        start = self.state.get("start", self._start)  # checkpoints of before have none
+        healthy = max(start, self._pixels)
+        if most > MORE * healthy:
             raise Failure(
                 "exploded",
-                f"{most} {name} at iteration {iteration}, more than {MORE} times the {self._most // MORE} at the start "
-                f"or pixels of the training views; {ADVICE}",
+                f"{most} {name} at iteration {iteration}, more than {MORE} times the {healthy} at the start or pixels "
+                f"of the training views; {ADVICE}",
             )
-        if since := self._lasting("few", most < FEWER * self._start, iteration):
+        if since := self._lasting("few", most < FEWER * start, iteration):
             raise Failure(
                 "collapsed",
-                f"{most} of {self._start} {name} are left at iteration {iteration}, few since {since}; {ADVICE}",
+                f"{most} of {start} {name} are left at iteration {iteration}, few since {since}; {ADVICE}",
             )
 
     def picture(self, drawing: Drawing, photograph: Tensor, iteration: int) -> None:

@@ -47,8 +47,13 @@ class ViewOrder:
         return int(self._order[min(self._position, len(self._order) - 1)])
 
     def take_all(self) -> None:
-        """From the next epoch on no view is set apart."""
-        self._apart = ()
+        """From now on no view is set apart; those that were come in what is left of this epoch, in random order."""
+        if self._apart:
+            done, left = self._order[: self._position], self._order[self._position :]
+            left = torch.cat((left, torch.tensor(self._apart)))
+            left = left[torch.randperm(len(left), generator=self._shuffler)]
+            self._order = torch.cat((done, left))
+            self._apart = ()
 
     def _shuffled(self) -> Tensor:
         numbers = [number for number in range(len(self._scene.train)) if number not in self._apart]

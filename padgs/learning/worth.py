@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from padgs.learning.targets import image_of, weight_of
+from padgs.learning.targets import even_weight, image_of
 from padgs.learning.trainee import Prunable
 from padgs.render.contract import ALPHA_MIN
 from padgs.render.leave_one_out import leave_one_out
@@ -22,7 +22,7 @@ LEAST = 0.1  # share of the rows that stays in one step, whatever they are worth
 class Worth:
     """Of N rows, over some views; an anchor counts for the sum of its Gaussians."""
 
-    error: Tensor  # [N] float64, mean change of the views' WS-MSE if a row is removed alone
+    error: Tensor  # [N] float64, mean change of the views' mean square error if a row is removed alone
     change: Tensor  # [N] float64 >= 0, mean square change of the views by that
     contribution: Tensor  # [N] float64, mean alpha T
     peak: Tensor  # [N] largest alpha T of any pixel
@@ -32,7 +32,7 @@ class Worth:
 
 @torch.no_grad()
 def worth(model: Prunable, views: Sequence[View]) -> Worth:
-    """Score all rows by the photographs of some views, every direction alike.
+    """Score all rows by the photographs of some views: every direction of a panorama alike, every pixel of others.
 
     Raises:
         ValueError: no views, one without a photograph, or a model that is not drawn as its Gaussians are.
@@ -43,7 +43,7 @@ def worth(model: Prunable, views: Sequence[View]) -> Worth:
     for view in views:
         parts = model.parts(view)
         target = image_of(view, parts.slots.device)
-        weight = weight_of(view, "solid_angle", parts.slots.device)
+        weight = even_weight(view, parts.slots.device)
         found = leave_one_out(parts.gaussians, view, target, weight, parts.options)
         if sums is None or peak is None or seen is None:
             rows = next(iter(model.counts().values()))

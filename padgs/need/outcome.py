@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -69,8 +69,8 @@ def keep(search: Search, epsilon: float) -> Result:
     """Make all steps, and keep what is needed for losing at most epsilon dB as a run beside the searched one.
 
     That is the smallest model with as few harmonics as it takes, refined once more on all training views, and the
-    smallest file that it can be kept in. Its training time is that of the run and of the search; its protocols are the
-    run's. What was kept before stays.
+    smallest file that it can be kept in. Its training time is that of the run, of the search and of this refinement;
+    its protocols are the run's. What was kept of the same step before stays.
 
     Raises:
         Interrupted, Failure: as `Search.complete` does.
@@ -89,9 +89,9 @@ def keep(search: Search, epsilon: float) -> Result:
     path = run.folder.with_name(f"{run.folder.name}_need-{epsilon:g}")
     folder = RunFolder(path, identity(values, run.result.fingerprint))
     before = folder.result()
-    if before is not None and "files" in before.need and before.need["seconds"] == found["seconds"]:  # the same steps
+    if before is not None and _is_same(before.need, found):
         return before
-    trained, model = run.method.state(), search.kept(number)
+    trained, (model, refined) = run.method.state(), search.kept(number)
     of_model, method = model.state(), build(replace(run.config, options=options))
     kept = {n: t for n, t in trained.tensors.items() if not n.startswith((MODEL, ADAM))}
     tensors = kept | {f"{MODEL}{name}": tensor for name, tensor in of_model.tensors.items()}
@@ -101,8 +101,9 @@ def keep(search: Search, epsilon: float) -> Result:
         folder.prepare(values)
         folder.save(method, Progress(**trained.values[PROGRESS]))
         scene, timing = run.scene, dict(run.result.timing)
-        for name in {"train_seconds", "cpu_seconds"} & timing.keys():
-            timing[name] += found[name.removeprefix("train_")]
+        for name, last in zip(("train_seconds", "cpu_seconds"), refined, strict=True):
+            if name in timing:
+                timing[name] += found[name.removeprefix("train_")] + last
         tested = {}
         if scene.test:
             timing |= frame_times(method, scene)
@@ -124,6 +125,12 @@ def keep(search: Search, epsilon: float) -> Result:
             **tested,
         )
         return folder.finish(made)
+
+
+def _is_same(before: Mapping[str, Any], found: Mapping[str, Any]) -> bool:
+    """Whether a need of before is of the same search, in which the first step took as long, and kept the same step."""
+    told = "files" in before and before["kept"] == found["kept"]
+    return told and before["steps"][0]["seconds"] == found["steps"][0]["seconds"]
 
 
 @torch.no_grad()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import cycle, islice
@@ -26,6 +25,7 @@ from padgs.runs.opened import OpenedRun
 from padgs.scene import View
 from padgs.scoring.evaluate import evaluate
 from padgs.splats.trainee import SplatTrainee
+from padgs.stopwatch import Lap
 
 FOLDER = "need"  # in that of the run
 FRAMES = 10  # timed; the smallest time counts, since other programs only add to it
@@ -99,17 +99,20 @@ class Search:
                 if stop.requested:
                     raise Interrupted(f"stopped after step {len(self.steps)}; nothing is lost, start again to go on")
 
-    def kept(self, number: int) -> Prunable:
+    def kept(self, number: int) -> tuple[Prunable, tuple[float, float]]:
         """The model of a step, refined once more on all training views if it was refined without some.
+
+        Returns:
+            The model, and the seconds that this took: of wall and of CPU time.
 
         Raises:
             Interrupted, Failure: as `complete` does.
         """
-        model = self.model_of(number)
+        lap, before, model = Lap(), (0.0, 0.0), self.model_of(number)
         if self.steps[number].depth > 0:
             with Interrupt(self._asked) as stop:
-                self._refine(model, self.run.scene.train, f"kept {number}", stop)
-        return model
+                before = self._refine(model, self.run.scene.train, f"kept {number}", number, stop)
+        return model, _in_all(before, lap)
 
     def model_of(self, number: int) -> Prunable:
         """The model of a step."""
@@ -126,7 +129,7 @@ class Search:
     @property
     def _schedule(self) -> int:
         """Iterations of the run's schedule; those of a budget of seconds are known afterwards."""
-        return self.run.method.state().values.get("schedule", self.run.config.train.iterations)
+        return self.run.method.state().values.get("schedule", self.run.config.training.iterations)
 
     def _resumed(self) -> Prunable:
         """The model of the run."""
@@ -139,7 +142,7 @@ class Search:
         return model
 
     def _make(self, wanted: Plan, stop: Interrupt) -> tuple[Step, State]:
-        started = time.perf_counter(), time.process_time()
+        lap, before, number = Lap(), (0.0, 0.0), len(self.steps)
         model = self._model if wanted.parent is None else self.model_of(wanted.parent)
         if wanted.kind == "waste":
             shown = worth(model, self.run.scene.train).peak > 0
@@ -149,25 +152,33 @@ class Search:
                 model.truncate(wanted.degree)
             if wanted.rows is not None:
                 model.keep(most_wanted(worth(model, self.run.scene.train), wanted.rows))
-            self._refine(model, self._views, f"step {len(self.steps)}", stop)
+            before = self._refine(model, self._views, f"step {number}: {wanted}", number, stop)
         step = self._measured(model, wanted)
-        seconds, cpu_seconds = time.perf_counter() - started[0], time.process_time() - started[1]
+        seconds, cpu_seconds = _in_all(before, lap)
         return replace(step, seconds=seconds, cpu_seconds=cpu_seconds), model.state()
 
-    def _refine(self, model: Prunable, views: tuple[View, ...], what: str, stop: Interrupt) -> None:
-        """Train a model a little on some views; `what` names this refinement among those of the search."""
-        config = self.run.config
+    def _refine(
+        self, model: Prunable, views: tuple[View, ...], what: str, number: int, stop: Interrupt
+    ) -> tuple[float, float]:
+        """Train a model a little on some views, in the order that belongs to the number of a step.
+
+        `what` says all that decides the outcome: an interrupted refinement goes on if it is that of the same. Returns
+        the seconds, of wall and of CPU time, that it had taken before.
+        """
+        config, seed = self.run.config, self.run.config.seed + number
+        options = replace(config.training, monitor=False)  # in so few iterations views that differ look like a sign
         count = max(len(views), round(refine.SHARE * self._schedule))
-        refining = Refining(model, config.train, self._schedule, count)
-        scene, seed = replace(self.run.scene, train=views), config.seed + len(self.steps)
+        refining = Refining(model, options, self._schedule, count)
         torch.manual_seed(seed)
-        trainer = Trainer(refining, scene, Budget(count), config.train, seed)
+        trainer = Trainer(refining, replace(self.run.scene, train=views), Budget(count), options, seed)
         if (begun := self.folder.begun(what, self._device)) is not None:
             trainer.load_state(begun)
+        before = trainer.seconds, trainer.cpu_seconds
         for record in trainer.records():
             if stop.requested and record.iteration < count:
                 self.folder.begin(what, trainer.state())
-                raise Interrupted(f"stopped within {what}; nothing is lost, start again to go on")
+                raise Interrupted("stopped within a refinement; nothing is lost, start again to go on")
+        return before
 
     def scored(self, model: Prunable) -> tuple[Scores, dict[str, float | None]]:
         """Marks of the calibration views, and means of the test views, which decide nothing."""
@@ -192,3 +203,9 @@ class Search:
             test=test,
             degree=wanted.degree,
         )
+
+
+def _in_all(before: tuple[float, float], lap: Lap) -> tuple[float, float]:
+    """Seconds of wall and of CPU time: those before an interruption, and those since the lap began."""
+    wall, cpu = lap.seconds()
+    return before[0] + wall, before[1] + cpu

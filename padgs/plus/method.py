@@ -66,11 +66,12 @@ class PlusMethod(SplatMethod):
         options, pixels = self.options, counted_pixels(scene.train[0])
         start, limit = (_within(share, pixels) for share in (options.start_share, options.limit_share))
         limit = fewest(options.max_gaussians, limit if self._target is None else self._target)
+        room = None if limit is None else math.ceil(limit / (1 + options.sky_share))  # for points, if the sky has its
         generator = torch.Generator().manual_seed(self.seed)
         splats = Splats.from_scene(
             filled(scene, round(options.fill_share * pixels), generator=generator),
             degree=options.sh_degree,
-            max_gaussians=fewest(start, limit),
+            max_gaussians=fewest(start, room),
             opacity=options.initial_opacity,
             scale=options.initial_scale,
             generator=generator,
@@ -80,8 +81,7 @@ class PlusMethod(SplatMethod):
         if directions > 0:
             sky = far_gaussians(scene, directions, degree=options.sh_degree, opacity=options.initial_opacity)
             splats.load({name: torch.cat((own, sky.rows()[name])) for name, own in splats.rows().items()})
-        more = {"limit": limit, "asked": super()._target}
-        return self._trainee_of(splats, options.extent_of(scene), iterations, scene.train, **more)
+        return self._trainee_of(splats, options.extent_of(scene), iterations, scene.train, limit=limit)
 
     def _trained_by(self, trainee: Trainee, scene: Scene, budget: Budget, stage: Stage) -> Trainer:
         share = self.options.coarse_share

@@ -27,7 +27,7 @@ def roughness(rendering: Rendering, camera: Camera, *, near: float) -> Tensor:
     Args:
         rendering: of [H, W] pixels, in any unit of length.
         camera: that it was drawn for.
-        near: no distance is taken to be less, in the same unit.
+        near: > 0, no distance is taken to be less, in the same unit.
     """
     depth = rendering.depth
     grey, opacity = rendering.image.detach().mean(-1), 1 - rendering.transmittance.detach()

@@ -15,7 +15,7 @@ from padgs.plus.options import PlusOptions
 from padgs.plus.smoothness import roughness
 from padgs.render.config import RenderConfig
 from padgs.scene import View
-from padgs.splats.model import Splats
+from padgs.splats.model import TINY, Splats
 from padgs.splats.nearest import cameras_of, finest_pixels, no_finer
 from padgs.splats.trainee import SplatTrainee
 
@@ -36,7 +36,7 @@ class PlusTrainee(SplatTrainee):
     """Splats with the schedule of padgs_plus for a run of `iterations`.
 
     Attributes:
-        average: name of a parameter -> its running mean; empty until the last tenth of the run.
+        average: name of a parameter -> its running mean in the last tenth of the run; empty before and after.
     """
 
     def __init__(
@@ -58,8 +58,8 @@ class PlusTrainee(SplatTrainee):
 
     def draw(self, view: View, probe: Tensor | None = None) -> Drawing:
         """Render all Gaussians, differentiably; large ones and rough surfaces are penalised, as the view sees them."""
-        drawing, options = super().draw(view, probe), self.options
-        near, penalties = self.render_options(view).near, []
+        drawing, options, penalties = super().draw(view, probe), self.options, []
+        near = max(self.render_options(view).near, TINY * self.splats.unit)  # that may be 0, as the depth of nothing is
         if options.size_weight > 0:
             penalties.append(options.size_weight * mean_angular_size(drawing.gaussians, view, near=near))
         if options.smoothness_weight > 0:
@@ -83,6 +83,7 @@ class PlusTrainee(SplatTrainee):
             return ()
         for name, parameter in parameters.items():
             parameter.copy_(self.average[name])
+        self.average = {}
         return ("the model is the mean of its last states",)
 
     @property
@@ -99,17 +100,6 @@ class PlusTrainee(SplatTrainee):
             means = gaussians.means.detach().clone()
             self._finest = means, finest_pixels(means, self._cameras)
         return no_finer(gaussians, view, self._finest[1], self._config.low_pass)
-
-    def keep(self, rows: Tensor) -> None:
-        """Keep these Gaussians only."""
-        super().keep(rows)
-        self.average = {name: mean[rows] for name, mean in self.average.items()}
-
-    def truncate(self, degree: int) -> None:
-        """Leave out the harmonics above a degree."""
-        super().truncate(degree)
-        if self.average:
-            self.average["sh_rest"] = self.average["sh_rest"][:, : self.splats.sh_rest.shape[1]]
 
     def state(self) -> State:
         """That of splats, and the running means."""

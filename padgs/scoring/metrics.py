@@ -76,8 +76,9 @@ def ws_ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor
 def seam(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
     """Seam error: how much worse the step from the last to the first column is than steps inside the image.
 
-    The mean over rows, weighted by solid angle, of |step of the image - step of the target| at the seam, divided by
-    the same over all neighbouring columns inside. 1 = no seam can be seen; NaN if all steps inside are exact.
+    The mean over rows, weighted by the square of their solid angle (both pixels of a step weigh, so poles count even
+    less), of |step of the image - step of the target| at the seam, divided by the same over all neighbouring columns
+    inside. 1 = no seam can be seen; NaN if all steps inside are exact.
     """
     difference = image - target
     steps = (difference - difference.roll(1, dims=1)).abs()  # column 0: across the seam

@@ -105,6 +105,7 @@ class SplatMethod(Method):
             views=views,
             target=self._target,
             seed=self.seed,
+            asked=self._gaussians,
             removal_psnr=self._removal_psnr,
             **more,
         )

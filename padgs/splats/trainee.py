@@ -45,7 +45,7 @@ class SplatTrainee:
         views: Sequence[View] = (),
         target: int | None = None,
         seed: int = 0,
-        asked: int | None = None,
+        asked: int | str | None = None,
         removal_psnr: float | None = None,
     ) -> None:
         """Wrap splats.
@@ -59,12 +59,14 @@ class SplatTrainee:
             views: of the training; without them there can be none.
             target: as `CloneSplit` has it.
             seed: of all that is random.
-            asked: as many Gaussians are kept a round after growth, those that the views would miss most.
-            removal_psnr: dB; ... or the others go as `padgs.learning.worth.needed` says. None: all are kept.
+            asked: by the budget. A number: so many Gaussians are kept a round after growth, those that the views would
+                miss most; auto, or None where nothing is asked: as many as `padgs.learning.worth.needed` says.
+            removal_psnr: dB, for that. None: all are kept.
         """
         self.splats, self.iterations = splats, iterations
         self._config, self._views, self._extent = config, views, extent
         self._asked, self._removal_psnr = asked, removal_psnr
+        self._has_chosen: bool | None = False  # None: not known yet, of a checkpoint that does not say
         self.densifier = CloneSplit(
             splats,
             options.for_run(iterations),
@@ -117,8 +119,7 @@ class SplatTrainee:
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
         """Densify, choose whom to keep, and bring the next SH degree into use, where it is time to."""
         events = self.densifier.adapt(iteration, optimizer, grows=self._has_seen_enough)
-        options = self.densifier.options
-        if self._removal_psnr is not None and iteration == options.densify_until - 1 + options.densify_every:
+        if self._removal_psnr is not None and self._must_choose(iteration):
             events += self._chosen(optimizer, self._removal_psnr)
         degree = min(self.splats.degree, self.degree_at(iteration + 1))
         if degree > self.splats.active_degree:
@@ -135,13 +136,29 @@ class SplatTrainee:
         views = int(self.densifier.statistics["seen"].max())  # some Gaussian is seen by all
         return 2 * views >= min(self.densifier.options.densify_every, MIN_DENSIFY_EVERY)
 
+    def _must_choose(self, iteration: int) -> bool:
+        """Whether it is time to choose: a round after growth.
+
+        What a budget asks for is met later, too: once a stop has left that out, and a number in any case at the end.
+        Where none asks, all stay then, for little is to come that mends what the others leave.
+        """
+        due = self.densifier.options.densify_until - 1 + self.densifier.options.densify_every
+        if self._asked is None:
+            return iteration == due
+        if isinstance(self._asked, int):
+            due = min(due, self.iterations)
+        if self._has_chosen is None:
+            self._has_chosen = iteration > due
+        return iteration >= due and not self._has_chosen
+
     def _chosen(self, optimizer: torch.optim.Adam, removal_psnr: float) -> tuple[str, ...]:
         """Keep those that the training views would miss most; scored by as many as lie between two rounds."""
         grown, step = len(self.splats), math.ceil(len(self._views) / self.densifier.options.densify_every)
         found = worth(self, self._views[::step])
-        kept = needed(found, removal_psnr) if self._asked is None else min(self._asked, grown)
+        kept = min(self._asked, grown) if isinstance(self._asked, int) else needed(found, removal_psnr)
         keep_rows(self.splats.rows(), optimizer, most_wanted(found, kept))
         self.densifier.forget()
+        self._has_chosen = True
         return (f"kept {kept} of {grown} Gaussians, those that the training views would miss most",)
 
     def degree_at(self, iteration: int) -> int:
@@ -190,6 +207,7 @@ class SplatTrainee:
             "unit": self.splats.unit,
             "extent": self._extent,
             "iterations": self.iterations,
+            "has_chosen": self._has_chosen,
         }
         return State(tensors, values)
 
@@ -203,6 +221,7 @@ class SplatTrainee:
         device = self.splats.means.device
         self.densifier.statistics = {n: t.to(device, copy=True) for n, t in state.under("statistics/").items()}
         self.densifier.generator.set_state(state.tensors["random/pieces"].cpu())
+        self._has_chosen = state.values.get("has_chosen")
 
     def load_model(self, state: State) -> None:
         """Take the splats alone, whose densification begins anew.

@@ -130,6 +130,12 @@ def test_options_of_splatting_are_refused_and_not_ignored(render, train, reason)
         )
 
 
+def test_it_can_go_on_whatever_the_monitor_sees():
+    unwatched = method(replace(EgoNeRFMethod.TRAIN, monitor=False))
+    next(unwatched.fit(tiny_scene(), Budget(1)))
+    assert "monitor" not in unwatched.state().values
+
+
 @pytest.mark.parametrize("name, value", [("rays", 0), ("grid_rate", 0.0), ("density_variation", -1.0)])
 def test_training_options_without_a_meaning_are_named(name, value):
     with pytest.raises(ValueError, match=f"{name} is {value}"):

@@ -164,6 +164,14 @@ def test_what_it_remembers_is_json_and_goes_on():
     )
 
 
+def test_a_resumed_run_is_compared_with_the_model_that_it_began_with():
+    began, resumed = Monitor(ITERATIONS, parts=5000, pixels=100), Monitor(ITERATIONS, parts=10, pixels=100)
+    resumed.state = json.loads(json.dumps(began.state))
+    resumed.counts({"gaussians": 50_000}, 1)
+    with pytest.raises(Failure, match="50001 gaussians at iteration 2, more than 10 times the 5000"):
+        resumed.counts({"gaussians": 50_001}, 2)
+
+
 class Deaf(SplatMethod):
     """A method whose rotations nothing pulls at."""
 

@@ -9,6 +9,7 @@ from torch import Tensor
 from padgs.baselines import METHODS
 from padgs.learning.budget import Budget
 from padgs.learning.loop import Trainer
+from padgs.learning.order import ViewOrder
 from padgs.learning.stopping import FADE, Plateau, quality, set_apart
 from padgs.registry import lookup
 from padgs.render import Rendering
@@ -75,6 +76,27 @@ def test_views_set_apart_come_back_when_rates_fade(scene, monkeypatch):
     assert apart.isdisjoint(trainee.drawn[: stopped + 1]) and apart < set(trainee.drawn[stopped + 1 :])
     assert trainee.moments == [*range(1, 51), *range(round((1 - FADE) * ITERATIONS) + 1, ITERATIONS + 1)]
     assert records[-1].progress == 1 and len(records) == 65 and run.skipped == 35 and "0.02 dB" in run.ended
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_they_come_back_within_the_epoch_that_runs(scene, seed):
+    apart = set_apart(scene.train)
+    order = ViewOrder(scene, seed, apart)
+    drawn = [order.next()]
+    order.take_all()
+    drawn += [order.next() for _ in range(2)]
+    order.take_all()
+    drawn += [order.next() for _ in range(3)]
+    assert drawn[0] not in apart and sorted(drawn) == list(range(6))
+
+
+@pytest.mark.parametrize("iterations", [1, 2, 3])
+def test_the_shortest_runs_end_well_when_they_are_stopped(scene, iterations):
+    run, progress = Trainer(Counted(scene), scene, Budget(iterations), seed=1), 0.0
+    for record in run.records():
+        run.stop("asked")
+        progress = record.progress
+    assert progress == 1
 
 
 def test_rates_never_rise_when_a_run_is_stopped(scene):

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import pytest
 import torch
@@ -17,13 +18,14 @@ from padgs.multirun import job
 from padgs.multirun.composition import composing, configuration
 from padgs.need import session, tiers
 from padgs.need.outcome import keep, need
-from padgs.need.search import smallest
+from padgs.need.search import Plan, smallest
 from padgs.need.session import Search
 from padgs.results import read
 from padgs.runs.checkpoint import CheckpointError
 from padgs.runs.interrupt import Interrupted
 from padgs.runs.session import Watch
 from padgs.runs.typed import ConfigError
+from padgs.stress.options import StressOptions
 
 METHODS = ("method=omnigs", "method=padgs")
 
@@ -77,6 +79,51 @@ def test_a_search_interrupted_everywhere_ends_as_if_nothing_had_happened(opened,
     assert not (again.folder.path / "begun").exists()
 
 
+@pytest.fixture
+def started(opened) -> Search:
+    """A search with its first step."""
+    search = Search(opened("method=omnigs"))
+    step, model = search._make(Plan("waste", None), session.Interrupt())
+    search.folder.add(0, step, model)
+    search.steps.append(step)
+    return search
+
+
+def test_an_interrupted_refinement_goes_on_in_its_own_plan_alone_and_all_of_its_time_counts(started):
+    rows = started.steps[0].rows
+    one, other = Plan("prune", 0, rows - 10), Plan("prune", 0, rows - 20)
+    with pytest.raises(Interrupted, match="stopped within a refinement"):
+        started._make(one, session.Interrupt(lambda: True))
+    what = f"step 1: {one}"
+    begun = started.folder.begun(what)
+    assert begun is not None and begun.values["iteration"] == 1
+    times = {"seconds": 1000.0, "cpu_seconds": 500.0}
+    started.folder.begin(what, State(begun.tensors, begun.values | times))
+    step, _ = started._make(other, session.Interrupt())
+    assert step.rows == rows - 20 and step.seconds < 1000
+    step, _ = started._make(one, session.Interrupt())
+    assert step.rows == rows - 10 and step.seconds > 1000 and step.cpu_seconds > 500
+
+
+def test_a_refinement_trains_as_the_run_did_under_its_stress_and_no_sign_ends_it(started, monkeypatch):
+    seen = []
+
+    class Noted(session.Trainer):
+        """Tells its options."""
+
+        def __init__(self, trainee, scene, budget, options, seed):
+            seen.append(options)
+            super().__init__(trainee, scene, budget, options, seed)
+
+    monkeypatch.setattr(session, "Trainer", Noted)
+    config = replace(started.run.config, stress=StressOptions("learning_rates", 2))
+    started.run.config = config
+    started._make(Plan("control", 0), session.Interrupt())
+    (options,) = seen
+    assert options.learning_rates == config.training.learning_rates != config.train.learning_rates
+    assert not options.monitor
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_the_pruned_model_is_a_run_that_opens_and_has_the_whole_front(opened, method):
     run = opened(method)
@@ -85,12 +132,19 @@ def test_the_pruned_model_is_a_run_that_opens_and_has_the_whole_front(opened, me
     result = keep(search, 1.0)
     assert_same_but_time(run.method.state(), before)
     pruned = padgs.load_run(run.folder.with_name(result.run), device="cpu")
-    kept = search.steps[search.complete(1.0)]
+    number = search.complete(1.0)
+    kept = search.steps[number]
     assert next(iter(pruned.method.size().counts.values())) == kept.rows < search.rows
     assert kept.rows == search.steps[smallest(search.steps, 1.0)].rows
     assert pruned.result == result and result.need.items() >= json.loads(json.dumps(need(search))).items()
     assert result.model_bytes == kept.bytes and pruned.config.variant == "need 1 dB"
-    assert keep(Search(opened(method)), 1.0) == result, "what was kept before stays"
+    assert result.timing["train_seconds"] > run.result.timing["train_seconds"] + result.need["seconds"]
+    of_another_loss = replace(search.steps[0], kind="degree", parent=0)
+    search.folder.add(len(search.steps), of_another_loss, search.model_of(0).state())
+    again = Search(opened(method))
+    assert len(again.steps) == len(search.steps) + 1
+    assert keep(again, 1.0) == result, "what was kept before stays"
+    assert_same_but_time(again.kept(number)[0].state(), pruned.method.trainee.state())
     assert pruned.score("sphere").metrics == pytest.approx(pruned.scores["sphere"].metrics, nan_ok=True)
     told = result.need
     assert [step["kind"] for step in told["steps"]][:3] == ["waste", "control", "prune"]

@@ -1,5 +1,6 @@
 """What padgs_plus promises: schedules for any length, no units, small Gaussians, a mean of its last states."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import count, islice
@@ -70,10 +71,50 @@ def test_what_is_kept_after_growth_is_what_the_views_would_miss():
     assert kept.sum() == len(chosen) and found.change[kept].min() >= found.change[~kept].max()
 
 
-def test_a_budget_of_gaussians_says_how_many_are_kept():
-    for record in PlusMethod(OPTIONS).fit(tiny_scene(), Budget(100, gaussians=150)):
+@pytest.mark.parametrize("iterations", [100, 6])
+def test_a_budget_of_gaussians_says_how_many_are_kept(iterations):
+    for record in PlusMethod(OPTIONS).fit(tiny_scene(), Budget(iterations, gaussians=150)):
         last = record.counts["gaussians"]
     assert last == 150
+
+
+@pytest.mark.parametrize(("gaussians", "chosen"), [(150, [31]), ("auto", [31]), (None, [])])
+def test_a_run_that_is_stopped_before_the_choice_makes_it_at_once_if_a_budget_asks_for_it(gaussians, chosen):
+    budget, whole, again = Budget(100, gaussians=gaussians), PlusMethod(OPTIONS), PlusMethod(OPTIONS)
+    counts, events = [], []
+    for record in whole.fit(tiny_scene(), budget):
+        counts.append(record.counts["gaussians"])
+        events += [record.iteration for event in record.events if "would miss most" in event]
+        if record.iteration == 30:
+            assert whole.stop("asked")
+            again.load_state(whole.state())
+    assert events == chosen and (counts[30] == counts[-1] < counts[29]) == bool(chosen)
+    assert gaussians != 150 or counts[-1] == 150
+    list(again.fit(tiny_scene(), budget))
+    assert_same_but_time(again.state(), whole.state())
+
+
+@pytest.mark.parametrize("at", [30, 45, 60])  # 45: after the choice
+def test_checkpoints_that_do_not_say_whether_there_was_a_choice_go_on_as_they_did(at):
+    budget, whole, again = Budget(100, gaussians="auto"), PlusMethod(OPTIONS), PlusMethod(OPTIONS)
+    for record in whole.fit(tiny_scene(), budget):
+        if record.iteration == at:
+            state = whole.state()
+            del state.values["model"]["has_chosen"]
+            again.load_state(state)
+    list(again.fit(tiny_scene(), budget))
+    assert_same_but_time(again.state(), whole.state())
+
+
+def test_a_tight_budget_leaves_room_for_the_sky_and_for_growth():
+    tiny = tiny_scene()
+    points = tiny.points[:1] + 0.1 * torch.randn(400, 3, generator=torch.Generator().manual_seed(0))
+    scene = replace(tiny, points=points, point_colors=tiny.point_colors[:1].expand(400, 3))
+    method = PlusMethod(OPTIONS)
+    method.fit(scene, Budget(64, gaussians=100))
+    far = method.trainee.splats.means.norm(dim=-1) > 2 * points.norm(dim=-1).max()
+    assert (~far).sum() == math.ceil(200 / 1.5) and far.sum() > 20
+    assert method.start < 200
 
 
 def test_a_run_of_seconds_rehearses_ends_on_time_and_resumes_bit_identically(monkeypatch):
@@ -148,6 +189,12 @@ def test_the_penalty_is_the_mean_size_as_the_view_sees_it():
     assert gradient is None or not gradient.any()  # it shall not push Gaussians away
 
 
+def test_where_gaussians_may_be_as_near_as_they_like_an_empty_direction_is_no_distance():
+    near = replace(PlusMethod.RENDER, near=0.0)
+    records = list(PlusMethod(replace(OPTIONS, sky_share=0.0), near).fit(tiny_scene(), Budget(3)))
+    assert len(records) == 3 and all(math.isfinite(record.loss) for record in records)
+
+
 def test_the_penalty_asks_for_smooth_surfaces_of_what_is_drawn():
     method, scene = PlusMethod(replace(OPTIONS, size_weight=0.0, smoothness_weight=0.3)), tiny_scene()
     next(method.fit(scene, Budget(10)))
@@ -189,6 +236,8 @@ def test_the_end_is_the_mean_of_the_last_states():
         method = PlusMethod(replace(OPTIONS, average_share=share))
         for record in method.fit(tiny_scene(), Budget(40)):
             states[share, record.iteration] = method.trainee.splats.means.detach().clone()
+            averaged = bool(method.state().under("model/average/"))
+            assert averaged == (share > 0 and 37 <= record.iteration < 40)
     assert torch.equal(states[0.0, 39], states[0.1, 39])  # training itself does not notice
     mean = states[0.0, 37].clone()
     for iteration in (38, 39, 40):
