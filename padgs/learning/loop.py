@@ -32,6 +32,7 @@ from padgs.learning.views.sizes import Sizes
 from padgs.scene import Scene
 from padgs.stopwatch import Lap
 
+READ_EVERY = 10  # iterations: losses are read from a GPU as often as runs log them, while their time is counted
 VIEWS = "views/"  # prefix of the corrections of views in the state of a trainer
 Stage = Callable[[str], AbstractContextManager[object]]  # entered with the name of each part of an iteration
 
@@ -277,8 +278,8 @@ class Trainer:
         return value, len(drawing.gaussians)  # and the graph is gone before rows of its leaves come and go
 
     def _read(self, loss: Tensor, iteration: int) -> float | Tensor:
-        """The loss as a number. On a GPU, which the host would have to wait for, only where all is checked."""
-        if loss.device.type == "cpu" or self._optimiser.is_checked(iteration):
+        """The loss as a number. On a GPU, which the host has to wait for, not each time."""
+        if loss.device.type == "cpu" or iteration % READ_EVERY == 0 or self._optimiser.is_checked(iteration):
             return loss.item()
         return loss.detach()
 
