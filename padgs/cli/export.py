@@ -42,10 +42,11 @@ def export(
     if points and path.suffixes != [".ply"]:
         raise ValueError(f"{path} is no plain .ply, which point clouds are written as")
     refuse_impossible(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     with Console().status("opening the run") as status:
+        trained = opened(run, data)
+        path.parent.mkdir(parents=True, exist_ok=True)
         found = exported(
-            opened(run, data),
+            trained,
             lessons=lessons,
             stand_up=upright or path.suffix == ".html",
             smooth=smooth or path.suffix == ".html",

@@ -98,9 +98,10 @@ def test_what_cannot_be_exported_says_why(tmp_path_factory, tmp_path, splat_run)
     folder = tiny_run(tmp_path_factory, "method=egonerf_small", "train.iterations=2")
     for arguments, message in (
         ((str(folder),), "egonerf has no Gaussians to export; padgs render and padgs view"),
-        ((str(tmp_path),), "has no config.yaml"),
+        ((str(tmp_path / "RUNX"),), "has no config.yaml"),
         ((str(splat_run), "--to", "a.obj"), "none of the known formats"),
         ((str(splat_run), "--points", "--to", str(tmp_path / "a.compressed.ply")), "is no plain .ply"),
     ):
         said = export(*arguments)
         assert said.exit_code == 1 and message in said.output + said.stderr
+    assert not (tmp_path / "RUNX").exists(), "a name that was misspelt"
