@@ -202,13 +202,16 @@ def decoded(document: Mapping[str, Any], where: str) -> Result:
     return result
 
 
-def read_all(folder: Path) -> tuple[list[Result], list[ResultError]]:
-    """Results of all runs in a folder of run folders, in the order of their names, and what could not be read."""
-    results: list[Result] = []
+def read_all(folder: Path) -> tuple[dict[Path, Result], list[ResultError]]:
+    """Run folder -> result, of all in a folder of run folders, in the order of their names; and what could not be read.
+
+    A folder may have another name than its run, if somebody renamed it.
+    """
+    results: dict[Path, Result] = {}
     errors: list[ResultError] = []
     for path in sorted(folder.glob(f"*/{FILE_NAME}")):
         try:
-            results.append(read(path))
+            results[path.parent] = read(path)
         except ResultError as error:
             errors.append(error)
     return results, errors

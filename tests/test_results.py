@@ -154,7 +154,7 @@ def test_read_all_keeps_the_good_and_names_the_bad(result, tmp_path):
     (tmp_path / "b" / "result.json").write_text("{")
     (tmp_path / "unfinished").mkdir()
     good, bad = results.read_all(tmp_path)
-    assert [r.run for r in good] == ["a", "c"]
+    assert {folder.name: r.run for folder, r in good.items()} == {"a": "a", "c": "c"}
     assert len(bad) == 1 and "b/result.json" in str(bad[0])
 
 

@@ -22,19 +22,15 @@ def track(
 
     if not Path(runs).is_dir():
         raise FileNotFoundError(f"there is no folder {runs}; give the folder of the runs")
+    found, broken = results.read_all(Path(runs))
+    for error in broken:
+        show(f"left out: {error}")
     trackers: dict[str, Tracker] = {}
-    mirrored = 0
-    for path in sorted(Path(runs).glob(f"*/{results.FILE_NAME}")):
-        try:
-            result = results.read(path)
-        except results.ResultError as error:
-            show(f"left out: {error}")
-            continue
+    for folder, result in found.items():
         experiment = " ".join(name for name in result.experiments if name != results.BY_ITSELF)
         if experiment not in trackers:
             trackers[experiment] = Tracker(TrackingOptions(uri=uri or None), Path(runs), experiment, show)
-        trackers[experiment].update(path.parent)
+        trackers[experiment].update(folder)
         if not trackers[experiment].on:
             raise typer.Exit(1)
-        mirrored += 1
-    print(f"mirrored: {mirrored} runs, as {', '.join(tracker.name for tracker in trackers.values())}")
+    print(f"mirrored: {len(found)} runs, as {', '.join(tracker.name for tracker in trackers.values())}")

@@ -77,4 +77,4 @@ def test_far_away_the_release_ends_as_oom_with_the_numbers(tmp_path, monkeypatch
     instances, needed = (int(number.replace(",", "")) for number in match.groups())
     assert needed == 24 * instances > 60_000
     assert run("op43dgs", far, tmp_path, monkeypatch).status == "ok"
-    assert {result.status for result in results.read_all(tmp_path)[0]} == {"ok", "oom"}, "the sweep goes on"
+    assert {result.status for result in results.read_all(tmp_path)[0].values()} == {"ok", "oom"}, "the sweep goes on"

@@ -56,7 +56,7 @@ def wait_for_new_checkpoint(folder: Path, before: bytes, process: subprocess.Pop
 
 def same_end(one: Path, other: Path) -> None:
     """Marks and checkpoint of the only run in each folder are equal, bit by bit."""
-    (mine,), (theirs,) = results.read_all(one)[0], results.read_all(other)[0]
+    (mine,), (theirs,) = results.read_all(one)[0].values(), results.read_all(other)[0].values()
     assert mine.status == "ok"
     assert (mine.run, mine.scores, mine.counts) == (theirs.run, theirs.scores, theirs.counts)
     first, second = (checkpoint.load(folder / mine.run / "checkpoint") for folder in (one, other))
@@ -94,7 +94,8 @@ def test_the_ablation_is_one_command_and_its_table_another(start, tmp_path, cach
     code, out, error = finish(start("+experiment=ablation", *quick, "train.iterations=30"))
     assert code == 0, error
     found, broken = results.read_all(tmp_path / "runs")
-    assert {result.variant for result in found} == {"baseline", "dagd", "dagd_daom_no_m", "full"} and not broken
+    variants = {result.variant for result in found.values()}
+    assert variants == {"baseline", "dagd", "dagd_daom_no_m", "full"} and not broken
     report = [sys.executable, "-m", "padgs.cli.app", "report", "table3"]
     done = subprocess.run(
         report, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True

@@ -23,7 +23,8 @@ def marks(folder: Path) -> dict[str, tuple]:
     """Run -> all that must not depend on how it came about."""
     found, broken = results.read_all(folder)
     assert not broken
-    return {result.run: (result.status, result.scores, result.counts, result.iterations_done) for result in found}
+    ends = found.values()
+    return {result.run: (result.status, result.scores, result.counts, result.iterations_done) for result in ends}
 
 
 def test_a_key_of_tracking_that_is_unknown_is_said_without_a_traceback(tmp_path, capsys):

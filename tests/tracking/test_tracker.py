@@ -74,7 +74,7 @@ def test_runs_stand_in_mlflow_with_settings_progress_marks_pictures_and_tables(t
         tracker = Tracker(TrackingOptions(), Path("runs"), "tau", said.append, multirun="tau 1234")
         tracker.update(good)
         tracker.update(bad)
-        tracker.finish(found)
+        tracker.finish([*found.values()])
         log(good, [40])
     client = mlflow.MlflowClient(f"sqlite:///{runs / 'mlflow.db'}")
     experiment = client.get_experiment_by_name("tau")
