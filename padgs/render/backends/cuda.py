@@ -167,7 +167,7 @@ class _Drawing(NativeImage):
         peak = torch.zeros(len(projected.order), device=device)
         drawn = projected.order[: projected.visible].long()
         for strip in projected.strips():
-            found = torch.zeros(strip.instances, REMOVAL, device=device)  # of all of the room, for `double`
+            found = torch.zeros(strip.instances, REMOVAL, device=device)  # what no instance fills is read, too
             forward = _blend_inputs(projected, strip, self.rays, background, outputs, None)
             arguments = cuda.RemovalInputs(forward, *map(pointer, (target, weight, found)))
             cuda.call("padgs_cuda_leave_one_out", projected.queue, arguments)
