@@ -16,27 +16,16 @@ from padgs.learning.budget import Budget
 from padgs.learning.loop import Stage, Trainer, TrainOptions
 from padgs.learning.trainee import Trainee
 from padgs.plus.fill import filled
-from padgs.plus.options import PlusOptions
+from padgs.plus.options import GROWN_PER_KEPT, PlusOptions
 from padgs.plus.sky import far_gaussians
-from padgs.plus.trainee import PlusTrainee
+from padgs.plus.trainee import PlusTrainee, counted_pixels
 from padgs.render.config import RenderConfig
-from padgs.scene import Scene, View
+from padgs.scene import Scene
 from padgs.splats.method import SplatMethod, fewest
 from padgs.splats.model import Splats
 from padgs.splats.trainee import SplatTrainee
 
-GROWN_PER_KEPT = 2  # Gaussians, where the budget says how many to keep
 PIXEL = 0.1  # square pixels; a pixel is the mean over a square, whose variance is 1/12
-
-
-FEWEST_PIXELS = 2000.0  # panoramas of less than 80 x 40: many of them together show more than each
-
-
-def counted_pixels(view: View) -> float:
-    """What numbers of Gaussians are shares of: the pixels of equal solid angle that a panorama shows, W H times the
-    mean cosine of the latitude, 2 / pi; at least `FEWEST_PIXELS`.
-    """
-    return max(FEWEST_PIXELS, 2 * view.width * view.height / math.pi)
 
 
 class PlusMethod(SplatMethod):

@@ -16,6 +16,8 @@ SCHEDULE = (  # options of 3DGS that mean nothing here
 )
 LONG = 2000  # iterations from which on the threshold of growth does not fall any more
 GROWN = 0.4  # share of the run after which nothing grows any more
+GROWN_PER_KEPT = 2  # Gaussians before the choice, for each after it; more or less
+PLENTY = 16  # pixels of training views for each Gaussian: with fewer, pleasing one view may spoil another
 
 
 def between_rounds(iterations: int) -> int:
@@ -42,6 +44,7 @@ class PlusOptions(SplatOptions):
     means_speed: float = 2.0  # learning rate of the means, beside that of 3DGS
     size_weight: float = 0.05  # in the loss, of the mean angular size: what is large costs pairs in every frame
     smoothness_weight: float = 0.12  # in the loss, of the roughness of surfaces, which few views leave open
+    drop_share: float = 0.1  # of Gaussians, left out of a drawing by chance where views are few; see `dropped_share`
     average_share: float = 0.04  # of the run: parameters are averaged over about so much of its end; 0: not
     sky_share: float = 0.5  # directions, per point to begin with, that get a far Gaussian if no point is there
 
@@ -54,6 +57,7 @@ class PlusOptions(SplatOptions):
         for name in ("size_weight", "smoothness_weight", "sky_share", "fill_share"):
             check(self, off, lambda value: 0 <= value < math.inf, name)
         check(self, "a share of the run in [0, 1]", lambda share: 0 <= share <= 1, "coarse_share")
+        check(self, "a share of the Gaussians in [0, 1)", lambda share: 0 <= share < 1, "drop_share")
         check(self, "a share of the run in [0, 0.1]", lambda share: 0 <= share <= 0.1, "average_share")
         for name in ("start_share", "limit_share"):
             check(self, "> 0, or none for no limit", lambda share: share is None or share > 0, name)
@@ -63,6 +67,14 @@ class PlusOptions(SplatOptions):
                     f"{field.name} is {getattr(self, field.name)}, but padgs_plus has rounds of growth of its own "
                     f"and no resets; leave it at {field.default}"
                 )
+
+    def dropped_share(self, pixels: float, gaussians: float) -> float:
+        """Share of so many Gaussians that a drawing leaves out, where training views have so many pixels in all.
+
+        None where each Gaussian has `PLENTY` of them to be learned from; then more with the logarithm of what is
+        missing, and all of `drop_share` where it has half as many.
+        """
+        return self.drop_share * min(max(math.log2(PLENTY * gaussians / pixels), 0.0), 1.0)
 
     def for_run(self, iterations: int) -> CloneSplitOptions:
         """Rounds of growth at even distances up to `GROWN`; no resets, which a run of any length must recover from.

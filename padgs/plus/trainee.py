@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -11,7 +12,7 @@ from torch import Tensor
 from padgs.gaussians import Gaussians
 from padgs.learning.schedule import ParameterGroup
 from padgs.learning.trainee import Drawing, State
-from padgs.plus.options import PlusOptions
+from padgs.plus.options import GROWN_PER_KEPT, PlusOptions
 from padgs.plus.smoothness import roughness
 from padgs.render.config import RenderConfig
 from padgs.scene import View
@@ -20,9 +21,17 @@ from padgs.splats.nearest import cameras_of, finest_pixels, no_finer
 from padgs.splats.trainee import SplatTrainee
 
 DEGREE_SHARE = 0.1  # of the run, after which the next SH degree comes into use
-AVERAGED_FROM = 0.9  # share of the run after which parameters are averaged
+AVERAGED_FROM = 0.9  # share of the run after which parameters are averaged, and all Gaussians drawn
 AVERAGE = "average/"  # of its tensors in a state
 CAMERAS = "cameras"  # of the training views, in a state
+FEWEST_PIXELS = 2000.0  # panoramas of less than 80 x 40: many of them together show more than each
+
+
+def counted_pixels(view: View) -> float:
+    """What numbers of Gaussians are shares of: the pixels of equal solid angle that a panorama shows, W H times the
+    mean cosine of the latitude, 2 / pi; at least `FEWEST_PIXELS`.
+    """
+    return max(FEWEST_PIXELS, 2 * view.width * view.height / math.pi)
 
 
 def mean_angular_size(gaussians: Gaussians, view: View, *, near: float) -> Tensor:
@@ -45,6 +54,8 @@ class PlusTrainee(SplatTrainee):
         """Arguments as for `SplatTrainee`; `limit`: as many Gaussians as there may be."""
         super().__init__(splats, replace(options, max_gaussians=limit), config, **kwargs)
         self.options, self.average = options, dict[str, Tensor]()
+        self._moment = 0  # of the schedule, the last that has passed
+        self._pixels = sum(map(counted_pixels, self._views))
         self._cameras = cameras_of(self._views)
         self._finest: tuple[Tensor, Tensor] | None = None  # means, and the pixel of the finest camera at each
 
@@ -66,8 +77,26 @@ class PlusTrainee(SplatTrainee):
             penalties.append(options.smoothness_weight * roughness(drawing.rendering, view.camera, near=near))
         return replace(drawing, penalty=sum(penalties)) if penalties else drawing
 
+    @torch.no_grad()
+    def _share_of_opacities(self) -> Tensor | None:
+        """Nothing of a few by chance, which the others must make up for, and so much more of all others.
+
+        Dropout, as DropGaussian has it: what stands in front of one view only to please it is found out. The last
+        states, which become the model, know all Gaussians.
+        """
+        if self._pixels == 0 or self._moment >= AVERAGED_FROM * self.iterations:
+            return None
+        has_choice = self._removal_psnr is not None and self._moment < self._choice_due
+        share = self.options.dropped_share(self._pixels, len(self.splats) / (GROWN_PER_KEPT if has_choice else 1))
+        if share == 0:
+            return None
+        opacities = torch.sigmoid(self.splats.opacity_logits)
+        drawn = torch.rand(len(opacities), generator=self.densifier.generator) >= share
+        return drawn.to(opacities) * (1 / opacities).clamp(max=1 / (1 - share))
+
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
         """Densify, choose whom to keep, bring the next SH degree into use, and average, where it is time to."""
+        self._moment = iteration
         events = super().adapt(iteration, optimizer)
         if iteration > AVERAGED_FROM * self.iterations and self.options.average_share > 0:
             events += self._averaged(iteration)
@@ -102,14 +131,15 @@ class PlusTrainee(SplatTrainee):
         return no_finer(gaussians, view, self._finest[1], self._config.low_pass)
 
     def state(self) -> State:
-        """That of splats, and the running means."""
+        """That of splats, the moment, and the running means."""
         state = super().state()
         averages = {AVERAGE + name: mean for name, mean in self.average.items()}
-        return State(state.tensors | averages | {CAMERAS: self._cameras}, state.values)
+        return State(state.tensors | averages | {CAMERAS: self._cameras}, state.values | {"moment": self._moment})
 
     def load_state(self, state: State) -> None:
         """Become the model that `state` was taken of."""
         super().load_state(state)
+        self._moment = state.values.get("moment", 0)
         device = self.splats.means.device
         self.average = {name: mean.to(device, copy=True) for name, mean in state.under(AVERAGE).items()}
         self._cameras = state.tensors.get(CAMERAS, self._cameras)  # older checkpoints have none

@@ -102,9 +102,14 @@ class SplatTrainee:
             self.render_options(view),
             signal=self.densifier.options.signal,
             probe=probe,
+            share=self._share_of_opacities(),
             backend=self._config.backend,
         )
         return Drawing(rendering, probe, gaussians, torch.arange(len(probe), device=probe.device))
+
+    def _share_of_opacities(self) -> Tensor | None:
+        """What opacities [N] are multiplied with in the next drawing of the training; None: 1."""
+        return None
 
     def observe(self, drawing: Drawing, iteration: int) -> None:
         """Note how hard each Gaussian was pulled."""
@@ -142,7 +147,7 @@ class SplatTrainee:
         What a budget asks for is met later, too: once a stop has left that out, and a number in any case at the end.
         Where none asks, all stay then, for little is to come that mends what the others leave.
         """
-        due = self.densifier.options.densify_until - 1 + self.densifier.options.densify_every
+        due = self._choice_due
         if self._asked is None:
             return iteration == due
         if isinstance(self._asked, int):
@@ -150,6 +155,11 @@ class SplatTrainee:
         if self._has_chosen is None:
             self._has_chosen = iteration > due
         return iteration >= due and not self._has_chosen
+
+    @property
+    def _choice_due(self) -> int:
+        """The iteration of the choice: a round after growth."""
+        return self.densifier.options.densify_until - 1 + self.densifier.options.densify_every
 
     def _chosen(self, optimizer: torch.optim.Adam, removal_psnr: float) -> tuple[str, ...]:
         """Keep those that the training views would miss most; scored by as many as lie between two rounds."""

@@ -45,6 +45,7 @@ WITHOUT = {  # variant (conf/without) -> title
             "average": "the last state",
             "sky": "no sky",
             "fill": "no points from photographs",
+            "drop": "all in each drawing",
             "coarse": "all views of full size",
         }.items()
     },

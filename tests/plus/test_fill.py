@@ -8,9 +8,10 @@ import torch
 from tiny_scene import tiny_scene
 
 from padgs.plus.fill import filled
-from padgs.plus.method import PlusMethod, counted_pixels
+from padgs.plus.method import PlusMethod
 from padgs.plus.options import PlusOptions
 from padgs.plus.sky import fibonacci_sphere
+from padgs.plus.trainee import counted_pixels
 from padgs.scene import Scene
 
 RADIUS = 4.0

@@ -14,9 +14,10 @@ from padgs import stopwatch
 from padgs.learning.budget import Budget
 from padgs.learning.loop import Record
 from padgs.learning.worth import needed, worth
-from padgs.plus.method import FEWEST_PIXELS, PlusMethod, counted_pixels
-from padgs.plus.options import GROWN, ROUNDS, PlusOptions, between_rounds
+from padgs.plus.method import PlusMethod
+from padgs.plus.options import GROWN, PLENTY, ROUNDS, PlusOptions, between_rounds
 from padgs.plus.smoothness import roughness
+from padgs.plus.trainee import FEWEST_PIXELS, counted_pixels
 from padgs.scene import Scene
 from padgs.sphere.distortion import solid_angle_weight
 from padgs.splats.method import SplatMethod
@@ -59,7 +60,7 @@ def test_the_threshold_of_growth_falls_with_the_length_of_a_run_and_then_stays()
 def test_what_is_kept_after_growth_is_what_the_views_would_miss():
     trained, tiny = [], tiny_scene()
     for psnr in (None, 44.0):
-        method = PlusMethod(replace(OPTIONS, removal_psnr=psnr))
+        method = PlusMethod(replace(OPTIONS, removal_psnr=psnr, drop_share=0.0))
         for record in islice(method.fit(tiny, Budget(100)), 9 * between_rounds(100)):
             before = record.counts["gaussians"]
         trained.append(method.trainee)
@@ -204,6 +205,45 @@ def test_the_penalty_asks_for_smooth_surfaces_of_what_is_drawn():
     assert drawing.penalty.item() == pytest.approx(0.3 * rough.item()) and rough > 0
     drawing.penalty.backward()
     assert method.trainee.splats.means.grad.any() and method.trainee.splats.log_scales.grad.any()
+
+
+def test_the_fewer_pixels_a_gaussian_has_the_more_of_them_a_drawing_leaves_out():
+    options = PlusOptions(drop_share=0.2)
+    found = [options.dropped_share(pixels=1000.0 * PLENTY, gaussians=n) for n in (1, 1000, 1414.2136, 2000, 10**6)]
+    assert found == pytest.approx([0, 0, 0.1, 0.2, 0.2], abs=1e-6)
+    assert PlusOptions(drop_share=0.0).dropped_share(1.0, 1000) == 0
+
+
+def crowded_scene() -> Scene:
+    """Of 10 000 pixels, as padgs_plus counts them, and 4000 points."""
+    tiny = tiny_scene()
+    points = tiny.points.repeat(100, 1) + 0.1 * torch.randn(4000, 3, generator=torch.Generator().manual_seed(0))
+    return replace(tiny, points=points, point_colors=tiny.point_colors.repeat(100, 1))
+
+
+@pytest.mark.parametrize(("done", "share"), [(1, 0.25), (17, 0.25), (18, 0.0), (20, 0.0)])
+def test_a_drawing_of_the_training_leaves_some_out_and_shows_more_of_the_others(done, share):
+    scene = crowded_scene()
+    method, view = PlusMethod(replace(OPTIONS, drop_share=0.25)), scene.train[0]
+    list(islice(method.fit(scene, Budget(20)), done))
+    drawings = [method.trainee.draw(view) for _ in range(60)]
+    drawn = torch.stack([drawing.gaussians.opacities for drawing in drawings])
+    whole = method.trainee.splats.gaussians(view).opacities
+    assert (drawn == 0).float().mean().item() == pytest.approx(share, abs=0.01)
+    assert torch.allclose(drawn.amax(0), (whole / (1 - share)).clamp(max=1)), "as much is seen on average"
+    drawings[0].rendering.image.sum().backward()
+    pulls = drawings[0].probe.grad.abs().amax(-1)
+    assert pulls[drawn[0] > 0].max() > 0 and not pulls[drawn[0] == 0].any()
+
+
+@pytest.mark.parametrize("at", [13, 28])
+def test_what_is_left_out_is_the_same_after_an_interruption(at):
+    scene, whole, resumed = crowded_scene(), PlusMethod(OPTIONS), PlusMethod(OPTIONS)
+    for record in whole.fit(scene, Budget(30)):
+        if record.iteration == at:
+            resumed.load_state(whole.state())
+    list(resumed.fit(scene, Budget(30)))
+    assert_same_but_time(resumed.state(), whole.state())
 
 
 def test_degrees_come_each_tenth_and_means_are_faster_than_those_of_3dgs():
