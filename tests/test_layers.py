@@ -15,6 +15,7 @@ import pytest
 ROOMS = (
     "padgs.registry",
     "padgs.checks",
+    "padgs.extras",
     "padgs.results",
     "padgs.stopwatch",
     "padgs.sphere",

@@ -7,6 +7,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+from padgs.extras import installing
+
 PACKAGES = {  # choice of conf/launcher -> module of its plugin, extra of pyproject.toml
     "local": ("hydra_plugins.hydra_joblib_launcher", "launchers"),
     "slurm": ("hydra_plugins.hydra_submitit_launcher", "launchers"),
@@ -27,7 +29,7 @@ def missing_plugin(arguments: Sequence[str]) -> str | None:
         except ModuleNotFoundError:  # there are no plugins at all
             found = False
         if not found:
-            return f"launcher={name} needs {module.partition('.')[2]}: pip install 'padgs[{extra}]'"
+            return f"launcher={name} needs {module.partition('.')[2]}: {installing(extra)}"
     return None
 
 

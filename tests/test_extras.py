@@ -1,0 +1,11 @@
+"""Whoever lacks an extra is told a command that installs it where it is missing."""
+
+import sys
+
+from padgs.multirun.launchers import missing_plugin
+
+
+def test_what_is_missing_is_installed_for_the_python_that_misses_it(monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr(sys, "executable", "/my place/python")
+    assert "'/my place/python' -m pip install 'padgs[launchers]'" in str(missing_plugin(["launcher=slurm"]))
