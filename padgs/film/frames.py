@@ -6,12 +6,14 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from fractions import Fraction
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from PIL import Image
 from torch import Tensor
 
 from padgs.data.replacing import replacing
+from padgs.extras import installing
 from padgs.film.spherical import mark_spherical
 from padgs.render import Rendering
 from padgs.scene import View
@@ -37,7 +39,8 @@ def write_film(
     """Draw the views and write them, in order.
 
     Args:
-        to: *.mp4, or a folder for PNGs. A film that is there is replaced once the new one is complete.
+        to: *.mp4, or a folder for PNGs, where they appear once all are drawn. A film that is there is replaced once the
+            new one is complete.
         views, draw: what is drawn, and who does it.
         fps: frames per second of an .mp4.
         unit: of the scene, which depths are shown and stored in.
@@ -60,7 +63,7 @@ def write_film(
         if film:
             puts = [stack.enter_context(_film(place, views[0], fps, spherical)) for place in places]
         else:
-            puts = [_folder(place) for place in places]
+            puts = [stack.enter_context(_folder(place)) for place in places]
         for number, view in enumerate(views):
             rendering = draw(view)
             puts[0](eight_bit(rendering.image))
@@ -74,16 +77,20 @@ def _sixteen_bit(depth: Tensor) -> np.ndarray:
     return (depth * DEPTH_STEPS).round().clamp(0, 2**16 - 1).cpu().numpy().astype(np.uint16)
 
 
-def _folder(place: Path) -> Put:
+@contextmanager
+def _folder(place: Path) -> Iterator[Put]:
     place.mkdir(parents=True, exist_ok=True)
     if stale := next(place.glob("*.png"), None):
         raise ValueError(f"{place} holds pictures already, such as {stale.name}; name another folder with --to")
     numbers = iter(range(1, 1 << 30))
+    with TemporaryDirectory(prefix=".", dir=place) as draft:  # pictures of a film that is cut off would bar the next
 
-    def put(frame: np.ndarray) -> None:
-        Image.fromarray(frame).save(place / f"{next(numbers):05d}.png")
+        def put(frame: np.ndarray) -> None:
+            Image.fromarray(frame).save(Path(draft) / f"{next(numbers):05d}.png")
 
-    return put
+        yield put
+        for picture in sorted(Path(draft).iterdir()):
+            picture.replace(place / picture.name)
 
 
 @contextmanager
@@ -93,9 +100,7 @@ def _film(place: Path, view: View, fps: float, spherical: bool) -> Iterator[Put]
     try:
         import av
     except ImportError as error:
-        raise ValueError(
-            f"writing {place} needs PyAV: pip install 'padgs[video]'; a folder for PNGs does not"
-        ) from error
+        raise ValueError(f"writing {place} needs PyAV: {installing('video')}; a folder for PNGs does not") from error
     place.parent.mkdir(parents=True, exist_ok=True)
     with replacing(place) as draft:
         with av.open(str(draft), "w") as film:

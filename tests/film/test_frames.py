@@ -33,3 +33,13 @@ def test_a_film_that_is_cut_off_leaves_the_earlier_one(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         write_film(tmp_path / "a.mp4", 100 * [VIEW], lambda view: SHOWN, fps=10, unit=1, progress=stop)
     assert [path.read_text() for path in tmp_path.iterdir()] == ["the earlier one"]
+
+
+def test_pictures_that_are_cut_off_do_not_bar_the_next(tmp_path):
+    def stop(done):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_film(tmp_path / "frames", 2 * [VIEW], lambda view: SHOWN, fps=10, unit=1, progress=stop)
+    write_film(tmp_path / "frames", 2 * [VIEW], lambda view: SHOWN, fps=10, unit=1)
+    assert sorted(path.name for path in (tmp_path / "frames").iterdir()) == ["00001.png", "00002.png"]
