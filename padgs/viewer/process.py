@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import sys
 import time
+import webbrowser
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing import get_context, parent_process
@@ -12,28 +15,50 @@ from pathlib import Path
 from padgs import results
 from padgs.runs import checkpoint
 from padgs.runs.folder import RunFolder
+from padgs.runs.lock import RunBusy, held
 from padgs.runs.opened import OpenedRun, load_run
-from padgs.viewer.server import LOCAL, PORT, serving, viser_module
+from padgs.viewer.server import LOCAL, PORT, is_local, serving, viser_module
 
 LOOKS = 0.5  # seconds between two looks at whether something is there, or still there
 PATIENCE = 5.0  # seconds that a server has to end
 
 
 def await_checkpoint(folder: str | Path) -> None:
-    """Return when a run has its first checkpoint, or can have none any more: opening it then says what is wrong."""
-    files, said = RunFolder(Path(folder)), False
-    while not checkpoint.exists(files.checkpoint) and _is_wanted():
-        begun = parent_process() is not None or (files.path / results.CONFIG_NAME).is_file()
-        if not begun or (files.path / results.FILE_NAME).exists():
+    """Return when a run has its first checkpoint, or can have none any more: opening it then says what is wrong.
+
+    Raises:
+        ValueError: it was begun, but nobody trains it.
+    """
+    files, said, beside = RunFolder(Path(folder)), False, parent_process() is not None
+
+    def decided() -> bool:
+        return checkpoint.exists(files.checkpoint) or (files.path / results.FILE_NAME).exists()
+
+    while not decided() and _is_wanted():
+        if not beside and not (files.path / results.CONFIG_NAME).is_file():
             return
+        # Training beside which this process stands may not hold its lock yet; what ended just now is looked at again.
+        if not beside and _is_left(files.path) and not decided():
+            raise ValueError(f"{folder} has no checkpoint, and nobody trains it; start the same padgs-run again")
         if not said:
             print(f"waiting for the first checkpoint of {folder}  (Ctrl-C ends it)", flush=True)
         said = True
         time.sleep(LOOKS)
 
 
-def serve(runs: list[OpenedRun], *, host: str = LOCAL, port: int = PORT) -> None:
+def _is_left(folder: Path) -> bool:
+    """Whether nobody works on a run, as far as can be told."""
+    try:
+        with held(folder):
+            return True
+    except (RunBusy, OSError):  # a folder of somebody else, which cannot be locked from here
+        return False
+
+
+def serve(runs: list[OpenedRun], *, host: str = LOCAL, port: int = PORT, browse: bool = False) -> None:
     """Serve one run, or two to compare, and say where, until the process that started this one, if any, is gone.
+
+    Where only this machine is served, `browse` opens the page as well.
 
     Raises:
         ValueError, OSError, KeyboardInterrupt: as `padgs.viewer.server.serving` does, and Ctrl-C.
@@ -41,8 +66,16 @@ def serve(runs: list[OpenedRun], *, host: str = LOCAL, port: int = PORT) -> None
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # libraries take it for a crash otherwise
     with serving(runs, host=host, port=port) as server:
         print(f"{server.address}  (Ctrl-C ends it)", flush=True)
+        if browse and is_local(host):
+            webbrowser.open(server.address)
         while _is_wanted():
             time.sleep(LOOKS)
+
+
+def has_screen() -> bool:
+    """Whether this was started at a screen with windows: elsewhere browsers that draw text would take the terminal."""
+    windows = sys.platform == "darwin" or not {"DISPLAY", "WAYLAND_DISPLAY"}.isdisjoint(os.environ)
+    return sys.stdout.isatty() and windows and "SSH_CONNECTION" not in os.environ
 
 
 def _is_wanted() -> bool:

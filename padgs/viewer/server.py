@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import threading
 import warnings
 from collections.abc import Iterator, Sequence
@@ -14,11 +15,13 @@ import numpy as np
 import torch
 
 from padgs.data.trajectory import gravity
+from padgs.extras import installing
 from padgs.runs.opened import OpenedRun
 from padgs.viewer.page import Page
 from padgs.viewer.picture import Box, Gallery
 
 LOCAL, PORT = "127.0.0.1", 8080
+EVERYWHERE = "0.0.0.0"  # any address of this machine
 EVERY = 1.0  # seconds between two looks at whether there is a newer checkpoint
 
 
@@ -49,7 +52,7 @@ def serving(runs: Sequence[OpenedRun], *, host: str = LOCAL, port: int = PORT) -
     viser = viser_module()
     warnings.filterwarnings("ignore", message="Queued .* on a closed connection")  # a page left while it was drawn for
     galleries, scene = [Gallery(run) for run in runs], runs[0].scene
-    local = host in (LOCAL, "localhost")
+    local = is_local(host)
     with redirect_stdout(None):  # it draws a box around addresses, whatever `verbose` says
         server = viser.ViserServer(host=host, port=port, label=f"padgs: {scene.name}", verbose=False)
     up = np.array(gravity(torch.stack([view.cam_from_world for view in scene.train])).up)
@@ -61,7 +64,8 @@ def serving(runs: Sequence[OpenedRun], *, host: str = LOCAL, port: int = PORT) -
     server.initial_camera.look_at = center + 0.3 * scene.unit * first.cam_from_world[2, :3].cpu().numpy()
     server.initial_camera.up = up
     box, drawing = box_of(scene.points), threading.Lock()
-    found = Serving(f"http://{'localhost' if local else host}:{server.get_port()}")
+    name = "localhost" if local else own_address() if host == EVERYWHERE else host
+    found = Serving(f"http://{name}:{server.get_port()}")
 
     @server.on_client_connect
     def _(client: Any) -> None:
@@ -87,6 +91,21 @@ def serving(runs: Sequence[OpenedRun], *, host: str = LOCAL, port: int = PORT) -
             server.stop()
 
 
+def is_local(host: str) -> bool:
+    """Whether only this machine is served."""
+    return host in (LOCAL, "localhost")
+
+
+def own_address() -> str:
+    """What others in the network call this machine; localhost where there is no network."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as way:
+        try:
+            way.connect(("192.0.2.1", 9))  # no machine has this address: the way out is looked up, nothing is sent
+        except OSError:
+            return "localhost"
+        return way.getsockname()[0]
+
+
 def viser_module() -> ModuleType:
     """The package that serves.
 
@@ -96,7 +115,7 @@ def viser_module() -> ModuleType:
     try:
         import viser
     except ImportError as error:
-        raise ValueError("the viewer needs viser: pip install 'padgs[view]'") from error
+        raise ValueError(f"the viewer needs viser: {installing('view')}") from error
     return viser
 
 

@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 import padgs
 from padgs.cli.commands import app
+from padgs.extras import installing
 from padgs.viewer.page import BOTH
 from padgs.viewer.server import box_of, serving
 
@@ -40,6 +41,13 @@ def test_the_page_is_served_here_only_and_ends(run):
         assert b"<html" in urlopen(server.address, timeout=20).read()[:500]
     with pytest.raises(OSError, match="refused"):
         urlopen(server.address, timeout=5)
+
+
+@WITH_VISER
+def test_a_page_for_the_network_has_an_address_that_others_can_open(run):
+    with serving([run], host="0.0.0.0", port=8410) as server:
+        assert "0.0.0.0" not in server.address
+        assert b"<html" in urlopen(server.address, timeout=20).read()[:500]
 
 
 @WITH_VISER
@@ -84,7 +92,7 @@ def test_a_browser_shows_all_that_can_be_asked_for(run, tmp_path):
 def test_without_viser_the_way_out_is_said(run, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     said = CliRunner().invoke(app, ["view", str(run.folder)])
-    assert said.exit_code == 1 and "pip install 'padgs[view]'" in said.stderr
+    assert said.exit_code == 1 and installing("view") in said.stderr
 
 
 def test_a_folder_that_is_no_run_is_refused(run, tmp_path):

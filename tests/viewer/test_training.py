@@ -1,6 +1,7 @@
 """Runs that are still in training: followed from checkpoint to checkpoint, and served beside their training."""
 
 import json
+import re
 import shutil
 import sys
 import threading
@@ -16,9 +17,11 @@ from tiny_run import tiny_run
 
 import padgs
 from padgs import results
+from padgs.extras import installing
 from padgs.learning.trainee import State
 from padgs.runs import checkpoint
 from padgs.runs.config import WATCHED, RunOptions
+from padgs.runs.folder import RunFolder
 from padgs.viewer import server
 from padgs.viewer.picture import Gallery, Look
 from padgs.viewer.process import await_checkpoint, shown
@@ -141,14 +144,21 @@ def test_the_first_checkpoint_is_waited_for(folder, tmp_path, capsys):
     await_checkpoint(tmp_path / "nothing")
     assert not capsys.readouterr().out
     moved = (folder / "checkpoint").rename(tmp_path / "elsewhere")
-    waiting = threading.Thread(target=await_checkpoint, args=(folder,), daemon=True)
-    waiting.start()
-    waiting.join(0.2)
-    assert waiting.is_alive()
-    moved.rename(folder / "checkpoint")
-    waiting.join(30)
-    assert not waiting.is_alive()
+    with RunFolder(folder).locked():  # as training does
+        waiting = threading.Thread(target=await_checkpoint, args=(folder,), daemon=True)
+        waiting.start()
+        waiting.join(0.2)
+        assert waiting.is_alive()
+        moved.rename(folder / "checkpoint")
+        waiting.join(30)
+        assert not waiting.is_alive()
     assert capsys.readouterr().out.count("waiting for the first checkpoint") == 1
+
+
+def test_a_run_that_was_killed_before_its_first_checkpoint_is_not_waited_for(folder):
+    shutil.rmtree(folder / "checkpoint")
+    with pytest.raises(ValueError, match="nobody trains it; start the same padgs-run again"):
+        await_checkpoint(folder)
 
 
 def test_a_run_that_failed_before_its_first_checkpoint_is_not_waited_for(folder):
@@ -176,7 +186,7 @@ def test_a_run_is_shown_beside_its_training_and_no_longer(folder, capfd):
 
 def test_without_viser_no_training_begins(folder, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(ValueError, match=r"pip install 'padgs\[view\]'"), shown(folder, None, "cpu"):
+    with pytest.raises(ValueError, match=re.escape(installing("view"))), shown(folder, None, "cpu"):
         raise AssertionError("it began")
 
 
