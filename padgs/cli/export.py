@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.opening import DataPath, Run, opened
+from padgs.cli.opening import DataPath, Run, naming_data, opened, writing
 from padgs.cli.refusing import refusing, show
 
 
@@ -44,21 +44,24 @@ def export(
     refuse_impossible(path)
     with Console().status("opening the run") as status:
         trained = opened(run, data)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        found = exported(
-            trained,
-            lessons=lessons,
-            stand_up=upright or path.suffix == ".html",
-            smooth=smooth or path.suffix == ".html",
-            progress=lambda done: status.update(f"lesson {done} of {lessons}"),
-        )
+        with writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+        with naming_data(run):
+            found = exported(
+                trained,
+                lessons=lessons,
+                stand_up=upright or path.suffix == ".html",
+                smooth=smooth or path.suffix == ".html",
+                progress=lambda done: status.update(f"lesson {done} of {lessons}"),
+            )
         status.update(f"writing {path}")
-        if points:
-            cloud = point_cloud(found.splats)
-            write_ply(path, cloud)
-            what = f"{len(cloud.points)} points"
-        else:
-            write_splats(path, found.splats, found.notes, begin=found.begin)
-            what = f"{len(found.splats)} Gaussians"
+        with writing(path):
+            if points:
+                cloud = point_cloud(found.splats)
+                write_ply(path, cloud)
+                what = f"{len(cloud.points)} points"
+            else:
+                write_splats(path, found.splats, found.notes, begin=found.begin)
+                what = f"{len(found.splats)} Gaussians"
     show("\n".join(f"  {note}" for note in found.notes))
     show(f"{path}: {what}, {path.stat().st_size / 1e6:.1f} MB")

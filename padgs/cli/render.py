@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.opening import DataPath, Run, opened
+from padgs.cli.opening import DataPath, Run, naming_data, opened, writing
 from padgs.cli.refusing import refusing
 
 
@@ -50,7 +50,8 @@ def render(
         raise ValueError(f"a film of {seconds} seconds at {fps} frames per second has no frame; both must be > 0")
     with Console().status("opening the run") as status:
         found = opened(run, data)
-        scene = found.scene
+        with naming_data(run):
+            scene = found.scene
         trained = scene.train[0]
         if camera == "panorama":
             lens = Panorama(width or trained.width, (width or trained.width) // 2)
@@ -69,15 +70,17 @@ def render(
             View(f"frame {number}", pose.to(trained.cam_from_world), lens.width, lens.height, lens=lens)
             for number, pose in enumerate(poses)
         ]
-        places = write_film(
-            Path(to) if to else found.folder / "film.mp4",
-            views,
-            found.through(lens).render,
-            fps=fps,
-            unit=scene.unit,
-            depth=depth,
-            spherical=camera == "panorama",
-            progress=lambda done: status.update(f"frame {done} of {len(views)}"),
-        )
+        film = Path(to) if to else found.folder / "film.mp4"
+        with writing(film):
+            places = write_film(
+                film,
+                views,
+                found.through(lens).render,
+                fps=fps,
+                unit=scene.unit,
+                depth=depth,
+                spherical=camera == "panorama",
+                progress=lambda done: status.update(f"frame {done} of {len(views)}"),
+            )
     for place in places:
         print(f"{place}: {len(views)} frames of {lens.width}x{lens.height}")

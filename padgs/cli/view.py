@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.opening import DataPath, Run, opened
+from padgs.cli.opening import DataPath, Run, naming_data, opened
 from padgs.cli.refusing import refusing
 
 
@@ -22,17 +22,19 @@ def view(
     data: DataPath = None,
 ) -> None:
     """Walk through a run in the browser, drawn here by the run's own renderer; one in training is followed."""
-    from padgs.viewer.process import await_checkpoint, serve
+    from padgs.viewer.process import await_checkpoint, has_screen, serve
     from padgs.viewer.server import LOCAL, PORT
 
-    runs = []
+    runs, names = [], []
     try:
         for folder in (run, beside) if beside else (run,):
             await_checkpoint(folder)
-            runs.append(opened(folder, data))
-        if beside and runs[0].scene.name != runs[1].scene.name:
-            names = " and ".join(found.scene.name for found in runs)
-            raise ValueError(f"{run} and {beside} are of two scenes, {names}; name two runs of one scene")
-        serve(runs, host=host or LOCAL, port=port or PORT)
+            runs.append(found := opened(folder, data))
+            with naming_data(folder):
+                names.append(found.scene.name)
+        if len({*names}) > 1:
+            scenes = " and ".join(names)
+            raise ValueError(f"{run} and {beside} are of two scenes, {scenes}; name two runs of one scene")
+        serve(runs, host=host or LOCAL, port=port or PORT, browse=has_screen())
     except KeyboardInterrupt:
         print()

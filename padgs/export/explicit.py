@@ -12,6 +12,7 @@ import padgs
 from padgs.anchors.trainee import AnchorTrainee
 from padgs.baselines.sc_omnigs import SCOmniGSMethod, aligned
 from padgs.data.capture import Cloud
+from padgs.data.errors import DataError
 from padgs.data.trajectory import gravity
 from padgs.export.bake import baked, cameras_around, teach
 from padgs.export.moved import moved, upright
@@ -36,7 +37,9 @@ class Exported:
 
     splats: Splats
     notes: tuple[str, ...]  # a line each
-    begin: Tensor  # [2, 3] where a viewer may begin, and what it looks at: those of the camera in the middle of all
+    # [2, 3] where a viewer may begin, and what it looks at: those of the camera in the middle of all; None where that
+    # is not known
+    begin: Tensor | None
 
 
 def exported(
@@ -59,7 +62,7 @@ def exported(
 
     Raises:
         ValueError: the run has no Gaussians.
-        DataError: its data set, which this takes, is not where it was.
+        DataError: its data set is not where it was, and all but trained Gaussians, as they are, takes it.
     """
     trainee = run.method.trainee
     config = run.config.render
@@ -82,12 +85,19 @@ def exported(
     kind = f"{config.low_pass:g} in {config.resolved_low_pass_kind}"
     notes.append(f"trained with projection {config.projection} and a low-pass of {kind}; viewers have others")
     notes.append(AXES)
-    if run.scene.origin.any():
-        place = " ".join(f"{number:.10g}" for number in run.scene.origin.tolist())
+    try:
+        scene = run.scene
+    except DataError:
+        if stand_up:
+            raise
+        notes.append("the data set is not where it was, so that it is not known whether this world has its origin")
+        return Exported(splats, tuple(notes), None)
+    if scene.origin.any():
+        place = " ".join(f"{number:.10g}" for number in scene.origin.tolist())
         notes.append(f"the origin of this world is at {place} in that of the data set, too far for float32")
-    begin = _middle(run.scene.train, run.scene.unit)
+    begin = _middle(scene.train, scene.unit)
     if stand_up:
-        up = torch.tensor(gravity(torch.stack([view.cam_from_world for view in run.scene.train])).up)
+        up = torch.tensor(gravity(torch.stack([view.cam_from_world for view in scene.train])).up)
         turn = upright(up)
         splats, begin = moved(splats, turn), turn(begin)
         notes[notes.index(AXES)] = "units of the scene, turned so that -y is up"

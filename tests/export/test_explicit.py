@@ -45,6 +45,12 @@ def test_an_exported_run_scores_as_it_did(splat_run):
     (splat_run / "splats.ply").unlink()
 
 
+def test_gaussians_are_exported_as_they_are_without_the_data(splat_run, tmp_path):
+    said = export(str(splat_run), "--data", str(tmp_path / "gone"), "--to", str(tmp_path / "a.ply"))
+    assert said.exit_code == 0 and "the data set is not where it was" in said.output
+    assert len(read_splats(tmp_path / "a.ply")) == len(padgs.load_run(splat_run).method.trainee.splats)
+
+
 def test_for_viewers_gaussians_are_as_wide_as_the_finest_view_draws_them(splat_run, tmp_path):
     said = export(str(splat_run), "--smooth", "--to", str(tmp_path / "smooth.ply"))
     assert said.exit_code == 0 and "as wide as the finest training view drew it" in " ".join(said.output.split())
@@ -96,11 +102,14 @@ def test_anchors_are_baked_and_the_loss_is_said_and_written(tmp_path_factory, tm
 
 def test_what_cannot_be_exported_says_why(tmp_path_factory, tmp_path, splat_run):
     folder = tiny_run(tmp_path_factory, "method=egonerf_small", "train.iterations=2")
+    (tmp_path / "file").touch()
     for arguments, message in (
         ((str(folder),), "egonerf has no Gaussians to export; padgs render and padgs view"),
         ((str(tmp_path / "RUNX"),), "has no config.yaml"),
         ((str(splat_run), "--to", "a.obj"), "none of the known formats"),
         ((str(splat_run), "--points", "--to", str(tmp_path / "a.compressed.ply")), "is no plain .ply"),
+        ((str(splat_run), "--to", str(tmp_path / "file" / "a.ply")), "name another place with --to"),
+        ((str(splat_run), "--upright", "--to", str(tmp_path / "a.ply"), "--data", "gone"), f"data of {splat_run}"),
     ):
         said = export(*arguments)
         assert said.exit_code == 1 and message in said.output + said.stderr

@@ -99,6 +99,14 @@ def test_pictures_are_not_mixed_with_others(folder, tmp_path):
     assert "holds pictures already" in render(*arguments).stderr
 
 
+def test_another_place_or_other_data_can_be_named(folder, tmp_path):
+    (tmp_path / "file").touch()
+    said = render(str(folder), "--to", str(tmp_path / "file"), "--seconds", "0.1", "--fps", "20")
+    assert said.exit_code == 1 and f"cannot write {tmp_path}/file: " in said.stderr and "with --to" in said.stderr
+    said = render(str(folder), "--data", str(tmp_path / "gone"), "--to", str(tmp_path / "f"))
+    assert said.exit_code == 1 and f"it is the data of {folder}: if it has moved" in said.stderr
+
+
 def test_films_of_other_kinds_are_refused_before_anything_is_drawn(folder, tmp_path):
     said = render(str(folder), "--to", str(tmp_path / "x.avi"))
     assert said.exit_code == 1 and "x.avi is no .mp4" in " ".join(said.output.split())
