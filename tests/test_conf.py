@@ -30,6 +30,7 @@ from padgs.runs.config import RunOptions, TrainConfig
 from padgs.runs.typed import ConfigError
 from padgs.scoring.protocols import PROTOCOLS, ROAM_360_BOTTOM_CROP
 from padgs.stress.conditions import CONDITIONS
+from padgs.tracking.tracker import TrackingOptions
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
@@ -55,7 +56,7 @@ def test_without_arguments_all_values_are_the_defaults_of_the_dataclasses():
     assert config.render == PlusMethod.RENDER
     paper = composed("method=padgs")
     assert paper.options == PaDGSMethodOptions() and paper.render == RenderConfig()
-    assert config.run == RunOptions()
+    assert config.run == RunOptions() and config.tracking == TrackingOptions()
     assert replace(config.train, iterations=1) == TrainConfig(iterations=1)
     assert config.protocols == {name: PROTOCOLS[name] for name in ("paper", "sphere")}
     assert config.data.path is None and config.data.generator == {"scene": "room"}

@@ -25,11 +25,11 @@ def track(
     found, broken = results.read_all(Path(runs))
     for error in broken:
         show(f"left out: {error}")
-    trackers: dict[str, Tracker] = {}
+    asked, trackers = TrackingOptions("mlflow", uri or None), dict[str, Tracker]()
     for folder, result in found.items():
         experiment = " ".join(name for name in result.experiments if name != results.BY_ITSELF)
         if experiment not in trackers:
-            trackers[experiment] = Tracker(TrackingOptions(uri=uri or None), Path(runs), experiment, show)
+            trackers[experiment] = Tracker(asked, Path(runs), experiment, show)
         trackers[experiment].update(folder)
         if not trackers[experiment].on:
             raise typer.Exit(1)

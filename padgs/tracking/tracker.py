@@ -16,12 +16,13 @@ from typing import TYPE_CHECKING
 from filelock import FileLock
 
 from padgs.checks import check_known
+from padgs.extras import installing
 from padgs.results import Result
 
 if TYPE_CHECKING:
     from padgs.tracking.mlflow_mirror import Mirror
 
-KINDS = ("mlflow", "none")
+KINDS = ("auto", "mlflow", "none")
 DEFAULT_EXPERIMENT = "padgs"  # of mlflow, for runs of no experiment of ours
 SERVERS = ("http", "databricks")  # how their URIs begin
 SECONDS_BETWEEN_LOOKS = 30.0  # at a run in progress
@@ -39,16 +40,21 @@ SETTINGS = {
 class TrackingOptions:
     """The `tracking` group of the configuration; no part of a run."""
 
-    kind: str = "mlflow"  # or none
+    kind: str = "auto"  # auto | mlflow | none; auto: mlflow where it is installed, and not a word where it is not
     uri: str | None = None  # of a server or database; None = mlflow.db in run.folder
     telemetry: bool = False  # whether mlflow may report its use to its makers
 
     def __post_init__(self) -> None:
         check_known(self, kind=KINDS)
 
+    @property
+    def asked(self) -> bool:
+        """Whether somebody counts on it."""
+        return self.kind == "mlflow" or (self.kind == "auto" and self.uri is not None)
+
 
 class Tracker:
-    """Keeps mlflow up to date about the runs of one experiment, or says once why it does not."""
+    """Keeps mlflow up to date about the runs of one experiment, or says once why it does not, to who asked for it."""
 
     def __init__(
         self, options: TrackingOptions, runs: Path, experiment: str, say: Callable[[str], None], multirun: str = ""
@@ -67,7 +73,9 @@ class Tracker:
         self._mirror: Mirror | None = None
         self.on = options.kind != "none"
         if self.on and importlib.util.find_spec("mlflow") is None:
-            self._give_up("runs are not mirrored into mlflow: pip install 'padgs[mlflow]', or set tracking=none")
+            self.on = False
+            if options.asked:
+                say(f"runs are not mirrored into mlflow: {installing('mlflow')}, or set tracking=none")
 
     @property
     def uri(self) -> str:

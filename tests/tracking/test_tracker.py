@@ -8,6 +8,7 @@ from typer.testing import CliRunner
 
 from padgs import results
 from padgs.cli.commands import app
+from padgs.extras import installing
 from padgs.results import Result, Scores
 from padgs.tracking import tracker as tracking
 from padgs.tracking.mlflow_mirror import batches
@@ -50,16 +51,20 @@ def test_none_needs_nothing_and_writes_nothing(tmp_path, said, monkeypatch):
     assert said == [] and [path.name for path in tmp_path.iterdir()] == ["room_padgs_1"]
 
 
-def test_without_mlflow_one_line_says_so(tmp_path, said, monkeypatch):
+@pytest.mark.parametrize(
+    ("options", "lines"), [(TrackingOptions(), 0), (TrackingOptions("mlflow"), 1), (TrackingOptions(uri="http://a"), 1)]
+)
+def test_without_mlflow_one_line_says_so_to_who_asked_for_it(tmp_path, said, monkeypatch, options, lines):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    tracker = Tracker(TrackingOptions(), tmp_path, "tau", said.append)
+    tracker = Tracker(options, tmp_path, "tau", said.append)
     tracker.update(make_run(tmp_path))
     tracker.finish([])
-    assert len(said) == 1 and "pip install" in said[0] and "tracking=none" in said[0]
+    assert not tracker.on and len(said) == lines
+    assert all(installing("mlflow") in line and "tracking=none" in line for line in said)
 
 
 def test_an_unknown_kind_is_refused():
-    with pytest.raises(ValueError, match="unknown kind 'wandb'; known: mlflow, none"):
+    with pytest.raises(ValueError, match="unknown kind 'wandb'; known: auto, mlflow, none"):
         TrackingOptions("wandb")
 
 
