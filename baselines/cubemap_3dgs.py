@@ -18,6 +18,7 @@ from padgs.data.perspectives import perspective_scene, solid_angle, square_lens
 from padgs.learning.budget import Budget
 from padgs.learning.loop import Record, Stage, Trainer
 from padgs.learning.trainee import Trainee
+from padgs.learning.views.corrections import GIVEN, LEARNED
 from padgs.render import RenderOptions
 from padgs.render.config import RenderConfig
 from padgs.render.contract import check_camera
@@ -74,6 +75,12 @@ class Cubemap3DGSMethod(SplatMethod):
                 f"train.weight is {self.train_options.weight}, but the rows of perspective views have no latitude; "
                 "set uniform"
             )
+        for learned in ("exposures", "poses"):
+            if getattr(self.train_options, learned) == LEARNED:
+                raise ValueError(
+                    f"train.{learned} is {LEARNED}, but each of the views that are cut from one photograph would learn "
+                    f"its own; leave it at {GIVEN}, or take omnigs"
+                )
         refuse_polar_threshold(self.options, "perspective views have no poles")
         super()._refuse_impossible()
         check_camera(self.lens(Panorama(8, 4)), of_cut_views(self.render_config.options(scene_unit=1.0)))

@@ -126,10 +126,11 @@ def contributions(gaussians: Gaussians, view: View, options: RenderOptions, back
 
 def axes_of(covariances: Tensor) -> tuple[Tensor, Tensor]:
     """Scales [N, 3] and quaternions (w, x, y, z) [N, 4] of covariances [N, 3, 3]; the inverse of R diag(s)^2 R^T."""
-    squares, axes = torch.linalg.eigh(covariances.double())
+    # On the CPU, for a GPU takes kilobytes for each, and refuses more than two million.
+    squares, axes = torch.linalg.eigh(covariances.double().cpu())
     axes[:, :, 0] *= torch.linalg.det(axes)[:, None]  # no mirror
     scales = squares.clamp(min=squares[:, -1:] * FLATTEST**2).sqrt()
-    quats = torch.from_numpy(Rotation.from_matrix(axes.cpu().numpy()).as_quat()).roll(1, -1)
+    quats = torch.from_numpy(Rotation.from_matrix(axes.numpy()).as_quat()).roll(1, -1)
     return scales.to(covariances), quats.to(covariances)
 
 

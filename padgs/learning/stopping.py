@@ -21,6 +21,7 @@ FADE = 0.15  # share of the schedule, at its end, that a stopped run still goes 
 GAIN = 0.02  # dB, less than which ...
 PATIENCE = 0.05  # ... within this share of the schedule is none
 EVERY = 0.01  # share of the schedule between two measurements
+SETTLED = 0.01  # share of its parts, by which a model that is neither growing nor thinned out may still change
 BEST = 1e-10  # mean square error that is as good as none: 100 dB
 
 
@@ -69,10 +70,12 @@ class Plateau:
     def reached(self, value: float, parts: int, moment: int) -> bool:
         """Take in what was measured, dB, of a model of so many parts; whether the average gains next to nothing.
 
-        Not while the model grows: what has just multiplied is worse before it is better.
+        Not while parts come and go: what has just multiplied, or lost those that are least missed, is worse before it
+        is better.
         """
         span = round(PATIENCE / EVERY)
         averages, counts = self.state["averages"][-span:], [*self.state["parts"][-span:], parts]
         averages = [*averages, averages[-1] + (value - averages[-1]) / span if averages else value]
         self.state = {"next": moment + self._every, "averages": averages, "parts": counts}
-        return len(averages) > span and parts <= counts[0] and averages[-1] - averages[0] < GAIN
+        is_settled = max(counts) - min(counts) <= SETTLED * parts
+        return len(averages) > span and is_settled and averages[-1] - averages[0] < GAIN

@@ -98,6 +98,7 @@ def done(config: RunConfig, console: Console, watch: Watch) -> Result:
         from padgs.need.searching import search  # scipy.stats, which other runs need not wait for
 
         run = load_run(session.folder.path, data_path=config.data.path, device=config.run.device)
+        run.scene = session.scene  # whose panoramas are loaded
         search(run, NEED_STATED, console, watch.stop_requested)
     return result
 

@@ -76,3 +76,8 @@ def available() -> bool:
 def works_on(_: torch.device) -> bool:
     """Whether the library is there; every CPU can run it."""
     return available()
+
+
+def require(_: torch.device) -> None:
+    """Raise OSError, as `library` does, where it is not there."""
+    library()

@@ -192,9 +192,21 @@ def available() -> bool:
 def works_on(device: torch.device) -> bool:
     """Whether the library is there, and was compiled for this GPU."""
     try:
-        return available() and queue(device) is not None
-    except RuntimeError:
+        require(device)
+    except (OSError, RuntimeError):
         return False
+    return True
+
+
+def require(device: torch.device) -> None:
+    """Say why nothing can be drawn on this device, if so.
+
+    Raises:
+        OSError: as `library` does.
+        RuntimeError: as `queue` does.
+    """
+    library()
+    queue(device)
 
 
 def device_type() -> str:

@@ -81,12 +81,13 @@ def keep(search: Search, epsilon: float) -> Result:
     assert run.result is not None, "only of a finished run"
     found, step = need(search), search.steps[number]
     found["kept"] = {"epsilon": epsilon, "degree": step.degree, "loss": loss(search.steps, number)}
-    variant = ", ".join(filter(None, (run.config.variant, f"need {epsilon:g} dB")))
+    stated = f"need {epsilon:g} dB"
+    variant = ", ".join(filter(None, (run.config.variant, stated)))
     values, options = {**run.result.config, "variant": variant}, run.config.options
     if step.degree is not None:
         values["method"] = {**values["method"], "sh_degree": step.degree}
         options = replace(options, sh_degree=step.degree)
-    path = run.folder.with_name(f"{run.folder.name}_need-{epsilon:g}")
+    path = run.folder.resolve().with_name(f"{run.result.run}_need-{epsilon:g}")  # whatever its folder is called now
     folder = RunFolder(path, identity(values, run.result.fingerprint))
     before = folder.result()
     if before is not None and _is_same(before.need, found):
@@ -113,7 +114,7 @@ def keep(search: Search, epsilon: float) -> Result:
         made: Result = replace(
             run.result,
             run=path.name,
-            variant=variant,
+            variant=", ".join(filter(None, (run.result.variant, stated))),  # stress, and how it ended, included
             counts={**size.counts, "parameters": size.parameters, **start},
             model_bytes=size.bytes,
             timing=timing,

@@ -23,11 +23,12 @@ def search(run: OpenedRun, epsilon: float, console: Console, asked: Callable[[],
         asked: whether to stop, besides signals.
 
     Raises:
-        ValueError: the run is none that can be searched.
+        ValueError: the run is none that can be searched, or its data set has changed since.
         RunBusy: another process searches it.
         Interrupted, Failure, CheckpointError, RunFolderError: as `padgs.need.outcome.keep` does.
     """
+    run.refuse_other_data()
     with run.files.locked():
         kept = keep(Search(run, console.print, asked), epsilon)
     show(kept.need, console)
-    say(console, run.folder.with_name(kept.run), "bold")
+    say(console, run.folder.resolve().with_name(kept.run), "bold")

@@ -29,7 +29,7 @@ def show(need: Mapping[str, Any], console: Console) -> None:
         table.add_row(title, str(step["rows"]), share, str(step["blended"]), size, f"{step['frame_ms']:.1f}", *quality)
     console.print(table)
     kept = need["kept"]
-    if made := need["degrees"][f"{kept['epsilon']:g}"]:
+    if made := need["degrees"].get(f"{kept['epsilon']:g}"):  # none of models without harmonics
         degree = made[0]["degree"] if kept["degree"] is None else kept["degree"]
         losses = ", ".join(f"{one['loss']:.2f} dB with {one['degree']}" for one in made[1:])
         console.print(

@@ -74,6 +74,8 @@ class PlusOptions(SplatOptions):
         None where each Gaussian has `PLENTY` of them to be learned from; then more with the logarithm of what is
         missing, and all of `drop_share` where it has half as many.
         """
+        if gaussians == 0:
+            return 0.0
         return self.drop_share * min(max(math.log2(PLENTY * gaussians / pixels), 0.0), 1.0)
 
     def for_run(self, iterations: int) -> CloneSplitOptions:

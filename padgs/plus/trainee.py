@@ -91,8 +91,10 @@ class PlusTrainee(SplatTrainee):
         if share == 0:
             return None
         opacities = torch.sigmoid(self.splats.opacity_logits)
-        drawn = torch.rand(len(opacities), generator=self.densifier.generator) >= share
-        return drawn.to(opacities) * (1 / opacities).clamp(max=1 / (1 - share))
+        seed = int(torch.randint(2**62, (), generator=self.densifier.generator))
+        chance = torch.Generator(opacities.device).manual_seed(seed)  # there, so that nobody waits for a GPU
+        drawn = torch.rand(len(opacities), generator=chance, device=opacities.device) >= share
+        return drawn * (1 / opacities).clamp(max=1 / (1 - share))
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
         """Densify, choose whom to keep, bring the next SH degree into use, and average, where it is time to."""
@@ -139,7 +141,7 @@ class PlusTrainee(SplatTrainee):
     def load_state(self, state: State) -> None:
         """Become the model that `state` was taken of."""
         super().load_state(state)
-        self._moment = state.values.get("moment", 0)
+        self._moment = state.values.get("moment", self.iterations)  # older checkpoints left nothing out
         device = self.splats.means.device
         self.average = {name: mean.to(device, copy=True) for name, mean in state.under(AVERAGE).items()}
         self._cameras = state.tensors.get(CAMERAS, self._cameras)  # older checkpoints have none

@@ -97,17 +97,17 @@ def resolve_backend(backend: str, means: Tensor) -> str:
     library = LIBRARIES.get(means.device.type)
     if library is None or means.dtype != torch.float32:
         return "torch"
-    if library.available():
+    if library.works_on(means.device):
         return means.device.type
-    _say_that_native_is_missing(means.device.type)
+    _say_that_native_is_missing(means.device)
     return "torch"
 
 
-@cache  # once in a process, whatever the filters of the warnings module say
-def _say_that_native_is_missing(backend: str) -> None:
+@cache  # once in a process for each device, whatever the filters of the warnings module say
+def _say_that_native_is_missing(device: torch.device) -> None:
     from padgs.native import LIBRARIES
 
     try:
-        LIBRARIES[backend].library()
-    except OSError as error:
-        warnings.warn(f"rendering with backend torch, many times slower than {backend}: {error}", stacklevel=4)
+        LIBRARIES[device.type].require(device)
+    except (OSError, RuntimeError) as error:
+        warnings.warn(f"rendering with backend torch, many times slower than {device.type}: {error}", stacklevel=4)

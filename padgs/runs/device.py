@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import torch
 
 from padgs.native import cuda
@@ -12,6 +14,8 @@ DEVICES = ("auto", "cpu", "cuda")
 
 def chosen(name: str, render: RenderConfig) -> torch.device:
     """The device that `run.device` stands for; auto, its default, is a GPU that can draw this, else the CPU.
+
+    Warns where a GPU is left alone because the library for it is not there, or was not compiled for it.
 
     Raises:
         ValueError: cuda where torch finds no GPU, or backend cuda on the CPU.
@@ -25,6 +29,16 @@ def chosen(name: str, render: RenderConfig) -> torch.device:
         if name == "cpu":
             raise ValueError("render.backend=cuda draws on a GPU only, not with run.device=cpu; set run.device=auto")
         cuda.library()
-    draws = render.backend in ("auto", "cuda") and cuda.available()  # there, and faster than the CPU does
-    on_gpu = name == "cuda" or (name == "auto" and torch.cuda.is_available() and draws)
-    return torch.device("cuda", torch.cuda.current_device()) if on_gpu else torch.device("cpu")
+    if not torch.cuda.is_available() or name == "cpu":
+        return torch.device("cpu")
+    gpu = torch.device("cuda", torch.cuda.current_device())
+    if name == "cuda":
+        return gpu
+    if render.backend not in ("auto", "cuda"):  # torch on a GPU is slower than the CPU
+        return torch.device("cpu")
+    try:
+        cuda.require(gpu)
+    except (OSError, RuntimeError) as error:
+        warnings.warn(f"a GPU is here, but the CPU is used: {error}", stacklevel=2)
+        return torch.device("cpu")
+    return gpu

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,6 +14,7 @@ from omegaconf import OmegaConf
 from yaml import YAMLError
 
 from padgs import results
+from padgs.data.errors import DataError
 from padgs.film.paths import between
 from padgs.learning.method import Method
 from padgs.results import Result, Scores
@@ -68,10 +70,35 @@ class OpenedRun:
     def scene(self) -> Scene:
         """The scene that it was trained on, loaded when first asked for.
 
+        Warns where that has changed since: poses and units may be others than the model's.
+
         Raises:
             DataError: it is not where it was; `load_run(folder, data_path=...)` says where it is now.
         """
-        return scene_of(self.config, chosen(self.config.run.device, self.config.render))
+        scene = scene_of(self.config, chosen(self.config.run.device, self.config.render))
+        if not self._was_trained_on(scene):
+            warnings.warn(f"{self.folder} was trained on other data than {self._place} holds now", stacklevel=3)
+        return scene
+
+    def refuse_other_data(self) -> None:
+        """For whoever goes on training, or compares.
+
+        Raises:
+            DataError: its data set has changed since.
+        """
+        if not self._was_trained_on(self.scene):
+            raise DataError(
+                f"{self.folder} was trained on other data than {self._place} holds now; say with --data where "
+                "those are, or train again on these"
+            )
+
+    @property
+    def _place(self) -> str:
+        """Where its data are, in words."""
+        return str(self.config.data.path or "the generator")
+
+    def _was_trained_on(self, scene: Scene) -> bool:
+        return self.result is None or self.result.fingerprint == scene.fingerprint
 
     @property
     def scores(self) -> dict[str, Scores]:

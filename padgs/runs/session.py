@@ -13,6 +13,7 @@ from rich.console import Console
 
 from padgs import clock, data, results
 from padgs.baselines import METHODS
+from padgs.data.errors import DataError
 from padgs.learning.failure import Failure
 from padgs.learning.loop import Record
 from padgs.learning.method import Method
@@ -101,13 +102,15 @@ class Session:
 
         Raises:
             Interrupted: it was stopped from outside; the checkpoint was written.
+            DataError: a panorama cannot be read any more; the last checkpoint stands.
             CheckpointError, RunFolderError: nothing can be read or written.
             ConfigError: what it shall begin with is no run on this scene.
         """
         config, folder = self.config, self.folder
         method, device = build(config), self.scene.points.device
         if config.init is not None and not checkpoint.exists(folder.checkpoint):
-            method.begin_with(config.init.state(self.scene.fingerprint, self._fingerprint_at, device))
+            stress = config.values().get("stress")
+            method.begin_with(config.init.state(self.scene.fingerprint, self._fingerprint_at, device, stress))
         folder.prepare(config.values())
         progress = folder.resume(method, device)
         if progress.iteration:
@@ -137,7 +140,7 @@ class Session:
             if self.scene.test:
                 scored = replace(result, **self._tested(method, progress))
                 result = outcome.judged(scored, self.scene, progress.iteration)
-        except Interrupted:
+        except (Interrupted, DataError):  # panoramas that cannot be read now may be there again: nothing has failed yet
             raise
         except KeyboardInterrupt as error:
             raise Interrupted("stopped at once, the last checkpoint stands") from error

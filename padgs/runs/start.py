@@ -6,9 +6,10 @@ and the model grows again where its method says so. docs/your_photographs.md say
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -48,16 +49,24 @@ class Start:
         except (ResultError, CheckpointError) as error:
             raise ConfigError(f"init={folder}: {error}") from error
 
-    def state(self, fingerprint: str, scene_at: Callable[[int | None], str], device: torch.device) -> State:
+    def state(
+        self,
+        fingerprint: str,
+        scene_at: Callable[[int | None], str],
+        device: torch.device,
+        stress: Mapping[str, Any] | None = None,
+    ) -> State:
         """The state that the run ended with.
 
         Args:
             fingerprint: of the scene of the new run.
             scene_at: the same of another `data.width`, asked for only where that of the two runs differ.
             device: of the tensors.
+            stress: that the new run is under, as its configuration has it; None: none.
 
         Raises:
-            ConfigError: it was trained on something else, or its checkpoint is not what it was any more.
+            ConfigError: it was trained on something else, under another stress, or its checkpoint is not what it was any
+                more.
         """
         files = RunFolder(Path(self.run))
         try:
@@ -68,6 +77,11 @@ class Start:
                 raise ConfigError(
                     f"init={self.run} was trained on other data: images, poses, points, split and masks must be the "
                     "same, only data.width may differ; take a run on this scene, or leave init out"
+                )
+            if (before := result.config.get("stress")) != stress:
+                raise ConfigError(
+                    f"init={self.run} was trained under stress {before or 'none'}, and this run is under "
+                    f"{stress or 'none'}: views, poses or units may be others; take the same stress, or leave init out"
                 )
             return checkpoint.load(files.checkpoint, device, identity(result.config, result.fingerprint))
         except (ResultError, CheckpointError) as error:

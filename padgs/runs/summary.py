@@ -34,7 +34,7 @@ def introduce(config: RunConfig, scene: Scene, folder: Path, console: Console) -
     view = scene.train[0]
     what = f"{config.preset}{f' ({config.row})' if config.row else ''} on {scene.name}"
     views = f"{len(scene.train)} training and {len(scene.test)} test views of {view.width}x{view.height}"
-    rest = f": {views}, {len(scene.points)} points, {config.time}"
+    rest = f": {views}, {len(scene.points)} points, {config.time}, on {scene.points.device}"
     console.print(Text(printable(what), "bold"), rest, sep="", highlight=False, soft_wrap=True)
     for note in (*scene.notes, folder):
         say(console, f"  {note}", "dim")

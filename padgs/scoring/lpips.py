@@ -22,6 +22,7 @@ INPUTS = ("11", "01")  # fed [-1, 1] or [0, 1]
 CHANNEL_SHIFT = (-0.030, -0.088, -0.188)
 CHANNEL_SCALE = (0.458, 0.448, 0.450)
 ROWS_AT_ONCE = 64  # a tap of VGG at 2048 x 1024 holds half a gigabyte; its distance is taken in bands of rows
+BAND = 512  # rows of an image that go through VGG at once, a multiple of its coarsest step, beside those that they see
 
 
 class LPIPS(nn.Module):
@@ -51,7 +52,7 @@ class LPIPS(nn.Module):
         ]
         return torch.stack(scaled).sum(0)
 
-    def _tap_distances(self, image: Tensor, target: Tensor, inputs: str) -> Iterator[Tensor]:
+    def _tap_distances(self, image: Tensor, target: Tensor, inputs: str) -> list[Tensor]:
         """Weighted squared distance of the two images' features at each tap, [1, 1, h, w]."""
         smallest = self.network.smallest_side
         if min(image.shape[:2]) < smallest:
@@ -59,8 +60,23 @@ class LPIPS(nn.Module):
             raise LpipsUnavailable(
                 f"LPIPS {self.network.name} needs at least {smallest} pixels per side; image is {size}"
             )
-        # Both images pass each layer together, so that only one layer of features is held at a time.
         a, b = self._network_input(image, inputs), self._network_input(target, inputs)
+        height, reach = len(image), self.network.reach
+        if reach is None:
+            return list(self._taps(a, b))
+        bands = []
+        for first in range(0, height, BAND):
+            top, end = max(first - reach, 0), first + BAND
+            taps = self._taps(a[:, :, top : end + reach], b[:, :, top : end + reach])
+            ends = None if end >= height else end - top
+            bands.append([_rows(tap, first - top, ends, step=2**number) for number, tap in enumerate(taps)])
+        return [torch.cat(tap, dim=2) for tap in zip(*bands, strict=True)]
+
+    def _taps(self, a: Tensor, b: Tensor) -> Iterator[Tensor]:
+        """The same of what the network is fed, [1, 3, H, W] each.
+
+        Both images pass each layer together, so that only one layer of features is held at a time.
+        """
         tap = 0
         for index, convolution in enumerate(self.network.convolutions):
             a, b = self._layer(a, index), self._layer(b, index)
@@ -153,6 +169,11 @@ def _distance(a: Tensor, b: Tensor, linear: Tensor) -> Tensor:
     """Sum over channels of linear x (a / |a| - b / |b|)^2, [1, 1, h, w]; features are [1, C, h, w], linear [C]."""
     difference = _unit(a) - _unit(b)
     return functional.conv2d(difference * difference, linear.to(a.dtype)[None, :, None, None])
+
+
+def _rows(tap: Tensor, first: int, end: int | None, *, step: int) -> Tensor:
+    """Rows of a tap, one for each `step` rows of the image: from a row of the image to another, or to the last."""
+    return tap[:, :, first // step : None if end is None else end // step]
 
 
 def _unit(features: Tensor) -> Tensor:

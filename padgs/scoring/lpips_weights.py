@@ -47,6 +47,9 @@ class Network:
     file: str
     file_key: str
     sha256: str
+    # Rows up and down that a feature sees at most, rounded up to the coarsest step, where each tap has half as many
+    # rows as the one before and steps begin at the first row: bands then have the features of the whole image.
+    reach: int | None = None
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,7 @@ NETS = {
         file="vgg16.ckpt",
         file_key="VGG16_0",
         sha256="2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d",
+        reach=112,
     ),
 }
 

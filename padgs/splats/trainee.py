@@ -138,6 +138,8 @@ class SplatTrainee:
         Where a schedule follows the clock, a round may come after few: it is left out, for growth on their noise would
         feed on itself, as larger models take fewer steps in the time.
         """
+        if len(self.splats) == 0:  # which ends the run at the next drawing
+            return False
         views = int(self.densifier.statistics["seen"].max())  # some Gaussian is seen by all
         return 2 * views >= min(self.densifier.options.densify_every, MIN_DENSIFY_EVERY)
 

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from statistics import fmean
+from typing import Any
 
 from pandas import DataFrame
 
@@ -129,16 +130,15 @@ def judge(claim: Claim, gathered: Gathered, negligible: float = NEGLIGIBLE) -> J
     runs = runs.loc[[claim.outdoor in (None, place.outdoor) for place in runs["place"]]]
     if claim.dataset:
         runs = runs.loc[runs["dataset"] == claim.dataset]
-    longest: dict[str, tuple[Line, list[int]]] = {}  # scene and what else is alike -> line, index of its runs
+    longest: dict[tuple[Any, ...], tuple[Line, list[int]]] = {}  # what is alike, the scene first -> line, its runs
     spreads: list[Cell] = []
-    for scene, length, own in _conditions(runs, claim):
-        where = f"{scene}, {length}"
+    for alike, where, own in _conditions(runs, claim):
         refuse_mixture(own, gathered.request, f"{claim.text}, {where}", ("protocol",))
         ours, rivals = _sides(claim, own, where)
         if rivals:
             spreads.append(spread(_advantages(claim, ours, rivals[0].runs)))
             used = [*ours.index, *(index for rival in rivals for index in rival.runs.index)]
-            longest[scene] = Line(where, len(rivals), rivals[0].title, spreads[-1]), used
+            longest[alike] = Line(where, len(rivals), rivals[0].title, spreads[-1]), used
     lines = [line for line, _ in longest.values()]
     variance, freedom = pooled_variance(spreads)
     if freedom:
@@ -164,15 +164,20 @@ def in_the_paper(claim: Claim, numbers: Mapping[Key, Published]) -> dict[str, fl
     return found
 
 
-def _conditions(runs: DataFrame, claim: Claim) -> Iterator[tuple[str, str, DataFrame]]:
-    """A scene with what else is alike, a length at which both sides meet there, shorter ones first, and their runs."""
+def _conditions(runs: DataFrame, claim: Claim) -> Iterator[tuple[tuple[Any, ...], str, DataFrame]]:
+    """A scene with what else is alike; the same in words, with a length at which both sides meet there; and their runs.
+
+    Shorter ones come first.
+    """
     shared = ["resolution", "data", *claim.apart, *(["machine"] if claim.quotient else [])]
-    for (place, resolution, *_), own in grouped(runs, "place", *shared) if len(runs) else ():
+    for alike, own in grouped(runs, "place", *shared) if len(runs) else ():
+        place, resolution, *_ = alike
         ours, others = (set(side.of(own)["length"]) for side in (claim.ours, claim.others))
         both = own.loc[own["length"].isin(ours & others)].sort_values("iterations", kind="stable")
         words = [f"{column.rpartition('.')[2]} {own[column].iloc[0]}" for column in claim.apart]
         for length in dict.fromkeys(both["length"]):
-            yield ", ".join([place.scene, resolution, *words]), str(length), own.loc[own["length"] == length]
+            where = ", ".join([place.scene, resolution, *words, str(length)])
+            yield tuple(alike), where, own.loc[own["length"] == length]
 
 
 def _sides(claim: Claim, runs: DataFrame, where: str) -> tuple[DataFrame, list[Setting]]:

@@ -61,8 +61,12 @@ def test_a_plateau_is_where_the_average_gains_nothing_and_not_before():
     first = next(moment for moment, value in enumerate(values, 1) if flat.reached(value, 1, moment))
     assert 45 < first < 75
     assert not flat.is_due(first) and flat.is_due(first + 1)
-    growing = Plateau(100)
-    assert not any(growing.reached(20.0, parts, parts) for parts in range(1, 101))
+    for parts in (range(1, 101), range(100, 0, -1), [100] * 97 + [50] * 3):  # growing, thinning out, just chosen
+        changing = Plateau(100)
+        found = [
+            changing.reached(20.0 + 0.1 * moment * (moment < 97), count, moment) for moment, count in enumerate(parts)
+        ]
+        assert not any(found)
 
 
 def test_views_set_apart_come_back_when_rates_fade(scene, monkeypatch):

@@ -20,6 +20,7 @@ from padgs.need import session, tiers
 from padgs.need.outcome import keep, need
 from padgs.need.search import Plan, smallest
 from padgs.need.session import Search
+from padgs.need.summary import show
 from padgs.results import read
 from padgs.runs.checkpoint import CheckpointError
 from padgs.runs.interrupt import Interrupted
@@ -145,6 +146,9 @@ def test_the_pruned_model_is_a_run_that_opens_and_has_the_whole_front(opened, me
     assert len(again.steps) == len(search.steps) + 1
     assert keep(again, 1.0) == result, "what was kept before stays"
     assert_same_but_time(again.kept(number)[0].state(), pruned.method.trainee.state())
+    with (console := Console(width=200)).capture() as shown:
+        show(result.need, console)
+    assert "kept for 1 dB" in shown.get()
     assert pruned.score("sphere").metrics == pytest.approx(pruned.scores["sphere"].metrics, nan_ok=True)
     told = result.need
     assert [step["kind"] for step in told["steps"]][:3] == ["waste", "control", "prune"]
@@ -254,9 +258,11 @@ def test_the_lowest_degree_that_is_good_enough_is_kept(opened, monkeypatch):
 
 
 def test_the_smallest_good_file_stays_and_shows_what_is_said_of_it(opened):
-    run = opened("method=padgs")
+    folder = opened("method=padgs").folder
+    run = padgs.load_run(folder.rename(folder.with_name("my room")), device="cpu")
     search = Search(run)
     result = keep(search, 1.0)
+    assert result.run == f"{run.result.run}_need-1", "and is not called as the folder is"
     (file,) = (file for file in result.need["files"] if file["kept"])
     exact, half, byte = result.need["files"][:3]
     assert byte["bytes"] < half["bytes"] < exact["bytes"] and exact["loss"] == 0

@@ -12,6 +12,7 @@ from tiny_scene import tiny_scene
 
 from padgs import stopwatch
 from padgs.learning.budget import Budget
+from padgs.learning.failure import Failure
 from padgs.learning.loop import Record
 from padgs.learning.worth import needed, worth
 from padgs.plus.method import PlusMethod
@@ -212,6 +213,11 @@ def test_the_fewer_pixels_a_gaussian_has_the_more_of_them_a_drawing_leaves_out()
     found = [options.dropped_share(pixels=1000.0 * PLENTY, gaussians=n) for n in (1, 1000, 1414.2136, 2000, 10**6)]
     assert found == pytest.approx([0, 0, 0.1, 0.2, 0.2], abs=1e-6)
     assert PlusOptions(drop_share=0.0).dropped_share(1.0, 1000) == 0
+
+
+def test_a_round_that_prunes_all_ends_the_run_as_collapsed():
+    with pytest.raises(Failure, match="no Gaussian is left to draw"):
+        list(PlusMethod(replace(OPTIONS, min_opacity=0.999)).fit(tiny_scene(), Budget(60)))
 
 
 def crowded_scene() -> Scene:

@@ -27,6 +27,7 @@ TOO_LATE = {
     "method=seam360gs render.projection=erp": "made for a Panorama camera, not a RayTable",
     "method=crops_3dgs render.projection=erp render.cubemap=false": "made for a Panorama camera, not a Pinhole",
     "method=cubemap_3dgs train.weight=solid_angle": "have no latitude; set uniform",
+    "method=cubemap_3dgs train.poses=learned": "cut from one photograph would learn its own; leave it at given",
     "method=egonerf render.projection=ray": "egonerf casts rays",
     "method=spags render=default": "signal=space_absolute is made for render.projection=ray",
     "render.projection=ray render.bounds=square render.wrap=false": "has no square bounds",

@@ -21,7 +21,7 @@ GPU = torch.device("cuda", 0)
 def with_gpu(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
-    monkeypatch.setattr(cuda, "available", lambda: True)
+    monkeypatch.setattr(cuda, "require", lambda device: None)
 
 
 def test_without_a_gpu_auto_is_the_cpu_and_cuda_is_refused(monkeypatch):
@@ -64,9 +64,15 @@ def test_with_a_gpu_auto_is_the_gpu_where_that_can_draw():
 
 
 @pytest.mark.usefixtures("with_gpu")
-def test_without_the_library_auto_is_the_cpu(monkeypatch):
-    monkeypatch.setattr(cuda, "available", lambda: False)
-    assert chosen("auto", RenderConfig()).type == "cpu"
+@pytest.mark.parametrize("error", [OSError("no libpadgs_cuda"), RuntimeError("compiled for 80 90; Tesla T4 has 75")])
+def test_without_a_library_for_it_a_gpu_is_left_alone_and_that_is_said(monkeypatch, error):
+    def missing(device):
+        raise error
+
+    monkeypatch.setattr(cuda, "require", missing)
+    with pytest.warns(UserWarning, match=f"a GPU is here, but the CPU is used: {error}"):
+        assert chosen("auto", RenderConfig()).type == "cpu"
+    assert chosen("cuda", RenderConfig()) == GPU, "by torch"
 
 
 def test_an_unknown_place_is_refused():

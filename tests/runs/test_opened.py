@@ -10,6 +10,7 @@ from omegaconf import OmegaConf
 from tiny_run import tiny_run
 
 import padgs
+from padgs.data.errors import DataError
 from padgs.results import read
 from padgs.runs import checkpoint
 from padgs.runs.folder import RunFolderError
@@ -107,6 +108,17 @@ def test_a_run_that_was_edited_is_refused(folder, tmp_path, file, old, new, erro
         return
     with pytest.raises(RuntimeError, match=error):
         padgs.load_run(copy)
+
+
+def test_data_that_have_changed_since_are_told_to_who_looks_and_refused_to_who_compares(folder):
+    run = padgs.load_run(folder, device="cpu")
+    run.refuse_other_data()
+    run = padgs.load_run(folder, device="cpu")
+    run.result = replace(run.result, fingerprint="other")
+    with pytest.warns(UserWarning, match="was trained on other data than the generator holds now"):
+        assert run.scene.train
+    with pytest.raises(DataError, match="say with --data where those are"):
+        run.refuse_other_data()
 
 
 def test_what_is_no_run_is_refused_with_a_way_out(folder, tmp_path):

@@ -16,6 +16,7 @@ from tiny_scene import HEIGHT, WIDTH, tiny_scene
 
 from padgs import results
 from padgs.anchors.method import PaDGSMethod
+from padgs.data.errors import DataError
 from padgs.learning.failure import Failure
 from padgs.reports import store
 from padgs.reports.frame import frame
@@ -257,6 +258,20 @@ def test_a_failed_run_has_a_result_with_its_status(config, monkeypatch, error, s
     assert reasons.get(type(error), str(error)) in result.reason and "Allocator" not in result.reason
     again, said = run(config)
     assert again == result and "retry=failed" in said
+
+
+def test_panoramas_that_cannot_be_read_any_more_interrupt_a_run_and_end_it_not(config, monkeypatch):
+    config = replace(config, run=replace(config.run, checkpoint_every=5))
+
+    def fail():
+        raise DataError("the disk has gone")
+
+    with monkeypatch.context() as patch:
+        stop_at(7, patch, fail)
+        with pytest.raises(DataError, match="the disk has gone"):
+            run(config)
+    result, said = run(config)
+    assert result.status == "ok" and "resuming after iteration 5" in said
 
 
 @pytest.mark.parametrize(("status", "starts_at"), [("nan", 0), ("oom", 5)])

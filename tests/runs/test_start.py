@@ -122,6 +122,8 @@ def test_other_data_and_another_checkpoint_are_refused_before_training(base, tmp
     with pytest.raises(ConfigError, match="trained on other data: .* only data.width may differ"):
         other.run()
     assert not (other.folder.path / "config.yaml").exists()
+    with pytest.raises(ConfigError, match="was trained under stress none, and this run is under .*few_views"):
+        session(tmp_path / "runs", f"init={base}", "stress.condition=few_views").run()
     shutil.copytree(base, tmp_path / "run")
     own = session(tmp_path / "runs", f"init={tmp_path}/run")
     state = checkpoint.load(tmp_path / "run" / "checkpoint")
