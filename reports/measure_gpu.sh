@@ -12,6 +12,7 @@
 # leaves out a million Gaussians, LIMIT gives a step so many seconds (540, as machines are lent for ten minutes).
 set -eu
 cd "$(dirname "$0")/.."
+self=$PWD/reports/$(basename "$0")
 python=${PYTHON:-python3}
 build=$PWD/build/gpu
 out=$build/out
@@ -75,7 +76,7 @@ for step in ${*:-$all}; do
   case " $all " in *" $step "*) ;; *) echo "unknown step $step; known: $all" >&2; exit 2 ;; esac
   if [ "$(cat "$out/$step.state" 2>/dev/null)" = ok ]; then continue; fi
   echo "$step ..."
-  if timeout "${LIMIT:-540}" "$0" --only "$step" >"$out/$step.log" 2>&1; then
+  if timeout "${LIMIT:-540}" "$self" --only "$step" >"$out/$step.log" 2>&1; then
     echo ok >"$out/$step.state"
   else
     echo "failed ($?)" >"$out/$step.state"

@@ -29,8 +29,9 @@ def program(folder: Path, name: str, *lines: str) -> str:
         ("native", ["12.0", "8.9", "12.0"], "89;120", ""),
         ("native", ["No devices were found"], "", "nvidia-smi finds no GPU here"),
         ("native", ["13.5"], "135", "nvcc does not know compute capability 135; it knows 75, 80, 89, 90, 120"),
+        ("native", ["6.1", "8.9"], "89", ""),
         ("90;80", [], "80;90", ""),
-        ("all", [], "80;89;90;120", ""),
+        ("all", [], "75;80;89;90;120", ""),
         ("90;35", [], "35;90", "nvcc does not know compute capability 35; it knows 75, 80, 89, 90, 120"),
     ],
 )

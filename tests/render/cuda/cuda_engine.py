@@ -8,6 +8,7 @@ from __future__ import annotations
 import atexit
 import ctypes
 import functools
+import os
 import shutil
 import subprocess
 import tempfile
@@ -25,6 +26,7 @@ from padgs.render.contract import Removals, Request
 from padgs.render.leave_one_out import BACKENDS as SCORERS
 from padgs.sphere.camera import RayTable
 
+os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # deterministic; older torch reads it but once
 HERE = Path(__file__).parent
 SOURCES = Path(cuda.__file__).parent / "csrc" / "cuda"
 COMPILER = shutil.which("c++") or shutil.which("g++")
