@@ -38,7 +38,19 @@ def extract_frames(
 
     Raises:
         DataError: the extra `video` is not installed, the file cannot be decoded, or its frames are no panoramas.
+        OSError: a frame cannot be written.
     """
+    written = 0
+    for frame in _sharpest(video, per_second, progress):
+        written += 1
+        Image.fromarray(frame).save(folder / f"frame_{written:05d}.jpg", quality=95, subsampling=0)
+    if written == 0:
+        raise DataError(f"{video} holds no frames")
+    return written
+
+
+def _sharpest(video: Path, per_second: float, progress: Callable[[int, int], None]) -> Iterator[NDArray[np.uint8]]:
+    """The sharpest frame [H, W, 3] of every interval. What their user raises is not taken for an error of decoding."""
     try:
         import imageio.v3 as imageio
 
@@ -55,19 +67,15 @@ def extract_frames(
                 progress(index + 1, max(total, index + 1))
                 yield frame
 
-        decoded, written = frames(), 0
+        decoded = frames()
         while (best := max(islice(decoded, interval), key=sharpness, default=None)) is not None:
-            written += 1
-            Image.fromarray(best).save(folder / f"frame_{written:05d}.jpg", quality=95, subsampling=0)
+            yield best
     except ImportError as error:
         raise DataError(f"reading {video} needs imageio and PyAV: pip install 'padgs[video]'") from error
     except DataError:  # no panoramas
         raise
     except (OSError, ValueError, RuntimeError, StopIteration) as error:
         raise DataError(f"{video} cannot be decoded ({error}); convert it to H.264 in an .mp4 file") from error
-    if written == 0:
-        raise DataError(f"{video} holds no frames")
-    return written
 
 
 def sharpness(frame: NDArray[np.uint8]) -> float:

@@ -1,6 +1,7 @@
 """Frames of a video. The decoding itself needs PyAV, an extra."""
 
 import builtins
+import errno
 
 import numpy as np
 import pytest
@@ -72,3 +73,15 @@ def test_not_a_video(tmp_path):
     (tmp_path / "a.mp4").write_bytes(b"no video")
     with pytest.raises(DataError, match="cannot be decoded"):
         extract_frames(tmp_path / "a.mp4", tmp_path, 2.0)
+
+
+def test_a_frame_that_cannot_be_written_is_no_fault_of_the_video(tmp_path, monkeypatch):
+    write(tmp_path / "a.mp4", 3 * [np.full((64, 128, 3), 90, np.uint8)])
+
+    def refuse(*args, **kwargs):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Image.Image, "save", refuse)
+    with pytest.raises(OSError, match="No space left on device") as refused:
+        extract_frames(tmp_path / "a.mp4", tmp_path, 2.0)
+    assert refused.value.errno == errno.ENOSPC
