@@ -18,6 +18,12 @@ from padgs.data.splits import split_frames
 from padgs.data.store import ImageStore, StoredImage
 from padgs.scene import Scene, View
 
+IMAGE_FOLDERS = ("images", "imgs", "image", "rgb")
+STATEMENT = "prepare.json"  # beside what `padgs.data.prepare` has made
+# What a folder of ours is known by: a data set, or a run (by the names of `padgs.results`). Pictures in there are no
+# photographs, or copies of them.
+OURS = ((STATEMENT,), ("config.yaml", "renders"))
+
 
 def assemble(capture: Capture, options: DataOptions) -> Scene:
     """The scene of a capture. Images are looked at, not decoded.
@@ -78,7 +84,7 @@ def view_name(frame_name: str) -> str:
     return str(PurePosixPath(frame_name).with_suffix(""))
 
 
-def image_folder(folder: Path, given: str | None, usual: Sequence[str] = ("images", "imgs", "image", "rgb")) -> Path:
+def image_folder(folder: Path, given: str | None, usual: Sequence[str] = IMAGE_FOLDERS) -> Path:
     """The folder with the images of a data set: the given one, else the first usual one, else the data set's own.
 
     Raises:
@@ -92,14 +98,22 @@ def image_folder(folder: Path, given: str | None, usual: Sequence[str] = ("image
 
 
 def image_names(folder: Path) -> list[str]:
-    """All images below a folder, relative to it, sorted; hidden files left out."""
+    """All images below a folder, as `file_names` lists them."""
+    return [name for name in file_names(folder) if name.lower().endswith(EXTENSIONS)]
+
+
+def file_names(folder: Path) -> list[str]:
+    """All files below a folder, relative to it, sorted; hidden ones and those in folders of ours left out."""
     found: list[str] = []
     for parent, folders, files in os.walk(folder):
-        folders[:] = [name for name in folders if not name.startswith(".")]
-        for name in files:
-            if name.lower().endswith(EXTENSIONS) and not name.startswith("."):
-                found.append((Path(parent) / name).relative_to(folder).as_posix())
+        here = Path(parent)
+        folders[:] = [name for name in folders if not name.startswith(".") and not _is_ours(here / name)]
+        found += [(here / name).relative_to(folder).as_posix() for name in files if not name.startswith(".")]
     return sorted(found)
+
+
+def _is_ours(folder: Path) -> bool:
+    return any(all((folder / sign).exists() for sign in signs) for signs in OURS)
 
 
 def refuse_clashes(names: Sequence[str]) -> None:

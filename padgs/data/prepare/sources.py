@@ -3,22 +3,30 @@
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import torch
 
-from padgs.data.assemble import image_folder, image_names, refuse_clashes
+from padgs.data.assemble import file_names, image_folder, image_names, refuse_clashes
 from padgs.data.capture import Capture, Frame
 from padgs.data.check.overlay import OVERLAY
-from padgs.data.errors import DataError
+from padgs.data.errors import DataError, listed
 from padgs.data.fisheye import refuse_dual_fisheye
-from padgs.data.images import ImageFile, decode, inspect
+from padgs.data.images import EXTENSIONS, ImageFile, decode, inspect
 from padgs.data.masks import PREVIEW, SCENE_MASKS, Mask, find_masks
+from padgs.data.prepare import video
 from padgs.data.store import ImageStore
 
 UNSTITCHED = (".insp", ".insv", ".360", ".dng")  # what cameras store before their own program has stitched it
+UNREAD = (".heic", ".heif", ".avif", ".jxl", ".jp2", ".hdr", ".exr")
 _NOT_YET = "is not stitched yet: export panoramas, or a 2:1 video, with the camera's own program"
+_WAYS_OUT = (  # endings of files that are no images here, and what to do with them
+    (UNSTITCHED, _NOT_YET),
+    (UNREAD, "is a picture of a kind that is not read here: convert all such pictures to JPEG"),
+    (video.EXTENSIONS, "is a video: give its own path, not that of its folder"),
+)
 LOOKED_AT = 3  # images that are decoded before any work is done; those of one camera are alike
 
 
@@ -29,7 +37,7 @@ class Source:
     images: dict[str, ImageFile]  # name (path relative to the folder) -> file, sorted by name
     masks: dict[str, Mask]  # name -> weights; names without one are used wholly
     fingerprint: str  # of names, image bytes and masks
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # of masks, and of files that are left out
 
 
 def find_source(path: Path, mask: str) -> Source:
@@ -50,10 +58,12 @@ def find_source(path: Path, mask: str) -> Source:
         raise DataError(f"{path} is not a folder; give a folder of panoramas, or a video file")
     folder = image_folder(path, None)
     names = panoramas(folder)
+    others, ways_out = _others(folder)
     if len(names) < 2:
-        raw = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in UNSTITCHED)
-        advice = f"; {raw[0]} {_NOT_YET}" if raw else ""
-        raise DataError(f"{folder} holds {len(names)} images; structure from motion needs at least two{advice}")
+        besides = f" (left out: {others})" if others else ""
+        raise DataError(
+            f"{folder} holds {len(names)} images{besides}; structure from motion needs at least two{ways_out}"
+        )
     refuse_clashes(names)
     images = {name: inspect(folder / name) for name in names}
     for name in names[:: -(-len(names) // LOOKED_AT)]:
@@ -63,6 +73,11 @@ def find_source(path: Path, mask: str) -> Source:
     capture = Capture(format="images", folder=mask_folder(path), image_folder=folder, frames=frames, cloud=None)
     sizes = [(image.width, image.height) for image in images.values()]
     masks, digests, notes = find_masks(capture, mask, list(images.values()), sizes, ImageStore())
+    if others:
+        notes.append(f"left out: {others}{ways_out}")
+    place = mask_folder(path)
+    if unused := [name for name in _scene_masks(folder) if mask == "auto" and (folder / name).parent != place]:
+        notes.append(f"not used: {listed(unused)}; the mask of all panoramas is looked for in {place} alone")
     digest = hashlib.sha256()
     for name, image in images.items():
         digest.update(f"{name}|{image.digest}|".encode())
@@ -78,7 +93,21 @@ def find_source(path: Path, mask: str) -> Source:
 def panoramas(folder: Path) -> list[str]:
     """The images below a folder, relative to it, sorted, without the masks and pictures of ours among them."""
     others = (*SCENE_MASKS, PREVIEW, OVERLAY)
-    return [name for name in image_names(folder) if name not in others and not name.startswith("masks/")]
+    names = [name for name in image_names(folder) if not name.startswith("masks/")]
+    return [name for name in names if PurePosixPath(name).name not in others]
+
+
+def _scene_masks(folder: Path) -> list[str]:
+    return [name for name in image_names(folder) if PurePosixPath(name).name in SCENE_MASKS]
+
+
+def _others(folder: Path) -> tuple[str, str]:
+    """How many files of which endings are no images, and what to do with them; both empty if there are none."""
+    names = [name for name in file_names(folder) if not name.lower().endswith(EXTENSIONS)]
+    counts = Counter(PurePosixPath(name).suffix.lower() or "without an ending" for name in names)
+    firsts = [(next((name for name in names if name.lower().endswith(kinds)), None), way) for kinds, way in _WAYS_OUT]
+    ways_out = "".join(f"; {name} {way}" for name, way in firsts if name)
+    return listed(f"{count} {ending}" for ending, count in counts.most_common()), ways_out
 
 
 def mask_folder(path: Path) -> Path:

@@ -5,7 +5,9 @@ import pytest
 from PIL import Image
 
 from padgs.data import DataError
+from padgs.data.assemble import OURS, STATEMENT
 from padgs.data.prepare.sources import find_source
+from padgs.results import CONFIG_NAME, PICTURES
 
 
 def save(path, value=100, size=(16, 32)):
@@ -36,10 +38,43 @@ def test_masks_and_pictures_of_ours_among_the_images_are_no_images(tmp_path):
     save(tmp_path / "a.png")
     save(tmp_path / "b.png")
     save(tmp_path / "masks" / "a.png", 255)
-    save(tmp_path / "check.png")
+    for place in (".", "kitchen", "flat/images", "runs/flat/renders"):
+        save(tmp_path / place / "check.png")
+        save(tmp_path / place / "mask_preview.jpg")
+    (tmp_path / "flat" / STATEMENT).touch()
+    assert OURS[1] == (CONFIG_NAME, PICTURES)
+    (tmp_path / "runs" / "flat" / CONFIG_NAME).touch()
+    for place in ("flat/images", "runs/flat/renders"):
+        save(tmp_path / place / "a.png")
     source = find_source(tmp_path, "auto")
     assert list(source.images) == ["a.png", "b.png"]
     assert list(source.masks) == ["a.png"]
+    assert source.notes == ("masks: masks/ for 1 of 2 views",)
+    save(tmp_path / "kitchen" / "mask.png", 255)
+    source = find_source(tmp_path, "auto")
+    assert list(source.images) == ["a.png", "b.png"]
+    assert source.notes[1:] == (
+        f"not used: kitchen/mask.png; the mask of all panoramas is looked for in {tmp_path} alone",
+    )
+
+
+def test_what_is_left_out_is_said(tmp_path):
+    for name in ("1.insp", "2.INSP", "3.insp", "a.heic", "notes"):
+        (tmp_path / name).touch()
+    with pytest.raises(
+        DataError,
+        match=r"holds 0 images \(left out: 3 .insp, 1 .heic, 1 without an ending\); structure from motion needs at "
+        "least two; 1.insp is not stitched yet: export .*; a.heic is .*: convert all such pictures to JPEG$",
+    ):
+        find_source(tmp_path, "auto")
+    for name in ("1.insp", "2.INSP", "3.insp", "a.heic"):
+        (tmp_path / name).unlink()
+    save(tmp_path / "a.png")
+    save(tmp_path / "b.png")
+    (tmp_path / "tour.MP4").touch()
+    assert find_source(tmp_path, "auto").notes == (
+        "left out: 1 without an ending, 1 .mp4; tour.MP4 is a video: give its own path, not that of its folder",
+    )
 
 
 def test_bad_input_is_refused(tmp_path):
