@@ -35,7 +35,9 @@ def prepare(
     level: Annotated[bool, typer.Option(help="turn the world so that the cameras' common up is +z")] = True,
     per_second: Annotated[float, typer.Option(help="frames kept per second of video")] = 2.0,
     seed: Annotated[int, typer.Option(help="of all random choices")] = 0,
-    threads: Annotated[int, typer.Option(help="processor threads; 0 = all, at most 8")] = 0,
+    threads: Annotated[
+        int, typer.Option(help="processor threads; 0 = all, at most 8, as free memory allows; fewer take less memory")
+    ] = 0,
 ) -> None:
     """Find the poses of panoramas, then check the result. Interrupted, the same command goes on where it stopped."""
     from pathlib import Path

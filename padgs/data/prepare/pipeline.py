@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -20,26 +19,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from PIL import Image
-from torch import Tensor
 
-from padgs.data.assemble import view_name
+from padgs.data.assemble import IMAGE_FOLDERS, STATEMENT, view_name
 from padgs.data.capture import Cloud, Frame, Tracks
 from padgs.data.errors import DataError, listed
 from padgs.data.formats import colmap
 from padgs.data.formats.writers import Content, write_colmap
+from padgs.data.images import decode
 from padgs.data.masks import mask_place, write_masks
 from padgs.data.options import DataOptions
-from padgs.data.prepare import rig, sfm
+from padgs.data.prepare import resources, rig, sfm
+from padgs.data.prepare.level import levelled
 from padgs.data.prepare.pairs import PAIRS, image_pairs
 from padgs.data.prepare.sources import Source, find_source
 from padgs.data.prepare.video import extract_frames, is_video
-from padgs.data.trajectory import gravity
 
-STATEMENT = "prepare.json"  # at the destination: what came out, of what
 STEPS = ("frames", "images", "views", "features", "matches", "poses", "result")
-LEVEL_AGREEMENT = 0.9  # length of the mean of the cameras' up directions from which they have a common one
 _REMEDIES = "take them closer together, hide what moves with the camera in a mask (--mask), or try --accurate"
 
 Progress = Callable[[str, int, int], None]  # (one of STEPS, done, in all)
@@ -55,7 +51,7 @@ class PrepareOptions:
     level: bool = True  # turn the world so that the cameras' common up is +z
     per_second: float = 2.0  # frames kept of a video
     seed: int = 0
-    threads: int = 0  # 0 = one per processor, at most 8; each takes about 0.6 GB at 2048 x 1024
+    threads: int = 0  # 0 = one per processor, at most 8 and as many as free memory allows
 
     def __post_init__(self) -> None:
         if self.pairs not in PAIRS:
@@ -63,7 +59,7 @@ class PrepareOptions:
         if not 0 < self.per_second <= 1000:
             raise DataError(f"per_second is {self.per_second}; it must be above 0")
         if self.threads < 0:
-            raise DataError(f"threads is {self.threads}; give 1 or more, or 0 for all processors")
+            raise DataError(f"threads is {self.threads}; give 1 or more, or 0 for what this machine allows")
 
 
 @dataclass
@@ -105,12 +101,26 @@ def prepare(
             f"{destination} exists, and is not what these options make of {source}; nothing is overwritten: remove it "
             "or choose another place"
         )
+    if destination.name in (*IMAGE_FOLDERS, "masks") and destination.resolve().parent == source.resolve():
+        raise DataError(
+            f"{destination} would be taken for the images or masks of {source}; choose another name or another place"
+        )
     work = destination.absolute().with_name(f".{destination.name}.prepare")
     try:
         return _Job(source, destination.absolute(), work, options, progress).run()
     except OSError as error:
         raise DataError(
             f"cannot prepare {destination} ({error.strerror or error}); the same command goes on where this stopped"
+        ) from error
+    except MemoryError as error:
+        raise DataError(
+            f"cannot prepare {destination} (out of memory); the same command with --threads 1 takes less, and goes on "
+            "where this stopped"
+        ) from error
+    except RuntimeError as error:  # pycolmap's: all that its database has to say, too
+        raise DataError(
+            f"cannot prepare {destination} ({_line(error)}); if its disk is full, make room and give the same command, "
+            f"which goes on where this stopped; else remove {work} to start over"
         ) from error
     finally:
         if work.is_dir() and not any(work.glob("*.done")) and not (work / "database.db").exists():
@@ -155,7 +165,6 @@ class _Job:
         self, source: Path, destination: Path, work: Path, options: PrepareOptions, progress: Progress
     ) -> None:
         self.destination, self.work, self.options, self.progress = destination, work, options, progress
-        self.threads = options.threads or min(8, os.cpu_count() or 1)
         self.seconds: dict[str, float] = {}
         self.input = None  # digest of what was given, a video or images
         if is_video(source):
@@ -164,10 +173,12 @@ class _Job:
             source = self.work / "frames"
         with self._step("images"):
             self.source: Source = find_source(source, options.mask)
+        first = next(iter(self.source.images.values()))
+        self.threads = options.threads or resources.threads_for(first.width, first.height)
         of_video = ("video.sha256", "frames", "frames.done") if source.parent == self.work else ()
         self._open("images", self.source.fingerprint, keep=of_video)
         # pycolmap's list of pairs knows no spaces, so it gets names of ours.
-        self.files = {f"{index:06d}{Path(name).suffix}": name for index, name in enumerate(self.source.images)}
+        self.files = {f"{index:06d}{_ending(name)}": name for index, name in enumerate(self.source.images)}
         self.paths = {short: self.source.images[name].path for short, name in self.files.items()}
         self.views = rig.VIEWS_PER_ROW * len(rig.LATITUDES) if options.accurate else 1
         self.database = self.work / "database.db"
@@ -193,7 +204,10 @@ class _Job:
         images, masks = _empty(self.work / "images"), _empty(self.work / "masks")
         for short, name in self.files.items():
             image, mask = self.source.images[name], self.source.masks.get(name)
-            (images / short).symlink_to(image.path.absolute())
+            if Path(short).suffix == image.path.suffix:
+                resources.link_or_copy(image.path, images / short)
+            else:
+                Image.fromarray(decode(image.path)).save(images / short, compress_level=1)
             if self.source.masks:
                 use = np.ones((image.height, image.width), bool) if mask is None else mask().numpy() >= 0.5
                 Image.fromarray(use * np.uint8(255)).save(masks / f"{short}.png", compress_level=1)
@@ -218,7 +232,7 @@ class _Job:
     def _find_features(self) -> None:
         masks = self.work / ("view_masks" if self.options.accurate else "masks")
         given = masks if self.options.accurate or self.source.masks else None
-        tell = partial(self.progress, "features")
+        tell = partial(self._tell, "features")
         sfm.extract_features(self.database, self.pictures, self._groups(), given, self.threads, tell)
         if self.options.accurate:
             sfm.make_rig(self.database, rig.rig_config())
@@ -244,7 +258,7 @@ class _Job:
         if self.options.accurate:
             both = list(product(range(self.views), repeat=2))
             pairs = [[(rig.view_name(i, a), rig.view_name(j, b)) for i, j in both] for [(a, b)] in pairs]
-        tell = partial(self.progress, "matches")
+        tell = partial(self._tell, "matches")
         sfm.match(self.database, pairs, self.options.accurate, self.threads, self.options.seed, tell)
 
     def _place(self) -> None:
@@ -260,7 +274,7 @@ class _Job:
         frames, cloud, tracks = self._panoramas(model)
         notes = list(self.source.notes)
         if self.options.level:
-            frames, cloud, note = _levelled(frames, cloud)
+            frames, cloud, note = levelled(frames, cloud)
             notes.append(note)
         registered = tuple(frame.name for frame in frames)
         unregistered = tuple(name for name in self.files.values() if name not in set(registered))
@@ -338,8 +352,25 @@ class _Job:
         marker = self.work / f"{step}.done"
         with self._step(step):
             if not marker.exists():
+                resources.refuse_full(self.work)
                 action()
                 marker.touch()
+
+    def _tell(self, step: str, done: int, total: int) -> None:
+        """Tell of a batch, and do not begin another on a full disk."""
+        self.progress(step, done, total)
+        resources.refuse_full(self.work)
+
+
+def _ending(name: str) -> str:
+    """Of a picture as pycolmap gets it."""
+    ending = Path(name).suffix
+    return ending if ending.lower() in sfm.ENDINGS else ".png"
+
+
+def _line(error: Exception) -> str:
+    """What pycolmap says, without the place in its source."""
+    return str(error).strip().rpartition("] ")[2]
 
 
 def _empty(folder: Path) -> Path:
@@ -347,35 +378,6 @@ def _empty(folder: Path) -> Path:
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     return folder
-
-
-def _levelled(frames: tuple[Frame, ...], cloud: Cloud) -> tuple[tuple[Frame, ...], Cloud, str]:
-    """The same in a world whose +z is the cameras' common up, if they have one, and a note."""
-    found = gravity(torch.stack([frame.cam_from_world for frame in frames]))
-    if found.agreement < LEVEL_AGREEMENT:
-        return frames, cloud, "the cameras have no common up; the world stays as structure from motion left it"
-    new_from_old = rotation_between(torch.tensor(found.up, dtype=torch.float64))
-    turn = torch.eye(4, dtype=torch.float64)
-    turn[:3, :3] = new_from_old.mT
-    frames = tuple(replace(frame, cam_from_world=frame.cam_from_world @ turn) for frame in frames)
-    cloud = Cloud(cloud.points @ new_from_old.mT, cloud.colors)
-    return frames, cloud, "the world's +z is the common up of the cameras; its scale is arbitrary"
-
-
-def rotation_between(up: Tensor) -> Tensor:
-    """The smallest rotation [3, 3] that takes a unit vector [3] to +z.
-
-    >>> rotation_between(torch.tensor([0.0, -1.0, 0.0]))
-    tensor([[ 1.,  0.,  0.],
-            [ 0.,  0.,  1.],
-            [ 0., -1.,  0.]])
-    """
-    x, y, z = up.tolist()
-    if z < -1 + 1e-9:
-        return torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=up.dtype))
-    k = 1 / (1 + z)
-    rows = ((1 - k * x * x, -k * x * y, -x), (-k * x * y, 1 - k * y * y, -y), (x, y, z))
-    return torch.tensor(rows, dtype=up.dtype) + 0.0
 
 
 def _file_digest(path: Path) -> str:

@@ -26,6 +26,7 @@ LOSS_SCALE = 1.0  # pixels, of the Cauchy loss in the last refinement
 MAX_ERROR = 4.0  # pixels: points with larger reprojection errors are dropped, as the mapper does
 MIN_ANGLE = 1.5  # degrees between the rays to a point
 _PAIRS_PER_BATCH = 64  # of images, however many panoramas that is
+ENDINGS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")  # of pictures that pycolmap reads
 
 
 @dataclass(frozen=True)

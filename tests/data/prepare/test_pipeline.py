@@ -13,8 +13,8 @@ import padgs.data
 from padgs.calibration.align import align
 from padgs.data import DataError
 from padgs.data.check.report import check
-from padgs.data.prepare import pipeline
-from padgs.data.prepare.pipeline import PrepareOptions, prepare, rotation_between
+from padgs.data.prepare import pipeline, resources, sfm
+from padgs.data.prepare.pipeline import PrepareOptions, prepare
 from padgs.data.synthetic import SyntheticOptions, generate
 from padgs.data.trajectory import gravity, path_length
 
@@ -169,15 +169,59 @@ def test_unrelated_images_are_reported(scene, tmp_path):
     assert not (tmp_path / "out" / "images" / "other.png").exists()
 
 
-def test_nothing_to_place(tmp_path):
-    source = tmp_path / "in"
-    source.mkdir()
-    for index in range(2):
-        noise = np.random.default_rng(index).integers(0, 256, (64, 128, 3), np.uint8)
-        Image.fromarray(noise).save(source / f"{index}.png")
+def noise(folder, count=2):
+    """Panoramas of nothing, in a folder."""
+    folder.mkdir()
+    for index in range(count):
+        pixels = np.random.default_rng(index).integers(0, 256, (64, 128, 3), np.uint8)
+        Image.fromarray(pixels).save(folder / f"{index}.png")
+    return folder
+
+
+def test_nothing_to_place(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(resources, "threads_for", lambda *size: asked.append(size) or 1)
     with pytest.raises(DataError, match="no two of the 2 panoramas could be placed together"):
-        prepare(source, tmp_path / "out", PrepareOptions(threads=1))
+        prepare(noise(tmp_path / "in"), tmp_path / "out")
     assert not (tmp_path / "out").exists()
+    assert asked == [(128, 64)]
+
+
+def test_made_among_its_panoramas_it_is_no_input_afterwards(scene, tmp_path):
+    """Of panoramas in a format that pycolmap does not read."""
+    for index in range(3):
+        Image.open(scene[1] / f"pano 00{index}.png").save(tmp_path / f"{index}.webp", lossless=True)
+    result = prepare(tmp_path, tmp_path / "flat", PrepareOptions(threads=1))
+    assert result.registered == ("0.webp", "1.webp", "2.webp")
+    assert [frame.image.suffix for frame in padgs.data.read(tmp_path / "flat").frames] == 3 * [".webp"]
+    shutil.copy(scene[1] / "pano 000.png", tmp_path / "flat" / "check.png")
+    assert prepare(tmp_path, tmp_path / "flat", PrepareOptions(threads=1)) == replace(result, seconds={})
+
+
+def test_what_pycolmap_raises_is_said_with_what_to_do(tmp_path, monkeypatch):
+    def run(tell=lambda step, done, total: None):
+        prepare(source, tmp_path / "out", PrepareOptions(threads=1), tell)
+
+    source, database = noise(tmp_path / "in"), tmp_path / ".out.prepare" / "database.db"
+    with (
+        monkeypatch.context() as patch,
+        pytest.raises(DataError, match=r"out \(fewer than \d+ MiB are left on its disk: make room\); the same command"),
+    ):
+        run(lambda step, done, total: patch.setattr(resources, "ROOM", 1 << 60))
+    found = database.read_bytes()
+    database.write_bytes(b"no database" * 1000)
+    with pytest.raises(
+        DataError, match=r"out \(.*\); if its disk is full, .*else remove .*\.out\.prepare to start over"
+    ):
+        run()
+    database.write_bytes(found)
+
+    def exhaust(*args):
+        raise MemoryError
+
+    monkeypatch.setattr(sfm, "match", exhaust)
+    with pytest.raises(DataError, match=r"out \(out of memory\); the same command with --threads 1 takes less"):
+        run()
 
 
 def test_bad_input_is_refused(scene, tmp_path):
@@ -193,17 +237,9 @@ def test_bad_input_is_refused(scene, tmp_path):
         prepare(tmp_path / "absent", tmp_path / "out")
     with pytest.raises(DataError, match="cannot be read"):
         prepare(tmp_path / "absent.mp4", tmp_path / "out")
+    with pytest.raises(DataError, match="images would be taken for the images or masks of"):
+        prepare(scene[1], scene[1] / "images")
     assert [path.name for path in tmp_path.iterdir()] == ["there"]
-
-
-def test_rotation_between_is_the_smallest_turn_to_z():
-    for vector in ((0.0, 0.0, 1.0), (0.0, 0.0, -1.0), (0.6, 0.0, 0.8), (-0.48, 0.64, -0.6)):
-        up = torch.tensor(vector, dtype=torch.float64)
-        rotation = rotation_between(up)
-        torch.testing.assert_close(rotation @ up, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
-        torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3, dtype=torch.float64))
-        assert torch.linalg.det(rotation).item() == pytest.approx(1.0)
-        assert (rotation.trace().item() - 1) / 2 == pytest.approx(vector[2], abs=1e-9)  # cosine of its angle
 
 
 @pytest.mark.slow
