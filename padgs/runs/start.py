@@ -65,8 +65,7 @@ class Start:
             stress: that the new run is under, as its configuration has it; None: none.
 
         Raises:
-            ConfigError: it was trained on something else, under another stress, or its checkpoint is not what it was any
-                more.
+            ConfigError: it was trained on something else or under another stress, or its checkpoint has changed since.
         """
         files = RunFolder(Path(self.run))
         try:
