@@ -118,8 +118,9 @@ def prepare(
             "where this stopped"
         ) from error
     except RuntimeError as error:  # pycolmap's: all that its database has to say, too
+        said = _said(error, work / "log.txt")
         raise DataError(
-            f"cannot prepare {destination} ({_line(error)}); if its disk is full, make room and give the same command, "
+            f"cannot prepare {destination} ({said}); if its disk is full, make room and give the same command, "
             f"which goes on where this stopped; else remove {work} to start over"
         ) from error
     finally:
@@ -368,9 +369,11 @@ def _ending(name: str) -> str:
     return ending if ending.lower() in sfm.ENDINGS else ".png"
 
 
-def _line(error: Exception) -> str:
-    """What pycolmap says, without the place in its source."""
-    return str(error).strip().rpartition("] ")[2]
+def _said(error: Exception, log: Path) -> str:
+    """What pycolmap says, and has logged at last if that is a complaint, without the places in its source."""
+    logged = log.read_text(encoding="utf-8", errors="replace").splitlines()[-1:] if log.is_file() else []
+    said = [str(error).strip(), *(line for line in logged if line[:1] in ("W", "E", "F"))]
+    return "; ".join(dict.fromkeys(line.rpartition("] ")[2] for line in said))
 
 
 def _empty(folder: Path) -> Path:

@@ -1,6 +1,7 @@
 """Structure from motion, against exact poses and against models of real panoramas; interruption, masks, bad input."""
 
 import json
+import os
 import shutil
 from dataclasses import replace
 
@@ -211,10 +212,19 @@ def test_what_pycolmap_raises_is_said_with_what_to_do(tmp_path, monkeypatch):
     found = database.read_bytes()
     database.write_bytes(b"no database" * 1000)
     with pytest.raises(
-        DataError, match=r"out \(.*\); if its disk is full, .*else remove .*\.out\.prepare to start over"
+        DataError,
+        match=r"out \(.*\); if its disk is full, .*else remove .*\.out\.prepare to start over",
     ):
         run()
     database.write_bytes(found)
+
+    def fail(*args):
+        os.write(2, b"E2026 database.cc:7] SQLite error: disk I/O error\n")
+        raise RuntimeError("[database.cc:8] no database")
+
+    monkeypatch.setattr(sfm, "match", fail)
+    with pytest.raises(DataError, match=r"out \(no database; SQLite error: disk I/O error\); if its disk is full"):
+        run()
 
     def exhaust(*args):
         raise MemoryError
