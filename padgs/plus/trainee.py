@@ -41,6 +41,18 @@ def mean_angular_size(gaussians: Gaussians, view: View, *, near: float) -> Tenso
     return (gaussians.scales / distances[:, None]).mean()
 
 
+def _chances(seed: int, count: int, device: torch.device) -> Tensor:
+    """Random integers [count] below 2^32, the same on each device and made there, so that nobody waits for a GPU.
+
+    They are the numbers from `seed` on, mixed as MurmurHash3 ends.
+    """
+    mixed = torch.arange(seed, seed + count, device=device)
+    for factor, shift in ((0x9E3779B1, 16), (0x85EBCA6B, 13), (0xC2B2AE35, 16)):
+        mixed = mixed * factor & 0xFFFFFFFF
+        mixed = mixed ^ (mixed >> shift)
+    return mixed
+
+
 class PlusTrainee(SplatTrainee):
     """Splats with the schedule of padgs_plus for a run of `iterations`.
 
@@ -91,9 +103,8 @@ class PlusTrainee(SplatTrainee):
         if share == 0:
             return None
         opacities = torch.sigmoid(self.splats.opacity_logits)
-        seed = int(torch.randint(2**62, (), generator=self.densifier.generator))
-        chance = torch.Generator(opacities.device).manual_seed(seed)  # there, so that nobody waits for a GPU
-        drawn = torch.rand(len(opacities), generator=chance, device=opacities.device) >= share
+        seed = int(torch.randint(2**31, (), generator=self.densifier.generator))
+        drawn = _chances(seed, len(opacities), opacities.device) >= share * 2**32
         return drawn * (1 / opacities).clamp(max=1 / (1 - share))
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:

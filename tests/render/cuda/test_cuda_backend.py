@@ -348,7 +348,7 @@ def test_without_the_library_auto_means_torch_and_says_so(tmp_path, monkeypatch:
     assert "slower than cuda: libpadgs_cuda.so not found in" in str(caught[0].message) and "nvcc" in str(
         caught[0].message
     )
-    monkeypatch.setattr(cuda, "available", lambda: True)
+    monkeypatch.setattr(cuda, "works_on", lambda device: True)
     assert package.resolve_backend("auto", means) == "cuda"
     assert package.resolve_backend("auto", SimpleNamespace(device=torch.device("cuda"), dtype=torch.float64)) == "torch"
 
