@@ -45,9 +45,8 @@ def unranked(runs: DataFrame, *, equal_images: bool = True) -> dict[str, Reason]
     for method, keys in MENDS.items():
         own = runs.loc[runs["method"] == method]
         there = own.reindex(columns=[f"{CONFIG}data.generator.{key}" for key in keys]).fillna(0).astype(bool)
-        mended = there.any(axis=1) & (
-            own["dataset"] == "synthetic"
-        )  # a folder's pictures have nothing of the generator
+        generated = own["dataset"] == "synthetic"  # a folder's pictures have nothing of the generator
+        mended = there.any(axis=1) & generated
         found |= dict.fromkeys(own.loc[~mended, "preset"], Reason(NOTHING_TO_MEND))
     return found
 

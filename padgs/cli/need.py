@@ -21,7 +21,7 @@ def need(
     """Find the smallest model as good as a trained one, for several losses; keep one as a run of its own."""
     from rich.console import Console
 
-    from padgs.need.searching import search
+    from padgs.need.entry import search
     from padgs.runs.interrupt import INTERRUPTED, Interrupted
     from padgs.runs.opened import load_run
 

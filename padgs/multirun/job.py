@@ -95,7 +95,7 @@ def done(config: RunConfig, console: Console, watch: Watch) -> Result:
     with page:
         result = session.run()
     if config.need == "on" and result.ok:
-        from padgs.need.searching import search  # scipy.stats, which other runs need not wait for
+        from padgs.need.entry import search  # scipy.stats, which other runs need not wait for
 
         run = load_run(session.folder.path, data_path=config.data.path, device=config.run.device)
         run.scene = session.scene  # whose panoramas are loaded

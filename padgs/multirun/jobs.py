@@ -122,7 +122,8 @@ class Multirun:
         seen = self.look()
         self._say(seen.line())
         self._track()
-        self._tracker.finish([result for state in self.states.values() if (result := self._result(state))])
+        found = [result for state in self.states.values() if (result := self._result(state))]
+        self._tracker.finish(found, len(self.states))
         if RETRIED & {*seen.counts}:
             self._say("failed runs are kept as they are; retry=failed starts them again")
         alive = any(self._numbers[index] >= 0 and not state.ended for index, state in self.states.items())

@@ -10,7 +10,7 @@ import torch
 from padgs.learning.trainee import Prunable
 from padgs.need import tiers
 from padgs.need.calibration import QUALITY, differences, objections
-from padgs.need.session import Search
+from padgs.need.search import Search
 
 NAME = "model"  # of the file, before what its tier adds
 

@@ -16,8 +16,8 @@ from PIL import Image
 from padgs.learning.trainee import MODEL, State
 from padgs.need.calibration import PERCEPTION, QUALITY
 from padgs.need.files import files
-from padgs.need.search import Step, against, degrees, knee, loss, smallest
-from padgs.need.session import Search
+from padgs.need.plan import Step, against, degrees, knee, loss, smallest
+from padgs.need.search import Search
 from padgs.results import NEED_LOSSES, NEED_PICTURE, NEED_PICTURED, Result
 from padgs.runs.folder import PROGRESS, Progress, RunFolder
 from padgs.runs.identity import config_hash, identity

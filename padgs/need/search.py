@@ -1,156 +1,211 @@
-"""Which model to make next, and what the models made so far say. Pure functions of a list of steps.
-
-The first step leaves out what no training view shows. Each other one refines a model without the calibration views, for
-always as many iterations, after it took rows from it: three tenths at a time, until even the largest loss asked for is
-exceeded; then, for each loss, so many that it is half-way (in log N) between the smallest model that is good enough and
-the next smaller one.
-
-A model that was refined forgets what the run knew of the calibration views, and gains what any training on gains. So it
-is compared with one that was refined as often and lost nothing, its control; these are steps, too.
-
-Then, for one loss, harmonics: the model that was kept is refined with all of its degrees, and with one less each time
-until it is no longer as good as with all.
-"""
+"""The search for the smallest model of a run, step after step of `padgs.need.plan`, resumable at any iteration."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import cycle, islice
 
-from padgs.need.calibration import QUALITY, differences, objections
-from padgs.results import NEED_LOSSES, Scores
+import torch
 
-KEPT = 0.7  # of the rows, in a step down; with more gone at once their removals no longer add up
-CLOSE = 1.2  # two sizes this close are told apart no further
-FEWEST_ROWS = 10
-SLOPE = 0.1  # dB per doubling, from which on more Gaussians are worth having
-HALF_A_DOUBLING = 2**-0.5
+from padgs.clock import timed
+from padgs.learning.budget import Budget
+from padgs.learning.loop import Trainer
+from padgs.learning.trainee import Prunable, State
+from padgs.learning.worth import most_wanted, worth
+from padgs.need import refine
+from padgs.need.calibration import RULES, calibration_split
+from padgs.need.plan import Plan, Step, loss, narrowest, plan, plan_degree, smallest
+from padgs.need.refine import Refining
+from padgs.need.steps import StepsFolder
+from padgs.results import Scores
+from padgs.runs import checkpoint
+from padgs.runs.interrupt import Interrupt, Interrupted
+from padgs.runs.opened import OpenedRun
+from padgs.scene import View
+from padgs.scoring.evaluate import evaluate
+from padgs.splats.trainee import SplatTrainee
+from padgs.stopwatch import Lap
 
-
-@dataclass(frozen=True)
-class Plan:
-    """A model to be made: from that of step `parent`, or for the first from the run's own, with so many rows or all."""
-
-    kind: str  # waste | control | prune | degree
-    parent: int | None
-    rows: int | None = None
-    degree: int | None = None  # highest of the harmonics, or None for those that there are
-
-
-@dataclass(frozen=True)
-class Step:
-    """A model that was made, and measured."""
-
-    kind: str
-    parent: int | None
-    depth: int  # how often it was refined since the run
-    rows: int  # Gaussians, or anchors
-    blended: int  # Gaussians that contribute to any training view
-    bytes: int
-    frame_ms: float  # smallest of some calibration views
-    marks: Scores  # of the calibration views
-    test: dict[str, float | None] = field(default_factory=dict)  # metric -> mean over the test views; decides nothing
-    seconds: float = 0.0  # to make and measure it
-    cpu_seconds: float = 0.0
-    degree: int | None = None  # of steps of that kind
+FOLDER = "need"  # in that of the run
+FRAMES = 10  # timed; the smallest time counts, since other programs only add to it
+WITHOUT_PERCEPTION = replace(RULES, lpips="none")  # for test views, which decide nothing
 
 
-def control(steps: Sequence[Step], depth: int) -> int | None:
-    """The step that was refined so often and lost nothing, if it was made."""
-    return next((n for n, s in enumerate(steps) if s.kind in ("waste", "control") and s.depth == depth), None)
+class Search:
+    """The steps of a run, those that were made before included.
 
-
-def models(steps: Sequence[Step]) -> list[int]:
-    """The first step and all that rows were taken from, from large to small."""
-    return sorted((n for n, s in enumerate(steps) if s.kind in ("waste", "prune")), key=lambda n: -steps[n].rows)
-
-
-def degrees(steps: Sequence[Step], parent: int) -> list[int]:
-    """The steps that harmonics were taken from a model in, from all of them to few."""
-    return [number for number, step in enumerate(steps) if step.kind == "degree" and step.parent == parent]
-
-
-def against(steps: Sequence[Step], number: int, epsilon: float) -> tuple[str, ...]:
-    """Why a step is not as good as its control up to epsilon; nothing where it is."""
-    return objections(steps[number].marks, _beside(steps, number).marks, epsilon)
-
-
-def loss(steps: Sequence[Step], number: int) -> float:
-    """Mean WS-PSNR, dB, that a step lost on the calibration views against its control."""
-    losses = differences(_beside(steps, number).marks, steps[number].marks, QUALITY)
-    return math.fsum(losses) / len(losses)
-
-
-def _beside(steps: Sequence[Step], number: int) -> Step:
-    """What a step is compared with: its control, or the same model with all of its harmonics."""
-    step = steps[number]
-    if step.kind == "degree" and step.parent is not None:
-        return steps[degrees(steps, step.parent)[0]]
-    other = control(steps, step.depth)
-    assert other is not None, "controls are made first"
-    return steps[other]
-
-
-def smallest(steps: Sequence[Step], epsilon: float) -> int:
-    """The smallest model as good as its control up to epsilon; of several steps at least the first."""
-    return [number for number in models(steps) if not against(steps, number, epsilon)][-1]
-
-
-def plan(steps: Sequence[Step], epsilons: Sequence[float] = NEED_LOSSES) -> Plan | None:
-    """What to make next; None where all is known."""
-    if not steps:
-        return Plan("waste", None)
-    wanted = _pruned(steps, epsilons)
-    if wanted is None or wanted.parent is None:
-        return wanted
-    depth = steps[wanted.parent].depth
-    if control(steps, depth + 1) is None:
-        return Plan("control", control(steps, depth))
-    return wanted
-
-
-def plan_degree(steps: Sequence[Step], parent: int, degree: int, epsilon: float) -> Plan | None:
-    """What to make next of a model that has harmonics up to a degree; None where the lowest good one is known."""
-    made = degrees(steps, parent)
-    lower = degree - len(made)
-    if lower < 0 or made and against(steps, made[-1], epsilon):
-        return None
-    return None if degree == 0 else Plan("degree", parent, degree=lower)
-
-
-def narrowest(steps: Sequence[Step], parent: int, epsilon: float) -> int:
-    """The step of the lowest degree that is as good as all up to epsilon; `parent` itself where that takes all."""
-    good = [number for number in degrees(steps, parent) if not against(steps, number, epsilon)]
-    return good[-1] if len(good) > 1 else parent
-
-
-def _pruned(steps: Sequence[Step], epsilons: Sequence[float]) -> Plan | None:
-    last = models(steps)[-1]
-    down = math.ceil(KEPT * steps[last].rows)
-    if smallest(steps, max(epsilons)) == last and FEWEST_ROWS <= down < steps[last].rows:
-        return Plan("prune", last, down)
-    for epsilon in sorted(epsilons, reverse=True):
-        enough = smallest(steps, epsilon)
-        rows = steps[enough].rows
-        below = max((steps[n].rows for n in models(steps) if steps[n].rows < rows), default=rows)
-        middle = round(math.sqrt(rows * below))
-        if rows > CLOSE * below and below < middle < rows:
-            return Plan("prune", enough, middle)
-    return None
-
-
-def knee(steps: Sequence[Step]) -> int | None:
-    """The largest model below which quality falls by more than 0.1 dB per halving; None where it never does.
-
-    Slopes are taken over at least half a doubling: over less they are noise.
+    Attributes:
+        run: whose model is looked at.
+        calibration: training views that are measured on.
+        row: what a row of the model is called, gaussians or anchors.
+        rows: how many the model of the run has.
+        steps, folder: what was made so far, and where it is.
     """
-    order = models(steps)
-    for number in order:
-        rows = steps[number].rows
-        lower = next((n for n in order if steps[n].rows <= HALF_A_DOUBLING * rows), None)
-        if lower is not None:
-            fall = loss(steps, lower) - loss(steps, number)
-            if fall / math.log2(rows / steps[lower].rows) > SLOPE:
-                return number
-    return None
+
+    def __init__(
+        self,
+        run: OpenedRun,
+        say: Callable[[str], None] = lambda text: None,
+        asked: Callable[[], bool] = lambda: False,
+    ) -> None:
+        """Prepare; nothing is drawn yet.
+
+        Args:
+            run: whose model is looked at.
+            say: is told of each step.
+            asked: whether to stop, besides signals.
+
+        Raises:
+            ValueError: the model has no Gaussians that could be left out, or the scene too few training views.
+            CheckpointError: steps of an earlier start are damaged, or of another model.
+        """
+        self.run, self._say, self._asked = run, say, asked
+        self.calibration, self._views = calibration_split(run.scene.train)
+        self._model = self._resumed()
+        self.row, self.rows = next(iter(self._model.counts().items()))
+        self.folder = StepsFolder(run.folder / FOLDER, checkpoint.digest(run.files.checkpoint))
+        self.steps = self.folder.steps()
+
+    def complete(self, epsilon: float) -> int:
+        """Make all steps that are missing; returns the one to keep.
+
+        That is the smallest model as good as its control up to epsilon, with as few harmonics as are as good as all.
+
+        Raises:
+            Interrupted: stopped from outside; starting again goes on, to the same result bit by bit (on the CPU).
+            Failure: a refinement failed.
+        """
+        if self.steps:
+            self._say(f"{len(self.steps)} steps were made before")
+        self._make_all(lambda: plan(self.steps))
+        number = smallest(self.steps, epsilon)
+        if isinstance(self._model, SplatTrainee):
+            degree = self._model.splats.degree
+            self._make_all(lambda: plan_degree(self.steps, number, degree, epsilon))
+        return narrowest(self.steps, number, epsilon)
+
+    def _make_all(self, following: Callable[[], Plan | None]) -> None:
+        with Interrupt(self._asked) as stop:
+            while (wanted := following()) is not None:
+                step, model = self._make(wanted, stop)
+                self.folder.add(len(self.steps), step, model)
+                self.steps.append(step)
+                kind = step.kind if step.degree is None else f"{step.kind} {step.degree}"
+                self._say(
+                    f"{len(self.steps):3d} {kind:8s} {step.rows:8d} {self.row}, {step.blended} Gaussians blended, "
+                    f"{loss(self.steps, len(self.steps) - 1):5.2f} dB lost, {step.seconds:.1f} s"
+                )
+                if stop.requested:
+                    raise Interrupted(f"stopped after step {len(self.steps)}; nothing is lost, start again to go on")
+
+    def kept(self, number: int) -> tuple[Prunable, tuple[float, float]]:
+        """The model of a step, refined once more on all training views if it was refined without some.
+
+        Returns:
+            The model, and the seconds that this took: of wall and of CPU time.
+
+        Raises:
+            Interrupted, Failure: as `complete` does.
+        """
+        lap, before, model = Lap(), (0.0, 0.0), self.model_of(number)
+        if self.steps[number].depth > 0:
+            with Interrupt(self._asked) as stop:
+                before = self._refine(model, self.run.scene.train, f"kept {number}", number, stop)
+        return model, _in_all(before, lap)
+
+    def model_of(self, number: int) -> Prunable:
+        """The model of a step."""
+        model, state = self._resumed(), self.folder.state(number, self._device)
+        if isinstance(model, SplatTrainee) and (degree := self.steps[number].degree) is not None:
+            model.truncate(degree)
+        model.load_state(State(state.tensors, state.values["model"]))
+        return model
+
+    @property
+    def _device(self) -> torch.device:
+        return self.run.scene.points.device
+
+    @property
+    def _schedule(self) -> int:
+        """Iterations of the run's schedule; those of a budget of seconds are known afterwards."""
+        return self.run.method.state().values.get("schedule", self.run.config.training.iterations)
+
+    def _resumed(self) -> Prunable:
+        """The model of the run."""
+        self.run.method.refuse_search()
+        model = self.run.method.resumed(self.run.scene, self._schedule)
+        if not isinstance(model, Prunable):
+            raise ValueError(
+                f"{self.run.config.method} has no Gaussians that could be left out; take a method that has"
+            )
+        return model
+
+    def _make(self, wanted: Plan, stop: Interrupt) -> tuple[Step, State]:
+        lap, before, number = Lap(), (0.0, 0.0), len(self.steps)
+        model = self._model if wanted.parent is None else self.model_of(wanted.parent)
+        if wanted.kind == "waste":
+            shown = worth(model, self.run.scene.train).peak > 0
+            model.keep(shown)
+        else:
+            if isinstance(model, SplatTrainee) and wanted.degree is not None:
+                model.truncate(wanted.degree)
+            if wanted.rows is not None:
+                model.keep(most_wanted(worth(model, self.run.scene.train), wanted.rows))
+            before = self._refine(model, self._views, f"step {number}: {wanted}", number, stop)
+        step = self._measured(model, wanted)
+        seconds, cpu_seconds = _in_all(before, lap)
+        return replace(step, seconds=seconds, cpu_seconds=cpu_seconds), model.state()
+
+    def _refine(
+        self, model: Prunable, views: tuple[View, ...], what: str, number: int, stop: Interrupt
+    ) -> tuple[float, float]:
+        """Train a model a little on some views, in the order that belongs to the number of a step.
+
+        `what` says all that decides the outcome: an interrupted refinement goes on if it is that of the same. Returns
+        the seconds, of wall and of CPU time, that it had taken before.
+        """
+        config, seed = self.run.config, self.run.config.seed + number
+        options = replace(config.training, monitor=False)  # in so few iterations views that differ look like a sign
+        count = max(len(views), round(refine.SHARE * self._schedule))
+        refining = Refining(model, options, self._schedule, count)
+        torch.manual_seed(seed)
+        trainer = Trainer(refining, replace(self.run.scene, train=views), Budget(count), options, seed)
+        if (begun := self.folder.begun(what, self._device)) is not None:
+            trainer.load_state(begun)
+        before = trainer.seconds, trainer.cpu_seconds
+        for record in trainer.records():
+            if stop.requested and record.iteration < count:
+                self.folder.begin(what, trainer.state())
+                raise Interrupted("stopped within a refinement; nothing is lost, start again to go on")
+        return before
+
+    def scored(self, model: Prunable) -> tuple[Scores, dict[str, float | None]]:
+        """Marks of the calibration views, and means of the test views, which decide nothing."""
+        test = self.run.scene.test
+        marks = replace(evaluate(model.render, self.calibration, RULES), protocol={}, notes=())
+        return marks, evaluate(model.render, test, WITHOUT_PERCEPTION).metrics if test else {}
+
+    def _measured(self, model: Prunable, wanted: Plan) -> Step:
+        scene = self.run.scene
+        marks, test = self.scored(model)
+        views = islice(cycle(self.calibration), FRAMES)
+        times = [timed(lambda view=view: model.render(view), self._device)[1] for view in views]
+        return Step(
+            kind=wanted.kind,
+            parent=wanted.parent,
+            depth=0 if wanted.parent is None else self.steps[wanted.parent].depth + 1,
+            rows=next(iter(model.counts().values())),
+            blended=worth(model, scene.train).blended,
+            bytes=model.size().bytes,
+            frame_ms=1000 * min(times),
+            marks=marks,
+            test=test,
+            degree=wanted.degree,
+        )
+
+
+def _in_all(before: tuple[float, float], lap: Lap) -> tuple[float, float]:
+    """Seconds of wall and of CPU time: those before an interruption, and those since the lap began."""
+    wall, cpu = lap.seconds()
+    return before[0] + wall, before[1] + cpu

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from padgs.learning.trainee import State
-from padgs.need.search import Step
+from padgs.need.plan import Step
 from padgs.results import Scores
 from padgs.runs import checkpoint
 

@@ -11,9 +11,8 @@ from torch import Tensor
 from padgs.scene import Scene
 from padgs.splats.model import Splats
 
-COVERED = (
-    2.0  # a point covers directions nearer than so many spacings of directions, or of the points if those are wider
-)
+# A point covers directions nearer than so many spacings of directions, or of the points if those are wider.
+COVERED = 2.0
 FARTHEST = 3.0  # times the distance that `QUANTILE` of the points are within
 QUANTILE = 0.99
 

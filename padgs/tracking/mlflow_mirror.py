@@ -40,25 +40,33 @@ class Mirror:
 
     def update(self, run: Path) -> None:
         """Bring mlflow up to date about a run, finished or in progress."""
+        result = results.read(run / results.FILE_NAME) if (run / results.FILE_NAME).exists() else None
         identity = self._find(RUN, run.name)
+        if identity and self._failed(identity) and (result is None or result.ok):
+            identity = None  # it was started again: nothing that the failed attempt said belongs to this one
         if identity is None:
             identity = self._create(RUN, run.name, {PARENT: self._parent} if self._parent else {})
             self._log_settings(identity, run)
         self._log_progress(identity, run)
-        if (run / results.FILE_NAME).exists():
-            self._log_result(identity, run, results.read(run / results.FILE_NAME))
+        if result:
+            self._log_result(identity, run, result)
         else:
             self._client.update_run(identity, status="RUNNING")
 
-    def finish(self, found: Sequence[Result]) -> None:
-        """End the run that stands for a multirun, with a table of all its results."""
+    def finish(self, found: Sequence[Result], jobs: int) -> None:
+        """End the run that stands for a multirun of so many jobs, with a table of all its results."""
         if self._parent:
             self._log_table(self._parent, found)
-            self._client.set_terminated(self._parent, "FINISHED" if all(result.ok for result in found) else "FAILED")
+            ended = "KILLED" if len(found) < jobs else "FINISHED" if all(result.ok for result in found) else "FAILED"
+            self._client.set_terminated(self._parent, ended)
 
     def _find(self, tag: str, value: str) -> str | None:
+        """The latest run of mlflow with a tag."""
         found = self._client.search_runs([self._experiment], f"tags.`{tag}` = '{value}'", max_results=1)
         return found[0].info.run_id if found else None
+
+    def _failed(self, identity: str) -> bool:
+        return self._client.get_run(identity).info.status == "FAILED"
 
     def _create(self, tag: str, name: str, more: Mapping[str, str] | None = None) -> str:
         tags = {tag: name, **(more or {})}

@@ -86,9 +86,9 @@ class Tracker:
         """Bring mlflow up to date about a run folder, finished or in progress."""
         self._attempt(lambda mirror: mirror.update(run))
 
-    def finish(self, found: Sequence[Result]) -> None:
-        """End the run that stands for a multirun, with a table of all its results."""
-        self._attempt(lambda mirror: mirror.finish(found))
+    def finish(self, found: Sequence[Result], jobs: int) -> None:
+        """End the run that stands for a multirun of so many jobs, with a table of all its results."""
+        self._attempt(lambda mirror: mirror.finish(found, jobs))
 
     def _attempt(self, work: Callable[[Mirror], None]) -> None:
         if not self.on:

@@ -58,7 +58,7 @@ def test_without_mlflow_one_line_says_so_to_who_asked_for_it(tmp_path, said, mon
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     tracker = Tracker(options, tmp_path, "tau", said.append)
     tracker.update(make_run(tmp_path))
-    tracker.finish([])
+    tracker.finish([], 0)
     assert not tracker.on and len(said) == lines
     assert all(installing("mlflow") in line and "tracking=none" in line for line in said)
 
@@ -79,7 +79,7 @@ def test_runs_stand_in_mlflow_with_settings_progress_marks_pictures_and_tables(t
         tracker = Tracker(TrackingOptions(), Path("runs"), "tau", said.append, multirun="tau 1234")
         tracker.update(good)
         tracker.update(bad)
-        tracker.finish([*found.values()])
+        tracker.finish([*found.values()], 2)
         log(good, [40])
     client = mlflow.MlflowClient(f"sqlite:///{runs / 'mlflow.db'}")
     experiment = client.get_experiment_by_name("tau")
@@ -98,6 +98,27 @@ def test_runs_stand_in_mlflow_with_settings_progress_marks_pictures_and_tables(t
     assert {"result.json", "renders/000.png", "tables/runs.md", "tables/runs.csv"} <= artifacts
     assert "20.00" in mlflow.artifacts.load_text(f"{parent.info.artifact_uri}/tables/runs.md")
     assert [path.name for path in tmp_path.iterdir()] == ["runs"]
+
+
+@NEEDS_MLFLOW
+def test_a_run_that_is_started_again_begins_anew_and_a_broken_multirun_did_not_finish(tmp_path, said):
+    mlflow = pytest.importorskip("mlflow")
+    run = make_run(tmp_path, status="nan")
+    tracker = Tracker(TrackingOptions(), tmp_path, "tau", said.append, multirun="tau 1234")
+    tracker.update(run)
+    (run / "result.json").unlink()
+    (run / "log.jsonl").unlink()
+    log(run, [10, 20])
+    tracker.update(run)
+    tracker.update(run)
+    tracker.finish([], 1)
+    client = mlflow.MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
+    stored = client.search_runs([client.get_experiment_by_name("tau").experiment_id], order_by=["start_time"])
+    assert [(stored.info.run_name, stored.info.status) for stored in stored] == [
+        ("tau 1234", "KILLED"), ("room_padgs_1", "FAILED"), ("room_padgs_1", "RUNNING")
+    ]  # fmt: skip
+    history = client.get_metric_history(stored[-1].info.run_id, "train/loss")
+    assert [point.step for point in history] == [10, 20] and said == []
 
 
 @NEEDS_MLFLOW

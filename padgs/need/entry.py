@@ -7,7 +7,7 @@ from collections.abc import Callable
 from rich.console import Console
 
 from padgs.need.outcome import keep
-from padgs.need.session import Search
+from padgs.need.search import Search
 from padgs.need.summary import show
 from padgs.runs.opened import OpenedRun
 from padgs.runs.terminal import say
