@@ -9,6 +9,8 @@ import typer
 from padgs.cli.opening import DataPath, Run, naming_data, opened, writing
 from padgs.cli.refusing import refusing, show
 
+LONG = 60.0  # seconds of writing, from which on it is said beforehand
+
 
 @refusing(ValueError, OSError)
 def export(
@@ -35,7 +37,7 @@ def export(
 
     from padgs.data.ply import write_ply
     from padgs.export.explicit import LESSONS, exported, point_cloud
-    from padgs.export.splat_file import refuse_impossible, write_splats
+    from padgs.export.splat_file import refuse_impossible, seconds_to_write, write_splats
 
     lessons = LESSONS if lessons is None else lessons
     path = Path(to) if to else Path(run) / ("points.ply" if points else "splats.ply")
@@ -54,6 +56,8 @@ def export(
                 smooth=smooth or path.suffix == ".html",
                 progress=lambda done: status.update(f"lesson {done} of {lessons}"),
             )
+        if not points and (seconds := seconds_to_write(path, found.splats)) > LONG:
+            show(f"{path.name}: its harmonics take some {seconds / 60:.0f} minutes; a .spz or .ply takes seconds")
         status.update(f"writing {path}")
         with writing(path):
             if points:

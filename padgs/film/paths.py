@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
-from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
@@ -38,6 +37,8 @@ def along_cameras(scene: Scene, frames: int) -> Tensor:
     Raises:
         ValueError: there is one camera only, or all stand in one place.
     """
+    from scipy.ndimage import gaussian_filter1d  # a quarter of a second, which opening a run need not wait for
+
     views = sorted(scene.train, key=lambda view: natural(view.name))
     given = torch.stack([view.cam_from_world for view in views])
     centers = torch.stack([view.center for view in views])

@@ -1,5 +1,6 @@
 import json
 import shutil
+from pathlib import Path
 
 import pytest
 import torch
@@ -10,7 +11,8 @@ from padgs.data.capture import Cloud
 from padgs.data.errors import DataError
 from padgs.data.ply import write_ply
 from padgs.export import splat_file
-from padgs.export.splat_file import read_splats, write_splats
+from padgs.export.splat_file import read_splats, seconds_to_write, write_splats
+from padgs.splats.model import Splats
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -64,6 +66,14 @@ def test_without_the_converter_the_way_out_is_said(tmp_path, generator, monkeypa
     monkeypatch.setattr(splat_file.shutil, "which", lambda name: None)
     with pytest.raises(ValueError, match="npm install -g @playcanvas/splat-transform; or write a .ply"):
         write_splats(tmp_path / "a.spz", random_splats(0, generator))
+
+
+def test_what_takes_minutes_is_known_beforehand():
+    splats = Splats(torch.zeros(100_000, 3), torch.zeros(100_000, 3), torch.zeros(100_000, 3), degree=2, unit=1.0)
+    assert seconds_to_write(Path("a.sog"), splats) == 0, "no harmonics in use"
+    splats.active_degree = 2
+    assert 400 < seconds_to_write(Path("a.sog"), splats) == seconds_to_write(Path("a.html"), splats) < 550  # took 476
+    assert {seconds_to_write(Path(name), splats) for name in ("a.ply", "a.compressed.ply", "a.spz")} == {0}
 
 
 @pytest.mark.skipif(shutil.which(splat_file.CONVERTER) is None, reason="splat-transform is not installed")
