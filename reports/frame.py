@@ -31,7 +31,7 @@ def frame(runs: Iterable[Run]) -> DataFrame:
     """The runs in their order; the index counts them."""
     runs = list(runs)
     results = [run.result for run in runs]
-    facts = DataFrame({name: [of(result) for result in results] for name, of in FACTS.items()})
+    facts = DataFrame({name: [of(result) for result in results] for name, of in FACTS.items()}, dtype=object)
     facts["log"], facts["pictures"] = [run.log for run in runs], [run.pictures for run in runs]
     numbers = DataFrame({name: [of(result) for result in results] for name, of in NUMBERS.items()}, dtype=float)
     last = [run.log.get("polar_transmittance", ())[-1:] for run in runs]

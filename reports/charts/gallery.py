@@ -58,6 +58,7 @@ def _sheet(name: str, where: str, runs: DataFrame, view: str, notes: Sequence[st
     shown.sort(key=lambda one: -one[0])
     made, axes = figure(COLUMNS, math.ceil(len(shown) / COLUMNS), 3.9, 2.2)
     for panel in axes.flat:
+        panel.set(xticks=[], yticks=[])  # where axes are off their labels are laid out all the same
         panel.set_axis_off()
     for panel, (_, words, picture) in zip(axes.flat, shown, strict=False):
         picture.thumbnail((WIDTH, WIDTH))

@@ -60,7 +60,9 @@ def better_rows(cells: Mapping[int, Cell], column: Column) -> dict[int, set[int]
     alone = pooled_variance(cells.values())
 
     def is_better(i: int, j: int) -> bool:
-        return printed[i] != printed[j] and numbers[j] - numbers[i] > _least_difference(cells[i], cells[j], alone)
+        ahead = numbers[j] - numbers[i]
+        # Most pairs are decided by the first of these, and the last takes the time of a t-test.
+        return ahead > 0 and printed[i] != printed[j] and ahead > _least_difference(cells[i], cells[j], alone)
 
     return {i: {j for j in cells if is_better(i, j)} for i in cells}
 
