@@ -207,6 +207,8 @@ def test_what_cannot_be_searched_is_refused_with_a_way_out(opened, tmp_path):
     assert "has no config.yaml; give the folder of one run" in refused(tmp_path)
     assert "--epsilon is 0; it must be > 0: 0.05, 0.1" in refused(run.folder, "--epsilon", "0")
     assert "is none of those that are searched for: 0.05" in refused(run.folder, "--epsilon", "0.3")
+    moved = refused(run.folder, "--data", str(tmp_path / "gone"))
+    assert f"it is the data of {run.folder}: if it has moved" in " ".join(moved.split())
     (run.folder / "result.json").rename(run.folder / "elsewhere")
     assert "is not finished" in refused(run.folder)
     shutil.rmtree(run.folder / "checkpoint")
