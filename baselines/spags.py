@@ -1,8 +1,8 @@
 """SPaGS: explicit Gaussians seen exactly along each ray, blended without sorting, densified by their 3D gradient.
 
-What is its own: projection `ray` with the 3D filter (variance 0.2 (r / f)^2), hybrid transparency, a Gaussian that
-reaches the near sphere is not drawn at all, and a densification signal that knows no image plane. All but the last is
-how it renders (`RENDER`); spags_sorted blends in the order of the means instead.
+What is its own: projection `ray`, hybrid transparency, a Gaussian that reaches the near sphere is not drawn at all (how
+it renders, `RENDER`); the 3D filter of its training views (variance 0.2 (r / f)^2), and a densification signal that
+knows no image plane. spags_sorted blends in the order of the means instead.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from padgs.splats.method import SplatMethod, SplatOptions
 
 @dataclass(frozen=True)
 class SPaGSOptions(SplatOptions):
-    """The published schedule; `opacity_decay` was read from a copy of the code and may belong to that copy alone."""
+    """The published schedule; `opacity_decay` is what two copies of the code have."""
 
     densify_from: int = 200
     signal: str = "space_absolute"
@@ -23,10 +23,11 @@ class SPaGSOptions(SplatOptions):
     sample_clones: bool = True
     reset_opacity: float = 0.1
     opacity_decay: float = 0.001
+    filter_pixels: float = 0.2
 
 
 class SPaGSMethod(SplatMethod):
     """See `padgs.learning.method.Method`."""
 
     Options = SPaGSOptions
-    RENDER = RenderConfig(projection="ray", near_cull="ellipsoid", low_pass=0.2, blending="hybrid", core_size=16)
+    RENDER = RenderConfig(projection="ray", near_cull="ellipsoid", low_pass=0.0, blending="hybrid", core_size=16)

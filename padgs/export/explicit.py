@@ -68,11 +68,11 @@ def exported(
     config = run.config.render
     notes = [f"padgs {padgs.__version__}, run {run.folder.name}"]
     if isinstance(trainee, SplatTrainee):
-        splats = trainee.splats
+        splats = trainee.baked()
         if isinstance(run.method, SCOmniGSMethod):  # it trained in the world of its refined poses
             splats = moved(splats, aligned(run.method.trainee.calibration.poses)[0].inverse())
         notes.append("Gaussians as trained")
-        if smooth and config.resolved_low_pass_kind == "solid":
+        if smooth and config.low_pass > 0 and config.resolved_low_pass_kind == "solid":
             splats = smoothed(splats, cameras_of(run.scene.train), config.low_pass)
             notes[-1] = "Gaussians as trained, each as wide as the finest training view drew it"
     elif isinstance(trainee, AnchorTrainee):

@@ -66,6 +66,14 @@ def append_rows(parameters: Mapping[str, nn.Parameter], optimizer: torch.optim.A
                 moments[moment] = torch.cat((moments[moment], torch.zeros_like(rows)))
 
 
+def forget_moments(parameter: nn.Parameter, optimizer: torch.optim.Adam) -> None:
+    """Set the Adam moments of a parameter to 0, if it has any yet."""
+    moments = optimizer.state.get(parameter, {})
+    for name in MOMENTS:
+        if name in moments:
+            moments[name].zero_()
+
+
 def load_rows(model: nn.Module, tensors: Mapping[str, Tensor], growing: Collection[str]) -> None:
     """Set all parameters to what `state_dict` of another model gave, whose `growing` tensors may have other row counts.
 

@@ -89,9 +89,15 @@ class PlusTrainee(SplatTrainee):
             penalties.append(options.smoothness_weight * roughness(drawing.rendering, view.camera, near=near))
         return replace(drawing, penalty=sum(penalties)) if penalties else drawing
 
+    def _in_training(self, gaussians: Gaussians) -> Gaussians:
+        """As all splats are, but that some are left out."""
+        share, gaussians = self._share_of_opacities(), super()._in_training(gaussians)
+        return gaussians if share is None else replace(gaussians, opacities=share * gaussians.opacities)
+
     @torch.no_grad()
     def _share_of_opacities(self) -> Tensor | None:
-        """Nothing of a few by chance, which the others must make up for, and so much more of all others.
+        """What opacities [N] are multiplied with in the next drawing; None: 1. Nothing of a few by chance, which the
+        others must make up for, and so much more of those.
 
         Dropout, as DropGaussian has it: what stands in front of one view only to please it is found out. The last
         states, which become the model, know all Gaussians.

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from padgs.checks import check, check_known
 from padgs.gaussians import rotation_matrices
-from padgs.learning.rows import append_rows, keep_rows
+from padgs.learning.rows import append_rows, forget_moments, keep_rows
 from padgs.learning.schedule import scaled
 from padgs.splats.model import Splats
 from padgs.splats.probes import SIGNALS
@@ -157,8 +157,8 @@ class CloneSplit:
         begin = 0 if options.released_start else options.densify_from
         if iteration > begin and iteration % options.densify_every == 0 and grows():
             cloned, split, left_out = self._multiply(optimizer, iteration)
-            self._decay_opacities(optimizer)
             pruned = self._prune(optimizer, iteration)
+            self._decay_opacities(optimizer)
             self.forget()
             events.append(f"cloned {cloned}, split {split}, pruned {pruned} Gaussians")
             if left_out:
@@ -247,7 +247,7 @@ class CloneSplit:
         if self.options.opacity_decay > 0:
             logits = self.splats.opacity_logits
             logits.copy_(torch.logit((torch.sigmoid(logits) - self.options.opacity_decay).clamp(min=FAINTEST)))
-            self._forget_moments_of_opacities(optimizer)
+            forget_moments(logits, optimizer)
 
     def _reset_opacities(self, optimizer: torch.optim.Adam) -> None:
         """Make everything nearly transparent, so that only what the images ask for comes back.
@@ -259,13 +259,7 @@ class CloneSplit:
             drawn = self._drawn_opacities()
             lowered = torch.logit(torch.sigmoid(logits) * highest / drawn)
             logits.copy_(torch.where(drawn > highest, lowered, logits))
-        self._forget_moments_of_opacities(optimizer)
-
-    def _forget_moments_of_opacities(self, optimizer: torch.optim.Adam) -> None:
-        moments = optimizer.state.get(self.splats.opacity_logits, {})
-        for name in ("exp_avg", "exp_avg_sq"):
-            if name in moments:
-                moments[name].zero_()
+        forget_moments(logits, optimizer)
 
     def _empty(self) -> dict[str, Tensor]:
         zeros = self.splats.means.new_zeros(len(self.splats))

@@ -6,6 +6,7 @@ subclass in `baselines` that says which.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -32,11 +33,15 @@ class SplatOptions(CloneSplitOptions, ExtentOptions):
     """The `method` group of the configuration: the model, and its densification."""
 
     sh_degree: int = 3  # 0: colours do not depend on the direction
+    # Variance in square pixels of the training view that has the finest one at a Gaussian, which is wider by that in
+    # whatever view (the 3D filter of Mip-Splatting and SPaGS, `padgs.splats.nearest`); 0: none.
+    filter_pixels: float = 0.0
 
     def __post_init__(self) -> None:
         for part in (CloneSplitOptions, ExtentOptions):
             part.__post_init__(self)
         check(self, f"0 to {MAX_DEGREE}", lambda degree: 0 <= degree <= MAX_DEGREE, "sh_degree")
+        check(self, "a variance >= 0 in square pixels", lambda v: 0 <= v < math.inf, "filter_pixels")
 
 
 def refuse_polar_threshold(options: SplatOptions, why: str) -> None:
@@ -107,5 +112,6 @@ class SplatMethod(Method):
             seed=self.seed,
             asked=self._gaussians,
             removal_psnr=self._removal_psnr,
+            filter_pixels=self.options.filter_pixels,
             **more,
         )

@@ -57,11 +57,40 @@ def no_finer(gaussians: Gaussians, view: View, pixels: Tensor, variance: float) 
     return replace(gaussians, scales=wide, opacities=gaussians.opacities * share)
 
 
+class PixelFilter:
+    """The 3D filter of Mip-Splatting as SPaGS has it: each Gaussian as wide as a pixel of the finest training view.
+
+    Its widths have no derivative, and follow the means when they are renewed.
+
+    Attributes:
+        variances: [N] world units squared, what each Gaussian is wider by; empty until they are first renewed.
+    """
+
+    def __init__(self, pixels: float, cameras: Tensor) -> None:
+        """Of so many square pixels of the cameras [V, 4] of `cameras_of`."""
+        self.pixels, self.cameras = pixels, cameras
+        self.variances = torch.zeros(0)
+
+    def renew(self, means: Tensor) -> None:
+        """Measure again what a pixel covers at each of the means [N, 3]."""
+        self.variances = self.pixels * finest_pixels(means.detach(), self.cameras).square()
+
+    def __call__(self, gaussians: Gaussians) -> Gaussians:
+        """The Gaussians wider, and fainter as their volume grows."""
+        wide, share = wider(gaussians.scales, self.variances)
+        return replace(gaussians, scales=wide, opacities=gaussians.opacities * share)
+
+
 @torch.no_grad()
 def smoothed(splats: Splats, cameras: Tensor, variance: float) -> Splats:
     """Splats for programs that know no such filter: as wide as it makes them in the finest of the cameras [V, 4]."""
-    pixels = finest_pixels(splats.means, cameras)
-    wide, share = wider(splats.log_scales.exp(), variance * pixels * pixels)
+    return widened(splats, variance * finest_pixels(splats.means, cameras).square())
+
+
+@torch.no_grad()
+def widened(splats: Splats, variances: Tensor) -> Splats:
+    """Splats with variances [N] more each way, and fainter as their volume grows."""
+    wide, share = wider(splats.log_scales.exp(), variances)
     new = copy.deepcopy(splats)
     opacity_logits = torch.logit(torch.sigmoid(splats.opacity_logits) * share, eps=1e-6)
     new.load(splats.rows() | {"log_scales": wide.log(), "opacity_logits": opacity_logits})

@@ -9,7 +9,7 @@ sum |dL/dmean|, by way of the footprints alone (`padgs.render.absolute`).
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
 
 from torch import Tensor
 
@@ -28,7 +28,7 @@ def render_probed(
     *,
     signal: str,
     probe: Tensor | None = None,
-    share: Tensor | None = None,
+    change: Callable[[Gaussians], Gaussians] = lambda gaussians: gaussians,
     backend: str = "auto",
 ) -> tuple[Rendering, Gaussians, Tensor]:
     """Render; returns what was drawn, too, and the probe, whose gradient `backward` fills.
@@ -38,7 +38,7 @@ def render_probed(
 
     A `probe` that is given is used again: its gradient is then the sum of several drawings of the same Gaussians.
 
-    `share` [N] is what each opacity is multiplied with; None: 1.
+    `change` is made to the Gaussians before they are drawn.
 
     Raises:
         ValueError: unknown signal, or what `render` raises.
@@ -46,18 +46,13 @@ def render_probed(
     means = splats.means
     if signal == "image":
         probe = means.new_zeros(len(means), 2, requires_grad=True) if probe is None else probe
-        gaussians = _with(share, splats.gaussians(view))
+        gaussians = change(splats.gaussians(view))
         return render(gaussians, view, options, probe=probe, backend=backend), gaussians, probe
     if signal not in SIGNALS:
         raise ValueError(f"unknown signal {signal!r}; known: {', '.join(SIGNALS)}")
     absolute = signal == "space_absolute"
     probe = means.new_zeros(len(means), 4 if absolute else 3, requires_grad=True) if probe is None else probe
     steps = 0.5 * (means.detach() - view.center.to(means)).norm(dim=-1, keepdim=True) * probe
-    gaussians = _with(share, splats.gaussians(view, shift=steps[:, :3]))
+    gaussians = change(splats.gaussians(view, shift=steps[:, :3]))
     pulls = steps[:, 3] if absolute else None
     return render(gaussians, view, options, absolute_probe=pulls, backend=backend), gaussians, probe
-
-
-def _with(share: Tensor | None, gaussians: Gaussians) -> Gaussians:
-    """The Gaussians, with such a share of their opacities."""
-    return gaussians if share is None else replace(gaussians, opacities=share * gaussians.opacities)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import reduce
 
 import torch
 from torch import Tensor
@@ -16,13 +15,16 @@ from padgs.learning.trainee import Drawing, Parts, Size, State
 from padgs.learning.worth import most_wanted, needed, worth
 from padgs.render import Rendering, RenderOptions, render
 from padgs.render.config import RenderConfig
-from padgs.render.low_pass import LowPass, low_pass_of, widened
+from padgs.render.contract import ALPHA_MIN
+from padgs.render.low_pass import wider
 from padgs.scene import View
 from padgs.sphere.panorama import longitude_latitude
 from padgs.splats.clone_split import MIN_DENSIFY_EVERY, CloneSplit, CloneSplitOptions
 from padgs.splats.model import Splats
+from padgs.splats.nearest import PixelFilter, cameras_of, finest_pixels, widened
 from padgs.splats.probes import render_probed
 
+VARIANCES = "filter/variances"  # of the filter, in a state
 DEGREE_EVERY = 1000  # published iterations after which the next SH degree comes into use
 
 
@@ -47,6 +49,7 @@ class SplatTrainee:
         seed: int = 0,
         asked: int | str | None = None,
         removal_psnr: float | None = None,
+        filter_pixels: float = 0.0,
     ) -> None:
         """Wrap splats.
 
@@ -62,6 +65,7 @@ class SplatTrainee:
             asked: by the budget. A number: so many Gaussians are kept a round after growth, those that the views would
                 miss most; auto, or None where nothing is asked: as many as `padgs.learning.worth.needed` says.
             removal_psnr: dB, for that. None: all are kept.
+            filter_pixels: variance of `padgs.splats.nearest.PixelFilter`, square pixels; 0: there is none.
         """
         self.splats, self.iterations = splats, iterations
         self._config, self._views, self._extent = config, views, extent
@@ -76,6 +80,9 @@ class SplatTrainee:
             seed=seed,
         )
         self._drawn: View | None = None  # the view of the last drawing
+        self._filter = PixelFilter(filter_pixels, cameras_of(views)) if filter_pixels > 0 else None
+        if self._filter is not None:
+            self._filter.renew(splats.means)
 
     def groups(self, means_speed: float = 1.0) -> list[ParameterGroup]:
         """Learning rates of 3DGS; that of the means falls over the whole run and follows the size of the scene."""
@@ -102,14 +109,14 @@ class SplatTrainee:
             self.render_options(view),
             signal=self.densifier.options.signal,
             probe=probe,
-            share=self._share_of_opacities(),
+            change=self._in_training,
             backend=self._config.backend,
         )
         return Drawing(rendering, probe, gaussians, torch.arange(len(probe), device=probe.device))
 
-    def _share_of_opacities(self) -> Tensor | None:
-        """What opacities [N] are multiplied with in the next drawing of the training; None: 1."""
-        return None
+    def _in_training(self, gaussians: Gaussians) -> Gaussians:
+        """All Gaussians as the next drawing of the training has them."""
+        return gaussians if self._filter is None else self._filter(gaussians)
 
     def observe(self, drawing: Drawing, iteration: int) -> None:
         """Note how hard each Gaussian was pulled."""
@@ -126,6 +133,8 @@ class SplatTrainee:
         events = self.densifier.adapt(iteration, optimizer, grows=self._has_seen_enough)
         if self._removal_psnr is not None and self._must_choose(iteration):
             events += self._chosen(optimizer, self._removal_psnr)
+        if self._filter is not None:
+            events += self._filtered(self._filter, iteration, optimizer)
         degree = min(self.splats.degree, self.degree_at(iteration + 1))
         if degree > self.splats.active_degree:
             self.splats.active_degree = degree
@@ -173,6 +182,20 @@ class SplatTrainee:
         self._has_chosen = True
         return (f"kept {kept} of {grown} Gaussians, those that the training views would miss most",)
 
+    def _filtered(self, pixels: PixelFilter, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
+        """Renew the filter where rows have changed and at least once a round; at the end leave out what nobody sees."""
+        splats, every = self.splats, self.densifier.options.densify_every
+        if len(pixels.variances) == len(splats) and iteration % every and iteration < self.iterations:
+            return ()
+        pixels.renew(splats.means)
+        if iteration < self.iterations:
+            return ()
+        seen, before = self._drawn_opacities() >= ALPHA_MIN, len(splats)
+        keep_rows(splats.rows(), optimizer, seen)
+        self.densifier.forget()
+        pixels.renew(splats.means)
+        return (f"left out {before - len(splats)} Gaussians that are too faint to be seen",)
+
     def degree_at(self, iteration: int) -> int:
         """The SH degree that is in use by then, if the model has it."""
         return iteration // scaled(DEGREE_EVERY, self.iterations)
@@ -190,6 +213,8 @@ class SplatTrainee:
         """Keep these Gaussians only."""
         keep_rows(self.splats.rows(), None, rows)
         self.densifier.statistics = {name: values[rows] for name, values in self.densifier.statistics.items()}
+        if self._filter is not None:
+            self._filter.variances = self._filter.variances[rows]
 
     def truncate(self, degree: int) -> None:
         """Leave out the harmonics above a degree; of all that has them, but no optimiser."""
@@ -202,7 +227,12 @@ class SplatTrainee:
 
     def _shown(self, view: View) -> Gaussians:
         """All Gaussians as a finished model shows them."""
-        return self.splats.gaussians(view)
+        gaussians = self.splats.gaussians(view)
+        return gaussians if self._filter is None else self._filter(gaussians)
+
+    def baked(self) -> Splats:
+        """The splats as a finished model shows them, for programs that know nothing of its filter."""
+        return self.splats if self._filter is None else widened(self.splats, self._filter.variances)
 
     def size(self) -> Size:
         """Counts and bytes of the model."""
@@ -213,6 +243,8 @@ class SplatTrainee:
         tensors = {f"splats/{name}": tensor for name, tensor in self.splats.state_dict().items()}
         tensors |= {f"statistics/{name}": tensor for name, tensor in self.densifier.statistics.items()}
         tensors["random/pieces"] = self.densifier.generator.get_state()
+        if self._filter is not None:
+            tensors[VARIANCES] = self._filter.variances
         values = {
             "active_degree": self.splats.active_degree,
             "degree": self.splats.degree,
@@ -234,6 +266,8 @@ class SplatTrainee:
         self.densifier.statistics = {n: t.to(device, copy=True) for n, t in state.under("statistics/").items()}
         self.densifier.generator.set_state(state.tensors["random/pieces"].cpu())
         self._has_chosen = state.values.get("has_chosen")
+        if self._filter is not None:
+            self._filter.variances = state.tensors[VARIANCES].to(device, copy=True)
 
     def load_model(self, state: State) -> None:
         """Take the splats alone, whose densification begins anew.
@@ -244,21 +278,17 @@ class SplatTrainee:
         self.splats.load(state.under("splats/"))
         self.splats.active_degree = state.values["active_degree"]
         self.densifier.forget()
+        if self._filter is not None:
+            self._filter.renew(self.splats.means)
 
     @torch.no_grad()
     def _drawn_opacities(self) -> Tensor:
-        """Opacities [N] as the nearest training camera draws them: the solid low-pass lowers them with the distance."""
-        if self._config.resolved_low_pass_kind != "solid":
-            return torch.sigmoid(self.splats.opacity_logits)
-        gaussians = self.splats.gaussians(self._views[0])
-        of_views = (
-            widened(gaussians, gaussians.means - view.center.to(gaussians.means), self._low_pass(view)).opacities
-            for view in self._views
-        )
-        return reduce(torch.maximum, of_views)
-
-    def _low_pass(self, view: View) -> LowPass:
-        return low_pass_of(self.render_options(view), view.camera)
+        """Opacities [N] as the training camera with the finest pixel there draws them: filters in space lower them."""
+        splats, pixels = self.splats, 0.0 if self._filter is None else self._filter.pixels
+        if self._config.resolved_low_pass_kind == "solid":
+            pixels += self._config.low_pass
+        squared = finest_pixels(splats.means, cameras_of(self._views)).square()
+        return torch.sigmoid(splats.opacity_logits) * wider(splats.log_scales.exp(), pixels * squared)[1]
 
     def render_options(self, view: View) -> RenderOptions:
         """How a view is drawn."""

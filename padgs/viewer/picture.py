@@ -136,15 +136,9 @@ class Gallery:
 def cropped(method: Method, crop: Box) -> Method:
     """The method without all that lies outside of a box, in place; only good for drawing."""
     trainee = method.trainee
-    model, places = (
-        (trainee.model, trainee.model.positions)
-        if isinstance(trainee, AnchorTrainee)
-        else (trainee.splats, trainee.splats.means)
-    )
+    places = trainee.model.positions if isinstance(trainee, AnchorTrainee) else trainee.splats.means
     low, high = (places.new_tensor(corner) for corner in crop)
-    keep = ((places >= low) & (places <= high)).all(-1)
-    rows = {"positions", *model.rows()}
-    model.load({name: t[keep] if name in rows else t for name, t in model.state_dict().items()})
+    trainee.keep(((places >= low) & (places <= high)).all(-1))
     return method
 
 

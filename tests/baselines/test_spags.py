@@ -20,9 +20,10 @@ from padgs.render import RenderOptions
 from padgs.render.backends.cpu_tiles import Projected
 from padgs.render.backends.native_camera import native_camera
 from padgs.render.config import RenderConfig
-from padgs.render.low_pass import low_pass_of, widened
 from padgs.scene import Scene
 from padgs.sphere.camera import Panorama
+from padgs.splats.model import Splats
+from padgs.splats.trainee import SplatTrainee
 
 WIDTH, HEIGHT = 2048, 1024
 OPTIONS = SPaGSMethod.RENDER.options(scene_unit=1.0)
@@ -49,20 +50,70 @@ def test_the_published_schedule():
     assert (options.densify_from, options.densify_until, options.densify_every) == (200, 15_000, 100)
     assert (options.signal, options.gradient_threshold, options.min_opacity) == ("space_absolute", 5e-5, 0.005)
     assert (options.reset_every, options.reset_opacity, options.opacity_decay) == (3000, 0.1, 0.001)
+    assert options.filter_pixels == 0.2
     assert not options.prune_by_extent and options.sh_degree == 3
 
 
-def test_the_filter_has_a_fifth_of_a_square_pixel_and_keeps_the_mass(generator):
-    """Sigma' = Sigma + 0.2 (r / f)^2 I with f = W / 2 pi, and o' = o sqrt(det Sigma / det Sigma')."""
-    low_pass = low_pass_of(OPTIONS, Panorama(WIDTH, HEIGHT))
-    means = torch.randn(20, 3, generator=generator, dtype=torch.float64)
-    scales = 1e-3 * torch.rand(20, 3, generator=generator, dtype=torch.float64)
-    gaussians = Gaussians(means, torch.ones(20, 4).double(), scales, torch.full((20,), 0.7).double(), means)
-    wide = widened(gaussians, means, low_pass)
-    added = wide.scales**2 - scales**2
-    assert torch.allclose(added, (0.2 * (means.norm(dim=-1) * 2 * math.pi / WIDTH) ** 2)[:, None].expand(-1, 3))
-    assert torch.allclose(wide.opacities * wide.scales.prod(-1), 0.7 * scales.prod(-1))
-    assert low_pass.own == 0, "there is no filter in the image beside it"
+def trainee_of(scene: Scene, iterations: int = 100) -> SplatTrainee:
+    splats = Splats.from_scene(scene, generator=torch.Generator().manual_seed(0))
+    options = SPaGSOptions()
+    return SplatTrainee(
+        splats,
+        options,
+        SPaGSMethod.RENDER,
+        extent=1.0,
+        iterations=iterations,
+        views=scene.train,
+        filter_pixels=options.filter_pixels,
+    )
+
+
+def test_the_filter_is_a_fifth_of_a_square_pixel_of_the_nearest_training_view_whoever_looks(scene):
+    """Sigma' = Sigma + 0.2 (r / f)^2 I with f = W / 2 pi, o' = o sqrt(det Sigma / det Sigma'), without a derivative."""
+    trainee = trainee_of(scene)
+    splats, views = trainee.splats, (scene.train[0], scene.test[0])
+    centers = torch.stack([view.center for view in scene.train]).float()
+    nearest = torch.cdist(splats.means, centers).amin(-1)
+    assert len({*torch.cdist(splats.means, centers).argmin(-1).tolist()}) > 1
+    added = 0.2 * (nearest * 2 * math.pi / scene.train[0].width) ** 2
+    for view in views:
+        drawn = trainee.draw(view).gaussians
+        torch.testing.assert_close(drawn.scales**2 - splats.log_scales.exp() ** 2, added[:, None].expand(-1, 3))
+        mass = torch.sigmoid(splats.opacity_logits) * splats.log_scales.exp().prod(-1)
+        torch.testing.assert_close(drawn.opacities * drawn.scales.prod(-1), mass)
+        assert trainee.parts(view).options.low_pass == 0, "there is no filter of the view beside it"
+    drawn.scales.sum().backward()
+    assert splats.means.grad is None and splats.log_scales.grad.abs().min() > 0
+
+
+def test_the_filter_follows_the_means_once_a_round_and_keeps_to_the_rows(scene):
+    trainee = trainee_of(scene, iterations=3000)
+    optimizer, view = torch.optim.Adam(trainee.splats.parameters()), scene.train[0]
+
+    def added() -> torch.Tensor:
+        return trainee.draw(view).gaussians.scales ** 2 - trainee.splats.log_scales.exp() ** 2
+
+    before = added()
+    trainee.splats.means.data *= 3
+    trainee.adapt(1, optimizer)
+    torch.testing.assert_close(added(), before, atol=1e-7, rtol=1e-3)
+    every = trainee.densifier.options.densify_every
+    trainee.adapt(every, optimizer)
+    after = added()
+    assert not torch.allclose(after, before, rtol=0.1)
+    trainee.keep(torch.arange(5))
+    torch.testing.assert_close(added(), after[:5])
+
+
+def test_what_is_too_faint_to_be_seen_is_no_part_of_the_model_and_was_in_no_image(scene):
+    trainee = trainee_of(scene, iterations=100)
+    trainee.splats.opacity_logits.data[::2] = torch.logit(torch.tensor(0.006))
+    trainee.splats.log_scales.data[::2] = math.log(1e-3)
+    image, count = trainee.render(scene.test[0]).image, len(trainee.splats)
+    events = trainee.adapt(100, torch.optim.Adam(trainee.splats.parameters()))
+    left_out = count - len(trainee.splats)
+    assert 0 < left_out <= (count + 1) // 2 and any(f"left out {left_out} Gaussians" in event for event in events)
+    assert torch.equal(trainee.render(scene.test[0]).image, image)
 
 
 def test_boxes_are_as_narrow_as_can_be_and_the_published_ones_are_not(generator):

@@ -224,9 +224,9 @@ def test_as_many_multiply_for_their_absolute_pull_as_pass_the_threshold():
     assert not grown.statistics["absolute"].any() and len(grown.statistics["absolute"]) == 10
 
 
-def test_opacities_decay_in_every_round_and_the_faintest_go():
+def test_opacities_decay_in_every_round_once_the_faintest_are_gone():
     grown, optimizer = densifier([SMALL] * 4, opacity_decay=0.001)
-    opacities = torch.tensor([0.0055, 0.0065, 0.5, 0.0005])
+    opacities = torch.tensor([0.0045, 0.0055, 0.5, 0.0005])
     grown.splats.opacity_logits.data = torch.logit(opacities)
     assert grown.adapt(EVERY, optimizer) == ("cloned 0, split 0, pruned 2 Gaussians",)
     assert torch.allclose(torch.sigmoid(grown.splats.opacity_logits), opacities[1:3] - 0.001, rtol=1e-4)
