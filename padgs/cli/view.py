@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from padgs import results
 from padgs.cli.opening import DataPath, Run, naming_data, opened
 from padgs.cli.refusing import refusing
+
+if TYPE_CHECKING:
+    from padgs.runs.opened import OpenedRun
 
 
 @refusing(ValueError, OSError)
@@ -22,12 +27,19 @@ def view(
     data: DataPath = None,
 ) -> None:
     """Walk through a run in the browser, drawn here by the run's own renderer; one in training is followed."""
-    from padgs.viewer.process import await_checkpoint, has_screen, serve
+    from padgs.viewer.process import has_screen, serve
     from padgs.viewer.server import LOCAL, PORT
 
-    runs, names = [], []
-    try:
-        for folder in (run, beside) if beside else (run,):
+    folders = (run, beside) if beside else (run,)
+    for folder in folders:
+        if not (Path(folder) / results.CONFIG_NAME).is_file():
+            opened(folder, data)  # says what is wrong before a page stands
+
+    def of_one_scene() -> list[OpenedRun]:
+        from padgs.viewer.waiting import await_checkpoint
+
+        runs, names = [], []
+        for folder in folders:
             await_checkpoint(folder)
             runs.append(found := opened(folder, data))
             with naming_data(folder):
@@ -35,6 +47,9 @@ def view(
         if len({*names}) > 1:
             scenes = " and ".join(names)
             raise ValueError(f"{run} and {beside} are of two scenes, {scenes}; name two runs of one scene")
-        serve(runs, host=host or LOCAL, port=port or PORT, browse=has_screen())
+        return runs
+
+    try:
+        serve(of_one_scene, host=host or LOCAL, port=port or PORT, browse=has_screen())
     except KeyboardInterrupt:
         print()

@@ -7,69 +7,47 @@ import signal
 import sys
 import time
 import webbrowser
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from multiprocessing import get_context, parent_process
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from padgs import results
-from padgs.runs import checkpoint
-from padgs.runs.folder import RunFolder
-from padgs.runs.lock import RunBusy, held
-from padgs.runs.opened import OpenedRun, load_run
-from padgs.viewer.server import LOCAL, PORT, is_local, serving, viser_module
+from padgs.viewer.server import LOCAL, PORT, serving, viser_module
+
+if TYPE_CHECKING:
+    from padgs.runs.opened import OpenedRun
 
 LOOKS = 0.5  # seconds between two looks at whether something is there, or still there
 PATIENCE = 5.0  # seconds that a server has to end
 
 
-def await_checkpoint(folder: str | Path) -> None:
-    """Return when a run has its first checkpoint, or can have none any more: opening it then says what is wrong.
+def serve(
+    opened: Callable[[], Sequence[OpenedRun]], *, host: str = LOCAL, port: int = PORT, browse: bool = False
+) -> None:
+    """Serve a page, say where, and show what `opened` returns, until the process that started this one, if any, ends.
+
+    Args:
+        opened: returns one run, or two to compare; called while browsers load the page, as both take seconds.
+        host, port: as `padgs.viewer.server.serving` takes them.
+        browse: whether to open the page as well, where only this machine is served.
 
     Raises:
-        ValueError: it was begun, but nobody trains it.
-    """
-    files, said, beside = RunFolder(Path(folder)), False, parent_process() is not None
-
-    def decided() -> bool:
-        return checkpoint.exists(files.checkpoint) or (files.path / results.FILE_NAME).exists()
-
-    while not decided() and _is_wanted():
-        if not beside and not (files.path / results.CONFIG_NAME).is_file():
-            return
-        # Training beside which this process stands may not hold its lock yet; what ended just now is looked at again.
-        if not beside and _is_left(files.path) and not decided():
-            raise ValueError(f"{folder} has no checkpoint, and nobody trains it; start the same padgs-run again")
-        if not said:
-            print(f"waiting for the first checkpoint of {folder}  (Ctrl-C ends it)", flush=True)
-        said = True
-        time.sleep(LOOKS)
-
-
-def _is_left(folder: Path) -> bool:
-    """Whether nobody works on a run, as far as can be told."""
-    try:
-        with held(folder):
-            return True
-    except (RunBusy, OSError):  # a folder of somebody else, which cannot be locked from here
-        return False
-
-
-def serve(runs: list[OpenedRun], *, host: str = LOCAL, port: int = PORT, browse: bool = False) -> None:
-    """Serve one run, or two to compare, and say where, until the process that started this one, if any, is gone.
-
-    Where only this machine is served, `browse` opens the page as well.
-
-    Raises:
-        ValueError, OSError, KeyboardInterrupt: as `padgs.viewer.server.serving` does, and Ctrl-C.
+        ValueError, OSError, KeyboardInterrupt: as `serving` and `opened` do, and Ctrl-C.
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # libraries take it for a crash otherwise
-    with serving(runs, host=host, port=port) as server:
+    with serving(host=host, port=port) as server:
         print(f"{server.address}  (Ctrl-C ends it)", flush=True)
-        if browse and is_local(host):
+        if browse and server.is_local:
             webbrowser.open(server.address)
-        while _is_wanted():
-            time.sleep(LOOKS)
+        said = server.viser.gui.add_markdown("opening the run")
+        runs = opened()
+        from padgs.viewer.pages import showing  # takes its time as well
+
+        said.remove()
+        with showing(server, runs):
+            while is_wanted():
+                time.sleep(LOOKS)
 
 
 def has_screen() -> bool:
@@ -78,7 +56,7 @@ def has_screen() -> bool:
     return sys.stdout.isatty() and windows and "SSH_CONNECTION" not in os.environ
 
 
-def _is_wanted() -> bool:
+def is_wanted() -> bool:
     """Whether the process that started this one is still there, if one of ours did."""
     return (parent := parent_process()) is None or parent.is_alive()
 
@@ -107,6 +85,9 @@ def shown(folder: Path, data_path: str | None, device: str) -> Iterator[None]:
 
 
 def _show(folder: Path, data_path: str | None, device: str) -> None:
+    from padgs.runs.opened import load_run
+    from padgs.viewer.waiting import await_checkpoint
+
     with suppress(KeyboardInterrupt):
         await_checkpoint(folder)
-        serve([load_run(folder, data_path=data_path, device=device)])
+        serve(lambda: [load_run(folder, data_path=data_path, device=device)])

@@ -13,7 +13,8 @@ import padgs
 from padgs.cli.commands import app
 from padgs.extras import installing
 from padgs.viewer.page import BOTH
-from padgs.viewer.server import box_of, serving
+from padgs.viewer.pages import box_of, showing
+from padgs.viewer.server import serving
 
 try:
     import viser
@@ -36,17 +37,17 @@ def until(condition) -> None:
 
 @WITH_VISER
 def test_the_page_is_served_here_only_and_ends(run):
-    with serving([run], port=8400) as server:
-        assert server.address.startswith("http://localhost:")
+    with serving(port=8400) as server, showing(server, [run]):
+        assert server.is_local and server.address.startswith("http://localhost:")
         assert b"<html" in urlopen(server.address, timeout=20).read()[:500]
     with pytest.raises(OSError, match="refused"):
         urlopen(server.address, timeout=5)
 
 
 @WITH_VISER
-def test_a_page_for_the_network_has_an_address_that_others_can_open(run):
-    with serving([run], host="0.0.0.0", port=8410) as server:
-        assert "0.0.0.0" not in server.address
+def test_a_page_for_the_network_has_an_address_that_others_can_open():
+    with serving(host="0.0.0.0", port=8410) as server:
+        assert not server.is_local and "0.0.0.0" not in server.address
         assert b"<html" in urlopen(server.address, timeout=20).read()[:500]
 
 
@@ -55,9 +56,9 @@ def test_a_page_for_the_network_has_an_address_that_others_can_open(run):
 @in_chromium
 def test_a_browser_shows_all_that_can_be_asked_for(run, tmp_path):
     """Controls are set from here, as the page would; what they do is seen on the page."""
-    with serving([run, run], port=8420) as server, visiting(server.address) as visit:
-        until(lambda: server.pages)
-        (page,) = server.pages.values()
+    with serving(port=8420) as server, visiting(server.address) as visit, showing(server, [run, run]) as pages:
+        until(lambda: pages)
+        (page,) = pages.values()
         page._width.value = "512"
 
         def shows(*texts: str) -> None:

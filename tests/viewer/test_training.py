@@ -22,9 +22,12 @@ from padgs.learning.trainee import State
 from padgs.runs import checkpoint
 from padgs.runs.config import WATCHED, RunOptions
 from padgs.runs.folder import RunFolder
-from padgs.viewer import server
+from padgs.viewer import pages
+from padgs.viewer.pages import showing
 from padgs.viewer.picture import Gallery, Look
-from padgs.viewer.process import await_checkpoint, shown
+from padgs.viewer.process import shown
+from padgs.viewer.server import LOCAL, serving
+from padgs.viewer.waiting import await_checkpoint
 
 try:
     import viser
@@ -95,12 +98,12 @@ def test_the_end_of_training_is_seen(folder, tmp_path_factory):
 @WITH_VISER
 @pytest.mark.slow
 @in_chromium
-@pytest.mark.parametrize("host", [server.LOCAL, "0.0.0.0"])
+@pytest.mark.parametrize("host", [LOCAL, "0.0.0.0"])
 def test_training_is_ended_from_a_page_on_this_machine_only(folder, host):
     run = padgs.load_run(folder, device="cpu")
-    with server.serving([run], host=host, port=8460) as serving, visiting(serving.address) as visit:
+    with serving(host=host, port=8460) as server, showing(server, [run]), visiting(server.address) as visit:
         visit.wait("document.body.innerText.includes('follow training')")
-        if host != server.LOCAL:
+        if host != LOCAL:
             visit.page.wait_for_timeout(500)
             assert "stop and score" not in visit.page.inner_text("body")
             return
@@ -130,10 +133,10 @@ class Renewed:
 
 @WITH_VISER
 def test_pages_draw_again_when_training_has_come_further(folder, monkeypatch):
-    monkeypatch.setattr(server, "EVERY", 0.05)
+    monkeypatch.setattr(pages, "EVERY", 0.05)
     page = Renewed()
-    with server.serving([padgs.load_run(folder, device="cpu")], port=8440) as serving:
-        serving.pages[-1] = page
+    with serving(port=8440) as server, showing(server, [padgs.load_run(folder, device="cpu")]) as there:
+        there[-1] = page
         assert not page.asked.wait(0.3)
         train_on(folder)
         assert page.asked.wait(30)

@@ -1,15 +1,24 @@
 """What `padgs view` refuses before it serves anything, and where it opens the page by itself."""
 
+import subprocess
+import sys
 from contextlib import nullcontext
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import pytest
 from tiny_run import tiny_run
 from typer.testing import CliRunner
 
 from padgs.cli.commands import app
-from padgs.viewer import process
-from padgs.viewer.server import EVERYWHERE, LOCAL
+from padgs.viewer import pages, process
+
+pytest.importorskip("viser", reason="the extra `view` is not installed")
+
+
+@pytest.fixture(autouse=True)
+def no_handlers(monkeypatch):
+    monkeypatch.setattr(process.signal, "signal", lambda *_: None)
 
 
 def test_runs_of_two_scenes_are_not_shown_beside_each_other(tmp_path_factory):
@@ -20,15 +29,21 @@ def test_runs_of_two_scenes_are_not_shown_beside_each_other(tmp_path_factory):
     assert said.exit_code == 1 and f"it is the data of {runs[0]}" in " ".join(said.output.split())
 
 
-@pytest.mark.parametrize(("host", "browse", "opens"), [(LOCAL, True, 1), (LOCAL, False, 0), (EVERYWHERE, True, 0)])
-def test_a_page_of_this_machine_alone_is_opened_where_there_is_a_screen(monkeypatch, host, browse, opens):
-    opened = []
-    monkeypatch.setattr(process.webbrowser, "open", opened.append)
-    monkeypatch.setattr(process.signal, "signal", lambda *_: None)
-    monkeypatch.setattr(process, "serving", lambda runs, **_: nullcontext(SimpleNamespace(address="http://here")))
-    monkeypatch.setattr(process, "_is_wanted", lambda: False)
-    process.serve([], host=host, browse=browse)
-    assert opened == opens * ["http://here"]
+@pytest.mark.parametrize(("local", "browse", "opens"), [(True, True, 1), (True, False, 0), (False, True, 0)])
+def test_a_page_of_this_machine_alone_is_opened_where_there_is_a_screen(monkeypatch, local, browse, opens):
+    visited, shown = [], []
+    server = SimpleNamespace(address="http://here", is_local=local, viser=MagicMock())
+    monkeypatch.setattr(process.webbrowser, "open", visited.append)
+    monkeypatch.setattr(process, "serving", lambda **_: nullcontext(server))
+    monkeypatch.setattr(process, "is_wanted", lambda: False)
+    monkeypatch.setattr(pages, "showing", lambda _, runs: nullcontext(shown.extend(runs)))
+    process.serve(lambda: [*visited, "a run"], browse=browse)
+    assert shown == [*opens * ["http://here"], "a run"], "browsers load the page while the run is being opened"
+
+
+def test_a_page_stands_before_anything_of_torch_is_loaded():
+    code = "import sys, viser, padgs.cli.view, padgs.viewer.process; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_a_screen_is_one_with_windows_on_this_machine(monkeypatch):
