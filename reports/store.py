@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from padgs import results
+from padgs.replacing import replace_file
 from padgs.results import Result, ResultError
 
 FILE_NAME = "results.jsonl"
@@ -68,7 +69,7 @@ def add(runs: Iterable[Run], store: Path) -> list[Run]:
     together = [by_name[name] for name in sorted(by_name)]
     lines = ({**(run.document or results.encoded(run.result)), "log": run.log} for run in together)
     texts = (json.dumps(line, separators=(",", ":"), allow_nan=False) for line in lines)
-    results.replace_file(store, "".join(f"{text}\n" for text in texts).encode())
+    replace_file(store, "".join(f"{text}\n" for text in texts).encode())
     return together
 
 

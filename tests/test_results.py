@@ -1,12 +1,13 @@
 import errno
 import json
 import math
+import os
 from dataclasses import replace
 
 import pytest
 
 from padgs import results
-from padgs.results import Result, ResultError, Scores
+from padgs.results import Result, ResultError, Scores, file
 
 
 @pytest.fixture
@@ -93,7 +94,7 @@ def test_a_file_from_before_the_memory_of_a_gpu_was_measured_is_read(result, tmp
     assert results.read(path) == on_gpu
     document = json.loads(path.read_text())
     del document["peak_device_memory_bytes"], document["sha256"]
-    document["sha256"] = results._digest({key: value for key, value in document.items() if key != "schema"})
+    document["sha256"] = file._digest({key: value for key, value in document.items() if key != "schema"})
     path.write_text(json.dumps(document))
     assert results.read(path) == result
 
@@ -140,7 +141,7 @@ def test_a_full_disk_leaves_the_old_file_and_no_litter(result, tmp_path, monkeyp
     def full(descriptor):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(results.os, "fsync", full)
+    monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError, match="No space left"):
         results.write(replace(result, seed=1), tmp_path)
     assert results.read(path) == result

@@ -33,7 +33,7 @@ def bench(
     from padgs.bench.picture import stacked_bars
     from padgs.bench.report import QUICK, BenchOptions, measure_all
     from padgs.bench.tables import lines
-    from padgs.results import replace_file
+    from padgs.replacing import replace_file
 
     def as_json(report: dict) -> bytes:
         return json.dumps(report, indent=1, allow_nan=False).encode()

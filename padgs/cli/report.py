@@ -10,15 +10,16 @@ from typing import Annotated
 
 import typer
 
-from padgs import results
 from padgs.cli.refusing import refusing, show
+from padgs.replacing import replace_file
 from padgs.reports import REPORTS, store
 from padgs.reports.tables.table import ReportError
+from padgs.results import ResultError
 
 ALL = "all"
 
 
-@refusing(ReportError, results.ResultError)
+@refusing(ReportError, ResultError)
 def report(
     what: Annotated[str, typer.Argument(help=f"{', '.join(REPORTS)}, or {ALL}")],
     runs: Annotated[str, typer.Argument(help="folder of run folders, or a results.jsonl")] = "runs",
@@ -70,7 +71,7 @@ def report(
         with _writing_to(target):
             for file, content in texts.items():
                 (target / file).parent.mkdir(parents=True, exist_ok=True)
-                results.replace_file(target / file, content)
+                replace_file(target / file, content)
         if what == name and f"{name}.md" in texts:
             show(texts[f"{name}.md"].decode())
     print(f"{len(found)} results, {len(broken)} left out; see {target}", file=sys.stderr)

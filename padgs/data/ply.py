@@ -10,7 +10,7 @@ import torch
 
 from padgs.data.capture import Cloud, color_bytes
 from padgs.data.errors import DataError
-from padgs.data.replacing import replacing
+from padgs.replacing import replacing
 
 _COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 

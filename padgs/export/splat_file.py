@@ -23,7 +23,7 @@ from torch import Tensor
 
 from padgs.data.errors import DataError
 from padgs.data.ply import read_vertices
-from padgs.data.replacing import replacing
+from padgs.replacing import replacing
 from padgs.splats.model import Splats
 
 CONVERTER = "splat-transform"

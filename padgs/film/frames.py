@@ -12,10 +12,10 @@ import numpy as np
 from PIL import Image
 from torch import Tensor
 
-from padgs.data.replacing import replacing
 from padgs.extras import installing
 from padgs.film.spherical import mark_spherical
 from padgs.render import Rendering
+from padgs.replacing import replacing
 from padgs.scene import View
 from padgs.scoring.pictures import depth_picture, eight_bit
 

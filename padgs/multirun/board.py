@@ -13,7 +13,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TextIO
 
-from padgs.results import STATUSES, replace_file
+from padgs.replacing import replace_file
+from padgs.results import STATUSES
 from padgs.runs.session import Watch
 
 WAITING, RUNNING, OK = "waiting", "running", "ok"

@@ -21,7 +21,7 @@ import torch
 
 from padgs.learning.failure import is_out_of_memory
 from padgs.learning.trainee import State
-from padgs.results import replace_file
+from padgs.replacing import replace_file
 
 FORMAT = 2
 MANIFEST = "state.json"

@@ -22,6 +22,7 @@ from padgs import results
 from padgs.learning.loop import Record
 from padgs.learning.method import Method
 from padgs.learning.trainee import State
+from padgs.replacing import replace_file
 from padgs.results import Result
 from padgs.runs import checkpoint
 from padgs.runs import lock as run_lock
@@ -65,9 +66,7 @@ class RunFolder:
         """
         with self._writing():
             self.renders.mkdir(parents=True, exist_ok=True)
-            results.replace_file(
-                self.path / results.CONFIG_NAME, OmegaConf.to_yaml(OmegaConf.create(dict(values))).encode()
-            )
+            replace_file(self.path / results.CONFIG_NAME, OmegaConf.to_yaml(OmegaConf.create(dict(values))).encode())
 
     def result(self) -> Result | None:
         """The result, if the run is done.
@@ -142,7 +141,7 @@ class RunFolder:
         if self._log.exists():
             kept = [line for line in results.log_lines(self.path) if line["iteration"] <= progress.iteration]
             with self._writing():
-                results.replace_file(self._log, "".join(json.dumps(line) + "\n" for line in kept).encode())
+                replace_file(self._log, "".join(json.dumps(line) + "\n" for line in kept).encode())
         return progress
 
     def save_picture(self, view: View, truth: Tensor, image: Tensor) -> None:

@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from padgs.data.replacing import replacing
+from padgs.replacing import replacing
 
 
 def test_a_file_takes_its_place_when_it_is_complete_or_not_at_all(tmp_path: Path) -> None:

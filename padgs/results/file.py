@@ -1,0 +1,180 @@
+"""The file of a result, `result.json`. It is written last and whole: where it exists, the run is done.
+
+A run that failed has a result too, with its status instead of scores; it appears in the tables as such.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, fields
+from pathlib import Path
+from types import UnionType
+from typing import Any, get_args, get_origin, get_type_hints
+
+from padgs.replacing import replace_file
+from padgs.results.result import Result, Scores
+
+SCHEMA = 2
+ADDED = {"peak_device_memory_bytes", "need", "ended"}  # since then: files without are read, with the default
+FILE_NAME = "result.json"
+CONFIG_GROUPS = {"budget", "data", "method", "protocol", "render", "run", "stress", "train"}  # sections of settings
+# What is no more than a name, even in a command line or a path; `@` parts an experiment from its scale.
+PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*(@[A-Za-z0-9._-]+)?")
+
+
+class ResultError(ValueError):
+    """A result file cannot be used; the message names the file, what is wrong with it, and the way out."""
+
+
+def write(result: Result, folder: Path) -> Path:
+    """Write `result.json` into the run folder, whole or not at all; returns its path.
+
+    Raises:
+        OSError: the disk is full, the folder is read-only, ...; no file is left behind, an older one stays.
+    """
+    path = folder / FILE_NAME
+    replace_file(path, (json.dumps(encoded(result), indent=1, allow_nan=False) + "\n").encode())
+    return path
+
+
+def read(path: Path) -> Result:
+    """Read one `result.json`.
+
+    Raises:
+        ResultError: it is missing, truncated, of another version, or was edited.
+    """
+    return decoded(parsed(file_content(path), str(path)), str(path))
+
+
+def file_content(path: Path) -> bytes:
+    """What the file holds.
+
+    Raises:
+        ResultError: it cannot be read.
+    """
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise ResultError(f"cannot read {path}: {error.strerror}") from error
+
+
+def encoded(result: Result) -> dict[str, Any]:
+    """What a file holds of a result: its fields, after the version of the schema and a digest of all."""
+    content = _encode(asdict(result))
+    return {"schema": SCHEMA, "sha256": _digest(content), **content}
+
+
+def parsed(content: bytes, where: str) -> dict[str, Any]:
+    """What `encoded` made, from its JSON; `where` names it in errors.
+
+    Raises:
+        ResultError: it is truncated, or something else.
+    """
+    try:
+        document = json.loads(content)
+    except (ValueError, RecursionError) as error:
+        raise ResultError(f"{where} is not JSON ({error}); delete it and run again") from error
+    if not isinstance(document, dict) or "schema" not in document:
+        raise ResultError(f"{where} is not a result file (no schema); delete it and run again")
+    return document
+
+
+def decoded(document: Mapping[str, Any], where: str) -> Result:
+    """The result that `encoded` made a document of; `where` names it in errors.
+
+    Raises:
+        ResultError: it is of another version, or was edited; or, as a digest is no signature and the file may be from
+            elsewhere, it has values of other types, or texts for names that would mean something in a path or command.
+    """
+    document = dict(document)
+    if document.pop("schema") != SCHEMA:
+        raise ResultError(f"{where} was written by another version (schema is not {SCHEMA}); run again with this one")
+    digest = document.pop("sha256", None)
+    known = {field.name for field in fields(Result)}
+    missing, unknown = known - document.keys() - ADDED, document.keys() - known
+    if missing or unknown:
+        raise ResultError(f"{where}: missing {sorted(missing)}, unknown {sorted(unknown)}; delete it and run again")
+    if digest != _digest(document):
+        raise ResultError(f"{where} was edited after it was written (SHA-256 differs); delete it and run again")
+    try:
+        result = Result(**document | {key: _DECODERS[key](document[key]) for key in _DECODERS})
+        _refuse_other_types(result)
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
+        raise ResultError(f"{where}: {error}; delete it and run again") from error
+    names = [result.run, result.method, result.preset, *result.experiments, *result.scores]
+    for name in (*names, *filter(None, [result.dataset])):
+        if not PLAIN.fullmatch(name):
+            raise ResultError(f"{where}: {name!r} is no name that this program gives; leave the file out")
+    return result
+
+
+def read_all(folder: Path) -> tuple[dict[Path, Result], list[ResultError]]:
+    """Run folder -> result, of all in a folder of run folders, in the order of their names; and what could not be read.
+
+    A folder may have another name than its run, if somebody renamed it.
+    """
+    results: dict[Path, Result] = {}
+    errors: list[ResultError] = []
+    for path in sorted(folder.glob(f"*/{FILE_NAME}")):
+        try:
+            results[path.parent] = read(path)
+        except ResultError as error:
+            errors.append(error)
+    return results, errors
+
+
+def _refuse_other_types(result: Result) -> None:
+    for name, hint in get_type_hints(Result).items():
+        hints = get_args(hint) if get_origin(hint) is UnionType else (hint,)
+        kinds = tuple(get_origin(kind) or kind for kind in hints)
+        value = getattr(result, name)
+        if not isinstance(value, kinds) or isinstance(value, bool):
+            raise TypeError(f"{name} is {value!r}, which is no {' or '.join(kind.__name__ for kind in kinds)}")
+    if not all(isinstance(name, str) for name in result.experiments):
+        raise TypeError(f"experiments are {result.experiments!r}; they must be names")
+    for name, count in result.counts.items():
+        if not (isinstance(count, int) and 0 <= count < 2**63):
+            raise TypeError(f"counts.{name} is {count!r}, which is no number of anything")
+    for name in CONFIG_GROUPS & result.config.keys():
+        if not isinstance(result.config[name], dict):
+            raise TypeError(f"config.{name} is {result.config[name]!r}, which is no group of settings")
+    float(result.config.get("budget", {}).get("seconds") or 0)
+    rules = [*result.config.get("protocol", {}).values(), *(scores.protocol for scores in result.scores.values())]
+    if odd := [rule for rule in rules if not isinstance(rule, dict)]:
+        raise TypeError(f"the rules of a protocol are {odd[0]!r}; they must be a table")
+
+
+def _digest(content: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True, allow_nan=False).encode()).hexdigest()
+
+
+def _encode(value: Any) -> Any:
+    """JSON has no infinity (the PSNR of a perfect image); such numbers are written as strings."""
+    if isinstance(value, dict):
+        return {str(key): _encode(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_encode(item) for item in value]
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _numbers(table: dict[str, Any]) -> dict[str, Any]:
+    return {name: None if value is None else float(value) for name, value in table.items()}
+
+
+def _scores(table: dict[str, Any]) -> dict[str, Scores]:
+    return {
+        name: Scores(
+            scores["protocol"],
+            _numbers(scores["metrics"]),
+            {view: _numbers(values) for view, values in scores["views"].items()},
+            tuple(scores["notes"]),
+        )
+        for name, scores in table.items()
+    }
+
+
+_DECODERS = {"scores": _scores, "timing": _numbers, "experiments": tuple}
