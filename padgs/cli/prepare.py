@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from padgs.cli.refusing import refusing, show
+from padgs.runs.interrupt import INTERRUPTED
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
@@ -45,8 +46,8 @@ def prepare(
     from padgs.cli.check import end_with, picture_place
     from padgs.data.check.report import check
     from padgs.data.errors import DataError
-    from padgs.data.prepare.pipeline import PrepareOptions
     from padgs.data.prepare.pipeline import prepare as find_poses
+    from padgs.data.prepare.statement import PrepareOptions
 
     target = Path(destination)
     try:
@@ -56,7 +57,7 @@ def prepare(
             report = check(target, overlay=picture_place(target))
     except KeyboardInterrupt as interrupt:
         print("interrupted; the same command goes on where this stopped")
-        raise typer.Exit(130) from interrupt
+        raise typer.Exit(INTERRUPTED) from interrupt
     placed = len(result.registered)
     print(f"{placed} of {placed + len(result.unregistered)} panoramas placed, {result.points} points")
     spent = ", ".join(f"{WORDS[step]} {seconds:.0f} s" for step, seconds in result.seconds.items() if seconds >= 1)

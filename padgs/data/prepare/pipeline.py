@@ -6,13 +6,9 @@ The destination appears at the end, complete, or not at all.
 
 from __future__ import annotations
 
-import hashlib
-import json
 import shutil
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, fields, replace
+from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -21,19 +17,21 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from padgs.data.assemble import IMAGE_FOLDERS, STATEMENT, view_name
+from padgs.data.assemble import IMAGE_FOLDERS, view_name
 from padgs.data.capture import Cloud, Frame, Tracks
 from padgs.data.errors import DataError, listed
 from padgs.data.formats import colmap
 from padgs.data.formats.writers import Content, write_colmap
 from padgs.data.images import decode
-from padgs.data.masks import mask_place, write_masks
+from padgs.data.masks import write_masks
 from padgs.data.options import DataOptions
 from padgs.data.prepare import resources, rig, sfm
 from padgs.data.prepare.level import levelled
-from padgs.data.prepare.pairs import PAIRS, image_pairs
+from padgs.data.prepare.pairs import image_pairs
 from padgs.data.prepare.sources import Source, find_source
+from padgs.data.prepare.statement import Prepared, PrepareOptions, digest_of, fingerprint, finished
 from padgs.data.prepare.video import extract_frames, is_video
+from padgs.data.prepare.work import WorkFolder
 
 STEPS = ("frames", "images", "views", "features", "matches", "poses", "result")
 _REMEDIES = "take them closer together, hide what moves with the camera in a mask (--mask), or try --accurate"
@@ -41,44 +39,10 @@ _REMEDIES = "take them closer together, hide what moves with the camera in a mas
 Progress = Callable[[str, int, int], None]  # (one of STEPS, done, in all)
 
 
-@dataclass(frozen=True)
-class PrepareOptions:
-    """What the user may decide."""
-
-    accurate: bool = False  # features in undistorted views: slower, better near the poles
-    pairs: str = "auto"  # auto | exhaustive | sequential (names in the order they were taken)
-    mask: str = "auto"  # auto (mask.png or masks/ with the images) | none | rows:959/1024 | a file or folder
-    level: bool = True  # turn the world so that the cameras' common up is +z
-    per_second: float = 2.0  # frames kept of a video
-    seed: int = 0
-    threads: int = 0  # 0 = one per processor, at most 8 and as many as free memory allows
-
-    def __post_init__(self) -> None:
-        if self.pairs not in PAIRS:
-            raise DataError(f"unknown pairs {self.pairs!r}; known: {', '.join(PAIRS)}")
-        if not 0 < self.per_second <= 1000:
-            raise DataError(f"per_second is {self.per_second}; it must be above 0")
-        if self.threads < 0:
-            raise DataError(f"threads is {self.threads}; give 1 or more, or 0 for what this machine allows")
-
-
-@dataclass
-class Prepared:
-    """What came out; also in prepare.json at the destination."""
-
-    folder: Path
-    registered: tuple[str, ...]
-    unregistered: tuple[str, ...]  # images that could not be placed; they are not at the destination
-    points: int
-    observations: int
-    seconds: dict[str, float] = field(default_factory=dict)  # per step, of this call
-    notes: tuple[str, ...] = ()
-
-
 def prepare(
     source: Path,
     destination: Path,
-    options: PrepareOptions = PrepareOptions(),
+    options: PrepareOptions | None = None,
     progress: Progress = lambda step, done, total: None,
 ) -> Prepared:
     """Find poses and points for panoramas by structure from motion.
@@ -87,16 +51,17 @@ def prepare(
         source: a folder of 2:1 panoramas (subfolders included), or a stitched 360-degree video.
         destination: a folder that does not exist yet, or is empty, or what the same call has made. It gets images/,
             sparse/0 (COLMAP, camera EQUIRECTANGULAR), masks if there are any, and prepare.json.
-        options: see PrepareOptions. The same options, input and machine give the same result.
+        options: None: the defaults. The same options, input and machine give the same result.
         progress: called with (step, done, in all).
 
     Raises:
         DataError: input that cannot be used, no two images that can be placed, or a full disk. What was found so far
             stays in the hidden folder beside the destination; nothing is at the destination.
     """
+    options = options or PrepareOptions()
     if destination.exists() and (not destination.is_dir() or any(destination.iterdir())):
-        if finished := _finished(source, destination, options):
-            return finished
+        if already := finished(source, destination, options):
+            return already
         raise DataError(
             f"{destination} exists, and is not what these options make of {source}; nothing is overwritten: remove it "
             "or choose another place"
@@ -128,37 +93,6 @@ def prepare(
             shutil.rmtree(work, ignore_errors=True)  # nothing in it that would be worth going on from
 
 
-def _finished(source: Path, destination: Path, options: PrepareOptions) -> Prepared | None:
-    """What an earlier call made of the same input with the same options."""
-    try:
-        stated = json.loads((destination / STATEMENT).read_text(encoding="utf-8"))
-        if stated["input"] != _digest(_fingerprint(source, options), options):
-            return None
-        known: dict[str, Any] = {field.name: stated[field.name] for field in fields(Prepared) if field.name != "folder"}
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-    lists = {name: tuple(known[name]) for name in ("registered", "unregistered", "notes")}
-    known |= {**lists, "seconds": {}}
-    return Prepared(destination, **known)
-
-
-def _fingerprint(source: Path, options: PrepareOptions) -> str:
-    """Of images with their masks; of a video and the files of its mask, since its frames are gone in the end."""
-    if not is_video(source):
-        return find_source(source, options.mask).fingerprint
-    digests, mask = [_file_digest(source)], mask_place(options.mask, Path())
-    if mask is not None:
-        files = sorted(file for file in (mask, *mask.rglob("*")) if file.is_file())
-        digests += [f"{file.relative_to(mask)}:{_file_digest(file)}" for file in files]
-    return "|".join(digests)
-
-
-def _digest(fingerprint: str, options: PrepareOptions) -> str:
-    """Of an input and all that decides what becomes of it."""
-    wanted = {key: value for key, value in asdict(options).items() if key != "threads"}
-    return hashlib.sha256(json.dumps([fingerprint, wanted], sort_keys=True).encode()).hexdigest()
-
-
 class _Job:
     """One preparation in its working folder."""
 
@@ -166,18 +100,21 @@ class _Job:
         self, source: Path, destination: Path, work: Path, options: PrepareOptions, progress: Progress
     ) -> None:
         self.destination, self.work, self.options, self.progress = destination, work, options, progress
-        self.seconds: dict[str, float] = {}
-        self.input = None  # digest of what was given, a video or images
+        self.folder = WorkFolder(work)
+        given = None
         if is_video(source):
-            self._open("video", _fingerprint(source, options))
-            self._once("frames", partial(self._extract_frames, source))
+            given = digest_of(fingerprint(source, options), options)
+            self.folder.open("video", given)
+            self.folder.once("frames", partial(self._extract_frames, source))
             source = self.work / "frames"
-        with self._step("images"):
+        with self.folder.step("images"):
             self.source: Source = find_source(source, options.mask)
         first = next(iter(self.source.images.values()))
         self.threads = options.threads or resources.threads_for(first.width, first.height)
         of_video = ("video.sha256", "frames", "frames.done") if source.parent == self.work else ()
-        self._open("images", self.source.fingerprint, keep=of_video)
+        of_images = digest_of(self.source.fingerprint, options)
+        self.folder.open("images", of_images, keep=of_video)
+        self.input = given or of_images  # of a video or images
         # pycolmap's list of pairs knows no spaces, so it gets names of ours.
         self.files = {f"{index:06d}{_ending(name)}": name for index, name in enumerate(self.source.images)}
         self.paths = {short: self.source.images[name].path for short, name in self.files.items()}
@@ -188,11 +125,11 @@ class _Job:
     def run(self) -> Prepared:
         """All steps; those that are done already are skipped."""
         with sfm.log_to(self.work / "log.txt"):
-            self._once("views", self._lay_out)
-            self._once("features", self._find_features)
-            self._once("matches", self._match)
-            self._once("poses", self._place)
-            with self._step("result"):
+            self.folder.once("views", self._lay_out)
+            self.folder.once("features", self._find_features)
+            self.folder.once("matches", self._match)
+            self.folder.once("poses", self._place)
+            with self.folder.step("result"):
                 return self._write()
 
     # Steps, in order.
@@ -202,7 +139,7 @@ class _Job:
         extract_frames(video, self.work / "frames", self.options.per_second, partial(self.progress, "frames"))
 
     def _lay_out(self) -> None:
-        images, masks = _empty(self.work / "images"), _empty(self.work / "masks")
+        images, masks = self.folder.empty("images"), self.folder.empty("masks")
         for short, name in self.files.items():
             image, mask = self.source.images[name], self.source.masks.get(name)
             if Path(short).suffix == image.path.suffix:
@@ -263,7 +200,7 @@ class _Job:
         sfm.match(self.database, pairs, self.options.accurate, self.threads, self.options.seed, tell)
 
     def _place(self) -> None:
-        parts = _empty(self.work / "parts")
+        parts = self.folder.empty("parts")
         tell = partial(self.progress, "poses")
         if not sfm.reconstruct(self.database, self.pictures, parts, self.threads, self.options.seed, self.views, tell):
             raise DataError(f"no two of the {len(self.files)} panoramas could be placed together; {_REMEDIES}")
@@ -286,14 +223,14 @@ class _Job:
             )
         if others:
             notes.append(f"{len(others)} smaller part(s) of {listed(others)} panoramas have no connection to the rest")
+        seconds = self.folder.seconds
         result = Prepared(
-            self.destination, registered, unregistered, len(cloud.points), len(tracks.frame), self.seconds, tuple(notes)
+            self.destination, registered, unregistered, len(cloud.points), len(tracks.frame), seconds, tuple(notes)
         )
-        partial_folder = _empty(self.work / "out")
+        partial_folder = self.folder.empty("out")
         self._copy_images(frames, partial_folder)
         write_colmap(Content(frames, cloud, tracks, {}), partial_folder)
-        stated = {**asdict(result), "folder": ".", "options": asdict(self.options), "input": self.input}
-        (partial_folder / STATEMENT).write_text(json.dumps(stated, indent=2, ensure_ascii=False), encoding="utf-8")
+        result.write(partial_folder, self.options, self.input)
         if self.destination.exists():
             self.destination.rmdir()
         partial_folder.rename(self.destination)
@@ -313,7 +250,7 @@ class _Job:
         if self.options.accurate:
             frames, cloud, tracks = rig.panoramas(model, self.paths, next(iter(self.source.images.values())).width)
         else:
-            refined = _empty(self.work / "refined")
+            refined = self.folder.empty("refined")
             model.write_binary(str(refined))
             capture = colmap.read(self.work, DataOptions(images="images"), refined)
             assert capture.cloud is not None and capture.tracks is not None
@@ -327,35 +264,6 @@ class _Job:
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(frame.image, target)
         write_masks({view_name(frame.name): self.source.masks.get(frame.name) for frame in frames}, folder)
-
-    # Bookkeeping.
-
-    def _open(self, of: str, fingerprint: str, keep: tuple[str, ...] = ()) -> None:
-        """Keep the working folder of the same input and options; start over, but for `keep`, with any other."""
-        stated = _digest(fingerprint, self.options)
-        self.input = self.input or stated
-        marker = self.work / f"{of}.sha256"
-        if not (marker.is_file() and marker.read_text() == stated):
-            for path in self.work.iterdir() if self.work.is_dir() else ():
-                if path.name not in keep:
-                    shutil.rmtree(path) if path.is_dir() else path.unlink()
-        self.work.mkdir(parents=True, exist_ok=True)
-        marker.write_text(stated)
-
-    @contextmanager
-    def _step(self, name: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        self.seconds[name] = round(time.perf_counter() - start, 2)
-
-    def _once(self, step: str, action: Callable[[], None]) -> None:
-        """Do a step unless it has been done in the working folder."""
-        marker = self.work / f"{step}.done"
-        with self._step(step):
-            if not marker.exists():
-                resources.refuse_full(self.work)
-                action()
-                marker.touch()
 
     def _tell(self, step: str, done: int, total: int) -> None:
         """Tell of a batch, and do not begin another on a full disk."""
@@ -374,21 +282,3 @@ def _said(error: Exception, log: Path) -> str:
     logged = log.read_text(encoding="utf-8", errors="replace").splitlines()[-1:] if log.is_file() else []
     said = [str(error).strip(), *(line for line in logged if line[:1] in ("W", "E", "F"))]
     return "; ".join(dict.fromkeys(line.rpartition("] ")[2] for line in said))
-
-
-def _empty(folder: Path) -> Path:
-    """Make a folder with nothing in it."""
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir()
-    return folder
-
-
-def _file_digest(path: Path) -> str:
-    digest = hashlib.sha256()
-    try:
-        with open(path, "rb") as file:
-            while block := file.read(1 << 20):
-                digest.update(block)
-    except OSError as error:
-        raise DataError(f"{path} cannot be read ({error.strerror}); check its name and permissions") from error
-    return digest.hexdigest()

@@ -15,7 +15,8 @@ from padgs.calibration.align import align
 from padgs.data import DataError
 from padgs.data.check.report import check
 from padgs.data.prepare import pipeline, resources, sfm
-from padgs.data.prepare.pipeline import PrepareOptions, prepare
+from padgs.data.prepare.pipeline import prepare
+from padgs.data.prepare.statement import PrepareOptions
 from padgs.data.synthetic import SyntheticOptions, generate
 from padgs.data.trajectory import gravity, path_length
 
