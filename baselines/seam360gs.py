@@ -20,6 +20,7 @@ from padgs.render.config import RenderConfig
 from padgs.render.contract import check_camera
 from padgs.scene import Scene
 from padgs.sphere.camera import RayTable
+from padgs.sphere.lens import AXES
 from padgs.splats.method import SplatOptions, refuse_polar_threshold
 
 
@@ -35,7 +36,7 @@ class Seam360GSOptions(SplatOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_known(self, lens_axis="xyz")
+        check_known(self, lens_axis=AXES)
         check(self, "at least 1", lambda order: order >= 1, "lens_order")
         check(self, "in [0, 90) degrees", lambda degrees: 0 <= degrees < 90, "lens_blend")
         check(self, "a learning rate > 0", lambda rate: 0 < rate < math.inf, "gap_rate", "coefficient_rate")

@@ -16,6 +16,7 @@ from torch.autograd.function import once_differentiable
 from padgs.native import cpu
 from padgs.native.abi import DecodeArguments, DecodeGradientArguments, HeadWeights, pointer
 
+OPACITY_VALUES, COLOR_VALUES, COVARIANCE_VALUES = 1, 3, 7  # outputs of each network per Gaussian
 SIZES = (3, 4, 3, 0, 3)  # values per Gaussian of means, quats, scales, opacities, colors; 0 = a scalar
 
 

@@ -13,13 +13,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from padgs.anchors.cpu_decoder import decode_on_cpu
+from padgs.anchors.cpu_decoder import COLOR_VALUES, COVARIANCE_VALUES, OPACITY_VALUES, decode_on_cpu
 from padgs.anchors.gpu_decoder import decode_on_gpu
 from padgs.anchors.precision import linear, reduced
 from padgs.gaussians import Gaussians
 from padgs.native import LIBRARIES, cpu, cuda
 
-OPACITY_VALUES, COLOR_VALUES, COVARIANCE_VALUES = 1, 3, 7  # outputs of each head per Gaussian
 SORT_OUT_BELOW = 0.9  # share of anchors with a positive opacity
 
 

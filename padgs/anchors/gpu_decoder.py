@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from padgs.anchors.cpu_decoder import SIZES, decode_arguments
+from padgs.anchors.cpu_decoder import COLOR_VALUES, COVARIANCE_VALUES, OPACITY_VALUES, SIZES, decode_arguments
 from padgs.anchors.precision import OF_GRADIENTS
 from padgs.native import cuda
 from padgs.native.abi import DecodeGradientArguments, pointer
@@ -68,7 +68,8 @@ class _DecodeOnGPU(torch.autograd.Function):
         offsets, log_scales = constants[1:3]
         grad_offsets, grad_log_scales = torch.empty_like(offsets), torch.empty_like(log_scales)
         anchors, per_anchor = raw.shape
-        grad_logits = [raw.new_empty(anchors, values * per_anchor) for values in (1, 3, 7)]
+        values = (OPACITY_VALUES, COLOR_VALUES, COVARIANCE_VALUES)
+        grad_logits = [raw.new_empty(anchors, value * per_anchor) for value in values]
         gradient = DecodeGradientArguments(
             decode_arguments(constants, raw, starts, slots, outputs),
             *map(pointer, upstream),

@@ -9,12 +9,10 @@ from __future__ import annotations
 import math
 
 import torch
-from scipy.spatial import KDTree
 from torch import Tensor
 
+from padgs.learning.cloud import refuse_unusable, squared_spacing
 from padgs.scene import Scene
-
-NEIGHBOURS = 3  # distances that set an anchor's initial size
 
 
 def automatic_voxel_size(scene: Scene, pixels: float) -> float:
@@ -72,11 +70,7 @@ def anchors_from_points(points: Tensor, voxel_size: float) -> Tensor:
     """
     if not (voxel_size > 0 and math.isfinite(voxel_size)):
         raise ValueError(f"voxel_size is {voxel_size}; it must be a length > 0 in world units, or auto")
-    if len(points) == 0:
-        raise ValueError("the point cloud is empty; anchors start from points, so the scene needs at least one")
-    if not torch.isfinite(points).all():
-        bad = int((~torch.isfinite(points).all(-1)).nonzero()[0])
-        raise ValueError(f"point {bad} of the cloud is {points[bad].tolist()}; remove points that are not finite")
+    refuse_unusable(points, "anchors")
     cells, _ = unique_cells(cells_from_points(points, voxel_size))
     return points_from_cells(cells, voxel_size)
 
@@ -86,10 +80,7 @@ def initial_log_scales(positions: Tensor, voxel_size: float) -> Tensor:
 
     No anchor has another within a voxel, so no floor is needed; a lone anchor gets the size of a voxel.
     """
-    neighbours = min(NEIGHBOURS, len(positions) - 1)
-    if neighbours < 1:
+    squared = squared_spacing(positions)
+    if squared is None:
         return positions.new_full((len(positions), 6), math.log(voxel_size))
-    xyz = positions.double().cpu().numpy()
-    distances, _ = KDTree(xyz).query(xyz, k=neighbours + 1)  # the first is the anchor itself, at distance 0
-    mean_square = torch.from_numpy(distances[:, 1:]).square().mean(-1)
-    return (0.5 * torch.log(mean_square)).to(positions)[:, None].repeat(1, 6)
+    return (0.5 * torch.log(squared)).to(positions)[:, None].repeat(1, 6)

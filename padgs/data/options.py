@@ -37,8 +37,9 @@ class DataSettings:
             raise DataError(
                 f"data.width is {self.width}; a panorama is twice as wide as high: give an even number >= 8"
             )
-        if self.cache_bytes < 0 or self.read_ahead < 0:
-            raise DataError("data.cache_bytes and data.read_ahead must not be negative; 0 switches them off")
+        for name in ("cache_bytes", "read_ahead"):
+            if getattr(self, name) < 0:
+                raise DataError(f"data.{name} is {getattr(self, name)}; it must be 0, which switches it off, or more")
 
 
 @dataclass(frozen=True)

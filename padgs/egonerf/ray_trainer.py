@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from contextlib import nullcontext
 from typing import Any, ClassVar, cast
 
@@ -16,6 +15,7 @@ from padgs.learning.budget import Budget
 from padgs.learning.loop import Stage, Trainer, TrainOptions
 from padgs.learning.trainee import Trainee
 from padgs.scene import Scene
+from padgs.stopwatch import Lap
 
 
 class RayTrainer(Trainer):
@@ -52,11 +52,10 @@ class RayTrainer(Trainer):
         # Rays are all that it draws, so of a trainee it has what does not depend on views.
         super().__init__(cast(Trainee, trainee), scene, budget, options, seed, stage=stage)
         self._tracer, self._rays = trainee, rays
-        started, started_cpu = time.perf_counter(), time.process_time()
+        lap = Lap()
         self._pixels = RayPixels(scene.train, options.weight, self._optimiser.device, seed)
         self._order = self._pixels
-        # Reading images is training, as it is where they are read view by view.
-        self.seconds, self.cpu_seconds = time.perf_counter() - started, time.process_time() - started_cpu
+        self.seconds, self.cpu_seconds = lap.seconds()  # reading images is training, as where they are read one by one
 
     def _step(self, iteration: int, moment: int) -> tuple[float | Tensor, dict[str, int], tuple[str, ...]]:
         tracer, optimiser, generator = self._tracer, self._optimiser, self._pixels.generator

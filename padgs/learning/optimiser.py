@@ -12,7 +12,7 @@ from padgs.learning.failure import Failure, first_non_finite
 from padgs.learning.schedule import Pace, ParameterGroup
 from padgs.learning.trainee import State
 
-PREFIX = "adam/"  # of its tensors in a state
+ADAM = "adam/"  # of its tensors in a state
 
 
 class Optimiser:
@@ -95,7 +95,7 @@ class Optimiser:
     def tensors(self) -> dict[str, Tensor]:
         """The moments of Adam, by name; not copies."""
         return {
-            f"{PREFIX}{name}/{key}": value
+            f"{ADAM}{name}/{key}": value
             for name, parameter in self.parameters().items()
             for key, value in self.adam.state.get(parameter, {}).items()
         }
@@ -104,7 +104,7 @@ class Optimiser:
         """Take the moments out of a whole state; parameters without any start anew."""
         self.adam.state.clear()
         for name, parameter in self.parameters().items():
-            moments = state.under(f"{PREFIX}{name}/")
+            moments = state.under(f"{ADAM}{name}/")
             if moments:
                 self.adam.state[parameter] = {k: v.to(parameter.device, copy=True) for k, v in moments.items()}
 

@@ -46,8 +46,7 @@ def only_job(composed: DictConfig) -> None:
         result = done(config, console, TrackedRun(tracker))
         ENDS.append(result.status)
         tracker.update(Path(config.run.folder) / result.run)
-        data = None if config.data.path is None else str(Path(config.data.path).absolute())
-        FinishedJobs(Path(config.run.folder)).add(ARGUMENTS, result.run, result.status, data)
+        FinishedJobs(Path(config.run.folder)).add(ARGUMENTS, result.run, result.status, _data_of(config))
     except EXPECTED as error:
         if os.environ.get("HYDRA_FULL_ERROR"):
             raise
@@ -71,7 +70,7 @@ def job_of_many(composed: DictConfig) -> str:
             if entry.stop_requested():
                 raise Interrupted("not started")
             config = typed_config(composed, hydra.runtime.choices)
-            entry.data = None if config.data.path is None else str(Path(config.data.path).absolute())
+            entry.data = _data_of(config)
             result = done(config, console, entry)
             return entry.end(result.status, result.reason)
         except KeyboardInterrupt as error:
@@ -84,6 +83,11 @@ def job_of_many(composed: DictConfig) -> str:
         except Exception as error:
             say(console, traceback.format_exc())
             return entry.end(CRASHED, f"{type(error).__name__}: {error}")
+
+
+def _data_of(config: RunConfig) -> str | None:
+    """The folder of its data set, absolute; None for a generated scene."""
+    return None if config.data.path is None else str(Path(config.data.path).absolute())
 
 
 def done(config: RunConfig, console: Console, watch: Watch) -> Result:

@@ -16,7 +16,7 @@ from rich.text import Text
 
 from padgs import results
 from padgs.multirun.board import ELSEWHERE, OK, RUNNING, STOPPED, WAITING, JobState
-from padgs.runs.live import Display, clock
+from padgs.runs.live import Display, duration
 
 SECONDS_BETWEEN_LOOKS = 1.0
 SECONDS_BETWEEN_LINES = 30.0  # where there is no terminal
@@ -61,7 +61,7 @@ class Overview:
             parts.append(f"{counts.total()} failed ({', '.join(statuses)})")
         parts += [f"{number} {name}" for name, number in neutral.items() if number]
         if neutral[RUNNING] + neutral[WAITING] and self.seconds_left is not None:
-            parts.append(f"ETA {clock(self.seconds_left)}")
+            parts.append(f"ETA {duration(self.seconds_left)}")
         return ", ".join(parts)
 
     def screen(self) -> Table:

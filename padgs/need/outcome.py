@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from PIL import Image
 
+from padgs.learning.optimiser import ADAM
 from padgs.learning.trainee import MODEL, State
 from padgs.need.calibration import PERCEPTION, QUALITY
 from padgs.need.files import files
@@ -25,7 +26,6 @@ from padgs.runs.scoring import frame_times, scores
 from padgs.runs.session import build
 from padgs.scoring.pictures import eight_bit
 
-ADAM = "adam/"  # moments of the run's own rows, which a pruned model does not have
 EXPERIMENT = "need"
 
 
@@ -94,6 +94,7 @@ def keep(search: Search, epsilon: float) -> Result:
         return before
     trained, (model, refined) = run.method.state(), search.kept(number)
     of_model, method = model.state(), build(replace(run.config, options=options))
+    # Adam's moments are those of the rows of the run, not of the pruned model's.
     kept = {n: t for n, t in trained.tensors.items() if not n.startswith((MODEL, ADAM))}
     tensors = kept | {f"{MODEL}{name}": tensor for name, tensor in of_model.tensors.items()}
     method.load_state(State(tensors, {**trained.values, "model": of_model.values}))

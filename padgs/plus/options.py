@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 
 from padgs.checks import check
 from padgs.splats.clone_split import CloneSplitOptions
-from padgs.splats.method import SplatOptions
+from padgs.splats.method import REMOVAL_PSNR, SplatOptions
 
 ROUNDS = 8
 SCHEDULE = (  # options of 3DGS that mean nothing here
@@ -38,7 +38,7 @@ class PlusOptions(SplatOptions):
     start_share: float | None = 0.6  # points to begin with, per independent pixel of a view; None: all that there are
     fill_share: float = 0.15  # ... of which so many at least: photographs give what the cloud has not; 0: not
     limit_share: float | None = 2.6  # ... and Gaussians at most while it grows: a guard on memory and time
-    removal_psnr: float | None = 44.0  # dB: a round later the least missed go, by what each alone changes, added up
+    removal_psnr: float | None = REMOVAL_PSNR  # a round later the least missed go, by what each alone changes, added up
     initial_opacity: float = 0.5  # 0.1 hides what lies in front until opacities have grown
     initial_scale: float = 0.6  # times the distance of the nearest points; 1 is 3DGS's, whose Gaussians overlap
     means_speed: float = 2.0  # learning rate of the means, beside that of 3DGS

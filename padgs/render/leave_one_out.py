@@ -90,9 +90,10 @@ def define(request: Request, target: Tensor, weight: Tensor) -> Removals:
     order = torch.argsort(footprints.depths, stable=True)
     order = order[footprints.visible[order]]
     colors = gaussians.colors[order]
-    error, squares, contribution = torch.zeros(3, len(gaussians), dtype=torch.float64)
+    device = gaussians.means.device
+    error, squares, contribution = torch.zeros(3, len(gaussians), dtype=torch.float64, device=device)
     peak = gaussians.means.new_zeros(len(gaussians))
-    for rows, columns in blocks(camera, len(order)):
+    for rows, columns in blocks(camera, len(order), device):
         alpha = fragments(footprints, order, rows, columns)
         shown, left = sorted_weights(alpha)  # [P, K], [P]
         parts = shown[..., None] * colors  # [P, K, 3]

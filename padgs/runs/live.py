@@ -77,7 +77,7 @@ class LiveLine(Display):
         (first, behind, start), (latest, share, end) = self._times[0], self._times[-1]
         if share > behind:
             parts += [f"{(latest - first) / max(end - start, 1e-9):.1f} it/s"]
-            parts += [f"ETA {clock((1 - share) / (share - behind) * (end - start))}"]
+            parts += [f"ETA {duration((1 - share) / (share - behind) * (end - start))}"]
         return "  ".join(parts)
 
 
@@ -92,10 +92,10 @@ def compact(count: int) -> str:
     return f"{count / 1000:.3g}k" if count < 999_500 else f"{count / 1e6:.3g}M"
 
 
-def clock(seconds: float) -> str:
+def duration(seconds: float) -> str:
     """A duration as people write it.
 
-    >>> [clock(s) for s in (7, 72, 3723)]
+    >>> [duration(s) for s in (7, 72, 3723)]
     ['0:07', '1:12', '1:02:03']
     """
     minutes, rest = divmod(round(seconds), 60)

@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from padgs.results import Result
-from padgs.runs.live import clock, compact
+from padgs.runs.live import compact, duration
 from padgs.runs.terminal import printable, say
 from padgs.scoring.bands import BANDS
 
@@ -54,7 +54,7 @@ def show_result(result: Result, folder: Path, console: Console) -> None:
     costs = [f"{compact(count)} {name}" for name, count in result.counts.items()]
     costs.append(f"{result.model_bytes / 1e6:.1f} MB")
     if "train_seconds" in result.timing:
-        costs.append(f"trained {clock(result.timing['train_seconds'])}")
+        costs.append(f"trained {duration(result.timing['train_seconds'])}")
     if "render_ms_median" in result.timing:
         costs.append(f"{result.timing['render_ms_median']:.1f} ms per frame")
     costs.append(f"peak memory {result.peak_memory_bytes / 1e9:.2f} GB")

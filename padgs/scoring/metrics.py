@@ -20,7 +20,7 @@ from torch import Tensor
 from padgs.learning.loss import ssim_map
 from padgs.scoring.bands import BANDS
 from padgs.sphere.distortion import solid_angle_weight
-from padgs.sphere.panorama import row_latitudes
+from padgs.sphere.panorama import continued, row_latitudes
 
 Metric = Callable[[Tensor, Tensor, Tensor | None], Tensor]
 
@@ -68,8 +68,8 @@ def ws_ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor
     So it does not depend on where the seam lies, nor does it see black beyond it.
     """
     r = WINDOW_RADIUS
-    padded = ssim_map(pad_panorama(image, r), pad_panorama(target, r))
-    whole = None if mask is None else _whole_windows(pad_panorama(mask, r))
+    padded = ssim_map(continued(image, r), continued(target, r))
+    whole = None if mask is None else _whole_windows(continued(mask, r))
     return weighted_mean(padded[r:-r, r:-r], sphere_weight(image, whole))
 
 
@@ -127,25 +127,6 @@ def band_rows(height: int, band: str, *, device: torch.device | str = "cpu") -> 
 def weighted_mean(values: Tensor, weight: Tensor) -> Tensor:
     """Mean of [H, W, C] values over channels and, with a weight [H, W], over pixels; NaN where the weights sum to 0."""
     return (values.mean(-1) * weight).sum() / weight.sum()
-
-
-def pad_panorama(image: Tensor, radius: int) -> Tensor:
-    """A panorama [H, W, ...] continued by `radius` pixels on every side, [H + 2 radius, W + 2 radius, ...].
-
-    Left and right it wraps. Beyond a pole it goes on down the opposite meridian: row -k is row k - 1 turned by W / 2.
-
-    Raises:
-        ValueError: the image has fewer than `radius` rows, or an odd width, which has no opposite column.
-    """
-    height, width = image.shape[:2]
-    if height < radius or width % 2:
-        raise ValueError(
-            f"cannot continue a {width}x{height} panorama by {radius}: needs even width, height >= {radius}"
-        )
-    opposite = image.roll(width // 2, dims=1)
-    tall = torch.cat((opposite[:radius].flip(0), image, opposite[height - radius :].flip(0)))
-    columns = torch.arange(-radius, width + radius, device=image.device) % width
-    return tall[:, columns]
 
 
 def _decibel(mean_square: Tensor) -> Tensor:

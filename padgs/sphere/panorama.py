@@ -165,13 +165,22 @@ def _keys(t: Tensor) -> Tensor:
 
 
 def continued(image: Tensor, margin: int) -> Tensor:
-    """A panorama [H, W, C] with so many pixels more on each side: what lies beyond its seam and its poles.
+    """A panorama [H, W, ...] with so many pixels more on each side: what lies beyond its seam and its poles.
 
-    Beyond a pole its rows come again, half a turn further.
+    Left and right it wraps. Beyond a pole it goes on down the opposite meridian: row -k is row k - 1 turned by W / 2.
+
+    Raises:
+        ValueError: it has fewer rows than that, or an odd width, which has no opposite column.
     """
-    turned = image.roll(image.shape[1] // 2, dims=1)
-    image = torch.cat((turned[:margin].flip(0), image, turned[-margin:].flip(0)))
-    return torch.cat((image[:, -margin:], image, image[:, :margin]), dim=1)
+    height, width = image.shape[:2]
+    if height < margin or width % 2:
+        raise ValueError(
+            f"cannot continue a {width}x{height} panorama by {margin} pixels: its width must be even and its height at "
+            f"least {margin}; resize it"
+        )
+    opposite = image.roll(width // 2, dims=1)
+    tall = torch.cat((opposite[:margin].flip(0), image, opposite[height - margin :].flip(0)))
+    return tall[:, torch.arange(-margin, width + margin, device=image.device) % width]
 
 
 def sample_pixels(image: Tensor, pixels: Tensor) -> Tensor:

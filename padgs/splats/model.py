@@ -6,17 +6,16 @@ import math
 from collections.abc import Mapping
 
 import torch
-from scipy.spatial import KDTree
 from torch import Tensor, nn
 
 from padgs.gaussians import Gaussians
+from padgs.learning.cloud import refuse_unusable, squared_spacing
 from padgs.learning.rows import load_rows
 from padgs.scene import Scene, View
 from padgs.sphere import harmonics as spherical_harmonics
 from padgs.splats import cpu_colors
 
 INITIAL_OPACITY = 0.1
-NEIGHBOURS = 3  # distances that set a Gaussian's initial size
 SMALLEST_SCALE = 1e-4  # initial scale of coinciding points, in scene units
 TINY = 1e-6  # scene units; keeps directions finite for a camera exactly on a Gaussian
 
@@ -87,11 +86,7 @@ class Splats(nn.Module):
             ValueError: the point cloud is empty or not finite.
         """
         points, colors = scene.points.float(), scene.point_colors.float() / 255
-        if len(points) == 0:
-            raise ValueError("the point cloud is empty; Gaussians start from points, so the scene needs at least one")
-        if not torch.isfinite(points).all():
-            bad = int((~torch.isfinite(points).all(-1)).nonzero()[0])
-            raise ValueError(f"point {bad} of the cloud is {points[bad].tolist()}; remove points that are not finite")
+        refuse_unusable(points, "Gaussians")
         if max_gaussians is not None and len(points) > max_gaussians:
             chosen = torch.randperm(len(points), generator=generator)[:max_gaussians].sort().values
             points, colors = points[chosen], colors[chosen]
@@ -149,10 +144,7 @@ def initial_scales(points: Tensor, unit: float) -> Tensor:
 
     A lone point gets a tenth of a unit.
     """
-    neighbours = min(NEIGHBOURS, len(points) - 1)
-    if neighbours < 1:
+    squared = squared_spacing(points)
+    if squared is None:
         return points.new_full((len(points),), 0.1 * unit)
-    xyz = points.double().cpu().numpy()
-    distances, _ = KDTree(xyz).query(xyz, k=neighbours + 1)  # the first is the point itself, or one that coincides
-    mean_square = torch.from_numpy(distances[:, 1:]).square().mean(-1)
-    return mean_square.sqrt().clamp(min=SMALLEST_SCALE * unit).to(points)
+    return squared.sqrt().clamp(min=SMALLEST_SCALE * unit).to(points)

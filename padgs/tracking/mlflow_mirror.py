@@ -106,7 +106,7 @@ class Mirror:
         metrics = [Metric(key, value, now, result.iterations_done) for key, value in final_numbers(result).items()]
         tags = [RunTag(f"padgs.{key}", value[:LONGEST_VALUE]) for key, value in words.items()]
         self._client.log_batch(identity, metrics=metrics, tags=tags)
-        self._client.log_artifacts(identity, str(run / "renders"), "renders")
+        self._client.log_artifacts(identity, str(run / results.PICTURES), results.PICTURES)
         self._client.log_artifact(identity, str(run / results.FILE_NAME))
         self._log_table(identity, [result])
         self._client.set_terminated(identity, "FINISHED" if result.ok else "FAILED")

@@ -4,7 +4,7 @@ A new method needs no line here, unless its defaults are too large for a test (`
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -18,12 +18,10 @@ from padgs.data.synthetic import SCENES, SyntheticOptions, generate
 from padgs.learning.budget import Budget
 from padgs.learning.loop import Record
 from padgs.learning.method import Method
-from padgs.registry import lookup
 from padgs.runs import checkpoint
 from padgs.runs.config import RunConfig
 from padgs.runs.session import build
 from padgs.scene import Scene
-from padgs.splats.method import SplatMethod
 
 WIDTH = 32
 STEPS = 20
@@ -41,7 +39,6 @@ TINY: dict[str, tuple[str, ...]] = {"egonerf": TINY_EGONERF, "egonerf_small": TI
 SLOW = {"padgs_small", "padgs_tangent", "padgs_unmodulated"}
 CONF = Path(__file__).resolve().parents[2] / "conf"
 SETTINGS = sorted({*METHODS, *(path.stem for path in (CONF / "method").glob("*.yaml"))})
-EXPLICIT = [name for name in METHODS if issubclass(lookup(METHODS, name, "method"), SplatMethod)]
 EVERY = [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in SETTINGS]
 
 
@@ -78,13 +75,6 @@ def test_every_method_has_a_setting_of_its_name():
     assert METHODS.keys() <= set(SETTINGS)
     assert {config_of(setting).method for setting in SETTINGS} == METHODS.keys()
     assert TINY.keys() | SLOW <= set(SETTINGS)
-
-
-@pytest.mark.parametrize("name", EXPLICIT)
-def test_explicit_gaussians_are_drawn_and_trained_as_their_setting_says(name):
-    method, config = lookup(METHODS, name, "method"), config_of(name)
-    assert config.render == method.RENDER
-    assert asdict(method.TRAIN).items() <= asdict(config.train).items()
 
 
 def test_every_method_has_a_section_in_the_docs(root):
@@ -146,14 +136,6 @@ def test_killed_and_resumed_every_method_ends_bit_identically(setting, scenes, t
     assert [record.iteration for record in second.fit(scene, Budget(steps))] == list(range(stop + 1, steps + 1))
     assert_same_but_time(second.state(), whole.state())
     assert torch.equal(second.render(scene.test[0]).image, whole.render(scene.test[0]).image)
-
-
-@pytest.mark.parametrize("setting", EVERY)
-def test_before_training_every_method_says_that_there_is_nothing(setting, scenes):
-    method = method_of(setting)
-    for ask in (method.state, method.size, lambda: method.render(scenes("room").test[0])):
-        with pytest.raises(RuntimeError, match="before fit or load_state|call fit or load_state first"):
-            ask()
 
 
 @pytest.mark.parametrize("setting", EVERY)

@@ -34,6 +34,12 @@ def test_an_ideal_camera_starts_as_one(scene):
     assert first == pytest.approx(plain, rel=1e-5)
 
 
+@pytest.mark.parametrize("axis", ["xy", "", "w"])
+def test_an_axis_that_there_is_not_is_refused_at_once(axis):
+    with pytest.raises(ValueError, match=f"unknown lens_axis '{axis}'; known: x, y, z"):
+        Seam360GSOptions(lens_axis=axis)
+
+
 def photographed(gap: float, bending: tuple[float, float]) -> Scene:
     """The tiny scene with its exact centres and colours as points, through two lenses."""
     scene, seen = tiny_scene(), truth()

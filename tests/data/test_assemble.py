@@ -124,7 +124,7 @@ def test_the_data_set_decides_the_mask(folder: Path) -> None:
         ("split", "half", "unknown data.split 'half'; known: auto, files, every, all"),
         ("test_every", 1, "data.test_every is 1"),
         ("width", 511, "data.width is 511; .*an even number"),
-        ("cache_bytes", -1, "must not be negative"),
+        ("cache_bytes", -1, "data.cache_bytes is -1; it must be 0"),
     ],
 )
 def test_unusable_options(field: str, value: object, message: str) -> None:

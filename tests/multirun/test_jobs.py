@@ -51,7 +51,7 @@ class Start:
         run = f"room_{job[-1]}"
         (self.runs / run).mkdir(parents=True, exist_ok=True)
         (self.runs / run / "result.json").write_text("{}")
-        self.board.write(number, JobState(status, run, 10))
+        self.board.write(number, JobState(status, run))
 
     def counts(self, batch_size: int | None = None) -> dict[str, int]:
         try:
@@ -117,7 +117,7 @@ class OneKills(Start):
     """Its second job takes the process down each time, together with whatever else runs there."""
 
     def end(self, number, job):
-        self.board.write(number, JobState("running", f"room_{job[-1]}", 10))
+        self.board.write(number, JobState("running", f"room_{job[-1]}"))
         if job == "++seed=1":
             raise RuntimeError("a worker process was terminated")
         self.finish(number, job, "ok")
@@ -159,7 +159,7 @@ def test_what_is_wrong_with_all_jobs_is_said_once(tmp_path, capsys):
 class AtWorkElsewhere(Start):
     def end(self, number, job):
         if job == "++seed=2":
-            self.board.write(number, JobState("elsewhere", "room_2", 10, "worked on by another process"))
+            self.board.write(number, JobState("elsewhere", "room_2", "worked on by another process"))
         else:
             self.finish(number, job, "ok")
 

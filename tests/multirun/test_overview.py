@@ -58,8 +58,8 @@ def test_in_a_terminal_the_picture_is_live_and_the_last_one_stays():
 def test_the_board_says_what_jobs_wrote_and_nothing_more(tmp_path):
     board = Board(tmp_path / "board")
     assert board.read(3) == JobState() and not board.stop_requested()
-    board.write(3, JobState("running", "room", 10, data="/data"))
-    assert Board(tmp_path / "board").read(3) == JobState("running", "room", 10, data="/data")
+    board.write(3, JobState("running", "room", data="/data"))
+    assert Board(tmp_path / "board").read(3) == JobState("running", "room", data="/data")
     (board.folder / "00004.json").write_text('{"status": "ok", "ru')
     assert board.read(4) == JobState()
 

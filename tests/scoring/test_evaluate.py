@@ -71,7 +71,7 @@ def test_a_perfect_render(name, pixels):
     assert [*evaluation.metrics] == [*protocol.metrics, *lpips]
 
 
-def test_means_timings_and_pictures_of_several_views(image, pixels):
+def test_means_and_pictures_of_several_views(image, pixels):
     views = [view("a", pixels), view("b", pixels.flip(0))]
     seen = []
     evaluation = evaluate(

@@ -12,7 +12,6 @@ from padgs.scoring.metrics import (
     METRICS,
     band_rows,
     band_ws_psnr,
-    pad_panorama,
     psnr,
     seam,
     ssim,
@@ -21,6 +20,7 @@ from padgs.scoring.metrics import (
     ws_ssim,
 )
 from padgs.sphere.distortion import solid_angle_weight
+from padgs.sphere.panorama import continued
 
 H, W = 32, 64
 
@@ -92,7 +92,7 @@ def test_ssim_windows_agree_with_scikit_image(pair):
     options = dict(
         gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1.0, channel_axis=2, full=True
     )
-    image, target = (pad_panorama(tensor, 5).numpy() for tensor in pair)
+    image, target = (continued(tensor, 5).numpy() for tensor in pair)
     theirs = torch.from_numpy(structural_similarity(image, target, **options)[1])[5:-5, 5:-5].mean(-1)
     weight = solid_angle_weight(H, dtype=torch.float64)[:, None]
     assert ws_ssim(*pair).item() == pytest.approx(((theirs * weight).sum() / (weight.sum() * W)).item(), abs=1e-9)
@@ -100,22 +100,6 @@ def test_ssim_windows_agree_with_scikit_image(pair):
     inside[5:-5, 5:-5] = 1
     # Masking the outer 0 pixels leaves windows that are whole only 5 further in.
     assert ssim(*pair, inside).item() == pytest.approx(theirs[10:-10, 10:-10].mean().item(), abs=1e-9)
-
-
-def test_continuation_past_a_pole_is_the_opposite_meridian():
-    columns = torch.arange(8).expand(4, 8) + 10 * torch.arange(4)[:, None]  # pixel = 10 row + column
-    padded = pad_panorama(columns, 2)
-    assert padded.shape == (8, 12)
-    assert padded[1, 2:-2].tolist() == [4, 5, 6, 7, 0, 1, 2, 3]  # row -1 = row 0, turned by half
-    assert padded[0, 2:-2].tolist() == [14, 15, 16, 17, 10, 11, 12, 13]  # row -2 = row 1
-    assert padded[-1, 2:-2].tolist() == [24, 25, 26, 27, 20, 21, 22, 23]
-    assert padded[2].tolist() == [6, 7, 0, 1, 2, 3, 4, 5, 6, 7, 0, 1]
-
-
-@pytest.mark.parametrize("shape", [(4, 9), (1, 8)])
-def test_a_panorama_that_cannot_be_continued_is_an_error(shape):
-    with pytest.raises(ValueError, match=f"{shape[1]}x{shape[0]}.*even width"):
-        pad_panorama(torch.zeros(*shape, 3), 2)
 
 
 @pytest.mark.parametrize("shift", [1, 13, W // 2])

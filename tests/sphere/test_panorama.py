@@ -9,6 +9,7 @@ from torch.autograd.functional import jacobian
 
 from padgs.sphere.panorama import (
     angles_from_pixel,
+    continued,
     direction,
     longitude_latitude,
     pixel_from_angles,
@@ -258,3 +259,19 @@ def test_a_row_beyond_a_pole_is_the_same_row_half_a_turn_further(generator):
     at = unproject(torch.tensor([[5.5, 0.25], [7.5, 15.75]], dtype=torch.float64), 32, 16)
     expected = torch.stack((0.75 * image[0, 5] + 0.25 * image[0, 21], 0.75 * image[15, 7] + 0.25 * image[15, 23]))
     assert torch.allclose(sample(image, at), expected, atol=1e-6)
+
+
+def test_continuation_past_a_pole_is_the_opposite_meridian():
+    columns = torch.arange(8).expand(4, 8) + 10 * torch.arange(4)[:, None]  # pixel = 10 row + column
+    padded = continued(columns, 2)
+    assert padded.shape == (8, 12)
+    assert padded[1, 2:-2].tolist() == [4, 5, 6, 7, 0, 1, 2, 3]  # row -1 = row 0, turned by half
+    assert padded[0, 2:-2].tolist() == [14, 15, 16, 17, 10, 11, 12, 13]  # row -2 = row 1
+    assert padded[-1, 2:-2].tolist() == [24, 25, 26, 27, 20, 21, 22, 23]
+    assert padded[2].tolist() == [6, 7, 0, 1, 2, 3, 4, 5, 6, 7, 0, 1]
+
+
+@pytest.mark.parametrize("shape", [(4, 9), (1, 8)])
+def test_a_panorama_that_cannot_be_continued_is_an_error(shape):
+    with pytest.raises(ValueError, match=f"{shape[1]}x{shape[0]}.*must be even"):
+        continued(torch.zeros(*shape, 3), 2)

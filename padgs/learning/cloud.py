@@ -1,0 +1,35 @@
+"""The points that models start from: whether they can be used, and how dense they are."""
+
+from __future__ import annotations
+
+import torch
+from scipy.spatial import KDTree
+from torch import Tensor
+
+NEIGHBOURS = 3  # distances that say how dense points are
+
+
+def refuse_unusable(points: Tensor, what: str) -> None:
+    """Refuse points [N, 3] that nothing can start from; `what` would, in words.
+
+    Raises:
+        ValueError: there are none, or one is not finite.
+    """
+    if len(points) == 0:
+        raise ValueError(f"the point cloud is empty; {what} start from points, so the scene needs at least one")
+    if not torch.isfinite(points).all():
+        bad = int((~torch.isfinite(points).all(-1)).nonzero()[0])
+        raise ValueError(f"point {bad} of the cloud is {points[bad].tolist()}; remove points that are not finite")
+
+
+def squared_spacing(points: Tensor) -> Tensor | None:
+    """Mean square distance [N] of each point [N, 3] to its three nearest others, float64 on the CPU.
+
+    None of a lone point. Points that coincide are 0 apart.
+    """
+    neighbours = min(NEIGHBOURS, len(points) - 1)
+    if neighbours < 1:
+        return None
+    xyz = points.detach().double().cpu().numpy()
+    distances, _ = KDTree(xyz).query(xyz, k=neighbours + 1)  # the first is the point itself, or one that coincides
+    return torch.from_numpy(distances[:, 1:]).square().mean(-1)
