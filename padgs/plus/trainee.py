@@ -114,12 +114,11 @@ class PlusTrainee(SplatTrainee):
         return drawn * (1 / opacities).clamp(max=1 / (1 - share))
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
-        """Densify, choose whom to keep, bring the next SH degree into use, and average, where it is time to."""
-        self._moment = iteration
-        events = super().adapt(iteration, optimizer)
+        """Average, densify, choose whom to keep, and bring the next SH degree into use, where it is time to."""
+        self._moment, events = iteration, ()
         if iteration > AVERAGED_FROM * self.iterations and self.options.average_share > 0:
-            events += self._averaged(iteration)
-        return events
+            events = self._averaged(iteration)
+        return events + super().adapt(iteration, optimizer)
 
     def _averaged(self, iteration: int) -> tuple[str, ...]:
         """Note the parameters; at the end of the run their mean takes their place."""
