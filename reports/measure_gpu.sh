@@ -2,7 +2,7 @@
 # On a machine with an NVIDIA GPU: build, benchmark, test, and look for faults, in this order; what is known by then is
 # written after each step to reports/measured/<device>.json, and the last line says what has been verified and what not.
 #
-#   reports/measure_gpu.sh [STEP...]     all of: build bench tests memcheck synccheck racecheck initcheck
+#   reports/measure_gpu.sh [STEP...]     all of: build bench kernels tests memcheck synccheck racecheck initcheck
 #
 # A step that is done is not done again, so the same command goes on where it was cut off; build/gpu/out/STEP.state says
 # how each ended, STEP.log what it printed. Delete build/gpu/out to start over.
@@ -17,7 +17,7 @@ python=${PYTHON:-python3}
 build=$PWD/build/gpu
 out=$build/out
 site=$build/site
-all="build bench tests memcheck synccheck racecheck initcheck"
+all="build bench kernels tests memcheck synccheck racecheck initcheck"
 mkdir -p "$site" "$out" reports/measured
 export PADGS_LIBRARY_DIR="$build/lib" PYTHONPATH="$PWD:$site" PYTHONUNBUFFERED=1 OMP_NUM_THREADS=4
 
@@ -33,7 +33,8 @@ bench() {
   if [ "${FULL:-1}" = 0 ]; then full=--no-full; fi
   $python -c 'from padgs.cli.app import main; main()' bench --device cuda $full --out "$out"
 }
-tests() { $python -m pytest -q -m cuda tests/render --junitxml="$out/tests.xml"; }
+kernels() { $python -m pytest -q -m cuda tests/render/cuda --junitxml="$out/kernels.xml"; }
+tests() { $python -m pytest -q -m cuda tests/render --ignore=tests/render/cuda --junitxml="$out/tests.xml"; }
 sanitizer() {
   compute-sanitizer --tool "$1" --error-exitcode 99 $python -m pytest -q -x -m cuda -k "not long and not any_size" \
     tests/render/cuda/test_cuda_backend.py tests/render/cuda/test_cuda_decoder.py tests/render/cuda/test_cuda_loss.py
@@ -54,11 +55,13 @@ out, steps = Path(sys.argv[1]), sys.argv[2:]
 states = {step: (out / f"{step}.state").read_text().strip() if (out / f"{step}.state").exists() else "not run" for step in steps}
 if (out / "bench_gpu.json").exists():
     report = json.loads((out / "bench_gpu.json").read_text()) | {"steps": states}
-    if (out / "tests.xml").exists():
-        suite = ElementTree.parse(out / "tests.xml").getroot().find("testsuite")
+    for step in ("kernels", "tests"):
+        if not (out / f"{step}.xml").exists():
+            continue
+        suite = ElementTree.parse(out / f"{step}.xml").getroot().find("testsuite")
         counts = {key: int(suite.get(key)) for key in ("tests", "failures", "errors", "skipped")}
         cases = [case for case in suite.iter("testcase") if case.find("failure") is not None]
-        report["tests"] = {**counts, "failed": [f"{case.get('classname')}::{case.get('name')}" for case in cases]}
+        report[step] = {**counts, "failed": [f"{case.get('classname')}::{case.get('name')}" for case in cases]}
     name = re.sub(r"[^a-z0-9]+", "-", report["machine"]["gpu"].lower()).strip("-")
     Path("reports/measured", f"{name}.json").write_text(json.dumps(report, indent=1) + "\n")
 verified = " ".join(step for step, state in states.items() if state == "ok")

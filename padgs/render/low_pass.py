@@ -3,8 +3,8 @@
 Four kinds. pixels: a variance in the image plane, as in 3D Gaussian splatting; on a panorama that is a circle of the
 chart, which spans less and less of the sphere towards the poles. angular: the same angle in every direction of view.
 solid: the same, but in 3D and with the opacity lowered as the volume grows: the mass stays, and a thin one fades
-instead of swelling (the 3D filter of SPaGS). fixed: as angular, but of pixels at 512 per radian whatever the image (the
-released OP43DGS).
+instead of swelling (as by the 3D filter of SPaGS, which is of another view, see `padgs.splats.nearest`). fixed: as
+angular, but of pixels at 512 per radian whatever the image (the released OP43DGS).
 
 angular and solid add low_pass (r / f)^2 to the 3D covariance, at distance r and with f pixels per radian. Every
 projection sees that as a circle of low_pass / f^2: charts and tangent planes do not see along the mean's own direction.

@@ -57,17 +57,17 @@ def measure(tmp_path: Path):
 def test_the_benchmark_comes_first_and_what_is_done_is_not_done_again(measure, tmp_path: Path):
     line, calls = measure("build", "bench")
     assert calls == ["cmake -S", "cmake --build", "bench"]
-    assert line.startswith("verified: build bench; not verified: tests (not run), memcheck (not run)")
+    assert line.startswith("verified: build bench; not verified: kernels (not run), tests (not run), memcheck")
     line, calls = measure()
-    assert calls == ["tests ", *(f"tests {tool}" for tool in ("memcheck", "synccheck", "racecheck", "initcheck"))]
+    assert calls == ["tests ", "tests ", *(f"tests {tool}" for tool in ("memcheck", "synccheck", "racecheck", "initcheck"))]
     assert line.endswith("racecheck initcheck; not verified: nothing")
     assert measure()[1] == []
     assert json.loads((tmp_path / "reports/measured/some-gpu.json").read_text())["steps"]["racecheck"] == "ok"
 
 
 def test_what_fails_is_said_and_tried_again(measure):
-    line, _ = measure("build", "bench", "tests", BROKEN="yes")
-    assert "verified: build bench; not verified: tests (failed (1))" in line
+    line, _ = measure("build", "bench", "kernels", "tests", BROKEN="yes")
+    assert "verified: build bench; not verified: kernels (failed (1)), tests (failed (1))" in line
     line, calls = measure("tests")
     assert calls == ["tests "] and line.startswith("verified: build bench tests;")
 
@@ -79,4 +79,4 @@ def test_a_build_that_could_not_be_configured_is_none(measure):
 
 def test_unknown_steps_list_the_known_ones(measure):
     line, _ = measure("racechek")
-    assert line.startswith("unknown step racechek; known: build bench tests")
+    assert line.startswith("unknown step racechek; known: build bench kernels tests")

@@ -136,7 +136,9 @@ class _Drawing(NativeImage):
             if counts is None or self._projected.fits(counts.values()):
                 break
             room = 0
-        _rooms[alike] = max(int(HEADROOM * self._projected.instances) + 1, room * 15 // 16)
+        instances = self._projected.instances
+        wanted = max(int(HEADROOM * instances) + 1, room * 15 // 16)
+        _rooms[alike] = min(wanted, limit) if instances <= limit else 0  # 0: strips, which count as they go
         self._kept = (outputs.last, outputs.core_size, outputs.core, outputs.tails)
         known = {"visible": self._projected.visible, "instances": self._projected.instances}
         self.counters = Counters(pairs, gaussians=inputs.count, **known)

@@ -194,6 +194,7 @@ def test_room_of_the_last_image_changes_nothing_and_too_little_is_noticed(
     assert rooms[2:] == [count - 1, count]  # drawn again
     assert_same_bits(drawn(gaussians, (72, 36), replace(options, max_instances=count)), usual, outputs)
     assert rooms[4:] == [count]  # the room would be for more than may be
+    assert {*cuda_backend._rooms.values()} == {count}  # the next has as much as may be
 
 
 @pytest.mark.parametrize("blending", ["sorted", "hybrid"])
