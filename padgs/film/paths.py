@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
 from padgs.data.natural_order import natural
@@ -23,6 +22,8 @@ def between(poses: Tensor, times: Sequence[float] | np.ndarray) -> Tensor:
 
     Centres move in straight lines, turns are even.
     """
+    from scipy.spatial.transform import Rotation, Slerp
+
     numbers = np.arange(len(poses))
     given = poses.double().cpu().numpy()
     centers = -np.einsum("fji,fj->fi", given[:, :3, :3], given[:, :3, 3])
@@ -37,7 +38,8 @@ def along_cameras(scene: Scene, frames: int) -> Tensor:
     Raises:
         ValueError: there is one camera only, or all stand in one place.
     """
-    from scipy.ndimage import gaussian_filter1d  # a quarter of a second, which opening a run need not wait for
+    from scipy.ndimage import gaussian_filter1d
+    from scipy.spatial.transform import Rotation
 
     views = sorted(scene.train, key=lambda view: natural(view.name))
     given = torch.stack([view.cam_from_world for view in views])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from scipy.spatial import KDTree
 from torch import Tensor
 
 NEIGHBOURS = 3  # distances that say how dense points are
@@ -27,6 +26,8 @@ def squared_spacing(points: Tensor) -> Tensor | None:
 
     None of a lone point. Points that coincide are 0 apart.
     """
+    from scipy.spatial import KDTree
+
     neighbours = min(NEIGHBOURS, len(points) - 1)
     if neighbours < 1:
         return None

@@ -19,6 +19,7 @@ from padgs.learning.stopping import set_apart
 from padgs.multirun.board import CRASHED, ELSEWHERE, REFUSED, STOPPED, Board, BoardEntry
 from padgs.multirun.composition import typed_config
 from padgs.multirun.finished import FinishedJobs
+from padgs.need.entry import search
 from padgs.results import NEED_STATED, Result
 from padgs.runs.checkpoint import CheckpointError
 from padgs.runs.config import RunConfig
@@ -99,8 +100,6 @@ def done(config: RunConfig, console: Console, watch: Watch) -> Result:
     with page:
         result = session.run()
     if config.need == "on" and result.ok:
-        from padgs.need.entry import search  # scipy.stats, which other runs need not wait for
-
         run = load_run(session.folder.path, data_path=config.data.path, device=config.run.device)
         run.scene = session.scene  # whose panoramas are loaded
         search(run, NEED_STATED, console, watch.stop_requested)

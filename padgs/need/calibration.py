@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from scipy.stats import t
-
 from padgs.learning.stopping import set_apart
 from padgs.results import Scores
 from padgs.scene import View
@@ -71,6 +69,8 @@ def lower_bound(changes: Sequence[float]) -> float:
     >>> round(lower_bound([0.1, 0.0, -0.1]), 3), lower_bound([0.0, 0.0, 0.0])
     (-0.169, 0.0)
     """
+    from scipy.stats import t
+
     count = len(changes)
     mean = math.fsum(changes) / count
     variance = math.fsum((change - mean) ** 2 for change in changes) / (count - 1)

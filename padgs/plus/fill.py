@@ -6,7 +6,6 @@ import math
 from dataclasses import replace
 
 import torch
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from padgs.learning.targets import even_weight
@@ -45,6 +44,8 @@ def filled(scene: Scene, count: int, *, generator: torch.Generator) -> Scene:
 
 def _seen(view: View, cloud: Tensor, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """At most `count` pixels of a view as points [n, 3] float64 world, and their colours [n, 3] uint8."""
+    from scipy.spatial import KDTree
+
     pose = view.cam_from_world.double().cpu()
     camera_points = cloud @ pose[:3, :3].T + pose[:3, 3]
     ranges = camera_points.norm(dim=-1)

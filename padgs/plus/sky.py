@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import torch
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from padgs.scene import Scene
@@ -22,6 +21,8 @@ def far_gaussians(scene: Scene, count: int, *, degree: int, opacity: float) -> S
 
     They are grey until the images say more, and touch each other. A room whose cloud covers all directions gets none.
     """
+    from scipy.spatial import KDTree
+
     centre = torch.stack([view.center for view in scene.train]).median(0).values
     rays = scene.points.double() - centre.to(scene.points).double()
     distances = rays.norm(dim=-1)

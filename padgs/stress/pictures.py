@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from PIL import Image
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from padgs.scene import Scene, View
@@ -49,6 +48,8 @@ def rolled(scene: Scene, degrees: float | None, random: np.random.Generator) -> 
     """
 
     def roll(view: View) -> View:
+        from scipy.spatial.transform import Rotation
+
         columns = round(view.width * (random.random() if degrees is None else degrees / 360))
         angle = 360 * columns / view.width
         turn = Rotation.from_rotvec((0, angle, 0), degrees=True).as_matrix()
@@ -63,6 +64,8 @@ def rolled(scene: Scene, degrees: float | None, random: np.random.Generator) -> 
 
 def pitched(scene: Scene, degrees: float, random: np.random.Generator) -> Scene:
     """All cameras look down by so much: what was at the horizon comes to the poles."""
+    from scipy.spatial.transform import Rotation
+
     turn = torch.from_numpy(Rotation.from_rotvec((degrees, 0, 0), degrees=True).as_matrix())
 
     def pitch(view: View) -> View:

@@ -11,7 +11,6 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from padgs.scene import Scene, View
@@ -22,6 +21,8 @@ DIAGONAL = (math.sqrt(0.5), math.sqrt(0.5), 0.0)
 
 def turned(scene: Scene, degrees: float, random: np.random.Generator) -> Scene:
     """The whole world, cameras included, in a frame that is turned; the images stay what they are."""
+    from scipy.spatial.transform import Rotation
+
     world = torch.from_numpy(Rotation.from_rotvec(degrees * np.array(DIAGONAL), degrees=True).as_matrix())
     points = (scene.points.double() @ world.T.to(scene.points.device)).float()
 
@@ -72,6 +73,8 @@ def twisted(scene: Scene, degrees: float, random: np.random.Generator) -> Scene:
     """Training cameras look beside where they looked: about any axis, by a normal angle of that standard deviation."""
 
     def pose(view: View) -> View:
+        from scipy.spatial.transform import Rotation
+
         axis, size = random.standard_normal(3), random.standard_normal()
         twist = Rotation.from_rotvec(axis / np.linalg.norm(axis) * degrees * size, degrees=True).as_matrix()
         return facing(view, torch.from_numpy(twist))

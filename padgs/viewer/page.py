@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from padgs.scene import View
@@ -118,14 +117,14 @@ class Page:
         world_from_cam = view.cam_from_world[:3, :3].mT.cpu().numpy()
         with self._client.atomic():
             self._client.camera.position = view.center.cpu().numpy()
-            self._client.camera.wxyz = np.roll(Rotation.from_matrix(world_from_cam).as_quat(), 1)
+            self._client.camera.wxyz = wxyz_of(world_from_cam)
 
     def asked(self) -> Asked:
         """What the controls and the camera say now."""
         crop: Box | None = (self._low.value, self._high.value) if self._crop.value else None
         look = Look(self._camera.value, self._layer.value, float(self._fov.value), crop)
         camera = self._client.camera
-        world_from_cam = Rotation.from_quat(np.roll(camera.wxyz, -1)).as_matrix()
+        world_from_cam = matrix_of(camera.wxyz)
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = world_from_cam.T, -world_from_cam.T @ camera.position
         width, height = sides(int(self._width.value), camera.aspect)
@@ -154,7 +153,7 @@ class Page:
             thickness=1.5,
             thickness_units="screen",
             color=(40, 120, 220),
-            wxyz=np.roll(Rotation.from_matrix(view.cam_from_world[:3, :3].mT.cpu().numpy()).as_quat(), 1),
+            wxyz=wxyz_of(view.cam_from_world[:3, :3].mT.cpu().numpy()),
             position=view.center.cpu().numpy(),
             visible=False,
         )
@@ -197,6 +196,20 @@ class Page:
                 facts += f"; error of {asked.galleries[0].nearest(asked.cam_from_world).name}"
             self._facts.content = "  \n".join((*(gallery.facts for gallery in asked.galleries), facts))
         return seconds
+
+
+def wxyz_of(matrix: np.ndarray) -> np.ndarray:
+    """The quaternion [4] of a rotation [3, 3]."""
+    from viser.transforms import SO3
+
+    return SO3.from_matrix(matrix).wxyz
+
+
+def matrix_of(wxyz: np.ndarray) -> np.ndarray:
+    """The rotation [3, 3] of a quaternion [4]."""
+    from viser.transforms import SO3
+
+    return SO3(wxyz).as_matrix()
 
 
 def sides(longer: int, aspect: float) -> tuple[int, int]:

@@ -44,14 +44,15 @@ def showing(server: Serving, runs: Sequence[OpenedRun]) -> Iterator[dict[int, Pa
     viser.gui.set_panel_label(f"padgs: {scene.name}")
     first = scene.train[len(scene.train) // 2]
     center = first.center.cpu().numpy()
-    viser.initial_camera.position = center
-    viser.initial_camera.look_at = center + 0.3 * scene.unit * first.cam_from_world[2, :3].cpu().numpy()
-    viser.initial_camera.up = up
+    ahead = center + 0.3 * scene.unit * first.cam_from_world[2, :3].cpu().numpy()
+    viser.initial_camera.position, viser.initial_camera.look_at, viser.initial_camera.up = center, ahead, up
     box, drawing = box_of(scene.points), threading.Lock()
     pages: dict[int, Page] = {}
 
     @viser.on_client_connect
     def _(client: Any) -> None:
+        with client.atomic():  # one that was there before the runs were has been somewhere else
+            client.camera.up_direction, client.camera.position, client.camera.look_at = up, center, ahead
         page = pages[client.client_id] = Page(client, galleries, box, drawing, may_stop=server.is_local)
         page.start()
 

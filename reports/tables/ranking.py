@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping
 
-from scipy.special import stdtrit
-
 from padgs.reports.tables.table import Block, Cell, Column, shown
 
 BEST, SECOND = "best", "second"
@@ -83,6 +81,8 @@ def quantile(freedom: float, tests: int = 1) -> float:
     >>> round(quantile(2), 3), round(quantile(2, tests=2), 3)
     (4.303, 6.205)
     """
+    from scipy.special import stdtrit
+
     return float(stdtrit(freedom, 1 - (1 - CONFIDENCE) / (2 * tests)))
 
 

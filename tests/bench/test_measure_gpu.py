@@ -59,7 +59,11 @@ def test_the_benchmark_comes_first_and_what_is_done_is_not_done_again(measure, t
     assert calls == ["cmake -S", "cmake --build", "bench"]
     assert line.startswith("verified: build bench; not verified: kernels (not run), tests (not run), memcheck")
     line, calls = measure()
-    assert calls == ["tests ", "tests ", *(f"tests {tool}" for tool in ("memcheck", "synccheck", "racecheck", "initcheck"))]
+    assert calls == [
+        "tests ",
+        "tests ",
+        *(f"tests {tool}" for tool in ("memcheck", "synccheck", "racecheck", "initcheck")),
+    ]
     assert line.endswith("racecheck initcheck; not verified: nothing")
     assert measure()[1] == []
     assert json.loads((tmp_path / "reports/measured/some-gpu.json").read_text())["steps"]["racecheck"] == "ok"

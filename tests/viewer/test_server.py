@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 import padgs
 from padgs.cli.commands import app
 from padgs.extras import installing
+from padgs.scene import View
 from padgs.viewer.page import BOTH
 from padgs.viewer.pages import box_of, showing
 from padgs.viewer.server import serving
@@ -60,6 +61,8 @@ def test_a_browser_shows_all_that_can_be_asked_for(run, tmp_path):
         until(lambda: pages)
         (page,) = pages.values()
         page._width.value = "512"
+        middle = run.scene.train[len(run.scene.train) // 2]
+        until(lambda: (View("", page.asked().cam_from_world, 1, 1).center - middle.center).norm() < 1e-4)
 
         def shows(*texts: str) -> None:
             until(lambda: all(text in page._facts.content for text in ("51", *texts)))
