@@ -104,8 +104,8 @@ class PlusTrainee(SplatTrainee):
         """
         if self._pixels == 0 or self._moment >= AVERAGED_FROM * self.iterations:
             return None
-        has_choice = self._removal_psnr is not None and self._moment < self._choice_due
-        share = self.options.dropped_share(self._pixels, len(self.splats) / (GROWN_PER_KEPT if has_choice else 1))
+        fewer = GROWN_PER_KEPT if self.choice.lies_ahead(self._moment) else 1
+        share = self.options.dropped_share(self._pixels, len(self.splats) / fewer)
         if share == 0:
             return None
         opacities = torch.sigmoid(self.splats.opacity_logits)

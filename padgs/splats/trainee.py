@@ -12,13 +12,14 @@ from padgs.gaussians import Gaussians
 from padgs.learning.rows import keep_rows
 from padgs.learning.schedule import Constant, LogLinear, ParameterGroup, scaled
 from padgs.learning.trainee import Drawing, Parts, Size, State
-from padgs.learning.worth import most_wanted, needed, worth
+from padgs.learning.worth import most_wanted, worth
 from padgs.render import Rendering, RenderOptions, render
 from padgs.render.config import RenderConfig
 from padgs.render.contract import ALPHA_MIN
 from padgs.render.low_pass import wider
 from padgs.scene import View
 from padgs.sphere.panorama import longitude_latitude
+from padgs.splats.choice import Choice
 from padgs.splats.clone_split import MIN_DENSIFY_EVERY, CloneSplit, CloneSplitOptions
 from padgs.splats.model import Splats
 from padgs.splats.nearest import PixelFilter, cameras_of, finest_pixels, widened
@@ -34,6 +35,7 @@ class SplatTrainee:
     Attributes:
         splats: the model.
         densifier: its growth.
+        choice: of those that stay after it.
     """
 
     def __init__(
@@ -62,15 +64,11 @@ class SplatTrainee:
             views: of the training; without them there can be none.
             target: as `CloneSplit` has it.
             seed: of all that is random.
-            asked: by the budget. A number: so many Gaussians are kept a round after growth, those that the views would
-                miss most; auto, or None where nothing is asked: as many as `padgs.learning.worth.needed` says.
-            removal_psnr: dB, for that. None: all are kept.
+            asked, removal_psnr: as `Choice` has them.
             filter_pixels: variance of `padgs.splats.nearest.PixelFilter`, square pixels; 0: there is none.
         """
         self.splats, self.iterations = splats, iterations
         self._config, self._views, self._extent = config, views, extent
-        self._asked, self._removal_psnr = asked, removal_psnr
-        self._has_chosen: bool | None = False  # None: not known yet, of a checkpoint that does not say
         self.densifier = CloneSplit(
             splats,
             options.for_run(iterations),
@@ -79,6 +77,7 @@ class SplatTrainee:
             drawn_opacities=self._drawn_opacities,
             seed=seed,
         )
+        self.choice = Choice(self.densifier.options, iterations, asked=asked, removal_psnr=removal_psnr)
         self._drawn: View | None = None  # the view of the last drawing
         self._filter = PixelFilter(filter_pixels, cameras_of(views)) if filter_pixels > 0 else None
         if self._filter is not None:
@@ -131,8 +130,8 @@ class SplatTrainee:
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
         """Densify, choose whom to keep, and bring the next SH degree into use, where it is time to."""
         events = self.densifier.adapt(iteration, optimizer, grows=self._has_seen_enough)
-        if self._removal_psnr is not None and self._must_choose(iteration):
-            events += self._chosen(optimizer, self._removal_psnr)
+        if self.choice.is_due(iteration):
+            events += self._chosen(optimizer)
         if self._filter is not None:
             events += self._filtered(self._filter, iteration, optimizer)
         degree = min(self.splats.degree, self.degree_at(iteration + 1))
@@ -152,34 +151,14 @@ class SplatTrainee:
         views = int(self.densifier.statistics["seen"].max())  # some Gaussian is seen by all
         return 2 * views >= min(self.densifier.options.densify_every, MIN_DENSIFY_EVERY)
 
-    def _must_choose(self, iteration: int) -> bool:
-        """Whether it is time to choose: a round after growth.
-
-        What a budget asks for is met later, too: once a stop has left that out, and a number in any case at the end.
-        Where none asks, all stay then, for little is to come that mends what the others leave.
-        """
-        due = self._choice_due
-        if self._asked is None:
-            return iteration == due
-        if isinstance(self._asked, int):
-            due = min(due, self.iterations)
-        if self._has_chosen is None:
-            self._has_chosen = iteration > due
-        return iteration >= due and not self._has_chosen
-
-    @property
-    def _choice_due(self) -> int:
-        """The iteration of the choice: a round after growth."""
-        return self.densifier.options.densify_until - 1 + self.densifier.options.densify_every
-
-    def _chosen(self, optimizer: torch.optim.Adam, removal_psnr: float) -> tuple[str, ...]:
+    def _chosen(self, optimizer: torch.optim.Adam) -> tuple[str, ...]:
         """Keep those that the training views would miss most; scored by as many as lie between two rounds."""
         grown, step = len(self.splats), math.ceil(len(self._views) / self.densifier.options.densify_every)
         found = worth(self, self._views[::step])
-        kept = min(self._asked, grown) if isinstance(self._asked, int) else needed(found, removal_psnr)
+        kept = self.choice.count(found)
         keep_rows(self.splats.rows(), optimizer, most_wanted(found, kept))
         self.densifier.forget()
-        self._has_chosen = True
+        self.choice.made = True
         return (f"kept {kept} of {grown} Gaussians, those that the training views would miss most",)
 
     def _filtered(self, pixels: PixelFilter, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
@@ -251,7 +230,7 @@ class SplatTrainee:
             "unit": self.splats.unit,
             "extent": self._extent,
             "iterations": self.iterations,
-            "has_chosen": self._has_chosen,
+            "has_chosen": self.choice.made,
         }
         return State(tensors, values)
 
@@ -265,7 +244,7 @@ class SplatTrainee:
         device = self.splats.means.device
         self.densifier.statistics = {n: t.to(device, copy=True) for n, t in state.under("statistics/").items()}
         self.densifier.generator.set_state(state.tensors["random/pieces"].cpu())
-        self._has_chosen = state.values.get("has_chosen")
+        self.choice.made = state.values.get("has_chosen")
         if self._filter is not None:
             self._filter.variances = state.tensors[VARIANCES].to(device, copy=True)
 
