@@ -49,7 +49,6 @@ __global__ void __launch_bounds__(kGaussiansPerBlock *kMoments) sum_kernel(Blend
   uint32_t slot = args.slot_start[i];
   const uint32_t end = args.slot_start[i + 1];
   for (; slot + 8 <= end; slot += 8)
-#pragma unroll
     for (int j = 0; j < 8; ++j) part[j] += args.moments[slot + j].of[k];
   for (; slot < end; ++slot) sum += args.moments[slot].of[k];
   for (int j = 0; j < 8; ++j) sum += part[j];
