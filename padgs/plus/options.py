@@ -15,6 +15,7 @@ SCHEDULE = (  # options of 3DGS that mean nothing here
     *("reset_every", "reset_opacity", "released_start", "released_reset"),
 )
 LONG = 2000  # iterations from which on the threshold of growth does not fall any more
+COARSE = 2 * 256 * 128 / math.pi  # pixels of equal solid angle in a view; where there are more, it falls on
 GROWN = 0.4  # share of the run after which nothing grows any more
 GROWN_PER_KEPT = 2  # Gaussians before the choice, for each after it; more or less
 PLENTY = 16  # pixels of training views for each Gaussian: with fewer, pleasing one view may spoil another
@@ -31,7 +32,10 @@ class PlusOptions(SplatOptions):
 
     sh_degree: int = 2  # a degree more each tenth of the run; the third gains nothing and costs a fifth of the time
     signal: str = "space_absolute"  # the pull on the mean itself, in no image plane and at no latitude
-    gradient_threshold: float = 5e-5  # SPaGS's, in runs of `LONG` iterations or more; see `for_run`
+    gradient_threshold: float = 5e-5  # SPaGS's; see `for_run` and `for_views`
+    pixel_power: float = (
+        0.5  # of the width of pixels smaller than those of 256x128: with it the threshold falls; 0: not
+    )
     sample_clones: bool = True
     min_opacity: float = 0.05  # what is fainter when a round ends was not needed
     coarse_share: float = 0.3  # of the run, on views that are half as wide if they are large, at first still smaller
@@ -54,7 +58,7 @@ class PlusOptions(SplatOptions):
         check(self, "> 0 and finite", lambda factor: 0 < factor < math.inf, "initial_scale", "means_speed")
         check(self, "> 0 and finite, or none to keep all", lambda p: p is None or 0 < p < math.inf, "removal_psnr")
         off = "at least 0, which switches it off"
-        for name in ("size_weight", "smoothness_weight", "sky_share", "fill_share"):
+        for name in ("size_weight", "smoothness_weight", "sky_share", "fill_share", "pixel_power"):
             check(self, off, lambda value: 0 <= value < math.inf, name)
         check(self, "a share of the run in [0, 1]", lambda share: 0 <= share <= 1, "coarse_share")
         check(self, "a share of the Gaussians in [0, 1)", lambda share: 0 <= share < 1, "drop_share")
@@ -77,6 +81,16 @@ class PlusOptions(SplatOptions):
         if gaussians == 0:
             return 0.0
         return self.drop_share * min(max(math.log2(PLENTY * gaussians / pixels), 0.0), 1.0)
+
+    def for_views(self, pixels: float) -> PlusOptions:
+        """With the threshold for views of so many pixels (`counted_pixels`): lower where they are more than `COARSE`.
+
+        A Gaussian as large as a few pixels has a part in the mean loss that falls with their solid angle, and a slope
+        that rises with one over their width, so its pull falls with their width: `pixel_power` 1. The default, its
+        root, gains less where views are many, and loses less where they are few (docs/plus.md).
+        """
+        finer = min(1.0, math.sqrt(COARSE / pixels))  # width of a pixel
+        return replace(self, gradient_threshold=self.gradient_threshold * finer**self.pixel_power)
 
     def for_run(self, iterations: int) -> CloneSplitOptions:
         """Rounds of growth at even distances up to `GROWN`; no resets, which a run of any length must recover from.
