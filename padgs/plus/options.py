@@ -33,9 +33,7 @@ class PlusOptions(SplatOptions):
     sh_degree: int = 2  # a degree more each tenth of the run; the third gains nothing and costs a fifth of the time
     signal: str = "space_absolute"  # the pull on the mean itself, in no image plane and at no latitude
     gradient_threshold: float = 5e-5  # SPaGS's; see `for_run` and `for_views`
-    pixel_power: float = (
-        0.5  # of the width of pixels smaller than those of 256x128: with it the threshold falls; 0: not
-    )
+    pixel_power: float = 0.5  # of the width of pixels under those of 256x128: the threshold falls with it; 0: not
     sample_clones: bool = True
     min_opacity: float = 0.05  # what is fainter when a round ends was not needed
     coarse_share: float = 0.3  # of the run, on views that are half as wide if they are large, at first still smaller
