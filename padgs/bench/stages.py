@@ -44,6 +44,7 @@ NATIVE_CALLS = {
     "padgs_bin": "sort",
     "padgs_blend_forward": "blend",
     "padgs_photometric_loss": "loss",
+    "padgs_roughness": "loss",
     "padgs_blend_backward": "blend_backward",
     "padgs_sum_moments": "blend_backward",
     "padgs_project_backward": "project_backward",

@@ -114,6 +114,14 @@ class LossArguments(ctypes.Structure):
     ]
 
 
+class RoughnessArguments(ctypes.Structure):
+    _fields_ = [
+        *fields(Int32, "width", "height", "wrap"),
+        *fields(ctypes.c_float, "nearest", "edges", "jump"),
+        *fields(Pointer, "image", "transmittance", "depth", "row_weight", "workspace", "gradient"),
+    ]
+
+
 class ColorArguments(ctypes.Structure):
     _fields_ = [
         ("count", Int64),

@@ -19,13 +19,14 @@ from padgs.native.abi import (
     LossArguments,
     NativeCamera,
     Pointer,
+    RoughnessArguments,
 )
 from padgs.native.loading import declared, opened
 from padgs.native.watch import Watchable
 
 STRUCTURES = (
     *(NativeCamera, Inputs, Gradients, BlendGradientArguments),
-    *(DecodeGradientArguments, LossArguments, ColorArguments, LeaveOneOutArguments),
+    *(DecodeGradientArguments, LossArguments, ColorArguments, LeaveOneOutArguments, RoughnessArguments),
 )
 SIGNATURES = {
     "padgs_isa": ([], ctypes.c_char_p),
@@ -47,6 +48,8 @@ SIGNATURES = {
     "padgs_colors": ([Pointer], None),
     "padgs_photometric_loss": ([Pointer], ctypes.c_double),
     "padgs_loss_workspace": ([Int32, Int32], Int64),
+    "padgs_roughness": ([Pointer], ctypes.c_double),
+    "padgs_roughness_workspace": ([Int32, Int32], Int64),
     "padgs_measure_fma": ([Int64], ctypes.c_double),
     "padgs_measure_triad": ([Pointer, Pointer, Int64], ctypes.c_double),
 }

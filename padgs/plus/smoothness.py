@@ -10,6 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from padgs.plus.cpu_roughness import fits, native_roughness
 from padgs.render import Rendering
 from padgs.sphere.camera import Camera, Panorama
 from padgs.sphere.distortion import solid_angle_weight
@@ -29,12 +30,16 @@ def roughness(rendering: Rendering, camera: Camera, *, near: float) -> Tensor:
         camera: that it was drawn for.
         near: > 0, no distance is taken to be less, in the same unit.
     """
-    depth = rendering.depth
-    grey, opacity = rendering.image.detach().mean(-1), 1 - rendering.transmittance.detach()
-    inverse, rows = 1 / depth.clamp(min=near), depth.new_ones(len(depth))
-    down = _bends(grey, opacity, inverse, 0)
-    if isinstance(camera, Panorama):
+    depth, around = rendering.depth, isinstance(camera, Panorama)
+    rows = depth.new_ones(len(depth))
+    if around:
         rows = solid_angle_weight(len(depth), dtype=depth.dtype, device=depth.device)
+    if fits(rendering):
+        return native_roughness(rendering, rows, around=around, near=near, edges=EDGES, jump=JUMP)
+    grey, opacity = rendering.image.detach().mean(-1), 1 - rendering.transmittance.detach()
+    inverse = 1 / depth.clamp(min=near)
+    down = _bends(grey, opacity, inverse, 0)
+    if around:
         grey, opacity, inverse = (torch.cat((v[:, -1:], v, v[:, :1]), dim=1) for v in (grey, opacity, inverse))
     return _mean(down, rows[1:-1]) + _mean(_bends(grey, opacity, inverse, 1), rows)
 

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from padgs.native import cpu
 from padgs.plus.smoothness import JUMP, roughness
 from padgs.render import Rendering
 from padgs.sphere.camera import Panorama, perspective
@@ -82,3 +83,28 @@ def test_gradients():
     inputs = (depth.requires_grad_(),)
     assert torch.autograd.gradcheck(lambda d: roughness(shown(d, image), Panorama(12, 6), near=1e-6), inputs)
     assert not torch.isnan(torch.autograd.grad(roughness(shown(depth), Panorama(12, 6), near=1e-6), depth)[0]).any()
+
+
+@pytest.mark.skipif(not cpu.available(), reason="the native library is not built")
+@pytest.mark.parametrize(
+    "camera", [Panorama(33, 17), Panorama(32, 3), perspective(47, 21, 70.0), perspective(3, 3, 70.0)]
+)
+def test_native_matches_the_definition(camera):
+    """Sizes that fill no vector, distances nearer than `near`, transparent places, edges of both kinds."""
+    random = torch.Generator().manual_seed(camera.width)
+    depth = 1 + 0.1 * torch.rand(camera.height, camera.width, generator=random)
+    depth[camera.height // 2, camera.width // 2 :] *= 0.01
+    image = 0.3 * torch.rand(*depth.shape, 3, generator=random)
+    transmittance = (torch.rand(depth.shape, generator=random) - 0.3).clamp(min=0)
+    transmittance[:, 1] = 1.0
+    found = []
+    for dtype in (torch.float32, torch.float64):  # the native pass takes float32 only
+        leaf = depth.to(dtype, copy=True).requires_grad_()
+        drawn = Rendering(image.to(dtype), transmittance.to(dtype), leaf, torch.ones(1, dtype=torch.bool))
+        for near in (0.5, 1e-3):  # the second time workspaces have been used
+            value = 3 * roughness(drawn, camera, near=near)
+            (gradient,) = torch.autograd.grad(value, leaf)
+            found.append((value.item(), gradient.double()))
+    for (value, gradient), (defined, derivative) in zip(found[:2], found[2:], strict=True):
+        assert value == pytest.approx(defined, rel=1e-5, abs=1e-9)
+        assert (gradient - derivative).abs().max() <= 1e-4 * derivative.abs().max()

@@ -165,6 +165,19 @@ struct LossArguments {
   float *gradient;   // [H,W,3], dL/dimage, or null
 };
 
+// What padgs.plus.smoothness.roughness takes.
+struct RoughnessArguments {
+  int32_t width, height;
+  int32_t wrap;                               // 1: the ends of rows are neighbours
+  float nearest;                              // no distance is taken to be less
+  float edges, jump;                          // EDGES and JUMP of the definition
+  const float *image;                         // [H,W,3]
+  const float *transmittance, *depth;         // [H,W]
+  const float *row_weight;                    // [H]
+  float *workspace;                           // padgs_roughness_workspace(H, W) floats, zero before the first call
+  float *gradient;                            // [H,W], by depth, or null
+};
+
 // Colours of explicit Gaussians as a view sees them; with `grad_colors` their derivatives instead.
 struct ColorArguments {
   int64_t count;

@@ -14,6 +14,7 @@ namespace padgs {
   extern const LeaveOneOutKernels leave_one_out_kernels; \
   extern const ColorKernels color_kernels;    \
   extern const LossKernels loss_kernels;      \
+  extern const RoughnessKernels roughness_kernels; \
   extern const DecodeKernels decode_kernels;  \
   extern const CeilingKernels ceiling_kernels; \
   }
@@ -31,14 +32,15 @@ struct Kernels {
   const LeaveOneOutKernels &leave_one_out;
   const ColorKernels &colors;
   const LossKernels &loss;
+  const RoughnessKernels &roughness;
   const DecodeKernels &decode;
   const CeilingKernels &ceilings;
 };
 
 #define PADGS_KERNELS(isa)                                                                                  \
   {#isa,                       isa::project_kernels, isa::blend_kernels, isa::hybrid_kernels,                \
-   isa::leave_one_out_kernels, isa::color_kernels,   isa::loss_kernels,  isa::decode_kernels,                \
-   isa::ceiling_kernels}
+   isa::leave_one_out_kernels, isa::color_kernels,   isa::loss_kernels,  isa::roughness_kernels,             \
+   isa::decode_kernels,        isa::ceiling_kernels}
 
 static Kernels choose() {
 #if PADGS_ISA_COUNT > 1
@@ -69,7 +71,7 @@ using namespace padgs;
 PADGS_API int64_t padgs_structure_bytes(int32_t index) {
   const size_t bytes[] = {sizeof(Camera), sizeof(Inputs), sizeof(Gradients), sizeof(BlendGradientArguments),
                           sizeof(DecodeGradientArguments), sizeof(LossArguments), sizeof(ColorArguments),
-                          sizeof(LeaveOneOutArguments)};
+                          sizeof(LeaveOneOutArguments), sizeof(RoughnessArguments)};
   return index >= 0 && size_t(index) < sizeof(bytes) / sizeof(*bytes) ? int64_t(bytes[index]) : -1;
 }
 
@@ -108,6 +110,12 @@ PADGS_API double padgs_photometric_loss(const LossArguments *args) { return kern
 
 PADGS_API int64_t padgs_loss_workspace(int32_t height, int32_t width) {
   return kernels().loss.workspace(height, width);
+}
+
+PADGS_API double padgs_roughness(const RoughnessArguments *args) { return kernels().roughness.run(*args); }
+
+PADGS_API int64_t padgs_roughness_workspace(int32_t height, int32_t width) {
+  return kernels().roughness.workspace(height, width);
 }
 
 PADGS_API void padgs_decode_select(const DecodeArguments *args) { kernels().decode.select(*args); }

@@ -32,6 +32,11 @@ struct LossKernels {
   int64_t (*workspace)(int32_t height, int32_t width);
 };
 
+struct RoughnessKernels {
+  double (*run)(const RoughnessArguments &);
+  int64_t (*workspace)(int32_t height, int32_t width);
+};
+
 struct DecodeKernels {
   void (*select)(const DecodeArguments &);  // raw opacities and slot_start; after it N is known
   void (*place)(const DecodeArguments &);   // everything else

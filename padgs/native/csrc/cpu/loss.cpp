@@ -9,7 +9,7 @@
 #include <vector>
 
 #include "kernels.h"
-#include "simd.h"
+#include "maps.h"
 
 namespace padgs {
 namespace PADGS_ISA {
@@ -18,7 +18,6 @@ namespace {
 constexpr int kHalf = 5;  // the window is 11 pixels long, sigma 1.5
 constexpr int kChannels = 3;
 constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;
-constexpr int kMargin = kLanes;  // floats of zeros on both sides of a row; >= kHalf * kChannels
 
 struct Window {
   float tap[kHalf + 1];  // by distance from the centre
@@ -32,22 +31,6 @@ struct Window {
   }
 };
 const Window kWindow;
-
-// A stack of maps over the image, rows padded to whole vectors with zero margins on the left and right. The memory is
-// the caller's, zero at first; margins are never written.
-class Maps {
- public:
-  Maps(float *&memory, int count, int height, int length) : height_(height), stride_(stride(length)), data_(memory) {
-    memory += size_t(count) * height * stride_;
-  }
-  float *row(int map, int y) { return data_ + (size_t(map) * height_ + y) * stride_ + kMargin; }
-  static size_t stride(int length) { return (length + kLanes - 1) / kLanes * kLanes + 2 * kMargin; }
-
- private:
-  int height_;
-  size_t stride_;
-  float *data_;
-};
 
 Vec blur_x(const float *at) {
   Vec total = load(at) * kWindow.tap[0];
