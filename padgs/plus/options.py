@@ -18,6 +18,7 @@ LONG = 2000  # iterations from which on the threshold of growth does not fall an
 COARSE = 2 * 256 * 128 / math.pi  # pixels of equal solid angle in a view; where there are more, it falls on
 GROWN = 0.4  # share of the run after which nothing grows any more
 GROWN_PER_KEPT = 2  # Gaussians before the choice, for each after it; more or less
+MANY = 28  # views; with fewer the threshold falls less
 PLENTY = 16  # pixels of training views for each Gaussian: with fewer, pleasing one view may spoil another
 
 
@@ -33,7 +34,7 @@ class PlusOptions(SplatOptions):
     sh_degree: int = 2  # a degree more each tenth of the run; the third gains nothing and costs a fifth of the time
     signal: str = "space_absolute"  # the pull on the mean itself, in no image plane and at no latitude
     gradient_threshold: float = 5e-5  # SPaGS's; see `for_run` and `for_views`
-    pixel_power: float = 0.5  # of the width of pixels under those of 256x128: the threshold falls with it; 0: not
+    pixel_power: float = 1.0  # of the width of pixels under those of 256x128: the threshold falls with it; 0: not
     sample_clones: bool = True
     min_opacity: float = 0.05  # what is fainter when a round ends was not needed
     coarse_share: float = 0.3  # of the run, on views that are half as wide if they are large, at first still smaller
@@ -80,15 +81,17 @@ class PlusOptions(SplatOptions):
             return 0.0
         return self.drop_share * min(max(math.log2(PLENTY * gaussians / pixels), 0.0), 1.0)
 
-    def for_views(self, pixels: float) -> PlusOptions:
-        """With the threshold for views of so many pixels (`counted_pixels`): lower where they are more than `COARSE`.
+    def for_views(self, pixels: float, count: int) -> PlusOptions:
+        """With the threshold for so many views of so many pixels (`counted_pixels`): lower where these are more than
+        `COARSE`.
 
         A Gaussian as large as a few pixels has a part in the mean loss that falls with their solid angle, and a slope
-        that rises with one over their width, so its pull falls with their width: `pixel_power` 1. The default, its
-        root, gains less where views are many, and loses less where they are few (docs/plus.md).
+        that rises with one over their width, so its pull falls with their width. What fewer views than `MANY` pull at
+        is so much less certain, as the root of what is missing.
         """
         finer = min(1.0, math.sqrt(COARSE / pixels))  # width of a pixel
-        return replace(self, gradient_threshold=self.gradient_threshold * finer**self.pixel_power)
+        lower = min(1.0, finer**self.pixel_power * max(1.0, math.sqrt(MANY / max(count, 1))))
+        return replace(self, gradient_threshold=self.gradient_threshold * lower)
 
     def for_run(self, iterations: int) -> CloneSplitOptions:
         """Rounds of growth at even distances up to `GROWN`; no resets, which a run of any length must recover from.

@@ -64,8 +64,9 @@ class PlusTrainee(SplatTrainee):
         self, splats: Splats, options: PlusOptions, config: RenderConfig, *, limit: int | None = None, **kwargs: Any
     ) -> None:
         """Arguments as for `SplatTrainee`; `limit`: as many Gaussians as there may be."""
-        largest = max(map(counted_pixels, kwargs.get("views", ())), default=FEWEST_PIXELS)
-        growth = replace(options.for_views(largest), max_gaussians=limit)
+        views = kwargs.get("views", ())
+        largest = max(map(counted_pixels, views), default=FEWEST_PIXELS)
+        growth = replace(options.for_views(largest, len(views)), max_gaussians=limit)
         super().__init__(splats, growth, config, **kwargs)
         self.options, self.average = options, dict[str, Tensor]()
         self._moment = 0  # of the schedule, the last that has passed

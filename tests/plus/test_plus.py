@@ -58,17 +58,21 @@ def test_the_threshold_of_growth_falls_with_the_length_of_a_run_and_then_stays()
     assert found == pytest.approx([2e-4, 1e-4, 5e-5, 5e-5])
 
 
-def test_the_threshold_of_growth_falls_with_the_root_of_the_width_of_a_pixel_but_not_below_a_width_of_256():
+def test_the_threshold_of_growth_falls_with_the_width_of_a_pixel_where_views_are_many_but_not_below_a_width_of_256():
     def threshold(width):
         scene = tiny_scene()
         views = tuple(replace(view, width=width, height=width // 2) for view in scene.train)
         trainee = PlusMethod(PlusOptions(fill_share=0.0))._start(replace(scene, train=views), 30_000)
         return trainee.densifier.options.gradient_threshold
 
-    found = [PlusOptions().for_views(2 * w * w / 2 / math.pi).gradient_threshold for w in (64, 256, 512, 1024)]
-    assert found == pytest.approx([5e-5, 5e-5, 5e-5 / math.sqrt(2), 2.5e-5])
-    assert PlusOptions(pixel_power=0.0).for_views(10**6) == PlusOptions(pixel_power=0.0)
-    assert [threshold(w) for w in (64, 1024)] == pytest.approx([5e-5, 2.5e-5])
+    pixels = [2 * w * w / 2 / math.pi for w in (64, 256, 512, 1024)]
+    found = [[PlusOptions().for_views(p, views).gradient_threshold for p in pixels] for views in (100, 28, 7, 1)]
+    assert found[0] == found[1] == pytest.approx([5e-5, 5e-5, 2.5e-5, 1.25e-5])
+    assert found[2] == pytest.approx([5e-5, 5e-5, 5e-5, 2.5e-5])
+    assert found[3] == pytest.approx([5e-5, 5e-5, 5e-5, 5e-5]), "few views never ask for less than small ones"
+    assert PlusOptions(pixel_power=0.0).for_views(10**6, 28) == PlusOptions(pixel_power=0.0)
+    few = math.sqrt(28 / len(tiny_scene().train))
+    assert [threshold(w) for w in (64, 1024)] == pytest.approx([5e-5, min(1, few / 4) * 5e-5])
 
 
 def test_what_is_kept_after_growth_is_what_the_views_would_miss():
