@@ -11,8 +11,9 @@ from padgs.egonerf.options import EgoNeRFOptions
 from padgs.egonerf.ray_trainer import RayTrainer
 from padgs.egonerf.trainee import EgoNeRFTrainee, EgoNeRFTraining
 from padgs.learning.budget import Budget
-from padgs.learning.loop import Stage, TrainOptions
+from padgs.learning.loop import Stage
 from padgs.learning.method import Method
+from padgs.learning.options import TrainOptions
 from padgs.learning.trainee import State
 from padgs.render.config import RenderConfig
 from padgs.scene import Scene

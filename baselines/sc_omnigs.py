@@ -19,8 +19,8 @@ from padgs.calibration.align import Difference, Similarity, align
 from padgs.calibration.camera_map import CameraMap
 from padgs.calibration.splats import CalibratedMethod, Calibration
 from padgs.checks import check
-from padgs.learning.loop import TrainOptions
 from padgs.learning.loss import pixel_weight
+from padgs.learning.options import TrainOptions
 from padgs.learning.schedule import Constant, ParameterGroup
 from padgs.learning.targets import Target
 from padgs.learning.trainee import Drawing, State

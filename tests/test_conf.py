@@ -16,7 +16,7 @@ from padgs.anchors.model import PaDGSOptions
 from padgs.baselines import METHODS
 from padgs.data.datasets import DATASETS
 from padgs.data.synthetic.options import SyntheticOptions
-from padgs.learning.loop import TrainOptions
+from padgs.learning.options import TrainOptions
 from padgs.multirun.choices import method_choices
 from padgs.multirun.composition import composing, configuration
 from padgs.multirun.launchers import missing_plugin

@@ -14,8 +14,8 @@ from padgs.bench.tile_counts import BOUNDS
 from padgs.bench.workload import OPTIONS, Workload
 from padgs.clock import measure
 from padgs.gaussians import Gaussians
-from padgs.learning.loop import TrainOptions
 from padgs.learning.loss import define_loss, photometric_loss, target_moments
+from padgs.learning.options import TrainOptions
 from padgs.learning.targets import Target, Targets
 from padgs.render import RenderOptions, render
 

@@ -12,7 +12,8 @@ from torch import Tensor
 from padgs.egonerf.ray_pixels import RayPixels
 from padgs.egonerf.trainee import EgoNeRFTrainee
 from padgs.learning.budget import Budget
-from padgs.learning.loop import Stage, Trainer, TrainOptions
+from padgs.learning.loop import Stage, Trainer
+from padgs.learning.options import TrainOptions
 from padgs.learning.trainee import Trainee
 from padgs.scene import Scene
 from padgs.stopwatch import Lap

@@ -17,7 +17,8 @@ from padgs.anchors.model import PaDGS
 from padgs.gaussians import Gaussians, rotation_matrices
 from padgs.learning.budget import Budget
 from padgs.learning.extent import ExtentOptions
-from padgs.learning.loop import Trainer, TrainOptions
+from padgs.learning.loop import Trainer
+from padgs.learning.options import TrainOptions
 from padgs.learning.trainee import Drawing
 from padgs.render import Rendering, RenderOptions, render
 from padgs.render.config import RenderConfig

@@ -17,17 +17,17 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from padgs.checks import check, check_known
 from padgs.learning.budget import Budget
 from padgs.learning.failure import Failure, is_out_of_memory, memory_reason
-from padgs.learning.loss import NORMALISATIONS, ROW_WEIGHTS, photometric_loss
+from padgs.learning.loss import photometric_loss
 from padgs.learning.monitor import Monitor
 from padgs.learning.optimiser import Optimiser
+from padgs.learning.options import TrainOptions
 from padgs.learning.order import Order, ViewOrder
-from padgs.learning.schedule import LEARNING_RATES, Pace
+from padgs.learning.schedule import Pace
 from padgs.learning.stopping import FADE, GAIN, PATIENCE, Plateau, quality, set_apart
 from padgs.learning.trainee import MODEL, State, Trainee
-from padgs.learning.views.corrections import CHOICES, GIVEN, LEARNED, Corrections
+from padgs.learning.views.corrections import LEARNED, Corrections
 from padgs.learning.views.sizes import Sizes
 from padgs.scene import Scene
 from padgs.stopwatch import Lap
@@ -48,31 +48,6 @@ class Record:
     cpu_seconds: float  # the same of all threads of the process on the CPU, which other programs change less
     counts: dict[str, int] = field(default_factory=dict)  # anchors, gaussians drawn, ...
     events: tuple[str, ...] = ()  # what happened besides the step: "grew 120 anchors", ...
-
-
-@dataclass(frozen=True)
-class TrainOptions:
-    """The `train` group of the configuration, without the run length (`Budget`)."""
-
-    lambda_l1: float = 0.8  # lambda of Eq. 16
-    weight: str = "solid_angle"  # M of Eq. 17, see `padgs.learning.loss.ROW_WEIGHTS`
-    normalisation: str = "mean"  # channel_sum: 3 x the mean, as the released code does
-    # published: made for 30 000 iterations | run: made for the length of this run, see `padgs.learning.schedule.Pace` |
-    # a factor on the published ones, at the beginning.
-    learning_rates: str | float = "run"
-    check_every: int = 50  # iterations between checks of all gradients and parameters; the loss is checked at each
-    monitor: bool = True  # end a run that diverges, explodes, collapses or falls silent: see `padgs.learning.monitor`
-    exposures: str = GIVEN  # learned: a gain and offset of each training view; test views have the mean one
-    poses: str = GIVEN  # learned: a small correction of each training view; test views stay where they are
-
-    def __post_init__(self) -> None:
-        check(self, "in [0, 1]", lambda share: 0 <= share <= 1, "lambda_l1")
-        check_known(self, weight=ROW_WEIGHTS, normalisation=NORMALISATIONS, exposures=CHOICES, poses=CHOICES)
-        if isinstance(self.learning_rates, str):
-            check_known(self, learning_rates=LEARNING_RATES)
-        else:
-            check(self, "> 0 and finite", lambda factor: 0 < factor < math.inf, "learning_rates")
-        check(self, "at least 1", lambda every: every >= 1, "check_every")
 
 
 class Trainer:

@@ -17,7 +17,8 @@ import torch
 
 from padgs.learning.budget import Budget
 from padgs.learning.failure import is_out_of_memory
-from padgs.learning.loop import Record, Stage, Trainer, TrainOptions
+from padgs.learning.loop import Record, Stage, Trainer
+from padgs.learning.options import TrainOptions
 from padgs.learning.schedule import PUBLISHED_ITERATIONS
 from padgs.learning.trainee import Size, State, Trainee
 from padgs.learning.views.corrections import LEARNED

@@ -12,7 +12,7 @@ from rich.console import Console
 from padgs.baselines import METHODS, OURS, distribution
 from padgs.data.datasets import DATASETS
 from padgs.data.synthetic.options import SCENES
-from padgs.learning.loop import TrainOptions
+from padgs.learning.options import TrainOptions
 from padgs.multirun.overrides import root
 from padgs.registry import lookup
 from padgs.render.config import RenderConfig

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import torch
 
-from padgs.learning.loop import TrainOptions
+from padgs.learning.options import TrainOptions
 from padgs.learning.schedule import Pace, ParameterGroup
 from padgs.learning.trainee import Drawing, Prunable, Size, State
 from padgs.render import Rendering

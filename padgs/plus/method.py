@@ -13,7 +13,8 @@ import math
 import torch
 
 from padgs.learning.budget import Budget
-from padgs.learning.loop import Stage, Trainer, TrainOptions
+from padgs.learning.loop import Stage, Trainer
+from padgs.learning.options import TrainOptions
 from padgs.learning.trainee import Trainee
 from padgs.plus.fill import filled
 from padgs.plus.options import GROWN_PER_KEPT, PlusOptions

@@ -14,7 +14,7 @@ from padgs.data.datasets import DATASETS
 from padgs.data.options import DataOptions, DataSettings
 from padgs.data.synthetic.options import SyntheticOptions
 from padgs.learning.budget import Budget
-from padgs.learning.loop import TrainOptions
+from padgs.learning.options import TrainOptions
 from padgs.learning.schedule import PUBLISHED_ITERATIONS
 from padgs.registry import lookup
 from padgs.render.config import RenderConfig

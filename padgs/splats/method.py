@@ -16,8 +16,8 @@ import torch
 from padgs.checks import check
 from padgs.learning.budget import AUTO
 from padgs.learning.extent import ExtentOptions
-from padgs.learning.loop import TrainOptions
 from padgs.learning.method import Method
+from padgs.learning.options import TrainOptions
 from padgs.learning.trainee import State
 from padgs.scene import Scene, View
 from padgs.sphere.harmonics import MAX_DEGREE

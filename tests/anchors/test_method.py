@@ -9,7 +9,7 @@ from padgs.anchors.method import PaDGSMethod, PaDGSMethodOptions
 from padgs.anchors.model import PaDGS
 from padgs.anchors.trainee import LearningRates
 from padgs.learning.budget import Budget
-from padgs.learning.loop import TrainOptions
+from padgs.learning.options import TrainOptions
 from padgs.render.config import RenderConfig
 from padgs.scene import Scene, View
 from padgs.sphere.panorama import rays

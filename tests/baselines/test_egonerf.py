@@ -10,7 +10,7 @@ from padgs.data.synthetic import SyntheticOptions, generate
 from padgs.egonerf.model import EgoNeRF
 from padgs.egonerf.trainee import EgoNeRFTrainee
 from padgs.learning.budget import Budget
-from padgs.learning.loop import TrainOptions
+from padgs.learning.options import TrainOptions
 from padgs.render.config import RenderConfig
 from padgs.runs.session import build
 from padgs.scene import Scene, View

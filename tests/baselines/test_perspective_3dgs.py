@@ -15,7 +15,7 @@ from padgs.baselines.crops_3dgs import NARROWEST, Crops3DGSMethod, Crops3DGSOpti
 from padgs.baselines.cubemap_3dgs import Cubemap3DGSMethod
 from padgs.data.perspectives import solid_angle
 from padgs.learning.budget import Budget
-from padgs.learning.loop import TrainOptions
+from padgs.learning.options import TrainOptions
 from padgs.registry import lookup
 from padgs.render.config import RenderConfig
 from padgs.sphere.camera import Panorama

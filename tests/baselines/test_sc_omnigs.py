@@ -11,7 +11,7 @@ from padgs.calibration.align import Similarity, align
 from padgs.data.synthetic import SyntheticOptions, SyntheticTruth, generate
 from padgs.gaussians import rotation_matrices
 from padgs.learning.budget import Budget
-from padgs.learning.loop import TrainOptions
+from padgs.learning.options import TrainOptions
 from padgs.learning.targets import Targets
 from padgs.learning.views.poses import PoseRates
 from padgs.render.config import RenderConfig

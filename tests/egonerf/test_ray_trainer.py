@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from padgs.egonerf.ray_trainer import RayTrainer
 from padgs.learning.budget import Budget
 from padgs.learning.failure import Failure
-from padgs.learning.loop import TrainOptions
+from padgs.learning.options import TrainOptions
 from padgs.learning.schedule import Constant, ParameterGroup
 from padgs.learning.trainee import State
 from padgs.scene import Scene

@@ -13,7 +13,8 @@ from padgs.gaussians import Gaussians
 from padgs.learning import schedule as schedules
 from padgs.learning.budget import Budget
 from padgs.learning.failure import Failure
-from padgs.learning.loop import Trainer, TrainOptions
+from padgs.learning.loop import Trainer
+from padgs.learning.options import TrainOptions
 from padgs.learning.schedule import Constant, LogLinear, ParameterGroup
 from padgs.learning.trainee import Drawing, State
 from padgs.render import Rendering

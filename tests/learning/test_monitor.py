@@ -6,8 +6,9 @@ from tiny_scene import tiny_scene
 
 from padgs.gaussians import Gaussians
 from padgs.learning.failure import Failure
-from padgs.learning.loop import Budget, TrainOptions
+from padgs.learning.loop import Budget
 from padgs.learning.monitor import Monitor
+from padgs.learning.options import TrainOptions
 from padgs.learning.trainee import Drawing
 from padgs.render import Rendering
 from padgs.results import STATUSES

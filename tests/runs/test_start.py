@@ -14,7 +14,7 @@ import padgs
 from padgs import results
 from padgs.baselines import METHODS
 from padgs.learning.budget import Budget
-from padgs.learning.loop import TrainOptions
+from padgs.learning.options import TrainOptions
 from padgs.multirun.composition import composing, configuration
 from padgs.registry import lookup
 from padgs.runs import checkpoint

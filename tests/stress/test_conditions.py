@@ -6,7 +6,7 @@ from composed import composed
 from tiny_scene import tiny_scene
 
 from padgs.data.synthetic import SyntheticOptions, SyntheticTruth, generate
-from padgs.learning.loop import TrainOptions
+from padgs.learning.options import TrainOptions
 from padgs.runs.config import config_from_values
 from padgs.runs.identity import run_id
 from padgs.scene import Scene

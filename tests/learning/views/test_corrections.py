@@ -12,7 +12,8 @@ from torch import nn
 
 from padgs.baselines.omnigs import OmniGSMethod
 from padgs.learning.budget import Budget
-from padgs.learning.loop import Trainer, TrainOptions
+from padgs.learning.loop import Trainer
+from padgs.learning.options import TrainOptions
 from padgs.learning.schedule import Constant, ParameterGroup
 from padgs.learning.trainee import Drawing
 from padgs.learning.views.corrections import Corrections
