@@ -6,10 +6,16 @@ import pytest
 from padgs.baselines import METHODS
 from padgs.data import LOADERS
 from padgs.registry import lookup
-from padgs.render import BACKENDS
+from padgs.render import BACKENDS, leave_one_out
 from padgs.render.projection import PROJECTIONS
 
-REGISTRIES = {"backend": BACKENDS, "projection": PROJECTIONS, "loader": LOADERS, "method": METHODS}
+REGISTRIES = {
+    "backend": BACKENDS,
+    "leave-one-out backend": leave_one_out.BACKENDS,
+    "projection": PROJECTIONS,
+    "loader": LOADERS,
+    "method": METHODS,
+}
 ENTRIES = [(kind, name) for kind, registry in REGISTRIES.items() for name in registry]
 
 
