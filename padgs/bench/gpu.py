@@ -23,24 +23,19 @@ sizes       name -> one workload of `padgs.bench.workload`:
 from __future__ import annotations
 
 import dataclasses
-import time
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
 import torch
 
 from padgs import clock
 from padgs.anchors.precision import PRECISIONS
-from padgs.bench.workload import OPTIONS, SIZES, Size, Workload, build, refuse_unknown
+from padgs.bench.on_device import OnDevice
+from padgs.bench.timeline import Timeline, calls_watched, timed
+from padgs.bench.workload import OPTIONS, SIZES, Size, build, refuse_unknown
 from padgs.native import cuda
-from padgs.native.abi import Pointer
-from padgs.native.watch import watched
-from padgs.render import Rendering, RenderOptions, render, resolve_backend
-from padgs.render.backends.captured import CapturedRender
-from padgs.scene import Scene, View
 
 SCHEMA = 1
 MEASURED = {
@@ -48,84 +43,10 @@ MEASURED = {
     "published": dataclasses.replace(OPTIONS, bounds="square", wrap=False),
     "hybrid": dataclasses.replace(OPTIONS, blending="hybrid"),
 }
-QUEUED = {name for name, (arguments, _) in cuda.SIGNATURES.items() if arguments[:2] == [Pointer, Pointer]}
 TITLES = {"ours": "exact bounds", "published": "published bounds", "hybrid": "exact bounds, hybrid blending"}
 # For 1M Gaussians at 2048x1024 on an H100 or H200; at most, if not AT_LEAST.
 LIMITS = {"frame_ms": 1.0, "iteration_ms": 3.5, "peak_gb": 6.0, "published_slower": 2.0}
 AT_LEAST = {"published_slower"}
-
-
-class Stopwatch:
-    """Marks on the device's own time line."""
-
-    def __init__(self, device: torch.device) -> None:
-        self.device = device
-
-    def mark(self) -> Any:
-        """Now, once the device gets here."""
-        if self.device.type != "cuda":
-            return time.perf_counter()
-        event = torch.cuda.Event(enable_timing=True)
-        event.record(torch.cuda.current_stream(self.device))
-        return event
-
-    def seconds(self, start: Any, end: Any) -> float:
-        """Between two marks that the device has reached."""
-        return end - start if self.device.type != "cuda" else start.elapsed_time(end) / 1000
-
-
-class OnDevice:
-    """A workload that is drawn and trained on a device."""
-
-    def __init__(self, work: Workload, options: RenderOptions, device: torch.device) -> None:
-        work.model.to(device)
-        work = dataclasses.replace(work, scene=resident(work.scene, device))
-        self.work, self.options, self.device = work, options, device
-        self.backend = resolve_backend("auto", work.model.positions)
-        self._records = work.trainer(options).records()
-
-    def frame(self) -> Rendering:
-        """Decode and draw."""
-        with torch.no_grad():
-            decoded = self.work.model.decode(self.work.view)
-            return render(decoded.gaussians, self.work.view, self.options, backend=self.backend)
-
-    def decoding(self, precision: str) -> Callable[[], object]:
-        """Decode without drawing."""
-        model = self.work.model
-
-        def work() -> None:
-            model.options = dataclasses.replace(usual, precision=precision)
-            with torch.no_grad():
-                model.decode(self.work.view)
-            model.options = usual
-
-        usual = model.options
-        return work
-
-    def captured_frame(self) -> Callable[[], object] | None:
-        """The same, recorded and played back; None if the backend cannot."""
-        if self.backend != "cuda":
-            return None
-        pose = self.work.view.cam_from_world.to(self.device)
-        draw = CapturedRender(self.work.model.show, self.work.view, self.options)
-        return lambda: draw(pose)
-
-    def train(self) -> None:
-        """One iteration of the trainer."""
-        next(self._records)
-
-
-def resident(scene: Scene, device: torch.device) -> Scene:
-    """The scene as a run trains on it: poses on the device, and panoramas as bytes there."""
-
-    def held(view: View) -> View:
-        assert view.load_pixels is not None, view.name
-        pixels = view.load_pixels().to(device)
-        return dataclasses.replace(view, load_pixels=lambda: pixels)
-
-    moved = scene.to(device)
-    return dataclasses.replace(moved, train=tuple(map(held, moved.train)))
 
 
 def measure_gpu(
@@ -177,25 +98,25 @@ def measure_gpu(
 
 def measure_ceilings(device: torch.device, megabytes: int) -> dict[str, float]:
     """What torch itself gets out of the device."""
-    watch = Stopwatch(device)
+    line = Timeline(device)
     source = torch.empty(megabytes << 18, device=device)
     side = min(8192, 8 * megabytes)
     matrix = torch.randn(side, side, device=device)
     target, product = torch.empty_like(source), torch.empty_like(matrix)
-    copy = _timed(lambda: target.copy_(source), watch, 10, 3)["min"]
-    multiply = _timed(lambda: torch.mm(matrix, matrix, out=product), watch, 5, 2)["min"]
+    copy = timed(lambda: target.copy_(source), line, 10, 3)["min"]
+    multiply = timed(lambda: torch.mm(matrix, matrix, out=product), line, 5, 2)["min"]
     return {"copy": 2 * 4 * source.numel() / copy, "fp32": 2 * side**3 / multiply}
 
 
 def _measure(iteration: OnDevice, repeats: int, warm_up: int) -> dict[str, Any]:
-    watch = Stopwatch(iteration.device)
-    frame = _timed(iteration.frame, watch, repeats, warm_up)
-    decode = {name: _timed(iteration.decoding(name), watch, repeats, warm_up) for name in PRECISIONS}
+    line = Timeline(iteration.device)
+    frame = timed(iteration.frame, line, repeats, warm_up)
+    decode = {name: timed(iteration.decoding(name), line, repeats, warm_up) for name in PRECISIONS}
     captured = iteration.captured_frame()
-    graph = None if captured is None else _timed(captured, watch, repeats, warm_up)
+    graph = None if captured is None else timed(captured, line, repeats, warm_up)
     del captured  # and its memory
     clock.reset_peak_memory(iteration.device)
-    timing = _timed(iteration.train, watch, repeats, warm_up)
+    timing = timed(iteration.train, line, repeats, warm_up)
     memory = clock.peak_memory(iteration.device)
     return {
         "backend": iteration.backend,
@@ -203,23 +124,11 @@ def _measure(iteration: OnDevice, repeats: int, warm_up: int) -> dict[str, Any]:
         "decode": decode,
         "graph": graph,
         "iteration": timing,
-        "stages": _stages(iteration, watch, repeats),
+        "stages": _stages(iteration, line, repeats),
         "waits": _waits(iteration),
         "counters": dict(iteration.frame().counters),
         "peak_bytes": memory["device"],
     }
-
-
-def _timed(work: Callable[[], object], watch: Stopwatch, repeats: int, warm_up: int) -> dict[str, float]:
-    for _ in range(warm_up):
-        work()
-    marks = []
-    for _ in range(repeats):
-        start = watch.mark()
-        work()
-        marks.append((start, watch.mark()))
-    clock.synchronise(watch.device)
-    return clock.summary([watch.seconds(*pair) for pair in marks])
 
 
 def _waits(iteration: OnDevice) -> int | None:
@@ -235,32 +144,16 @@ def _waits(iteration: OnDevice) -> int | None:
     return sum("synchronizing" in str(warning.message) for warning in caught)
 
 
-def _stages(iteration: OnDevice, watch: Stopwatch, repeats: int) -> dict[str, dict[str, float]]:
+def _stages(iteration: OnDevice, line: Timeline, repeats: int) -> dict[str, dict[str, float]]:
     rounds: list[defaultdict[str, float]] = []  # name -> seconds
     for _ in range(repeats):
-        with _calls_watched(watch) as marks:
+        with calls_watched(line) as marks:
             iteration.train()
-        clock.synchronise(watch.device)
+        clock.synchronise(line.device)
         rounds.append(defaultdict(float))
         for name, start, end in marks:
-            rounds[-1][name] += watch.seconds(start, end)
+            rounds[-1][name] += line.seconds(start, end)
     return {name: clock.summary([spent[name] for spent in rounds]) for name in sorted(set().union(*rounds))}
-
-
-@contextmanager
-def _calls_watched(watch: Stopwatch) -> Iterator[list[tuple[str, Any, Any]]]:
-    """Marks around every call that puts work into the device's queue."""
-    marks: list[tuple[str, Any, Any]] = []
-
-    @contextmanager
-    def stage(name: str) -> Iterator[None]:
-        start = watch.mark()
-        yield
-        if name in QUEUED:
-            marks.append((name.removeprefix("padgs_cuda_"), start, watch.mark()))
-
-    with watched(stage):
-        yield marks
 
 
 def _targets(size: Size, entry: dict[str, Any]) -> dict[str, dict[str, Any]]:

@@ -10,7 +10,7 @@ import torch
 from pretended_gpu import GPU, pretended_gpu
 from typer.testing import CliRunner
 
-from padgs.bench import gpu
+from padgs.bench import gpu, on_device, timeline
 from padgs.bench.workload import OPTIONS, SIZES, build
 from padgs.cli.commands import app
 from padgs.native import cpu
@@ -44,8 +44,8 @@ def test_the_report_says_what_was_measured(report: dict):
 
 def test_on_a_gpu_the_frame_is_also_played_back_from_a_graph(monkeypatch: pytest.MonkeyPatch):
     made, poses = [], []
-    monkeypatch.setattr(gpu, "CapturedRender", lambda *how: made.append(how) or poses.append)
-    iteration = gpu.OnDevice(build(SIZES["quick"]), OPTIONS, torch.device("cpu"))
+    monkeypatch.setattr(on_device, "CapturedRender", lambda *how: made.append(how) or poses.append)
+    iteration = on_device.OnDevice(build(SIZES["quick"]), OPTIONS, torch.device("cpu"))
     assert iteration.captured_frame() is None
     iteration.backend = "cuda"
     draw = iteration.captured_frame()
@@ -67,7 +67,7 @@ def test_on_a_gpu_the_frame_is_also_played_back_from_a_graph(monkeypatch: pytest
 
 
 def test_decoding_is_timed_in_a_precision_and_leaves_the_model_as_it_was(monkeypatch: pytest.MonkeyPatch):
-    iteration, seen = gpu.OnDevice(build(SIZES["quick"]), OPTIONS, torch.device("cpu")), []
+    iteration, seen = on_device.OnDevice(build(SIZES["quick"]), OPTIONS, torch.device("cpu")), []
     monkeypatch.setattr(iteration.work.model, "decode", lambda _: seen.append(iteration.work.model.options.precision))
     iteration.decoding("float16")()
     assert seen == ["float16"] and iteration.work.model.options.precision == "float32"
@@ -75,7 +75,7 @@ def test_decoding_is_timed_in_a_precision_and_leaves_the_model_as_it_was(monkeyp
 
 def test_what_trains_has_poses_and_panoramas_on_the_device():
     with pretended_gpu() as waits:
-        scene = gpu.resident(build(SIZES["quick"]).scene, GPU)
+        scene = on_device.resident(build(SIZES["quick"]).scene, GPU)
         waits.clear()
         for view in scene.train:
             assert view.cam_from_world.device == GPU and view.image(device=GPU).device == GPU
@@ -107,7 +107,7 @@ def test_targets_are_judged_for_the_size_that_they_are_stated_for():
 
 def test_calls_of_the_library_are_charged_to_stages():
     library = Watchable(SimpleNamespace(padgs_cuda_bin=lambda: 0, padgs_cuda_pose_blocks=lambda: 1))
-    with gpu._calls_watched(gpu.Stopwatch(torch.device("cpu"))) as marks:
+    with timeline.calls_watched(timeline.Timeline(torch.device("cpu"))) as marks:
         assert (library.padgs_cuda_bin(), library.padgs_cuda_pose_blocks()) == (0, 1)
     ((name, start, end),) = marks  # the other one asks the host
     assert name == "bin" and start <= end
