@@ -24,7 +24,7 @@ STAGES = {
     "sort": "depth order, counting and binning of tile instances",
     "blend": "footprints to pixels",
     "draw": "drawing around its native calls: allocation, checks",
-    "loss": "L1 and SSIM, with their gradient",
+    "loss": "L1, SSIM and what penalties are native, with their gradients",
     "blend_backward": "pixels to moments of the footprints, and their sums",
     "project_backward": "moments to gradients of the Gaussians",
     "decode_backward": "gradients of anchors and networks",

@@ -76,7 +76,7 @@ class Trainer:
         trainee: Trainee,
         scene: Scene,
         budget: Budget,
-        options: TrainOptions = TrainOptions(),
+        options: TrainOptions = TrainOptions(),  # noqa: B008 - frozen dataclass
         seed: int = 0,
         *,
         views_each: int = 1,

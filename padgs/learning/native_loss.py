@@ -73,7 +73,8 @@ def _on_cpu(arguments: LossArguments, image: Tensor, total: Tensor) -> Tensor:
 
 @functools.lru_cache(maxsize=2)
 def _workspace(height: int, width: int) -> Tensor:
-    # Kept between iterations: fresh memory costs more in page faults than the loss does in arithmetic.
+    # Kept between iterations: fresh memory costs more in page faults than the loss does in arithmetic. Python threads
+    # would share it: one at a time may train.
     return torch.zeros(cpu.library().padgs_loss_workspace(height, width), dtype=torch.float32)
 
 

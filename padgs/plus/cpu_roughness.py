@@ -21,9 +21,10 @@ LEAST = 3  # pixels across and down: neighbours on both sides
 
 def fits(rendering: Rendering) -> bool:
     """Whether there is a native pass for it: float32 on the CPU, a picture with neighbours, a library."""
-    depth = rendering.depth
-    on_cpu = depth.device.type == "cpu" and depth.dtype == torch.float32
-    return on_cpu and min(depth.shape) >= LEAST and cpu.available()
+    shape, parts = rendering.depth.shape, (rendering.depth, rendering.transmittance, rendering.image)
+    plain = all(part.device.type == "cpu" and part.dtype == torch.float32 for part in parts)
+    alike = rendering.transmittance.shape == shape and rendering.image.shape == (*shape, 3)
+    return plain and alike and min(shape) >= LEAST and cpu.available()
 
 
 def native_roughness(
@@ -32,10 +33,10 @@ def native_roughness(
     """A scalar, differentiable by `rendering.depth`.
 
     Args:
-        rendering: of [H, W] pixels.
+        rendering: of [H, W] pixels that `fits`.
         rows: [H] what the pixels of each row count.
         around: whether the left and the right end of a row are neighbours.
-        near: no distance is taken to be less.
+        near: > 0, in the unit of the distances; none is taken to be less.
         edges, jump: `EDGES` and `JUMP` of the definition.
     """
     return _Roughness.apply(rendering.depth, rendering.image, rendering.transmittance, rows, around, near, edges, jump)
@@ -60,4 +61,5 @@ class _Roughness(torch.autograd.Function):
 
 @functools.lru_cache(maxsize=2)
 def _workspace(height: int, width: int) -> Tensor:
+    # Kept as that of `padgs.learning.native_loss` is, so only one thread at a time may train.
     return torch.zeros(cpu.library().padgs_roughness_workspace(height, width), dtype=torch.float32)

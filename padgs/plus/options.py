@@ -18,7 +18,6 @@ LONG = 2000  # iterations from which on the threshold of growth does not fall an
 COARSE = 2 * 256 * 128 / math.pi  # pixels of equal solid angle in a view; where there are more, it falls on
 GROWN = 0.4  # share of the run after which nothing grows any more
 GROWN_PER_KEPT = 2  # Gaussians before the choice, for each after it; more or less
-MANY = 28  # views; with fewer the threshold falls less
 PLENTY = 16  # pixels of training views for each Gaussian: with fewer, pleasing one view may spoil another
 
 
@@ -35,6 +34,7 @@ class PlusOptions(SplatOptions):
     signal: str = "space_absolute"  # the pull on the mean itself, in no image plane and at no latitude
     gradient_threshold: float = 5e-5  # SPaGS's; see `for_run` and `for_views`
     pixel_power: float = 1.0  # of the width of pixels under those of 256x128: the threshold falls with it; 0: not
+    many_views: int = 28  # as `bedroom` has; with fewer that threshold falls less, by the root of them; 0: as much
     sample_clones: bool = True
     min_opacity: float = 0.05  # what is fainter when a round ends was not needed
     coarse_share: float = 0.3  # of the run, on views that are half as wide if they are large, at first still smaller
@@ -57,7 +57,7 @@ class PlusOptions(SplatOptions):
         check(self, "> 0 and finite", lambda factor: 0 < factor < math.inf, "initial_scale", "means_speed")
         check(self, "> 0 and finite, or none to keep all", lambda p: p is None or 0 < p < math.inf, "removal_psnr")
         off = "at least 0, which switches it off"
-        for name in ("size_weight", "smoothness_weight", "sky_share", "fill_share", "pixel_power"):
+        for name in ("size_weight", "smoothness_weight", "sky_share", "fill_share", "pixel_power", "many_views"):
             check(self, off, lambda value: 0 <= value < math.inf, name)
         check(self, "a share of the run in [0, 1]", lambda share: 0 <= share <= 1, "coarse_share")
         check(self, "a share of the Gaussians in [0, 1)", lambda share: 0 <= share < 1, "drop_share")
@@ -86,11 +86,12 @@ class PlusOptions(SplatOptions):
         `COARSE`.
 
         A Gaussian as large as a few pixels has a part in the mean loss that falls with their solid angle, and a slope
-        that rises with one over their width, so its pull falls with their width. What fewer views than `MANY` pull at
-        is so much less certain, as the root of what is missing.
+        that rises with one over their width, so its pull falls with their width. Fewer panoramas than `many_views`
+        raise it by the square root of many_views / count, to that of `COARSE` at most: a mean over few is less certain.
         """
         finer = min(1.0, math.sqrt(COARSE / pixels))  # width of a pixel
-        lower = min(1.0, finer**self.pixel_power * max(1.0, math.sqrt(MANY / max(count, 1))))
+        fewer = max(1.0, math.sqrt(self.many_views / max(count, 1)))
+        lower = min(1.0, finer**self.pixel_power * fewer)
         return replace(self, gradient_threshold=self.gradient_threshold * lower)
 
     def for_run(self, iterations: int) -> CloneSplitOptions:

@@ -71,6 +71,7 @@ def test_the_threshold_of_growth_falls_with_the_width_of_a_pixel_where_views_are
     assert found[2] == pytest.approx([5e-5, 5e-5, 5e-5, 2.5e-5])
     assert found[3] == pytest.approx([5e-5, 5e-5, 5e-5, 5e-5]), "few views never ask for less than small ones"
     assert PlusOptions(pixel_power=0.0).for_views(10**6, 28) == PlusOptions(pixel_power=0.0)
+    assert PlusOptions(many_views=0).for_views(pixels[2], 1).gradient_threshold == pytest.approx(2.5e-5)
     few = math.sqrt(28 / len(tiny_scene().train))
     assert [threshold(w) for w in (64, 1024)] == pytest.approx([5e-5, min(1, few / 4) * 5e-5])
 

@@ -1,12 +1,19 @@
 """Roughness: nothing of a plane, whatever its place, and the same in all units and for all headings."""
 
+import math
+from dataclasses import replace
+
 import pytest
 import torch
 
 from padgs.native import cpu
+from padgs.plus import smoothness
+from padgs.plus.cpu_roughness import fits
 from padgs.plus.smoothness import JUMP, roughness
 from padgs.render import Rendering
-from padgs.sphere.camera import Panorama, perspective
+from padgs.sphere.camera import Panorama, Pinhole, perspective
+
+needs_native = pytest.mark.skipif(not cpu.available(), reason="the native library is not built")
 
 
 def shown(depth: torch.Tensor, image: torch.Tensor | None = None) -> Rendering:
@@ -85,26 +92,54 @@ def test_gradients():
     assert not torch.isnan(torch.autograd.grad(roughness(shown(depth), Panorama(12, 6), near=1e-6), depth)[0]).any()
 
 
-@pytest.mark.skipif(not cpu.available(), reason="the native library is not built")
-@pytest.mark.parametrize(
-    "camera", [Panorama(33, 17), Panorama(32, 3), perspective(47, 21, 70.0), perspective(3, 3, 70.0)]
-)
-def test_native_matches_the_definition(camera):
-    """Sizes that fill no vector, distances nearer than `near`, transparent places, edges of both kinds."""
+def noisy(camera: Panorama | Pinhole) -> Rendering:
+    """A drawing with distances nearer than 0.5, transparent places, and edges of both kinds."""
     random = torch.Generator().manual_seed(camera.width)
     depth = 1 + 0.1 * torch.rand(camera.height, camera.width, generator=random)
     depth[camera.height // 2, camera.width // 2 :] *= 0.01
-    image = 0.3 * torch.rand(*depth.shape, 3, generator=random)
+    depth[0, 0] = 0.5
     transmittance = (torch.rand(depth.shape, generator=random) - 0.3).clamp(min=0)
     transmittance[:, 1] = 1.0
-    found = []
+    return Rendering(0.3 * torch.rand(*depth.shape, 3, generator=random), transmittance, depth, torch.ones(1).bool())
+
+
+@needs_native
+@pytest.mark.parametrize(
+    "camera",  # sizes that fill no vector; the second finds what the first has left in its workspace
+    [Panorama(33, 17), perspective(33, 17, 70.0), Panorama(32, 3), perspective(3, 3, 70.0), perspective(47, 21, 70.0)],
+)
+def test_native_matches_the_definition(camera, monkeypatch):
+    taken, native = [], smoothness.native_roughness
+    monkeypatch.setattr(smoothness, "native_roughness", lambda *a, **k: taken.append(1) or native(*a, **k))
+    found, drawn = {}, noisy(camera)
     for dtype in (torch.float32, torch.float64):  # the native pass takes float32 only
-        leaf = depth.to(dtype, copy=True).requires_grad_()
-        drawn = Rendering(image.to(dtype), transmittance.to(dtype), leaf, torch.ones(1, dtype=torch.bool))
-        for near in (0.5, 1e-3):  # the second time workspaces have been used
-            value = 3 * roughness(drawn, camera, near=near)
-            (gradient,) = torch.autograd.grad(value, leaf)
-            found.append((value.item(), gradient.double()))
-    for (value, gradient), (defined, derivative) in zip(found[:2], found[2:], strict=True):
+        for near in (0.5, 1e-3):
+            leaf = drawn.depth.to(dtype, copy=True).requires_grad_()
+            parts = {"image": drawn.image.to(dtype), "transmittance": drawn.transmittance.to(dtype), "depth": leaf}
+            value = 3 * roughness(replace(drawn, **parts), camera, near=near)
+            found[near, dtype] = value.item(), torch.autograd.grad(value, leaf)[0].double()
+    assert len(taken) == 2
+    for near in (0.5, 1e-3):
+        (value, gradient), (defined, derivative) = found[near, torch.float32], found[near, torch.float64]
         assert value == pytest.approx(defined, rel=1e-5, abs=1e-9)
         assert (gradient - derivative).abs().max() <= 1e-4 * derivative.abs().max()
+
+
+@needs_native
+@pytest.mark.parametrize("part", ["depth", "transmittance", "image"])
+@pytest.mark.parametrize("place", [(4, 5), (4, 1)])  # opaque, transparent
+def test_what_is_no_number_is_seen_in_the_loss(part, place):
+    camera = Panorama(33, 17)
+    drawn = noisy(camera)
+    getattr(drawn, part)[place] = math.nan
+    assert math.isnan(roughness(drawn, camera, near=1e-3).item())
+
+
+@needs_native
+def test_what_the_native_pass_would_misread_goes_to_the_definition():
+    camera = Panorama(16, 8)
+    drawn = noisy(camera)
+    assert fits(drawn) and not fits(replace(drawn, image=drawn.image.double()))
+    assert not fits(replace(drawn, image=drawn.image[:4])) and not fits(replace(drawn, depth=drawn.depth[:2]))
+    strided = replace(drawn, depth=drawn.depth.T.contiguous().T)
+    assert roughness(strided, camera, near=1e-3) == roughness(drawn, camera, near=1e-3)

@@ -16,8 +16,9 @@ from torch import Tensor
 from padgs.anchors.decoder import Decoder, SeenAnchors, decode_gaussians
 from padgs.learning.loss import photometric_loss
 from padgs.native import cpu
-from padgs.render import RenderOptions, render
-from padgs.sphere.camera import RayTable
+from padgs.plus.smoothness import roughness
+from padgs.render import Rendering, RenderOptions, render
+from padgs.sphere.camera import Panorama, RayTable
 
 pytestmark = needs_native
 RENDERINGS = {
@@ -83,7 +84,18 @@ def compared(size: tuple[int, int] = (203, 101)) -> dict[str, Tensor]:
     return {"loss": loss.detach(), "by image": torch.autograd.grad(loss, image)[0]}
 
 
-EVERYTHING = {**{name: (drawn, name) for name in RENDERINGS}, "decode": (decoded,), "loss": (compared,)}
+def roughened(size: tuple[int, int] = (101, 203)) -> dict[str, Tensor]:
+    """The roughness of a drawing and its gradient."""
+    generator = torch.Generator().manual_seed(96)
+    image, transmittance = torch.rand(*size, 3, generator=generator), torch.rand(size, generator=generator)
+    depth = (1 + 0.1 * torch.rand(size, generator=generator)).requires_grad_()
+    shown = Rendering(image, transmittance, depth, torch.ones(1, dtype=torch.bool))
+    value = roughness(shown, Panorama(size[1], size[0]), near=0.1)
+    return {"roughness": value.detach(), "by depth": torch.autograd.grad(value, depth)[0]}
+
+
+NAMELESS = {"decode": decoded, "loss": compared, "roughness": roughened}
+EVERYTHING = {**{name: (drawn, name) for name in RENDERINGS}, **{name: (made,) for name, made in NAMELESS.items()}}
 
 
 @pytest.fixture
@@ -108,7 +120,7 @@ def test_results_are_bit_equal_for_any_number_of_threads(name: str, restored_thr
 def small_results() -> dict[str, dict[str, Tensor]]:
     """So few pairs that in none of them rounding decides about the cut."""
     results = {name: drawn(name, 6, (72, 36)) for name in RENDERINGS}
-    return {**results, "decode": decoded(), "loss": compared()}
+    return {**results, **{name: made() for name, made in NAMELESS.items()}}
 
 
 IN_ANOTHER_PROCESS = """

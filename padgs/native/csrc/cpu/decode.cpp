@@ -16,7 +16,6 @@ namespace {
 
 constexpr int64_t kBlock = 1024;  // anchors per partial sum
 constexpr int kGroups = 4;        // groups of sixteen anchors that share one visit to the sums
-constexpr float kLog2E = 1.44269504088896341f;
 
 Vec sigmoid(Vec x) {
   const Vec limited = maximum(minimum(x, splat(60.0f)), splat(-60.0f));

@@ -17,6 +17,7 @@ namespace {
 
 constexpr int kHalf = 5;  // the window is 11 pixels long, sigma 1.5
 constexpr int kChannels = 3;
+static_assert(kHalf * kChannels <= kMargin, "the window looks no further than the margins reach");
 constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;
 
 struct Window {

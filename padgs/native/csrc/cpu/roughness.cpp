@@ -3,7 +3,7 @@
 //
 // Three sweeps over the rows: what neighbours are compared by, how much 1 / r bends across and down, and from that the
 // derivatives. With v = (before + after) / here - 2 and w what a place counts, the term w |v| pulls at both neighbours
-// with p = w sign(v) / here and at the place itself with -p (v + 2).
+// with p = w sign(v) / here and at the place itself with -p (v + 2); above the jump it is constant and pulls at nothing.
 #include <algorithm>
 #include <vector>
 
@@ -13,8 +13,6 @@
 namespace padgs {
 namespace PADGS_ISA {
 namespace {
-
-constexpr float kLog2E = 1.44269504f;
 
 // Three neighbours, as the three maps of a place have them.
 struct Neighbours {
@@ -55,8 +53,8 @@ class Roughness {
     const float across = across_ * args_.row_weight[y], down = down_ * args_.row_weight[y];
     for (int x = 0; x < args_.width; x += kLanes) {
       const Mask inside = less(iota() + float(x), splat(float(args_.width)));
-      total += bend(neighbours(y, x, 0, 1), inside, across, pulls_.row(0, y) + x);
-      if (has_rows_around(y)) total += bend(neighbours(y, x, 1, 0), inside, down, pulls_.row(1, y) + x);
+      total += terms(neighbours(y, x, 0, 1), inside, across, pulls_.row(0, y) + x);
+      if (has_rows_around(y)) total += terms(neighbours(y, x, 1, 0), inside, down, pulls_.row(1, y) + x);
     }
     continue_around(pulls_.row(0, y));
     return double(sum(total));
@@ -103,19 +101,19 @@ class Roughness {
   }
 
   // The terms of sixteen places; leaves what pulls at their neighbours. Places next to what is not there have a
-  // neighbour without opacity: they count nothing, whatever their distances.
-  Vec bend(const Neighbours &places, Mask inside, float weight, float *pull) const {
+  // neighbour without opacity and count nothing. Of two numbers `minimum` takes the second if one is no number, so what
+  // may be none stands there: it has to reach the loss, which somebody looks at.
+  Vec terms(const Neighbours &places, Mask inside, float weight, float *pull) const {
     const auto outer = [&](int map) { return load(places.before[map]) + load(places.after[map]); };
     const Vec here = load(places.here[kInverse]);
     const Vec bright = magnitude_of(outer(kGrey) - 2.0f * load(places.here[kGrey]));
-    const Vec excuse = exp2_fast(maximum(bright * (-args_.edges * kLog2E), splat(-100.0f)));
+    const Vec excuse = exp2_fast(-minimum(splat(100.0f), bright * (args_.edges * kLog2E)));
     const Vec opacity = load(places.before[kOpacity]) * load(places.here[kOpacity]) * load(places.after[kOpacity]);
     const Vec counts = weight * opacity * excuse, bent = outer(kInverse) / here - 2.0f;
     const Vec size = magnitude_of(bent), jump = splat(args_.jump);
-    const Mask known = both(inside, either(less(opacity, zero()), less(zero(), opacity)));
     const Vec sign = select(less(bent, zero()), splat(-1.0f), select(less(zero(), bent), splat(1.0f), zero()));
-    store(pull, keep(without(known, less(jump, size)), counts * sign / here));
-    return keep(known, counts * minimum(size, jump));
+    store(pull, keep(without(inside, less(jump, size)), counts * sign / here));
+    return keep(inside, counts * minimum(jump, size));
   }
 
   static Vec magnitude_of(Vec a) { return maximum(a, -a); }

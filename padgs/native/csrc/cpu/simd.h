@@ -201,6 +201,8 @@ PADGS_INLINE void sum8(const Vec *v, float *out) {
   std::memcpy(out, &total, sizeof total);
 }
 
+constexpr float kLog2E = 1.44269504088896341f;
+
 // 2^x to 2.3e-7 relative for x in [-100, 100]: 2^round(x) times a degree-5 minimax polynomial of the rest.
 PADGS_INLINE Vec exp2_fast(Vec x) {
   const Vec n = round_nearest(x);
