@@ -43,6 +43,7 @@ NATIVE_CALLS = {
     "padgs_count_instances": "sort",
     "padgs_bin": "sort",
     "padgs_blend_forward": "blend",
+    "padgs_angular_size": "loss",
     "padgs_photometric_loss": "loss",
     "padgs_roughness": "loss",
     "padgs_blend_backward": "blend_backward",

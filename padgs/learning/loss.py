@@ -64,7 +64,7 @@ def photometric_loss(
     if normalisation not in NORMALISATIONS:
         raise ValueError(f"unknown normalisation {normalisation!r}; known: {', '.join(NORMALISATIONS)}")
     height, width, channels = image.shape
-    total = weight.expand(height, width).sum() * (channels if normalisation == "mean" else 1)
+    total = weight.sum() * (height * width // weight.numel() * (channels if normalisation == "mean" else 1))
     if fits(image):
         loss = fused_photometric_loss(image, target.detach(), weight, lambda_l1, total)
         if target.requires_grad:  # Eq. 16 is symmetric, so that is the derivative by the image with both exchanged

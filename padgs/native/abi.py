@@ -122,13 +122,25 @@ class RoughnessArguments(ctypes.Structure):
     ]
 
 
-class ColorArguments(ctypes.Structure):
+class SplatArguments(ctypes.Structure):
     _fields_ = [
         ("count", Int64),
-        *fields(Int32, "degree", "stored"),
+        *fields(Int32, "degree", "stored", "probe_width"),
         ("center", ctypes.c_float * 3),
         ("tiny", ctypes.c_float),
-        *fields(Pointer, "means", "dc", "rest", "colors", "grad_colors", "grad_means", "grad_dc", "grad_rest"),
+        *fields(Pointer, "means", "log_scales", "opacity_logits", "dc", "rest", "probe"),
+        *fields(Pointer, "moved", "scales", "opacities", "colors", "pulls"),
+        *fields(Pointer, "grad_moved", "grad_scales", "grad_opacities", "grad_colors", "grad_pulls"),
+        *fields(Pointer, "grad_means", "grad_log_scales", "grad_opacity_logits", "grad_dc", "grad_rest", "grad_probe"),
+    ]
+
+
+class AngularSizeArguments(ctypes.Structure):
+    _fields_ = [
+        ("count", Int64),
+        ("center", ctypes.c_float * 3),
+        ("nearest", ctypes.c_float),
+        *fields(Pointer, "means", "scales", "gradient"),
     ]
 
 

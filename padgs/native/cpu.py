@@ -8,8 +8,8 @@ import functools
 import torch
 
 from padgs.native.abi import (
+    AngularSizeArguments,
     BlendGradientArguments,
-    ColorArguments,
     DecodeGradientArguments,
     Gradients,
     Inputs,
@@ -20,13 +20,15 @@ from padgs.native.abi import (
     NativeCamera,
     Pointer,
     RoughnessArguments,
+    SplatArguments,
 )
 from padgs.native.loading import declared, opened
 from padgs.native.watch import Watchable
 
 STRUCTURES = (
     *(NativeCamera, Inputs, Gradients, BlendGradientArguments),
-    *(DecodeGradientArguments, LossArguments, ColorArguments, LeaveOneOutArguments, RoughnessArguments),
+    *(DecodeGradientArguments, LossArguments, SplatArguments, LeaveOneOutArguments, RoughnessArguments),
+    AngularSizeArguments,
 )
 SIGNATURES = {
     "padgs_isa": ([], ctypes.c_char_p),
@@ -45,7 +47,8 @@ SIGNATURES = {
     "padgs_decode_select": ([Pointer], None),
     "padgs_decode_place": ([Pointer], None),
     "padgs_decode_backward": ([Pointer], None),
-    "padgs_colors": ([Pointer], None),
+    "padgs_splats": ([Pointer], None),
+    "padgs_angular_size": ([Pointer], ctypes.c_double),
     "padgs_photometric_loss": ([Pointer], ctypes.c_double),
     "padgs_loss_workspace": ([Int32, Int32], Int64),
     "padgs_roughness": ([Pointer], ctypes.c_double),

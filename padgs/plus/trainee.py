@@ -12,6 +12,7 @@ from torch import Tensor
 from padgs.gaussians import Gaussians
 from padgs.learning.schedule import ParameterGroup
 from padgs.learning.trainee import Drawing, State
+from padgs.plus.angular_size import mean_angular_size
 from padgs.plus.options import GROWN_PER_KEPT, PlusOptions
 from padgs.plus.smoothness import roughness
 from padgs.render.config import RenderConfig
@@ -32,13 +33,6 @@ def counted_pixels(view: View) -> float:
     mean cosine of the latitude, 2 / pi; at least `FEWEST_PIXELS`.
     """
     return max(FEWEST_PIXELS, 2 * view.width * view.height / math.pi)
-
-
-def mean_angular_size(gaussians: Gaussians, view: View, *, near: float) -> Tensor:
-    """Mean over Gaussians and axes of scale / distance, differentiable by the scales; no distance is below `near`."""
-    means = gaussians.means.detach()
-    distances = (means - view.center.detach().to(means)).norm(dim=-1).clamp(min=near)
-    return (gaussians.scales / distances[:, None]).mean()
 
 
 def _chances(seed: int, count: int, device: torch.device) -> Tensor:

@@ -13,7 +13,7 @@ from padgs.learning.cloud import refuse_unusable, squared_spacing
 from padgs.learning.rows import load_rows
 from padgs.scene import Scene, View
 from padgs.sphere import harmonics as spherical_harmonics
-from padgs.splats import cpu_colors
+from padgs.splats import cpu_splats
 
 INITIAL_OPACITY = 0.1
 SMALLEST_SCALE = 1e-4  # initial scale of coinciding points, in scene units
@@ -113,22 +113,29 @@ class Splats(nn.Module):
         """
         load_rows(self, tensors, self.rows())
 
-    def gaussians(self, view: View, shift: Tensor | None = None) -> Gaussians:
-        """The Gaussians with the colours that this view sees, shift [N, 3] world units away from where they are."""
-        means = self.means if shift is None else self.means + shift
-        return Gaussians(
-            means=means,
-            quats=self.quats,
-            scales=torch.exp(self.log_scales),
-            opacities=torch.sigmoid(self.opacity_logits),
-            colors=self._colors(view, means),
-        )
+    def gaussians(self, view: View) -> Gaussians:
+        """The Gaussians with the colours that this view sees."""
+        return self.probed(view)[0]
 
-    def _colors(self, view: View, means: Tensor) -> Tensor:
+    def probed(self, view: View, probe: Tensor | None = None) -> tuple[Gaussians, Tensor | None]:
+        """The same, moved by a probe [N, 3] along the world's axes, in halves of the distance from the camera.
+
+        Of a probe [N, 4] the last values, in the same unit, are returned, too, [N]: see `padgs.splats.probes`.
+        """
+        center, tiny = view.center.to(self.means), TINY * self.unit
+        if cpu_splats.fits(self.means, center):
+            learned = (self.means, self.log_scales, self.opacity_logits, self.sh_dc, self.sh_rest)
+            seen = cpu_splats.native_splats(cpu_splats.Learned(*learned, probe), self.active_degree, center, tiny)
+            return Gaussians(seen.means, self.quats, seen.scales, seen.opacities, seen.colors), seen.pulls
+        means, pulls = self.means, None
+        if probe is not None:
+            steps = 0.5 * (means.detach() - center).norm(dim=-1, keepdim=True) * probe
+            means, pulls = means + steps[:, :3], steps[:, 3] if steps.shape[1] > 3 else None
+        opacities, colors = torch.sigmoid(self.opacity_logits), self._colors(means, center, tiny)
+        return Gaussians(means, self.quats, torch.exp(self.log_scales), opacities, colors), pulls
+
+    def _colors(self, means: Tensor, center: Tensor, tiny: float) -> Tensor:
         """Max(0, 1/2 + SH), [N, 3], seen along camera -> Gaussian in the world frame."""
-        center, tiny = view.center.to(means), TINY * self.unit
-        if cpu_colors.fits(means, center):
-            return cpu_colors.native_colors(means, self.sh_dc, self.sh_rest, self.active_degree, center, tiny)
         colors = 0.5 + spherical_harmonics.DC * self.sh_dc
         if self.active_degree > 0:
             rays = means - center

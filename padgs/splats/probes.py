@@ -52,7 +52,6 @@ def render_probed(
         raise ValueError(f"unknown signal {signal!r}; known: {', '.join(SIGNALS)}")
     absolute = signal == "space_absolute"
     probe = means.new_zeros(len(means), 4 if absolute else 3, requires_grad=True) if probe is None else probe
-    steps = 0.5 * (means.detach() - view.center.to(means)).norm(dim=-1, keepdim=True) * probe
-    gaussians = change(splats.gaussians(view, shift=steps[:, :3]))
-    pulls = steps[:, 3] if absolute else None
+    gaussians, pulls = splats.probed(view, probe)
+    gaussians = change(gaussians)
     return render(gaussians, view, options, absolute_probe=pulls, backend=backend), gaussians, probe

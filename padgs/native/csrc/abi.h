@@ -178,17 +178,27 @@ struct RoughnessArguments {
   float *gradient;                            // [H,W], by depth, or null
 };
 
-// Colours of explicit Gaussians as a view sees them; with `grad_colors` their derivatives instead.
-struct ColorArguments {
+// Explicit Gaussians as a view sees them, from what is learned of them; with `grad_colors` the derivatives by that.
+struct SplatArguments {
   int64_t count;
-  int32_t degree;  // of the spherical harmonics that are in use, 0 to 3
-  int32_t stored;  // coefficients of a row of `rest`, which may be more
+  int32_t degree;       // of the spherical harmonics that are in use, 0 to 3
+  int32_t stored;       // coefficients of a row of `rest`, which may be more
+  int32_t probe_width;  // 0: no probe; 3, or 4 with that of absolute pulls
   float center[3], tiny;  // of the camera; what a distance is at least taken for; world units
-  const float *means, *dc;  // [N,3]
-  const float *rest;        // [N,stored,3]
-  float *colors;            // [N,3]
-  const float *grad_colors;              // [N,3], or null
-  float *grad_means, *grad_dc, *grad_rest;  // as means, dc and rest
+  const float *means, *log_scales, *opacity_logits, *dc;  // [N,3] [N,3] [N] [N,3]
+  const float *rest;                                      // [N,stored,3]
+  const float *probe;                                     // [N,probe_width], in halves of the distance
+  float *moved, *scales, *opacities, *colors, *pulls;     // [N,3] [N,3] [N] [N,3] [N] or null
+  const float *grad_moved, *grad_scales, *grad_opacities, *grad_colors, *grad_pulls;  // as these, or null
+  float *grad_means, *grad_log_scales, *grad_opacity_logits, *grad_dc, *grad_rest, *grad_probe;
+};
+
+// What padgs.plus.angular_size.mean_angular_size takes.
+struct AngularSizeArguments {
+  int64_t count;
+  float center[3], nearest;     // of the camera; what a distance is at least taken for; world units
+  const float *means, *scales;  // [N,3]
+  float *gradient;              // [N,3], by scales, or null
 };
 
 }  // namespace padgs

@@ -47,20 +47,33 @@ std::vector<int32_t> depth_order(const Footprint *footprints, const PixelBox *bo
   return order;
 }
 
-// The patches that a Gaussian can reach: a pixel box in other units, as the passes over all instances read it.
+// The patches that a Gaussian can reach: a pixel box in other units.
 struct PatchBox {
-  int32_t gaussian;
   uint16_t column, column_end, second_end, row, row_end;
 
-  PatchBox(const PixelBox &box, int32_t index)
-      : gaussian(index),
-        column(uint16_t(box.column / kPatchWidth)),
+  explicit PatchBox(const PixelBox &box)
+      : column(uint16_t(box.column / kPatchWidth)),
         column_end(uint16_t(units(box.column_end, kPatchWidth))),
         second_end(uint16_t(units(box.second_end, kPatchWidth))), row(uint16_t(box.row / kPatchHeight)),
         row_end(uint16_t(units(box.row_end, kPatchHeight))) {}
 };
 
 constexpr int kPatchRows = kTile / kPatchHeight;  // of a tile
+
+// An instance before it is known where in the list of its tile it comes. Its four bytes of patches are put together in a
+// register: who reads a word right after it was written byte by byte waits for all of them.
+struct Listed {
+  int32_t gaussian;
+  uint32_t tile;
+  uint32_t patches;
+
+  static uint32_t packed(int row, int row_end, int column, int column_end) {
+    return uint32_t(row) | uint32_t(row_end) << 8 | uint32_t(column) << 16 | uint32_t(column_end) << 24;
+  }
+  Instance at(uint32_t slot) const {
+    return {gaussian, slot, uint8_t(patches), uint8_t(patches >> 8), uint8_t(patches >> 16), uint8_t(patches >> 24)};
+  }
+};
 
 // Calls visit(row, run) for each run of drawn tiles of a box, in a fixed order.
 template <typename Visit>
@@ -104,7 +117,7 @@ PADGS_API void padgs_count_instances(const PixelBox *boxes, int64_t count, const
   const TileGrid grid{0, 0, 0, rows, level, nullptr};
   for (int64_t i = 0; i < count; ++i)
     if (boxes[i].row < boxes[i].row_end)
-      for_each_run(PatchBox(boxes[i], int32_t(i)), grid,
+      for_each_run(PatchBox(boxes[i]), grid,
                    [&](int row, const Run &run) { per_row[row] += run.tile_end - run.tile; });
 }
 
@@ -116,25 +129,33 @@ PADGS_API void padgs_bin(const PixelBox *boxes, int64_t count, const int32_t *or
   const int64_t tiles = grid->row_start[grid->end_row - grid->first_row];
   std::fill_n(slot_start, count + 1, int64_t(0));
   // Each thread takes a block of the Gaussians, in depth order, and has a histogram of its own. Counting sort is
-  // stable, so that the lists do not depend on how many blocks there are.
+  // stable, so that the lists do not depend on how many blocks there are. Which tiles a box touches is worked out once:
+  // how far its loops go, nobody can predict.
   const int blocks = threads();
   const auto start = [&](int64_t block) { return visible * block / blocks; };
   std::vector<int64_t> next(blocks * tiles, 0);
-  std::vector<std::vector<PatchBox>> sorted(blocks);
+  std::vector<std::vector<Listed>> listed(blocks);
 #pragma omp parallel for schedule(static, 1)
   for (int block = 0; block < blocks; ++block) {
     int64_t *histogram = next.data() + block * tiles;
-    sorted[block].reserve(start(block + 1) - start(block));
+    std::vector<Listed> &own = listed[block];
+    own.reserve(2 * (start(block + 1) - start(block)));
     for (int64_t i = start(block); i < start(block + 1); ++i) {
       if (i + kAhead < visible) __builtin_prefetch(boxes + order[i + kAhead]);
-      sorted[block].emplace_back(boxes[order[i]], order[i]);
-      int64_t own = 0;
-      for_each_run(sorted[block].back(), *grid, [&](int row, const Run &run) {
-        int64_t *tile = histogram + grid->row_start[row - grid->first_row];
-        for (int t = run.tile; t < run.tile_end; ++t) ++tile[t];
-        own += run.tile_end - run.tile;
+      const PatchBox box(boxes[order[i]]);
+      const size_t before = own.size();
+      for_each_run(box, *grid, [&](int row, const Run &run) {
+        const int64_t base = grid->row_start[row - grid->first_row];
+        const int shift = grid->level[row] + kTileShift, top = row * kPatchRows;
+        const int first_row = std::max(box.row - top, 0), end_row = std::min(box.row_end - top, kPatchRows);
+        for (int tile = run.tile; tile < run.tile_end; ++tile) {
+          const int left = tile << shift;
+          const int column = std::max(run.column - left, 0), column_end = std::min(run.column_end - left, 1 << shift);
+          own.push_back({order[i], uint32_t(base + tile), Listed::packed(first_row, end_row, column, column_end)});
+          ++histogram[base + tile];
+        }
       });
-      slot_start[order[i] + 1] = own;
+      slot_start[order[i] + 1] = int64_t(own.size() - before);
     }
   }
   for (int64_t i = 0; i < count; ++i) slot_start[i + 1] += slot_start[i];
@@ -151,24 +172,14 @@ PADGS_API void padgs_bin(const PixelBox *boxes, int64_t count, const int32_t *or
 #pragma omp parallel for schedule(static, 1)
   for (int block = 0; block < blocks; ++block) {
     int64_t *cursor = next.data() + block * tiles;
-    const std::vector<PatchBox> &own = sorted[block];
+    const std::vector<Listed> &own = listed[block];
+    int32_t gaussian = -1;
+    uint32_t slot = 0;
     for (size_t i = 0; i < own.size(); ++i) {
       if (i + kAhead < own.size()) __builtin_prefetch(slot_start + own[i + kAhead].gaussian);
-      const PatchBox &box = own[i];
-      Instance part{box.gaussian, uint32_t(slot_start[box.gaussian]), 0, 0, 0, 0};
-      for_each_run(box, *grid, [&](int row, const Run &run) {
-        const int64_t base = grid->row_start[row - grid->first_row];
-        const int shift = grid->level[row] + kTileShift, top = row * kPatchRows;
-        part.row = uint8_t(std::max(box.row - top, 0));
-        part.row_end = uint8_t(std::min(box.row_end - top, kPatchRows));
-        for (int tile = run.tile; tile < run.tile_end; ++tile) {
-          const int first = tile << shift;
-          part.column = uint8_t(std::max(run.column - first, 0));
-          part.column_end = uint8_t(std::min(run.column_end - first, 1 << shift));
-          instances[cursor[base + tile]++] = part;
-          ++part.slot;
-        }
-      });
+      slot = own[i].gaussian == gaussian ? slot + 1 : uint32_t(slot_start[own[i].gaussian]);
+      gaussian = own[i].gaussian;
+      instances[cursor[own[i].tile]++] = own[i].at(slot);
     }
   }
 }

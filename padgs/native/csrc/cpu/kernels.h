@@ -23,8 +23,12 @@ struct LeaveOneOutKernels {
   void (*run)(const LeaveOneOutArguments &);  // sorted blending only
 };
 
-struct ColorKernels {
-  void (*run)(const ColorArguments &);
+struct SplatKernels {
+  void (*run)(const SplatArguments &);
+};
+
+struct AngularSizeKernels {
+  double (*run)(const AngularSizeArguments &);
 };
 
 struct LossKernels {

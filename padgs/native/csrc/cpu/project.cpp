@@ -4,6 +4,7 @@
 #include <cstring>
 #include <vector>
 
+#include "items.h"
 #include "kernels.h"
 #include "simd_math.h"
 
@@ -14,26 +15,6 @@ namespace PADGS_ISA {
 namespace {
 
 constexpr int64_t kBlock = 1024;  // Gaussians per partial sum of the pose gradient; fixed, so that sums are too
-
-// Sixteen items of an array of N x width floats, one vector per component. Lanes past the end repeat the last item.
-template <int kWidth>
-void load_items(const float *array, int64_t first, int64_t count, Vec *out) {
-  float lanes[kWidth][kLanes];
-  for (int lane = 0; lane < kLanes; ++lane) {
-    const float *item = array + std::min(first + lane, count - 1) * kWidth;
-    for (int k = 0; k < kWidth; ++k) lanes[k][lane] = item[k];
-  }
-  for (int k = 0; k < kWidth; ++k) out[k] = load(lanes[k]);
-}
-
-template <int kWidth>
-void store_items(float *array, int64_t first, int64_t count, const Vec *in) {
-  float lanes[kWidth][kLanes];
-  for (int k = 0; k < kWidth; ++k) store(lanes[k], in[k]);
-  const int end = int(std::min<int64_t>(kLanes, count - first));
-  for (int lane = 0; lane < end; ++lane)
-    for (int k = 0; k < kWidth; ++k) array[(first + lane) * kWidth + k] = lanes[k][lane];
-}
 
 // Sixteen Gaussians in the camera frame; a probe has moved those of projective footprints.
 PosedGaussian<Vec> load_posed(const Camera &camera, const Inputs &in, int64_t first, Probe<Vec> &probe) {
@@ -63,15 +44,16 @@ void forward_batch(const Camera &camera, const Inputs &in, int64_t first, Footpr
   const int reads = planar(camera.projection) ? 6 : 12;
   const int end = int(std::min<int64_t>(kLanes, in.count - first));
   for (int lane = 0; lane < end; ++lane) {
-    float own[kOwn], bound[12];
-    for (int k = 0; k < kOwn; ++k) own[k] = footprint[k][lane];
+    float bound[12];
     Footprint &f = footprints[first + lane];
-    std::memcpy(&f, own, sizeof own);
+    char *own = reinterpret_cast<char *>(&f);  // value by value: a vector of them would wait for all to be written
+    for (int k = 0; k < kOwn; ++k) std::memcpy(own + k * sizeof(float), &footprint[k][lane], sizeof(float));
     std::memcpy(&f.red, in.colors + 3 * (first + lane), 3 * sizeof(float));
     boxes[first + lane] = no_pixels();
     if (!(drawn[lane] > 0)) continue;
     for (int k = 0; k < reads; ++k) bound[k] = bounds[k][lane];
-    boxes[first + lane] = box_of(camera, own, bound);
+    const float centre[2] = {footprint[0][lane], footprint[1][lane]};
+    boxes[first + lane] = box_of(camera, centre, bound);
   }
 }
 

@@ -203,16 +203,19 @@ PADGS_INLINE void sum8(const Vec *v, float *out) {
 
 constexpr float kLog2E = 1.44269504088896341f;
 
-// 2^x to 2.3e-7 relative for x in [-100, 100]: 2^round(x) times a degree-5 minimax polynomial of the rest.
-PADGS_INLINE Vec exp2_fast(Vec x) {
-  const Vec n = round_nearest(x);
-  const Vec r = x - n;
+// 2^r to 2.3e-7 relative for r in [-1/2, 1/2]: a minimax polynomial of degree 5.
+PADGS_INLINE Vec exp2_fraction(Vec r) {
   Vec p = r * 0.0013276471f + 0.0096755419f;
   p = p * r + 0.0555071309f;
   p = p * r + 0.2402212024f;
   p = p * r + 0.6931469440f;
-  p = p * r + 1.0f;
-  return scale_by_power(p, n);
+  return p * r + 1.0f;
+}
+
+// 2^x as accurately for x in [-100, 100].
+PADGS_INLINE Vec exp2_fast(Vec x) {
+  const Vec n = round_nearest(x);
+  return scale_by_power(exp2_fraction(x - n), n);
 }
 
 }  // namespace PADGS_ISA

@@ -60,5 +60,18 @@ PADGS_INLINE Vec logarithm2(Vec x) {
   return exponent + z * p;
 }
 
+// e^x to 3e-7 relative: 2^n e^r of the nearest n. What ordinary exponents do not reach is the C library's.
+PADGS_INLINE Vec exponential(Vec x) {
+  constexpr float kMost = 69.0f, kLog2High = 0.693359375f, kLog2Low = -2.12194440e-4f;  // n * kLog2High is exact
+  if (bits(less(magnitude(x), splat(kMost))) != (1u << kLanes) - 1) {  // NaN is not less either
+    float lanes[kLanes];
+    store(lanes, x);
+    for (int i = 0; i < kLanes; ++i) lanes[i] = expf(lanes[i]);
+    return load(lanes);
+  }
+  const Vec n = round_nearest(x * kLog2E), r = (x - n * kLog2High) - n * kLog2Low;
+  return scale_by_power(exp2_fraction(r * kLog2E), n);
+}
+
 }  // namespace PADGS_ISA
 }  // namespace padgs

@@ -28,10 +28,11 @@ PADGS_HD PixelBox pixel_box(const Camera &camera, const PixelRange &range) {
     column_end = width;
   }
   if (column >= column_end) return no_pixels();
-  const int turns = column >= 0 ? column / width : -((-column + width - 1) / width);
-  box.column = column - turns * width;
-  box.column_end = least(column_end - turns * width, width);
-  box.second_end = most(column_end - turns * width - width, 0);
+  for (; column < 0; column += width) column_end += width;  // at most twice, by the clamping above
+  for (; column >= width; column -= width) column_end -= width;
+  box.column = column;
+  box.column_end = least(column_end, width);
+  box.second_end = most(column_end - width, 0);
   return box;
 }
 

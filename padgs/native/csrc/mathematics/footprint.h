@@ -134,7 +134,7 @@ PADGS_HD Projected<T> projected(const Camera &camera, const CameraGaussian<T> &p
                         model.frame.r, in_front);
 }
 
-// The box of a Gaussian that is drawn.
+// The box of a Gaussian that is drawn, from the first two values of its shape and its bounds.
 PADGS_HD PixelBox box_of(const Camera &camera, const float *shape, const float *b) {
   if (planar(camera.projection)) {
     const float u = shape[0], v = shape[1];

@@ -2,6 +2,8 @@
 // weighted sum of them changes by with the direction.
 #pragma once
 
+#include "scalar.h"
+
 namespace padgs {
 
 constexpr int kHarmonics = 15;  // of degrees 1 to 3; degree D has those below (D + 1)^2 - 1
@@ -12,10 +14,10 @@ constexpr float kSecond = 1.0925484305920792f, kZonal = 0.31539156525252005f;   
 constexpr float kOuter = 0.5900435899266435f, kMiddle = 2.890611442640554f;      // sqrt(35 / 32pi), sqrt(105 / 4pi)
 constexpr float kInner = 0.4570457994644658f, kThird = 0.3731763325901154f;      // sqrt(21 / 32pi), sqrt(7 / 16pi)
 
-// Values of the functions up to a degree.
-template <int kDegree>
-inline void harmonics(float x, float y, float z, float *value) {
-  const float xx = x * x, yy = y * y, zz = z * z;
+// Values of the functions up to a degree, for one direction or sixteen.
+template <int kDegree, class T>
+PADGS_HD void harmonics(T x, T y, T z, T *value) {
+  const T xx = x * x, yy = y * y, zz = z * z;
   value[0] = -kFirst * y;
   value[1] = kFirst * z;
   value[2] = -kFirst * x;
@@ -38,9 +40,9 @@ inline void harmonics(float x, float y, float z, float *value) {
 }
 
 // Derivatives of sum_k weight[k] value[k] by x, y and z, as polynomials of three free variables.
-template <int kDegree>
-inline void harmonics_gradient(float x, float y, float z, const float *weight, float &dx, float &dy, float &dz) {
-  const float *w = weight;
+template <int kDegree, class T>
+PADGS_HD void harmonics_gradient(T x, T y, T z, const T *weight, T &dx, T &dy, T &dz) {
+  const T *w = weight;
   dx = -kFirst * w[2];
   dy = -kFirst * w[0];
   dz = kFirst * w[1];
@@ -50,8 +52,8 @@ inline void harmonics_gradient(float x, float y, float z, const float *weight, f
     dz += -kSecond * (y * w[4] + x * w[6]) + 4 * kZonal * z * w[5];
   }
   if constexpr (kDegree > 2) {
-    const float xx = x * x, yy = y * y, zz = z * z, xy = x * y, xz = x * z, yz = y * z;
-    const float ring = 4 * zz - xx - yy;
+    const T xx = x * x, yy = y * y, zz = z * z, xy = x * y, xz = x * z, yz = y * z;
+    const T ring = 4 * zz - xx - yy;
     dx += -6 * kOuter * xy * w[8] + kMiddle * (yz * w[9] + xz * w[13]) + kInner * (2 * xy * w[10]) -
           6 * kThird * xz * w[11] - kInner * (ring - 2 * xx) * w[12] - 3 * kOuter * (xx - yy) * w[14];
     dy += -3 * kOuter * (xx - yy) * w[8] + kMiddle * (xz * w[9] - yz * w[13]) - kInner * (ring - 2 * yy) * w[10] -

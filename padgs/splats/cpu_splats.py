@@ -1,0 +1,85 @@
+"""Splats as a view sees them, and the derivatives by what is learned, in one native call each (csrc/cpu/splats.cpp).
+
+`padgs.splats.model.Splats` has the definition.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from padgs.native import cpu
+from padgs.native.abi import SplatArguments, pointer
+
+
+class Learned(NamedTuple):
+    """What is learned of N Gaussians, but for their quaternions, and the probe that moves them."""
+
+    means: Tensor  # [N, 3] world
+    log_scales: Tensor  # [N, 3] of world units
+    opacity_logits: Tensor  # [N]
+    dc: Tensor  # [N, 3] coefficients of degree 0
+    rest: Tensor  # [N, K, 3] of the degrees from 1 on
+    probe: Tensor | None  # [N, 3] or [N, 4], as `Splats.probed` has it
+
+
+class Seen(NamedTuple):
+    """What becomes of it."""
+
+    means: Tensor  # [N, 3] world, moved by the probe
+    scales: Tensor  # [N, 3] world units
+    opacities: Tensor  # [N]
+    colors: Tensor  # [N, 3]
+    pulls: Tensor | None  # [N] where the probe is [N, 4]
+
+
+def fits(means: Tensor, center: Tensor) -> bool:
+    """Whether there is a native pass for these: float32 on the CPU, a camera that does not learn, a library."""
+    on_cpu = means.device.type == "cpu" and means.dtype == torch.float32
+    return on_cpu and not center.requires_grad and cpu.available()
+
+
+def native_splats(learned: Learned, degree: int, center: Tensor, tiny: float) -> Seen:
+    """The Gaussians that a camera sees, differentiable by all that is learned and by the probe.
+
+    Args:
+        learned: of the Gaussians.
+        degree: of the harmonics that is in use.
+        center: [3] of the camera, world.
+        tiny: what is added to distances, in squares; world units.
+    """
+    return Seen(*_Splats.apply(degree, center, tiny, *learned))
+
+
+class _Splats(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, degree: int, center: Tensor, tiny: float, *learned: Any):
+        parameters, probe = [tensor.contiguous() for tensor in learned[:-1]], learned[-1]
+        means, log_scales, opacity_logits, dc, rest = parameters
+        probe = None if probe is None else probe.contiguous()
+        width = 0 if probe is None else probe.shape[1]
+        like = (means, log_scales, opacity_logits, dc, opacity_logits if width > 3 else None)
+        seen = tuple(map(_empty_like, like))
+        ctx.scalars = (len(means), degree, rest.shape[1], width, (ctypes.c_float * 3)(*center.tolist()), tiny)
+        ctx.save_for_backward(*parameters, probe, *seen)
+        _run(ctx.scalars, *parameters, probe, *seen)
+        return seen
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor | None):
+        saved = ctx.saved_tensors
+        contiguous = (None if gradient is None else gradient.contiguous() for gradient in upstream)
+        gradients = tuple(map(_empty_like, saved[: len(Learned._fields)]))
+        _run(ctx.scalars, *saved, *contiguous, *gradients)
+        return None, None, None, *gradients
+
+
+def _empty_like(tensor: Tensor | None) -> Tensor | None:
+    return None if tensor is None else torch.empty_like(tensor)
+
+
+def _run(scalars: tuple, *tensors: Tensor | None) -> None:
+    cpu.library().padgs_splats(ctypes.byref(SplatArguments(*scalars, *map(pointer, tensors))))
