@@ -128,8 +128,10 @@ def decode_gaussians(
     ):
         return define_gaussians(weights, anchors, precision)
     flat = tuple(tensor for head in weights for tensor in head)
-    fused = decode_on_gpu(flat, *anchors, dtype=dtype) if library is cuda else decode_on_cpu(flat, *anchors)
-    *values, slots, raw = fused
+    if library is cuda:
+        *values, slots, raw, _ = decode_on_gpu(flat, *anchors, dtype=dtype)
+    else:
+        *values, slots, raw = decode_on_cpu(flat, *anchors)
     return Gaussians(*values), slots, raw
 
 
@@ -149,7 +151,7 @@ def decode_padded(weights: DecoderWeights, anchors: SeenAnchors, precision: str 
             "them, or use decode_gaussians"
         )
     flat = tuple(tensor for head in weights for tensor in head)
-    *values, _, _ = decode_on_gpu(flat, *anchors, dtype=reduced(precision), padded=True)
+    values = decode_on_gpu(flat, *anchors, dtype=reduced(precision), room=anchors.offsets[..., 0].numel())[:5]
     return Gaussians(*values)
 
 

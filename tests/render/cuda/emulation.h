@@ -30,7 +30,7 @@
 struct Dim {
   unsigned x;
 };
-inline Dim threadIdx, blockIdx, blockDim;
+inline Dim threadIdx, blockIdx, blockDim, gridDim;
 inline int current_device, last_error;  // of CUDA's, which nothing here runs on, but which code may choose and read
 
 inline int cudaGetDevice(int *device) { return *device = current_device, 0; }
@@ -205,7 +205,7 @@ void emulate(unsigned blocks, unsigned threads, F kernel) {
     for (auto &box : mailbox) box.resize(threads + kLanes);
   }
   body = kernel;
-  blockDim.x = threads;
+  blockDim.x = threads, gridDim.x = blocks;
   const Memory shared = shared_memory();
   for (unsigned block = 0; block < blocks; ++block) {
     blockIdx.x = block;
@@ -240,6 +240,7 @@ inline unsigned __ballot_sync(unsigned, bool vote, PADGS_HERE) {
 }
 inline bool __any_sync(unsigned lanes, bool vote, PADGS_HERE) { return __ballot_sync(lanes, vote, file, line); }
 inline int __ffs(unsigned bits) { return __builtin_ffs(int(bits)); }
+inline int __popc(unsigned bits) { return __builtin_popcount(bits); }
 inline int __clz(int bits) { return bits ? __builtin_clz(unsigned(bits)) : 32; }
 
 template <class T>
