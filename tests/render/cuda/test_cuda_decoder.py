@@ -14,11 +14,11 @@ from padgs.anchors.decoder import (
     DecoderWeights,
     SeenAnchors,
     decode_gaussians,
-    decode_padded,
+    decode_within,
     define_gaussians,
 )
 from padgs.anchors.gpu_decoder import decode_on_gpu
-from padgs.anchors.precision import OF_GRADIENTS, reduced
+from padgs.anchors.precision import OF_GRADIENTS, PRECISIONS, reduced
 from padgs.gaussians import Gaussians
 from padgs.native.watch import watched
 
@@ -200,20 +200,40 @@ def test_float16_overflows_where_the_definition_does(large: str, hidden: int, ge
         torch.testing.assert_close(value, expected, atol=4e-3, rtol=4e-3, equal_nan=True)
 
 
-def test_padded_decoding_is_the_same_with_zeros_behind(generator: torch.Generator):
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("rows", ["all", "some more", "too few"])
+def test_decoding_into_room_is_the_same_with_zeros_behind(precision: str, rows: str, generator: torch.Generator):
     tensors, decoder = problem(60, 10, 37, 32, generator)
-    exact = on_gpu(decoder.weights(), SeenAnchors(**tensors))[0]
-    padded = decode_padded(decoder.weights(), SeenAnchors(**tensors))
+    exact, slots, raw = on_gpu(decoder.weights(), SeenAnchors(**tensors), precision)
     count = len(exact)
-    assert 0 < count < len(padded) == 600
+    assert 100 < count < 500
+    room = {"all": 1000, "some more": count + 30, "too few": count - 30}[rows]
+    within, all_slots, same_raw, said = decode_within(decoder.weights(), SeenAnchors(**tensors), room, precision)
+    assert said.tolist() == [count] and len(within) == len(all_slots) == min(room, 600) and torch.equal(raw, same_raw)
     for name, value in vars(exact).items():
-        assert torch.equal(getattr(padded, name)[:count], value) and not getattr(padded, name)[count:].any(), name
+        found = getattr(within, name)
+        assert torch.equal(found[:count], value[:room]) and not found[count:].any(), name
+    assert torch.equal(all_slots[:count], slots[:room])
+    others = (raw <= 0).flatten().nonzero()[:, 0]
+    assert torch.equal(all_slots[count:], others[: len(all_slots[count:])])
 
 
-def test_padded_decoding_elsewhere_is_refused(generator: torch.Generator):
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_rows_behind_the_selected_change_no_gradient(precision: str, generator: torch.Generator):
+    tensors, decoder = problem(60, 10, 37, 32, generator)
+
+    def within(weights: DecoderWeights, anchors: SeenAnchors, precision: str):
+        gaussians, slots, raw, count = decode_within(weights, anchors, 600, precision)
+        return gaussians.first(int(count)), slots, raw
+
+    exact, padded = (decoded(function, tensors, decoder, precision)[3] for function in (on_gpu, within))
+    assert all(torch.equal(padded[name], gradient) for name, gradient in exact.items())
+
+
+def test_decoding_into_room_elsewhere_is_refused(generator: torch.Generator):
     tensors, decoder = problem(3, 10, 37, 32, generator)
     with pytest.raises(ValueError, match="only a GPU decodes without counting, and float32; got torch.float64 on "):
-        decode_padded(decoder.weights(), SeenAnchors(*(tensor.double() for tensor in tensors.values())))
+        decode_within(decoder.weights(), SeenAnchors(*(tensor.double() for tensor in tensors.values())), 30)
 
 
 def test_nothing_selected_is_no_gaussians(generator: torch.Generator):
