@@ -174,8 +174,8 @@ class PaDGS(nn.Module):
         weights, anchors, precision = self.decoder.weights(), self.as_seen(view), self.options.precision
         if room is None or not decodes_within(anchors, precision):
             return Decoded(*decode_gaussians(weights, anchors, precision))
-        *decoded, count = decode_within(weights, anchors, room, precision)
-        return Decoded(*decoded, Reading(count))
+        gaussians, slots, raw_opacities, count = decode_within(weights, anchors, room, precision)
+        return Decoded(gaussians, slots, raw_opacities, Reading(count))
 
     def show(self, view: View) -> Gaussians:
         """The same for `padgs.render.backends.captured`: A K Gaussians, of which those that are not selected are zeros.

@@ -19,11 +19,11 @@ __global__ void __launch_bounds__(kThreads) place_kernel(DeviceDecodeArguments d
   for (int64_t other = anchor * k; other < slot; ++other) before += args.raw_opacities[other] > 0;
   const int64_t count = args.slot_start[args.anchors];
   const Row row = row_of(slot, args.raw_opacities[slot] > 0, before, count, device.room);
-  const float *color = device.color_logits + kColorValues * slot;
-  const float *covariance = device.covariance_logits + kCovarianceValues * slot;
-  place_gaussian(args, anchor, slot, row);
-  for (int c = 0; c < kColorValues; ++c) place_output<kColorValues>(args, anchor, row, c, color[c]);
-  for (int c = 0; c < kCovarianceValues; ++c) place_output<kCovarianceValues>(args, anchor, row, c, covariance[c]);
+  if (!row.written) return;
+  float color[kColorValues], covariance[kCovarianceValues];
+  for (int c = 0; c < kColorValues; ++c) color[c] = device.color_logits[kColorValues * slot + c];
+  for (int c = 0; c < kCovarianceValues; ++c) covariance[c] = device.covariance_logits[kCovarianceValues * slot + c];
+  place(args, anchor, slot, row, color, covariance);
 }
 
 // A thread for each anchor, which sums over its Gaussians in their order. The networks' outputs are left out where

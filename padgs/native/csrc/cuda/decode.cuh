@@ -11,7 +11,7 @@ namespace padgs {
 // quaternion.
 constexpr int kOpacityValues = 1, kColorValues = 3, kShrinkage = 3, kCovarianceValues = 7;
 
-__device__ inline float sigmoid(float x) { return 1.0f / (1.0f + expf(-x)); }
+__device__ inline float sigmoid(float x) { return quick_inverse(1.0f + expf(-x)); }
 
 // The row of a slot's Gaussian. Selected ones come first; others, zeros that nobody draws, fill the room behind them.
 struct Row {
@@ -24,30 +24,20 @@ __device__ inline Row row_of(int64_t slot, bool selected, int64_t before, int64_
   return {index, selected, index < room};
 }
 
-// All of a Gaussian that takes no network but that of opacities.
-__device__ inline void place_gaussian(const DecodeArguments &args, int64_t anchor, int64_t slot, const Row &row) {
-  if (!row.written) return;
+// A Gaussian's attributes, from what the networks of colours and of covariances say.
+__device__ inline void place(const DecodeArguments &args, int64_t anchor, int64_t slot, const Row &row,
+                             const float (&color)[kColorValues], const float (&covariance)[kCovarianceValues]) {
   const float *logs = args.log_scales + 6 * anchor;
-  args.slots[row.index] = slot;
-  args.opacities[row.index] = row.selected ? args.raw_opacities[slot] * args.attenuation[anchor] : 0.0f;
+  const int64_t n = row.index;
+  args.slots[n] = slot;
+  args.opacities[n] = row.selected ? args.raw_opacities[slot] * args.attenuation[anchor] : 0.0f;
   for (int c = 0; c < 3; ++c) {
     const float mean = args.positions[3 * anchor + c] + expf(logs[c]) * args.offset_rows[3 * slot + c];
-    args.means[3 * row.index + c] = row.selected ? mean : 0.0f;
+    args.means[3 * n + c] = row.selected ? mean : 0.0f;
+    args.scales[3 * n + c] = row.selected ? expf(logs[3 + c]) * sigmoid(covariance[c]) : 0.0f;
+    args.colors[3 * n + c] = row.selected ? sigmoid(color[c]) : 0.0f;
   }
-}
-
-// What becomes of output `c` of the networks of colours, or of covariances.
-template <int kValues>
-__device__ void place_output(const DecodeArguments &args, int64_t anchor, const Row &row, int c, float output) {
-  if (!row.written) return;
-  if constexpr (kValues == kColorValues) {
-    args.colors[3 * row.index + c] = row.selected ? sigmoid(output) : 0.0f;
-  } else if (c < kShrinkage) {
-    const float size = expf(args.log_scales[6 * anchor + 3 + c]);
-    args.scales[3 * row.index + c] = row.selected ? size * sigmoid(output) : 0.0f;
-  } else {
-    args.quats[4 * row.index + c - kShrinkage] = row.selected ? output : 0.0f;
-  }
+  for (int c = 0; c < 4; ++c) args.quats[4 * n + c] = row.selected ? covariance[kShrinkage + c] : 0.0f;
 }
 
 // dL by output `c` of a network for the selected Gaussian in row `n`.

@@ -22,18 +22,31 @@ struct Network {
       bias[i] = unpacked(packed(i < kValues * args.offsets ? head.b2[i] : 0.0f, 0, T{}), T{}).x;
   }
 
-  // Visits (half, output, what it is) of the lane's anchors.
+  // Visits (half, output, pair of its and the next one's) of the lane's anchors.
   template <class T, class Visit>
-  __device__ void outputs(const InputRows<T> &inputs, const DecodeArguments &args, Visit visit) const {
+  __device__ void outputs(const InputRows<T> &inputs, int units, Visit visit) const {
     FragmentA hidden[kMostHidden / 16];
-    HiddenUnits<T>(inputs, first, args.hidden).as_factors(hidden);
+    HiddenUnits<T>(inputs, first, units).as_factors(hidden);
     for (int tile = 0; tile < kOutputParts<kValues, 8>; ++tile) {
       const int output = 8 * tile + 2 * (lane_index() % 4);
       Sums sums{bias[output], bias[output + 1], bias[output], bias[output + 1]};
       multiply_add<T>(sums, hidden, second.at[tile]);
-      round_to<T>(sums);
-      for (int i = 0; i < 4; ++i)
-        if (output + i % 2 < kValues * args.offsets) visit(i / 2, output + i % 2, sums.of[i]);
+      for (int half = 0; half < 2; ++half) visit(half, output, packed(sums.of[2 * half], sums.of[2 * half + 1], T{}));
+    }
+  }
+};
+
+// Outputs of a warp's anchors, on their way from the lanes that summed them to those that place a Gaussian each.
+template <int kValues>
+struct Outputs {
+  uint32_t pairs[kRows][kOutputParts<kValues, 8> * 4 | 4];  // so many that rows begin at different banks
+
+  template <class T>
+  __device__ void of_gaussian(int row, int k, float (&values)[kValues]) const {
+    for (int c = 0; c < kValues; ++c) {
+      const int output = kValues * k + c;
+      const float2 pair = unpacked(pairs[row][output / 2], T{});
+      values[c] = output % 2 ? pair.y : pair.x;
     }
   }
 };
@@ -49,14 +62,18 @@ __global__ void __launch_bounds__(kThreads) opacity_kernel(NetworkArguments netw
     const Anchors anchors(tile, args.anchors);
     const InputRows<T> inputs(network.inputs, anchors, args.inputs);
     int selected[2] = {};
-    opacity.outputs(inputs, args, [&](int half, int k, float output) {
-      const float raw = tanhf(output);
-      selected[half] += raw > 0;
-      if (anchors.there(half)) args.raw_opacities[anchors.of(half) * args.offsets + k] = raw;
+    opacity.outputs(inputs, args.hidden, [&](int half, int output, uint32_t pair) {
+      const float2 numbers = unpacked(pair, T{});
+      for (int k = output; k < output + 2; ++k) {
+        const float raw = tanhf(k == output ? numbers.x : numbers.y);
+        if (k >= args.offsets || anchors.of(half) < 0) continue;
+        args.raw_opacities[anchors.of(half) * args.offsets + k] = raw;
+        selected[half] += raw > 0;
+      }
     });
     for (int half = 0; half < 2; ++half) {
       for (int step = 1; step < 4; step *= 2) selected[half] += __shfl_xor_sync(kAllLanes, selected[half], step);
-      if (anchors.there(half) && lane_index() % 4 == 0) args.slot_start[anchors.of(half) + 1] = selected[half];
+      if (anchors.of(half) >= 0 && lane_index() % 4 == 0) args.slot_start[anchors.of(half) + 1] = selected[half];
     }
   }
 }
@@ -66,30 +83,35 @@ __global__ void __launch_bounds__(kThreads) attributes_kernel(NetworkArguments n
   const DecodeArguments &args = network.device.decode;
   __shared__ Network<kColorValues> color;
   __shared__ Network<kCovarianceValues> covariance;
+  __shared__ Outputs<kColorValues> colors[kWarps];
+  __shared__ Outputs<kCovarianceValues> covariances[kWarps];
   color.fill<T>(args.color, args);
   covariance.fill<T>(args.covariance, args);
   __syncthreads();
   const int64_t count = args.slot_start[args.anchors];
+  auto &my_colors = colors[threadIdx.x / kWarp];
+  auto &my_covariances = covariances[threadIdx.x / kWarp];
+  const int group = lane_index() / 4;
   for (int64_t tile = blockIdx.x; tile * kWarps * kRows < args.anchors; tile += gridDim.x) {
     const Anchors anchors(tile, args.anchors);
     const InputRows<T> inputs(network.inputs, anchors, args.inputs);
-    const Selection selections[] = {{args, anchors, 0}, {args, anchors, 1}};
-    const auto row = [&](int half, int k) {
-      const Selection &s = selections[half];
-      return row_of(anchors.of(half) * args.offsets + k, s.has(k), s.before(k), count, network.device.room);
-    };
-    for (int half = 0; half < 2; ++half)
-      for (int k = lane_index() % 4; anchors.there(half) && k < args.offsets; k += 4)
-        place_gaussian(args, anchors.of(half), anchors.of(half) * args.offsets + k, row(half, k));
-    color.outputs(inputs, args, [&](int half, int i, float output) {
-      if (!anchors.there(half)) return;
-      place_output<kColorValues>(args, anchors.of(half), row(half, i / kColorValues), i % kColorValues, output);
+    color.outputs(inputs, args.hidden, [&](int half, int output, uint32_t pair) {
+      my_colors.pairs[8 * half + group][output / 2] = pair;
     });
-    covariance.outputs(inputs, args, [&](int half, int i, float output) {
-      if (!anchors.there(half)) return;
-      const Row place = row(half, i / kCovarianceValues);
-      place_output<kCovarianceValues>(args, anchors.of(half), place, i % kCovarianceValues, output);
+    covariance.outputs(inputs, args.hidden, [&](int half, int output, uint32_t pair) {
+      my_covariances.pairs[8 * half + group][output / 2] = pair;
     });
+    __syncwarp();
+    each_gaussian(args, anchors, [&](int row, int k, bool selected, int64_t before) {
+      const int64_t anchor = anchors.first + row, slot = anchor * args.offsets + k;
+      const Row to = row_of(slot, selected, before, count, network.device.room);
+      if (!to.written) return;
+      float of_color[kColorValues], of_covariance[kCovarianceValues];
+      my_colors.template of_gaussian<T>(row, k, of_color);
+      my_covariances.template of_gaussian<T>(row, k, of_covariance);
+      place(args, anchor, slot, to, of_color, of_covariance);
+    });
+    __syncwarp();
   }
 }
 

@@ -55,13 +55,20 @@ __device__ void fill_first_layer(FirstLayer &layer, const HeadWeights &head, con
   });
 }
 
-// Anchors of which a lane has numbers: the one of its group, and eight further on.
+// The sixteen anchors of a warp, as far as there are so many.
 struct Anchors {
-  int64_t first, end;  // end: behind the last of all
-  __device__ Anchors(int64_t tile, int64_t count)
-      : first((tile * kWarps + threadIdx.x / kWarp) * kRows + lane_index() / 4), end(count) {}
-  __device__ int64_t of(int half) const { return first + 8 * half; }
-  __device__ bool there(int half) const { return of(half) < end; }
+  int64_t first;
+  int count;
+
+  __device__ Anchors(int64_t tile, int64_t all) : first((tile * kWarps + threadIdx.x / kWarp) * kRows) {
+    const int64_t left = all - first;
+    count = left < 0 ? 0 : left < kRows ? int(left) : kRows;
+  }
+  // Of those in whose rows the lane has numbers, one of the first or of the second eight; -1 where there is none.
+  __device__ int64_t of(int half) const {
+    const int row = 8 * half + lane_index() / 4;
+    return row < count ? first + row : -1;
+  }
 };
 
 // No more than so many blocks, for each prepares the weights and leaves a gradient of all of them. The number depends on
@@ -71,10 +78,10 @@ inline int64_t blocks_of_anchors(int64_t anchors) { return std::min(blocks_for(a
 
 // Input `column` of an anchor, and 1 behind the last.
 __device__ inline float input(const NetworkInputs &in, int64_t anchor, int column, int count) {
-  if (column < in.feature_count) return in.features[anchor * in.feature_count + column];
-  const int seen = count - in.feature_count;
-  if (column < count) return in.seen[anchor * seen + column - in.feature_count];
-  return column == count ? 1.0f : 0.0f;
+  const float *features = in.features + anchor * in.feature_count;
+  const float *seen = in.seen + anchor * (count - in.feature_count) - in.feature_count;
+  if (column >= count) return column == count ? 1.0f : 0.0f;
+  return (column < in.feature_count ? features : seen)[column];
 }
 
 template <class T>
@@ -86,9 +93,8 @@ struct InputRows {
       for (int i = 0; i < 4; ++i) {
         const int column = 16 * step + i / 2 * 8 + 2 * (lane_index() % 4);
         const int64_t anchor = anchors.of(i % 2);
-        const bool there = anchors.there(i % 2);
-        steps[step].pairs[i] = packed(there ? input(in, anchor, column, count) : 0.0f,
-                                      there ? input(in, anchor, column + 1, count) : 0.0f, T{});
+        steps[step].pairs[i] = anchor < 0 ? 0 : packed(input(in, anchor, column, count),
+                                                       input(in, anchor, column + 1, count), T{});
       }
     }
   }
@@ -114,22 +120,18 @@ struct HiddenUnits {
   }
 };
 
-// Which Gaussians of an anchor are selected, and how many of anchors before it are. All lanes of a warp ask at once.
-struct Selection {
-  unsigned bits = 0;
-  int64_t start = 0;
-
-  __device__ Selection(const DecodeArguments &args, const Anchors &anchors, int half) {
-    const int64_t anchor = anchors.of(half);
-    if (anchors.there(half)) {
-      start = args.slot_start[anchor];
-      for (int k = lane_index() % 4; k < args.offsets; k += 4)
-        bits |= unsigned(args.raw_opacities[anchor * args.offsets + k] > 0) << k;
-    }
-    for (int step = 1; step < 4; step *= 2) bits |= __shfl_xor_sync(kAllLanes, bits, step);
+// Visits the Gaussians of a warp's anchors, a lane each, with (row of the anchor, k, whether it is selected, how many
+// selected ones are before it). All lanes of the warp have to come along.
+template <class Visit>
+__device__ void each_gaussian(const DecodeArguments &args, const Anchors &anchors, Visit visit) {
+  const int count = anchors.count * args.offsets;
+  int64_t before = count ? args.slot_start[anchors.first] : 0;
+  for (int i = lane_index(); i - lane_index() < count; i += kWarp) {
+    const bool selected = i < count && args.raw_opacities[anchors.first * args.offsets + i] > 0;
+    const unsigned all = __ballot_sync(kAllLanes, selected), lower = (1u << lane_index()) - 1;
+    if (i < count) visit(i / args.offsets, i % args.offsets, selected, before + __popc(all & lower));
+    before += __popc(all);
   }
-  __device__ bool has(int k) const { return bits >> k & 1; }
-  __device__ int64_t before(int k) const { return start + __popc(bits & ((1u << k) - 1)); }
-};
+}
 
 }  // namespace padgs

@@ -93,41 +93,40 @@ struct WeightSums {
   }
 };
 
-// dL by sixteen outputs of a network for a warp's anchors.
+using Number __attribute__((may_alias)) = uint16_t;
+
+// Leaves dL by the outputs of a network.
 template <int kValues>
-__device__ FragmentA output_gradients(const DecodeGradientArguments &args, const Anchors &anchors,
-                                      const Selection (&selections)[2], int step) {
-  FragmentA rows;
-  for (int i = 0; i < 4; ++i) {
-    const Selection &selection = selections[i % 2];
-    const int64_t anchor = anchors.of(i % 2);
-    float pair[2];
-    for (int j = 0; j < 2; ++j) {
-      const int output = kSide * step + i / 2 * 8 + 2 * (lane_index() % 4) + j, k = output / kValues;
-      const int64_t slot = anchor * args.forward.offsets + k;
-      pair[j] = !selection.has(k) ? 0.0f :
-                output_gradient<kValues>(args, anchor, slot, selection.before(k), output % kValues);
+__device__ void leave_output_gradients(const DecodeGradientArguments &args, const Anchors &anchors, Left &mine) {
+  for (int step = 0; step < kOutputParts<kValues, kSide>; ++step) mine.of_outputs[step][lane_index()] = {};
+  __syncwarp();
+  each_gaussian(args.forward, anchors, [&](int row, int k, bool selected, int64_t n) {
+    if (!selected) return;
+    const int64_t anchor = anchors.first + row, slot = anchor * args.forward.offsets + k;
+    for (int c = 0; c < kValues; ++c) {
+      const int output = kValues * k + c, lane = output % 8 * 4 + row % 8 / 2;
+      uint32_t &pair = mine.of_outputs[output / kSide][lane].pairs[output % kSide / 8 + row / 8 * 2];
+      const float gradient = output_gradient<kValues>(args, anchor, slot, n, c);
+      reinterpret_cast<Number *>(&pair)[row % 2] = Number(packed(gradient, 0, Bfloat16{}));
     }
-    rows.pairs[i] = packed(pair[0], pair[1], Bfloat16{});
-  }
-  return rows;
+  });
+  __syncwarp();
 }
 
 // What one network adds to the gradients of the features, and to those of its weights.
 template <class T, int kValues>
 __device__ void go_back(const NetworkGradientArguments &network, const Network<kValues> &weights, const Anchors &anchors,
-                        const InputRows<T> &inputs, const Selection (&selections)[2],
-                        Sums (&of_features)[kMostFeatures / 8], WeightSums<kValues> &of_weights, Left (&left)[kWarps]) {
+                        const InputRows<T> &inputs, Sums (&of_features)[kMostFeatures / 8], WeightSums<kValues> &of_weights, Left (&left)[kWarps]) {
   const DecodeGradientArguments &args = network.gradient;
   const int lane = lane_index();
   Left &mine = left[threadIdx.x / kWarp];
+  leave_output_gradients<kValues>(args, anchors, mine);
   const HiddenUnits<T> hidden(inputs, weights.first, args.forward.hidden);
   Sums of_hidden[kHiddenTiles] = {};
   for (int step = 0; step < kOutputParts<kValues, kSide>; ++step) {
-    const FragmentA of_outputs = output_gradients<kValues>(args, anchors, selections, step);
+    const FragmentA of_outputs = transposed(mine.of_outputs[step][lane]);
     for (int tile = 0; tile < kHiddenTiles; ++tile)
       multiply_add(of_hidden[tile], of_outputs, weights.from_outputs.at[tile][step][lane], Bfloat16{});
-    mine.of_outputs[step][lane] = transposed(of_outputs);
   }
   for (int i = 0; i < 4 * kHiddenTiles; ++i)
     if (!(hidden.tiles[i / 4].of[i % 4] > 0)) of_hidden[i / 4].of[i % 4] = 0;
@@ -162,19 +161,18 @@ __global__ void __launch_bounds__(kThreads) backward_kernel(NetworkGradientArgum
   WeightSums<kCovarianceValues> of_covariance;
   for (int64_t tile = blockIdx.x; tile * kWarps * kRows < in.anchors; tile += gridDim.x) {
     const Anchors anchors(tile, in.anchors);
-    const Selection selections[] = {{in, anchors, 0}, {in, anchors, 1}};
     const InputRows<T> inputs(network.inputs, anchors, in.inputs);
     const InputRows<Bfloat16> rounded(network.inputs, anchors, in.inputs);
     for (int step = 0; step < kInputParts; ++step)
       left[threadIdx.x / kWarp].inputs[step][lane] = transposed(rounded.steps[step]);
     Sums of_features[kMostFeatures / 8] = {};
-    go_back(network, opacity, anchors, inputs, selections, of_features, of_opacity, left);
-    go_back(network, color, anchors, inputs, selections, of_features, of_color, left);
-    go_back(network, covariance, anchors, inputs, selections, of_features, of_covariance, left);
+    go_back(network, opacity, anchors, inputs, of_features, of_opacity, left);
+    go_back(network, color, anchors, inputs, of_features, of_color, left);
+    go_back(network, covariance, anchors, inputs, of_features, of_covariance, left);
     for (int step = 0; step < kMostFeatures / 8; ++step) {
       for (int i = 0; i < 4; ++i) {
         const int feature = 8 * step + 2 * (lane % 4) + i % 2;
-        if (anchors.there(i / 2) && feature < features)
+        if (anchors.of(i / 2) >= 0 && feature < features)
           args.features_out[anchors.of(i / 2) * features + feature] = of_features[step].of[i];
       }
     }
