@@ -61,20 +61,19 @@ __global__ void __launch_bounds__(kThreads) opacity_kernel(NetworkArguments netw
   for (int64_t tile = blockIdx.x; tile * kWarps * kRows < args.anchors; tile += gridDim.x) {
     const Anchors anchors(tile, args.anchors);
     const InputRows<T> inputs(network.inputs, anchors, args.inputs);
-    int selected[2] = {};
+    unsigned selected = 0;  // how many of both anchors of the lane, in 16 bits each
     opacity.outputs(inputs, args.hidden, [&](int half, int output, uint32_t pair) {
       const float2 numbers = unpacked(pair, T{});
-      for (int k = output; k < output + 2; ++k) {
-        const float raw = tanhf(k == output ? numbers.x : numbers.y);
-        if (k >= args.offsets || anchors.of(half) < 0) continue;
-        args.raw_opacities[anchors.of(half) * args.offsets + k] = raw;
-        selected[half] += raw > 0;
+      for (int j = 0; j < 2 && output + j < args.offsets && anchors.of(half) >= 0; ++j) {
+        const float raw = tanhf(j ? numbers.y : numbers.x);
+        args.raw_opacities[anchors.of(half) * args.offsets + output + j] = raw;
+        selected += unsigned(raw > 0) << 16 * half;
       }
     });
-    for (int half = 0; half < 2; ++half) {
-      for (int step = 1; step < 4; step *= 2) selected[half] += __shfl_xor_sync(kAllLanes, selected[half], step);
-      if (anchors.of(half) >= 0 && lane_index() % 4 == 0) args.slot_start[anchors.of(half) + 1] = selected[half];
-    }
+    for (int step = 1; step < 4; step *= 2) selected += __shfl_xor_sync(kAllLanes, selected, step);
+    for (int half = 0; half < 2; ++half)
+      if (anchors.of(half) >= 0 && lane_index() % 4 == 0)
+        args.slot_start[anchors.of(half) + 1] = selected >> 16 * half & 0xffff;
   }
 }
 
