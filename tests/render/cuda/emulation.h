@@ -153,18 +153,26 @@ inline void run_block(int threads) {
     order[i] = i;
     prepare(fibers[i]);
   }
+  const auto some_warps = [&] { return seed ? random() : 0; };
+  const auto among = [](auto warps, int i) { return warps >> (i / kLanes % 16) & 1; };
+  auto behind = some_warps();  // until all others wait for them
   for (;;) {
     bool moved = false;
     if (seed) std::shuffle(order.begin(), order.end(), random);
-    const auto slow = seed ? random() : 0;  // warps that wait for another round
+    const auto slow = some_warps();  // wait for another round
     for (const int i : order) {
-      if (fibers[i].wait != kNothing) continue;
+      if (fibers[i].wait != kNothing || among(behind, i)) continue;
       moved = true;
-      if (!(slow >> (i / kLanes % 16) & 1)) resume(i);
+      if (!among(slow, i)) resume(i);
     }
     for (int first = 0; first < threads; first += kLanes)
       moved |= release_warp(first, first + kLanes < threads ? first + kLanes : threads);
     if (moved) continue;
+    if (behind) {
+      behind = 0;
+      continue;
+    }
+    behind = some_warps();
     const auto at_barrier = [](const Fiber &fiber) { return fiber.wait == kBlock; };
     const auto end = fibers.begin() + threads, first = std::find_if(fibers.begin(), end, at_barrier);
     if (first == end) return;  // all are over
