@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 
 from padgs.anchors.cpu_decoder import SIZES, decode_arguments
 from padgs.native import cuda
-from padgs.native.abi import DecodeArguments, DecodeGradientArguments, pointer
+from padgs.native.abi import DecodeGradientArguments, pointer
 from padgs.native.cuda import DeviceDecodeArguments, DeviceDecodeGradientArguments, NetworkInputs
 
 TYPES = {torch.bfloat16: 0, torch.float16: 1}  # as `ReducedType` of csrc/cuda/arguments.h
@@ -53,12 +53,12 @@ class _DecodeFused(torch.autograd.Function):
         raw = features.new_empty(anchors, per_anchor)
         starts = torch.zeros(anchors + 1, dtype=torch.int64, device=raw.device)
         read, queue = _network_inputs(inputs, reduced_type), cuda.queue(raw.device)
-        nowhere = _arguments(weights, constants, raw, starts, None, [None] * len(SIZES))
+        nowhere = decode_arguments(constants, raw, starts, None, [None] * len(SIZES), weights=weights)
         arguments = cuda.NetworkArguments(DeviceDecodeArguments(nowhere, 0, None, None), read)
         cuda.call("padgs_cuda_networks_opacity", queue, arguments)
         starts.cumsum_(0)
         slots, outputs = rows_for(starts, raw, room)
-        placed = _arguments(weights, constants, raw, starts, slots, outputs)
+        placed = decode_arguments(constants, raw, starts, slots, outputs, weights=weights)
         arguments = cuda.NetworkArguments(DeviceDecodeArguments(placed, len(slots), None, None), read)
         cuda.call("padgs_cuda_networks_attributes", queue, arguments)
         ctx.save_for_backward(*inputs, *weights, *constants, raw, starts, slots, *outputs)
@@ -78,7 +78,7 @@ class _DecodeFused(torch.autograd.Function):
         blocks = cuda.library().padgs_cuda_networks_blocks(len(raw))
         grad_weights = raw.new_empty(blocks, sum(sizes))
         gradient = DecodeGradientArguments(
-            _arguments(weights, constants, raw, starts, slots, saved[21:]),
+            decode_arguments(constants, raw, starts, slots, saved[21:], weights=weights),
             *map(pointer, upstream),
             inputs[0].shape[1],
             *map(pointer, (grad_features, grad_offsets, grad_log_scales, grad_weights)),
@@ -100,9 +100,3 @@ def rows_for(starts: Tensor, raw: Tensor, room: int | None) -> tuple[Tensor, lis
 
 def _network_inputs(inputs: Sequence[Tensor], reduced_type: int) -> NetworkInputs:
     return NetworkInputs(*map(pointer, inputs), inputs[0].shape[1], reduced_type)
-
-
-def _arguments(weights, constants, raw, starts, slots, outputs) -> DecodeArguments:
-    arguments = decode_arguments(constants, raw, starts, slots, outputs, weights=weights)
-    arguments.hidden, arguments.inputs = weights[0].shape
-    return arguments
