@@ -72,7 +72,7 @@ def readable(mangled: str) -> str:
     """What of a kernel's name tells it from the others, without a demangler."""
     (own,) = re.findall(r"\d([a-z_]+_kernel)", mangled)
     arguments = mangled.split(own)[1].split("EEv")[0]
-    told = re.findall(r"(Planar|Projective)Pixel|(Sorted|Hybrid)Pixel|Lb([01])|Li(\d+)", arguments)
+    told = re.findall(r"(Planar|Projective)Pixel|(Sorted|Hybrid)Pixel|Lb([01])|Li(\d+)|(B?[Ff]loat16)", arguments)
     words = [next(filter(None, groups)).lower() for groups in told]
     return f"{own.removesuffix('_kernel')} {' '.join(dict.fromkeys(words))}".strip()
 

@@ -26,6 +26,10 @@ class Gaussians:
         """Number of Gaussians."""
         return self.means.shape[0]
 
+    def first(self, count: int) -> Gaussians:
+        """The first so many, in the same memory."""
+        return replace(self, **{f.name: getattr(self, f.name)[:count] for f in fields(self)})
+
     def to(self, *args, **kwargs) -> Gaussians:
         """The same Gaussians on another device or in another dtype (arguments of `Tensor.to`)."""
         return replace(self, **{f.name: getattr(self, f.name).to(*args, **kwargs) for f in fields(self)})

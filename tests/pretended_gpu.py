@@ -54,6 +54,10 @@ class OnGPU(Tensor):
         """What is held."""
         return f"OnGPU({self.held!r})"
 
+    def data_ptr(self) -> int:
+        """For kernels that are emulated."""
+        return self.held.data_ptr()
+
     @classmethod
     def __torch_dispatch__(cls, function, types, args=(), kwargs=None):
         """Where no mode is active: outside of `pretended_gpu`, which would otherwise have been asked first."""

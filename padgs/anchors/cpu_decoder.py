@@ -85,8 +85,8 @@ def decode_arguments(
     inputs: Tensor | None = None,
     weights: Sequence[Tensor] = (),
 ) -> DecodeArguments:
-    """For a library; without inputs and weights for that of a GPU, which does not see the networks."""
+    """For a library; without inputs for that of a GPU, and without weights where it does not see the networks."""
     heads = [HeadWeights(*map(pointer, weights[first : first + 4])) for first in (0, 4, 8)]
-    widths = (0, 0) if inputs is None else (inputs.shape[1], len(weights[0]))
+    hidden, width = weights[0].shape if weights else (0, 0)
     buffers = (inputs, *constants, raw, starts, slots, *outputs)
-    return DecodeArguments(*raw.shape, *widths, *heads, *map(pointer, buffers))
+    return DecodeArguments(*raw.shape, width, hidden, *heads, *map(pointer, buffers))

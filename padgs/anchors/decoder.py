@@ -8,6 +8,7 @@ products alone: what becomes of their outputs is computed in the tensors' own ty
 from __future__ import annotations
 
 import math
+from types import ModuleType
 from typing import NamedTuple
 
 import torch
@@ -118,25 +119,34 @@ def decode_gaussians(
     Raises:
         ValueError: an unknown precision.
     """
-    dtype, library = reduced(precision), LIBRARIES.get(anchors.features.device.type)
-    no_reduced_types = dtype is not None and library is cpu
-    if (
-        library is None
-        or no_reduced_types
-        or anchors.features.dtype != torch.float32
-        or not library.works_on(anchors.features.device)
-    ):
+    library = _library_for(anchors, precision)
+    if library is None:
         return define_gaussians(weights, anchors, precision)
     flat = tuple(tensor for head in weights for tensor in head)
-    fused = decode_on_gpu(flat, *anchors, dtype=dtype) if library is cuda else decode_on_cpu(flat, *anchors)
-    *values, slots, raw = fused
+    if library is cuda:
+        *values, slots, raw, _ = decode_on_gpu(flat, *anchors, dtype=reduced(precision))
+    else:
+        *values, slots, raw = decode_on_cpu(flat, *anchors)
     return Gaussians(*values), slots, raw
 
 
-def decode_padded(weights: DecoderWeights, anchors: SeenAnchors, precision: str = "float32") -> Gaussians:
-    """`decode_gaussians` for frames that a GPU draws without its host waiting (`padgs.render.backends.captured`).
+def decodes_within(anchors: SeenAnchors, precision: str = "float32") -> bool:
+    """Whether `decode_within` takes these tensors: float32 on a GPU that the library works on."""
+    return _library_for(anchors, precision) is cuda
 
-    There are A K Gaussians however many are selected: those in order, and behind them zeros, which nobody draws.
+
+def decode_within(
+    weights: DecoderWeights, anchors: SeenAnchors, room: int, precision: str = "float32"
+) -> tuple[Gaussians, Tensor, Tensor, Tensor]:
+    """`decode_gaussians` without the host waiting for how many are selected.
+
+    Args:
+        weights, anchors, precision: as there.
+        room: there are so many Gaussians, or all A K if those are fewer: first the selected ones, as far as there is
+            room, behind them zeros, which nobody draws.
+
+    Returns:
+        What is returned there, the slots of the zeros being those of others that are not selected; N, [1] int64.
 
     Raises:
         ValueError: tensors that are not float32 on a GPU, or an unknown precision.
@@ -149,8 +159,18 @@ def decode_padded(weights: DecoderWeights, anchors: SeenAnchors, precision: str 
             "them, or use decode_gaussians"
         )
     flat = tuple(tensor for head in weights for tensor in head)
-    *values, _, _ = decode_on_gpu(flat, *anchors, dtype=reduced(precision), padded=True)
-    return Gaussians(*values)
+    room = min(room, anchors.offsets[..., 0].numel())
+    *values, slots, raw, count = decode_on_gpu(flat, *anchors, dtype=reduced(precision), room=room)
+    return Gaussians(*values), slots, raw, count
+
+
+def _library_for(anchors: SeenAnchors, precision: str) -> ModuleType | None:
+    """What decodes these tensors; None: torch does."""
+    dtype, library = reduced(precision), LIBRARIES.get(anchors.features.device.type)
+    no_reduced_types = dtype is not None and library is cpu
+    if library is None or no_reduced_types or anchors.features.dtype != torch.float32:
+        return None
+    return library if library.works_on(anchors.features.device) else None
 
 
 def define_gaussians(

@@ -1,8 +1,8 @@
 """Decoding anchors into Gaussians on a GPU: matrix products by torch, all around them by csrc/cuda/decode.cu.
 
-`padgs.anchors.decoder` is the definition. The hidden layers of the three networks are one product; their values are
-kept for the way back, 4 bytes for each of the 96 units of an anchor (2 in a reduced precision). TF32 in the products is
-torch's own switch.
+`padgs.anchors.decoder` is the definition. Reduced precisions go to `padgs.anchors.fused_decoder` where it takes
+them. The hidden layers of the three networks are one product; their values are kept for the way back, 4 bytes for each
+of the 96 units of an anchor (2 in a reduced precision). TF32 in the products is torch's own switch.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from padgs.anchors import fused_decoder
 from padgs.anchors.cpu_decoder import COLOR_VALUES, COVARIANCE_VALUES, OPACITY_VALUES, SIZES, decode_arguments
 from padgs.anchors.precision import OF_GRADIENTS
 from padgs.native import cuda
@@ -20,19 +21,29 @@ from padgs.native.abi import DecodeGradientArguments, pointer
 
 
 def decode_on_gpu(
-    weights: tuple[Tensor, ...], *tensors: Tensor, dtype: torch.dtype | None = None, padded: bool = False
+    weights: tuple[Tensor, ...], *tensors: Tensor, dtype: torch.dtype | None = None, room: int | None = None
 ) -> tuple[Tensor, ...]:
-    """`padgs.anchors.cpu_decoder.decode_on_cpu` where the GPU's library keeps its tensors; waits once, for a count.
+    """`padgs.anchors.cpu_decoder.decode_on_cpu` where the GPU's library keeps its tensors.
 
-    Products may be taken in a reduced type. Padded, it waits for nothing: behind the selected Gaussians come zeros, as
-    many as there are others.
+    Args:
+        weights, tensors: as there.
+        dtype: of the products; None: float32.
+        room: rows of the result, at most A K. The selected Gaussians come first, as far as there is room; rows behind
+            them are zeros, and have the slots of others that are not selected. None: as many as are selected, for which
+            the host waits.
+
+    Returns:
+        What is returned there, and how many Gaussians are selected, [1] int64.
     """
-    return _DecodeOnGPU.apply(dtype, padded, *tensors, *weights)
+    features, offsets = tensors[0], tensors[3]
+    if dtype is not None and fused_decoder.fits(weights, features, offsets):
+        return fused_decoder.decode_fused(weights, *tensors, dtype=dtype, room=room)
+    return _DecodeOnGPU.apply(dtype, room, *tensors, *weights)
 
 
 class _DecodeOnGPU(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, dtype, padded, features, seen, positions, offsets, log_scales, attenuation, *weights):
+    def forward(ctx: Any, dtype, room, features, seen, positions, offsets, log_scales, attenuation, *weights):
         dtype = dtype or features.dtype
         inputs = torch.cat((features.detach(), seen), dim=-1).to(dtype)
         constants = [t.detach().contiguous() for t in (positions, offsets, log_scales, attenuation)]
@@ -47,17 +58,16 @@ class _DecodeOnGPU(torch.autograd.Function):
         raw = opacity.tanh_()
         starts = torch.zeros(len(raw) + 1, dtype=torch.int64, device=raw.device)
         torch.cumsum((raw > 0).sum(-1), 0, out=starts[1:])
-        count, new = (raw.numel(), Tensor.new_zeros) if padded else (int(starts[-1]), Tensor.new_empty)
-        slots = new(starts, (count,))
-        outputs = [new(raw, (count, size) if size else (count,)) for size in SIZES]
+        slots, outputs = fused_decoder.rows_for(starts, raw, room)
         arguments = cuda.DeviceDecodeArguments(
-            decode_arguments(constants, raw, starts, slots, outputs), pointer(color), pointer(covariance)
+            decode_arguments(constants, raw, starts, slots, outputs), len(slots), pointer(color), pointer(covariance)
         )
         cuda.call("padgs_cuda_decode_place", cuda.queue(raw.device), arguments)
         ctx.save_for_backward(inputs, w1, hidden, *weights, *constants, raw, starts, slots, *outputs)
         ctx.features = features.shape[1]
-        ctx.mark_non_differentiable(slots, raw)
-        return *outputs, slots, raw
+        count = starts[-1:]
+        ctx.mark_non_differentiable(slots, raw, count)
+        return *outputs, slots, raw, count
 
     @staticmethod
     @once_differentiable

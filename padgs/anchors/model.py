@@ -9,12 +9,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from padgs.anchors.decoder import Decoder, SeenAnchors, decode_gaussians, decode_padded
+from padgs.anchors.decoder import Decoder, SeenAnchors, decode_gaussians, decode_within, decodes_within
 from padgs.anchors.grid import anchors_from_points, automatic_voxel_size, initial_log_scales
 from padgs.anchors.precision import PRECISIONS
 from padgs.checks import check, check_known
 from padgs.gaussians import Gaussians
 from padgs.learning.rows import load_rows
+from padgs.native.reading import Reading
 from padgs.scene import Scene, View
 from padgs.sphere.distortion import OMEGA_AXES, distortion, opacity_factor, polar_axis
 
@@ -65,6 +66,11 @@ class Decoded:
     gaussians: Gaussians  # N, opacities modulated
     slots: Tensor  # [N] int64 ascending, anchor K + k
     raw_opacities: Tensor  # [A, K] in (-1, 1), before selection and modulation
+    counted: Reading | None = None  # N, where `gaussians` and `slots` have rows for another number, see `PaDGS.decode`
+
+    def count(self) -> int:
+        """N; waits for it if it is not there yet."""
+        return len(self.slots) if self.counted is None else self.counted.values()[0]
 
 
 class PaDGS(nn.Module):
@@ -157,17 +163,28 @@ class PaDGS(nn.Module):
         axis = polar_axis(self.options.omega_axis, view.cam_from_world.to(self.positions))
         return direction, distance / self.unit, distortion(direction, axis)
 
-    def decode(self, view: View) -> Decoded:
-        """The Gaussians that this view shows (Eq. 13-15)."""
-        return Decoded(*decode_gaussians(self.decoder.weights(), self.as_seen(view), self.options.precision))
+    def decode(self, view: View, room: int | None = None) -> Decoded:
+        """The Gaussians that this view shows (Eq. 13-15).
+
+        Args:
+            view: from where.
+            room: on a GPU, decode so many rows without waiting for N: zeros, which nobody draws, are behind the N, and
+                if there are fewer rows than N, the last are missing. Elsewhere, and with None, there are N.
+        """
+        weights, anchors, precision = self.decoder.weights(), self.as_seen(view), self.options.precision
+        if room is None or not decodes_within(anchors, precision):
+            return Decoded(*decode_gaussians(weights, anchors, precision))
+        gaussians, slots, raw_opacities, count = decode_within(weights, anchors, room, precision)
+        return Decoded(gaussians, slots, raw_opacities, Reading(count))
 
     def show(self, view: View) -> Gaussians:
         """The same for `padgs.render.backends.captured`: A K Gaussians, of which those that are not selected are zeros.
 
         Raises:
-            ValueError, OSError: as `padgs.anchors.decoder.decode_padded` does.
+            ValueError, OSError: as `padgs.anchors.decoder.decode_within` does.
         """
-        return decode_padded(self.decoder.weights(), self.as_seen(view), self.options.precision)
+        everything = self.offsets[..., 0].numel()
+        return decode_within(self.decoder.weights(), self.as_seen(view), everything, self.options.precision)[0]
 
     def as_seen(self, view: View) -> SeenAnchors:
         """What is decoded."""

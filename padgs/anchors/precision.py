@@ -1,8 +1,9 @@
 """Matrix products of small networks in a reduced floating-point type: what tensor cores are for.
 
 Parameters and results stay float32; operands are rounded for the product, which is summed in float32 and rounded once.
-(On a GPU partial sums may be rounded too: `torch.backends.cuda.matmul.allow_bf16_reduced_precision_reduction`, on by
-default, and the same for float16.)
+(Where torch multiplies on a GPU, partial sums may be rounded too:
+`torch.backends.cuda.matmul.allow_bf16_reduced_precision_reduction`, on by default, and the same for float16. The
+kernels of `padgs.anchors.fused_decoder` round none, and sum gradients without rounding the result.)
 Products of gradients are taken in bfloat16 whatever the type: those of a mean over pixels are smaller than float16's
 numbers begin.
 """

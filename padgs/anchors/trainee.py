@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from padgs.anchors.growth import Growth, GrowthOptions
-from padgs.anchors.model import PaDGS
+from padgs.anchors.model import Decoded, PaDGS
 from padgs.checks import check, check_known
 from padgs.learning.extent import ExtentOptions
 from padgs.learning.schedule import Constant, LogLinear, ParameterGroup
 from padgs.learning.trainee import Drawing, Parts, Size, State
-from padgs.render import Rendering, RenderOptions, render
+from padgs.render import Rendering, RenderOptions, render, resolve_backend
 from padgs.scene import View
 
 OFFSET_RATE_UNITS = ("scene", "world")
+HEADROOM = 1.3  # room for so many times the Gaussians that the last view showed
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,10 @@ class LearningRates(ExtentOptions):
 
 @dataclass(frozen=True)
 class AnchorDrawing(Drawing):
-    """A drawing that remembers the opacities of all anchors, which decide what is pruned."""
+    """A drawing that remembers the opacities of all anchors, which decide what is pruned.
+
+    Its probe may have more rows than there are Gaussians; the first are theirs.
+    """
 
     raw_opacities: Tensor  # [A, K]
 
@@ -94,22 +98,38 @@ class AnchorTrainee:
         self.model, self.growth = model, Growth(model, growth, seed=seed)
         self._options, self._backend = options, backend
         self._rates, self._extent, self._iterations = rates, extent, iterations
+        self._room = 0  # for the Gaussians of the next view; 0: as many as there are
 
     def groups(self) -> list[ParameterGroup]:
         """All learnable parameters; positions of anchors are none."""
         return self._rates.groups(self.model, self._extent, self._iterations)
 
     def draw(self, view: View) -> AnchorDrawing:
-        """Decode the anchors for the view and render them, differentiably."""
-        decoded = self.model.decode(view)
+        """Decode the anchors for the view and render them, differentiably.
+
+        Backend cuda need not be told how many Gaussians there are: there is room for more than the last view showed,
+        and the number is read while they are drawn. Where there was too little room, all is done once more.
+        """
+        ahead = resolve_backend(self._backend, self.model.positions) == "cuda"
+        decoded = self.model.decode(view, (self._room if ahead else 0) or None)
+        rendering, probe = self._rendered(decoded, view)
+        if decoded.count() > len(decoded.slots):
+            decoded = self.model.decode(view)
+            rendering, probe = self._rendered(decoded, view)
+        count = decoded.count()
+        self._room = max(int(HEADROOM * count) + 1, self._room * 15 // 16)
+        drawn = replace(rendering, visible=rendering.visible[:count])
+        return AnchorDrawing(drawn, probe, decoded.gaussians.first(count), decoded.slots[:count], decoded.raw_opacities)
+
+    def _rendered(self, decoded: Decoded, view: View) -> tuple[Rendering, Tensor]:
         probe = decoded.gaussians.means.new_zeros(len(decoded.slots), 2, requires_grad=True)
-        rendering = render(decoded.gaussians, view, self._options, probe=probe, backend=self._backend)
-        return AnchorDrawing(rendering, probe, decoded.gaussians, decoded.slots, decoded.raw_opacities)
+        return render(decoded.gaussians, view, self._options, probe=probe, backend=self._backend), probe
 
     def observe(self, drawing: Drawing, iteration: int) -> None:
         """Collect opacities and image-plane gradients."""
         assert isinstance(drawing, AnchorDrawing), type(drawing)
         gradient = drawing.probe.grad if drawing.probe.grad is not None else torch.zeros_like(drawing.probe)
+        gradient = gradient[: len(drawing.slots)]
         self.growth.observe(drawing.raw_opacities, drawing.slots, gradient, drawing.rendering.visible, iteration)
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:

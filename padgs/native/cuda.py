@@ -111,11 +111,23 @@ class DeviceLossArguments(ctypes.Structure):
 
 
 class DeviceDecodeArguments(ctypes.Structure):
-    _fields_ = [("decode", DecodeArguments), *fields(Pointer, "color_logits", "covariance_logits")]
+    _fields_ = [("decode", DecodeArguments), ("room", Int64), *fields(Pointer, "color_logits", "covariance_logits")]
 
 
 class DeviceDecodeGradientArguments(ctypes.Structure):
     _fields_ = [("gradient", DecodeGradientArguments), *fields(Pointer, "opacity_out", "color_out", "covariance_out")]
+
+
+class NetworkInputs(ctypes.Structure):
+    _fields_ = [*fields(Pointer, "features", "seen"), *fields(Int32, "feature_count", "type")]
+
+
+class NetworkArguments(ctypes.Structure):
+    _fields_ = [("device", DeviceDecodeArguments), ("inputs", NetworkInputs)]
+
+
+class NetworkGradientArguments(ctypes.Structure):
+    _fields_ = [("gradient", DecodeGradientArguments), ("inputs", NetworkInputs)]
 
 
 STRUCTURES = (
@@ -130,6 +142,9 @@ STRUCTURES = (
     DeviceLossArguments,
     DeviceDecodeArguments,
     DeviceDecodeGradientArguments,
+    NetworkInputs,
+    NetworkArguments,
+    NetworkGradientArguments,
 )
 SIGNATURES: dict[str, tuple[list, Any]] = {
     "padgs_cuda_structure_bytes": ([Int32], Int64),
@@ -149,6 +164,11 @@ SIGNATURES: dict[str, tuple[list, Any]] = {
     "padgs_cuda_project_backward": ([Pointer, Pointer], Int32),
     "padgs_cuda_decode_place": ([Pointer, Pointer], Int32),
     "padgs_cuda_decode_take_back": ([Pointer, Pointer], Int32),
+    "padgs_cuda_networks_fit": ([Pointer, Int32, Int32, Int32, Int32], Int32),
+    "padgs_cuda_networks_opacity": ([Pointer, Pointer], Int32),
+    "padgs_cuda_networks_attributes": ([Pointer, Pointer], Int32),
+    "padgs_cuda_networks_blocks": ([Int64], Int64),
+    "padgs_cuda_networks_backward": ([Pointer, Pointer], Int32),
     "padgs_cuda_loss_blocks": ([Int32, Int32], Int64),
     "padgs_cuda_photometric_loss": ([Pointer, Pointer], Int32),
 }

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from padgs.native import cuda
 from padgs.native.abi import MOMENTS, REMOVAL, Gradients, Inputs, pointer
-from padgs.render.backends.cuda_tiles import MAX_INSTANCES, DeviceProjected, DeviceStrip, Reading
+from padgs.native.reading import Reading
+from padgs.render.backends.cuda_tiles import MAX_INSTANCES, DeviceProjected, DeviceStrip
 from padgs.render.backends.native import NativeImage, Pixels, Upstream, rasterize_as, score_as
 from padgs.render.backends.native_camera import NativeRays, native_camera, native_rays
 from padgs.render.contract import Removals, Rendering, RenderOptions, Request

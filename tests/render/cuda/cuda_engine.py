@@ -61,6 +61,7 @@ def compiled(name: str, sources: list[Path], *more: str) -> ctypes.CDLL:
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     target = folder / f"lib{name}.so"
     flags = ["-std=c++17", "-O2", "-fPIC", "-shared", "-Wall", "-Wextra", "-Werror", "-DPADGS_EMULATED"]
+    flags += ["-Wno-unknown-pragmas"]  # nvcc's
     flags += ["-fno-gnu-unique"]  # or the emulations of two libraries would be one
     flags += ["-fsanitize=bounds", "-fsanitize-undefined-trap-on-error"]  # of arrays: ends the process
     paths = [f"-I{HERE}", f"-I{SOURCES}", "-x", "c++", *map(str, sources), "-o", str(target)]

@@ -30,7 +30,7 @@
 struct Dim {
   unsigned x;
 };
-inline Dim threadIdx, blockIdx, blockDim;
+inline Dim threadIdx, blockIdx, blockDim, gridDim;
 inline int current_device, last_error;  // of CUDA's, which nothing here runs on, but which code may choose and read
 
 inline int cudaGetDevice(int *device) { return *device = current_device, 0; }
@@ -153,18 +153,26 @@ inline void run_block(int threads) {
     order[i] = i;
     prepare(fibers[i]);
   }
+  const auto some_warps = [&] { return seed ? random() : 0; };
+  const auto among = [](auto warps, int i) { return warps >> (i / kLanes % 16) & 1; };
+  auto behind = some_warps();  // until all others wait for them
   for (;;) {
     bool moved = false;
     if (seed) std::shuffle(order.begin(), order.end(), random);
-    const auto slow = seed ? random() : 0;  // warps that wait for another round
+    const auto slow = some_warps();  // wait for another round
     for (const int i : order) {
-      if (fibers[i].wait != kNothing) continue;
+      if (fibers[i].wait != kNothing || among(behind, i)) continue;
       moved = true;
-      if (!(slow >> (i / kLanes % 16) & 1)) resume(i);
+      if (!among(slow, i)) resume(i);
     }
     for (int first = 0; first < threads; first += kLanes)
       moved |= release_warp(first, first + kLanes < threads ? first + kLanes : threads);
     if (moved) continue;
+    if (behind) {
+      behind = 0;
+      continue;
+    }
+    behind = some_warps();
     const auto at_barrier = [](const Fiber &fiber) { return fiber.wait == kBlock; };
     const auto end = fibers.begin() + threads, first = std::find_if(fibers.begin(), end, at_barrier);
     if (first == end) return;  // all are over
@@ -205,7 +213,7 @@ void emulate(unsigned blocks, unsigned threads, F kernel) {
     for (auto &box : mailbox) box.resize(threads + kLanes);
   }
   body = kernel;
-  blockDim.x = threads;
+  blockDim.x = threads, gridDim.x = blocks;
   const Memory shared = shared_memory();
   for (unsigned block = 0; block < blocks; ++block) {
     blockIdx.x = block;
@@ -240,6 +248,7 @@ inline unsigned __ballot_sync(unsigned, bool vote, PADGS_HERE) {
 }
 inline bool __any_sync(unsigned lanes, bool vote, PADGS_HERE) { return __ballot_sync(lanes, vote, file, line); }
 inline int __ffs(unsigned bits) { return __builtin_ffs(int(bits)); }
+inline int __popc(unsigned bits) { return __builtin_popcount(bits); }
 inline int __clz(int bits) { return bits ? __builtin_clz(unsigned(bits)) : 32; }
 
 template <class T>

@@ -23,6 +23,19 @@ void race(float *out) {
   out[i] = float(i == 0 || i == 63 ? 1 : there[i - 1] + there[i + 1]);
 }
 
+// The second warp does not wait for the first, but is kept so long that it seems to.
+void ahead(float *out) {
+  __shared__ float room[64];
+  const int i = int(threadIdx.x);
+  room[i] = 0;
+  __syncthreads();
+  if (i < kWarp)
+    room[i] = 1;
+  else
+    for (int k = 0; k < 1000; ++k) __syncwarp();
+  out[i] = room[i % kWarp];
+}
+
 // The warps of a block wait at a barrier each.
 void two_barriers(float *out) {
   if (threadIdx.x < kWarp)
@@ -48,6 +61,6 @@ void contraction(float *out) {
 }  // namespace
 
 extern "C" void plant(int fault, float *out) {
-  void (*const faults[])(float *) = {unwritten, race, two_barriers, two_votes, contraction};
+  void (*const faults[])(float *) = {unwritten, race, ahead, two_barriers, two_votes, contraction};
   launch(faults[fault], 1, 64, Queue{0, nullptr}, out);
 }

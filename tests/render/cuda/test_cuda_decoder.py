@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
+
 import cuda_engine
 import pytest
 import torch
@@ -12,12 +14,13 @@ from padgs.anchors.decoder import (
     DecoderWeights,
     SeenAnchors,
     decode_gaussians,
-    decode_padded,
+    decode_within,
     define_gaussians,
 )
 from padgs.anchors.gpu_decoder import decode_on_gpu
-from padgs.anchors.precision import OF_GRADIENTS, reduced
+from padgs.anchors.precision import OF_GRADIENTS, PRECISIONS, reduced
 from padgs.gaussians import Gaussians
+from padgs.native.watch import watched
 
 pytestmark = [*cuda_engine.marks()]
 DEVICE = "cuda" if cuda_engine.ON_GPU else "cpu"
@@ -31,7 +34,7 @@ def on_gpu(
     if cuda_engine.ON_GPU:
         return decode_gaussians(weights, anchors, precision)
     flat = tuple(tensor for head in weights for tensor in head)
-    *values, slots, raw = decode_on_gpu(flat, *anchors, dtype=reduced(precision))
+    *values, slots, raw, _ = decode_on_gpu(flat, *anchors, dtype=reduced(precision))
     return Gaussians(*values), slots, raw
 
 
@@ -75,43 +78,162 @@ def test_the_gpu_matches_the_definition(anchors: int, offsets: int, inputs: int,
         assert expected.any() or anchors == 1, name
 
 
-@pytest.mark.parametrize("precision", ["bfloat16", "float16"])
+REDUCED = pytest.mark.parametrize("precision", ["bfloat16", "float16"])
+OF_PRODUCTS = ["opacity", "attributes", "backward"]  # kernels of csrc/cuda/networks*.cu
+
+
+@contextmanager
+def products_of_ours():
+    """Yields the list of the kernels with products of networks that are called."""
+    called: list[str] = []
+
+    @contextmanager
+    def stage(name: str):
+        if name.startswith("padgs_cuda_networks_") and name.split("_")[-1] in OF_PRODUCTS:
+            called.append(name.split("_")[-1])
+        yield
+
+    with watched(stage):
+        yield called
+
+
+def assert_near(ours, truth, limit: float, of_gradients: float) -> None:
+    """What two calls of `decoded` gave; limits are shares of norms."""
+    assert torch.equal(ours[1], truth[1]) and (ours[2] - truth[2]).abs().max() < limit
+    for name, value in vars(truth[0]).items():
+        assert (getattr(ours[0], name) - value).norm() <= limit * value.norm(), name
+    for name, expected in truth[3].items():
+        assert (ours[3][name] - expected).norm() <= of_gradients * expected.norm(), name
+
+
+def unit(dtype: torch.dtype | None) -> float:
+    return torch.finfo(dtype or torch.float32).eps / 2
+
+
+@REDUCED
 def test_reduced_precisions_match_the_definition_and_stay_near_float32(precision: str, generator: torch.Generator):
     tensors, decoder = problem(300, 10, 37, 32, generator)
     with torch.no_grad():  # opacities away from the threshold, so that rounding selects nobody else
         decoder.opacity["b2"] += 4
-    ours, slots, raw, gradients = decoded(on_gpu, tensors, decoder, precision)
-    assert all(value.dtype == torch.float32 for value in (raw, *vars(ours).values(), *gradients.values()))
-    u, u_of_gradients = (torch.finfo(dtype or torch.float32).eps / 2 for dtype in (reduced(precision), OF_GRADIENTS))
+    with products_of_ours() as called:
+        ours = decoded(on_gpu, tensors, decoder, precision)
+    assert called == OF_PRODUCTS
+    assert all(value.dtype == torch.float32 for value in (ours[2], *vars(ours[0]).values(), *ours[3].values()))
+    u, u_of_gradients = unit(reduced(precision)), unit(OF_GRADIENTS)
+    # Sums in another order may be rounded to the number beside.
+    assert_near(ours, decoded(define_gaussians, tensors, decoder, precision), 8 * u, 8 * u_of_gradients)
     flips = (4 * u) ** 0.5  # of the norm: near enough to 0, a share of some u of the hidden units changes sides
-    for their_precision, limit, of_gradients in (
-        (precision, 8 * u, 8 * u_of_gradients),  # sums in another order may be rounded to the number beside
-        ("float32", 16 * u, 8 * u_of_gradients + flips),
-    ):
-        truth, true_slots, true_raw, true_gradients = decoded(define_gaussians, tensors, decoder, their_precision)
-        assert torch.equal(slots, true_slots) and (raw - true_raw).abs().max() < limit
-        for name, value in vars(truth).items():
-            assert (getattr(ours, name) - value).norm() < limit * value.norm(), name
-        for name, expected in true_gradients.items():
-            assert (gradients[name] - expected).norm() < of_gradients * expected.norm(), name
+    assert_near(ours, decoded(define_gaussians, tensors, decoder), 16 * u, 8 * u_of_gradients + flips)
     exact = on_gpu(decoder.weights(), SeenAnchors(**tensors))[0]
-    assert torch.equal(ours.means, exact.means) and not torch.equal(ours.colors, exact.colors)
+    assert torch.equal(ours[0].means, exact.means) and not torch.equal(ours[0].colors, exact.colors)
 
 
-def test_padded_decoding_is_the_same_with_zeros_behind(generator: torch.Generator):
+@REDUCED
+@pytest.mark.parametrize("anchors", [1, 17, 300])
+@pytest.mark.parametrize(("offsets", "inputs", "hidden"), [(10, 36, 16), (1, 36, 32), (3, 37, 20)])
+def test_reduced_precisions_match_the_definition_in_any_size(
+    precision: str, anchors: int, offsets: int, inputs: int, hidden: int, generator: torch.Generator
+):
+    tensors, decoder = problem(anchors, offsets, inputs, hidden, generator)
+    with torch.no_grad():  # some Gaussians of each anchor are selected, and some are not; none nearly
+        decoder.opacity["w2"] *= 0.1
+        decoder.opacity["b2"][:] = torch.where(torch.arange(offsets) % 3 == 1, -1.0, 1.0)
+    with products_of_ours() as called:
+        ours = decoded(on_gpu, tensors, decoder, precision)
+    assert called == OF_PRODUCTS and len(ours[1]) == anchors * (offsets - (offsets + 1) // 3)
+    truth = decoded(define_gaussians, tensors, decoder, precision)
+    assert_near(ours, truth, 8 * unit(reduced(precision)), 8 * unit(OF_GRADIENTS))
+    assert all(gradient.any() for gradient in ours[3].values()) or anchors == 1
+
+
+@REDUCED
+@pytest.mark.parametrize(("offsets", "inputs", "hidden"), [(11, 37, 32), (10, 48, 32), (10, 37, 33)])
+def test_networks_that_do_not_fit_are_left_to_torch(precision, offsets, inputs, hidden, generator: torch.Generator):
+    tensors, decoder = problem(20, offsets, inputs, hidden, generator)
+    with torch.no_grad():
+        decoder.opacity["b2"] += 4
+    with products_of_ours() as called:
+        ours = decoded(on_gpu, tensors, decoder, precision)
+    assert called == []
+    truth = decoded(define_gaussians, tensors, decoder, precision)
+    assert_near(ours, truth, 8 * unit(reduced(precision)), 8 * unit(OF_GRADIENTS))
+
+
+@pytest.mark.slow
+def test_blocks_go_on_to_further_anchors(generator: torch.Generator):
+    tensors, decoder = problem(64 * 512 + 100, 1, 36, 32, generator)
+    with torch.no_grad():
+        decoder.opacity["b2"] += 4
+    ours, truth = (decoded(function, tensors, decoder, "bfloat16") for function in (on_gpu, define_gaussians))
+    assert_near(ours, truth, 8 * unit(torch.bfloat16), 8 * unit(OF_GRADIENTS))
+
+
+@REDUCED
+def test_reduced_precisions_are_the_same_bits_again(precision: str, generator, monkeypatch: pytest.MonkeyPatch):
+    tensors, decoder = problem(150, 10, 37, 32, generator)
+    first = decoded(on_gpu, tensors, decoder, precision)
+    for seed in range(2):
+        monkeypatch.setenv("PADGS_EMULATION_SEED", str(seed))  # another order, where the GPU is emulated
+        again = decoded(on_gpu, tensors, decoder, precision)
+        assert torch.equal(again[1], first[1]) and torch.equal(again[2], first[2])
+        for ours, before in ((vars(again[0]), vars(first[0])), (again[3], first[3])):
+            assert all(torch.equal(ours[name], value) for name, value in before.items())
+
+
+@pytest.mark.parametrize("hidden", [32, 20])
+@pytest.mark.parametrize("large", ["features", "w1", "w2"])
+def test_float16_overflows_where_the_definition_does(large: str, hidden: int, generator: torch.Generator):
+    tensors, decoder = problem(40, 10, 37, hidden, generator)
+    with torch.no_grad():
+        decoder.opacity["b2"] += 4
+        if large == "features":
+            tensors["features"][7, 3] = 1e5
+        else:
+            decoder.color[large][2] *= 3e5
+    ours, truth = (
+        function(decoder.weights(), SeenAnchors(**tensors), "float16") for function in (on_gpu, define_gaussians)
+    )
+    said, colors = ours[2], ours[0].colors
+    overflown = torch.cat((said.isnan().flatten(), ~((colors > 0) & (colors < 1)).flatten()))  # sigmoids at their ends
+    assert overflown.any() and not overflown.all() and torch.equal(ours[1], truth[1])
+    for value, expected in zip((ours[2], *vars(ours[0]).values()), (truth[2], *vars(truth[0]).values()), strict=True):
+        torch.testing.assert_close(value, expected, atol=4e-3, rtol=4e-3, equal_nan=True)
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("rows", ["all", "some more", "too few"])
+def test_decoding_into_room_is_the_same_with_zeros_behind(precision: str, rows: str, generator: torch.Generator):
     tensors, decoder = problem(60, 10, 37, 32, generator)
-    exact = on_gpu(decoder.weights(), SeenAnchors(**tensors))[0]
-    padded = decode_padded(decoder.weights(), SeenAnchors(**tensors))
+    exact, slots, raw = on_gpu(decoder.weights(), SeenAnchors(**tensors), precision)
     count = len(exact)
-    assert 0 < count < len(padded) == 600
+    assert 100 < count < 500
+    room = {"all": 1000, "some more": count + 30, "too few": count - 30}[rows]
+    within, all_slots, same_raw, said = decode_within(decoder.weights(), SeenAnchors(**tensors), room, precision)
+    assert said.tolist() == [count] and len(within) == len(all_slots) == min(room, 600) and torch.equal(raw, same_raw)
     for name, value in vars(exact).items():
-        assert torch.equal(getattr(padded, name)[:count], value) and not getattr(padded, name)[count:].any(), name
+        found = getattr(within, name)
+        assert torch.equal(found[:count], value[:room]) and not found[count:].any(), name
+    assert torch.equal(all_slots[:count], slots[:room])
+    others = (raw <= 0).flatten().nonzero()[:, 0]
+    assert torch.equal(all_slots[count:], others[: len(all_slots[count:])])
 
 
-def test_padded_decoding_elsewhere_is_refused(generator: torch.Generator):
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_rows_behind_the_selected_change_no_gradient(precision: str, generator: torch.Generator):
+    tensors, decoder = problem(60, 10, 37, 32, generator)
+
+    def within(weights: DecoderWeights, anchors: SeenAnchors, precision: str):
+        gaussians, slots, raw, count = decode_within(weights, anchors, 600, precision)
+        return gaussians.first(int(count)), slots, raw
+
+    exact, padded = (decoded(function, tensors, decoder, precision)[3] for function in (on_gpu, within))
+    assert all(torch.equal(padded[name], gradient) for name, gradient in exact.items())
+
+
+def test_decoding_into_room_elsewhere_is_refused(generator: torch.Generator):
     tensors, decoder = problem(3, 10, 37, 32, generator)
     with pytest.raises(ValueError, match="only a GPU decodes without counting, and float32; got torch.float64 on "):
-        decode_padded(decoder.weights(), SeenAnchors(*(tensor.double() for tensor in tensors.values())))
+        decode_within(decoder.weights(), SeenAnchors(*(tensor.double() for tensor in tensors.values())), 30)
 
 
 def test_nothing_selected_is_no_gaussians(generator: torch.Generator):

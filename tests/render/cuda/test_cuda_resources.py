@@ -48,6 +48,7 @@ def test_every_kernel_of_every_architecture_is_a_row():
     ]
     assert table(found).splitlines()[2] == "| blend 1 | 89 | 40 | 0 | 19472 | 256 | 67% |"  # 4 blocks of 256 in 1536
     assert readable(MOMENTS.replace("Projective", "Planar")) == "moments planar hybrid 0"
+    assert readable("_ZN5padgs8_a_cu_b_16attributes_kernelINS_8Bfloat16EEEvNS_1XE") == "attributes bfloat16"
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ import torch
 from padgs.native.abi import Pointer
 
 pytestmark = pytest.mark.skipif(cuda_engine.COMPILER is None, reason="no C++ compiler")
-FAULTS = ("unwritten", "race", "two barriers", "two votes", "contraction")
+FAULTS = ("unwritten", "race", "ahead", "two barriers", "two votes", "contraction")
 ALONE = """
 import ctypes, sys
 ctypes.CDLL(sys.argv[1]).plant(int(sys.argv[2]), (ctypes.c_float * 64)())
@@ -45,6 +45,15 @@ def test_a_race_that_neither_order_of_turns_brings_out_shows_in_some_schedule(mo
     assert outcomes[0] == [1.0] * 64 and all(outcome != outcomes[0] for outcome in outcomes[1:])
     monkeypatch.setenv("PADGS_EMULATION_SEED", "0")
     assert planted("race").tolist() == outcomes[1]  # a schedule can be had again
+
+
+def test_in_some_schedule_a_warp_stays_behind_until_others_wait_for_it(monkeypatch: pytest.MonkeyPatch):
+    assert planted("ahead").all()
+    outcomes = []
+    for seed in range(8):
+        monkeypatch.setenv("PADGS_EMULATION_SEED", str(seed))
+        outcomes.append(bool(planted("ahead").all()))
+    assert {*outcomes} == {True, False}
 
 
 @pytest.mark.parametrize(

@@ -91,14 +91,31 @@ struct RemovalInputs {
   float *removals;               // [I, kRemoval] by slot
 };
 
-// Of the structures of decoding, the networks are not used: their outputs are here.
+// Without networks: their outputs are here. `slots` and the Gaussians' tensors have `room` rows.
 struct DeviceDecodeArguments {
   DecodeArguments decode;
+  int64_t room;
   const float *color_logits, *covariance_logits;  // [A, 3 K] [A, 7 K]
 };
 struct DeviceDecodeGradientArguments {
   DecodeGradientArguments gradient;                     // features_out and weights_out are not used
-  float *opacity_out, *color_out, *covariance_out;  // [A, K] [A, 3 K] [A, 7 K]: dL by the networks' outputs
+  float *opacity_out, *color_out, *covariance_out;  // [A, K] [A, 3 K] [A, 7 K] or null: dL by the networks' outputs
+};
+
+// With networks, whose products are taken in a reduced type. The I inputs of an anchor are its features, then how it is
+// seen, in two tables; `input_rows` is not used.
+enum ReducedType : int32_t { kBfloat16 = 0, kFloat16 = 1 };
+struct NetworkInputs {
+  const float *features, *seen;  // [A, feature_count] [A, I - feature_count]
+  int32_t feature_count, type;
+};
+struct NetworkArguments {
+  DeviceDecodeArguments device;  // its logits are not used
+  NetworkInputs inputs;
+};
+struct NetworkGradientArguments {
+  DecodeGradientArguments gradient;  // weights_out: [padgs_cuda_networks_blocks], to be added up
+  NetworkInputs inputs;
 };
 
 // The loss over all pixels is the sum of block_sums / total. Its workspace holds dL by three window means,

@@ -24,7 +24,10 @@ PADGS_API int64_t padgs_cuda_structure_bytes(int32_t index) {
                           sizeof(RemovalInputs),
                           sizeof(DeviceLossArguments),
                           sizeof(DeviceDecodeArguments),
-                          sizeof(DeviceDecodeGradientArguments)};
+                          sizeof(DeviceDecodeGradientArguments),
+                          sizeof(NetworkInputs),
+                          sizeof(NetworkArguments),
+                          sizeof(NetworkGradientArguments)};
   return index >= 0 && size_t(index) < sizeof(bytes) / sizeof(*bytes) ? int64_t(bytes[index]) : -1;
 }
 

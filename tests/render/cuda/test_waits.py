@@ -1,0 +1,86 @@
+"""How often the host waits while PaD-GS trains with the kernels: those of the emulation, on a GPU that is not there.
+
+Numbers that are read beside the drawing (`Reading`) are no wait: the device goes on with what it has.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from itertools import islice
+
+import cuda_engine
+import pytest
+import torch
+from pretended_gpu import GPU, pretended_gpu
+from torch import Tensor
+
+from padgs.anchors.growth import GrowthOptions
+from padgs.anchors.precision import PRECISIONS
+from padgs.anchors.trainee import AnchorTrainee, LearningRates
+from padgs.bench.on_device import resident
+from padgs.bench.workload import Size, build
+from padgs.learning.budget import Budget
+from padgs.learning.loop import Trainer
+from padgs.learning.native_loss import EVALUATIONS
+from padgs.native import LIBRARIES, cuda
+from padgs.native.reading import Reading
+from padgs.render import RenderOptions
+
+pytestmark = pytest.mark.skipif(cuda_engine.ON_GPU or cuda_engine.COMPILER is None, reason="for the emulation")
+SIZE = Size(32, 16, 100, views=3)
+STEPS = 6
+
+
+@pytest.fixture(autouse=True)
+def kernels_are_there(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(cuda, "device_type", lambda: GPU.type)
+    monkeypatch.setitem(LIBRARIES, GPU.type, cuda)
+    monkeypatch.setitem(EVALUATIONS, GPU.type, EVALUATIONS["cuda"])
+    monkeypatch.setattr(Reading, "values", lambda reading: reading._values.held.tolist())
+
+
+def trained(precision: str) -> tuple[Trainer, list[Counter[str]]]:
+    """After some iterations with statistics in each and no growth; what made the host wait, iteration by iteration."""
+    work = build(SIZE)
+    work.model.options = replace(work.model.options, precision=precision)
+    with pretended_gpu() as waits:
+        work.model.to(GPU)
+        growth = GrowthOptions(statistics_from=0, grow_until=10**6, grow_from=10**6)
+        trainee = AnchorTrainee(
+            work.model, RenderOptions(), "cuda", growth=growth, rates=LearningRates(), extent=1.0, iterations=1000
+        )
+        waited, trainer = [], Trainer(trainee, resident(work.scene, GPU), Budget(1000))
+        waits.clear()
+        for _ in islice(trainer.records(), STEPS):
+            waited.append(Counter(waits))
+            waits.clear()
+        return trainer, waited
+
+
+def learned(trainer: Trainer) -> dict[str, Tensor]:
+    """All that the iterations have changed, statistics of growth included."""
+    with pretended_gpu():
+        return {name: tensor.cpu() for name, tensor in trainer.state().tensors.items()}
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_an_iteration_of_padgs_waits_for_nothing(precision: str, monkeypatch: pytest.MonkeyPatch):
+    trainer, waited = trained(precision)
+    assert waited[0] and waited[2:] == [Counter()] * (STEPS - 2), waited  # the first counts Gaussians and instances
+    ahead = learned(trainer)
+    monkeypatch.setattr("padgs.anchors.trainee.resolve_backend", lambda *_: "another")
+    exact, waited = trained(precision)
+    assert all(waited), "with as many rows as there are Gaussians it waits"
+    for name, tensor in learned(exact).items():
+        assert torch.equal(ahead[name], tensor), name
+    assert ahead["model/growth/seen"].any() and ahead["model/growth/gradient"].any()
+
+
+def test_too_little_room_is_noticed_and_changes_nothing(monkeypatch: pytest.MonkeyPatch):
+    enough = learned(trained("float32")[0])
+    monkeypatch.setattr("padgs.anchors.trainee.HEADROOM", 0.5)
+    trainer, waited = trained("float32")
+    assert any(waited[2:]), "it was decoded once more"
+    for name, tensor in learned(trainer).items():
+        assert torch.equal(enough[name], tensor), name
