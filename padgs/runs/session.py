@@ -251,5 +251,6 @@ def scene_of(config: RunConfig, device: torch.device) -> Scene:
 
 
 def build(config: RunConfig) -> Method:
-    """The method of a configuration, untrained."""
-    return lookup(METHODS, config.method, "method")(config.options, config.render, config.training, seed=config.seed)
+    """The method of a configuration, untrained, with the settings that its stress leaves it."""
+    options = config.stress.options(config.options)
+    return lookup(METHODS, config.method, "method")(options, config.render, config.training, seed=config.seed)

@@ -21,17 +21,18 @@ T = TypeVar("T", bound=Any)
 class Condition:
     """One way in which a capture or its training is out of the ordinary.
 
-    Exactly one of `scene`, `training` and `budget` is what it does, given the value of a level.
+    Exactly one of `scene`, `training`, `budget` and `option` is what it does, given the value of a level.
     """
 
     what: str  # with {} for the value of the level
-    levels: tuple[Any, Any, Any]
+    levels: tuple[Any, ...]  # mild first; three, or fewer where there is nothing worse
     scene: Callable[[Scene, Any, np.random.Generator], Scene] | None = None
     training: Callable[[Any, Any], Any] | None = None  # (a `TrainConfig`, value) -> another one
     budget: Callable[[Budget, Scene, Any], Budget] | None = None
+    option: str | None = None  # of the method that has the value then; to a method without it nothing happens
 
     def says(self, level: int) -> str:
-        """What it is at a level from 1 to 3."""
+        """What it is at a level from 1 on."""
         value = self.levels[level - 1]
         return self.what.format("any angle" if value is None else value)
 
@@ -72,5 +73,7 @@ CONDITIONS: Mapping[str, Condition] = {
     "capacity": Condition("there may be {:.0%} as many Gaussians as pixels of a view", (0.5, 0.2, 0.05), budget=capped),
     "schedule": Condition("training is {} times as long", (2, 4, 8), training=longer),
     "learning_rates": Condition("all learning rates are {} times as large", (3, 10, 30), training=faster),
+    # 11 bits of each factor, then 8; there is no coarser type that networks are trained in
+    "precision": Condition("PaD-GS's networks, if any, multiply in {}", ("float16", "bfloat16"), option="precision"),
     "jpeg": Condition("training views are JPEGs of quality {}", (90, 70, 40), pictures.compressed),
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -21,8 +21,10 @@ NONE = "none"
 class StressOptions:
     """A condition at a level. Whatever is random in it follows from the seed of the run.
 
-    >>> StressOptions("few_views", 2).title, StressOptions("few_views", 0).title
-    ('few_views 2', '')
+    A level that a condition does not have is its worst.
+
+    >>> StressOptions("few_views", 2).title, StressOptions("few_views", 0).title, StressOptions("precision", 3).title
+    ('few_views 2', '', 'precision 2')
     """
 
     condition: str = NONE  # a name of `padgs.stress.conditions.CONDITIONS`
@@ -32,6 +34,8 @@ class StressOptions:
         check_known(self, condition=(NONE, *CONDITIONS))
         if self.level not in LEVELS:
             raise ValueError(f"unknown level {self.level}; known: {', '.join(map(str, LEVELS))}")
+        if self._condition is not None:  # matrices have the same levels for all: nothing runs twice
+            object.__setattr__(self, "level", min(self.level, len(self._condition.levels)))
 
     @property
     def title(self) -> str:
@@ -61,6 +65,14 @@ class StressOptions:
         if condition is None or condition.training is None:
             return train
         return condition.training(train, condition.levels[self.level - 1])
+
+    def options(self, options: T) -> T:
+        """The settings of a method under the condition; as they are where they hold nothing that it sets."""
+        condition: Condition | None = self._condition
+        if condition is None or condition.option is None or not hasattr(options, condition.option):
+            return options
+        changed: Any = options
+        return replace(changed, **{condition.option: condition.levels[self.level - 1]})
 
     def budget(self, budget: Budget, scene: Scene) -> Budget:
         """What training may take under the condition."""

@@ -9,6 +9,7 @@ from padgs.data.synthetic import SyntheticOptions, SyntheticTruth, generate
 from padgs.learning.options import TrainOptions
 from padgs.runs.config import config_from_values
 from padgs.runs.identity import run_id
+from padgs.runs.session import build
 from padgs.scene import Scene
 from padgs.scoring.metrics import psnr
 from padgs.sphere.camera import Pinhole
@@ -116,6 +117,21 @@ def test_training_is_changed_and_its_configuration_is_not():
     assert faster.train.learning_rates == "run" and faster.training.learning_rates == 6.0
     assert faster.values()["train"]["learning_rates"] == "run"
     assert composed().training == composed().train and isinstance(composed().training, TrainOptions)
+
+
+def test_networks_multiply_in_fewer_bits_and_methods_without_any_are_what_they_were():
+    for level, precision in ((0, "float32"), (1, "float16"), (2, "bfloat16"), (3, "bfloat16")):
+        stress = ("stress.condition=precision", f"stress.level={level}")
+        config = composed("method=padgs", *stress)
+        assert build(config).options == replace(config.options, precision=precision)
+        assert config.options.precision == "float32" == config.values()["method"]["precision"]
+        explicit = composed("method=omnigs", *stress)
+        assert build(explicit).options == explicit.options
+
+
+def test_levels_that_a_condition_does_not_have_are_no_runs_of_their_own():
+    second, third = (composed("method=padgs", "stress.condition=precision", f"stress.level={n}") for n in (2, 3))
+    assert third.values() == second.values() and third.row == "precision 2"
 
 
 def test_a_run_without_stress_is_the_run_that_it_was_before_there_was_any():

@@ -1,4 +1,4 @@
-"""Six cells of the matrix that stand for the others: padgs_plus on the built-in room, small, and a number each.
+"""Cells of the matrix that stand for the others: padgs_plus on the built-in room, small, and a number each.
 
 What a cell may cost is some way above what it costs today (LOG.md, 2026-11-22), so that luck breaks none of them.
 """
@@ -65,6 +65,12 @@ def test_a_hundredth_of_the_points_is_enough_to_begin_with():
 
 def test_a_quarter_of_the_views_does_not_collapse():
     assert lost("few_views", 2) < 2 and marks("few_views", 2)["depth_error"] < 0.3
+
+
+@pytest.mark.parametrize("level", [1, 2])
+def test_networks_may_multiply_in_fewer_bits(level):
+    rest, reduced = (marks(name, level, "method=padgs_small")["ws_psnr"] for name in ("none", "precision"))
+    assert 0 < abs(rest - reduced) < 0.3
 
 
 def test_rates_ten_times_as_high_end_without_a_nan():
