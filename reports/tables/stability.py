@@ -13,10 +13,12 @@ from padgs.reports.survival import HALF, QUALITY, Survivor, in_order, survivors
 from padgs.reports.tables.cells import spread
 from padgs.reports.tables.table import Block, Cell, Column, Row, Table
 
-UNSTRESSED = {  # title -> column of the frame, or of the one that is subtracted from the other
+EQUATOR, POLE = "stability/ws_psnr_equator", "stability/ws_psnr_pole"
+UNSTRESSED = {  # title -> column of the frame, and those that are subtracted from it
     "WS-PSNR, dB": (QUALITY,),
     "training views above test views, dB": ("stability/ws_psnr_training", QUALITY),
-    "equator above poles, dB": ("stability/ws_psnr_equator", "stability/ws_psnr_pole"),
+    "equator above poles, dB": (EQUATOR, POLE),
+    "the same, above a truth blurred alike, dB": (EQUATOR, POLE, "stability/pole_gap_oracle"),
     "seam": ("stability/seam",),
     "yaw error": ("stability/yaw_error",),
     "depth error (AbsRel)": ("stability/depth_error",),
@@ -64,16 +66,15 @@ def _scores(columns: Sequence[Survivor | None]) -> tuple[Row, ...]:
         Row("worst quartile", tuple(Cell(one and one.worst_quartile) for one in columns)),
         Row("failure rate", tuple(Cell(one and one.failure_rate) for one in columns)),
     ]
-    for title, names in UNSTRESSED.items():
-        rows.append(Row(f"unstressed: {title}", tuple(_unstressed(one, *names) for one in columns)))
-    return tuple(rows)
+    unstressed = {title: tuple(_unstressed(one, *names) for one in columns) for title, names in UNSTRESSED.items()}
+    known = {title: cells for title, cells in unstressed.items() if any(cell.value is not None for cell in cells)}
+    return (*rows, *(Row(f"unstressed: {title}", cells) for title, cells in known.items()))
 
 
-def _unstressed(one: Survivor | None, name: str, other: str | None = None) -> Cell:
-    if one is None or name not in one.rest:
+def _unstressed(one: Survivor | None, name: str, *others: str) -> Cell:
+    if one is None or not {name, *others} <= {*one.rest}:
         return Cell()
-    values = one.rest[name] - (one.rest[other] if other else 0)
-    return spread(values.dropna().tolist())
+    return spread((one.rest[name] - one.rest[[*others]].sum(axis=1, skipna=False)).dropna().tolist())
 
 
 def _retentions(columns: Sequence[Survivor | None]) -> tuple[Row, ...]:

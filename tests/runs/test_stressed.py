@@ -53,6 +53,7 @@ def test_a_run_says_what_it_is_stressed_by_and_has_marks_that_show_harm(run):
     marks = made.scores["stability"].metrics
     assert marks["ws_psnr"] > marks["ws_psnr_one_color"] and marks["ws_psnr_training"] > 0
     assert 0 < marks["depth_error"] < 0.5 and marks["yaw_error"] < 1e-4
+    assert marks["pole_gap_oracle"] < -20  # its poles are nearly empty
     assert run("stress.condition=few_views", "stress.level=1")[0] == made  # found again
 
 

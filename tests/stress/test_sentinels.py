@@ -67,6 +67,12 @@ def test_a_quarter_of_the_views_does_not_collapse():
     assert lost("few_views", 2) < 2 and marks("few_views", 2)["depth_error"] < 0.3
 
 
+def test_no_detail_at_the_poles_is_lost_that_an_even_blur_would_keep():
+    for spokes, dB in ((4, 1), (16, 2)):
+        poles = marks("none", 1, "data.generator.scene=pole_torture", f"data.generator.spokes={spokes}")
+        assert poles["ws_psnr_equator"] - poles["ws_psnr_pole"] - poles["pole_gap_oracle"] < dB
+
+
 @pytest.mark.parametrize("level", [1, 2])
 def test_networks_may_multiply_in_fewer_bits(level):
     rest, reduced = (marks(name, level, "method=padgs_small")["ws_psnr"] for name in ("none", "precision"))
