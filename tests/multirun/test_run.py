@@ -134,6 +134,8 @@ def test_a_folder_that_cannot_be_written_is_a_clear_error(start, tmp_path, argum
                 ("method=foo", "Available options in 'method'"),
                 ("+experiment=foo", "Available options in 'experiment'"),
                 ("data.path=/no/such/folder", "/no/such/folder"),
+                ("protocol=null", "protocol is a group of settings, chosen by name"),
+                ("render.near=${nothing}", "Interpolation key 'nothing' not found"),
             )
         ),
     ],

@@ -62,6 +62,12 @@ def test_a_longer_schedule_is_trained_to_its_end(run):
     assert (made.iterations, made.iterations_done) == (20, 20)
 
 
+@pytest.mark.parametrize("method", ["omnigs", "spags_sorted", "padgs", "padgs_plus"])
+def test_rates_a_thousand_times_as_high_never_end_well(run, method):
+    made, said = run(f"method={method}", "train.learning_rates=1000")
+    assert made.status not in ("ok", "rejected") and made.reason in said.replace("\n", " ")
+
+
 def test_wrong_depths_are_degenerate(run, monkeypatch):
     monkeypatch.setattr(session.data, "load", lambda path, format, options: with_depth(0.3))
     made, said = run()
