@@ -115,6 +115,11 @@ def test_a_file_from_before_the_memory_of_a_gpu_was_measured_is_read(result, tmp
         ({"counts": {"gaussians": "many"}}, "counts.gaussians is 'many'"),
         ({"config": {"train": []}}, r"config.train is \[\], which is no group"),
         ({"config": {"budget": {"seconds": "long"}}}, "could not convert"),
+        (
+            {"config": {"budget": {"clock": "cpu; rm -rf ."}}},
+            "config.budget.clock is 'cpu; rm -rf .', which is no name",
+        ),
+        ({"config": {"budget": {"clock": ["cpu"]}}}, "config.budget.clock is .'cpu'."),
         ({"config": {"protocol": {"sphere": "sphere"}}}, "rules of a protocol are 'sphere'"),
     ],
 )

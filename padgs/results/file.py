@@ -142,7 +142,10 @@ def _refuse_other_types(result: Result) -> None:
     for name in CONFIG_GROUPS & result.config.keys():
         if not isinstance(result.config[name], dict):
             raise TypeError(f"config.{name} is {result.config[name]!r}, which is no group of settings")
-    float(result.config.get("budget", {}).get("seconds") or 0)
+    budget = result.config.get("budget", {})
+    float(budget.get("seconds") or 0)
+    if not PLAIN.fullmatch(str(clock := budget.get("clock", "wall"))):  # findings print it in a command
+        raise ValueError(f"config.budget.clock is {clock!r}, which is no name")
     rules = [*result.config.get("protocol", {}).values(), *(scores.protocol for scores in result.scores.values())]
     if odd := [rule for rule in rules if not isinstance(rule, dict)]:
         raise TypeError(f"the rules of a protocol are {odd[0]!r}; they must be a table")

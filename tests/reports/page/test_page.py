@@ -41,9 +41,10 @@ def test_it_has_the_tables_the_charts_and_what_was_left_out(html):
 
 
 def test_what_names_contain_is_text_and_not_markup():
-    evil = small(25.0, scene="</script><b-x>$a_b", method="<i-x>")
-    html = page.html(gathered([evil]))
-    assert "<b-x>" not in html and "<i-x>" not in html and "&lt;b-x&gt;$a_b" in html
+    evil = "</script><b-x>$a_b"
+    texts = {"scene": evil, "code_version": evil, "finished": evil, "machine": {"gpu": evil}}
+    html = page.html(gathered([small(25.0, method="<i-x>", **texts), replace(failed(evil, "oom"), reason=evil)]))
+    assert "<b-x>" not in html and "<i-x>" not in html and html.count("&lt;b-x&gt;$a_b") > 10
 
 
 def test_runs_without_pictures_give_a_page_without_them():

@@ -146,6 +146,15 @@ def test_it_is_written_and_stands_on_the_page():
     assert 'id="stability"' in html and 'id="heat_maps"' in html
 
 
+def test_the_name_of_a_condition_is_text_and_not_markup():
+    evil = "</script><b-x>"
+    made = [run("omnigs", 22.0), run("omnigs", 21.0, evil, 1)]
+    table, *charts = stability(gathered(made))
+    assert "<b-x>" not in markdown.text(table) and all("<b-x>" not in chart.svg for chart in charts)
+    html = page.html(gathered(made))
+    assert "<b-x>" not in html and "&lt;b-x&gt; 1" in html
+
+
 def test_without_such_runs_there_is_nothing():
     (table,) = stability(gathered([failed("", "oom")]))
     assert table.blocks == ()
