@@ -37,6 +37,13 @@ def test_a_blur_is_the_same_wherever_it_looks():
         assert sample(wide, at).item() == pytest.approx(spot**2 / (spot**2 + sigma**2), rel=0.05)
 
 
+def test_it_goes_on_beyond_the_poles():
+    """Of directions themselves all that a blur changes is their length."""
+    ahead = rays(WIDTH, HEIGHT)
+    for sigma in (0.01, 0.1):  # the first leans on half a pixel across a pole
+        assert (blurred(ahead, sigma) - ahead * math.exp(-(sigma**2))).abs().max() < 5e-4
+
+
 def test_the_oracle_is_as_good_as_the_image_and_knows_where_the_detail_is():
     gaps = []
     for target in (detail(0.02), detail(0.3, 0.02)):
