@@ -55,7 +55,7 @@ class _DecodeOnGPU(torch.autograd.Function):
         constants = [t.detach().contiguous() for t in (positions, offsets, log_scales, attenuation)]
         weights = [w.detach() for w in weights]
         w1, b1 = functional.pad(torch.cat(weights[0::4]), (0, padding)).to(dtype), torch.cat(weights[1::4]).to(dtype)
-        hidden = torch._addmm_activation(b1, inputs, w1.T)  # of which ReLU is the default
+        hidden = torch.ops.aten._addmm_activation(b1, inputs, w1.T)  # ReLU is its default
         parts = hidden.split(len(weights[0]), dim=1)
         opacity, color, covariance = (
             torch.addmm(b2.to(dtype), part, w2.to(dtype).T).float()
