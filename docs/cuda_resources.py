@@ -19,6 +19,7 @@ REGISTERS = 65536  # of an SM; a warp takes them in units of 256
 # Threads, blocks and bytes of shared memory of an SM, by compute capability: CUDA C++ Programming Guide, "Compute
 # Capabilities".
 SMS = {
+    75: (1024, 16, 64 << 10),
     80: (2048, 32, 164 << 10),
     86: (1536, 16, 100 << 10),
     89: (1536, 24, 100 << 10),

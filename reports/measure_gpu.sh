@@ -37,7 +37,8 @@ kernels() { $python -m pytest -q -m cuda tests/render/cuda --junitxml="$out/kern
 tests() { $python -m pytest -q -m cuda tests/render --ignore=tests/render/cuda --junitxml="$out/tests.xml"; }
 sanitizer() {
   compute-sanitizer --tool "$1" --error-exitcode 99 $python -m pytest -q -x -m cuda -k "not long and not any_size" \
-    tests/render/cuda/test_cuda_backend.py tests/render/cuda/test_cuda_decoder.py tests/render/cuda/test_cuda_loss.py
+    tests/render/cuda/test_cuda_backend.py tests/render/cuda/test_cuda_decoder.py tests/render/cuda/test_cuda_loss.py \
+    tests/render/cuda/test_cuda_splats.py
 }
 # Without torch's cache of memory, in which it sees one large block that has been written before.
 memcheck() { PYTORCH_NO_CUDA_MEMORY_CACHING=1 sanitizer memcheck; }

@@ -54,6 +54,11 @@ class OnDevice:
         """One iteration of the trainer."""
         next(self._records)
 
+    def explicit(self) -> Callable[[], object]:
+        """One iteration of the trainer of as many explicit Gaussians."""
+        records = self.work.explicit_trainer(self.options).records()
+        return lambda: next(records)
+
 
 def resident(scene: Scene, device: torch.device) -> Scene:
     """The scene as a run trains on it: poses on the device, and panoramas as bytes there."""

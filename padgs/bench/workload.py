@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 
 import torch
 from torch import Tensor
@@ -20,8 +20,13 @@ from padgs.anchors.model import PaDGS
 from padgs.anchors.trainee import AnchorTrainee, LearningRates
 from padgs.learning.budget import Budget
 from padgs.learning.loop import Stage, Trainer
+from padgs.learning.schedule import Constant, ParameterGroup
 from padgs.render import RenderOptions
+from padgs.render.config import RenderConfig
 from padgs.scene import Scene, View
+from padgs.splats.clone_split import CloneSplitOptions
+from padgs.splats.model import Splats
+from padgs.splats.trainee import SplatTrainee
 
 NEAREST, FURTHEST = 1.0, 4.0  # distances of anchors, world units, uniform
 SIGMA = 0.7  # median size of a Gaussian's axis, in pixels of the equator
@@ -91,6 +96,26 @@ class Workload:
         growth = GrowthOptions(statistics_from=0, grow_from=grow_from, grow_until=NEVER, grow_every=1 if grows else 100)
         trainee = AnchorTrainee(self.model, options, growth=growth, rates=STILL, extent=1.0, iterations=NEVER)
         return Trainer(trainee, self.scene, Budget(NEVER), stage=stage)
+
+    def explicit_trainer(self, options: RenderOptions = OPTIONS) -> Trainer:
+        """That of the Gaussians of the first view, each for itself with harmonics of all degrees; nothing learns."""
+        with torch.no_grad():
+            seen = self.model.decode(self.view).gaussians
+        splats = Splats(seen.means, seen.scales.log(), seen.colors)
+        splats.opacity_logits.data, splats.quats.data = seen.opacities.logit(), seen.quats
+        splats.active_degree = splats.degree
+        config = RenderConfig(**asdict(options))
+        return Trainer(
+            StillSplats(splats, CloneSplitOptions(), config, extent=1.0, iterations=NEVER), self.scene, Budget(NEVER)
+        )
+
+
+class StillSplats(SplatTrainee):
+    """Splats that stay as they are, though the optimiser does all of its work."""
+
+    def groups(self, means_speed: float = 1.0) -> list[ParameterGroup]:
+        """All parameters."""
+        return [replace(group, learning_rate=Constant(0.0)) for group in super().groups(means_speed)]
 
 
 def build(size: Size, seed: int = 0) -> Workload:

@@ -23,6 +23,7 @@ from padgs.native.abi import (
     NativeCamera,
     Pointer,
     RayPointers,
+    SplatArguments,
     fields,
 )
 from padgs.native.loading import declared, opened
@@ -110,6 +111,10 @@ class DeviceLossArguments(ctypes.Structure):
     _fields_ = [("loss", LossArguments), *fields(Pointer, "total", "block_sums")]
 
 
+class DeviceSplatArguments(ctypes.Structure):
+    _fields_ = [("splats", SplatArguments), ("center", Pointer)]
+
+
 class DeviceDecodeArguments(ctypes.Structure):
     _fields_ = [("decode", DecodeArguments), ("room", Int64), *fields(Pointer, "color_logits", "covariance_logits")]
 
@@ -140,6 +145,7 @@ STRUCTURES = (
     BlendGradientInputs,
     RemovalInputs,
     DeviceLossArguments,
+    DeviceSplatArguments,
     DeviceDecodeArguments,
     DeviceDecodeGradientArguments,
     NetworkInputs,
@@ -162,6 +168,7 @@ SIGNATURES: dict[str, tuple[list, Any]] = {
     "padgs_cuda_blend_backward": ([Pointer, Pointer], Int32),
     "padgs_cuda_leave_one_out": ([Pointer, Pointer], Int32),
     "padgs_cuda_project_backward": ([Pointer, Pointer], Int32),
+    "padgs_cuda_splats": ([Pointer, Pointer], Int32),
     "padgs_cuda_decode_place": ([Pointer, Pointer], Int32),
     "padgs_cuda_decode_take_back": ([Pointer, Pointer], Int32),
     "padgs_cuda_networks_fit": ([Pointer, Int32, Int32, Int32, Int32], Int32),

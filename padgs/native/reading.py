@@ -13,7 +13,8 @@ class Reading:
         self._event = None
         device = values.device
         if device.type == "cuda":
-            values = torch.empty(values.shape, dtype=values.dtype, pin_memory=True).copy_(values, non_blocking=True)
+            pinned = torch.empty(values.shape, dtype=values.dtype, device="cpu", pin_memory=True)
+            values = pinned.copy_(values, non_blocking=True)
             self._event = torch.cuda.Event()
             self._event.record(torch.cuda.current_stream(device))
         self._values = values

@@ -1,11 +1,13 @@
 """Splats as a view sees them, and the derivatives by what is learned, in one native call each (csrc/cpu/splats.cpp).
 
-`padgs.splats.model.Splats` has the definition.
+`padgs.splats.model.Splats` has the definition; `padgs.splats.gpu_splats` fills the same structure.
 """
 
 from __future__ import annotations
 
 import ctypes
+import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -42,7 +44,14 @@ def fits(means: Tensor, center: Tensor) -> bool:
     return on_cpu and not center.requires_grad and cpu.available()
 
 
-def native_splats(learned: Learned, degree: int, center: Tensor, tiny: float) -> Seen:
+def _run(sizes: tuple, center: Tensor, tiny: float, *tensors: Tensor | None) -> None:
+    arguments = SplatArguments(*sizes, (ctypes.c_float * 3)(*center.tolist()), tiny, *map(pointer, tensors))
+    cpu.library().padgs_splats(ctypes.byref(arguments))
+
+
+def native_splats(
+    learned: Learned, degree: int, center: Tensor, tiny: float, *, run: Callable[..., None] = _run
+) -> Seen:
     """The Gaussians that a camera sees, differentiable by all that is learned and by the probe.
 
     Args:
@@ -50,22 +59,23 @@ def native_splats(learned: Learned, degree: int, center: Tensor, tiny: float) ->
         degree: of the harmonics that is in use.
         center: [3] of the camera, world.
         tiny: what is added to distances, in squares; world units.
+        run: calls a library with sizes, center, tiny and tensors as `SplatArguments` has them.
     """
-    return Seen(*_Splats.apply(degree, center, tiny, *learned))
+    return Seen(*_Splats.apply(run, degree, center, tiny, *learned))
 
 
 class _Splats(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, degree: int, center: Tensor, tiny: float, *learned: Any):
+    def forward(ctx: Any, run: Callable[..., None], degree: int, center: Tensor, tiny: float, *learned: Any):
         parameters, probe = [tensor.contiguous() for tensor in learned[:-1]], learned[-1]
         means, log_scales, opacity_logits, dc, rest = parameters
         probe = None if probe is None else probe.contiguous()
         width = 0 if probe is None else probe.shape[1]
         like = (means, log_scales, opacity_logits, dc, opacity_logits if width > 3 else None)
         seen = tuple(map(_empty_like, like))
-        ctx.scalars = (len(means), degree, rest.shape[1], width, (ctypes.c_float * 3)(*center.tolist()), tiny)
+        ctx.run = functools.partial(run, (len(means), degree, rest.shape[1], width), center, tiny)
         ctx.save_for_backward(*parameters, probe, *seen)
-        _run(ctx.scalars, *parameters, probe, *seen)
+        ctx.run(*parameters, probe, *seen)
         return seen
 
     @staticmethod
@@ -73,13 +83,9 @@ class _Splats(torch.autograd.Function):
         saved = ctx.saved_tensors
         contiguous = (None if gradient is None else gradient.contiguous() for gradient in upstream)
         gradients = tuple(map(_empty_like, saved[: len(Learned._fields)]))
-        _run(ctx.scalars, *saved, *contiguous, *gradients)
-        return None, None, None, *gradients
+        ctx.run(*saved, *contiguous, *gradients)
+        return None, None, None, None, *gradients
 
 
 def _empty_like(tensor: Tensor | None) -> Tensor | None:
     return None if tensor is None else torch.empty_like(tensor)
-
-
-def _run(scalars: tuple, *tensors: Tensor | None) -> None:
-    cpu.library().padgs_splats(ctypes.byref(SplatArguments(*scalars, *map(pointer, tensors))))

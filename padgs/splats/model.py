@@ -13,7 +13,7 @@ from padgs.learning.cloud import refuse_unusable, squared_spacing
 from padgs.learning.rows import load_rows
 from padgs.scene import Scene, View
 from padgs.sphere import harmonics as spherical_harmonics
-from padgs.splats import cpu_splats
+from padgs.splats import cpu_splats, gpu_splats
 
 INITIAL_OPACITY = 0.1
 SMALLEST_SCALE = 1e-4  # initial scale of coinciding points, in scene units
@@ -123,10 +123,11 @@ class Splats(nn.Module):
         Of a probe [N, 4] the last values, in the same unit, are returned, too, [N]: see `padgs.splats.probes`.
         """
         center, tiny = view.center.to(self.means), TINY * self.unit
-        if cpu_splats.fits(self.means, center):
-            learned = (self.means, self.log_scales, self.opacity_logits, self.sh_dc, self.sh_rest)
-            seen = cpu_splats.native_splats(cpu_splats.Learned(*learned, probe), self.active_degree, center, tiny)
-            return Gaussians(seen.means, self.quats, seen.scales, seen.opacities, seen.colors), seen.pulls
+        for native in (cpu_splats, gpu_splats):
+            if native.fits(self.means, center):
+                learned = (self.means, self.log_scales, self.opacity_logits, self.sh_dc, self.sh_rest)
+                seen = native.native_splats(cpu_splats.Learned(*learned, probe), self.active_degree, center, tiny)
+                return Gaussians(seen.means, self.quats, seen.scales, seen.opacities, seen.colors), seen.pulls
         means, pulls = self.means, None
         if probe is not None:
             steps = 0.5 * (means.detach() - center).norm(dim=-1, keepdim=True) * probe

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from padgs.gaussians import Gaussians
 from padgs.render import RenderOptions, render
+from padgs.render.backends.native_camera import native_rays
 from padgs.sphere.camera import Camera, Panorama, Pinhole, RayTable
 from padgs.sphere.panorama import project as pixel_of
 
@@ -164,3 +165,14 @@ def test_the_gradient_of_the_rays_is_that_of_the_pose(projection: str, backend: 
         torch.testing.assert_close(rays_turn, camera_turn, rtol=1e-6 if dtype == torch.float64 else 1e-3, atol=1e-3)
     along = (by_table * table).sum(-1)  # the length of a ray means nothing
     assert along.abs().max() <= 1e-4 * by_table.norm(dim=-1).max()
+
+
+def test_a_table_is_brought_to_a_device_once_and_again_where_it_changes():
+    table = Panorama(20, 10).rays()
+    camera = RayTable(table, 20 / 6)
+    first = native_rays(camera).table
+    assert native_rays(camera).table is first and native_rays(RayTable(table, 5.0)).table is first
+    table.neg_()
+    second = native_rays(camera).table
+    assert first is not None and second is not None and torch.equal(second, -first)
+    assert native_rays(camera, torch.device("meta")).table.device.type == "meta"

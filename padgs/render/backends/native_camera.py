@@ -93,10 +93,18 @@ def _panorama_rays(width: int, height: int, device: torch.device) -> Tensor:
 
 
 def native_rays(camera: Camera, device: torch.device = CPU) -> NativeRays:
-    """Directions of the pixels; computed once, for each device, for cameras that are formulas."""
-    if isinstance(camera, RayTable):
-        return NativeRays(table=_padded_table(camera.table.detach().to(device, torch.float32)))
-    return _formula_rays(camera, device)
+    """Directions of the pixels; computed once for a camera and a device, and again where a table has changed."""
+    if not isinstance(camera, RayTable):
+        return _formula_rays(camera, device)
+    state, known = (camera.table._version, device), _padded_tables.get(camera.table)
+    if known is None or known[0] != state:
+        padded = _padded_table(camera.table.detach().to(device, torch.float32))
+        known = _padded_tables[camera.table] = state, padded
+    return NativeRays(table=known[1])
+
+
+# Of tables as they were at some version of theirs, on a device.
+_padded_tables: MutableMapping[Tensor, tuple[tuple[int, torch.device], Tensor]] = WeakTensorKeyDictionary()
 
 
 @functools.lru_cache(maxsize=16)

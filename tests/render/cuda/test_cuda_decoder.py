@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from padgs.anchors import gpu_decoder
 from padgs.anchors.decoder import (
     Decoder,
     DecoderWeights,
@@ -76,6 +77,15 @@ def test_the_gpu_matches_the_definition(anchors: int, offsets: int, inputs: int,
         limit = 2e-5 * expected.abs().max().clamp(min=1e-6)
         assert (gradients[name] - expected).abs().max() <= limit, name
         assert expected.any() or anchors == 1, name
+
+
+@pytest.mark.parametrize("part", [100, 128])
+def test_products_in_parts_sum_up_to_the_whole(part: int, generator: torch.Generator, monkeypatch: pytest.MonkeyPatch):
+    tensors, decoder = problem(300, 10, 37, 32, generator)
+    whole = decoded(on_gpu, tensors, decoder)[3]
+    monkeypatch.setattr(gpu_decoder, "PART", part)
+    for name, gradient in decoded(on_gpu, tensors, decoder)[3].items():
+        assert (gradient - whole[name]).abs().max() <= 2e-6 * whole[name].abs().max(), name
 
 
 REDUCED = pytest.mark.parametrize("precision", ["bfloat16", "float16"])

@@ -55,6 +55,7 @@ def test_every_kernel_of_every_architecture_is_a_row():
     ("kernel", "occupancy"),
     [
         (Kernel("by threads", 90, 32, 0, 0, 256), 1.0),
+        (Kernel("by threads", 75, 64, 0, 0, 256), 1.0),  # of which that has half as many
         (Kernel("by registers", 90, 64, 0, 0, 256), 0.5),  # 65536 / (64 * 256) = 4 blocks
         (Kernel("in steps of 256", 90, 65, 0, 0, 256), 0.375),
         (Kernel("by shared memory", 86, 32, 0, 26 << 10, 256), 0.5),  # 3 of 100 KiB

@@ -1,4 +1,4 @@
-"""How often the host waits while PaD-GS trains with the kernels: those of the emulation, on a GPU that is not there.
+"""How often the host waits while a method trains with the kernels: those of the emulation, on a GPU that is not there.
 
 Numbers that are read beside the drawing (`Reading`) are no wait: the device goes on with what it has.
 """
@@ -6,6 +6,7 @@ Numbers that are read beside the drawing (`Reading`) are no wait: the device goe
 from __future__ import annotations
 
 from collections import Counter
+from contextlib import contextmanager
 from dataclasses import replace
 from itertools import islice
 
@@ -25,7 +26,14 @@ from padgs.learning.loop import Trainer
 from padgs.learning.native_loss import EVALUATIONS
 from padgs.native import LIBRARIES, cuda
 from padgs.native.reading import Reading
+from padgs.native.watch import Stage, watched
 from padgs.render import RenderOptions
+from padgs.render.backends import cuda as cuda_backend
+from padgs.render.config import RenderConfig
+from padgs.splats.clone_split import CloneSplitOptions
+from padgs.splats.model import Splats
+from padgs.splats.probes import SIGNALS
+from padgs.splats.trainee import SplatTrainee
 
 pytestmark = pytest.mark.skipif(cuda_engine.ON_GPU or cuda_engine.COMPILER is None, reason="for the emulation")
 SIZE = Size(32, 16, 100, views=3)
@@ -38,6 +46,7 @@ def kernels_are_there(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(LIBRARIES, GPU.type, cuda)
     monkeypatch.setitem(EVALUATIONS, GPU.type, EVALUATIONS["cuda"])
     monkeypatch.setattr(Reading, "values", lambda reading: reading._values.held.tolist())
+    monkeypatch.setattr(cuda_backend, "_rooms", {})
 
 
 def trained(precision: str) -> tuple[Trainer, list[Counter[str]]]:
@@ -50,12 +59,29 @@ def trained(precision: str) -> tuple[Trainer, list[Counter[str]]]:
         trainee = AnchorTrainee(
             work.model, RenderOptions(), "cuda", growth=growth, rates=LearningRates(), extent=1.0, iterations=1000
         )
-        waited, trainer = [], Trainer(trainee, resident(work.scene, GPU), Budget(1000))
+        trainer = Trainer(trainee, resident(work.scene, GPU), Budget(1000))
+        return trainer, steps_of(trainer, waits)
+
+
+def steps_of(trainer: Trainer, waits: Counter[str]) -> list[Counter[str]]:
+    """Train; what made the host wait, iteration by iteration."""
+    waited = []
+    waits.clear()
+    for _ in islice(trainer.records(), STEPS):
+        waited.append(Counter(waits))
         waits.clear()
-        for _ in islice(trainer.records(), STEPS):
-            waited.append(Counter(waits))
-            waits.clear()
-        return trainer, waited
+    return waited
+
+
+def stage_of(called: list[str]) -> Stage:
+    """Notes the names of the library's functions that are called."""
+
+    @contextmanager
+    def stage(name: str):
+        called.append(name)
+        yield
+
+    return stage
 
 
 def learned(trainer: Trainer) -> dict[str, Tensor]:
@@ -84,3 +110,19 @@ def test_too_little_room_is_noticed_and_changes_nothing(monkeypatch: pytest.Monk
     assert any(waited[2:]), "it was decoded once more"
     for name, tensor in learned(trainer).items():
         assert torch.equal(enough[name], tensor), name
+
+
+@pytest.mark.parametrize("signal", SIGNALS)
+def test_an_iteration_of_explicit_gaussians_waits_for_nothing(signal: str):
+    work = build(SIZE)
+    with torch.no_grad():
+        seen = work.model.decode(work.view).gaussians
+    splats = Splats(seen.means, seen.scales.log(), seen.colors, degree=3)
+    splats.active_degree = 3
+    options, config = CloneSplitOptions(signal=signal), RenderConfig("ray", backend="cuda")
+    with pretended_gpu() as waits, watched(stage_of(called := [])):
+        trainee = SplatTrainee(splats.to(GPU), options, config, extent=1.0, iterations=30_000)
+        trainer = Trainer(trainee, resident(work.scene, GPU), Budget(30_000))
+        waited = steps_of(trainer, waits)
+    assert waited[0] and waited[2:] == [Counter()] * (STEPS - 2), waited  # the first counts instances
+    assert called.count("padgs_cuda_splats") == 2 * STEPS and trainee.densifier.statistics["gradient"].held.any()

@@ -118,6 +118,11 @@ struct NetworkGradientArguments {
   NetworkInputs inputs;
 };
 
+struct DeviceSplatArguments {
+  SplatArguments splats;  // its center is not used
+  const float *center;    // [3]
+};
+
 // The loss over all pixels is the sum of block_sums / total. Its workspace holds dL by three window means,
 // [3, H, W, 3].
 struct DeviceLossArguments {

@@ -23,6 +23,7 @@ PADGS_API int64_t padgs_cuda_structure_bytes(int32_t index) {
                           sizeof(BlendGradientInputs),
                           sizeof(RemovalInputs),
                           sizeof(DeviceLossArguments),
+                          sizeof(DeviceSplatArguments),
                           sizeof(DeviceDecodeArguments),
                           sizeof(DeviceDecodeGradientArguments),
                           sizeof(NetworkInputs),

@@ -48,27 +48,31 @@ __device__ inline float2 unpacked(uint32_t pair, Float16) {
   return __half22float2(reinterpret_cast<const __half2 &>(pair));
 }
 
+// Where the code is of an older capability, nobody calls what it has not; `padgs_cuda_networks_fit` sees to it.
 #if __CUDA_ARCH__ >= 800
 #define PADGS_MMA(type)                                                                                            \
   asm volatile("mma.sync.aligned.m16n8k16.row.col.f32." type "." type ".f32 {%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, " \
                "{%0,%1,%2,%3};"                                                                                      \
                : "+f"(sums.of[0]), "+f"(sums.of[1]), "+f"(sums.of[2]), "+f"(sums.of[3])                              \
                : "r"(a.pairs[0]), "r"(a.pairs[1]), "r"(a.pairs[2]), "r"(a.pairs[3]), "r"(b.pairs[0]), "r"(b.pairs[1]))
+#define PADGS_MOVMATRIX asm volatile("movmatrix.sync.aligned.m8n8.trans.b16 %0, %1;" : "=r"(result) : "r"(pair))
 #else
 #define PADGS_MMA(type) __trap()
+#define PADGS_MOVMATRIX __trap()
 #endif
 
 // Adds a product of matrices to sums.
 __device__ inline void multiply_add(Sums &sums, const FragmentA &a, const FragmentB &b, Bfloat16) { PADGS_MMA("bf16"); }
 __device__ inline void multiply_add(Sums &sums, const FragmentA &a, const FragmentB &b, Float16) { PADGS_MMA("f16"); }
-#undef PADGS_MMA
 
 // Of an 8x8 matrix of 16-bit numbers: row group, columns 2 thread and 2 thread + 1 in, those of its transpose out.
 __device__ inline uint32_t transposed(uint32_t pair) {
-  uint32_t result;
-  asm volatile("movmatrix.sync.aligned.m8n8.trans.b16 %0, %1;" : "=r"(result) : "r"(pair));
+  uint32_t result = 0;
+  PADGS_MOVMATRIX;
   return result;
 }
+#undef PADGS_MMA
+#undef PADGS_MOVMATRIX
 
 }  // namespace padgs
 #endif

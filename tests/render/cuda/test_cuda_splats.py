@@ -1,0 +1,72 @@
+"""Explicit Gaussians as a view sees them, by the GPU against their definition: values and gradients; or emulated."""
+
+from __future__ import annotations
+
+import cuda_engine
+import pytest
+import torch
+from torch import Tensor
+
+from padgs.scene import View
+from padgs.splats import cpu_splats, gpu_splats
+from padgs.splats.model import Splats
+
+pytestmark = [*cuda_engine.marks()]
+DEVICE = "cuda" if cuda_engine.ON_GPU else "cpu"
+POSE = torch.eye(4)
+POSE[:3, 3] = torch.tensor([0.1, -0.2, 0.3])
+VIEW = View("v", POSE.to(DEVICE), 32, 16)
+
+
+def splats_of(count: int, stored: int, active: int, generator: torch.Generator) -> Splats:
+    """Of all sizes and opacities, the first in the camera; some colours are cut at 0."""
+    means = torch.randn(count, 3, generator=generator)
+    means[0] = -POSE[:3, 3]
+    log_scales = 3 * torch.randn(count, 3, generator=generator) - 4
+    splats = Splats(means, log_scales, torch.rand(count, 3, generator=generator), degree=stored)
+    splats.opacity_logits.data = 4 * torch.randn(count, generator=generator)
+    splats.sh_rest.data = 0.4 * torch.randn(splats.sh_rest.shape, generator=generator)
+    splats.active_degree = active
+    return splats.to(DEVICE)
+
+
+def seen(splats: Splats, width: int, how: str, monkeypatch: pytest.MonkeyPatch) -> list[Tensor]:
+    """Values and gradients, by kernels or by the definition."""
+    probe = 0.1 * torch.ones(len(splats), width, device=DEVICE).cumsum(-1).requires_grad_() if width else None
+    with monkeypatch.context() as patch:
+        patch.setattr(cpu_splats, "fits", lambda *_: False)
+        patch.setattr(gpu_splats, "fits", lambda *_: how == "kernels")
+        gaussians, pulls = splats.probed(VIEW, probe)
+    values = [gaussians.means, gaussians.scales, gaussians.opacities, gaussians.colors]
+    values += [] if pulls is None else [pulls]
+    generator = torch.Generator().manual_seed(0)
+    upstream = [torch.randn(value.shape, generator=generator).to(DEVICE) for value in values]
+    leaves = [*splats.parameters(), *([] if probe is None else [probe])]
+    gradients = torch.autograd.grad(values, leaves, upstream, allow_unused=True)
+    return [*values, *(torch.zeros((), device=DEVICE) if one is None else one for one in gradients)]
+
+
+@pytest.mark.parametrize("count", [1, 128, 300])
+@pytest.mark.parametrize("width", [0, 3, 4])
+@pytest.mark.parametrize("stored", [0, 1, 2, 3])
+def test_values_and_gradients_are_those_of_the_definition(monkeypatch, generator, stored: int, width: int, count: int):
+    for active in range(stored + 1):
+        splats = splats_of(count, stored, active, generator)
+        found, expected = (seen(splats, width, how, monkeypatch) for how in ("kernels", "definition"))
+        for ours, truth in zip(found, expected, strict=True):
+            limit = 4e-6 * max(1.0, float(truth.detach().abs().max()))
+            torch.testing.assert_close(ours, truth.expand_as(ours), atol=limit, rtol=2e-6)
+
+
+def test_what_is_no_number_stays_none(monkeypatch: pytest.MonkeyPatch, generator: torch.Generator):
+    splats = splats_of(5, 3, 3, generator)
+    splats.sh_rest.data[2, 4, 1] = float("nan")
+    colors = seen(splats, 0, "kernels", monkeypatch)[3]
+    assert colors.isnan().nonzero().tolist() == [[2, 1]]
+
+
+def test_there_are_kernels_for_float32_on_a_gpu_and_a_camera_that_does_not_learn(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(gpu_splats.LIBRARIES, DEVICE, gpu_splats.cuda)
+    means, center = torch.zeros(2, 3, device=DEVICE), torch.zeros(3, device=DEVICE)
+    assert gpu_splats.fits(means, center)
+    assert not gpu_splats.fits(means.double(), center) and not gpu_splats.fits(means, center.requires_grad_())
