@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from padgs.learning.targets import even_weight
+from padgs.plus.sweep import swept
 from padgs.scene import Scene, View
 
 NEIGHBOURS = 4  # points that say how far a new one is
@@ -33,7 +35,8 @@ def filled(scene: Scene, count: int, *, generator: torch.Generator) -> Scene:
     if missing <= 0 or len(cloud) == 0:
         return scene
     views = scene.train[:: math.ceil(len(scene.train) / MOST_VIEWS)]
-    made = [_seen(view, cloud, math.ceil(missing / len(views)), generator) for view in views]
+    each = math.ceil(missing / len(views))
+    made = [_seen(view, cloud, each, generator, scene.train) for view in views]
     points, colors = (torch.cat(parts) for parts in zip(*made, strict=True))
     return replace(
         scene,
@@ -42,7 +45,9 @@ def filled(scene: Scene, count: int, *, generator: torch.Generator) -> Scene:
     )
 
 
-def _seen(view: View, cloud: Tensor, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+def _seen(
+    view: View, cloud: Tensor, count: int, generator: torch.Generator, others: Sequence[View]
+) -> tuple[Tensor, Tensor]:
     """At most `count` pixels of a view as points [n, 3] float64 world, and their colours [n, 3] uint8."""
     from scipy.spatial import KDTree
 
@@ -66,6 +71,7 @@ def _seen(view: View, cloud: Tensor, count: int, generator: torch.Generator) -> 
     near = (angles < apart).any(-1)
     weights = 1 / angles[near].clamp(min=BESIDE).square()
     inverse_range = (weights * nearness[neighbours[near]]).sum(-1) / weights.sum(-1)
+    inverse_range = swept(view, rays[near], inverse_range, nearness[neighbours[near]], others)
 
     camera_frame = rays[near] / inverse_range[:, None]
     colors = view.image().reshape(-1, 3)[pixels[near]]
