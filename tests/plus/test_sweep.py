@@ -37,7 +37,7 @@ def ranges(rays: Tensor, center: Tensor) -> Tensor:
 
 
 def found(views: tuple[View, ...], scale: float = 1.0, count: int = 300) -> tuple[Tensor, Tensor, Tensor]:
-    """Inverse ranges found for pixels of the first view but the poles, the true ones, and what was said to be likely."""
+    """Inverse ranges found for pixels of the first view, the true ones, and what was said to be likely."""
     rays = views[0].camera.rays(dtype=torch.float64)[8:-8].reshape(-1, 3)
     rays = rays[torch.randperm(len(rays), generator=torch.Generator().manual_seed(0))[:count]]
     true = 1 / (scale * ranges(rays, torch.zeros(3, dtype=torch.float64)))
