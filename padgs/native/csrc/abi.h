@@ -74,7 +74,7 @@ struct Instance {
   uint32_t slot;                             // where its moments go
   uint8_t row, row_end, column, column_end;  // of patches, from the tile's corner; ends are exclusive
 };
-static_assert(sizeof(Instance) == 12, "padgs/render/tiles.py allocates 3 integers per instance");
+static_assert(sizeof(Instance) == 12, "padgs/render/backends/cpu_tiles.py allocates 3 integers per instance");
 
 struct Inputs {
   int64_t count;
