@@ -23,7 +23,8 @@ def filled(scene: Scene, count: int, *, generator: torch.Generator) -> Scene:
 
     New points are pixels of the training views, chosen at random by solid angle and mask. Their range is interpolated
     from the points that this view has in directions nearby (Shepard's way, weights of 1 / angle², of 1 / range, which
-    of a plane is smooth). A direction further from all of them than points are apart gets none: that may be the sky.
+    of a plane is smooth), and then put where other views see them alike (`padgs.plus.sweep`). A direction further from
+    all of them than points are apart gets none: that may be the sky.
 
     Args:
         scene: with photographs; points at the centre of a camera, or not finite, are not asked.

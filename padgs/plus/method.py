@@ -57,11 +57,12 @@ class PlusMethod(SplatMethod):
         start, limit = (_within(share, pixels) for share in (options.start_share, options.limit_share))
         limit = fewest(options.max_gaussians, limit if self._target is None else self._target)
         room = None if limit is None else math.ceil(limit / (1 + options.sky_share))  # for points, if the sky has its
+        most, sought = fewest(start, room), round(options.fill_share * pixels)
         generator = torch.Generator().manual_seed(self.seed)
         splats = Splats.from_scene(
-            filled(scene, round(options.fill_share * pixels), generator=generator),
+            filled(scene, sought if most is None else min(sought, most), generator=generator),
             degree=options.sh_degree,
-            max_gaussians=fewest(start, room),
+            max_gaussians=most,
             opacity=options.initial_opacity,
             scale=options.initial_scale,
             generator=generator,

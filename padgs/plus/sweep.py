@@ -33,7 +33,8 @@ def swept(view: View, rays: Tensor, inverse_range: Tensor, around: Tensor, views
         rays: [n, 3] float64, of the pixels, in its camera frame.
         inverse_range: [n] > 0, what is likely, 1 / world units.
         around: [n, K] > 0, those of points around.
-        views: all there are; those that are no panoramas, or stand where this one does, are not asked.
+        views: all there are; those that are no panoramas, or stand where this one does, are not asked. What their masks
+            hide is asked all the same; it is outvoted, as what hides behind something is.
     """
     others = [other for other in views if isinstance(other.camera, Panorama) and _apart(view, other) > 0]
     others = sorted(others, key=lambda other: _apart(view, other))[:OTHERS]

@@ -7,6 +7,8 @@ import pytest
 import torch
 from tiny_scene import tiny_scene
 
+from padgs.learning.budget import Budget
+from padgs.plus import method as method_module
 from padgs.plus.fill import filled
 from padgs.plus.method import PlusMethod
 from padgs.plus.options import PlusOptions
@@ -121,3 +123,11 @@ def test_padgs_plus_starts_from_what_it_asks_for():
         method = PlusMethod(PlusOptions(fill_share=share, sky_share=0.0), seed=0)
         started = len(method._start(scene, 10).splats)
         assert count <= started < count + len(scene.train)
+
+
+def test_no_more_is_sought_than_a_budget_has_room_for(monkeypatch):
+    sought = []
+    monkeypatch.setattr(method_module, "filled", lambda scene, count, **_: sought.append(count) or scene)
+    for budget in (None, 150):
+        list(PlusMethod(PlusOptions(sky_share=0.5)).fit(dome(300), Budget(16, gaussians=budget)))
+    assert sought == [round(PlusOptions().fill_share * counted_pixels(dome(8).train[0])), math.ceil(2 * 150 / 1.5)]

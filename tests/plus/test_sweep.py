@@ -6,8 +6,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from padgs.plus import fill
+from padgs.plus.sky import fibonacci_sphere
 from padgs.plus.sweep import AT_ONCE, swept
-from padgs.scene import View
+from padgs.scene import Scene, View
 from padgs.sphere.camera import perspective
 
 RADIUS, WIDTH = 4.0, 128
@@ -80,3 +82,17 @@ def test_parts_are_put_together_in_order():
     whole, true, _ = found(views, count=AT_ONCE + 5)
     assert len(whole) == len(true) == AT_ONCE + 5
     assert torch.equal(whole[:300], found(views)[0])
+
+
+def test_points_from_photographs_lie_where_these_agree_and_not_where_the_cloud_has_them(monkeypatch):
+    directions = fibonacci_sphere(60)
+    off = torch.where(torch.arange(60) % 2 == 0, 0.65, 1.5)[:, None]  # of a rough cloud
+    points = (RADIUS * off * directions).float()
+    scene = Scene("ball", ball(), (), points, torch.zeros(60, 3, dtype=torch.uint8), "")
+    errors = []
+    for others in (True, False):
+        if not others:
+            monkeypatch.setattr(fill, "swept", lambda view, rays, inverse_range, *_: inverse_range)
+        filled = fill.filled(scene, 1000, generator=torch.Generator().manual_seed(0))
+        errors.append((filled.points[60:].norm(dim=-1) / RADIUS).log2().abs().median().item())
+    assert errors[0] < 0.5 * errors[1] and errors[1] > 0.15
