@@ -37,6 +37,7 @@ REPORTS: Mapping[str, Report] = {
     "modulation": Report("padgs.reports.tables.modulation:modulation", ("modulation",)),
     "plus_ablation": Report("padgs.reports.tables.variants:plus_ablation", ("plus_ablation",)),
     "stability": Report("padgs.reports.tables.stability:stability", ("stress",)),
+    "limits": Report("padgs.reports.tables.limits:limits", ("stress",)),
     "capacity": Report("padgs.reports.tables.capacity:capacity", ("capacity",)),
     "need": Report("padgs.reports.tables.need:need", ("need",)),
     "need_chart": Report("padgs.reports.charts.need_chart:charts", ("need",)),

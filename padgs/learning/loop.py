@@ -248,6 +248,8 @@ class Trainer:
             self._monitor.picture(drawing, target.image, iteration)
         with stage("backward"):
             loss.backward()
+        if self._monitor is not None and optimiser.is_checked(iteration):
+            self._monitor.probe(drawing.probe.grad, iteration)
         with stage("observe"), torch.no_grad():
             trainee.observe(drawing, moment)
         return value, len(drawing.gaussians)  # and the graph is gone before rows of its leaves come and go

@@ -173,6 +173,19 @@ class Monitor:
                     "silent", f"the {GRADIENT}{name} is exactly 0 at iteration {iteration}, and since {since}; {ADVICE}"
                 )
 
+    def probe(self, gradient: Tensor | None, iteration: int) -> None:
+        """Take in what growth goes by, the gradient of the probe of a drawing.
+
+        Raises:
+            Failure: silent.
+        """
+        if since := self._lasting("probe", gradient is None or not gradient.any(), iteration, SILENT):
+            raise Failure(
+                "silent",
+                f"the pull that growth goes by is exactly 0 at iteration {iteration}, and since {since}, so nothing "
+                f"can grow; {ADVICE}",
+            )
+
     def _lasting(
         self, sign: str, holds: bool, iteration: int, share: float = LASTING, least: int = LEAST
     ) -> int | None:

@@ -14,6 +14,7 @@ from padgs.runs.scoring import quality_of_one_color
 from padgs.scene import Scene
 
 WRONG_DEPTH = 0.5  # AbsRel
+FLAT = 0.01  # of the true thickness of all surfaces together, along the axis where they are thinnest
 SOON = 50  # iterations; before that a run may simply not have got anywhere yet
 RETRIED = STATUSES.keys() - {"ok", "timeout"}  # by retry=failed; with more train.max_seconds it would be another run
 
@@ -68,7 +69,7 @@ def judged(result: Result, scene: Scene, iterations: int) -> Result:
     marks: dict[str, float | None] = {}
     for scores in result.scores.values():
         marks |= scores.metrics
-    quality, depth = marks.get("ws_psnr"), marks.get("depth_error")
+    quality, depth, extent = (marks.get(name) for name in ("ws_psnr", "depth_error", "least_extent"))
     if not result.ok:
         return result
     if quality is not None and iterations >= SOON and quality < (one_color := quality_of_one_color(scene)):
@@ -76,6 +77,9 @@ def judged(result: Result, scene: Scene, iterations: int) -> Result:
         return replace(result, status="diverged", reason=reason)
     if depth is not None and depth > WRONG_DEPTH:
         reason = f"depths are off by {depth:.0%} on average (AbsRel), more than {WRONG_DEPTH:.0%}"
+        return replace(result, status="degenerate", reason=reason)
+    if extent is not None and extent < FLAT:
+        reason = f"surfaces are {extent:.2%} as thick as the true ones along some axis, less than {FLAT:.0%}"
         return replace(result, status="degenerate", reason=reason)
     return result
 

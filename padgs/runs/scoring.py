@@ -15,7 +15,7 @@ from padgs.results import Scores
 from padgs.scene import Scene, View
 from padgs.scoring import geometry
 from padgs.scoring.evaluate import Marks, OnView, as_stored, evaluate
-from padgs.scoring.metrics import mean_color, psnr
+from padgs.scoring.metrics import mean_color, psnr, ws_psnr_fitted
 from padgs.scoring.pole_gap import oracle, pole_gap
 from padgs.scoring.protocols import Protocol
 from padgs.sphere.panorama import row_latitudes
@@ -42,14 +42,16 @@ def evaluated(method: Method, scene: Scene, protocol: Protocol, on_view: OnView 
 
 
 def stability(method: Method, scene: Scene, protocol: Protocol, on_view: OnView | None) -> Scores:
-    """The same, and besides: geometry (`padgs.scoring.geometry`), the WS-PSNR of one colour, and of training views, and
-    the pole gap of an oracle (`padgs.scoring.pole_gap`).
+    """The same, and besides: geometry (`padgs.scoring.geometry`), the WS-PSNR of one colour, of training views, and
+    after colours were fitted, and the pole gap of an oracle (`padgs.scoring.pole_gap`).
     """
 
     def also(view: View, rendering: Rendering) -> Marks:
         truth, mask = view.image(device=rendering.image.device), view.mask(device=rendering.image.device)
+        image = as_stored(rendering.image)
         marks = {"ws_psnr_one_color": mean_color(truth, mask).item(), "pole_gap_oracle": None}
-        if view.lens is None and (blurred := oracle(as_stored(rendering.image), truth, mask)) is not None:
+        marks["ws_psnr_fitted"] = ws_psnr_fitted(image, truth, mask).item()
+        if view.lens is None and (blurred := oracle(image, truth, mask)) is not None:
             gap = pole_gap(blurred, truth, mask).item()
             marks["pole_gap_oracle"] = None if math.isnan(gap) else gap
         return {**marks, **geometry.of_view(method.render, view, rendering)}

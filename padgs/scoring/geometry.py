@@ -16,6 +16,7 @@ from torch import Tensor
 from padgs.render import Rendering
 from padgs.scene import View
 from padgs.sphere.distortion import solid_angle_weight
+from padgs.sphere.panorama import rays
 
 WITHIN = 1.25  # a depth is right if it is off by less than this factor
 IN_FRONT = 0.05  # share of the distance by which a floater hangs before the surface
@@ -45,6 +46,21 @@ def floaters(depth: Tensor, alpha: Tensor, truth: Tensor) -> Tensor:
     return _mean(alpha * (depth < (1 - IN_FRONT) * truth), truth)
 
 
+def least_extent(depth: Tensor, truth: Tensor) -> Tensor:
+    """How thick the surfaces that a view shows are all together, as a share of the true ones: the ratio of the smallest
+    standard deviations along any axis. Near 0 where all has collapsed onto a plane, or into a point.
+    """
+    thinnest = []
+    directions = rays(depth.shape[1], depth.shape[0]).to(depth)
+    for distances in (depth, truth):
+        points = torch.where(torch.isfinite(truth)[..., None], distances[..., None] * directions, 0.0)
+        mean = torch.stack([_mean(points[..., axis], truth) for axis in range(3)])
+        off = points - mean
+        spread = torch.stack([_mean(off[..., i] * off[..., j], truth) for i in range(3) for j in range(3)])
+        thinnest.append(torch.linalg.eigvalsh(spread.reshape(3, 3).double())[0].clamp(min=0).sqrt())
+    return thinnest[0] / thinnest[1]
+
+
 def yaw_error(render: Callable[[View], Rendering], view: View, image: Tensor) -> Tensor:
     """Largest difference of a panorama from the one that a camera draws that looks back, turned back by whole pixels.
 
@@ -62,7 +78,8 @@ def yaw_error(render: Callable[[View], Rendering], view: View, image: Tensor) ->
 
 def of_view(render: Callable[[View], Rendering], view: View, rendering: Rendering) -> dict[str, float | None]:
     """All of these numbers of a rendering; None where there is nothing to compare with."""
-    marks: dict[str, float | None] = {"yaw_error": None, "depth_error": None, "depth_within": None, "floaters": None}
+    names = ("yaw_error", "depth_error", "depth_within", "floaters", "least_extent")
+    marks: dict[str, float | None] = dict.fromkeys(names)
     if view.lens is None and view.width % 2 == 0:
         marks["yaw_error"] = yaw_error(render, view, rendering.image).item()
     if view.load_depth is not None:
@@ -70,6 +87,7 @@ def of_view(render: Callable[[View], Rendering], view: View, rendering: Renderin
         marks["depth_error"] = _known(depth_error(depth, truth))
         marks["depth_within"] = _known(depth_within(depth, truth))
         marks["floaters"] = _known(floaters(depth, 1 - rendering.transmittance, truth))
+        marks["least_extent"] = _known(least_extent(depth, truth)) if view.lens is None else None
     return marks
 
 

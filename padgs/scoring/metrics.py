@@ -24,6 +24,7 @@ from padgs.sphere.panorama import continued, row_latitudes
 
 Metric = Callable[[Tensor, Tensor, Tensor | None], Tensor]
 
+FLAT = 1e-12  # variance of a channel without any contrast, which no gain brings nearer to anything
 WINDOW_RADIUS = 5  # of the 11 x 11 window of SSIM
 
 
@@ -39,6 +40,18 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
 def ws_psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
     """PSNR in dB with each row weighted by its solid angle (Sun, Lu, Yu 2017)."""
     return _decibel(weighted_mean((image - target) ** 2, sphere_weight(image, mask)))
+
+
+def ws_psnr_fitted(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    """`ws_psnr` after the gain and the offset of each channel that bring the image nearest to the target.
+
+    What is left is wrong otherwise than by the exposure and the white balance of the image as a whole.
+    """
+    weight = sphere_weight(image, mask)[..., None] / sphere_weight(image, mask).sum()
+    means = [(of * weight).sum((0, 1)) for of in (image, target)]
+    seen, true = (of - mean for of, mean in zip((image, target), means, strict=True))
+    gain = (seen * true * weight).sum((0, 1)) / (seen.square() * weight).sum((0, 1)).clamp(min=FLAT)
+    return ws_psnr(gain * seen + means[1], target, mask)
 
 
 def band_ws_psnr(image: Tensor, target: Tensor, mask: Tensor | None = None, *, band: str) -> Tensor:

@@ -47,6 +47,11 @@ def faster(train: T, factor: float) -> T:
     return replace(train, learning_rates=factor * Pace.of(train.learning_rates, train.iterations).factor)
 
 
+def slower(train: T, factor: float) -> T:
+    """The same training with all learning rates so many times as small."""
+    return faster(train, 1 / factor)
+
+
 def capped(budget: Budget, scene: Scene, share: float) -> Budget:
     """The same budget, for a model of at most that share of the pixels of a training view."""
     view = scene.train[0]
@@ -73,7 +78,9 @@ CONDITIONS: Mapping[str, Condition] = {
     "capacity": Condition("there may be {:.0%} as many Gaussians as pixels of a view", (0.5, 0.2, 0.05), budget=capped),
     "schedule": Condition("training is {} times as long", (2, 4, 8), training=longer),
     "learning_rates": Condition("all learning rates are {} times as large", (3, 10, 30), training=faster),
+    "low_rates": Condition("all learning rates are 1/{} as large", (3,), training=slower),
     # 11 bits of each factor, then 8; there is no coarser type that networks are trained in
     "precision": Condition("PaD-GS's networks, if any, multiply in {}", ("float16", "bfloat16"), option="precision"),
     "jpeg": Condition("training views are JPEGs of quality {}", (90, 70, 40), pictures.compressed),
+    "noise": Condition("training views have noise of {:.0%} of white", (0.02, 0.05, 0.1), pictures.noisy),
 }

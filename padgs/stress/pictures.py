@@ -135,6 +135,27 @@ def compressed(scene: Scene, quality: int, random: np.random.Generator) -> Scene
     return of_training(scene, lambda view: repainted(view, squeeze))
 
 
+def noisy(scene: Scene, sigma: float, random: np.random.Generator) -> Scene:
+    """Each channel of each pixel of the training views is off by a normal deviate, as in little light.
+
+    Args:
+        scene, random: as everywhere here.
+        sigma: standard deviation, as a share of white.
+    """
+
+    def spoil(view: View) -> View:
+        seed = int(random.integers(2**63))  # the same noise whenever the view is asked for
+
+        def add(pixels: Tensor) -> Tensor:
+            deviates = np.random.default_rng(seed).standard_normal(tuple(pixels.shape), np.float32)
+            off = 255 * sigma * torch.from_numpy(deviates).to(pixels.device)
+            return (pixels.float() + off).clamp(0, 255).round().to(torch.uint8)
+
+        return repainted(view, add)
+
+    return of_training(scene, spoil)
+
+
 def shrunk(scene: Scene, factor: int, random: np.random.Generator) -> Scene:
     """Training views have so many times fewer pixels on a side than test views.
 

@@ -144,6 +144,13 @@ def test_parameters_without_a_gradient_are_silent_after_a_quarter_of_the_run():
         late.gradients(("sh_rest",) if iteration <= 200 else (), iteration)
 
 
+@pytest.mark.parametrize("gradient", [None, torch.zeros(9, 3)])
+def test_growth_that_nothing_pulls_at_is_silent(gradient):
+    watch = monitor()
+    failure, when = ends(lambda i: watch.probe(gradient if i > 300 else torch.eye(3), i), "silent")
+    assert when == 301 + ITERATIONS // 4 and "since 301, so nothing can grow" in str(failure)
+
+
 def test_where_the_schedule_follows_the_clock_a_sign_lasts_for_a_share_of_it():
     watch = monitor()
     for iteration in range(1, 2000):  # 2000 steps are a tenth of the schedule

@@ -54,6 +54,7 @@ def test_a_run_says_what_it_is_stressed_by_and_has_marks_that_show_harm(run):
     assert marks["ws_psnr"] > marks["ws_psnr_one_color"] and marks["ws_psnr_training"] > 0
     assert 0 < marks["depth_error"] < 0.5 and marks["yaw_error"] < 1e-4
     assert marks["pole_gap_oracle"] < -20  # its poles are nearly empty
+    assert marks["ws_psnr_fitted"] > marks["ws_psnr"] and marks["least_extent"] > 0.01
     assert run("stress.condition=few_views", "stress.level=1")[0] == made  # found again
 
 
@@ -76,18 +77,20 @@ def test_wrong_depths_are_degenerate(run, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("better", "depth_error", "iterations", "status"),
+    ("better", "depth_error", "least_extent", "iterations", "status"),
     [
-        (-0.1, None, 50, "diverged"),
-        (-0.1, None, 49, "ok"),  # too soon to say
-        (5.0, 0.51, 50, "degenerate"),
-        (5.0, None, 50, "ok"),
+        (-0.1, None, None, 50, "diverged"),
+        (-0.1, None, None, 49, "ok"),  # too soon to say
+        (5.0, 0.51, 0.5, 50, "degenerate"),
+        (5.0, 0.4, 0.009, 50, "degenerate"),
+        (5.0, 0.4, 0.011, 50, "ok"),
+        (5.0, None, None, 50, "ok"),
     ],
 )
-def test_results_are_judged_by_what_they_show(better, depth_error, iterations, status):
+def test_results_are_judged_by_what_they_show(better, depth_error, least_extent, iterations, status):
     """Worse than one colour, under any protocol; depths where they are known."""
     scene = tiny_scene()
-    marks = {"ws_psnr": quality_of_one_color(scene) + better, "depth_error": depth_error}
+    marks = {"ws_psnr": quality_of_one_color(scene) + better, "depth_error": depth_error, "least_extent": least_extent}
     made = replace(result(), scores={"sphere": Scores({}, marks, {})})
     assert judged(made, scene, iterations).status == status
     assert judged(replace(made, status="timeout"), scene, iterations).status == "timeout"

@@ -6,7 +6,7 @@ import torch
 from tiny_scene import tiny_scene, truth
 
 from padgs.render import Rendering, RenderOptions, render
-from padgs.scoring.geometry import depth_error, depth_within, floaters, of_view, yaw_error
+from padgs.scoring.geometry import depth_error, depth_within, floaters, least_extent, of_view, yaw_error
 from padgs.scoring.metrics import mean_color
 from padgs.sphere.distortion import solid_angle_weight
 
@@ -40,6 +40,15 @@ def test_what_hangs_in_front_floats_as_far_as_it_is_opaque():
     assert floaters(upper(9.0), opaque, SURFACE) == 0  # behind
 
 
+def test_what_has_collapsed_onto_a_plane_or_a_point_is_thin():
+    assert least_extent(SURFACE, SURFACE).item() == pytest.approx(1)
+    assert least_extent(0.5 * SURFACE, SURFACE).item() == pytest.approx(0.5)
+    disc = torch.zeros(16, 32)
+    disc[7:9] = 2.0  # all of it within 11 degrees of the horizon
+    assert least_extent(disc, SURFACE) < 0.1 and least_extent(0 * SURFACE, SURFACE) == 0
+    assert least_extent(upper(9.0), upper(math.inf)).item() == pytest.approx(1), "the sky is not measured"
+
+
 @pytest.mark.parametrize(("wrap", "sees"), [(True, False), (False, True)])
 def test_a_renderer_with_a_seam_does_not_draw_the_same_when_it_looks_back(wrap, sees):
     view, gaussians = tiny_scene().test[0], truth()
@@ -60,6 +69,7 @@ def test_a_view_without_depth_or_that_is_no_panorama_has_marks_that_are_missing(
     assert marks["yaw_error"] == 0 and marks["depth_error"] is None and marks["floaters"] is None
     known = of_view(lambda _: rendering, replace(view, load_depth=lambda: SURFACE), rendering)
     assert (known["depth_error"], known["depth_within"], known["floaters"]) == (0, 1, 0)
+    assert known["least_extent"] == pytest.approx(1) and marks["least_extent"] is None
 
 
 def test_one_colour_is_that_of_the_sphere_and_not_of_the_image():

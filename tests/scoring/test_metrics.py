@@ -12,11 +12,13 @@ from padgs.scoring.metrics import (
     METRICS,
     band_rows,
     band_ws_psnr,
+    mean_color,
     psnr,
     seam,
     ssim,
     weighted_ssim,
     ws_psnr,
+    ws_psnr_fitted,
     ws_ssim,
 )
 from padgs.sphere.distortion import solid_angle_weight
@@ -110,6 +112,27 @@ def test_panoramic_metrics_do_not_depend_on_yaw(pair, shift):
     for name in ("ws_psnr", "ws_ssim", *(f"ws_psnr_{band}" for band in BANDS)):
         assert METRICS[name](*turned).item() == pytest.approx(METRICS[name](*pair, mask).item(), abs=1e-10), name
     assert weighted_ssim(*turned).item() != pytest.approx(weighted_ssim(*pair, mask).item(), abs=1e-6)  # flat windows
+
+
+def test_a_fit_of_colours_forgives_exposure_and_white_balance_and_nothing_else(pair, generator):
+    image, target = pair
+    gain, offset = torch.tensor([0.5, 1.2, 2.0]), torch.tensor([0.1, 0.0, -0.2])
+    assert ws_psnr_fitted(target * gain + offset, target) > 100 > ws_psnr(target * gain + offset, target)
+    fitted = ws_psnr_fitted(image, target)
+    assert fitted > ws_psnr(image, target)
+    torch.testing.assert_close(ws_psnr_fitted(image * gain + offset, target), fitted)
+    weight = solid_angle_weight(H, dtype=torch.float64)[:, None].expand(H, W).reshape(-1).numpy()
+    errors = []
+    for seen, true in zip(image.reshape(-1, 3).T.numpy(), target.reshape(-1, 3).T.numpy(), strict=True):
+        line = np.polynomial.Polynomial.fit(seen, true, 1, w=np.sqrt(weight))
+        errors.append(np.average((line(seen) - true) ** 2, weights=weight))
+    assert fitted.item() == pytest.approx(-10 * math.log10(np.mean(errors)))
+    flat = torch.full_like(target, 0.3)
+    torch.testing.assert_close(ws_psnr_fitted(flat, target), mean_color(target))
+    hidden = ones()
+    hidden[:, ::2] = 0
+    spoilt = torch.where(hidden[..., None] > 0, image, torch.rand(H, W, 3, generator=generator, dtype=torch.float64))
+    torch.testing.assert_close(ws_psnr_fitted(spoilt, target, hidden), ws_psnr_fitted(image, target, hidden))
 
 
 def test_bands_divide_the_sphere_and_have_the_known_shares():

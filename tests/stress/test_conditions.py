@@ -54,7 +54,7 @@ def test_a_seed_says_it_all_and_each_level_is_another_scene(name):
 
 
 @pytest.mark.parametrize(
-    "name", ["pose_noise", "pose_rotation", "exposure", "nadir", "jpeg", "resolution", "few_views"]
+    "name", ["pose_noise", "pose_rotation", "exposure", "nadir", "jpeg", "noise", "resolution", "few_views"]
 )
 def test_test_views_stay_what_they_are_where_training_views_alone_are_wrong(name):
     rest, scene = generate(OPTIONS).test[0], stressed(name, 3).test[0]
@@ -110,12 +110,25 @@ def test_pose_noise_has_the_size_that_it_says():
         assert 0 < (after.cam_from_world[:3, :3] @ before.cam_from_world[:3, :3].T - torch.eye(3)).norm() < 0.1
 
 
+def test_noise_has_the_size_that_it_says_and_is_the_same_each_time():
+    grey = torch.full((32, 64, 3), 128, dtype=torch.uint8)
+    scene = generate(OPTIONS)
+    scene = replace(scene, train=tuple(replace(view, load_pixels=lambda: grey) for view in scene.train))
+    first, second = stressed("noise", 2, scene).train[:2]
+    off = (first.load_pixels().float() - 128) / 255
+    assert off.std().item() == pytest.approx(0.05, rel=0.05) and abs(off.mean().item()) < 0.003
+    assert torch.equal(first.load_pixels(), first.load_pixels())
+    assert not torch.equal(first.load_pixels(), second.load_pixels())
+
+
 def test_training_is_changed_and_its_configuration_is_not():
     config = composed("stress.condition=schedule", "stress.level=2", "train.iterations=300")
     assert (config.train.iterations, config.training.iterations) == (300, 1200)
     faster = composed("stress.condition=learning_rates", "stress.level=1", "train.iterations=7500")
     assert faster.train.learning_rates == "run" and faster.training.learning_rates == 6.0
     assert faster.values()["train"]["learning_rates"] == "run"
+    slower = composed("stress.condition=low_rates", "stress.level=3", "train.iterations=7500")
+    assert slower.training.learning_rates == pytest.approx(2 / 3) and slower.row == "low_rates 1"
     assert composed().training == composed().train and isinstance(composed().training, TrainOptions)
 
 

@@ -38,6 +38,8 @@ class SyntheticOptions:
     texture_frequency: float = 1.0  # multiplies the spatial frequency of every pattern
     objects: int | None = None  # number of loose objects besides the furniture; None = the scene's own
     spokes: int = 16  # of the Siemens stars in pole_torture
+    nearest: float | None = None  # metres from the path to what hangs beside it in near_clutter; None = 0.05
+    horizon: float | None = None  # metres to the mountains outdoors; None = 300
     points: int = 20_000  # of the cloud, on surfaces that a training view sees
     point_noise: float = 0.002  # standard deviation per axis, relative to the distance from the observing camera
     outliers: float = 0.01  # share of points that are nowhere near a surface
@@ -74,22 +76,29 @@ class SyntheticOptions:
         for field in ("texture_frequency", "world_scale"):
             if not 0 < getattr(self, field) < math.inf:
                 raise DataError(f"{field} {getattr(self, field)} is not a finite number > 0")
-        if self.reach is not None and not 0 < self.reach < math.inf:
-            raise DataError(f"reach {self.reach} is not a finite length > 0 in metres; use null for the scene's own")
+        for field in ("reach", "nearest", "horizon"):
+            length = getattr(self, field)
+            if length is not None and not 0 < length < math.inf:
+                raise DataError(f"{field} {length} is not a finite length > 0 in metres; use null for the scene's own")
         if self.objects is not None and self.objects < 0:
             raise DataError(f"objects {self.objects} is negative; use null for the scene's own number")
 
     @property
     def title(self) -> str:
-        """What the scene is called. From a path of another length, with noisy poses, or seen by two lenses, a room is
-        another scene than the room.
+        """What the scene is called. From a path of another length, with nearer or farther things, with noisy poses, or
+        seen by two lenses, a room is another scene than the room.
 
         >>> SyntheticOptions(pose_noise_rotation=0.2).title, SyntheticOptions(reach=1.0, lens_gap=0.05).title
         ('synthetic-room-noisy-poses', 'synthetic-room-other-path-two-lenses')
+        >>> SyntheticOptions("outdoor", horizon=3000).title
+        'synthetic-outdoor-horizon-3000m'
         """
         words = ["synthetic", self.scene]
         if self.reach is not None:
             words.append("other-path")
+        words += [
+            f"{name}-{length:g}m" for name in ("nearest", "horizon") if (length := getattr(self, name)) is not None
+        ]
         if self.pose_noise_translation or self.pose_noise_rotation:
             words.append("noisy-poses")
         if self.lens_gap or self.lens_k1:

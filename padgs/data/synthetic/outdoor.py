@@ -1,4 +1,6 @@
-"""Ground, houses and street furniture near and far, a ring of mountains at 300 m, and a sky: range 1 : 1000."""
+"""Ground, houses and street furniture near and far, a ring of mountains, at 300 m unless asked otherwise, and a sky: a
+range of 1 : 1000.
+"""
 
 from __future__ import annotations
 
@@ -40,6 +42,7 @@ def _meadow(frequency: float) -> Texture:
 
 
 def _mountains(uv: Array) -> Array:
+    """As they look at 300 m."""
     rock = tx.noise(uv[0], uv[1] * 2, 260.0)
     height = uv[1] / 45 + 0.35 * (rock - 0.5)
     color = tx.mix((0.32, 0.42, 0.38), (0.5, 0.54, 0.62), tx.step(0.45, height, 0.3))
@@ -67,15 +70,19 @@ def outdoor(options: SyntheticOptions, path: Array, rng: np.random.Generator) ->
         tx.stripes(((0.62, 0.7, 0.74), (0.7, 0.77, 0.8)), 0.25, 0.3),
     )
     roof = Material(scaled(tx.bricks((0.4, 0.15, 0.1), (0.6, 0.28, 0.2), (0.25, 0.12, 0.1), 0.35, 0.3), f))
+    horizon = 300.0 if options.horizon is None else options.horizon
+    away = horizon / 300
     shapes: list[Shape] = [
         Ground((Material(_meadow(f)),)),
-        Ring(300.0, 60.0, (Material(_mountains, glows=True),)),
+        Ring(horizon, 60 * away, (Material(scaled(_mountains, 1 / away), glows=True),)),
     ]
     for k in range(14):
         far = 11 + 5.5 * k * rng.uniform(0.8, 1.2)
         angle = 2.4 * k + rng.uniform(-0.3, 0.3)
         half = rng.uniform((2.5, 2.5, 2.5), (4.5, 4.0, 6.0))
         x, y, yaw = far * math.cos(angle), far * math.sin(angle), float(rng.uniform(-0.5, 0.5))
+        if far > 0.8 * horizon:  # it would stand in the mountains or behind them
+            continue
         side = [Material(_facade(scaled(walls[k % 4], f), 2 * half[axis], 2 * half[2])) for axis in (1, 1, 0, 0)]
         shapes.append(Box((x, y, half[2]), fu.point(half), (*side, roof, roof), yaw))
         shapes.append(Box((x, y, 2 * half[2] + 0.15), (half[0] + 0.3, half[1] + 0.3, 0.15), (roof,), yaw))

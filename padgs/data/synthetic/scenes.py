@@ -111,9 +111,10 @@ def room(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> Wo
 
 
 def near_clutter(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
-    """The room with small objects hanging 5-30 cm from the camera path."""
+    """The room with small objects hanging beside the camera path, in a layer 25 cm thick that begins at 5 cm."""
     shapes = [Room(_LOW, _HIGH, _room_materials(options, 6, 5)), *_furniture(rng)]
-    return World((*shapes, *fu.beside(_objects(options), path, 0.05, 0.3, rng)), _LIGHT)
+    nearest = 0.05 if options.nearest is None else options.nearest
+    return World((*shapes, *fu.beside(_objects(options), path, nearest, nearest + 0.25, rng)), _LIGHT)
 
 
 def glossy(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:

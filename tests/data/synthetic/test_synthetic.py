@@ -107,6 +107,7 @@ def test_load_takes_name_width_and_knobs_from_the_data_options():
         ({"world_scale": 0.0}, "world_scale 0.0"),
         ({"point_noise": float("nan")}, "finite"),
         ({"reach": 0.0}, "reach 0.0 is not a finite length"),
+        ({"horizon": float("inf")}, "horizon inf is not a finite length"),
         ({"path": "zigzag"}, "known: cross, line, roaming"),
         ({"objects": 2000}, "no place"),
     ],
@@ -116,8 +117,8 @@ def test_bad_knobs_are_refused(knobs, message):
         SyntheticTruth(SyntheticOptions(**knobs))
 
 
-def depths(name, width=128):
-    truth = SyntheticTruth(SyntheticOptions(scene=name))
+def depths(name, width=128, **knobs):
+    truth = SyntheticTruth(SyntheticOptions(scene=name, **knobs))
     return truth, [camera.trace(truth.world, pose, width) for pose in truth.poses]
 
 
@@ -129,6 +130,13 @@ def test_outdoor_spans_three_orders_of_magnitude_and_has_sky():
     assert finite.max() > 290
     assert finite.max() / finite.min() > 500
     assert 0.2 < np.mean([(object_id == -1).mean() for _, object_id in views]) < 0.6
+
+
+@pytest.mark.parametrize("horizon", [30, 3000])
+def test_mountains_stand_where_they_are_asked_to(horizon):
+    _, views = depths("outdoor", 64, horizon=horizon, train_views=2, test_views=0)
+    farthest = max(depth[np.isfinite(depth)].max() for depth, _ in views)
+    assert 0.85 * horizon < farthest < 1.25 * horizon
 
 
 def test_each_room_of_two_hides_most_of_the_other():
@@ -171,17 +179,18 @@ def test_posters_cover_a_tenth_of_the_bare_walls():
     assert covered / area == pytest.approx(0.10, abs=0.02)
 
 
-def test_near_clutter_is_5_to_30_cm_from_the_path():
-    options = SyntheticOptions(scene="near_clutter")
+@pytest.mark.parametrize("layer", [None, 0.02, 0.4])
+def test_near_clutter_is_in_a_layer_of_25_cm_beside_the_path(layer):
+    options, begins = SyntheticOptions(scene="near_clutter", nearest=layer), layer or 0.05
     truth, blueprint = SyntheticTruth(options), BLUEPRINTS["near_clutter"]
     path = curve(blueprint.walk, blueprint.path, truth.random("path"))
     near = truth.world.shapes[-blueprint.objects :]
     for shape in near:
         center, radius = shape.bounds
         gap = np.linalg.norm(path - center, axis=1).min() - radius
-        assert -0.01 < gap < 0.3  # bounding spheres: those of bars reach farther than the bars
+        assert begins - 0.06 < gap < begins + 0.25  # bounding spheres: those of bars reach farther than the bars
     nearest = min(camera.trace(truth.world, pose, 128)[0].min() for pose in truth.poses)
-    assert 0.04 < nearest < 0.2
+    assert 0.8 * begins < nearest < begins + 0.15
 
 
 @pytest.mark.parametrize(("name", "changes"), [("glossy", True), ("room", False)])
