@@ -25,8 +25,10 @@ DEGREE = f"{CONFIG}method.sh_degree"
 class Curve:
     """The sizes of one run's model, from large to small."""
 
-    title: str
+    title: str  # of the method, with what sets it apart from others, and the seed where there are several
+    method: str  # the same without the seed
     preset: str
+    seed: int
     steps: tuple[Mapping[str, Any], ...]  # of `Result.need`, controls left out
     needs: Mapping[str, Mapping[str, Any]]  # epsilon -> the smallest step that loses at most so much
     knee: Mapping[str, Any] | None
@@ -93,8 +95,15 @@ def curves(runs: DataFrame) -> list[Curve]:
         knee = None if run["need"]["knee"] is None else steps[run["need"]["knee"]]
         picture = None if run["pictures"] is None else run["pictures"].with_name(NEED_PICTURE)
         there = picture if picture is not None and picture.is_file() else None
-        found.append(Curve(title, setting.preset, tuple(rows), needs, knee, run["need"], there))
+        names = {"title": title, "method": setting.title, "preset": setting.preset, "seed": int(run["seed"])}
+        found.append(Curve(**names, steps=tuple(rows), needs=needs, knee=knee, found=run["need"], picture=there))
     return found
+
+
+def by_method(found: Sequence[Curve]) -> dict[str, list[Curve]]:
+    """The curves of each method, one a seed."""
+    methods = dict.fromkeys(one.method for one in found)
+    return {method: [one for one in found if one.method == method] for method in methods}
 
 
 def gain(ours: Curve, other: Curve) -> float | None:

@@ -1,7 +1,8 @@
 """Decoding anchors on a GPU's tensor cores: a reduced precision's products within the kernels that use them.
 
 csrc/cuda/networks.cu and networks_backward.cu; `padgs.anchors.precision` says what is rounded. Going back, hidden units
-are computed once more, and the gradients of features and weights leave as float32 sums that are not rounded again.
+are computed once more, and the gradients of features and weights leave as float32 sums of rounded factors (those of the
+biases of outputs, too) that are not rounded again.
 """
 
 from __future__ import annotations
@@ -46,6 +47,7 @@ def decode_fused(
 class _DecodeFused(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, reduced_type, room, features, seen, positions, offsets, log_scales, attenuation, *weights):
+        _refuse_others((features, seen, offsets, log_scales, *weights))
         inputs = [t.detach().contiguous() for t in (features, seen)]
         constants = [t.detach().contiguous() for t in (positions, offsets, log_scales, attenuation)]
         weights = [w.detach().contiguous() for w in weights]
@@ -83,13 +85,30 @@ class _DecodeFused(torch.autograd.Function):
             inputs[0].shape[1],
             *map(pointer, (grad_features, grad_offsets, grad_log_scales, grad_weights)),
         )
-        arguments = DeviceDecodeGradientArguments(gradient, None, None, None)
+        arguments = DeviceDecodeGradientArguments(gradient, len(slots), None, None, None)
         cuda.call("padgs_cuda_decode_take_back", queue, arguments)
-        arguments = cuda.NetworkGradientArguments(gradient, _network_inputs(inputs, ctx.reduced_type))
+        arguments = cuda.NetworkGradientArguments(gradient, _network_inputs(inputs, ctx.reduced_type), len(slots))
         cuda.call("padgs_cuda_networks_backward", queue, arguments)
         of_weights = grad_weights.sum(0).split(sizes)
         shaped = (part.view_as(weight) for part, weight in zip(of_weights, weights, strict=True))
         return None, None, grad_features, None, None, grad_offsets, grad_log_scales, None, *shaped
+
+
+def _refuse_others(tensors: Sequence[Tensor]) -> None:
+    """Kernels take what pointers point at for what it should be."""
+    features, seen, *_ = tensors
+    first = tensors[4]  # w1
+    if features.shape[1] + seen.shape[1] != first.shape[1]:
+        raise ValueError(
+            f"networks of {first.shape[1]} inputs do not fit {features.shape[1]} features and {seen.shape[1]} numbers "
+            "of how an anchor is seen; use_distortion must be as the networks were made for"
+        )
+    for tensor in tensors:
+        if tensor.dtype != torch.float32 or tensor.device != features.device:
+            raise ValueError(
+                f"a tensor of the decoder is {tensor.dtype} on {tensor.device}; all must be float32 on "
+                f"{features.device}, and are rounded where they are multiplied (method.precision)"
+            )
 
 
 def rows_for(starts: Tensor, raw: Tensor, room: int | None) -> tuple[Tensor, list[Tensor]]:

@@ -95,7 +95,7 @@ class _DecodeOnGPU(torch.autograd.Function):
             pointer(grad_log_scales),
             None,
         )
-        arguments = cuda.DeviceDecodeGradientArguments(gradient, *map(pointer, grad_logits))
+        arguments = cuda.DeviceDecodeGradientArguments(gradient, len(slots), *map(pointer, grad_logits))
         cuda.call("padgs_cuda_decode_take_back", cuda.queue(raw.device), arguments)
 
         dtype = raw.dtype if inputs.dtype == raw.dtype else OF_GRADIENTS  # of the products

@@ -120,7 +120,10 @@ class DeviceDecodeArguments(ctypes.Structure):
 
 
 class DeviceDecodeGradientArguments(ctypes.Structure):
-    _fields_ = [("gradient", DecodeGradientArguments), *fields(Pointer, "opacity_out", "color_out", "covariance_out")]
+    _fields_ = [
+        *(("gradient", DecodeGradientArguments), ("room", Int64)),
+        *fields(Pointer, "opacity_out", "color_out", "covariance_out"),
+    ]
 
 
 class NetworkInputs(ctypes.Structure):
@@ -132,7 +135,7 @@ class NetworkArguments(ctypes.Structure):
 
 
 class NetworkGradientArguments(ctypes.Structure):
-    _fields_ = [("gradient", DecodeGradientArguments), ("inputs", NetworkInputs)]
+    _fields_ = [("gradient", DecodeGradientArguments), ("inputs", NetworkInputs), ("room", Int64)]
 
 
 STRUCTURES = (

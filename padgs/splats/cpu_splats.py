@@ -12,9 +12,14 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from padgs.native import cpu
 from padgs.native.abi import SplatArguments, pointer
+from padgs.sphere.harmonics import MAX_DEGREE
+
+MOST_STORED = (MAX_DEGREE + 1) ** 2 - 1
+PROBES = (3, 4)  # widths; with 4 absolute pulls are wanted, too
 
 
 class Learned(NamedTuple):
@@ -71,6 +76,7 @@ class _Splats(torch.autograd.Function):
         means, log_scales, opacity_logits, dc, rest = parameters
         probe = None if probe is None else probe.contiguous()
         width = 0 if probe is None else probe.shape[1]
+        _refuse_others(degree, rest.shape[1], width, *parameters, *([] if probe is None else [probe]))
         like = (means, log_scales, opacity_logits, dc, opacity_logits if width > 3 else None)
         seen = tuple(map(_empty_like, like))
         ctx.run = functools.partial(run, (len(means), degree, rest.shape[1], width), center, tiny)
@@ -79,12 +85,23 @@ class _Splats(torch.autograd.Function):
         return seen
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *upstream: Tensor | None):
         saved = ctx.saved_tensors
         contiguous = (None if gradient is None else gradient.contiguous() for gradient in upstream)
         gradients = tuple(map(_empty_like, saved[: len(Learned._fields)]))
         ctx.run(*saved, *contiguous, *gradients)
         return None, None, None, None, *gradients
+
+
+def _refuse_others(degree: int, stored: int, width: int, *tensors: Tensor) -> None:
+    """The library takes what pointers point at for what it should be."""
+    if not (degree + 1) ** 2 - 1 <= stored <= MOST_STORED:
+        raise ValueError(f"{stored} coefficients beside the first are no harmonics of degree {degree}")
+    if width not in (0, *PROBES):
+        raise ValueError(f"the probe is {width} wide; it must be {' or '.join(map(str, PROBES))}")
+    if len({(tensor.dtype, tensor.device) for tensor in tensors}) > 1:
+        raise ValueError(f"tensors differ in type or device: {', '.join(f'{t.dtype} {t.device}' for t in tensors)}")
 
 
 def _empty_like(tensor: Tensor | None) -> Tensor | None:

@@ -17,6 +17,7 @@ from padgs.splats import cpu_splats, gpu_splats
 
 INITIAL_OPACITY = 0.1
 SMALLEST_SCALE = 1e-4  # initial scale of coinciding points, in scene units
+DARKEST = 1 / 1024  # initial colour; one of exactly 0 is cut off at 0 by rounding, where nothing pulls at it
 TINY = 1e-6  # scene units; keeps directions finite for a camera exactly on a Gaussian
 
 
@@ -58,7 +59,7 @@ class Splats(nn.Module):
         self.quats = nn.Parameter(means.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1))
         self.log_scales = nn.Parameter(log_scales.clone())
         self.opacity_logits = nn.Parameter(means.new_full((count,), math.log(opacity / (1 - opacity))))
-        self.sh_dc = nn.Parameter(spherical_harmonics.dc_from_colors(colors))
+        self.sh_dc = nn.Parameter(spherical_harmonics.dc_from_colors(colors.clamp(min=DARKEST)))
         self.sh_rest = nn.Parameter(means.new_zeros(count, (degree + 1) ** 2 - 1, 3))
 
     @classmethod

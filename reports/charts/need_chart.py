@@ -12,7 +12,7 @@ from padgs.reports.charts.palette import INK, color_of
 from padgs.reports.conditions import OF_TIMES, footnotes, refuse_mixture
 from padgs.reports.frame import by_conditions
 from padgs.reports.gathered import Gathered
-from padgs.reports.needs import STATED, Curve, curves, searched
+from padgs.reports.needs import STATED, Curve, by_method, curves, searched
 from padgs.reports.pictures import split
 from padgs.results import NEED_PICTURED, file_name
 
@@ -45,13 +45,17 @@ def _chart(name: str, title: str, runs: DataFrame, notes: list[str]) -> Chart:
     made, axes = figure(len(PANELS), 1, 3.6, 3.4)
     tips = Tips()
     for panel, (quantity, words, unit) in zip(axes.flat, PANELS, strict=True):
-        for curve in found:
-            _draw(panel, curve, quantity, unit, tips, [one.preset for one in found])
+        for method, seeds in by_method(found).items():
+            for curve in seeds:
+                _draw(panel, curve, quantity, unit, tips, [one.preset for one in found], first=curve is seeds[0])
+            panel.plot([], [], color=color_of(seeds[0].preset, [one.preset for one in found]), label=method)
         dress(panel.xaxis, [v * unit for one in found for v in one.values(quantity)], log_from=DOUBLINGS)
         panel.set_xlabel(words)
     axes[0, 0].set_ylabel("WS-PSNR of test views, dB ↑")
     made.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     what = f"{title}\nsmaller models of the same run; ring: what is needed for {STATED} dB, labels: for more"
+    if len(found) > len(by_method(found)):
+        what += "; thin: further seeds"
     lay_out(made, what)
     return Chart(name, what, svg(made, name, tips), png(made), tuple(notes), _numbers(name, found))
 
@@ -76,19 +80,20 @@ def _pictures(name: str, title: str, found: list[Curve], notes: list[str]) -> Ch
     return Chart(name, what, svg(made, name, Tips()), png(made), tuple(notes))
 
 
-def _draw(panel: Any, curve: Curve, quantity: str, unit: float, tips: Tips, presets: list[str]) -> None:
+def _draw(panel: Any, curve: Curve, quantity: str, unit: float, tips: Tips, presets: list[str], *, first: bool) -> None:
+    """A curve; further seeds of a method are thinner, and say nothing."""
     color = color_of(curve.preset, presets)
     xs = [value * unit for value in curve.values(quantity)]
     there = sorted((x, y) for x, y in zip(xs, curve.quality, strict=True) if math.isfinite(x) and math.isfinite(y))
-    panel.plot(*zip(*there, strict=True), color=color, linewidth=1.2, label=curve.title)
+    panel.plot(*zip(*there, strict=True), color=color, linewidth=1.2 if first else 0.6)
     for step, x, y in zip(curve.steps, xs, curve.quality, strict=True):
         text = f"{curve.title}\n{step['blended']} Gaussians, {step['bytes'] / 1e6:.2f} MB, {step['frame_ms']:.1f} ms"
         text += f"\n{y:.2f} dB; lost {step['loss']:.2f} dB of calibration views"
-        panel.plot([x], [y], MARKERS[0], color=color, markersize=4, gid=tips.add(text))
+        panel.plot([x], [y], MARKERS[0], color=color, markersize=4 if first else 2.5, gid=tips.add(text))
         reached = [epsilon for epsilon, at in curve.needs.items() if at is step]
         if STATED in reached:
             panel.plot([x], [y], MARKERS[0], markersize=9, fillstyle="none", color=INK[0], markeredgewidth=1)
-        if further := [epsilon for epsilon in reached if float(epsilon) > float(STATED)]:
+        if first and (further := [epsilon for epsilon in reached if float(epsilon) > float(STATED)]):
             panel.annotate(
                 f"{further[-1]} dB", (x, y), xytext=(4, -9), textcoords="offset points", fontsize=7, color=color
             )

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from padgs.reports.conditions import OF_TIMES, footnotes, refuse_mixture
 from padgs.reports.frame import by_conditions
 from padgs.reports.gathered import Gathered
-from padgs.reports.needs import EPSILONS, STATED, Curve, curves, gain, ratio, searched
+from padgs.reports.needs import EPSILONS, STATED, Curve, by_method, curves, gain, ratio, searched
+from padgs.reports.tables.cells import spread
 from padgs.reports.tables.table import Block, Cell, Column, Row, Table
 
 COLUMNS: dict[Column, Callable[[Curve, Curve], float | None]] = {
@@ -42,8 +43,15 @@ NOTES = (
 )
 
 
+def _over_seeds(seeds: Sequence[Curve], first: Sequence[Curve], of: Callable[[Curve, Curve], float | None]) -> Cell:
+    """A number of the runs of a method, each beside that of the first method with its seed, if there is one."""
+    beside = {one.seed: one for one in first}
+    values = [of(one, beside.get(one.seed, first[0])) for one in seeds]
+    return spread([value for value in values if value is not None])
+
+
 def need(gathered: Gathered) -> Table:
-    """A block for each scene, resolution and length, a row for each run that `padgs need` searched.
+    """A block for each scene, resolution and length, a row for each method whose runs `padgs need` searched.
 
     Raises:
         ReportError: results that must not stand together.
@@ -51,8 +59,12 @@ def need(gathered: Gathered) -> Table:
     blocks, runs_of = [], {}
     for title, own in by_conditions(searched(gathered), "resolution", "length").items():
         refuse_mixture(own, gathered.request, title, OF_TIMES)
-        found = curves(own)
-        rows = (Row(one.title, tuple(Cell(of(one, found[0])) for of in COLUMNS.values())) for one in found)
+        found = by_method(curves(own))
+        first = next(iter(found.values()))
+        rows = (
+            Row(method, tuple(_over_seeds(seeds, first, of) for of in COLUMNS.values()))
+            for method, seeds in found.items()
+        )
         blocks.append(Block(title, tuple(rows)))
         runs_of[title] = own
     notes = (*footnotes(runs_of, gathered.request.protocol), *NOTES) if blocks else ()

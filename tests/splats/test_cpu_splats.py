@@ -51,6 +51,37 @@ def test_values_and_gradients_are_those_of_the_definition(monkeypatch, generator
             torch.testing.assert_close(native, defined.expand_as(native), atol=limit, rtol=1e-6)
 
 
+def test_colours_that_begin_at_an_end_of_their_range_learn_in_every_channel(monkeypatch, generator):
+    """Rounding must not cut off what begins at 0, for nothing would ever pull at it."""
+    splats = splats_of(4, 2, generator)
+    black = Splats(splats.means, splats.log_scales, torch.eye(4)[:, :3], degree=2)
+    for native in (True, False):
+        with monkeypatch.context() as patch:
+            if not native:
+                patch.setattr(cpu_splats, "fits", lambda *_: False)
+            black.zero_grad()
+            black.gaussians(VIEW).colors.sum().backward()
+            assert black.sh_dc.grad is not None and (black.sh_dc.grad > 0.28).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"rest": torch.zeros(2, 3, 3)}, "3 coefficients beside the first are no harmonics of degree 2"),
+        ({"rest": torch.zeros(2, 24, 3)}, "24 coefficients"),
+        ({"probe": torch.zeros(2, 5)}, "the probe is 5 wide; it must be 3 or 4"),
+        ({"dc": torch.zeros(2, 3, dtype=torch.float64)}, "differ in type or device"),
+    ],
+)
+def test_what_a_library_would_read_wrongly_is_refused(change, said):
+    two = {"means": torch.zeros(2, 3), "log_scales": torch.zeros(2, 3), "opacity_logits": torch.zeros(2)}
+    learned = cpu_splats.Learned(
+        **two | {"dc": torch.zeros(2, 3), "rest": torch.zeros(2, 8, 3), "probe": None} | change
+    )
+    with pytest.raises(ValueError, match=said):
+        cpu_splats.native_splats(learned, 2, torch.zeros(3), 1e-6)
+
+
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 80.0, -80.0, 200.0, -200.0, 0.0])
 @pytest.mark.parametrize("count", [1, 16, 40])
 def test_extreme_parameters_become_what_they_do_in_the_definition(generator, value, count):

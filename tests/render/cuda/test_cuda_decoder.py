@@ -229,6 +229,33 @@ def test_decoding_into_room_is_the_same_with_zeros_behind(precision: str, rows: 
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
+def test_what_there_was_no_room_for_has_no_gradient(precision: str, generator: torch.Generator):
+    tensors, decoder = problem(60, 10, 37, 32, generator)
+    count = len(on_gpu(decoder.weights(), SeenAnchors(**tensors), precision)[0])
+    upstream, found = torch.randn(count - 30, 3, generator=generator), []
+    leaves = [tensors[name].requires_grad_() for name in ("features", "offsets", "log_scales")]
+    for room in (count - 30, count):
+        gaussians = decode_within(decoder.weights(), SeenAnchors(**tensors), room, precision)[0]
+        loss = sum((getattr(gaussians, of)[: count - 30] * upstream).sum() for of in ("means", "scales", "colors"))
+        found.append(torch.autograd.grad(loss, [*leaves, *decoder.parameters()], allow_unused=True))
+    for less, all_of_them in zip(*found, strict=True):
+        assert less is None or torch.equal(less, all_of_them)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda tensors: tensors | {"seen": tensors["seen"][:, :-1]}, "networks of 37 inputs do not fit"),
+        (lambda tensors: tensors | {"offsets": tensors["offsets"].double()}, "must be float32"),
+    ],
+)
+def test_fused_kernels_refuse_what_they_would_read_wrongly(change, said, generator: torch.Generator):
+    tensors, decoder = problem(10, 10, 37, 32, generator)
+    with pytest.raises(ValueError, match=said):
+        on_gpu(decoder.weights(), SeenAnchors(**change(tensors)), "bfloat16")
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
 def test_rows_behind_the_selected_change_no_gradient(precision: str, generator: torch.Generator):
     tensors, decoder = problem(60, 10, 37, 32, generator)
 

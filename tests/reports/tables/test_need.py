@@ -62,6 +62,20 @@ def test_a_row_for_each_search_with_its_needs():
     assert need(gathered(runs()[2:])).blocks == () and charts(gathered(runs()[2:])) == []
 
 
+def test_seeds_of_a_method_share_a_row_and_an_entry_of_the_legend():
+    again = [replace(one, seed=1, run=f"{one.run}_1") for one in runs()[:2]]
+    sizes = again[1].need["steps"][0] | {"blended": 6000}
+    again[1] = replace(again[1], need=again[1].need | {"steps": [sizes, *again[1].need["steps"][1:]]})
+    seeds = gathered([*runs(), *again])
+    (block,) = need(seeds).blocks
+    columns = need(seeds).columns
+    texts = {row.title: row.texts(columns)[:2] for row in block.rows}
+    assert list(texts.values()) == [["OmniGS, corrected (n=2)", "8000 ± 0"], ["PaD-GS (n=2)", "7000 ± 1414"]]
+    first, *_ = charts(seeds)
+    assert first.numbers is not None and first.numbers["curve"].nunique() == 4
+    assert "thin: further seeds" in first.svg and first.svg.count(">PaD-GS</") <= 1
+
+
 def kept(loss: str, degree: int | None = None, tau: float = 0.9, seed: int = 0):
     """A run that `padgs need` left of another that has four degrees of harmonics."""
     more = {"kept": {"epsilon": float(loss), "degree": degree}, "degrees": {loss: [{"degree": 3, "objections": {}}]}}

@@ -23,8 +23,9 @@ float sixteen(const AngularSizeArguments &args, int64_t first, float each) {
     squared += away * away;
     sizes += scale[c];
   }
-  // Of two numbers `maximum` takes the second if one is no number, which has to reach the loss.
-  const Vec inverse = each / maximum(splat(args.nearest), root(squared));
+  // What is no number is not less than any, and has to reach the loss; `maximum` loses it on some machines.
+  const Vec distance = root(squared), nearest = splat(args.nearest);
+  const Vec inverse = each / select(less(distance, nearest), nearest, distance);
   if (args.gradient) {
     const Vec gradient[kAxes] = {inverse, inverse, inverse};
     store_items<kAxes>(args.gradient, first, args.count, gradient);

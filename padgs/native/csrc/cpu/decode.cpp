@@ -110,7 +110,7 @@ struct Group {
   }
   void run_hidden(const HeadWeights &head) {
     affine(head.w1, head.b1, args.hidden, args.inputs, inputs, hidden);
-    for (int h = 0; h < args.hidden; ++h) hidden[h] = maximum(hidden[h], zero());
+    for (int h = 0; h < args.hidden; ++h) hidden[h] = select(less(hidden[h], zero()), zero(), hidden[h]);  // keeps NaN
   }
   void run(const HeadWeights &head, int count) {
     run_hidden(head);

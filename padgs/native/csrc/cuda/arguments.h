@@ -98,7 +98,8 @@ struct DeviceDecodeArguments {
   const float *color_logits, *covariance_logits;  // [A, 3 K] [A, 7 K]
 };
 struct DeviceDecodeGradientArguments {
-  DecodeGradientArguments gradient;                     // features_out and weights_out are not used
+  DecodeGradientArguments gradient;                 // features_out and weights_out are not used
+  int64_t room;                                     // there is no gradient of Gaussians behind it
   float *opacity_out, *color_out, *covariance_out;  // [A, K] [A, 3 K] [A, 7 K] or null: dL by the networks' outputs
 };
 
@@ -116,6 +117,7 @@ struct NetworkArguments {
 struct NetworkGradientArguments {
   DecodeGradientArguments gradient;  // weights_out: [padgs_cuda_networks_blocks], to be added up
   NetworkInputs inputs;
+  int64_t room;  // there is no gradient of Gaussians behind it
 };
 
 struct DeviceSplatArguments {

@@ -39,7 +39,7 @@ __global__ void __launch_bounds__(kThreads) take_back_kernel(DeviceDecodeGradien
   float reach[3], grad_log[6] = {};
   for (int c = 0; c < 3; ++c) reach[c] = expf(in.log_scales[6 * anchor + c]);
   for (int64_t slot = anchor * k; slot < (anchor + 1) * k; ++slot) {
-    const bool selected = in.raw_opacities[slot] > 0;
+    const bool chosen = in.raw_opacities[slot] > 0, selected = chosen && n < device.room;
     for (int c = 0; c < 3; ++c) {
       const float grad_offset = selected ? args.means[3 * n + c] * reach[c] : 0.0f;
       args.offsets_out[3 * slot + c] = grad_offset;
@@ -57,7 +57,7 @@ __global__ void __launch_bounds__(kThreads) take_back_kernel(DeviceDecodeGradien
       for (int c = 0; c < kCovarianceValues; ++c)
         covariance[c] = selected ? output_gradient<kCovarianceValues>(args, anchor, slot, n, c) : 0.0f;
     }
-    n += selected;
+    n += chosen;
   }
   for (int c = 0; c < 6; ++c) args.log_scales_out[6 * anchor + c] = grad_log[c];
 }

@@ -72,7 +72,8 @@ struct Anchors {
 };
 
 // No more than so many blocks, for each prepares the weights and leaves a gradient of all of them. The number depends on
-// nothing else, so that sums have the same order on every GPU.
+// nothing else, so that each block adds up the same on every GPU; torch
+// adds the blocks, in an order that is the same on GPUs of one model.
 constexpr int64_t kMostBlocks = 512;
 inline int64_t blocks_of_anchors(int64_t anchors) { return std::min(blocks_for(anchors, kWarps * kRows), kMostBlocks); }
 

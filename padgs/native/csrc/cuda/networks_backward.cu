@@ -97,11 +97,12 @@ using Number __attribute__((may_alias)) = uint16_t;
 
 // Leaves dL by the outputs of a network.
 template <int kValues>
-__device__ void leave_output_gradients(const DecodeGradientArguments &args, const Anchors &anchors, Left &mine) {
+__device__ void leave_output_gradients(const NetworkGradientArguments &network, const Anchors &anchors, Left &mine) {
+  const DecodeGradientArguments &args = network.gradient;
   for (int step = 0; step < kOutputParts<kValues, kSide>; ++step) mine.of_outputs[step][lane_index()] = {};
   __syncwarp();
   each_gaussian(args.forward, anchors, [&](int row, int k, bool selected, int64_t n) {
-    if (!selected) return;
+    if (!selected || n >= network.room) return;
     const int64_t anchor = anchors.first + row, slot = anchor * args.forward.offsets + k;
     for (int c = 0; c < kValues; ++c) {
       const int output = kValues * k + c, lane = output % 8 * 4 + row % 8 / 2;
@@ -120,7 +121,7 @@ __device__ void go_back(const NetworkGradientArguments &network, const Network<k
   const DecodeGradientArguments &args = network.gradient;
   const int lane = lane_index();
   Left &mine = left[threadIdx.x / kWarp];
-  leave_output_gradients<kValues>(args, anchors, mine);
+  leave_output_gradients<kValues>(network, anchors, mine);
   const HiddenUnits<T> hidden(inputs, weights.first, args.forward.hidden);
   Sums of_hidden[kHiddenTiles] = {};
   for (int step = 0; step < kOutputParts<kValues, kSide>; ++step) {
@@ -129,7 +130,7 @@ __device__ void go_back(const NetworkGradientArguments &network, const Network<k
       multiply_add(of_hidden[tile], of_outputs, weights.from_outputs.at[tile][step][lane], Bfloat16{});
   }
   for (int i = 0; i < 4 * kHiddenTiles; ++i)
-    if (!(hidden.tiles[i / 4].of[i % 4] > 0)) of_hidden[i / 4].of[i % 4] = 0;
+    if (hidden.tiles[i / 4].of[i % 4] <= 0) of_hidden[i / 4].of[i % 4] = 0;
   FragmentA rows[kHiddenParts];
   for (int step = 0; step < kHiddenParts; ++step) {
     rows[step] = as_factor<Bfloat16>(of_hidden[2 * step], of_hidden[2 * step + 1]);

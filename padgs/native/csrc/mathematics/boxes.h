@@ -28,8 +28,8 @@ PADGS_HD PixelBox pixel_box(const Camera &camera, const PixelRange &range) {
     column_end = width;
   }
   if (column >= column_end) return no_pixels();
-  for (; column < 0; column += width) column_end += width;  // at most twice, by the clamping above
-  for (; column >= width; column -= width) column_end -= width;
+  for (; column < 0; column += width) column_end += width;  // by the clamping above, no more
+  for (; column >= width; column -= width) column_end -= width;  // than three times
   box.column = column;
   box.column_end = least(column_end, width);
   box.second_end = most(column_end - width, 0);
