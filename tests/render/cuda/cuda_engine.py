@@ -29,6 +29,7 @@ from padgs.sphere.camera import RayTable
 os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # deterministic; older torch reads it but once
 HERE = Path(__file__).parent
 SOURCES = Path(cuda.__file__).parent / "csrc" / "cuda"
+NVCC = shutil.which("nvcc")
 COMPILER = shutil.which("c++") or shutil.which("g++")
 FUSED = ("-mfma", "-ffp-contract=fast")
 FUSES = Path("/proc/cpuinfo").exists() and " fma " in Path("/proc/cpuinfo").read_text()
@@ -57,15 +58,24 @@ def fused_library() -> ctypes.CDLL:
 
 def compiled(name: str, sources: list[Path], *more: str) -> ctypes.CDLL:
     """A shared library of C++ sources, CUDA ones included, for as long as this process lives; `more` flags."""
-    folder = Path(tempfile.mkdtemp(prefix="padgs-emulated-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    target = folder / f"lib{name}.so"
     flags = ["-std=c++17", "-O2", "-fPIC", "-shared", "-Wall", "-Wextra", "-Werror", "-DPADGS_EMULATED"]
     flags += ["-Wno-unknown-pragmas"]  # nvcc's
     flags += ["-fno-gnu-unique"]  # or the emulations of two libraries would be one
     flags += ["-fsanitize=bounds", "-fsanitize-undefined-trap-on-error"]  # of arrays: ends the process
-    paths = [f"-I{HERE}", f"-I{SOURCES}", "-x", "c++", *map(str, sources), "-o", str(target)]
-    done = subprocess.run([str(COMPILER), *flags, *more, *paths], capture_output=True, text=True)
+    return _loaded(name, [str(COMPILER), *flags, *more, f"-I{HERE}", f"-I{SOURCES}", "-x", "c++", *map(str, sources)])
+
+
+def compiled_for_gpu(name: str, source: Path) -> ctypes.CDLL:
+    """The same of one source, by nvcc for the GPU of this machine."""
+    flags = ["-std=c++17", "-shared", "-Xcompiler", "-fPIC", "--expt-relaxed-constexpr", "-arch=native"]
+    return _loaded(name, [str(NVCC), *flags, f"-I{SOURCES}", "-x", "cu", str(source)])
+
+
+def _loaded(name: str, command: list[str]) -> ctypes.CDLL:
+    folder = Path(tempfile.mkdtemp(prefix="padgs-emulated-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    target = folder / f"lib{name}.so"
+    done = subprocess.run([*command, "-o", str(target)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return ctypes.CDLL(str(target))
 

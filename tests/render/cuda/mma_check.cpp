@@ -7,7 +7,7 @@ using namespace padgs;
 namespace {
 
 template <class T>
-void product(const float *a, const float *b, float *out) {
+__global__ void product(const float *a, const float *b, float *out) {
   const int group = lane_index() >> 2, thread = lane_index() % 4;
   float of_a[8], of_b[4];
   for (int i = 0; i < 8; ++i) {
@@ -27,7 +27,7 @@ void product(const float *a, const float *b, float *out) {
 }
 
 // A^T B for A [16, 16] and B [16, 16] of which a lane has the rows that sums would have.
-void transposed_product(const float *a, const float *b, float *out) {
+__global__ void transposed_product(const float *a, const float *b, float *out) {
   const int group = lane_index() / 4, thread = lane_index() % 4;
   Sums rows[2][2], result[2] = {};
   const auto place = [&](int half, int i) { return 16 * (group + i / 2 * 8) + 8 * half + 2 * thread + i % 2; };
@@ -42,7 +42,7 @@ void transposed_product(const float *a, const float *b, float *out) {
 }
 
 template <class T>
-void rounded(const float *numbers, float *out) {
+__global__ void rounded(const float *numbers, float *out) {
   const int i = 2 * int(global_thread());
   const float2 pair = unpacked(packed(numbers[i], numbers[i + 1], T{}), T{});
   out[i] = pair.x, out[i + 1] = pair.y;
