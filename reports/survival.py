@@ -27,6 +27,7 @@ from padgs.results import file_name
 CONDITION, LEVEL = f"{CONFIG}stress.condition", f"{CONFIG}stress.level"
 QUALITY, ONE_COLOR = "stability/ws_psnr", "stability/ws_psnr_one_color"
 ALIKE = ("resolution", "learning_rates", "data", "machine")  # iterations: a condition may change them
+NOT_SCORED = {"precision"}  # conditions that mean nothing to some methods, and cost these nothing
 HALF = 0.5  # a condition breaks a method where less is kept
 
 Stress = tuple[str, int]  # condition, level
@@ -80,7 +81,8 @@ class Survivor:
         """What it keeps under each condition, the mean of the levels; the worst first. Empty where it lacks any, for
         means of less say nothing beside means of more.
         """
-        cells = [self.levels(condition).values() for condition in self.conditions if not self.lacks]
+        scored = [condition for condition in self.conditions if condition not in NOT_SCORED and not self.lacks]
+        cells = [self.levels(condition).values() for condition in scored]
         return sorted(math.fsum(cell.value or 0.0 for cell in of) / len(of) for of in cells)
 
     @property
@@ -117,7 +119,7 @@ def survivors(gathered: Gathered) -> dict[str, list[Survivor]]:
         refuse_mixture(own, gathered.request, title, ALIKE)
         kept = [one for preset in methods.ordered(own["preset"]) if (one := _survivor(own, preset, title))]
         if kept:
-            every = {stress for one in kept for stress in one.runs}
+            every = {stress for one in kept for stress in one.runs if stress[0] not in NOT_SCORED}
             kept = [replace(one, lacks=every - one.runs.keys()) for one in kept]
             found[title] = sorted(kept, key=lambda one: math.inf if one.lacks else -(one.worst_quartile or 0.0))
     return found

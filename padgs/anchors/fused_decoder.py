@@ -47,7 +47,7 @@ def decode_fused(
 class _DecodeFused(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, reduced_type, room, features, seen, positions, offsets, log_scales, attenuation, *weights):
-        _refuse_others((features, seen, offsets, log_scales, *weights))
+        _refuse_others((features, seen, *weights, positions, offsets, log_scales, attenuation))
         inputs = [t.detach().contiguous() for t in (features, seen)]
         constants = [t.detach().contiguous() for t in (positions, offsets, log_scales, attenuation)]
         weights = [w.detach().contiguous() for w in weights]
@@ -96,8 +96,7 @@ class _DecodeFused(torch.autograd.Function):
 
 def _refuse_others(tensors: Sequence[Tensor]) -> None:
     """Kernels take what pointers point at for what it should be."""
-    features, seen, *_ = tensors
-    first = tensors[4]  # w1
+    features, seen, first, *_ = tensors
     if features.shape[1] + seen.shape[1] != first.shape[1]:
         raise ValueError(
             f"networks of {first.shape[1]} inputs do not fit {features.shape[1]} features and {seen.shape[1]} numbers "

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from padgs.gaussians import Gaussians
 from padgs.native import cpu
@@ -43,5 +44,6 @@ class _AngularSize(torch.autograd.Function):
         return scales.new_tensor(cpu.library().padgs_angular_size(ctypes.byref(arguments)))
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, grad_size: Tensor):
         return ctx.gradient * grad_size, None, None, None

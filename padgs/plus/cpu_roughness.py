@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from padgs.native import cpu
 from padgs.native.abi import RoughnessArguments, pointer
@@ -55,6 +56,7 @@ class _Roughness(torch.autograd.Function):
         return depth.new_tensor(cpu.library().padgs_roughness(ctypes.byref(arguments)))
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, grad_loss: Tensor):
         return ctx.gradient * grad_loss, *[None] * 7
 

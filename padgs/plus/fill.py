@@ -9,7 +9,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from padgs.learning.targets import even_weight
+from padgs.learning.targets import even_weight, image_of
 from padgs.plus.sweep import swept
 from padgs.scene import Scene, View
 
@@ -19,7 +19,7 @@ BESIDE = 1e-3  # radians; a point nearer to the direction asked for says it all
 
 
 def filled(scene: Scene, count: int, *, generator: torch.Generator) -> Scene:
-    """The scene with about `count` points; itself, where its cloud has as many.
+    """The scene with up to `count` points; itself, where its cloud has as many.
 
     New points are pixels of the training views, chosen at random by solid angle and mask. Their range is interpolated
     from the points that this view has in directions nearby (Shepard's way, weights of 1 / angle², of 1 / range, which
@@ -75,5 +75,5 @@ def _seen(
     inverse_range = swept(view, rays[near], inverse_range, nearness[neighbours[near]], others)
 
     camera_frame = rays[near] / inverse_range[:, None]
-    colors = view.image().reshape(-1, 3)[pixels[near]]
+    colors = image_of(view, torch.device("cpu")).reshape(-1, 3)[pixels[near]]
     return (camera_frame - pose[:3, 3]) @ pose[:3, :3], (255 * colors).round().to(torch.uint8)

@@ -1,6 +1,6 @@
 """padgs_plus: what one gets when the measured facts of this project decide.
 
-Explicit Gaussians, drawn exactly along each ray, that start few, grow in eight rounds by the pull in space, lose in a
+Explicit Gaussians, drawn exactly along each ray, that grow in eight rounds by the pull in space, lose in a
 ninth those that are least missed, and are kept small as seen from the cameras. No constant is in world units, counts
 follow the pixels of the images, and latitude is nowhere a special case. docs/plus.md has the reason for each part; each
 is an option with a value that takes it away (`+experiment=plus_ablation`).
@@ -52,15 +52,30 @@ class PlusMethod(SplatMethod):
         """See `padgs.splats.nearest`; checkpoints of earlier versions do not know the training views."""
         return self.trainee.is_drawn_no_finer
 
+    _sought: tuple[Scene, int, Scene, torch.Tensor] | None = None  # what `_filled` found last
+
+    def _filled(self, scene: Scene, count: int) -> tuple[Scene, torch.Generator]:
+        """The scene with points from its photographs, and the generator of all else that is chosen at random.
+
+        They are sought once for a rehearsal and for its run, and not where the model comes from elsewhere.
+        """
+        generator = torch.Generator().manual_seed(self.seed)
+        if self._loaded is not None or self._given is not None:
+            return scene, generator
+        if self._sought is None or self._sought[0] is not scene or self._sought[1] != count:
+            self._sought = scene, count, filled(scene, count, generator=generator), generator.get_state()
+        generator.set_state(self._sought[3])
+        return self._sought[2], generator
+
     def _start(self, scene: Scene, iterations: int) -> SplatTrainee:
         options, pixels = self.options, counted_pixels(scene.train[0])
         start, limit = (_within(share, pixels) for share in (options.start_share, options.limit_share))
         limit = fewest(options.max_gaussians, limit if self._target is None else self._target)
         room = None if limit is None else math.ceil(limit / (1 + options.sky_share))  # for points, if the sky has its
         most, sought = fewest(start, room), round(options.fill_share * pixels)
-        generator = torch.Generator().manual_seed(self.seed)
+        points, generator = self._filled(scene, sought if most is None else min(sought, most))
         splats = Splats.from_scene(
-            filled(scene, sought if most is None else min(sought, most), generator=generator),
+            points,
             degree=options.sh_degree,
             max_gaussians=most,
             opacity=options.initial_opacity,

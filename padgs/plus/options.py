@@ -39,7 +39,7 @@ class PlusOptions(SplatOptions):
     min_opacity: float = 0.05  # what is fainter when a round ends was not needed
     coarse_share: float = 0.3  # of the run, on views that are half as wide if they are large, at first still smaller
     start_share: float | None = 0.6  # points to begin with, per independent pixel of a view; None: all that there are
-    fill_share: float = 0.6  # ... of which so many at least: photographs give what the cloud has not; 0: not
+    fill_share: float = 0.6  # ... up to which photographs give what the cloud has not, near its points; 0: not
     limit_share: float | None = 2.6  # ... and Gaussians at most while it grows: a guard on memory and time
     removal_psnr: float | None = REMOVAL_PSNR  # a round later the least missed go, by what each alone changes, added up
     initial_opacity: float = 0.5  # 0.1 hides what lies in front until opacities have grown

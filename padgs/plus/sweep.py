@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from padgs.learning.targets import image_of
 from padgs.scene import View
 from padgs.sphere.camera import Panorama
 from padgs.sphere.panorama import sample
@@ -22,6 +23,7 @@ TRIED = 13  # inverse ranges, from below those of the points around to above
 BEYOND = 1.2  # times the least and the largest of them
 PATCH = ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1))  # pixels across and along
 DOUBT = 0.01  # of the range of colours: how much better an octave away must look
+PARALLAX = 1e-3  # of a range; a camera that moved by less sees nothing move
 AT_ONCE = 4096  # pixels, so that memory does not follow their number
 
 
@@ -33,15 +35,21 @@ def swept(view: View, rays: Tensor, inverse_range: Tensor, around: Tensor, views
         rays: [n, 3] float64, of the pixels, in its camera frame.
         inverse_range: [n] > 0, what is likely, 1 / world units.
         around: [n, K] > 0, those of points around.
-        views: all there are; those that are no panoramas, or stand where this one does, are not asked. What their masks
+        views: all there are; those that are no panoramas, or stand where this one does (within `PARALLAX` of the median
+            range), are not asked. What their masks
             hide is asked all the same; it is outvoted, as what hides behind something is.
     """
-    others = [other for other in views if isinstance(other.camera, Panorama) and _apart(view, other) > 0]
-    others = sorted(others, key=lambda other: _apart(view, other))[:OTHERS]
-    if not others or not isinstance(view.camera, Panorama):
+    if not isinstance(view.camera, Panorama) or len(rays) == 0:
+        return inverse_range
+    least = PARALLAX / inverse_range.median().item()
+    others = [other for other in views if isinstance(other.camera, Panorama)]
+    apart = [_apart(view, other) for other in others]
+    nearest = sorted((number for number, away in enumerate(apart) if away > least), key=lambda number: apart[number])
+    others = [others[number] for number in nearest[:OTHERS]]
+    if not others:
         return inverse_range
     parts = zip(*(tensor.split(AT_ONCE) for tensor in (rays, inverse_range, around)), strict=True)
-    images = [other.image() for other in (view, *others)]
+    images = [image_of(other, torch.device("cpu")) for other in (view, *others)]
     return torch.cat([_swept(view, others, images, *part) for part in parts])
 
 

@@ -69,9 +69,8 @@ def score(
     Why LPIPS is missing, where it is, is added to `notes`.
     """
     rows = protocol.rows(image.shape[0])
-    if protocol.solid_angle and rows < image.shape[0]:  # hidden, not cut off: latitude is a matter of the whole image
-        counts = torch.arange(image.shape[0], device=image.device) < rows
-        mask = counts[:, None] * (torch.ones_like(image[..., 0]) if mask is None else mask)
+    if protocol.solid_angle:
+        mask = weight_of(mask, image, protocol)
     elif rows < image.shape[0]:
         image, truth, mask = image[:rows], truth[:rows], None if mask is None else mask[:rows]
     marks: Marks = {name: _value(METRICS[name](image, truth, mask)) for name in protocol.metrics}
@@ -83,6 +82,18 @@ def score(
             if notes is not None:
                 notes[f"{protocol.lpips_name} is missing: {reason}"] = None
     return marks
+
+
+def weight_of(mask: Tensor | None, image: Tensor, protocol: Protocol) -> Tensor | None:
+    """A mask [H, W] or None, with the rows of an image [H, W, 3] hidden that do not count.
+
+    Hidden, not cut off: latitude is a matter of the whole image.
+    """
+    rows = protocol.rows(image.shape[0])
+    if rows == image.shape[0]:
+        return mask
+    counts = torch.arange(image.shape[0], device=image.device) < rows
+    return counts[:, None] * (torch.ones_like(image[..., 0]) if mask is None else mask)
 
 
 def mean_marks(views: Sequence[Marks]) -> Marks:

@@ -97,11 +97,15 @@ class _Splats(torch.autograd.Function):
 def _refuse_others(degree: int, stored: int, width: int, *tensors: Tensor) -> None:
     """The library takes what pointers point at for what it should be."""
     if not (degree + 1) ** 2 - 1 <= stored <= MOST_STORED:
-        raise ValueError(f"{stored} coefficients beside the first are no harmonics of degree {degree}")
+        raise ValueError(
+            f"sh_rest has {stored} coefficients, but degree {degree} in use takes {(degree + 1) ** 2 - 1} to "
+            f"{MOST_STORED}; lower active_degree"
+        )
     if width not in (0, *PROBES):
         raise ValueError(f"the probe is {width} wide; it must be {' or '.join(map(str, PROBES))}")
     if len({(tensor.dtype, tensor.device) for tensor in tensors}) > 1:
-        raise ValueError(f"tensors differ in type or device: {', '.join(f'{t.dtype} {t.device}' for t in tensors)}")
+        kinds = ", ".join(f"{name} {t.dtype} on {t.device}" for name, t in zip(Learned._fields, tensors, strict=False))
+        raise ValueError(f"Gaussians of one type and device are drawn together, not {kinds}; move them with .to()")
 
 
 def _empty_like(tensor: Tensor | None) -> Tensor | None:

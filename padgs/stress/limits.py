@@ -13,7 +13,7 @@ MADE_FOR = ("256x128", 1500)  # resolution, and iterations without stress
 
 @dataclass(frozen=True)
 class Limit:
-    """How far a mark of the protocol `stability` may go at levels 1, 2 and 3."""
+    """How far a mark of the protocol `stability` may go at each level from 1 on, as far as there is a limit."""
 
     levels: tuple[float, ...]
     mark: str = "ws_psnr"

@@ -131,3 +131,37 @@ def test_no_more_is_sought_than_a_budget_has_room_for(monkeypatch):
     for budget in (None, 150):
         list(PlusMethod(PlusOptions(sky_share=0.5)).fit(dome(300), Budget(16, gaussians=budget)))
     assert sought == [round(PlusOptions().fill_share * counted_pixels(dome(8).train[0])), math.ceil(2 * 150 / 1.5)]
+
+
+def test_points_are_sought_once_for_a_run_and_not_where_it_goes_on(monkeypatch):
+    sought, scene = [], dome(40)
+
+    def counted(scene, count, *, generator):
+        sought.append(count)
+        torch.rand(1, generator=generator)  # as a choice of pixels does
+        return scene
+
+    monkeypatch.setattr(method_module, "filled", counted)
+    first = PlusMethod(seed=3)
+    list(first.fit(scene, Budget(10_000, seconds=0.3)))  # rehearses
+    assert len(sought) == 1
+    model = first.resumed(scene, 100).splats
+    assert len(sought) == 1 and torch.equal(model.means, first.trainee.splats.means)
+    for again in (PlusMethod(seed=3), PlusMethod(seed=3)):
+        list(again.fit(scene, Budget(2)))
+    assert len(sought) == 3
+    resumed = PlusMethod(seed=3)
+    resumed.load_state(again.state())
+    list(resumed.fit(scene, Budget(4)))
+    begun = PlusMethod(seed=3)
+    begun.begin_with(again.state())
+    list(begun.fit(scene, Budget(2)))
+    assert len(sought) == 3
+
+
+def test_a_rehearsal_changes_nothing_of_the_points_that_a_run_begins_with():
+    scene, one = dome(40), PlusMethod(seed=3)
+    first, second, other = (
+        method._start(scene, length).splats for method, length in ((one, 9), (one, 20), (PlusMethod(seed=3), 20))
+    )
+    assert torch.equal(first.means, second.means) and torch.equal(second.means, other.means)

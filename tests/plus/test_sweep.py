@@ -82,6 +82,7 @@ def test_parts_are_put_together_in_order():
     whole, true, _ = found(views, count=AT_ONCE + 5)
     assert len(whole) == len(true) == AT_ONCE + 5
     assert torch.equal(whole[:300], found(views)[0])
+    assert ((whole[-5:] / true[-5:]).log2().abs() < 0.2).all()
 
 
 def test_points_from_photographs_lie_where_these_agree_and_not_where_the_cloud_has_them(monkeypatch):

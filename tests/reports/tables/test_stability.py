@@ -104,6 +104,14 @@ def test_who_was_spared_something_has_no_score_and_stands_last():
         assert scores["unstressed: WS-PSNR, dB"]["PaD-GS"] == "32.00" and "score –, worst quartile –" in chart.svg
 
 
+def test_what_means_nothing_to_some_methods_is_told_and_not_scored():
+    both = [*runs(), *rest()]
+    reduced = run("padgs", 12.0, "precision", 1)  # PaD-GS alone has networks
+    with_it, without = (cells(stability(gathered(of))[0], "synthetic-room") for of in ([*both, reduced], both))
+    assert with_it["stability score"] == without["stability score"]
+    assert cells(stability(gathered([*both, reduced]))[0], "Retention")["precision 1"]["PaD-GS"] == "0.00"
+
+
 def test_a_run_that_was_stopped_is_neither_a_seed_nor_a_reference():
     names = ("stopped after 9 iterations", "pose_noise 1, stopped after 9 iterations")
     stopped = [replace(one, run="stopped", seed=9, variant=name) for one, name in zip(runs(), names, strict=False)]
