@@ -14,7 +14,7 @@ from padgs.render import Rendering
 from padgs.results import Scores
 from padgs.scene import Scene, View
 from padgs.scoring import geometry
-from padgs.scoring.evaluate import Marks, OnView, as_stored, evaluate, weight_of
+from padgs.scoring.evaluate import Marks, OnView, as_stored, evaluate, known, weight_of
 from padgs.scoring.metrics import mean_color, psnr, ws_psnr_fitted
 from padgs.scoring.pole_gap import oracle, pole_gap
 from padgs.scoring.protocols import Protocol
@@ -49,11 +49,10 @@ def stability(method: Method, scene: Scene, protocol: Protocol, on_view: OnView 
     def also(view: View, rendering: Rendering) -> Marks:
         truth, image = view.image(device=rendering.image.device), as_stored(rendering.image)
         mask = weight_of(view.mask(device=image.device), image, protocol)
-        marks = {"ws_psnr_one_color": mean_color(truth, mask).item(), "pole_gap_oracle": None}
-        marks["ws_psnr_fitted"] = ws_psnr_fitted(image, truth, mask).item()
+        marks = {"ws_psnr_one_color": mean_color(truth, mask), "ws_psnr_fitted": ws_psnr_fitted(image, truth, mask)}
         if view.lens is None and (blurred := oracle(image, truth, mask)) is not None:
-            gap = pole_gap(blurred, truth, mask).item()
-            marks["pole_gap_oracle"] = None if math.isnan(gap) else gap
+            marks["pole_gap_oracle"] = pole_gap(blurred, truth, mask)
+        marks = {"pole_gap_oracle": None, **{name: known(mark) for name, mark in marks.items()}}
         return {**marks, **geometry.of_view(method.render, view, rendering)}
 
     found = evaluate(method.render, scene.test, protocol, on_view=on_view, also=also)

@@ -73,10 +73,10 @@ def score(
         mask = weight_of(mask, image, protocol)
     elif rows < image.shape[0]:
         image, truth, mask = image[:rows], truth[:rows], None if mask is None else mask[:rows]
-    marks: Marks = {name: _value(METRICS[name](image, truth, mask)) for name in protocol.metrics}
+    marks: Marks = {name: known(METRICS[name](image, truth, mask)) for name in protocol.metrics}
     if protocol.lpips_name is not None:
         try:
-            marks[protocol.lpips_name] = _value(_lpips(image, truth, mask, protocol))
+            marks[protocol.lpips_name] = known(_lpips(image, truth, mask, protocol))
         except LpipsUnavailable as reason:
             marks[protocol.lpips_name] = None
             if notes is not None:
@@ -138,6 +138,7 @@ def _lpips(image: Tensor, truth: Tensor, mask: Tensor | None, protocol: Protocol
     return weighted_lpips(image, truth, sphere_weight(image, mask), mask=mask, net=net, inputs=inputs)
 
 
-def _value(metric: Tensor) -> float | None:
+def known(metric: Tensor) -> float | None:
+    """A metric as a number; None where no pixel counts."""
     value = metric.item()
     return None if value != value else value  # images are finite, so NaN only says that no pixel counts

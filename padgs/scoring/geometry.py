@@ -6,7 +6,6 @@ measured. All means are over the sphere: each row weighs as much as its solid an
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -15,6 +14,7 @@ from torch import Tensor
 
 from padgs.render import Rendering
 from padgs.scene import View
+from padgs.scoring.evaluate import known
 from padgs.sphere.distortion import solid_angle_weight
 from padgs.sphere.panorama import rays
 
@@ -84,10 +84,10 @@ def of_view(render: Callable[[View], Rendering], view: View, rendering: Renderin
         marks["yaw_error"] = yaw_error(render, view, rendering.image).item()
     if view.load_depth is not None:
         depth, truth = rendering.depth, view.load_depth().to(rendering.depth)
-        marks["depth_error"] = _known(depth_error(depth, truth))
-        marks["depth_within"] = _known(depth_within(depth, truth))
-        marks["floaters"] = _known(floaters(depth, 1 - rendering.transmittance, truth))
-        marks["least_extent"] = _known(least_extent(depth, truth)) if view.lens is None else None
+        marks["depth_error"] = known(depth_error(depth, truth))
+        marks["depth_within"] = known(depth_within(depth, truth))
+        marks["floaters"] = known(floaters(depth, 1 - rendering.transmittance, truth))
+        marks["least_extent"] = known(least_extent(depth, truth)) if view.lens is None else None
     return marks
 
 
@@ -96,8 +96,3 @@ def _mean(values: Tensor, truth: Tensor) -> Tensor:
     rows = solid_angle_weight(len(truth), dtype=values.dtype, device=values.device)[:, None]
     weight = rows * torch.isfinite(truth)
     return (torch.where(weight > 0, values, 0) * weight).sum() / weight.sum()
-
-
-def _known(mean: Tensor) -> float | None:
-    value = mean.item()
-    return None if math.isnan(value) else value

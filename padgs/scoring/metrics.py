@@ -47,7 +47,8 @@ def ws_psnr_fitted(image: Tensor, target: Tensor, mask: Tensor | None = None) ->
 
     What is left is wrong otherwise than by the exposure and the white balance of the image as a whole.
     """
-    weight = sphere_weight(image, mask)[..., None] / sphere_weight(image, mask).sum()
+    weight = sphere_weight(image, mask)[..., None]
+    weight = weight / weight.sum()
     means = [(of * weight).sum((0, 1)) for of in (image, target)]
     seen, true = (of - mean for of, mean in zip((image, target), means, strict=True))
     gain = (seen * true * weight).sum((0, 1)) / (seen.square() * weight).sum((0, 1)).clamp(min=FLAT)
