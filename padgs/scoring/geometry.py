@@ -48,8 +48,11 @@ def floaters(depth: Tensor, alpha: Tensor, truth: Tensor) -> Tensor:
 
 def least_extent(depth: Tensor, truth: Tensor) -> Tensor:
     """How thick the surfaces that a view shows are all together, as a share of the true ones: the ratio of the smallest
-    standard deviations along any axis. Near 0 where all has collapsed onto a plane, or into a point.
+    standard deviations along any axis. Near 0 where all has collapsed onto a plane, or into a point; NaN if there are
+    none.
     """
+    if not torch.isfinite(truth).any():
+        return truth.new_tensor(torch.nan)
     thinnest = []
     directions = rays(depth.shape[1], depth.shape[0]).to(depth)
     for distances in (depth, truth):

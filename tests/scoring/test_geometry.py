@@ -47,6 +47,7 @@ def test_what_has_collapsed_onto_a_plane_or_a_point_is_thin():
     disc[7:9] = 2.0  # all of it within 11 degrees of the horizon
     assert least_extent(disc, SURFACE) < 0.1 and least_extent(0 * SURFACE, SURFACE) == 0
     assert least_extent(upper(9.0), upper(math.inf)).item() == pytest.approx(1), "the sky is not measured"
+    assert least_extent(SURFACE, torch.full_like(SURFACE, math.inf)).isnan()
 
 
 @pytest.mark.parametrize(("wrap", "sees"), [(True, False), (False, True)])
