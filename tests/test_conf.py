@@ -152,7 +152,7 @@ def test_one_scene_indoors_and_one_outdoors_stand_in_for_the_data_sets():
 
 def test_the_stress_experiment_puts_every_method_under_every_condition_and_under_none():
     stresses = {tuple(setting for setting in job if "stress." in setting) for job in expanded("+experiment=stress")}
-    names = ("none", *CONDITIONS)
+    names = ("none", *(name for name, of in CONDITIONS.items() if of.option is None))  # which few methods have
     assert stresses == {(f"++stress.condition={name}", f"++stress.level={n}") for name in names for n in (1, 2, 3)}
 
 

@@ -255,7 +255,7 @@ class SplatTrainee:
             ValueError: the state is of a model with other options.
         """
         self.splats.load(state.under("splats/"))
-        self.splats.active_degree = state.values["active_degree"]
+        self.splats.active_degree, self.splats.unit = state.values["active_degree"], state.values["unit"]
         self.densifier.forget()
         if self._filter is not None:
             self._filter.renew(self.splats.means)

@@ -1,4 +1,4 @@
-"""What methods lose under stress, beside what they may: `padgs.stress.limits`, where these are made for such runs."""
+"""What methods lose under stress, beside what they may: `padgs.reports.limits`, where these are made for such runs."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from dataclasses import replace
 from padgs.reports import methods
 from padgs.reports.conditions import footnotes
 from padgs.reports.gathered import Gathered
+from padgs.reports.limits import LIMITS, MADE_FOR, Limit
 from padgs.reports.survival import QUALITY, Stress, Survivor, in_order, survivors
 from padgs.reports.tables.cells import spread
 from padgs.reports.tables.table import Block, Cell, Column, Row, Table
-from padgs.stress.limits import LIMITS, MADE_FOR, Limit
 
 TOLD = Limit(())  # of a condition without a limit: what is lost of the WS-PSNR
 BEYOND = "beyond"
