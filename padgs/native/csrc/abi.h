@@ -51,14 +51,14 @@ struct alignas(16) Footprint {
   float depth;
   float red, green, blue;
 };
-static_assert(sizeof(Footprint) == 64, "padgs/render/tiles.py allocates 16 floats per footprint");
+static_assert(sizeof(Footprint) == 64, "padgs/render/backends/cpu_tiles.py allocates 16 floats per footprint");
 
 // Pixels that a footprint can reach: rows [row, row_end), columns [column, column_end) and, beyond the seam,
 // [0, second_end) with second_end <= column. Nothing where row == row_end.
 struct PixelBox {
   int32_t column, column_end, second_end, row, row_end;
 };
-static_assert(sizeof(PixelBox) == 20, "padgs/render/tiles.py allocates 5 integers per box");
+static_assert(sizeof(PixelBox) == 20, "padgs/render/backends/cpu_tiles.py allocates 5 integers per box");
 
 // Tiles: rows of 16 pixels; in a row of level l a tile is 16 2^l pixels wide.
 struct TileGrid {
