@@ -1,6 +1,10 @@
 """The mean angular size: of what is known, in any units, and natively as the definition has it."""
 
 import math
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -52,3 +56,17 @@ def test_what_is_no_number_reaches_the_loss(place, generator):
     values = {"means": torch.randn(20, 3, generator=generator), "scales": torch.rand(20, 3, generator=generator)}
     values[place][7, 1] = math.nan
     assert mean_angular_size(gaussians_at(**values), view_from((0.0, 0.0, 0.0)), near=0.1).isnan()
+
+
+def test_no_instruction_set_takes_what_is_no_number_for_near():
+    """Which of two numbers a maximum takes, if one is none, differs between them; this machine's own is above."""
+    code = (
+        "import torch; from test_angular_size import gaussians_at, view_from, mean_angular_size as size; "
+        "means = torch.full((20, 3), float('nan')); "
+        "print(size(gaussians_at(means, torch.ones(20, 3)), view_from((0.0, 0.0, 0.0)), near=0.1).item())"
+    )
+    for isa in ("baseline", "avx2"):
+        path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+        environment = {**os.environ, "PYTHONPATH": path, "PADGS_ISA": isa}
+        done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+        assert done.stdout.strip() == "nan", done.stderr
