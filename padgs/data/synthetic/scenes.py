@@ -111,7 +111,7 @@ def room(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> Wo
 
 
 def near_clutter(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
-    """The room with small objects beside the camera path, in a layer 25 cm thick, from 5 cm on unless asked otherwise."""
+    """The room with small objects beside the camera path: a layer 25 cm thick, from 5 cm on unless asked otherwise."""
     shapes = [Room(_LOW, _HIGH, _room_materials(options, 6, 5)), *_furniture(rng)]
     nearest = 0.05 if options.nearest is None else options.nearest
     return World((*shapes, *fu.beside(_objects(options), path, nearest, nearest + 0.25, rng)), _LIGHT)
