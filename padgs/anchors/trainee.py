@@ -44,9 +44,12 @@ class LearningRates(ExtentOptions):
         """The parameters of a model with their rates in a run of `iterations`; `extent` in `offset_rate_unit`."""
         first, last = self.offset_rate
         groups = [
-            ParameterGroup("offsets", (model.offsets,), LogLinear(extent * first, extent * last, iterations)),
-            ParameterGroup("features", (model.features,), Constant(self.feature_rate)),
-            ParameterGroup("log_scales", (model.log_scales,), Constant(self.log_scale_rate)),
+            ParameterGroup(name, (getattr(model, name),), rate, is_of_rows=True)
+            for name, rate in (
+                ("offsets", LogLinear(extent * first, extent * last, iterations)),
+                ("features", Constant(self.feature_rate)),
+                ("log_scales", Constant(self.log_scale_rate)),
+            )
         ]
         for head in ("opacity", "color", "covariance"):
             weights = tuple(getattr(model.decoder, head).values())

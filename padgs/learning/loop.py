@@ -19,6 +19,7 @@ from torch import Tensor
 
 from padgs.learning.budget import Budget
 from padgs.learning.failure import Failure, is_out_of_memory, memory_reason
+from padgs.learning.guard import Guard
 from padgs.learning.loss import photometric_loss
 from padgs.learning.monitor import Monitor
 from padgs.learning.optimiser import Optimiser
@@ -107,6 +108,7 @@ class Trainer:
         self._corrections.to(groups[0].parameters[0].device)
         groups = [*groups, *self._corrections.groups(budget.iterations)]
         self._optimiser = Optimiser(groups, self._pace(1, 1), options.check_every, **self.ADAM)
+        self._guard = Guard(groups, scene, gradients=options.guard_gradients, scales=options.guard_scales)
         self._sizes = Sizes(scene.train, options.weight, self._optimiser.device, coarse_share)
         apart = set_apart(scene.train) if budget.stop == "auto" else ()
         self._calibration = [scene.train[number] for number in apart]
@@ -197,10 +199,13 @@ class Trainer:
         optimiser.pace = self._pace(iteration, moment)
         with stage("optimiser"):
             optimiser.step(moment)
+            self._guard.bound()
             self._corrections.centre()
         with stage("adapt"), torch.no_grad():
             passed = range(self.moment + 1, moment + 1)  # all that comes at a moment of the schedule comes once
             events = tuple(event for one in passed for event in trainee.adapt(one, optimiser.adam))
+        if optimiser.is_checked(iteration):
+            events += self._guard.look(iteration)
         return sum(losses) / len(losses), {**trainee.counts(), "drawn": max(drawn)}, events
 
     def _watch(self, loss: float | Tensor, iteration: int) -> None:
@@ -248,6 +253,7 @@ class Trainer:
             self._monitor.picture(drawing, target.image, iteration)
         with stage("backward"):
             loss.backward()
+            self._guard.clean(drawing.probe)
         if self._monitor is not None and optimiser.is_checked(iteration):
             self._monitor.probe(drawing.probe.grad, iteration)
         with stage("observe"), torch.no_grad():
@@ -271,6 +277,7 @@ class Trainer:
         tensors |= {f"{VIEWS}{name}": tensor for name, tensor in self._corrections.state_dict().items()}
         tensors |= self._optimiser.tensors() | {"random/torch": torch.get_rng_state()} | order.tensors
         values = {"model": model.values, **{name: getattr(self, name) for name in self.PROGRESS}, **order.values}
+        values["left_out"] = self._guard.left_out
         if self._monitor is not None:
             values["monitor"] = copy.deepcopy(self._monitor.state)
         if self._calibration:
@@ -292,6 +299,7 @@ class Trainer:
         before |= {"skipped": 0, "ended": ""}
         for name in self.PROGRESS:  # older checkpoints have some of them less
             setattr(self, name, {**before, **state.values}[name])
+        self._guard.left_out = state.values.get("left_out", 0)
         if self._monitor is not None and "monitor" in state.values:  # not in checkpoints from before there was one
             self._monitor.state = copy.deepcopy(state.values["monitor"])
         if self._calibration:

@@ -22,6 +22,7 @@ class ParameterGroup:
     parameters: tuple[nn.Parameter, ...]
     learning_rate: Callable[[int], float]  # iteration (1 for the first step) -> published learning rate
     paced: bool = True  # whether it follows `Pace`; cameras that learn do not
+    is_of_rows: bool = False  # whether each row belongs to one Gaussian or anchor, and all such groups have as many
 
 
 @dataclass(frozen=True)

@@ -86,15 +86,16 @@ class SplatTrainee:
     def groups(self, means_speed: float = 1.0) -> list[ParameterGroup]:
         """Learning rates of 3DGS; that of the means falls over the whole run and follows the size of the scene."""
         splats, speed = self.splats, means_speed * self._extent
-        means = LogLinear(1.6e-4 * speed, 1.6e-6 * speed, self.iterations)
-        return [
-            ParameterGroup("means", (splats.means,), means),
-            ParameterGroup("quats", (splats.quats,), Constant(1e-3)),
-            ParameterGroup("log_scales", (splats.log_scales,), Constant(5e-3)),
-            ParameterGroup("opacity_logits", (splats.opacity_logits,), Constant(5e-2)),
-            ParameterGroup("sh_dc", (splats.sh_dc,), Constant(2.5e-3)),
-            ParameterGroup("sh_rest", (splats.sh_rest,), Constant(2.5e-3 / 20)),
-        ]
+        rates = {
+            "means": LogLinear(1.6e-4 * speed, 1.6e-6 * speed, self.iterations),
+            "quats": Constant(1e-3),
+            "log_scales": Constant(5e-3),
+            "opacity_logits": Constant(5e-2),
+            "sh_dc": Constant(2.5e-3),
+            "sh_rest": Constant(2.5e-3 / 20),
+        }
+        rows = splats.rows()
+        return [ParameterGroup(name, (rows[name],), rate, is_of_rows=True) for name, rate in rates.items()]
 
     def draw(self, view: View, probe: Tensor | None = None) -> Drawing:
         """Render all Gaussians, differentiably.
