@@ -9,7 +9,7 @@ from padgs.data.errors import DataError
 
 SCENES = (
     *("room", "two_rooms", "outdoor", "pole_torture", "bare_room", "near_clutter", "glossy"),
-    *("white_room", "checker_room"),
+    *("white_room", "checker_room", "enfilade"),
 )
 PATHS = ("roaming", "cross", "line")
 HEADINGS = ("path", "fixed", "random")
@@ -37,6 +37,7 @@ class SyntheticOptions:
     seed: int = 0  # of the path, the points and the noise
     texture_frequency: float = 1.0  # multiplies the spatial frequency of every pattern
     objects: int | None = None  # number of loose objects besides the furniture; None = the scene's own
+    rooms: int = 2  # of an enfilade, with as many loose objects each
     spokes: int = 16  # of the Siemens stars in pole_torture
     nearest: float | None = None  # metres from the path to what hangs beside it in near_clutter; None = 0.05
     horizon: float | None = None  # metres to the mountains outdoors; None = 300
@@ -61,7 +62,7 @@ class SyntheticOptions:
             raise DataError(f"width {self.width} is not an even number >= 8; a panorama is 2:1 (data.width)")
         if math.isqrt(max(self.samples, 0)) ** 2 != self.samples or self.samples < 1:
             raise DataError(f"samples {self.samples} is not a square number; use 1, 4, 9, 16, 25, ...")
-        for field, least in (("train_views", 2), ("test_views", 0), ("points", 1), ("spokes", 1)):
+        for field, least in (("train_views", 2), ("test_views", 0), ("points", 1), ("spokes", 1), ("rooms", 1)):
             if getattr(self, field) < least:
                 raise DataError(f"{field} {getattr(self, field)} is less than {least}")
         for field in ("point_noise", "pose_noise_translation", "pose_noise_rotation", "exposure", "tilt", "lens_gap"):

@@ -2,7 +2,8 @@
 
 room, two_rooms (a door between them), outdoor (far ring and sky), pole_torture (Siemens stars and rods at both poles),
 bare_room (posters on a tenth of the walls), near_clutter (objects 5-30 cm from the path), glossy (mirror-like
-materials, so colours depend on the view); white_room and checker_room, whose complexity is known.
+materials, so colours depend on the view); white_room and checker_room, whose complexity is known; enfilade (as many
+rooms in a row as are asked for).
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ import numpy as np
 
 from padgs.data.synthetic import furniture as fu
 from padgs.data.synthetic import textures as tx
+from padgs.data.synthetic.enfilade import enfilade
+from padgs.data.synthetic.enfilade import walk as through_rooms
 from padgs.data.synthetic.light import Light
 from padgs.data.synthetic.options import SyntheticOptions
 from padgs.data.synthetic.outdoor import outdoor
@@ -30,7 +33,7 @@ Furnish = Callable[[SyntheticOptions, Array, np.random.Generator], World]  # opt
 class Blueprint:
     """A scene before it is built."""
 
-    walk: Walk
+    walk: Walk | Callable[[SyntheticOptions], Walk]
     path: str  # the kind of path it has unless asked otherwise
     objects: int  # likewise, loose objects
     furnish: Furnish
@@ -201,4 +204,5 @@ BLUEPRINTS: dict[str, Blueprint] = {
     "glossy": Blueprint(Walk((-0.1, -0.1), (1.4, 1.15)), "roaming", 8, glossy),
     "white_room": Blueprint(Walk((-0.1, -0.1), (1.4, 1.15)), "roaming", 0, white_room),
     "checker_room": Blueprint(Walk((-0.1, -0.1), (1.4, 1.15)), "roaming", 0, checker_room),
+    "enfilade": Blueprint(through_rooms, "roaming", 4, enfilade),
 }

@@ -34,8 +34,11 @@ class SyntheticTruth:
         if options.objects is None:
             options = replace(options, objects=blueprint.objects)
         self.options = options
-        reach = options.reach
-        walk = blueprint.walk if reach is None else replace(blueprint.walk, half=(reach, reach), waypoints=())
+        reach, walk = options.reach, blueprint.walk
+        if not isinstance(walk, paths.Walk):
+            walk = walk(options)
+        if reach is not None:
+            walk = replace(walk, half=(reach, reach), waypoints=())
         path = paths.curve(walk, options.path or blueprint.path, self.random("path"))
         self.poses = paths.poses(options, path, self.random("poses"))  # [n, 4, 4] metres, exact
         self.world: World = blueprint.furnish(options, path, self.random("furniture"))
