@@ -57,14 +57,14 @@ def enfilade(options: SyntheticOptions, path: Array, rng: np.random.Generator) -
         shapes += [Box((x, side * WIDTH / 2, HEIGHT / 2), (LENGTH / 2, 0.01, HEIGHT / 2), paper) for side in (-1, 1)]
         shapes += _furniture(k, x, rng)
         if k:
-            shapes += _door(x - LENGTH / 2, paper)
+            shapes += doorway(x - LENGTH / 2, paper)
     low, high = (-half + 0.7, -1.9, 0.5), (half - 0.7, 1.7, 2.2)
     shapes += fu.scatter((options.objects or 0) * options.rooms, path, low, high, 0.35, rng)
     return World(tuple(shapes), Light(tuple(((x, 0.0, 2.35), 0.7) for x in middles)))
 
 
-def _door(x: float, paper: tuple[Material, ...]) -> list[Shape]:
-    """A wall across the row, and the frame of the opening in it."""
+def doorway(x: float, paper: tuple[Material, ...]) -> list[Shape]:
+    """A wall across at `x`, of the width and height of a room, and the frame of the opening in its middle."""
     frame = fu.matt(tx.planks(*fu.WALNUT, width=0.06))
     return [
         *(Box((x, side * 1.45, 1.4), (0.08, 1.05, 1.4), paper) for side in (-1, 1)),

@@ -15,7 +15,7 @@ import numpy as np
 
 from padgs.data.synthetic import furniture as fu
 from padgs.data.synthetic import textures as tx
-from padgs.data.synthetic.enfilade import enfilade
+from padgs.data.synthetic.enfilade import doorway, enfilade
 from padgs.data.synthetic.enfilade import walk as through_rooms
 from padgs.data.synthetic.light import Light
 from padgs.data.synthetic.options import SyntheticOptions
@@ -161,15 +161,10 @@ def pole_torture(options: SyntheticOptions, path: Array, rng: np.random.Generato
 def two_rooms(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
     """Two furnished rooms of 5 x 5 m with an open door between them; most things are hidden from most views."""
     f = options.texture_frequency
-    partition = Material(scaled(tx.wallpaper((0.62, 0.5, 0.42), (0.9, 0.82, 0.7)), f))
-    frame = fu.matt(tx.planks(*fu.WALNUT, width=0.06))
+    partition = fu.matt(scaled(tx.wallpaper((0.62, 0.5, 0.42), (0.9, 0.82, 0.7)), f))
     shapes: list[Shape] = [
         Room((-5.0, -2.5, 0.0), (5.0, 2.5, 2.8), _room_materials(options, 10, 5, rugs=((-2.6, 0.0), (2.6, 0.0)))),
-        Box((0, -1.45, 1.4), (0.08, 1.05, 1.4), (partition,)),
-        Box((0, 1.45, 1.4), (0.08, 1.05, 1.4), (partition,)),
-        Box((0, 0, 2.45), (0.08, 0.4, 0.35), (partition,)),
-        *(Box((0, y, 1.05), (0.1, 0.03, 1.05), frame) for y in (-0.4, 0.4)),
-        Box((0, 0, 2.1), (0.1, 0.43, 0.03), frame),
+        *doorway(0, partition),
         *fu.bookshelf(-2.4, 2.3, 1.8, 2.1),
         *fu.table(-3.9, -1.6, 1.2, 0.8, 0.75),
         *fu.crates(-0.6, -2.0, rng),
