@@ -32,7 +32,8 @@ NEEDS = ("off", "on")
 IMAGES_ON = ("device", "cpu")
 WATCHED = 5.0  # seconds between checkpoints at most, where somebody watches
 CONTINUED = "continued"  # the word for runs with `init` in tables
-LATER = ("exposures", "poses")  # keys of `train` that older runs do not have; they did what is the default
+# Keys of `train` that older runs do not have; they did what is the default.
+LATER = ("exposures", "poses", "guard_gradients", "guard_scales")
 
 
 @dataclass(frozen=True)
