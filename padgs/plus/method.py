@@ -18,6 +18,7 @@ from padgs.learning.options import TrainOptions
 from padgs.learning.trainee import Trainee
 from padgs.plus.fill import filled
 from padgs.plus.options import GROWN_PER_KEPT, PlusOptions
+from padgs.plus.rooms import rooms
 from padgs.plus.sky import far_gaussians
 from padgs.plus.trainee import PlusTrainee, counted_pixels
 from padgs.render.config import RenderConfig
@@ -68,7 +69,7 @@ class PlusMethod(SplatMethod):
         return self._sought[2], generator
 
     def _start(self, scene: Scene, iterations: int) -> SplatTrainee:
-        options, pixels = self.options, counted_pixels(scene.train[0])
+        options, pixels = self.options, rooms(scene) * counted_pixels(scene.train[0])
         start, limit = (_within(share, pixels) for share in (options.start_share, options.limit_share))
         limit = fewest(options.max_gaussians, limit if self._target is None else self._target)
         room = None if limit is None else math.ceil(limit / (1 + options.sky_share))  # for points, if the sky has its
