@@ -4,23 +4,23 @@ from dataclasses import replace
 
 import pytest
 import torch
-from composed import composed
-
 from padgs.data.synthetic import SyntheticOptions, generate
+from padgs.plus.method import PlusMethod
+from padgs.plus.options import PlusOptions
 from padgs.plus.rooms import rooms
-from padgs.runs.session import build
 from padgs.stress.options import StressOptions
 
 
 @pytest.fixture(autouse=True)
-def cached(monkeypatch, root, cache):
-    monkeypatch.setenv("PADGS_ROOT", str(root))
+def cached(monkeypatch, cache):
     monkeypatch.setenv("PADGS_CACHE", str(cache))
 
 
 def scene_of(name: str, count: int = 1):
-    views = {"train_views": 8 * count, "test_views": 1, "points": 3000 * count}
-    return generate(SyntheticOptions(scene=name, rooms=count, width=16, samples=1, **views))
+    views, points = 8 * count, 3000 * count
+    return generate(
+        SyntheticOptions(scene=name, rooms=count, width=16, samples=1, train_views=views, test_views=1, points=points)
+    )
 
 
 def test_more_rooms_are_more_and_one_is_one():
@@ -54,6 +54,6 @@ def test_a_row_of_rooms_may_have_more_gaussians_than_one():
     row = scene_of("enfilade", 5)
     near = row.train[0].center
     one = replace(row, points=near + 0.3 * torch.nn.functional.normalize(row.points - near, dim=-1))
-    method = build(composed("method=padgs_plus", "method.sky_share=0", "method.fill_share=0"))
+    method = PlusMethod(PlusOptions(sky_share=0.0, fill_share=0.0))
     starts = [len(method._start(scene, 100).splats) for scene in (one, row)]
     assert starts[1] == pytest.approx(rooms(row) * starts[0], rel=0.01)
