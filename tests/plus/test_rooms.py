@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+
 from padgs.data.synthetic import SyntheticOptions, generate
 from padgs.plus.method import PlusMethod
 from padgs.plus.options import PlusOptions
