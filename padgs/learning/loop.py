@@ -204,7 +204,7 @@ class Trainer:
         with stage("adapt"), torch.no_grad():
             passed = range(self.moment + 1, moment + 1)  # all that comes at a moment of the schedule comes once
             events = tuple(event for one in passed for event in trainee.adapt(one, optimiser.adam))
-        if optimiser.is_checked(iteration):
+        if optimiser.is_checked(iteration) or moment == self._budget.iterations:
             events += self._guard.look(iteration)
         return sum(losses) / len(losses), {**trainee.counts(), "drawn": max(drawn)}, events
 
@@ -277,7 +277,7 @@ class Trainer:
         tensors |= {f"{VIEWS}{name}": tensor for name, tensor in self._corrections.state_dict().items()}
         tensors |= self._optimiser.tensors() | {"random/torch": torch.get_rng_state()} | order.tensors
         values = {"model": model.values, **{name: getattr(self, name) for name in self.PROGRESS}, **order.values}
-        values["left_out"] = self._guard.left_out
+        values["guard"] = self._guard.state
         if self._monitor is not None:
             values["monitor"] = copy.deepcopy(self._monitor.state)
         if self._calibration:
@@ -299,7 +299,8 @@ class Trainer:
         before |= {"skipped": 0, "ended": ""}
         for name in self.PROGRESS:  # older checkpoints have some of them less
             setattr(self, name, {**before, **state.values}[name])
-        self._guard.left_out = state.values.get("left_out", 0)
+        if "guard" in state.values:  # nor the guard
+            self._guard.load(state.values["guard"])
         if self._monitor is not None and "monitor" in state.values:  # not in checkpoints from before there was one
             self._monitor.state = copy.deepcopy(state.values["monitor"])
         if self._calibration:

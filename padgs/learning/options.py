@@ -23,7 +23,7 @@ class TrainOptions:
     learning_rates: str | float = "run"
     check_every: int = 50  # iterations between checks of all gradients and parameters; the loss is checked at each
     monitor: bool = True  # end a run that diverges, explodes, collapses or falls silent: see `padgs.learning.monitor`
-    guard_gradients: bool = False  # leave Gaussians and anchors whose gradients are not finite out of a step, counted
+    guard_gradients: bool = False  # gradients of Gaussians and anchors that are not finite count as none, and are told
     guard_scales: bool = False  # keep scales within bounds; both: see `padgs.learning.guard`
     exposures: str = GIVEN  # learned: a gain and offset of each training view; test views have the mean one
     poses: str = GIVEN  # learned: a small correction of each training view; test views stay where they are

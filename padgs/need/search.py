@@ -166,7 +166,8 @@ class Search:
         the seconds, of wall and of CPU time, that it had taken before.
         """
         config, seed = self.run.config, self.run.config.seed + number
-        options = replace(config.training, monitor=False)  # in so few iterations views that differ look like a sign
+        # In so few iterations views that differ look like a sign; bounds of scales are of the beginning of a run.
+        options = replace(config.training, monitor=False, guard_scales=False)
         count = max(len(views), round(refine.SHARE * self._schedule))
         refining = Refining(model, options, self._schedule, count)
         torch.manual_seed(seed)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from padgs.scene import Scene, View
 
-POINTS, VIEWS = 10_000, 16  # that are looked at, of the cloud and of the training, evenly
+POINTS, VIEWS = 10_000, 16  # at most, that are looked at, evenly of the cloud and of the training
 EACH = 16  # points in a bin of directions, on average
 NEAREST = 3  # point of a bin that surely is on a surface: nearer ones may float
 BEHIND = 1.5  # times as far as that: behind the surface
@@ -22,11 +22,11 @@ def rooms(scene: Scene) -> float:
     A view shows a point if it is not far behind the nearest points of its direction. In a room of its own that is
     nearly all of them; what is left of it in a scene, as a mean over the training views, is the share of one view.
     """
-    points = scene.points[:: max(1, len(scene.points) // POINTS)].double()
+    points = scene.points[:: max(1, -(-len(scene.points) // POINTS))].double()
     points = points[points.isfinite().all(1)]
     if len(points) == 0:
         return 1.0  # whoever needs points says so
-    views = scene.train[:: max(1, len(scene.train) // VIEWS)]
+    views = scene.train[:: -(-len(scene.train) // VIEWS)]
     seen = sum(_seen(points, view) for view in views) / len(views)
     return max(1.0, 1 / (ALONE * seen))
 

@@ -20,7 +20,15 @@ def cached(monkeypatch, cache):
 def scene_of(name: str, count: int = 1):
     views, points = 8 * count, 3000 * count
     return generate(
-        SyntheticOptions(scene=name, rooms=count, width=16, samples=1, train_views=views, test_views=1, points=points)
+        SyntheticOptions(
+            scene=name,
+            rooms=count if name == "enfilade" else None,
+            width=16,
+            samples=1,
+            train_views=views,
+            test_views=1,
+            points=points,
+        )
     )
 
 

@@ -14,6 +14,7 @@ from padgs.data.synthetic.textures import Array
 from padgs.data.synthetic.world import World
 
 LENGTH, WIDTH, HEIGHT = 5.0, 5.0, 2.8  # metres, of a room
+ROOMS = 2  # unless asked otherwise
 ASIDE = 0.9  # metres from the line of the doors at which the cameras pass through a room
 GROUNDS: tuple[tuple[tx.Color, tx.Color], ...] = (  # of the wallpapers, a pair a room
     ((0.55, 0.62, 0.52), (0.86, 0.83, 0.68)),
@@ -31,23 +32,26 @@ def _middles(rooms: int) -> list[float]:
 
 def walk(options: SyntheticOptions) -> Walk:
     """From end to end and back, on the other side of each room."""
-    middles = _middles(options.rooms)
+    rooms = options.rooms or ROOMS
+    middles = _middles(rooms)
     doors = [x + LENGTH / 2 for x in middles[:-1]]
     there = [(middles[0] - 1.2, 0.0), (middles[0], ASIDE)]
     for door, x in zip(doors, middles[1:], strict=True):
         there += [(door, 0.0), (x, ASIDE)]
     back = [(middles[-1] + 1.2, 0.0), *((x, -y) for x, y in reversed(there[1:]))]
-    return Walk((0.0, 0.0), (LENGTH * options.rooms / 2 - 1.2, ASIDE), waypoints=(*there, *back))
+    center = 0.0 if rooms % 2 else LENGTH / 2  # of a cross: in a room, not in the wall between two
+    return Walk((center, 0.0), (LENGTH * rooms / 2 - center - 1.2, ASIDE), waypoints=(*there, *back))
 
 
 def enfilade(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
-    """`options.rooms` furnished rooms of 5 x 5 m; 1 - 1 / rooms of all that there is, is hidden from a view."""
-    f, middles = options.texture_frequency, _middles(options.rooms)
+    """Furnished rooms of 5 x 5 m; but for what the doors show, 1 - 1 / rooms of all is hidden from a view."""
+    rooms = options.rooms or ROOMS
+    f, middles = options.texture_frequency, _middles(rooms)
     rug = tx.scaled(tx.medallion((0.55, 0.13, 0.12), (0.14, 0.17, 0.32), (0.9, 0.76, 0.45), 1.7 * f, 8), f)
     floor = tx.disc(tx.scaled(tx.planks(*fu.OAK), f), rug, 1.7, [(x, 0.0) for x in middles])
     ceiling = tx.scaled(tx.checker((0.84, 0.82, 0.77), (0.8, 0.78, 0.73), 0.6), f)
     ends = tx.scaled(tx.bricks((0.45, 0.2, 0.14), (0.78, 0.45, 0.33), (0.78, 0.74, 0.68)), f)
-    half = LENGTH * options.rooms / 2
+    half = LENGTH * rooms / 2
     skins = (ends, ends, ends, ends, floor, ceiling)
     shapes: list[Shape] = [
         Room((-half, -WIDTH / 2, 0.0), (half, WIDTH / 2, HEIGHT), tuple(Material(skin) for skin in skins))
@@ -59,7 +63,7 @@ def enfilade(options: SyntheticOptions, path: Array, rng: np.random.Generator) -
         if k:
             shapes += doorway(x - LENGTH / 2, paper)
     low, high = (-half + 0.7, -1.9, 0.5), (half - 0.7, 1.7, 2.2)
-    shapes += fu.scatter((options.objects or 0) * options.rooms, path, low, high, 0.35, rng)
+    shapes += fu.scatter((options.objects or 0) * rooms, path, low, high, 0.35, rng)
     return World(tuple(shapes), Light(tuple(((x, 0.0, 2.35), 0.7) for x in middles)))
 
 

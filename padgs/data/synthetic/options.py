@@ -37,7 +37,7 @@ class SyntheticOptions:
     seed: int = 0  # of the path, the points and the noise
     texture_frequency: float = 1.0  # multiplies the spatial frequency of every pattern
     objects: int | None = None  # number of loose objects besides the furniture; None = the scene's own
-    rooms: int = 2  # of an enfilade, with as many loose objects each
+    rooms: int | None = None  # of an enfilade, with `objects` each; None = 2
     spokes: int = 16  # of the Siemens stars in pole_torture
     nearest: float | None = None  # metres from the path to what hangs beside it in near_clutter; None = 0.05
     horizon: float | None = None  # metres to the mountains outdoors; None = 300
@@ -62,7 +62,7 @@ class SyntheticOptions:
             raise DataError(f"width {self.width} is not an even number >= 8; a panorama is 2:1 (data.width)")
         if math.isqrt(max(self.samples, 0)) ** 2 != self.samples or self.samples < 1:
             raise DataError(f"samples {self.samples} is not a square number; use 1, 4, 9, 16, 25, ...")
-        for field, least in (("train_views", 2), ("test_views", 0), ("points", 1), ("spokes", 1), ("rooms", 1)):
+        for field, least in (("train_views", 2), ("test_views", 0), ("points", 1), ("spokes", 1)):
             if getattr(self, field) < least:
                 raise DataError(f"{field} {getattr(self, field)} is less than {least}")
         for field in ("point_noise", "pose_noise_translation", "pose_noise_rotation", "exposure", "tilt", "lens_gap"):
@@ -83,11 +83,16 @@ class SyntheticOptions:
                 raise DataError(f"{field} {length} is not a finite length > 0 in metres; use null for the scene's own")
         if self.objects is not None and self.objects < 0:
             raise DataError(f"objects {self.objects} is negative; use null for the scene's own number")
+        if self.rooms is not None and (self.scene != "enfilade" or self.rooms < 1):
+            raise DataError(
+                f"rooms is {self.rooms} of scene {self.scene}; an enfilade has 1 or more, and others none to choose: "
+                "set data.generator.scene=enfilade, or rooms to null"
+            )
 
     @property
     def title(self) -> str:
-        """What the scene is called. From a path of another length, with nearer or farther things, with noisy poses, or
-        seen by two lenses, a room is another scene than the room.
+        """What the scene is called. From a path of another length, with nearer or farther things, of other rooms, with
+        noisy poses, or seen by two lenses, a room is another scene than the room.
 
         >>> SyntheticOptions(pose_noise_rotation=0.2).title, SyntheticOptions(reach=1.0, lens_gap=0.05).title
         ('synthetic-room-noisy-poses', 'synthetic-room-other-path-two-lenses')
@@ -100,6 +105,8 @@ class SyntheticOptions:
         words += [
             f"{name}-{length:g}m" for name in ("nearest", "horizon") if (length := getattr(self, name)) is not None
         ]
+        if self.rooms is not None:
+            words.append(f"of-{self.rooms}")
         if self.pose_noise_translation or self.pose_noise_rotation:
             words.append("noisy-poses")
         if self.lens_gap or self.lens_k1:

@@ -141,7 +141,8 @@ def test_mountains_stand_where_they_are_asked_to(horizon):
 
 @pytest.mark.parametrize(("scene", "rooms"), [("two_rooms", 2), ("enfilade", 2), ("enfilade", 5)])
 def test_rooms_hide_most_of_one_another(scene, rooms):
-    truth, _ = depths(scene, 16, rooms=rooms, train_views=8 * rooms, test_views=0)
+    asked = {"rooms": rooms} if scene == "enfilade" else {}
+    truth, _ = depths(scene, 16, train_views=8 * rooms, test_views=0, **asked)
     rng = np.random.default_rng(0)
     middles = 5.0 * (np.arange(rooms) - (rooms - 1) / 2)
     cameras = np.stack([camera.center(pose) for pose in truth.poses])
@@ -156,6 +157,20 @@ def test_rooms_hide_most_of_one_another(scene, rooms):
         inside, outside = np.array(seen)[away < 1.5], np.array(seen)[away > 3.5]
         assert len(inside) >= 4 and inside.mean() > 0.8
         assert outside.mean() < 0.3
+
+
+@pytest.mark.parametrize("rooms", [1, 2, 5])
+@pytest.mark.parametrize("path", ["roaming", "cross", "line"])
+def test_cameras_of_an_enfilade_stand_clear_of_its_walls(rooms, path):
+    _, views = depths("enfilade", 64, rooms=rooms, path=path, train_views=6 * rooms, test_views=0)
+    assert min(depth.min() for depth, _ in views) > 0.25
+
+
+def test_only_an_enfilade_has_rooms_to_choose():
+    assert SyntheticOptions("enfilade", rooms=3).title == "synthetic-enfilade-of-3"
+    for scene, rooms in (("room", 2), ("enfilade", 0)):
+        with pytest.raises(DataError, match="rooms is"):
+            SyntheticOptions(scene, rooms=rooms)
 
 
 def test_rods_pass_over_and_under_the_cameras_of_pole_torture():
