@@ -50,12 +50,12 @@ class Guard:
             (), -1.0, device=device
         )  # most bad rows of a drawing since a look, beyond the allowed
         self._told = 0  # of the bad rows
-        self._bounds = (0.0, 0.0)
+        self._bounds = [0.0, 0.0]
         if self._scales:
             farthest = (scene.points.double() - scene.train[0].center).norm(dim=-1).max().item()
             beginning = max(parameter[..., -3:].max().item() for parameter in self._scales)
             largest = max(math.log(max(farthest, scene.unit)), beginning)
-            self._bounds = (math.log(SMALLEST * scene.unit), largest)
+            self._bounds = [math.log(SMALLEST * scene.unit), largest]
 
     @torch.no_grad()
     def clean(self, probe: Tensor) -> None:
@@ -103,10 +103,15 @@ class Guard:
     @property
     def state(self) -> dict[str, Any]:
         """All that it remembers, as JSON can hold it."""
-        return {"bad": int(self._bad.item()), "excess": self._excess.item(), "told": self._told, "bounds": self._bounds}
+        return {
+            "bad": int(self._bad.item()),
+            "excess": self._excess.item(),
+            "told": self._told,
+            "bounds": [*self._bounds],
+        }
 
     def load(self, state: Mapping[str, Any]) -> None:
         """Go on where `state` was taken: bounds are those of that run's beginning."""
         self._bad.fill_(state["bad"])
         self._excess.fill_(state["excess"])
-        self._told, self._bounds = state["told"], tuple(state["bounds"])
+        self._told, self._bounds = state["told"], [*state["bounds"]]
