@@ -12,12 +12,13 @@ from padgs.reports.charts.palette import INK, color_of
 from padgs.reports.conditions import OF_TIMES, footnotes, refuse_mixture
 from padgs.reports.frame import by_conditions
 from padgs.reports.gathered import Gathered
-from padgs.reports.needs import STATED, Curve, by_method, curves, searched
+from padgs.reports.needs import Curve, by_method, curves, searched
 from padgs.reports.pictures import split
 from padgs.results import NEED_PICTURED, file_name
 
 PANELS = (("blended", "Gaussians blended", 1.0), ("bytes", "model, MB", 1e-6), ("frame_ms", "ms per frame", 1.0))
 PICTURED = tuple(f"{loss:g}" for loss in NEED_PICTURED)  # dB
+AROUND = MARKERS[: len(PICTURED)]  # a ring and a square, about what is needed
 WIDTH = 512  # pixels of a picture at most
 DOUBLINGS = 1.5  # ratio from which on sizes stand on a logarithmic axis
 
@@ -53,7 +54,8 @@ def _chart(name: str, title: str, runs: DataFrame, notes: list[str]) -> Chart:
         panel.set_xlabel(words)
     axes[0, 0].set_ylabel("WS-PSNR of test views, dB ↑")
     made.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
-    what = f"{title}\nsmaller models of the same run; ring: what is needed for {STATED} dB, labels: for more"
+    rings = f"in a ring what is needed for {PICTURED[0]} dB, in a square for {PICTURED[1]} dB"
+    what = f"{title}\nsmaller models of the same run; {rings}"
     if len(found) > len(by_method(found)):
         what += "; thin: further seeds"
     lay_out(made, what)
@@ -90,13 +92,9 @@ def _draw(panel: Any, curve: Curve, quantity: str, unit: float, tips: Tips, pres
         text = f"{curve.title}\n{step['blended']} Gaussians, {step['bytes'] / 1e6:.2f} MB, {step['frame_ms']:.1f} ms"
         text += f"\n{y:.2f} dB; lost {step['loss']:.2f} dB of calibration views"
         panel.plot([x], [y], MARKERS[0], color=color, markersize=4 if first else 2.5, gid=tips.add(text))
-        reached = [epsilon for epsilon, at in curve.needs.items() if at is step]
-        if STATED in reached:
-            panel.plot([x], [y], MARKERS[0], markersize=9, fillstyle="none", color=INK[0], markeredgewidth=1)
-        if first and (further := [epsilon for epsilon in reached if float(epsilon) > float(STATED)]):
-            panel.annotate(
-                f"{further[-1]} dB", (x, y), xytext=(4, -9), textcoords="offset points", fontsize=7, color=color
-            )
+        for epsilon, around in zip(PICTURED, AROUND, strict=True):
+            if curve.needs.get(epsilon) is step:
+                panel.plot([x], [y], around, markersize=9, fillstyle="none", color=INK[0], markeredgewidth=1)
 
 
 def _numbers(name: str, found: list[Curve]) -> DataFrame:
