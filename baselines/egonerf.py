@@ -82,7 +82,7 @@ class EgoNeRFMethod(Method):
         rays = RenderConfig(backend=self.render_config.backend)
         for group, given, possible, why in (
             ("render", self.render_config, rays, "casts rays and draws no Gaussians"),
-            ("train", train, loss, "minimises the squared error"),
+            ("train", train, loss, "minimises the squared error of single rays, with neither Gaussians nor pictures"),
         ):
             for field in fields(possible):
                 if getattr(given, field.name) != getattr(possible, field.name):

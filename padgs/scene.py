@@ -8,8 +8,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from padgs.sphere.camera import Camera, Panorama
@@ -66,8 +68,10 @@ class View:
         """Per-pixel weight [H, W] in [0, 1] (0 = ignore), or None where every pixel counts."""
         return None if self.load_mask is None else self.load_mask().to(device=device, dtype=dtype)
 
-    def at(self, cam_from_world: Tensor) -> View:
-        """The same camera at another pose [4, 4], without pixels."""
+    def at(self, cam_from_world: Tensor | NDArray[Any]) -> View:
+        """The same camera at another pose [4, 4], of torch or numpy, without pixels."""
+        if not isinstance(cam_from_world, Tensor):
+            cam_from_world = torch.as_tensor(cam_from_world).to(self.cam_from_world)
         return replace(self, cam_from_world=cam_from_world, load_pixels=None, load_mask=None, load_depth=None)
 
 

@@ -131,7 +131,7 @@ def ratio(ours: Curve, other: Curve) -> float | None:
 
 def _is_stated(found: Mapping[str, Any]) -> bool:
     """Whether the model that a search kept is that for `STATED`."""
-    return f"{found.get('kept', {}).get('epsilon')}" == STATED
+    return found.get("kept", {}).get("epsilon") == NEED_STATED
 
 
 def _trained_degree(run: Any) -> Any:

@@ -27,7 +27,9 @@ from padgs.results import file_name
 CONDITION, LEVEL = f"{CONFIG}stress.condition", f"{CONFIG}stress.level"
 QUALITY, ONE_COLOR = "stability/ws_psnr", "stability/ws_psnr_one_color"
 ALIKE = ("resolution", "learning_rates", "data", "machine")  # iterations: a condition may change them
-NOT_SCORED = {"precision"}  # conditions that mean nothing to some methods, and cost these nothing
+# Conditions that are shown, but neither scored nor counted: what some methods cannot be put under, which would be
+# neither survived nor failed, and what makes the scene easier, where the quality only rises.
+NOT_SCORED = {"precision", "capacity", "textureless"}
 HALF = 0.5  # a condition breaks a method where less is kept
 
 Stress = tuple[str, int]  # condition, level
@@ -81,7 +83,7 @@ class Survivor:
         """What it keeps under each condition, the mean of the levels; the worst first. Empty where it lacks any, for
         means of less say nothing beside means of more.
         """
-        scored = [condition for condition in self.conditions if condition not in NOT_SCORED and not self.lacks]
+        scored = {condition for condition, _ in self._scored}
         cells = [self.levels(condition).values() for condition in scored]
         return sorted(math.fsum(cell.value or 0.0 for cell in of) / len(of) for of in cells)
 
@@ -97,9 +99,13 @@ class Survivor:
 
     @property
     def failure_rate(self) -> float | None:
-        """Share of the runs under stress that failed."""
-        ok = pd.concat([runs["ok"] for runs in self.runs.values()])
-        return None if self.lacks else float(1 - ok.mean())
+        """Share of the runs under what is scored that failed; None where it lacks any."""
+        return float(1 - pd.concat([runs["ok"] for runs in self._scored.values()]).mean()) if self._scored else None
+
+    @property
+    def _scored(self) -> dict[Stress, DataFrame]:
+        """The runs that are scored; none where it lacks any."""
+        return {} if self.lacks else {of: runs for of, runs in self.runs.items() if of[0] not in NOT_SCORED}
 
 
 def survivors(gathered: Gathered) -> dict[str, list[Survivor]]:

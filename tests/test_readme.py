@@ -15,6 +15,7 @@ from typer.main import get_command
 
 from padgs.cli.commands import app
 from padgs.multirun.launchers import missing_plugin
+from padgs.reports import REPORTS
 
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text()
@@ -34,6 +35,13 @@ def commands(program: str) -> list[str]:
 @pytest.fixture(autouse=True)
 def padgs_root(monkeypatch):
     monkeypatch.setenv("PADGS_ROOT", str(ROOT))
+
+
+def test_every_report_stands_in_its_table():
+    rows = re.search(r"\| report \| content \|.*?\n\n", README, re.DOTALL)
+    assert rows
+    names = [name for row in rows[0].split("\n|")[2:] for name in re.findall(r"`(\w+)`", row.partition("|")[0])]
+    assert sorted(names) == sorted(REPORTS)
 
 
 def test_every_command_is_looked_at_here():

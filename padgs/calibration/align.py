@@ -66,9 +66,11 @@ def align(first: Tensor, second: Tensor) -> tuple[Similarity, Difference]:
     a, b = centers(first), centers(second)
     spread = (b - b.mean(0)) @ rotation.mT
     variance = spread.square().sum().item()
-    if variance == 0:
+    if not variance > (torch.finfo(b.dtype).eps * b.abs().max().item()) ** 2:
         raise ValueError("cannot align poses whose centres all coincide: there is no scale")
     scale = ((a - a.mean(0)) * spread).sum().item() / variance
+    if not scale > 0:
+        raise ValueError(f"cannot align poses whose centres have no shape in common: the best scale is {scale:.3g}")
     similarity = Similarity(scale, rotation, a.mean(0) - scale * rotation @ b.mean(0))
     chord = (rotations - rotation).flatten(1).norm(dim=1) / (2 * 2**0.5)  # exact for small angles too
     degrees = torch.rad2deg(2 * torch.asin(chord.clamp(max=1)))

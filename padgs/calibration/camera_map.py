@@ -77,7 +77,8 @@ class CameraMap(nn.Module):
         # East a step is cos(latitude) shorter and varies more per radian, but so much smaller is its solid angle.
         across = (d.roll(-1, dims=1) - d).abs().sum(-1).mean() * (self.width / 4)
         down = (d[1:] - d[:-1]).abs().sum(-1).mean(1) * (self.height / math.pi)
-        return across + (down * self._weight[1:, 0, 0]).sum()
+        weight = self._weight[:, 0, 0]
+        return across + (down * (weight[1:] + weight[:-1]) / 2).sum()  # a step is between two rows
 
     def _free_offsets(self) -> Tensor:
         """D without its mean rotation, which is that of all cameras: poses and D could shift it to and fro forever."""

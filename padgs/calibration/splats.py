@@ -114,11 +114,11 @@ class CalibratedMethod(SplatMethod):
         return True
 
     def refuse_budget(self, budget: Budget) -> None:
-        """Nobody knows where to draw from what the training views would miss."""
+        """Poses as given, which the choice scores Gaussians from, may be far from where the cameras end."""
         super().refuse_budget(budget)
         if budget.gaussians == "auto":
             raise ValueError(
-                "budget.gaussians is auto, which draws training views without what might go, but cameras learn along "
+                "budget.gaussians is auto, which scores Gaussians from the poses as given, but cameras learn along "
                 "here; set it to a number or null"
             )
 

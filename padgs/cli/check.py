@@ -81,7 +81,7 @@ def lines(report: Report) -> list[str]:
     if report.colour_correlation is not None:
         out.append(f"  colours        points and panoramas correlate by {report.colour_correlation:.2f}")
     if report.exposure_spread is not None:
-        out.append(f"  exposures      differ by {report.exposure_spread:.2f} stops (standard deviation)")
+        out.append(f"  exposures      differ by a factor of {2**report.exposure_spread:.2f} (standard deviation)")
     if report.masked:
         shares = sorted(report.masked.values())
         which = f"{len(shares)} of {report.train + report.test} views"

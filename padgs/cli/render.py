@@ -47,7 +47,8 @@ def render(
     if camera == "panorama" and (fov is not None or height is not None):
         raise ValueError("--fov and --height are of perspective pictures: add --camera perspective")
     if not (fps > 0 and (seconds is None or seconds > 0)):
-        raise ValueError(f"a film of {seconds} seconds at {fps} frames per second has no frame; both must be > 0")
+        wrong = f"--fps is {fps:g}" if seconds is None or seconds > 0 else f"--seconds is {seconds:g}"
+        raise ValueError(f"{wrong}, which makes a film without a frame; it must be > 0")
     with Console().status("opening the run") as status:
         found = opened(run, data)
         with naming_data(run):

@@ -14,7 +14,7 @@ from padgs.cli.refusing import refusing, show
 from padgs.replacing import replace_file
 from padgs.reports import REPORTS, store
 from padgs.reports.tables.table import ReportError
-from padgs.results import ResultError
+from padgs.results import ASKED, FILE_NAME, ResultError
 
 ALL = "all"
 
@@ -56,7 +56,13 @@ def report(
             found = store.add(found, target / store.FILE_NAME)  # pictures are there of those in `source` only
     for error in broken:
         show(f"left out: {error}", sys.stderr)
+    if not found:
+        single_run = (source / FILE_NAME).is_file()
+        hint = f"{source} is one run: give {source.resolve().parent}" if single_run else "give a folder of run folders"
+        raise ReportError(f"no result that can be used is in {source}; {hint}")
     gathered = Gathered(frame(found), request, tuple(map(str, broken)))
+    if early := [run.result.run for run in found if run.result.ended == ASKED]:
+        gathered.warnings.append(f"asked to stop before their end, and so in no table but `runs`: {', '.join(early)}")
     refused = 0
     single = what != ALL
     for name in [what] if single else REPORTS:

@@ -138,9 +138,9 @@ def _refuse_absent(capture: Capture) -> None:
         return
     present = {name.casefold(): name for name in image_names(capture.image_folder)}
     hint = next((present[name.casefold()] for name in absent if name.casefold() in present), None)
-    remedy = (
-        f"there is {hint!r}, in another case: rename it" if hint else "set data.images to the folder that holds them"
-    )
+    remedy = "set data.images to the folder that holds them, or make poses of those that are there (padgs prepare)"
+    if hint:
+        remedy = f"there is {hint!r}, in another case: rename it"
     raise DataError(
         f"{len(absent)} of {len(capture.frames)} poses have no image in {capture.image_folder}: "
         f"{listed(absent)}; {remedy}"

@@ -26,9 +26,9 @@ ANISOTROPY = 1e3  # longest axis in units of the shortest
 class Guard:
     """On the rows of a model in training. Nothing of a step waits for a GPU but `look`.
 
-    A bad row, which has a gradient that is not finite, counts as one without any gradient in that drawing; Adam goes on
-    with what it knows of the row. Anchors have the scales that their networks shrink; those of their Gaussians are
-    bounded from above alone.
+    A bad row, which has a gradient that is not finite, counts as one without any gradient so far in that step (most
+    methods have one drawing a step); Adam goes on with what it knows of the row. Anchors have the scales that their
+    networks shrink; those of their Gaussians are bounded from above alone.
     """
 
     def __init__(self, groups: Sequence[ParameterGroup], scene: Scene, *, gradients: bool, scales: bool) -> None:
@@ -46,9 +46,8 @@ class Guard:
         self._scales = [p for group in groups if scales and group.name == SCALES for p in group.parameters]
         device = groups[0].parameters[0].device
         self._bad = torch.zeros((), dtype=torch.int64, device=device)  # rows, each as often as it was
-        self._excess = torch.full(
-            (), -1.0, device=device
-        )  # most bad rows of a drawing since a look, beyond the allowed
+        # Of the bad rows of a drawing, the most since a look, less those that are allowed.
+        self._excess = torch.full((), -1.0, device=device)
         self._told = 0  # of the bad rows
         self._bounds = [0.0, 0.0]
         if self._scales:

@@ -74,7 +74,7 @@ def needed(worth: Worth, psnr: float) -> int:
     """How many rows stay if the least missed go, as long as what each changes alone adds up to a PSNR of so many dB.
 
     In mean squares, by solid angle. Together they change far more, as they stand in for each other: right afterwards
-    pictures have 20 to 40 dB to those before, and the rest of a training mends that (docs/need.md). At least a tenth
+    pictures have 19 to 40 dB to those before, and the rest of a training mends that (docs/need.md). At least a tenth
     stays, for where nearly all stand in for each other the sum says nothing.
     """
     changes = worth.change.sort().values.cumsum(0)

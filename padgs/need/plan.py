@@ -48,7 +48,7 @@ class Step:
     rows: int  # Gaussians, or anchors
     blended: int  # Gaussians that contribute to any training view
     bytes: int
-    frame_ms: float  # smallest of some calibration views
+    frame_ms: float  # of the quickest of some frames of calibration views
     marks: Scores  # of the calibration views
     test: dict[str, float | None] = field(default_factory=dict)  # metric -> mean over the test views; decides nothing
     seconds: float = 0.0  # to make and measure it

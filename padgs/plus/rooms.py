@@ -17,7 +17,7 @@ ALONE = 1.3  # what furniture hides in one room, or trees in a court
 
 
 def rooms(scene: Scene) -> float:
-    """How many single rooms the points of a scene would fill; at least 1, and less than there are.
+    """How many single rooms the points of a scene would fill; at least 1; of several it finds too few.
 
     A view shows a point if it is not far behind the nearest points of its direction. In a room of its own that is
     nearly all of them; what is left of it in a scene, as a mean over the training views, is the share of one view.

@@ -36,8 +36,8 @@ def swept(view: View, rays: Tensor, inverse_range: Tensor, around: Tensor, views
         inverse_range: [n] > 0, what is likely, 1 / world units.
         around: [n, K] > 0, those of points around.
         views: all there are; those that are no panoramas, or stand where this one does (within `PARALLAX` of the median
-            range), are not asked. What their masks
-            hide is asked all the same; it is outvoted, as what hides behind something is.
+            range), are not asked. What their masks hide is asked all the same; it is outvoted, as what hides behind
+            something is.
     """
     if not isinstance(view.camera, Panorama) or len(rays) == 0:
         return inverse_range

@@ -17,6 +17,7 @@ from padgs.results.file import (
 )
 from padgs.results.folder import CONFIG_NAME, LOG_NAME, NEED_PICTURE, PICTURES, file_name, log_lines, picture_name
 from padgs.results.result import (
+    ASKED,
     BY_ITSELF,
     NEED_LOSSES,
     NEED_PICTURED,
@@ -29,6 +30,7 @@ from padgs.results.result import (
 )
 
 __all__ = [
+    "ASKED",
     "BY_ITSELF",
     "CONFIG_NAME",
     "DECIDE_NOTHING",

@@ -18,6 +18,7 @@ STATUSES = {
     "timeout": "the time limit came before the last iteration",
     "rejected": "the input was refused with a clear error",
 }
+ASKED = "asked to stop and score"  # why a run ended, where no setting says so: it is no seed of one that ran on
 BY_ITSELF = "by_itself"  # among experiments: a command without any asked for the run as well
 HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "lpips": False}  # of every metric with the word in it
 NEED_LOSSES = (0.05, 0.1, 0.25, 0.5, 1.0)  # dB, for each of which `padgs need` finds the smallest model

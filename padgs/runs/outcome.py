@@ -12,6 +12,7 @@ from padgs.runs.config import RunConfig
 from padgs.runs.identity import config_hash
 from padgs.runs.scoring import quality_of_one_color
 from padgs.scene import Scene
+from padgs.scoring.protocols import Protocol
 
 WRONG_DEPTH = 0.5  # AbsRel
 FLAT = 0.01  # of the true thickness of all surfaces together, along the axis where they are thinnest
@@ -66,15 +67,18 @@ def reason(error: Exception) -> str:
 
 def judged(result: Result, scene: Scene, iterations: int) -> Result:
     """The result with its status, now that test views of the scene were scored after so many iterations."""
+    if not result.ok:
+        return result
     marks: dict[str, float | None] = {}
     for scores in result.scores.values():
         marks |= scores.metrics
-    quality, depth, extent = (marks.get(name) for name in ("ws_psnr", "depth_error", "least_extent"))
-    if not result.ok:
-        return result
-    if quality is not None and iterations >= SOON and quality < (one_color := quality_of_one_color(scene)):
-        reason = f"WS-PSNR {quality:.2f} dB, and one colour for all would have {one_color:.2f} dB"
-        return replace(result, status="diverged", reason=reason)
+        quality = scores.metrics.get("ws_psnr")
+        if quality is None or iterations < SOON:
+            continue
+        if quality < (one_color := quality_of_one_color(scene, Protocol(**scores.protocol))):
+            reason = f"WS-PSNR {quality:.2f} dB, and one colour for all would have {one_color:.2f} dB"
+            return replace(result, status="diverged", reason=reason)
+    depth, extent = marks.get("depth_error"), marks.get("least_extent")
     if depth is not None and depth > WRONG_DEPTH:
         reason = f"depths are off by {depth:.0%} on average (AbsRel), more than {WRONG_DEPTH:.0%}"
         return replace(result, status="degenerate", reason=reason)

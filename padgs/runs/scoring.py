@@ -61,9 +61,14 @@ def stability(method: Method, scene: Scene, protocol: Protocol, on_view: OnView 
     return replace(found, metrics={**found.metrics, "ws_psnr_training": own})
 
 
-def quality_of_one_color(scene: Scene) -> float:
-    """Mean WS-PSNR of the test views if each were of one colour, in dB."""
-    return sum(mean_color(view.image(), view.mask()).item() for view in scene.test) / len(scene.test)
+def quality_of_one_color(scene: Scene, protocol: Protocol) -> float:
+    """Mean WS-PSNR of the test views under a protocol if each were of one colour, in dB."""
+
+    def quality(view: View) -> float:
+        truth = view.image()
+        return mean_color(truth, weight_of(view.mask(), truth, protocol)).item()
+
+    return sum(map(quality, scene.test)) / len(scene.test)
 
 
 def probe(method: Method, view: View) -> dict[str, float]:

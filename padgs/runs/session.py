@@ -18,7 +18,7 @@ from padgs.learning.failure import Failure
 from padgs.learning.loop import Record
 from padgs.learning.method import Method
 from padgs.registry import lookup
-from padgs.results import Result
+from padgs.results import ASKED, Result
 from padgs.runs import checkpoint, outcome
 from padgs.runs.config import RunConfig
 from padgs.runs.device import chosen
@@ -32,8 +32,6 @@ from padgs.runs.terminal import say
 from padgs.scene import Scene
 from padgs.scoring.protocols import Protocol
 from padgs.stopwatch import notice_stops
-
-ASKED = "asked to stop and score"
 
 
 class Watch:
@@ -148,7 +146,7 @@ class Session:
             what = {"status": outcome.status(error), "reason": outcome.reason(error)}
             result = replace(result, **what, **outcome.peak_memory(self.scene))
         finished = datetime.now(timezone.utc).isoformat(timespec="seconds")
-        if result.ended == ASKED:  # no configuration says so: it must not be taken for a seed of what ran to its end
+        if result.ended == ASKED:
             words = (config.row, f"stopped after {progress.iteration} iterations")
             result = replace(result, variant=", ".join(filter(None, words)))
         asked = progress.iteration if config.budget.seconds is not None else result.iterations

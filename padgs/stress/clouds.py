@@ -68,7 +68,9 @@ def _moved(scene: Scene, share: float, places, random: np.random.Generator) -> S
 
 
 def _size(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Corners of the box of the points, the middle of the cameras, and the radius of the points around it."""
+    """Corners of the box of the points between quantiles `INSIDE`, the middle of the cameras, and the radius of the
+    points around it.
+    """
     points = scene.points.double().cpu().numpy()
     center = np.mean([view.center.cpu().numpy() for view in scene.train], axis=0)
     radius = np.quantile(np.linalg.norm(points - center, axis=1), INSIDE[1])

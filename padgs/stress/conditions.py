@@ -72,7 +72,7 @@ CONDITIONS: Mapping[str, Condition] = {
     "pose_rotation": Condition("training cameras are twisted by {} degrees", (0.05, 0.2, 1.0), worlds.twisted),
     "few_views": Condition("one of {} training views is left", (2, 4, 8), worlds.thinned),
     "textureless": Condition("{:.0%} of the fine contrast is gone", (0.5, 0.8, 0.95), pictures.bleached),
-    "exposure": Condition("training views are up to {} stops off", (0.25, 0.5, 1.0), pictures.exposed),
+    "exposure": Condition("training views are up to 2^{} times brighter or darker", (0.25, 0.5, 1.0), pictures.exposed),
     "nadir": Condition("somebody hides the lowest {:.0%} of the rows", (0.03, 0.06, 0.15), pictures.accompanied),
     "resolution": Condition("training views have 1/{} of the pixels on a side", (2, 4, 8), pictures.shrunk),
     "capacity": Condition("there may be {:.0%} as many Gaussians as pixels of a view", (0.5, 0.2, 0.05), budget=capped),

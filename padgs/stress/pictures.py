@@ -98,11 +98,13 @@ def bleached(scene: Scene, share: float, random: np.random.Generator) -> Scene:
     return of_all(scene, lambda view: repainted(panorama(view), fade))
 
 
-def exposed(scene: Scene, stops: float, random: np.random.Generator) -> Scene:
-    """Each training view is brighter by a factor 2^e of its own, e uniform in [-stops, stops]."""
+def exposed(scene: Scene, doublings: float, random: np.random.Generator) -> Scene:
+    """The stored values of each training view are 2^e times what they were, e uniform in [-doublings, doublings]; in
+    sRGB that is about 2e stops of light.
+    """
 
     def expose(view: View) -> View:
-        factor = 2 ** random.uniform(-stops, stops)
+        factor = 2 ** random.uniform(-doublings, doublings)
         return repainted(view, lambda pixels: (pixels.float() * factor).clamp(0, 255).round().to(torch.uint8))
 
     return of_training(scene, expose)

@@ -16,7 +16,11 @@ from padgs.reports.needs import Curve, by_method, curves, searched
 from padgs.reports.pictures import split
 from padgs.results import NEED_PICTURED, file_name
 
-PANELS = (("blended", "Gaussians blended", 1.0), ("bytes", "model, MB", 1e-6), ("frame_ms", "ms per frame", 1.0))
+PANELS = (
+    ("blended", "Gaussians blended", 1.0),
+    ("bytes", "model, MB", 1e-6),
+    ("frame_ms", "ms of a frame, the least", 1.0),
+)
 PICTURED = tuple(f"{loss:g}" for loss in NEED_PICTURED)  # dB
 AROUND = MARKERS[: len(PICTURED)]  # a ring and a square, about what is needed
 WIDTH = 512  # pixels of a picture at most

@@ -13,16 +13,19 @@ from padgs.reports.findings.claims import CLAIMS
 from padgs.reports.findings.judging import NEGLIGIBLE, Claim, Judgement, Line, Verdict, in_the_paper, judge
 from padgs.reports.gathered import Gathered, of_a_table
 from padgs.reports.request import experiment_of
+from padgs.reports.scenes import BUILT_IN
 from padgs.reports.tables.ranking import CONFIDENCE
 from padgs.reports.tables.table import MISSING
 
 INTRODUCTION = f"""# Findings
 
-What the paper claims, and what the runs in `reports/measured/results.jsonl` say of it. The command
+What the paper claims, and what runs say of it. The command
 
-    padgs report findings reports/measured/results.jsonl --out docs
+    padgs report findings RUNS --out docs
 
-makes this page: verdicts and numbers follow from rules (`reports/findings`), only the words are written by hand.
+makes this page, for the project itself of `reports/measured/results.jsonl`: verdicts, and the numbers beside them,
+follow from rules (`reports/findings`). The words are written by hand, with the few numbers in them, which are of the
+project's own runs.
 
 Every number says by how much the side that the claim favours is better than the best of the others: a difference, or
 for costs a quotient (×). Behind ours stands the half-width of its {CONFIDENCE:.0%} interval: Student's t over pairs of
@@ -127,9 +130,16 @@ def _command(name: str, runs: DataFrame) -> str:
         words.append(f"seed={','.join(map(str, sorted(runs['seed'].unique())))}")
         if runs["length"].nunique() == 1:
             words += _length(runs.iloc[0])
-        if (runs["dataset"] == "").any():
-            words.append("data.path=FOLDER")
+        captures, generated = runs.loc[runs["dataset"] == ""], runs.loc[runs["dataset"] == BUILT_IN]
+        words += ["data.path=FOLDER", *_width("data.width", captures)] if len(captures) else []
+        words += _width("data.generator.width", generated)
     return " ".join(words)
+
+
+def _width(key: str, runs: DataFrame) -> list[str]:
+    """The setting of how wide panoramas were, whatever a scale says."""
+    widths = sorted({int(resolution.partition("x")[0]) for resolution in runs["resolution"]})
+    return [f"{key}={','.join(map(str, widths))}"] if widths else []
 
 
 def _length(run: Series) -> list[str]:

@@ -24,7 +24,7 @@ COLUMNS: dict[Column, Callable[[Curve, Curve], float | None]] = {
     Column(f"MB of its file, {STATED} dB", 2, False): lambda own, _: (
         None if own.file is None else own.file["bytes"] / 1e6
     ),
-    Column(f"ms for {STATED} dB", 1, False): lambda own, _: own.needs[STATED]["frame_ms"],
+    Column(f"least ms of a frame for {STATED} dB", 1, False): lambda own, _: own.needs[STATED]["frame_ms"],
     Column(f"WS-PSNR for {STATED} dB", 2, True): lambda own, _: own.quality_of(own.needs[STATED]),
     Column("WS-PSNR of all", 2, True): lambda own, _: own.quality_of(own.found["steps"][0]),
     Column("dB at equal N against the first", 2, signed=True): gain,

@@ -9,7 +9,7 @@ from padgs.reports.charts import heat_map, survival_chart
 from padgs.reports.charts.drawing import Chart
 from padgs.reports.conditions import footnotes
 from padgs.reports.gathered import Gathered
-from padgs.reports.survival import HALF, QUALITY, Survivor, in_order, survivors
+from padgs.reports.survival import HALF, NOT_SCORED, QUALITY, Survivor, in_order, survivors
 from padgs.reports.tables.cells import spread
 from padgs.reports.tables.table import Block, Cell, Column, Row, Table
 
@@ -28,9 +28,10 @@ NOTES = (
     "Retention: how far above one colour for the image a run stays under a condition, as a share of what the same "
     "method and seed have without it, within [0, 1]; 0 for a run that failed. Level 1 is mild, 3 is severe.",
     f"A method breaks at the first level where it keeps less than {HALF:g} or a run fails; – where it does not.",
-    "Score: the mean over levels, then conditions. Worst quartile: the mean of the worst quarter of the conditions; "
-    "columns stand in its order on the first scene, the best first. Both, and the failure rate, are missing for a "
-    "method that was not put under all that others were put under on the scene.",
+    "Score: the mean over conditions of the mean over their levels. Worst quartile: that of the worst quarter of the "
+    "conditions; columns stand in its order on the first scene, the best first. Both, and the failure rate, are of "
+    f"all conditions but {', '.join(sorted(NOT_SCORED))}, and missing for a method that was not put under all of them "
+    "that others were put under on the scene.",
 )
 
 

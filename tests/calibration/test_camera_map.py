@@ -73,12 +73,20 @@ def test_gradients_are_those_of_differences(generator):
 
 
 def test_roughness_of_a_linear_field_is_its_slope():
-    """D = a (d.z) varies by a |grad(cos)| per radian: on the sphere that is pi/4 on average along each axis pair."""
+    """D = a d.y along one axis, a times the sine of the latitude: its slope is a times the cosine, pi/4 on average."""
     rough = []
     for scale in (1.0, 2.0):
         camera = CameraMap(256, 128, dtype=torch.float64)
         with torch.no_grad():
             camera.offsets[..., 0] = scale * rays(256, 128, dtype=torch.float64)[..., 1]
         rough.append(camera.roughness().item())
-    # d.y = sin(latitude): its derivative is cos(latitude), whose mean over the sphere is pi / 4.
     assert rough[0] == pytest.approx(torch.pi / 4, rel=1e-3) and rough[1] == pytest.approx(2 * rough[0])
+
+
+def test_roughness_is_the_same_upside_down(generator: torch.Generator):
+    camera = CameraMap(64, 32, dtype=torch.float64)
+    with torch.no_grad():
+        camera.offsets.copy_(torch.randn(camera.offsets.shape, generator=generator, dtype=torch.float64))
+        upright = camera.roughness().item()
+        camera.offsets.copy_(camera.offsets.flip(0))
+    assert camera.roughness().item() == pytest.approx(upright, rel=1e-12)

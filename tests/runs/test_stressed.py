@@ -1,7 +1,7 @@
 """Runs under stress, from the configuration to the result."""
 
 import io
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 
 import pytest
@@ -17,6 +17,7 @@ from padgs.runs.outcome import judged
 from padgs.runs.scoring import quality_of_one_color
 from padgs.runs.session import Session
 from padgs.scene import Scene
+from padgs.scoring.protocols import Protocol
 
 
 def depth_of(distance: float) -> torch.Tensor:
@@ -98,9 +99,11 @@ def test_wrong_depths_are_degenerate(run, monkeypatch):
 )
 def test_results_are_judged_by_what_they_show(better, depth_error, least_extent, iterations, status):
     """Worse than one colour, under any protocol; depths where they are known."""
-    scene = tiny_scene()
-    marks = {"ws_psnr": quality_of_one_color(scene) + better, "depth_error": depth_error, "least_extent": least_extent}
-    made = replace(result(), scores={"sphere": Scores({}, marks, {})})
+    scene, protocol = tiny_scene(), Protocol("half", ("ws_psnr",), "none", "11", solid_angle=True, bottom_crop=0.5)
+    one_color = quality_of_one_color(scene, protocol)
+    assert one_color != quality_of_one_color(scene, replace(protocol, bottom_crop=0.0))
+    marks = {"ws_psnr": one_color + better, "depth_error": depth_error, "least_extent": least_extent}
+    made = replace(result(), scores={"half": Scores(asdict(protocol), marks, {})})
     assert judged(made, scene, iterations).status == status
     assert judged(replace(made, status="timeout"), scene, iterations).status == "timeout"
     assert judged(result(), scene, iterations).ok, "without marks"

@@ -100,25 +100,47 @@ def test_points_go_where_their_condition_says():
     assert (stressed("random_points", 1).point_colors == 128).all()
 
 
-def test_pose_noise_has_the_size_that_it_says():
+def test_poses_are_off_by_as_much_as_they_say():
     rest, scene = generate(OPTIONS), stressed("pose_noise", 3)
     offsets = torch.stack([a.center - b.center for a, b in zip(rest.train, scene.train, strict=True)])
     assert offsets.std().item() == pytest.approx(0.02 * rest.unit, rel=0.35)
-    twisted = stressed("pose_rotation", 3)
-    for before, after in zip(rest.train, twisted.train, strict=True):
+    angles = []
+    for before, after in zip(rest.train, stressed("pose_rotation", 3).train, strict=True):
         torch.testing.assert_close(after.center, before.center)
-        assert 0 < (after.cam_from_world[:3, :3] @ before.cam_from_world[:3, :3].T - torch.eye(3)).norm() < 0.1
+        twist = after.cam_from_world[:3, :3] @ before.cam_from_world[:3, :3].T - torch.eye(3)
+        angles.append(twist.norm() / 2**0.5)  # 2 sqrt(2) sin(angle / 2)
+    assert torch.stack(angles).square().mean().sqrt().rad2deg().item() == pytest.approx(1.0, rel=0.35)
+
+
+def painted(pixels: torch.Tensor) -> Scene:
+    """The scene with that picture for each training view."""
+    scene = generate(OPTIONS)
+    return replace(scene, train=tuple(replace(view, load_pixels=lambda: pixels) for view in scene.train))
+
+
+def test_pictures_change_by_as_much_as_they_say(generator: torch.Generator):
+    grey = torch.full((32, 64, 3), 100, dtype=torch.uint8)
+    gains = [view.load_pixels()[0, 0, 0] / 100 for view in stressed("exposure", 3, painted(grey)).train]
+    doublings = torch.stack(gains).log2().abs()
+    assert doublings.max() <= 1.01 and doublings.mean().item() == pytest.approx(0.5, abs=0.25)
+    for view in stressed("nadir", 3, painted(grey)).train:
+        assert (view.load_pixels() != grey).any(-1).any(1).nonzero().flatten().tolist() == [27, 28, 29, 30, 31]
+    fine = torch.randint(0, 256, (64, 128, 3), generator=generator, dtype=torch.uint8)
+    left = stressed("textureless", 2, painted(fine)).train[0].load_pixels()
+    assert left.float().std().item() == pytest.approx(0.2 * fine.float().std().item(), rel=0.15)
 
 
 def test_noise_has_the_size_that_it_says_and_is_the_same_each_time():
-    grey = torch.full((32, 64, 3), 128, dtype=torch.uint8)
-    scene = generate(OPTIONS)
-    scene = replace(scene, train=tuple(replace(view, load_pixels=lambda: grey) for view in scene.train))
-    first, second = stressed("noise", 2, scene).train[:2]
+    first, second = stressed("noise", 2, painted(torch.full((32, 64, 3), 128, dtype=torch.uint8))).train[:2]
     off = (first.load_pixels().float() - 128) / 255
     assert off.std().item() == pytest.approx(0.05, rel=0.05) and abs(off.mean().item()) < 0.003
     assert torch.equal(first.load_pixels(), first.load_pixels())
     assert not torch.equal(first.load_pixels(), second.load_pixels())
+
+
+def test_a_capacity_is_of_the_pixels_of_a_view():
+    config = composed("stress.condition=capacity", "stress.level=2")
+    assert config.stress.budget(config.time, generate(OPTIONS)).gaussians == round(0.2 * 64 * 32)
 
 
 def test_training_is_changed_and_its_configuration_is_not():

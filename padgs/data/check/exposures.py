@@ -13,7 +13,8 @@ ROUNDS = 10  # of medians over points and views, after which they stand
 
 
 def exposure_gains(poses: Tensor, images: Tensor, points: Tensor) -> Tensor:
-    """By how many stops each view [F] is brighter than the median one; 0 where too little is known.
+    """How often each view [F] doubles the stored values of the median one, a doubling being about two stops of light
+    in sRGB; 0 where too little is known.
 
     A pixel is a gain of its view times a brightness of its point. Both are medians of what the other leaves, so the
     points that something hides from a view, or that shine, are outvoted.
@@ -29,10 +30,10 @@ def exposure_gains(poses: Tensor, images: Tensor, points: Tensor) -> Tensor:
     column, row = project(seen, width, height).long().unbind(-1)
     pixels = images[torch.arange(len(images))[:, None], row.clamp(0, height - 1), column % width].float()
     usable = (pixels.mean(-1) >= DARKEST) & (pixels.amax(-1) <= BRIGHTEST)
-    stops = torch.where(usable, pixels.mean(-1).log2(), torch.nan)  # [F, P]
-    gains = stops.new_zeros(len(stops))
+    doublings = torch.where(usable, pixels.mean(-1).log2(), torch.nan)  # [F, P]
+    gains = doublings.new_zeros(len(doublings))
     for _ in range(ROUNDS):
-        of_points = (stops - gains[:, None]).nanmedian(0).values
-        gains = (stops - of_points).nanmedian(1).values.nan_to_num()
+        of_points = (doublings - gains[:, None]).nanmedian(0).values
+        gains = (doublings - of_points).nanmedian(1).values.nan_to_num()
         gains = gains - gains.median()
     return gains

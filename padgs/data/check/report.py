@@ -29,7 +29,7 @@ REPROJECTION_LIMIT = 1 / 500  # of the width, on the median: 4 pixels of 2048
 BETTER = 0.1  # by how much the correlation under another convention must exceed the stated one's
 FITS = 0.3  # correlation from which points and pictures can be said to agree
 SAME_PLACE = 0.01  # of the median depth: a test view as near as this to a training view tests memory
-UNEVEN = 0.1  # stops, standard deviation of the views' gains from which it is worth learning them
+UNEVEN = 0.1  # doublings, standard deviation of the views' gains from which it is worth learning them
 EXPOSURES = 40  # views at most that they are measured in
 
 
@@ -52,7 +52,7 @@ class Report:
     reprojection_median: float | None = None  # pixels
     reprojection_95: float | None = None  # pixels
     colour_correlation: float | None = None  # of the points with the pictures, as stated
-    exposure_spread: float | None = None  # stops, standard deviation of the gains of the training views
+    exposure_spread: float | None = None  # doublings, standard deviation of the gains of the training views
     masked: dict[str, float] = field(default_factory=dict)  # view -> share of its pixels (by weight) that is ignored
     notes: list[str] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
@@ -235,8 +235,8 @@ def _check_exposures(scene: Scene, report: Report) -> None:
     if report.exposure_spread >= UNEVEN:
         dark, bright = (views[int(index)].name for index in (gains.argmin(), gains.argmax()))
         report.notes.append(
-            f"the views are exposed differently, from {gains.min():+.2f} stops ({dark}) to {gains.max():+.2f} "
-            f"({bright}); train with train.exposures=learned, or fix the exposure when you take them again"
+            f"the views are exposed differently, by {2 ** gains.min():.2f} ({dark}) to {2 ** gains.max():.2f} times "
+            f"the values ({bright}); train with train.exposures=learned, or fix the exposure when you take them again"
         )
 
 

@@ -100,6 +100,6 @@ def poses(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> A
 
 
 def held_out(options: SyntheticOptions) -> list[int]:
-    """Which positions along the path are test views: spread evenly, never the first or last."""
+    """Which positions along the path are test views: spread evenly; the ends train if no more are held out."""
     total = options.train_views + options.test_views
     return [int((k + 0.5) * total / options.test_views) for k in range(options.test_views)]

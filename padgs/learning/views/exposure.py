@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from padgs.learning.schedule import Constant, ParameterGroup
 
-RATE = 3e-3  # of log-gains; they follow the model to the end, for what is frozen early is wrong
+RATE = 3e-3  # of log-gains; at the end still so much, for what is frozen early is wrong
 OFFSET_RATE = RATE / 5  # of offsets, in colours from 0 to 1
 
 
@@ -30,7 +30,7 @@ class Exposures(nn.Module):
         self.log_gains, self.offsets = (nn.ParameterList([torch.zeros(3) for _ in range(views)]) for _ in range(2))
 
     def groups(self) -> list[ParameterGroup]:
-        """Learning rates, the same in all of a run."""
+        """Learning rates, at the pace of the run as those of the model that they follow."""
         return [
             ParameterGroup("exposure_log_gains", tuple(self.log_gains), Constant(RATE)),
             ParameterGroup("exposure_offsets", tuple(self.offsets), Constant(OFFSET_RATE)),

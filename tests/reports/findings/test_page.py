@@ -41,7 +41,8 @@ def test_verdict_number_reason_and_command_stand_together(crossed):
     assert row[2].count("-2.00 ± 0.00") == 2 and row[3] == "**does not hold**" and "see" in row[4]
     assert row[5] == "`modulation@cpu`"
     assert (
-        "- `modulation@cpu`: `padgs-run +experiment=modulation scale=cpu seed=0,1 train.iterations=1500`" in page.text
+        "- `modulation@cpu`: `padgs-run +experiment=modulation scale=cpu seed=0,1 train.iterations=1500 "
+        "data.generator.width=512`" in page.text
     )
     assert "- `tau`: `padgs-run +sweep=tau`; not run." in page.text
 

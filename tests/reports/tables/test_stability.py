@@ -104,12 +104,14 @@ def test_who_was_spared_something_has_no_score_and_stands_last():
         assert scores["unstressed: WS-PSNR, dB"]["PaD-GS"] == "32.00" and "score –, worst quartile –" in chart.svg
 
 
-def test_what_means_nothing_to_some_methods_is_told_and_not_scored():
+def test_what_means_nothing_to_some_methods_is_told_and_neither_scored_nor_counted():
     both = [*runs(), *rest()]
-    reduced = run("padgs", 12.0, "precision", 1)  # PaD-GS alone has networks
-    with_it, without = (cells(stability(gathered(of))[0], "synthetic-room") for of in ([*both, reduced], both))
-    assert with_it["stability score"] == without["stability score"]
-    assert cells(stability(gathered([*both, reduced]))[0], "Retention")["precision 1"]["PaD-GS"] == "0.00"
+    told = [run("padgs", 12.0, "precision", 1)]  # PaD-GS alone has networks
+    told.append(replace(run("padgs", 12.0, "capacity", 1), status="rejected"))  # and cannot be told a number
+    with_it, without = (cells(stability(gathered(of))[0], "synthetic-room") for of in ([*both, *told], both))
+    assert with_it == without
+    kept = cells(stability(gathered([*both, *told]))[0], "Retention")
+    assert kept["precision 1"]["PaD-GS"] == "0.00" and kept["capacity 1"]["PaD-GS"] == "0.00 [REJECTED]"
 
 
 def test_a_run_that_was_stopped_is_neither_a_seed_nor_a_reference():
