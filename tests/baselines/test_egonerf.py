@@ -117,7 +117,8 @@ def test_weights_of_rows_are_honoured():
             "draws no Gaussians, so render.projection=ray means nothing to it; leave it at erp",
         ),
         ({"backend": "cpu"}, {}, "no backend 'cpu'; it casts rays in torch, known: auto, torch"),
-        ({}, {"lambda_l1": 0.5}, "squared error, so train.lambda_l1=0.5 means nothing to it; leave it at 0.8"),
+        ({}, {"lambda_l1": 0.5}, "squared error .* so train.lambda_l1=0.5 means nothing to it; leave it at 0.8"),
+        ({}, {"guard_gradients": True}, "neither Gaussians .* so train.guard_gradients=True means nothing to it"),
         ({}, {"normalisation": "channel_sum"}, "train.normalisation=channel_sum means nothing"),
     ],
 )
