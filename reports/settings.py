@@ -26,9 +26,13 @@ class Setting:
     @property
     def title(self) -> str:
         """Preset, variant, and what sets it apart."""
-        parts = [methods.title(self.preset), self.variant]
-        parts += [f"{key.rpartition('.')[2]} {value}" for key, value in self.changed.items()]
-        return ", ".join(part for part in parts if part)
+        return ", ".join([methods.title(self.preset), *self.apart])
+
+    @property
+    def apart(self) -> list[str]:
+        """Variant, if any, and what sets it apart."""
+        changed = [f"{key.rpartition('.')[2]} {value}" for key, value in self.changed.items()]
+        return [self.variant, *changed] if self.variant else changed
 
 
 def settings(runs: DataFrame) -> list[Setting]:

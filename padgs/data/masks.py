@@ -17,7 +17,7 @@ from padgs.data.capture import Capture
 from padgs.data.errors import DataError
 from padgs.data.images import EXTENSIONS, ImageFile, inspect, save_png
 from padgs.data.store import ImageStore, StoredImage
-from padgs.sphere.panorama import row_latitudes
+from padgs.sphere.distortion import solid_angle_weight
 
 SCENE_MASKS = ("mask.png", "mask.jpg", "mask.bmp")
 PREVIEW = "mask_preview.jpg"  # beside them, of `padgs.data.prepare.nadir`
@@ -128,7 +128,7 @@ def mask_place(spec: str, folder: Path) -> Path | None:
 
 def _refuse_hidden(weights: Tensor, message: str) -> None:
     """Refuse weights [H, W or 1] that let next to nothing of the sphere through, with how much they hide."""
-    area = row_latitudes(len(weights)).cos()
+    area = solid_angle_weight(len(weights))
     # The mean weight, not the share of pixels that have any: 1 for "use" in place of 255 would hide nearly all.
     shown = (weights.mean(-1).cpu() @ area / area.sum()).item()
     if shown < LEAST:

@@ -12,6 +12,7 @@ from padgs.reports.frame import grouped
 from padgs.reports.gathered import Gathered
 from padgs.reports.measures import costs, gpu_memory, mark
 from padgs.reports.published import scene_title
+from padgs.reports.settings import Setting, settings
 from padgs.reports.tables.cells import over_seeds
 from padgs.reports.tables.table import Block, Row, Table
 
@@ -28,7 +29,7 @@ COSTS = (
 
 
 def runs(gathered: Gathered) -> Table:
-    """A block per scene, resolution and length, a row per run."""
+    """A block per scene, resolution and length, a row per run, which says in what the settings of a preset differ."""
     found = gathered.asked_for
     measured = [mark(protocol, metric, protocol) for protocol, metrics in MARKS.items() for metric in metrics]
     plain = [replace(measure, column=replace(measure.column, higher_is_better=None)) for measure in measured]
@@ -37,8 +38,9 @@ def runs(gathered: Gathered) -> Table:
     for (place, resolution, length), own in grouped(found, "place", "resolution", "length"):
         title = f"{scene_title(place.dataset, place.scene)}, {resolution}, {length}"
         rows = (
-            Row(_title(*words), tuple(over_seeds(own.loc[[index]], measures)))
-            for index, *words in own[["preset", "variant", "seed", "run"]].itertuples()
+            Row(_title(setting, seed, run), tuple(over_seeds(own.loc[[index]], measures)))
+            for setting in settings(own)
+            for index, seed, run in setting.runs[["seed", "run"]].itertuples()
         )
         blocks.append(Block(title, tuple(rows)))
         runs_of[title] = own
@@ -46,5 +48,5 @@ def runs(gathered: Gathered) -> Table:
     return Table("runs", "Runs", "Run", tuple(m.column for m in measures), tuple(blocks), tuple(notes))
 
 
-def _title(preset: str, variant: str, seed: int, run: str) -> str:
-    return ", ".join(word for word in (preset, variant, f"seed {seed}", run.rpartition("_")[2]) if word)
+def _title(setting: Setting, seed: int, run: str) -> str:
+    return ", ".join([setting.preset, *setting.apart, f"seed {seed}", run.rpartition("_")[2]])

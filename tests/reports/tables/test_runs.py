@@ -24,3 +24,9 @@ def test_presets_of_a_method_are_told_apart_and_nothing_stands_out():
     text = markdown.text(runs(gathered([result("", method="odgs"), release])))
     assert "| odgs, seed 0" in text and "| odgs\\_release, seed 0" in text
     assert "**" not in text and "<ins>" not in text
+
+
+def test_runs_of_a_sweep_say_what_was_swept():
+    swept = [replace(result(""), run=f"bar_{tau}", config={"method": {"tau": tau}}) for tau in (0.9, 0.5)]
+    (block,) = runs(gathered(swept)).blocks
+    assert [row.title for row in block.rows] == ["padgs, tau 0.5, seed 0, 0.5", "padgs, tau 0.9, seed 0, 0.9"]
