@@ -104,8 +104,11 @@ def _groups() -> set[str]:
 
 
 def conflict(arguments: Sequence[str]) -> str | None:
-    """What is wrong with a command line that says two things at once, or takes a group for a value; None if none is.
+    """What is wrong with a command line that says two things at once, nothing, or takes a group for a value; None if
+    none is.
 
+    >>> conflict(["photographs", "seed=1"])
+    'photographs is no setting: these are KEY=VALUE, e.g. data.path=photographs; see padgs-run --help'
     >>> conflict(["seed=1", "-m", "method=padgs", "++seed=2"])
     'seed is set twice, by seed=1 and ++seed=2; keep one of them'
     >>> conflict(["+sweep=tau,seeds"])
@@ -120,8 +123,12 @@ def conflict(arguments: Sequence[str]) -> str | None:
     'run.jobs=4 takes a launcher that runs several jobs at a time, e.g. launcher=local'
     """
     settings: dict[str, str] = {}
+    before = ""
     for argument in arguments:
         key, equals, value = argument.partition("=")
+        if not (equals or argument.startswith(("-", "~")) or before.startswith("-")):  # which may have a value
+            return f"{argument} is no setting: these are KEY=VALUE, e.g. data.path={argument}; see padgs-run --help"
+        before = argument
         if not equals or key.startswith("-"):
             continue
         key = key.lstrip("+~")
