@@ -34,7 +34,10 @@ from padgs.data.prepare.video import extract_frames, is_video
 from padgs.data.prepare.work import WorkFolder
 
 STEPS = ("frames", "images", "views", "features", "matches", "poses", "result")
-_REMEDIES = "take them closer together, hide what moves with the camera in a mask (--mask), or try --accurate"
+_REMEDIES = (
+    "take them closer together (of a video: --per-second), hide what moves with the camera in a mask (--mask), or try "
+    "--accurate"
+)
 
 Progress = Callable[[str, int, int], None]  # (one of STEPS, done, in all)
 
