@@ -82,7 +82,8 @@ def test_a_perspective_picture_shows_what_the_panorama_shows_there(folder, tmp_p
     ("arguments", "message"),
     [
         (("--camera", "fisheye"), "unknown camera 'fisheye'; known: panorama, perspective"),
-        (("--fps", "0"), "both must be > 0"),
+        (("--fps", "0"), "--fps is 0, which makes a film without a frame; it must be > 0"),
+        (("--seconds", "0"), "--seconds is 0, which makes a film"),
         (("--height", "9"), "are of perspective pictures: add --camera perspective"),
         (("--path", "spiral"), "there is no path spiral; known: cameras, orbit, dolly"),
         (("--camera", "perspective", "--fov", "180"), "across 180 degrees"),
