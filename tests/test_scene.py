@@ -1,6 +1,7 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -53,6 +54,12 @@ def test_a_mask_is_optional_and_a_missing_image_is_an_error():
     assert view_at(0, 0, 0).mask() is None
     with pytest.raises(ValueError, match="view 'view' has a pose but no image; it can only be rendered"):
         view_at(0, 0, 0).image()
+
+
+def test_a_pose_may_be_of_numpy():
+    view = view_at(1.0, 2.0, 3.0)
+    elsewhere = view.at(np.eye(4, dtype=np.float32))
+    assert torch.equal(elsewhere.cam_from_world, torch.eye(4, dtype=torch.float64)) and elsewhere.load_pixels is None
 
 
 def test_the_same_camera_elsewhere_has_no_pixels():

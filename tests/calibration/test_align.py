@@ -70,3 +70,7 @@ def test_what_cannot_be_aligned_is_refused(generator):
         align(poses, poses[:2])
     with pytest.raises(ValueError, match="coincide"):
         align(poses, torch.eye(4, dtype=torch.float64).repeat(3, 1, 1))
+    mirrored = poses.clone()
+    mirrored[:, :3, 3] *= -1  # centres on the other side, while all look where they did
+    with pytest.raises(ValueError, match="no shape in common: the best scale is -1"):
+        align(poses, mirrored)

@@ -31,6 +31,24 @@ def test_it_writes_markdown_and_latex_and_shows_the_first(runs, tmp_path):
     assert written["table3.md"] in done.output
 
 
+def test_a_folder_without_results_is_refused_and_left_alone(runs, tmp_path):
+    (empty := tmp_path / "empty").mkdir()
+    for folder, way_out in ((empty, "give a folder of run folders"), (runs / "full", f"is one run: give {runs}")):
+        before = sorted(folder.iterdir())
+        done = report("all", folder)
+        said = "".join((done.output + done.stderr).split())
+        assert done.exit_code == 1 and "".join(way_out.split()) in said
+        assert sorted(folder.iterdir()) == before
+
+
+def test_runs_that_were_asked_to_stop_are_named(runs):
+    (runs / "early").mkdir()
+    early = replace(result("", run="early_1"), variant="stopped after 9 iterations", ended=results.ASKED)
+    results.write(early, runs / "early")
+    done = report("table3", runs)
+    assert done.exit_code == 0 and "in no table but `runs`: early_1" in " ".join(done.stderr.split())
+
+
 def test_the_same_results_give_the_same_bytes(runs, tmp_path):
     for name in ("one", "two"):
         report("table3", runs, "--out", tmp_path / name)
