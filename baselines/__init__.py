@@ -1,4 +1,4 @@
-"""The methods that are compared, one file each; PaD-GS, which they are compared with, has a room (padgs/anchors).
+"""The methods that are compared, one file each; PaD-GS, which they are compared with, has a room (padgs/methods/anchors).
 
 Packages elsewhere add theirs by entry points, see docs/your_own_method.
 """
@@ -6,7 +6,7 @@ Packages elsewhere add theirs by entry points, see docs/your_own_method.
 from importlib.metadata import entry_points
 
 METHODS = {
-    "padgs": "padgs.anchors.method:PaDGSMethod",
+    "padgs": "padgs.methods.anchors.method:PaDGSMethod",
     "omnigs": "padgs.baselines.omnigs:OmniGSMethod",
     "odgs": "padgs.baselines.odgs:ODGSMethod",
     "op43dgs": "padgs.baselines.op43dgs:OP43DGSMethod",
@@ -16,7 +16,7 @@ METHODS = {
     "egonerf": "padgs.baselines.egonerf:EgoNeRFMethod",
     "sc_omnigs": "padgs.baselines.sc_omnigs:SCOmniGSMethod",
     "seam360gs": "padgs.baselines.seam360gs:Seam360GSMethod",
-    "padgs_plus": "padgs.plus.method:PlusMethod",
+    "padgs_plus": "padgs.methods.plus.method:PlusMethod",
 }
 OURS = frozenset(METHODS)
 GROUP = "padgs.methods"  # of entry points

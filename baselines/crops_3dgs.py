@@ -13,9 +13,9 @@ from torch import Tensor
 
 from padgs.baselines.cubemap_3dgs import Cubemap3DGSMethod
 from padgs.data.perspectives import looking_at, square_lens
+from padgs.geometry.camera import Panorama, Pinhole
+from padgs.methods.splats.method import SplatOptions
 from padgs.render.cubemap import FINENESS
-from padgs.sphere.camera import Panorama, Pinhole
-from padgs.splats.method import SplatOptions
 
 GOLDEN = (1 + math.sqrt(5)) / 2
 ICOSAHEDRON = [
@@ -41,7 +41,7 @@ class Crops3DGSOptions(SplatOptions):
 
 
 class Crops3DGSMethod(Cubemap3DGSMethod):
-    """See `padgs.learning.method.Method`."""
+    """See `padgs.training.method.Method`."""
 
     Options = Crops3DGSOptions
 

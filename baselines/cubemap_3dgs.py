@@ -15,18 +15,18 @@ from dataclasses import replace
 from torch import Tensor
 
 from padgs.data.perspectives import perspective_scene, solid_angle, square_lens
-from padgs.learning.budget import Budget
-from padgs.learning.loop import Record, Stage, Trainer
-from padgs.learning.trainee import Trainee
-from padgs.learning.views.corrections import GIVEN, LEARNED
+from padgs.geometry.camera import Panorama, Pinhole
+from padgs.methods.splats.method import SplatMethod, refuse_polar_threshold
+from padgs.methods.splats.trainee import SplatTrainee
 from padgs.render import RenderOptions
 from padgs.render.config import RenderConfig
 from padgs.render.contract import check_camera
 from padgs.render.cubemap import FACES, FINENESS
 from padgs.scene import Scene, View
-from padgs.sphere.camera import Panorama, Pinhole
-from padgs.splats.method import SplatMethod, refuse_polar_threshold
-from padgs.splats.trainee import SplatTrainee
+from padgs.training.budget import Budget
+from padgs.training.loop import Record, Stage, Trainer
+from padgs.training.trainee import Trainee
+from padgs.training.views.corrections import GIVEN, LEARNED
 
 
 def of_cut_views(options: RenderOptions) -> RenderOptions:
@@ -46,7 +46,7 @@ class CutTrainee(SplatTrainee):
 
 
 class Cubemap3DGSMethod(SplatMethod):
-    """See `padgs.learning.method.Method`."""
+    """See `padgs.training.method.Method`."""
 
     TRAINEE = CutTrainee
     CUT_FINENESS = FINENESS

@@ -6,17 +6,17 @@ from dataclasses import dataclass, fields, replace
 
 import torch
 
-from padgs.egonerf.model import EgoNeRF
-from padgs.egonerf.options import EgoNeRFOptions
-from padgs.egonerf.ray_trainer import RayTrainer
-from padgs.egonerf.trainee import EgoNeRFTrainee, EgoNeRFTraining
-from padgs.learning.budget import Budget
-from padgs.learning.loop import Stage
-from padgs.learning.method import Method
-from padgs.learning.options import TrainOptions
-from padgs.learning.trainee import State
+from padgs.methods.egonerf.model import EgoNeRF
+from padgs.methods.egonerf.options import EgoNeRFOptions
+from padgs.methods.egonerf.ray_trainer import RayTrainer
+from padgs.methods.egonerf.trainee import EgoNeRFTrainee, EgoNeRFTraining
 from padgs.render.config import RenderConfig
 from padgs.scene import Scene
+from padgs.training.budget import Budget
+from padgs.training.loop import Stage
+from padgs.training.method import Method
+from padgs.training.options import TrainOptions
+from padgs.training.trainee import State
 
 BACKENDS = ("auto", "torch")
 
@@ -36,7 +36,7 @@ class EgoNeRFMethodOptions(EgoNeRFOptions, EgoNeRFTraining):
 
 
 class EgoNeRFMethod(Method):
-    """See `padgs.learning.method.Method`; most options of renderer and loss mean nothing to it."""
+    """See `padgs.training.method.Method`; most options of renderer and loss mean nothing to it."""
 
     Options = EgoNeRFMethodOptions
     TRAIN = TrainOptions(weight="uniform", learning_rates="published")

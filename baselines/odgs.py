@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from padgs.splats.method import SplatMethod, SplatOptions
+from padgs.methods.splats.method import SplatMethod, SplatOptions
 
 
 @dataclass(frozen=True)
@@ -20,6 +20,6 @@ class ODGSOptions(SplatOptions):
 
 
 class ODGSMethod(SplatMethod):
-    """See `padgs.learning.method.Method`."""
+    """See `padgs.training.method.Method`."""
 
     Options = ODGSOptions

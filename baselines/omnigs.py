@@ -6,8 +6,8 @@ conf/method/omnigs_release.yaml switches on what its released code does otherwis
 
 from __future__ import annotations
 
-from padgs.splats.method import SplatMethod
+from padgs.methods.splats.method import SplatMethod
 
 
 class OmniGSMethod(SplatMethod):
-    """See `padgs.learning.method.Method`."""
+    """See `padgs.training.method.Method`."""

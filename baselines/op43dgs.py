@@ -6,11 +6,11 @@ code, which grow with the distance of a Gaussian in scene units, and the memory 
 
 from __future__ import annotations
 
+from padgs.methods.splats.method import SplatMethod
 from padgs.render.config import RenderConfig
-from padgs.splats.method import SplatMethod
 
 
 class OP43DGSMethod(SplatMethod):
-    """See `padgs.learning.method.Method`."""
+    """See `padgs.training.method.Method`."""
 
     RENDER = RenderConfig(projection="tangent")

@@ -15,20 +15,20 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from padgs.calibration.align import Difference, Similarity, align
-from padgs.calibration.camera_map import CameraMap
-from padgs.calibration.splats import CalibratedMethod, Calibration
 from padgs.checks import check
-from padgs.learning.loss import pixel_weight
-from padgs.learning.options import TrainOptions
-from padgs.learning.schedule import Constant, ParameterGroup
-from padgs.learning.targets import Target
-from padgs.learning.trainee import Drawing, State
-from padgs.learning.views.poses import PoseRates, PoseRefinement
+from padgs.geometry.panorama import sample_pixels
+from padgs.methods.calibration.align import Difference, Similarity, align
+from padgs.methods.calibration.camera_map import CameraMap
+from padgs.methods.calibration.splats import CalibratedMethod, Calibration
+from padgs.methods.splats.method import SplatOptions
 from padgs.render import Rendering
 from padgs.scene import Scene, View
-from padgs.sphere.panorama import sample_pixels
-from padgs.splats.method import SplatOptions
+from padgs.training.loss import pixel_weight
+from padgs.training.options import TrainOptions
+from padgs.training.schedule import Constant, ParameterGroup
+from padgs.training.targets import Target
+from padgs.training.trainee import Drawing, State
+from padgs.training.views.poses import PoseRates, PoseRefinement
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class SelfCalibration(Calibration):
     """Poses of all training views and the one camera that took them."""
 
     def __init__(self, poses: PoseRefinement, camera: CameraMap, options: SCOmniGSOptions, weight: str) -> None:
-        """Start from the given poses and an ideal camera; `weight` is a name of `padgs.learning.loss.ROW_WEIGHTS`."""
+        """Start from the given poses and an ideal camera; `weight` is a name of `padgs.training.loss.ROW_WEIGHTS`."""
         super().__init__()
         self.poses, self.camera = poses, camera
         self._options, self._weight = options, weight
@@ -106,7 +106,7 @@ class SelfCalibration(Calibration):
 
 
 class SCOmniGSMethod(CalibratedMethod):
-    """See `padgs.learning.method.Method`.
+    """See `padgs.training.method.Method`.
 
     Held-out views: their poses are given in the world of the given training poses, the model lives in that of the
     refined ones. The similarity that maps the former cameras onto the latter takes each view across; no pixel of a

@@ -13,15 +13,15 @@ from typing import Any
 
 import torch
 
-from padgs.calibration.dual_lens import DualLens
-from padgs.calibration.splats import CalibratedMethod
 from padgs.checks import check, check_known
+from padgs.geometry.camera import RayTable
+from padgs.geometry.lens import AXES
+from padgs.methods.calibration.dual_lens import DualLens
+from padgs.methods.calibration.splats import CalibratedMethod
+from padgs.methods.splats.method import SplatOptions, refuse_polar_threshold
 from padgs.render.config import RenderConfig
 from padgs.render.contract import check_camera
 from padgs.scene import Scene
-from padgs.sphere.camera import RayTable
-from padgs.sphere.lens import AXES
-from padgs.splats.method import SplatOptions, refuse_polar_threshold
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Seam360GSOptions(SplatOptions):
 
 
 class Seam360GSMethod(CalibratedMethod):
-    """See `padgs.learning.method.Method`. Trained through `DualLens`; `render` is the ideal camera, without a seam.
+    """See `padgs.training.method.Method`. Trained through `DualLens`; `render` is the ideal camera, without a seam.
 
     Lenses see along rays of their own, which the projection erp cannot draw.
     """

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from padgs.methods.splats.method import SplatMethod, SplatOptions
 from padgs.render.config import RenderConfig
-from padgs.splats.method import SplatMethod, SplatOptions
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class SPaGSOptions(SplatOptions):
 
 
 class SPaGSMethod(SplatMethod):
-    """See `padgs.learning.method.Method`."""
+    """See `padgs.training.method.Method`."""
 
     Options = SPaGSOptions
     RENDER = RenderConfig(projection="ray", near_cull="ellipsoid", low_pass=0.0, blending="hybrid", core_size=16)

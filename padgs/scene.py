@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from padgs.sphere.camera import Camera, Panorama
+from padgs.geometry.camera import Camera, Panorama
 
 ONE_PLACE = 1e-6  # units of the scene; a reach up to here is rounding
 FAR = 1000.0  # units of the scene that its cameras may be away from the origin; there float32 has steps of 6e-5 units

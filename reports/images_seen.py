@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from padgs.results import Result
 
-LEAST_WIDTH = 512  # pixels of views that are made smaller; as `padgs.learning.views.sizes` has it, without torch
+LEAST_WIDTH = 512  # pixels of views that are made smaller; as `padgs.training.views.sizes` has it, without torch
 
 
 def images_seen(result: Result) -> float | None:

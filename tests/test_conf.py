@@ -10,27 +10,27 @@ from composed import composed, expanded, first_and_last_job, jobs
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
-from padgs.anchors.growth import PUBLISHED_THRESHOLD
-from padgs.anchors.method import PaDGSMethodOptions
-from padgs.anchors.model import PaDGSOptions
 from padgs.baselines import METHODS
 from padgs.data.datasets import DATASETS
 from padgs.data.synthetic.options import SyntheticOptions
-from padgs.learning.options import TrainOptions
+from padgs.evaluation.protocols import PROTOCOLS, ROAM_360_BOTTOM_CROP
+from padgs.methods.anchors.growth import PUBLISHED_THRESHOLD
+from padgs.methods.anchors.method import PaDGSMethodOptions
+from padgs.methods.anchors.model import PaDGSOptions
+from padgs.methods.plus.method import PlusMethod
+from padgs.methods.plus.options import PlusOptions
 from padgs.multirun.choices import method_choices
 from padgs.multirun.composition import composing, configuration
 from padgs.multirun.launchers import missing_plugin
 from padgs.multirun.overrides import expand, lenient, quoted
-from padgs.plus.method import PlusMethod
-from padgs.plus.options import PlusOptions
 from padgs.registry import lookup
 from padgs.render.config import RenderConfig
 from padgs.reports.unranked import MENDS
 from padgs.runs.config import RunOptions, TrainConfig
+from padgs.runs.tracking.tracker import TrackingOptions
 from padgs.runs.typed import ConfigError
-from padgs.scoring.protocols import PROTOCOLS, ROAM_360_BOTTOM_CROP
 from padgs.stress.conditions import CONDITIONS
-from padgs.tracking.tracker import TrackingOptions
+from padgs.training.options import TrainOptions
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import torch
 
 from padgs.checks import check
+from padgs.methods.splats.method import SplatMethod, SplatOptions
+from padgs.methods.splats.trainee import SplatTrainee
 from padgs.render.config import RenderConfig
 from padgs.scene import Scene
-from padgs.splats.method import SplatMethod, SplatOptions
-from padgs.splats.trainee import SplatTrainee
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class MyOptions(SplatOptions):
 
 
 class MyMethod(SplatMethod):
-    """See `padgs.learning.method.Method` for what a method may say, and `padgs.splats.method` for this kind."""
+    """See `padgs.training.method.Method` for what a method may say, and `padgs.methods.splats.method` for this kind."""
 
     Options = MyOptions
     RENDER = RenderConfig(projection="ray")

@@ -18,7 +18,9 @@ def bench(
     repeats: Annotated[int, typer.Option(help="of each measurement; 0 for the usual number")] = 0,
     seed: Annotated[int, typer.Option(help="of the Gaussians")] = 0,
     isas: Annotated[bool, typer.Option(help="also on each instruction set")] = False,
-    device: Annotated[str, typer.Option(help="cpu, or cuda for the GPU: other stages, see padgs/bench/gpu.py")] = "cpu",
+    device: Annotated[
+        str, typer.Option(help="cpu, or cuda for the GPU: other stages, see padgs/apps/bench/gpu.py")
+    ] = "cpu",
 ) -> None:
     """Measure training and rendering, stage by stage, against what this machine can do and what is asked."""
     import json
@@ -29,10 +31,10 @@ def bench(
     import torch
     from rich.console import Console
 
-    from padgs.bench.gpu import gpu_lines, measure_gpu
-    from padgs.bench.picture import stacked_bars
-    from padgs.bench.report import QUICK, BenchOptions, measure_all
-    from padgs.bench.tables import lines
+    from padgs.apps.bench.gpu import gpu_lines, measure_gpu
+    from padgs.apps.bench.picture import stacked_bars
+    from padgs.apps.bench.report import QUICK, BenchOptions, measure_all
+    from padgs.apps.bench.tables import lines
     from padgs.replacing import replace_file
 
     def as_json(report: dict) -> bytes:

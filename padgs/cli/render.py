@@ -34,13 +34,13 @@ def render(
     import torch
     from rich.console import Console
 
+    from padgs.apps.camera_path_video.frames import write_film
+    from padgs.apps.camera_path_video.keyframes import read_path
+    from padgs.apps.camera_path_video.paths import PATHS
     from padgs.data.formats.transforms import described
     from padgs.data.trajectory import gravity
-    from padgs.film.frames import write_film
-    from padgs.film.keyframes import read_path
-    from padgs.film.paths import PATHS
+    from padgs.geometry.camera import Panorama, perspective
     from padgs.scene import View, about
-    from padgs.sphere.camera import Panorama, perspective
 
     if camera not in ("panorama", "perspective"):
         raise ValueError(f"unknown camera {camera!r}; known: panorama, perspective")

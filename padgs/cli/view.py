@@ -27,8 +27,8 @@ def view(
     data: DataPath = None,
 ) -> None:
     """Walk through a run in the browser, drawn here by the run's own renderer; one in training is followed."""
-    from padgs.viewer.process import has_screen, serve
-    from padgs.viewer.server import LOCAL, PORT
+    from padgs.apps.viewer.process import has_screen, serve
+    from padgs.apps.viewer.server import LOCAL, PORT
 
     folders = (run, beside) if beside else (run,)
     for folder in folders:
@@ -36,7 +36,7 @@ def view(
             opened(folder, data)  # says what is wrong before a page stands
 
     def of_one_scene() -> list[OpenedRun]:
-        from padgs.viewer.waiting import await_checkpoint
+        from padgs.apps.viewer.waiting import await_checkpoint
 
         runs, names = [], []
         for folder in folders:

@@ -17,7 +17,7 @@ from padgs.data.capture import Capture
 from padgs.data.errors import DataError
 from padgs.data.images import EXTENSIONS, ImageFile, inspect, save_png
 from padgs.data.store import ImageStore, StoredImage
-from padgs.sphere.distortion import solid_angle_weight
+from padgs.geometry.distortion import solid_angle_weight
 
 SCENE_MASKS = ("mask.png", "mask.jpg", "mask.bmp")
 PREVIEW = "mask_preview.jpg"  # beside them, of `padgs.data.prepare.nadir`

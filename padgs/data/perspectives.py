@@ -17,9 +17,9 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from padgs.data.store import ImageStore, StoredImage
+from padgs.geometry.camera import Panorama, Pinhole
+from padgs.geometry.panorama import CUBIC_REACH, continued, sample, sample_sharply
 from padgs.scene import Scene, View
-from padgs.sphere.camera import Panorama, Pinhole
-from padgs.sphere.panorama import CUBIC_REACH, continued, sample, sample_sharply
 
 
 @dataclass(frozen=True, eq=False)  # a key of the store by identity: tensors are neither compared nor hashed by value

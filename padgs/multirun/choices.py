@@ -12,12 +12,12 @@ from rich.console import Console
 from padgs.baselines import METHODS, OURS, distribution
 from padgs.data.datasets import DATASETS
 from padgs.data.synthetic.options import SCENES
-from padgs.learning.options import TrainOptions
 from padgs.multirun.overrides import root
 from padgs.registry import lookup
 from padgs.render.config import RenderConfig
 from padgs.runs.config import default_fields, method_fields
 from padgs.runs.terminal import say
+from padgs.training.options import TrainOptions
 
 
 def register_choices() -> None:

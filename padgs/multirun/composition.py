@@ -12,12 +12,12 @@ from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from padgs.learning.method import Method
 from padgs.multirun.choices import register_choices
 from padgs.multirun.overrides import lenient, quoted, root
 from padgs.runs.config import DEFAULT_METHOD, RunConfig, config_from_values
 from padgs.runs.identity import labels
 from padgs.runs.session import build
+from padgs.training.method import Method
 
 
 @contextmanager

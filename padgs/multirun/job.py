@@ -14,8 +14,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from rich.console import Console
 
-from padgs.learning.failure import Failure
-from padgs.learning.stopping import set_apart
+from padgs.apps.viewer.process import shown
 from padgs.multirun.board import CRASHED, ELSEWHERE, REFUSED, STOPPED, Board, BoardEntry
 from padgs.multirun.composition import typed_config
 from padgs.multirun.finished import FinishedJobs
@@ -29,8 +28,9 @@ from padgs.runs.lock import RunBusy
 from padgs.runs.opened import load_run
 from padgs.runs.session import Session, Watch
 from padgs.runs.terminal import say
-from padgs.tracking.tracker import SECONDS_BETWEEN_LOOKS, Tracker
-from padgs.viewer.process import shown
+from padgs.runs.tracking.tracker import SECONDS_BETWEEN_LOOKS, Tracker
+from padgs.training.failure import Failure
+from padgs.training.stopping import set_apart
 
 # A traceback would only hide what these say. Failure is one of a search for needs: those of training are results.
 EXPECTED = (ValueError, OSError, Failure, CheckpointError, RunFolderError, RunBusy)

@@ -27,8 +27,8 @@ from padgs.runs.identity import labels
 from padgs.runs.interrupt import Interrupt, Interrupted
 from padgs.runs.outcome import RETRIED
 from padgs.runs.terminal import say
+from padgs.runs.tracking.tracker import SECONDS_BETWEEN_LOOKS, Tracker, TrackingOptions
 from padgs.runs.typed import typed
-from padgs.tracking.tracker import SECONDS_BETWEEN_LOOKS, Tracker, TrackingOptions
 
 ATTEMPTS = 2  # of a job whose process died: it may have been the fault of another one
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from padgs.learning.stopping import set_apart
+from padgs.evaluation.metrics import BANDS
+from padgs.evaluation.protocols import PROTOCOLS
 from padgs.results import Scores
 from padgs.scene import View
-from padgs.scoring.metrics import BANDS
-from padgs.scoring.protocols import PROTOCOLS
+from padgs.training.stopping import set_apart
 
 RULES = PROTOCOLS["sphere"]
 QUALITY, PERCEPTION = "ws_psnr", RULES.lpips_name

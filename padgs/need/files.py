@@ -7,10 +7,10 @@ from typing import Any
 
 import torch
 
-from padgs.learning.trainee import Prunable
 from padgs.need import tiers
 from padgs.need.calibration import QUALITY, differences, objections
 from padgs.need.search import Search
+from padgs.training.trainee import Prunable
 
 NAME = "model"  # of the file, before what its tier adds
 

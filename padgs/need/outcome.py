@@ -13,8 +13,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from padgs.learning.optimiser import ADAM
-from padgs.learning.trainee import MODEL, State
+from padgs.evaluation.pictures import eight_bit
 from padgs.need.calibration import PERCEPTION, QUALITY
 from padgs.need.files import files
 from padgs.need.plan import Step, against, degrees, knee, loss, smallest
@@ -24,7 +23,8 @@ from padgs.runs.folder import PROGRESS, Progress, RunFolder
 from padgs.runs.identity import config_hash, identity
 from padgs.runs.scoring import frame_times, scores
 from padgs.runs.session import build
-from padgs.scoring.pictures import eight_bit
+from padgs.training.optimiser import ADAM
+from padgs.training.trainee import MODEL, State
 
 EXPERIMENT = "need"
 

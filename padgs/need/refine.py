@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import torch
 
-from padgs.learning.options import TrainOptions
-from padgs.learning.schedule import Pace, ParameterGroup
-from padgs.learning.trainee import Drawing, Prunable, Size, State
 from padgs.render import Rendering
 from padgs.scene import View
+from padgs.training.options import TrainOptions
+from padgs.training.schedule import Pace, ParameterGroup
+from padgs.training.trainee import Drawing, Prunable, Size, State
 
 SHARE = 0.04  # of the iterations of the run, in a refinement
 REPLAYED = 0.2  # share of the run, at its end, whose learning rates a refinement goes through again

@@ -9,10 +9,8 @@ from itertools import cycle, islice
 import torch
 
 from padgs.clock import timed
-from padgs.learning.budget import Budget
-from padgs.learning.loop import Trainer
-from padgs.learning.trainee import Prunable, State
-from padgs.learning.worth import most_wanted, worth
+from padgs.evaluation.evaluate import evaluate
+from padgs.methods.splats.trainee import SplatTrainee
 from padgs.need import refine
 from padgs.need.calibration import RULES, calibration_split
 from padgs.need.plan import Plan, Step, loss, narrowest, plan, plan_degree, smallest
@@ -23,9 +21,11 @@ from padgs.runs import checkpoint
 from padgs.runs.interrupt import Interrupt, Interrupted
 from padgs.runs.opened import OpenedRun
 from padgs.scene import View
-from padgs.scoring.evaluate import evaluate
-from padgs.splats.trainee import SplatTrainee
 from padgs.stopwatch import Lap
+from padgs.training.budget import Budget
+from padgs.training.loop import Trainer
+from padgs.training.trainee import Prunable, State
+from padgs.training.worth import most_wanted, worth
 
 FOLDER = "need"  # in that of the run
 FRAMES = 10  # timed; the smallest time counts, since other programs only add to it

@@ -9,10 +9,10 @@ from typing import Any
 
 import torch
 
-from padgs.learning.trainee import State
 from padgs.need.plan import Step
 from padgs.results import Scores
 from padgs.runs import checkpoint
+from padgs.training.trainee import State
 
 STEP, BEGUN, OF = "step", "begun", "of"  # values of a checkpoint: the numbers of a step, what was begun, of what model
 

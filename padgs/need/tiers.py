@@ -1,7 +1,7 @@
 """Files of a trained model, from exact to small, that can be read back.
 
 Our own hold its tensors with 32 or 16 bits, or with 8: these are relative to the extremes of 256 rows that lie close
-together, and positions have 16. Those that other programs open are written, and read, by `padgs.export.splat_file`.
+together, and positions have 16. Those that other programs open are written, and read, by `padgs.apps.export.splat_file`.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from padgs.anchors.model import PaDGS
-from padgs.anchors.trainee import AnchorTrainee
-from padgs.export.splat_file import CONVERTED, CONVERTER, read_splats, write_splats
-from padgs.learning.trainee import Prunable
-from padgs.splats.model import Splats
-from padgs.splats.trainee import SplatTrainee
+from padgs.apps.export.splat_file import CONVERTED, CONVERTER, read_splats, write_splats
+from padgs.methods.anchors.model import PaDGS
+from padgs.methods.anchors.trainee import AnchorTrainee
+from padgs.methods.splats.model import Splats
+from padgs.methods.splats.trainee import SplatTrainee
+from padgs.training.trainee import Prunable
 
 Model = Splats | PaDGS
 WHOLE, HALF, BYTE = ".float32.npz", ".float16.npz", ".8bit.npz"  # endings of our own

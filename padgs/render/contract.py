@@ -19,7 +19,7 @@ from torch import Tensor
 
 from padgs.checks import check, check_known
 from padgs.gaussians import Gaussians
-from padgs.sphere.camera import Camera, Panorama, Pinhole, RayTable
+from padgs.geometry.camera import Camera, Panorama, Pinhole, RayTable
 
 ALPHA_MIN = 1 / 255
 ALPHA_MAX = 0.99

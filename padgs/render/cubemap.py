@@ -17,11 +17,11 @@ from math import ceil, pi
 import torch
 from torch import Tensor
 
+from padgs.geometry.camera import Panorama, Pinhole
+from padgs.geometry.panorama import rays
 from padgs.render.contract import Backend, Rendering, Request
 from padgs.render.projection import camera_frame
 from padgs.render.projective import shift_of_probe
-from padgs.sphere.camera import Panorama, Pinhole
-from padgs.sphere.panorama import rays
 
 FINENESS = 2  # pixels per radian at the middle of a face, where it is coarsest, over those of the panorama's horizon
 

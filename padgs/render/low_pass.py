@@ -3,7 +3,7 @@
 Four kinds. pixels: a variance in the image plane, as in 3D Gaussian splatting; on a panorama that is a circle of the
 chart, which spans less and less of the sphere towards the poles. angular: the same angle in every direction of view.
 solid: the same, but in 3D and with the opacity lowered as the volume grows: the mass stays, and a thin one fades
-instead of swelling (as by the 3D filter of SPaGS, which is of another view, see `padgs.splats.nearest`). fixed: as
+instead of swelling (as by the 3D filter of SPaGS, which is of another view, see `padgs.methods.splats.nearest`). fixed: as
 angular, but of pixels at 512 per radian whatever the image (the released OP43DGS).
 
 angular and solid add low_pass (r / f)^2 to the 3D covariance, at distance r and with f pixels per radian. Every
@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 from padgs.gaussians import Gaussians
+from padgs.geometry.camera import Camera
 from padgs.render.contract import PUBLISHED_FOCAL, RenderOptions
-from padgs.sphere.camera import Camera
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from padgs.geometry.camera import Panorama, Pinhole
+from padgs.geometry.panorama import longitude_latitude, pixel_from_angles, projection_jacobian
 from padgs.render.contract import ALPHA_MIN, Request
 from padgs.render.low_pass import low_pass_of, widened
 from padgs.render.projection import Footprints, camera_frame, is_sound, plane_moments
 from padgs.render.published_bounds import is_on_image, square_boxes
-from padgs.sphere.camera import Panorama, Pinhole
-from padgs.sphere.panorama import longitude_latitude, pixel_from_angles, projection_jacobian
 
 MIN_COS_LATITUDE = 1e-4  # nearer to the axis than 0.006 degrees an erp footprint is undefined: its width is 1 / cos
 SLOPE_LIMIT = 1.3  # pinhole: slopes in the Jacobian are limited to this times the half field of view

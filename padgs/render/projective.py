@@ -13,11 +13,11 @@ from math import pi
 import torch
 from torch import Tensor
 
+from padgs.geometry.camera import Camera, Panorama
 from padgs.render.contract import ALPHA_MIN, Request
 from padgs.render.low_pass import low_pass_of, widened
 from padgs.render.projection import Footprints, camera_frame, is_sound, plane_moments
 from padgs.render.published_bounds import is_on_image, tangent_boxes
-from padgs.sphere.camera import Camera, Panorama
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from padgs.geometry.camera import Panorama
+from padgs.geometry.panorama import longitude_latitude, pixel_from_angles, projection_jacobian
 from padgs.render.contract import PUBLISHED_FOCAL, RenderOptions
-from padgs.sphere.camera import Panorama
-from padgs.sphere.panorama import longitude_latitude, pixel_from_angles, projection_jacobian
 
 TILE = 16  # pixels
 INSTANCE_BYTES = 24  # a key of 8 bytes and a value of 4, before and after sorting; what the sort needs comes on top

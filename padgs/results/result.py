@@ -58,7 +58,7 @@ class Result:
     fingerprint: str  # of the data
     finished: str  # UTC, ISO 8601
     reason: str = ""  # why a run failed
-    ended: str = ""  # why a run that ended well left out a part of its schedule, see `padgs.learning.stopping`
+    ended: str = ""  # why a run that ended well left out a part of its schedule, see `padgs.training.stopping`
     scores: dict[str, Scores] = field(default_factory=dict)  # protocol -> marks
     timing: dict[str, float] = field(default_factory=dict)  # train_seconds, render_ms_median, render_ms_p95, ...
     counts: dict[str, int] = field(default_factory=dict)  # anchors, gaussians, ...

@@ -19,9 +19,9 @@ from typing import Any
 import safetensors.torch
 import torch
 
-from padgs.learning.failure import is_out_of_memory
-from padgs.learning.trainee import State
 from padgs.replacing import replace_file
+from padgs.training.failure import is_out_of_memory
+from padgs.training.trainee import State
 
 FORMAT = 2
 MANIFEST = "state.json"

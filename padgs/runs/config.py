@@ -13,18 +13,18 @@ from padgs.data import LOADERS
 from padgs.data.datasets import DATASETS
 from padgs.data.options import DataOptions, DataSettings
 from padgs.data.synthetic.options import SyntheticOptions
-from padgs.learning.budget import Budget
-from padgs.learning.options import TrainOptions
-from padgs.learning.schedule import PUBLISHED_ITERATIONS
+from padgs.evaluation.protocols import PROTOCOLS, Protocol, protocol_from_options
 from padgs.registry import lookup
 from padgs.render.config import RenderConfig
 from padgs.runs.device import DEVICES
 from padgs.runs.identity import Labels
 from padgs.runs.start import Start
+from padgs.runs.tracking.tracker import TrackingOptions
 from padgs.runs.typed import ConfigError, typed
-from padgs.scoring.protocols import PROTOCOLS, Protocol, protocol_from_options
 from padgs.stress.options import StressOptions
-from padgs.tracking.tracker import TrackingOptions
+from padgs.training.budget import Budget
+from padgs.training.options import TrainOptions
+from padgs.training.schedule import PUBLISHED_ITERATIONS
 
 DEFAULT_METHOD = "padgs_plus"  # as conf/config.yaml says
 RETRIES = ("none", "failed")

@@ -19,15 +19,15 @@ from PIL import Image
 from torch import Tensor
 
 from padgs import results
-from padgs.learning.loop import Record
-from padgs.learning.method import Method
-from padgs.learning.trainee import State
+from padgs.evaluation.pictures import comparison
 from padgs.replacing import replace_file
 from padgs.results import Result
 from padgs.runs import checkpoint
 from padgs.runs import lock as run_lock
 from padgs.scene import View
-from padgs.scoring.pictures import comparison
+from padgs.training.loop import Record
+from padgs.training.method import Method
+from padgs.training.trainee import State
 
 
 class RunFolderError(RuntimeError):

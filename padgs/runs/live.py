@@ -11,7 +11,7 @@ from rich.live import Live
 from rich.text import Text
 
 if TYPE_CHECKING:
-    from padgs.learning.loop import Record
+    from padgs.training.loop import Record
 
 REDRAWS_PER_SECOND = 5
 SECONDS_BETWEEN_LINES = 10.0  # where there is no terminal

@@ -14,9 +14,10 @@ from omegaconf import OmegaConf
 from yaml import YAMLError
 
 from padgs import results
+from padgs.apps.camera_path_video.paths import between
 from padgs.data.errors import DataError
-from padgs.film.paths import between
-from padgs.learning.method import Method
+from padgs.evaluation.protocols import PROTOCOLS
+from padgs.geometry.camera import Camera, Panorama, Pinhole
 from padgs.results import Result, Scores
 from padgs.runs import checkpoint
 from padgs.runs.config import RunConfig, config_from_values, known_to
@@ -26,8 +27,7 @@ from padgs.runs.identity import config_hash
 from padgs.runs.scoring import scores
 from padgs.runs.session import build, scene_of
 from padgs.scene import Scene, View
-from padgs.scoring.protocols import PROTOCOLS
-from padgs.sphere.camera import Camera, Panorama, Pinhole
+from padgs.training.method import Method
 
 
 @dataclass(frozen=True)

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 from padgs import clock
 from padgs.baselines import distribution
-from padgs.learning.failure import Failure, is_out_of_memory, memory_reason
+from padgs.evaluation.protocols import Protocol
 from padgs.results import STATUSES, Result
 from padgs.runs.config import RunConfig
 from padgs.runs.identity import config_hash
 from padgs.runs.scoring import quality_of_one_color
 from padgs.scene import Scene
-from padgs.scoring.protocols import Protocol
+from padgs.training.failure import Failure, is_out_of_memory, memory_reason
 
 WRONG_DEPTH = 0.5  # AbsRel
 FLAT = 0.01  # of the true thickness of all surfaces together, along the axis where they are thinnest

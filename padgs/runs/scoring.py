@@ -9,16 +9,16 @@ from itertools import cycle, islice
 from typing import Any
 
 from padgs.clock import summary, timed
-from padgs.learning.method import Method
+from padgs.evaluation import geometry
+from padgs.evaluation.evaluate import Marks, OnView, as_stored, evaluate, known, weight_of
+from padgs.evaluation.metrics import mean_color, psnr, ws_psnr_fitted
+from padgs.evaluation.pole_gap import oracle, pole_gap
+from padgs.evaluation.protocols import Protocol
+from padgs.geometry.panorama import row_latitudes
 from padgs.render import Rendering
 from padgs.results import Scores
 from padgs.scene import Scene, View
-from padgs.scoring import geometry
-from padgs.scoring.evaluate import Marks, OnView, as_stored, evaluate, known, weight_of
-from padgs.scoring.metrics import mean_color, psnr, ws_psnr_fitted
-from padgs.scoring.pole_gap import oracle, pole_gap
-from padgs.scoring.protocols import Protocol
-from padgs.sphere.panorama import row_latitudes
+from padgs.training.method import Method
 
 POLAR = 85.0  # degrees
 STABILITY = "stability"  # the protocol that has more than image metrics
@@ -42,8 +42,8 @@ def evaluated(method: Method, scene: Scene, protocol: Protocol, on_view: OnView 
 
 
 def stability(method: Method, scene: Scene, protocol: Protocol, on_view: OnView | None) -> Scores:
-    """The same, and besides: geometry (`padgs.scoring.geometry`), the WS-PSNR of one colour, of training views, and
-    after colours were fitted, and the pole gap of an oracle (`padgs.scoring.pole_gap`).
+    """The same, and besides: geometry (`padgs.evaluation.geometry`), the WS-PSNR of one colour, of training views, and
+    after colours were fitted, and the pole gap of an oracle (`padgs.evaluation.pole_gap`).
     """
 
     def also(view: View, rendering: Rendering) -> Marks:

@@ -14,9 +14,7 @@ from rich.console import Console
 from padgs import clock, data, results
 from padgs.baselines import METHODS
 from padgs.data.errors import DataError
-from padgs.learning.failure import Failure
-from padgs.learning.loop import Record
-from padgs.learning.method import Method
+from padgs.evaluation.protocols import Protocol
 from padgs.registry import lookup
 from padgs.results import ASKED, Result
 from padgs.runs import checkpoint, outcome
@@ -30,8 +28,10 @@ from padgs.runs.scoring import frame_times, probe, same_rules, scores
 from padgs.runs.summary import introduce, show_result
 from padgs.runs.terminal import say
 from padgs.scene import Scene
-from padgs.scoring.protocols import Protocol
 from padgs.stopwatch import notice_stops
+from padgs.training.failure import Failure
+from padgs.training.loop import Record
+from padgs.training.method import Method
 
 
 class Watch:

@@ -14,13 +14,13 @@ from typing import Any
 import torch
 
 from padgs import results
-from padgs.learning.trainee import State
 from padgs.results import Result, ResultError
 from padgs.runs import checkpoint
 from padgs.runs.checkpoint import CheckpointError
 from padgs.runs.folder import RunFolder
 from padgs.runs.identity import identity
 from padgs.runs.typed import ConfigError
+from padgs.training.trainee import State
 
 
 @dataclass(frozen=True)

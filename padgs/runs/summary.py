@@ -11,10 +11,10 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from padgs.evaluation.bands import BANDS
 from padgs.results import Result
 from padgs.runs.live import compact, duration
 from padgs.runs.terminal import printable, say
-from padgs.scoring.bands import BANDS
 
 if TYPE_CHECKING:
     from padgs.runs.config import RunConfig

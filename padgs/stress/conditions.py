@@ -8,10 +8,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from padgs.learning.budget import Budget
-from padgs.learning.schedule import Pace
 from padgs.scene import Scene
 from padgs.stress import clouds, pictures, worlds
+from padgs.training.budget import Budget
+from padgs.training.schedule import Pace
 
 LEVELS = (0, 1, 2, 3)  # 0: nothing is changed, the rest that the others are compared with
 T = TypeVar("T", bound=Any)

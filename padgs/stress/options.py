@@ -9,9 +9,9 @@ from typing import Any, TypeVar
 import numpy as np
 
 from padgs.checks import check_known
-from padgs.learning.budget import Budget
 from padgs.scene import Scene
 from padgs.stress.conditions import CONDITIONS, LEVELS, Condition
+from padgs.training.budget import Budget
 
 T = TypeVar("T")
 NONE = "none"

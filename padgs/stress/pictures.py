@@ -16,8 +16,8 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from padgs.geometry.panorama import continued, project, rays, sample, sample_sharply
 from padgs.scene import Scene, View
-from padgs.sphere.panorama import continued, project, rays, sample, sample_sharply
 from padgs.stress.worlds import facing, of_all, of_training
 
 SECTORS = 8  # colours of what stands under the camera

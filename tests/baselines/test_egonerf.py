@@ -7,13 +7,13 @@ from tiny_scene import tiny_scene
 
 from padgs.baselines.egonerf import EgoNeRFMethod, EgoNeRFMethodOptions
 from padgs.data.synthetic import SyntheticOptions, generate
-from padgs.egonerf.model import EgoNeRF
-from padgs.egonerf.trainee import EgoNeRFTrainee
-from padgs.learning.budget import Budget
-from padgs.learning.options import TrainOptions
+from padgs.methods.egonerf.model import EgoNeRF
+from padgs.methods.egonerf.trainee import EgoNeRFTrainee
 from padgs.render.config import RenderConfig
 from padgs.runs.session import build
 from padgs.scene import Scene, View
+from padgs.training.budget import Budget
+from padgs.training.options import TrainOptions
 
 SMALL = EgoNeRFMethodOptions(
     radial_nodes=16,

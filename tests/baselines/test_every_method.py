@@ -15,13 +15,13 @@ from states import assert_same_but_time
 
 from padgs.baselines import METHODS, OURS
 from padgs.data.synthetic import SCENES, SyntheticOptions, generate
-from padgs.learning.budget import Budget
-from padgs.learning.loop import Record
-from padgs.learning.method import Method
 from padgs.runs import checkpoint
 from padgs.runs.config import RunConfig
 from padgs.runs.session import build
 from padgs.scene import Scene
+from padgs.training.budget import Budget
+from padgs.training.loop import Record
+from padgs.training.method import Method
 
 WIDTH = 32
 STEPS = 20

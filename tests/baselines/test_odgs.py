@@ -10,9 +10,9 @@ from torch import Tensor
 
 from padgs.baselines.odgs import ODGSOptions
 from padgs.gaussians import Gaussians
+from padgs.geometry.panorama import direction, longitude_latitude, projection_jacobian
 from padgs.render import RenderOptions, render
 from padgs.scene import View
-from padgs.sphere.panorama import direction, longitude_latitude, projection_jacobian
 
 
 def tangent_plane_jacobian(means: Tensor, width: int, height: int) -> Tensor:

@@ -8,15 +8,15 @@ from tiny_scene import tiny_scene
 
 from padgs.baselines import METHODS
 from padgs.baselines.omnigs import OmniGSMethod
-from padgs.learning.budget import Budget
-from padgs.learning.failure import Failure
-from padgs.learning.trainee import State
+from padgs.methods.splats.method import SplatOptions
 from padgs.native import cpu
 from padgs.registry import lookup
 from padgs.render.config import RenderConfig
 from padgs.runs import checkpoint
 from padgs.scene import Scene, View
-from padgs.splats.method import SplatOptions
+from padgs.training.budget import Budget
+from padgs.training.failure import Failure
+from padgs.training.trainee import State
 
 ITERATIONS = 120  # densifies at 50, and goes through all degrees
 

@@ -10,13 +10,13 @@ from composed import composed
 from pretended_gpu import GPU, pretended_gpu
 
 from padgs.data.synthetic import SyntheticOptions, generate
-from padgs.learning.budget import Budget
-from padgs.learning.failure import Failure
-from padgs.learning.trainee import State
 from padgs.runs import checkpoint, scoring
 from padgs.runs.scoring import frame_times, scores
 from padgs.runs.session import build
 from padgs.scene import Scene
+from padgs.training.budget import Budget
+from padgs.training.failure import Failure
+from padgs.training.trainee import State
 
 STEPS, CHECK_EVERY = 8, 5
 LONGER = {"padgs_plus": 12}  # which grows in eight rounds, however short the run, and chooses in a ninth

@@ -12,9 +12,9 @@ from tiny_scene import tiny_scene
 
 from padgs import results
 from padgs.baselines.op43dgs import OP43DGSMethod
-from padgs.learning.budget import Budget
 from padgs.runs import session
 from padgs.scene import Scene, View
+from padgs.training.budget import Budget
 
 
 @pytest.fixture(autouse=True)

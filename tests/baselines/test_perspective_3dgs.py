@@ -14,12 +14,12 @@ from padgs.baselines import METHODS
 from padgs.baselines.crops_3dgs import NARROWEST, Crops3DGSMethod, Crops3DGSOptions
 from padgs.baselines.cubemap_3dgs import Cubemap3DGSMethod
 from padgs.data.perspectives import solid_angle
-from padgs.learning.budget import Budget
-from padgs.learning.options import TrainOptions
+from padgs.geometry.camera import Panorama
+from padgs.geometry.panorama import rays
 from padgs.registry import lookup
 from padgs.render.config import RenderConfig
-from padgs.sphere.camera import Panorama
-from padgs.sphere.panorama import rays
+from padgs.training.budget import Budget
+from padgs.training.options import TrainOptions
 
 PANORAMA = Panorama(256, 128)
 METHOD = {"cubemap_3dgs": Cubemap3DGSMethod, "crops_3dgs": Crops3DGSMethod}

@@ -7,17 +7,17 @@ from tiny_scene import HEIGHT, WIDTH, tiny_scene
 
 from padgs.baselines.omnigs import OmniGSMethod
 from padgs.baselines.sc_omnigs import SCOmniGSMethod, SCOmniGSOptions, aligned, carried
-from padgs.calibration.align import Similarity, align
 from padgs.data.synthetic import SyntheticOptions, SyntheticTruth, generate
+from padgs.evaluation.metrics import psnr
 from padgs.gaussians import rotation_matrices
-from padgs.learning.budget import Budget
-from padgs.learning.options import TrainOptions
-from padgs.learning.targets import Targets
-from padgs.learning.views.poses import PoseRates
+from padgs.methods.calibration.align import Similarity, align
+from padgs.methods.splats.method import SplatOptions
 from padgs.render.config import RenderConfig
 from padgs.scene import Scene
-from padgs.scoring.metrics import psnr
-from padgs.splats.method import SplatOptions
+from padgs.training.budget import Budget
+from padgs.training.options import TrainOptions
+from padgs.training.targets import Targets
+from padgs.training.views.poses import PoseRates
 
 TORCH = RenderConfig(backend="torch")
 

@@ -5,15 +5,15 @@ import torch
 from tiny_scene import tiny_scene, truth
 
 from padgs.baselines.seam360gs import Seam360GSMethod, Seam360GSOptions
-from padgs.calibration.dual_lens import DualLens
 from padgs.data.synthetic import SyntheticOptions, SyntheticTruth, generate
-from padgs.learning.budget import Budget
-from padgs.learning.trainee import Drawing
+from padgs.evaluation.metrics import seam, ws_psnr
+from padgs.methods.calibration.dual_lens import DualLens
+from padgs.methods.splats.method import SplatMethod, SplatOptions
 from padgs.render import RenderOptions, render
 from padgs.render.config import RenderConfig
 from padgs.scene import Scene, View
-from padgs.scoring.metrics import seam, ws_psnr
-from padgs.splats.method import SplatMethod, SplatOptions
+from padgs.training.budget import Budget
+from padgs.training.trainee import Drawing
 
 TORCH = RenderConfig(projection="ray", backend="torch")
 

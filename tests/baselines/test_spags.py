@@ -12,7 +12,9 @@ from tiny_scene import tiny_scene
 from padgs.baselines import METHODS
 from padgs.baselines.spags import SPaGSMethod, SPaGSOptions
 from padgs.gaussians import Gaussians, rotation_matrices
-from padgs.learning.budget import Budget
+from padgs.geometry.camera import Panorama
+from padgs.methods.splats.model import Splats
+from padgs.methods.splats.trainee import SplatTrainee
 from padgs.native import cpu
 from padgs.native.abi import Inputs, pointer
 from padgs.registry import lookup
@@ -21,9 +23,7 @@ from padgs.render.backends.cpu_tiles import Projected
 from padgs.render.backends.native_camera import native_camera
 from padgs.render.config import RenderConfig
 from padgs.scene import Scene
-from padgs.sphere.camera import Panorama
-from padgs.splats.model import Splats
-from padgs.splats.trainee import SplatTrainee
+from padgs.training.budget import Budget
 
 WIDTH, HEIGHT = 2048, 1024
 OPTIONS = SPaGSMethod.RENDER.options(scene_unit=1.0)

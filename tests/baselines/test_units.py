@@ -7,14 +7,14 @@ import torch
 from tiny_scene import tiny_scene
 
 from padgs.baselines import METHODS
-from padgs.learning.budget import Budget
+from padgs.methods.splats.method import SplatMethod
 from padgs.registry import lookup
 from padgs.scene import Scene, View
-from padgs.splats.method import SplatMethod
+from padgs.training.budget import Budget
 
 LARGER = 64.0  # a power of two: lengths are multiplied exactly, and what differs is the rounding of logarithms
 STEPS = 20
-# padgs_plus grows in twenty steps, so it has a test of its own (tests/plus).
+# padgs_plus grows in twenty steps, so it has a test of its own (tests/methods/plus).
 EXPLICIT = [
     name for name in METHODS if issubclass(lookup(METHODS, name, "method"), SplatMethod) and name != "padgs_plus"
 ]

@@ -13,7 +13,7 @@ from padgs.data import DataError
 from padgs.data.check.report import check
 from padgs.data.fisheye import is_dual_fisheye
 from padgs.data.prepare.sources import find_source
-from padgs.sphere.panorama import sample
+from padgs.geometry.panorama import sample
 
 SIZE = 96
 FIELD = math.radians(190)  # of each lens

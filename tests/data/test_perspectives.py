@@ -13,11 +13,11 @@ from PIL import Image
 from padgs.data.perspectives import looking_at, perspective_scene, perspective_views, square_lens
 from padgs.data.store import ImageStore, StoredImage
 from padgs.gaussians import Gaussians, rotation_matrices
+from padgs.geometry.camera import Panorama, Pinhole
+from padgs.geometry.panorama import rays, sample
 from padgs.render import Rendering, RenderOptions, render
 from padgs.render.cubemap import FACES, face_camera, panorama_from_faces
 from padgs.scene import Scene, View
-from padgs.sphere.camera import Panorama, Pinhole
-from padgs.sphere.panorama import rays, sample
 
 WIDTH, HEIGHT = 256, 128
 

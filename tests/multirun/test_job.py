@@ -2,10 +2,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from padgs.learning.failure import Failure
 from padgs.multirun import job
 from padgs.multirun.board import REFUSED
 from padgs.multirun.job import TrackedRun
+from padgs.training.failure import Failure
 
 
 def test_a_run_in_progress_is_not_looked_at_all_the_time(tmp_path, monkeypatch):

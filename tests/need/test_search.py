@@ -12,9 +12,6 @@ from typer.testing import CliRunner
 
 import padgs
 from padgs.cli.commands import app
-from padgs.learning.loop import Trainer
-from padgs.learning.trainee import State
-from padgs.learning.worth import most_wanted, worth
 from padgs.multirun import job
 from padgs.multirun.composition import composing, configuration
 from padgs.need import tiers
@@ -28,6 +25,9 @@ from padgs.runs.interrupt import Interrupt, Interrupted
 from padgs.runs.session import Watch
 from padgs.runs.typed import ConfigError
 from padgs.stress.options import StressOptions
+from padgs.training.loop import Trainer
+from padgs.training.trainee import State
+from padgs.training.worth import most_wanted, worth
 
 METHODS = ("method=omnigs", "method=padgs")
 

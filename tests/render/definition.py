@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from padgs.gaussians import Gaussians, rotation_matrices
+from padgs.geometry.camera import Camera, Panorama, Pinhole, RayTable
 from padgs.render import RenderOptions
 from padgs.render.contract import ALPHA_MIN
-from padgs.sphere.camera import Camera, Panorama, Pinhole, RayTable
 
 MARGIN = 1e-3  # relative; closer than this to flipping, rounding may decide
 

@@ -11,6 +11,8 @@ import torch
 from torch import Tensor
 
 from padgs.gaussians import Gaussians, rotation_matrices
+from padgs.geometry.camera import Camera, Panorama, Pinhole, RayTable
+from padgs.geometry.panorama import direction
 from padgs.native import cpu
 from padgs.render import BACKENDS, Rendering, RenderOptions, render
 from padgs.render.contract import ALPHA_MIN, Request
@@ -18,8 +20,6 @@ from padgs.render.planar import PlanarFootprints
 from padgs.render.projection import Footprints, project
 from padgs.render.projective import RayFootprints
 from padgs.scene import View
-from padgs.sphere.camera import Camera, Panorama, Pinhole, RayTable
-from padgs.sphere.panorama import direction
 
 INPUTS = ("means", "quats", "scales", "opacities", "colors")
 KINDS = ("ordinary", "polar", "pole", "seam", "near", "huge", "needle")

@@ -10,9 +10,9 @@ from render_cases import blended, each_engine, gaussians_of, identity_pose, mixt
 from torch import Tensor
 
 from padgs.gaussians import Gaussians
+from padgs.geometry.camera import Panorama, RayTable
 from padgs.render import RenderOptions, render
 from padgs.scene import View
-from padgs.sphere.camera import Panorama, RayTable
 
 BLENDINGS = ("sorted", "hybrid")
 each_blending = pytest.mark.parametrize("blending", BLENDINGS)

@@ -19,9 +19,9 @@ from render_cases import (
 )
 
 from padgs.gaussians import Gaussians
+from padgs.geometry.camera import Panorama, Pinhole, RayTable
 from padgs.render import RenderOptions, render
 from padgs.scene import View
-from padgs.sphere.camera import Panorama, Pinhole, RayTable
 
 VIEW = View("v", identity_pose(), 32, 16)
 

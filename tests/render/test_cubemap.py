@@ -21,12 +21,12 @@ from render_cases import (
 )
 
 from padgs.gaussians import Gaussians
+from padgs.geometry.camera import Panorama, Pinhole
+from padgs.geometry.panorama import rays
 from padgs.render import Rendering, RenderOptions, render
 from padgs.render.config import RenderConfig
 from padgs.render.cubemap import FACES, FINENESS, _corners, face_camera, panorama_from_faces
 from padgs.scene import View
-from padgs.sphere.camera import Panorama, Pinhole
-from padgs.sphere.panorama import rays
 
 PROJECTIONS = ("pinhole", "tangent", "ray")
 SIZES = ((64, 32), (70, 44), (33, 17), (8, 4), (2, 1))

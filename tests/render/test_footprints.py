@@ -9,8 +9,8 @@ import torch
 from render_cases import draw, each_engine, each_panorama
 
 from padgs.gaussians import Gaussians
+from padgs.geometry.panorama import direction, rays, row_latitudes
 from padgs.render import RenderOptions
-from padgs.sphere.panorama import direction, rays, row_latitudes
 
 
 def footprint(sigma: float, latitude: float, *, projection: str, backend: str, dtype: torch.dtype, opacity=0.9):

@@ -15,10 +15,10 @@ import torch
 from render_cases import INPUTS, engines, needs_native, view_of
 
 from padgs.gaussians import Gaussians
+from padgs.geometry.camera import Camera, Panorama, Pinhole, RayTable
 from padgs.render import RenderOptions, render
 from padgs.render.planar import SLOPE_LIMIT
 from padgs.render.projection import PROJECTIONS
-from padgs.sphere.camera import Camera, Panorama, Pinhole, RayTable
 
 FOLDER = Path(__file__).resolve().parents[2].parent / "shared" / "golden"
 CASES = sorted(path.stem for projection in PROJECTIONS for path in FOLDER.glob(f"{projection}_*.npz"))

@@ -30,11 +30,11 @@ from render_cases import (
 from torch import Tensor
 
 from padgs.gaussians import Gaussians, rotation_matrices
+from padgs.geometry.camera import Camera, Panorama, Pinhole, RayTable
+from padgs.geometry.panorama import direction
 from padgs.render import Rendering, RenderOptions, render
 from padgs.render.planar import PlanarFootprints
 from padgs.scene import View
-from padgs.sphere.camera import Camera, Panorama, Pinhole, RayTable
-from padgs.sphere.panorama import direction
 
 PROJECTIONS = ("erp", "pinhole", "tangent", "ray")
 BACKGROUND = torch.tensor([0.3, 0.6, 0.9], dtype=torch.float64)

@@ -18,10 +18,10 @@ from scipy.stats import spearmanr
 from torch import Tensor
 
 from padgs.gaussians import Gaussians
+from padgs.geometry.panorama import rays
 from padgs.render import RenderOptions, render
 from padgs.render.leave_one_out import leave_one_out
 from padgs.scene import View
-from padgs.sphere.panorama import rays
 
 COUNT = 1000
 SHARP = RenderOptions(projection="ray", low_pass=0.0)

@@ -10,11 +10,11 @@ from scipy.stats import spearmanr
 from torch import Tensor
 
 from padgs.gaussians import Gaussians
+from padgs.geometry.panorama import rays
 from padgs.render import RenderOptions, render
 from padgs.render.leave_one_out import leave_one_out
 from padgs.render.leave_some_out import leave_some_out
 from padgs.scene import View
-from padgs.sphere.panorama import rays
 
 SHARP = RenderOptions(projection="ray", low_pass=0.0)
 

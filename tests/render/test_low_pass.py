@@ -11,6 +11,8 @@ import torch
 from render_cases import INPUTS, identity_pose, leaves, mixture, needs_native, projected, random_pose, row_error
 
 from padgs.gaussians import Gaussians
+from padgs.geometry.camera import Camera, Panorama, Pinhole
+from padgs.geometry.panorama import direction
 from padgs.native import cpu
 from padgs.native.abi import NativeCamera
 from padgs.render import RenderOptions, render
@@ -19,8 +21,6 @@ from padgs.render.contract import ALPHA_MIN, LOW_PASS_KINDS, PUBLISHED_FOCAL
 from padgs.render.planar import PlanarFootprints
 from padgs.render.projection import PROJECTIONS
 from padgs.scene import View
-from padgs.sphere.camera import Camera, Panorama, Pinhole
-from padgs.sphere.panorama import direction
 
 COMBINATIONS = [(projection, kind) for projection, kinds in LOW_PASS_KINDS.items() for kind in kinds]
 each_combination = pytest.mark.parametrize(("projection", "kind"), COMBINATIONS)

@@ -10,10 +10,10 @@ import torch
 from render_cases import each_engine, gaussians_of, identity_pose, projected
 
 from padgs.gaussians import Gaussians, rotation_matrices
+from padgs.geometry.camera import Panorama
+from padgs.geometry.panorama import direction
 from padgs.render import RenderOptions, render
 from padgs.scene import View
-from padgs.sphere.camera import Panorama
-from padgs.sphere.panorama import direction
 
 VIEW = View("v", identity_pose(), 64, 32, lens=Panorama(64, 32))
 NEAR = 0.1

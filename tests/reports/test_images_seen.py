@@ -4,9 +4,9 @@ import pytest
 import torch
 from made_up import result
 
-from padgs.learning.views.sizes import Sizes
 from padgs.reports.images_seen import images_seen
 from padgs.scene import View
+from padgs.training.views.sizes import Sizes
 
 
 def test_rays_count_as_pixels_and_all_else_as_whole_panoramas():

@@ -6,9 +6,9 @@ import signal
 import pytest
 import torch
 
-from padgs.learning.trainee import State
 from padgs.runs import checkpoint
 from padgs.runs.checkpoint import CheckpointError
+from padgs.training.trainee import State
 
 
 def example(seed: int = 0) -> State:

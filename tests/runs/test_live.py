@@ -2,9 +2,9 @@ import io
 
 from rich.console import Console
 
-from padgs.learning.loop import Record
 from padgs.runs import live
 from padgs.runs.live import LiveLine
+from padgs.training.loop import Record
 
 
 def lines(monkeypatch, *, terminal: bool, seconds_per_iteration: float = 2.0, iterations: int = 12) -> str:

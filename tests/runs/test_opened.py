@@ -11,12 +11,12 @@ from tiny_run import tiny_run
 
 import padgs
 from padgs.data.errors import DataError
+from padgs.geometry.camera import Panorama, perspective
+from padgs.geometry.panorama import sample
 from padgs.results import read
 from padgs.runs import checkpoint
 from padgs.runs.folder import RunFolderError
 from padgs.runs.identity import config_hash
-from padgs.sphere.camera import Panorama, perspective
-from padgs.sphere.panorama import sample
 
 
 @pytest.fixture(scope="module")

@@ -15,9 +15,8 @@ from rich.console import Console
 from tiny_scene import HEIGHT, WIDTH, tiny_scene
 
 from padgs import results
-from padgs.anchors.method import PaDGSMethod
 from padgs.data.errors import DataError
-from padgs.learning.failure import Failure
+from padgs.methods.anchors.method import PaDGSMethod
 from padgs.reports import store
 from padgs.reports.frame import frame
 from padgs.reports.gathered import Gathered
@@ -29,6 +28,7 @@ from padgs.runs.interrupt import Interrupted
 from padgs.runs.lock import RunBusy
 from padgs.runs.scoring import probe
 from padgs.runs.session import Session, Watch, build, scene_of
+from padgs.training.failure import Failure
 
 ITERATIONS = 12
 SMALL = ("method=padgs", "protocol=paper", "protocol.paper.lpips=none", "render.backend=torch")

@@ -13,14 +13,14 @@ from tiny_scene import tiny_scene
 import padgs
 from padgs import results
 from padgs.baselines import METHODS
-from padgs.learning.budget import Budget
-from padgs.learning.options import TrainOptions
 from padgs.multirun.composition import composing, configuration
 from padgs.registry import lookup
 from padgs.runs import checkpoint
 from padgs.runs.interrupt import Interrupted
 from padgs.runs.session import Session, Watch
 from padgs.runs.typed import ConfigError
+from padgs.training.budget import Budget
+from padgs.training.options import TrainOptions
 
 SMALL_GRIDS = {"radial_nodes": 8, "polar_nodes": 8, "azimuth_nodes": 16, "density_components": 2}
 SMALL_GRIDS |= {

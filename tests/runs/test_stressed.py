@@ -11,13 +11,13 @@ from made_up import result
 from rich.console import Console
 from tiny_scene import tiny_scene
 
+from padgs.evaluation.protocols import Protocol
 from padgs.results import Scores
 from padgs.runs import session
 from padgs.runs.outcome import judged
 from padgs.runs.scoring import quality_of_one_color
 from padgs.runs.session import Session
 from padgs.scene import Scene
-from padgs.scoring.protocols import Protocol
 
 
 def depth_of(distance: float) -> torch.Tensor:

@@ -6,15 +6,15 @@ from composed import composed
 from tiny_scene import tiny_scene
 
 from padgs.data.synthetic import SyntheticOptions, SyntheticTruth, generate
-from padgs.learning.options import TrainOptions
+from padgs.evaluation.metrics import psnr
+from padgs.geometry.camera import Pinhole
 from padgs.runs.config import config_from_values
 from padgs.runs.identity import run_id
 from padgs.runs.session import build
 from padgs.scene import Scene
-from padgs.scoring.metrics import psnr
-from padgs.sphere.camera import Pinhole
 from padgs.stress.conditions import CONDITIONS
 from padgs.stress.options import StressOptions
+from padgs.training.options import TrainOptions
 
 OPTIONS = SyntheticOptions("room", 64, train_views=9, test_views=1, samples=1, points=1000, outliers=0.0)
 

@@ -10,14 +10,14 @@ import torch
 from composed import composed
 from tiny_scene import tiny_scene
 
-from padgs.learning.failure import Failure
-from padgs.learning.loop import Budget
-from padgs.learning.method import Method
+from padgs.evaluation.geometry import yaw_error
+from padgs.geometry.distortion import distortion, polar_axis
 from padgs.runs.session import build
 from padgs.scene import Scene
-from padgs.scoring.geometry import yaw_error
-from padgs.sphere.distortion import distortion, polar_axis
 from padgs.stress.options import StressOptions
+from padgs.training.failure import Failure
+from padgs.training.loop import Budget
+from padgs.training.method import Method
 
 
 @pytest.fixture(autouse=True)

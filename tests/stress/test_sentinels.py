@@ -12,9 +12,9 @@ import pytest
 import torch
 from composed import composed
 
-from padgs.learning.failure import Failure
 from padgs.runs.scoring import scores
 from padgs.runs.session import build, scene_of
+from padgs.training.failure import Failure
 
 pytestmark = pytest.mark.slow
 SMALL = ("data.generator.width=64", "data.generator.train_views=16", "data.generator.test_views=1")

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from padgs.data.capture import Tracks
 from padgs.data.trajectory import centers
-from padgs.sphere.panorama import project
+from padgs.geometry.panorama import project
 
 POINTS = 3000  # a sample is enough to tell conventions apart
 VIEWS = 8

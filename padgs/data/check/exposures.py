@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from padgs.data.check.conventions import POINTS
-from padgs.sphere.panorama import project
+from padgs.geometry.panorama import project
 
 DARKEST, BRIGHTEST = 8, 250  # pixel values between which a gain shows
 ROUNDS = 10  # of medians over points and views, after which they stand

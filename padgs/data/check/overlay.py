@@ -10,8 +10,8 @@ from PIL import Image
 from torch import Tensor
 
 from padgs.data.errors import DataError
+from padgs.geometry.panorama import project
 from padgs.scene import View
-from padgs.sphere.panorama import project
 
 OVERLAY = "check.png"  # beside the data, where no other place is given
 WIDTH = 2048  # of the picture at most

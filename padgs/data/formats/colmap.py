@@ -1,6 +1,6 @@
 """COLMAP models, text or binary, with or without rigs, of the camera EQUIRECTANGULAR (in forks: SPHERICAL).
 
-COLMAP's panoramic camera is this project's (padgs.sphere.panorama), so poses are taken as they are.
+COLMAP's panoramic camera is this project's (padgs.geometry.panorama), so poses are taken as they are.
 """
 
 from __future__ import annotations

@@ -21,8 +21,8 @@ from padgs.data.formats.colmap import cloud_of, pycolmap_module
 from padgs.data.formats.poses import rigid
 from padgs.data.images import decode
 from padgs.data.perspectives import looking_at
-from padgs.sphere.camera import Pinhole
-from padgs.sphere.panorama import direction, project, sample
+from padgs.geometry.camera import Pinhole
+from padgs.geometry.panorama import direction, project, sample
 
 LATITUDES = (-35.0, 0.0, 35.0)  # degrees, positive down
 VIEWS_PER_ROW = 4

@@ -48,7 +48,7 @@ class SyntheticOptions:
     pose_noise_rotation: float = 0.0  # degrees, standard deviation of the angle
     exposure: float = 0.0  # training views are brightened by a factor 2^e, e uniform in [-exposure, exposure]
     lens_gap: float = 0.0  # between the two lenses of the camera of training views, relative to the median depth
-    lens_k1: float = 0.0  # theta' = theta (1 + k1 theta^2) of both lenses, see padgs/sphere/lens.py
+    lens_k1: float = 0.0  # theta' = theta (1 + k1 theta^2) of both lenses, see padgs/geometry/lens.py
     lens_blend: float = 5.0  # degrees on both sides of the plane between the lenses in which both are seen
     world_scale: float = 1.0  # world units per metre
     world_rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)  # degrees about world x, then y, then z

@@ -15,8 +15,8 @@ from padgs.data.synthetic import camera
 from padgs.data.synthetic.options import SyntheticOptions
 from padgs.data.synthetic.textures import Array
 from padgs.data.synthetic.world import World
-from padgs.sphere.lens import axis_direction, bend, hemisphere_weight
-from padgs.sphere.panorama import rays
+from padgs.geometry.lens import axis_direction, bend, hemisphere_weight
+from padgs.geometry.panorama import rays
 
 
 def draw_stitched(world: World, cam_from_world: Array, gap: float, options: SyntheticOptions, gain: float) -> Array:

@@ -165,7 +165,7 @@ struct LossArguments {
   float *gradient;   // [H,W,3], dL/dimage, or null
 };
 
-// What padgs.plus.smoothness.roughness takes.
+// What padgs.methods.plus.smoothness.roughness takes.
 struct RoughnessArguments {
   int32_t width, height;
   int32_t wrap;                               // 1: the ends of rows are neighbours
@@ -193,7 +193,7 @@ struct SplatArguments {
   float *grad_means, *grad_log_scales, *grad_opacity_logits, *grad_dc, *grad_rest, *grad_probe;
 };
 
-// What padgs.plus.angular_size.mean_angular_size takes.
+// What padgs.methods.plus.angular_size.mean_angular_size takes.
 struct AngularSizeArguments {
   int64_t count;
   float center[3], nearest;     // of the camera; what a distance is at least taken for; world units

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from padgs.geometry.camera import Camera
 from padgs.native import cuda
 from padgs.native.abi import MOMENTS, REMOVAL, Gradients, Inputs, pointer
 from padgs.native.reading import Reading
@@ -21,7 +22,6 @@ from padgs.render.backends.native import NativeImage, Pixels, Upstream, rasteriz
 from padgs.render.backends.native_camera import NativeRays, native_camera, native_rays
 from padgs.render.contract import Removals, Rendering, RenderOptions, Request
 from padgs.render.published_bounds import check_memory
-from padgs.sphere.camera import Camera
 
 IDENTITY = torch.eye(4)
 HEADROOM = 1.3  # room for so many times the instances of the last image of this size

@@ -14,10 +14,10 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from padgs.geometry.camera import RayTable
 from padgs.native.abi import ABSOLUTE_MOMENT, Inputs, pointer
 from padgs.render.backends.native_camera import NativeRays
 from padgs.render.contract import Removals, Rendering, Request
-from padgs.sphere.camera import RayTable
 
 Pixels = tuple[Tensor, Tensor, Tensor]  # image [H, W, 3], transmittance [H, W], depth [H, W]
 

@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
+from padgs.geometry.camera import Camera, Panorama, Pinhole, RayTable
+from padgs.geometry.panorama import row_latitudes
 from padgs.native.abi import NativeCamera, RayPointers, pointer
 from padgs.render.contract import RenderOptions
 from padgs.render.low_pass import low_pass_of
-from padgs.sphere.camera import Camera, Panorama, Pinhole, RayTable
-from padgs.sphere.panorama import row_latitudes
 
 CPU = torch.device("cpu")
 FAR_OFF = 0.3  # radians; with rays further off a panorama's its bounds would exclude little

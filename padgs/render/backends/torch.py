@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from padgs.geometry.camera import Camera
 from padgs.render.absolute import with_absolute_pull
 from padgs.render.contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Rendering, RenderOptions, Request
 from padgs.render.hybrid import hybrid_weights
 from padgs.render.projection import Footprints, project
 from padgs.render.published_bounds import check_memory, instances
-from padgs.sphere.camera import Camera
 
 PAIRS_PER_BLOCK = 1 << 21  # (pixel, Gaussian) pairs held at once
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from padgs.data.capture import Tracks
 from padgs.data.check.conventions import colour_fit, known_conventions, reprojection_error, track_fit
-from padgs.sphere.panorama import project
+from padgs.geometry.panorama import project
 
 FLIP = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
 MIRROR = torch.diag(torch.tensor([-1.0, 1, 1, 1], dtype=torch.float64))

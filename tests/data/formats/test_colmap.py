@@ -8,7 +8,7 @@ import torch
 from fixtures import World, write_colmap_binary, write_colmap_text
 
 from padgs.data import DataError, load, read
-from padgs.sphere.panorama import project
+from padgs.geometry.panorama import project
 
 LAYOUTS = {
     "text": write_colmap_text,

@@ -11,8 +11,8 @@ from fixtures import WRITERS, World, paint, write_transforms
 
 from padgs.data import DataError, load, read
 from padgs.data.formats.transforms import described
+from padgs.geometry.panorama import rays
 from padgs.scene import Scene
-from padgs.sphere.panorama import rays
 
 
 @pytest.mark.parametrize("name", WRITERS)

@@ -11,7 +11,6 @@ import torch
 from PIL import Image
 
 import padgs.data
-from padgs.calibration.align import align
 from padgs.data import DataError
 from padgs.data.check.report import check
 from padgs.data.prepare import pipeline, resources, sfm
@@ -19,6 +18,7 @@ from padgs.data.prepare.pipeline import prepare
 from padgs.data.prepare.statement import PrepareOptions
 from padgs.data.synthetic import SyntheticOptions, generate
 from padgs.data.trajectory import gravity, path_length
+from padgs.methods.calibration.align import align
 
 VIEWS = 6
 

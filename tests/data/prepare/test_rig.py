@@ -6,7 +6,7 @@ import torch
 from PIL import Image
 
 from padgs.data.prepare import rig
-from padgs.sphere.panorama import direction, project, rays
+from padgs.geometry.panorama import direction, project, rays
 
 
 def test_views_are_rotations_that_look_where_they_should():

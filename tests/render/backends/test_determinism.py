@@ -13,12 +13,12 @@ import torch
 from render_cases import camera_of, leaves, mixture, needs_native, random_pose, view_of
 from torch import Tensor
 
-from padgs.anchors.decoder import Decoder, SeenAnchors, decode_gaussians
-from padgs.learning.loss import photometric_loss
+from padgs.geometry.camera import Panorama, RayTable
+from padgs.methods.anchors.decoder import Decoder, SeenAnchors, decode_gaussians
+from padgs.methods.plus.smoothness import roughness
 from padgs.native import cpu
-from padgs.plus.smoothness import roughness
 from padgs.render import Rendering, RenderOptions, render
-from padgs.sphere.camera import Panorama, RayTable
+from padgs.training.loss import photometric_loss
 
 pytestmark = needs_native
 RENDERINGS = {

@@ -24,9 +24,9 @@ from render_cases import (
 from torch import Tensor
 
 from padgs.gaussians import Gaussians, rotation_matrices
+from padgs.geometry.camera import RayTable
+from padgs.geometry.panorama import direction
 from padgs.render import RenderOptions, render
-from padgs.sphere.camera import RayTable
-from padgs.sphere.panorama import direction
 
 WIDTH, HEIGHT = 48, 24
 PLACES = ("random", "pole", "seam")

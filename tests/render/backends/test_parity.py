@@ -22,8 +22,8 @@ from render_cases import (
 from torch import Tensor
 
 from padgs.gaussians import Gaussians
+from padgs.geometry.camera import RayTable
 from padgs.render import Rendering, RenderOptions, render
-from padgs.sphere.camera import RayTable
 
 OUTPUTS = ("image", "transmittance", "depth")
 CONFIGURATIONS = {

@@ -7,11 +7,11 @@ from render_cases import INPUTS
 from torch import Tensor
 
 from padgs.gaussians import Gaussians
+from padgs.geometry.camera import Camera
 from padgs.native.abi import Inputs, pointer
 from padgs.render import RenderOptions
 from padgs.render.backends.cpu_tiles import TILE, Projected
 from padgs.render.backends.native_camera import native_camera
-from padgs.sphere.camera import Camera
 
 
 def projected(gaussians: Gaussians, camera: Camera, options: RenderOptions, pose: Tensor) -> Projected:

@@ -28,10 +28,10 @@ from render_cases import (
 from torch import Tensor
 
 from padgs.gaussians import Gaussians
+from padgs.geometry.camera import Camera, Panorama, Pinhole
+from padgs.geometry.panorama import direction
 from padgs.render import RenderOptions, render
 from padgs.render.contract import ALPHA_MIN
-from padgs.sphere.camera import Camera, Panorama, Pinhole
-from padgs.sphere.panorama import direction
 
 KINDS_OF_SCENE = st.sampled_from(KINDS)
 SEEDS = st.integers(0, 2**31)

@@ -11,10 +11,10 @@ from native_tiles import NativeTiles
 from render_cases import each_engine, identity_pose, needs_native, projected
 
 from padgs.gaussians import Gaussians
+from padgs.geometry.camera import Panorama
 from padgs.render import RenderOptions, render
 from padgs.render.published_bounds import instances
 from padgs.scene import View
-from padgs.sphere.camera import Panorama
 
 OMNIGS = RenderOptions("erp", near=0.2, wrap=False, bounds="square")
 OP43DGS = RenderOptions("tangent", near=0.2, wrap=False, bounds="square", low_pass_kind="fixed")

@@ -27,10 +27,10 @@ from render_cases import (
     view_of,
 )
 
+from padgs.geometry.camera import Panorama
 from padgs.render import RenderOptions, render
 from padgs.render.backends.cpu_tiles import TILE
 from padgs.render.contract import ALPHA_MIN
-from padgs.sphere.camera import Panorama
 
 few = settings(max_examples=10, deadline=None, derandomize=True, database=None)
 SIZES = st.sampled_from([*ODD_SIZES, (200, 90), (256, 128), (1, 1), (90, 200)])

@@ -19,12 +19,12 @@ import pytest
 import torch
 
 from padgs.gaussians import Gaussians
+from padgs.geometry.camera import RayTable
 from padgs.native import cuda, loading
 from padgs.render import BACKENDS, Rendering
 from padgs.render.backends import cuda as cuda_backend
 from padgs.render.contract import Removals, Request
 from padgs.render.leave_one_out import BACKENDS as SCORERS
-from padgs.sphere.camera import RayTable
 
 os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # deterministic; older torch reads it but once
 HERE = Path(__file__).parent

@@ -17,12 +17,12 @@ from torch import Tensor
 
 from padgs import render as package
 from padgs.gaussians import Gaussians
-from padgs.learning.failure import is_out_of_memory
 from padgs.native import cuda, loading
 from padgs.render import Rendering, RenderOptions, render
 from padgs.render.backends import cuda as cuda_backend
 from padgs.render.backends import cuda_tiles, native_camera
 from padgs.render.leave_one_out import leave_one_out
+from padgs.training.failure import is_out_of_memory
 
 pytestmark = [*cuda_engine.marks()]
 

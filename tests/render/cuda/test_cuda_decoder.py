@@ -9,8 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from padgs.anchors import gpu_decoder
-from padgs.anchors.decoder import (
+from padgs.gaussians import Gaussians
+from padgs.methods.anchors import gpu_decoder
+from padgs.methods.anchors.decoder import (
     Decoder,
     DecoderWeights,
     SeenAnchors,
@@ -18,9 +19,8 @@ from padgs.anchors.decoder import (
     decode_within,
     define_gaussians,
 )
-from padgs.anchors.gpu_decoder import decode_on_gpu
-from padgs.anchors.precision import OF_GRADIENTS, PRECISIONS, reduced
-from padgs.gaussians import Gaussians
+from padgs.methods.anchors.gpu_decoder import decode_on_gpu
+from padgs.methods.anchors.precision import OF_GRADIENTS, PRECISIONS, reduced
 from padgs.native.watch import watched
 
 pytestmark = [*cuda_engine.marks()]

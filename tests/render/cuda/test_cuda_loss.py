@@ -6,9 +6,9 @@ import cuda_engine
 import pytest
 import torch
 
-from padgs.learning import native_loss
-from padgs.learning.loss import photometric_loss, pixel_weight
-from padgs.learning.native_loss import fused_photometric_loss
+from padgs.training import native_loss
+from padgs.training.loss import photometric_loss, pixel_weight
+from padgs.training.native_loss import fused_photometric_loss
 
 pytestmark = [*cuda_engine.marks()]
 DEVICE = "cuda" if cuda_engine.ON_GPU else "cpu"

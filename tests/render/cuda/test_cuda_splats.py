@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from padgs.methods.splats import cpu_splats, gpu_splats
+from padgs.methods.splats.model import Splats
 from padgs.scene import View
-from padgs.splats import cpu_splats, gpu_splats
-from padgs.splats.model import Splats
 
 pytestmark = [*cuda_engine.marks()]
 DEVICE = "cuda" if cuda_engine.ON_GPU else "cpu"

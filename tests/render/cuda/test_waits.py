@@ -16,24 +16,24 @@ import torch
 from pretended_gpu import GPU, pretended_gpu
 from torch import Tensor
 
-from padgs.anchors.growth import GrowthOptions
-from padgs.anchors.precision import PRECISIONS
-from padgs.anchors.trainee import AnchorTrainee, LearningRates
-from padgs.bench.on_device import resident
-from padgs.bench.workload import Size, build
-from padgs.learning.budget import Budget
-from padgs.learning.loop import Trainer
-from padgs.learning.native_loss import EVALUATIONS
+from padgs.apps.bench.on_device import resident
+from padgs.apps.bench.workload import Size, build
+from padgs.methods.anchors.growth import GrowthOptions
+from padgs.methods.anchors.precision import PRECISIONS
+from padgs.methods.anchors.trainee import AnchorTrainee, LearningRates
+from padgs.methods.splats.clone_split import CloneSplitOptions
+from padgs.methods.splats.model import Splats
+from padgs.methods.splats.probes import SIGNALS
+from padgs.methods.splats.trainee import SplatTrainee
 from padgs.native import LIBRARIES, cuda
 from padgs.native.reading import Reading
 from padgs.native.watch import Stage, watched
 from padgs.render import RenderOptions
 from padgs.render.backends import cuda as cuda_backend
 from padgs.render.config import RenderConfig
-from padgs.splats.clone_split import CloneSplitOptions
-from padgs.splats.model import Splats
-from padgs.splats.probes import SIGNALS
-from padgs.splats.trainee import SplatTrainee
+from padgs.training.budget import Budget
+from padgs.training.loop import Trainer
+from padgs.training.native_loss import EVALUATIONS
 
 pytestmark = pytest.mark.skipif(cuda_engine.ON_GPU or cuda_engine.COMPILER is None, reason="for the emulation")
 SIZE = Size(32, 16, 100, views=3)
@@ -95,7 +95,7 @@ def test_an_iteration_of_padgs_waits_for_nothing(precision: str, monkeypatch: py
     trainer, waited = trained(precision)
     assert waited[0] and waited[2:] == [Counter()] * (STEPS - 2), waited  # the first counts Gaussians and instances
     ahead = learned(trainer)
-    monkeypatch.setattr("padgs.anchors.trainee.resolve_backend", lambda *_: "another")
+    monkeypatch.setattr("padgs.methods.anchors.trainee.resolve_backend", lambda *_: "another")
     exact, waited = trained(precision)
     assert all(waited), "with as many rows as there are Gaussians it waits"
     for name, tensor in learned(exact).items():
@@ -105,7 +105,7 @@ def test_an_iteration_of_padgs_waits_for_nothing(precision: str, monkeypatch: py
 
 def test_too_little_room_is_noticed_and_changes_nothing(monkeypatch: pytest.MonkeyPatch):
     enough = learned(trained("float32")[0])
-    monkeypatch.setattr("padgs.anchors.trainee.HEADROOM", 0.5)
+    monkeypatch.setattr("padgs.methods.anchors.trainee.HEADROOM", 0.5)
     trainer, waited = trained("float32")
     assert any(waited[2:]), "it was decoded once more"
     for name, tensor in learned(trainer).items():

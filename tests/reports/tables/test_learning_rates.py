@@ -4,8 +4,8 @@ from dataclasses import replace
 import pytest
 from made_up import gathered, of_experiment
 
-from padgs.learning.schedule import Pace
 from padgs.reports.tables.learning_rates import law, learning_rates
+from padgs.training.schedule import Pace
 
 FACTORS, LENGTHS = (1.0, 2.0, 4.0, 8.0), (400, 1600, 6400)
 

@@ -1,5 +1,5 @@
 // How rough the surfaces of a drawing are and the derivative by its distances, in one call.
-// padgs.plus.smoothness.roughness is the definition.
+// padgs.methods.plus.smoothness.roughness is the definition.
 //
 // Three sweeps over the rows: what neighbours are compared by, how much 1 / r bends across and down, and from that the
 // derivatives. With v = (before + after) / here - 2 and w what a place counts, the term w |v| pulls at both neighbours

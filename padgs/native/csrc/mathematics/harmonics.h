@@ -1,4 +1,4 @@
-// Real spherical harmonics of degrees 1 to 3 at a direction, in the order of padgs/sphere/harmonics.py, and what a
+// Real spherical harmonics of degrees 1 to 3 at a direction, in the order of padgs/geometry/harmonics.py, and what a
 // weighted sum of them changes by with the direction.
 #pragma once
 

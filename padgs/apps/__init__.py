@@ -1,0 +1,1 @@
+"""Programs that use finished runs: viewer, export, camera-path video, benchmark."""

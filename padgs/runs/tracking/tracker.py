@@ -1,0 +1,123 @@
+"""Runs mirrored into mlflow. It reads run folders and writes elsewhere, so whatever happens to it, no run is lost.
+
+Only one process of a multirun does this, the one that the user started. mlflow takes seconds to import and to make its
+database, so that is done when there is first something to say, which is after training has begun.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from filelock import FileLock
+
+from padgs.checks import check_known
+from padgs.extras import installing
+from padgs.results import Result
+
+if TYPE_CHECKING:
+    from padgs.runs.tracking.mlflow_mirror import Mirror
+
+KINDS = ("auto", "mlflow", "none")
+DEFAULT_EXPERIMENT = "padgs"  # of mlflow, for runs of no experiment of ours
+SERVERS = ("http", "databricks")  # how their URIs begin
+SECONDS_BETWEEN_LOOKS = 30.0  # at a run in progress
+PATIENCE = 60.0  # seconds for another process that makes the database
+# A server that does not answer must not hold up anything for minutes, as it does by default.
+# And nobody wants to know about the tables of a new database.
+SETTINGS = {
+    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1",
+    "MLFLOW_HTTP_REQUEST_TIMEOUT": "10",
+    "MLFLOW_LOGGING_LEVEL": "WARNING",
+}
+
+
+@dataclass(frozen=True)
+class TrackingOptions:
+    """The `tracking` group of the configuration; no part of a run."""
+
+    kind: str = "auto"  # auto | mlflow | none; auto: mlflow where it is installed, and not a word where it is not
+    uri: str | None = None  # of a server or database; None = mlflow.db in run.folder
+    telemetry: bool = False  # whether mlflow may report its use to its makers
+
+    def __post_init__(self) -> None:
+        check_known(self, kind=KINDS)
+
+    @property
+    def asked(self) -> bool:
+        """Whether somebody counts on it."""
+        return self.kind == "mlflow" or (self.kind == "auto" and self.uri is not None)
+
+
+class Tracker:
+    """Keeps mlflow up to date about the runs of one experiment, or says once why it does not, to who asked for it."""
+
+    def __init__(
+        self, options: TrackingOptions, runs: Path, experiment: str, say: Callable[[str], None], multirun: str = ""
+    ) -> None:
+        """Nothing is imported or connected yet.
+
+        Args:
+            options: where to.
+            runs: the folder of run folders.
+            experiment: of mlflow; empty = DEFAULT_EXPERIMENT.
+            say: shows a line to the user; called at most once.
+            multirun: name of the run of mlflow under which the runs stand; empty = none.
+        """
+        self._options, self._runs, self.name = options, runs.absolute(), experiment or DEFAULT_EXPERIMENT
+        self._say, self._multirun = say, multirun
+        self._mirror: Mirror | None = None
+        self.on = options.kind != "none"
+        if self.on and importlib.util.find_spec("mlflow") is None:
+            self.on = False
+            if options.asked:
+                say(f"runs are not mirrored into mlflow: {installing('mlflow')}, or set tracking=none")
+
+    @property
+    def uri(self) -> str:
+        """Where runs are mirrored to, whatever the working folder."""
+        return self._options.uri or f"sqlite:///{self._runs / 'mlflow.db'}"
+
+    def update(self, run: Path) -> None:
+        """Bring mlflow up to date about a run folder, finished or in progress."""
+        self._attempt(lambda mirror: mirror.update(run))
+
+    def finish(self, found: Sequence[Result], jobs: int) -> None:
+        """End the run that stands for a multirun of so many jobs, with a table of all its results."""
+        self._attempt(lambda mirror: mirror.finish(found, jobs))
+
+    def _attempt(self, work: Callable[[Mirror], None]) -> None:
+        if not self.on:
+            return
+        try:
+            if self._mirror is None:
+                self._mirror = self._connected()
+            work(self._mirror)
+        except Exception as error:  # of any kind: mlflow, its database and its server are not ours
+            reason = f"{type(error).__name__}: {str(error).strip().partition(chr(10))[0][:200]}"
+            self._give_up(f"no longer mirrored into mlflow at {self.uri} ({reason}); `padgs track` does it later")
+
+    def _give_up(self, why: str) -> None:
+        self.on = False
+        self._say(why)
+
+    def _connected(self) -> Mirror:
+        for name, value in SETTINGS.items():
+            os.environ.setdefault(name, value)
+        if not self._options.telemetry:
+            os.environ["MLFLOW_DISABLE_TELEMETRY"] = os.environ["DO_NOT_TRACK"] = "true"
+        from mlflow import MlflowClient
+
+        from padgs.runs.tracking.mlflow_mirror import Mirror
+
+        with FileLock(self._runs / ".mlflow.lock", timeout=PATIENCE):  # two processes that make one database destroy it
+            client = MlflowClient(self.uri)
+            known = client.get_experiment_by_name(self.name)
+            # A server has a place for artifacts; beside a database they would land wherever one happens to stand.
+            place = None if self.uri.startswith(SERVERS) else (self._runs / "mlflow-artifacts").as_uri()
+            identity = known.experiment_id if known else client.create_experiment(self.name, place)
+            return Mirror(client, identity, self._multirun)

@@ -1,0 +1,105 @@
+"""What the loss compares renderings with: image, weight and SSIM moments of each training view."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from padgs.geometry.camera import Panorama
+from padgs.scene import View
+from padgs.training.loss import TargetMoments, pixel_weight, target_moments
+from padgs.training.native_loss import fits
+
+CACHE_BYTES = 1 << 29  # weights and moments of views beyond this are computed again at every iteration
+
+
+@dataclass(frozen=True)
+class Target:
+    """One view, ready for `padgs.training.loss.photometric_loss`."""
+
+    image: Tensor  # [H, W, 3]
+    weight: Tensor  # [H, W] or [H, 1]
+    moments: TargetMoments | None  # None where the loss does without
+
+
+class Targets(Sequence[Target]):
+    """The targets of some views, by number. Keeps what fits into a fixed amount of memory."""
+
+    def __init__(self, views: Sequence[View], weight: str, device: torch.device | str = "cpu") -> None:
+        """Load nothing yet; `weight` is a name of `padgs.training.loss.ROW_WEIGHTS`."""
+        self._views, self._weight, self._device = views, weight, device
+        self._weights: dict[int, Tensor] = {}
+        self._moments: dict[int, TargetMoments] = {}
+        self._bytes_left = CACHE_BYTES
+
+    def __len__(self) -> int:
+        """Number of views."""
+        return len(self._views)
+
+    def __getitem__(self, index: int) -> Target:
+        """The target of view `index`.
+
+        Raises:
+            ValueError: the view has no pixels, or they have another size than the view, or the mask leaves none.
+        """
+        image = image_of(self._views[index], self._device)
+        weight = self._weights[index] if index in self._weights else self._weight_of(index)
+        return Target(image, weight, None if fits(image) else self._moments_of(index, image))
+
+    def _weight_of(self, index: int) -> Tensor:
+        weight = weight_of(self._views[index], self._weight, self._device)
+        if self._keeps(weight.nbytes):
+            self._weights[index] = weight
+        return weight
+
+    def _moments_of(self, index: int, image: Tensor) -> TargetMoments:
+        if index in self._moments:
+            return self._moments[index]
+        moments = target_moments(image)
+        if self._keeps(2 * image.nbytes):
+            self._moments[index] = moments
+        return moments
+
+    def _keeps(self, size: int) -> bool:
+        """Whether so many bytes more may be kept; they count from now on."""
+        kept = size <= self._bytes_left
+        self._bytes_left -= size if kept else 0
+        return kept
+
+
+def image_of(view: View, device: torch.device | str = "cpu") -> Tensor:
+    """Image [H, W, 3] in [0, 1] of a view.
+
+    Raises:
+        ValueError: the view has no pixels, or they have another size than the view.
+    """
+    return _fitting(view, "image", view.image(device=device))
+
+
+def weight_of(view: View, weight: str, device: torch.device | str = "cpu") -> Tensor:
+    """Weight of the pixels of a view, [H, W], or [H, 1] without a mask; `weight` is a name of `ROW_WEIGHTS`.
+
+    Raises:
+        ValueError: the mask has another size than the view, or leaves no pixel.
+    """
+    mask = view.mask(device=device)
+    mask = None if mask is None else _fitting(view, "mask", mask)
+    try:
+        return pixel_weight(weight, view.height, mask, device=device)
+    except ValueError as error:
+        raise ValueError(f"view {view.name!r}: {error}") from error
+
+
+def even_weight(view: View, device: torch.device) -> Tensor:
+    """Weight [H, W] or [H, 1] of pixels: all directions of a panorama count alike, and all pixels of other views."""
+    return weight_of(view, "solid_angle" if isinstance(view.camera, Panorama) else "uniform", device)
+
+
+def _fitting(view: View, what: str, pixels: Tensor) -> Tensor:
+    height, width = pixels.shape[:2]
+    if (height, width) != (view.height, view.width):
+        raise ValueError(f"{what} of view {view.name!r} is {width}x{height}; the view is {view.width}x{view.height}")
+    return pixels

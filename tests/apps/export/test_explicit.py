@@ -1,0 +1,116 @@
+"""The command, from a run to a file and back."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from plyfile import PlyData
+from tiny_run import tiny_run
+from typer.testing import CliRunner
+
+import padgs
+from padgs.apps.export.explicit import exported
+from padgs.apps.export.splat_file import read_splats
+from padgs.baselines.sc_omnigs import aligned, carried
+from padgs.cli.commands import app
+from padgs.data.ply import read_ply
+from padgs.evaluation.evaluate import evaluate
+from padgs.evaluation.protocols import protocol_from_options
+from padgs.render import render
+
+RULES = protocol_from_options("sphere", lpips="none", metrics=["ws_psnr"])
+
+
+def export(*arguments: str):
+    return CliRunner().invoke(app, ["export", *arguments])
+
+
+@pytest.fixture(scope="module")
+def splat_run(tmp_path_factory):
+    return tiny_run(tmp_path_factory, "method=padgs_plus")
+
+
+def test_an_exported_run_scores_as_it_did(splat_run):
+    said = export(str(splat_run))
+    assert said.exit_code == 0 and "Gaussians as trained" in said.output
+    run = padgs.load_run(splat_run)
+    splats = read_splats(splat_run / "splats.ply", unit=run.scene.unit)
+    options = run.config.render.options(run.scene.unit)
+    again = evaluate(lambda view: render(splats.gaussians(view), view, options), run.scene.test, RULES)
+    plain = run.method.trainee.splats
+    same = evaluate(lambda view: render(plain.gaussians(view), view, options), run.scene.test, RULES)
+    own = evaluate(run.method.render, run.scene.test, RULES)
+    assert again.metrics["ws_psnr"] == pytest.approx(same.metrics["ws_psnr"], abs=1e-6)
+    assert again.metrics["ws_psnr"] == pytest.approx(own.metrics["ws_psnr"], abs=0.05)  # a file knows no cameras
+    (splat_run / "splats.ply").unlink()
+
+
+def test_gaussians_are_exported_as_they_are_without_the_data(splat_run, tmp_path):
+    said = export(str(splat_run), "--data", str(tmp_path / "gone"), "--to", str(tmp_path / "a.ply"))
+    assert said.exit_code == 0 and "the data set is not where it was" in said.output
+    assert len(read_splats(tmp_path / "a.ply")) == len(padgs.load_run(splat_run).method.trainee.splats)
+
+
+def test_for_viewers_gaussians_are_as_wide_as_the_finest_view_draws_them(splat_run, tmp_path):
+    said = export(str(splat_run), "--smooth", "--to", str(tmp_path / "smooth.ply"))
+    assert said.exit_code == 0 and "as wide as the finest training view drew it" in " ".join(said.output.split())
+    run = padgs.load_run(splat_run)
+    view, options = run.scene.train[0], run.config.render.options(run.scene.unit)
+    exact, smooth = (exported(run, smooth=wanted).splats for wanted in (False, True))
+    written = read_splats(tmp_path / "smooth.ply", unit=run.scene.unit)
+    assert torch.allclose(written.log_scales, smooth.log_scales, atol=1e-5)
+    without_filter = replace(options, low_pass=0.0)
+    drawn = run.method.trainee.render(view).image
+    errors = [
+        (render(splats.gaussians(view), view, without_filter).image - drawn).abs().mean() for splats in (exact, smooth)
+    ]
+    assert errors[1] < 0.5 * errors[0], "without the filter the smooth ones look more like the run"
+
+
+def test_refined_poses_do_not_move_the_world(tmp_path_factory):
+    run = padgs.load_run(tiny_run(tmp_path_factory, "method=sc_omnigs", "data.generator.train_views=4"))
+    poses = run.method.trainee.calibration.poses
+    with torch.no_grad():
+        for correction in poses.parameters():
+            correction += 0.02 * torch.randn(correction.shape, generator=torch.Generator().manual_seed(1))
+    splats, view = exported(run).splats, run.scene.test[0]
+    carried_view = view.at(carried(view.cam_from_world, aligned(poses)[0]))
+    options = run.config.render.options(run.scene.unit)
+    own = run.method.trainee.render(carried_view).image
+    assert torch.allclose(render(splats.gaussians(view), view, options).image, own, atol=0.02)
+    assert (run.method.trainee.render(view).image - own).abs().max() > 0.05, "it is another world"
+
+
+def test_points_and_upright_worlds(splat_run, tmp_path):
+    assert export(str(splat_run), "--points", "--to", str(tmp_path / "new" / "p.ply")).exit_code == 0
+    cloud = read_ply(tmp_path / "new" / "p.ply")
+    assert len(cloud.points) > 10 and cloud.colors is not None
+    assert export(str(splat_run), "--upright", "--to", str(tmp_path / "u.ply")).exit_code == 0
+    assert any("-y is up" in line for line in PlyData.read(str(tmp_path / "u.ply"))["vertex"].comments)
+    up, plain = read_splats(tmp_path / "u.ply").means, padgs.load_run(splat_run).method.trainee.splats.means
+    assert torch.allclose(-up[:, 1], plain[:, 2], atol=1e-4), "z is up in the built-in room"
+
+
+def test_anchors_are_baked_and_the_loss_is_said_and_written(tmp_path_factory, tmp_path):
+    folder = tiny_run(tmp_path_factory, "method=padgs_small", "train.iterations=60")
+    said = export(str(folder), "--to", str(tmp_path / "a.ply"), "--lessons", "40")
+    assert said.exit_code == 0, said.output
+    (line,) = [line for line in PlyData.read(str(tmp_path / "a.ply"))["vertex"].comments if line.startswith("baked")]
+    assert line in said.output and "WS-PSNR of the test views" in line
+    assert len(read_splats(tmp_path / "a.ply")) > 0
+
+
+def test_what_cannot_be_exported_says_why(tmp_path_factory, tmp_path, splat_run):
+    folder = tiny_run(tmp_path_factory, "method=egonerf_small", "train.iterations=2")
+    (tmp_path / "file").touch()
+    for arguments, message in (
+        ((str(folder),), "egonerf has no Gaussians to export; padgs render and padgs view"),
+        ((str(tmp_path / "RUNX"),), "has no config.yaml"),
+        ((str(splat_run), "--to", "a.obj"), "none of the known formats"),
+        ((str(splat_run), "--points", "--to", str(tmp_path / "a.compressed.ply")), "is no plain .ply"),
+        ((str(splat_run), "--to", str(tmp_path / "file" / "a.ply")), "name another place with --to"),
+        ((str(splat_run), "--upright", "--to", str(tmp_path / "a.ply"), "--data", "gone"), f"data of {splat_run}"),
+    ):
+        said = export(*arguments)
+        assert said.exit_code == 1 and message in said.output + said.stderr
+    assert not (tmp_path / "RUNX").exists(), "a name that was misspelt"

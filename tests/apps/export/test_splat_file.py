@@ -1,0 +1,112 @@
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from plyfile import PlyData
+from random_splats import random_splats
+
+from padgs.apps.export import splat_file
+from padgs.apps.export.splat_file import read_splats, seconds_to_write, write_splats
+from padgs.data.capture import Cloud
+from padgs.data.errors import DataError
+from padgs.data.ply import write_ply
+from padgs.methods.splats.model import Splats
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_what_is_read_is_what_was_written_bit_by_bit(degree, tmp_path, generator):
+    splats = random_splats(degree, generator)
+    write_splats(tmp_path / "a.ply", splats, ["said of it"])
+    found = read_splats(tmp_path / "a.ply", unit=splats.unit)
+    assert (found.degree, found.active_degree, found.unit) == (degree, degree, splats.unit)
+    for name, row in splats.rows().items():
+        assert torch.equal(found.rows()[name], row), name
+    assert PlyData.read(str(tmp_path / "a.ply"))["vertex"].comments == ["said of it"]
+
+
+def test_the_columns_are_those_of_3dgs(tmp_path, generator):
+    splats = random_splats(2, generator)
+    write_splats(tmp_path / "a.ply", splats)
+    vertex = PlyData.read(str(tmp_path / "a.ply"))["vertex"]
+    assert vertex["f_rest_1"][5] == splats.sh_rest[5, 1, 0].item(), "all of red comes first"
+    assert vertex["f_rest_8"][5] == splats.sh_rest[5, 0, 1].item()
+    assert vertex["rot_0"][5] == splats.quats[5, 0].item(), "w"
+    splats.active_degree = 1
+    write_splats(tmp_path / "a.ply", splats)
+    assert read_splats(tmp_path / "a.ply").degree == 1, "harmonics that wait are not written"
+
+
+def test_the_header_is_what_the_viewer_of_3dgs_counts_on(tmp_path, generator):
+    """It takes the number of Gaussians from the third line, and rows by position; PLY is ASCII."""
+    splats = random_splats(0, generator)
+    write_splats(tmp_path / "a.ply", splats, ["run flat é"])
+    header = (tmp_path / "a.ply").read_bytes().partition(b"end_header")[0].decode("ascii").splitlines()
+    assert header[2:4] == [f"element vertex {len(splats)}", r"comment run flat \xe9"]
+    first = [line.split()[-1] for line in header[4:13]]
+    assert first == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+
+
+def test_files_that_are_none_are_refused(tmp_path, generator):
+    splats = random_splats(0, generator)
+    with pytest.raises(ValueError, match=r"a.obj ends in none of the known formats: .ply, .compressed.ply"):
+        write_splats(tmp_path / "a.obj", splats)
+    write_ply(tmp_path / "cloud.ply", Cloud(torch.zeros(2, 3), None))
+    with pytest.raises(DataError, match="has no property f_dc_0; Gaussians of 3DGS have x, y, z"):
+        read_splats(tmp_path / "cloud.ply")
+    write_splats(tmp_path / "a.ply", splats)
+    text = (tmp_path / "a.ply").read_bytes().replace(b"float opacity", b"float f_rest_0")
+    (tmp_path / "a.ply").write_bytes(text)
+    with pytest.raises(DataError, match="no property opacity"):
+        read_splats(tmp_path / "a.ply")
+
+
+def test_without_the_converter_the_way_out_is_said(tmp_path, generator, monkeypatch):
+    monkeypatch.setattr(splat_file.shutil, "which", lambda name: None)
+    with pytest.raises(ValueError, match="npm install -g @playcanvas/splat-transform; or write a .ply"):
+        write_splats(tmp_path / "a.spz", random_splats(0, generator))
+
+
+def test_what_takes_minutes_is_known_beforehand():
+    splats = Splats(torch.zeros(100_000, 3), torch.zeros(100_000, 3), torch.zeros(100_000, 3), degree=2, unit=1.0)
+    assert seconds_to_write(Path("a.sog"), splats) == 0, "no harmonics in use"
+    splats.active_degree = 2
+    assert 400 < seconds_to_write(Path("a.sog"), splats) == seconds_to_write(Path("a.html"), splats) < 550  # took 476
+    assert {seconds_to_write(Path(name), splats) for name in ("a.ply", "a.compressed.ply", "a.spz")} == {0}
+
+
+@pytest.mark.skipif(shutil.which(splat_file.CONVERTER) is None, reason="splat-transform is not installed")
+def test_a_converted_file_holds_the_same_gaussians(tmp_path, generator):
+    splats = random_splats(1, generator)
+    write_splats(tmp_path / "a.spz", splats)
+    splat_file.subprocess.run(
+        [splat_file.CONVERTER, "-q", str(tmp_path / "a.spz"), str(tmp_path / "back.ply")], check=True
+    )
+    back = read_splats(tmp_path / "back.ply")
+    nearest = torch.cdist(splats.means, back.means).min(dim=1)
+    assert nearest.values.max() < 1e-3
+    assert torch.allclose(back.log_scales[nearest.indices], splats.log_scales, atol=0.05)
+
+
+def test_a_page_begins_where_a_photograph_was_taken(tmp_path, generator, monkeypatch):
+    script = "#!/bin/sh\nwhile [ $# -gt 2 ]; do [ $1 = --viewer-settings ] && found=$2; shift; done\ncp $found $2\n"
+    (tmp_path / splat_file.CONVERTER).write_text(script)
+    (tmp_path / splat_file.CONVERTER).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    begin = torch.tensor([[1.0, 2.0, 3.0], [1.0, 2.0, 4.0]])
+    write_splats(tmp_path / "a.html", random_splats(0, generator), begin=begin)
+    camera = json.loads((tmp_path / "a.html").read_text())["camera"]
+    assert (camera["position"], camera["target"]) == ([-1, -2, 3], [-1, -2, 4]), "its y is up, and its x is left"
+
+
+def test_a_converter_that_fails_is_quoted_and_leaves_the_earlier_file(tmp_path, generator, monkeypatch):
+    script = "#!/bin/sh\nwhile [ $# -gt 1 ]; do shift; done\necho half >$1\necho no room left\nexit 3\n"
+    (tmp_path / splat_file.CONVERTER).write_text(script)
+    (tmp_path / splat_file.CONVERTER).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    (tmp_path / "a.spz").write_text("the earlier one")
+    with pytest.raises(ValueError, match="could not make .*a.spz of .*: no room left"):
+        write_splats(tmp_path / "a.spz", random_splats(0, generator))
+    assert (tmp_path / "a.spz").read_text() == "the earlier one"
+    assert {path.name for path in tmp_path.iterdir()} == {"a.spz", splat_file.CONVERTER}

@@ -1,0 +1,199 @@
+"""Runs that are still in training: followed from checkpoint to checkpoint, and served beside their training."""
+
+import json
+import re
+import shutil
+import sys
+import threading
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from urllib.request import urlopen
+
+import numpy as np
+import pytest
+from chromium import in_chromium, visiting
+from tiny_run import tiny_run
+
+import padgs
+from padgs import results
+from padgs.apps.viewer import pages
+from padgs.apps.viewer.pages import showing
+from padgs.apps.viewer.picture import Gallery, Look
+from padgs.apps.viewer.process import shown
+from padgs.apps.viewer.server import LOCAL, serving
+from padgs.apps.viewer.waiting import await_checkpoint
+from padgs.extras import installing
+from padgs.runs import checkpoint
+from padgs.runs.config import WATCHED, RunOptions
+from padgs.runs.folder import RunFolder
+from padgs.training.trainee import State
+
+try:
+    import viser
+except ImportError:
+    viser = None
+WITH_VISER = pytest.mark.skipif(viser is None, reason="the extra `view` is not installed")
+
+
+@pytest.fixture
+def folder(tmp_path_factory, tmp_path) -> Path:
+    """Of a run that has not come to its end."""
+    training = tmp_path / "training"
+    shutil.copytree(tiny_run(tmp_path_factory), training)
+    (training / results.FILE_NAME).unlink()
+    return training
+
+
+def train_on(folder: Path) -> None:
+    """Write the next checkpoint: everything a little nearer, ten iterations later."""
+    place = folder / "checkpoint"
+    before, run = checkpoint.load(place), json.loads((place / checkpoint.MANIFEST).read_text())["run"]
+    tensors = {name: 0.9 * tensor if name.endswith("means") else tensor for name, tensor in before.tensors.items()}
+    progress = before.values["progress"]
+    progress = {**progress, "iteration": progress["iteration"] + 10}
+    checkpoint.save(State(tensors, {**before.values, "progress": progress}), place, run)
+
+
+def test_a_run_in_training_is_followed_until_told_not_to(folder):
+    gallery = Gallery(padgs.load_run(folder, device="cpu"))
+    scene, pose = gallery.run.scene, gallery.run.scene.train[0].cam_from_world
+
+    def picture() -> np.ndarray:
+        return gallery.picture(Look("panorama"), pose, 32, 16)
+
+    first = picture()
+    assert "after 30 iterations" in gallery.facts and not gallery.follow()
+    train_on(folder)
+    assert gallery.follow() and "after 40 iterations" in gallery.facts
+    assert not np.array_equal(picture(), first)
+    assert gallery.run.scene is scene, "the scene is not loaded again"
+    gallery.follows = False
+    train_on(folder)
+    assert not gallery.follow() and "after 40 iterations" in gallery.facts
+    gallery.follows = True
+    assert gallery.follow() and "after 50 iterations" in gallery.facts
+    (folder / "checkpoint" / checkpoint.MANIFEST).write_text("{")
+    assert gallery.follow() and "not followed" in gallery.facts and not gallery.follow()
+    assert "after 50 iterations" in gallery.facts and picture().std() > 0, "what cannot be read changes no picture"
+    gallery.follows = False
+    assert gallery.follow() and "not followed" not in gallery.facts
+
+
+def test_a_finished_run_is_not_followed(tmp_path_factory):
+    gallery = Gallery(padgs.load_run(tiny_run(tmp_path_factory), device="cpu"))
+    assert not gallery.follows and "iterations" not in gallery.facts
+    gallery.stop()
+    assert not gallery.run.files.stop.exists(), "nor ended: the next run of that name would end at once"
+
+
+def test_the_end_of_training_is_seen(folder, tmp_path_factory):
+    gallery = Gallery(padgs.load_run(folder, device="cpu"))
+    shutil.copy(tiny_run(tmp_path_factory) / results.FILE_NAME, folder)
+    gallery.stop()
+    assert not gallery.run.files.stop.exists(), "it has ended, although the page does not say so yet"
+    assert gallery.follow() and "iterations" not in gallery.facts and not gallery.follow()
+
+
+@WITH_VISER
+@pytest.mark.slow
+@in_chromium
+@pytest.mark.parametrize("host", [LOCAL, "0.0.0.0"])
+def test_training_is_ended_from_a_page_on_this_machine_only(folder, host):
+    run = padgs.load_run(folder, device="cpu")
+    with serving(host=host, port=8460) as server, showing(server, [run]), visiting(server.address) as visit:
+        visit.wait("document.body.innerText.includes('follow training')")
+        if host != LOCAL:
+            visit.page.wait_for_timeout(500)
+            assert "stop and score" not in visit.page.inner_text("body")
+            return
+        for answer in ("go on training", "end training"):
+            assert not (folder / "stop").exists()
+            visit.page.get_by_role("button", name="stop and score").click()
+            visit.page.get_by_role("button", name=answer).click()
+            visit.wait("!document.body.innerText.includes('End training now?')")
+        end = time.monotonic() + 20
+        while not (folder / "stop").exists():
+            assert time.monotonic() < end, "training was not asked to end"
+            time.sleep(0.05)
+
+
+@dataclass
+class Renewed:
+    """A page that only notes that it shall draw again."""
+
+    asked: threading.Event = field(default_factory=threading.Event)
+
+    def renew(self) -> None:
+        self.asked.set()
+
+    def leave(self) -> None:
+        """Nothing to end."""
+
+
+@WITH_VISER
+def test_pages_draw_again_when_training_has_come_further(folder, monkeypatch):
+    monkeypatch.setattr(pages, "EVERY", 0.05)
+    page = Renewed()
+    with serving(port=8440) as server, showing(server, [padgs.load_run(folder, device="cpu")]) as there:
+        there[-1] = page
+        assert not page.asked.wait(0.3)
+        train_on(folder)
+        assert page.asked.wait(30)
+
+
+def test_the_first_checkpoint_is_waited_for(folder, tmp_path, capsys):
+    await_checkpoint(folder)
+    await_checkpoint(tmp_path / "nothing")
+    assert not capsys.readouterr().out
+    moved = (folder / "checkpoint").rename(tmp_path / "elsewhere")
+    with RunFolder(folder).locked():  # as training does
+        waiting = threading.Thread(target=await_checkpoint, args=(folder,), daemon=True)
+        waiting.start()
+        waiting.join(0.2)
+        assert waiting.is_alive()
+        moved.rename(folder / "checkpoint")
+        waiting.join(30)
+        assert not waiting.is_alive()
+    assert capsys.readouterr().out.count("waiting for the first checkpoint") == 1
+
+
+def test_a_run_that_was_killed_before_its_first_checkpoint_is_not_waited_for(folder):
+    shutil.rmtree(folder / "checkpoint")
+    with pytest.raises(ValueError, match="nobody trains it; start the same padgs-run again"):
+        await_checkpoint(folder)
+
+
+def test_a_run_that_failed_before_its_first_checkpoint_is_not_waited_for(folder):
+    shutil.rmtree(folder / "checkpoint")
+    (folder / results.FILE_NAME).write_text("{}")
+    waiting = threading.Thread(target=await_checkpoint, args=(folder,), daemon=True)
+    waiting.start()
+    waiting.join(30)
+    assert not waiting.is_alive()
+
+
+@WITH_VISER
+def test_a_run_is_shown_beside_its_training_and_no_longer(folder, capfd):
+    with shown(folder, None, "cpu"):
+        said, end = "", time.monotonic() + 60
+        while "http" not in said:
+            assert time.monotonic() < end, "no address was said"
+            said += capfd.readouterr().out
+            time.sleep(0.1)
+        address = next(word for word in said.split() if word.startswith("http"))
+        assert b"<html" in urlopen(address, timeout=20).read()[:500]
+    with pytest.raises(OSError, match="refused"):
+        urlopen(address, timeout=5)
+
+
+def test_without_viser_no_training_begins(folder, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(ValueError, match=re.escape(installing("view"))), shown(folder, None, "cpu"):
+        raise AssertionError("it began")
+
+
+def test_who_watches_sees_something_every_few_seconds():
+    assert RunOptions().seconds_between_checkpoints == 60
+    assert RunOptions(view=True).seconds_between_checkpoints == WATCHED
+    assert RunOptions(view=True, checkpoint_seconds=1).seconds_between_checkpoints == 1

@@ -1,0 +1,58 @@
+"""What `padgs view` refuses before it serves anything, and where it opens the page by itself."""
+
+import subprocess
+import sys
+from contextlib import nullcontext
+from types import SimpleNamespace
+from unittest.mock import MagicMock
+
+import pytest
+from tiny_run import tiny_run
+from typer.testing import CliRunner
+
+from padgs.apps.viewer import pages, process
+from padgs.cli.commands import app
+
+pytest.importorskip("viser", reason="the extra `view` is not installed")
+
+
+@pytest.fixture(autouse=True)
+def no_handlers(monkeypatch):
+    monkeypatch.setattr(process.signal, "signal", lambda *_: None)
+
+
+def test_runs_of_two_scenes_are_not_shown_beside_each_other(tmp_path_factory):
+    runs = [str(tiny_run(tmp_path_factory, f"data.generator.scene={scene}")) for scene in ("room", "white_room")]
+    said = CliRunner().invoke(app, ["view", runs[0], "--beside", runs[1]])
+    assert said.exit_code == 1 and "are of two scenes" in " ".join(said.output.split())
+    said = CliRunner().invoke(app, ["view", runs[0], "--data", "gone"])
+    assert said.exit_code == 1 and f"it is the data of {runs[0]}" in " ".join(said.output.split())
+
+
+@pytest.mark.parametrize(("local", "browse", "opens"), [(True, True, 1), (True, False, 0), (False, True, 0)])
+def test_a_page_of_this_machine_alone_is_opened_where_there_is_a_screen(monkeypatch, local, browse, opens):
+    visited, shown = [], []
+    server = SimpleNamespace(address="http://here", is_local=local, viser=MagicMock())
+    monkeypatch.setattr(process.webbrowser, "open", visited.append)
+    monkeypatch.setattr(process, "serving", lambda **_: nullcontext(server))
+    monkeypatch.setattr(process, "is_wanted", lambda: False)
+    monkeypatch.setattr(pages, "showing", lambda _, runs: nullcontext(shown.extend(runs)))
+    process.serve(lambda: [*visited, "a run"], browse=browse)
+    assert shown == [*opens * ["http://here"], "a run"], "browsers load the page while the run is being opened"
+
+
+def test_a_page_stands_before_anything_of_torch_is_loaded():
+    code = "import sys, viser, padgs.cli.view, padgs.apps.viewer.process; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_a_screen_is_one_with_windows_on_this_machine(monkeypatch):
+    monkeypatch.setattr(process.sys, "stdout", SimpleNamespace(isatty=lambda: True))
+    monkeypatch.setattr(process.sys, "platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "SSH_CONNECTION"):
+        monkeypatch.delenv(name, raising=False)
+    assert not process.has_screen()
+    monkeypatch.setenv("WAYLAND_DISPLAY", "wayland-0")
+    assert process.has_screen()
+    monkeypatch.setenv("SSH_CONNECTION", "from afar")
+    assert not process.has_screen()

@@ -1,0 +1,152 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from padgs.evaluation import evaluate as module
+from padgs.evaluation.evaluate import as_stored, evaluate, mean_marks, score
+from padgs.evaluation.lpips_weights import LpipsUnavailable
+from padgs.evaluation.metrics import METRICS, psnr, ssim, ws_psnr
+from padgs.evaluation.protocols import PAPER_360ROAM, PROTOCOLS, protocol_from_options
+from padgs.render import Rendering
+from padgs.scene import View
+from padgs.training.failure import Failure
+
+H, W = 32, 64
+PAPER = protocol_from_options("paper", lpips="none")
+SPHERE = protocol_from_options("sphere", lpips="none")
+
+
+def view(name: str, pixels: torch.Tensor | None, mask: torch.Tensor | None = None) -> View:
+    return View(
+        name,
+        torch.eye(4, dtype=torch.float64),
+        W,
+        H,
+        load_pixels=None if pixels is None else lambda: pixels,
+        load_mask=None if mask is None else lambda: mask,
+    )
+
+
+def rendering(image: torch.Tensor) -> Rendering:
+    return Rendering(image, torch.zeros(H, W), torch.zeros(H, W), torch.zeros(0, dtype=torch.bool))
+
+
+@pytest.fixture
+def pixels(generator):
+    return torch.randint(0, 256, (H, W, 3), generator=generator, dtype=torch.uint8)
+
+
+@pytest.fixture
+def image(generator, pixels):
+    """A render with values beyond [0, 1]."""
+    return pixels / 255 + 0.2 * torch.randn(H, W, 3, generator=generator)
+
+
+def test_the_number_is_that_of_the_saved_files(tmp_path, image, pixels):
+    evaluation = evaluate(lambda _: rendering(image), [view("a", pixels)], PAPER)
+    Image.fromarray((image.clamp(0, 1) * 255).round().byte().numpy()).save(tmp_path / "render.png")
+    stored = torch.from_numpy(np.array(Image.open(tmp_path / "render.png"))) / 255
+    assert evaluation.views["a"]["psnr"] == psnr(stored, pixels / 255).item()
+    assert evaluation.views["a"]["ssim"] == ssim(stored, pixels / 255).item()
+    assert evaluation.views["a"]["psnr"] != pytest.approx(psnr(image, pixels / 255).item(), abs=1e-3)
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_a_perfect_render(name, pixels):
+    protocol = protocol_from_options(name)
+    evaluation = evaluate(lambda _: rendering(pixels / 255), [view("a", pixels)], protocol)
+    for metric, value in evaluation.metrics.items():
+        if "psnr" in metric:
+            assert value == math.inf, metric
+        elif "ssim" in metric:
+            assert value == pytest.approx(1.0), metric
+        elif metric == "seam":
+            assert value is None  # nothing to compare with
+        elif value is not None:  # LPIPS, where there are weights
+            assert value == 0, metric
+    lpips = [] if protocol.lpips_name is None else [protocol.lpips_name]
+    assert [*evaluation.metrics] == [*protocol.metrics, *lpips]
+
+
+def test_means_and_pictures_of_several_views(image, pixels):
+    views = [view("a", pixels), view("b", pixels.flip(0))]
+    seen = []
+    evaluation = evaluate(
+        lambda wanted: rendering(image if wanted.name == "a" else image + 0.1),
+        views,
+        PAPER,
+        on_view=lambda *arguments: seen.append(arguments),
+    )
+    assert [arguments[0] for arguments in seen] == views
+    for seen_view, truth, shown in seen:
+        assert torch.equal(truth, seen_view.image())
+        assert torch.equal(shown, as_stored(shown)) and shown.min() >= 0 and shown.max() <= 1
+        assert evaluation.views[seen_view.name]["psnr"] == psnr(shown, truth).item()
+    a, b = (evaluation.views[name]["psnr"] for name in "ab")
+    assert evaluation.metrics["psnr"] == pytest.approx((a + b) / 2)
+    assert evaluation.protocol["name"] == "paper" and evaluation.protocol["lpips"] == "none"
+
+
+@pytest.mark.parametrize("protocol", [PAPER, SPHERE, protocol_from_options("paper", lpips="alex")])
+def test_what_a_mask_hides_changes_nothing_in_any_protocol(image, pixels, generator, protocol):
+    mask = torch.ones(H, W)
+    mask[-6:] = 0
+    ruined = torch.where(mask[..., None] > 0, image, torch.rand(H, W, 3, generator=generator))
+    masked = view("a", pixels, mask)
+    first, second = (evaluate(lambda _, shown=shown: rendering(shown), [masked], protocol) for shown in (image, ruined))
+    assert first.metrics == pytest.approx(second.metrics)
+    unmasked = evaluate(lambda _: rendering(ruined), [view("a", pixels)], protocol)
+    assert first.metrics["psnr"] != pytest.approx(unmasked.metrics["psnr"], abs=1e-3)
+
+
+def test_paper_cuts_the_bottom_off_and_sphere_hides_it(image, pixels):
+    truth, stored = pixels / 255, as_stored(image)
+    rows = PAPER_360ROAM.rows(H)
+    assert rows == 29  # 32 x 959 / 1024 = 29.97
+    paper = score(stored, truth, None, protocol_from_options("paper", lpips="none", bottom_crop=65 / 1024))
+    assert paper["ssim"] == ssim(stored[:rows], truth[:rows]).item()
+    mask = (torch.arange(H) < rows)[:, None].float().expand(H, W)
+    sphere = score(stored, truth, None, protocol_from_options("sphere", lpips="none", bottom_crop=65 / 1024))
+    assert sphere["ws_psnr"] == ws_psnr(stored, truth, mask).item()
+    assert sphere["ws_ssim"] == METRICS["ws_ssim"](stored, truth, mask).item()
+    assert sphere["ws_psnr_nadir"] is None  # rows 29 to 31
+
+
+def test_a_band_that_no_pixel_counts_in_is_missing_and_does_not_spoil_the_mean(image, pixels):
+    mask = torch.ones(H, W)
+    mask[H // 2 :] = 0
+    views = [view("a", pixels, mask), view("b", pixels)]
+    evaluation = evaluate(lambda _: rendering(image), views, SPHERE)
+    assert evaluation.views["a"]["ws_psnr_nadir"] is None
+    assert evaluation.metrics["ws_psnr_nadir"] == evaluation.views["b"]["ws_psnr_nadir"]
+    assert mean_marks([{"x": None}, {"x": None}]) == {"x": None}
+
+
+def test_missing_lpips_is_said_once_and_the_rest_stands(image, pixels, monkeypatch):
+    def nothing_here(*_, **__):
+        raise LpipsUnavailable("no weights for LPIPS vgg")
+
+    monkeypatch.setattr(module, "lpips", nothing_here)
+    views = [view("a", pixels), view("b", pixels)]
+    evaluation = evaluate(lambda _: rendering(image), views, PROTOCOLS["paper"])
+    assert evaluation.notes == ("lpips_vgg_01 is missing: no weights for LPIPS vgg",)
+    assert evaluation.metrics["lpips_vgg_01"] is None
+    assert evaluation.metrics["psnr"] == pytest.approx(psnr(as_stored(image), pixels / 255).item())
+
+
+def test_renders_that_cannot_be_scored(image, pixels):
+    broken = image.clone()
+    broken[3, 4, 1] = math.nan
+    broken[5, 6, :] = math.inf
+    with pytest.raises(Failure, match="view 'a' has 4 non-finite values") as caught:
+        evaluate(lambda _: rendering(broken), [view("a", pixels)], PAPER)
+    assert caught.value.status == "nan"
+    with pytest.raises(ValueError, match=r"shape \(31, 64, 3\); the view is 32x64x3"):
+        evaluate(lambda _: rendering(image[1:]), [view("a", pixels)], PAPER)
+    with pytest.raises(ValueError, match="view 'a' has a pose but no image"):
+        evaluate(lambda _: rendering(image), [view("a", None)], PAPER)
+    with pytest.raises(ValueError, match="no test views"):
+        evaluate(lambda _: rendering(image), [], PAPER)

@@ -1,0 +1,84 @@
+from dataclasses import FrozenInstanceError, asdict
+
+import pytest
+
+from padgs.evaluation.protocols import LPIPS_CHOICES, PAPER_360ROAM, PROTOCOLS, Protocol, protocol_from_options
+from padgs.results import higher_is_better
+
+
+def test_paper_is_the_released_evaluation():
+    paper = PROTOCOLS["paper"]
+    assert paper.metrics == ("psnr", "ssim")
+    assert paper.lpips_name == "lpips_vgg_01"
+    assert paper.bottom_crop == 0 and not paper.solid_angle
+
+
+def test_rows_of_360roam_end_at_the_959th_of_1024():
+    assert PAPER_360ROAM.rows(1024) == 959
+    # Scaled down, a row counts only if all of it lies above the cut: 512 x 959 / 1024 = 479.5.
+    assert [PAPER_360ROAM.rows(height) for height in (512, 256, 2048)] == [479, 239, 1918]
+    assert PROTOCOLS["paper"].rows(1000) == 1000
+
+
+@pytest.mark.parametrize("height", [100, 1000, 1024, 1520])
+@pytest.mark.parametrize("rows", [1, 37, 99])
+def test_a_crop_given_as_a_share_of_the_rows_hits_the_row(height, rows):
+    assert protocol_from_options("paper", bottom_crop=rows / height).rows(height) == height - rows  # whatever rounding
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+@pytest.mark.parametrize("lpips", LPIPS_CHOICES)
+@pytest.mark.parametrize("inputs", ["11", "01"])
+def test_every_metric_of_a_protocol_but_the_seam_has_a_direction(name, lpips, inputs):
+    protocol = protocol_from_options(name, lpips=lpips, lpips_inputs=inputs)
+    names = [*protocol.metrics, *([protocol.lpips_name] if lpips != "none" else [])]
+    assert all(higher_is_better(name) is not None for name in names if name != "seam")
+    assert (protocol.lpips_name is None) == (lpips == "none")
+
+
+def test_lpips_names_tell_all_variants_apart():
+    variants = [
+        protocol_from_options(name, lpips=net, lpips_inputs=inputs).lpips_name
+        for name in ("paper", "sphere")  # the others have none
+        for net in ("alex", "vgg")
+        for inputs in ("11", "01")
+    ]
+    assert len(set(variants)) == len(variants)
+
+
+def test_a_protocol_is_a_record():
+    protocol = protocol_from_options("sphere", lpips="none", metrics=["psnr"])
+    assert asdict(protocol) == {
+        "name": "sphere",
+        "metrics": ("psnr",),
+        "lpips": "none",
+        "lpips_inputs": "11",
+        "solid_angle": True,
+        "bottom_crop": 0.0,
+    }
+    with pytest.raises(FrozenInstanceError):
+        protocol.lpips = "vgg"  # type: ignore[misc]
+    assert PROTOCOLS["sphere"].lpips == "alex"
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("papers", {}, "unknown protocol 'papers'; known: paper, sphere"),
+        ("paper", {"lpips": "squeeze"}, "unknown lpips 'squeeze'; known: alex, vgg, none"),
+        ("paper", {"lpips_inputs": "0-1"}, "unknown lpips_inputs '0-1'; known: 11, 01"),
+        ("paper", {"crop": 0.1}, "unknown option 'crop' of protocol 'paper'; known: metrics, lpips"),
+        ("paper", {"name": "mine"}, "unknown option 'name'"),
+        ("paper", {"metrics": ("psnr", "mse")}, "unknown metric 'mse'; known: psnr, ssim"),
+        ("paper", {"bottom_crop": 1.0}, "bottom_crop is 1.0"),
+        ("paper", {"bottom_crop": -0.1}, "bottom_crop is -0.1"),
+    ],
+)
+def test_bad_options_are_named(name, options, message):
+    with pytest.raises(ValueError, match=message):
+        protocol_from_options(name, **options)
+
+
+def test_a_protocol_of_its_own_is_checked_too():
+    with pytest.raises(ValueError, match="unknown metric"):
+        Protocol("mine", ("brightness",), lpips="none", lpips_inputs="11", solid_angle=False)

@@ -1,0 +1,135 @@
+import math
+
+import pytest
+import torch
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from torch.nn.functional import normalize
+
+from padgs.geometry.distortion import (
+    distortion,
+    distortion_map,
+    end_row_weight,
+    opacity_factor,
+    pixel_solid_angle,
+    polar_axis,
+    solid_angle_weight,
+)
+from padgs.geometry.panorama import longitude_latitude, row_latitudes
+
+SIZES = [(64, 32), (2048, 1024), (33, 17), (10, 1)]
+coordinates = st.floats(-10, 10, allow_subnormal=False)
+
+
+def omega(point) -> torch.Tensor:
+    """Of a point in the camera frame."""
+    point = torch.as_tensor(point, dtype=torch.float64)
+    return distortion(normalize(point, dim=-1), polar_axis("camera_y", torch.eye(4, dtype=torch.float64)))
+
+
+@pytest.mark.parametrize(
+    ("point", "expected"),
+    [
+        ((0, 0, 3), 0.0),  # horizon
+        ((-5, 0, 0), 0.0),
+        ((0, -2, 0), 1.0),  # zenith
+        ((0, 7, 0), 1.0),  # nadir
+        ((0, 1, 1), 0.5),  # 45 degrees
+        ((1, 1, 1), 1 / 3),
+        ((0, 1, -(3**0.5)), 0.25),  # 30 degrees
+    ],
+)
+def test_known_points(point, expected):
+    assert omega(point).item() == pytest.approx(expected, abs=1e-15)
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_the_map_is_sine_squared_of_the_latitude_of_each_row(width, height):
+    expected = torch.sin(row_latitudes(height, dtype=torch.float64)) ** 2
+    ours = distortion_map(width, height, dtype=torch.float64)
+    assert ours.shape == (height, width)
+    torch.testing.assert_close(ours, expected[:, None].expand(height, width), rtol=0, atol=1e-14)
+
+
+@given(st.tuples(coordinates, coordinates, coordinates), st.floats(1e-3, 1e3))
+def test_it_is_sine_squared_of_the_latitude_at_any_distance(point, scale):
+    point = torch.tensor(point, dtype=torch.float64)
+    assume(point.norm() > 1e-3)
+    assert 0 <= omega(point).item() <= 1 + 1e-15
+    _, latitude = longitude_latitude(point)
+    torch.testing.assert_close(omega(point), torch.sin(latitude) ** 2, rtol=0, atol=1e-13)
+    torch.testing.assert_close(omega(point * scale), omega(point), rtol=0, atol=1e-13)
+
+
+def test_it_is_smooth_on_the_polar_axis():
+    points = torch.tensor([[0.0, 1.0, 0.0], [0.0, -3.0, 0.0], [1e-9, 1.0, 0.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
+    points.requires_grad_()
+    omega(points).sum().backward()
+    assert points.grad.abs().max() < 1e-8  # both extremes are flat: Omega is 1 at the poles and 0 on the horizon
+    assert torch.autograd.gradcheck(omega, points)
+
+
+def test_the_axis_is_the_cameras_or_as_released_the_worlds(generator):
+    points = torch.randn(50, 3, generator=generator, dtype=torch.float64)
+    rotation = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64)).Q
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = rotation
+    directions = normalize(points, dim=-1)
+    assert torch.allclose(distortion(directions, polar_axis("camera_y", pose)), omega(points @ rotation.T))
+    assert torch.allclose(distortion(directions, polar_axis("world_z", pose)), directions[:, 2] ** 2)
+    with pytest.raises(ValueError, match="unknown omega_axis 'y'; known: camera_y, world_z"):
+        polar_axis("y", pose)
+
+
+def test_opacities_fall_towards_the_poles():
+    degrees = torch.tensor([0.0, 0.5, 1.0])
+    assert torch.allclose(opacity_factor(degrees, 0.9), torch.tensor([1.0, 0.55, 0.1]))
+    assert torch.equal(opacity_factor(degrees, 0.0), torch.ones(3))
+    assert torch.allclose(opacity_factor(degrees, 1.0, 1 - 1e-4), torch.tensor([1.0, 0.5, 1e-4]), atol=1e-7)
+
+
+def test_distortion_and_weight_are_two_sides_of_the_latitude():
+    # Eq. 11 and 12: Omega = 1 - cos^2, M = cos.
+    weight = solid_angle_weight(48, dtype=torch.float64)
+    torch.testing.assert_close(distortion_map(4, 48, dtype=torch.float64)[:, 0], 1 - weight**2)
+
+
+def test_mean_distortion_of_the_sphere_is_a_third():
+    # Over the sphere the mean of y^2 is 1/3; the mean over the pixels, which overcount the poles, is 1/2.
+    height = 512
+    weight, degree = solid_angle_weight(height).double(), distortion_map(1, height)[:, 0].double()
+    assert ((degree * weight).sum() / weight.sum()).item() == pytest.approx(1 / 3, abs=1e-5)
+    assert degree.mean().item() == pytest.approx(1 / 2, abs=1e-6)
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_solid_angles_are_exact_and_sum_to_the_sphere(width, height):
+    angles = pixel_solid_angle(width, height, dtype=torch.float64)
+    edges = (torch.arange(height + 1, dtype=torch.float64) / height - 0.5) * math.pi
+    between = torch.sin(edges[1:]) - torch.sin(edges[:-1])  # Eq. 8 integrated over a row
+    torch.testing.assert_close(angles, between * 2 * math.pi / width, rtol=1e-9, atol=1e-15)
+    assert (angles.sum() * width).item() == pytest.approx(4 * math.pi, rel=1e-12)
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_the_weight_is_proportional_to_the_solid_angle(width, height):
+    weight = solid_angle_weight(height, dtype=torch.float64)
+    ratio = pixel_solid_angle(width, height, dtype=torch.float64) / weight
+    torch.testing.assert_close(ratio, ratio[0].expand(height), rtol=1e-12, atol=0)
+    torch.testing.assert_close(weight, torch.cos(row_latitudes(height, dtype=torch.float64)))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("height", [1, 2, 17, 4096])
+def test_no_row_has_weight_zero(height, dtype):
+    weight = solid_angle_weight(height, dtype=dtype)
+    assert weight.dtype == dtype and (weight > 0).all() and (weight <= 1).all()
+    assert weight[0].item() == pytest.approx(math.sin(math.pi / (2 * height)), rel=2e-3)  # half a row from the pole
+    torch.testing.assert_close(weight, weight.flip(0), rtol=1e-3, atol=1e-6)
+
+
+def test_the_released_weight_gives_up_the_end_rows():
+    weight = end_row_weight(9, dtype=torch.float64)
+    assert weight[[0, -1]].tolist() == pytest.approx([0, 0], abs=1e-15)
+    assert weight[4].item() == pytest.approx(1)
+    assert weight[2].item() == pytest.approx(math.sqrt(0.5))

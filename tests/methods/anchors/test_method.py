@@ -1,0 +1,160 @@
+"""PaD-GS as a method: it learns, resumes bit-identically, and does not care about the units of the world."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from padgs.geometry.panorama import rays
+from padgs.methods.anchors.method import PaDGSMethod, PaDGSMethodOptions
+from padgs.methods.anchors.model import PaDGS
+from padgs.methods.anchors.trainee import LearningRates
+from padgs.render.config import RenderConfig
+from padgs.scene import Scene, View
+from padgs.training.budget import Budget
+from padgs.training.options import TrainOptions
+
+WIDTH, HEIGHT = 48, 24
+EAGER = PaDGSMethodOptions(  # growth early and often, so that a short run has it
+    offsets=4, voxel_size=0.05, statistics_from=4, grow_from=8, grow_until=40, grow_every=4, scale_windows=False
+)
+TORCH = RenderConfig(backend="torch")
+
+
+def scene(scale: float = 1.0) -> Scene:
+    """A ball of radius 2 painted with a smooth pattern, seen from inside by four cameras."""
+    generator = torch.Generator().manual_seed(5)
+    points = 2 * torch.nn.functional.normalize(torch.randn(60, 3, generator=generator, dtype=torch.float64), dim=-1)
+    views = []
+    for index in range(4):
+        center = 0.2 * torch.tensor([index - 1.5, 0.3 * index, (-1.0) ** index], dtype=torch.float64)
+        directions = rays(WIDTH, HEIGHT, dtype=torch.float64)
+        along = directions @ center
+        hit = center + directions * (torch.sqrt(along**2 + 4 - center @ center) - along)[..., None]
+        pixels = (255 * (0.5 + 0.4 * torch.sin(2 * hit))).to(torch.uint8)
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, 3] = -scale * center
+        views.append(View(f"view{index}", pose, WIDTH, HEIGHT, lambda pixels=pixels: pixels))
+    colors = torch.zeros(len(points), 3, dtype=torch.uint8)
+    return Scene("ball", tuple(views[:3]), tuple(views[3:]), (scale * points).float(), colors, "0")
+
+
+def trained(iterations: int, *, scale: float = 1.0, options=EAGER, seed: int = 0):
+    method = PaDGSMethod(options, TORCH, TrainOptions(), seed)
+    return method, list(method.fit(scene(scale), Budget(iterations)))
+
+
+@pytest.fixture(scope="module")
+def long_run():
+    return trained(60)
+
+
+def error(method) -> float:
+    view = scene().test[0]
+    return (method.render(view).image - view.image()).square().mean().item()
+
+
+def test_learns_a_view_it_has_not_seen(long_run):
+    method, records = long_run
+    untrained, _ = trained(1)
+    assert [record.iteration for record in records] == list(range(1, 61))
+    assert error(method) < 0.35 * error(untrained)
+    assert records[-1].loss < 0.6 * records[0].loss
+
+
+def test_grows_in_its_window_only(long_run):
+    _, records = long_run
+    assert {r.iteration for r in records if any("grew" in e for e in r.events)} <= set(range(12, 40, 4))
+    assert records[-1].counts["anchors"] > records[0].counts["anchors"]
+
+
+def test_resumed_run_is_bit_identical(long_run):
+    whole, records = long_run
+    interrupted = PaDGSMethod(EAGER, TORCH, TrainOptions(), 0)
+    run = interrupted.fit(scene(), Budget(60))
+    for _ in range(22):
+        next(run)
+    state = interrupted.state()
+    assert len(state.tensors["model/positions"]) != records[0].counts["anchors"]  # it has grown by then
+
+    resumed = PaDGSMethod(EAGER, TORCH, TrainOptions(), seed=99)  # the state brings all randomness along
+    resumed.load_state(state)
+    view = scene().test[0]
+    assert torch.equal(resumed.render(view).image, interrupted.render(view).image)
+    assert resumed.state() is state
+    rest = list(resumed.fit(scene(), Budget(60)))
+    assert [(r.iteration, r.loss, r.counts) for r in rest] == [(r.iteration, r.loss, r.counts) for r in records[22:]]
+    end, expected = resumed.state(), whole.state()
+    assert end.tensors.keys() == expected.tensors.keys()
+    for name, tensor in expected.tensors.items():
+        assert torch.equal(end.tensors[name], tensor), name
+
+
+def test_multiplying_the_world_by_100_changes_nothing():
+    options = replace(EAGER, voxel_size="auto", voxel_pixels=3.0, coarsest=4, refinement=2, offset_rate_unit="scene")
+    (small, before), (large, after) = trained(14, options=options), trained(14, scale=100.0, options=options)
+    assert [r.counts for r in before] == [r.counts for r in after]
+    assert before[-1].counts["anchors"] > before[0].counts["anchors"]
+    assert [r.loss for r in after] == pytest.approx([r.loss for r in before], rel=1e-3)
+    view, far = scene().test[0], scene(100.0).test[0]
+    assert (small.render(view).image - large.render(far).image).abs().max() < 0.02
+    assert torch.allclose(100 * small.render(view).depth, large.render(far).depth, rtol=0.05)
+
+
+def test_seeds_matter_and_repeat():
+    losses = [[r.loss for r in trained(3, seed=seed)[1]] for seed in (1, 1, 2)]
+    assert losses[0] == losses[1] != losses[2]
+
+
+def test_size_is_what_is_stored(long_run):
+    method, records = long_run
+    size, anchors = method.size(), records[-1].counts["anchors"]
+    networks = sum(p.numel() for p in method.trainee.model.decoder.parameters())
+    assert size.counts == {"anchors": anchors, "gaussians": 4 * anchors}
+    assert size.parameters == anchors * (32 + 4 * 3 + 6) + networks
+    assert size.bytes == 4 * (size.parameters + 3 * anchors)
+
+
+def test_a_state_of_other_options_is_refused(long_run):
+    other = PaDGSMethod(replace(EAGER, features=16), TORCH, TrainOptions())
+    with pytest.raises(ValueError, match="features of the stored model has shape"):
+        other.load_state(long_run[0].state())
+
+
+def test_published_learning_rates():
+    model, world = PaDGS.from_scene(scene()), scene()
+    groups = {g.name: g for g in LearningRates().groups(model, world.extent, 30_000)}
+    ends = {
+        "offsets": (0.01 * world.extent, 0.0001 * world.extent),
+        "features": (0.0075, 0.0075),
+        "log_scales": (0.007, 0.007),
+        "opacity": (0.002, 2e-5),
+        "covariance": (0.004, 0.004),
+        "color": (0.008, 5e-5),
+    }
+    for name, (first, last) in ends.items():
+        assert groups[name].learning_rate(0) == pytest.approx(first), name
+        assert groups[name].learning_rate(30_000) == pytest.approx(last), name
+    held = [id(p) for g in groups.values() for p in g.parameters]
+    assert sorted(held) == sorted(id(p) for p in model.parameters())
+
+
+def test_a_single_camera_can_still_place_gaussians():
+    world = scene()
+    alone = replace(world, train=world.train[:1])
+    method = PaDGSMethod(replace(EAGER, offset_rate_unit="scene"), TORCH)
+    next(method.fit(alone, Budget(100)))
+    assert method.trainee.groups()[0].learning_rate(0) == pytest.approx(0.01 * EAGER.min_extent)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"omega_axis": "z"}, "omega_axis"),
+        ({"coarsest": 7}, "coarsest"),
+        ({"offset_rate_unit": "m"}, "offset_rate_unit"),
+    ],
+)
+def test_options_check_every_part(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        PaDGSMethodOptions(**wrong)

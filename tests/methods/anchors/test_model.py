@@ -1,0 +1,287 @@
+"""The anchor model against the golden case, then its invariances and its corner cases."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from padgs.methods.anchors.model import Decoded, PaDGS, PaDGSOptions
+from padgs.native import cpu
+from padgs.render import BACKENDS, RenderOptions, render
+from padgs.scene import Scene, View
+from padgs.training.loss import photometric_loss, pixel_weight
+
+RELEASED = {  # of conf/method/padgs_release.yaml, what concerns the model
+    "omega_axis": "world_z",
+    "omega_input": "cos",
+    "max_modulated_omega": 1 - 1e-4,
+    "distance_unit": "world",
+}
+HEADS = ("opacity", "color", "covariance")
+DTYPES = (torch.float64, torch.float32)
+
+
+@pytest.fixture(scope="module")
+def golden(shared):
+    data = dict(np.load(shared / "golden" / "model_a.npz"))
+    return {name: torch.from_numpy(value) for name, value in data.items() if name != "meta"} | {
+        "meta": json.loads(str(data["meta"]))
+    }
+
+
+def golden_model(golden, dtype, **options) -> PaDGS:
+    options = PaDGSOptions(**{"distance_unit": "world", "voxel_size": 0.1, **options})
+    model = PaDGS(golden["anchors"].clone(), golden["log_scales"].clone(), options, voxel_size=0.1)
+    with torch.no_grad():
+        model.features.copy_(golden["features"])
+        model.offsets.copy_(golden["offsets"])
+        for head in HEADS:
+            for name, weight in getattr(model.decoder, head).items():
+                weight.copy_(golden[f"{head}_{name}"])
+    return model.to(dtype)
+
+
+def golden_view(golden) -> View:
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3], pose[:3, 3] = golden["R"], golden["t"]
+    return View("golden", pose, golden["meta"]["width"], golden["meta"]["height"])
+
+
+def assert_decoded(decoded: Decoded, golden, prefix: str, tolerance: float = 1e-5) -> None:
+    selected = golden[f"{prefix}raw_opacities"] > 0
+    assert torch.equal(decoded.raw_opacities.flatten() > 0, selected)
+    assert torch.equal(decoded.slots, selected.nonzero()[:, 0])
+    got = {
+        "raw_opacities": decoded.raw_opacities.flatten()[selected],
+        "opacities": decoded.gaussians.opacities,
+        "means": decoded.gaussians.means,
+        "scales": decoded.gaussians.scales,
+        "quats": torch.nn.functional.normalize(decoded.gaussians.quats, dim=-1),
+        "colors": decoded.gaussians.colors,
+    }
+    for name, value in got.items():
+        if prefix + name in golden or name not in ("means", "quats"):
+            expected = golden[prefix + name][selected].to(value.dtype)
+            assert (value.detach() - expected).abs().max() <= tolerance, name
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_golden_decode(golden, dtype):
+    model, view = golden_model(golden, dtype), golden_view(golden)
+    assert_decoded(model.decode(view), golden, "expected_")
+    assert (model.seen_from(view)[2] - golden["expected_omega"]).abs().max() <= 1e-5
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_golden_decode_released(golden, dtype):
+    model, view = golden_model(golden, dtype, **RELEASED), golden_view(golden)
+    assert_decoded(model.decode(view), golden, "expected_released_")
+    omega = model.seen_from(view)[2].clamp(max=model.options.max_modulated_omega)
+    assert (omega - golden["expected_released_omega"]).abs().max() <= 1e-5
+
+
+def backend_cases():
+    for backend in BACKENDS:
+        for dtype in DTYPES if backend == "torch" else (torch.float32,):
+            yield pytest.param(backend, dtype, id=f"{backend}-{dtype}")
+
+
+@pytest.mark.parametrize(("backend", "dtype"), list(backend_cases()))
+def test_golden_image_and_gradients(golden, backend, dtype):
+    if backend == "cpu" and not cpu.available():
+        pytest.skip("the native CPU library is not built")
+    if backend == "cuda" and "cuda_engine" not in sys.modules:
+        pytest.skip("tests/render, which arranges for backend cuda, is not part of this run")
+    meta = golden["meta"]
+    model, view = golden_model(golden, dtype), golden_view(golden)
+    options = RenderOptions(near=meta["near"], wrap=meta["wrap"], low_pass=meta["dilation"])
+    drawn = render(
+        model.decode(view).gaussians, view, options, background=golden["background"].to(dtype), backend=backend
+    )
+    assert (drawn.image.detach() - golden["expected_image"]).abs().max() <= 2e-5
+    assert (drawn.transmittance.detach() - golden["expected_transmittance"]).abs().max() <= 2e-5
+
+    weight = pixel_weight("solid_angle", meta["height"], dtype=dtype)
+    loss = photometric_loss(drawn.image, golden["target"].to(dtype), weight, meta["lambda"])
+    assert loss.item() == pytest.approx(meta["loss"], abs=1e-5)
+    loss.backward()
+    gradients = {name: parameter.grad for name, parameter in model.rows().items()}
+    gradients |= {f"{head}_{name}": w.grad for head in HEADS for name, w in getattr(model.decoder, head).items()}
+    for name, gradient in gradients.items():
+        expected, valid = golden[f"grad_{name}"], golden[f"valid_{name}"]
+        assert gradient is not None
+        error = (gradient.flatten()[golden[f"grad_index_{name}"].long()] - expected).abs()[valid]
+        assert valid.any() and error.max() <= 1e-3 * expected.abs().max(), name
+
+
+def box_scene(*, scale: float = 1.0, count: int = 500) -> Scene:
+    """Points on a sphere-like shell around three cameras; everything scaled by `scale`."""
+    generator = torch.Generator().manual_seed(7)
+    points = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator, dtype=torch.float64), dim=-1)
+    points = points * (2 + torch.rand(count, 1, generator=generator, dtype=torch.float64))
+    views = []
+    for index in range(3):
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, 3] = scale * torch.tensor([0.3 * index, 0.05 * index, -0.2])
+        views.append(View(f"v{index}", pose, 64, 32))
+    colors = torch.zeros(count, 3, dtype=torch.uint8)
+    return Scene("box", tuple(views), (), (scale * points).float(), colors, "0")
+
+
+def perturbed(model: PaDGS) -> PaDGS:
+    """The model as training might leave it: nothing at its initial value."""
+    generator = torch.Generator().manual_seed(11)
+    with torch.no_grad():
+        for parameter in (model.features, model.offsets):
+            parameter.copy_(torch.randn(parameter.shape, generator=generator, dtype=torch.float64))
+    return model
+
+
+def one_anchor(position, options=PaDGSOptions(), dtype=torch.float32) -> PaDGS:  # noqa: B008
+    generator = torch.Generator().manual_seed(3)
+    position = torch.tensor([position], dtype=torch.float32)
+    model = PaDGS(position, torch.full((1, 6), -2.0), options, voxel_size=0.1, generator=generator)
+    return perturbed(model).to(dtype)
+
+
+def view_from(center, rotation=None) -> View:
+    pose = torch.eye(4, dtype=torch.float64)
+    if rotation is not None:
+        pose[:3, :3] = torch.tensor(rotation, dtype=torch.float64)
+    pose[:3, 3] = -pose[:3, :3] @ torch.tensor(center, dtype=torch.float64)
+    return View("here", pose, 64, 32)
+
+
+def test_inputs_are_as_published_and_as_in_the_ablation_ladder():
+    assert PaDGSOptions().inputs == 37
+    assert PaDGSOptions(use_distortion=False).inputs == 36
+    assert PaDGSOptions(use_distortion=False, use_distance=False).inputs == 35
+
+
+@pytest.mark.parametrize("use_distance", [True, False])
+@pytest.mark.parametrize("use_distortion", [True, False])
+def test_unused_inputs_change_nothing(use_distance, use_distortion):
+    options = PaDGSOptions(use_distance=use_distance, use_distortion=use_distortion, tau=0.0)
+    model = one_anchor([0.0, 0.0, 0.0], options)
+    near, far = (model.decode(view_from(center)).raw_opacities for center in ([0.0, 0.0, -1.0], [0.0, 0.0, -5.0]))
+    assert torch.equal(near, far) != use_distance
+    level, rolled = (
+        model.decode(view_from([1.0, 0.0, 0.0], rotation)).raw_opacities
+        for rotation in (None, [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    )
+    assert torch.equal(level, rolled) != use_distortion
+
+
+def test_direction_points_from_camera_to_anchor_in_the_world_frame():
+    quarter_turn = [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]
+    model = one_anchor([3.0, 4.0, 0.0])
+    direction, distance, omega = model.seen_from(view_from([0.0, 0.0, 0.0], quarter_turn))
+    assert torch.allclose(direction, torch.tensor([[0.6, 0.8, 0.0]]))
+    assert distance.item() == pytest.approx(5.0) and omega.item() == pytest.approx(0.64)
+
+
+def test_modulation_dims_by_the_anchors_latitude_in_the_camera():
+    bright, dim = (one_anchor([0.0, -2.0, 0.0], PaDGSOptions(tau=tau, use_distortion=False)) for tau in (0.0, 0.9))
+    view = view_from([0.0, 0.0, 0.0])
+    full, modulated = bright.decode(view).gaussians.opacities, dim.decode(view).gaussians.opacities
+    assert len(full) > 0 and torch.allclose(modulated, 0.1 * full)
+    tilted = view_from([0.0, 0.0, 0.0], [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # now on the horizon
+    assert torch.allclose(dim.decode(tilted).gaussians.opacities, bright.decode(tilted).gaussians.opacities)
+
+
+@pytest.mark.parametrize("overrides", [{}, RELEASED])
+@pytest.mark.parametrize("position", [[0, 2, 0], [0, -2, 0], [0, 0, 2], [0, 0, -2], [0, 0, 0], [1e-9, 0, 0]])
+def test_finite_on_the_poles_and_on_the_camera(overrides, position):
+    model = one_anchor([float(x) for x in position], PaDGSOptions(**overrides))
+    decoded = model.decode(view_from([0.0, 0.0, 0.0]))
+    assert len(decoded.slots) > 0
+    torch.cat([value.flatten() for value in vars(decoded.gaussians).values()]).sum().backward()
+    for name, parameter in model.named_parameters():
+        assert parameter.grad is not None
+        assert torch.isfinite(parameter).all() and torch.isfinite(parameter.grad).all(), name
+
+
+def test_positions_are_no_parameter_and_views_carry_no_gradient():
+    model = one_anchor([1.0, 1.0, 1.0])
+    assert "positions" not in dict(model.named_parameters()) and "positions" in dict(model.named_buffers())
+    assert not any(value.requires_grad for value in model.seen_from(view_from([0.0, 0.0, 0.0])))
+
+
+def test_multiplying_the_world_by_100_changes_nothing():
+    small, large = (perturbed(PaDGS.from_scene(box_scene(scale=scale))) for scale in (1.0, 100.0))
+    assert large.voxel_size == pytest.approx(100 * small.voxel_size)
+    assert torch.allclose(large.positions, 100 * small.positions, rtol=1e-6)
+    seen = [model.decode(box_scene(scale=scale).train[1]) for model, scale in ((small, 1.0), (large, 100.0))]
+    assert torch.equal(seen[0].slots, seen[1].slots)
+    assert torch.allclose(seen[0].raw_opacities, seen[1].raw_opacities, atol=1e-5)
+    first, second = seen[0].gaussians, seen[1].gaussians
+    assert torch.allclose(100 * first.means, second.means, rtol=1e-4, atol=1e-3)
+    assert torch.allclose(100 * first.scales, second.scales, rtol=1e-4)
+    assert torch.allclose(first.opacities, second.opacities, atol=1e-5)
+
+
+def test_same_seed_same_networks_and_another_seed_others():
+    first, same, other = (PaDGS.from_scene(box_scene(), seed=seed).decoder.opacity["w1"] for seed in (1, 1, 2))
+    assert torch.equal(first, same) and not torch.equal(first, other)
+
+
+@pytest.mark.parametrize("precision", ["bfloat16", "float16"])
+def test_a_reduced_precision_is_that_of_the_networks_and_all_learns_in_float32(precision):
+    exact, rounded = (
+        perturbed(PaDGS.from_scene(box_scene(count=40), PaDGSOptions(precision=name)))
+        for name in ("float32", precision)
+    )
+    view, limit = box_scene().train[1], 8 * torch.finfo(getattr(torch, precision)).eps
+    truth, decoded = exact.decode(view), rounded.decode(view)
+    error = (decoded.raw_opacities - truth.raw_opacities).abs().max()
+    assert 1e-5 < error < limit and len(decoded.slots) == pytest.approx(len(truth.slots), rel=limit)
+    for model, seen in ((exact, truth), (rounded, decoded)):
+        gaussians = seen.gaussians
+        (gaussians.means.sum() + gaussians.opacities.sum() + gaussians.colors.sum() + gaussians.scales.sum()).backward()
+        assert all(p.grad is not None and p.grad.dtype == p.dtype == torch.float32 for p in model.parameters())
+    for mine, theirs in zip(rounded.parameters(), exact.parameters(), strict=True):
+        assert mine.grad is not None and theirs.grad is not None
+        assert (mine.grad - theirs.grad).norm() < 0.1 * theirs.grad.norm()
+
+
+def test_gradients_match_finite_differences():
+    model = perturbed(PaDGS.from_scene(box_scene(count=4), PaDGSOptions(features=3, offsets=2, hidden=4))).double()
+    view = box_scene().train[1]
+    names = [name for name, _ in model.named_parameters()]
+
+    def outputs(*parameters):
+        decoded = torch.func.functional_call(
+            _Decode(model), dict(zip([f"model.{n}" for n in names], parameters, strict=True)), view
+        )
+        return decoded.means, decoded.scales, decoded.quats, decoded.opacities, decoded.colors
+
+    parameters = tuple(parameter.detach().clone().requires_grad_() for parameter in model.parameters())
+    assert torch.autograd.gradcheck(outputs, parameters)
+
+
+class _Decode(torch.nn.Module):
+    def __init__(self, model):
+        super().__init__()
+        self.model = model
+
+    def forward(self, view):
+        return self.model.decode(view).gaussians
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"omega_axis": "up"}, "omega_axis 'up'; known: camera_y, world_z"),
+        ({"omega_input": "sin"}, "known: sin2, cos"),
+        ({"distance_unit": "metre"}, "known: scene, world"),
+        ({"precision": "half"}, "unknown precision 'half'; known: float32, bfloat16, float16"),
+        ({"voxel_size": "small"}, "known: auto"),
+        ({"tau": 1.5}, r"tau is 1.5; it must be in \[0, 1\]"),
+        ({"offsets": 0}, "offsets is 0"),
+    ],
+)
+def test_options_name_what_is_wrong(options, message):
+    with pytest.raises(ValueError, match=message):
+        PaDGSOptions(**options)

@@ -1,0 +1,309 @@
+"""What padgs_plus promises: schedules for any length, no units, small Gaussians, a mean of its last states."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import count, islice
+
+import pytest
+import torch
+from states import assert_same_but_time
+from tiny_scene import tiny_scene
+
+from padgs import stopwatch
+from padgs.geometry.distortion import solid_angle_weight
+from padgs.methods.plus.method import PlusMethod
+from padgs.methods.plus.options import GROWN, PLENTY, ROUNDS, PlusOptions, between_rounds
+from padgs.methods.plus.smoothness import roughness
+from padgs.methods.plus.trainee import FEWEST_PIXELS, counted_pixels
+from padgs.methods.splats.method import SplatMethod
+from padgs.scene import Scene
+from padgs.training.budget import Budget
+from padgs.training.failure import Failure
+from padgs.training.loop import Record
+from padgs.training.worth import needed, worth
+
+OPTIONS = PlusOptions(gradient_threshold=1e-6, start_share=None, limit_share=None, fill_share=0.0)
+
+
+def in_other_units(scene: Scene, scale: float) -> Scene:
+    def moved(view):
+        pose = view.cam_from_world.clone()
+        pose[:3, 3] *= scale
+        return replace(view, cam_from_world=pose)
+
+    views = {"train": tuple(map(moved, scene.train)), "test": tuple(map(moved, scene.test))}
+    return replace(scene, points=scene.points * scale, **views)
+
+
+@pytest.mark.parametrize("iterations", [16, 60, 500, 7000, 30_000])
+def test_growth_has_as_many_rounds_in_a_run_of_any_length(iterations):
+    options = PlusOptions().for_run(iterations)
+    rounds = [i for i in range(1, iterations + 1) if i < options.densify_until and i % options.densify_every == 0]
+    assert len(rounds) == ROUNDS and options.reset_every > iterations
+    assert rounds[-1] == pytest.approx(GROWN * iterations, abs=ROUNDS / 2)
+
+
+@pytest.mark.parametrize("points", [40, 20])
+@pytest.mark.parametrize("units", [1.0, 100.0])
+def test_a_budget_of_gaussians_is_met_whatever_the_points_and_units(points, units):
+    scene = in_other_units(tiny_scene(), units)
+    scene = replace(scene, points=scene.points[:points], point_colors=scene.point_colors[:points])
+    records = list(PlusMethod(PlusOptions(start_share=None)).fit(scene, Budget(64, gaussians=150)))
+    assert 135 <= records[-1].counts["gaussians"] <= 150
+
+
+def test_the_threshold_of_growth_falls_with_the_length_of_a_run_and_then_stays():
+    found = [PlusOptions().for_run(iterations).gradient_threshold for iterations in (125, 500, 2000, 30_000)]
+    assert found == pytest.approx([2e-4, 1e-4, 5e-5, 5e-5])
+
+
+def test_the_threshold_of_growth_falls_with_the_width_of_a_pixel_where_views_are_many_but_not_below_a_width_of_256():
+    def threshold(width):
+        scene = tiny_scene()
+        views = tuple(replace(view, width=width, height=width // 2) for view in scene.train)
+        trainee = PlusMethod(PlusOptions(fill_share=0.0))._start(replace(scene, train=views), 30_000)
+        return trainee.densifier.options.gradient_threshold
+
+    pixels = [2 * w * w / 2 / math.pi for w in (64, 256, 512, 1024)]
+    found = [[PlusOptions().for_views(p, views).gradient_threshold for p in pixels] for views in (100, 28, 7, 1)]
+    assert found[0] == found[1] == pytest.approx([5e-5, 5e-5, 2.5e-5, 1.25e-5])
+    assert found[2] == pytest.approx([5e-5, 5e-5, 5e-5, 2.5e-5])
+    assert found[3] == pytest.approx([5e-5, 5e-5, 5e-5, 5e-5]), "few views never ask for less than small ones"
+    assert PlusOptions(pixel_power=0.0).for_views(10**6, 28) == PlusOptions(pixel_power=0.0)
+    assert PlusOptions(many_views=0).for_views(pixels[2], 1).gradient_threshold == pytest.approx(2.5e-5)
+    few = math.sqrt(28 / len(tiny_scene().train))
+    assert [threshold(w) for w in (64, 1024)] == pytest.approx([5e-5, min(1, few / 4) * 5e-5])
+
+
+def test_what_is_kept_after_growth_is_what_the_views_would_miss():
+    trained, tiny = [], tiny_scene()
+    for psnr in (None, 44.0):
+        method = PlusMethod(replace(OPTIONS, removal_psnr=psnr, drop_share=0.0))
+        for record in islice(method.fit(tiny, Budget(100)), 9 * between_rounds(100)):
+            before = record.counts["gaussians"]
+        trained.append(method.trainee)
+        assert method.render(tiny.test[0]).image.isfinite().all(), "at once"
+    whole, chosen = (trainee.splats.means for trainee in trained)
+    found = worth(trained[0], tiny.train)
+    assert len(whole) > before == len(chosen) == needed(found, 44.0)
+    kept = torch.isin(whole[:, 0], chosen[:, 0])
+    assert kept.sum() == len(chosen) and found.change[kept].min() >= found.change[~kept].max()
+
+
+@pytest.mark.parametrize("iterations", [100, 6])
+def test_a_budget_of_gaussians_says_how_many_are_kept(iterations):
+    for record in PlusMethod(OPTIONS).fit(tiny_scene(), Budget(iterations, gaussians=150)):
+        last = record.counts["gaussians"]
+    assert last == 150
+
+
+@pytest.mark.parametrize(("gaussians", "chosen"), [(150, [31]), ("auto", [31]), (None, [])])
+def test_a_run_that_is_stopped_before_the_choice_makes_it_at_once_if_a_budget_asks_for_it(gaussians, chosen):
+    budget, whole, again = Budget(100, gaussians=gaussians), PlusMethod(OPTIONS), PlusMethod(OPTIONS)
+    counts, events = [], []
+    for record in whole.fit(tiny_scene(), budget):
+        counts.append(record.counts["gaussians"])
+        events += [record.iteration for event in record.events if "would miss most" in event]
+        if record.iteration == 30:
+            assert whole.stop("asked")
+            again.load_state(whole.state())
+    assert events == chosen and (counts[30] == counts[-1] < counts[29]) == bool(chosen)
+    assert gaussians != 150 or counts[-1] == 150
+    list(again.fit(tiny_scene(), budget))
+    assert_same_but_time(again.state(), whole.state())
+
+
+@pytest.mark.parametrize("at", [30, 45, 60])  # 45: after the choice
+def test_checkpoints_that_do_not_say_whether_there_was_a_choice_go_on_as_they_did(at):
+    budget, whole, again = Budget(100, gaussians="auto"), PlusMethod(OPTIONS), PlusMethod(OPTIONS)
+    for record in whole.fit(tiny_scene(), budget):
+        if record.iteration == at:
+            state = whole.state()
+            del state.values["model"]["has_chosen"]
+            again.load_state(state)
+    list(again.fit(tiny_scene(), budget))
+    assert_same_but_time(again.state(), whole.state())
+
+
+def test_a_tight_budget_leaves_room_for_the_sky_and_for_growth():
+    tiny = tiny_scene()
+    points = tiny.points[:1] + 0.1 * torch.randn(400, 3, generator=torch.Generator().manual_seed(0))
+    scene = replace(tiny, points=points, point_colors=tiny.point_colors[:1].expand(400, 3))
+    method = PlusMethod(OPTIONS)
+    method.fit(scene, Budget(64, gaussians=100))
+    far = method.trainee.splats.means.norm(dim=-1) > 2 * points.norm(dim=-1).max()
+    assert (~far).sum() == math.ceil(200 / 1.5) and far.sum() > 20
+    assert method.start < 200
+
+
+def test_a_run_of_seconds_rehearses_ends_on_time_and_resumes_bit_identically(monkeypatch):
+    def fitted(method: PlusMethod) -> Iterator[Record]:
+        ticks = count()
+        monkeypatch.setattr(stopwatch.time, "perf_counter", lambda: next(ticks) / 64)  # so each step takes as long
+        monkeypatch.setattr(stopwatch.time, "process_time", lambda: 0.0)
+        return method.fit(tiny_scene(), Budget(1, seconds=60 / 64))
+
+    torch.manual_seed(5)
+    whole = PlusMethod(OPTIONS)
+    records = list(fitted(whole))
+    assert records[-1].seconds == pytest.approx(60 / 64, rel=0.05) and records[-1].progress == 1
+    assert len(records) == 60 - 2, "two steps were thrown away, and counted"
+    assert whole.state().values["schedule"] == round(0.6 * (60 - 2))
+    assert records[-1].counts["gaussians"] > records[0].counts["gaussians"]
+    torch.manual_seed(5)
+    stopped = PlusMethod(OPTIONS)
+    first = list(islice(fitted(stopped), 23))
+    resumed = PlusMethod(OPTIONS)
+    resumed.load_state(stopped.state())
+    assert [*first, *fitted(resumed)] == records
+    assert_same_but_time(resumed.state(), whole.state())
+
+
+def test_a_limit_of_seconds_does_not_end_the_rehearsal():
+    method = PlusMethod(OPTIONS)
+    assert not list(method.fit(tiny_scene(), Budget(10, max_seconds=1e-4, seconds=5))), (
+        "but the run, which it counts for"
+    )
+
+
+def test_options_of_the_schedule_of_3dgs_are_refused_and_not_ignored():
+    with pytest.raises(ValueError, match="reset_every is 100, but padgs_plus has rounds of growth of its own"):
+        PlusOptions(reset_every=100)
+
+
+def test_pixels_are_counted_by_what_they_see():
+    tiny = tiny_scene().train[0]
+    view = replace(tiny, width=256, height=128)
+    weight = solid_angle_weight(128).sum().item() * 256  # 1 at the horizon
+    assert counted_pixels(view) == pytest.approx(weight, rel=0.01)
+    assert counted_pixels(tiny) == FEWEST_PIXELS
+
+
+def test_the_units_of_the_world_do_not_matter():
+    losses = []
+    for scale in (1.0, 100.0):
+        records = list(PlusMethod(OPTIONS).fit(in_other_units(tiny_scene(), scale), Budget(32)))
+        losses.append([record.loss for record in records])
+        assert records[-1].counts["gaussians"] > records[0].counts["gaussians"]
+    assert losses[1] == pytest.approx(losses[0], rel=1e-3)
+
+
+def test_it_starts_with_a_share_of_the_pixels_and_stays_below_another():
+    options = replace(OPTIONS, start_share=0.01, limit_share=0.03, sky_share=0.5, fill_share=0.0)
+    method = PlusMethod(options)
+    counts = [record.counts["gaussians"] for record in method.fit(tiny_scene(), Budget(32))]
+    assert 0 <= method.start - 0.01 * FEWEST_PIXELS <= 0.005 * FEWEST_PIXELS
+    assert max(counts) <= 0.03 * FEWEST_PIXELS
+    assert max(counts) > counts[0]
+
+
+def test_the_penalty_is_the_mean_size_as_the_view_sees_it():
+    method, scene = PlusMethod(replace(OPTIONS, size_weight=0.7, smoothness_weight=0.0)), tiny_scene()
+    next(method.fit(scene, Budget(10)))
+    drawing = method.trainee.draw(scene.train[1])
+    splats, centre = method.trainee.splats, scene.train[1].center
+    angles = torch.exp(splats.log_scales) / (splats.means - centre).norm(dim=-1, keepdim=True)
+    assert drawing.penalty.item() == pytest.approx(0.7 * angles.mean().item())
+    (gradient,) = torch.autograd.grad(drawing.penalty, splats.means, allow_unused=True)
+    assert gradient is None or not gradient.any()  # it shall not push Gaussians away
+
+
+def test_where_gaussians_may_be_as_near_as_they_like_an_empty_direction_is_no_distance():
+    near = replace(PlusMethod.RENDER, near=0.0)
+    records = list(PlusMethod(replace(OPTIONS, sky_share=0.0), near).fit(tiny_scene(), Budget(3)))
+    assert len(records) == 3 and all(math.isfinite(record.loss) for record in records)
+
+
+def test_the_penalty_asks_for_smooth_surfaces_of_what_is_drawn():
+    method, scene = PlusMethod(replace(OPTIONS, size_weight=0.0, smoothness_weight=0.3)), tiny_scene()
+    next(method.fit(scene, Budget(10)))
+    view = scene.train[1]
+    drawing = method.trainee.draw(view)
+    rough = roughness(drawing.rendering, view.camera, near=method.trainee.render_options(view).near)
+    assert drawing.penalty.item() == pytest.approx(0.3 * rough.item()) and rough > 0
+    drawing.penalty.backward()
+    assert method.trainee.splats.means.grad.any() and method.trainee.splats.log_scales.grad.any()
+
+
+def test_the_fewer_pixels_a_gaussian_has_the_more_of_them_a_drawing_leaves_out():
+    options = PlusOptions(drop_share=0.2)
+    found = [options.dropped_share(pixels=1000.0 * PLENTY, gaussians=n) for n in (1, 1000, 1414.2136, 2000, 10**6)]
+    assert found == pytest.approx([0, 0, 0.1, 0.2, 0.2], abs=1e-6)
+    assert PlusOptions(drop_share=0.0).dropped_share(1.0, 1000) == 0
+
+
+def test_a_round_that_prunes_all_ends_the_run_as_collapsed():
+    with pytest.raises(Failure, match="no Gaussian is left to draw"):
+        list(PlusMethod(replace(OPTIONS, min_opacity=0.999)).fit(tiny_scene(), Budget(60)))
+
+
+def crowded_scene() -> Scene:
+    """Of 10 000 pixels, as padgs_plus counts them, and 4000 points."""
+    tiny = tiny_scene()
+    points = tiny.points.repeat(100, 1) + 0.1 * torch.randn(4000, 3, generator=torch.Generator().manual_seed(0))
+    return replace(tiny, points=points, point_colors=tiny.point_colors.repeat(100, 1))
+
+
+@pytest.mark.parametrize(("done", "share"), [(1, 0.25), (17, 0.25), (18, 0.0), (20, 0.0)])
+def test_a_drawing_of_the_training_leaves_some_out_and_shows_more_of_the_others(done, share):
+    scene = crowded_scene()
+    method, view = PlusMethod(replace(OPTIONS, drop_share=0.25)), scene.train[0]
+    list(islice(method.fit(scene, Budget(20)), done))
+    drawings = [method.trainee.draw(view) for _ in range(60)]
+    drawn = torch.stack([drawing.gaussians.opacities for drawing in drawings])
+    whole = method.trainee.splats.gaussians(view).opacities
+    assert (drawn == 0).float().mean().item() == pytest.approx(share, abs=0.01)
+    assert torch.allclose(drawn.amax(0), (whole / (1 - share)).clamp(max=1)), "as much is seen on average"
+    drawings[0].rendering.image.sum().backward()
+    pulls = drawings[0].probe.grad.abs().amax(-1)
+    assert pulls[drawn[0] > 0].max() > 0 and not pulls[drawn[0] == 0].any()
+
+
+@pytest.mark.parametrize("at", [13, 28])
+def test_what_is_left_out_is_the_same_after_an_interruption(at):
+    scene, whole, resumed = crowded_scene(), PlusMethod(OPTIONS), PlusMethod(OPTIONS)
+    for record in whole.fit(scene, Budget(30)):
+        if record.iteration == at:
+            resumed.load_state(whole.state())
+    list(resumed.fit(scene, Budget(30)))
+    assert_same_but_time(resumed.state(), whole.state())
+
+
+def test_degrees_come_each_tenth_and_means_are_faster_than_those_of_3dgs():
+    method, scene = PlusMethod(replace(OPTIONS, means_speed=3.0, initial_opacity=0.3, initial_scale=0.5)), tiny_scene()
+    degrees = {r.iteration: method.trainee.splats.active_degree for r in method.fit(scene, Budget(100))}
+    assert [degrees[i] for i in (8, 9, 18, 19, 100)] == [0, 1, 1, 2, 2]  # as the next iteration will draw
+    usual, ours = SplatMethod(), PlusMethod(replace(OPTIONS, initial_opacity=0.3, initial_scale=0.5, sky_share=0.0))
+    for started in (usual, ours):
+        started.fit(scene, Budget(100))
+    rates = [{g.name: g.learning_rate(50) for g in m.trainee.groups()} for m in (usual, method)]
+    assert {name: rate / rates[0][name] for name, rate in rates[1].items()} == pytest.approx(
+        dict.fromkeys(rates[0], 1.0) | {"means": 3.0}
+    )
+    assert torch.allclose(torch.sigmoid(ours.trainee.splats.opacity_logits), torch.tensor(0.3))
+    torch.testing.assert_close(ours.trainee.splats.log_scales.exp(), 0.5 * usual.trainee.splats.log_scales.exp())
+
+
+def test_resumed_while_it_averages_it_ends_the_same():
+    whole = PlusMethod(OPTIONS)
+    states = [whole.state() for record in whole.fit(tiny_scene(), Budget(40)) if record.iteration in (38, 40)]
+    again = PlusMethod(OPTIONS)
+    again.load_state(states[0])
+    list(again.fit(tiny_scene(), Budget(40)))
+    assert_same_but_time(again.state(), states[1])
+
+
+def test_the_end_is_the_mean_of_the_last_states():
+    states = {}
+    for share in (0.0, 0.1):
+        method = PlusMethod(replace(OPTIONS, average_share=share))
+        for record in method.fit(tiny_scene(), Budget(40)):
+            states[share, record.iteration] = method.trainee.splats.means.detach().clone()
+            averaged = bool(method.state().under("model/average/"))
+            assert averaged == (share > 0 and 37 <= record.iteration < 40)
+    assert torch.equal(states[0.0, 39], states[0.1, 39])  # training itself does not notice
+    mean = states[0.0, 37].clone()
+    for iteration in (38, 39, 40):
+        mean.lerp_(states[0.0, iteration], 1 / 4)
+    torch.testing.assert_close(states[0.1, 40], mean)

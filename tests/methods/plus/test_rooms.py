@@ -1,0 +1,68 @@
+"""How many rooms a scene is."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from padgs.data.synthetic import SyntheticOptions, generate
+from padgs.methods.plus.method import PlusMethod
+from padgs.methods.plus.options import PlusOptions
+from padgs.methods.plus.rooms import rooms
+from padgs.stress.options import StressOptions
+
+
+@pytest.fixture(autouse=True)
+def cached(monkeypatch, cache):
+    monkeypatch.setenv("PADGS_CACHE", str(cache))
+
+
+def scene_of(name: str, count: int = 1):
+    views, points = 8 * count, 3000 * count
+    return generate(
+        SyntheticOptions(
+            scene=name,
+            rooms=count if name == "enfilade" else None,
+            width=16,
+            samples=1,
+            train_views=views,
+            test_views=1,
+            points=points,
+        )
+    )
+
+
+def test_more_rooms_are_more_and_one_is_one():
+    one, two, five = (rooms(scene_of("enfilade", count)) for count in (1, 2, 5))
+    assert one == 1.0 < two < five
+    assert 1.5 < five < 5
+
+
+@pytest.mark.parametrize("name", ["room", "outdoor", "near_clutter"])
+def test_furniture_and_trees_make_no_room(name):
+    assert rooms(scene_of(name)) == 1.0
+
+
+@pytest.mark.parametrize(("condition", "level"), [("world_scale", 3), ("world_offset", 2), ("world_rotation", 3)])
+def test_the_world_may_be_anywhere(condition, level):
+    scene = scene_of("enfilade", 3)
+    assert rooms(StressOptions(condition, level).scene(scene, 0)) == pytest.approx(rooms(scene), rel=0.1)
+
+
+def test_points_that_are_none_count_as_nothing():
+    scene = scene_of("enfilade", 2)
+    lost = replace(scene, points=torch.cat((scene.points, torch.full((9, 3), torch.nan))))
+    assert rooms(lost) == pytest.approx(rooms(scene), rel=0.01)
+    assert rooms(replace(scene, points=scene.points[:0])) == 1.0
+    here = scene.train[0].center.float().expand(3, 3)
+    assert rooms(replace(scene, points=here)) >= 1.0
+
+
+def test_a_row_of_rooms_may_have_more_gaussians_than_one():
+    """With as many points and views, the row begins with more of them."""
+    row = scene_of("enfilade", 5)
+    near = row.train[0].center
+    one = replace(row, points=near + 0.3 * torch.nn.functional.normalize(row.points - near, dim=-1))
+    method = PlusMethod(PlusOptions(sky_share=0.0, fill_share=0.0))
+    starts = [len(method._start(scene, 100).splats) for scene in (one, row)]
+    assert starts[1] == pytest.approx(rooms(row) * starts[0], rel=0.01)

@@ -1,0 +1,309 @@
+import math
+
+import pytest
+import torch
+from tiny_scene import tiny_scene
+
+from padgs.gaussians import rotation_matrices
+from padgs.methods.splats.clone_split import SHRINK, CloneSplit, CloneSplitOptions
+from padgs.methods.splats.model import Splats
+from padgs.methods.splats.trainee import SplatTrainee
+from padgs.render.config import RenderConfig
+from padgs.scene import View
+
+LARGE, SMALL = 0.5, 0.005  # scales above and below percent_dense x extent = 0.01
+EVERY = 10
+
+
+def densifier(scales: list[float], **options) -> tuple[CloneSplit, torch.optim.Adam]:
+    """Gaussians of these scales, of opacity 1/2, numbered by their mean; extent 1."""
+    means = torch.arange(len(scales), dtype=torch.float32)[:, None].repeat(1, 3)
+    splats = Splats(means, torch.tensor(scales).log()[:, None].repeat(1, 3), torch.rand(len(scales), 3))
+    splats.opacity_logits.data.zero_()
+    optimizer = torch.optim.Adam(splats.parameters(), lr=0.0, fused=True)
+    sum(p.sum() for p in splats.parameters()).backward()
+    optimizer.step()  # fills the moments, moves nothing
+    optimizer.zero_grad()
+    settings = {"densify_from": 0, "densify_every": EVERY, "reset_every": 10**6, "prune_by_extent_from": 0} | options
+    return CloneSplit(splats, CloneSplitOptions(**settings), extent=1.0), optimizer
+
+
+def pull(densifier: CloneSplit, gradients: list[float], views: int = 1) -> None:
+    for _ in range(views):
+        gradient = torch.tensor(gradients)[:, None] * torch.tensor([0.6, 0.8])
+        densifier.observe(gradient, torch.ones(len(gradients), dtype=torch.bool), iteration=1)
+
+
+def test_small_gaussians_are_cloned_exactly():
+    grown, optimizer = densifier([SMALL, SMALL])
+    before = {name: p.detach().clone() for name, p in grown.splats.rows().items()}
+    pull(grown, [0.0, 1e-3])
+    assert grown.adapt(EVERY, optimizer) == ("cloned 1, split 0, pruned 0 Gaussians",)
+    for name, parameter in grown.splats.rows().items():
+        assert torch.equal(parameter, torch.cat((before[name], before[name][1:]))), name
+        assert torch.equal(optimizer.state[parameter]["exp_avg"][2:], torch.zeros_like(parameter[2:])), name
+
+
+def test_large_gaussians_are_replaced_by_two_smaller_ones():
+    grown, optimizer = densifier([LARGE, LARGE])
+    pull(grown, [1e-3, 0.0])
+    assert grown.adapt(EVERY, optimizer) == ("cloned 0, split 1, pruned 0 Gaussians",)
+    assert len(grown.splats) == 3
+    assert torch.equal(grown.splats.means[0], torch.ones(3)), "the one that was split is gone"
+    assert torch.allclose(grown.splats.log_scales[1:].exp(), torch.full((2, 3), LARGE / 1.6))
+    assert not torch.equal(grown.splats.means[1], grown.splats.means[2])
+
+
+def test_a_margin_on_the_extent_clones_what_would_be_split():
+    for margin, expected in ((0.0, "cloned 0, split 1"), (100.0, "cloned 1, split 0")):
+        grown, optimizer = densifier([LARGE, LARGE], extent_margin=margin)
+        pull(grown, [1e-3, 0.0])
+        assert grown.adapt(EVERY, optimizer)[0].startswith(expected)
+
+
+def test_the_threshold_may_rise_towards_the_poles():
+    """At 60 degrees half way up: with 2e-4 at the horizon and 6e-4 at the poles a pull of 4e-4 is just enough there."""
+    for latitude, multiplies in ((0.0, True), (59.0, True), (61.0, False), (90.0, False)):
+        grown, optimizer = densifier([SMALL], polar_threshold=6e-4)
+        cos = torch.tensor([math.cos(math.radians(latitude))])
+        for _ in range(3):
+            grown.observe(torch.tensor([[4e-4, 0.0]]), torch.tensor([True]), 1, cos)
+        grown.observe(torch.tensor([[1.0, 0.0]]), torch.tensor([False]), 1, torch.tensor([1.0]))  # not seen: no vote
+        assert grown.adapt(EVERY, optimizer)[0].startswith(f"cloned {int(multiplies)}")
+
+
+def test_the_latitude_is_that_in_the_view():
+    scene = tiny_scene()
+    splats = Splats(torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[-1.0] * 3]), torch.ones(1, 3))
+    above = torch.eye(4)
+    above[:3, 3] = torch.tensor([0.0, 2.0, 0.0])  # the camera is 2 above the origin (y is down): it looks down by 45
+    trained = SplatTrainee(splats, CloneSplitOptions(polar_threshold=1e-3), RenderConfig(), extent=1.0, iterations=9)
+    drawing = trained.draw(scene.train[0].at(above))
+    drawing.rendering.image.sum().backward()
+    trained.observe(drawing, 1)
+    assert trained.densifier.statistics["polar"].item() == pytest.approx(1 - math.sqrt(0.5), rel=1e-5)
+
+
+def test_pruning_by_extent_may_begin_later():
+    grown, optimizer = densifier([LARGE, SMALL], prune_by_extent=True, prune_by_extent_from=EVERY)
+    assert grown.adapt(EVERY, optimizer) == ("cloned 0, split 0, pruned 0 Gaussians",)
+    assert grown.adapt(2 * EVERY, optimizer) == ("cloned 0, split 0, pruned 1 Gaussians",)
+
+
+def test_pieces_are_samples_of_the_gaussian_they_replace():
+    count = 4000
+    grown, optimizer = densifier([LARGE] * count, max_gaussians=None)
+    scales = torch.tensor([0.5, 0.2, 0.05])
+    splats = grown.splats
+    splats.means.data.zero_()
+    splats.log_scales.data = scales.log().repeat(count, 1)
+    quat = torch.tensor([0.8, 0.3, -0.4, 0.2])
+    splats.quats.data = quat.repeat(count, 1)
+    pull(grown, [1.0] * count)
+    grown.adapt(EVERY, optimizer)
+    spread = rotation_matrices(quat) @ torch.diag(scales)
+    covariance = splats.means.T @ splats.means / len(splats)
+    assert len(splats) == 2 * count
+    assert torch.allclose(covariance, spread @ spread.T, atol=0.05 * scales[0].item() ** 2)
+
+
+def test_threshold_is_on_the_mean_over_views_that_saw_it():
+    grown, optimizer = densifier([SMALL, SMALL, SMALL], gradient_threshold=2e-4)
+    visible = torch.tensor([[True, True, True], [True, False, True]])
+    for view, size in zip(visible, (3e-4, 0.9e-4), strict=True):
+        gradient = torch.full((3, 2), size / math.sqrt(2))
+        gradient[2] *= 1.1
+        grown.observe(gradient, view, iteration=1)
+    grown.adapt(EVERY, optimizer)  # means: 1.95e-4, 3e-4, 2.145e-4
+    assert grown.splats.means[3:, 0].tolist() == [1.0, 2.0]
+
+
+def test_statistics_start_again_after_each_round():
+    grown, optimizer = densifier([SMALL, SMALL])
+    pull(grown, [1e-3, 1e-3])
+    grown.adapt(EVERY, optimizer)
+    assert grown.adapt(2 * EVERY, optimizer) == ("cloned 0, split 0, pruned 0 Gaussians",)
+    assert len(grown.splats) == 4
+
+
+def test_faint_gaussians_are_pruned():
+    grown, optimizer = densifier([SMALL, SMALL, SMALL])
+    grown.splats.opacity_logits.data = torch.logit(torch.tensor([0.0049, 0.0051, 0.9]))
+    assert grown.adapt(EVERY, optimizer) == ("cloned 0, split 0, pruned 1 Gaussians",)
+    assert grown.splats.means[:, 0].tolist() == [1.0, 2.0]
+
+
+@pytest.mark.parametrize("prune, left", [(False, 2), (True, 1)])
+def test_large_gaussians_are_pruned_only_on_request(prune, left):
+    grown, optimizer = densifier([LARGE, SMALL], prune_by_extent=prune)
+    grown.adapt(EVERY, optimizer)
+    assert len(grown.splats) == left
+
+
+@pytest.mark.parametrize("scale", [SMALL, LARGE])
+def test_the_cap_holds_and_the_hardest_pulled_come_first(scale):
+    grown, optimizer = densifier([scale] * 5, max_gaussians=7)
+    pull(grown, [1e-3, 5e-3, 2e-3, 4e-3, 3e-3])
+    assert grown.adapt(EVERY, optimizer)[1:] == ("max_gaussians 7 left out 3 of 5 candidates",)
+    assert len(grown.splats) == 7
+    unchanged = {0.0, 2.0, 4.0}
+    assert unchanged <= set(grown.splats.means[:, 0].tolist())
+    if scale == SMALL:
+        assert grown.splats.means[5:, 0].tolist() == [1.0, 3.0]
+    pull(grown, [1.0] * 7)
+    grown.adapt(2 * EVERY, optimizer)
+    assert len(grown.splats) == 7
+
+
+def test_the_cap_leaves_out_what_is_below_its_own_threshold():
+    """The one at the pole is pulled hardest, but not hard enough there; the cap has room for one of the other two."""
+    grown, optimizer = densifier([SMALL] * 3, polar_threshold=1e-2, max_gaussians=4)
+    for _ in range(3):
+        gradient = torch.tensor([[5e-3, 0.0], [1e-3, 0.0], [2e-3, 0.0]])
+        grown.observe(gradient, torch.ones(3, dtype=torch.bool), 1, torch.tensor([0.0, 1.0, 1.0]))
+    assert grown.adapt(EVERY, optimizer)[0].startswith("cloned 1")
+    assert torch.equal(grown.splats.means[3], grown.splats.means[2])
+
+
+def test_opacity_reset_makes_all_nearly_transparent():
+    grown, optimizer = densifier([SMALL, SMALL], densify_from=10**6, reset_every=30)
+    grown.splats.opacity_logits.data = torch.logit(torch.tensor([0.007, 0.9]))
+    assert grown.adapt(29, optimizer) == ()
+    assert grown.adapt(30, optimizer) == ("reset opacities",)
+    assert torch.allclose(torch.sigmoid(grown.splats.opacity_logits), torch.tensor([0.007, 0.01]))
+    assert optimizer.state[grown.splats.opacity_logits]["exp_avg_sq"].abs().sum() == 0
+    assert optimizer.state[grown.splats.means]["exp_avg_sq"].abs().sum() > 0
+
+
+@pytest.mark.parametrize("signal", ["space", "space_absolute"])
+def test_towards_a_target_those_that_are_pulled_hardest_multiply_in_equal_steps(signal):
+    count, target = 20, 50
+    grown, optimizer = densifier([SMALL] * count, densify_until=3 * EVERY + 1, signal=signal, gradient_threshold=1.0)
+    grown = CloneSplit(grown.splats, grown.options, extent=1.0, target=target)
+    found = []
+    for turn in range(1, 4):
+        now = len(grown.splats)
+        pulls = torch.arange(now, dtype=torch.float32)[:, None].repeat(1, 4)
+        if signal == "space_absolute":
+            pulls[:, 3] = -pulls[:, 3].flip(0)  # by these the first ones are pulled least, too, but none is 0
+            pulls[:, 3] += now
+        grown.observe(pulls if signal == "space_absolute" else pulls[:, :3], torch.ones(now, dtype=torch.bool), 1)
+        before = grown.splats.means.detach().clone()
+        assert grown.adapt(turn * EVERY, optimizer)[0].startswith("cloned 10,")
+        found.append(len(grown.splats))
+        assert torch.equal(grown.splats.means[now:].sort(0).values, before[-10:].sort(0).values)
+    assert found == [30, 40, 50]
+
+
+def test_clones_may_be_samples_of_their_gaussian():
+    """Means N(mean, Sigma), everything else as it was (GOF's way to clone)."""
+    count = 4000
+    grown, optimizer = densifier([SMALL] * count, max_gaussians=None, sample_clones=True)
+    splats, scales = grown.splats, torch.tensor([5e-3, 2e-3, 1e-3])
+    quat = torch.tensor([0.8, 0.3, -0.4, 0.2])
+    splats.log_scales.data, splats.quats.data = scales.log().repeat(count, 1), quat.repeat(count, 1)
+    pull(grown, [1.0] * count)
+    assert grown.adapt(EVERY, optimizer) == (f"cloned {count}, split 0, pruned 0 Gaussians",)
+    steps = splats.means[count:] - splats.means[:count]
+    spread = rotation_matrices(quat) @ torch.diag(scales)
+    assert torch.allclose(steps.T @ steps / count, spread @ spread.T, atol=0.1 * scales[0].item() ** 2)
+    assert torch.equal(splats.log_scales[count:], splats.log_scales[:count])
+
+
+def test_as_many_multiply_for_their_absolute_pull_as_pass_the_threshold():
+    """GOF: above the quantile 1 - r, with r the share of those above the threshold."""
+    grown, optimizer = densifier([SMALL] * 6, signal="space_absolute", gradient_threshold=1e-4)
+    pulls = torch.tensor([2e-4, 3e-4, 0.0, 5e-5, 0.0, 0.0])
+    absolute = torch.tensor([1e-3, 0.0, 9e-3, 2e-3, 8e-3, 9.0])
+    visible = torch.tensor([True, True, True, True, True, False])
+    grown.observe(torch.cat((pulls[:, None] * torch.tensor([0.6, 0.0, 0.8]), absolute[:, None]), dim=-1), visible, 1)
+    quantile = torch.quantile(torch.where(visible, absolute, 0.0), 1 - 2 / 6)
+    assert torch.equal(visible & (absolute >= quantile), torch.tensor([False, False, True, False, True, False]))
+    assert grown.adapt(EVERY, optimizer) == ("cloned 4, split 0, pruned 0 Gaussians",)
+    assert grown.splats.means[6:, 0].tolist() == [0.0, 1.0, 2.0, 4.0]
+    assert not grown.statistics["absolute"].any() and len(grown.statistics["absolute"]) == 10
+
+
+def test_opacities_decay_in_every_round_once_the_faintest_are_gone():
+    grown, optimizer = densifier([SMALL] * 4, opacity_decay=0.001)
+    opacities = torch.tensor([0.0045, 0.0055, 0.5, 0.0005])
+    grown.splats.opacity_logits.data = torch.logit(opacities)
+    assert grown.adapt(EVERY, optimizer) == ("cloned 0, split 0, pruned 2 Gaussians",)
+    assert torch.allclose(torch.sigmoid(grown.splats.opacity_logits), opacities[1:3] - 0.001, rtol=1e-4)
+    moments = {name: optimizer.state[parameter]["exp_avg_sq"] for name, parameter in grown.splats.rows().items()}
+    assert [name for name, moment in moments.items() if not moment.any()] == ["opacity_logits"]
+
+
+def test_the_opacity_after_a_reset_is_an_option():
+    grown, optimizer = densifier([SMALL, SMALL], densify_from=10**6, reset_every=30, reset_opacity=0.1)
+    grown.splats.opacity_logits.data = torch.logit(torch.tensor([0.05, 0.9]))
+    grown.adapt(30, optimizer)
+    assert torch.allclose(torch.sigmoid(grown.splats.opacity_logits), torch.tensor([0.05, 0.1]))
+
+
+@pytest.mark.parametrize("kind", ["solid", "angular"])
+def test_a_reset_limits_the_opacity_that_the_nearest_camera_draws(kind, generator):
+    """SPaGS: min(o c, 0.1) / c, with c^2 = prod s^2 / (s^2 + 0.2 (r / f)^2); without the 3D filter c is 1."""
+    count, width = 40, 64
+    means, centers = torch.randn(count, 3, generator=generator), torch.randn(3, 3, generator=generator)
+    scales = 0.1 * torch.rand(count, 3, generator=generator) + 0.02
+    splats = Splats(means, scales.log(), torch.rand(count, 3, generator=generator))
+    before = torch.rand(count, generator=generator)
+    splats.opacity_logits.data = torch.logit(before)
+    views = [View("v", torch.eye(4), width, width // 2) for _ in centers]
+    for view, center in zip(views, centers, strict=True):
+        view.cam_from_world[:3, 3] = -center
+    options = CloneSplitOptions(densify_from=10**6, reset_every=3000, reset_opacity=0.1)
+    render = RenderConfig(projection="ray", low_pass=0.2, low_pass_kind=kind)
+    trained = SplatTrainee(splats, options, render, extent=1.0, iterations=30_000, views=views)
+    trained.adapt(3000, torch.optim.Adam(splats.parameters()))
+
+    nearest = torch.cdist(means, centers).amin(-1)[:, None]
+    squares = scales**2
+    c = (squares / (squares + 0.2 * (nearest * 2 * math.pi / width) ** 2)).prod(-1).sqrt()
+    c = c if kind == "solid" else torch.ones(count)
+    after = torch.sigmoid(splats.opacity_logits)
+    assert torch.allclose(after, (before * c).clamp(max=0.1) / c, rtol=1e-4)
+    assert (after < before - 1e-3).sum() > 5 and (kind == "angular" or (after > 0.2).sum() > 5)
+
+
+def test_released_reset_keeps_the_opacities_and_clears_their_moments():
+    grown, optimizer = densifier([SMALL], densify_from=10**6, reset_every=30, released_reset=True)
+    grown.splats.opacity_logits.data = torch.logit(torch.tensor([0.9]))
+    grown.adapt(30, optimizer)
+    assert torch.sigmoid(grown.splats.opacity_logits).item() == pytest.approx(0.9)
+    assert optimizer.state[grown.splats.opacity_logits]["exp_avg_sq"].abs().sum() == 0
+
+
+@pytest.mark.parametrize("released, first", [(False, 600), (True, 100)])
+def test_first_round(released, first):
+    grown, optimizer = densifier([SMALL], densify_from=500, densify_every=100, released_start=released)
+    rounds = [i for i in range(1, 700) if grown.adapt(i, optimizer)]
+    assert rounds[0] == first
+
+
+def test_nothing_happens_from_densify_until():
+    grown, optimizer = densifier([SMALL], densify_until=40, reset_every=20)
+    assert [i for i in range(1, 200) if grown.adapt(i, optimizer)] == [10, 20, 30]
+
+
+def test_windows_follow_the_run_length():
+    published = CloneSplitOptions()
+    assert published.for_run(30_000) == published
+    short = published.for_run(3_000)
+    assert (short.densify_from, short.densify_until) == (50, 1500)
+    assert (short.densify_every, short.reset_every) == (50, 500), "intervals have a floor"
+    long = published.for_run(60_000)
+    assert (long.densify_until, long.densify_every, long.reset_every) == (30_000, 200, 6000)
+
+
+def test_options_without_a_meaning_are_refused():
+    with pytest.raises(ValueError, match="densify_every is 0"):
+        CloneSplitOptions(densify_every=0)
+    with pytest.raises(ValueError, match="reset_opacity is 0.0; it must be an opacity"):
+        CloneSplitOptions(reset_opacity=0.0)
+    with pytest.raises(ValueError, match="opacity_decay is 1.5; it must be an opacity"):
+        CloneSplitOptions(opacity_decay=1.5)
+    with pytest.raises(ValueError, match="max_gaussians is 0"):
+        CloneSplitOptions(max_gaussians=0)
+    assert pytest.approx(1.6) == SHRINK

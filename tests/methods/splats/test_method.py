@@ -1,0 +1,34 @@
+"""Budgets of Gaussians, for all methods that have some."""
+
+import pytest
+from tiny_scene import tiny_scene
+
+from padgs.baselines import METHODS
+from padgs.multirun.composition import make_method
+from padgs.registry import lookup
+from padgs.training.budget import Budget
+
+
+@pytest.mark.parametrize("name", ["omnigs", "spags", "cubemap_3dgs"])
+def test_what_nobody_would_see_goes_once_when_growth_is_over(name):
+    method = lookup(METHODS, name, "method")()
+    counts, events = [], []
+    for record in method.fit(tiny_scene(), Budget(120, gaussians="auto")):
+        counts.append(record.counts["gaussians"])
+        events += [(record.iteration, event) for event in record.events if "would miss most" in event]
+    ((iteration, event),) = events
+    assert iteration == method.trainee.densifier.options.densify_until + 49
+    assert event.startswith(f"kept {counts[iteration - 1]} of {counts[iteration - 2]} Gaussians")
+    assert counts[iteration - 1] < counts[iteration - 2]
+
+
+def test_cameras_that_learn_along_say_nothing_of_what_would_be_seen():
+    with pytest.raises(ValueError, match="budget.gaussians is auto.*set it to a number or null"):
+        lookup(METHODS, "sc_omnigs", "method")().refuse_budget(Budget(120, gaussians="auto"))
+
+
+def test_exposures_that_learn_along_do_not_matter_to_what_would_be_seen():
+    method = make_method("omnigs", "train.exposures=learned")
+    method.refuse_budget(Budget(120, gaussians="auto"))
+    with pytest.raises(ValueError, match="budget.stop is auto"):
+        method.refuse_budget(Budget(120, stop="auto"))

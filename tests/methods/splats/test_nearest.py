@@ -1,0 +1,87 @@
+"""No picture is finer than the photographs."""
+
+import pytest
+import torch
+from tiny_scene import tiny_scene
+
+from padgs.geometry.camera import perspective
+from padgs.methods.plus.method import PlusMethod
+from padgs.methods.plus.options import PlusOptions
+from padgs.methods.splats.nearest import RESOLVED, cameras_of, finest_pixels, no_finer
+from padgs.render import render
+from padgs.render.low_pass import LowPass, widened
+from padgs.scene import View
+from padgs.training.budget import Budget
+
+
+@pytest.fixture(scope="module")
+def trained():
+    method = PlusMethod(PlusOptions(start_share=None))
+    list(method.fit(tiny_scene(), Budget(20)))
+    return method
+
+
+def close_up(view: View) -> View:
+    return View("close", view.cam_from_world, 96, 96, lens=perspective(96, 96, 90))
+
+
+def test_the_finest_pixel_is_that_of_the_nearest_camera_or_of_the_sharpest():
+    cameras = torch.tensor([[0.0, 0, 0, 10], [4.0, 0, 0, 10], [0.0, 0, 0, 20]], dtype=torch.float64)
+    found = finest_pixels(torch.tensor([[1.0, 0, 0], [3.9, 0, 0], [0, 8.0, 0]]), cameras)
+    assert found.tolist() == pytest.approx([1 / 20, 0.1 / 10, 8 / 20])
+    assert not finest_pixels(torch.ones(2, 3), cameras[:0]).any()
+
+
+def test_the_filter_of_a_view_on_top_makes_that_of_the_larger_pixel(trained):
+    view, variance = tiny_scene().train[0], 0.1
+    gaussians = trained.trainee.splats.gaussians(view)
+    distances = (gaussians.means - view.center.float()).norm(dim=-1)
+    own = distances / view.camera.focal
+    pixels = own * torch.linspace(0.5, 3, len(own))
+    seen = widened(
+        no_finer(gaussians, view, pixels, variance),
+        gaussians.means - view.center.float(),
+        LowPass(0.0, variance / view.camera.focal**2, compensate=True),
+    )
+    wide = torch.sqrt(gaussians.scales**2 + variance * torch.maximum(own, RESOLVED * pixels)[:, None] ** 2)
+    torch.testing.assert_close(seen.scales, wide)
+    torch.testing.assert_close(seen.opacities, gaussians.opacities * (gaussians.scales / wide).prod(-1))
+
+
+def test_training_views_are_drawn_as_they_were_trained_and_closer_ones_wider(trained):
+    trainee, scene = trained.trainee, tiny_scene()
+
+    def plainly(view: View):
+        return render(trainee.splats.gaussians(view), view, trainee.render_options(view)).image
+
+    for view in scene.train:
+        torch.testing.assert_close(trainee.render(view).image, plainly(view), atol=1e-5, rtol=0)
+    near = close_up(scene.train[0])
+    difference = (trainee.render(near).image - plainly(near)).abs().max()
+    assert difference > 0.01
+    pixels = finest_pixels(trainee.splats.means, cameras_of(scene.train))
+    wider = no_finer(trainee.splats.gaussians(near), near, pixels, trained.render_config.low_pass)
+    drawn = render(wider, near, trainee.render_options(near)).image
+    assert torch.equal(trainee.render(near).image, drawn)
+
+
+def test_a_loaded_model_knows_its_cameras_and_forgets_pixels_with_the_gaussians_that_it_loses(trained):
+    view = close_up(tiny_scene().train[1])
+    loaded = PlusMethod(PlusOptions(start_share=None))
+    loaded.load_state(trained.state())
+    assert torch.equal(loaded.render(view).image, trained.render(view).image)
+    kept = torch.arange(len(loaded.trainee.splats)) % 2 == 0
+    loaded.trainee.keep(kept)
+    pixels = finest_pixels(loaded.trainee.splats.means, cameras_of(tiny_scene().train))
+    wider = no_finer(loaded.trainee.splats.gaussians(view), view, pixels, loaded.render_config.low_pass)
+    drawn = render(wider, view, loaded.trainee.render_options(view)).image
+    assert torch.equal(loaded.render(view).image, drawn)
+
+
+def test_a_model_in_another_order_is_drawn_the_same(trained):
+    view, trainee = close_up(tiny_scene().train[0]), trained.trainee
+    before, stored = trainee.render(view).image, trainee.splats.state_dict()
+    rows = {name: tensor.flip(0) if name in trainee.splats.rows() else tensor for name, tensor in stored.items()}
+    trainee.splats.load(rows)
+    torch.testing.assert_close(trainee.render(view).image, before, atol=1e-5, rtol=0)
+    trainee.splats.load(stored)

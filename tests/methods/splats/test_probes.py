@@ -1,0 +1,159 @@
+"""Densification signals against their formulas."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from padgs.gaussians import rotation_matrices
+from padgs.geometry.panorama import direction
+from padgs.methods.splats.clone_split import CloneSplitOptions
+from padgs.methods.splats.method import SplatMethod, SplatOptions
+from padgs.methods.splats.model import Splats
+from padgs.methods.splats.probes import render_probed
+from padgs.methods.splats.trainee import SplatTrainee
+from padgs.render import RenderOptions, render
+from padgs.render.config import RenderConfig
+from padgs.scene import View
+
+RAY = RenderOptions(projection="ray")
+
+
+def colored_splats(count: int, generator: torch.Generator) -> Splats:
+    """Gaussians all around, float64, whose colours depend on the direction they are seen from."""
+    means = 2 * torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    log_scales = torch.log(0.05 + 0.3 * torch.rand(count, 3, generator=generator, dtype=torch.float64))
+    splats = Splats(means, log_scales, torch.rand(count, 3, generator=generator, dtype=torch.float64))
+    splats.sh_rest.data.normal_(0, 0.1, generator=generator)
+    splats.active_degree = 3
+    return splats
+
+
+def view_at(generator: torch.Generator | None, width: int = 48) -> View:
+    """A panorama from somewhere, turned; without a generator from the origin."""
+    pose = torch.eye(4, dtype=torch.float64)
+    if generator is not None:
+        pose[:3, :3] = rotation_matrices(torch.randn(4, generator=generator, dtype=torch.float64))
+        pose[:3, 3] = 0.3 * torch.randn(3, generator=generator, dtype=torch.float64)
+    return View("v", pose, width, width // 2)
+
+
+@pytest.mark.parametrize("projection", ["erp", "tangent", "ray"])
+def test_the_signal_in_space_is_half_the_distance_times_the_gradient_of_the_mean(projection, generator):
+    """By autograd, in float64, with a pose that is turned and shifted: 0.5 |mean - centre| |dL/dmean|.
+
+    The direction of the mean, which its colour depends on, counts.
+    """
+    splats, view = colored_splats(30, generator), view_at(generator)
+    options, weight = RenderOptions(projection=projection), torch.rand(24, 48, 3, generator=generator).double()
+    rendering, _, probe = render_probed(splats, view, options, signal="space", backend="torch")
+    (weight * rendering.image).sum().backward()
+
+    gaussians = splats.gaussians(view)
+    plain = render(gaussians, view, options)
+    painted = render(replace(gaussians, colors=gaussians.colors.detach()), view, options)
+    whole, footprint = (
+        torch.autograd.grad((weight * drawn.image).sum(), splats.means, retain_graph=True)[0]
+        for drawn in (plain, painted)
+    )
+    assert (whole - footprint).norm() > 0.1 * whole.norm(), "colours matter here"
+    in_camera = view.cam_from_world[:3, :3] @ splats.means.detach().T + view.cam_from_world[:3, 3:]
+    expected = 0.5 * in_camera.norm(dim=0) * whole.norm(dim=-1)
+    assert probe.grad is not None
+    assert torch.equal(rendering.image, plain.image), "a probe of zeros moves nothing"
+    assert (expected > 0).sum() > 20
+    assert torch.allclose(probe.grad.norm(dim=-1), expected, rtol=1e-9, atol=1e-14)
+
+
+def test_a_small_gaussian_is_pulled_alike_wherever_it_is(generator):
+    """r |dL/dmean| is per radian: neither turning the world nor multiplying its lengths changes the signal."""
+    signals = []
+    for scale, axis in ((1.0, 2), (1.0, 0), (3.0, 2)):
+        splats = colored_splats(1, generator)
+        splats.means.data = torch.zeros(1, 3).double()
+        splats.means.data[0, axis] = 2 * scale
+        splats.log_scales.data[:] = torch.tensor(0.2 * scale).double().log()
+        splats.sh_dc.data[:] = 1.0
+        splats.active_degree = 0
+        view = view_at(None, width=256)
+        rendering, _, probe = render_probed(splats, view, RAY, signal="space", backend="torch")
+        rays = view.camera.rays(dtype=torch.float64)
+        aside = (splats.means.detach()[0].roll(1) / (2 * scale) * rays).sum(-1)  # odd about the ball's centre
+        (rendering.image.sum(-1) * aside * (1 - rays[..., 1] ** 2).sqrt()).sum().backward()
+        signals.append(probe.grad.norm().item())
+    assert signals[1] == pytest.approx(signals[0], rel=2e-3)
+    assert signals[2] == pytest.approx(signals[0], rel=1e-6)
+
+
+@pytest.mark.parametrize("latitude", [15.0, 45.0, 70.0])
+@pytest.mark.parametrize("projection", ["tangent", "ray"])
+def test_the_signal_in_the_image_has_one_unit_in_every_projection(projection, latitude, generator):
+    """So one threshold of growth means the same: medians over many small Gaussians agree to some percent."""
+    count, width = 60, 256
+    longitude = math.pi * (2 * torch.rand(count, generator=generator, dtype=torch.float64) - 1)
+    means = 2 * direction(longitude, torch.full_like(longitude, math.radians(latitude)))
+    sizes = 2 * 2 * math.pi / width * (0.6 + 0.8 * torch.rand(count, 3, generator=generator, dtype=torch.float64))
+    quats = torch.randn(count, 4, generator=generator, dtype=torch.float64)
+    splats = Splats(means, sizes.log(), torch.rand(count, 3, generator=generator).double())
+    splats.quats.data, splats.opacity_logits.data = quats, torch.zeros_like(longitude)
+    blobs = torch.rand(1, 3, 8, 16, generator=generator, dtype=torch.float64)
+    target = torch.nn.functional.interpolate(blobs, (width // 2, width), mode="bicubic")[0].permute(1, 2, 0)
+    signals = {}
+    for name, kind in (("erp", "pixels"), (projection, "angular")):
+        options = RenderOptions(projection=name, low_pass_kind=kind)
+        rendering, _, probe = render_probed(splats, view_at(None, width), options, signal="image", backend="torch")
+        ((rendering.image - target) ** 2).mean().backward()
+        assert probe.grad is not None
+        signals[name] = probe.grad.norm(dim=-1)
+    assert (signals[projection] / signals["erp"]).median().item() == pytest.approx(1, abs=0.15)
+
+
+def test_the_absolute_signal_is_half_the_distance_times_the_pulls_of_all_pixels(generator):
+    """Beside the signal in space, which is what it is without them."""
+    splats, view = colored_splats(30, generator), view_at(generator)
+    gaussians, weight = splats.gaussians(view), torch.randn(24, 48, 3, generator=generator).double()
+    probes = []
+    for signal in ("space", "space_absolute"):
+        rendering, _, probe = render_probed(splats, view, RAY, signal=signal, backend="torch")
+        (weight * rendering.image).sum().backward()
+        probes.append(probe.grad)
+    assert torch.equal(probes[0], probes[1][:, :3])
+
+    pulls = torch.zeros(30, dtype=torch.float64, requires_grad=True)
+    (weight * render(gaussians, view, RAY, absolute_probe=pulls).image).sum().backward()
+    distance = (gaussians.means.detach() @ view.cam_from_world[:3, :3].T + view.cam_from_world[:3, 3]).norm(dim=-1)
+    assert pulls.grad is not None and (pulls.grad > 0).sum() > 20
+    assert torch.allclose(probes[1][:, 3], 0.5 * distance * pulls.grad, rtol=1e-9, atol=1e-14)
+
+
+@pytest.mark.parametrize(("signal", "axes"), [("image", 2), ("space", 3), ("space_absolute", 4)])
+def test_the_densifier_is_given_the_signal_of_its_options(signal, axes, generator):
+    splats, render_config = colored_splats(10, generator), RenderConfig(backend="torch", projection="ray")
+    trainee = SplatTrainee(splats, CloneSplitOptions(signal=signal), render_config, extent=1.0, iterations=100)
+    drawing = trainee.draw(view_at(generator))
+    drawing.rendering.image.sum().backward()
+    assert drawing.probe.grad is not None and drawing.probe.grad.shape == (10, axes)
+    trainee.observe(drawing, 1)
+    norms = torch.where(drawing.rendering.visible, drawing.probe.grad[:, :3].norm(dim=-1), 0.0)
+    assert torch.equal(trainee.densifier.statistics["gradient"], norms)
+    assert norms.sum() > 0
+    if axes == 4:
+        assert torch.equal(trainee.densifier.statistics["absolute"], drawing.probe.grad[:, 3])
+
+
+def test_the_absolute_signal_wants_the_projection_that_has_it():
+    with pytest.raises(
+        ValueError, match=r"space_absolute is made for render\.projection=ray, not erp; set .*signal=space"
+    ):
+        SplatMethod(SplatOptions(signal="space_absolute"), RenderConfig())
+
+
+def test_unknown_signals_are_named(generator):
+    with pytest.raises(ValueError, match="unknown signal 'pixels'; known: image, space, space_absolute"):
+        CloneSplitOptions(signal="pixels")
+    view = view_at(generator)
+    with pytest.raises(ValueError, match="unknown signal 'pixels'; known: image, space, space_absolute"):
+        render_probed(colored_splats(1, generator), view, RAY, signal="pixels")

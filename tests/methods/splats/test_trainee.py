@@ -1,0 +1,140 @@
+"""The published schedule of explicit Gaussians, number by number, and what it measures lengths with."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from composed import composed
+from tiny_scene import tiny_scene
+
+from padgs.methods.splats.clone_split import CloneSplitOptions
+from padgs.methods.splats.method import SplatMethod
+from padgs.methods.splats.model import Splats
+from padgs.methods.splats.trainee import SplatTrainee
+from padgs.render.config import RenderConfig
+from padgs.runs.session import build
+from padgs.scene import Scene
+from padgs.training.budget import Budget
+from padgs.training.extent import ExtentOptions
+from padgs.training.schedule import PUBLISHED_ITERATIONS
+
+EXTENT = 7.0
+# group -> learning rates of 3DGS at the start and at the end; that of the means is for an extent of 1
+RATES = {
+    "means": (1.6e-4, 1.6e-6),
+    "quats": (1e-3, 1e-3),
+    "log_scales": (5e-3, 5e-3),
+    "opacity_logits": (5e-2, 5e-2),
+    "sh_dc": (2.5e-3, 2.5e-3),
+    "sh_rest": (1.25e-4, 1.25e-4),
+}
+LENGTHS = {"means": EXTENT}  # what a rate is multiplied by
+
+
+def trainable(iterations: int = PUBLISHED_ITERATIONS) -> SplatTrainee:
+    splats = Splats.from_scene(tiny_scene(), generator=torch.Generator())
+    return SplatTrainee(splats, CloneSplitOptions(), RenderConfig(), extent=EXTENT, iterations=iterations)
+
+
+def travelling(scene: Scene, times: float) -> Scene:
+    """All cameras so many times as far apart; the points stay."""
+    train = []
+    for view in scene.train:
+        pose = view.cam_from_world.clone()
+        pose[:3, 3] *= times
+        train.append(replace(view, cam_from_world=pose))
+    return replace(scene, train=tuple(train))
+
+
+def in_one_place(scene: Scene, rounding: float) -> Scene:
+    """All cameras at the first one's place, up to `rounding` world units."""
+    train = []
+    for number, view in enumerate(scene.train):
+        pose = scene.train[0].cam_from_world.clone()
+        pose[0, 3] += rounding * number
+        train.append(replace(view, cam_from_world=pose))
+    return replace(scene, train=tuple(train))
+
+
+@pytest.mark.parametrize("iterations", [PUBLISHED_ITERATIONS, 600])
+def test_published_learning_rates(iterations):
+    model = trainable(iterations)
+    groups = {group.name: group for group in model.groups()}
+    assert groups.keys() == RATES.keys()
+    for name, (first, last) in RATES.items():
+        times, rate = LENGTHS.get(name, 1.0), groups[name].learning_rate
+        assert rate(0) == pytest.approx(times * first), name
+        assert rate(iterations // 2) == pytest.approx(times * (first * last) ** 0.5), name
+        assert rate(iterations) == pytest.approx(times * last), name
+    for name, parameter in model.splats.named_parameters():
+        (held,) = groups[name].parameters
+        assert held is parameter, name
+
+
+def test_adam_is_that_of_3dgs():
+    method = SplatMethod(render=RenderConfig(backend="torch"))
+    next(method.fit(tiny_scene(), Budget(10)))
+    for settings in method._trainer._optimiser.adam.param_groups:
+        assert (settings["betas"], settings["eps"], settings["weight_decay"]) == ((0.9, 0.999), 1e-15, 0)
+
+
+@pytest.mark.parametrize(("iterations", "every"), [(PUBLISHED_ITERATIONS, 1000), (3000, 100), (60, 2)])
+def test_a_degree_comes_into_use_every_thousand_published_iterations(iterations, every):
+    """Iteration -> degree that it is drawn with, where that is another one than before."""
+    model = trainable(iterations)
+    optimizer = torch.optim.Adam(model.splats.parameters())
+    rises, degree = {}, model.splats.active_degree
+    for iteration in range(1, 4 * every + 1):
+        if model.splats.active_degree > degree:
+            degree = rises[iteration] = model.splats.active_degree
+        model.adapt(iteration, optimizer)
+    assert rises == {every: 1, 2 * every: 2, 3 * every: 3}
+
+
+@pytest.mark.parametrize("apart", [2.0, 5.0])
+def test_lengths_are_measured_with_the_extent_of_cameras_that_move(apart):
+    scene = travelling(tiny_scene(), apart)
+    centers = torch.stack([view.center for view in scene.train])
+    extent = 1.1 * (centers - centers.mean(0)).norm(dim=-1).max().item()
+    assert 0.15 < extent / scene.unit < 0.9
+    assert scene.extent == ExtentOptions(0.1).extent_of(scene) == pytest.approx(extent)
+
+
+@pytest.mark.parametrize("apart", [0.0, 1e-8, 0.5])
+def test_lengths_are_measured_with_a_tenth_of_the_unit_where_cameras_hardly_move(apart):
+    scene = travelling(tiny_scene(), apart)
+    assert ExtentOptions(0.1).extent_of(scene) == pytest.approx(0.1 * scene.unit)
+
+
+@pytest.mark.parametrize("release", ["padgs_release", "omnigs_release", "odgs_release", "op43dgs_release"])
+def test_releases_measure_with_the_extent_of_their_cameras_however_little_they_move(release, monkeypatch, root):
+    """The rate of the means or offsets falls from a published share of it; in one place they could not learn."""
+    monkeypatch.setenv("PADGS_ROOT", str(root))
+    config, scene = composed(f"method={release}"), travelling(tiny_scene(), 0.1)
+    assert 0 < scene.extent < 0.05 * scene.unit
+    method = build(config)
+    method.fit(scene, Budget(1))
+    published = 0.01 if release == "padgs_release" else 1.6e-4
+    assert method.trainee.groups()[0].learning_rate(0) == pytest.approx(published * scene.extent, rel=1e-6)
+    with pytest.raises(ValueError, match=r"stand in one place, so their extent is 0 .* set method\.min_extent to a"):
+        build(config).fit(travelling(scene, 0.0), Budget(1))
+
+
+def test_the_least_that_counts_as_a_move():
+    """Around a millionth of the unit: below it is rounding, above it travel."""
+    scene = tiny_scene()
+    for times, still in ((0.3, True), (3.0, False)):
+        moved = in_one_place(scene, times * 1e-6 * scene.unit / 2.2)  # the extent of steps 0 to 4 is 2.2 of them
+        assert moved.stands_still == still
+
+
+@pytest.mark.parametrize(
+    "scene", [travelling(tiny_scene(), 3.0), travelling(tiny_scene(), 0.0)], ids=["moving", "still"]
+)
+def test_a_method_trains_means_at_the_rate_of_its_scene(scene):
+    method = SplatMethod(render=RenderConfig(backend="torch"))
+    next(method.fit(scene, Budget(10)))
+    means = next(group for group in method.trainee.groups() if group.name == "means")
+    extent = ExtentOptions(0.1).extent_of(scene)
+    assert means.learning_rate(0) == pytest.approx(1.6e-4 * extent)
+    assert method.trainee.densifier.extent == extent

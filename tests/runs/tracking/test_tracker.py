@@ -1,0 +1,187 @@
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from filelock import FileLock
+from typer.testing import CliRunner
+
+from padgs import results
+from padgs.cli.commands import app
+from padgs.extras import installing
+from padgs.results import Result, Scores
+from padgs.runs.tracking import tracker as tracking
+from padgs.runs.tracking.mlflow_mirror import batches
+from padgs.runs.tracking.tracker import Tracker, TrackingOptions
+
+NEEDS_MLFLOW = pytest.mark.filterwarnings("ignore")  # what it warns of is not ours
+
+
+def make_run(runs: Path, name: str = "room_padgs_1", *, status: str = "ok", iterations: int = 30) -> Path:
+    run = runs / name
+    (run / "renders").mkdir(parents=True)
+    (run / "renders" / "000.png").write_bytes(b"a picture")
+    (run / "config.yaml").write_text("method: {name: padgs, tau: 0.9}\nseed: 0\n")
+    log(run, range(10, iterations + 1, 10))
+    machine = {"cpu": "a processor", "cores": 2, "torch": "2.13.0", "gpu": None}
+    marks = {"paper": Scores({"lpips": "none"}, {"psnr": 20.0, "ssim": None}, {})} if status == "ok" else {}
+    result = Result(
+        run=name, status=status, method="padgs", preset="padgs", variant="", dataset="synthetic", scene="room",
+        width=64, height=32, iterations=30, iterations_done=30, seed=0, code_version="0", machine=machine,
+        config_hash="", fingerprint="", finished="", scores=marks, counts={"anchors": 5}, experiments=("tau",),
+    )  # fmt: skip
+    results.write(result, run)
+    return run
+
+
+def log(run: Path, iterations) -> None:
+    with (run / "log.jsonl").open("a") as file:
+        file.writelines(json.dumps({"iteration": n, "loss": 1 / n, "events": ["x"]}) + "\n" for n in iterations)
+
+
+@pytest.fixture
+def said():
+    return []
+
+
+def test_none_needs_nothing_and_writes_nothing(tmp_path, said, monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: pytest.fail("looked for mlflow"))
+    tracker = Tracker(TrackingOptions("none"), tmp_path, "tau", said.append)
+    tracker.update(make_run(tmp_path))
+    assert said == [] and [path.name for path in tmp_path.iterdir()] == ["room_padgs_1"]
+
+
+@pytest.mark.parametrize(
+    ("options", "lines"), [(TrackingOptions(), 0), (TrackingOptions("mlflow"), 1), (TrackingOptions(uri="http://a"), 1)]
+)
+def test_without_mlflow_one_line_says_so_to_who_asked_for_it(tmp_path, said, monkeypatch, options, lines):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    tracker = Tracker(options, tmp_path, "tau", said.append)
+    tracker.update(make_run(tmp_path))
+    tracker.finish([], 0)
+    assert not tracker.on and len(said) == lines
+    assert all(installing("mlflow") in line and "tracking=none" in line for line in said)
+
+
+def test_an_unknown_kind_is_refused():
+    with pytest.raises(ValueError, match="unknown kind 'wandb'; known: auto, mlflow, none"):
+        TrackingOptions("wandb")
+
+
+@NEEDS_MLFLOW
+def test_runs_stand_in_mlflow_with_settings_progress_marks_pictures_and_tables(tmp_path, said, monkeypatch):
+    mlflow = pytest.importorskip("mlflow")
+    runs = tmp_path / "runs"
+    good, bad = make_run(runs), make_run(runs, "room_padgs_2", status="nan")
+    monkeypatch.chdir(tmp_path)  # what mlflow writes where it stands would be found here
+    found, _ = results.read_all(runs)
+    for _ in range(2):  # the second time as after a restart: everything is found again
+        tracker = Tracker(TrackingOptions(), Path("runs"), "tau", said.append, multirun="tau 1234")
+        tracker.update(good)
+        tracker.update(bad)
+        tracker.finish([*found.values()], 2)
+        log(good, [40])
+    client = mlflow.MlflowClient(f"sqlite:///{runs / 'mlflow.db'}")
+    experiment = client.get_experiment_by_name("tau")
+    stored = {run.info.run_name: run for run in client.search_runs([experiment.experiment_id])}
+    assert said == [] and sorted(stored) == ["room_padgs_1", "room_padgs_2", "tau 1234"]
+    run, parent = stored["room_padgs_1"], stored["tau 1234"]
+    assert run.data.params == {"method.name": "padgs", "method.tau": "0.9", "seed": "0"}
+    assert run.data.metrics["paper/psnr"] == 20 and "paper/ssim" not in run.data.metrics
+    assert run.data.tags["mlflow.parentRunId"] == parent.info.run_id
+    assert (run.info.status, stored["room_padgs_2"].info.status, parent.info.status) == ("FINISHED", "FAILED", "FAILED")
+    history = client.get_metric_history(run.info.run_id, "train/loss")
+    assert sorted(point.step for point in history) == [10, 20, 30, 40]
+    artifacts = {
+        item.path for folder in ("", "renders", "tables") for item in client.list_artifacts(run.info.run_id, folder)
+    }
+    assert {"result.json", "renders/000.png", "tables/runs.md", "tables/runs.csv"} <= artifacts
+    assert "20.00" in mlflow.artifacts.load_text(f"{parent.info.artifact_uri}/tables/runs.md")
+    assert [path.name for path in tmp_path.iterdir()] == ["runs"]
+
+
+@NEEDS_MLFLOW
+def test_a_run_that_is_started_again_begins_anew_and_a_broken_multirun_did_not_finish(tmp_path, said):
+    mlflow = pytest.importorskip("mlflow")
+    run = make_run(tmp_path, status="nan")
+    tracker = Tracker(TrackingOptions(), tmp_path, "tau", said.append, multirun="tau 1234")
+    tracker.update(run)
+    (run / "result.json").unlink()
+    (run / "log.jsonl").unlink()
+    log(run, [10, 20])
+    tracker.update(run)
+    tracker.update(run)
+    tracker.finish([], 1)
+    client = mlflow.MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
+    stored = client.search_runs([client.get_experiment_by_name("tau").experiment_id], order_by=["start_time"])
+    assert [(stored.info.run_name, stored.info.status) for stored in stored] == [
+        ("tau 1234", "KILLED"), ("room_padgs_1", "FAILED"), ("room_padgs_1", "RUNNING")
+    ]  # fmt: skip
+    history = client.get_metric_history(stored[-1].info.run_id, "train/loss")
+    assert [point.step for point in history] == [10, 20] and said == []
+
+
+@NEEDS_MLFLOW
+def test_a_server_that_is_away_costs_a_line(tmp_path, said):
+    pytest.importorskip("mlflow")
+    tracker = Tracker(TrackingOptions(uri="http://127.0.0.1:9"), tmp_path, "tau", said.append)
+    run = make_run(tmp_path)
+    for _ in range(3):
+        tracker.update(run)
+    assert len(said) == 1 and "no longer mirrored into mlflow at http://127.0.0.1:9" in said[0]
+    assert results.read(run / "result.json").ok
+
+
+@NEEDS_MLFLOW
+def test_a_database_that_is_lost_costs_a_line(tmp_path, said):
+    pytest.importorskip("mlflow")
+    tracker = Tracker(TrackingOptions(), tmp_path, "tau", said.append)
+    run = make_run(tmp_path)
+    tracker.update(run)
+    (tmp_path / "mlflow.db").write_text("no database any more")
+    tracker.update(run)
+    tracker.update(run)
+    assert len(said) == 1 and "padgs track" in said[0]
+
+
+@NEEDS_MLFLOW
+def test_a_lock_that_is_never_free_costs_a_line(tmp_path, said, monkeypatch):
+    pytest.importorskip("mlflow")
+    monkeypatch.setattr(tracking, "PATIENCE", 0.1)
+    with FileLock(tmp_path / ".mlflow.lock"):
+        Tracker(TrackingOptions(), tmp_path, "tau", said.append).update(make_run(tmp_path))
+    assert len(said) == 1 and "Timeout" in said[0]
+
+
+def test_a_folder_of_a_run_is_mirrored_whatever_its_name(tmp_path, monkeypatch):
+    make_run(tmp_path).rename(tmp_path / "the best")
+    mirrored = []
+    fake = SimpleNamespace(name="tau", on=True, update=mirrored.append)
+    monkeypatch.setattr(tracking, "Tracker", lambda *_: fake)
+    done = CliRunner().invoke(app, ["track", str(tmp_path)])
+    assert done.exit_code == 0 and mirrored == [tmp_path / "the best"]
+    done = CliRunner().invoke(app, ["track", str(tmp_path / "rums")])
+    assert done.exit_code == 1 and f"there is no folder {tmp_path / 'rums'}" in done.output
+
+
+@pytest.mark.slow
+@NEEDS_MLFLOW
+def test_runs_of_a_cluster_are_mirrored_later(tmp_path, monkeypatch):
+    mlflow = pytest.importorskip("mlflow")
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    make_run(tmp_path)
+    make_run(tmp_path, "room_padgs_2")
+    (tmp_path / "cut").mkdir()
+    (tmp_path / "cut" / "result.json").write_text("{")
+    done = CliRunner().invoke(app, ["track", str(tmp_path), "--uri", f"sqlite:///{tmp_path}/other.db"])
+    assert done.exit_code == 0 and "mirrored: 2 runs, as tau" in done.output and "left out: " in done.output
+    client = mlflow.MlflowClient(f"sqlite:///{tmp_path}/other.db")
+    assert len(client.search_runs([client.get_experiment_by_name("tau").experiment_id])) == 2
+    assert list(Path.cwd().iterdir()) == []
+    away = CliRunner().invoke(app, ["track", str(tmp_path), "--uri", "http://127.0.0.1:9"])
+    assert away.exit_code == 1 and "no longer mirrored" in away.output
+
+
+def test_batches_hold_everything_once():
+    assert list(batches(range(5), 2)) == [range(0, 2), range(2, 4), range(4, 5)]

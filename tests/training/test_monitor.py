@@ -1,0 +1,204 @@
+import json
+
+import pytest
+import torch
+from tiny_scene import tiny_scene
+
+from padgs.gaussians import Gaussians
+from padgs.methods.splats.method import SplatMethod
+from padgs.render import Rendering
+from padgs.results import STATUSES
+from padgs.training.failure import Failure
+from padgs.training.loop import Budget
+from padgs.training.monitor import Monitor
+from padgs.training.options import TrainOptions
+from padgs.training.trainee import Drawing
+
+ITERATIONS = 1000
+
+
+def monitor() -> Monitor:
+    return Monitor(ITERATIONS, parts=1000, pixels=2000)
+
+
+def ends(see, expected: str) -> tuple[Failure, int]:
+    """What `see(iteration)` ends in, and when."""
+    for iteration in range(1, ITERATIONS + 1):
+        try:
+            see(iteration)
+        except Failure as failure:
+            assert failure.status == expected in STATUSES and "train.monitor=false" in str(failure)
+            return failure, iteration
+    raise AssertionError("nothing was seen")
+
+
+def losses(of):
+    watch = monitor()
+    return lambda iteration: watch.loss(of(iteration), iteration)
+
+
+def drawing(image: torch.Tensor, *, transmittance: float = 0.2, scale: float = 0.1, large: int = 0) -> Drawing:
+    means = torch.randn(200, 3, generator=torch.Generator().manual_seed(1))
+    scales = torch.full((200, 3), 0.1)
+    scales[:large] = scale
+    gaussians = Gaussians(means, torch.ones(200, 4), scales, torch.ones(200), torch.ones(200, 3))
+    flat = torch.full(image.shape[:2], transmittance)
+    return Drawing(Rendering(image, flat, flat, torch.ones(200, dtype=torch.bool)), means, gaussians, torch.arange(200))
+
+
+def test_a_loss_that_rises_and_stays_has_diverged():
+    failure, when = ends(losses(lambda i: 0.1 if i < 400 else 0.3), "diverged")
+    assert 500 <= when <= 520
+    assert "the loss at iteration" in str(failure) and "the best, 0.1 " in str(failure)
+
+
+def test_losses_of_views_of_another_size_are_not_compared():
+    watch = monitor()
+    for iteration in range(1, 401):
+        watch.size(1 if iteration < 200 else 0, iteration)
+        watch.loss(0.1 if iteration < 200 else 0.3, iteration)
+    with pytest.raises(Failure, match="the best, 0.3 "):
+        for iteration in range(401, ITERATIONS):
+            watch.loss(0.6, iteration)
+
+
+@pytest.mark.parametrize(
+    "of",
+    [
+        lambda i: 0.3 * 0.995**i + 0.05,  # falls
+        lambda i: 0.05 + 0.2 * 0.9 ** (i % 100),  # opacities are reset every 100 iterations
+        lambda i: 0.05 + (0.0 if i < 500 else 0.2 * 0.995 ** (i - 500)),  # ... and come back slowly after one
+        lambda i: 0.1 + 0.08 * (i % 3),  # views differ
+        lambda i: 0.01 if i == 1 else 0.2,  # the first view is an easy one
+        lambda i: 0.1 if i < 800 or i > 860 else 0.3,  # recovers
+    ],
+)
+def test_a_loss_that_comes_back_has_not(of):
+    see = losses(of)
+    for iteration in range(1, ITERATIONS + 1):
+        see(iteration)
+
+
+def test_a_short_run_that_ends_while_its_loss_is_high_has_diverged():
+    watch = Monitor(60, parts=1000, pixels=2000)
+    for iteration in range(1, 60):
+        watch.loss(0.2 if iteration < 20 else 0.6, iteration)
+    with pytest.raises(Failure, match="the loss at iteration 60 is .* since iteration 2"):
+        watch.loss(0.6, 60)
+    calm = Monitor(60, parts=1000, pixels=2000)
+    for iteration in range(1, 61):
+        calm.loss(0.2 if iteration != 58 else 0.9, iteration)
+
+
+def test_losses_may_be_seen_now_and_then():
+    rarely, always = monitor(), monitor()
+    for iteration in range(1, 401):
+        always.loss(0.2, iteration)
+        if iteration % 50 == 0:
+            rarely.loss(0.2, iteration)
+    assert rarely.state["sum"] == pytest.approx(always.state["sum"])
+    assert rarely.state["seen"] == always.state["seen"] == 400
+
+
+def test_too_many_parts_have_exploded_at_once_and_too_few_have_collapsed_after_a_while():
+    watch = monitor()
+    watch.counts({"gaussians": 20_000}, 1)
+    with pytest.raises(Failure, match="20001 gaussians at iteration 2, more than 10 times the 2000") as caught:
+        watch.counts({"gaussians": 20_001}, 2)
+    assert caught.value.status == "exploded"
+    failure, when = ends(lambda i: watch.counts({"gaussians": 9}, i), "collapsed")
+    assert when == 101 and "9 of 1000 gaussians are left" in str(failure)
+
+
+def test_pictures_of_nothing_have_collapsed():
+    photograph = torch.rand(4, 8, 3, generator=torch.Generator().manual_seed(1))
+    for made, said in (
+        (drawing(photograph, transmittance=0.99), "the mean opacity is 0.01"),
+        (drawing(torch.full((4, 8, 3), 0.4)), "of the variance of the photograph"),
+    ):
+        watch = monitor()
+        failure, _ = ends(lambda i, made=made, watch=watch: watch.picture(made, photograph, 50 * i), "collapsed")
+        assert said in str(failure) and "at iteration 150, and since 50" in str(failure)
+
+
+def test_single_large_gaussians_are_healthy_and_many_have_exploded():
+    photograph = torch.rand(4, 8, 3, generator=torch.Generator().manual_seed(1))
+    for large, healthy in ((2, True), (3, False)):
+        watch = monitor()
+        watch.picture(drawing(photograph), photograph, 0)
+        made = drawing(photograph, large=large, scale=1e3)
+        if healthy:
+            for i in range(1, 20):
+                watch.picture(made, photograph, 50 * i)
+        else:
+            failure, _ = ends(lambda i, made=made, watch=watch: watch.picture(made, photograph, 50 * i), "exploded")
+            assert "scales[0] is 1e+03 world units at iteration 150; since 50 more than 1% of all" in str(failure)
+
+
+def test_parameters_without_a_gradient_are_silent_after_a_quarter_of_the_run():
+    watch = monitor()
+    failure, when = ends(lambda i: watch.gradients(("quats",) if i > 300 else (), i), "silent")
+    assert when == 551 and "the gradient of quats is exactly 0 at iteration 551, and since 301" in str(failure)
+    late = monitor()  # degrees of the spherical harmonics come one after the other
+    for iteration in range(0, ITERATIONS, 50):
+        late.gradients(("sh_rest",) if iteration <= 200 else (), iteration)
+
+
+@pytest.mark.parametrize("gradient", [None, torch.zeros(9, 3)])
+def test_growth_that_nothing_pulls_at_is_silent(gradient):
+    watch = monitor()
+    failure, when = ends(lambda i: watch.probe(gradient if i > 300 else torch.eye(3), i), "silent")
+    assert when == 301 + ITERATIONS // 4 and "since 301, so nothing can grow" in str(failure)
+
+
+def test_where_the_schedule_follows_the_clock_a_sign_lasts_for_a_share_of_it():
+    watch = monitor()
+    for iteration in range(1, 2000):  # 2000 steps are a tenth of the schedule
+        watch.moment = iteration // 20
+        watch.counts({"gaussians": 9}, iteration)
+    watch.moment = 101
+    with pytest.raises(Failure, match="few since 1"):
+        watch.counts({"gaussians": 9}, 2001)
+
+
+def test_what_it_remembers_is_json_and_goes_on():
+    first, second = monitor(), monitor()
+    for iteration in range(1, 150):
+        first.loss(0.1 if iteration < 100 else 0.4, iteration)
+    second.state = json.loads(json.dumps(first.state))
+    assert (
+        ends(lambda i: first.loss(0.4, 149 + i), "diverged")[1]
+        == ends(lambda i: second.loss(0.4, 149 + i), "diverged")[1]
+    )
+
+
+def test_a_resumed_run_is_compared_with_the_model_that_it_began_with():
+    began, resumed = Monitor(ITERATIONS, parts=5000, pixels=100), Monitor(ITERATIONS, parts=10, pixels=100)
+    resumed.state = json.loads(json.dumps(began.state))
+    resumed.counts({"gaussians": 50_000}, 1)
+    with pytest.raises(Failure, match="50001 gaussians at iteration 2, more than 10 times the 5000"):
+        resumed.counts({"gaussians": 50_001}, 2)
+
+
+class Deaf(SplatMethod):
+    """A method whose rotations nothing pulls at."""
+
+    def _start(self, scene, iterations):
+        trainee = super()._start(scene, iterations)
+        draw = trainee.draw
+
+        def without(view, probe=None):
+            made = draw(view, probe)
+            trainee.splats.quats.register_hook(torch.zeros_like)
+            return made
+
+        trainee.draw = without
+        return trainee
+
+
+def test_a_run_that_is_silent_stops_early_unless_it_is_not_to_be_watched():
+    scene, budget = tiny_scene(), Budget(160)
+    with pytest.raises(Failure, match="gradient of quats is exactly 0 at iteration 150, and since 50") as caught:
+        list(Deaf(train=TrainOptions(check_every=50)).fit(scene, budget))
+    assert caught.value.status == "silent"
+    assert len(list(Deaf(train=TrainOptions(monitor=False)).fit(scene, budget))) == 160

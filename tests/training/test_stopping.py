@@ -1,0 +1,158 @@
+"""Runs that stop by themselves or are stopped: they fade, train on all views again, and resume to the same."""
+
+import pytest
+import torch
+from states import assert_same_but_time
+from tiny_scene import HEIGHT, WIDTH, tiny_scene
+from torch import Tensor
+
+from padgs.baselines import METHODS
+from padgs.methods.splats.clone_split import CloneSplitOptions
+from padgs.methods.splats.model import Splats
+from padgs.methods.splats.trainee import SplatTrainee
+from padgs.registry import lookup
+from padgs.render import Rendering
+from padgs.render.config import RenderConfig
+from padgs.scene import View
+from padgs.training.budget import Budget
+from padgs.training.loop import Trainer
+from padgs.training.order import ViewOrder
+from padgs.training.stopping import FADE, Plateau, quality, set_apart
+
+ITERATIONS = 100
+
+
+class Counted(SplatTrainee):
+    """Notes the views that are drawn, and which moments of the schedule come."""
+
+    def __init__(self, scene) -> None:
+        splats = Splats.from_scene(scene, degree=0, generator=torch.Generator().manual_seed(0))
+        super().__init__(splats, CloneSplitOptions(), RenderConfig(), extent=1.0, iterations=ITERATIONS)
+        self.drawn, self.moments = [], []
+
+    def draw(self, view: View, probe: Tensor | None = None):
+        self.drawn.append(view.name)
+        return super().draw(view, probe)
+
+    def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
+        self.moments.append(iteration)
+        return super().adapt(iteration, optimizer)
+
+
+def views_of(count: int) -> list[View]:
+    return [View(str(number), torch.eye(4, dtype=torch.float64), WIDTH, HEIGHT) for number in range(count)]
+
+
+@pytest.fixture
+def scene():
+    tiny = tiny_scene()
+    return type(tiny)(**{**vars(tiny), "train": (*tiny.train, *tiny.test)})
+
+
+def trainer(scene, stop: str = "auto") -> Trainer:
+    torch.manual_seed(0)
+    return Trainer(Counted(scene), scene, Budget(ITERATIONS, stop=stop), seed=1)
+
+
+def test_a_plateau_is_where_the_average_gains_nothing_and_not_before():
+    rising, flat = Plateau(100), Plateau(100)
+    assert not any(rising.reached(20 + 0.1 * moment, 1, moment) for moment in range(1, 101))
+    values = [20 + min(moment, 40) for moment in range(1, 101)]
+    first = next(moment for moment, value in enumerate(values, 1) if flat.reached(value, 1, moment))
+    assert 45 < first < 75
+    assert not flat.is_due(first) and flat.is_due(first + 1)
+    for parts in (range(1, 101), range(100, 0, -1), [100] * 97 + [50] * 3):  # growing, thinning out, just chosen
+        changing = Plateau(100)
+        found = [
+            changing.reached(20.0 + 0.1 * moment * (moment < 97), count, moment) for moment, count in enumerate(parts)
+        ]
+        assert not any(found)
+
+
+def test_views_set_apart_come_back_when_rates_fade(scene, monkeypatch):
+    monkeypatch.setattr(Plateau, "reached", lambda self, value, parts, moment: moment > 49)
+    run = trainer(scene)
+    apart = {scene.train[number].name for number in set_apart(scene.train)}
+    records = list(run.records())
+    trainee = run._trainee
+    stopped = next(number for number, record in enumerate(records) if any("stopping" in e for e in record.events))
+    assert stopped == 49
+    assert apart.isdisjoint(trainee.drawn[: stopped + 1]) and apart < set(trainee.drawn[stopped + 1 :])
+    assert trainee.moments == [*range(1, 51), *range(round((1 - FADE) * ITERATIONS) + 1, ITERATIONS + 1)]
+    assert records[-1].progress == 1 and len(records) == 65 and run.skipped == 35 and "0.02 dB" in run.ended
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_they_come_back_within_the_epoch_that_runs(scene, seed):
+    apart = set_apart(scene.train)
+    order = ViewOrder(scene, seed, apart)
+    drawn = [order.next()]
+    order.take_all()
+    drawn += [order.next() for _ in range(2)]
+    order.take_all()
+    drawn += [order.next() for _ in range(3)]
+    assert drawn[0] not in apart and sorted(drawn) == list(range(6))
+
+
+@pytest.mark.parametrize("iterations", [1, 2, 3])
+def test_the_shortest_runs_end_well_when_they_are_stopped(scene, iterations):
+    run, progress = Trainer(Counted(scene), scene, Budget(iterations), seed=1), 0.0
+    for record in run.records():
+        run.stop("asked")
+        progress = record.progress
+    assert progress == 1
+
+
+def test_rates_never_rise_when_a_run_is_stopped(scene):
+    run = trainer(scene, "end")
+    rates = []
+    for record in run.records():
+        rates.append([group["lr"] for group in run._optimiser.adam.param_groups])
+        if record.iteration == 70:
+            assert run.stop("asked")
+    assert not run.stop("asked again"), "it is over"
+    for before, now in zip(rates[:-1], rates[1:], strict=True):
+        assert all(rate <= last for rate, last in zip(now, before, strict=True))
+
+
+@pytest.mark.parametrize("at", [30, 50, 60])
+def test_a_stopped_run_resumes_to_the_same(scene, monkeypatch, at):
+    monkeypatch.setattr(Plateau, "reached", lambda self, value, parts, moment: moment > 49)
+    whole = trainer(scene)
+    expected = [record.loss for record in whole.records()]
+    first = trainer(scene)
+    losses = [record.loss for _, record in zip(range(at), first.records(), strict=False)]
+    again = trainer(scene)
+    again.load_state(first.state())
+    losses += [record.loss for record in again.records()]
+    assert losses == expected
+    assert_same_but_time(again.state(), whole.state())
+
+
+def test_in_a_budget_of_seconds_the_fade_takes_its_share_of_them():
+    budget = Budget(100, seconds=10.0)
+    assert budget.moment(85, spent=3.0, step=0.1, skipped=55) == 86
+    assert budget.moment(99, spent=4.45, step=0.1, skipped=55) == 100
+
+
+def test_quality_is_the_mean_ws_psnr():
+    from padgs.evaluation.metrics import ws_psnr
+
+    views = tiny_scene().train[:2]
+    images = {view.name: view.image() * 0.9 + 0.05 for view in views}
+    nothing = torch.zeros(HEIGHT, WIDTH)
+    found = quality(lambda view: Rendering(images[view.name], nothing, nothing, nothing[0] > 0), views)
+    assert found == pytest.approx(sum(ws_psnr(images[v.name], v.image()).item() for v in views) / 2, abs=1e-4)
+
+
+def test_too_few_views_to_set_any_apart_are_refused():
+    with pytest.raises(ValueError, match="5 training views leave no calibration views.*it takes 6"):
+        Trainer(Counted(tiny_scene()), tiny_scene(), Budget(10, stop="auto"))
+    with pytest.raises(ValueError, match="unknown stop 'never'; known: end, auto"):
+        Budget(10, stop="never")
+
+
+@pytest.mark.parametrize("name", ["egonerf", "sc_omnigs"])
+def test_methods_that_views_set_apart_say_nothing_of_refuse_to_stop_by_themselves(name, scene):
+    with pytest.raises(ValueError, match="budget.stop is auto.*set it to end"):
+        lookup(METHODS, name, "method")().fit(scene, Budget(10, stop="auto"))
