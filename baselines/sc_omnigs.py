@@ -156,12 +156,12 @@ class SCOmniGSMethod(CalibratedMethod):
         sizes = {(view.width, view.height) for view in scene.train}
         if len(sizes) > 1:
             raise ValueError(f"sc_omnigs calibrates one camera, but the training views have sizes {sorted(sizes)}")
-        if scene.stands_still:
+        if scene.has_single_center:
             raise ValueError(
                 f"the {len(scene.train)} training cameras of scene {scene.name!r} stand in one place, which has no "
                 "scale to carry held-out views by; sc_omnigs needs two places, omnigs does without"
             )
-        poses = PoseRefinement.of(scene.train, unit=scene.unit)
+        poses = PoseRefinement.of(scene.train, unit=scene.scale)
         return self._calibrating(poses, *sizes.pop())
 
     def _as_stored(self, values: Mapping[str, Any]) -> SelfCalibration:

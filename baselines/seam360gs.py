@@ -57,7 +57,7 @@ class Seam360GSMethod(CalibratedMethod):
         refuse_polar_threshold(self.options, "a view is made of two, each by a lens of its own")
 
     def _as_given(self, scene: Scene) -> DualLens:
-        return self._as_stored({"unit": scene.unit})
+        return self._as_stored({"unit": scene.scale})
 
     def _as_stored(self, values: Mapping[str, Any]) -> DualLens:
         options = self.options

@@ -1,4 +1,4 @@
-"""What every method is given: views with known poses, a split, and a point cloud.
+"""Views with known poses, a split into training and test views, and a point cloud: the input of every method.
 
 Transforms are named a_from_b: `cam_from_world` maps world points to the camera frame (x right, y down, z forward).
 """
@@ -16,16 +16,16 @@ from torch import Tensor
 
 from padgs.geometry.camera import Camera, Panorama
 
-ONE_PLACE = 1e-6  # units of the scene; a reach up to here is rounding
-FAR = 1000.0  # units of the scene that its cameras may be away from the origin; there float32 has steps of 6e-5 units
+SINGLE_CENTER = 1e-6  # an extent up to so many scene scales is rounding
+FAR = 1000.0  # largest distance of the cameras from the origin, in scene scales; there float32 has steps of 6e-5
 
 
 @dataclass(frozen=True)
 class View:
-    """One image: its pose and size, and how to get its pixels. A panorama, unless it says otherwise by `lens`.
+    """One image: its pose, its size, and functions that load its pixels. A panorama unless `lens` is given.
 
-    `load_pixels` and `load_mask` are called whenever pixels are asked for; the loader decides what is cached. A view
-    without `load_pixels` can be rendered but not compared with anything.
+    `load_pixels` and `load_mask` are called on every access; the loader decides what is cached. A view without
+    `load_pixels` can be rendered, but has no ground truth.
     """
 
     name: str
@@ -35,41 +35,41 @@ class View:
     load_pixels: Callable[[], Tensor] | None = None  # () -> [H, W, 3] uint8
     load_mask: Callable[[], Tensor] | None = None  # () -> [H, W] float32 in [0, 1], 0 = ignore this pixel
     lens: Camera | None = None  # None: a panorama of this size
-    load_depth: Callable[[], Tensor] | None = None  # () -> [H, W] true distance, world units, inf = sky; where known
+    load_depth: Callable[[], Tensor] | None = None  # () -> [H, W] true distance, world units, inf = sky
 
     @property
     def camera(self) -> Camera:
-        """Which direction each pixel looks."""
+        """Return the camera model, which gives the direction of each pixel."""
         return Panorama(self.width, self.height) if self.lens is None else self.lens
 
     @property
     def center(self) -> Tensor:
-        """Camera centre in the world frame, [3]."""
+        """Return the camera centre in the world frame, [3]."""
         rotation, translation = self.cam_from_world[:3, :3], self.cam_from_world[:3, 3]
         return -rotation.transpose(0, 1) @ translation
 
     def image(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
-        """The panorama as floats in [0, 1], [H, W, 3], linear in the stored values.
+        """Return the image as floats in [0, 1], [H, W, 3], linear in the stored values.
 
         Raises:
             ValueError: the view has no pixels.
         """
         if self.load_pixels is None:
             raise ValueError(f"view {self.name!r} has a pose but no image; it can only be rendered")
-        return self.load_pixels().to(device).to(dtype) / 255  # in this order: a quarter of the bytes travel
+        return self.load_pixels().to(device).to(dtype) / 255  # move first: bytes are a quarter of the floats
 
     def prefetch(self) -> None:
-        """Have the pixels loaded in the background, where the source can; the next `image` is then quicker."""
+        """Start loading the pixels in the background if the source supports it, so that the next `image` is quicker."""
         start = getattr(self.load_pixels, "prefetch", None)
         if start is not None:
             start()
 
     def mask(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor | None:
-        """Per-pixel weight [H, W] in [0, 1] (0 = ignore), or None where every pixel counts."""
+        """Return the weight of each pixel [H, W] in [0, 1] (0 = ignore), or None if every pixel counts."""
         return None if self.load_mask is None else self.load_mask().to(device=device, dtype=dtype)
 
     def at(self, cam_from_world: Tensor | NDArray[Any]) -> View:
-        """The same camera at another pose [4, 4], of torch or numpy, without pixels."""
+        """Return a view without pixels of the same camera at another pose [4, 4], a tensor or an array."""
         if not isinstance(cam_from_world, Tensor):
             cam_from_world = torch.as_tensor(cam_from_world).to(self.cam_from_world)
         return replace(self, cam_from_world=cam_from_world, load_pixels=None, load_mask=None, load_depth=None)
@@ -77,7 +77,7 @@ class View:
 
 @dataclass(frozen=True)
 class Scene:
-    """Views split into train and test, and the point cloud that methods start from. All in one world frame."""
+    """Training and test views, and the point cloud that methods start from, in one world frame."""
 
     name: str
     train: tuple[View, ...]
@@ -85,30 +85,31 @@ class Scene:
     points: Tensor  # [P, 3] float32 world
     point_colors: Tensor  # [P, 3] uint8
     fingerprint: str  # hex digest of everything read: images, poses, points, split, masks, size
-    notes: tuple[str, ...] = ()  # what the loader decided by itself, for the user to read
-    # [3] float64: what was taken from the world of the data set, which is x + origin; not 0 if that was far away
+    notes: tuple[str, ...] = ()  # decisions of the loader, for the user to read
+    # [3] float64: x + origin are coordinates in the world of the data set; not 0 after `recentered` moved the scene
     origin: Tensor = field(default_factory=lambda: torch.zeros(3, dtype=torch.float64))
 
-    def centred(self) -> Scene:
-        """The scene with points as float32, and in a world about its cameras if they are more than `FAR` units away
-        from the origin: georeferenced captures are, and float32 would blur them.
+    def recentered(self) -> Scene:
+        """Return the scene with float32 points, moved to the origin if its cameras are more than `FAR` scales from it.
+
+        Georeferenced captures are so far away that float32 coordinates would blur them.
         """
         middle = torch.stack([view.center for view in self.train]).double().median(0).values
-        distance = middle.norm() / self.unit
+        distance = middle.norm() / self.scale
         if not distance > FAR:
             return replace(self, points=self.points.float())
         train, test = (
-            tuple(replace(view, cam_from_world=about(middle, view.cam_from_world)) for view in views)
+            tuple(replace(view, cam_from_world=move_origin(view.cam_from_world, middle)) for view in views)
             for views in (self.train, self.test)
         )
         points = (self.points.double() - middle.to(self.points.device)).float()
         text = ", ".join(f"{number:.10g}" for number in middle.tolist())
-        note = f"world: about ({text}), for the cameras are {distance:.0f} units of the scene away from its origin"
+        note = f"world: origin moved to ({text}), because the cameras are {distance:.0f} scene scales away from it"
         origin, notes = self.origin + middle.to(self.origin), (*self.notes, note)
         return replace(self, train=train, test=test, points=points, origin=origin, notes=notes)
 
     def to(self, device: torch.device | str) -> Scene:
-        """The scene with poses and points on a device, where what is made of it will be; pixels come when asked for."""
+        """Return the scene with poses and points on a device; pixels are loaded on access."""
         if self.points.device == torch.device(device):
             return self
         train, test = (
@@ -120,34 +121,34 @@ class Scene:
 
     @cached_property
     def extent(self) -> float:
-        """What 3DGS measures with, in world units: 1.1 x `spread`."""
-        return 1.1 * self.spread
+        """Return the scene extent of 3DGS in world units: 1.1 x `camera_radius`."""
+        return 1.1 * self.camera_radius
 
     @cached_property
-    def spread(self) -> float:
-        """The largest distance of a training camera from their mean, world units."""
+    def camera_radius(self) -> float:
+        """Return the largest distance of a training camera from their mean, in world units."""
         centers = torch.stack([view.center for view in self.train])
         return (centers - centers.mean(0)).norm(dim=-1).max().item()
 
     @property
-    def stands_still(self) -> bool:
-        """Whether all training cameras stand in one place, up to the rounding of their poses."""
-        return self.extent <= ONE_PLACE * self.unit
+    def has_single_center(self) -> bool:
+        """Return whether all training cameras share one centre, up to the rounding of their poses."""
+        return self.extent <= SINGLE_CENTER * self.scale
 
     @cached_property
-    def unit(self) -> float:
-        """The scene's own unit of length: the median distance from a training camera to a point, in world units.
+    def scale(self) -> float:
+        """Return the scene scale: the median distance from a training camera to a point, in world units.
 
-        Lengths that the user does not give in world units are multiples of it, so that scaling a scene and its poses
-        together changes nothing.
+        Lengths in the configuration are multiples of it unless they say world units, so that training does not depend
+        on the scale of points and poses.
         """
         points = self.points[:: max(1, len(self.points) // 20_000)].double()
         medians = [(points - view.center.double()).norm(dim=-1).median() for view in self.train]
         return torch.stack(medians).median().item()
 
 
-def about(origin: Tensor, cam_from_world: Tensor) -> Tensor:
-    """Poses [..., 4, 4] in a world whose origin [3] is there."""
+def move_origin(cam_from_world: Tensor, origin: Tensor) -> Tensor:
+    """Return poses [..., 4, 4] in a world frame whose origin is moved to `origin` [3] of the old frame."""
     poses = cam_from_world.clone()
     poses[..., :3, 3] += poses[..., :3, :3] @ origin.to(poses)
     return poses

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from padgs.gaussians import rotation_matrices
-from padgs.scene import FAR, Scene, View, about
+from padgs.scene import FAR, Scene, View, move_origin
 
 H, W = 4, 8
 
@@ -28,7 +28,7 @@ def scene_of(centers: list[tuple[float, float, float]], points: torch.Tensor) ->
     return Scene("scene", train, (), points, torch.zeros(len(points), 3, dtype=torch.uint8), fingerprint="0")
 
 
-def test_the_centre_is_where_the_camera_stands():
+def test_center_of_a_pose():
     center = torch.tensor((1.0, -2.0, 3.0), dtype=torch.float64)
     view = View("view", pose(center, (0.3, -0.5, 0.1, 0.8)), W, H)
     torch.testing.assert_close(view.center, center)
@@ -36,7 +36,7 @@ def test_the_centre_is_where_the_camera_stands():
     torch.testing.assert_close((view.cam_from_world @ homogeneous)[:3], torch.zeros(3).double())
 
 
-def test_pixels_become_floats_in_the_unit_range_and_are_read_when_asked_for():
+def test_pixels_are_loaded_on_access_as_floats():
     pixels = torch.arange(H * W * 3).reshape(H, W, 3).remainder(256).byte()
     pixels[0, 0] = 255
     reads = []
@@ -48,7 +48,7 @@ def test_pixels_become_floats_in_the_unit_range_and_are_read_when_asked_for():
     assert view.image().dtype == torch.float32
 
 
-def test_a_mask_is_optional_and_a_missing_image_is_an_error():
+def test_mask_is_optional_and_missing_image_is_an_error():
     mask = torch.rand(H, W)
     assert torch.equal(view_at(0, 0, 0, load_mask=lambda: mask).mask(dtype=torch.float64), mask.double())
     assert view_at(0, 0, 0).mask() is None
@@ -56,93 +56,92 @@ def test_a_mask_is_optional_and_a_missing_image_is_an_error():
         view_at(0, 0, 0).image()
 
 
-def test_a_pose_may_be_of_numpy():
-    view = view_at(1.0, 2.0, 3.0)
-    elsewhere = view.at(np.eye(4, dtype=np.float32))
-    assert torch.equal(elsewhere.cam_from_world, torch.eye(4, dtype=torch.float64)) and elsewhere.load_pixels is None
-
-
-def test_the_same_camera_elsewhere_has_no_pixels():
+def test_view_at_another_pose_has_no_pixels():
     view = view_at(0, 0, 0, load_pixels=lambda: torch.zeros(H, W, 3).byte(), load_mask=lambda: torch.zeros(H, W))
     moved = view.at(pose(torch.tensor((5.0, 0, 0))))
     assert moved.center.tolist() == [5, 0, 0] and (moved.width, moved.height, moved.name) == (W, H, "view")
     assert moved.load_pixels is None and moved.mask() is None
+    assert torch.equal(view.at(np.eye(4, dtype=np.float32)).cam_from_world, torch.eye(4, dtype=torch.float64))
 
 
-def test_extent_is_a_tenth_more_than_the_farthest_camera():
+def test_extent_is_1_1_times_the_camera_radius():
     scene = scene_of([(-1, 0, 0), (1, 0, 0), (0, 3, 0), (0, -3, 0)], torch.rand(10, 3))
     assert scene.extent == pytest.approx(1.1 * 3)
 
 
-def test_the_unit_is_the_median_distance_to_the_points():
+def test_scale_is_the_median_distance_to_the_points():
     distances = torch.tensor([1.0, 2.0, 3.0, 4.0, 500.0])  # one far outlier does not matter
     points = torch.stack((distances, torch.zeros(5), torch.zeros(5)), dim=-1)
-    assert scene_of([(0, 0, 0)], points).unit == pytest.approx(3.0)
+    assert scene_of([(0, 0, 0)], points).scale == pytest.approx(3.0)
     # From (0, 4, 0) they are sqrt(d^2 + 16) away, median 5; the lower of two medians is taken.
-    assert scene_of([(0, 0, 0), (0, 4, 0)], points).unit == pytest.approx(3.0)
-    assert scene_of([(0, 4, 0), (0, 4, 0), (0, 0, 0)], points).unit == pytest.approx(5.0)
+    assert scene_of([(0, 0, 0), (0, 4, 0)], points).scale == pytest.approx(3.0)
+    assert scene_of([(0, 4, 0), (0, 4, 0), (0, 0, 0)], points).scale == pytest.approx(5.0)
 
 
-def test_a_large_cloud_is_thinned_for_the_unit(generator):
+def test_scale_of_a_large_cloud(generator):
     points = torch.randn(100_000, 3, generator=generator)
     scene = scene_of([(0.1, 0, 0)], points)
     exact = (points - torch.tensor((0.1, 0, 0))).norm(dim=-1).median().item()
-    assert scene.unit == pytest.approx(exact, rel=0.02)
+    assert scene.scale == pytest.approx(exact, rel=0.02)
 
 
 @pytest.mark.parametrize("factor", [1e-3, 100.0])
-def test_lengths_of_a_scene_grow_with_it(generator, factor):
+def test_lengths_scale_with_the_scene(generator, factor):
     centers = [(0.0, 0.0, 0.0), (1.0, 0.5, 0.0), (0.0, -2.0, 1.0)]
     points = torch.randn(500, 3, generator=generator) * 4
     scene = scene_of(centers, points)
     grown = scene_of([tuple(factor * value for value in center) for center in centers], points * factor)
-    assert grown.unit == pytest.approx(factor * scene.unit, rel=1e-5)
+    assert grown.scale == pytest.approx(factor * scene.scale, rel=1e-5)
     assert grown.extent == pytest.approx(factor * scene.extent, rel=1e-5)
 
 
-def test_lengths_do_not_depend_on_where_the_world_has_its_origin(generator):
+def test_lengths_do_not_depend_on_the_origin(generator):
     points = torch.randn(500, 3, generator=generator)
     scene = scene_of([(0.0, 0.0, 0.0), (1.0, 0.5, 0.0)], points)
     moved = scene_of([(10.0, 0.0, -7.0), (11.0, 0.5, -7.0)], points + torch.tensor((10.0, 0.0, -7.0)))
-    assert moved.unit == pytest.approx(scene.unit, rel=1e-5) and moved.extent == pytest.approx(scene.extent)
+    assert moved.scale == pytest.approx(scene.scale, rel=1e-5) and moved.extent == pytest.approx(scene.extent)
 
 
-def test_a_changed_scene_measures_itself_anew():
+def test_a_changed_scene_has_its_own_scale():
     scene = scene_of([(0, 0, 0)], torch.ones(3, 3))
-    assert scene.unit == pytest.approx(math.sqrt(3))
-    assert replace(scene, points=2 * scene.points).unit == pytest.approx(2 * math.sqrt(3))
+    assert scene.scale == pytest.approx(math.sqrt(3))
+    assert replace(scene, points=2 * scene.points).scale == pytest.approx(2 * math.sqrt(3))
 
 
 UTM = torch.tensor((691_000.5, 5_334_000.25, 520.0), dtype=torch.float64)
 
 
-def test_a_far_world_is_brought_about_its_cameras(generator):
+def test_a_far_scene_is_recentered(generator):
     centers = [(0.0, 0.0, 0.0), (1.0, 0.5, 0.0), (0.0, -2.0, 1.0)]
     points = torch.randn(500, 3, generator=generator, dtype=torch.float64)
     far_away = [tuple((torch.tensor(center).double() + UTM).tolist()) for center in centers]
-    scene = replace(scene_of([(0, 0, 0)], points + UTM), train=tuple(view_at_exactly(*c) for c in far_away)).centred()
-    assert scene.points.dtype == torch.float32 and "world: about (69100" in scene.notes[-1]
+    scene = replace(
+        scene_of([(0, 0, 0)], points + UTM), train=tuple(view_at_exactly(*c) for c in far_away)
+    ).recentered()
+    assert scene.points.dtype == torch.float32 and "world: origin moved to (69100" in scene.notes[-1]
     assert scene.origin.tolist() == pytest.approx(UTM.tolist(), abs=2)
     shift = scene.origin - UTM
     torch.testing.assert_close(scene.points, (points - shift).float(), atol=1e-6, rtol=0)
     for view, center in zip(scene.train, centers, strict=True):
         torch.testing.assert_close(view.center, torch.tensor(center).double() - shift, atol=1e-8, rtol=0)
-    assert torch.equal(scene.centred().origin, scene.origin), "once is enough"
+    assert torch.equal(scene.recentered().origin, scene.origin)
 
 
 def view_at_exactly(*center: float) -> View:
     return View("view", pose(torch.tensor(center, dtype=torch.float64), (0.3, -0.5, 0.1, 0.8)), W, H)
 
 
-@pytest.mark.parametrize(("units", "moved"), [(0.9 * FAR, False), (1.1 * FAR, True)])
-def test_a_world_stays_where_it_is_if_it_is_not_far(units, moved):
-    scene = scene_of([(units, 0, 0)], torch.tensor([[units, 1.0, 0], [units, 0, 1.0]], dtype=torch.float64)).centred()
+@pytest.mark.parametrize(("scales", "moved"), [(0.9 * FAR, False), (1.1 * FAR, True)])
+def test_only_far_scenes_are_recentered(scales, moved):
+    scene = scene_of(
+        [(scales, 0, 0)], torch.tensor([[scales, 1.0, 0], [scales, 0, 1.0]], dtype=torch.float64)
+    ).recentered()
     assert scene.points.dtype == torch.float32 and bool(scene.origin.any()) == moved == bool(scene.notes)
 
 
-def test_a_pose_about_an_origin_has_its_centre_there():
+def test_move_origin_shifts_camera_centers():
     poses = torch.stack([pose(torch.tensor((1.0, 2, 3)), (0.5, 0.5, -0.5, 0.5)), pose(torch.tensor((4.0, 5, 6)))])
-    found = about(torch.tensor((1.0, 1, 1)), poses)
+    found = move_origin(poses, torch.tensor((1.0, 1, 1)))
     assert torch.equal(found[:, :3, :3], poses[:, :3, :3])
     centers = -(found[:, :3, :3].transpose(1, 2) @ found[:, :3, 3:])[..., 0]
     torch.testing.assert_close(centers, torch.tensor([[0.0, 1, 2], [3, 4, 5]]).double())

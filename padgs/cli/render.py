@@ -40,7 +40,7 @@ def render(
     from padgs.data.formats.transforms import described
     from padgs.data.trajectory import gravity
     from padgs.geometry.camera import Panorama, perspective
-    from padgs.scene import View, about
+    from padgs.scene import View, move_origin
 
     if camera not in ("panorama", "perspective"):
         raise ValueError(f"unknown camera {camera!r}; known: panorama, perspective")
@@ -66,7 +66,7 @@ def render(
             up = gravity(torch.stack([view.cam_from_world for view in scene.train])).up
             data_set = found.config.data
             poses = read_path(Path(path), frames, up, described(data_set.path, data_set.format))
-            poses = about(scene.origin, poses)
+            poses = move_origin(poses, scene.origin)
         views = [
             View(f"frame {number}", pose.to(trained.cam_from_world), lens.width, lens.height, lens=lens)
             for number, pose in enumerate(poses)
@@ -78,7 +78,7 @@ def render(
                 views,
                 found.through(lens).render,
                 fps=fps,
-                unit=scene.unit,
+                unit=scene.scale,
                 depth=depth,
                 spherical=camera == "panorama",
                 progress=lambda done: status.update(f"frame {done} of {len(views)}"),

@@ -68,7 +68,7 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
         point_colors=colors,
         fingerprint="",
         notes=(*notes, *split.notes, *mask_notes, *cloud_notes),
-    ).centred()
+    ).recentered()
     digest = hashlib.sha256()
     for view, image in zip(views, images, strict=True):
         digest.update(f"{view.name}|{view.width}x{view.height}|{image.digest}|".encode())

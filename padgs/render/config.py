@@ -17,7 +17,7 @@ class RenderConfig(RenderOptions):
     """As `RenderOptions`, but that lengths are relative to the scene; refuses what those refuse."""
 
     near: float = 0.01  # in `near_unit`
-    near_unit: str = "scene"  # scene: multiples of Scene.unit; world: as the published code does
+    near_unit: str = "scene"  # scene: multiples of Scene.scale; world: as the published code does
     backend: str = "auto"  # a name of `padgs.render.BACKENDS`, or auto
 
     def __post_init__(self) -> None:

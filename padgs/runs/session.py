@@ -245,7 +245,7 @@ def scene_of(config: RunConfig, device: torch.device) -> Scene:
     """
     images_on = str(device) if config.run.images_on == "device" else config.run.images_on
     scene = data.load(config.data.path, config.data.format, config.data.options(images_on))
-    return config.stress.scene(scene, config.seed).centred().to(device)
+    return config.stress.scene(scene, config.seed).recentered().to(device)
 
 
 def build(config: RunConfig) -> Method:

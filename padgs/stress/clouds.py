@@ -53,7 +53,7 @@ def in_the_face(scene: Scene, share: float, random: np.random.Generator) -> Scen
     centers = np.stack([view.center.cpu().numpy() for view in scene.train])
 
     def near(count: int) -> np.ndarray:
-        distance = NEAR * scene.unit * random.uniform(0.1, 1, (count, 1))
+        distance = NEAR * scene.scale * random.uniform(0.1, 1, (count, 1))
         return centers[random.integers(len(centers), size=count)] + distance * _directions(count, random)
 
     return _moved(scene, share, near, random)

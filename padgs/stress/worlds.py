@@ -48,7 +48,7 @@ def scaled(scene: Scene, factor: float, random: np.random.Generator) -> Scene:
 
 def moved_away(scene: Scene, units: float, random: np.random.Generator) -> Scene:
     """The whole world so many units of the scene away from the origin, as georeferenced captures are; float64."""
-    offset = units * scene.unit * torch.tensor(DIAGONAL, dtype=torch.float64)
+    offset = units * scene.scale * torch.tensor(DIAGONAL, dtype=torch.float64)
 
     def pose(view: View) -> View:
         moved = view.cam_from_world.clone()
@@ -63,7 +63,7 @@ def shaken(scene: Scene, share: float, random: np.random.Generator) -> Scene:
 
     def pose(view: View) -> View:
         moved, offset = view.cam_from_world.clone(), torch.from_numpy(random.standard_normal(3)).to(view.cam_from_world)
-        moved[:3, 3] -= moved[:3, :3] @ (share * scene.unit * offset)
+        moved[:3, 3] -= moved[:3, :3] @ (share * scene.scale * offset)
         return replace(view, cam_from_world=moved)
 
     return of_training(scene, pose)

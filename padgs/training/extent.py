@@ -24,9 +24,9 @@ class ExtentOptions:
         Raises:
             ValueError: nothing is left of it, because they stand in one place.
         """
-        if scene.stands_still and self.min_extent == 0:
+        if scene.has_single_center and self.min_extent == 0:
             raise ValueError(
                 f"the training cameras of scene {scene.name!r} stand in one place, so their extent is 0 and no "
                 "Gaussian would ever move; set method.min_extent to a share of the scene's unit, such as 0.1"
             )
-        return max(scene.extent, self.min_extent * scene.unit)
+        return max(scene.extent, self.min_extent * scene.scale)

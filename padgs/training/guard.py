@@ -53,8 +53,8 @@ class Guard:
         if self._scales:
             farthest = (scene.points.double() - scene.train[0].center).norm(dim=-1).max().item()
             beginning = max(parameter[..., -3:].max().item() for parameter in self._scales)
-            largest = max(math.log(max(farthest, scene.unit)), beginning)
-            self._bounds = [math.log(SMALLEST * scene.unit), largest]
+            largest = max(math.log(max(farthest, scene.scale)), beginning)
+            self._bounds = [math.log(SMALLEST * scene.scale), largest]
 
     @torch.no_grad()
     def clean(self, probe: Tensor) -> None:

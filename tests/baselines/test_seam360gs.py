@@ -44,7 +44,7 @@ def photographed(gap: float, bending: tuple[float, float]) -> Scene:
     """The tiny scene with its exact centres and colours as points, through two lenses."""
     scene, seen = tiny_scene(), truth()
     scene = replace(scene, points=seen.means, point_colors=(255 * seen.colors).round().to(torch.uint8))
-    lenses = DualLens(order=1, unit=scene.unit)
+    lenses = DualLens(order=1, unit=scene.scale)
     with torch.no_grad():
         lenses.gap.fill_(gap)
         lenses.coefficients[:, 0] = torch.tensor(bending)
@@ -141,7 +141,7 @@ def test_a_simulated_gap_is_found_and_the_seam_goes(tmp_path, monkeypatch):
             pass
         marks[name] = torch.tensor([near_the_seam(method, view) for view in (*ideal.test, *ideal.train[:4])]).mean(0)
     lenses = lenses_of(found)
-    gap = options.lens_gap * truth.median_depth / stitched.unit
+    gap = options.lens_gap * truth.median_depth / stitched.scale
     print(gap, lenses.summary(), marks)
     assert lenses.gap.item() == pytest.approx(gap, rel=0.1)  # measured: 1.5 %
     everywhere, band, step = marks["seam360gs"] - marks["one centre"]

@@ -45,7 +45,7 @@ def test_a_world_64_times_as_large_is_learned_the_same(name):
     (moves, image, losses), (far, larger_image, larger_losses) = (
         trained(name, scaled(scene, factor)) for factor in (1.0, LARGER)
     )
-    assert moves.norm(dim=-1).mean() > 1e-5 * scene.unit, "measured: 5e-5"
+    assert moves.norm(dim=-1).mean() > 1e-5 * scene.scale, "measured: 5e-5"
     assert (far / LARGER - moves).norm() < 0.05 * moves.norm()  # measured: 1e-4
     assert larger_losses == pytest.approx(losses, rel=1e-3)  # measured: 1.5e-5
     # A response around 1/255 is drawn or is not, as rounding has it.

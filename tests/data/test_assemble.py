@@ -52,7 +52,7 @@ def test_a_georeferenced_capture_is_the_same_scene_elsewhere(world: World, folde
     utm = np.array([691_000.0, 5_334_000.0, 520.0])
     write_colmap_text(replace(world, centers=world.centers + utm, points=world.points + utm), tmp_path / "utm")
     near, far = load(folder), load(tmp_path / "utm")
-    assert not near.origin.any() and far.notes[-1].startswith("world: about (")
+    assert not near.origin.any() and far.notes[-1].startswith("world: origin moved to (")
     shift = (far.origin - torch.from_numpy(utm)).float()
     torch.testing.assert_close(far.points + shift, near.points, atol=1e-5, rtol=0)
     for one, other in zip(near.train, far.train, strict=True):

@@ -132,7 +132,7 @@ def test_views_that_a_mask_hides_are_left_out(panorama: View):
     cut = perspective_scene(scene, FACES, lambda camera: square_lens(camera, 1.0))
     assert [view.name for view in cut.train] == [f"p-{i}" for i in (0, 1, 2, 3, 4, 5, 0, 1, 2, 3, 5)]  # 4 looks down
     assert cut.test == scene.test, "whole panoramas are held out"
-    assert cut.extent == pytest.approx(scene.extent) and cut.unit == pytest.approx(scene.unit)
+    assert cut.extent == pytest.approx(scene.extent) and cut.scale == pytest.approx(scene.scale)
 
 
 def test_lenses_have_the_exact_field_of_view_and_the_panoramas_resolution():

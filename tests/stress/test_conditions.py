@@ -77,7 +77,7 @@ def test_a_turned_camera_sees_what_a_camera_turned_so_would_have_taken(name, dec
 @pytest.mark.parametrize("name", ["world_rotation", "world_scale"])
 def test_another_frame_changes_nothing_that_a_camera_sees(name):
     rest, scene = generate(OPTIONS), stressed(name, 3)
-    factor = scene.unit / rest.unit
+    factor = scene.scale / rest.scale
     for before, after in zip(rest.train, scene.train, strict=True):
         seen, again = (
             s.points.double() @ v.cam_from_world[:3, :3].T + v.cam_from_world[:3, 3]
@@ -91,7 +91,7 @@ def test_another_frame_changes_nothing_that_a_camera_sees(name):
 def test_points_go_where_their_condition_says():
     rest = generate(OPTIONS)
     centers = torch.stack([view.center for view in rest.train])
-    near = torch.cdist(stressed("near_points", 3).points.double(), centers).amin(1) < 0.02 * rest.unit
+    near = torch.cdist(stressed("near_points", 3).points.double(), centers).amin(1) < 0.02 * rest.scale
     assert near.sum() == 100
     assert len(stressed("few_points", 1).points) == 100 and len(stressed("few_points", 3).points) == 8
     moved = (stressed("outlier_points", 3).points != rest.points).any(1)
@@ -103,7 +103,7 @@ def test_points_go_where_their_condition_says():
 def test_poses_are_off_by_as_much_as_they_say():
     rest, scene = generate(OPTIONS), stressed("pose_noise", 3)
     offsets = torch.stack([a.center - b.center for a, b in zip(rest.train, scene.train, strict=True)])
-    assert offsets.std().item() == pytest.approx(0.02 * rest.unit, rel=0.35)
+    assert offsets.std().item() == pytest.approx(0.02 * rest.scale, rel=0.35)
     angles = []
     for before, after in zip(rest.train, stressed("pose_rotation", 3).train, strict=True):
         torch.testing.assert_close(after.center, before.center)
@@ -218,7 +218,7 @@ def test_masks_go_along_with_the_pixels():
 def test_a_world_far_away_comes_back_as_loaded_ones_do(level):
     rest, far = generate(OPTIONS), stressed("world_offset", level)
     assert far.points.dtype == torch.float64
-    shift = (far.centred().points - rest.points).mean(0)
-    torch.testing.assert_close(far.centred().points - shift, rest.points, atol=1e-4 * rest.unit, rtol=0)
-    for one, other in zip(rest.train, far.centred().train, strict=True):
-        torch.testing.assert_close(other.center - shift, one.center, atol=1e-4 * rest.unit, rtol=0)
+    shift = (far.recentered().points - rest.points).mean(0)
+    torch.testing.assert_close(far.recentered().points - shift, rest.points, atol=1e-4 * rest.scale, rtol=0)
+    for one, other in zip(rest.train, far.recentered().train, strict=True):
+        torch.testing.assert_close(other.center - shift, one.center, atol=1e-4 * rest.scale, rtol=0)

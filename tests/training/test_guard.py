@@ -95,7 +95,7 @@ def test_a_guard_without_cause_changes_nothing(preset):
 def test_scales_stay_within_the_bounds_of_the_beginning(others):
     scene = tiny_scene()
     farthest = (scene.points.double() - scene.train[0].center).norm(dim=-1).max().item()
-    assert farthest > scene.unit
+    assert farthest > scene.scale
     scales = nn.Parameter(torch.full((3, others + 3), math.log(0.1)))
     group = ParameterGroup("log_scales", (scales,), Constant(1.0), is_of_rows=True)
     state = Guard([group], scene, gradients=False, scales=True).state
@@ -105,6 +105,6 @@ def test_scales_stay_within_the_bounds_of_the_beginning(others):
     guard.load(state)
     guard.bound()
     assert torch.allclose(scales[0, others:].exp(), torch.tensor(farthest, dtype=torch.float32))
-    assert torch.allclose(scales[1, others:].exp() / scene.unit, torch.tensor(SMALLEST))
+    assert torch.allclose(scales[1, others:].exp() / scene.scale, torch.tensor(SMALLEST))
     assert scales[2, others:].exp().tolist() == pytest.approx([0.1, 0.1, 0.1 / ANISOTROPY], rel=1e-5)
     assert (scales[:2, :others].abs() == 50).all()

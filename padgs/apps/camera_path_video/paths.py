@@ -45,7 +45,7 @@ def along_cameras(scene: Scene, frames: int) -> Tensor:
     given = torch.stack([view.cam_from_world for view in views])
     centers = torch.stack([view.center for view in views])
     steps = (centers[1:] - centers[:-1]).norm(dim=-1).cpu().numpy()
-    if len(given) < 2 or scene.stands_still:
+    if len(given) < 2 or scene.has_single_center:
         raise ValueError(
             f"{len(given)} training cameras in one place make no path; --path orbit and --path dolly need none"
         )
@@ -67,7 +67,7 @@ def orbit(scene: Scene, frames: int) -> Tensor:
     angles = 2 * np.pi * np.arange(frames) / frames
     side = np.cross(ahead, up)
     out = np.cos(angles)[:, None] * side - np.sin(angles)[:, None] * ahead
-    radius = ORBIT * scene.spread if not scene.stands_still else ALONE * scene.unit
+    radius = ORBIT * scene.camera_radius if not scene.has_single_center else ALONE * scene.scale
     return looking(middle + radius * out, -out, up)
 
 
@@ -76,7 +76,7 @@ def dolly(scene: Scene, frames: int) -> Tensor:
     middle, up, ahead = _frame(scene)
     centers = torch.stack([view.center for view in scene.train]).cpu().numpy()
     along = (centers - middle) @ ahead
-    reach = (along.min(), along.max()) if not scene.stands_still else (-ALONE * scene.unit, ALONE * scene.unit)
+    reach = (along.min(), along.max()) if not scene.has_single_center else (-ALONE * scene.scale, ALONE * scene.scale)
     at = middle + np.linspace(*reach, frames)[:, None] * ahead
     return looking(at, np.broadcast_to(ahead, at.shape), up)
 
@@ -101,7 +101,7 @@ def _frame(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     middle = centers.mean(0)
     level = np.eye(3) - np.outer(up, up)
     ahead = np.linalg.svd((centers - middle) @ level)[2][0]
-    if scene.stands_still or np.linalg.norm(level @ ahead) < 1e-6:
+    if scene.has_single_center or np.linalg.norm(level @ ahead) < 1e-6:
         ahead = level @ poses[0, 2, :3].numpy()
     ahead = level @ ahead
     if ahead @ (centers[-1] - centers[0]) < 0:

@@ -95,7 +95,7 @@ def exported(
     if scene.origin.any():
         place = " ".join(f"{number:.10g}" for number in scene.origin.tolist())
         notes.append(f"the origin of this world is at {place} in that of the data set, too far for float32")
-    begin = _middle(scene.train, scene.unit)
+    begin = _middle(scene.train, scene.scale)
     if stand_up:
         up = torch.tensor(gravity(torch.stack([view.cam_from_world for view in scene.train])).up)
         turn = upright(up)
@@ -114,9 +114,9 @@ def _middle(views: Sequence[View], unit: float) -> Tensor:
 
 def _baked(run: OpenedRun, lessons: int, progress: Callable[[int], None]) -> tuple[Splats, str]:
     scene, config, method = run.scene, run.config.render, run.method
-    options = config.options(scene.unit)
+    options = config.options(scene.scale)
     views = cameras_around(scene.train)
-    splats = baked(method.trainee.model, views, options, config.backend, scene.unit)
+    splats = baked(method.trainee.model, views, options, config.backend, scene.scale)
     if lessons:
         teach(splats, method.render, replace(scene, train=tuple(views)), config, lessons, progress)
 

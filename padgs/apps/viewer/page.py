@@ -95,7 +95,7 @@ class Page:
             control.on_update(self.renew)
         self._goal.on_update(lambda _: self.go_to(self._views[self._goal.value]) if self._goal.value else None)
         client.camera.on_update(self.renew)
-        client.camera.near, client.camera.far = 1e-3 * scene.unit, 1e3 * scene.unit
+        client.camera.near, client.camera.far = 1e-3 * scene.scale, 1e3 * scene.scale
 
     def start(self) -> None:
         """Draw, in a thread of its own, whatever is asked for next."""
@@ -149,7 +149,7 @@ class Page:
             f"/cameras/{view.name}",
             fov=1.0,
             aspect=1.5,
-            scale=0.05 * self._galleries[0].run.scene.unit,
+            scale=0.05 * self._galleries[0].run.scene.scale,
             thickness=1.5,
             thickness_units="screen",
             color=(40, 120, 220),

@@ -44,7 +44,7 @@ def showing(server: Serving, runs: Sequence[OpenedRun]) -> Iterator[dict[int, Pa
     viser.gui.set_panel_label(f"padgs: {scene.name}")
     first = scene.train[len(scene.train) // 2]
     center = first.center.cpu().numpy()
-    ahead = center + 0.3 * scene.unit * first.cam_from_world[2, :3].cpu().numpy()
+    ahead = center + 0.3 * scene.scale * first.cam_from_world[2, :3].cpu().numpy()
     viser.initial_camera.position, viser.initial_camera.look_at, viser.initial_camera.up = center, ahead, up
     box, drawing = box_of(scene.points), threading.Lock()
     pages: dict[int, Page] = {}

@@ -95,7 +95,9 @@ class Gallery:
         else:
             rendering = self._method(full, look.crop).render(view)
             drawn = (
-                eight_bit(rendering.image) if look.layer == "colours" else depth_picture(rendering, self.run.scene.unit)
+                eight_bit(rendering.image)
+                if look.layer == "colours"
+                else depth_picture(rendering, self.run.scene.scale)
             )
         return drawn if isinstance(lens, Pinhole) else _framed(drawn, max(2, round(share * height)))
 

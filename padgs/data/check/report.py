@@ -22,7 +22,7 @@ from padgs.data.images import decode, inspect
 from padgs.data.options import DataOptions
 from padgs.data.resize import area_resize
 from padgs.data.trajectory import Gravity, centers, gravity, median_depth, path_length
-from padgs.scene import Scene, View, about
+from padgs.scene import Scene, View, move_origin
 
 SMALL = 256  # width at which colours are compared
 REPROJECTION_LIMIT = 1 / 500  # of the width, on the median: 4 pixels of 2048
@@ -207,7 +207,9 @@ def _check_fit(capture: Capture, scene: Scene, report: Report) -> None:
         return
     views = (*scene.train, *scene.test)
     views = views[:: max(1, len(views) // VIEWS)][:VIEWS]
-    poses = about(-scene.origin, torch.stack([view.cam_from_world for view in views]))  # as stated: others were misread
+    poses = move_origin(
+        torch.stack([view.cam_from_world for view in views]), -scene.origin
+    )  # in the world of the data set
     points = scene.points.double() + scene.origin
     fits = colour_fit(poses, _small(views), points, scene.point_colors, conventions)
     stated, best = fits[0], max(fits, key=lambda fit: fit.score)

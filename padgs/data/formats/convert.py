@@ -66,7 +66,9 @@ def convert(
         partial.mkdir(parents=True)
         content = _write_images(capture, scene, partial, to, progress)
         if options.points != "auto":
-            points, colors, _ = starting_cloud(capture, options.points)  # where the poses are: the scene may be centred
+            points, colors, _ = starting_cloud(
+                capture, options.points
+            )  # where the poses are: the scene may be recentered
             content = replace(content, cloud=Cloud(points, colors), tracks=None)
         write_masks({view.name: view.load_mask for view in (*scene.train, *scene.test)}, partial)
         WRITERS[to](content, partial)

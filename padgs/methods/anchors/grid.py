@@ -19,7 +19,7 @@ def automatic_voxel_size(scene: Scene, pixels: float) -> float:
     """The voxel size in world units that spans so many pixels of the training panoramas (pi / H radians each) at the
     scene's median depth, so that neither the world's units nor the density of the point cloud matter.
     """
-    return pixels * math.pi / scene.train[0].height * scene.unit
+    return pixels * math.pi / scene.train[0].height * scene.scale
 
 
 def cells_from_points(points: Tensor, size: float) -> Tensor:

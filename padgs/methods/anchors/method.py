@@ -40,7 +40,7 @@ class PaDGSMethod(Method):
 
     def fit(self, scene: Scene, budget: Budget, *, stage: Stage = nullcontext) -> Iterator[Record]:
         """Train; see `Method.fit`."""
-        self._scene_unit = scene.unit if scene.train else math.nan
+        self._scene_unit = scene.scale if scene.train else math.nan
         return super().fit(scene, budget, stage=stage)
 
     def state(self) -> State:
@@ -66,7 +66,7 @@ class PaDGSMethod(Method):
 
     def _start(self, scene: Scene, iterations: int) -> AnchorTrainee:
         extent = self.options.extent_of(scene)
-        extent /= scene.unit if self.options.offset_rate_unit == "scene" else 1.0
+        extent /= scene.scale if self.options.offset_rate_unit == "scene" else 1.0
         return self._trainee_of(PaDGS.from_scene(scene, self.options, seed=self.seed), extent, iterations)
 
     def _blank(self, state: State) -> AnchorTrainee:

@@ -38,7 +38,7 @@ class PaDGSOptions:
     omega_axis: str = "camera_y"  # the latitude's axis: camera_y | world_z
     omega_input: str = "sin2"  # what the networks see: sin2 = Omega | cos = sqrt(1 - Omega)
     max_modulated_omega: float = 1.0  # limit of Omega in Eq. 15
-    distance_unit: str = "scene"  # distances as input are in Scene.unit, or in units of the world
+    distance_unit: str = "scene"  # distances as input are in Scene.scale, or in units of the world
     voxel_size: float | str = "auto"  # world units, as the paper states it for its data sets; auto: `voxel_pixels`
     voxel_pixels: float = 0.1  # ... at the median depth, with voxel_size auto: below a pixel, as the paper's voxels are
 
@@ -124,7 +124,7 @@ class PaDGS(nn.Module):
             initial_log_scales(positions, voxel_size),
             options,
             voxel_size=voxel_size,
-            unit=scene.unit if options.distance_unit == "scene" else 1.0,
+            unit=scene.scale if options.distance_unit == "scene" else 1.0,
             generator=torch.Generator().manual_seed(seed),
         )
 

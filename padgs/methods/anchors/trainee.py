@@ -26,7 +26,7 @@ class LearningRates(ExtentOptions):
     """Learning rates of Adam; pairs are the first and the last of a log-linear decay over the run."""
 
     offset_rate: tuple[float, float] = (0.01, 0.0001)  # times the extent of the cameras in `offset_rate_unit`
-    offset_rate_unit: str = "world"  # world: as released | scene: Scene.unit, so the world's units do not matter
+    offset_rate_unit: str = "world"  # world: as released | scene: Scene.scale, so the world's units do not matter
     feature_rate: float = 0.0075  # of the features of anchors
     log_scale_rate: float = 0.007  # of the scales of anchors
     opacity_rate: tuple[float, float] = (0.002, 2e-5)  # of the network that decodes opacities

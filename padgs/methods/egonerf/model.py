@@ -69,7 +69,7 @@ class EgoNeRF(nn.Module):
     @classmethod
     def from_scene(cls, scene: Scene, options: EgoNeRFOptions, seed: int = 0) -> EgoNeRF:
         """An untrained model around the mean of the training cameras, on the device of the scene's points."""
-        unit = scene.unit if options.length_unit == "scene" else 1.0
+        unit = scene.scale if options.length_unit == "scene" else 1.0
         centers = torch.stack([view.center for view in scene.train]).double().cpu()
         centre = centers.mean(0)
         travel = (centers - centre).norm(dim=-1).max().item() / unit

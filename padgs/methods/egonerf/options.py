@@ -49,7 +49,7 @@ class EgoNeRFOptions:
     coarse_samples: int = 128  # of each ray
     fine_samples: int = 128  # ... and more where those found something
     min_weight: float = 0.0  # ours: samples that contribute less are not shaded, their share is black
-    length_unit: str = "scene"  # ours: Scene.unit, so the world's units do not matter | world: as published
+    length_unit: str = "scene"  # ours: Scene.scale, so the world's units do not matter | world: as published
     surroundings: str = "auto"  # indoor | outdoor | auto: as the cloud says, see `surroundings.of_scene`
     density_shift: float | None = None  # density = softplus(feature + shift)
     distance_scale: float | None = None  # optical depth = density x scale x length

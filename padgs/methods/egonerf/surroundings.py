@@ -24,4 +24,4 @@ def reach(scene: Scene) -> float:
     """The distance within which `SHARE` of the points lie from the median training camera, in units of the scene."""
     points = scene.points[:: max(1, len(scene.points) // 20_000)].double()
     distances = [(points - view.center.to(points)).norm(dim=-1).quantile(SHARE) for view in scene.train]
-    return torch.stack(distances).median().item() / scene.unit
+    return torch.stack(distances).median().item() / scene.scale

@@ -36,7 +36,7 @@ def far_gaussians(scene: Scene, count: int, *, degree: int, opacity: float) -> S
     means = (centre.to(free) + far * free).to(scene.points)
     log_scales = torch.full_like(means, math.log(0.5 * spacing * far))
     grey = torch.full_like(means, 0.5)
-    return Splats(means, log_scales, grey, degree=degree, unit=scene.unit, opacity=opacity)
+    return Splats(means, log_scales, grey, degree=degree, unit=scene.scale, opacity=opacity)
 
 
 def fibonacci_sphere(count: int) -> Tensor:

@@ -91,8 +91,8 @@ class Splats(nn.Module):
         if max_gaussians is not None and len(points) > max_gaussians:
             chosen = torch.randperm(len(points), generator=generator)[:max_gaussians].sort().values
             points, colors = points[chosen], colors[chosen]
-        log_scales = torch.log(scale * initial_scales(points, scene.unit))[:, None].repeat(1, 3)
-        return cls(points, log_scales, colors, degree=degree, unit=scene.unit, opacity=opacity)
+        log_scales = torch.log(scale * initial_scales(points, scene.scale))[:, None].repeat(1, 3)
+        return cls(points, log_scales, colors, degree=degree, unit=scene.scale, opacity=opacity)
 
     def __len__(self) -> int:
         return len(self.means)

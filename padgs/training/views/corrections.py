@@ -24,7 +24,7 @@ class Corrections(nn.Module):
         """
         super().__init__()
         self.exposures = Exposures(len(scene.train)) if exposures else None
-        self.poses = PoseRefinement.of(scene.train, unit=scene.unit) if poses else None
+        self.poses = PoseRefinement.of(scene.train, unit=scene.scale) if poses else None
 
     def groups(self, iterations: int) -> list[ParameterGroup]:
         """All parameters, with their learning rates in a run of `iterations`."""

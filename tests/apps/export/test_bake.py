@@ -32,16 +32,16 @@ def decibels(method: PaDGSMethod, splats: Splats) -> float:
 
 def test_baked_anchors_look_like_the_method(trained):
     scene = tiny_scene()
-    options = trained.render_config.options(scene.unit)
-    splats = baked(trained.trainee.model, cameras_around(scene.train, 16), options, "auto", scene.unit)
+    options = trained.render_config.options(scene.scale)
+    splats = baked(trained.trainee.model, cameras_around(scene.train, 16), options, "auto", scene.scale)
     assert decibels(trained, splats) > 35
     assert 0 < len(splats) < trained.size().counts["gaussians"], "what never shows is dropped"
 
 
 def test_lessons_bring_them_nearer(trained):
     scene = tiny_scene()
-    options = trained.render_config.options(scene.unit)
-    splats = baked(trained.trainee.model, scene.train, options, "auto", scene.unit)
+    options = trained.render_config.options(scene.scale)
+    splats = baked(trained.trainee.model, scene.train, options, "auto", scene.scale)
     splats.sh_dc.data += 0.5
     first, done = decibels(trained, splats), []
     teach(splats, trained.render, scene, trained.render_config, 60, done.append)
@@ -50,8 +50,8 @@ def test_lessons_bring_them_nearer(trained):
 
 def test_cameras_in_one_place_teach_as_well(trained):
     scene = tiny_scene()
-    options = trained.render_config.options(scene.unit)
-    splats = baked(trained.trainee.model, scene.train, options, "auto", scene.unit)
+    options = trained.render_config.options(scene.scale)
+    splats = baked(trained.trainee.model, scene.train, options, "auto", scene.scale)
     before = splats.means.clone()
     alone = replace(scene, train=tuple(view.at(scene.train[0].cam_from_world) for view in scene.train))
     teach(splats, trained.render, alone, trained.render_config, 5)

@@ -34,8 +34,8 @@ def test_an_exported_run_scores_as_it_did(splat_run):
     said = export(str(splat_run))
     assert said.exit_code == 0 and "Gaussians as trained" in said.output
     run = padgs.load_run(splat_run)
-    splats = read_splats(splat_run / "splats.ply", unit=run.scene.unit)
-    options = run.config.render.options(run.scene.unit)
+    splats = read_splats(splat_run / "splats.ply", unit=run.scene.scale)
+    options = run.config.render.options(run.scene.scale)
     again = evaluate(lambda view: render(splats.gaussians(view), view, options), run.scene.test, RULES)
     plain = run.method.trainee.splats
     same = evaluate(lambda view: render(plain.gaussians(view), view, options), run.scene.test, RULES)
@@ -55,9 +55,9 @@ def test_for_viewers_gaussians_are_as_wide_as_the_finest_view_draws_them(splat_r
     said = export(str(splat_run), "--smooth", "--to", str(tmp_path / "smooth.ply"))
     assert said.exit_code == 0 and "as wide as the finest training view drew it" in " ".join(said.output.split())
     run = padgs.load_run(splat_run)
-    view, options = run.scene.train[0], run.config.render.options(run.scene.unit)
+    view, options = run.scene.train[0], run.config.render.options(run.scene.scale)
     exact, smooth = (exported(run, smooth=wanted).splats for wanted in (False, True))
-    written = read_splats(tmp_path / "smooth.ply", unit=run.scene.unit)
+    written = read_splats(tmp_path / "smooth.ply", unit=run.scene.scale)
     assert torch.allclose(written.log_scales, smooth.log_scales, atol=1e-5)
     without_filter = replace(options, low_pass=0.0)
     drawn = run.method.trainee.render(view).image
@@ -75,7 +75,7 @@ def test_refined_poses_do_not_move_the_world(tmp_path_factory):
             correction += 0.02 * torch.randn(correction.shape, generator=torch.Generator().manual_seed(1))
     splats, view = exported(run).splats, run.scene.test[0]
     carried_view = view.at(carried(view.cam_from_world, aligned(poses)[0]))
-    options = run.config.render.options(run.scene.unit)
+    options = run.config.render.options(run.scene.scale)
     own = run.method.trainee.render(carried_view).image
     assert torch.allclose(render(splats.gaussians(view), view, options).image, own, atol=0.02)
     assert (run.method.trainee.render(view).image - own).abs().max() > 0.05, "it is another world"

@@ -34,7 +34,7 @@ def test_scaling_and_turning_the_world_changes_no_pixel():
     near_frame = view.cam_from_world[:3, :3] @ scene.points.double().T + view.cam_from_world[:3, 3:]
     far_frame = far.cam_from_world[:3, :3] @ other.points.double().T + far.cam_from_world[:3, 3:]
     torch.testing.assert_close(far_frame, 100 * near_frame, rtol=0, atol=1e-3)
-    assert other.unit == pytest.approx(100 * scene.unit, rel=1e-5)
+    assert other.scale == pytest.approx(100 * scene.scale, rel=1e-5)
 
 
 @pytest.mark.parametrize("scene", ["bare_room", "two_rooms"])  # the second has a route of its own

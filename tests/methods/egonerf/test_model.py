@@ -78,8 +78,8 @@ def test_the_defaults_have_the_published_number_of_parameters():
 def test_the_defaults_are_the_published_model_of_a_scene_of_some_unit(generator, surroundings, unit, published):
     """Lengths are published in units of the data; the optical depth of a length is the same, too."""
     world = tiny_scene()
-    world = moved(world, unit / world.unit)
-    assert world.unit == pytest.approx(unit)
+    world = moved(world, unit / world.scale)
+    assert world.scale == pytest.approx(unit)
     free = dict.fromkeys(Constants._fields)
     ours, theirs = (
         dense(replace(SMALL, **free, surroundings=surroundings, length_unit=unit_of_lengths), world)
@@ -201,7 +201,7 @@ def test_the_units_of_the_world_do_not_matter(scale):
     scene = tiny_scene()
     other = moved(scene, scale)
     plain, scaled = dense(scene=scene), dense(scene=other)
-    assert scaled.unit == pytest.approx(scale * plain.unit)
+    assert scaled.scale == pytest.approx(scale * plain.scale)
     a, b = plain.render(scene.test[0]), scaled.render(other.test[0])
     assert torch.allclose(a.image, b.image, atol=1e-4)
     assert torch.allclose(a.depth * scale, b.depth, rtol=1e-3)

@@ -26,7 +26,7 @@ def test_starts_as_the_point_cloud():
     assert torch.equal(drawn.means, scene.points)
     assert torch.allclose(drawn.colors, scene.point_colors / 255, atol=1e-6)
     assert torch.allclose(drawn.opacities, torch.full((40,), 0.1))
-    assert torch.allclose(drawn.scales, initial_scales(scene.points, scene.unit)[:, None].expand(40, 3), rtol=1e-5)
+    assert torch.allclose(drawn.scales, initial_scales(scene.points, scene.scale)[:, None].expand(40, 3), rtol=1e-5)
 
 
 def test_initial_scale_is_the_root_mean_square_of_three_neighbours():

@@ -96,14 +96,14 @@ def test_lengths_are_measured_with_the_extent_of_cameras_that_move(apart):
     scene = travelling(tiny_scene(), apart)
     centers = torch.stack([view.center for view in scene.train])
     extent = 1.1 * (centers - centers.mean(0)).norm(dim=-1).max().item()
-    assert 0.15 < extent / scene.unit < 0.9
+    assert 0.15 < extent / scene.scale < 0.9
     assert scene.extent == ExtentOptions(0.1).extent_of(scene) == pytest.approx(extent)
 
 
 @pytest.mark.parametrize("apart", [0.0, 1e-8, 0.5])
 def test_lengths_are_measured_with_a_tenth_of_the_unit_where_cameras_hardly_move(apart):
     scene = travelling(tiny_scene(), apart)
-    assert ExtentOptions(0.1).extent_of(scene) == pytest.approx(0.1 * scene.unit)
+    assert ExtentOptions(0.1).extent_of(scene) == pytest.approx(0.1 * scene.scale)
 
 
 @pytest.mark.parametrize("release", ["padgs_release", "omnigs_release", "odgs_release", "op43dgs_release"])
@@ -111,7 +111,7 @@ def test_releases_measure_with_the_extent_of_their_cameras_however_little_they_m
     """The rate of the means or offsets falls from a published share of it; in one place they could not learn."""
     monkeypatch.setenv("PADGS_ROOT", str(root))
     config, scene = composed(f"method={release}"), travelling(tiny_scene(), 0.1)
-    assert 0 < scene.extent < 0.05 * scene.unit
+    assert 0 < scene.extent < 0.05 * scene.scale
     method = build(config)
     method.fit(scene, Budget(1))
     published = 0.01 if release == "padgs_release" else 1.6e-4
@@ -124,8 +124,8 @@ def test_the_least_that_counts_as_a_move():
     """Around a millionth of the unit: below it is rounding, above it travel."""
     scene = tiny_scene()
     for times, still in ((0.3, True), (3.0, False)):
-        moved = in_one_place(scene, times * 1e-6 * scene.unit / 2.2)  # the extent of steps 0 to 4 is 2.2 of them
-        assert moved.stands_still == still
+        moved = in_one_place(scene, times * 1e-6 * scene.scale / 2.2)  # the extent of steps 0 to 4 is 2.2 of them
+        assert moved.has_single_center == still
 
 
 @pytest.mark.parametrize(
