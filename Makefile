@@ -23,6 +23,7 @@ test-all: .venv/installed-dev ## the slow ones too
 lint: .venv/installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	ln -sfn ../baselines padgs/baselines && ln -sfn ../reports padgs/reports # pyright ignores import hooks
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
 bench: .venv/installed ## speed and memory, as ratios within one run

@@ -19,8 +19,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from padgs import results
-from padgs.baselines import outside
+from padgs import baselines, results
 from padgs.multirun.overrides import root
 
 FOLDER = ".multirun"  # in run.folder
@@ -114,7 +113,8 @@ def signature(data: str) -> str:
 def _sources() -> str:
     digest = hashlib.sha256()
     package = Path(__file__).resolve().parent.parent
-    for place in (package, package / "baselines", root() / "conf", root() / "sweeps", *_outside_sources()):
+    methods = Path(baselines.__file__).parent
+    for place in (package, methods, root() / "conf", root() / "sweeps", *_outside_sources()):
         for path in sorted(place.rglob("*")) if place.is_dir() else [place]:
             if path.suffix in (".py", ".yaml"):
                 digest.update(path.read_bytes())
@@ -123,7 +123,7 @@ def _sources() -> str:
 
 def _outside_sources() -> Iterator[Path]:
     """The packages that bring methods, folders and single modules, none of which is imported here."""
-    for name in sorted({re.split("[.:]", value)[0] for value in outside().values()}):
+    for name in sorted({re.split("[.:]", value)[0] for value in baselines.outside().values()}):
         if spec := find_spec(name):  # else it is left out, as `padgs.multirun.choices` says
             yield from map(Path, spec.submodule_search_locations or filter(None, [spec.origin]))
 
