@@ -4,7 +4,6 @@ A new room needs one line in `ROOMS`: the highest from which it can see all that
 """
 
 import ast
-import re
 import statistics
 import subprocess
 import sys
@@ -224,7 +223,7 @@ def test_the_rules_bite(module, source, expected):
     [
         ("padgs.training.loop", "from padgs.training.loss import photometric_loss\nfrom padgs.scene import View"),
         ("padgs.data.splits", "def f():\n    import zlib\n    import pycolmap"),
-        ("padgs.data.splits", "from padgs.data.errors import DataError\nfrom padgs.scene import Scene"),
+        ("padgs.data.splits", "from padgs.data.capture import DataError\nfrom padgs.scene import Scene"),
         ("padgs.reports.tables.table3", "import pandas\nfrom padgs.results import Result\nfrom padgs import results"),
         (
             "padgs.multirun.run",

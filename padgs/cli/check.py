@@ -11,7 +11,7 @@ import typer
 from padgs.cli.refusing import refusing, show
 
 if TYPE_CHECKING:
-    from padgs.data.check.report import Report
+    from padgs.data.check import Report
 
 
 @refusing(ValueError, OSError)
@@ -29,8 +29,8 @@ def check(
     """Look a data set through and list what is wrong with it. Exit code 1 if anything is."""
     from rich.console import Console
 
-    from padgs.data.check.report import check as look_through
-    from padgs.data.options import DataOptions
+    from padgs.data.capture import DataOptions
+    from padgs.data.check import check as look_through
 
     with Console().status("looking at the images") as status:
         report = look_through(
@@ -45,7 +45,7 @@ def check(
 
 def picture_place(data: Path) -> Path:
     """Where the picture of a data set goes if nobody says: into its folder, or here if that is read-only."""
-    from padgs.data.check.overlay import OVERLAY
+    from padgs.data.check import OVERLAY
 
     folder = data if data.is_dir() else data.parent
     return (folder if os.access(folder, os.W_OK) else Path()) / OVERLAY

@@ -27,8 +27,8 @@ def convert(
 
     from rich.console import Console
 
+    from padgs.data.capture import DataOptions
     from padgs.data.formats.convert import convert as write
-    from padgs.data.options import DataOptions
 
     with Console().status("reading") as status:
         scene = write(

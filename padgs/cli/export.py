@@ -37,7 +37,7 @@ def export(
 
     from padgs.apps.export.explicit import LESSONS, exported, point_cloud
     from padgs.apps.export.splat_file import refuse_impossible, seconds_to_write, write_splats
-    from padgs.data.ply import write_ply
+    from padgs.data.cloud import write_ply
 
     lessons = LESSONS if lessons is None else lessons
     path = Path(to) if to else Path(run) / ("points.ply" if points else "splats.ply")

@@ -35,7 +35,7 @@ def opened(run: str, data: str | None) -> OpenedRun:
 @contextmanager
 def naming_data(run: str) -> Iterator[None]:
     """Say of data that cannot be used whose they are, and what to do if they have moved."""
-    from padgs.data.errors import DataError
+    from padgs.data.capture import DataError
 
     try:
         yield

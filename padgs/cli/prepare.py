@@ -44,10 +44,10 @@ def prepare(
     from pathlib import Path
 
     from padgs.cli.check import end_with, picture_place
-    from padgs.data.check.report import check
-    from padgs.data.errors import DataError
+    from padgs.data.capture import DataError
+    from padgs.data.check import check
     from padgs.data.prepare.pipeline import prepare as find_poses
-    from padgs.data.prepare.statement import PrepareOptions
+    from padgs.data.prepare.work import PrepareOptions
 
     target = Path(destination)
     try:

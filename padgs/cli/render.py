@@ -34,11 +34,9 @@ def render(
     import torch
     from rich.console import Console
 
-    from padgs.apps.camera_path_video.frames import write_film
-    from padgs.apps.camera_path_video.keyframes import read_path
-    from padgs.apps.camera_path_video.paths import PATHS
+    from padgs.apps.camera_path_video import write_film
+    from padgs.data.camera_paths import PATHS, gravity, read_path
     from padgs.data.formats.transforms import described
-    from padgs.data.trajectory import gravity
     from padgs.geometry.camera import Panorama, perspective
     from padgs.scene import View, move_origin
 

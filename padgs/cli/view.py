@@ -36,7 +36,7 @@ def view(
             opened(folder, data)  # says what is wrong before a page stands
 
     def of_one_scene() -> list[OpenedRun]:
-        from padgs.apps.viewer.waiting import await_checkpoint
+        from padgs.apps.viewer.process import await_checkpoint
 
         runs, names = [], []
         for folder in folders:

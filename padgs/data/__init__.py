@@ -9,11 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from padgs.data.assemble import assemble
-from padgs.data.capture import Capture
+from padgs.data.capture import Capture, DataError, DataOptions
 from padgs.data.datasets import DATASETS, lookup_dataset, refuse_missing
-from padgs.data.errors import DataError
-from padgs.data.formats.detect import detect
-from padgs.data.options import DataOptions
+from padgs.data.formats import detect
 from padgs.registry import lookup
 from padgs.scene import Scene
 
@@ -24,10 +22,10 @@ LOADERS = {
     "nerfstudio": "padgs.data.formats.transforms:read",  # the same, by the name of the program
     "openmvg": "padgs.data.formats.openmvg:read",
     "opensfm": "padgs.data.formats.opensfm:read",
-    "roam360": "padgs.data.formats.roam360:read",
-    "ricoh360": "padgs.data.formats.ricoh360:read",
-    "omniblender": "padgs.data.formats.omniblender:read",
-    "released": "padgs.data.formats.released:read",
+    "roam360": "padgs.data.formats.published:read_roam360",
+    "ricoh360": "padgs.data.formats.published:read_ricoh360",
+    "omniblender": "padgs.data.formats.published:read_omniblender",
+    "released": "padgs.data.formats.published:read_released",
     "synthetic": "padgs.data.synthetic:load",
 }
 

@@ -8,12 +8,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
-from padgs.data.capture import Capture, Frame
+from padgs.data.capture import Capture, DataError, DataOptions, Frame, listed
 from padgs.data.cloud import starting_cloud
-from padgs.data.errors import DataError, listed
 from padgs.data.images import EXTENSIONS, ImageFile, inspect
 from padgs.data.masks import find_masks
-from padgs.data.options import DataOptions
 from padgs.data.splits import split_frames
 from padgs.data.store import ImageStore, StoredImage
 from padgs.scene import Scene, View

@@ -1,13 +1,10 @@
-"""What a file format says, before any pixel is read: frames with poses, points, split lists.
-
-Every file format has one reader, `read(path, options) -> Capture`; `padgs.data.assemble` makes the scene of it, and
-`padgs.data.formats.convert` writes it in another format.
-"""
+"""The data structures that readers of formats return, their options, and the error that refuses input."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +12,34 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from padgs.data.errors import DataError
+
+class DataError(ValueError):
+    """Input that cannot be used. The message names the file, the rule and the way out; no traceback is needed."""
+
+
+def listed(names: Iterable[object], most: int = 5) -> str:
+    """The first few names and how many more there are.
+
+    >>> listed("abcdefg", most=3)
+    'a, b, c and 4 more'
+    """
+    names = [str(name) for name in names]
+    shown = ", ".join(names[:most])
+    return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
+
+
+_NUMBER = re.compile(r"(\d+)")
+
+
+def natural(name: str) -> tuple[list[Any], str]:
+    """What to sort names by so that numbers in them stand by their value.
+
+    >>> sorted(["view_10", "view_2", "door"], key=natural)
+    ['door', 'view_2', 'view_10']
+    """
+    parts: list[Any] = _NUMBER.split(name)
+    parts[1::2] = map(int, parts[1::2])
+    return parts, name
 
 
 @dataclass(frozen=True)
@@ -82,3 +106,44 @@ class Capture:
     width: int | None = None  # what wider images are reduced to if data.width is null; None = as stored
     tracks: Callable[[], Tracks] | None = None
     notes: tuple[str, ...] = ()
+
+
+SPLITS = ("auto", "files", "every", "all")
+
+
+@dataclass(frozen=True)
+class DataSettings:
+    """What the user decides. The defaults suit a folder about which nothing else is known."""
+
+    dataset: str | None = None  # a name of DATASETS: its mask, size and where to get it
+    width: int | None = None  # panoramas are reduced to this width (area filter); None = as stored
+    images: str | None = None  # image folder, relative to the data set's; None = found
+    points: str = "auto"  # auto | random | a PLY file, relative to the data set's folder
+    mask: str = "auto"  # auto | none | rows:959/1024 (keep the first 959 of 1024) | a file, or a folder of files
+    split: str = "auto"  # auto | files (train.txt, test.txt) | every (k-th view) | all (train on everything)
+    test_every: int = 8  # k of split=every
+    cache_bytes: int = 1 << 30  # decoded images kept, all views together
+    read_ahead: int = 2  # threads that decode images before they are asked for
+    generator: Mapping[str, Any] = field(default_factory=dict)  # knobs of the synthetic scene
+
+    def __post_init__(self) -> None:
+        if self.split not in SPLITS:
+            raise DataError(f"unknown data.split {self.split!r}; known: {', '.join(SPLITS)}")
+        if self.test_every < 2:
+            raise DataError(
+                f"data.test_every is {self.test_every}; every k-th view is a test view, k must be 2 or more"
+            )
+        if self.width is not None and (self.width < 8 or self.width % 2):
+            raise DataError(
+                f"data.width is {self.width}; a panorama is twice as wide as high: give an even number >= 8"
+            )
+        for name in ("cache_bytes", "read_ahead"):
+            if getattr(self, name) < 0:
+                raise DataError(f"data.{name} is {getattr(self, name)}; it must be 0, which switches it off, or more")
+
+
+@dataclass(frozen=True)
+class DataOptions(DataSettings):
+    """How to turn files into a scene."""
+
+    device: str = "cpu"  # where decoded images are kept, as uint8

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from padgs.data.errors import DataError
+from padgs.data.capture import DataError
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,7 @@ from pathlib import Path, PurePosixPath
 import torch
 from torch import Tensor
 
-from padgs.data.capture import Capture
-from padgs.data.errors import DataError
+from padgs.data.capture import Capture, DataError
 from padgs.data.images import EXTENSIONS, ImageFile, inspect, save_png
 from padgs.data.store import ImageStore, StoredImage
 from padgs.geometry.distortion import solid_angle_weight

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
-from padgs.data.errors import DataError, listed
+from padgs.data.capture import DataError, listed
 
 LONGEST = 255  # bytes of a file's name
 LISTS = {"train": "train.txt", "test": "test.txt"}

@@ -10,8 +10,8 @@ from typing import Any
 from padgs.baselines import METHODS
 from padgs.checks import check, check_known
 from padgs.data import LOADERS
+from padgs.data.capture import DataOptions, DataSettings
 from padgs.data.datasets import DATASETS
-from padgs.data.options import DataOptions, DataSettings
 from padgs.data.synthetic.options import SyntheticOptions
 from padgs.evaluation.protocols import PROTOCOLS, Protocol, protocol_from_options
 from padgs.registry import lookup

@@ -14,8 +14,8 @@ from omegaconf import OmegaConf
 from yaml import YAMLError
 
 from padgs import results
-from padgs.apps.camera_path_video.paths import between
-from padgs.data.errors import DataError
+from padgs.data.camera_paths import between
+from padgs.data.capture import DataError
 from padgs.evaluation.protocols import PROTOCOLS
 from padgs.geometry.camera import Camera, Panorama, Pinhole
 from padgs.results import Result, Scores

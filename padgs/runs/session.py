@@ -13,7 +13,7 @@ from rich.console import Console
 
 from padgs import clock, data, results
 from padgs.baselines import METHODS
-from padgs.data.errors import DataError
+from padgs.data.capture import DataError
 from padgs.evaluation.protocols import Protocol
 from padgs.registry import lookup
 from padgs.results import ASKED, Result

@@ -10,8 +10,8 @@ from fixtures import World, write_colmap_text
 from PIL import Image
 
 from padgs.data import DataError
-from padgs.data.check.report import check
-from padgs.data.fisheye import is_dual_fisheye
+from padgs.data.check import check
+from padgs.data.images import is_dual_fisheye
 from padgs.data.prepare.sources import find_source
 from padgs.geometry.panorama import sample
 

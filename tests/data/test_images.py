@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from padgs.data.errors import DataError
+from padgs.data.capture import DataError
 from padgs.data.images import decode, inspect
 
 PIXELS = np.random.default_rng(3).integers(0, 256, (64, 128, 3), dtype=np.uint8)

@@ -4,9 +4,8 @@ import pytest
 import torch
 from fixtures import World, write_cloud
 
-from padgs.data.capture import Cloud
-from padgs.data.errors import DataError
-from padgs.data.ply import read_ply, write_ply
+from padgs.data.capture import Cloud, DataError
+from padgs.data.cloud import read_ply, write_ply
 
 
 def test_write_and_read_lose_nothing(tmp_path: Path, generator: torch.Generator) -> None:

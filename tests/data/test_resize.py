@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from padgs.data.resize import area_resize
+from padgs.data.store import area_resize
 
 
 def test_an_output_pixel_is_the_mean_of_what_it_covers() -> None:

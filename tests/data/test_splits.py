@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from padgs.data.errors import DataError
+from padgs.data.capture import DataError
 from padgs.data.splits import read_list, split_frames
 
 NAMES = ("a.jpg", "b.jpg", "c.jpg", "sub/d.png", "sub/e.png")

@@ -9,9 +9,8 @@ import pytest
 import torch
 from PIL import Image
 
-from padgs.data.errors import DataError
-from padgs.data.resize import area_resize
-from padgs.data.store import ImageStore, StoredImage
+from padgs.data.capture import DataError
+from padgs.data.store import ImageStore, StoredImage, area_resize
 
 BYTES = 32 * 16 * 3
 

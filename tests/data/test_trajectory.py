@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from padgs.data.trajectory import centers, gravity, median_depth, path_length
+from padgs.data.camera_paths import centers, gravity, median_depth, path_length
 
 
 def _pose(heading: float, center: tuple[float, float, float], tilt: float = 0.0) -> torch.Tensor:

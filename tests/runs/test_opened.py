@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 from tiny_run import tiny_run
 
 import padgs
-from padgs.data.errors import DataError
+from padgs.data.capture import DataError
 from padgs.geometry.camera import Panorama, perspective
 from padgs.geometry.panorama import sample
 from padgs.results import read

@@ -15,7 +15,7 @@ from rich.console import Console
 from tiny_scene import HEIGHT, WIDTH, tiny_scene
 
 from padgs import results
-from padgs.data.errors import DataError
+from padgs.data.capture import DataError
 from padgs.methods.anchors.method import PaDGSMethod
 from padgs.reports import store
 from padgs.reports.frame import frame

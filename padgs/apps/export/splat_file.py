@@ -21,8 +21,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from padgs.data.errors import DataError
-from padgs.data.ply import read_vertices
+from padgs.data.capture import DataError
+from padgs.data.cloud import read_vertices
 from padgs.methods.splats.model import Splats
 from padgs.replacing import replacing
 

@@ -1,4 +1,4 @@
-"""A process that serves a page: of `padgs view`, or beside a run in training, which keeps its thread and its memory."""
+"""Process."""
 
 from __future__ import annotations
 
@@ -13,7 +13,11 @@ from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from padgs import results
 from padgs.apps.viewer.server import LOCAL, PORT, serving, viser_module
+from padgs.runs import checkpoint
+from padgs.runs.folder import RunFolder
+from padgs.runs.lock import RunBusy, held
 
 if TYPE_CHECKING:
     from padgs.runs.opened import OpenedRun
@@ -85,9 +89,41 @@ def shown(folder: Path, data_path: str | None, device: str) -> Iterator[None]:
 
 
 def _show(folder: Path, data_path: str | None, device: str) -> None:
-    from padgs.apps.viewer.waiting import await_checkpoint
+    from padgs.apps.viewer.process import await_checkpoint
     from padgs.runs.opened import load_run
 
     with suppress(KeyboardInterrupt):
         await_checkpoint(folder)
         serve(lambda: [load_run(folder, data_path=data_path, device=device)])
+
+
+def await_checkpoint(folder: str | Path) -> None:
+    """Return when a run has its first checkpoint, or can have none any more: opening it then says what is wrong.
+
+    Raises:
+        ValueError: it was begun, but nobody trains it.
+    """
+    files, said, beside = RunFolder(Path(folder)), False, parent_process() is not None
+
+    def decided() -> bool:
+        return checkpoint.exists(files.checkpoint) or (files.path / results.FILE_NAME).exists()
+
+    while not decided() and is_wanted():
+        if not beside and not (files.path / results.CONFIG_NAME).is_file():
+            return
+        # Training beside which this process stands may not hold its lock yet; what ended just now is looked at again.
+        if not beside and _is_left(files.path) and not decided():
+            raise ValueError(f"{folder} has no checkpoint, and nobody trains it; start the same padgs-run again")
+        if not said:
+            print(f"waiting for the first checkpoint of {folder}  (Ctrl-C ends it)", flush=True)
+        said = True
+        time.sleep(LOOKS)
+
+
+def _is_left(folder: Path) -> bool:
+    """Whether nobody works on a run, as far as can be told."""
+    try:
+        with held(folder):
+            return True
+    except (RunBusy, OSError):  # a folder of somebody else, which cannot be locked from here
+        return False

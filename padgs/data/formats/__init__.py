@@ -1,1 +1,54 @@
-"""One file for each format of a data set, and what they share: `read(path, options) -> Capture`, `load -> Scene`."""
+"""Formats."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from padgs.data.capture import DataError, listed
+from padgs.data.formats.colmap import find_model
+
+# Files that together tell a format, most specific first: the native folders of data sets also hold files of the
+# general formats. No files: a COLMAP model.
+SIGNS: tuple[tuple[str, tuple[str, ...]], ...] = (
+    ("roam360", ("pose_c2w.json",)),
+    ("ricoh360", ("output_dir/colmap/images.txt",)),
+    ("released", ("data_extrinsics.json", "data_views.json")),
+    ("colmap", ()),
+    ("omniblender", ("transform.json",)),
+    ("transforms", ("transforms.json",)),
+    ("transforms", ("transforms_train.json",)),
+    ("openmvg", ("sfm_data.json",)),
+    ("opensfm", ("reconstruction.json",)),
+)
+# Files that may be given themselves, instead of their folder.
+ALONE = ("transform.json", "transforms.json", "sfm_data.json", "reconstruction.json")
+
+
+def detect(path: Path) -> tuple[str, str]:
+    """The format of a data set, and the reason in words.
+
+    Raises:
+        DataError: nothing known is there; the message says what was looked for.
+
+    """
+    found: dict[str, str] = {}
+    for format, files in SIGNS:
+        if not files and path.is_dir() and (model := find_model(path)):
+            found[format] = f"the COLMAP model in {model.relative_to(path)}"
+        elif files == (path.name,) and path.is_file() and path.name in ALONE:
+            found[format] = path.name
+        elif files and all((path / file).exists() for file in files):
+            found.setdefault(format, " and ".join(files))
+    if not found:
+        inside = listed(sorted(child.name for child in path.iterdir())) if path.is_dir() else "a file"
+        raise DataError(
+            f"{path} has no known format; it holds {inside or 'nothing'}. Known are a COLMAP model (sparse/0), "
+            "transforms.json, sfm_data.json, reconstruction.json, pose_c2w.json (360Roam), output_dir/colmap "
+            "(Ricoh360), transform.json (OmniBlender), data_views.json with data_extrinsics.json. Panoramas without "
+            "poses: run `padgs prepare IMAGES OUT` first"
+        )
+    name, *others = found
+    reason = f"format: {name}, because there is {found[name]}"
+    if others:
+        reason += f" (also there, not used: {', '.join(found[other] for other in others)}; data.format chooses)"
+    return name, reason

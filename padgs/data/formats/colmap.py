@@ -1,12 +1,11 @@
-"""COLMAP models, text or binary, with or without rigs, of the camera EQUIRECTANGULAR (in forks: SPHERICAL).
-
-COLMAP's panoramic camera is this project's (padgs.geometry.panorama), so poses are taken as they are.
-"""
+"""COLMAP."""
 
 from __future__ import annotations
 
 import re
+import struct
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -15,12 +14,9 @@ import numpy as np
 import torch
 
 from padgs.data.assemble import image_folder
-from padgs.data.capture import Capture, Cloud, Frame, Tracks
-from padgs.data.errors import DataError, listed
-from padgs.data.formats.colmap_binary import check_whole
+from padgs.data.capture import Capture, Cloud, DataError, DataOptions, Frame, Tracks, listed
 from padgs.data.formats.poses import cam_from_world, checked_quaternion
 from padgs.data.images import read_bytes
-from padgs.data.options import DataOptions
 from padgs.data.splits import check_inside
 
 FILES = ("cameras", "images", "points3D")
@@ -172,3 +168,82 @@ def _tracks(images: list[Any], row_of: dict[int, int]) -> Tracks:
         for frame, image in enumerate(images)
         for seen in image.get_observation_points2D()
     )
+
+
+_CAMERA_PARAMETERS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12, 7: 5, 8: 4, 9: 5, 10: 12}  # by model id
+_EQUIRECTANGULAR = 17
+
+
+def check_whole(folder: Path) -> None:
+    """Walk through all .bin files of a model folder.
+
+    Raises:
+        DataError: a file ends early, or goes on after its last entry.
+    """
+    for stem, skip in _ENTRIES.items():
+        path = folder / f"{stem}.bin"
+        if not path.is_file():
+            continue
+        data = path.read_bytes()
+        try:
+            (count,) = struct.unpack_from("<Q", data)
+            if count > len(data):  # every entry takes more than a byte
+                raise struct.error
+            offset = 8
+            for _ in range(count):
+                offset = skip(data, offset)
+        except (struct.error, ValueError) as error:
+            raise DataError(
+                f"{path} ends early or is not a COLMAP {stem} file; copy it again or rebuild the model"
+            ) from error
+        if offset != len(data):
+            raise DataError(f"{path} has {len(data)} bytes but its {count} entries take {offset}; copy it again")
+
+
+def _skip(data: bytes, offset: int, size: int) -> int:
+    if offset + size > len(data):
+        raise struct.error
+    return offset + size
+
+
+def _skip_camera(data: bytes, offset: int) -> int:
+    (model,) = struct.unpack_from("<4xi", data, offset)
+    if model not in _CAMERA_PARAMETERS and model != _EQUIRECTANGULAR:
+        raise DataError(
+            f"the model holds a camera of type {model}; only EQUIRECTANGULAR ({_EQUIRECTANGULAR}) can be used here"
+        )
+    return _skip(data, offset, 24 + 8 * _CAMERA_PARAMETERS.get(model, 2))
+
+
+def _skip_image(data: bytes, offset: int) -> int:
+    offset = data.index(b"\0", _skip(data, offset, 64)) + 1
+    (count,) = struct.unpack_from("<Q", data, offset)
+    return _skip(data, offset, 8 + 24 * count)
+
+
+def _skip_point(data: bytes, offset: int) -> int:
+    (length,) = struct.unpack_from("<43xQ", data, offset)
+    return _skip(data, offset, 51 + 8 * length)
+
+
+def _skip_rig(data: bytes, offset: int) -> int:
+    (sensors,) = struct.unpack_from("<4xI", data, offset)
+    offset = _skip(data, offset, 16 if sensors else 8)
+    for _ in range(max(0, sensors - 1)):
+        (posed,) = struct.unpack_from("<8xB", data, offset)
+        offset = _skip(data, offset, 65 if posed else 9)
+    return offset
+
+
+def _skip_frame(data: bytes, offset: int) -> int:
+    (count,) = struct.unpack_from("<64xI", data, offset)
+    return _skip(data, offset, 68 + 16 * count)
+
+
+_ENTRIES: dict[str, Callable[[bytes, int], int]] = {
+    "cameras": _skip_camera,
+    "images": _skip_image,
+    "points3D": _skip_point,
+    "rigs": _skip_rig,
+    "frames": _skip_frame,
+}

@@ -13,13 +13,11 @@ from PIL import Image
 
 import padgs.data
 from padgs.data.assemble import assemble, view_name
-from padgs.data.capture import Capture, Cloud, Frame, Tracks
+from padgs.data.capture import Capture, Cloud, DataError, DataOptions, Frame, Tracks
 from padgs.data.cloud import starting_cloud
-from padgs.data.errors import DataError
 from padgs.data.formats.writers import WRITERS, Content
 from padgs.data.images import save_png
 from padgs.data.masks import write_masks
-from padgs.data.options import DataOptions
 from padgs.scene import Scene
 
 IMAGE_FOLDERS = {"ricoh360": "imgs"}  # "images" otherwise

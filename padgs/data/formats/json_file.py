@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from padgs.data.errors import DataError, listed
+from padgs.data.capture import DataError, listed
 from padgs.data.images import read_bytes
 from padgs.data.splits import check_inside
 

@@ -11,12 +11,10 @@ from pathlib import Path, PurePosixPath
 from torch import Tensor
 
 from padgs.data.assemble import image_folder
-from padgs.data.capture import Capture, Cloud, Frame, Tracks
+from padgs.data.capture import Capture, Cloud, DataError, DataOptions, Frame, Tracks
 from padgs.data.cloud import existing_ply
-from padgs.data.errors import DataError
 from padgs.data.formats.json_file import Json, file_in, read_json
 from padgs.data.formats.poses import cam_from_center
-from padgs.data.options import DataOptions
 from padgs.data.splits import check_inside
 
 _PLY = ("colorized.ply", "scene.ply", "pcd.ply")

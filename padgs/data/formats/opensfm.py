@@ -10,11 +10,9 @@ from pathlib import Path
 from torch import Tensor
 
 from padgs.data.assemble import image_folder
-from padgs.data.capture import Capture, Cloud, Frame, color_bytes
-from padgs.data.errors import DataError
+from padgs.data.capture import Capture, Cloud, DataError, DataOptions, Frame, color_bytes
 from padgs.data.formats.json_file import Json, file_in, read_json
 from padgs.data.formats.poses import cam_from_world, rotation_from_vector
-from padgs.data.options import DataOptions
 from padgs.data.splits import check_inside
 
 MODELS = ("spherical", "equirectangular")

@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from padgs.data.errors import DataError
+from padgs.data.capture import DataError
 
 TOLERANCE = 1e-3  # of R R^T against the identity; files with four digits pass, scaled or sheared matrices do not
 FURTHEST = 1e15  # world units, as for what renderers draw (`padgs.render.contract`)

@@ -8,15 +8,12 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
-from padgs.data.capture import Capture, Frame
-from padgs.data.cloud import existing_ply
-from padgs.data.errors import DataError
-from padgs.data.formats.detect import detect
+from padgs.data.capture import Capture, DataError, DataOptions, Frame
+from padgs.data.cloud import existing_ply, read_ply
+from padgs.data.formats import detect
 from padgs.data.formats.json_file import Json, file_in, read_json
 from padgs.data.formats.poses import cam_from_opengl_pose
 from padgs.data.images import EXTENSIONS
-from padgs.data.options import DataOptions
-from padgs.data.ply import read_ply
 
 FILE = "transforms.json"
 SIDES = {"train": "transforms_train.json", "test": "transforms_test.json"}

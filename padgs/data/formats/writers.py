@@ -10,11 +10,10 @@ from typing import Any
 
 import torch
 
-from padgs.data.capture import Cloud, Frame, Tracks
-from padgs.data.errors import DataError
+from padgs.data.capture import Cloud, DataError, Frame, Tracks
+from padgs.data.cloud import write_ply
 from padgs.data.formats.colmap import pycolmap_module
 from padgs.data.formats.poses import OPENCV_FROM_OPENGL, quaternion_from_rotation, vector_from_rotation
-from padgs.data.ply import write_ply
 from padgs.data.splits import LISTS
 
 

@@ -10,7 +10,7 @@ from PIL import Image
 
 import padgs.data
 from padgs.data.assemble import image_folder
-from padgs.data.errors import DataError, listed
+from padgs.data.capture import DataError, listed
 from padgs.data.images import decode, inspect, save_png
 from padgs.data.masks import PREVIEW, SCENE_MASKS, row_weights
 from padgs.data.prepare.sources import mask_folder, panoramas

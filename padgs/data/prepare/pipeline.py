@@ -1,8 +1,4 @@
-"""From panoramas without poses, or a 360-degree video, to a data set that is ready for training.
-
-Works beside its destination, in a hidden folder that outlives an interruption: the same call goes on where it stopped.
-The destination appears at the end, complete, or not at all.
-"""
+"""Pipeline."""
 
 from __future__ import annotations
 
@@ -15,23 +11,31 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from PIL import Image
+from torch import Tensor
 
 from padgs.data.assemble import IMAGE_FOLDERS, view_name
-from padgs.data.capture import Cloud, Frame, Tracks
-from padgs.data.errors import DataError, listed
+from padgs.data.camera_paths import gravity
+from padgs.data.capture import Cloud, DataError, DataOptions, Frame, Tracks, listed
 from padgs.data.formats import colmap
 from padgs.data.formats.writers import Content, write_colmap
 from padgs.data.images import decode
 from padgs.data.masks import write_masks
-from padgs.data.options import DataOptions
-from padgs.data.prepare import resources, rig, sfm
-from padgs.data.prepare.level import levelled
-from padgs.data.prepare.pairs import image_pairs
-from padgs.data.prepare.sources import Source, find_source
-from padgs.data.prepare.statement import Prepared, PrepareOptions, digest_of, fingerprint, finished
-from padgs.data.prepare.video import extract_frames, is_video
-from padgs.data.prepare.work import WorkFolder
+from padgs.data.prepare import rig, sfm
+from padgs.data.prepare.sfm import image_pairs
+from padgs.data.prepare.sources import Source, extract_frames, find_source, is_video
+from padgs.data.prepare.work import (
+    Prepared,
+    PrepareOptions,
+    WorkFolder,
+    digest_of,
+    fingerprint,
+    finished,
+    link_or_copy,
+    refuse_full,
+    threads_for,
+)
 
 STEPS = ("frames", "images", "views", "features", "matches", "poses", "result")
 _REMEDIES = (
@@ -113,7 +117,7 @@ class _Job:
         with self.folder.step("images"):
             self.source: Source = find_source(source, options.mask)
         first = next(iter(self.source.images.values()))
-        self.threads = options.threads or resources.threads_for(first.width, first.height)
+        self.threads = options.threads or threads_for(first.width, first.height)
         of_video = ("video.sha256", "frames", "frames.done") if source.parent == self.work else ()
         of_images = digest_of(self.source.fingerprint, options)
         self.folder.open("images", of_images, keep=of_video)
@@ -146,7 +150,7 @@ class _Job:
         for short, name in self.files.items():
             image, mask = self.source.images[name], self.source.masks.get(name)
             if Path(short).suffix == image.path.suffix:
-                resources.link_or_copy(image.path, images / short)
+                link_or_copy(image.path, images / short)
             else:
                 Image.fromarray(decode(image.path)).save(images / short, compress_level=1)
             if self.source.masks:
@@ -271,7 +275,7 @@ class _Job:
     def _tell(self, step: str, done: int, total: int) -> None:
         """Tell of a batch, and do not begin another on a full disk."""
         self.progress(step, done, total)
-        resources.refuse_full(self.work)
+        refuse_full(self.work)
 
 
 def _ending(name: str) -> str:
@@ -285,3 +289,35 @@ def _said(error: Exception, log: Path) -> str:
     logged = log.read_text(encoding="utf-8", errors="replace").splitlines()[-1:] if log.is_file() else []
     said = [str(error).strip(), *(line for line in logged if line[:1] in ("W", "E", "F"))]
     return "; ".join(dict.fromkeys(line.rpartition("] ")[2] for line in said))
+
+
+LEVEL_AGREEMENT = 0.9  # length of the mean of the cameras' up directions from which they have a common one
+
+
+def levelled(frames: tuple[Frame, ...], cloud: Cloud) -> tuple[tuple[Frame, ...], Cloud, str]:
+    """The same in a world whose +z is the cameras' common up, if they have one, and a note."""
+    found = gravity(torch.stack([frame.cam_from_world for frame in frames]))
+    if found.agreement < LEVEL_AGREEMENT:
+        return frames, cloud, "the cameras have no common up; the world stays as structure from motion left it"
+    new_from_old = rotation_between(torch.tensor(found.up, dtype=torch.float64))
+    turn = torch.eye(4, dtype=torch.float64)
+    turn[:3, :3] = new_from_old.mT
+    frames = tuple(replace(frame, cam_from_world=frame.cam_from_world @ turn) for frame in frames)
+    cloud = Cloud(cloud.points @ new_from_old.mT, cloud.colors)
+    return frames, cloud, "the world's +z is the common up of the cameras; its scale is arbitrary"
+
+
+def rotation_between(up: Tensor) -> Tensor:
+    """The smallest rotation [3, 3] that takes a unit vector [3] to +z.
+
+    >>> rotation_between(torch.tensor([0.0, -1.0, 0.0]))
+    tensor([[ 1.,  0.,  0.],
+            [ 0.,  0.,  1.],
+            [ 0., -1.,  0.]])
+    """
+    x, y, z = up.tolist()
+    if z < -1 + 1e-9:
+        return torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=up.dtype))
+    k = 1 / (1 + z)
+    rows = ((1 - k * x * x, -k * x * y, -x), (-k * x * y, 1 - k * y * y, -y), (x, y, z))
+    return torch.tensor(rows, dtype=up.dtype) + 0.0

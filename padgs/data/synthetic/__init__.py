@@ -15,13 +15,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from padgs.data.errors import DataError
-from padgs.data.options import DataOptions
+from padgs.data.capture import DataError, DataOptions
 from padgs.data.store import ImageStore, StoredImage
 from padgs.data.synthetic import cache, camera, paths
+from padgs.data.synthetic.camera import draw_stitched
 from padgs.data.synthetic.options import SCENES, SyntheticOptions
 from padgs.data.synthetic.points import sample_points
-from padgs.data.synthetic.stitching import draw_stitched
 from padgs.data.synthetic.truth import SyntheticTruth
 from padgs.scene import Scene, View
 

@@ -1,8 +1,4 @@
-"""Panoramas of a synthetic world: supersampled colour, and exact depth and object id through pixel centres.
-
-Poses are in metres here. The sub-pixel jitter of a pixel depends on its row only, never on its column or the view:
-turning the camera by whole pixels about its vertical therefore shifts the image exactly.
-"""
+"""Camera."""
 
 from __future__ import annotations
 
@@ -12,9 +8,13 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
+import torch
 
+from padgs.data.synthetic.options import SyntheticOptions
 from padgs.data.synthetic.textures import Array
 from padgs.data.synthetic.world import World
+from padgs.geometry.lens import axis_direction, bend, hemisphere_weight
+from padgs.geometry.panorama import rays
 
 _BLOCK = (32, 64)  # pixels; rays of a block share the list of shapes that they can hit, and fit into the cache
 
@@ -86,3 +86,21 @@ def _jitter(height: int, samples: int, seed: int) -> Array:
     side = math.isqrt(samples)
     cell = np.stack(np.divmod(np.arange(samples), side)[::-1], axis=-1)
     return (cell + np.random.default_rng((seed, 0x5EED)).random((height, samples, 2))) / side
+
+
+def draw_stitched(world: World, cam_from_world: Array, gap: float, options: SyntheticOptions, gain: float) -> Array:
+    """The panorama [H, W, 3] uint8 of a camera whose lenses are `gap` metres apart, its centre midway between them."""
+    axis, coefficients = axis_direction("z"), torch.tensor([options.lens_k1], dtype=torch.float64)
+    images = []
+    for sign in (1.0, -1.0):
+        pose = cam_from_world.copy()
+        pose[:3, 3] -= sign * 0.5 * gap * axis.numpy()
+
+        def bent(directions: Array, axis: torch.Tensor = sign * axis) -> Array:
+            there = bend(torch.from_numpy(directions).double().T, axis, coefficients)
+            return there.T.to(torch.float32).numpy()
+
+        images.append(draw(world, pose, options.width, options.samples, options.seed, gain, bent))
+    directions = rays(options.width, options.height, dtype=torch.float64)
+    weight = hemisphere_weight(directions, axis, math.radians(options.lens_blend)).numpy()[..., None]
+    return np.round(weight * images[0] + (1 - weight) * images[1]).astype(np.uint8)

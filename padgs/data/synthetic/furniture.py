@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from padgs.data.errors import DataError
+from padgs.data.capture import DataError
 from padgs.data.synthetic import textures as tx
 from padgs.data.synthetic.shapes import Box, Material, Point, Rod, Shape, Sphere
 from padgs.data.synthetic.textures import Array, Texture

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from padgs.data.errors import DataError
+from padgs.data.capture import DataError
 
 SCENES = (
     *("room", "two_rooms", "outdoor", "pole_torture", "bare_room", "near_clutter", "glossy"),

@@ -10,11 +10,10 @@ import numpy as np
 
 from padgs.data.synthetic import furniture as fu
 from padgs.data.synthetic import textures as tx
-from padgs.data.synthetic.light import Light
 from padgs.data.synthetic.options import SyntheticOptions
 from padgs.data.synthetic.shapes import Box, Ground, Material, Ring, Rod, Shape
 from padgs.data.synthetic.textures import Array, Texture, scaled
-from padgs.data.synthetic.world import World
+from padgs.data.synthetic.world import Light, World
 
 
 def sky(direction: Array) -> Array:

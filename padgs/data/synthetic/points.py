@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from padgs.data.errors import DataError
+from padgs.data.capture import DataError
 from padgs.data.synthetic.camera import center, directions
 from padgs.data.synthetic.options import SyntheticOptions
 from padgs.data.synthetic.textures import Array

@@ -1,10 +1,4 @@
-"""The scenes of the stress suite, as blueprints of one generator.
-
-room, two_rooms (a door between them), outdoor (far ring and sky), pole_torture (Siemens stars and rods at both poles),
-bare_room (posters on a tenth of the walls), near_clutter (objects 5-30 cm from the path), glossy (mirror-like
-materials, so colours depend on the view); white_room and checker_room, whose complexity is known; enfilade (as many
-rooms in a row as are asked for).
-"""
+"""Scenes."""
 
 from __future__ import annotations
 
@@ -15,16 +9,14 @@ import numpy as np
 
 from padgs.data.synthetic import furniture as fu
 from padgs.data.synthetic import textures as tx
-from padgs.data.synthetic.enfilade import doorway, enfilade
-from padgs.data.synthetic.enfilade import walk as through_rooms
-from padgs.data.synthetic.light import Light
 from padgs.data.synthetic.options import SyntheticOptions
 from padgs.data.synthetic.outdoor import outdoor
 from padgs.data.synthetic.paths import Walk
-from padgs.data.synthetic.plain_rooms import checker_room, white_room
+from padgs.data.synthetic.room_chain import doorway, enfilade
+from padgs.data.synthetic.room_chain import walk as through_rooms
 from padgs.data.synthetic.shapes import Box, Material, Rod, Room, Shape
 from padgs.data.synthetic.textures import Array, Texture, scaled
-from padgs.data.synthetic.world import World
+from padgs.data.synthetic.world import Light, World
 
 Furnish = Callable[[SyntheticOptions, Array, np.random.Generator], World]  # options, dense path [n, 3], random
 
@@ -184,6 +176,28 @@ def two_rooms(options: SyntheticOptions, path: Array, rng: np.random.Generator) 
 
 def _objects(options: SyntheticOptions) -> int:
     return options.objects or 0  # the blueprint's number has been filled in by SyntheticTruth
+
+
+LIGHT = Light((((0.0, 0.0, 2.5), 0.9),))
+WHITE: tx.Color = (0.8, 0.8, 0.78)
+DARK: tx.Color = (0.25, 0.3, 0.35)
+TILE = 1.0  # metres, at `texture_frequency` 1
+
+
+def white_room(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
+    """White walls, floor and ceiling, and as many objects as are asked for, none by default."""
+    return _room(tx.plain(WHITE), options, path, rng)
+
+
+def checker_room(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
+    """The same with two-coloured tiles everywhere, `texture_frequency` of them a metre."""
+    tiles = tx.checker(WHITE, DARK, TILE / options.texture_frequency, mottle=0.0)
+    return _room(tiles, options, path, rng)
+
+
+def _room(skin: Texture, options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
+    objects = fu.scatter(options.objects or 0, path, (-2.0, -1.8, 0.3), (2.0, 1.5, 2.5), 0.35, rng)
+    return World((Room(_LOW, _HIGH, (Material(skin),) * 6), *objects), LIGHT)
 
 
 _DOOR_ROUTE = ((0.0, 0.05), (-1.3, 0.3), (-2.4, 1.1), (-3.7, 0.7), (-3.6, -0.6), (-2.2, -1.0), (-1.2, -0.3),

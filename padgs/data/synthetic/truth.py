@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from padgs.data.errors import DataError
+from padgs.data.capture import DataError
 from padgs.data.synthetic import camera, paths
 from padgs.data.synthetic.options import SyntheticOptions
 from padgs.data.synthetic.scenes import BLUEPRINTS

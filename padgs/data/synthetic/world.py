@@ -1,8 +1,4 @@
-"""A synthetic world: shapes and light, and what a ray sees in it.
-
-Flat faces of rooms and the ground carry light maps; everything else is lit by its lamps without shadows and darkened
-near the floor. Mirror-like materials show one reflection.
-"""
+"""World."""
 
 from __future__ import annotations
 
@@ -12,9 +8,146 @@ from functools import cached_property
 
 import numpy as np
 
-from padgs.data.synthetic.light import Light, LightMap, bake
-from padgs.data.synthetic.shapes import Flat, Shape
-from padgs.data.synthetic.textures import Array
+from padgs.data.synthetic.shapes import Flat, Point, Shape
+from padgs.data.synthetic.textures import Array, Color, bilinear
+
+# (origins [3, n], directions [3, n], candidates) -> distance [n] of the first hit
+FirstHit = Callable[[Array, Array, Sequence[int]], Array]
+
+_REACH = 0.9  # metres within which things darken their surroundings
+_LAMP_SAMPLES, _OPEN_SAMPLES = 8, 12
+_TILE = 16  # texels; rays of a tile share the list of shapes that can be in their way
+
+
+@dataclass(frozen=True)
+class Light:
+    """Lamps (position, strength), their colour, and the colour of the light from everywhere."""
+
+    lamps: tuple[tuple[Point, float], ...]
+    color: Color = (1.0, 0.95, 0.86)
+    ambient: Color = (0.46, 0.48, 0.52)
+    size: float = 0.25  # radius of a lamp: softness of its shadows
+
+    def direct(self, points: Array, normal: Array) -> Array:
+        """Unshadowed direct light [n] on points [3, n] with the given normals."""
+        return np.sum([lambert(points, normal, np.asarray(lamp), power) for lamp, power in self.lamps], axis=0)
+
+
+def lambert(points: Array, normal: Array, lamp: Array, power: float) -> Array:
+    """Light [n] of one lamp at [3]: cosine law, and a falloff that is gentler than nature's."""
+    toward = lamp.astype(points.dtype).reshape(3, 1) - points
+    far = np.sqrt((toward * toward).sum(0))
+    return power * np.maximum((toward * normal).sum(0) / far, 0) / (1 + 0.25 * far)
+
+
+@dataclass(frozen=True)
+class LightMap:
+    """Direct light and openness [rows, columns] over a flat face of the given size in metres."""
+
+    direct: Array
+    openness: Array
+    size: tuple[float, float]
+
+    def at(self, uv: Array) -> tuple[Array, Array]:
+        """Direct light [n] and openness [n] at texture coordinates [2, n]; beyond the face, that of its edge."""
+        rows, columns = self.direct.shape
+        x = np.clip((uv[0] / self.size[0] + 0.5) * columns - 0.5, 0, columns - 1.001)
+        y = np.clip((uv[1] / self.size[1] + 0.5) * rows - 0.5, 0, rows - 1.001)
+        return bilinear(self.direct, x, y), bilinear(self.openness, x, y)
+
+
+def bake(flat: Flat, face: int, light: Light, bounds: tuple[Array, Array], casts: Array, hit: FirstHit) -> LightMap:
+    """The light map of one face.
+
+    Args:
+        flat: the shape with the face.
+        face: which of its faces.
+        light: the lamps.
+        bounds: centres [k, 3] and radii [k] of all shapes.
+        casts: [k] bool, which of them throw shadows.
+        hit: nearest hit of rays with some of the shapes.
+    """
+    width, height = flat.size(face)
+    columns, rows = (int(np.ceil(extent / flat.texel / 2)) * 2 + 1 for extent in (width, height))  # odd: not periodic
+    direct, openness = np.zeros((rows, columns), np.float32), np.zeros((rows, columns), np.float32)
+    for i in range(0, rows, _TILE):
+        for j in range(0, columns, _TILE):
+            tile = np.s_[i : min(i + _TILE, rows), j : min(j + _TILE, columns)]
+            v, u = np.mgrid[tile].reshape(2, -1) + 0.5
+            uv = np.stack(((u / columns - 0.5) * width, (v / rows - 0.5) * height)).astype(np.float32)
+            points = flat.point_at(face, uv)
+            normal = flat.surface(points).normal
+            shape = direct[tile].shape
+            direct[tile] = _direct(points, normal, light, bounds, casts, hit).reshape(shape)
+            openness[tile] = _openness(points, normal, bounds, hit).reshape(shape)
+    return LightMap(_smooth(direct), _smooth(openness), (width, height))
+
+
+def _direct(
+    points: Array, normal: Array, light: Light, bounds: tuple[Array, Array], casts: Array, hit: FirstHit
+) -> Array:
+    middle, spread = _ball(points)
+    total = np.zeros(points.shape[1], np.float32)
+    for lamp, power in light.lamps:
+        position = np.asarray(lamp)
+        way = position - middle
+        along = np.clip((bounds[0] - middle) @ way / (way @ way), 0, 1)
+        gap = np.linalg.norm(bounds[0] - middle - along[:, None] * way, axis=1)
+        between = np.flatnonzero(casts & (gap < bounds[1] + spread + light.size)).tolist()
+        unshadowed = lambert(points, normal, position, power)
+        if not between:
+            total += unshadowed
+            continue
+        targets = (position + light.size * sphere_points(_LAMP_SAMPLES)).T.astype(np.float32)
+        start, toward = _all_pairs(points + np.float32(2e-3) * normal, targets)
+        toward = toward - start
+        far = np.sqrt((toward * toward).sum(0))
+        lit = hit(start, toward / far, between) >= far
+        total += unshadowed * lit.reshape(points.shape[1], -1).mean(1)
+    return total
+
+
+def _openness(points: Array, normal: Array, bounds: tuple[Array, Array], hit: FirstHit) -> Array:
+    middle, spread = _ball(points)
+    near = np.flatnonzero(np.linalg.norm(bounds[0] - middle, axis=1) < bounds[1] + spread + _REACH).tolist()
+    up = normal[:, 0]
+    first = np.roll(np.abs(np.round(up)), 1)
+    second = np.cross(up, first)
+    steps = np.arange(_OPEN_SAMPLES)
+    radius, angle = np.sqrt((steps + 0.5) / _OPEN_SAMPLES), 2.4 * steps  # a cosine-weighted spiral
+    ways = np.outer(first, radius * np.cos(angle)) + np.outer(second, radius * np.sin(angle))
+    ways += np.outer(up, np.sqrt(1 - radius**2))
+    start, rays = _all_pairs(points + np.float32(2e-3) * normal, ways.astype(np.float32))
+    free = np.minimum(hit(start, rays, near) / _REACH, 1)
+    return free.reshape(points.shape[1], -1).mean(1)
+
+
+def _all_pairs(first: Array, second: Array) -> tuple[Array, Array]:
+    """Columns of [3, n] and [3, k], each with each: twice [3, n * k]."""
+    return np.repeat(first, second.shape[1], axis=1), np.tile(second, first.shape[1])
+
+
+def _ball(points: Array) -> tuple[Array, float]:
+    """Centre [3] and radius of a ball around points [3, n]."""
+    middle = points.mean(1).astype(np.float64)
+    return middle, float(np.sqrt(((points - middle[:, None]) ** 2).sum(0).max()))
+
+
+def sphere_points(count: int) -> Array:
+    """Evenly spread unit vectors [count, 3]: a golden spiral."""
+    z = 1 - (2 * np.arange(count) + 1) / count
+    angle = np.arange(count) * (np.pi * (3 - np.sqrt(5)))
+    radius = np.sqrt(1 - z * z)
+    return np.stack((radius * np.cos(angle), radius * np.sin(angle), z), axis=1)
+
+
+def _smooth(table: Array) -> Array:
+    """A 3 x 3 binomial blur: hides that shadows come from a few samples."""
+    for _ in range(2):
+        padded = np.pad(table, ((1, 1), (0, 0)), mode="edge")
+        table = ((padded[:-2] + padded[2:]) / 4 + table / 2).T
+    return np.ascontiguousarray(table, np.float32)
+
 
 SKY = -1  # object id of a ray that hits nothing
 

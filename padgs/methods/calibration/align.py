@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from padgs.data.trajectory import centers
+from padgs.data.camera_paths import centers
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from padgs.apps.camera_path_video.frames import write_film
+from padgs.apps.camera_path_video import write_film
 from padgs.scene import View
 
 av = pytest.importorskip("av", reason="PyAV, the extra `video`, is not installed")

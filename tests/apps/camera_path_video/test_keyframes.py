@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from padgs.apps.camera_path_video.keyframes import PathError, read_path
+from padgs.data.camera_paths import PathError, read_path
 
 UP = (0.0, 0.0, 1.0)
 

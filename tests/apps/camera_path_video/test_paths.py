@@ -4,7 +4,7 @@ import pytest
 import torch
 from tiny_scene import tiny_scene
 
-from padgs.apps.camera_path_video.paths import PATHS, along_cameras, between, looking
+from padgs.data.camera_paths import PATHS, along_cameras, between, looking
 from padgs.scene import Scene
 
 

@@ -13,7 +13,7 @@ from padgs.apps.export.explicit import exported
 from padgs.apps.export.splat_file import read_splats
 from padgs.baselines.sc_omnigs import aligned, carried
 from padgs.cli.commands import app
-from padgs.data.ply import read_ply
+from padgs.data.cloud import read_ply
 from padgs.evaluation.evaluate import evaluate
 from padgs.evaluation.protocols import protocol_from_options
 from padgs.render import render

@@ -5,7 +5,7 @@ from random_splats import random_splats
 from scipy.spatial.transform import Rotation
 from tiny_scene import tiny_scene
 
-from padgs.apps.export.moved import harmonics_turn, moved, upright
+from padgs.apps.export.explicit import harmonics_turn, moved, upright
 from padgs.geometry import harmonics
 from padgs.methods.calibration.align import Similarity
 from padgs.render import RenderOptions, render

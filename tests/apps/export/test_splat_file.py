@@ -9,9 +9,8 @@ from random_splats import random_splats
 
 from padgs.apps.export import splat_file
 from padgs.apps.export.splat_file import read_splats, seconds_to_write, write_splats
-from padgs.data.capture import Cloud
-from padgs.data.errors import DataError
-from padgs.data.ply import write_ply
+from padgs.data.capture import Cloud, DataError
+from padgs.data.cloud import write_ply
 from padgs.methods.splats.model import Splats
 
 

@@ -6,7 +6,7 @@ import torch
 from tiny_run import tiny_run
 
 import padgs
-from padgs.apps.viewer.picture import Gallery, Look, beside
+from padgs.apps.viewer.renders import Gallery, Look, beside
 from padgs.evaluation.pictures import eight_bit
 
 

@@ -10,8 +10,7 @@ from tiny_run import tiny_run
 from typer.testing import CliRunner
 
 import padgs
-from padgs.apps.viewer.page import BOTH
-from padgs.apps.viewer.pages import box_of, showing
+from padgs.apps.viewer.pages import BOTH, box_of, showing
 from padgs.apps.viewer.server import serving
 from padgs.cli.commands import app
 from padgs.extras import installing

@@ -19,10 +19,9 @@ import padgs
 from padgs import results
 from padgs.apps.viewer import pages
 from padgs.apps.viewer.pages import showing
-from padgs.apps.viewer.picture import Gallery, Look
-from padgs.apps.viewer.process import shown
+from padgs.apps.viewer.process import await_checkpoint, shown
+from padgs.apps.viewer.renders import Gallery, Look
 from padgs.apps.viewer.server import LOCAL, serving
-from padgs.apps.viewer.waiting import await_checkpoint
 from padgs.extras import installing
 from padgs.runs import checkpoint
 from padgs.runs.config import WATCHED, RunOptions

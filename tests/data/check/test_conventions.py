@@ -8,7 +8,7 @@ from fixtures import World
 from torch import Tensor
 
 from padgs.data.capture import Tracks
-from padgs.data.check.conventions import colour_fit, known_conventions, reprojection_error, track_fit
+from padgs.data.conventions import colour_fit, known_conventions, reprojection_error, track_fit
 from padgs.geometry.panorama import project
 
 FLIP = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))

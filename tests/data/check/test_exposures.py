@@ -8,8 +8,8 @@ import torch
 from fixtures import World, write_colmap_text
 
 from padgs.cli.check import lines
-from padgs.data.check.exposures import exposure_gains
-from padgs.data.check.report import check
+from padgs.data.check import check
+from padgs.data.conventions import exposure_gains
 
 STOPS = np.array([0.0, -0.5, 0.3, -0.2, 0.0, 0.1])
 

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from padgs.cli import check as check_command
 from padgs.cli import convert as convert_command
 from padgs.data import load
-from padgs.data.check.report import check
+from padgs.data.check import check
 
 app = Typer()
 app.command()(check_command.check)

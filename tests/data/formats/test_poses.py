@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padgs.data.errors import DataError
+from padgs.data.capture import DataError
 from padgs.data.formats.poses import (
     cam_from_center,
     cam_from_opengl_pose,

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from padgs.data.prepare.level import rotation_between
+from padgs.data.prepare.pipeline import rotation_between
 
 
 def test_rotation_between_is_the_smallest_turn_to_z():

@@ -3,7 +3,7 @@
 import pytest
 
 from padgs.data import DataError
-from padgs.data.prepare.pairs import EXHAUSTIVE_UP_TO, image_pairs
+from padgs.data.prepare.sfm import EXHAUSTIVE_UP_TO, image_pairs
 
 NAMES = [f"{index:04d}" for index in range(500)]
 

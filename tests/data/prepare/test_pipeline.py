@@ -12,12 +12,12 @@ from PIL import Image
 
 import padgs.data
 from padgs.data import DataError
-from padgs.data.check.report import check
-from padgs.data.prepare import pipeline, resources, sfm
+from padgs.data.camera_paths import gravity, path_length
+from padgs.data.check import check
+from padgs.data.prepare import pipeline, sfm, work
 from padgs.data.prepare.pipeline import prepare
-from padgs.data.prepare.statement import PrepareOptions
+from padgs.data.prepare.work import PrepareOptions
 from padgs.data.synthetic import SyntheticOptions, generate
-from padgs.data.trajectory import gravity, path_length
 from padgs.methods.calibration.align import align
 
 VIEWS = 6
@@ -182,7 +182,7 @@ def noise(folder, count=2):
 
 def test_nothing_to_place(tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr(resources, "threads_for", lambda *size: asked.append(size) or 1)
+    monkeypatch.setattr(pipeline, "threads_for", lambda *size: asked.append(size) or 1)
     with pytest.raises(DataError, match="no two of the 2 panoramas could be placed together"):
         prepare(noise(tmp_path / "in"), tmp_path / "out")
     assert not (tmp_path / "out").exists()
@@ -209,7 +209,7 @@ def test_what_pycolmap_raises_is_said_with_what_to_do(tmp_path, monkeypatch):
         monkeypatch.context() as patch,
         pytest.raises(DataError, match=r"out \(fewer than \d+ MiB are left on its disk: make room\); the same command"),
     ):
-        run(lambda step, done, total: patch.setattr(resources, "ROOM", 1 << 60))
+        run(lambda step, done, total: patch.setattr(work, "ROOM", 1 << 60))
     found = database.read_bytes()
     database.write_bytes(b"no database" * 1000)
     with pytest.raises(

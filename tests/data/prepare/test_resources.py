@@ -6,20 +6,20 @@ from pathlib import Path
 
 import pytest
 
-from padgs.data.prepare import resources
+from padgs.data.prepare import work
 
 
 def test_threads_are_as_many_as_free_memory_allows(monkeypatch):
-    assert resources.free_memory() > 50_000_000
+    assert work.free_memory() > 50_000_000
     monkeypatch.setattr(os, "cpu_count", lambda: 12)
     free = {"bytes": 2_000_000_000}
-    monkeypatch.setattr(resources, "free_memory", lambda: free["bytes"])
-    assert resources.threads_for(2048, 1024) == resources.threads_for(512, 256) == 3
-    assert resources.threads_for(4096, 2048) == resources.threads_for(8192, 4096) == 1
+    monkeypatch.setattr(work, "free_memory", lambda: free["bytes"])
+    assert work.threads_for(2048, 1024) == work.threads_for(512, 256) == 3
+    assert work.threads_for(4096, 2048) == work.threads_for(8192, 4096) == 1
     for free["bytes"] in (None, 64_000_000_000):
-        assert resources.threads_for(2048, 1024) == 8
+        assert work.threads_for(2048, 1024) == 8
     free["bytes"] = 1
-    assert resources.threads_for(2048, 1024) == 1
+    assert work.threads_for(2048, 1024) == 1
 
 
 def test_free_memory_without_what_linux_tells(monkeypatch):
@@ -27,9 +27,9 @@ def test_free_memory_without_what_linux_tells(monkeypatch):
         raise FileNotFoundError
 
     monkeypatch.setattr("builtins.open", absent)
-    assert resources.free_memory() == os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
+    assert work.free_memory() == os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
     monkeypatch.delattr(os, "sysconf")
-    assert resources.free_memory() is None
+    assert work.free_memory() is None
 
 
 def test_a_disk_without_links_gets_copies(tmp_path, monkeypatch):
@@ -41,19 +41,19 @@ def test_a_disk_without_links_gets_copies(tmp_path, monkeypatch):
     def refuse(*args, **kwargs):
         raise PermissionError(errno.EPERM, "Operation not permitted")
 
-    resources.link_or_copy(original, link)
+    work.link_or_copy(original, link)
     monkeypatch.setattr(Path, "symlink_to", refuse)
-    resources.link_or_copy(link, hard)
+    work.link_or_copy(link, hard)
     monkeypatch.setattr(Path, "hardlink_to", refuse)
-    resources.link_or_copy(link, copy)
+    work.link_or_copy(link, copy)
     assert link.is_symlink() and not hard.is_symlink() and not copy.is_symlink()
     assert hard.samefile(original) and not copy.samefile(original)
     assert copy.read_bytes() == b"a picture"
 
 
 def test_a_full_disk_is_refused(tmp_path, monkeypatch):
-    resources.refuse_full(tmp_path)
-    monkeypatch.setattr(resources, "ROOM", 1 << 60)
+    work.refuse_full(tmp_path)
+    monkeypatch.setattr(work, "ROOM", 1 << 60)
     with pytest.raises(OSError, match="MiB are left on its disk: make room") as refused:
-        resources.refuse_full(tmp_path)
+        work.refuse_full(tmp_path)
     assert refused.value.errno == errno.ENOSPC

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from padgs.data import DataError
-from padgs.data.prepare.video import extract_frames, is_video, sharpness
+from padgs.data.prepare.sources import extract_frames, is_video, sharpness
 
 
 def test_videos_are_known_by_name(tmp_path):

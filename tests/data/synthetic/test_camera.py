@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 from padgs.data.synthetic import SyntheticOptions, SyntheticTruth, camera
-from padgs.data.synthetic.light import Light
 from padgs.data.synthetic.paths import cam_from_world
 from padgs.data.synthetic.shapes import Material, Room, Sphere
 from padgs.data.synthetic.textures import plain
-from padgs.data.synthetic.world import SKY, World
+from padgs.data.synthetic.world import SKY, Light, World
 
 
 @pytest.fixture(scope="module")

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from padgs.data.synthetic.light import Light, lambert, sphere_points
 from padgs.data.synthetic.shapes import Box, Ground, Material, Room
 from padgs.data.synthetic.textures import plain
-from padgs.data.synthetic.world import World
+from padgs.data.synthetic.world import Light, World, lambert, sphere_points
 
 SKIN = (Material(plain((0.5, 0.5, 0.5))),)
 LIGHT = Light((((0.0, 0.0, 2.0), 1.0),), size=0.1)

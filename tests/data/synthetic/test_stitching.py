@@ -6,7 +6,7 @@ import torch
 
 from padgs.data import DataError
 from padgs.data.synthetic import SyntheticOptions, SyntheticTruth, camera, generate
-from padgs.data.synthetic.stitching import draw_stitched
+from padgs.data.synthetic.camera import draw_stitched
 
 SMALL = {"scene": "bare_room", "width": 64, "train_views": 3, "test_views": 1, "points": 200, "samples": 4}
 

@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
+from padgs.data.camera_paths import centers
 from padgs.data.formats.poses import rigid, rotation_from_vector
-from padgs.data.trajectory import centers
 from padgs.methods.calibration.align import align
 
 

@@ -6,12 +6,11 @@ import numpy as np
 
 from padgs.data.synthetic import furniture as fu
 from padgs.data.synthetic import textures as tx
-from padgs.data.synthetic.light import Light
 from padgs.data.synthetic.options import SyntheticOptions
 from padgs.data.synthetic.paths import Walk
 from padgs.data.synthetic.shapes import Box, Material, Room, Shape
 from padgs.data.synthetic.textures import Array
-from padgs.data.synthetic.world import World
+from padgs.data.synthetic.world import Light, World
 
 LENGTH, WIDTH, HEIGHT = 5.0, 5.0, 2.8  # metres, of a room
 ROOMS = 2  # unless asked otherwise

@@ -1,4 +1,4 @@
-"""Looks a data set through and says what it holds and what is wrong with it, all at once instead of one by one."""
+"""Check."""
 
 from __future__ import annotations
 
@@ -7,21 +7,19 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 
 import padgs.data
 from padgs.data.assemble import assemble
-from padgs.data.capture import Capture
-from padgs.data.check.conventions import VIEWS, colour_fit, known_conventions, reprojection_error, track_fit
-from padgs.data.check.exposures import exposure_gains
-from padgs.data.check.overlay import draw_overlay
-from padgs.data.errors import DataError, listed
-from padgs.data.fisheye import refuse_dual_fisheye
-from padgs.data.images import decode, inspect
-from padgs.data.options import DataOptions
-from padgs.data.resize import area_resize
-from padgs.data.trajectory import Gravity, centers, gravity, median_depth, path_length
+from padgs.data.camera_paths import Gravity, centers, gravity, median_depth, path_length
+from padgs.data.capture import Capture, DataError, DataOptions, listed
+from padgs.data.conventions import VIEWS, colour_fit, exposure_gains, known_conventions, reprojection_error, track_fit
+from padgs.data.images import decode, inspect, refuse_dual_fisheye
+from padgs.data.store import area_resize
+from padgs.geometry.panorama import project
 from padgs.scene import Scene, View, move_origin
 
 SMALL = 256  # width at which colours are compared
@@ -250,3 +248,43 @@ def _small(views: Sequence[View]) -> Tensor:
         assert view.load_pixels is not None
         images.append(torch.from_numpy(area_resize(view.load_pixels().cpu().numpy(), width, width // 2)))
     return torch.stack(images)
+
+
+OVERLAY = "check.png"  # beside the data, where no other place is given
+WIDTH = 2048  # of the picture at most
+
+
+def draw_overlay(view: View, points: Tensor, path: Path, most: int = 20_000) -> None:
+    """Save a panorama with points on it, red = near, blue = far (by rank), as PNG.
+
+    Args:
+        view: pose and pixels.
+        points: [P, 3] world.
+        path: where to.
+        most: points drawn; more of them are thinned out evenly.
+
+    Raises:
+        DataError: the file cannot be written.
+    """
+    assert view.load_pixels is not None
+    image = Image.fromarray(view.load_pixels().cpu().numpy())
+    if image.width > WIDTH:
+        image = image.resize((WIDTH, WIDTH // 2), Image.Resampling.BOX)
+    pixels = np.asarray(image).astype(np.float32) * 0.6
+    height, width = pixels.shape[:2]
+    points = points[:: -(-len(points) // most)].double()
+    seen = points @ view.cam_from_world[:3, :3].T + view.cam_from_world[:3, 3]
+    column, row = project(seen, width, height).long().unbind(1)
+    rank = seen.norm(dim=1).argsort(descending=True)  # far ones first, so that near ones lie on top
+    nearness = torch.linspace(0, 1, len(rank)).numpy()[:, None]
+    color = 255 * (nearness * np.array([1.0, 0.25, 0.0]) + (1 - nearness) * np.array([0.0, 0.5, 1.0]))
+    radius = max(0, width // 1024)
+    for down in range(-radius, radius + 1):
+        for right in range(-radius, radius + 1):
+            r, c = (row[rank] + down).clamp(0, height - 1).numpy(), ((column[rank] + right) % width).numpy()
+            pixels[r, c] = color
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(pixels.clip(0, 255).astype(np.uint8)).save(path)
+    except OSError as error:
+        raise DataError(f"cannot write the picture {path} ({error.strerror or error}); give another place") from error

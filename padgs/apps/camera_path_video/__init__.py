@@ -1,1 +1,0 @@
-"""Films: paths of a camera, and the files that their frames go into."""

@@ -1,1 +1,0 @@
-"""Is a data set fit for training, and if not, why?"""

@@ -1,0 +1,109 @@
+"""Published."""
+
+from __future__ import annotations
+
+from pathlib import Path, PurePosixPath
+
+import torch
+
+from padgs.data.assemble import image_folder, image_names
+from padgs.data.capture import Capture, Cloud, DataError, DataOptions, Frame, color_bytes
+from padgs.data.cloud import existing_ply
+from padgs.data.datasets import DATASETS
+from padgs.data.formats.colmap import image_lines
+from padgs.data.formats.json_file import Json, file_in, read_json
+from padgs.data.formats.openmvg import read_extrinsics, read_views
+from padgs.data.formats.poses import cam_from_opengl_pose, cam_from_pose, cam_from_world, rotation_from_quaternion
+from padgs.data.splits import check_inside, read_lines
+
+
+def read_roam360(path: Path, options: DataOptions) -> Capture:
+    """Read the poses and the split."""
+    file = path / "pose_c2w.json"
+    data = read_json(file)
+    images = image_folder(path, options.images)
+    frames: list[Frame] = []
+    split: dict[str, tuple[str, ...]] = {}
+    for side in ("train", "test"):
+        names = []
+        for item in data[side].entries():
+            stated = item["rgb_file"].name()
+            name = stated if (images / stated).is_file() else PurePosixPath(stated).name
+            matrix = Json(item.value, f"{name} in {file}")["transform_matrix"]
+            frames.append(Frame(name, images / name, cam_from_pose(matrix.numbers(4, 4), matrix.where)))
+            names.append(name)
+        split[side] = tuple(names)
+    twice = set(split["train"]) & set(split["test"])
+    if twice:
+        raise DataError(f"{file}: {sorted(twice)[0]} is both a train and a test view; it may be one of them")
+    known = DATASETS["roam360"]
+    cloud = existing_ply(path, ("scene.ply", f"{path.name}.ply", "pcd.ply"))
+    return Capture("roam360", path, images, tuple(frames), cloud, split, known.mask, known.width)
+
+
+_RICOH360_MODEL = "output_dir/colmap"
+
+
+def read_ricoh360(path: Path, options: DataOptions) -> Capture:
+    """Read poses and points."""
+    images = image_folder(path, options.images, ("imgs", "images"))
+    files = {str(PurePosixPath(name).with_suffix("")): name for name in image_names(images)}
+    files.pop("mask", None)
+    mask = path / "imgs" / "mask.png"
+    file = path / _RICOH360_MODEL / "images.txt"
+    frames = []
+    for fields in image_lines(file):
+        name = check_inside(fields[9], str(file))
+        name = files.get(str(PurePosixPath(name).with_suffix("")), name)
+        where = f"{name} in {file}"
+        try:
+            values = torch.tensor([float(field) for field in fields[1:8]], dtype=torch.float64)
+        except ValueError as error:
+            raise DataError(f"{where}: the pose is not numbers ({error})") from error
+        pose = cam_from_world(rotation_from_quaternion(values[:4], where), values[4:], where)
+        frames.append(Frame(name, images / name, pose, mask=mask if mask.is_file() else None))
+    cloud = existing_ply(path, ("openMVG/scene.ply", "scene.ply", "pcd.ply"))
+    points = path / _RICOH360_MODEL / "points3D.txt"
+    if cloud is None and points.is_file():
+        cloud = _ricoh360_cloud(points)
+    return Capture("ricoh360", path, images, tuple(frames), cloud)
+
+
+def _ricoh360_cloud(file: Path) -> Cloud | None:
+    rows = [line.split()[1:7] for line in read_lines(file) if line.strip() and not line.startswith("#")]
+    if not rows:
+        return None
+    try:
+        values = torch.tensor([[float(field) for field in row] for row in rows], dtype=torch.float64)
+    except ValueError as error:
+        raise DataError(f"{file}: a point is not 'id x y z red green blue error' ({error})") from error
+    if values.shape[1] < 6:
+        raise DataError(f"{file}: a point has {values.shape[1] + 1} fields; it must have id x y z red green blue")
+    return Cloud(values[:, :3], color_bytes(values[:, 3:6], str(file)))
+
+
+_OMNIBLENDER_CLOUDS = ("pcd.ply", "scene.ply", "openMVG/scene.ply", "openMVG/reconstruction/colorized.ply")
+
+
+def read_omniblender(path: Path, options: DataOptions) -> Capture:
+    """Read `transform.json`."""
+    file = file_in(path, "transform.json")
+    meta = read_json(file)
+    images = image_folder(file.parent, options.images)
+    width, height = (side and side.whole() for side in (meta.get("width"), meta.get("height")))
+    frames = []
+    for item in meta["frames"].entries():
+        name = item["file_path"].name()
+        matrix = Json(item.value, f"{name} in {file}")["transform_matrix"]
+        pose = cam_from_opengl_pose(matrix.numbers(4, 4), matrix.where)
+        frames.append(Frame(name, images / name, pose, width, height))
+    return Capture("omniblender", file.parent, images, tuple(frames), existing_ply(file.parent, _OMNIBLENDER_CLOUDS))
+
+
+def read_released(path: Path, options: DataOptions) -> Capture:
+    """Read the views, the extrinsics and the cloud."""
+    views = read_views(read_json(path / "data_views.json"))
+    poses = read_extrinsics(read_json(path / "data_extrinsics.json"))
+    images = image_folder(path, options.images)
+    frames = tuple(Frame(view.name, images / view.name, poses[view.key]) for view in views if view.key in poses)
+    return Capture("released", path, images, frames, existing_ply(path, ("pcd.ply", "colorized.ply")))
