@@ -30,7 +30,7 @@ REPORTS: Mapping[str, Report] = {
     "methods": Report("padgs.reports.tables.side_by_side:methods", (*OF_ALL_METHODS, "calibration")),
     "equal_time": Report("padgs.reports.tables.side_by_side:equal_time", ("equal_time",)),
     "ladder": Report("padgs.reports.tables.variants:ladder", ("ladder",)),
-    "quirks": Report("padgs.reports.tables.variants:quirks", ("quirks",)),
+    "quirks": Report("padgs.reports.tables.variants:quirks", ("deviations",)),
     "order": Report("padgs.reports.tables.order:order", (*OF_AN_ORDER, "pixel_constants")),
     "length": Report("padgs.reports.tables.length:length", ("length",)),
     "learning_rates": Report("padgs.reports.tables.learning_rates:learning_rates", ("learning_rates",)),

@@ -9,8 +9,9 @@ import pytest
 from composed import composed, expanded, first_and_last_job, jobs
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
-
 from padgs.baselines import METHODS
+from padgs.reports.unranked import MENDS
+
 from padgs.data.datasets import DATASETS
 from padgs.data.synthetic.options import SyntheticOptions
 from padgs.evaluation.protocols import PROTOCOLS, ROAM_360_BOTTOM_CROP
@@ -19,13 +20,12 @@ from padgs.methods.anchors.method import PaDGSMethodOptions
 from padgs.methods.anchors.model import PaDGSOptions
 from padgs.methods.plus.method import PlusMethod
 from padgs.methods.plus.options import PlusOptions
-from padgs.multirun.choices import method_choices
+from padgs.multirun.choices import method_choices, variant_choices
 from padgs.multirun.composition import composing, configuration
 from padgs.multirun.launchers import missing_plugin
 from padgs.multirun.overrides import expand, lenient, quoted
 from padgs.registry import lookup
 from padgs.render.config import RenderConfig
-from padgs.reports.unranked import MENDS
 from padgs.runs.config import RunOptions, TrainConfig
 from padgs.runs.tracking.tracker import TrackingOptions
 from padgs.runs.typed import ConfigError
@@ -292,16 +292,15 @@ def test_every_rung_of_the_ladder_changes_one_thing():
     assert replace(rungs[-1].train, normalisation="mean") == paper.train
 
 
-def test_every_quirk_is_a_part_of_its_release_and_changes_something():
-    found = {job.variant: job for job in jobs("+experiment=quirks")}
-    assert set(found) == {path.stem for path in (CONF / "quirk").glob("*.yaml")}
+def test_every_deviation_is_a_part_of_its_release_and_changes_something():
+    found = {job.variant: job for job in jobs("+experiment=deviations")}
+    assert found.keys() == variant_choices()["deviation"].keys()
     for name, job in found.items():
         method = name.partition("_")[0]
         described, released = found[method].values(), found[f"{method}_all"].values()
         changed = different_keys(described, job.values()) - {"variant"}
         assert bool(changed) == (name != method)
         assert not changed & different_keys(job.values(), released), "and to what the release has"
-    assert found["odgs_all"].preset == "odgs_release"
 
 
 def test_calibration_is_compared_where_its_claims_can_show_and_where_not():

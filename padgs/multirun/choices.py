@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
+from omegaconf import OmegaConf
 from rich.console import Console
 
 from padgs.baselines import METHODS, OURS, distribution
@@ -40,8 +42,9 @@ def register_choices() -> None:
         store.store(group="fields/method", name=method, node=keys)
         for group, node in nodes:
             store.store(group=group, name=method, node=node, package="_global_")
-    for name, scene in scene_choices().items():
-        store.store(group="scene", name=name, node=scene, package="_global_")
+    for group, rows in {"scene": scene_choices(), **variant_choices(), **set_choices()}.items():
+        for name, node in rows.items():
+            store.store(group=group, name=name, node=node, package="_global_")
 
 
 def method_choices(name: str) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -80,6 +83,45 @@ def scene_choices() -> dict[str, dict[str, Any]]:
         for scene in known.scenes
     }
     return {**built_in, **published}
+
+
+def variant_choices() -> dict[str, dict[str, dict[str, Any]]]:
+    """Return group -> name -> node for each table in `conf/variants`.
+
+    >>> variant_choices()["ablation"]["a2_distance"]
+    {'defaults': ['a1_anchors'], 'variant': 'a2_distance', 'method': {'use_distance': True}}
+    """
+    return {
+        path.stem: {name: _variant(name, row) for name, row in _table(path).items()}
+        for path in sorted((root() / "conf" / "variants").glob("*.yaml"))
+    }
+
+
+def _variant(name: str, row: dict[str, Any]) -> dict[str, Any]:
+    extended = [row["from"]] if "from" in row else []
+    chosen = [{f"override /{group}": choice} for group, choice in row.get("choose", {}).items()]
+    return {"defaults": [*extended, *chosen], "variant": name, **row.get("set", {})}
+
+
+def set_choices() -> dict[str, dict[str, dict[str, Any]]]:
+    """Return group -> NAME_SCALE -> node for each list of scenes, methods or lengths in `conf/sets.yaml`.
+
+    >>> set_choices()["scene_set"]["bar_cpu"]
+    {'hydra': {'sweeper': {'params': {'+scene': 'synthetic_room'}}}}
+    """
+    return {
+        group: {
+            f"{name}_{scale}": {"hydra": {"sweeper": {"params": {rows["key"]: values}}}}
+            for name, by_scale in rows.items()
+            if name != "key"
+            for scale, values in by_scale.items()
+        }
+        for group, rows in _table(root() / "conf" / "sets.yaml").items()
+    }
+
+
+def _table(path: Path) -> dict[str, dict[str, Any]]:
+    return OmegaConf.to_container(OmegaConf.load(path))  # type: ignore[return-value]
 
 
 def _scene(data: str, values: dict[str, Any]) -> dict[str, Any]:

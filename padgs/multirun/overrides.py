@@ -100,7 +100,8 @@ def _is_multirun(arguments: Sequence[str]) -> bool:
 
 
 def _groups() -> set[str]:
-    return {path.name for path in (root() / "conf").iterdir() if path.is_dir()}
+    folders = [path for path in (root() / "conf").iterdir() if path.is_dir()]
+    return {path.stem for path in (*folders, *(root() / "conf" / "variants").iterdir())}
 
 
 def conflict(arguments: Sequence[str]) -> str | None:
@@ -138,7 +139,8 @@ def conflict(arguments: Sequence[str]) -> str | None:
             return f"{argument}: one {key} at a time, because each says itself what is swept"
         if key in _groups() and re.fullmatch(r"null|~|true|false|[-+.\d]*", value, re.IGNORECASE):
             known = sorted(path.stem for path in (root() / "conf" / key).glob("*.yaml"))
-            return f"{argument}: {key} is a group of settings, chosen by name, e.g. {key}={known[0]}"
+            example = f", e.g. {key}={known[0]}" if known else ""
+            return f"{argument}: {key} is a group of settings, chosen by name{example}"
         settings[key] = argument
     launcher = settings.get("launcher", "=none").partition("=")[2]
     jobs = settings.get("run.jobs", "=1").partition("=")[2]

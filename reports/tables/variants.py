@@ -17,14 +17,14 @@ from padgs.reports.tables.cells import of_each
 from padgs.reports.tables.ranking import NOTE
 from padgs.reports.tables.table import Block, Column, Row, Table
 
-PARTS = {  # variant (conf/ablation) -> title
+PARTS = {  # variant (conf/variants/ablation.yaml) -> title
     "baseline": "Baseline",
     "dagd": "+ DAGD",
     "dagd_daom_no_m": "+ DAGD + DAOM, w/o M",
     "full": "+ DAGD + DAOM + M",
 }
 PAPER_SCENES = (Place("roam360", "bar"), Place("ricoh360", "cat_tower"))
-WITHOUT = {  # variant (conf/without) -> title
+WITHOUT = {  # variant (conf/variants/plus_ablation.yaml) -> title
     "complete": "complete",
     **{
         f"without_{part}": title
@@ -50,7 +50,7 @@ WITHOUT = {  # variant (conf/without) -> title
         }.items()
     },
 }
-RUNGS = {  # variant (conf/ablation) -> title
+RUNGS = {  # variant (conf/variants/ablation.yaml) -> title
     "a0_pano_3dgs": "A0 panoramic 3DGS",
     "a1_anchors": "A1 + anchors and networks",
     "a2_distance": "A2 + distance",
@@ -59,7 +59,7 @@ RUNGS = {  # variant (conf/ablation) -> title
     "a5_weight": "A5 + solid-angle weight (M)",
     "a6_triple_loss": "A6 + loss three times as large",
 }
-QUIRKS = {  # method -> variant (conf/quirk) -> title
+QUIRKS = {  # method -> variant (conf/variants/deviation.yaml) -> title
     method: {method: "as described", **{f"{method}_{name}": title for name, title in quirks.items()}}
     | {f"{method}_all": "as released"}
     for method, quirks in {

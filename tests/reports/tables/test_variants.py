@@ -1,13 +1,12 @@
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 from made_up import RULES, failed, gathered, result, small
 from omegaconf import OmegaConf
-
 from padgs.reports.tables.table import MISSING, ReportError
 from padgs.reports.tables.variants import PARTS, QUIRKS, RUNGS, WITHOUT, ladder, quirks, table3
 from padgs.reports.writers import markdown
+
 from padgs.results import Scores
 
 FOUR = [
@@ -27,12 +26,16 @@ def lines(results, **request) -> list[list[str]]:
 
 
 @pytest.mark.parametrize(
-    "folder, titles",
-    [("ablation", {**PARTS, **RUNGS}), ("without", WITHOUT), ("quirk", {v: "" for of in QUIRKS.values() for v in of})],
+    "table, titles",
+    [
+        ("ablation", {**PARTS, **RUNGS}),
+        ("plus_ablation", WITHOUT),
+        ("deviation", {variant: title for titles in QUIRKS.values() for variant, title in titles.items()}),
+    ],
 )
-def test_each_variant_that_can_be_run_has_a_row(root, folder, titles):
-    files = (root / "conf" / folder).glob("*.yaml")
-    assert {OmegaConf.load(file).get("variant") for file in files} == set(titles)
+def test_each_variant_that_can_be_run_has_a_row(root, table, titles):
+    rows = OmegaConf.load(root / "conf" / "variants" / f"{table}.yaml")
+    assert {variant: row.title for variant, row in rows.items()} == titles
 
 
 def test_published_numbers_stand_beside_ours_with_the_difference():
@@ -165,7 +168,8 @@ def test_times_of_two_machines_are_not_compared():
 
 def quirky(**psnr: float):
     return [
-        replace(small(value), variant=variant, run=variant, experiments=("quirks",)) for variant, value in psnr.items()
+        replace(small(value), variant=variant, run=variant, experiments=("deviations",))
+        for variant, value in psnr.items()
     ]
 
 
@@ -183,8 +187,3 @@ def test_what_was_measured_otherwise_does_not_stand_beside():
     first, second = quirky(odgs=25.0, odgs_bias=24.25)
     with pytest.raises(ReportError, match="differ in length"):
         quirks(gathered([first, replace(second, iterations=7)]))
-
-
-def test_every_file_has_a_row(root: Path):
-    variants = {variant for titles in QUIRKS.values() for variant in titles}
-    assert variants == {path.stem for path in (root / "conf" / "quirk").glob("*.yaml")}
