@@ -5,8 +5,11 @@ Conditions without a limit have none to hold: what they cost is shown.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib.resources import files
+
+import yaml
 
 MADE_FOR = ("256x128", 1500)  # resolution, and iterations without stress
 
@@ -20,19 +23,15 @@ class Limit:
     lost: bool = True  # against the same run without the condition, which has more; otherwise what it has itself
 
 
+CONDITIONS = files("padgs").joinpath("data/perturb/conditions.yaml")  # the file explains itself
+
+
+def _limit(allowed: Sequence[float], metric: str = "ws_psnr") -> Limit:
+    return Limit(tuple(allowed), metric, lost=metric.startswith("ws_psnr"))
+
+
 LIMITS: Mapping[str, Limit] = {
-    "world_rotation": Limit((0.2, 0.3, 0.5)),
-    "seam": Limit((1.1, 1.1, 1.1), "seam", lost=False),
-    "world_scale": Limit((0.1, 0.1, 0.1)),
-    "near_points": Limit((0.5, 0.5, 0.5)),
-    "few_points": Limit((0.5, 1.5, 4.0)),
-    "random_points": Limit((2.0, 3.0, 5.0)),
-    "outlier_points": Limit((0.2, 0.5, 1.0)),
-    "pose_noise": Limit((0.5, 2.0, 6.0)),
-    "pose_rotation": Limit((0.5, 3.0, 8.0)),
-    "textureless": Limit((0.1, 0.15, 0.3), "depth_error", lost=False),
-    "exposure": Limit((0.5, 1.5, 3.0), "ws_psnr_fitted"),
-    "resolution": Limit((2.0,)),
-    "schedule": Limit((0.1, 0.1, 0.1)),
-    "precision": Limit((0.05, 0.05)),
+    name: _limit(**{key: row[key] for key in ("allowed", "metric") if key in row})
+    for name, row in yaml.safe_load(CONDITIONS.read_text("utf-8")).items()
+    if "allowed" in row
 }

@@ -25,7 +25,6 @@ ROOMS = (
     "padgs.native",
     "padgs.render",
     "padgs.training",
-    "padgs.stress",
     "padgs.methods.splats",
     "padgs.methods.plus",
     "padgs.methods.anchors",
@@ -50,7 +49,7 @@ ROOMS = (
 )
 # Closed doors besides the order: room -> the only rooms that it knows.
 KNOWS = {
-    "padgs.data": ("padgs.registry", "padgs.replacing", "padgs.geometry", "padgs.scene"),
+    "padgs.data": ("padgs.registry", "padgs.checks", "padgs.replacing", "padgs.geometry", "padgs.scene"),
     "padgs.results": ("padgs.replacing",),
     "padgs.reports": ("padgs.replacing", "padgs.results"),
 }
@@ -207,7 +206,7 @@ def test_every_room_is_a_folder_or_a_file():
         (
             "padgs.data.splits",
             "from padgs.methods.anchors.model import PaDGS",
-            "padgs.data knows only padgs.registry, padgs.replacing, padgs.geometry",
+            "padgs.data knows only padgs.registry, padgs.checks, padgs.replacing, padgs.geometry",
         ),
         ("padgs.data.splits", "import zlib, pycolmap", "import it inside the function that needs it"),
         ("padgs.results.file", "import numpy as np", "it may use the standard library only"),

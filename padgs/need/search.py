@@ -129,7 +129,7 @@ class Search:
     @property
     def _schedule(self) -> int:
         """Iterations of the run's schedule; those of a budget of seconds are known afterwards."""
-        return self.run.method.state().values.get("schedule", self.run.config.training.iterations)
+        return self.run.method.state().values.get("schedule", self.run.config.train.iterations)
 
     def _resumed(self) -> Prunable:
         """The model of the run."""
@@ -167,7 +167,7 @@ class Search:
         """
         config, seed = self.run.config, self.run.config.seed + number
         # In so few iterations views that differ look like a sign; bounds of scales are of the beginning of a run.
-        options = replace(config.training, monitor=False, guard_scales=False)
+        options = replace(config.train, monitor=False, guard_scales=False)
         count = max(len(views), round(refine.SHARE * self._schedule))
         refining = Refining(model, options, self._schedule, count)
         torch.manual_seed(seed)

@@ -12,6 +12,7 @@ from padgs.checks import check, check_known
 from padgs.data import LOADERS
 from padgs.data.capture import DataOptions, DataSettings
 from padgs.data.datasets import DATASETS
+from padgs.data.perturb import StressOptions
 from padgs.data.synthetic.options import SyntheticOptions
 from padgs.evaluation.protocols import PROTOCOLS, Protocol, protocol_from_options
 from padgs.registry import lookup
@@ -21,7 +22,6 @@ from padgs.runs.identity import Labels
 from padgs.runs.start import Start
 from padgs.runs.tracking.tracker import TrackingOptions
 from padgs.runs.typed import ConfigError, typed
-from padgs.stress.options import StressOptions
 from padgs.training.budget import Budget
 from padgs.training.options import TrainOptions
 from padgs.training.schedule import PUBLISHED_ITERATIONS
@@ -165,17 +165,12 @@ class RunConfig(Settings):
     @property
     def time(self) -> Budget:
         """How long the method may train."""
-        return Budget(self.training.iterations, self.training.max_seconds, **asdict(self.budget))
+        return Budget(self.train.iterations, self.train.max_seconds, **asdict(self.budget))
 
     @property
     def row(self) -> str:
         """What sets the run apart within an experiment: its variant, what it is stressed by, and begins with."""
         return ", ".join(filter(None, (self.variant, self.stress.title, CONTINUED if self.init else "")))
-
-    @property
-    def training(self) -> TrainConfig:
-        """How it is trained: as `train` says, but for what the stress changes."""
-        return self.stress.training(self.train)
 
     def values(self) -> dict[str, Any]:
         """The configuration of a run as plain values in the shape of the YAML files, defaults included.

@@ -36,7 +36,7 @@ def begun(config: RunConfig, scene: Scene, run: str) -> Result:
         scene=scene.name,
         width=view.width,
         height=view.height,
-        iterations=config.training.iterations,
+        iterations=config.train.iterations,
         iterations_done=0,
         seed=config.seed,
         code_version=" ".join(filter(None, code)) or "unknown",

@@ -121,7 +121,7 @@ class Session:
                 Interrupt(folder.stop.exists, ENOUGH) as enough,
                 LiveLine(self.console) as line,
             ):
-                for record in method.fit(self.scene, config.stress.budget(config.time, self.scene)):
+                for record in method.fit(self.scene, config.time):
                     progress = Progress(record.iteration, record.seconds, record.cpu_seconds, record.progress)
                     line.update(record, self._logged(record, method))
                     stopping = stop.requested
@@ -241,14 +241,13 @@ def scene_of(config: RunConfig, device: torch.device) -> Scene:
 
     Raises:
         DataError: the input cannot be used.
-        ValueError: nor can it be stressed so.
+        ValueError: the stress condition cannot be applied to it.
     """
     images_on = str(device) if config.run.images_on == "device" else config.run.images_on
     scene = data.load(config.data.path, config.data.format, config.data.options(images_on))
-    return config.stress.scene(scene, config.seed).recentered().to(device)
+    return config.stress.apply(scene, config.seed).recentered().to(device)
 
 
 def build(config: RunConfig) -> Method:
-    """The method of a configuration, untrained, with the settings that its stress leaves it."""
-    options = config.stress.options(config.options)
-    return lookup(METHODS, config.method, "method")(options, config.render, config.training, seed=config.seed)
+    """Return the untrained method of a configuration."""
+    return lookup(METHODS, config.method, "method")(config.options, config.render, config.train, seed=config.seed)

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 import padgs
 from padgs.cli.commands import app
+from padgs.data.perturb import StressOptions
 from padgs.multirun import job
 from padgs.multirun.composition import composing, configuration
 from padgs.need import tiers
@@ -24,7 +25,6 @@ from padgs.runs.checkpoint import CheckpointError
 from padgs.runs.interrupt import Interrupt, Interrupted
 from padgs.runs.session import Watch
 from padgs.runs.typed import ConfigError
-from padgs.stress.options import StressOptions
 from padgs.training.loop import Trainer
 from padgs.training.trainee import State
 from padgs.training.worth import most_wanted, worth

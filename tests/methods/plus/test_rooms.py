@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
+from padgs.data.perturb import StressOptions
 from padgs.data.synthetic import SyntheticOptions, generate
 from padgs.methods.plus.method import PlusMethod
 from padgs.methods.plus.options import PlusOptions
 from padgs.methods.plus.rooms import rooms
-from padgs.stress.options import StressOptions
 
 
 @pytest.fixture(autouse=True)
@@ -46,7 +46,7 @@ def test_furniture_and_trees_make_no_room(name):
 @pytest.mark.parametrize(("condition", "level"), [("world_scale", 3), ("world_offset", 2), ("world_rotation", 3)])
 def test_the_world_may_be_anywhere(condition, level):
     scene = scene_of("enfilade", 3)
-    assert rooms(StressOptions(condition, level).scene(scene, 0)) == pytest.approx(rooms(scene), rel=0.1)
+    assert rooms(StressOptions(condition, level).apply(scene, 0)) == pytest.approx(rooms(scene), rel=0.1)
 
 
 def test_points_that_are_none_count_as_nothing():

@@ -1,11 +1,11 @@
 from dataclasses import replace
 
 from made_up import failed, gathered, of_experiment
-
 from padgs.reports.limits import LIMITS, MADE_FOR
 from padgs.reports.tables.limits import limits
+
+from padgs.data.perturb import CONDITIONS
 from padgs.results import Scores
-from padgs.stress.conditions import CONDITIONS
 
 RULES = {"name": "stability", "lpips": "none", "lpips_inputs": "11", "bottom_crop": 0.0}
 MARKS = {"ws_psnr_one_color": 12.0, "seam": 1.0, "depth_error": 0.05}

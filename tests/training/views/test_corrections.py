@@ -6,16 +6,16 @@ from dataclasses import replace
 import pytest
 import torch
 from composed import composed
+from padgs.baselines.omnigs import OmniGSMethod
 from states import assert_same_but_time
 from tiny_scene import tiny_scene, truth
 from torch import nn
 
-from padgs.baselines.omnigs import OmniGSMethod
+from padgs.data.perturb import StressOptions
+from padgs.data.perturb.images import change_pixels
 from padgs.render import RenderOptions, render
 from padgs.runs.config import LATER
 from padgs.scene import Scene, View
-from padgs.stress.options import StressOptions
-from padgs.stress.pictures import repainted
 from padgs.training.budget import Budget
 from padgs.training.loop import Trainer
 from padgs.training.options import TrainOptions
@@ -33,7 +33,7 @@ def padgs_root(monkeypatch, root):
 
 
 def stressed(condition: str) -> Scene:
-    return StressOptions(condition, 3).scene(tiny_scene(), 1)
+    return StressOptions(condition, 3).apply(tiny_scene(), 1)
 
 
 def trained(scene: Scene, train: TrainOptions, iterations: int = 150) -> OmniGSMethod:
@@ -74,7 +74,7 @@ def corrected(scene: Scene, train: TrainOptions, iterations: int = 250) -> Corre
 def test_exposures_that_differ_are_found_but_for_their_mean():
     stops = torch.tensor([-0.3, 0.1, 0.2, 0.0, -0.2])
     views = tuple(
-        repainted(view, lambda pixels, stop=stop: (pixels * 2**stop).clamp(0, 255).to(torch.uint8))
+        change_pixels(view, lambda pixels, stop=stop: (pixels * 2**stop).clamp(0, 255).to(torch.uint8))
         for view, stop in zip(tiny_scene().train, stops, strict=True)
     )
     scene = replace(tiny_scene(), train=views)

@@ -1,7 +1,4 @@
-"""The field's known failures, each under the condition that brings it about: the release has it, ours does not.
-
-That OP43DGS runs out of memory with distance is in tests/baselines/test_op43dgs.py.
-"""
+"""Known failures of released programs, each under the condition that causes it: the release fails, ours does not."""
 
 from dataclasses import replace
 
@@ -10,11 +7,11 @@ import torch
 from composed import composed
 from tiny_scene import tiny_scene
 
+from padgs.data.perturb import StressOptions
 from padgs.evaluation.geometry import yaw_error
 from padgs.geometry.distortion import distortion, polar_axis
 from padgs.runs.session import build
 from padgs.scene import Scene
-from padgs.stress.options import StressOptions
 from padgs.training.failure import Failure
 from padgs.training.loop import Budget
 from padgs.training.method import Method
@@ -32,7 +29,7 @@ def trained(preset: str, scene: Scene, iterations: int = 3) -> Method:
 
 
 def stressed(scene: Scene, condition: str, level: int) -> Scene:
-    return StressOptions(condition, level).scene(scene, 0)
+    return StressOptions(condition, level).apply(scene, 0)
 
 
 @pytest.mark.parametrize(("preset", "cuts"), [("omnigs_release", True), ("omnigs", False)])

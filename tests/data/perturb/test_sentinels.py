@@ -1,7 +1,4 @@
-"""Cells of the matrix that stand for the others: padgs_plus on the built-in room, small, and a number each.
-
-What a cell may cost is some way above what it costs today (LOG.md, 2026-11-22), so that luck breaks none of them.
-"""
+"""Robustness of padgs_plus on the small built-in room under some conditions, with generous limits."""
 
 from __future__ import annotations
 
@@ -15,6 +12,7 @@ from composed import composed
 from padgs.runs.scoring import scores
 from padgs.runs.session import build, scene_of
 from padgs.training.failure import Failure
+from padgs.training.schedule import FASTEST
 
 pytestmark = pytest.mark.slow
 SMALL = ("data.generator.width=64", "data.generator.train_views=16", "data.generator.test_views=1")
@@ -28,8 +26,8 @@ def cached(monkeypatch, root, cache):
 
 
 @cache
-def marks(condition: str = "none", level: int = 1, *more: str) -> dict[str, Any]:
-    """The marks of a run and how many Gaussians it has."""
+def quality(condition: str = "none", level: int = 1, *more: str) -> dict[str, Any]:
+    """Return the metrics of a run, and the number of its Gaussians."""
     stress = (f"stress.condition={condition}", f"stress.level={level}")
     config = composed(*SMALL, *LENGTH, "protocol=stability", "protocol.stability.lpips=none", *stress, *more)
     torch.manual_seed(0)
@@ -40,8 +38,8 @@ def marks(condition: str = "none", level: int = 1, *more: str) -> dict[str, Any]
 
 
 def lost(condition: str, level: int) -> float:
-    """WS-PSNR that a condition costs, dB."""
-    return marks()["ws_psnr"] - marks(condition, level)["ws_psnr"]
+    """Return the WS-PSNR that a condition costs, dB."""
+    return quality()["ws_psnr"] - quality(condition, level)["ws_psnr"]
 
 
 def test_the_world_may_be_turned():
@@ -50,13 +48,13 @@ def test_the_world_may_be_turned():
 
 def test_the_seam_may_lie_anywhere():
     assert abs(lost("seam", 2)) < 0.3
-    assert marks("seam", 2)["seam"] < 1.5 and marks("seam", 2)["yaw_error"] < 1e-3
+    assert quality("seam", 2)["seam"] < 1.5 and quality("seam", 2)["yaw_error"] < 1e-3
 
 
 def test_the_world_may_have_any_unit():
     for level in (1, 3):
         assert abs(lost("world_scale", level)) < 0.2
-        assert marks("world_scale", level)["gaussians"] == pytest.approx(marks()["gaussians"], rel=0.02)
+        assert quality("world_scale", level)["gaussians"] == pytest.approx(quality()["gaussians"], rel=0.02)
 
 
 def test_a_hundredth_of_the_points_is_enough_to_begin_with():
@@ -64,24 +62,28 @@ def test_a_hundredth_of_the_points_is_enough_to_begin_with():
 
 
 def test_a_quarter_of_the_views_does_not_collapse():
-    assert lost("few_views", 2) < 2 and marks("few_views", 2)["depth_error"] < 0.3
+    assert lost("few_views", 2) < 2 and quality("few_views", 2)["depth_error"] < 0.3
 
 
 def test_no_detail_at_the_poles_is_lost_that_an_even_blur_would_keep():
     for spokes, dB in ((4, 1), (16, 2)):
-        poles = marks("none", 1, "data.generator.scene=pole_torture", f"data.generator.spokes={spokes}")
+        poles = quality("none", 1, "data.generator.scene=pole_torture", f"data.generator.spokes={spokes}")
         assert poles["ws_psnr_equator"] - poles["ws_psnr_pole"] - poles["pole_gap_oracle"] < dB
 
 
-@pytest.mark.parametrize("level", [1, 2])
-def test_networks_may_multiply_in_fewer_bits(level):
-    rest, reduced = (marks(name, level, "method=padgs_small")["ws_psnr"] for name in ("none", "precision"))
-    assert 0 < abs(rest - reduced) < 0.3
+@pytest.mark.parametrize("precision", ["float16", "bfloat16"])
+def test_networks_may_multiply_in_fewer_bits(precision):
+    exact, reduced = (
+        quality("none", 1, "method=padgs_small", f"method.precision={name}")["ws_psnr"]
+        for name in ("float32", precision)
+    )
+    assert 0 < abs(exact - reduced) < 0.3
 
 
-def test_rates_ten_times_as_high_end_without_a_nan():
-    assert lost("learning_rates", 1) < 0.5
+@pytest.mark.parametrize(("factor", "allowed"), [(3, 0.5), (10, 100.0)])
+def test_learning_rates_ten_times_as_high_end_without_a_nan(factor, allowed):
+    rates = f"train.learning_rates={factor * FASTEST}"  # of a run so short, `run` is this factor of the published ones
     try:
-        lost("learning_rates", 2)
+        assert quality()["ws_psnr"] - quality("none", 1, rates)["ws_psnr"] < allowed
     except Failure as failure:
-        assert failure.status != "nan"
+        assert factor == 10 and failure.status != "nan"

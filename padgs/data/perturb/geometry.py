@@ -1,0 +1,178 @@
+"""Conditions of the world frame, the poses and the point cloud. Each is `(scene, value, random) -> scene`.
+
+Test views keep the poses that their images were taken at.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from padgs.scene import Scene, View
+
+DIAGONAL = (math.sqrt(0.5), math.sqrt(0.5), 0.0)  # horizontal; a rotation about it moves both the y and the z axis
+MIN_POINTS = 8  # explicit Gaussians take their first size from their three nearest neighbors
+NEAR = 0.02  # scene scales: closer to a camera than any surface
+FAR = 10.0  # times the size of the cloud
+GRAY = 128
+QUANTILES = (0.02, 0.98)  # of the points, between which the size of the cloud is measured
+
+
+def world_rotation(scene: Scene, degrees: float, random: np.random.Generator) -> Scene:
+    """Rotate the world, cameras included; the images stay the same."""
+    from scipy.spatial.transform import Rotation
+
+    world = torch.from_numpy(Rotation.from_rotvec(degrees * np.array(DIAGONAL), degrees=True).as_matrix())
+    points = (scene.points.double() @ world.T.to(scene.points.device)).float()
+
+    def move(view: View) -> View:
+        pose = view.cam_from_world.clone()
+        pose[:3, :3] = view.cam_from_world[:3, :3] @ world.T.to(pose)
+        return replace(view, cam_from_world=pose)
+
+    return replace(change_views(scene, move), points=points)
+
+
+def world_scale(scene: Scene, factor: float, random: np.random.Generator) -> Scene:
+    """Scale the world, cameras and depths included; the images stay the same."""
+
+    def move(view: View) -> View:
+        pose = view.cam_from_world.clone()
+        pose[:3, 3] *= factor
+        load = view.load_depth
+        return replace(view, cam_from_world=pose, load_depth=None if load is None else lambda: load() * factor)
+
+    return replace(change_views(scene, move), points=scene.points * factor)
+
+
+def world_offset(scene: Scene, distance: float, random: np.random.Generator) -> Scene:
+    """Move the world `distance` scene scales away from its origin, like georeferenced captures; points in float64."""
+    offset = distance * scene.scale * torch.tensor(DIAGONAL, dtype=torch.float64)
+    scene = change_views(scene, lambda view: _shift(view, offset))
+    return replace(scene, points=scene.points.double() + offset.to(scene.points.device))
+
+
+def pose_noise(scene: Scene, sigma: float, random: np.random.Generator) -> Scene:
+    """Move training cameras by a normal offset with a standard deviation of `sigma` scene scales on each axis."""
+
+    def move(view: View) -> View:
+        offset = torch.from_numpy(random.standard_normal(3)).to(view.cam_from_world)
+        return _shift(view, sigma * scene.scale * offset)
+
+    return change_training_views(scene, move)
+
+
+def pose_rotation(scene: Scene, sigma: float, random: np.random.Generator) -> Scene:
+    """Rotate training cameras about random axes by a normal angle with a standard deviation of `sigma` degrees."""
+
+    def move(view: View) -> View:
+        from scipy.spatial.transform import Rotation
+
+        axis, size = random.standard_normal(3), random.standard_normal()
+        rotation = Rotation.from_rotvec(axis / np.linalg.norm(axis) * sigma * size, degrees=True).as_matrix()
+        return rotate_camera(view, torch.from_numpy(rotation))
+
+    return change_training_views(scene, move)
+
+
+def few_views(scene: Scene, every: int, random: np.random.Generator) -> Scene:
+    """Keep one of `every` training views, evenly along the capture, and at least two."""
+    kept = scene.train[::every] if len(scene.train) > every else (scene.train[0], scene.train[-1])
+    return replace(scene, train=kept)
+
+
+def few_points(scene: Scene, share: float, random: np.random.Generator) -> Scene:
+    """Keep a random share of the points, and at least `MIN_POINTS`."""
+    count = min(len(scene.points), max(MIN_POINTS, round(share * len(scene.points))))
+    kept = torch.from_numpy(np.sort(random.permutation(len(scene.points))[:count]))
+    return replace(scene, points=scene.points[kept], point_colors=scene.point_colors[kept])
+
+
+def random_points(scene: Scene, shape: str, random: np.random.Generator) -> Scene:
+    """Replace the points by as many gray ones: uniform in the box of the cloud, or in a sphere around the cameras, or
+    there with one in ten in a shell that is `FAR` times as large.
+    """
+    low, high, center, radius = _cloud_size(scene)
+    count = len(scene.points)
+    if shape == "box":
+        points = random.uniform(low, high, (count, 3))
+    else:
+        distance = radius * np.cbrt(random.random(count))
+        if "shell" in shape:
+            distance[: count // 10] = FAR * radius
+        points = center + distance[:, None] * _directions(count, random)
+    return replace(
+        scene, points=torch.from_numpy(points).to(scene.points), point_colors=torch.full_like(scene.point_colors, GRAY)
+    )
+
+
+def outlier_points(scene: Scene, share: float, random: np.random.Generator) -> Scene:
+    """Move a share of the points to anywhere in a box `FAR` times the size of the cloud."""
+    low, high, _, _ = _cloud_size(scene)
+    middle, half = (low + high) / 2, FAR * (high - low) / 2
+    return _move_points(scene, share, lambda count: random.uniform(middle - half, middle + half, (count, 3)), random)
+
+
+def near_points(scene: Scene, share: float, random: np.random.Generator) -> Scene:
+    """Move a share of the points to directly in front of training cameras."""
+    centers = np.stack([view.center.cpu().numpy() for view in scene.train])
+
+    def sample(count: int) -> np.ndarray:
+        distance = NEAR * scene.scale * random.uniform(0.1, 1, (count, 1))
+        return centers[random.integers(len(centers), size=count)] + distance * _directions(count, random)
+
+    return _move_points(scene, share, sample, random)
+
+
+def change_training_views(scene: Scene, change: Callable[[View], View]) -> Scene:
+    """Return the scene with all training views changed."""
+    return replace(scene, train=tuple(map(change, scene.train)))
+
+
+def change_views(scene: Scene, change: Callable[[View], View]) -> Scene:
+    """Return the scene with all training views changed, and then all test views."""
+    return replace(change_training_views(scene, change), test=tuple(map(change, scene.test)))
+
+
+def rotate_camera(view: View, rotation: Tensor) -> View:
+    """Return the view with its camera frame rotated by a matrix [3, 3] about its own center."""
+    pose = view.cam_from_world.clone()
+    pose[:3] = rotation.to(pose) @ pose[:3]
+    return replace(view, cam_from_world=pose)
+
+
+def _shift(view: View, offset: Tensor) -> View:
+    """Return the view with its camera moved by an offset [3] in the world frame."""
+    pose = view.cam_from_world.clone()
+    pose[:3, 3] -= pose[:3, :3] @ offset.to(pose)
+    return replace(view, cam_from_world=pose)
+
+
+def _move_points(scene: Scene, share: float, sample: Callable[[int], np.ndarray], random: np.random.Generator) -> Scene:
+    """Return the scene with a random share of its points, colors kept, at the positions that `sample` returns."""
+    chosen = random.permutation(len(scene.points))[: round(share * len(scene.points))]
+    points = scene.points.clone()
+    points[torch.from_numpy(chosen).to(points.device)] = torch.from_numpy(sample(len(chosen))).to(points)
+    return replace(scene, points=points)
+
+
+def _cloud_size(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Return the two corners of the cloud's box between `QUANTILES`, the mean of the camera centers, and the cloud's
+    radius around it.
+    """
+    points = scene.points.double().cpu().numpy()
+    center = np.mean([view.center.cpu().numpy() for view in scene.train], axis=0)
+    radius = np.quantile(np.linalg.norm(points - center, axis=1), QUANTILES[1])
+    low, high = np.quantile(points, QUANTILES, axis=0)
+    return low, high, center, float(radius)
+
+
+def _directions(count: int, random: np.random.Generator) -> np.ndarray:
+    """Return random unit vectors [count, 3]."""
+    vectors = random.standard_normal((count, 3))
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
