@@ -36,7 +36,7 @@ def render(
 
     from padgs.apps.camera_path_video import write_film
     from padgs.data.camera_paths import PATHS, gravity, read_path
-    from padgs.data.formats.transforms import described
+    from padgs.data.formats.transforms import transforms_file
     from padgs.geometry.camera import Panorama, perspective
     from padgs.scene import View, move_origin
 
@@ -63,7 +63,7 @@ def render(
         else:
             up = gravity(torch.stack([view.cam_from_world for view in scene.train])).up
             data_set = found.config.data
-            poses = read_path(Path(path), frames, up, described(data_set.path, data_set.format))
+            poses = read_path(Path(path), frames, up, transforms_file(data_set.path, data_set.format))
             poses = move_origin(poses, scene.origin)
         views = [
             View(f"frame {number}", pose.to(trained.cam_from_world), lens.width, lens.height, lens=lens)

@@ -1,6 +1,6 @@
-"""Data sources: panoramas with poses, from the formats people have, as one `Scene`.
+"""Data sources: panoramas with poses, read from any supported format into one `Scene`.
 
-`load(path)` looks at the folder, decides, and says in `Scene.notes` what it decided and why.
+`load(path)` detects the format; `Scene.notes` says what was decided and why.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from padgs.data.formats import detect
 from padgs.registry import lookup
 from padgs.scene import Scene
 
-# Each is `read(path, options) -> Capture`; synthetic alone reads no files and is `load(path, options) -> Scene`.
+# `read(path, options) -> Capture`, except synthetic, which reads no files: `load(path, options) -> Scene`.
 LOADERS = {
     "colmap": "padgs.data.formats.colmap:read",
     "transforms": "padgs.data.formats.transforms:read",
-    "nerfstudio": "padgs.data.formats.transforms:read",  # the same, by the name of the program
+    "nerfstudio": "padgs.data.formats.transforms:read",  # an alias of transforms
     "openmvg": "padgs.data.formats.openmvg:read",
     "opensfm": "padgs.data.formats.opensfm:read",
     "roam360": "padgs.data.formats.published:read_roam360",
@@ -38,16 +38,16 @@ def load(
     options: DataOptions = DataOptions(),  # noqa: B008 - frozen dataclass
     **fields: object,
 ) -> Scene:
-    """The scene in a folder.
+    """Load the scene of a data set.
 
     Args:
-        path: the data set's folder, or the file that describes it; without one, the built-in room is made.
+        path: the data set's folder, or the file that describes it; None generates the built-in room.
         format: a name of `LOADERS`, or auto.
         options: the `data` group of the configuration.
-        fields: single options by name, over `options`.
+        fields: single options by name; they override `options`.
 
     Raises:
-        DataError: input that cannot be used; the message names the file, the rule and the way out.
+        DataError: unusable input; the message names the file, the rule and the way out.
         ValueError: unknown format.
     """
     options = replace(options, **fields)  # type: ignore[arg-type]
@@ -63,7 +63,7 @@ def load(
 
 
 def read(path: str | Path, format: str = "auto", options: DataOptions = DataOptions()) -> Capture:  # noqa: B008
-    """What a folder holds, images unread: the half of `load` that `padgs convert` and `padgs check` need."""
+    """Read poses, points and split lists of a data set, but no images; for `padgs convert` and `padgs check`."""
     path = Path(path)
     refuse_missing(path, options.dataset)
     notes = ()

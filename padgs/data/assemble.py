@@ -1,4 +1,4 @@
-"""From what a format says to a scene: find the images, check them, split, mask, and take the fingerprint."""
+"""Build a scene from a capture: find and check its images, split, mask, and compute the fingerprint."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 from padgs.data.capture import Capture, DataError, DataOptions, Frame, listed
-from padgs.data.cloud import starting_cloud
+from padgs.data.cloud import initial_cloud
 from padgs.data.images import EXTENSIONS, ImageFile, inspect
 from padgs.data.masks import find_masks
 from padgs.data.splits import split_frames
@@ -17,24 +17,24 @@ from padgs.data.store import ImageStore, StoredImage
 from padgs.scene import Scene, View
 
 IMAGE_FOLDERS = ("images", "imgs", "image", "rgb")
-STATEMENT = "prepare.json"  # beside what `padgs.data.prepare` has made
-# What a folder of ours is known by: a data set, or a run (by the names of `padgs.results`). Pictures in there are no
-# photographs, or copies of them.
-OURS = ((STATEMENT,), ("config.yaml", "renders"))
+PREPARED = "prepare.json"  # written by `padgs.data.prepare`
+# Files that identify a prepared data set, and a run (see `padgs.results`). Searches for images skip such folders: they
+# hold renders, or copies of images.
+SKIPPED = ((PREPARED,), ("config.yaml", "renders"))
 
 
 def assemble(capture: Capture, options: DataOptions) -> Scene:
-    """The scene of a capture. Images are looked at, not decoded.
+    """Build the scene of a capture. Images are checked, but not decoded.
 
     Raises:
-        DataError: anything about images, poses, points, split or masks that training could not use.
+        DataError: images, poses, points, split or masks that training cannot use.
     """
     capture = replace(capture, frames=tuple(sorted(capture.frames, key=lambda frame: frame.name)))
     names = [frame.name for frame in capture.frames]
     if not names:
         raise DataError(f"the {capture.format} model in {capture.folder} holds no posed image")
     refuse_clashes(names)
-    _refuse_absent(capture)
+    _refuse_missing(capture)
     images = [inspect(frame.image) for frame in capture.frames]
     notes = [*capture.notes, *_camera_notes(capture.frames, images)]
     target = options.width
@@ -51,15 +51,15 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
     split = split_frames(
         names, capture.folder, mode=options.split, every=options.test_every, stated=capture.split, unposed=unposed
     )
-    points, colors, cloud_notes = starting_cloud(capture, options.points)
-    store = ImageStore(options.cache_bytes, options.read_ahead, options.device)
+    points, colors, cloud_notes = initial_cloud(capture, options.points)
+    store = ImageStore(options.cache_bytes, options.prefetch_threads, options.device)
     masks, mask_digests, mask_notes = find_masks(capture, options.mask, images, sizes, store)
     views = [
         View(view_name(frame.name), frame.cam_from_world, *size, StoredImage(frame.image, *size, store), mask)
         for frame, size, mask in zip(capture.frames, sizes, masks, strict=True)
     ]
     scene = Scene(
-        name=Path(os.path.abspath(capture.folder)).name,  # of "." as well; not resolved: a link's name is its own
+        name=Path(os.path.abspath(capture.folder)).name,  # works for "." too; a link keeps its own name
         train=tuple(views[i] for i in split.train),
         test=tuple(views[i] for i in split.test),
         points=points,
@@ -78,15 +78,15 @@ def assemble(capture: Capture, options: DataOptions) -> Scene:
 
 
 def view_name(frame_name: str) -> str:
-    """What a view is called: its image's path in the image folder, without extension."""
+    """Return a view's name: its image's path in the image folder, without extension."""
     return str(PurePosixPath(frame_name).with_suffix(""))
 
 
 def image_folder(folder: Path, given: str | None, usual: Sequence[str] = IMAGE_FOLDERS) -> Path:
-    """The folder with the images of a data set: the given one, else the first usual one, else the data set's own.
+    """Return the image folder of a data set: the given one, else the first existing usual one, else its own folder.
 
     Raises:
-        DataError: the given one is not there.
+        DataError: the given folder does not exist.
     """
     if given is not None:
         if not (folder / given).is_dir():
@@ -96,29 +96,29 @@ def image_folder(folder: Path, given: str | None, usual: Sequence[str] = IMAGE_F
 
 
 def image_names(folder: Path) -> list[str]:
-    """All images below a folder, as `file_names` lists them."""
+    """Return the names of all images below a folder, as in `file_names`."""
     return [name for name in file_names(folder) if name.lower().endswith(EXTENSIONS)]
 
 
 def file_names(folder: Path) -> list[str]:
-    """All files below a folder, relative to it, sorted; hidden ones and those in folders of ours left out."""
+    """Return all files below a folder, relative to it and sorted, without hidden and `SKIPPED` ones."""
     found: list[str] = []
     for parent, folders, files in os.walk(folder):
         here = Path(parent)
-        folders[:] = [name for name in folders if not name.startswith(".") and not _is_ours(here / name)]
+        folders[:] = [name for name in folders if not name.startswith(".") and not _is_skipped(here / name)]
         found += [(here / name).relative_to(folder).as_posix() for name in files if not name.startswith(".")]
     return sorted(found)
 
 
-def _is_ours(folder: Path) -> bool:
-    return any(all((folder / sign).exists() for sign in signs) for signs in OURS)
+def _is_skipped(folder: Path) -> bool:
+    return any(all((folder / file).exists() for file in files) for files in SKIPPED)
 
 
 def refuse_clashes(names: Sequence[str]) -> None:
-    """Raise if two images would give views of one name.
+    """Refuse images whose views would have the same name.
 
     Raises:
-        DataError: they would.
+        DataError: two names differ only in case or extension.
     """
     seen: dict[str, str] = {}
     for name in names:
@@ -130,15 +130,15 @@ def refuse_clashes(names: Sequence[str]) -> None:
         seen[key] = name
 
 
-def _refuse_absent(capture: Capture) -> None:
+def _refuse_missing(capture: Capture) -> None:
     absent = [frame.name for frame in capture.frames if not frame.image.is_file()]
     if not absent:
         return
     present = {name.casefold(): name for name in image_names(capture.image_folder)}
     hint = next((present[name.casefold()] for name in absent if name.casefold() in present), None)
-    remedy = "set data.images to the folder that holds them, or make poses of those that are there (padgs prepare)"
+    remedy = "set data.images to the folder that holds them, or compute poses of the images that exist (padgs prepare)"
     if hint:
-        remedy = f"there is {hint!r}, in another case: rename it"
+        remedy = f"there is {hint!r}, which differs in case: rename it"
     raise DataError(
         f"{len(absent)} of {len(capture.frames)} poses have no image in {capture.image_folder}: "
         f"{listed(absent)}; {remedy}"
@@ -146,14 +146,14 @@ def _refuse_absent(capture: Capture) -> None:
 
 
 def _unposed(capture: Capture) -> list[str]:
-    if capture.image_folder == capture.folder:  # masks and pictures of all kinds may lie there
+    if capture.image_folder == capture.folder:  # may hold masks and other images too
         return []
     posed = {frame.image for frame in capture.frames}
     return [name for name in image_names(capture.image_folder) if capture.image_folder / name not in posed]
 
 
 def _camera_notes(frames: Sequence[Frame], images: Sequence[ImageFile]) -> list[str]:
-    """A panorama may be stored smaller or larger than its camera says, but all of them alike."""
+    """Check that all panoramas have the size of their camera, or differ from it by one common factor."""
     scales: dict[float, str] = {}
     for frame, image in zip(frames, images, strict=True):
         if frame.width is None or frame.height is None:
@@ -175,5 +175,5 @@ def _view_size(image: ImageFile, width: int | None) -> tuple[int, int]:
     if width is None:
         return image.width, image.height
     if width > image.width:
-        raise DataError(f"data.width={width} is wider than {image.path} ({image.width}); images are only ever reduced")
+        raise DataError(f"data.width={width} is wider than {image.path} ({image.width}); images are only reduced")
     return width, width // 2

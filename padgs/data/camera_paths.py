@@ -1,4 +1,10 @@
-"""Camera paths: their extent and up direction, paths made from a scene, and paths read from JSON files."""
+"""Camera paths: statistics of poses, paths through a scene, and paths read from JSON files.
+
+Poses are cam_from_world [F, 4, 4] float64. Keyframe files of padgs: {"keyframes": [{"position": [x, y, z], "look_at":
+[x, y, z]} or {"cam_from_world": 4 rows of 4}, ...], "up": [x, y, z]}, in the world of the data set. Camera paths of
+nerfstudio's viewer hold one pose per frame (x right, y up, z backward) in a normalised world, which the run's
+`dataparser_transforms.json` defines; put that file beside the path.
+"""
 
 from __future__ import annotations
 
@@ -12,23 +18,23 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from padgs.data.capture import natural
+from padgs.data.capture import natural_key
 from padgs.scene import Scene
 
 
 @dataclass(frozen=True)
 class Gravity:
-    """The direction that the cameras agree to call up, in the world frame."""
+    """Common up direction of cameras, in the world frame."""
 
     up: tuple[float, float, float]
-    agreement: float  # length of the mean of the cameras' up directions: 1 = all level, 0 = no common direction
-    axis: str  # the world axis nearest to it: +x, -x, ...
-    off_axis: float  # degrees between the two
-    tilt: float  # degrees, median angle of a camera's own up to the common one
+    agreement: float  # length of the mean of the cameras' up directions: 1 = all upright, 0 = no common direction
+    axis: str  # nearest world axis: +x, -x, ...
+    off_axis: float  # degrees between `up` and `axis`
+    tilt: float  # degrees, median angle between a camera's up and the common one
 
 
 def gravity(poses: Tensor) -> Gravity:
-    """Up of the world from cam_from_world [F, 4, 4]: panoramic cameras are mostly upright, so -y averages to up."""
+    """Estimate the world's up direction from poses [F, 4, 4]: panoramic cameras are mostly upright."""
     ups = -poses[:, 1, :3]  # the camera's -y in the world: minus the second row of the rotation
     mean = ups.mean(0)
     up = mean / mean.norm().clamp(min=1e-12)
@@ -44,18 +50,18 @@ def gravity(poses: Tensor) -> Gravity:
 
 
 def path_length(poses: Tensor) -> float:
-    """Length of the way from camera centre to camera centre in the order given, world units."""
+    """Return the length of the path through the camera centres in the given order, in world units."""
     return (centers(poses)[1:] - centers(poses)[:-1]).norm(dim=1).sum().item()
 
 
 def median_depth(poses: Tensor, points: Tensor) -> float:
-    """Median distance from a camera to a point, world units."""
+    """Return the median distance between cameras and points, in world units."""
     some = points[:: max(1, len(points) // 20_000)].double()
     return torch.cdist(centers(poses), some).median().item()
 
 
 def centers(poses: Tensor) -> Tensor:
-    """Camera centres [F, 3] of cam_from_world [F, 4, 4]."""
+    """Return the camera centres [F, 3] of poses [F, 4, 4]."""
     return -(poses[:, :3, :3].mT @ poses[:, :3, 3:])[..., 0]
 
 
@@ -63,106 +69,107 @@ def _degrees(cosine: Tensor) -> float:
     return torch.rad2deg(torch.acos(cosine.clamp(-1, 1))).item()
 
 
-SMOOTHING = 0.5  # of the way through the training cameras, in mean distances of neighbours
-ORBIT = 0.4  # radius, in largest distances of a training camera from their mean
-ALONE = 0.1  # the same where all cameras stand in one place, in units of the scene
+SMOOTHING = 0.5  # standard deviation, in mean distances of neighbouring training cameras
+ORBIT_RADIUS = 0.4  # in camera radii of the scene
+SINGLE_CENTER_RADIUS = 0.1  # of orbit and dolly if all cameras share one centre, in scene scales
 
 
-def between(poses: Tensor, times: Sequence[float] | np.ndarray) -> Tensor:
-    """Poses [T, 4, 4] at times along the way through given ones [F, 4, 4]; 0 is the first of them, F - 1 the last.
-
-    Centres move in straight lines, turns are even.
-    """
+def interpolate_poses(poses: Tensor, times: Sequence[float] | np.ndarray) -> Tensor:
+    """Interpolate poses [F, 4, 4] at times in [0, F - 1]: centres linearly, rotations spherically. [T, 4, 4]."""
     from scipy.spatial.transform import Rotation, Slerp
 
     numbers = np.arange(len(poses))
     given = poses.double().cpu().numpy()
     centers = -np.einsum("fji,fj->fi", given[:, :3, :3], given[:, :3, 3])
-    turns = Slerp(numbers, Rotation.from_matrix(given[:, :3, :3]))(times).as_matrix()
+    rotations = Slerp(numbers, Rotation.from_matrix(given[:, :3, :3]))(times).as_matrix()
     at = np.stack([np.interp(times, numbers, axis) for axis in centers.T], axis=-1)
-    return _poses(turns, at)
+    return _poses(rotations, at)
 
 
 def along_cameras(scene: Scene, frames: int) -> Tensor:
-    """Through the training cameras in the order of their names, at one speed, and smoothly.
+    """Return a smooth path of constant speed through the training cameras, in the order of their names.
 
     Raises:
-        ValueError: there is one camera only, or all stand in one place.
+        ValueError: there is only one camera, or all share one centre.
     """
     from scipy.ndimage import gaussian_filter1d
     from scipy.spatial.transform import Rotation
 
-    views = sorted(scene.train, key=lambda view: natural(view.name))
+    views = sorted(scene.train, key=lambda view: natural_key(view.name))
     given = torch.stack([view.cam_from_world for view in views])
     centers = torch.stack([view.center for view in views])
     steps = (centers[1:] - centers[:-1]).norm(dim=-1).cpu().numpy()
     if len(given) < 2 or scene.has_single_center:
         raise ValueError(
-            f"{len(given)} training cameras in one place make no path; --path orbit and --path dolly need none"
+            f"{len(given)} training cameras with one centre make no path; use --path orbit or --path dolly"
         )
-    walked = np.concatenate(([0.0], np.cumsum(np.maximum(steps, 1e-9 * steps.max()))))
-    times = np.interp(np.linspace(0, walked[-1], frames), walked, np.arange(len(walked)))
-    poses = between(given, times).numpy()
+    distance = np.concatenate(([0.0], np.cumsum(np.maximum(steps, 1e-9 * steps.max()))))
+    times = np.interp(np.linspace(0, distance[-1], frames), distance, np.arange(len(distance)))
+    poses = interpolate_poses(given, times).numpy()
     width = SMOOTHING * frames / len(steps)
     centers = gaussian_filter1d(-np.einsum("fji,fj->fi", poses[:, :3, :3], poses[:, :3, 3]), width, 0, mode="nearest")
     quats = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
     signs = np.where((quats[1:] * quats[:-1]).sum(-1) < 0, -1.0, 1.0)  # q and -q are one turn
     quats[1:] *= np.cumprod(signs)[:, None]
-    turns = Rotation.from_quat(gaussian_filter1d(quats, width, 0, mode="nearest")).as_matrix()
-    return _poses(turns, centers)
+    rotations = Rotation.from_quat(gaussian_filter1d(quats, width, 0, mode="nearest")).as_matrix()
+    return _poses(rotations, centers)
 
 
 def orbit(scene: Scene, frames: int) -> Tensor:
-    """Once around the middle of the training cameras, level, looking across it."""
-    middle, up, ahead = _frame(scene)
+    """Return a level circle around the mean training camera, looking through its centre."""
+    middle, up, forward = _frame(scene)
     angles = 2 * np.pi * np.arange(frames) / frames
-    side = np.cross(ahead, up)
-    out = np.cos(angles)[:, None] * side - np.sin(angles)[:, None] * ahead
-    radius = ORBIT * scene.camera_radius if not scene.has_single_center else ALONE * scene.scale
-    return looking(middle + radius * out, -out, up)
+    side = np.cross(forward, up)
+    out = np.cos(angles)[:, None] * side - np.sin(angles)[:, None] * forward
+    radius = ORBIT_RADIUS * scene.camera_radius if not scene.has_single_center else SINGLE_CENTER_RADIUS * scene.scale
+    return look_along(middle + radius * out, -out, up)
 
 
 def dolly(scene: Scene, frames: int) -> Tensor:
-    """Straight through the middle of the training cameras, where they are spread the widest, looking ahead."""
-    middle, up, ahead = _frame(scene)
+    """Return a straight path through the mean training camera, along their widest level direction, looking ahead."""
+    middle, up, forward = _frame(scene)
     centers = torch.stack([view.center for view in scene.train]).cpu().numpy()
-    along = (centers - middle) @ ahead
-    reach = (along.min(), along.max()) if not scene.has_single_center else (-ALONE * scene.scale, ALONE * scene.scale)
-    at = middle + np.linspace(*reach, frames)[:, None] * ahead
-    return looking(at, np.broadcast_to(ahead, at.shape), up)
+    along = (centers - middle) @ forward
+    reach = (
+        (along.min(), along.max())
+        if not scene.has_single_center
+        else (-SINGLE_CENTER_RADIUS * scene.scale, SINGLE_CENTER_RADIUS * scene.scale)
+    )
+    at = middle + np.linspace(*reach, frames)[:, None] * forward
+    return look_along(at, np.broadcast_to(forward, at.shape), up)
 
 
 PATHS: dict[str, Callable[[Scene, int], Tensor]] = {"cameras": along_cameras, "orbit": orbit, "dolly": dolly}
 
 
-def looking(centers: np.ndarray, directions: np.ndarray, up: np.ndarray) -> Tensor:
-    """Poses of cameras at centres [F, 3] that look along directions [F, 3], `up` [3] upwards in the picture."""
-    ahead = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-    right = np.cross(ahead, up)
-    right[np.linalg.norm(right, axis=-1) < 1e-6] = np.cross(up, np.eye(3)[np.abs(up).argmin()])  # straight up or down
+def look_along(centers: np.ndarray, directions: np.ndarray, up: np.ndarray) -> Tensor:
+    """Return poses of cameras at centres [F, 3] that look along directions [F, 3], with `up` [3] upwards."""
+    forward = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    right = np.cross(forward, up)
+    right[np.linalg.norm(right, axis=-1) < 1e-6] = np.cross(up, np.eye(3)[np.abs(up).argmin()])  # vertical
     right /= np.linalg.norm(right, axis=-1, keepdims=True)
-    return _poses(np.stack((right, np.cross(ahead, right), ahead), axis=1), centers)
+    return _poses(np.stack((right, np.cross(forward, right), forward), axis=1), centers)
 
 
 def _frame(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Middle of the training cameras, up, and the level direction in which they are spread the widest."""
+    """Return the mean centre of the training cameras, up, and the level direction of their widest extent."""
     poses = torch.stack([view.cam_from_world for view in scene.train]).double().cpu()
     up = np.array(gravity(poses).up)
     centers = torch.stack([view.center for view in scene.train]).double().cpu().numpy()
     middle = centers.mean(0)
     level = np.eye(3) - np.outer(up, up)
-    ahead = np.linalg.svd((centers - middle) @ level)[2][0]
-    if scene.has_single_center or np.linalg.norm(level @ ahead) < 1e-6:
-        ahead = level @ poses[0, 2, :3].numpy()
-    ahead = level @ ahead
-    if ahead @ (centers[-1] - centers[0]) < 0:
-        ahead = -ahead
-    return middle, up, ahead / np.linalg.norm(ahead)
+    forward = np.linalg.svd((centers - middle) @ level)[2][0]
+    if scene.has_single_center or np.linalg.norm(level @ forward) < 1e-6:
+        forward = level @ poses[0, 2, :3].numpy()
+    forward = level @ forward
+    if forward @ (centers[-1] - centers[0]) < 0:
+        forward = -forward
+    return middle, up, forward / np.linalg.norm(forward)
 
 
-def _poses(turns: np.ndarray, centers: np.ndarray) -> Tensor:
-    poses = np.tile(np.eye(4), (len(turns), 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = turns, -np.einsum("fij,fj->fi", turns, centers)
+def _poses(rotations: np.ndarray, centers: np.ndarray) -> Tensor:
+    poses = np.tile(np.eye(4), (len(rotations), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = rotations, -np.einsum("fij,fj->fi", rotations, centers)
     return torch.from_numpy(poses)
 
 
@@ -170,42 +177,43 @@ TRANSFORMS = "dataparser_transforms.json"
 
 
 class PathError(ValueError):
-    """A file of a path that cannot be used; the message says what is wrong where."""
+    """An unusable path file; the message says what is wrong."""
 
 
-def read_path(file: Path, frames: int | None, up: tuple[float, float, float], described: Path | None = None) -> Tensor:
-    """The poses of a file, [F, 4, 4] float64 cam_from_world.
+def read_path(
+    file: Path, frames: int | None, up: tuple[float, float, float], transforms_json: Path | None = None
+) -> Tensor:
+    """Read the poses [F, 4, 4] of a path file.
 
     Args:
-        file: see above.
-        frames: how many there shall be, spread evenly; None: those of a camera path as they are, and 30 between two
-            keyframes.
-        up: what is up for keyframes that look at something, unless the file says so.
-        described: the `transforms.json` of the scene, if it was read from one.
+        file: keyframes, or a camera path of nerfstudio.
+        frames: number of poses, resampled evenly; None: a camera path as it is, or 30 poses between two keyframes.
+        up: default up direction of keyframes with look_at.
+        transforms_json: the `transforms.json` from which the scene was read, if any.
 
     Raises:
-        PathError: it cannot be read, or is neither.
+        PathError: unreadable file, or of neither kind.
     """
     try:
         content = json.loads(file.read_text())
     except FileNotFoundError as error:
-        raise PathError(f"there is no path {file}; known: cameras, orbit, dolly, or a JSON file") from error
+        raise PathError(f"the path {file} does not exist; known: cameras, orbit, dolly, or a JSON file") from error
     except (OSError, ValueError) as error:
-        raise PathError(f"{file} is no readable JSON: {error}") from error
+        raise PathError(f"{file} is not readable JSON: {error}") from error
     try:
         if "camera_path" in content:
-            poses = _nerfstudio(content["camera_path"], file.parent / TRANSFORMS, described)
+            poses = _nerfstudio(content["camera_path"], file.parent / TRANSFORMS, transforms_json)
         else:
             poses = torch.cat([_keyframe(entry, content.get("up", up)) for entry in content["keyframes"]])
             frames = frames or 30 * (len(poses) - 1)
     except (KeyError, TypeError, ValueError, IndexError, OSError) as error:
         raise PathError(
-            f"{file} is no path ({type(error).__name__}: {error}); it needs keyframes with position and look_at, or "
-            "nerfstudio's camera_path with camera_to_world"
+            f"{file} is not a camera path ({type(error).__name__}: {error}); it needs keyframes with position "
+            "and look_at, or nerfstudio's camera_path with camera_to_world"
         ) from error
     if len(poses) < 2:
-        raise PathError(f"{file} has {len(poses)} poses; a path needs two")
-    return poses if frames is None else between(poses, np.linspace(0, len(poses) - 1, frames))
+        raise PathError(f"{file} has {len(poses)} poses; a path needs at least two")
+    return poses if frames is None else interpolate_poses(poses, np.linspace(0, len(poses) - 1, frames))
 
 
 def _keyframe(entry: dict[str, Any], up: Any) -> Tensor:
@@ -216,19 +224,21 @@ def _keyframe(entry: dict[str, Any], up: Any) -> Tensor:
     if not np.isfinite([*place, *target, up]).all():
         raise ValueError(f"position, look_at or up is not finite: {place[0]}, {target[0]}, {up}")
     if (place == target).all() or not up.any():
-        raise ValueError(f"position and look_at are both {place[0]}, or up is 0: neither says where to look")
-    return looking(place, target - place, up / np.linalg.norm(up))
+        raise ValueError(
+            f"position and look_at are both {place[0]}, or up is 0; give different positions and a non-zero up"
+        )
+    return look_along(place, target - place, up / np.linalg.norm(up))
 
 
-def _nerfstudio(cameras: list[dict[str, Any]], transforms: Path, described: Path | None) -> Tensor:
+def _nerfstudio(cameras: list[dict[str, Any]], transforms: Path, transforms_json: Path | None) -> Tensor:
     world_from_cam = np.array([camera["camera_to_world"] for camera in cameras], dtype=np.float64).reshape(-1, 4, 4)
     world_from_cam[:, :3, 1:3] *= -1  # to y down, z forward
-    if transforms.is_file():  # theirs = scale (transform @ original), and ours = applied_transform @ original
-        told = json.loads(transforms.read_text())
-        applied = {} if described is None else json.loads(described.read_text(encoding="utf-8-sig"))
-        to_ours = _homogeneous(applied.get("applied_transform", np.eye(3, 4)))
-        transform = _homogeneous(told["transform"]) @ np.linalg.inv(to_ours)
-        scale = told["scale"] / applied.get("applied_scale", 1.0)
+    if transforms.is_file():  # nerfstudio = scale (transform @ original); padgs = applied_transform @ original
+        normalized = json.loads(transforms.read_text())
+        applied = {} if transforms_json is None else json.loads(transforms_json.read_text(encoding="utf-8-sig"))
+        applied_transform = _homogeneous(applied.get("applied_transform", np.eye(3, 4)))
+        transform = _homogeneous(normalized["transform"]) @ np.linalg.inv(applied_transform)
+        scale = normalized["scale"] / applied.get("applied_scale", 1.0)
         world_from_cam[:, :3, 3] = (world_from_cam[:, :3, 3] / scale - transform[:3, 3]) @ transform[:3, :3]
         world_from_cam[:, :3, :3] = transform[:3, :3].T @ world_from_cam[:, :3, :3]
     return _rigid(np.linalg.inv(world_from_cam))
@@ -239,9 +249,12 @@ def _homogeneous(rows: Any) -> np.ndarray:
 
 
 def _rigid(poses: np.ndarray) -> Tensor:
-    turns = poses[:, :3, :3]
+    rotations = poses[:, :3, :3]
     if not np.isfinite(poses).all():
         raise ValueError("a pose is not finite")
-    if not np.allclose(turns @ turns.swapaxes(1, 2), np.eye(3), atol=1e-3) or np.linalg.det(turns).min() < 0:
+    if (
+        not np.allclose(rotations @ rotations.swapaxes(1, 2), np.eye(3), atol=1e-3)
+        or np.linalg.det(rotations).min() < 0
+    ):
         raise ValueError("a pose has a 3x3 part that is not a rotation")
     return torch.from_numpy(poses)

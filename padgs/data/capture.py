@@ -1,4 +1,8 @@
-"""The data structures that readers of formats return, their options, and the error that refuses input."""
+"""Data structures shared by all readers, the `data` options, and `DataError`.
+
+Every file format has one reader, `read(path, options) -> Capture`; `padgs.data.assemble` turns that into a scene, and
+`padgs.data.formats.convert` writes it in another format.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +18,11 @@ from torch import Tensor
 
 
 class DataError(ValueError):
-    """Input that cannot be used. The message names the file, the rule and the way out; no traceback is needed."""
+    """Unusable input. The message names the file, the rule and the way out; no traceback is needed."""
 
 
 def listed(names: Iterable[object], most: int = 5) -> str:
-    """The first few names and how many more there are.
+    """Join the first names and say how many more there are.
 
     >>> listed("abcdefg", most=3)
     'a, b, c and 4 more'
@@ -31,10 +35,10 @@ def listed(names: Iterable[object], most: int = 5) -> str:
 _NUMBER = re.compile(r"(\d+)")
 
 
-def natural(name: str) -> tuple[list[Any], str]:
-    """What to sort names by so that numbers in them stand by their value.
+def natural_key(name: str) -> tuple[list[Any], str]:
+    """Return a sort key that orders numbers in names by value.
 
-    >>> sorted(["view_10", "view_2", "door"], key=natural)
+    >>> sorted(["view_10", "view_2", "door"], key=natural_key)
     ['door', 'view_2', 'view_10']
     """
     parts: list[Any] = _NUMBER.split(name)
@@ -44,14 +48,14 @@ def natural(name: str) -> tuple[list[Any], str]:
 
 @dataclass(frozen=True)
 class Frame:
-    """One posed panorama of a capture."""
+    """A posed panorama."""
 
     name: str  # path relative to the image folder, with its extension, "/" between folders
     image: Path
     cam_from_world: Tensor  # [4, 4] float64, rigid; x right, y down, z forward
-    width: int | None = None  # of the camera, where the format states it
+    width: int | None = None  # of the camera in pixels, if the format states it
     height: int | None = None
-    mask: Path | None = None  # where the format names one
+    mask: Path | None = None  # if the format names one
 
 
 @dataclass(frozen=True)
@@ -63,28 +67,30 @@ class Cloud:
 
 
 def color_bytes(values: Tensor, where: str) -> Tensor:
-    """Colours [P, 3] in 0..255 as uint8; values beyond are cut off.
+    """Round colours [P, 3] to uint8, clamped to 0..255.
 
     Raises:
-        DataError: one is not finite.
+        DataError: a colour is not finite; `where` names the file.
     """
     if not (finite := values.isfinite().all(1)).all():
-        raise DataError(f"the colour of point {(~finite).nonzero()[0].item()} of {where} is not finite; mend the cloud")
+        raise DataError(
+            f"the colour of point {(~finite).nonzero()[0].item()} of {where} is not finite; repair the cloud"
+        )
     return values.round().clamp(0, 255).to(torch.uint8)
 
 
 @dataclass(frozen=True)
 class Tracks:
-    """Observations: point `point[i]` was seen in frame `frame[i]` at `pixels[i]`."""
+    """Observations: `pixels[i]` in frame `frame[i]` shows point `point[i]`."""
 
     frame: Tensor  # [T] int64, index into Capture.frames
     point: Tensor  # [T] int64, index into Cloud.points
     pixels: Tensor  # [T, 2] float64, continuous (u, v) at the camera's size
 
     @classmethod
-    def of(cls, seen: Iterable[tuple[int, int, Any]]) -> Tracks:
-        """Of (frame, point, pixel) of every observation."""
-        rows = list(seen)
+    def from_observations(cls, observations: Iterable[tuple[int, int, Any]]) -> Tracks:
+        """Build tracks from (frame, point, pixel) triples."""
+        rows = list(observations)
         return cls(
             torch.tensor([frame for frame, _, _ in rows], dtype=torch.int64),
             torch.tensor([point for _, point, _ in rows], dtype=torch.int64),
@@ -94,16 +100,16 @@ class Tracks:
 
 @dataclass(frozen=True)
 class Capture:
-    """Everything a format holds."""
+    """Contents of a data set before its images are read."""
 
     format: str
-    folder: Path  # of the data set; masks and split lists are looked for here
+    folder: Path  # of the data set; may also hold masks and split lists
     image_folder: Path
     frames: tuple[Frame, ...]
     cloud: Cloud | None
-    split: Mapping[str, tuple[str, ...]] | None = None  # "train", "test" -> names, where the format states them
-    mask: str = "auto"  # what data.mask=auto means for this format
-    width: int | None = None  # what wider images are reduced to if data.width is null; None = as stored
+    split: Mapping[str, tuple[str, ...]] | None = None  # "train", "test" -> names, if the format states them
+    mask: str = "auto"  # meaning of data.mask=auto
+    width: int | None = None  # wider images are reduced to it if data.width is null; None = as stored
     tracks: Callable[[], Tracks] | None = None
     notes: tuple[str, ...] = ()
 
@@ -113,18 +119,18 @@ SPLITS = ("auto", "files", "every", "all")
 
 @dataclass(frozen=True)
 class DataSettings:
-    """What the user decides. The defaults suit a folder about which nothing else is known."""
+    """The `data` group of the configuration, as far as users set it."""
 
-    dataset: str | None = None  # a name of DATASETS: its mask, size and where to get it
-    width: int | None = None  # panoramas are reduced to this width (area filter); None = as stored
-    images: str | None = None  # image folder, relative to the data set's; None = found
+    dataset: str | None = None  # a name of DATASETS, which defines mask, size and source
+    width: int | None = None  # panoramas are reduced to this width by an area filter; None = as stored
+    images: str | None = None  # image folder, relative to the data set's; None = search
     points: str = "auto"  # auto | random | a PLY file, relative to the data set's folder
     mask: str = "auto"  # auto | none | rows:959/1024 (keep the first 959 of 1024) | a file, or a folder of files
     split: str = "auto"  # auto | files (train.txt, test.txt) | every (k-th view) | all (train on everything)
     test_every: int = 8  # k of split=every
-    cache_bytes: int = 1 << 30  # decoded images kept, all views together
-    read_ahead: int = 2  # threads that decode images before they are asked for
-    generator: Mapping[str, Any] = field(default_factory=dict)  # knobs of the synthetic scene
+    cache_bytes: int = 1 << 30  # memory for decoded images of all views
+    prefetch_threads: int = 2  # threads that decode images in advance; 0 = none
+    generator: Mapping[str, Any] = field(default_factory=dict)  # options of the synthetic scene
 
     def __post_init__(self) -> None:
         if self.split not in SPLITS:
@@ -137,13 +143,13 @@ class DataSettings:
             raise DataError(
                 f"data.width is {self.width}; a panorama is twice as wide as high: give an even number >= 8"
             )
-        for name in ("cache_bytes", "read_ahead"):
+        for name in ("cache_bytes", "prefetch_threads"):
             if getattr(self, name) < 0:
                 raise DataError(f"data.{name} is {getattr(self, name)}; it must be 0, which switches it off, or more")
 
 
 @dataclass(frozen=True)
 class DataOptions(DataSettings):
-    """How to turn files into a scene."""
+    """The `data` group and the device of the run."""
 
     device: str = "cpu"  # where decoded images are kept, as uint8

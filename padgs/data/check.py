@@ -1,4 +1,4 @@
-"""Check."""
+"""Checks of a data set: everything that is wrong with it, reported at once; and an image of its points."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from padgs.geometry.panorama import project
 from padgs.scene import Scene, View, move_origin
 
 SMALL = 256  # width at which colours are compared
-REPROJECTION_LIMIT = 1 / 500  # of the width, on the median: 4 pixels of 2048
-BETTER = 0.1  # by how much the correlation under another convention must exceed the stated one's
-FITS = 0.3  # correlation from which points and pictures can be said to agree
-SAME_PLACE = 0.01  # of the median depth: a test view as near as this to a training view tests memory
-UNEVEN = 0.1  # doublings, standard deviation of the views' gains from which it is worth learning them
-EXPOSURES = 40  # views at most that they are measured in
+MAX_REPROJECTION = 1 / 500  # of the width, for the median error: 4 pixels of 2048
+MIN_GAIN = 0.1  # in correlation, from which another pose convention is suggested
+MIN_CORRELATION = 0.3  # of the colours of points and images that agree
+LEAK_DISTANCE = 0.01  # of the median depth: a test view nearer to a training view tests memory
+UNEVEN_EXPOSURE = 0.1  # standard deviation of the gains in doublings, from which learning exposures helps
+EXPOSURE_VIEWS = 40  # maximum number of views for measuring exposures
 
 
 @dataclass
 class Report:
-    """What `padgs check` says. Lengths are in world units, pixels are those of the model's cameras."""
+    """Result of `padgs check`. Lengths are in world units; pixels are those of the model's cameras."""
 
     path: Path
     format: str = ""
@@ -49,12 +49,12 @@ class Report:
     observations: int = 0
     reprojection_median: float | None = None  # pixels
     reprojection_95: float | None = None  # pixels
-    colour_correlation: float | None = None  # of the points with the pictures, as stated
+    colour_correlation: float | None = None  # between points and images, with the poses as stated
     exposure_spread: float | None = None  # doublings, standard deviation of the gains of the training views
-    masked: dict[str, float] = field(default_factory=dict)  # view -> share of its pixels (by weight) that is ignored
+    masked: dict[str, float] = field(default_factory=dict)  # view -> masked share of its pixels (by weight)
     notes: list[str] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
-    suggestion: str | None = None  # how to read the poses so that the points fit
+    suggestion: str | None = None  # pose convention under which the points fit
     overlay: Path | None = None
 
 
@@ -66,13 +66,13 @@ def check(
     overlay: Path | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Report:
-    """Check a data set; whatever is wrong ends up in `Report.problems`, nothing is raised for it.
+    """Check a data set. Problems are collected in `Report.problems`; they raise nothing.
 
     Args:
         path: folder or file, as for `padgs.data.load`.
         format: a name of LOADERS, or auto.
         options: the `data` group of the configuration.
-        overlay: where the picture of points on a panorama goes; none if not given.
+        overlay: file for the image of points on a panorama; None writes none.
         progress: called with (images decoded, images in all).
     """
     report = Report(Path(path))
@@ -102,7 +102,7 @@ def check(
     report.masked = {view.name: 1 - mask.mean().item() for view in views if (mask := view.mask()) is not None}
     _check_leaks(scene, capture, report)
     _check_movement(poses, report)
-    if damaged:  # nothing can be compared with pixels that cannot be read
+    if damaged:  # the fit needs readable pixels
         return report
     _check_fit(capture, scene, report)
     if overlay is not None:
@@ -115,9 +115,9 @@ def check(
 
 
 def _check_images(capture: Capture, report: Report, progress: Callable[[int, int], None]) -> None:
-    """Decode everything once; a damaged file must show now, not in the middle of a training."""
+    """Decode all images, so that damaged files are found before training."""
     for done, frame in enumerate(capture.frames):
-        if frame.image.is_file():  # absent ones are reported together
+        if frame.image.is_file():  # missing ones are reported together
             try:
                 inspect(frame.image)
                 refuse_dual_fisheye(decode(frame.image), frame.image)
@@ -127,8 +127,8 @@ def _check_images(capture: Capture, report: Report, progress: Callable[[int, int
 
 
 def _assemble(capture: Capture, options: DataOptions, report: Report) -> Scene | None:
-    """The scene, or what keeps it from being one: each part is tried by itself, so that all problems are told."""
-    easier: tuple[dict[str, Any], ...] = (
+    """Build the scene; if that fails, retry without mask, split or points, to report all problems."""
+    relaxations: tuple[dict[str, Any], ...] = (
         {},
         {"mask": "none"},
         {"split": "all"},
@@ -136,7 +136,7 @@ def _assemble(capture: Capture, options: DataOptions, report: Report) -> Scene |
         {"mask": "none", "split": "all"},
         {"mask": "none", "split": "all", "points": "random"},
     )
-    for change in easier:
+    for change in relaxations:
         try:
             return assemble(capture, replace(options, **change))
         except DataError as error:
@@ -146,7 +146,7 @@ def _assemble(capture: Capture, options: DataOptions, report: Report) -> Scene |
 
 
 def _check_leaks(scene: Scene, capture: Capture, report: Report) -> None:
-    """Test views that training has seen."""
+    """Find test views that are identical or close to training views."""
     files = {frame.name.rpartition(".")[0]: frame.image for frame in capture.frames}
     digests = {inspect(files[view.name]).digest: view.name for view in scene.train}
     for view in scene.test:
@@ -158,22 +158,22 @@ def _check_leaks(scene: Scene, capture: Capture, report: Report) -> None:
     if not scene.test:
         return
     train, test = (centers(torch.stack([view.cam_from_world for view in views])) for views in (scene.train, scene.test))
-    near = torch.cdist(test, train).min(1).values < SAME_PLACE * report.median_depth
+    near = torch.cdist(test, train).min(1).values < LEAK_DISTANCE * report.median_depth
     if near.any():
         names = [view.name for view, is_near in zip(scene.test, near.tolist(), strict=True) if is_near]
         report.notes.append(
-            f"{len(names)} test views stand within {SAME_PLACE:.0%} of the median depth of a training view "
+            f"{len(names)} test views are within {LEAK_DISTANCE:.0%} of the median depth of a training view "
             f"({listed(names)}); they test memory more than synthesis"
         )
 
 
 def _check_movement(poses: Tensor, report: Report) -> None:
     if report.path_length == 0 and len(poses) > 1:
-        report.problems.append("all cameras stand at one place; there is nothing to learn depth from")
+        report.problems.append("all cameras have the same centre; depth cannot be learned")
 
 
 def _check_fit(capture: Capture, scene: Scene, report: Report) -> None:
-    """Reprojection of observations, else colours; and whether another convention does better."""
+    """Compare points with observations, else with colours, under the stated and other pose conventions."""
     conventions = known_conventions()
     tracks = None if capture.tracks is None or capture.cloud is None else capture.tracks()
     sizes = {(frame.width, frame.height) for frame in capture.frames}
@@ -187,17 +187,17 @@ def _check_fit(capture: Capture, scene: Scene, report: Report) -> None:
         report.observations = len(error)
         report.reprojection_median = error.median().item()
         report.reprojection_95 = error.sort().values[int(0.95 * (len(error) - 1))].item()
-        limit = REPROJECTION_LIMIT * width
+        limit = MAX_REPROJECTION * width
         if report.reprojection_median > limit:
             report.problems.append(
-                f"points are {report.reprojection_median:.1f} pixels (median) from where they were seen; up to "
-                f"{limit:.1f} would be fine at this size"
+                f"the median reprojection error is {report.reprojection_median:.1f} pixels; it must be at most "
+                f"{limit:.1f} at this size"
             )
             fits = track_fit(poses, capture.cloud.points, tracks, width, height, conventions)
             best = max(fits, key=lambda fit: fit.score)
             if -best.score <= limit:
                 report.suggestion = best.convention.words
-    if any("random ones" in note for note in scene.notes):
+    if any("random points" in note for note in scene.notes):
         return
     if report.suggestion is None:
         _check_exposures(scene, report)
@@ -212,36 +212,36 @@ def _check_fit(capture: Capture, scene: Scene, report: Report) -> None:
     fits = colour_fit(poses, _small(views), points, scene.point_colors, conventions)
     stated, best = fits[0], max(fits, key=lambda fit: fit.score)
     report.colour_correlation = stated.score
-    if best.score > max(FITS, stated.score + BETTER) and report.suggestion is None:
+    if best.score > max(MIN_CORRELATION, stated.score + MIN_GAIN) and report.suggestion is None:
         report.problems.append(
-            f"points and panoramas do not agree: their colours correlate by {stated.score:.2f} as the poses are stated "
-            f"and by {best.score:.2f} if read otherwise"
+            f"points and panoramas do not agree: their colours correlate by {stated.score:.2f} with the poses as "
+            f"stated, and by {best.score:.2f} under another convention"
         )
         report.suggestion = best.convention.words
-    elif stated.score < FITS and report.suggestion is None:
+    elif stated.score < MIN_CORRELATION and report.suggestion is None:
         report.notes.append(
-            f"the colours of points and panoramas correlate by only {stated.score:.2f}, and by no more in any other "
-            "known convention; look at the overlay"
+            f"the colours of points and panoramas correlate by only {stated.score:.2f}, and not better under any "
+            "other known convention; look at the overlay"
         )
 
 
 def _check_exposures(scene: Scene, report: Report) -> None:
-    """Gains of the training views."""
-    views = scene.train[:: -(-len(scene.train) // EXPOSURES)]
+    """Measure how differently the training views are exposed."""
+    views = scene.train[:: -(-len(scene.train) // EXPOSURE_VIEWS)]
     if len(views) < 2:
         return
     gains = exposure_gains(torch.stack([view.cam_from_world for view in views]), _small(views), scene.points)
     report.exposure_spread = gains.std().item()
-    if report.exposure_spread >= UNEVEN:
+    if report.exposure_spread >= UNEVEN_EXPOSURE:
         dark, bright = (views[int(index)].name for index in (gains.argmin(), gains.argmax()))
         report.notes.append(
-            f"the views are exposed differently, by {2 ** gains.min():.2f} ({dark}) to {2 ** gains.max():.2f} times "
-            f"the values ({bright}); train with train.exposures=learned, or fix the exposure when you take them again"
+            f"exposures differ: pixel values are {2 ** gains.min():.2f} ({dark}) to {2 ** gains.max():.2f} times "
+            f"those of the median view ({bright}); train with train.exposures=learned, or capture with a fixed exposure"
         )
 
 
 def _small(views: Sequence[View]) -> Tensor:
-    """The panoramas [F, H, W, 3] uint8, all reduced to one width of a few hundred pixels."""
+    """Load the panoramas [F, H, W, 3] uint8, reduced to one width of at most `SMALL`."""
     width = min(SMALL, *(view.width for view in views))
     images = []
     for view in views:
@@ -250,32 +250,32 @@ def _small(views: Sequence[View]) -> Tensor:
     return torch.stack(images)
 
 
-OVERLAY = "check.png"  # beside the data, where no other place is given
-WIDTH = 2048  # of the picture at most
+OVERLAY = "check.png"  # default name, beside the data
+MAX_WIDTH = 2048  # of the overlay
 
 
 def draw_overlay(view: View, points: Tensor, path: Path, most: int = 20_000) -> None:
-    """Save a panorama with points on it, red = near, blue = far (by rank), as PNG.
+    """Save a panorama with points drawn on it, red = near, blue = far (by rank), as PNG.
 
     Args:
-        view: pose and pixels.
+        view: the panorama.
         points: [P, 3] world.
-        path: where to.
-        most: points drawn; more of them are thinned out evenly.
+        path: of the PNG.
+        most: maximum number of points; larger clouds are thinned out evenly.
 
     Raises:
         DataError: the file cannot be written.
     """
     assert view.load_pixels is not None
     image = Image.fromarray(view.load_pixels().cpu().numpy())
-    if image.width > WIDTH:
-        image = image.resize((WIDTH, WIDTH // 2), Image.Resampling.BOX)
+    if image.width > MAX_WIDTH:
+        image = image.resize((MAX_WIDTH, MAX_WIDTH // 2), Image.Resampling.BOX)
     pixels = np.asarray(image).astype(np.float32) * 0.6
     height, width = pixels.shape[:2]
     points = points[:: -(-len(points) // most)].double()
     seen = points @ view.cam_from_world[:3, :3].T + view.cam_from_world[:3, 3]
     column, row = project(seen, width, height).long().unbind(1)
-    rank = seen.norm(dim=1).argsort(descending=True)  # far ones first, so that near ones lie on top
+    rank = seen.norm(dim=1).argsort(descending=True)  # far points first, near ones on top
     nearness = torch.linspace(0, 1, len(rank)).numpy()[:, None]
     color = 255 * (nearness * np.array([1.0, 0.25, 0.0]) + (1 - nearness) * np.array([0.0, 0.5, 1.0]))
     radius = max(0, width // 1024)
@@ -287,4 +287,4 @@ def draw_overlay(view: View, points: Tensor, path: Path, most: int = 20_000) -> 
         path.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(pixels.clip(0, 255).astype(np.uint8)).save(path)
     except OSError as error:
-        raise DataError(f"cannot write the picture {path} ({error.strerror or error}); give another place") from error
+        raise DataError(f"cannot write the image {path} ({error.strerror or error}); choose another path") from error

@@ -1,4 +1,4 @@
-"""Point clouds."""
+"""Point clouds: PLY files through plyfile, and the cloud from which training starts."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_g
 
 
 def read_ply(path: Path) -> Cloud:
-    """Read the vertices of a PLY file with x, y, z and, where present, red, green, blue (0..255, or floats in 0..1).
+    """Read a point cloud from a PLY file: x, y, z and optional red, green, blue (0..255, or floats in 0..1).
 
     Raises:
-        DataError: not there, not a PLY file, cut short, or without x, y, z.
+        DataError: missing file, no PLY file, truncated, or without x, y, z.
     """
     vertex, names = read_vertices(path)
     if not {"x", "y", "z"} <= names:
@@ -37,15 +37,15 @@ def read_ply(path: Path) -> Cloud:
 
 
 def read_vertices(path: Path) -> tuple[Any, set[str]]:
-    """The vertices of a PLY file, a column for each property's name, and those names.
+    """Return the vertices of a PLY file, one column per property, and the property names.
 
     Raises:
-        DataError: not there, not a PLY file, cut short, or without vertices.
+        DataError: missing file, no PLY file, truncated, or without vertices.
     """
     from plyfile import PlyData, PlyParseError
 
     try:
-        vertex = PlyData.read(str(path))["vertex"]  # mapped: read row by row, 500 000 Gaussians take minutes
+        vertex = PlyData.read(str(path))["vertex"]  # memory-mapped; reading 500 000 Gaussians row by row takes minutes
     except FileNotFoundError as error:
         raise DataError(f"the point cloud {path} does not exist") from error
     except KeyError as error:
@@ -58,7 +58,7 @@ def read_vertices(path: Path) -> tuple[Any, set[str]]:
 
 
 def write_ply(path: Path, cloud: Cloud) -> None:
-    """Write a binary PLY file with x, y, z as doubles (nothing is lost) and red, green, blue if there are colours."""
+    """Write a binary PLY file: x, y, z as doubles, which is lossless, and red, green, blue if there are colours."""
     from plyfile import PlyData, PlyElement
 
     columns, fields = [*cloud.points.T.numpy()], [(axis, "f8") for axis in "xyz"]
@@ -71,19 +71,19 @@ def write_ply(path: Path, cloud: Cloud) -> None:
 
 
 RANDOM_POINTS = 100_000
-RANDOM_RADII = (0.5, 50.0)  # nearest and farthest made-up point, in multiples of the cameras' spread
+RANDOM_RADII = (0.5, 50.0)  # nearest and farthest random point, in multiples of the camera radius
 GREY = 128
 
 
-def starting_cloud(capture: Capture, source: str) -> tuple[Tensor, Tensor, tuple[str, ...]]:
-    """Points [P, 3] float64, colours [P, 3] uint8 and notes.
+def initial_cloud(capture: Capture, source: str) -> tuple[Tensor, Tensor, tuple[str, ...]]:
+    """Return the initial points [P, 3] float64, their colours [P, 3] uint8, and notes.
 
     Args:
-        capture: what the format holds.
+        capture: a data set.
         source: `data.points`: auto (the format's own, else random), random, or a PLY file.
 
     Raises:
-        DataError: no point, or one that is not finite.
+        DataError: there is no point, or one is not finite.
     """
     notes: tuple[str, ...] = ()
     cloud, where = capture.cloud, f"the {capture.format} model in {capture.folder}"
@@ -97,7 +97,7 @@ def starting_cloud(capture: Capture, source: str) -> tuple[Tensor, Tensor, tuple
             if source == "random"
             else f"{capture.format} holds none; set data.points to a PLY file"
         )
-        notes = (f"points: {RANDOM_POINTS} random ones around the cameras ({why})",)
+        notes = (f"points: {RANDOM_POINTS} random points around the cameras ({why})",)
     points, colors = cloud.points, cloud.colors
     if not len(points):
         raise DataError(
@@ -108,14 +108,14 @@ def starting_cloud(capture: Capture, source: str) -> tuple[Tensor, Tensor, tuple
         raise DataError(f"{bad} of {len(points)} points of {where} are not finite; remove them from the cloud")
     if colors is None:
         colors = torch.full((len(points), 3), GREY, dtype=torch.uint8)
-        notes = (*notes, "points: they have no colours; grey is taken")
+        notes = (*notes, "points: the cloud has no colours; grey is used")
     return points.double(), colors, notes
 
 
 def random_cloud(cam_from_world: Tensor, count: int = RANDOM_POINTS) -> Cloud:
-    """Grey points in all directions around the cameras [F, 4, 4], their distances spread evenly on a log scale.
+    """Draw random points around cameras [F, 4, 4], uniform in direction and in the logarithm of the distance.
 
-    Always the same for the same cameras, and it scales with them.
+    Deterministic, and equivariant to the scale of the cameras.
     """
     places = centers(cam_from_world)
     middle = places.mean(0)
@@ -127,6 +127,6 @@ def random_cloud(cam_from_world: Tensor, count: int = RANDOM_POINTS) -> Cloud:
     return Cloud(middle + spread * radius * direction, None)
 
 
-def existing_ply(folder: Path, names: tuple[str, ...]) -> Cloud | None:
-    """The first of the named PLY files that is in a folder."""
+def first_ply(folder: Path, names: tuple[str, ...]) -> Cloud | None:
+    """Read the first of the named PLY files that exists in a folder; None if there is none."""
     return next((read_ply(folder / name) for name in names if (folder / name).is_file()), None)

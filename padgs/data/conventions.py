@@ -1,4 +1,9 @@
-"""Conventions."""
+"""Agreement of points and panoramas: pose conventions and exposures.
+
+A wrong axis convention trains without an error, but badly. Observations of structure from motion reveal it exactly, by
+their reprojection error. Otherwise the colours of points are compared with the pixels they project to: they correlate
+strongly only if axes, handedness and direction of the poses are right, even if some points are hidden.
+"""
 
 from __future__ import annotations
 
@@ -13,37 +18,37 @@ from padgs.data.camera_paths import centers
 from padgs.data.capture import Tracks
 from padgs.geometry.panorama import project
 
-POINTS = 3000  # a sample is enough to tell conventions apart
+POINTS = 3000  # sampled for a comparison
 VIEWS = 8
 
 
 @dataclass(frozen=True)
 class Convention:
-    """Another way to read the poses: what to do about it, and the poses it gives."""
+    """A pose convention: how to correct poses that were stated in it."""
 
-    words: str
-    convert: Callable[[Tensor], Tensor]  # cam_from_world [F, 4, 4] -> the same
+    words: str  # instruction for users
+    convert: Callable[[Tensor], Tensor]  # stated poses [F, 4, 4] -> cam_from_world [F, 4, 4]
 
 
 @dataclass(frozen=True)
 class Fit:
-    """How well the points fit under a convention."""
+    """Agreement of points and images under a convention."""
 
     convention: Convention
-    score: float  # correlation of colours, or minus the median error in pixels
+    score: float  # colour correlation, or negative median reprojection error in pixels
 
 
 def colour_fit(
     poses: Tensor, images: Tensor, points: Tensor, colors: Tensor, conventions: Sequence[Convention]
 ) -> list[Fit]:
-    """Correlation of point and pixel colours under each convention; 1 = the same, about 0 = unrelated.
+    """Return the correlation of point and pixel colours under each convention; 1 = equal, about 0 = unrelated.
 
     Args:
         poses: [F, 4, 4] cam_from_world.
         images: [F, H, W, 3] uint8, panoramas reduced to a few hundred pixels width.
         points: [P, 3] world.
         colors: [P, 3] uint8.
-        conventions: to be tried.
+        conventions: candidates.
     """
     step = max(1, len(points) // POINTS)
     points, colors = points[::step].double(), colors[::step].float()
@@ -62,7 +67,7 @@ def colour_fit(
 def track_fit(
     poses: Tensor, points: Tensor, tracks: Tracks, width: int, height: int, conventions: Sequence[Convention]
 ) -> list[Fit]:
-    """Minus the median reprojection error of the observations under each convention, in pixels of width x height."""
+    """Return the negative median reprojection error under each convention, in pixels of width x height."""
     step = max(1, len(tracks.frame) // POINTS)
     frame, point, pixels = tracks.frame[::step], tracks.point[::step], tracks.pixels[::step]
     some = points[point].double()
@@ -75,10 +80,10 @@ def track_fit(
 
 
 def reprojection_error(points: Tensor, pixels: Tensor, width: int, height: int) -> Tensor:
-    """Distance in pixels [T] between where camera-frame points [T, 3] fall and where they were seen [T, 2].
+    """Return the reprojection errors [T] of camera-frame points [T, 3] observed at pixels [T, 2].
 
-    Taken on the image, so that it says what structure from motion says, but the short way round across the seam, and
-    along a row by the cosine of the latitude, so that it means the same angle everywhere.
+    Errors wrap around the seam, and are scaled by the cosine of the latitude along rows, so that a pixel is the same
+    angle everywhere.
     """
     difference = project(points, width, height) - pixels
     along = (difference[:, 0] + width / 2) % width - width / 2
@@ -87,36 +92,36 @@ def reprojection_error(points: Tensor, pixels: Tensor, width: int, height: int) 
 
 
 def known_conventions() -> list[Convention]:
-    """As stated first, then every reading that files of other programs have been seen to need."""
-    readings: dict[str, Callable[[Tensor], Tensor]] = {
+    """Return the stated convention first, then all that files of other programs are known to use."""
+    corrections: dict[str, Callable[[Tensor], Tensor]] = {
         "": lambda poses: poses,
         "the poses are world from camera: invert them": torch.linalg.inv,
         "the rotations are transposed: transpose them and keep the centres": _transposed,
-        "what stands for the translation is the centre: use t = -R t": _from_center,
-        "what stands for the centre is the translation: use C = -R^T C": _to_center,
+        "the translations are camera centres: use t = -R t": _from_center,
+        "the camera centres are translations: use C = -R^T C": _to_center,
     }
     same, *others = _signed_axes()
     found = []
-    for (reading, convert), (words, axes) in product(readings.items(), (same, *others)):
-        text = "; ".join(filter(None, (reading, words and f"camera axes: {words}")))
+    for (correction, convert), (words, axes) in product(corrections.items(), (same, *others)):
+        text = "; ".join(filter(None, (correction, words and f"camera axes: {words}")))
         whole = text or "the poses are right as they are"
         found.append(Convention(whole, lambda poses, convert=convert, axes=axes: axes @ convert(poses)))
     for words, axes in others:
-        text = f"poses and points stand in different worlds: rotate the points, {words}"
+        text = f"poses and points are in different world frames: rotate the points, {words}"
         found.append(Convention(text, lambda poses, axes=axes: poses @ axes))
     return found
 
 
 def _signed_axes() -> Iterator[tuple[str, Tensor]]:
-    """The 48 ways to name and point three axes, in words and as [4, 4]; the first is the identity, without words."""
+    """Yield the 48 signed axis permutations, in words and as [4, 4]; the identity first, with empty words."""
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         matrix = torch.zeros(4, 4, dtype=torch.float64)
         matrix[3, 3] = 1
         matrix[range(3), order] = torch.tensor(signs, dtype=torch.float64)
         names = [f"{'-' if sign < 0 else ''}{'xyz'[axis]}" for axis, sign in zip(order, signs, strict=True)]
-        words = f"take ({', '.join(names)}) for (x, y, z)" if names != ["x", "y", "z"] else ""
+        words = f"use ({', '.join(names)}) as (x, y, z)" if names != ["x", "y", "z"] else ""
         if names == ["x", "-y", "-z"]:
-            words += ", as from OpenGL, Blender or nerfstudio"
+            words += ", the convention of OpenGL, Blender and nerfstudio"
         yield words + (", which mirrors" if torch.linalg.det(matrix) < 0 else ""), matrix
 
 
@@ -140,21 +145,20 @@ def _with(poses: Tensor, rotation: Tensor, translation: Tensor) -> Tensor:
 
 
 def _correlation(a: Tensor, b: Tensor) -> Tensor:
-    """Pearson's over P of two [F, P, 3]; [F, 3]."""
+    """Return Pearson's correlation over P of two [F, P, 3]; [F, 3]."""
     a, b = a - a.mean(1, keepdim=True), b - b.mean(1, keepdim=True)
     return (a * b).sum(1) / (a.norm(dim=1) * b.norm(dim=1)).clamp(min=1e-6)
 
 
-DARKEST, BRIGHTEST = 8, 250  # pixel values between which a gain shows
-ROUNDS = 10  # of medians over points and views, after which they stand
+DARKEST, BRIGHTEST = 8, 250  # pixel values that are not clipped
+ROUNDS = 10  # of alternating medians, until convergence
 
 
 def exposure_gains(poses: Tensor, images: Tensor, points: Tensor) -> Tensor:
-    """How often each view [F] doubles the stored values of the median one, a doubling being about two stops of light
-    in sRGB; 0 where too little is known.
+    """Estimate the gain of each view [F], as log2 of pixel values relative to the median view; 0 if unknown.
 
-    A pixel is a gain of its view times a brightness of its point. Both are medians of what the other leaves, so the
-    points that something hides from a view, or that shine, are outvoted.
+    A doubling is about two stops of light in sRGB. A pixel is modelled as the gain of its view times the brightness of
+    its point; both are alternating medians, robust to hidden and shiny points.
 
     Args:
         poses: [F, 4, 4] cam_from_world.
@@ -167,10 +171,10 @@ def exposure_gains(poses: Tensor, images: Tensor, points: Tensor) -> Tensor:
     column, row = project(seen, width, height).long().unbind(-1)
     pixels = images[torch.arange(len(images))[:, None], row.clamp(0, height - 1), column % width].float()
     usable = (pixels.mean(-1) >= DARKEST) & (pixels.amax(-1) <= BRIGHTEST)
-    doublings = torch.where(usable, pixels.mean(-1).log2(), torch.nan)  # [F, P]
-    gains = doublings.new_zeros(len(doublings))
+    brightness = torch.where(usable, pixels.mean(-1).log2(), torch.nan)  # [F, P]
+    gains = brightness.new_zeros(len(brightness))
     for _ in range(ROUNDS):
-        of_points = (doublings - gains[:, None]).nanmedian(0).values
-        gains = (doublings - of_points).nanmedian(1).values.nan_to_num()
+        of_points = (brightness - gains[:, None]).nanmedian(0).values
+        gains = (brightness - of_points).nanmedian(1).values.nan_to_num()
         gains = gains - gains.median()
     return gains

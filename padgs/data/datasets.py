@@ -1,6 +1,6 @@
-"""The public panoramic data sets: what is in them, where they come from, and where to put them.
+"""Published panoramic data sets: their scenes, sources and folders.
 
-None of them may be redistributed with the project. Facts: the paper's section 4.1 and the authors' pages.
+Their licences do not allow redistribution. Source: section 4.1 of the PaD-GS paper, and the authors' pages.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from padgs.data.capture import DataError
 
 @dataclass(frozen=True)
 class Dataset:
-    """A published set of panoramic scenes."""
+    """A published data set of panoramic scenes."""
 
     title: str
     scenes: tuple[str, ...]
-    width: int  # at which the paper reports (OmniBlender is not in the paper)
-    mask: str  # what data.mask=auto means
-    source: str  # where to get it
-    holds: str  # what the folder of a scene must hold
+    width: int  # of the paper's evaluation (OmniBlender is not in the paper)
+    mask: str  # meaning of data.mask=auto
+    source: str  # download
+    contents: str  # of a scene's folder
 
 
 DATASETS = {
@@ -42,7 +42,7 @@ DATASETS = {
         width=2048,
         mask="rows:959/1024",
         source="its authors, https://huajianup.github.io/research/360Roam/ (it may not be redistributed)",
-        holds="images/, pose_c2w.json and scene.ply",
+        contents="images/, pose_c2w.json and scene.ply",
     ),
     "ricoh360": Dataset(
         title="Ricoh360",
@@ -63,7 +63,7 @@ DATASETS = {
         width=1920,
         mask="none",
         source="the 'Data' link of github.com/changwoonchoi/EgoNeRF",
-        holds="imgs/, train.txt, test.txt and output_dir/colmap/",
+        contents="imgs/, train.txt, test.txt and output_dir/colmap/",
     ),
     "omniblender": Dataset(
         title="OmniBlender",
@@ -83,46 +83,48 @@ DATASETS = {
         width=2000,
         mask="none",
         source="the 'Data' link of github.com/changwoonchoi/EgoNeRF",
-        holds="images/ and transform.json",
+        contents="images/ and transform.json",
     ),
 }
 
 
 def refuse_missing(path: Path, dataset: str | None) -> None:
-    """Raise if a data set's folder is not there, and say how to get it if it is a known one.
+    """Refuse a missing folder, and say how to get a known data set.
 
     Raises:
-        DataError: always, unless `path` exists.
+        DataError: `path` does not exist.
     """
     if path.exists():
         return
     likely = [key for key, known in DATASETS.items() if path.name in known.scenes]
-    likely.sort(key=lambda key: DATASETS[key].title.casefold() != path.parent.name.casefold())  # "center" is in two
+    likely.sort(
+        key=lambda key: DATASETS[key].title.casefold() != path.parent.name.casefold()
+    )  # two data sets have a "center"
     key = dataset or (likely[0] if likely else None)
     if key is None:
-        raise DataError(f"there is no {path.absolute()}; give the folder of panoramas and their poses")
+        raise DataError(f"{path.absolute()} does not exist; give the folder of panoramas and their poses")
     known = lookup_dataset(key)
     if path.name not in known.scenes:
         raise DataError(
-            f"there is no {path.absolute()}, and {path.name!r} is no scene of {known.title}; "
+            f"{path.absolute()} does not exist, and {path.name!r} is not a scene of {known.title}; "
             f"its scenes: {', '.join(known.scenes)}"
         )
-    if not path.parent.exists():  # the same words for all scenes, which a multirun says once
+    if not path.parent.exists():  # the same message for all scenes, which a multirun prints once
         raise DataError(
-            f"{known.title} is not there. Get it from {known.source}, and put it into {path.parent.absolute()}, so "
-            f"that the folder of each scene holds {known.holds}; or set data.path to a scene where it is"
+            f"{known.title} is missing. Get it from {known.source}, and put it into {path.parent.absolute()}, so "
+            f"that the folder of each scene holds {known.contents}; or set data.path to the folder of a scene"
         )
     raise DataError(
-        f"the scene {path.name!r} of {known.title} is not there. Get it from {known.source}, and put it into "
-        f"{path.absolute()}, so that this folder holds {known.holds}; or set data.path to where it is"
+        f"the scene {path.name!r} of {known.title} is missing. Get it from {known.source}, and put it into "
+        f"{path.absolute()}, so that this folder holds {known.contents}; or set data.path to its folder"
     )
 
 
 def lookup_dataset(name: str) -> Dataset:
-    """The data set of that name.
+    """Return the data set of a name.
 
     Raises:
-        DataError: unknown; the message lists the known ones.
+        DataError: unknown name; the message lists the known ones.
     """
     if name not in DATASETS:
         raise DataError(f"unknown data.dataset {name!r}; known: {', '.join(DATASETS)}")

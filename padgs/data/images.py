@@ -1,4 +1,8 @@
-"""Image files."""
+"""Image files: checks, decoding and saving.
+
+A panorama is an 8-bit colour image, twice as wide as high, stored upright. Other files are refused when the scene is
+loaded, before any training.
+"""
 
 from __future__ import annotations
 
@@ -18,13 +22,13 @@ from padgs.data.capture import DataError
 EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 _ORIENTATION = 0x0112  # EXIF tag; 1 = stored upright
 _GREY = ("1", "L", "LA", "La")
-GREY = 128  # what libjpeg shows where data end
-FILLING = b"\x55" * 2048  # some pixels of a scan
+GREY = 128  # libjpeg fills missing rows with it
+FILLING = b"\x55" * 2048  # decodes to a few pixels of a JPEG scan
 
 
 @dataclass(frozen=True)
 class ImageFile:
-    """An image file that was looked at: its size in pixels and the digest of its bytes."""
+    """A checked image file: its size in pixels and the digest of its bytes."""
 
     path: Path
     width: int
@@ -33,10 +37,10 @@ class ImageFile:
 
 
 def inspect(path: Path, *, mask: bool = False) -> ImageFile:
-    """Check that a file is a usable panorama (or mask: grey is then fine); decoded where that is needed to know.
+    """Check that a file is a usable panorama, or mask, which may be grey. Decodes only if the header is not enough.
 
     Raises:
-        DataError: not there, unreadable, not an image, cut short, turned by EXIF, 16-bit, grey, CMYK, not 2:1 or partly
+        DataError: missing, unreadable, not an image, truncated, rotated by EXIF, 16-bit, grey, CMYK, not 2:1, or partly
             transparent.
     """
     data = read_bytes(path)
@@ -49,8 +53,8 @@ def inspect(path: Path, *, mask: bool = False) -> ImageFile:
         raise DataError(f"{path} is not an image that Pillow can read ({error}); replace or remove it") from error
     if orientation not in (None, 0, 1):
         raise DataError(
-            f"{path} carries EXIF orientation {orientation}: its pixels are stored turned, and which way the poses "
-            "mean them cannot be known; store it upright (`mogrify -auto-orient`) or remove the flag"
+            f"{path} carries EXIF orientation {orientation}: its pixels are stored rotated, and it is unknown which "
+            "orientation the poses refer to; store it upright (`mogrify -auto-orient`) or remove the flag"
         )
     if deep and not mask:
         raise DataError(f"{path} has 16 bits or more per channel ({mode}); convert it to 8 bits (`mogrify -depth 8`)")
@@ -65,10 +69,10 @@ def inspect(path: Path, *, mask: bool = False) -> ImageFile:
 
 
 def refuse_other_shapes(width: int, height: int, path: Path) -> None:
-    """Refuse pictures that cannot be panoramas, by their sides in pixels.
+    """Refuse image sizes that are not 2:1.
 
     Raises:
-        DataError: they are not 2:1.
+        DataError: the size is not that of a full panorama.
     """
     if width != 2 * height:
         raise DataError(
@@ -78,16 +82,16 @@ def refuse_other_shapes(width: int, height: int, path: Path) -> None:
 
 
 def decode(path: Path, mode: str = "RGB") -> NDArray[np.uint8]:
-    """The pixels of a file, [H, W, 3] for RGB and [H, W, 1] for L, uint8.
+    """Decode an image file to uint8 pixels, [H, W, 3] for RGB and [H, W, 1] for L.
 
     Raises:
-        DataError: the file is cut short or damaged, or partly transparent.
+        DataError: the file is truncated, damaged, or partly transparent.
     """
     return _decode(BytesIO(read_bytes(path)), path, mode)
 
 
 def save_png(pixels: Tensor, path: Path) -> None:
-    """Write pixels [H, W, 3] or [H, W] in 0..255, rounded, in a folder that is made where it is not there."""
+    """Save pixels [H, W, 3] or [H, W] in 0..255, rounded, as PNG; creates the folder if needed."""
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(pixels.round().to(torch.uint8).cpu().numpy()).save(path)
 
@@ -110,17 +114,17 @@ def _decode(file: BytesIO, path: Path, mode: str) -> NDArray[np.uint8]:
 
 
 def _eight_bit(image: Image.Image) -> Image.Image:
-    """16-bit masks scaled to 8 bits; Pillow's own conversion would clip them."""
+    """Scale 16-bit masks to 8 bits; Pillow's own conversion would clip them."""
     if not image.mode.startswith("I"):
         return image
     return Image.fromarray((np.asarray(image).astype(np.int64) >> 8).clip(0, 255).astype(np.uint8))
 
 
 def read_bytes(path: Path) -> bytes:
-    """The contents of a file.
+    """Read a file.
 
     Raises:
-        DataError: not there, unreadable or empty.
+        DataError: missing, unreadable or empty.
     """
     try:
         data = path.read_bytes()
@@ -134,7 +138,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def _is_deep(image: Image.Image, data: bytes) -> bool:
-    """More than 8 bits per channel. Pillow opens a 16-bit RGB PNG as 8-bit without a word, so look at its header."""
+    """Return whether there are more than 8 bits per channel. Pillow silently opens 16-bit RGB PNGs as 8-bit."""
     if image.format == "PNG":
         return data[24] > 8
     if image.format == "TIFF":
@@ -144,15 +148,16 @@ def _is_deep(image: Image.Image, data: bytes) -> bool:
 
 
 def _looks_cut(data: bytes) -> bool:
-    """Whether a JPEG or PNG seems to end early; a cheap suspicion, to be confirmed by decoding."""
+    """Return whether a JPEG or PNG seems truncated; a cheap test, to be confirmed by decoding."""
     if data[:2] == b"\xff\xd8":  # a scan without an end-of-image marker behind it
         return data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda")
     return data[:4] == b"\x89PNG" and b"IEND" not in data[-4096:]
 
 
 def _misses_pixels(image: Image.Image, data: bytes, pixels: NDArray[np.uint8]) -> bool:
-    """Whether a decoded JPEG ends before its last pixel; libjpeg then makes up the rest, grey if it is not progressive.
-    More bytes before the end marker become pixels there, and are passed over in a whole file.
+    """Return whether a JPEG ends before its last pixel; libjpeg then invents the rest, grey if not progressive.
+
+    Bytes added before the end marker become pixels in a truncated file, and are ignored in a complete one.
     """
     if image.format != "JPEG" or not ("progressive" in image.info or (pixels[-1] == GREY).all()):
         return False
@@ -161,28 +166,28 @@ def _misses_pixels(image: Image.Image, data: bytes, pixels: NDArray[np.uint8]) -
         return not np.array_equal(np.array(longer.convert("RGB" if pixels.shape[-1] == 3 else "L")), pixels)
 
 
-FISHEYE_ROWS = 128  # looked at
-OUTSIDE, RIM = 1.06, (0.7, 0.9)  # distances from the middle of a half, in halves of its side
-BLACK = 24  # the largest pixel value there
-ALL, SOME = 0.98, 0.5  # shares of the pixels
+# Detection of dual-fisheye images: radii are relative to half the side of each circle's square.
+FISHEYE_ROWS = 128  # sampled
+OUTSIDE, RIM = 1.06, (0.7, 0.9)
+BLACK = 24  # largest pixel value that counts as black
+MIN_BLACK_OUTSIDE, MAX_BLACK_RIM = 0.98, 0.5  # shares of the pixels
 
 
 def refuse_dual_fisheye(pixels: NDArray[np.uint8], path: Path) -> None:
-    """Refuse the pixels [H, 2H, 3] of a file with black corners around two round pictures.
+    """Refuse pixels [H, 2H, 3] of an unstitched dual-fisheye camera.
 
     Raises:
-        DataError: it is no panorama but what two fisheye lenses saw.
+        DataError: the image shows two circles on black instead of a panorama.
     """
     if is_dual_fisheye(pixels):
         raise DataError(
-            f"{path} shows two circles side by side: it is the dual-fisheye picture of a 360-degree camera, not a "
-            "panorama. Stitch it with the program of the camera's maker, and export equirectangular 2:1 pictures or "
-            "video"
+            f"{path} shows two circles side by side: it is the dual-fisheye image of a 360-degree camera, not a "
+            "panorama. Stitch it with the program of the camera's maker, and export equirectangular 2:1 images or video"
         )
 
 
 def is_dual_fisheye(pixels: NDArray[np.uint8]) -> bool:
-    """Whether all is black outside of two circles, and most is not at their rims; pixels [H, 2H, 3]."""
+    """Return whether pixels [H, 2H, 3] are black outside two circles, but mostly not at their rims."""
     step = max(1, len(pixels) // FISHEYE_ROWS)
     brightest = pixels[::step, ::step].max(-1)
     height, width = brightest.shape
@@ -191,4 +196,4 @@ def is_dual_fisheye(pixels: NDArray[np.uint8]) -> bool:
     distance = np.hypot(row[:, None], column)
     black = brightest <= BLACK
     rim = (distance > RIM[0]) & (distance < RIM[1])
-    return bool(black[distance > OUTSIDE].mean() >= ALL and black[rim].mean() <= SOME)
+    return bool(black[distance > OUTSIDE].mean() >= MIN_BLACK_OUTSIDE and black[rim].mean() <= MAX_BLACK_RIM)

@@ -1,4 +1,4 @@
-"""Masks: which pixels count. 255 = use, 0 = ignore; never a reason to blacken an image.
+"""Masks: weights of pixels, 255 = use, 0 = ignore. Images themselves are never blackened.
 
 A mask is one file for the scene, one file per image, the rule that only the first rows count, or their product.
 """
@@ -19,20 +19,20 @@ from padgs.data.store import ImageStore, StoredImage
 from padgs.geometry.distortion import solid_angle_weight
 
 SCENE_MASKS = ("mask.png", "mask.jpg", "mask.bmp")
-PREVIEW = "mask_preview.jpg"  # beside them, of `padgs.data.prepare.nadir`
-LEAST = 0.01  # of the sphere must be seen; from less nothing is learned, and no metric has a value
+PREVIEW = "mask_preview.jpg"  # written beside them by `padgs.data.prepare.nadir`
+MIN_VISIBLE = 0.01  # of the sphere; with less, training has no signal and metrics are undefined
 _ROWS = re.compile(r"rows:(\d+)/(\d+)")
 
 
 @dataclass(frozen=True)
 class Mask:
-    """The weights of one view: what `View.load_mask` is."""
+    """Weights of one view; used as `View.load_mask`."""
 
     file: StoredImage | None
     rows: Tensor | None  # [H, 1] float32
 
     def __call__(self) -> Tensor:
-        """Weights [H, W] float32 in [0, 1]."""
+        """Return weights [H, W] float32 in [0, 1]."""
         weight = None if self.file is None else self.file()[..., 0].float() / 255
         if self.rows is None:
             assert weight is not None
@@ -42,9 +42,9 @@ class Mask:
 
 
 def row_weights(keep: float, of: float, height: int) -> Tensor:
-    """Weights [height, 1] of the rule "only the first `keep` of `of` rows count", at any height.
+    """Return weights [height, 1] that keep the first `keep` of `of` rows, at any height.
 
-    A row that the border cuts counts by its share, so that reducing the image and its mask agree.
+    A row that the border cuts has a fractional weight, as if image and mask had been reduced together.
 
     >>> row_weights(959, 1024, 1024).sum().item()
     959.0
@@ -55,24 +55,24 @@ def row_weights(keep: float, of: float, height: int) -> Tensor:
 def find_masks(
     capture: Capture, spec: str, images: Sequence[ImageFile], sizes: Sequence[tuple[int, int]], store: ImageStore
 ) -> tuple[list[Mask | None], list[str], list[str]]:
-    """The mask of each frame, the digests of the files used, and notes.
+    """Return the mask of each frame, the digests of the mask files, and notes.
 
     Args:
-        capture: the frames, and the folder in which masks are looked for.
-        spec: `data.mask`; see `mask_place`.
+        capture: frames, and the folder that is searched for masks.
+        spec: `data.mask`; see `mask_path`.
         images: the files of the frames.
         sizes: (width, height) of the views.
-        store: where decoded masks are kept.
+        store: caches decoded masks.
 
     Raises:
-        DataError: a mask of another size than its image, one that hides all but `LEAST` or has transparent pixels, or
-            an unusable `spec`.
+        DataError: a mask differs in size from its image, shows less than `MIN_VISIBLE`, or has transparent pixels; or
+            `spec` is invalid.
     """
     spec = capture.mask if spec == "auto" else spec
     if spec == "none":
         return [None] * len(images), [], []
     rule = _ROWS.fullmatch(spec)
-    files, note = _mask_files(capture, mask_place(spec, capture.folder))
+    files, note = _mask_files(capture, mask_path(spec, capture.folder))
     notes = [note] if note else []
     rows: dict[int, Tensor] = {}  # by height
     if rule:
@@ -86,7 +86,7 @@ def find_masks(
     masks: list[Mask | None] = []
     digests = [spec] if rule else []
     inspected: dict[Path, ImageFile] = {}
-    shown: set[StoredImage | None] = set()  # that are known to show something
+    checked: set[StoredImage | None] = set()
     for frame, image, (width, height) in zip(capture.frames, images, sizes, strict=True):
         path = files.get(frame.name)
         if path is None:
@@ -101,44 +101,46 @@ def find_masks(
                 f"{image.width}x{image.height}; a mask must have the size of its image"
             )
         mask = Mask(StoredImage(path, width, height, store, "L"), rows.get(height))
-        if mask.file not in shown:
+        if mask.file not in checked:
             _refuse_hidden(mask(), f"{path} hides {{}} of {frame.name}; in a mask 255 means use, 0 means ignore")
-        shown.add(mask.file)
+        checked.add(mask.file)
         masks.append(mask)
         digests.append(f"{frame.name}:{mask_file.digest}")
     return masks, digests, notes
 
 
-def mask_place(spec: str, folder: Path) -> Path | None:
-    """The file or folder that `data.mask` names, in the folder of the data set or where one stands; None for a word.
+def mask_path(spec: str, folder: Path) -> Path | None:
+    """Return the file or folder that `data.mask` names; None for a keyword.
+
+    Relative paths are looked up in the data set's folder and in the working directory.
 
     Raises:
-        DataError: there is one in both.
+        DataError: both exist and differ.
     """
     if spec in ("auto", "none") or _ROWS.fullmatch(spec):
         return None
-    there, here = folder / spec, Path(spec).absolute()
-    if not here.exists():
-        return there
-    if there.exists() and not there.samefile(here):
-        raise DataError(f"data.mask={spec} is {there} as well as {here}; give the whole path of the one that is meant")
-    return here
+    inside, given = folder / spec, Path(spec).absolute()
+    if not given.exists():
+        return inside
+    if inside.exists() and not inside.samefile(given):
+        raise DataError(f"data.mask={spec} is both {inside} and {given}; give the absolute path of one")
+    return given
 
 
 def _refuse_hidden(weights: Tensor, message: str) -> None:
-    """Refuse weights [H, W or 1] that let next to nothing of the sphere through, with how much they hide."""
+    """Refuse weights [H, W or 1] that show less than `MIN_VISIBLE` of the sphere."""
     area = solid_angle_weight(len(weights))
-    # The mean weight, not the share of pixels that have any: 1 for "use" in place of 255 would hide nearly all.
+    # The mean weight, not the share of non-zero pixels: a mask with 1 in place of 255 hides nearly everything.
     shown = (weights.mean(-1).cpu() @ area / area.sum()).item()
-    if shown < LEAST:
+    if shown < MIN_VISIBLE:
         much = f"all but {shown:.2%} of the sphere" if shown else "every pixel"
         raise DataError(message.format(much))
 
 
 def _mask_files(capture: Capture, given: Path | None) -> tuple[dict[str, Path], str | None]:
-    """Frame name -> mask file, and a note: one file for all, a folder of files, or those that the format names."""
+    """Map frame names to mask files (one for all, a folder of files, or files that the format names); and a note."""
     if given is not None and not given.exists():
-        raise DataError(f"data.mask={given}: there is no such file or folder; known words: auto, none, rows:959/1024")
+        raise DataError(f"data.mask={given}: there is no such file or folder; keywords: auto, none, rows:959/1024")
     named = {frame.name: frame.mask for frame in capture.frames if frame.mask is not None}
     if given is None and named:
         absent = [path for path in named.values() if not path.is_file()]
@@ -162,16 +164,18 @@ def _mask_files(capture: Capture, given: Path | None) -> tuple[dict[str, Path], 
 
 
 def _in_folder(folder: Path, name: str) -> Path | None:
-    """`a.jpg` has its mask in `a.jpg.png` (COLMAP's habit), `a.png` or another image named `a`."""
+    """Return the mask of image `a.jpg`: `a.jpg.png` (COLMAP's convention), `a.png` or another image named `a`."""
     stem = PurePosixPath(name).with_suffix("")
     candidates = [f"{name}.png", *(f"{stem}{extension}" for extension in (".png", *EXTENSIONS))]
     return next((folder / file for file in candidates if (folder / file).is_file()), None)
 
 
 def write_masks(masks: Mapping[str, Callable[[], Tensor] | None], folder: Path) -> None:
-    """mask.png if all views (name -> what loads its weights [H, W]) have the same, else masks/, a file per masked view.
+    """Write mask.png if all views share a mask, else masks/ with one file per masked view.
 
-    No more than two of them are in memory: all, as float32, would take more than the panoramas.
+    Args:
+        masks: view name -> function that loads its weights [H, W]. At most two masks are in memory at a time.
+        folder: of the data set.
     """
     loaders = {name: load for name, load in masks.items() if load is not None}
     if loaders and len(loaders) == len(masks):

@@ -1,4 +1,4 @@
-"""Which views are trained on and which are held out: two list files, or every k-th view."""
+"""Split of the views into training and test views: by list files, or every k-th view."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from padgs.data.capture import DataError, listed
 
-LONGEST = 255  # bytes of a file's name
+MAX_NAME_BYTES = 255  # of a file name
 LISTS = {"train": "train.txt", "test": "test.txt"}
 
 
 @dataclass(frozen=True)
 class Split:
-    """Indices into the frames, ascending, and what was decided."""
+    """Ascending indices into the frames, and notes about the decision."""
 
     train: tuple[int, ...]
     test: tuple[int, ...]
@@ -30,24 +30,24 @@ def split_frames(
     stated: Mapping[str, tuple[str, ...]] | None = None,
     unposed: Sequence[str] = (),
 ) -> Split:
-    """Decide for each frame whether it is trained on, held out, or unused.
+    """Decide for each frame whether it is a training view, a test view, or unused.
 
     Args:
         names: frame names with extension, sorted.
-        folder: where `train.txt` and `test.txt` are looked for; one name a line, with or without extension.
-        mode: files; every (view 0, k, 2k, ... are held out); all (nothing held out); auto: what the format states,
-            else files if there is a list, else every.
+        folder: holds `train.txt` and `test.txt`, if any: one name a line, with or without extension.
+        mode: files; every (views 0, k, 2k, ... are test views); all (no test views); auto: the format's own lists, else
+            files if there is a list, else every.
         every: k.
-        stated: lists that the format itself holds.
-        unposed: names of images that have no pose, to tell them from absent ones.
+        stated: the format's own lists.
+        unposed: names of images without a pose, for clear error messages.
 
     Raises:
-        DataError: a list names what is not there or is ambiguous, lists overlap, or a side is empty.
+        DataError: a list holds unknown or ambiguous names, lists overlap, or a side is empty.
     """
     if mode == "all":
-        return Split(tuple(range(len(names))), (), ("split: every view is trained on, none held out (data.split=all)",))
+        return Split(tuple(range(len(names))), (), ("split: every view is a training view (data.split=all)",))
     lists = dict(stated or {}) if mode == "auto" else {}
-    origin = "the split that the data set states"
+    origin = "the split of the data set"
     if not lists and mode != "every":
         lists = {side: read_list(folder / file) for side, file in LISTS.items() if (folder / file).is_file()}
         origin = " and ".join(LISTS[side] for side in lists)
@@ -62,7 +62,7 @@ def split_frames(
     for side, other in (("train", "test"), ("test", "train")):
         if side not in chosen:
             chosen[side] = set(range(len(names))) - chosen[other]
-            notes.append(f"there is no {side} list; it is what the {other} list leaves")
+            notes.append(f"there is no {side} list; all views missing from the {other} list are used")
     both = chosen["train"] & chosen["test"]
     if both:
         raise DataError(
@@ -78,10 +78,10 @@ def split_frames(
 
 
 def read_list(path: Path) -> tuple[str, ...]:
-    """The names in a list file: one a line, blank lines skipped, any line ending, optional byte-order mark.
+    """Read the names in a list file: one a line, blank lines skipped, any line ending, optional byte-order mark.
 
     Raises:
-        DataError: not text, or a name that points outside the image folder.
+        DataError: no text file, or a name points outside the image folder.
     """
     names = tuple(line.strip().replace("\\", "/") for line in read_lines(path) if line.strip())
     for name in names:
@@ -90,30 +90,30 @@ def read_list(path: Path) -> tuple[str, ...]:
 
 
 def read_lines(path: Path) -> list[str]:
-    """The lines of a text file.
+    """Read the lines of a text file.
 
     Raises:
-        DataError: not text.
+        DataError: not UTF-8, or unreadable.
     """
     try:
         return path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path} cannot be read as UTF-8 text ({error}); save it as such") from error
+        raise DataError(f"{path} cannot be read as UTF-8 text ({error}); save it as UTF-8") from error
 
 
 def check_inside(name: str, where: str) -> str:
-    """The name, if it stays inside the folder it is relative to.
+    """Return a relative name that stays inside its folder; lists from elsewhere must not reach other files.
 
     Raises:
-        DataError: absolute, or with `..` in it; a list from elsewhere must not reach other files.
+        DataError: the name is absolute, contains `..`, is not Unicode, or is too long; `where` names its source.
     """
     parts = PurePosixPath(name.replace("\\", "/"))
     if parts.is_absolute() or PureWindowsPath(name).drive or ".." in parts.parts or not parts.name or "\0" in name:
         raise DataError(f"{where} names {name!r}; names must be relative and stay inside the image folder (no '..')")
     if any(0xD800 <= ord(character) < 0xE000 for character in name):
         raise DataError(f"{where} names {name!r}, which is not Unicode; rename the file, and export again")
-    if any(len(part.encode()) > LONGEST for part in parts.parts):
-        raise DataError(f"{where} names {name[:60]!r}..., a name longer than the {LONGEST} bytes that files can have")
+    if any(len(part.encode()) > MAX_NAME_BYTES for part in parts.parts):
+        raise DataError(f"{where} names {name[:60]!r}...; file names have at most {MAX_NAME_BYTES} bytes: rename it")
     return name
 
 
@@ -125,7 +125,7 @@ def _every(names: Sequence[str], every: int, mode: str) -> Split:
             f"{len(names)} posed view(s) cannot be split; at least 2 are needed to train on one and test on one"
         )
     why = "no train.txt or test.txt" if mode == "auto" else "data.split=every"
-    return Split(train, test, (f"split: every {every}th view is held out ({why})",))
+    return Split(train, test, (f"split: every {every}th view is a test view ({why})",))
 
 
 def _resolve(lines: Sequence[str], names: Sequence[str], which: str, unposed: Sequence[str]) -> set[int]:
@@ -140,7 +140,7 @@ def _resolve(lines: Sequence[str], names: Sequence[str], which: str, unposed: Se
         found = exact.get(line) or loose.get(line) or loose.get(PurePosixPath(line).name) or set()
         if len(found) > 1:
             raise DataError(
-                f"the {which} names {line!r}, which fits {listed(names[i] for i in sorted(found))}; be specific"
+                f"the {which} names {line!r}, which matches {listed(names[i] for i in sorted(found))}; be specific"
             )
         if not found:
             absent.append(line)
@@ -149,14 +149,14 @@ def _resolve(lines: Sequence[str], names: Sequence[str], which: str, unposed: Se
         known = {key for name in unposed for key in (name, *_keys(name))}
         without = [line for line in absent if line in known]
         if without:
-            raise DataError(f"the {which} names images that have no pose: {listed(without)}; take them off the list")
+            raise DataError(f"the {which} names images that have no pose: {listed(without)}; remove them from the list")
         raise DataError(
-            f"the {which} names images that are not there: {listed(absent)}; the data set has {listed(names)}"
+            f"the {which} names images that do not exist: {listed(absent)}; the data set has {listed(names)}"
         )
     return chosen
 
 
 def _keys(name: str) -> set[str]:
-    """What a list may call a frame besides its full name: without extension, without folders, without both."""
+    """Return the short forms of a frame's name in lists: without extension, without folders, without both."""
     path = PurePosixPath(name)
     return {str(path.with_suffix("")), path.name, path.stem}

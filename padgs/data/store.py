@@ -1,4 +1,7 @@
-"""Store."""
+"""Decoded images of all views: area filter, and one bounded cache that a few threads fill in advance.
+
+Caching and prefetching do not change pixel values.
+"""
 
 from __future__ import annotations
 
@@ -18,13 +21,13 @@ from padgs.data.images import decode
 
 
 def area_resize(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
-    """Reduce an image [H, W, C] uint8 to [height, width, C], rounding to the nearest value.
+    """Reduce an image [H, W, C] uint8 to [height, width, C] by an area filter, rounding to the nearest value.
 
-    Exact for any ratio, which Pillow's BOX is for whole ratios only. Works in bands of rows, so that reducing a
-    6080 x 3040 panorama takes a few MB besides input and output.
+    Every output pixel is the mean of the input area it covers, fractions of pixels included; Pillow's BOX is exact for
+    integer ratios only. Works in bands of rows: a 6080 x 3040 panorama takes a few MB besides input and output.
 
     Raises:
-        ValueError: the output is larger than the input; an area filter only reduces.
+        ValueError: the output is larger than the input.
 
     >>> area_resize(np.array([[[0], [90], [30]]], np.uint8), 2, 1)[..., 0]
     array([[30, 50]], dtype=uint8)
@@ -47,7 +50,7 @@ def area_resize(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np
 
 
 def _coverage(size_in: int, size_out: int) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
-    """Input pixels under each output pixel, [size_out, K], and the share of the output pixel each covers."""
+    """Return indices [size_out, K] of the input pixels under each output pixel, and their weights."""
     scale = size_in / size_out
     start = np.arange(size_out)[:, None] * scale
     index = np.floor(start).astype(np.intp) + np.arange(int(np.ceil(scale)) + 1)
@@ -65,21 +68,21 @@ def _weighted_sum(image: NDArray, index: NDArray[np.intp], weight: NDArray[np.fl
 
 
 class Decodable(Protocol):
-    """What a store keeps the pixels of; compared and hashed as a key."""
+    """A cache key of `ImageStore` that can compute its pixels."""
 
     def decode(self) -> Tensor:
-        """The pixels, past the cache."""
+        """Return the pixels without the cache."""
         ...
 
 
 class ImageStore:
-    """Least-recently-used cache of decoded images, bounded in bytes. Safe to use from several threads."""
+    """Least-recently-used cache of decoded images, bounded in bytes. Thread-safe."""
 
     def __init__(self, limit_bytes: int = 1 << 30, threads: int = 2, device: str = "cpu") -> None:
-        """Keep at most `limit_bytes` of pixels on `device`; `threads` = 0 reads nothing ahead."""
+        """Keep at most `limit_bytes` of pixels on `device`; `threads` = 0 disables prefetching."""
         self.limit_bytes, self.threads, self.device = limit_bytes, threads, device
-        self.bytes = 0  # kept now
-        self.decoded = 0  # images decoded so far
+        self.bytes = 0
+        self.decoded = 0  # number of decoded images
         self._kept: OrderedDict[Decodable, Tensor] = OrderedDict()
         self._pending: dict[Decodable, Future[Tensor]] = {}
         self._lock = Lock()
@@ -90,7 +93,7 @@ class ImageStore:
             return image in self._kept
 
     def get(self, image: Decodable) -> Tensor:
-        """Pixels [H, W, C] uint8 of an image; shared, not to be written to."""
+        """Return the pixels [H, W, C] uint8 of an image; shared, do not modify."""
         with self._lock:
             if image in self._kept:
                 self._kept.move_to_end(image)
@@ -104,18 +107,18 @@ class ImageStore:
         return future.result()
 
     def prefetch(self, image: Decodable) -> None:
-        """Start decoding an image in the background, unless it is there, under way, or enough others are."""
+        """Decode an image in the background, unless it is cached or pending, or too many others are pending."""
         with self._lock:
             if image in self._kept or image in self._pending or len(self._pending) >= 2 * self.threads:
                 return
             if self._pool is None:
-                self._pool = ThreadPoolExecutor(self.threads, thread_name_prefix="padgs-read-ahead")
+                self._pool = ThreadPoolExecutor(self.threads, thread_name_prefix="padgs-prefetch")
             future: Future[Tensor] = Future()
             self._pending[image] = future
             self._pool.submit(self._fill, image, future)
 
     def _fill(self, image: Decodable, future: Future[Tensor]) -> None:
-        """Decode; an error reaches whoever asks for the image."""
+        """Decode into the cache; an error is raised where the future's result is used."""
         try:
             pixels = image.decode().to(self.device)
         except BaseException as error:
@@ -136,7 +139,7 @@ class ImageStore:
 
 @dataclass(frozen=True)
 class StoredImage:
-    """An image file at a size, decoded by its store when called: what `View.load_pixels` is."""
+    """An image file at a size, decoded by its store when called; used as `View.load_pixels`."""
 
     path: Path
     width: int
@@ -145,13 +148,13 @@ class StoredImage:
     mode: str = "RGB"  # RGB, or L for masks
 
     def __call__(self) -> Tensor:
-        """Pixels [H, W, 3] uint8 (L: [H, W, 1]); shared, not to be written to."""
+        """Return pixels [H, W, 3] uint8 (L: [H, W, 1]); shared, do not modify."""
         return self.store.get(self)
 
     def prefetch(self) -> None:
-        """Have the pixels decoded in the background."""
+        """Decode the pixels in the background."""
         self.store.prefetch(self)
 
     def decode(self) -> Tensor:
-        """Read, decode and reduce, past the cache."""
+        """Read, decode and reduce without the cache."""
         return torch.from_numpy(area_resize(decode(self.path, self.mode), self.width, self.height))

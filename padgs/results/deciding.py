@@ -8,7 +8,7 @@ from typing import Any
 # Keys that no trained number depends on but by rounding: of the machine, and the others. What was
 # read is said by the fingerprint of the data; scoring comes after training; a monitor changes no number, but may end a
 # run. `data.device` is in files of old runs only.
-OF_THE_MACHINE = ("run", "render.max_instances", "data.cache_bytes", "data.read_ahead", "data.device")
+OF_THE_MACHINE = ("run", "render.max_instances", "data.cache_bytes", "data.prefetch_threads", "data.device")
 DECIDE_NOTHING = (*OF_THE_MACHINE, "data.path", "init.run", "protocol", "train.monitor")
 
 

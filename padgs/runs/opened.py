@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from yaml import YAMLError
 
 from padgs import results
-from padgs.data.camera_paths import between
+from padgs.data.camera_paths import interpolate_poses
 from padgs.data.capture import DataError
 from padgs.evaluation.protocols import PROTOCOLS
 from padgs.geometry.camera import Camera, Panorama, Pinhole
@@ -143,7 +143,9 @@ class OpenedRun:
         views = self.scene.train
         if len(views) < 2 or frames < 2:
             raise ValueError(f"a path of {frames} frames through {len(views)} views; it takes at least two of both")
-        poses = between(torch.stack([view.cam_from_world for view in views]), np.linspace(0, len(views) - 1, frames))
+        poses = interpolate_poses(
+            torch.stack([view.cam_from_world for view in views]), np.linspace(0, len(views) - 1, frames)
+        )
         return [
             replace(views[0].at(pose.to(views[0].cam_from_world)), name=f"frame-{number:05d}")
             for number, pose in enumerate(poses)

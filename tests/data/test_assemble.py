@@ -91,22 +91,22 @@ def test_the_folder_in_which_one_stands_has_a_name(folder: Path, monkeypatch: py
 
 
 def test_nothing_where_a_scene_should_be(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"there is no .*absent; give the folder of"):
+    with pytest.raises(DataError, match=r"absent does not exist; give the folder of"):
         load(tmp_path / "absent")
     (tmp_path / "photo.jpg").touch()
-    with pytest.raises(DataError, match=r"no known format; it holds photo.jpg. Known are .*`padgs prepare IMAGES"):
+    with pytest.raises(DataError, match=r"no known format; it holds photo.jpg. Known: .*`padgs prepare IMAGES"):
         load(tmp_path)
     with pytest.raises(ValueError, match="unknown data.format 'colmpa'; known: colmap"):
         load(tmp_path, "colmpa")
 
 
 def test_an_absent_public_data_set_says_how_to_get_it(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"360Roam is not there.*huajianup.* put it into .*360Roam, .*pose_c2w.json"):
+    with pytest.raises(DataError, match=r"360Roam is missing.*huajianup.* put it into .*360Roam, .*pose_c2w.json"):
         load(tmp_path / "360Roam" / "bar")
     (tmp_path / "Ricoh360").mkdir()
-    with pytest.raises(DataError, match=r"'center' of Ricoh360 is not there. Get it from .*EgoNeRF"):
+    with pytest.raises(DataError, match=r"'center' of Ricoh360 is missing. Get it from .*EgoNeRF"):
         load(tmp_path / "Ricoh360" / "center")
-    with pytest.raises(DataError, match=r"'cat' is no scene of Ricoh360; its scenes: bricks, .*cat_tower"):
+    with pytest.raises(DataError, match=r"'cat' is not a scene of Ricoh360; its scenes: bricks, .*cat_tower"):
         load(tmp_path / "cat", dataset="ricoh360")
     assert [len(DATASETS[name].scenes) for name in ("roam360", "ricoh360", "omniblender")] == [11, 12, 11]
 

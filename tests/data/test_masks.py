@@ -94,7 +94,7 @@ def test_a_mask_may_lie_where_one_stands(folder: Path, monkeypatch: pytest.Monke
     monkeypatch.chdir(folder / "desk")
     assert load(folder, mask="hands.png").train[0].mask() is not None
     _mask(folder / "hands.png")
-    with pytest.raises(DataError, match=r"data.mask=hands.png is .*hands.png as well as .*desk/hands.png; give"):
+    with pytest.raises(DataError, match=r"data.mask=hands.png is both .*hands.png and .*desk/hands.png; give"):
         load(folder, mask="hands.png")
     assert load(folder, mask=str(folder / "hands.png")).train[0].mask() is not None
 
@@ -126,7 +126,7 @@ def test_unusable_masks(folder: Path) -> None:
     _mask(folder / "mask.png", hidden_rows=32)
     with pytest.raises(DataError, match=r"mask.png hides every pixel of pano_00.png; in a mask 255 means use"):
         load(folder)
-    with pytest.raises(DataError, match="absent.png: there is no such file or folder; known words: auto, none, rows"):
+    with pytest.raises(DataError, match="absent.png: there is no such file or folder; keywords: auto, none, rows"):
         load(folder, mask="absent.png")
     with pytest.raises(DataError, match="rows:40/32: the first number"):
         load(folder, mask="rows:40/32")

@@ -153,5 +153,5 @@ def test_cameras_look_where_they_are_told_without_roll(generator: torch.Generato
 
 def test_only_panoramas_are_cut(panorama: View):
     pinhole = Pinhole(WIDTH, HEIGHT, 50, 50, 32, 16)
-    with pytest.raises(ValueError, match="view 'p' is made by a Pinhole; views are cut out of panoramas only"):
+    with pytest.raises(ValueError, match="view 'p' has a Pinhole camera; only panoramas can be resampled"):
         perspective_views(replace(panorama, lens=pinhole), FACES, pinhole)

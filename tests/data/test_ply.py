@@ -30,7 +30,7 @@ def test_ascii_and_float_colours(world: World, tmp_path: Path) -> None:
     (tmp_path / "b.ply").write_text(text + "end_header\n1 2 3 0.0 0.5 1.0\n")
     assert read_ply(tmp_path / "b.ply").colors.tolist() == [[0, 128, 255]]  # type: ignore[union-attr]
     (tmp_path / "b.ply").write_text(text + "end_header\n1 2 3 0.0 nan 1.0\n")
-    with pytest.raises(DataError, match="the colour of point 0 of .*b.ply is not finite; mend the cloud"):
+    with pytest.raises(DataError, match="the colour of point 0 of .*b.ply is not finite; repair the cloud"):
         read_ply(tmp_path / "b.ply")
 
 

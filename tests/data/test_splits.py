@@ -34,7 +34,7 @@ def test_lists_in_every_spelling(train: str, test: str, tmp_path: Path) -> None:
 def test_one_list_leaves_the_other_side_the_rest(tmp_path: Path) -> None:
     split = split_frames(NAMES, _lists(tmp_path, None, "b"))
     assert (split.train, split.test) == ((0, 2, 3, 4), (1,))
-    assert "there is no train list; it is what the test list leaves" in split.notes
+    assert "there is no train list; all views missing from the test list are used" in split.notes
 
 
 def test_every_kth(tmp_path: Path) -> None:
@@ -60,8 +60,8 @@ def test_unused_views_are_reported(tmp_path: Path) -> None:
     ("train", "test", "message"),
     [
         ("a\nb", "b\nc", "train and test list overlap: b.jpg; a view is one or the other"),
-        ("a\nx\ny", "b", r"the train list names images that are not there: x, y; the data set has a.jpg, b.jpg"),
-        ("a\nlost", "b", "the train list names images that have no pose: lost; take them off"),
+        ("a\nx\ny", "b", r"the train list names images that do not exist: x, y; the data set has a.jpg, b.jpg"),
+        ("a\nlost", "b", "the train list names images that have no pose: lost; remove them"),
         ("a", "\n\n", "the test split is empty; name at least one view, or set data.split=every"),
         ("", "a", "the train split is empty"),
         ("../../etc/passwd", "a", r"train.txt names '../../etc/passwd'; names must be relative .*no '\.\.'"),
@@ -77,7 +77,7 @@ def test_unusable_lists(train: str, test: str, message: str, tmp_path: Path) -> 
 
 def test_ambiguous_names(tmp_path: Path) -> None:
     names = ("left/a.jpg", "right/a.jpg", "b.jpg")
-    with pytest.raises(DataError, match="names 'a', which fits left/a.jpg, right/a.jpg; be specific"):
+    with pytest.raises(DataError, match="names 'a', which matches left/a.jpg, right/a.jpg; be specific"):
         split_frames(names, _lists(tmp_path, "a", "b"))
     assert split_frames(names, _lists(tmp_path, "left/a", "b")).train == (0,)
 

@@ -1,4 +1,4 @@
-"""Formats."""
+"""Readers and writers of data set formats: one `read(path, options) -> Capture` each. `detect` chooses."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from pathlib import Path
 from padgs.data.capture import DataError, listed
 from padgs.data.formats.colmap import find_model
 
-# Files that together tell a format, most specific first: the native folders of data sets also hold files of the
-# general formats. No files: a COLMAP model.
+# Files that together identify a format, most specific first: folders of published data sets also hold files of general
+# formats. No files: a COLMAP model.
 SIGNS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("roam360", ("pose_c2w.json",)),
     ("ricoh360", ("output_dir/colmap/images.txt",)),
@@ -20,16 +20,15 @@ SIGNS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("openmvg", ("sfm_data.json",)),
     ("opensfm", ("reconstruction.json",)),
 )
-# Files that may be given themselves, instead of their folder.
+# Files that may be given instead of their folder.
 ALONE = ("transform.json", "transforms.json", "sfm_data.json", "reconstruction.json")
 
 
 def detect(path: Path) -> tuple[str, str]:
-    """The format of a data set, and the reason in words.
+    """Detect the format of a data set; returns its name and the reason in words.
 
     Raises:
-        DataError: nothing known is there; the message says what was looked for.
-
+        DataError: no known format; the message lists the files that identify one.
     """
     found: dict[str, str] = {}
     for format, files in SIGNS:
@@ -42,13 +41,13 @@ def detect(path: Path) -> tuple[str, str]:
     if not found:
         inside = listed(sorted(child.name for child in path.iterdir())) if path.is_dir() else "a file"
         raise DataError(
-            f"{path} has no known format; it holds {inside or 'nothing'}. Known are a COLMAP model (sparse/0), "
+            f"{path} has no known format; it holds {inside or 'nothing'}. Known: a COLMAP model (sparse/0), "
             "transforms.json, sfm_data.json, reconstruction.json, pose_c2w.json (360Roam), output_dir/colmap "
             "(Ricoh360), transform.json (OmniBlender), data_views.json with data_extrinsics.json. Panoramas without "
             "poses: run `padgs prepare IMAGES OUT` first"
         )
     name, *others = found
-    reason = f"format: {name}, because there is {found[name]}"
+    reason = f"format: {name}, detected by {found[name]}"
     if others:
-        reason += f" (also there, not used: {', '.join(found[other] for other in others)}; data.format chooses)"
+        reason += f" (also present, not used: {', '.join(found[other] for other in others)}; set data.format to choose)"
     return name, reason

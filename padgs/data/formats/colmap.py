@@ -1,4 +1,7 @@
-"""COLMAP."""
+"""COLMAP models, text or binary, with or without rigs, of EQUIRECTANGULAR cameras (in forks: SPHERICAL).
+
+COLMAP's panoramic camera has the axes of `padgs.geometry.panorama`, so poses are used unchanged.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,7 @@ _ALIAS = re.compile(r"^(\s*\d+\s+)SPHERICAL\s+(\d+)\s+(\d+).*$", re.MULTILINE)
 
 
 def find_model(path: Path) -> Path | None:
-    """The folder with the model's files, in a data set's folder or itself; the largest of several parts."""
+    """Find the folder with the model's files, in a data set's folder or itself; the largest of several parts."""
     for folder in (path / "sparse_equirectangular", path / "sparse", path / "colmap" / "sparse", path):
         parts = [folder, *sorted(part for part in folder.glob("*") if part.is_dir())] if folder != path else [folder]
         found = [part for part in parts if _suffix(part)]
@@ -39,10 +42,10 @@ def read(path: Path, options: DataOptions, model: Path | None = None) -> Capture
     Args:
         path: the data set's folder.
         options: only `images` is used.
-        model: the folder with the model's files, where it is not in a usual place.
+        model: the folder with the model's files; None searches the usual places.
 
     Raises:
-        DataError: files missing or damaged, a camera that is not panoramic, no pose.
+        DataError: missing or damaged files, a camera that is not panoramic, or no pose.
     """
     model = model or find_model(path)
     if model is None:
@@ -55,7 +58,7 @@ def read(path: Path, options: DataOptions, model: Path | None = None) -> Capture
     reconstruction = _open(model, str(suffix))
     images = [image for _, image in sorted(reconstruction.images.items()) if image.has_pose]
     notes = _part_notes(path, model)
-    # pycolmap ends the names of text models at the first space.
+    # pycolmap cuts names in text models at the first space.
     names = {int(line[0]): line[9] for line in image_lines(model / "images.txt")} if suffix == ".txt" else {}
     without = [image.name for image in reconstruction.images.values() if not image.has_pose]
     if without:
@@ -74,8 +77,8 @@ def read(path: Path, options: DataOptions, model: Path | None = None) -> Capture
 
 
 def pycolmap_module() -> ModuleType:
-    """The module pycolmap, imported such that Pillow can still write PNG files afterwards."""
-    import zlib  # noqa: F401 - before pycolmap, whose own deflate symbols would otherwise replace the system's
+    """Import pycolmap without breaking PNG files of Pillow."""
+    import zlib  # noqa: F401 - first, or pycolmap's deflate symbols replace the system's
 
     import pycolmap
 
@@ -83,7 +86,7 @@ def pycolmap_module() -> ModuleType:
 
 
 def cloud_of(reconstruction: Any) -> tuple[Cloud, dict[int, int]]:
-    """The points of a pycolmap.Reconstruction, and the row of each by its id."""
+    """Return the points of a pycolmap.Reconstruction, and the row of each point id."""
     ids = sorted(reconstruction.points3D.keys())
     points = [reconstruction.points3D[point_id] for point_id in ids]
     cloud = Cloud(
@@ -94,10 +97,10 @@ def cloud_of(reconstruction: Any) -> tuple[Cloud, dict[int, int]]:
 
 
 def image_lines(file: Path) -> list[list[str]]:
-    """The ten fields of every image in images.txt; each has a second line, its observations, which may be empty.
+    """Read the ten fields of every image in images.txt; observations, on every second line, are skipped.
 
     Raises:
-        DataError: not there, or a line with fewer fields.
+        DataError: missing file, or a line with fewer fields.
     """
     lines = iter(read_bytes(file).decode("utf-8", "surrogateescape").splitlines())
     found = []
@@ -118,7 +121,7 @@ def _part_notes(path: Path, model: Path) -> list[str]:
     others = [part.name for part in sorted(model.parent.glob("*")) if part != model and part.is_dir() and _suffix(part)]
     if model == path or not others:
         return []
-    return [f"the model has several parts; {model.name} is the largest and is used, not {listed(others)}"]
+    return [f"the model has several parts; the largest, {model.name}, is used, not {listed(others)}"]
 
 
 def _open(model: Path, suffix: str) -> Any:
@@ -151,7 +154,9 @@ def _frame(image: Any, name: str, folder: Path, model: Path) -> Frame:
             "reconstruct from the panoramas themselves (`padgs prepare`), or give the sparse_equirectangular model"
         )
     where = f"{name} in {model}"
-    checked_quaternion(torch.tensor(image.cam_from_world().rotation.quat), where)  # that of 0 0 0 0 is the identity
+    checked_quaternion(
+        torch.tensor(image.cam_from_world().rotation.quat), where
+    )  # pycolmap turns 0 0 0 0 into the identity
     pose = torch.from_numpy(np.asarray(image.cam_from_world().matrix(), np.float64))
     return Frame(
         name=check_inside(name, str(model)),
@@ -163,7 +168,7 @@ def _frame(image: Any, name: str, folder: Path, model: Path) -> Frame:
 
 
 def _tracks(images: list[Any], row_of: dict[int, int]) -> Tracks:
-    return Tracks.of(
+    return Tracks.from_observations(
         (frame, row_of[seen.point3D_id], seen.xy)
         for frame, image in enumerate(images)
         for seen in image.get_observation_points2D()
@@ -175,10 +180,13 @@ _EQUIRECTANGULAR = 17
 
 
 def check_whole(folder: Path) -> None:
-    """Walk through all .bin files of a model folder.
+    """Check the structure of all .bin files of a model folder.
+
+    pycolmap does not return from some truncated files, because it reserves as many points as garbage says. Source: the
+    description of COLMAP's output format, 3.x and 4.x.
 
     Raises:
-        DataError: a file ends early, or goes on after its last entry.
+        DataError: a file is truncated, or longer than its entries.
     """
     for stem, skip in _ENTRIES.items():
         path = folder / f"{stem}.bin"
@@ -187,7 +195,7 @@ def check_whole(folder: Path) -> None:
         data = path.read_bytes()
         try:
             (count,) = struct.unpack_from("<Q", data)
-            if count > len(data):  # every entry takes more than a byte
+            if count > len(data):  # every entry has more than one byte
                 raise struct.error
             offset = 8
             for _ in range(count):
@@ -200,7 +208,7 @@ def check_whole(folder: Path) -> None:
             raise DataError(f"{path} has {len(data)} bytes but its {count} entries take {offset}; copy it again")
 
 
-def _skip(data: bytes, offset: int, size: int) -> int:
+def _advance(data: bytes, offset: int, size: int) -> int:
     if offset + size > len(data):
         raise struct.error
     return offset + size
@@ -212,32 +220,32 @@ def _skip_camera(data: bytes, offset: int) -> int:
         raise DataError(
             f"the model holds a camera of type {model}; only EQUIRECTANGULAR ({_EQUIRECTANGULAR}) can be used here"
         )
-    return _skip(data, offset, 24 + 8 * _CAMERA_PARAMETERS.get(model, 2))
+    return _advance(data, offset, 24 + 8 * _CAMERA_PARAMETERS.get(model, 2))
 
 
 def _skip_image(data: bytes, offset: int) -> int:
-    offset = data.index(b"\0", _skip(data, offset, 64)) + 1
+    offset = data.index(b"\0", _advance(data, offset, 64)) + 1
     (count,) = struct.unpack_from("<Q", data, offset)
-    return _skip(data, offset, 8 + 24 * count)
+    return _advance(data, offset, 8 + 24 * count)
 
 
 def _skip_point(data: bytes, offset: int) -> int:
     (length,) = struct.unpack_from("<43xQ", data, offset)
-    return _skip(data, offset, 51 + 8 * length)
+    return _advance(data, offset, 51 + 8 * length)
 
 
 def _skip_rig(data: bytes, offset: int) -> int:
     (sensors,) = struct.unpack_from("<4xI", data, offset)
-    offset = _skip(data, offset, 16 if sensors else 8)
+    offset = _advance(data, offset, 16 if sensors else 8)
     for _ in range(max(0, sensors - 1)):
         (posed,) = struct.unpack_from("<8xB", data, offset)
-        offset = _skip(data, offset, 65 if posed else 9)
+        offset = _advance(data, offset, 65 if posed else 9)
     return offset
 
 
 def _skip_frame(data: bytes, offset: int) -> int:
     (count,) = struct.unpack_from("<64xI", data, offset)
-    return _skip(data, offset, 68 + 16 * count)
+    return _advance(data, offset, 68 + 16 * count)
 
 
 _ENTRIES: dict[str, Callable[[bytes, int], int]] = {

@@ -1,4 +1,4 @@
-"""From any format to any other: read, check everything, write beside, then move into place at once."""
+"""Conversion between formats: read and check everything, write to a temporary folder, then rename it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from PIL import Image
 import padgs.data
 from padgs.data.assemble import assemble, view_name
 from padgs.data.capture import Capture, Cloud, DataError, DataOptions, Frame, Tracks
-from padgs.data.cloud import starting_cloud
+from padgs.data.cloud import initial_cloud
 from padgs.data.formats.writers import WRITERS, Content
 from padgs.data.images import save_png
 from padgs.data.masks import write_masks
@@ -35,28 +35,28 @@ def convert(
 ) -> Scene:
     """Write a data set in another format.
 
-    Images are copied byte for byte, unless they are reduced (`options.width`) or the format wants PNG. The split is
-    written as decided; masks are written as mask.png or masks/, and the row rule of 360Roam becomes such a mask.
+    Images are copied byte for byte, unless they are reduced (`options.width`) or the format requires PNG. The split is
+    written as decided; masks, including the row rule of 360Roam, become mask.png or masks/.
 
     Args:
         source: a data set in any known format.
-        destination: a folder that does not exist yet, or is empty.
+        destination: a folder that does not exist, or is empty.
         to: a name of `padgs.data.formats.writers.WRITERS`.
-        format: that of the source, or auto.
+        format: of the source, or auto.
         options: as for `padgs.data.load`.
-        progress: called with (images written, images in all).
+        progress: called with (images written, total).
 
     Returns:
-        The scene as it was read from the source.
+        The scene of the source.
 
     Raises:
-        DataError: a source that `load` would refuse, or a destination that cannot be written. Nothing is left there.
+        DataError: `load` would refuse the source, or the destination cannot be written; then it stays unchanged.
         ValueError: unknown format.
     """
     if to not in WRITERS:
         raise ValueError(f"unknown format {to!r}; known: {', '.join(WRITERS)}")
     if destination.exists() and (not destination.is_dir() or any(destination.iterdir())):
-        raise DataError(f"{destination} exists; nothing is overwritten: remove it or choose another place")
+        raise DataError(f"{destination} exists; nothing is overwritten: remove it or choose another path")
     capture = padgs.data.read(source, format, options)
     scene = assemble(capture, options)
     partial = destination.with_name(f".{destination.name}.partial-{os.getpid()}")
@@ -64,7 +64,7 @@ def convert(
         partial.mkdir(parents=True)
         content = _write_images(capture, scene, partial, to, progress)
         if options.points != "auto":
-            points, colors, _ = starting_cloud(
+            points, colors, _ = initial_cloud(
                 capture, options.points
             )  # where the poses are: the scene may be recentered
             content = replace(content, cloud=Cloud(points, colors), tracks=None)
@@ -74,7 +74,7 @@ def convert(
             destination.rmdir()
         partial.rename(destination)
     except OSError as error:
-        raise DataError(f"cannot write {destination} ({error.strerror or error}); nothing was left there") from error
+        raise DataError(f"cannot write {destination} ({error.strerror or error}); nothing was written") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return scene
@@ -83,7 +83,7 @@ def convert(
 def _write_images(
     capture: Capture, scene: Scene, folder: Path, to: str, progress: Callable[[int, int], None]
 ) -> Content:
-    """Copy or re-encode the images, and say what is to be written about them."""
+    """Copy or re-encode the images, and return the content of the files beside them."""
     views = {view.name: view for view in (*scene.train, *scene.test)}
     target = folder / IMAGE_FOLDERS.get(to, "images")
     frames: list[Frame] = []
@@ -115,7 +115,7 @@ def _write_images(
 
 
 def _kept_tracks(capture: Capture, kept: list[int], frames: list[Frame]) -> Tracks | None:
-    """The observations in the frames that are written, in pixels of the written images."""
+    """Return the observations in the written frames, in pixels of the written images."""
     if capture.tracks is None or any(frame.width is None for frame in capture.frames):
         return None
     tracks = capture.tracks()

@@ -1,5 +1,6 @@
-"""JSON files of other programs: values that know where they stand and are asked for by type, so that whatever is wrong
-names its place. Readers never touch `value` itself.
+"""JSON files of other programs: values that know their position, so that typed access reports it in errors.
+
+Readers use the typed accessors, not `value`.
 """
 
 from __future__ import annotations
@@ -17,15 +18,15 @@ from padgs.data.capture import DataError, listed
 from padgs.data.images import read_bytes
 from padgs.data.splits import check_inside
 
-LARGEST = 2**53  # up to which floats tell whole numbers apart
+LARGEST = 2**53  # largest range of exact integers in floats
 
 
 @dataclass(frozen=True)
 class Json:
-    """A value of a JSON file."""
+    """A value in a JSON file."""
 
     value: Any
-    where: str  # in words: "transform_matrix of pano_00.png in FILE"
+    where: str  # position in words: "transform_matrix of pano_00.png in FILE"
 
     def __getitem__(self, key: str) -> Json:
         fields = self._of(Mapping, f"an object with the field {key!r}")
@@ -35,37 +36,37 @@ class Json:
         return Json(fields[key], f"{key} of {self.where}")
 
     def get(self, key: str) -> Json | None:
-        """A field that may be absent, or null, which is the same."""
+        """Return an optional field; None if absent or null."""
         return self[key] if self._of(Mapping, "an object").get(key) is not None else None
 
     def items(self) -> dict[str, Json]:
-        """What an object holds."""
+        """Return the fields of an object."""
         return {key: Json(value, f"{key} of {self.where}") for key, value in self._of(Mapping, "an object").items()}
 
     def entries(self) -> list[Json]:
-        """What a list holds."""
+        """Return the entries of a list."""
         return [Json(entry, f"entry {i} of {self.where}") for i, entry in enumerate(self._of(list, "a list"))]
 
     def text(self) -> str:
-        """A text."""
+        """Return a string."""
         return self._of(str, "a text")
 
     def whole(self) -> int:
-        """A whole number, such as a key or a number of pixels."""
+        """Return an integer, such as a key or a number of pixels."""
         value = self._of((int, float), "a whole number")
         if isinstance(value, bool) or value != value or abs(value) > LARGEST or value != int(value):
             raise DataError(f"{self.where} is {value!r}; it must be a whole number up to {LARGEST}")
         return int(value)
 
     def name(self) -> str:
-        """The path of a file inside the folder it is relative to."""
+        """Return a relative path that stays inside its folder."""
         return check_inside(self.text(), self.where)
 
     def numbers(self, *shape: int) -> Tensor:
-        """A nested list of numbers as a float64 tensor; of the given shape, if one is given.
+        """Return a nested list of numbers as a float64 tensor, of the given shape if there is one.
 
         Raises:
-            DataError: something else than numbers, or of another shape.
+            DataError: not numbers, or another shape.
         """
         try:
             tensor = torch.tensor(self.value, dtype=torch.float64)
@@ -76,24 +77,24 @@ class Json:
         return tensor
 
     def _of(self, kind: type | tuple[type, ...], words: str) -> Any:
-        """The value, which is of this type, or refused."""
+        """Return the value if it has this type, else refuse it."""
         if not isinstance(self.value, kind):
             raise DataError(f"{self.where} must be {words}, not {type(self.value).__name__}")
         return self.value
 
 
 def read_json(path: Path) -> Json:
-    """The contents of a JSON file.
+    """Read a JSON file.
 
     Raises:
-        DataError: not there, unreadable or not JSON; says in which line.
+        DataError: missing, unreadable or not JSON; the message names the line.
     """
     try:
         return Json(json.loads(read_bytes(path).decode("utf-8-sig")), str(path))
-    except (ValueError, RecursionError) as error:  # not UTF-8, not JSON, a number of thousands of digits, too deep
+    except (ValueError, RecursionError) as error:  # not UTF-8, not JSON, huge numbers, deep nesting
         raise DataError(f"{path} is not valid JSON ({error}); export it again") from error
 
 
 def file_in(path: Path, name: str) -> Path:
-    """The file that describes a data set, of which `path` is the folder or that very file."""
+    """Return the file that describes a data set; `path` is its folder or the file itself."""
     return path if path.is_file() else path / name

@@ -1,6 +1,7 @@
 """OpenMVG's `sfm_data.json` with a spherical camera: views, intrinsics, extrinsics, structure.
 
-An extrinsic is the rotation cam from world (row by row) and the camera's centre in the world; camera axes are ours.
+An extrinsic holds the rotation cam_from_world (row-major) and the camera centre in the world; camera axes are those of
+`padgs.geometry.panorama`.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from padgs.data.assemble import image_folder
 from padgs.data.capture import Capture, Cloud, DataError, DataOptions, Frame, Tracks
-from padgs.data.cloud import existing_ply
+from padgs.data.cloud import first_ply
 from padgs.data.formats.json_file import Json, file_in, read_json
 from padgs.data.formats.poses import cam_from_center
 from padgs.data.splits import check_inside
@@ -26,8 +27,8 @@ def read(path: Path, options: DataOptions) -> Capture:
     folder, data = file.parent, read_json(file)
     _check_cameras(data)
     views, poses = read_views(data), read_extrinsics(data)
-    # Where the images were on the machine that reconstructed. Only its last name counts: a file from elsewhere must not
-    # reach other folders.
+    # The image folder on the machine of the reconstruction; only its last name is used, because a file from elsewhere
+    # must not reach other folders.
     stated = data.get("root_path")
     root = PurePosixPath(stated.text().replace("\\", "/")).name if stated else ""
     images = image_folder(folder, options.images, ("images", "imgs", *([root] if root not in ("", "..") else [])))
@@ -35,7 +36,7 @@ def read(path: Path, options: DataOptions) -> Capture:
     frames = tuple(Frame(view.name, images / view.name, poses[view.pose], view.width, view.height) for view in posed)
     stated = data.get("structure")
     structure = stated.entries() if stated else []
-    colored = existing_ply(folder, _PLY)
+    colored = first_ply(folder, _PLY)
     cloud = colored
     if cloud is None and structure:
         points = Json([item["value"]["X"].value for item in structure], f"X of the structure of {file}")
@@ -53,17 +54,17 @@ def read(path: Path, options: DataOptions) -> Capture:
 
 @dataclass(frozen=True)
 class MvgView:
-    """One entry of `views`."""
+    """An entry of `views`."""
 
     key: int
     pose: int  # id_pose
-    name: str  # local_path and filename
+    name: str  # local_path/filename
     width: int
     height: int
 
 
 def read_views(data: Json) -> list[MvgView]:
-    """The entries of `views`, in the file's order."""
+    """Read the entries of `views`, in the file's order."""
     views = []
     for item in data["views"].entries():
         view = item["value"]["ptr_wrapper"]["data"]
@@ -77,7 +78,7 @@ def read_views(data: Json) -> list[MvgView]:
 
 
 def read_extrinsics(data: Json) -> dict[int, Tensor]:
-    """Key of the pose -> cam_from_world [4, 4] float64."""
+    """Read the extrinsics: pose key -> cam_from_world [4, 4] float64."""
     poses = {}
     for item in data["extrinsics"].entries():
         key = item["key"].whole()
@@ -91,15 +92,17 @@ def read_extrinsics(data: Json) -> dict[int, Tensor]:
 
 
 def _check_cameras(data: Json) -> None:
-    """cereal names a class where it first occurs, so a file of only spherical cameras names "spherical" once."""
+    """Refuse cameras that are not spherical; cereal names a class only where it first occurs."""
     for item in data["intrinsics"].entries():
         name = item["value"].get("polymorphic_name")
         if name and name.text() != "spherical":
-            raise DataError(f"{data.where} holds a {name.text()!r} camera; only spherical ones (panoramas) can be used")
+            raise DataError(
+                f"{data.where} holds a {name.text()!r} camera; only spherical cameras (panoramas) can be used"
+            )
 
 
 def _tracks(structure: list[Json], frame_of_view: dict[int, int]) -> Tracks:
-    return Tracks.of(
+    return Tracks.from_observations(
         (frame_of_view[key], point, seen["value"]["x"].numbers(2).tolist())
         for point, item in enumerate(structure)
         if (observations := item["value"].get("observations"))

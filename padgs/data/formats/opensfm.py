@@ -1,6 +1,6 @@
 """OpenSfM's `reconstruction.json` with spherical (equirectangular) cameras.
 
-A shot is the rotation vector and the translation cam from world; camera axes and image are ours.
+A shot holds the rotation vector and translation of cam_from_world; camera axes are those of `padgs.geometry.panorama`.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ def read(path: Path, options: DataOptions) -> Capture:
         camera = best["cameras"][shot["camera"].text()]
         model = camera["projection_type"].text()
         if model not in MODELS:
-            raise DataError(f"{shot.where} has a {model!r} camera; only spherical ones (panoramas) can be used")
+            raise DataError(f"{shot.where} has a {model!r} camera; only spherical cameras (panoramas) can be used")
         rotation = rotation_from_vector(shot["rotation"].numbers(3), shot.where)
         pose = cam_from_world(rotation, shot["translation"].numbers(3), shot.where)
         name = check_inside(name, str(file))
         width, height = (side and side.whole() for side in (camera.get("width"), camera.get("height")))
         frames.append(Frame(name, images / name, pose, width, height))
-    used = f"{file.name} holds {len(parts)} reconstructions; the one with most shots, {len(frames)}, is used"
+    used = f"{file.name} holds {len(parts)} reconstructions; the one with the most shots, {len(frames)}, is used"
     notes = (used,) if len(parts) > 1 else ()
     return Capture("opensfm", file.parent, images, tuple(frames), _cloud(best), notes=notes)
 

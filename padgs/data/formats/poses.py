@@ -1,6 +1,6 @@
-"""Poses as files state them, checked once for all formats, and turned into `cam_from_world`.
+"""Conversion of poses in files to `cam_from_world` [4, 4] float64, with checks shared by all formats.
 
-Whatever is not a rotation is refused: a pose that is a little wrong costs quality without a word.
+Matrices that are not rotations are refused, because slightly wrong poses silently cost quality.
 """
 
 from __future__ import annotations
@@ -10,33 +10,33 @@ from torch import Tensor
 
 from padgs.data.capture import DataError
 
-TOLERANCE = 1e-3  # of R R^T against the identity; files with four digits pass, scaled or sheared matrices do not
-FURTHEST = 1e15  # world units, as for what renderers draw (`padgs.render.contract`)
+TOLERANCE = 1e-3  # of R R^T - I; accepts files with four digits, refuses scaled or sheared matrices
+FARTHEST = 1e15  # world units, the limit of renderers (`padgs.render.contract`)
 
-# Rotations between the camera frames in use: `OPENCV_FROM_OPENGL @ x_gl` is x right, y down, z forward.
-OPENCV_FROM_OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))  # y up, z backward
+# `OPENCV_FROM_OPENGL @ x_gl` is x right, y down, z forward.
+OPENCV_FROM_OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))  # OpenGL: y up, z backward
 
 
 def rigid(rotation: Tensor, translation: Tensor) -> Tensor:
-    """[4, 4] float64 of a rotation [3, 3] and a translation [3]."""
+    """Return the rigid transform [4, 4] float64 of a rotation [3, 3] and a translation [3]."""
     matrix = torch.eye(4, dtype=torch.float64)
     matrix[:3, :3], matrix[:3, 3] = rotation, translation
     return matrix
 
 
 def cam_from_world(rotation: Tensor, translation: Tensor, where: str) -> Tensor:
-    """[4, 4] float64 of a cam-from-world rotation [3, 3] and translation [3]; `where` names the pose in errors."""
+    """Return the pose [4, 4] of a cam-from-world rotation [3, 3] and translation [3]; `where` names it in errors."""
     return rigid(checked_rotation(rotation, where), _finite(translation, where))
 
 
 def cam_from_center(rotation: Tensor, center: Tensor, where: str) -> Tensor:
-    """[4, 4] float64 of a cam-from-world rotation [3, 3] and the camera centre [3] in the world."""
+    """Return the pose [4, 4] of a cam-from-world rotation [3, 3] and the camera centre [3] in the world."""
     rotation = checked_rotation(rotation, where)
     return rigid(rotation, -rotation @ _finite(center, where))
 
 
 def cam_from_pose(world_from_cam: Tensor, where: str) -> Tensor:
-    """[4, 4] float64 of a world-from-cam matrix [3 or 4, 4] of an OpenCV camera."""
+    """Return the pose [4, 4] of a world-from-cam matrix [3 or 4, 4] of an OpenCV camera."""
     matrix = torch.as_tensor(world_from_cam, dtype=torch.float64)
     if matrix.dim() != 2 or matrix.shape[0] not in (3, 4) or matrix.shape[1] != 4:
         raise DataError(f"{where}: a pose has the shape {list(matrix.shape)}; it must be 4x4 (or 3x4)")
@@ -53,12 +53,12 @@ def cam_from_pose(world_from_cam: Tensor, where: str) -> Tensor:
 
 
 def cam_from_opengl_pose(world_from_cam: Tensor, where: str) -> Tensor:
-    """[4, 4] float64 of a world-from-cam matrix [3 or 4, 4] of an OpenGL camera: x right, y up, z backward."""
+    """Return the pose [4, 4] of a world-from-cam matrix [3 or 4, 4] of an OpenGL camera: x right, y up, z backward."""
     return rigid(OPENCV_FROM_OPENGL, torch.zeros(3, dtype=torch.float64)) @ cam_from_pose(world_from_cam, where)
 
 
 def rotation_from_quaternion(quaternion: Tensor, where: str) -> Tensor:
-    """[3, 3] of a quaternion (w, x, y, z); its length must be 1 up to rounding."""
+    """Return the rotation [3, 3] of a quaternion (w, x, y, z), which must have unit length up to rounding."""
     w, x, y, z = checked_quaternion(quaternion, where).tolist()
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -69,7 +69,7 @@ def rotation_from_quaternion(quaternion: Tensor, where: str) -> Tensor:
 
 
 def checked_quaternion(quaternion: Tensor, where: str) -> Tensor:
-    """A quaternion [4] whose length is 1 up to rounding, with the length 1."""
+    """Normalise a quaternion [4], which must have unit length up to rounding."""
     quaternion = _finite(quaternion, where)
     length = quaternion.norm().item()
     if abs(length - 1) > 0.01:
@@ -78,14 +78,14 @@ def checked_quaternion(quaternion: Tensor, where: str) -> Tensor:
 
 
 def rotation_from_vector(vector: Tensor, where: str) -> Tensor:
-    """[3, 3] of a rotation vector: axis times angle in radians."""
+    """Return the rotation [3, 3] of a rotation vector: axis times angle in radians."""
     x, y, z = _finite(vector, where).tolist()
     cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
     return torch.linalg.matrix_exp(cross)
 
 
 def quaternion_from_rotation(rotation: Tensor) -> Tensor:
-    """(w, x, y, z) with w >= 0 of a rotation [3, 3], as an eigenvector, so that no case is special.
+    """Return the quaternion (w, x, y, z), w >= 0, of a rotation [3, 3], as an eigenvector, without special cases.
 
     Source: I. Bar-Itzhack, "New method for extracting the quaternion from a rotation matrix", 2000.
     """
@@ -99,7 +99,7 @@ def quaternion_from_rotation(rotation: Tensor) -> Tensor:
 
 
 def vector_from_rotation(rotation: Tensor) -> Tensor:
-    """Rotation vector [3] of a rotation [3, 3], at most pi long."""
+    """Return the rotation vector [3], of length at most pi, of a rotation [3, 3]."""
     quaternion = quaternion_from_rotation(rotation)
     sine = quaternion[1:].norm()
     half = torch.atan2(sine, quaternion[0])
@@ -107,7 +107,7 @@ def vector_from_rotation(rotation: Tensor) -> Tensor:
 
 
 def checked_rotation(rotation: Tensor, where: str) -> Tensor:
-    """The rotation nearest to a [3, 3] matrix that is one up to rounding, float64.
+    """Return the rotation nearest to a [3, 3] matrix, which must be one up to rounding, as float64.
 
     Raises:
         DataError: not finite, scaled, left-handed or not orthogonal; the message says which.
@@ -122,12 +122,12 @@ def checked_rotation(rotation: Tensor, where: str) -> Tensor:
         scale = gram.diagonal().mean().sqrt().item()
         if scale > 0 and (gram / scale**2 - identity).abs().max() <= TOLERANCE:
             raise DataError(
-                f"{where}: the pose holds a rotation times {scale:.6g}; scale belongs to the positions, divide the "
+                f"{where}: the pose holds a rotation times {scale:.6g}; scale belongs to the positions: divide the "
                 "3x3 part by it"
             )
         raise DataError(
             f"{where}: the 3x3 part of the pose is not a rotation: R R^T differs from the identity by "
-            f"{(gram - identity).abs().max().item():.3g} (at most {TOLERANCE:g} is taken for rounding)"
+            f"{(gram - identity).abs().max().item():.3g} (at most {TOLERANCE:g} is accepted as rounding)"
         )
     if determinant < 0:
         raise DataError(
@@ -142,12 +142,13 @@ def _finite(values: Tensor, where: str) -> Tensor:
     values = torch.as_tensor(values, dtype=torch.float64)
     if not values.isfinite().all():
         raise DataError(
-            f"{where}: the pose contains {_numbers(values[~values.isfinite()][:1])}; remove the image or redo it"
+            f"{where}: the pose contains {_numbers(values[~values.isfinite()][:1])}; remove the image or compute its "
+            "pose again"
         )
-    if (far := values[values.abs() > FURTHEST]).numel():
+    if (far := values[values.abs() > FARTHEST]).numel():
         raise DataError(
-            f"{where}: the pose contains {_numbers(far[:1])}; nothing farther than {FURTHEST:g} from the origin can be "
-            "drawn: remove the image or redo it"
+            f"{where}: the pose contains {_numbers(far[:1])}; nothing farther than {FARTHEST:g} from the origin can be "
+            "rendered: remove the image or compute its pose again"
         )
     return values
 

@@ -1,4 +1,17 @@
-"""Published."""
+"""Readers of published data sets: 360Roam, Ricoh360, OmniBlender, and the folders of released PaD-GS and ODGS code.
+
+360Roam: images/, `pose_c2w.json` (world from camera, OpenCV axes; includes the split) and scene.ply. Images of
+6080 x 3040 are reduced to the paper's 2048 x 1024 unless data.width is set; the bottom rows (tripod) are masked.
+
+Ricoh360 (EgoNeRF): imgs/, train.txt, test.txt, and COLMAP text files in output_dir/colmap. They were written by OpenMVG
+with a camera unknown to COLMAP, so they are parsed here. Their names may differ from the images in extension.
+
+OmniBlender (EgoNeRF): `transform.json`, images/, train.txt, test.txt; no points. Poses are world from camera, with
+OpenGL axes, in Blender's z-up world.
+
+Released PaD-GS and ODGS: images/, data_views.json, data_extrinsics.json, pcd.ply (or colorized.ply), train.txt and
+test.txt. Views and extrinsics are joined by key; sizes are those of the images.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +21,7 @@ import torch
 
 from padgs.data.assemble import image_folder, image_names
 from padgs.data.capture import Capture, Cloud, DataError, DataOptions, Frame, color_bytes
-from padgs.data.cloud import existing_ply
+from padgs.data.cloud import first_ply
 from padgs.data.datasets import DATASETS
 from padgs.data.formats.colmap import image_lines
 from padgs.data.formats.json_file import Json, file_in, read_json
@@ -18,7 +31,7 @@ from padgs.data.splits import check_inside, read_lines
 
 
 def read_roam360(path: Path, options: DataOptions) -> Capture:
-    """Read the poses and the split."""
+    """Read poses, split and points of a 360Roam scene."""
     file = path / "pose_c2w.json"
     data = read_json(file)
     images = image_folder(path, options.images)
@@ -35,9 +48,9 @@ def read_roam360(path: Path, options: DataOptions) -> Capture:
         split[side] = tuple(names)
     twice = set(split["train"]) & set(split["test"])
     if twice:
-        raise DataError(f"{file}: {sorted(twice)[0]} is both a train and a test view; it may be one of them")
+        raise DataError(f"{file}: {sorted(twice)[0]} is both a train and a test view; keep it in one list")
     known = DATASETS["roam360"]
-    cloud = existing_ply(path, ("scene.ply", f"{path.name}.ply", "pcd.ply"))
+    cloud = first_ply(path, ("scene.ply", f"{path.name}.ply", "pcd.ply"))
     return Capture("roam360", path, images, tuple(frames), cloud, split, known.mask, known.width)
 
 
@@ -45,7 +58,7 @@ _RICOH360_MODEL = "output_dir/colmap"
 
 
 def read_ricoh360(path: Path, options: DataOptions) -> Capture:
-    """Read poses and points."""
+    """Read poses and points of a Ricoh360 scene."""
     images = image_folder(path, options.images, ("imgs", "images"))
     files = {str(PurePosixPath(name).with_suffix("")): name for name in image_names(images)}
     files.pop("mask", None)
@@ -59,10 +72,10 @@ def read_ricoh360(path: Path, options: DataOptions) -> Capture:
         try:
             values = torch.tensor([float(field) for field in fields[1:8]], dtype=torch.float64)
         except ValueError as error:
-            raise DataError(f"{where}: the pose is not numbers ({error})") from error
+            raise DataError(f"{where}: the pose is not numeric ({error})") from error
         pose = cam_from_world(rotation_from_quaternion(values[:4], where), values[4:], where)
         frames.append(Frame(name, images / name, pose, mask=mask if mask.is_file() else None))
-    cloud = existing_ply(path, ("openMVG/scene.ply", "scene.ply", "pcd.ply"))
+    cloud = first_ply(path, ("openMVG/scene.ply", "scene.ply", "pcd.ply"))
     points = path / _RICOH360_MODEL / "points3D.txt"
     if cloud is None and points.is_file():
         cloud = _ricoh360_cloud(points)
@@ -86,7 +99,7 @@ _OMNIBLENDER_CLOUDS = ("pcd.ply", "scene.ply", "openMVG/scene.ply", "openMVG/rec
 
 
 def read_omniblender(path: Path, options: DataOptions) -> Capture:
-    """Read `transform.json`."""
+    """Read `transform.json` of an OmniBlender scene."""
     file = file_in(path, "transform.json")
     meta = read_json(file)
     images = image_folder(file.parent, options.images)
@@ -97,13 +110,13 @@ def read_omniblender(path: Path, options: DataOptions) -> Capture:
         matrix = Json(item.value, f"{name} in {file}")["transform_matrix"]
         pose = cam_from_opengl_pose(matrix.numbers(4, 4), matrix.where)
         frames.append(Frame(name, images / name, pose, width, height))
-    return Capture("omniblender", file.parent, images, tuple(frames), existing_ply(file.parent, _OMNIBLENDER_CLOUDS))
+    return Capture("omniblender", file.parent, images, tuple(frames), first_ply(file.parent, _OMNIBLENDER_CLOUDS))
 
 
 def read_released(path: Path, options: DataOptions) -> Capture:
-    """Read the views, the extrinsics and the cloud."""
+    """Read a folder of the released PaD-GS or ODGS code."""
     views = read_views(read_json(path / "data_views.json"))
     poses = read_extrinsics(read_json(path / "data_extrinsics.json"))
     images = image_folder(path, options.images)
     frames = tuple(Frame(view.name, images / view.name, poses[view.key]) for view in views if view.key in poses)
-    return Capture("released", path, images, frames, existing_ply(path, ("pcd.ply", "colorized.ply")))
+    return Capture("released", path, images, frames, first_ply(path, ("pcd.ply", "colorized.ply")))

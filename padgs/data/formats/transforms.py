@@ -1,6 +1,6 @@
 """nerfstudio's `transforms.json` (and the pair transforms_train.json, transforms_test.json) of EQUIRECTANGULAR cameras.
 
-Poses are world from camera, for a camera of OpenGL's axes: x right, y up, z backward.
+Poses are world from camera, with OpenGL axes: x right, y up, z backward.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 from padgs.data.capture import Capture, DataError, DataOptions, Frame
-from padgs.data.cloud import existing_ply, read_ply
+from padgs.data.cloud import first_ply, read_ply
 from padgs.data.formats import detect
 from padgs.data.formats.json_file import Json, file_in, read_json
 from padgs.data.formats.poses import cam_from_opengl_pose
@@ -25,7 +25,7 @@ def read(path: Path, options: DataOptions) -> Capture:
     """Read `transforms.json`, or the pair of files for train and test.
 
     Raises:
-        DataError: another camera model, a pose that is none, a path outside the folder.
+        DataError: another camera model, an invalid pose, or a path outside the folder.
     """
     file = file_in(path, FILE)
     folder = file.parent
@@ -52,7 +52,7 @@ def read(path: Path, options: DataOptions) -> Capture:
         frames = [replace(frame, name=frame.name.removeprefix(f"{prefix}/")) for frame in frames]
         split = {side: tuple(name.removeprefix(f"{prefix}/") for name in names) for side, names in split.items()}
     named = first.get("ply_file_path")
-    cloud = read_ply(folder / named.name()) if named else existing_ply(folder, _PLY)
+    cloud = read_ply(folder / named.name()) if named else first_ply(folder, _PLY)
     return Capture(
         format="transforms",
         folder=folder,
@@ -63,11 +63,11 @@ def read(path: Path, options: DataOptions) -> Capture:
     )
 
 
-def described(path: str | None, format: str) -> Path | None:
-    """The `transforms.json` that a scene with this `data.path` and `data.format` is read from; None for another format.
+def transforms_file(path: str | None, format: str) -> Path | None:
+    """Return the `transforms.json` behind `data.path` and `data.format`; None for other formats.
 
     Raises:
-        DataError: nothing known is there.
+        DataError: no known format.
     """
     if path is None or (detect(Path(path))[0] if format == "auto" else format) not in ("transforms", "nerfstudio"):
         return None
@@ -84,7 +84,7 @@ def _frame(meta: Json, frame: Json, root: Path) -> Frame:
             f"{meta.where}: {name} has camera_model {model!r}; only EQUIRECTANGULAR panoramas can be used "
             "(set camera_model if these are panoramas)"
         )
-    if not PurePosixPath(name).suffix:  # as in Blender's files
+    if not PurePosixPath(name).suffix:  # as in files of Blender
         found = [f"{name}{extension}" for extension in EXTENSIONS if (root / f"{name}{extension}").is_file()]
         name = found[0] if found else f"{name}.png"
     matrix = Json(frame.value, f"{name} in {meta.where}")["transform_matrix"]
@@ -105,6 +105,6 @@ def _name(path: Json) -> str:
 
 
 def _shared_folder(names: list[str]) -> str:
-    """The folder in which all images lie, "" if there is none: "images" for images/a.jpg, images/b.jpg."""
+    """Return the folder that holds all images, "" if there is none: "images" for images/a.jpg, images/b.jpg."""
     folders = {str(PurePosixPath(name).parent) for name in names}
     return folders.pop() if len(folders) == 1 and "." not in folders else ""

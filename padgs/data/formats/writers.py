@@ -1,4 +1,4 @@
-"""How each format is written: the files beside the images. The readers are the modules of the same names."""
+"""Writers of all formats: the files beside the images."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ from padgs.data.splits import LISTS
 
 @dataclass(frozen=True)
 class Content:
-    """What is to be written. Frame sizes are those of the image files; names are those in the image folder."""
+    """Data to be written. Frame sizes are those of the image files; names are relative to the image folder."""
 
     frames: tuple[Frame, ...]
     cloud: Cloud | None
     tracks: Tracks | None
-    split: Mapping[str, tuple[str, ...]]  # "train", "test" -> names; empty where nothing is held out
+    split: Mapping[str, tuple[str, ...]]  # "train", "test" -> names; empty without test views
 
 
 def write_colmap(content: Content, folder: Path) -> None:
-    """sparse/0 in binary, with rigs and frames, and the lists."""
+    """Write a binary model with rigs and frames to sparse/0, and the lists."""
     pycolmap = pycolmap_module()
     if content.cloud is None:
         raise DataError(
             "there is no point cloud, and a COLMAP model needs one; set data.points to a PLY file or random"
         )
-    tracks, model = content.tracks or Tracks.of([]), pycolmap.Reconstruction()
-    elements: dict[int, list[Any]] = {}  # of the points' tracks
+    tracks, model = content.tracks or Tracks.from_observations([]), pycolmap.Reconstruction()
+    elements: dict[int, list[Any]] = {}  # point -> its track
     cameras: dict[tuple[int, int], int] = {}
     for image_id, frame in enumerate(content.frames, 1):
         size = _size(frame)
@@ -59,7 +59,7 @@ def write_colmap(content: Content, folder: Path) -> None:
 
 
 def write_transforms(content: Content, folder: Path) -> None:
-    """`transforms.json` and sparse_pc.ply."""
+    """Write `transforms.json` and sparse_pc.ply."""
     frames = []
     for frame in content.frames:
         width, height = _size(frame)
@@ -77,12 +77,12 @@ def write_transforms(content: Content, folder: Path) -> None:
 
 
 def write_openmvg(content: Content, folder: Path) -> None:
-    """`sfm_data.json`, colorized.ply for the colours, and the lists."""
+    """Write `sfm_data.json`, colorized.ply for the colours, and the lists."""
     views, extrinsics = _mvg_views(content)
     width, height = _size(content.frames[0])
     cereal = {"polymorphic_id": 2147483649, "polymorphic_name": "spherical"}
     intrinsic = {"id": 2147483649, "data": {"value0": {"width": width, "height": height}}}
-    cloud, tracks = content.cloud or Cloud(torch.zeros(0, 3), None), content.tracks or Tracks.of([])
+    cloud, tracks = content.cloud or Cloud(torch.zeros(0, 3), None), content.tracks or Tracks.from_observations([])
     structure = [
         {"key": key, "value": {"X": point, "observations": []}} for key, point in enumerate(cloud.points.tolist())
     ]
@@ -106,7 +106,7 @@ def write_openmvg(content: Content, folder: Path) -> None:
 
 
 def write_opensfm(content: Content, folder: Path) -> None:
-    """`reconstruction.json` with one reconstruction, and the lists."""
+    """Write `reconstruction.json` with one reconstruction, and the lists."""
     cameras, shots = {}, {}
     for frame in content.frames:
         width, height = _size(frame)
@@ -126,9 +126,9 @@ def write_opensfm(content: Content, folder: Path) -> None:
 
 
 def write_roam360(content: Content, folder: Path) -> None:
-    """`pose_c2w.json` and scene.ply. The format has no place for views in neither list."""
+    """Write `pose_c2w.json` and scene.ply. The format cannot hold unused views."""
     if not content.split:
-        raise DataError("360Roam's format states a split, and there is none; set data.split to every or files")
+        raise DataError("360Roam's format needs test views, and there are none; set data.split to every or files")
     frames = {frame.name: frame for frame in content.frames}
     poses = {
         side: [
@@ -142,7 +142,7 @@ def write_roam360(content: Content, folder: Path) -> None:
 
 
 def write_ricoh360(content: Content, folder: Path) -> None:
-    """COLMAP text files in output_dir/colmap, and the lists (without extensions)."""
+    """Write COLMAP text files to output_dir/colmap, and the lists (without extensions)."""
     model = folder / "output_dir" / "colmap"
     model.mkdir(parents=True)
     width, height = _size(content.frames[0])
@@ -164,7 +164,7 @@ def write_ricoh360(content: Content, folder: Path) -> None:
 
 
 def write_omniblender(content: Content, folder: Path) -> None:
-    """`transform.json`, the lists, and pcd.ply, which EgoNeRF's own scenes lack."""
+    """Write `transform.json`, the lists, and pcd.ply, which EgoNeRF's scenes lack."""
     width, height = _size(content.frames[0])
     frames = [{"file_path": frame.name, "transform_matrix": _opengl_pose(frame)} for frame in content.frames]
     meta = {"indoor": False, "width": width, "height": height, "frames": frames}
@@ -174,7 +174,7 @@ def write_omniblender(content: Content, folder: Path) -> None:
 
 
 def write_released(content: Content, folder: Path) -> None:
-    """data_views.json, data_extrinsics.json, pcd.ply and the lists (of stems): what the released programs read."""
+    """Write data_views.json, data_extrinsics.json, pcd.ply and the lists (without extensions)."""
     views, extrinsics = _mvg_views(content)
     _write_json(folder / "data_views.json", {"views": views})
     _write_json(folder / "data_extrinsics.json", {"extrinsics": extrinsics})

@@ -1,1 +1,1 @@
-"""From panoramas without poses, or a video, to a data set: structure from motion."""
+"""Structure from motion: from panoramas without poses, or a 360-degree video, to a data set."""

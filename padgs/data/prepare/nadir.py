@@ -1,4 +1,4 @@
-"""A mask over what stands below the camera, tripod or photographer, for all panoramas of a folder."""
+"""Nadir masks: hide tripod and photographer below the camera in all panoramas of a folder."""
 
 from __future__ import annotations
 
@@ -15,31 +15,33 @@ from padgs.data.images import decode, inspect, save_png
 from padgs.data.masks import PREVIEW, SCENE_MASKS, row_weights
 from padgs.data.prepare.sources import mask_folder, panoramas
 
-WIDTH = 1024  # of the preview at most
-RED = (220, 30, 30)  # half of which covers what is hidden
+MAX_WIDTH = 1024  # of the preview
+RED = (220, 30, 30)  # blended into masked pixels by half
 
 
 class NadirMask(NamedTuple):
-    """What was written."""
+    """Written files."""
 
     mask: Path
-    preview: Path  # the first panorama, with what is hidden in red
-    images: int  # that it is for
+    preview: Path  # the first panorama, masked pixels in red
+    images: int  # number of masked panoramas
 
 
 def write_nadir_mask(path: Path, below: float, *, overwrite: bool = False) -> NadirMask:
-    """Write mask.png, which hides all that is further below the horizon of the camera, and a preview.
+    """Write mask.png, which hides everything more than `below` degrees under the horizon, and a preview.
 
     Args:
-        path: folder of panoramas, or of a data set; the mask goes where reading it looks for one.
+        path: folder of panoramas, or of a data set; readers find the mask there.
         below: degrees.
-        overwrite: replace a mask that is there.
+        overwrite: replace an existing mask.
 
     Raises:
-        DataError: no such angle, no panoramas or of several sizes, or there are masks already.
+        DataError: invalid angle, no panoramas or several sizes, or other masks exist.
     """
     if not 0 < below < 90:
-        raise DataError(f"{below:g} degrees below the horizon hide nothing, or half of all; give more than 0, up to 89")
+        raise DataError(
+            f"{below:g} degrees below the horizon hides nothing, or half of the image; give more than 0, up to 89"
+        )
     if not path.is_dir():
         raise DataError(f"{path} is not a folder; give a folder of panoramas, or of a data set")
     images, place = image_folder(path, None), mask_folder(path)
@@ -47,43 +49,43 @@ def write_nadir_mask(path: Path, below: float, *, overwrite: bool = False) -> Na
     if not names:
         raise DataError(f"{images} holds no images; give a folder of panoramas, or of a data set")
     if not overwrite and (found := next((place / name for name in SCENE_MASKS if (place / name).exists()), None)):
-        raise DataError(f"{found} exists; look at it, and say --overwrite to replace it")
+        raise DataError(f"{found} exists; check it, and use --overwrite to replace it")
     _refuse_other_masks(place)
     files = [inspect(images / name) for name in names]
     sizes = sorted({(file.width, file.height) for file in files})
     if len(sizes) > 1:
         found = listed(f"{width}x{height}" for width, height in sizes)
         raise DataError(
-            f"the panoramas have {len(sizes)} sizes ({found}), and a mask has that of its image: resize them"
+            f"the panoramas have {len(sizes)} sizes ({found}), and a mask must have the size of its image: resize them"
         )
     width, height = sizes[0]
     use = row_weights(90 + below, 180, height)
     hidden = 1 - use.numpy()[..., None]
-    picture = decode(files[0].path) * (1 - hidden / 2) + hidden / 2 * np.array(RED)
-    preview = Image.fromarray(picture.round().astype(np.uint8))
-    preview.thumbnail((WIDTH, WIDTH // 2))
+    image = decode(files[0].path) * (1 - hidden / 2) + hidden / 2 * np.array(RED)
+    preview = Image.fromarray(image.round().astype(np.uint8))
+    preview.thumbnail((MAX_WIDTH, MAX_WIDTH // 2))
     try:
         save_png(255 * use.expand(-1, width), place / SCENE_MASKS[0])
         preview.save(place / PREVIEW)
     except OSError as error:
-        raise DataError(f"cannot write into {place} ({error.strerror or error}); mend its permissions") from error
+        raise DataError(f"cannot write into {place} ({error.strerror or error}); check its permissions") from error
     return NadirMask(place / SCENE_MASKS[0], place / PREVIEW, len(files))
 
 
 def _refuse_other_masks(folder: Path) -> None:
-    """Refuse a folder with masks of single images: they would not be read beside mask.png, or it beside them."""
+    """Refuse a folder with per-image masks, of which only one kind would be read."""
     if (folder / "masks").is_dir():
         raise DataError(
-            f"{folder / 'masks'} holds masks of single images, which mask.png would put out of use; hide what is below "
-            "the camera in those, or give that folder another name"
+            f"{folder / 'masks'} holds masks of single images, which mask.png would replace; mask the nadir in those "
+            "files, or rename that folder"
         )
     try:
         capture = padgs.data.read(folder)
-    except DataError:  # panoramas alone: nothing names their masks
+    except DataError:  # panoramas without a model, which could name masks
         return
     named = next((frame.mask for frame in capture.frames if frame.mask is not None), None)
     if named is not None:
         raise DataError(
-            f"{capture.format} names masks of its own, such as {named}, beside which mask.png would not be read; hide "
-            f"what is below the camera in those, or take them out of {folder} and of what describes it"
+            f"{capture.format} names masks of its own, such as {named}, which take precedence over mask.png; mask the "
+            f"nadir in those files, or remove them from {folder} and from the file that names them"
         )

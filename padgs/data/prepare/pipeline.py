@@ -1,4 +1,8 @@
-"""Pipeline."""
+"""Pipeline of `padgs prepare`: from panoramas without poses, or a 360-degree video, to a data set.
+
+Works in a hidden folder beside the destination, so that an interrupted call can be resumed. The destination appears
+when it is complete.
+"""
 
 from __future__ import annotations
 
@@ -30,8 +34,8 @@ from padgs.data.prepare.work import (
     PrepareOptions,
     WorkFolder,
     digest_of,
+    find_result,
     fingerprint,
-    finished,
     link_or_copy,
     refuse_full,
     threads_for,
@@ -43,7 +47,7 @@ _REMEDIES = (
     "--accurate"
 )
 
-Progress = Callable[[str, int, int], None]  # (one of STEPS, done, in all)
+Progress = Callable[[str, int, int], None]  # (one of STEPS, done, total)
 
 
 def prepare(
@@ -52,56 +56,53 @@ def prepare(
     options: PrepareOptions | None = None,
     progress: Progress = lambda step, done, total: None,
 ) -> Prepared:
-    """Find poses and points for panoramas by structure from motion.
+    """Compute poses and points of panoramas by structure from motion.
 
     Args:
         source: a folder of 2:1 panoramas (subfolders included), or a stitched 360-degree video.
-        destination: a folder that does not exist yet, or is empty, or what the same call has made. It gets images/,
-            sparse/0 (COLMAP, camera EQUIRECTANGULAR), masks if there are any, and prepare.json.
-        options: None: the defaults. The same options, input and machine give the same result.
-        progress: called with (step, done, in all).
+        destination: a folder that does not exist, is empty, or was written by the same call. Gets images/, sparse/0
+            (COLMAP, camera EQUIRECTANGULAR), masks if there are any, and prepare.json.
+        options: defaults if None. Results are reproducible on one machine.
+        progress: called with (step, done, total).
 
     Raises:
-        DataError: input that cannot be used, no two images that can be placed, or a full disk. What was found so far
-            stays in the hidden folder beside the destination; nothing is at the destination.
+        DataError: unusable input, no two images with a relative pose, or a full disk. Intermediate results stay in the
+            hidden folder; nothing is written to the destination.
     """
     options = options or PrepareOptions()
     if destination.exists() and (not destination.is_dir() or any(destination.iterdir())):
-        if already := finished(source, destination, options):
-            return already
+        if result := find_result(source, destination, options):
+            return result
         raise DataError(
-            f"{destination} exists, and is not what these options make of {source}; nothing is overwritten: remove it "
-            "or choose another place"
+            f"{destination} exists, and was not made of {source} with these options; nothing is overwritten: remove it "
+            "or choose another path"
         )
     if destination.name in (*IMAGE_FOLDERS, "masks") and destination.resolve().parent == source.resolve():
-        raise DataError(
-            f"{destination} would be taken for the images or masks of {source}; choose another name or another place"
-        )
+        raise DataError(f"{destination} would be read as the images or masks of {source}; choose another path")
     work = destination.absolute().with_name(f".{destination.name}.prepare")
     try:
         return _Job(source, destination.absolute(), work, options, progress).run()
     except OSError as error:
         raise DataError(
-            f"cannot prepare {destination} ({error.strerror or error}); the same command goes on where this stopped"
+            f"cannot prepare {destination} ({error.strerror or error}); the same command resumes"
         ) from error
     except MemoryError as error:
         raise DataError(
-            f"cannot prepare {destination} (out of memory); the same command with --threads 1 takes less, and goes on "
-            "where this stopped"
+            f"cannot prepare {destination} (out of memory); the same command with --threads 1 uses less, and resumes"
         ) from error
-    except RuntimeError as error:  # pycolmap's: all that its database has to say, too
-        said = _said(error, work / "log.txt")
+    except RuntimeError as error:  # of pycolmap, its database included
+        message = _pycolmap_message(error, work / "log.txt")
         raise DataError(
-            f"cannot prepare {destination} ({said}); if its disk is full, make room and give the same command, "
-            f"which goes on where this stopped; else remove {work} to start over"
+            f"cannot prepare {destination} ({message}); if its disk is full, free some space and repeat the command, "
+            f"which resumes; else remove {work} to start over"
         ) from error
     finally:
         if work.is_dir() and not any(work.glob("*.done")) and not (work / "database.db").exists():
-            shutil.rmtree(work, ignore_errors=True)  # nothing in it that would be worth going on from
+            shutil.rmtree(work, ignore_errors=True)  # nothing to resume
 
 
 class _Job:
-    """One preparation in its working folder."""
+    """A preparation in its working folder."""
 
     def __init__(
         self, source: Path, destination: Path, work: Path, options: PrepareOptions, progress: Progress
@@ -112,7 +113,7 @@ class _Job:
         if is_video(source):
             given = digest_of(fingerprint(source, options), options)
             self.folder.open("video", given)
-            self.folder.once("frames", partial(self._extract_frames, source))
+            self.folder.run_once("frames", partial(self._extract_frames, source))
             source = self.work / "frames"
         with self.folder.step("images"):
             self.source: Source = find_source(source, options.mask)
@@ -121,31 +122,29 @@ class _Job:
         of_video = ("video.sha256", "frames", "frames.done") if source.parent == self.work else ()
         of_images = digest_of(self.source.fingerprint, options)
         self.folder.open("images", of_images, keep=of_video)
-        self.input = given or of_images  # of a video or images
-        # pycolmap's list of pairs knows no spaces, so it gets names of ours.
-        self.files = {f"{index:06d}{_ending(name)}": name for index, name in enumerate(self.source.images)}
+        self.input = given or of_images
+        # Short names, because pycolmap's list of pairs does not support spaces.
+        self.files = {f"{index:06d}{_suffix(name)}": name for index, name in enumerate(self.source.images)}
         self.paths = {short: self.source.images[name].path for short, name in self.files.items()}
         self.views = rig.VIEWS_PER_ROW * len(rig.LATITUDES) if options.accurate else 1
         self.database = self.work / "database.db"
-        self.pictures = self.work / ("views" if options.accurate else "images")  # in which features are found
+        self.feature_images = self.work / ("views" if options.accurate else "images")
 
     def run(self) -> Prepared:
-        """All steps; those that are done already are skipped."""
+        """Run all steps that are not done."""
         with sfm.log_to(self.work / "log.txt"):
-            self.folder.once("views", self._lay_out)
-            self.folder.once("features", self._find_features)
-            self.folder.once("matches", self._match)
-            self.folder.once("poses", self._place)
+            self.folder.run_once("views", self._link_images)
+            self.folder.run_once("features", self._extract_features)
+            self.folder.run_once("matches", self._match)
+            self.folder.run_once("poses", self._reconstruct)
             with self.folder.step("result"):
                 return self._write()
-
-    # Steps, in order.
 
     def _extract_frames(self, video: Path) -> None:
         (self.work / "frames").mkdir(exist_ok=True)
         extract_frames(video, self.work / "frames", self.options.per_second, partial(self.progress, "frames"))
 
-    def _lay_out(self) -> None:
+    def _link_images(self) -> None:
         images, masks = self.folder.empty("images"), self.folder.empty("masks")
         for short, name in self.files.items():
             image, mask = self.source.images[name], self.source.masks.get(name)
@@ -164,7 +163,7 @@ class _Job:
         if len(sizes) > 1:
             raise DataError(
                 f"the panoramas have {len(sizes)} sizes ({listed(f'{w}x{h}' for w, h in sorted(sizes))}); --accurate "
-                "needs one: resize them, or do without it"
+                "needs one: resize them, or omit it"
             )
         rig.render_views(
             self.paths,
@@ -174,16 +173,16 @@ class _Job:
             partial(self.progress, "views"),
         )
 
-    def _find_features(self) -> None:
+    def _extract_features(self) -> None:
         masks = self.work / ("view_masks" if self.options.accurate else "masks")
         given = masks if self.options.accurate or self.source.masks else None
-        tell = partial(self._tell, "features")
-        sfm.extract_features(self.database, self.pictures, self._groups(), given, self.threads, tell)
+        progress = partial(self._progress, "features")
+        sfm.extract_features(self.database, self.feature_images, self._groups(), given, self.threads, progress)
         if self.options.accurate:
             sfm.make_rig(self.database, rig.rig_config())
 
     def _groups(self) -> list[sfm.Group]:
-        """Images that share a camera: panoramas of one size, or one view of all panoramas."""
+        """Group images that share a camera: panoramas of one size, or one view of all panoramas."""
         if self.options.accurate:
             lens = rig.view_lens(next(iter(self.source.images.values())).width)
             return [
@@ -198,19 +197,19 @@ class _Job:
 
     def _match(self) -> None:
         short = {name: short for short, name in self.files.items()}
-        # Of the names as they were given: ours are in the order of their letters, where 10 comes before 2.
+        # Sorted by the original names, in natural order.
         pairs = [[(short[a], short[b])] for a, b in image_pairs(list(short), self.options.pairs)]
         if self.options.accurate:
             both = list(product(range(self.views), repeat=2))
             pairs = [[(rig.view_name(i, a), rig.view_name(j, b)) for i, j in both] for [(a, b)] in pairs]
-        tell = partial(self._tell, "matches")
-        sfm.match(self.database, pairs, self.options.accurate, self.threads, self.options.seed, tell)
+        progress = partial(self._progress, "matches")
+        sfm.match(self.database, pairs, self.options.accurate, self.threads, self.options.seed, progress)
 
-    def _place(self) -> None:
+    def _reconstruct(self) -> None:
         parts = self.folder.empty("parts")
-        tell = partial(self.progress, "poses")
-        if not sfm.reconstruct(self.database, self.pictures, parts, self.threads, self.options.seed, self.views, tell):
-            raise DataError(f"no two of the {len(self.files)} panoramas could be placed together; {_REMEDIES}")
+        progress, seed = partial(self.progress, "poses"), self.options.seed
+        if not sfm.reconstruct(self.database, self.feature_images, parts, self.threads, seed, self.views, progress):
+            raise DataError(f"no relative pose was found for any two of the {len(self.files)} panoramas; {_REMEDIES}")
 
     def _write(self) -> Prepared:
         self.progress("result", 0, 1)
@@ -219,17 +218,18 @@ class _Job:
         frames, cloud, tracks = self._panoramas(model)
         notes = list(self.source.notes)
         if self.options.level:
-            frames, cloud, note = levelled(frames, cloud)
+            frames, cloud, note = level_world(frames, cloud)
             notes.append(note)
         registered = tuple(frame.name for frame in frames)
         unregistered = tuple(name for name in self.files.values() if name not in set(registered))
         if unregistered:
             notes.append(
-                f"{len(unregistered)} of {len(self.files)} panoramas could not be placed: {listed(unregistered)}; "
-                f"{_REMEDIES}"
+                f"{len(unregistered)} of {len(self.files)} panoramas have no pose: {listed(unregistered)}; {_REMEDIES}"
             )
         if others:
-            notes.append(f"{len(others)} smaller part(s) of {listed(others)} panoramas have no connection to the rest")
+            notes.append(
+                f"{len(others)} smaller part(s) of {listed(others)} panoramas are not connected to the largest"
+            )
         seconds = self.folder.seconds
         result = Prepared(
             self.destination, registered, unregistered, len(cloud.points), len(tracks.frame), seconds, tuple(notes)
@@ -246,14 +246,14 @@ class _Job:
         return result
 
     def _largest_part(self) -> tuple[Any, list[int]]:
-        """The part with most panoramas, and the sizes of the others."""
+        """Return the part with most panoramas, and the sizes of the others."""
         pycolmap = colmap.pycolmap_module()
         parts = [pycolmap.Reconstruction(str(path)) for path in sorted((self.work / "parts").iterdir())]
         parts.sort(key=lambda part: -part.num_reg_frames())
         return parts[0], [part.num_reg_frames() for part in parts[1:]]
 
     def _panoramas(self, model: Any) -> tuple[tuple[Frame, ...], Cloud, Tracks]:
-        """Frames under their own names, points and observations."""
+        """Return frames with their original names, points and observations."""
         if self.options.accurate:
             frames, cloud, tracks = rig.panoramas(model, self.paths, next(iter(self.source.images.values())).width)
         else:
@@ -272,43 +272,43 @@ class _Job:
             shutil.copyfile(frame.image, target)
         write_masks({view_name(frame.name): self.source.masks.get(frame.name) for frame in frames}, folder)
 
-    def _tell(self, step: str, done: int, total: int) -> None:
-        """Tell of a batch, and do not begin another on a full disk."""
+    def _progress(self, step: str, done: int, total: int) -> None:
+        """Report a batch, and stop before the next one if the disk is full."""
         self.progress(step, done, total)
         refuse_full(self.work)
 
 
-def _ending(name: str) -> str:
-    """Of a picture as pycolmap gets it."""
-    ending = Path(name).suffix
-    return ending if ending.lower() in sfm.ENDINGS else ".png"
+def _suffix(name: str) -> str:
+    """Return the suffix of an image for pycolmap."""
+    suffix = Path(name).suffix
+    return suffix if suffix.lower() in sfm.IMAGE_SUFFIXES else ".png"
 
 
-def _said(error: Exception, log: Path) -> str:
-    """What pycolmap says, and has logged at last if that is a complaint, without the places in its source."""
+def _pycolmap_message(error: Exception, log: Path) -> str:
+    """Return pycolmap's error and last logged warning, without positions in its source."""
     logged = log.read_text(encoding="utf-8", errors="replace").splitlines()[-1:] if log.is_file() else []
-    said = [str(error).strip(), *(line for line in logged if line[:1] in ("W", "E", "F"))]
-    return "; ".join(dict.fromkeys(line.rpartition("] ")[2] for line in said))
+    messages = [str(error).strip(), *(line for line in logged if line[:1] in ("W", "E", "F"))]
+    return "; ".join(dict.fromkeys(line.rpartition("] ")[2] for line in messages))
 
 
-LEVEL_AGREEMENT = 0.9  # length of the mean of the cameras' up directions from which they have a common one
+LEVEL_AGREEMENT = 0.9  # minimal length of the mean of the cameras' up directions
 
 
-def levelled(frames: tuple[Frame, ...], cloud: Cloud) -> tuple[tuple[Frame, ...], Cloud, str]:
-    """The same in a world whose +z is the cameras' common up, if they have one, and a note."""
-    found = gravity(torch.stack([frame.cam_from_world for frame in frames]))
-    if found.agreement < LEVEL_AGREEMENT:
-        return frames, cloud, "the cameras have no common up; the world stays as structure from motion left it"
-    new_from_old = rotation_between(torch.tensor(found.up, dtype=torch.float64))
-    turn = torch.eye(4, dtype=torch.float64)
-    turn[:3, :3] = new_from_old.mT
-    frames = tuple(replace(frame, cam_from_world=frame.cam_from_world @ turn) for frame in frames)
+def level_world(frames: tuple[Frame, ...], cloud: Cloud) -> tuple[tuple[Frame, ...], Cloud, str]:
+    """Rotate the world so that +z is the cameras' common up, if they have one; also returns a note."""
+    estimate = gravity(torch.stack([frame.cam_from_world for frame in frames]))
+    if estimate.agreement < LEVEL_AGREEMENT:
+        return frames, cloud, "the cameras have no common up direction; the world is not rotated"
+    new_from_old = rotation_between(torch.tensor(estimate.up, dtype=torch.float64))
+    old_from_new = torch.eye(4, dtype=torch.float64)
+    old_from_new[:3, :3] = new_from_old.mT
+    frames = tuple(replace(frame, cam_from_world=frame.cam_from_world @ old_from_new) for frame in frames)
     cloud = Cloud(cloud.points @ new_from_old.mT, cloud.colors)
-    return frames, cloud, "the world's +z is the common up of the cameras; its scale is arbitrary"
+    return frames, cloud, "the world's +z is the cameras' common up direction; its scale is arbitrary"
 
 
 def rotation_between(up: Tensor) -> Tensor:
-    """The smallest rotation [3, 3] that takes a unit vector [3] to +z.
+    """Return the smallest rotation [3, 3] that maps a unit vector [3] to +z.
 
     >>> rotation_between(torch.tensor([0.0, -1.0, 0.0]))
     tensor([[ 1.,  0.,  0.],

@@ -1,7 +1,7 @@
-"""A panorama as a rig of twelve perspective views: structure from motion with features where they are undistorted.
+"""Panoramas as rigs of twelve perspective views, for structure from motion with undistorted features.
 
-Three rows of four 90-degree views at latitudes -35, 0 and 35 degrees; every direction belongs to the view whose centre
-is nearest, so that no feature is found twice. The views' focal length has the panorama's resolution at its horizon.
+Three rows of four 90-degree views at latitudes -35, 0 and 35 degrees. Every direction belongs to the view with the
+nearest centre, so that no feature is found twice. The views have the panorama's resolution at its horizon.
 """
 
 from __future__ import annotations
@@ -29,26 +29,26 @@ VIEWS_PER_ROW = 4
 
 
 def cam_from_pano() -> Tensor:
-    """Rotations [12, 3, 3] from the panorama's frame to those of its views; rows are right, down, forward."""
-    # Every other row is turned by half a view, which evens out the overlap.
+    """Return rotations [12, 3, 3] from the panorama's frame to its views'; rows are right, down, forward."""
+    # The middle row is rotated by half a view, which evens out the overlap.
     longitude = 90.0 * torch.arange(VIEWS_PER_ROW) + 45.0 * (torch.arange(len(LATITUDES)) % 2)[:, None]  # degrees
     latitude = torch.tensor(LATITUDES)[:, None].expand_as(longitude)
     return looking_at(direction(longitude.double().deg2rad(), latitude.double().deg2rad()).flatten(0, 1))
 
 
 def view_lens(pano_width: int) -> Pinhole:
-    """The lens of all views: 90 degrees at the resolution of a panorama at its horizon, W / pi pixels; even sides."""
+    """Return the pinhole camera of all views: 90 degrees, about W / pi pixels, even sides."""
     size = 2 * round(pano_width / math.pi / 2)
     return Pinhole(size, size, size / 2, size / 2, size / 2, size / 2)
 
 
 def owned(index: int, rays: Tensor) -> Tensor:
-    """Whether directions [..., 3] in the panorama's frame belong to view `index`: bool [...]."""
+    """Return whether directions [..., 3] in the panorama's frame belong to view `index`: bool [...]."""
     return (rays @ cam_from_pano()[:, 2].mT).argmax(-1) == index
 
 
 def resample(image: Tensor, rays: Tensor) -> Tensor:
-    """Bilinear samples [..., C] of a panorama [H, W, C] uint8 in the given directions [..., 3]; rounded to uint8."""
+    """Sample a panorama [H, W, C] uint8 bilinearly in directions [..., 3]; returns [..., C] uint8."""
     return sample(image, rays).round().to(torch.uint8)
 
 
@@ -63,10 +63,10 @@ def render_views(
 
     Args:
         images: name -> panorama; all of one size.
-        masks: name -> mask [H, W], 255 = use; names without one are used wholly.
-        folder: where the views go.
-        mask_folder: where their masks go, named as COLMAP wants them: <view>/<name>.png.png.
-        progress: called with (panoramas done, in all).
+        masks: name -> mask [H, W], 255 = use; panoramas without one are used entirely.
+        folder: of the written views.
+        mask_folder: of their masks, named as COLMAP requires: <view>/<name>.png.png.
+        progress: called with (panoramas done, total).
     """
     rotations = cam_from_pano()
     for done, (name, path) in enumerate(sorted(images.items())):
@@ -74,7 +74,7 @@ def render_views(
         mask = torch.from_numpy(decode(masks[name], "L")) if name in masks else None
         rays = view_lens(image.shape[1]).rays(dtype=torch.float64)
         for index, rotation in enumerate(rotations):
-            pano_rays = rays @ rotation  # transposed: from the view's frame to the panorama's
+            pano_rays = rays @ rotation  # R^T d: from the view's frame to the panorama's
             use = owned(index, pano_rays)
             if mask is not None:
                 use &= resample(mask, pano_rays)[..., 0] >= 128
@@ -84,12 +84,12 @@ def render_views(
 
 
 def view_name(index: int, name: str) -> str:
-    """File of a view of the panorama `name`, relative to the folder of views."""
+    """Return the file of a view of the panorama `name`, relative to the folder of views."""
     return f"{index:02d}/{name}.png"
 
 
 def split_name(view: str) -> tuple[int, str]:
-    """The inverse of `view_name`.
+    """Invert `view_name`.
 
     >>> split_name("03/kitchen.jpg.png")
     (3, 'kitchen.jpg')
@@ -98,7 +98,7 @@ def split_name(view: str) -> tuple[int, str]:
 
 
 def rig_config() -> Any:
-    """The rig for pycolmap: the first view is its reference, all share one centre."""
+    """Return the rig for pycolmap: the first view is its reference, all share one centre."""
     pycolmap = pycolmap_module()
     rotations = cam_from_pano()
     cameras = []
@@ -116,7 +116,7 @@ def rig_config() -> Any:
 
 
 def panoramas(model: Any, images: dict[str, Path], width: int) -> tuple[tuple[Frame, ...], Cloud, Tracks]:
-    """Frames, points and observations of the panoramas behind a reconstruction of their views.
+    """Convert a reconstruction of rig views to frames, points and observations of their panoramas.
 
     Args:
         model: pycolmap.Reconstruction of the rig.
@@ -126,7 +126,7 @@ def panoramas(model: Any, images: dict[str, Path], width: int) -> tuple[tuple[Fr
     rotations = cam_from_pano()
     cloud, row_of = cloud_of(model)
     poses: dict[str, Tensor] = {}
-    seen: list[tuple[str, Tensor, Tensor]] = []  # name, rows of the points and pixels, of every view
+    seen: list[tuple[str, Tensor, Tensor]] = []  # name, rows of points, pixels; per view
     for image in model.images.values():
         if not image.has_pose:
             continue

@@ -1,4 +1,8 @@
-"""SfM."""
+"""Structure from motion with pycolmap, step by step: pairs, features, matches, poses, and a final robust refinement.
+
+Features and matches are computed in batches, which gives progress and resumes from the database. pycolmap logs to the
+process's standard error and ignores its own switches; `log_to` redirects that.
+"""
 
 from __future__ import annotations
 
@@ -11,47 +15,46 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-from padgs.data.capture import DataError, natural
+from padgs.data.capture import DataError, natural_key
 from padgs.data.formats.colmap import pycolmap_module
 
 PAIRS = ("auto", "exhaustive", "sequential")
 EXHAUSTIVE_UP_TO = 80  # images: 3160 pairs
-_NEIGHBOURS = 10  # images before and after in the order of their names, each
-_ANCHORS = 30  # images spread over the sequence, all matched with each other
+_NEIGHBOURS = 10  # following images in natural order
+_LOOP_IMAGES = 30  # spread over the sequence and all matched with each other, for loop closure
 
 
 def image_pairs(names: Sequence[str], kind: str = "auto") -> list[tuple[str, str]]:
-    """Pairs of names to match, each once.
+    """Return pairs of names to match, each once.
 
-    `sequential` takes the names in order, numbers in them by their value: every image with the next ten and with those
-    16, 32, 64, ... further on; to notice that a path returns, 30 images spread over the sequence are also matched with
-    each other.
+    `sequential` sorts the names naturally and pairs every image with the next ten and with those 16, 32, 64, ...
+    further on. For loop closure, 30 images spread over the sequence are also matched with each other.
 
     >>> image_pairs(["a", "b", "c"])
     [('a', 'b'), ('a', 'c'), ('b', 'c')]
     """
     if kind not in PAIRS:
         raise DataError(f"unknown kind of pairs {kind!r}; known: {', '.join(PAIRS)}")
-    names = sorted(names, key=natural)
+    names = sorted(names, key=natural_key)
     if kind == "exhaustive" or (kind == "auto" and len(names) <= EXHAUSTIVE_UP_TO):
         return list(combinations(names, 2))
     steps = [*range(1, _NEIGHBOURS + 1), *(2**k for k in range(4, 32) if 2**k < len(names))]
     near = {(i, i + step) for i in range(len(names)) for step in steps if i + step < len(names)}
-    anchors = sorted({round(k * (len(names) - 1) / (_ANCHORS - 1)) for k in range(_ANCHORS)})
-    return [(names[i], names[j]) for i, j in sorted(near | set(combinations(anchors, 2)))]
+    loop = sorted({round(k * (len(names) - 1) / (_LOOP_IMAGES - 1)) for k in range(_LOOP_IMAGES)})
+    return [(names[i], names[j]) for i, j in sorted(near | set(combinations(loop, 2)))]
 
 
-Progress = Callable[[int, int], None]  # (done, in all)
+Progress = Callable[[int, int], None]  # (done, total)
 
-# Tuned on real indoor and garden panoramas: more features than COLMAP's defaults, because at 2048 x 1024 those leave
-# textureless rooms with a thousand.
+# Tuned on real indoor and garden panoramas. COLMAP's defaults find only a thousand features in textureless rooms at
+# 2048 x 1024.
 PEAK_THRESHOLD = 0.004
 MAX_FEATURES = 12_000
-LOSS_SCALE = 1.0  # pixels, of the Cauchy loss in the last refinement
-MAX_ERROR = 4.0  # pixels: points with larger reprojection errors are dropped, as the mapper does
+LOSS_SCALE = 1.0  # pixels, of the Cauchy loss in the final refinement
+MAX_ERROR = 4.0  # pixels; points with larger reprojection errors are dropped, as in the mapper
 MIN_ANGLE = 1.5  # degrees between the rays to a point
-_PAIRS_PER_BATCH = 64  # of images, however many panoramas that is
-ENDINGS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")  # of pictures that pycolmap reads
+_PAIRS_PER_BATCH = 64  # of images
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")  # that pycolmap reads
 
 
 @dataclass(frozen=True)
@@ -61,21 +64,21 @@ class Group:
     names: tuple[str, ...]  # relative to the image folder
     width: int
     height: int
-    focal: float | None = None  # pixels, of a pinhole camera that looks through its middle; None = equirectangular
+    focal: float | None = None  # pixels, of a pinhole camera with a central principal point; None = equirectangular
 
 
 def extract_features(
     database: Path, folder: Path, groups: Sequence[Group], masks: Path | None, threads: int, progress: Progress
 ) -> None:
-    """Find features in all images; those that are in the database already are left alone.
+    """Extract features of all images that are not in the database.
 
     Args:
-        database: created if absent.
+        database: created if missing.
         folder: of the images.
         groups: the images.
         masks: a folder with <image name>.png for every image, 0 = ignore; or None.
         threads: processor threads.
-        progress: called with (images done, in all).
+        progress: called with (images done, total).
     """
     pycolmap = pycolmap_module()
     cameras = _register(database, groups)
@@ -100,9 +103,9 @@ def extract_features(
 
 
 def _register(database: Path, groups: Sequence[Group]) -> list[int]:
-    """Enter cameras and images that are not there yet; returns the camera of each group.
+    """Add missing cameras and images to the database; returns the camera of each group.
 
-    pycolmap would enter images itself, but in the order in which its threads finish; results would depend on that.
+    pycolmap would add images in the order in which its threads finish, on which results depend.
     """
     pycolmap = pycolmap_module()
     cameras = []
@@ -135,24 +138,24 @@ def _register(database: Path, groups: Sequence[Group]) -> list[int]:
 
 
 def make_rig(database: Path, config: Any) -> None:
-    """Tell the database which images were taken at once, from one place."""
+    """Group the images of the database into rigs."""
     pycolmap = pycolmap_module()
-    with pycolmap.Database.open(database) as found:
-        pycolmap.apply_rig_config([config], found)
+    with pycolmap.Database.open(database) as entries:
+        pycolmap.apply_rig_config([config], entries)
 
 
 def match(
     database: Path, pairs: Sequence[Sequence[tuple[str, str]]], rig: bool, threads: int, seed: int, progress: Progress
 ) -> None:
-    """Match and verify pairs of images; those that have been matched before are left alone.
+    """Match and verify pairs of images that have no matches in the database.
 
     Args:
         database: with features.
-        pairs: groups of pairs that belong together; for a rig, all pairs of views of two panoramas.
-        rig: verify the views of two panoramas together.
+        pairs: groups of pairs; for a rig, all pairs of views of two panoramas.
+        rig: verify the views of two panoramas jointly.
         threads: processor threads.
-        seed: of the random samples in the verification.
-        progress: called with (groups done, in all).
+        seed: of the verification's random samples.
+        progress: called with (groups done, total).
     """
     pycolmap = pycolmap_module()
     matching = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=threads)
@@ -177,16 +180,16 @@ def match(
 def reconstruct(
     database: Path, folder: Path, parts: Path, threads: int, seed: int, images_per_pose: int, progress: Progress
 ) -> int:
-    """Poses and points, in parts that could not be connected.
+    """Compute poses and points, in parts that cannot be connected.
 
     Args:
         database: with matches.
         folder: of the images, for the colours of the points.
-        parts: folder that pycolmap writes a model of each part to.
+        parts: folder for the model of each part.
         threads: processor threads.
         seed: of all random choices.
         images_per_pose: views in a rig, else 1.
-        progress: called with (panoramas placed, in all).
+        progress: called with (panoramas placed, total).
 
     Returns:
         Number of parts; 0 if no two images could be placed.
@@ -196,7 +199,7 @@ def reconstruct(
     with pycolmap.Database.open(database) as found:
         total = found.num_images() // images_per_pose
     options = pycolmap.IncrementalPipelineOptions(num_threads=threads, random_seed=seed, min_model_size=2)
-    # What a camera that looks all around moves towards is not special: moving forward is as good as any way.
+    # For a panoramic camera, forward motion is as good as any other direction.
     options.mapper.init_max_forward_motion = 1.0
     options.ba_refine_focal_length = options.ba_refine_principal_point = options.ba_refine_extra_params = False
     options.ba_refine_sensor_from_rig = False
@@ -219,10 +222,10 @@ def reconstruct(
 
 
 def refine(model: Any, threads: int) -> None:
-    """Adjust all poses and points together once more, robustly, and drop points that still do not fit.
+    """Run a robust bundle adjustment, and drop points with large errors.
 
-    The mapper adjusts with squared errors; a Cauchy loss takes the weight from the wrong matches among them, which
-    halves the largest errors of rotation on real panoramas.
+    The mapper minimises squared errors; a Cauchy loss reduces the weight of wrong matches, which halves the largest
+    rotation errors on real panoramas.
     """
     pycolmap = pycolmap_module()
     options = pycolmap.BundleAdjustmentOptions(print_summary=False)
@@ -239,7 +242,7 @@ def refine(model: Any, threads: int) -> None:
 
 @contextmanager
 def log_to(path: Path) -> Iterator[None]:
-    """While this lasts, standard error of the whole process (Python's and pycolmap's) is appended to a file."""
+    """Append standard error of the whole process (Python's and pycolmap's) to a file while the context lasts."""
     sys.stderr.flush()
     kept = os.dup(2)
     try:

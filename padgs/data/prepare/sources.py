@@ -1,4 +1,4 @@
-"""Sources."""
+"""Input of `prepare`: a folder of panoramas with masks, or a 360-degree video, checked before any work is done."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ VIDEO_EXTENSIONS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
 
 
 def is_video(path: Path) -> bool:
-    """Whether a path is taken for a video, by its name."""
+    """Return whether a path has the suffix of a video."""
     return path.suffix.lower() in VIDEO_EXTENSIONS
 
 
@@ -36,15 +36,15 @@ def extract_frames(
 
     Args:
         video: a stitched (equirectangular) video.
-        folder: exists; files there are overwritten.
+        folder: exists; files in it are overwritten.
         per_second: frames kept per second of video.
-        progress: called with (frames decoded, frames in all as far as is known).
+        progress: called with (frames decoded, estimated total).
 
     Returns:
         Number of frames written.
 
     Raises:
-        DataError: the extra `video` is not installed, the file cannot be decoded, or its frames are no panoramas.
+        DataError: the extra `video` is not installed, the file cannot be decoded, or its frames are not panoramas.
         OSError: a frame cannot be written.
     """
     written = 0
@@ -57,7 +57,7 @@ def extract_frames(
 
 
 def _sharpest(video: Path, per_second: float, progress: Callable[[int, int], None]) -> Iterator[NDArray[np.uint8]]:
-    """The sharpest frame [H, W, 3] of every interval. What their user raises is not taken for an error of decoding."""
+    """Yield the sharpest frame [H, W, 3] of every interval."""
     try:
         import imageio.v3 as imageio
 
@@ -68,7 +68,7 @@ def _sharpest(video: Path, per_second: float, progress: Callable[[int, int], Non
 
         def frames() -> Iterator[NDArray[np.uint8]]:
             for index, frame in enumerate(imageio.imiter(video, plugin="pyav")):
-                if index == 0:  # an hour of decoding would tell no more
+                if index == 0:  # before an hour of decoding
                     refuse_other_shapes(frame.shape[1], frame.shape[0], video)
                     refuse_dual_fisheye(frame, video)
                 progress(index + 1, max(total, index + 1))
@@ -79,14 +79,14 @@ def _sharpest(video: Path, per_second: float, progress: Callable[[int, int], Non
             yield best
     except ImportError as error:
         raise DataError(f"reading {video} needs imageio and PyAV: pip install 'padgs[video]'") from error
-    except DataError:  # no panoramas
+    except DataError:  # not panoramas
         raise
     except (OSError, ValueError, RuntimeError, StopIteration) as error:
         raise DataError(f"{video} cannot be decoded ({error}); convert it to H.264 in an .mp4 file") from error
 
 
 def sharpness(frame: NDArray[np.uint8]) -> float:
-    """Mean strength of the Laplacian of a frame [H, W, 3]; higher is sharper. Comparable within one video only.
+    """Return the mean absolute Laplacian of a frame [H, W, 3]; higher is sharper. Comparable within one video only.
 
     >>> sharpness(np.full((8, 16, 3), 7, np.uint8))
     0.0
@@ -97,15 +97,15 @@ def sharpness(frame: NDArray[np.uint8]) -> float:
     )
 
 
-UNSTITCHED = (".insp", ".insv", ".360", ".dng")  # what cameras store before their own program has stitched it
-UNREAD = (".heic", ".heif", ".avif", ".jxl", ".jp2", ".hdr", ".exr")
-_NOT_YET = "is not stitched yet: export panoramas, or a 2:1 video, with the camera's own program"
-_WAYS_OUT = (  # endings of files that are no images here, and what to do with them
-    (UNSTITCHED, _NOT_YET),
-    (UNREAD, "is a picture of a kind that is not read here: convert all such pictures to JPEG"),
+UNSTITCHED = (".insp", ".insv", ".360", ".dng")  # raw files of 360-degree cameras
+UNSUPPORTED = (".heic", ".heif", ".avif", ".jxl", ".jp2", ".hdr", ".exr")
+_NOT_STITCHED = "is not stitched: export panoramas, or a 2:1 video, with the camera's own program"
+_WAYS_OUT = (  # suffixes of unsupported files, and what to do with them
+    (UNSTITCHED, _NOT_STITCHED),
+    (UNSUPPORTED, "is an image in an unsupported format: convert all such images to JPEG"),
     (VIDEO_EXTENSIONS, "is a video: give its own path, not that of its folder"),
 )
-LOOKED_AT = 3  # images that are decoded before any work is done; those of one camera are alike
+DECODED = 3  # images checked for dual fisheye; images of one camera are alike
 
 
 @dataclass(frozen=True)
@@ -113,25 +113,25 @@ class Source:
     """Panoramas without poses."""
 
     images: dict[str, ImageFile]  # name (path relative to the folder) -> file, sorted by name
-    masks: dict[str, Mask]  # name -> weights; names without one are used wholly
+    masks: dict[str, Mask]  # name -> weights; images without one are used entirely
     fingerprint: str  # of names, image bytes and masks
-    notes: tuple[str, ...]  # of masks, and of files that are left out
+    notes: tuple[str, ...]  # about masks and ignored files
 
 
 def find_source(path: Path, mask: str) -> Source:
-    """Look through a folder of panoramas.
+    """Read and check a folder of panoramas.
 
     Args:
         path: the folder, or one that holds them in images/.
-        mask: as `data.mask`: auto | none | rows:959/1024 | a file, or a folder of files. auto looks for mask.png and
+        mask: as `data.mask`: auto | none | rows:959/1024 | a file, or a folder of files. auto searches for mask.png and
             masks/ beside the images and beside an images/ folder.
 
     Raises:
-        DataError: no folder, a file that is not stitched yet, fewer than two panoramas, an image that cannot be used,
-            names that differ only in case or extension, a mask that does not fit.
+        DataError: no folder, an unstitched file, fewer than two panoramas, an unusable image, names that differ only in
+            case or extension, or an unusable mask.
     """
     if path.is_file() and path.suffix.lower() in UNSTITCHED:
-        raise DataError(f"{path} {_NOT_YET}")
+        raise DataError(f"{path} {_NOT_STITCHED}")
     if not path.is_dir():
         raise DataError(f"{path} is not a folder; give a folder of panoramas, or a video file")
     folder = image_folder(path, None)
@@ -144,10 +144,10 @@ def find_source(path: Path, mask: str) -> Source:
         )
     refuse_clashes(names)
     images = {name: inspect(folder / name) for name in names}
-    for name in names[:: -(-len(names) // LOOKED_AT)]:
+    for name in names[:: -(-len(names) // DECODED)]:
         refuse_dual_fisheye(decode(folder / name), folder / name)
-    nowhere = torch.eye(4, dtype=torch.float64)
-    frames = tuple(Frame(name, image.path, nowhere, image.width, image.height) for name, image in images.items())
+    no_pose = torch.eye(4, dtype=torch.float64)
+    frames = tuple(Frame(name, image.path, no_pose, image.width, image.height) for name, image in images.items())
     capture = Capture(format="images", folder=mask_folder(path), image_folder=folder, frames=frames, cloud=None)
     sizes = [(image.width, image.height) for image in images.values()]
     masks, digests, notes = find_masks(capture, mask, list(images.values()), sizes, ImageStore())
@@ -155,7 +155,7 @@ def find_source(path: Path, mask: str) -> Source:
         notes.append(f"left out: {others}{ways_out}")
     place = mask_folder(path)
     if unused := [name for name in _scene_masks(folder) if mask == "auto" and (folder / name).parent != place]:
-        notes.append(f"not used: {listed(unused)}; the mask of all panoramas is looked for in {place} alone")
+        notes.append(f"not used: {listed(unused)}; a mask of all panoramas must be in {place}")
     digest = hashlib.sha256()
     for name, image in images.items():
         digest.update(f"{name}|{image.digest}|".encode())
@@ -169,7 +169,7 @@ def find_source(path: Path, mask: str) -> Source:
 
 
 def panoramas(folder: Path) -> list[str]:
-    """The images below a folder, relative to it, sorted, without the masks and pictures of ours among them."""
+    """Return the panoramas below a folder, relative to it and sorted, without masks and previews."""
     others = (*SCENE_MASKS, PREVIEW, OVERLAY)
     names = [name for name in image_names(folder) if not name.startswith("masks/")]
     return [name for name in names if PurePosixPath(name).name not in others]
@@ -180,14 +180,14 @@ def _scene_masks(folder: Path) -> list[str]:
 
 
 def _others(folder: Path) -> tuple[str, str]:
-    """How many files of which endings are no images, and what to do with them; both empty if there are none."""
+    """Count the files that are not images by suffix, and say what to do with them; both empty if there are none."""
     names = [name for name in file_names(folder) if not name.lower().endswith(EXTENSIONS)]
-    counts = Counter(PurePosixPath(name).suffix.lower() or "without an ending" for name in names)
+    counts = Counter(PurePosixPath(name).suffix.lower() or "without a suffix" for name in names)
     firsts = [(next((name for name in names if name.lower().endswith(kinds)), None), way) for kinds, way in _WAYS_OUT]
     ways_out = "".join(f"; {name} {way}" for name, way in firsts if name)
-    return listed(f"{count} {ending}" for ending, count in counts.most_common()), ways_out
+    return listed(f"{count} {suffix}" for suffix, count in counts.most_common()), ways_out
 
 
 def mask_folder(path: Path) -> Path:
-    """Where masks of a folder of panoramas are looked for: there, or beside it if it is called images."""
+    """Return the folder that is searched for masks: that of the panoramas, or its parent if it is called images."""
     return path.parent if path.name == "images" and image_folder(path, None) == path else path

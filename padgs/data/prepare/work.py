@@ -1,4 +1,7 @@
-"""Work."""
+"""State of a preparation: options, result, the hidden working folder that can be resumed, and the machine's resources.
+
+prepare.json, at the destination, records options and result, by which a finished preparation is recognised.
+"""
 
 from __future__ import annotations
 
@@ -14,28 +17,28 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from padgs.data.assemble import STATEMENT
+from padgs.data.assemble import PREPARED
 from padgs.data.capture import DataError
-from padgs.data.masks import mask_place
+from padgs.data.masks import mask_path
 from padgs.data.prepare.sfm import PAIRS
 from padgs.data.prepare.sources import find_source, is_video
 
-MOST_THREADS = 8
-PER_THREAD = 600_000_000  # bytes, for panoramas of 2048 x 1024 and for matching those of any size
-LARGEST = 3200 * 1600  # pixels, to which pycolmap reduces larger panoramas
-ROOM = 128 << 20  # bytes on the disk, several times what one batch of features or matches writes
+MAX_THREADS = 8
+MEMORY_PER_THREAD = 600_000_000  # bytes, for panoramas of 2048 x 1024, and for matching any size
+MAX_PIXELS = 3200 * 1600  # pycolmap reduces larger panoramas to this
+MIN_FREE_DISK = 128 << 20  # bytes, several times the output of a batch of features or matches
 
 
 def threads_for(width: int, height: int) -> int:
-    """One per processor, at most 8 and only as many as free memory allows for panoramas of a size; at least one."""
-    each = PER_THREAD * max(1.0, min(width * height, LARGEST) / (2048 * 1024))
+    """Return the number of threads for panoramas of a size: one per processor, at most 8, limited by free memory."""
+    each = MEMORY_PER_THREAD * max(1.0, min(width * height, MAX_PIXELS) / (2048 * 1024))
     free = free_memory()
-    affordable = MOST_THREADS if free is None else int(free / each)
-    return max(1, min(MOST_THREADS, os.cpu_count() or 1, affordable))
+    affordable = MAX_THREADS if free is None else int(free / each)
+    return max(1, min(MAX_THREADS, os.cpu_count() or 1, affordable))
 
 
 def free_memory() -> int | None:
-    """Bytes that programs can still have, half of all where only that is told, None where nothing is."""
+    """Return the free memory in bytes, half of the total if only that is known, or None."""
     try:
         with open("/proc/meminfo", encoding="ascii") as file:
             return next(int(line.split()[1]) * 1024 for line in file if line.startswith("MemAvailable:"))
@@ -48,17 +51,19 @@ def free_memory() -> int | None:
 
 
 def refuse_full(folder: Path) -> None:
-    """Raise where the disk of a folder is all but full: pycolmap's threads would end this process without a word.
+    """Refuse to work on a nearly full disk, on which pycolmap's threads would kill the process without a message.
 
     Raises:
-        OSError: it is.
+        OSError: less than `MIN_FREE_DISK` is left.
     """
-    if shutil.disk_usage(folder).free < ROOM:
-        raise OSError(errno.ENOSPC, f"fewer than {ROOM >> 20} MiB are left on its disk: make room", str(folder))
+    if shutil.disk_usage(folder).free < MIN_FREE_DISK:
+        raise OSError(
+            errno.ENOSPC, f"less than {MIN_FREE_DISK >> 20} MiB is left on its disk: free some space", str(folder)
+        )
 
 
 def link_or_copy(file: Path, place: Path) -> None:
-    """Have a file at another place: by a link, or by a copy on disks without links, as exFAT ones are."""
+    """Link a file, or copy it on file systems without links, such as exFAT."""
     for link in (place.symlink_to, place.hardlink_to):
         try:
             return link(file.resolve())
@@ -69,15 +74,15 @@ def link_or_copy(file: Path, place: Path) -> None:
 
 @dataclass(frozen=True)
 class PrepareOptions:
-    """What the user may decide."""
+    """Options of `padgs prepare`."""
 
-    accurate: bool = False  # features in undistorted views: slower, better near the poles
+    accurate: bool = False  # features in perspective views: slower, better near the poles
     pairs: str = "auto"  # auto | exhaustive | sequential (names in the order they were taken)
     mask: str = "auto"  # auto (mask.png or masks/ with the images) | none | rows:959/1024 | a file or folder
-    level: bool = True  # turn the world so that the cameras' common up is +z
+    level: bool = True  # rotate the world so that the cameras' common up is +z
     per_second: float = 2.0  # frames kept of a video
     seed: int = 0
-    threads: int = 0  # 0 = one per processor, at most 8 and as many as free memory allows
+    threads: int = 0  # 0 = one per processor, at most 8, limited by free memory
 
     def __post_init__(self) -> None:
         if self.pairs not in PAIRS:
@@ -85,34 +90,34 @@ class PrepareOptions:
         if not 0 < self.per_second <= 1000:
             raise DataError(f"per_second is {self.per_second}; it must be above 0 and at most 1000 frames a second")
         if self.threads < 0:
-            raise DataError(f"threads is {self.threads}; give 1 or more, or 0 for what this machine allows")
+            raise DataError(f"threads is {self.threads}; give 1 or more, or 0 for automatic")
 
 
 @dataclass
 class Prepared:
-    """What came out; also in prepare.json at the destination."""
+    """Result of a preparation; also written to prepare.json."""
 
     folder: Path
     registered: tuple[str, ...]
-    unregistered: tuple[str, ...]  # images that could not be placed; they are not at the destination
+    unregistered: tuple[str, ...]  # images without a pose; they are not copied
     points: int
     observations: int
-    seconds: dict[str, float] = field(default_factory=dict)  # per step, of this call
+    seconds: dict[str, float] = field(default_factory=dict)  # per step
     notes: tuple[str, ...] = ()
 
     def write(self, folder: Path, options: PrepareOptions, digest: str) -> None:
-        """State it in a folder; `digest` is of the input, see `digest_of`."""
-        stated = {**asdict(self), "folder": ".", "options": asdict(options), "input": digest}
-        (folder / STATEMENT).write_text(json.dumps(stated, indent=2, ensure_ascii=False), encoding="utf-8")
+        """Write prepare.json to a folder; `digest` identifies the input, see `digest_of`."""
+        record = {**asdict(self), "folder": ".", "options": asdict(options), "input": digest}
+        (folder / PREPARED).write_text(json.dumps(record, indent=2, ensure_ascii=False), encoding="utf-8")
 
 
-def finished(source: Path, destination: Path, options: PrepareOptions) -> Prepared | None:
-    """What an earlier call made of the same input with the same options."""
+def find_result(source: Path, destination: Path, options: PrepareOptions) -> Prepared | None:
+    """Return the result of an earlier call with the same input and options, if there is one."""
     try:
-        stated = json.loads((destination / STATEMENT).read_text(encoding="utf-8"))
-        if stated["input"] != digest_of(fingerprint(source, options), options):
+        record = json.loads((destination / PREPARED).read_text(encoding="utf-8"))
+        if record["input"] != digest_of(fingerprint(source, options), options):
             return None
-        known: dict[str, Any] = {field.name: stated[field.name] for field in fields(Prepared) if field.name != "folder"}
+        known: dict[str, Any] = {field.name: record[field.name] for field in fields(Prepared) if field.name != "folder"}
     except (OSError, ValueError, KeyError, TypeError):
         return None
     lists = {name: tuple(known[name]) for name in ("registered", "unregistered", "notes")}
@@ -121,10 +126,10 @@ def finished(source: Path, destination: Path, options: PrepareOptions) -> Prepar
 
 
 def fingerprint(source: Path, options: PrepareOptions) -> str:
-    """Of images with their masks; of a video and the files of its mask, since its frames are gone in the end."""
+    """Return a digest of images with masks, or of a video and its mask files, since its frames are deleted."""
     if not is_video(source):
         return find_source(source, options.mask).fingerprint
-    digests, mask = [_file_digest(source)], mask_place(options.mask, Path())
+    digests, mask = [_file_digest(source)], mask_path(options.mask, Path())
     if mask is not None:
         files = sorted(file for file in (mask, *mask.rglob("*")) if file.is_file())
         digests += [f"{file.relative_to(mask)}:{_file_digest(file)}" for file in files]
@@ -132,9 +137,9 @@ def fingerprint(source: Path, options: PrepareOptions) -> str:
 
 
 def digest_of(fingerprint: str, options: PrepareOptions) -> str:
-    """Of an input and all that decides what becomes of it."""
-    wanted = {key: value for key, value in asdict(options).items() if key != "threads"}
-    return hashlib.sha256(json.dumps([fingerprint, wanted], sort_keys=True).encode()).hexdigest()
+    """Return a digest of an input and all options that affect the result."""
+    relevant = {key: value for key, value in asdict(options).items() if key != "threads"}
+    return hashlib.sha256(json.dumps([fingerprint, relevant], sort_keys=True).encode()).hexdigest()
 
 
 def _file_digest(path: Path) -> str:
@@ -149,20 +154,20 @@ def _file_digest(path: Path) -> str:
 
 
 class WorkFolder:
-    """Steps that are done once in a folder, each with a marker, `STEP.done`.
+    """Working folder in which each step runs once, with the marker file `STEP.done`.
 
     Attributes:
         path: of the folder.
-        seconds: name of a step -> what it took in this process.
+        seconds: step -> duration in this process.
     """
 
     def __init__(self, path: Path) -> None:
-        """Of a folder that need not be there yet."""
+        """Use a folder, which need not exist."""
         self.path, self.seconds = path, dict[str, float]()
 
-    def open(self, of: str, digest: str, keep: tuple[str, ...] = ()) -> None:
-        """Go on with what is there of the same digest; start over, but for `keep`, with any other."""
-        marker = self.path / f"{of}.sha256"
+    def open(self, kind: str, digest: str, keep: tuple[str, ...] = ()) -> None:
+        """Resume if the folder has the same digest of this kind of input; else delete all but `keep`."""
+        marker = self.path / f"{kind}.sha256"
         if not (marker.is_file() and marker.read_text() == digest):
             for path in self.path.iterdir() if self.path.is_dir() else ():
                 if path.name not in keep:
@@ -171,7 +176,7 @@ class WorkFolder:
         marker.write_text(digest)
 
     def empty(self, name: str) -> Path:
-        """A folder within it, with nothing in that."""
+        """Create an empty subfolder."""
         folder = self.path / name
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir()
@@ -179,16 +184,16 @@ class WorkFolder:
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
-        """Note how long a step takes."""
+        """Record the duration of a step."""
         start = time.perf_counter()
         yield
         self.seconds[name] = round(time.perf_counter() - start, 2)
 
-    def once(self, step: str, action: Callable[[], None]) -> None:
-        """Do a step unless it has been done in this folder.
+    def run_once(self, step: str, action: Callable[[], None]) -> None:
+        """Run a step unless its marker exists.
 
         Raises:
-            DataError: the disk is full.
+            OSError: the disk is full.
         """
         marker = self.path / f"{step}.done"
         with self.step(step):

@@ -48,7 +48,7 @@ def load(path: str | Path, options: DataOptions) -> Scene:
             raise DataError(f"unknown data.generator.{name}; known: {', '.join(sorted(known))}")
     if "world_rotation" in knobs:  # a list in a configuration file
         knobs["world_rotation"] = tuple(knobs["world_rotation"])
-    store = ImageStore(options.cache_bytes, options.read_ahead, options.device)
+    store = ImageStore(options.cache_bytes, options.prefetch_threads, options.device)
     return generate(SyntheticOptions(**knobs), store)
 
 

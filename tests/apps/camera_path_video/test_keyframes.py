@@ -51,14 +51,17 @@ def test_a_camera_path_of_nerfstudio_comes_back_into_our_world(applied, tmp_path
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{", "is no readable JSON"),
-        ("[1]", "is no path"),
-        ('{"keyframes": [{"position": [0, 0, 0]}]}', "is no path .KeyError: 'look_at'"),
-        ('{"keyframes": [{"position": [0, 0, 0], "look_at": [1, 0, 0]}]}', "has 1 poses; a path needs two"),
-        ('{"keyframes": [{"position": [1, 2, 3], "look_at": [1, 2, 3]}]}', "neither says where to look"),
+        ("{", "is not readable JSON"),
+        ("[1]", "is not a camera path"),
+        ('{"keyframes": [{"position": [0, 0, 0]}]}', "is not a camera path .KeyError: 'look_at'"),
+        ('{"keyframes": [{"position": [0, 0, 0], "look_at": [1, 0, 0]}]}', "has 1 poses; a path needs at least two"),
+        (
+            '{"keyframes": [{"position": [1, 2, 3], "look_at": [1, 2, 3]}]}',
+            "give different positions and a non-zero up",
+        ),
         ('{"up": [0, 0, 0], "keyframes": [{"position": [0, 0, 0], "look_at": [1, 0, 0]}]}', "or up is 0"),
         ('{"keyframes": [{"position": [NaN, 0, 0], "look_at": [1, 0, 0]}]}', "is not finite"),
-        ('{"camera_path": [{"camera_to_world": [1, 2]}]}', "is no path"),
+        ('{"camera_path": [{"camera_to_world": [1, 2]}]}', "is not a camera path"),
         ('{"camera_path": [{"camera_to_world": [2,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1]}]}', "that is not a rotation"),
     ],
 )
@@ -66,5 +69,5 @@ def test_what_is_no_path_is_refused(text, message, tmp_path):
     (tmp_path / "a.json").write_text(text)
     with pytest.raises(PathError, match=message):
         read_path(tmp_path / "a.json", None, UP)
-    with pytest.raises(PathError, match="there is no path .*known: cameras, orbit, dolly, or a JSON file"):
+    with pytest.raises(PathError, match="does not exist; known: cameras, orbit, dolly, or a JSON file"):
         read_path(tmp_path / "orbti", None, UP)

@@ -4,7 +4,7 @@ import pytest
 import torch
 from tiny_scene import tiny_scene
 
-from padgs.data.camera_paths import PATHS, along_cameras, between, looking
+from padgs.data.camera_paths import PATHS, along_cameras, interpolate_poses, look_along
 from padgs.scene import Scene
 
 
@@ -38,7 +38,7 @@ def test_the_way_through_the_cameras_is_walked_at_one_speed_and_rounds_corners()
     assert torch.allclose(steps[15:25], steps[20].expand(10), rtol=0.05), "however far apart the cameras"
     corner = (found - torch.tensor([4.0, 0, 0], dtype=torch.float64)).norm(dim=-1).min()
     assert 0.05 < corner < 1.0
-    with pytest.raises(ValueError, match="--path orbit and --path dolly need none"):
+    with pytest.raises(ValueError, match="use --path orbit or --path dolly"):
         along_cameras(walk([[1, 0, 0]] * 3), 5)
     assert PATHS["dolly"](walk([[1, 0, 0]] * 3), 5).isfinite().all()
 
@@ -50,8 +50,8 @@ def test_cameras_are_passed_in_the_order_of_their_numbers():
 
 
 def test_between_two_turns_lies_the_half_turn():
-    quarter = looking(torch.zeros(2, 3).numpy(), torch.tensor([[0.0, 0, 1], [1, 0, 0]]).numpy(), [0, -1, 0])
-    ahead = between(quarter, [0.5])[0, 2, :3]
+    quarter = look_along(torch.zeros(2, 3).numpy(), torch.tensor([[0.0, 0, 1], [1, 0, 0]]).numpy(), [0, -1, 0])
+    ahead = interpolate_poses(quarter, [0.5])[0, 2, :3]
     assert torch.allclose(ahead, torch.tensor([0.5**0.5, 0, 0.5**0.5], dtype=torch.float64))
 
 
@@ -74,5 +74,5 @@ def test_a_dolly_goes_where_the_cameras_are_spread():
 
 
 def test_looking_straight_up_is_a_pose_too():
-    poses = looking(torch.zeros(1, 3).numpy(), torch.tensor([[0.0, -1, 0]]).numpy(), [0.0, -1.0, 0.0])
+    poses = look_along(torch.zeros(1, 3).numpy(), torch.tensor([[0.0, -1, 0]]).numpy(), [0.0, -1.0, 0.0])
     assert torch.allclose(torch.linalg.det(poses[:, :3, :3]), torch.ones(1, dtype=torch.float64))

@@ -85,7 +85,7 @@ def test_a_perspective_picture_shows_what_the_panorama_shows_there(folder, tmp_p
         (("--fps", "0"), "--fps is 0, which makes a film without a frame; it must be > 0"),
         (("--seconds", "0"), "--seconds is 0, which makes a film"),
         (("--height", "9"), "are of perspective pictures: add --camera perspective"),
-        (("--path", "spiral"), "there is no path spiral; known: cameras, orbit, dolly"),
+        (("--path", "spiral"), "the path spiral does not exist; known: cameras, orbit, dolly"),
         (("--camera", "perspective", "--fov", "180"), "across 180 degrees"),
     ],
 )

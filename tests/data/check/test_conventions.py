@@ -17,8 +17,8 @@ Z_UP = torch.tensor([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]],
 
 MISREADINGS: dict[str, tuple[Callable[[Tensor], Tensor], str]] = {
     "none": (lambda poses: poses, "the poses are right as they are"),
-    "OpenGL": (lambda poses: FLIP @ poses, r"camera axes: take \(x, -y, -z\) .*, as from OpenGL, Blender"),
-    "mirrored": (lambda poses: MIRROR @ poses, r"camera axes: take \(-x, y, z\) .*, which mirrors"),
+    "OpenGL": (lambda poses: FLIP @ poses, r"camera axes: use \(x, -y, -z\) .*, the convention of OpenGL, Blender"),
+    "mirrored": (lambda poses: MIRROR @ poses, r"camera axes: use \(-x, y, z\) .*, which mirrors"),
     "inverse": (torch.linalg.inv, "the poses are world from camera: invert them"),
     "transposed": (
         lambda poses: _pose(poses[:, :3, :3].mT, -poses[:, :3, :3].mT @ _center(poses)),
@@ -26,14 +26,14 @@ MISREADINGS: dict[str, tuple[Callable[[Tensor], Tensor], str]] = {
     ),
     "centre for translation": (
         lambda poses: _pose(poses[:, :3, :3], _center(poses)),
-        "what stands for the translation is the centre",
+        "the translations are camera centres",
     ),
     "translation for centre": (
         lambda poses: _pose(poses[:, :3, :3], -poses[:, :3, :3] @ poses[:, :3, 3:]),
-        "what stands for the centre is the translation",
+        "the camera centres are translations",
     ),
     "OpenGL inverse": (lambda poses: torch.linalg.inv(FLIP @ poses), "world from camera: invert them; camera axes"),
-    "turned cloud": (lambda poses: poses @ Z_UP.T, r"different worlds: rotate the points, take \(x, z, -y\)"),
+    "turned cloud": (lambda poses: poses @ Z_UP.T, r"different world frames: rotate the points, use \(x, z, -y\)"),
 }
 
 

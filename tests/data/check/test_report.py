@@ -88,7 +88,10 @@ BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
     "not 2:1": (lambda f: _save(f, "images/pano_03.png", WIDE), "pano_03.png is 60x32, which is not 2:1"),
     "mask of another size": (lambda f: _save(f, "mask.png", WIDE[:30]), "mask.png is 60x30 but pano_00.png is 64x32"),
     "mask hides all": (lambda f: _save(f, "mask.png", np.zeros((32, 64), np.uint8)), "mask.png hides every pixel"),
-    "list names absent": (lambda f: _edit(f, "test.txt", lambda t: t + "nobody\n"), "names images .*there: nobody"),
+    "list names absent": (
+        lambda f: _edit(f, "test.txt", lambda t: t + "nobody\n"),
+        "names images that do not exist: nobody",
+    ),
     "lists overlap": (lambda f: shutil.copy(f / "train.txt", f / "test.txt"), "train and test list overlap: pano_00"),
     "list escapes": (lambda f: _edit(f, "train.txt", lambda t: t + "../../x\n"), "'../../x'; names must be relative"),
     "same image twice": (
@@ -101,7 +104,7 @@ BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
         "has a PINHOLE camera",
     ),
     "binary garbage": (lambda f: (f / "sparse/0/images.bin").write_bytes(b"\x07" * 99), "lacks cameras.bin"),
-    "other axes": (lambda f: _turn(f), "colours correlate by -?0.* and by 0.9. if read otherwise"),
+    "other axes": (lambda f: _turn(f), "colours correlate by -?0.* and by 0.9. under another convention"),
 }
 
 
@@ -135,7 +138,9 @@ def test_a_wrong_convention_in_a_transforms_file(world: World, tmp_path: Path) -
         frame["transform_matrix"] = world.world_from_cam(i).tolist()
     (tmp_path / "transforms.json").write_text(json.dumps(meta))
     report = check(tmp_path)
-    assert report.suggestion is not None and "take (x, -y, -z) for (x, y, z), as from OpenGL" in report.suggestion
+    assert (
+        report.suggestion is not None and "use (x, -y, -z) as (x, y, z), the convention of OpenGL" in report.suggestion
+    )
     assert report.colour_correlation is not None and report.colour_correlation < 0.5
 
 

@@ -63,7 +63,7 @@ def test_an_image_without_pose_is_reported_and_a_pose_without_image_refused(worl
 def test_case_of_a_file_name(world: World, tmp_path: Path) -> None:
     write_colmap_text(world, tmp_path)
     (tmp_path / "images" / "pano_03.png").rename(tmp_path / "images" / "Pano_03.PNG")
-    with pytest.raises(DataError, match="there is 'Pano_03.PNG', in another case: rename it"):
+    with pytest.raises(DataError, match="there is 'Pano_03.PNG', which differs in case: rename it"):
         load(tmp_path)
 
 

@@ -121,7 +121,7 @@ def test_a_full_disk_leaves_nothing(world: World, tmp_path: Path, monkeypatch: p
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setitem(writers.WRITERS, "released", full)
-    with pytest.raises(DataError, match=r"cannot write .*out \(No space left on device\); nothing was left there"):
+    with pytest.raises(DataError, match=r"cannot write .*out \(No space left on device\); nothing was written"):
         convert(tmp_path / "in", tmp_path / "out", "released")
     assert [path.name for path in tmp_path.iterdir()] == ["in"]
 

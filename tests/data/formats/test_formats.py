@@ -10,7 +10,7 @@ import torch
 from fixtures import WRITERS, World, paint, write_transforms
 
 from padgs.data import DataError, load, read
-from padgs.data.formats.transforms import described
+from padgs.data.formats.transforms import transforms_file
 from padgs.geometry.panorama import rays
 from padgs.scene import Scene
 
@@ -20,7 +20,7 @@ def test_the_scene_is_exact(name: str, world: World, tmp_path: Path) -> None:
     folder = tmp_path / "ein Ordner ünd mehr"
     WRITERS[name](world, folder)
     scene = load(folder)
-    assert scene.notes[0].startswith(f"format: {name}, because there is ")
+    assert scene.notes[0].startswith(f"format: {name}, detected by ")
     assert [view.name for view in scene.train] == list(world.train)
     assert [view.name for view in scene.test] == list(world.test)
     for view in (*scene.train, *scene.test):
@@ -31,11 +31,11 @@ def test_the_scene_is_exact(name: str, world: World, tmp_path: Path) -> None:
         if name != "roam360":  # JPEG
             assert torch.equal(view.load_pixels(), torch.from_numpy(world.images[i]))
     if name == "omniblender":
-        assert any("100000 random ones" in note for note in scene.notes)
+        assert any("100000 random points" in note for note in scene.notes)
         return
     torch.testing.assert_close(scene.points, torch.from_numpy(world.points).float())
     if name == "openmvg":
-        assert "points: they have no colours; grey is taken" in scene.notes
+        assert "points: the cloud has no colours; grey is used" in scene.notes
     else:
         assert torch.equal(scene.point_colors, torch.from_numpy(world.colors))
 
@@ -114,12 +114,12 @@ def test_several_formats_in_one_folder(world: World, tmp_path: Path) -> None:
     (tmp_path / "scene" / "transforms.json").write_text((tmp_path / "other" / "scene" / "transforms.json").read_text())
     (tmp_path / "scene" / "sparse_pc.ply").write_bytes((tmp_path / "other" / "scene" / "sparse_pc.ply").read_bytes())
     note = load(tmp_path / "scene").notes[0]
-    assert note.startswith("format: colmap") and "also there, not used: transforms.json" in note
+    assert note.startswith("format: colmap") and "also present, not used: transforms.json" in note
     assert load(tmp_path / "scene", "transforms").train[0].name == "pano_00"
     assert load(tmp_path / "scene" / "transforms.json").notes[0].startswith("format: transforms")
     scene = str(tmp_path / "scene")
-    assert described(scene, "auto") is None and described(None, "auto") is None
-    assert described(scene, "nerfstudio") == tmp_path / "scene" / "transforms.json"
+    assert transforms_file(scene, "auto") is None and transforms_file(None, "auto") is None
+    assert transforms_file(scene, "nerfstudio") == tmp_path / "scene" / "transforms.json"
 
 
 Change = Callable[[dict[str, Any]], object]

@@ -65,7 +65,7 @@ def test_values_of_other_types_are_no_tracebacks(name: str, small: World, tmp_pa
 WRONG = [
     ("transforms", ("w",), 0, "the camera of pano_00.png is 0x8; a full panorama is 2:1"),
     ("transforms", ("w",), float("inf"), "w of .*transforms.json is inf; it must be a whole number"),
-    ("transforms", ("frames", 0, "file_path"), "x" * 300 + ".png", "a name longer than the 255 bytes that files"),
+    ("transforms", ("frames", 0, "file_path"), "x" * 300 + ".png", "file names have at most 255 bytes"),
     ("transforms", ("frames", 0, "file_path"), "\udce9.png", "which is not Unicode; rename the file"),
     ("transforms", ("frames", 0, "transform_matrix", 0, 3), 1e300, r"contains 1e\+300; nothing farther"),
     ("omniblender", ("width",), [], "width of .*transform.json must be a whole number, not list"),
@@ -104,7 +104,7 @@ def test_openmvg_cannot_name_another_folder(small: World, tmp_path: Path) -> Non
     ("column", "value", "message"),
     [
         (slice(1, 5), ["0"] * 4, "the quaternion has the length 0; it must be 1"),
-        (slice(5, 6), ["1e308"], r"contains 1e\+308; nothing farther than 1e\+15 .* can be drawn"),
+        (slice(5, 6), ["1e308"], r"contains 1e\+308; nothing farther than 1e\+15 .* can be rendered"),
     ],
 )
 def test_poses_of_colmap_that_are_none(column, value, message, small: World, tmp_path: Path) -> None:

@@ -45,11 +45,13 @@ def test_masks_of_single_images_are_not_put_out_of_use(world: World, tmp_path: P
     meta = json.loads((tmp_path / "posed" / "transforms.json").read_text())
     meta["frames"][2]["mask_path"] = "hands/pano_02.png"
     (tmp_path / "posed" / "transforms.json").write_text(json.dumps(meta))
-    with pytest.raises(DataError, match=r"transforms names masks of its own, such as .*pano_02.png, beside which mask"):
+    with pytest.raises(
+        DataError, match=r"transforms names masks of its own, such as .*pano_02.png, which take precedence over mask"
+    ):
         write_nadir_mask(tmp_path / "posed", 60)
     write_images(world, tmp_path / "shoot")
     (tmp_path / "shoot" / "masks").mkdir()
-    with pytest.raises(DataError, match=r"masks holds masks of single images, which mask.png would put out of use"):
+    with pytest.raises(DataError, match=r"masks holds masks of single images, which mask.png would replace"):
         write_nadir_mask(tmp_path / "shoot", 60, overwrite=True)
     assert not list(tmp_path.rglob("mask.png"))
 

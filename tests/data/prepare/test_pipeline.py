@@ -58,7 +58,7 @@ def test_what_is_finished_is_not_done_again(scene, prepared):
     written = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
     again = prepare(scene[1], out, PrepareOptions(threads=2))
     assert again == replace(result, seconds={}) and written == {p: p.stat().st_mtime_ns for p in out.rglob("*")}
-    with pytest.raises(DataError, match="not what these options make of"):
+    with pytest.raises(DataError, match="was not made of"):
         prepare(scene[1], out, PrepareOptions(level=False))
 
 
@@ -154,7 +154,7 @@ def test_masked_pixels_have_no_features_and_the_mask_comes_along(scene, tmp_path
     assert prepare(video, tmp_path / "out", options).points == result.points
     mask[150:] = 0
     Image.fromarray(mask).save(hands)
-    with pytest.raises(DataError, match="not what these options make of"):
+    with pytest.raises(DataError, match="was not made of"):
         prepare(video, tmp_path / "out", options)
 
 
@@ -167,7 +167,7 @@ def test_unrelated_images_are_reported(scene, tmp_path):
     Image.fromarray(noise).save(source / "other.png")
     result = prepare(source, tmp_path / "out", PrepareOptions(threads=2))
     assert result.unregistered == ("other.png",)
-    assert any("1 of 4 panoramas could not be placed: other.png" in note for note in result.notes)
+    assert any("1 of 4 panoramas have no pose: other.png" in note for note in result.notes)
     assert not (tmp_path / "out" / "images" / "other.png").exists()
 
 
@@ -183,7 +183,7 @@ def noise(folder, count=2):
 def test_nothing_to_place(tmp_path, monkeypatch):
     asked = []
     monkeypatch.setattr(pipeline, "threads_for", lambda *size: asked.append(size) or 1)
-    with pytest.raises(DataError, match="no two of the 2 panoramas could be placed together"):
+    with pytest.raises(DataError, match="no relative pose was found for any two of the 2 panoramas"):
         prepare(noise(tmp_path / "in"), tmp_path / "out")
     assert not (tmp_path / "out").exists()
     assert asked == [(128, 64)]
@@ -207,9 +207,11 @@ def test_what_pycolmap_raises_is_said_with_what_to_do(tmp_path, monkeypatch):
     source, database = noise(tmp_path / "in"), tmp_path / ".out.prepare" / "database.db"
     with (
         monkeypatch.context() as patch,
-        pytest.raises(DataError, match=r"out \(fewer than \d+ MiB are left on its disk: make room\); the same command"),
+        pytest.raises(
+            DataError, match=r"out \(less than \d+ MiB is left on its disk: free some space\); the same command"
+        ),
     ):
-        run(lambda step, done, total: patch.setattr(work, "ROOM", 1 << 60))
+        run(lambda step, done, total: patch.setattr(work, "MIN_FREE_DISK", 1 << 60))
     found = database.read_bytes()
     database.write_bytes(b"no database" * 1000)
     with pytest.raises(
@@ -231,7 +233,7 @@ def test_what_pycolmap_raises_is_said_with_what_to_do(tmp_path, monkeypatch):
         raise MemoryError
 
     monkeypatch.setattr(sfm, "match", exhaust)
-    with pytest.raises(DataError, match=r"out \(out of memory\); the same command with --threads 1 takes less"):
+    with pytest.raises(DataError, match=r"out \(out of memory\); the same command with --threads 1 uses less"):
         run()
 
 
@@ -248,7 +250,7 @@ def test_bad_input_is_refused(scene, tmp_path):
         prepare(tmp_path / "absent", tmp_path / "out")
     with pytest.raises(DataError, match="cannot be read"):
         prepare(tmp_path / "absent.mp4", tmp_path / "out")
-    with pytest.raises(DataError, match="images would be taken for the images or masks of"):
+    with pytest.raises(DataError, match="images would be read as the images or masks of"):
         prepare(scene[1], scene[1] / "images")
     assert [path.name for path in tmp_path.iterdir()] == ["there"]
 

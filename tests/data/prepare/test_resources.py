@@ -53,7 +53,7 @@ def test_a_disk_without_links_gets_copies(tmp_path, monkeypatch):
 
 def test_a_full_disk_is_refused(tmp_path, monkeypatch):
     work.refuse_full(tmp_path)
-    monkeypatch.setattr(work, "ROOM", 1 << 60)
-    with pytest.raises(OSError, match="MiB are left on its disk: make room") as refused:
+    monkeypatch.setattr(work, "MIN_FREE_DISK", 1 << 60)
+    with pytest.raises(OSError, match="MiB is left on its disk: free some space") as refused:
         work.refuse_full(tmp_path)
     assert refused.value.errno == errno.ENOSPC

@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from padgs.data import DataError
-from padgs.data.assemble import OURS, STATEMENT
+from padgs.data.assemble import PREPARED, SKIPPED
 from padgs.data.prepare.sources import find_source
 from padgs.results import CONFIG_NAME, PICTURES
 
@@ -41,8 +41,8 @@ def test_masks_and_pictures_of_ours_among_the_images_are_no_images(tmp_path):
     for place in (".", "kitchen", "flat/images", "runs/flat/renders"):
         save(tmp_path / place / "check.png")
         save(tmp_path / place / "mask_preview.jpg")
-    (tmp_path / "flat" / STATEMENT).touch()
-    assert OURS[1] == (CONFIG_NAME, PICTURES)
+    (tmp_path / "flat" / PREPARED).touch()
+    assert SKIPPED[1] == (CONFIG_NAME, PICTURES)
     (tmp_path / "runs" / "flat" / CONFIG_NAME).touch()
     for place in ("flat/images", "runs/flat/renders"):
         save(tmp_path / place / "a.png")
@@ -53,9 +53,7 @@ def test_masks_and_pictures_of_ours_among_the_images_are_no_images(tmp_path):
     save(tmp_path / "kitchen" / "mask.png", 255)
     source = find_source(tmp_path, "auto")
     assert list(source.images) == ["a.png", "b.png"]
-    assert source.notes[1:] == (
-        f"not used: kitchen/mask.png; the mask of all panoramas is looked for in {tmp_path} alone",
-    )
+    assert source.notes[1:] == (f"not used: kitchen/mask.png; a mask of all panoramas must be in {tmp_path}",)
 
 
 def test_what_is_left_out_is_said(tmp_path):
@@ -63,8 +61,8 @@ def test_what_is_left_out_is_said(tmp_path):
         (tmp_path / name).touch()
     with pytest.raises(
         DataError,
-        match=r"holds 0 images \(left out: 3 .insp, 1 .heic, 1 without an ending\); structure from motion needs at "
-        "least two; 1.insp is not stitched yet: export .*; a.heic is .*: convert all such pictures to JPEG$",
+        match=r"holds 0 images \(left out: 3 .insp, 1 .heic, 1 without a suffix\); structure from motion needs at "
+        "least two; 1.insp is not stitched: export .*; a.heic is .*: convert all such images to JPEG$",
     ):
         find_source(tmp_path, "auto")
     for name in ("1.insp", "2.INSP", "3.insp", "a.heic"):
@@ -73,7 +71,7 @@ def test_what_is_left_out_is_said(tmp_path):
     save(tmp_path / "b.png")
     (tmp_path / "tour.MP4").touch()
     assert find_source(tmp_path, "auto").notes == (
-        "left out: 1 without an ending, 1 .mp4; tour.MP4 is a video: give its own path, not that of its folder",
+        "left out: 1 without a suffix, 1 .mp4; tour.MP4 is a video: give its own path, not that of its folder",
     )
 
 
@@ -81,14 +79,14 @@ def test_bad_input_is_refused(tmp_path):
     with pytest.raises(DataError, match="is not a folder; give a folder of panoramas, or a video"):
         find_source(tmp_path / "nothing", "auto")
     (tmp_path / "VID_1.insv").write_bytes(b"a film")
-    with pytest.raises(DataError, match="VID_1.insv is not stitched yet: export panoramas, or a 2:1 video, with the"):
+    with pytest.raises(DataError, match="VID_1.insv is not stitched: export panoramas, or a 2:1 video, with the"):
         find_source(tmp_path / "VID_1.insv", "auto")
     (tmp_path / "VID_1.insv").unlink()
     save(tmp_path / "a.png")
     with pytest.raises(DataError, match="holds 1 images; structure from motion needs at least two$"):
         find_source(tmp_path, "auto")
     (tmp_path / "IMG_1.insp").write_bytes(b"\xff\xd8")
-    with pytest.raises(DataError, match="at least two; IMG_1.insp is not stitched yet: export"):
+    with pytest.raises(DataError, match="at least two; IMG_1.insp is not stitched: export"):
         find_source(tmp_path, "auto")
     save(tmp_path / "A.png")
     with pytest.raises(DataError, match=r"'A.png' and 'a.png' would share one name"):
