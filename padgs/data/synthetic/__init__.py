@@ -1,8 +1,8 @@
-"""Synthetic scenes with exact truth: an analytic world, ray-cast into panoramas. The embedded data of the program.
+"""Synthetic scenes with exact ground truth: an analytic world, ray-cast into panoramas.
 
-`generate(SyntheticOptions()) -> Scene` draws (or fetches from the cache) panoramas, poses and a noisy point cloud;
-`SyntheticTruth` answers with exact depth, object ids and poses, and draws new views. World frame: z up, x and y
-horizontal, one unit per metre unless `world_scale` and `world_rotation` say otherwise.
+`generate(SyntheticOptions()) -> Scene` renders (or reads from the cache) panoramas, poses and a noisy point cloud;
+`SyntheticTruth` gives exact depth, object ids and poses, and renders new views. World frame: z up, x and y horizontal,
+one unit per metre unless `world_scale` and `world_rotation` change that.
 """
 
 from __future__ import annotations
@@ -28,38 +28,38 @@ __all__ = ["SCENES", "SyntheticOptions", "SyntheticTruth", "generate", "load"]
 
 
 def load(path: str | Path, options: DataOptions) -> Scene:
-    """The entry of LOADERS: `path` is the name of a scene, e.g. "room".
+    """Load a synthetic scene by name; the entry of LOADERS.
 
     Args:
-        path: one of SCENES; empty = the one in `options.generator`.
-        options: `options.generator` holds the knobs of SyntheticOptions, `options.width` the image width if set.
+        path: one of SCENES; empty = the scene in `options.generator`.
+        options: `options.generator` holds fields of SyntheticOptions; `options.width` overrides the image width.
 
     Raises:
-        DataError: an unknown scene or knob, or a value that cannot be generated.
+        DataError: unknown scene or field, or an invalid value.
     """
-    knobs = dict(options.generator)
+    settings = dict(options.generator)
     if str(path) not in ("", "."):
-        knobs["scene"] = str(path)
+        settings["scene"] = str(path)
     if options.width is not None:
-        knobs["width"] = options.width
+        settings["width"] = options.width
     known = [field.name for field in fields(SyntheticOptions)]
-    for name in knobs:
+    for name in settings:
         if name not in known:
             raise DataError(f"unknown data.generator.{name}; known: {', '.join(sorted(known))}")
-    if "world_rotation" in knobs:  # a list in a configuration file
-        knobs["world_rotation"] = tuple(knobs["world_rotation"])
+    if "world_rotation" in settings:  # a list in configuration files
+        settings["world_rotation"] = tuple(settings["world_rotation"])
     store = ImageStore(options.cache_bytes, options.prefetch_threads, options.device)
-    return generate(SyntheticOptions(**knobs), store)
+    return generate(SyntheticOptions(**settings), store)
 
 
 def generate(options: SyntheticOptions, store: ImageStore | None = None) -> Scene:
-    """The scene of a configuration, from the disk cache where it has been generated before.
+    """Generate a scene, or read it from the disk cache.
 
-    Generating takes 15-20 s of processor time for 30 views at 512 x 256, shared by all processors.
+    Takes 15-20 s of processor time for 30 views at 512 x 256, on all processors.
 
     Args:
-        options: what to generate.
-        store: keeps decoded images; a new one with its defaults if None.
+        options: of the scene.
+        store: caches decoded images; a new one if None.
     """
     stored, notes = cache.read(options), []
     if stored is None:
@@ -91,7 +91,7 @@ def generate(options: SyntheticOptions, store: ImageStore | None = None) -> Scen
 
 @lru_cache(maxsize=64)
 def _depth(options: SyntheticOptions, index: int) -> torch.Tensor:
-    """True distances [H, W] from where the image of a view was taken."""
+    """Return the true distances [H, W] from the exact camera centre of a view."""
     truth = _truth(options)
     name = truth.names[index]
     return truth.depth(View(name, truth.exact_pose(name), options.width, options.height)).float()
@@ -105,7 +105,7 @@ def _truth(options: SyntheticOptions) -> SyntheticTruth:
 def _make(options: SyntheticOptions) -> cache.Stored:
     truth = SyntheticTruth(options)
     held_out = set(paths.held_out(options))
-    exposure = truth.random("exposure").uniform(-1, 1, len(truth.poses)) * options.exposure
+    exposure = truth.random("exposure").uniform(-1, 1, len(truth.poses)) * options.exposure_range
     images = []
     for index, pose in enumerate(truth.poses):
         gain = 1.0 if index in held_out else float(2 ** exposure[index])

@@ -1,7 +1,7 @@
-"""Generated scenes on disk, by content hash of their configuration and of the generator itself.
+"""Disk cache of generated scenes, keyed by a hash of their options and of the generator's source code.
 
-The folder is $PADGS_CACHE, or ~/.cache/padgs. One scene is one folder of PNGs and `scene.npz`, written beside its
-final place and then renamed, so a reader never sees half of one. Where nothing can be written there is no cache.
+The folder is $PADGS_CACHE, or ~/.cache/padgs. A scene is a folder of PNGs and `scene.npz`, written to a temporary
+folder and then renamed, so that readers never see incomplete scenes. Without write access there is no cache.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ from padgs.data.synthetic.textures import Array
 
 @dataclass(frozen=True)
 class Stored:
-    """What generating costs time to make: everything that a Scene holds, in world units."""
+    """Generated data of a Scene, in world units."""
 
-    images: list[Array] | list[Path]  # of all views along the path: [H, W, 3] uint8, or where their PNGs lie
-    poses: Array  # [n, 4, 4] cam_from_world as given to methods, noise included
+    images: list[Array] | list[Path]  # of all views along the path: [H, W, 3] uint8, or PNG files
+    poses: Array  # [n, 4, 4] cam_from_world with pose noise
     points: Array  # [P, 3]
     colors: Array  # [P, 3] uint8
     fingerprint: str
 
 
 def folder() -> Path:
-    """Where generated scenes are kept."""
+    """Return the folder of the cache."""
     named = os.environ.get("PADGS_CACHE")
     return (Path(named) if named else Path.home() / ".cache" / "padgs") / "synthetic"
 
 
 def key(options: SyntheticOptions) -> str:
-    """Content hash of a configuration and of the code that turns it into pixels."""
+    """Return a hash of the options and of the code that generates scenes."""
     digest = hashlib.sha256(json.dumps(asdict(options), sort_keys=True).encode())
     digest.update(_source())
     return digest.hexdigest()[:24]
@@ -54,10 +54,10 @@ def _source() -> bytes:
 
 
 def read(options: SyntheticOptions) -> Stored | None:
-    """The stored scene of a configuration, or None if there is none, or a damaged one."""
+    """Read a cached scene; None if missing or damaged."""
     place = folder() / key(options)
     try:
-        # Opened here, because numpy leaves a file that is not a zip archive open.
+        # Opened here, because numpy does not close files that are not zip archives.
         with open(place / "scene.npz", "rb") as file, np.load(file, allow_pickle=False) as table:
             count = len(table["poses"])
             images = [place / f"{index:03d}.png" for index in range(count)]
@@ -69,7 +69,7 @@ def read(options: SyntheticOptions) -> Stored | None:
 
 
 def write(options: SyntheticOptions, stored: Stored) -> str | None:
-    """Keep a scene; returns why not, where that is impossible."""
+    """Cache a scene; returns the reason if that is impossible."""
     place = folder() / key(options)
     draft = None
     try:
@@ -86,7 +86,7 @@ def write(options: SyntheticOptions, stored: Stored) -> str | None:
         draft.rename(place)
     except OSError as error:
         if place.exists() and read(options) is not None:
-            return None  # somebody else was faster
+            return None  # another process was faster
         return f"generated scene not cached: {error}; set PADGS_CACHE to a folder that can be written"
     finally:
         if draft is not None:

@@ -1,4 +1,8 @@
-"""Camera."""
+"""Ray casting of panoramas: supersampled colour, exact depth and object ids, and stitched dual-fisheye cameras.
+
+Poses are in metres. The sub-pixel jitter of a pixel depends on its row only: rotating the camera by whole pixels about
+the vertical shifts the image exactly.
+"""
 
 from __future__ import annotations
 
@@ -16,11 +20,11 @@ from padgs.data.synthetic.world import World
 from padgs.geometry.lens import axis_direction, bend, hemisphere_weight
 from padgs.geometry.panorama import rays
 
-_BLOCK = (32, 64)  # pixels; rays of a block share the list of shapes that they can hit, and fit into the cache
+_BLOCK = (32, 64)  # pixels; rays of a block share a list of candidate shapes, and fit into the processor cache
 
 
 def directions(rows: Array, columns: Array, width: int, height: int) -> Array:
-    """Unit camera-frame directions [3, n] through continuous pixel positions (u = columns, v = rows), each [n]."""
+    """Return unit camera-frame directions [3, n] through continuous pixel positions u = columns [n], v = rows [n]."""
     longitude = (columns / width - 0.5) * (2 * math.pi)
     latitude = (rows / height - 0.5) * math.pi
     flat = np.cos(latitude)
@@ -36,9 +40,9 @@ def draw(
     gain: float = 1.0,
     lens: Callable[[Array], Array] | None = None,
 ) -> Array:
-    """The panorama [H, W, 3] uint8 that a camera at `cam_from_world` [4, 4] sees, with `samples` rays a pixel.
+    """Render the panorama [H, W, 3] uint8 of a camera at `cam_from_world` [4, 4], with `samples` rays per pixel.
 
-    `lens` says where it looks instead of along the camera-frame directions [3, n] of an ideal panorama.
+    `lens` maps the camera-frame directions [3, n] of an ideal panorama to those of the rays.
     """
     height = width // 2
     image = np.empty((height, width, 3), np.uint8)
@@ -57,13 +61,13 @@ def draw(
         mean = color.reshape(3, len(rows), len(columns), samples).mean(-1)
         image[np.ix_(rows, columns)] = np.clip(mean * (255 * gain) + 0.5, 0, 255).astype(np.uint8).transpose(1, 2, 0)
 
-    with ThreadPoolExecutor(workers()) as pool:  # numpy lets go of the interpreter lock
+    with ThreadPoolExecutor(workers()) as pool:  # numpy releases the interpreter lock
         list(pool.map(fill, blocks))
     return image
 
 
 def trace(world: World, cam_from_world: Array, width: int) -> tuple[Array, Array]:
-    """Exact distance [H, W] float64 in metres (inf = sky) and object id [H, W] (-1 = sky) at pixel centres."""
+    """Return exact distances [H, W] float64 in metres (inf = sky) and object ids [H, W] (-1 = sky) at pixel centres."""
     height = width // 2
     rows, columns = np.indices((height, width)) + 0.5
     world_rays = cam_from_world[:3, :3].T @ directions(rows.ravel(), columns.ravel(), width, height)
@@ -72,35 +76,39 @@ def trace(world: World, cam_from_world: Array, width: int) -> tuple[Array, Array
 
 
 def center(cam_from_world: Array) -> Array:
-    """Camera centre [3] of a pose [4, 4]."""
+    """Return the camera centre [3] of a pose [4, 4]."""
     return -cam_from_world[:3, :3].T @ cam_from_world[:3, 3]
 
 
 def workers() -> int:
-    """Threads to draw with: one per processor that this process may use, at most 8."""
+    """Return the number of rendering threads: one per available processor, at most 8."""
     return min(8, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
 
 
 def _jitter(height: int, samples: int, seed: int) -> Array:
-    """Positions [H, samples, 2] within a pixel, one in each cell of a square grid."""
+    """Return stratified positions [H, samples, 2] within a pixel, one per cell of a square grid."""
     side = math.isqrt(samples)
     cell = np.stack(np.divmod(np.arange(samples), side)[::-1], axis=-1)
     return (cell + np.random.default_rng((seed, 0x5EED)).random((height, samples, 2))) / side
 
 
 def draw_stitched(world: World, cam_from_world: Array, gap: float, options: SyntheticOptions, gain: float) -> Array:
-    """The panorama [H, W, 3] uint8 of a camera whose lenses are `gap` metres apart, its centre midway between them."""
+    """Render the panorama [H, W, 3] uint8 of two fisheye lenses `gap` metres apart, centred between them.
+
+    Rays of each lens are exact; stitching ignores the gap and the radial distortion, so that the image has parallax and
+    a kink at the plane between the lenses. The front lens looks along the camera's z.
+    """
     axis, coefficients = axis_direction("z"), torch.tensor([options.lens_k1], dtype=torch.float64)
     images = []
     for sign in (1.0, -1.0):
         pose = cam_from_world.copy()
         pose[:3, 3] -= sign * 0.5 * gap * axis.numpy()
 
-        def bent(directions: Array, axis: torch.Tensor = sign * axis) -> Array:
-            there = bend(torch.from_numpy(directions).double().T, axis, coefficients)
-            return there.T.to(torch.float32).numpy()
+        def distorted(directions: Array, axis: torch.Tensor = sign * axis) -> Array:
+            bent = bend(torch.from_numpy(directions).double().T, axis, coefficients)
+            return bent.T.to(torch.float32).numpy()
 
-        images.append(draw(world, pose, options.width, options.samples, options.seed, gain, bent))
+        images.append(draw(world, pose, options.width, options.samples, options.seed, gain, distorted))
     directions = rays(options.width, options.height, dtype=torch.float64)
     weight = hemisphere_weight(directions, axis, math.radians(options.lens_blend)).numpy()[..., None]
     return np.round(weight * images[0] + (1 - weight) * images[1]).astype(np.uint8)

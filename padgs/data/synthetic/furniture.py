@@ -1,4 +1,4 @@
-"""Things to put into synthetic scenes, each a list of shapes. Positions in metres, z = 0 is the floor."""
+"""Furniture and loose objects of synthetic scenes, as lists of shapes. Positions in metres, z = 0 is the floor."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ SPINES = (*BRIGHT, (0.3, 0.16, 0.1), (0.1, 0.2, 0.3), (0.75, 0.7, 0.6), (0.15, 0
 
 
 def point(values: Array) -> Point:
-    """Three numbers of an array as a point."""
+    """Convert an array of three numbers to a point."""
     return float(values[0]), float(values[1]), float(values[2])
 
 
 def matt(texture: Texture, reflectance: float = 0.0) -> tuple[Material, ...]:
-    """One material for every face."""
+    """Return one material for all faces."""
     return (Material(texture, reflectance),)
 
 
 def metal(color: tx.Color = (0.75, 0.75, 0.78)) -> tuple[Material, ...]:
-    """The material of rods: plain with fine bands, so that it is not featureless."""
+    """Return the material of rods: plain with fine bands, so that it has texture."""
     darker = (0.8 * color[0], 0.8 * color[1], 0.8 * color[2])
     return matt(tx.stripes((color, color, color, darker), 0.06, 0.0))
 
 
 def table(x: float, y: float, width: float, depth: float, height: float) -> list[Shape]:
-    """A wooden table top on four thin legs."""
+    """Return a wooden table top on four thin legs."""
     shapes: list[Shape] = [Box((x, y, height - 0.02), (width / 2, depth / 2, 0.02), matt(tx.planks(*OAK, width=0.11)))]
     for i, j in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
         px, py = x + i * (width / 2 - 0.05), y + j * (depth / 2 - 0.05)
@@ -50,14 +50,14 @@ def table(x: float, y: float, width: float, depth: float, height: float) -> list
 
 
 def bookshelf(x: float, y: float, width: float, height: float) -> list[Shape]:
-    """A shelf full of books."""
+    """Return a shelf full of books."""
     wood = Material(tx.planks(*WALNUT))
     front = Material(tx.books(SPINES, (0.45, 0.3, 0.18)))
     return [Box((x, y, height / 2), (width / 2, 0.15, height / 2), (wood, wood, front, front, wood, wood))]
 
 
 def sofa(x: float, y: float) -> list[Shape]:
-    """A sofa of four cushions' worth of boxes; its back is towards +y."""
+    """Return a sofa with its back towards +y."""
     cloth = matt(tx.wallpaper((0.2, 0.36, 0.4), (0.75, 0.78, 0.68), 0.16))
     pillow = matt(tx.checker((0.85, 0.55, 0.2), (0.95, 0.9, 0.8), 0.08))
     parts = (
@@ -72,7 +72,7 @@ def sofa(x: float, y: float) -> list[Shape]:
 
 
 def floor_lamp(x: float, y: float, height: float = 1.7) -> list[Shape]:
-    """A thin vertical rod with a glowing globe; thin structure against the wall."""
+    """Return a thin vertical rod with a glowing globe."""
     globe = Material(tx.stripes(((1, 0.95, 0.8), (0.98, 0.85, 0.6)), 0.04), glows=True)
     return [
         Rod((x, y, 0.02), (x, y, height), 0.012, metal((0.8, 0.65, 0.3))),
@@ -82,7 +82,7 @@ def floor_lamp(x: float, y: float, height: float = 1.7) -> list[Shape]:
 
 
 def pendant(x: float, y: float, ceiling: float, drop: float) -> list[Shape]:
-    """A glowing globe on a thin cord from the ceiling."""
+    """Return a glowing globe on a thin cord from the ceiling."""
     globe = Material(tx.stripes(((1, 0.98, 0.9), (1, 0.9, 0.7)), 0.05), glows=True)
     return [
         Sphere((x, y, ceiling - drop), 0.14, (globe,)),
@@ -91,7 +91,7 @@ def pendant(x: float, y: float, ceiling: float, drop: float) -> list[Shape]:
 
 
 def plant(x: float, y: float, height: float, rng: np.random.Generator) -> list[Shape]:
-    """A pot with thin leaning stems that carry small leaves and blossoms."""
+    """Return a pot with thin leaning stems that carry small leaves and blossoms."""
     pot = matt(tx.bricks((0.5, 0.22, 0.14), (0.8, 0.45, 0.3), (0.9, 0.8, 0.7), 0.1, 0.05))
     shapes: list[Shape] = [Box((x, y, 0.2), (0.16, 0.16, 0.2), pot)]
     leaf = matt(tx.plain((0.2, 0.5, 0.2), 0.6, 0.2))
@@ -105,7 +105,7 @@ def plant(x: float, y: float, height: float, rng: np.random.Generator) -> list[S
 
 
 def crates(x: float, y: float, rng: np.random.Generator) -> list[Shape]:
-    """A stack of printed wooden crates."""
+    """Return a stack of printed wooden crates."""
     shapes: list[Shape] = []
     z = 0.0
     for half in (0.3, 0.24, 0.17):
@@ -117,7 +117,7 @@ def crates(x: float, y: float, rng: np.random.Generator) -> list[Shape]:
 
 
 def loose_object(where: Point, size: float, rng: np.random.Generator, reflectance: float = 0.0) -> Shape:
-    """A random ball, box or bar of the given radius about a point."""
+    """Return a random ball, box or bar of the given radius about a point."""
     first, second = (BRIGHT[i] for i in rng.choice(len(BRIGHT), 2, replace=False))
     pale = (0.93, 0.9, 0.84)
     kind = rng.integers(4)
@@ -144,9 +144,9 @@ def scatter(
     rng: np.random.Generator,
     reflectance: float = 0.0,
 ) -> list[Shape]:
-    """Loose objects within a box that touch neither each other nor anything within `clearance` of the camera path.
+    """Place loose objects in a box, apart from each other and at least `clearance` from the camera path.
 
-    Those in the lower part stand on thin rods, the others float.
+    Objects in the lower part stand on thin rods, the others float.
     """
     shapes: list[Shape] = []
     places, sizes = np.empty((0, 3)), np.empty(0)
@@ -158,23 +158,23 @@ def scatter(
             if apart and np.linalg.norm(path - where, axis=1).min() > clearance + size:
                 break
         else:
-            raise DataError(f"found no place for object {len(sizes) + 1} of {count}; set data.generator.objects lower")
+            raise DataError(f"no free position for object {len(sizes) + 1} of {count}; lower data.generator.objects")
         places, sizes = np.vstack((places, where)), np.append(sizes, size)
         shapes.append(loose_object(point(where), size, rng, reflectance))
         x, y, z = point(where)
-        if z < high[2] * 0.6:  # the support must not stand in the way of the cameras
+        if z < high[2] * 0.6:  # supports of higher objects would block the cameras
             shapes.append(Rod((x, y, 0), (x, y, z), 0.01, metal()))
     return shapes
 
 
 def beside(count: int, path: Array, nearest: float, farthest: float, rng: np.random.Generator) -> list[Shape]:
-    """Small objects whose surface lies between `nearest` and `farthest` metres from the camera path."""
+    """Place small objects with surfaces `nearest` to `farthest` metres from the camera path."""
     shapes: list[Shape] = []
     attempts = 0
     while len(shapes) < count:
         attempts += 1
         if attempts > 200 * count:
-            raise DataError(f"found no place for {count} objects beside the path; set data.generator.objects lower")
+            raise DataError(f"no free positions for {count} objects beside the path; lower data.generator.objects")
         size = rng.uniform(0.02, 0.07)
         way = rng.normal(size=3) * (1, 1, 0.7)
         gap = rng.uniform(nearest, farthest)

@@ -1,4 +1,4 @@
-"""The knobs of the synthetic scenes. A configuration determines every pixel, pose and point, and is the cache key."""
+"""Options of the synthetic scenes. They determine every pixel, pose and point, and are the cache key."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from padgs.data.capture import DataError
 
 SCENES = (
     *("room", "two_rooms", "outdoor", "pole_torture", "bare_room", "near_clutter", "glossy"),
-    *("white_room", "checker_room", "enfilade"),
+    *("white_room", "checker_room", "room_chain"),
 )
 PATHS = ("roaming", "cross", "line")
 HEADINGS = ("path", "fixed", "random")
@@ -17,39 +17,38 @@ HEADINGS = ("path", "fixed", "random")
 
 @dataclass(frozen=True)
 class SyntheticOptions:
-    """What to generate. The defaults are the embedded scene of a run without arguments.
+    """Options of a synthetic scene. The defaults are the scene of a run without arguments.
 
-    Everything is built and drawn in metres; `world_scale` and `world_rotation` then move poses, points and depth, so
-    the images do not depend on them. Pose noise, exposure and the two lenses touch training views only: test views are
-    the truth.
+    Worlds are built and rendered in metres; `world_scale` and `world_rotation` are then applied to poses, points and
+    depth, so that images do not depend on them. Pose noise, exposure and the two lenses affect training views only.
     """
 
     scene: str = "room"  # a name of `padgs.data.synthetic.SCENES`
     width: int = 512  # pixels; the height is half of it
     train_views: int = 24  # along the path
     test_views: int = 6  # spread evenly between the training views along the path
-    path: str | None = None  # roaming | cross | line; None = the scene's own
-    reach: float | None = None  # metres from the middle of the path to its ends; None = the scene's own
-    heading: str = "path"  # path = look along the path; fixed = along world x; random = any, per view
-    yaw: float = 0.0  # degrees, added to every heading
+    path: str | None = None  # roaming | cross | line; None = default of the scene
+    path_radius: float | None = None  # metres from the middle of the path to its ends; None = default of the scene
+    heading: str = "path"  # path = look along the path; fixed = along world x; random = random per view
+    yaw: float = 0.0  # degrees, added to all headings
     tilt: float = 0.0  # degrees, standard deviation of roll and of pitch per view
-    samples: int = 16  # rays per pixel, a square number: stratified and jittered
-    seed: int = 0  # of the path, the points and the noise
-    texture_frequency: float = 1.0  # multiplies the spatial frequency of every pattern
-    objects: int | None = None  # number of loose objects besides the furniture; None = the scene's own
-    rooms: int | None = None  # of an enfilade, with `objects` each; None = 2
+    samples: int = 16  # rays per pixel, a square number; stratified and jittered
+    seed: int = 0  # of path, points and noise
+    texture_frequency: float = 1.0  # factor on the spatial frequency of all patterns
+    objects: int | None = None  # number of loose objects besides the furniture; None = default of the scene
+    rooms: int | None = None  # of room_chain, with `objects` in each; None = 2
     spokes: int = 16  # of the Siemens stars in pole_torture
-    nearest: float | None = None  # metres from the path to what hangs beside it in near_clutter; None = 0.05
-    horizon: float | None = None  # metres to the mountains outdoors; None = 300
-    points: int = 20_000  # of the cloud, on surfaces that a training view sees
+    nearest: float | None = None  # metres between the path and the objects beside it in near_clutter; None = 0.05
+    horizon: float | None = None  # metres to the mountains of outdoor; None = 300
+    points: int = 20_000  # of the cloud, on surfaces that training views see
     point_noise: float = 0.002  # standard deviation per axis, relative to the distance from the observing camera
-    outliers: float = 0.01  # share of points that are nowhere near a surface
+    outliers: float = 0.01  # share of random points that lie on no surface
     pose_noise_translation: float = 0.0  # standard deviation per axis, relative to the scene's median depth
     pose_noise_rotation: float = 0.0  # degrees, standard deviation of the angle
-    exposure: float = 0.0  # training views are brightened by a factor 2^e, e uniform in [-exposure, exposure]
-    lens_gap: float = 0.0  # between the two lenses of the camera of training views, relative to the median depth
-    lens_k1: float = 0.0  # theta' = theta (1 + k1 theta^2) of both lenses, see padgs/geometry/lens.py
-    lens_blend: float = 5.0  # degrees on both sides of the plane between the lenses in which both are seen
+    exposure_range: float = 0.0  # training views are scaled by 2^e, e uniform in [-exposure_range, exposure_range]
+    lens_gap: float = 0.0  # distance of the two lenses of training views, relative to the median depth
+    lens_k1: float = 0.0  # of both lenses: theta' = theta (1 + k1 theta^2), see padgs/geometry/lens.py
+    lens_blend: float = 5.0  # degrees on both sides of the plane between the lenses in which both are blended
     world_scale: float = 1.0  # world units per metre
     world_rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)  # degrees about world x, then y, then z
 
@@ -65,42 +64,48 @@ class SyntheticOptions:
         for field, least in (("train_views", 2), ("test_views", 0), ("points", 1), ("spokes", 1)):
             if getattr(self, field) < least:
                 raise DataError(f"{field} {getattr(self, field)} is less than {least}")
-        for field in ("point_noise", "pose_noise_translation", "pose_noise_rotation", "exposure", "tilt", "lens_gap"):
+        for field in (
+            "point_noise",
+            "pose_noise_translation",
+            "pose_noise_rotation",
+            "exposure_range",
+            "tilt",
+            "lens_gap",
+        ):
             if not 0 <= getattr(self, field) < math.inf:
                 raise DataError(f"{field} {getattr(self, field)} is not a finite number >= 0")
         if not 0 <= self.lens_blend < 90:
             raise DataError(f"lens_blend {self.lens_blend} is not an angle in [0, 90) degrees")
-        if not -0.1 <= self.lens_k1 <= 0.1:  # up to the horizon of a lens, theta' must grow with theta
+        if not -0.1 <= self.lens_k1 <= 0.1:  # theta' must increase with theta up to 90 degrees
             raise DataError(f"lens_k1 {self.lens_k1} is not in [-0.1, 0.1]")
         if not 0 <= self.outliers < 1:
             raise DataError(f"outliers {self.outliers} is not a share in [0, 1)")
         for field in ("texture_frequency", "world_scale"):
             if not 0 < getattr(self, field) < math.inf:
                 raise DataError(f"{field} {getattr(self, field)} is not a finite number > 0")
-        for field in ("reach", "nearest", "horizon"):
+        for field in ("path_radius", "nearest", "horizon"):
             length = getattr(self, field)
             if length is not None and not 0 < length < math.inf:
-                raise DataError(f"{field} {length} is not a finite length > 0 in metres; use null for the scene's own")
+                raise DataError(f"{field} {length} is not a finite length > 0 in metres; use null for the default")
         if self.objects is not None and self.objects < 0:
-            raise DataError(f"objects {self.objects} is negative; use null for the scene's own number")
-        if self.rooms is not None and (self.scene != "enfilade" or self.rooms < 1):
+            raise DataError(f"objects {self.objects} is negative; use null for the default")
+        if self.rooms is not None and (self.scene != "room_chain" or self.rooms < 1):
             raise DataError(
-                f"rooms is {self.rooms} of scene {self.scene}; an enfilade has 1 or more, and others none to choose: "
-                "set data.generator.scene=enfilade, or rooms to null"
+                f"rooms is {self.rooms} of scene {self.scene}; only room_chain has this option, which must be 1 or "
+                "more: set data.generator.scene=room_chain, or rooms to null"
             )
 
     @property
     def title(self) -> str:
-        """What the scene is called. From a path of another length, with nearer or farther things, of other rooms, with
-        noisy poses, or seen by two lenses, a room is another scene than the room.
+        """Name of the scene, with a suffix for every option that makes it a different scene.
 
-        >>> SyntheticOptions(pose_noise_rotation=0.2).title, SyntheticOptions(reach=1.0, lens_gap=0.05).title
+        >>> SyntheticOptions(pose_noise_rotation=0.2).title, SyntheticOptions(path_radius=1.0, lens_gap=0.05).title
         ('synthetic-room-noisy-poses', 'synthetic-room-other-path-two-lenses')
         >>> SyntheticOptions("outdoor", horizon=3000).title
         'synthetic-outdoor-horizon-3000m'
         """
         words = ["synthetic", self.scene]
-        if self.reach is not None:
+        if self.path_radius is not None:
             words.append("other-path")
         words += [
             f"{name}-{length:g}m" for name in ("nearest", "horizon") if (length := getattr(self, name)) is not None

@@ -1,5 +1,6 @@
-"""Ground, houses and street furniture near and far, a ring of mountains, at 300 m unless asked otherwise, and a sky: a
-range of 1 : 1000.
+"""Outdoor scene: ground, houses and street furniture, a ring of mountains (by default at 300 m), and a sky.
+
+The range of depths is 1 : 1000.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from padgs.data.synthetic.world import Light, World
 
 
 def sky(direction: Array) -> Array:
-    """A blue gradient with clouds on a flat layer overhead."""
+    """Return the colours [3, n] of a blue gradient with clouds on a flat layer overhead."""
     up = np.maximum(direction[2], 0)
     color = tx.mix((0.86, 0.9, 0.94), (0.3, 0.52, 0.85), np.sqrt(up))
     reach = 1 / (up + 0.12)
@@ -41,7 +42,7 @@ def _meadow(frequency: float) -> Texture:
 
 
 def _mountains(uv: Array) -> Array:
-    """As they look at 300 m."""
+    """Draw the mountains for a distance of 300 m."""
     rock = tx.noise(uv[0], uv[1] * 2, 260.0)
     height = uv[1] / 45 + 0.35 * (rock - 0.5)
     color = tx.mix((0.32, 0.42, 0.38), (0.5, 0.54, 0.62), tx.step(0.45, height, 0.3))
@@ -60,7 +61,7 @@ def _facade(wall: Texture, width: float, height: float) -> Texture:
 
 
 def outdoor(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
-    """Build the scene; loose objects stand between 0.3 m from the path and 6 m from the centre."""
+    """Build the scene; loose objects are at least 0.3 m from the path and at most 6 m from the centre."""
     f = options.texture_frequency
     walls = (
         tx.bricks((0.5, 0.24, 0.18), (0.8, 0.5, 0.38), (0.8, 0.77, 0.7), 0.4, 0.13),
@@ -70,17 +71,17 @@ def outdoor(options: SyntheticOptions, path: Array, rng: np.random.Generator) ->
     )
     roof = Material(scaled(tx.bricks((0.4, 0.15, 0.1), (0.6, 0.28, 0.2), (0.25, 0.12, 0.1), 0.35, 0.3), f))
     horizon = 300.0 if options.horizon is None else options.horizon
-    away = horizon / 300
+    magnification = horizon / 300
     shapes: list[Shape] = [
         Ground((Material(_meadow(f)),)),
-        Ring(horizon, 60 * away, (Material(scaled(_mountains, 1 / away), glows=True),)),
+        Ring(horizon, 60 * magnification, (Material(scaled(_mountains, 1 / magnification), glows=True),)),
     ]
     for k in range(14):
         far = 11 + 5.5 * k * rng.uniform(0.8, 1.2)
         angle = 2.4 * k + rng.uniform(-0.3, 0.3)
         half = rng.uniform((2.5, 2.5, 2.5), (4.5, 4.0, 6.0))
         x, y, yaw = far * math.cos(angle), far * math.sin(angle), float(rng.uniform(-0.5, 0.5))
-        if far > 0.8 * horizon:  # it would stand in the mountains or behind them
+        if far > 0.8 * horizon:  # in the mountains or behind them
             continue
         side = [Material(_facade(scaled(walls[k % 4], f), 2 * half[axis], 2 * half[2])) for axis in (1, 1, 0, 0)]
         shapes.append(Box((x, y, half[2]), fu.point(half), (*side, roof, roof), yaw))
@@ -94,5 +95,5 @@ def outdoor(options: SyntheticOptions, path: Array, rng: np.random.Generator) ->
         end = (6.5 * math.cos(next_angle), 6.5 * math.sin(next_angle), 4.4)
         shapes.append(Rod((x, y, 4.4), end, 0.015, fu.metal((0.2, 0.2, 0.2))))
     shapes += fu.scatter(options.objects or 0, path, (-5.0, -4.0, 0.3), (5.0, 4.0, 1.6), 0.3, rng)
-    sun = ((260.0, 180.0, 330.0), 90.0)  # far, large and strong: nearly parallel light
+    sun = ((260.0, 180.0, 330.0), 90.0)  # nearly parallel light
     return World(tuple(shapes), Light((sun,), ambient=(0.45, 0.5, 0.58), size=4.0), sky)

@@ -1,6 +1,6 @@
-"""Where the synthetic cameras stand: a curve through the scene, and poses at equal steps along it.
+"""Paths of synthetic cameras: a curve through the scene, and poses at equal steps along it.
 
-World frame: x, y horizontal, z up, metres. A camera heading of 0 looks along +x, positive turns left.
+World frame: x, y horizontal, z up, metres. A heading of 0 looks along +x; positive headings turn left.
 """
 
 from __future__ import annotations
@@ -13,28 +13,28 @@ import numpy as np
 from padgs.data.synthetic.options import SyntheticOptions
 from padgs.data.synthetic.textures import Array
 
-_DENSE = 2000  # vertices of the polyline that stands for a curve
+_DENSE = 2000  # vertices of the polyline of a curve
 
 
 @dataclass(frozen=True)
 class Walk:
-    """Where one can walk in a scene: a rectangle, and optionally a route of its own through waypoints."""
+    """Free space for cameras in a scene: a rectangle, and optionally a route through waypoints."""
 
     center: tuple[float, float]
     half: tuple[float, float]
-    height: float = 1.5  # of the camera
-    sway: float = 0.12  # amplitude of its vertical motion
+    height: float = 1.5  # of the cameras
+    sway: float = 0.12  # amplitude of their vertical motion
     waypoints: tuple[tuple[float, float], ...] = ()  # closed; replaces the roaming curve
 
 
 def curve(walk: Walk, kind: str, rng: np.random.Generator) -> Array:
-    """Dense points [n, 3] along a path of the given kind (roaming, cross, line)."""
+    """Return dense points [n, 3] along a path of the given kind (roaming, cross, line)."""
     phases = rng.uniform(0, 2 * math.pi, 4)
     s = np.linspace(0, 1, _DENSE, endpoint=kind != "roaming")
     angle = 2 * math.pi * s
     if kind == "roaming" and walk.waypoints:
         return np.column_stack((_closed_spline(np.asarray(walk.waypoints), s), _heights(walk, angle, phases)))
-    if kind == "roaming":  # a figure of eight, bent by the seed
+    if kind == "roaming":  # a randomly bent figure of eight
         x = np.sin(angle) + 0.15 * np.sin(3 * angle + phases[0])
         y = np.sin(2 * angle + 0.4 * math.sin(phases[1])) + 0.2 * np.cos(angle + phases[2])
         x, y = x / np.abs(x).max(), y / np.abs(y).max()
@@ -52,7 +52,7 @@ def _heights(walk: Walk, angle: Array, phases: Array) -> Array:
 
 
 def _closed_spline(points: Array, s: Array) -> Array:
-    """Catmull-Rom through closed waypoints [k, 2] at parameters s in [0, 1), each segment equally long in s."""
+    """Evaluate the closed Catmull-Rom spline through waypoints [k, 2] at s in [0, 1); segments have equal lengths."""
     t = s * len(points)
     segment, f = np.floor(t).astype(int), (t % 1)[:, None]
     p0, p1, p2, p3 = (points[(segment + k) % len(points)] for k in (-1, 0, 1, 2))
@@ -60,7 +60,7 @@ def _closed_spline(points: Array, s: Array) -> Array:
 
 
 def stations(path: Array, count: int) -> tuple[Array, Array]:
-    """`count` positions [count, 3] at equal arc length on a dense path, and the path's heading [count] there."""
+    """Return `count` positions [count, 3] at equal arc length on a dense path, and its headings [count] there."""
     jumps = np.linalg.norm(np.diff(path, axis=0), axis=1)
     jumps[jumps > 20 * np.median(jumps)] = 0  # from one arm of the cross to the next
     length = np.concatenate(([0.0], np.cumsum(jumps)))
@@ -72,9 +72,9 @@ def stations(path: Array, count: int) -> tuple[Array, Array]:
 
 
 def cam_from_world(position: Array, heading: float, roll: float = 0.0, pitch: float = 0.0) -> Array:
-    """Pose [4, 4] of a camera at a position [3]; angles in radians.
+    """Return the pose [4, 4] of a camera at a position [3]; angles in radians.
 
-    >>> (cam_from_world(np.zeros(3), 0.0) @ [2, 0, 0, 1]).tolist()  # straight ahead is camera z
+    >>> (cam_from_world(np.zeros(3), 0.0) @ [2, 0, 0, 1]).tolist()  # forward is camera z
     [0.0, 0.0, 2.0, 1.0]
     """
     c, s = math.cos(heading), math.sin(heading)
@@ -89,7 +89,7 @@ def cam_from_world(position: Array, heading: float, roll: float = 0.0, pitch: fl
 
 
 def poses(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> Array:
-    """Poses [n, 4, 4] of all cameras, training and test, in order along the path."""
+    """Return the poses [n, 4, 4] of all training and test views, in order along the path."""
     count = options.train_views + options.test_views
     positions, headings = stations(path, count)
     if options.heading != "path":
@@ -100,6 +100,6 @@ def poses(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> A
 
 
 def held_out(options: SyntheticOptions) -> list[int]:
-    """Which positions along the path are test views: spread evenly; the ends train if no more are held out."""
+    """Return the positions of the test views along the path: spread evenly, without the ends if there are few."""
     total = options.train_views + options.test_views
     return [int((k + 0.5) * total / options.test_views) for k in range(options.test_views)]

@@ -1,4 +1,4 @@
-"""A point cloud as structure from motion leaves it: on texture that two cameras see, with noise and outliers."""
+"""Point clouds like those of structure from motion: on texture that two cameras see, with noise and outliers."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from padgs.data.synthetic.world import SKY, World
 def sample_points(
     world: World, poses: Array, images: list[Array], options: SyntheticOptions, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Points [P, 3] float64 in metres and their colours [P, 3] uint8, as the given views would have triangulated them.
+    """Sample points [P, 3] float64 in metres and their colours [P, 3] uint8.
 
-    A pixel is chosen with a probability proportional to its solid angle times the local contrast of the image, as
-    features are found at texture; its exact surface point is kept if a second, random view sees it too.
+    Pixels are drawn with a probability proportional to solid angle times local contrast, because features are found at
+    texture; their exact surface points are kept if a second, random view sees them too.
 
     Args:
-        world: what is there.
+        world: the scene.
         poses: [n, 4, 4] exact poses of the training views, metres.
         images: their n panoramas [H, W, 3] uint8.
         options: number of points, noise, outliers.
-        rng: source of randomness.
+        rng: random numbers.
     """
     outliers = round(options.outliers * options.points)
     wanted = options.points - outliers
@@ -40,7 +40,10 @@ def sample_points(
         if found >= wanted:
             break
     if not found:
-        raise DataError("no surface point is seen by two cameras: the scene has no texture, or only sky")
+        raise DataError(
+            "no surface point is seen by two cameras, because the scene has no texture, or only sky; "
+            "choose another scene or path"
+        )
     points, color = np.concatenate(kept), np.concatenate(colors)
     choice = rng.permutation(found)[:wanted]
     points, color = points[choice], color[choice]
@@ -50,13 +53,13 @@ def sample_points(
 
 
 def _contrast(image: Array) -> Array:
-    """Probability [H * W] of a feature at each pixel: solid angle x gradient magnitude."""
+    """Return the probability [H * W] of a feature at each pixel: solid angle x gradient magnitude."""
     gray = image.astype(np.float32).mean(-1)
     across = np.roll(gray, -1, 1) - np.roll(gray, 1, 1)
     down = np.gradient(gray, axis=0) * 2
     height = len(gray)
     weight = np.cos(((np.arange(height) + 0.5) / height - 0.5) * np.pi)[:, None]
-    # Across, a pixel is narrower near the poles: the same contrast there is a steeper edge but fewer features.
+    # Pixels are narrower near the poles: the same contrast there is a steeper edge, but fewer features.
     chance = (np.hypot(across, down) + 1e-3) * weight
     return (chance / chance.sum()).ravel()
 

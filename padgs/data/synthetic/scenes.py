@@ -1,4 +1,10 @@
-"""Scenes."""
+"""Built-in scenes, as blueprints of one generator.
+
+room, two_rooms (a door between them), outdoor (far ring and sky), pole_torture (Siemens stars and rods at both poles),
+bare_room (posters on a tenth of the walls), near_clutter (objects 5-30 cm from the path), glossy (mirror-like
+materials, so colours depend on the view), white_room and checker_room (known complexity), room_chain (any number of
+rooms in a row).
+"""
 
 from __future__ import annotations
 
@@ -12,8 +18,8 @@ from padgs.data.synthetic import textures as tx
 from padgs.data.synthetic.options import SyntheticOptions
 from padgs.data.synthetic.outdoor import outdoor
 from padgs.data.synthetic.paths import Walk
-from padgs.data.synthetic.room_chain import doorway, enfilade
-from padgs.data.synthetic.room_chain import walk as through_rooms
+from padgs.data.synthetic.room_chain import doorway, room_chain
+from padgs.data.synthetic.room_chain import walk as room_chain_walk
 from padgs.data.synthetic.shapes import Box, Material, Rod, Room, Shape
 from padgs.data.synthetic.textures import Array, Texture, scaled
 from padgs.data.synthetic.world import Light, World
@@ -23,11 +29,11 @@ Furnish = Callable[[SyntheticOptions, Array, np.random.Generator], World]  # opt
 
 @dataclass(frozen=True)
 class Blueprint:
-    """A scene before it is built."""
+    """Recipe of a scene."""
 
     walk: Walk | Callable[[SyntheticOptions], Walk]
-    path: str  # the kind of path it has unless asked otherwise
-    objects: int  # likewise, loose objects
+    path: str  # default kind of path
+    objects: int  # default number of loose objects
     furnish: Furnish
 
 
@@ -37,7 +43,7 @@ INK: tx.Color = (0.16, 0.13, 0.12)
 
 
 def _posters(count: int, width: float, size: float) -> list[tuple[float, float, float, float, Texture]]:
-    """`count` posters of height `size` in a row along a wall of the given width."""
+    """Return `count` posters of height `size` in a row along a wall of the given width."""
     looks = (
         tx.picture((0.35, 0.6, 0.85), (0.12, 0.32, 0.22), (0.98, 0.75, 0.25), size),
         tx.print_of(PAPER, INK, size / 16),
@@ -74,7 +80,7 @@ def _room_materials(
 
 
 def _furniture(rng: np.random.Generator) -> list[Shape]:
-    """What stands along the walls of the 6 x 5 x 2.8 m room, and the rods that cross it."""
+    """Return the furniture of the 6 x 5 x 2.8 m room, and the rods that cross it."""
     steel = fu.metal()
     return [
         *fu.bookshelf(-1.5, 2.3, 1.6, 2.0),
@@ -99,28 +105,28 @@ _LIGHT = Light((((0.0, 0.0, 2.4), 0.85), ((2.6, 0.7, 1.75), 0.35)))
 
 
 def room(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
-    """A furnished room, 6 x 5 x 2.8 m."""
+    """Build a furnished room, 6 x 5 x 2.8 m."""
     shapes = [Room(_LOW, _HIGH, _room_materials(options, 6, 5)), *_furniture(rng)]
     shapes += fu.scatter(_objects(options), path, (-2.0, -1.8, 0.5), (2.0, 1.5, 2.5), 0.35, rng)
     return World(tuple(shapes), _LIGHT)
 
 
 def near_clutter(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
-    """The room with small objects beside the camera path: a layer 25 cm thick, from 5 cm on unless asked otherwise."""
+    """Build the room with small objects in a layer of 25 cm beside the camera path, by default from 5 cm on."""
     shapes = [Room(_LOW, _HIGH, _room_materials(options, 6, 5)), *_furniture(rng)]
     nearest = 0.05 if options.nearest is None else options.nearest
     return World((*shapes, *fu.beside(_objects(options), path, nearest, nearest + 0.25, rng)), _LIGHT)
 
 
 def glossy(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
-    """The room with a polished floor and mirror-like objects."""
+    """Build the room with a polished floor and mirror-like objects."""
     shapes = [Room(_LOW, _HIGH, _room_materials(options, 6, 5, gloss=0.12)), *_furniture(rng)]
     shapes += fu.scatter(_objects(options), path, (-2.0, -1.8, 0.5), (2.0, 1.5, 2.5), 0.35, rng, reflectance=0.3)
     return World(tuple(shapes), _LIGHT)
 
 
 def bare_room(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
-    """Smooth one-coloured surfaces; posters cover a tenth of the walls."""
+    """Build a room of smooth surfaces of one colour; posters cover a tenth of the walls."""
     white, gray = tx.plain((0.8, 0.8, 0.78)), tx.plain((0.55, 0.55, 0.55))
     # 4 walls are 61.6 m2; 9 posters of 0.72 x 0.975 m cover a tenth.
     rows = [
@@ -132,7 +138,7 @@ def bare_room(options: SyntheticOptions, path: Array, rng: np.random.Generator) 
 
 
 def pole_torture(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
-    """Siemens stars on floor and ceiling, and thin rods across, above, below and beside the cameras."""
+    """Build a room with Siemens stars on floor and ceiling, and thin rods around the cameras."""
     f = options.texture_frequency
     star = tx.siemens_star(INK, PAPER, options.spokes, 0.8 / f)
     walls = _room_materials(options, 6, 5)[:4]
@@ -151,7 +157,7 @@ def pole_torture(options: SyntheticOptions, path: Array, rng: np.random.Generato
 
 
 def two_rooms(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
-    """Two furnished rooms of 5 x 5 m with an open door between them; most things are hidden from most views."""
+    """Build two furnished rooms of 5 x 5 m with an open door between them; most things are hidden from most views."""
     f = options.texture_frequency
     partition = fu.matt(scaled(tx.wallpaper((0.62, 0.5, 0.42), (0.9, 0.82, 0.7)), f))
     shapes: list[Shape] = [
@@ -175,7 +181,7 @@ def two_rooms(options: SyntheticOptions, path: Array, rng: np.random.Generator) 
 
 
 def _objects(options: SyntheticOptions) -> int:
-    return options.objects or 0  # the blueprint's number has been filled in by SyntheticTruth
+    return options.objects or 0  # SyntheticTruth has filled in the default
 
 
 LIGHT = Light((((0.0, 0.0, 2.5), 0.9),))
@@ -185,12 +191,12 @@ TILE = 1.0  # metres, at `texture_frequency` 1
 
 
 def white_room(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
-    """White walls, floor and ceiling, and as many objects as are asked for, none by default."""
+    """Build a room with white walls, floor and ceiling, and by default no objects."""
     return _room(tx.plain(WHITE), options, path, rng)
 
 
 def checker_room(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> World:
-    """The same with two-coloured tiles everywhere, `texture_frequency` of them a metre."""
+    """Build the white room with two-coloured tiles everywhere, `texture_frequency` per metre."""
     tiles = tx.checker(WHITE, DARK, TILE / options.texture_frequency, mottle=0.0)
     return _room(tiles, options, path, rng)
 
@@ -213,5 +219,5 @@ BLUEPRINTS: dict[str, Blueprint] = {
     "glossy": Blueprint(Walk((-0.1, -0.1), (1.4, 1.15)), "roaming", 8, glossy),
     "white_room": Blueprint(Walk((-0.1, -0.1), (1.4, 1.15)), "roaming", 0, white_room),
     "checker_room": Blueprint(Walk((-0.1, -0.1), (1.4, 1.15)), "roaming", 0, checker_room),
-    "enfilade": Blueprint(through_rooms, "roaming", 4, enfilade),
+    "room_chain": Blueprint(room_chain_walk, "roaming", 4, room_chain),
 }

@@ -1,7 +1,7 @@
-"""The solids that synthetic scenes are made of, each with a closed-form nearest hit along a ray.
+"""Solids of synthetic scenes, with closed-form ray intersections.
 
 Arrays are component-first, [3, n], because numpy is fastest on contiguous components. World axes: x, y horizontal,
-z up, metres. `hit` works in the precision of the directions (float32 for colour, float64 for exact depth).
+z up, metres. `hit` uses the precision of the directions (float32 for colour, float64 for exact depth).
 """
 
 from __future__ import annotations
@@ -20,41 +20,41 @@ Point = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Material:
-    """How a surface looks."""
+    """Appearance of a surface."""
 
     texture: Texture
     reflectance: float = 0.0  # at normal incidence: 0 = matt, 1 = mirror
-    glows: bool = False  # shows its texture unlit, and casts no shadow
+    glows: bool = False  # unlit, and casts no shadow
 
 
 @dataclass(frozen=True)
 class Surface:
-    """Where rays met a shape."""
+    """Surface properties at ray hits."""
 
-    normal: Array  # [3, n] towards the side that is seen
+    normal: Array  # [3, n] towards the visible side
     uv: Array  # [2, n] metres from the centre of the face
     face: Array  # [n] int, index into the shape's materials
 
 
 class Shape(Protocol):
-    """A solid (or the inside of one)."""
+    """Solid, or the inside of one."""
 
     @property
     def materials(self) -> tuple[Material, ...]:
-        """One per face, or one for all."""
+        """Return one material per face, or one for all."""
         ...
 
     @property
     def bounds(self) -> tuple[Point, float] | None:
-        """A sphere (centre, radius) around it, or None where it surrounds the camera."""
+        """Return a bounding sphere (centre, radius); None if the shape surrounds the camera."""
         ...
 
     def hit(self, origin: Array, direction: Array) -> Array:
-        """Distance [n] along unit directions [3, n] from origins [3, 1] or [3, n] to the first hit; inf = missed."""
+        """Return distances [n] along unit directions [3, n] from origins [3, 1 or n] to the first hit; inf = none."""
         ...
 
     def surface(self, points: Array) -> Surface:
-        """Normal, texture coordinates and face of points [3, n] on it."""
+        """Return normals, texture coordinates and faces of points [3, n] on the shape."""
         ...
 
 
@@ -62,20 +62,20 @@ def _column(point: Point | Array, like: Array) -> Array:
     return np.asarray(point, like.dtype).reshape(3, 1)
 
 
-def _turned(vectors: Array, yaw: float) -> Array:
-    """Vectors [3, n] turned about the vertical, to the left."""
+def _rotated(vectors: Array, yaw: float) -> Array:
+    """Rotate vectors [3, n] about the vertical, to the left."""
     if yaw == 0:
         return vectors
     c, s = math.cos(yaw), math.sin(yaw)
     return np.stack((c * vectors[0] - s * vectors[1], c * vectors[1] + s * vectors[0], vectors[2]))
 
 
-_FACE_AXES = np.array(((1, 1, 0, 0, 0, 0), (2, 2, 2, 2, 1, 1)))  # which coordinate is u, which v
+_FACE_AXES = np.array(((1, 1, 0, 0, 0, 0), (2, 2, 2, 2, 1, 1)))  # coordinates of u and v
 _FACE_SIGNS = np.array((-1, 1, 1, -1, 1, 1))  # of u, seen from outside
 
 
 def _face_uv(local: Array, face: Array, side: float) -> Array:
-    """Texture coordinates on the six faces of a box; `side` = 1 seen from outside, -1 from inside."""
+    """Return texture coordinates on the six faces of a box; `side` = 1 seen from outside, -1 from inside."""
     first, second = _FACE_AXES[:, face]
     sign = (_FACE_SIGNS * side).astype(local.dtype)  # floors and ceilings are not mirrored
     sign[4:] = 1
@@ -92,14 +92,14 @@ def _face_normal(face: Array, dtype: np.dtype) -> Array:
 
 @dataclass(frozen=True)
 class Room:
-    """The inside of an axis-aligned box. Faces in the order -x, +x, -y, +y, -z (floor), +z (ceiling)."""
+    """Inside of an axis-aligned box. Faces in the order -x, +x, -y, +y, -z (floor), +z (ceiling)."""
 
     low: Point
     high: Point
     materials: tuple[Material, ...]
 
     bounds = None
-    texel, faces = 0.08, 6  # metres, of the light maps that each face carries
+    texel, faces = 0.08, 6  # texel: metres, of the light map of each face
 
     def hit(self, origin: Array, direction: Array) -> Array:
         low, high = _column(self.low, direction), _column(self.high, direction)
@@ -115,12 +115,12 @@ class Room:
         return Surface(-_face_normal(face, points.dtype), _face_uv(local, face, -1), face)
 
     def size(self, face: int) -> tuple[float, float]:
-        """Extent (u, v) of a face in metres."""
+        """Return the extent (u, v) of a face in metres."""
         extent = np.subtract(self.high, self.low)
         return ((extent[1], extent[2]), (extent[0], extent[2]), (extent[0], extent[1]))[face // 2]
 
     def point_at(self, face: int, uv: Array) -> Array:
-        """The point [3, n] of a face at texture coordinates [2, n]: the inverse of `surface`."""
+        """Return the points [3, n] of a face at texture coordinates [2, n]: the inverse of `surface`."""
         axis, sign = face // 2, 1.0 if face % 2 else -1.0
         points = np.empty((3, uv.shape[1]), uv.dtype)
         points[axis] = sign * (self.high[axis] - self.low[axis]) / 2
@@ -134,7 +134,7 @@ class Room:
 
 @dataclass(frozen=True)
 class Box:
-    """A box, turned about the vertical. Faces as in Room; a single material covers all of them."""
+    """Box, rotated about the vertical. Faces as in Room; a single material covers all faces."""
 
     center: Point
     half: Point
@@ -146,7 +146,7 @@ class Box:
         return self.center, math.hypot(*self.half)
 
     def hit(self, origin: Array, direction: Array) -> Array:
-        start, ray = _turned(origin - _column(self.center, direction), -self.yaw), _turned(direction, -self.yaw)
+        start, ray = _rotated(origin - _column(self.center, direction), -self.yaw), _rotated(direction, -self.yaw)
         half = _column(self.half, direction)
         with np.errstate(divide="ignore", invalid="ignore"):
             inverse = 1 / ray
@@ -157,16 +157,16 @@ class Box:
         return np.where((enter <= leave) & (enter > 0), enter, np.inf)
 
     def surface(self, points: Array) -> Surface:
-        local = _turned(points - _column(self.center, points), -self.yaw)
+        local = _rotated(points - _column(self.center, points), -self.yaw)
         outside = np.abs(local) - _column(self.half, points)
         axis = np.argmax(outside, axis=0)
         face = 2 * axis + (np.take_along_axis(local, axis[None], 0)[0] > 0)
-        return Surface(_turned(_face_normal(face, points.dtype), self.yaw), _face_uv(local, face, 1), face)
+        return Surface(_rotated(_face_normal(face, points.dtype), self.yaw), _face_uv(local, face, 1), face)
 
 
 @dataclass(frozen=True)
 class Sphere:
-    """A sphere. uv = (longitude, latitude) x radius."""
+    """Sphere. uv = (longitude, latitude) x radius."""
 
     center: Point
     radius: float
@@ -193,13 +193,13 @@ class Sphere:
 
 @dataclass(frozen=True)
 class Rod:
-    """A round bar from `start` to `end`, open or with spherical ends. uv = (angle x radius, length along)."""
+    """Cylinder from `start` to `end`, open or with spherical ends. uv = (angle x radius, length along)."""
 
     start: Point
     end: Point
     radius: float
     materials: tuple[Material, ...]
-    rounded: bool = False  # not needed where both ends stick in something
+    rounded: bool = False  # not needed if both ends are inside other shapes
 
     @property
     def bounds(self) -> tuple[Point, float]:
@@ -248,12 +248,12 @@ class Rod:
 
 @dataclass(frozen=True)
 class Ground:
-    """The plane z = 0, seen from above. Its light map covers the middle."""
+    """Plane z = 0, seen from above. Its light map covers the middle."""
 
     materials: tuple[Material, ...]
 
     bounds = None
-    texel, faces = 0.15, 1  # as of a room
+    texel, faces = 0.15, 1  # as in Room
 
     def hit(self, origin: Array, direction: Array) -> Array:
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -274,7 +274,7 @@ class Ground:
 
 @dataclass(frozen=True)
 class Ring:
-    """The inside of an upright cylinder about the z axis with a jagged top: mountains far away."""
+    """Inside of a cylinder about the z axis with a jagged top: distant mountains."""
 
     radius: float
     height: float  # of the highest peaks
@@ -283,7 +283,7 @@ class Ring:
     bounds = None
 
     def ridge(self, angle: Array) -> Array:
-        """Height of the top at an azimuth in radians; periodic."""
+        """Return the height of the top at an azimuth in radians; periodic."""
         waves = np.sum([np.sin(k * angle + 1.7 * k * k) / k for k in (2, 3, 5, 9, 17, 31)], axis=0)
         return self.height * (0.55 + 0.3 * waves)
 
@@ -303,4 +303,4 @@ class Ring:
         return Surface(normal, np.stack((angle * self.radius, points[2])), np.zeros(points.shape[1], np.int64))
 
 
-Flat = Room | Ground  # their faces carry light maps
+Flat = Room | Ground  # shapes with light maps

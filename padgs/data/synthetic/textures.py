@@ -1,7 +1,7 @@
-"""Procedural surface textures: functions of the position on a surface in metres, resolution-free and seeded.
+"""Procedural surface textures: seeded functions of the position on a surface, without a resolution.
 
 A texture maps uv [2, n] (metres from the centre of a face, u to the right, v up) to colours [3, n] in [0, 1].
-What is marked `texture` below is called without uv, and returns such a function.
+Functions decorated by `texture` are called without uv, and return a texture.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 Texture = Callable[[Array], Array]
 Color = tuple[float, float, float]
-Knobs = ParamSpec("Knobs")
+Params = ParamSpec("Params")
 
 _TABLE = 4096
 
 
-def texture(draw: Callable[Concatenate[Array, Knobs], Array]) -> Callable[Knobs, Texture]:
-    """Make a factory of textures of a function that draws one."""
+def texture(draw: Callable[Concatenate[Array, Params], Array]) -> Callable[Params, Texture]:
+    """Turn a function of uv and parameters into a factory of textures."""
 
     @wraps(draw)
-    def factory(*args: Knobs.args, **kwargs: Knobs.kwargs) -> Texture:
+    def factory(*args: Params.args, **kwargs: Params.kwargs) -> Texture:
         return lambda uv: draw(uv, *args, **kwargs)
 
     return factory
@@ -38,7 +38,7 @@ def _random_table() -> Array:
 
 @cache
 def _noise_table(size: int = 512) -> Array:
-    """A periodic picture of 1/f noise in [0, 1]: white noise, filtered in the frequency domain."""
+    """Return a periodic table of 1/f noise in [0, 1]: white noise, filtered in the frequency domain."""
     white = np.fft.rfft2(np.random.default_rng(7).standard_normal((size, size)))
     frequency = np.hypot(np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)) * size
     frequency[0, 0] = 1
@@ -54,16 +54,16 @@ def _glyphs() -> Array:
 
 
 def bilinear(table: Array, x: Array, y: Array) -> Array:
-    """Value of a table [h, w] at continuous texel positions; texel (i, j) lies at (x, y) = (j, i).
+    """Sample a table [h, w] bilinearly at continuous texel positions; texel (i, j) is at (x, y) = (j, i).
 
-    The table is periodic, with a width and height that are powers of two, or x and y stay in [0, w - 1) and [0, h - 1).
+    Tables are periodic if width and height are powers of two; else x and y must be in [0, w - 1) and [0, h - 1).
     """
     height, width = table.shape
     x0, y0 = np.floor(x), np.floor(y)
     fx, fy = x - x0, y - y0
     left, top = x0.astype(np.int32), y0.astype(np.int32)
     right, bottom = left + 1, top + 1
-    if not (width & (width - 1) or height & (height - 1)):  # remainders are slow, masks are not
+    if not (width & (width - 1) or height & (height - 1)):  # bit masks are faster than remainders
         left, right, top, bottom = left & (width - 1), right & (width - 1), top & (height - 1), bottom & (height - 1)
     top *= width
     bottom *= width
@@ -75,41 +75,41 @@ def bilinear(table: Array, x: Array, y: Array) -> Array:
 
 
 def noise(u: Array, v: Array, period: float) -> Array:
-    """1/f noise in [0, 1] that repeats every `period` metres."""
+    """Return 1/f noise in [0, 1] that repeats every `period` metres."""
     table = _noise_table()
     scale = table.shape[0] / period
     return bilinear(table, u * scale, v * scale)
 
 
 def random_of(*cells: Array | int) -> Array:
-    """A fixed pseudo-random number in [0, 1) for every combination of integer cells."""
+    """Return a fixed pseudo-random number in [0, 1) for every combination of integer cells."""
     total = 0
     for cell, prime in zip(cells, (7919, 104_729, 1_299_709), strict=False):
-        total = total + np.asarray(cell).astype(np.int32) * np.int32(prime)  # wraps around; so be it
+        total = total + np.asarray(cell).astype(np.int32) * np.int32(prime)  # wraps around
     return _random_table().take((total ^ (total >> 7)) & (_TABLE - 1))
 
 
 def mix(first: Array | Color, second: Array | Color, weight: Array | float) -> Array:
-    """(1 - weight) first + weight second for colours [3] or [3, n] and weights [n]."""
+    """Return (1 - weight) first + weight second for colours [3] or [3, n] and weights [n]."""
     a, b = (np.asarray(c, np.float32).reshape(3, -1) for c in (first, second))
     return a + (b - a) * weight
 
 
 def step(edge: float, x: Array, blur: float) -> Array:
-    """0 below `edge`, 1 above, a linear ramp of width `blur` between."""
+    """Return 0 below `edge`, 1 above, with a linear ramp of width `blur` between."""
     return np.clip((x - edge) / blur + 0.5, 0, 1)
 
 
 @texture
 def plain(uv: Array, color: Color, mottle: float = 0.0, period: float = 1.5) -> Array:
-    """One colour, mottled by noise of relative strength `mottle`."""
+    """Draw one colour, mottled by noise of relative strength `mottle`."""
     tone = 1 + mottle * (2 * noise(uv[0], uv[1], period) - 1) if mottle else np.ones_like(uv[0])
     return np.asarray(color, np.float32)[:, None] * tone
 
 
 @texture
 def planks(uv: Array, dark: Color, light: Color, width: float = 0.14, length: float = 1.3) -> Array:
-    """Wooden boards along u with grain and dark gaps."""
+    """Draw wooden boards along u with grain and dark gaps."""
     row = np.floor(uv[1] / width)
     along = uv[0] / length + random_of(row, 3)
     column = np.floor(along)
@@ -124,7 +124,7 @@ def planks(uv: Array, dark: Color, light: Color, width: float = 0.14, length: fl
 
 @texture
 def bricks(uv: Array, dark: Color, light: Color, mortar: Color, length: float = 0.25, height: float = 0.085) -> Array:
-    """A running bond of bricks."""
+    """Draw a running bond of bricks."""
     row = np.floor(uv[1] / height)
     along = uv[0] / length + 0.5 * (row % 2)
     column = np.floor(along)
@@ -138,7 +138,7 @@ def bricks(uv: Array, dark: Color, light: Color, mortar: Color, length: float = 
 
 @texture
 def checker(uv: Array, first: Color, second: Color, size: float = 0.3, mottle: float = 0.25) -> Array:
-    """Two-coloured square tiles with fine joints and marble-like veins."""
+    """Draw two-coloured square tiles with fine joints and marble-like veins."""
     column, row = np.floor(uv[0] / size), np.floor(uv[1] / size)
     tone = 1 + mottle * (noise(uv[0] + 3 * random_of(row, column), uv[1], 0.9) - 0.5)
     edge = np.maximum(np.abs(uv[0] / size - column - 0.5), np.abs(uv[1] / size - row - 0.5))
@@ -147,7 +147,7 @@ def checker(uv: Array, first: Color, second: Color, size: float = 0.3, mottle: f
 
 @texture
 def wallpaper(uv: Array, ground: Color, figure: Color, period: float = 0.42) -> Array:
-    """An ornamental repeat: two interlocked families of soft rosettes with fine stripes between."""
+    """Draw a periodic ornament: two families of soft rosettes with fine stripes between."""
     a, b = uv[0] * (2 * np.pi / period), uv[1] * (2 * np.pi / period)
     bloom = np.cos(a) * np.cos(b) + 0.45 * np.cos(2 * a + np.sin(b)) * np.cos(3 * b) + 0.3 * np.cos(4 * a)
     ring = np.abs(bloom - 0.35)
@@ -158,7 +158,7 @@ def wallpaper(uv: Array, ground: Color, figure: Color, period: float = 0.42) -> 
 
 @texture
 def stripes(uv: Array, colors: Sequence[Color], width: float = 0.05, mottle: float = 0.1) -> Array:
-    """Bands across v that go through the colours in order."""
+    """Draw bands across v that cycle through the colours."""
     palette = np.asarray(colors, np.float32)
     band = np.floor(uv[1] / width).astype(np.int64) % len(palette)
     return palette[band].T * (1 + mottle * (noise(uv[0], uv[1], 0.6) - 0.5))
@@ -166,7 +166,7 @@ def stripes(uv: Array, colors: Sequence[Color], width: float = 0.05, mottle: flo
 
 @texture
 def print_of(uv: Array, paper: Color, ink: Color, size: float = 0.06) -> Array:
-    """Lines of text-like marks: random glyphs of 5 x 7 dots, grouped into words."""
+    """Draw lines of random glyphs of 5 x 7 dots, grouped into words."""
     column, line = np.floor(uv[0] / (0.75 * size)), np.floor(uv[1] / (1.6 * size))
     x = ((uv[0] / (0.75 * size) - column) * 6).astype(np.int64)
     y = ((uv[1] / (1.6 * size) - line) * 11).astype(np.int64)
@@ -178,7 +178,7 @@ def print_of(uv: Array, paper: Color, ink: Color, size: float = 0.06) -> Array:
 
 @texture
 def books(uv: Array, spines: Sequence[Color], board: Color, shelf: float = 0.32) -> Array:
-    """Shelves of book spines of different heights and colours, with labels."""
+    """Draw shelves of book spines of different heights and colours, with labels."""
     palette = np.asarray(spines, np.float32)
     level = np.floor(uv[1] / shelf)
     up = (uv[1] / shelf - level) * shelf
@@ -197,7 +197,7 @@ def books(uv: Array, spines: Sequence[Color], board: Color, shelf: float = 0.32)
 
 @texture
 def siemens_star(uv: Array, dark: Color, light: Color, spokes: int, pitch: float) -> Array:
-    """A lattice of Siemens stars, `pitch` apart, one at the origin; detail of every size towards each centre."""
+    """Draw a lattice of Siemens stars, `pitch` apart, one at the origin."""
     x, y = uv / pitch - np.round(uv / pitch)
     radius = np.hypot(x, y)
     spoke = (np.arctan2(y, x) * (spokes / (2 * np.pi))) % 1 < 0.5
@@ -207,7 +207,7 @@ def siemens_star(uv: Array, dark: Color, light: Color, spokes: int, pitch: float
 
 @texture
 def medallion(uv: Array, ground: Color, figure: Color, accent: Color, radius: float, fold: int) -> Array:
-    """A round ornament of `fold`-fold symmetry: a rug on the floor, a rosette on the ceiling."""
+    """Draw a round ornament of `fold`-fold symmetry: a rug on the floor, a rosette on the ceiling."""
     r, angle = np.hypot(uv[0], uv[1]) / radius, np.arctan2(uv[1], uv[0])
     petal = np.cos(fold * angle)
     wave = np.sin(18 * r + 1.4 * petal) * np.cos(2 * fold * angle * np.floor(1 + 2 * r))
@@ -220,7 +220,7 @@ def medallion(uv: Array, ground: Color, figure: Color, accent: Color, radius: fl
 
 @texture
 def picture(uv: Array, sky: Color, land: Color, sun: Color, size: float) -> Array:
-    """A poster: a landscape of layered hills with a disc, over a line of print."""
+    """Draw a poster: a landscape of layered hills with a sun, over a line of print."""
     caption = print_of((0.93, 0.91, 0.86), (0.15, 0.13, 0.12), size / 14)
     u, v = uv / size
     color = mix(sky, (1, 0.97, 0.9), np.clip(0.5 - 0.9 * v, 0, 1))
@@ -233,7 +233,7 @@ def picture(uv: Array, sky: Color, land: Color, sun: Color, size: float) -> Arra
 
 @texture
 def window(uv: Array, glow: Color, frame: Color, panes: int = 2) -> Array:
-    """A window seen from inside: bright sky behind a wooden cross."""
+    """Draw a window seen from inside: bright sky behind a wooden cross."""
     cloud = noise(uv[0], uv[1] * 2, 2.3)
     light = mix(glow, (1, 1, 1), np.clip(1.6 * cloud - 0.4, 0, 1))
     cell = np.abs(uv * panes - np.floor(uv * panes) - 0.5).max(axis=0)
@@ -242,7 +242,7 @@ def window(uv: Array, glow: Color, frame: Color, panes: int = 2) -> Array:
 
 @texture
 def sectors(uv: Array, colors: Sequence[Color], count: int, radius: float) -> Array:
-    """Beach-ball gores on a sphere of the given radius (u = longitude x radius, v = latitude x radius)."""
+    """Draw beach-ball sectors on a sphere of the given radius (u = longitude x radius, v = latitude x radius)."""
     palette = np.asarray(colors, np.float32)
     sector = np.floor((uv[0] / (2 * np.pi * radius) % 1) * count).astype(np.int64) % len(palette)
     band = np.abs(uv[1] / radius) < 0.12
@@ -251,13 +251,13 @@ def sectors(uv: Array, colors: Sequence[Color], count: int, radius: float) -> Ar
 
 
 def scaled(texture: Texture, frequency: float) -> Texture:
-    """The same texture with every detail `frequency` times finer."""
+    """Return the texture with all details `frequency` times finer."""
     return texture if frequency == 1 else lambda uv: texture(uv * frequency)
 
 
 @texture
 def framed(uv: Array, base: Texture, patches: Sequence[tuple[float, float, float, float, Texture]]) -> Array:
-    """Rectangles (u, v, width, height, texture) with a dark border on top of `base`; each is drawn about its centre."""
+    """Draw rectangles (u, v, width, height, texture) with dark borders on top of `base`."""
     color = np.array(base(uv))
     for u, v, width, height, patch in patches:
         local = uv - np.asarray((u, v), uv.dtype)[:, None]
@@ -273,7 +273,7 @@ def framed(uv: Array, base: Texture, patches: Sequence[tuple[float, float, float
 def disc(
     uv: Array, base: Texture, patch: Texture, radius: float, centers: Sequence[tuple[float, float]] = ((0, 0),)
 ) -> Array:
-    """`patch` within `radius` of each centre, drawn about it, `base` outside."""
+    """Draw `patch` within `radius` of each centre, `base` outside."""
     color = np.empty((3, uv.shape[1]), np.float32)
     outside = np.ones(uv.shape[1], bool)
     for center in centers:

@@ -1,4 +1,4 @@
-"""The exact truth behind a synthetic scene: poses without noise, radial depth, object ids, and new views."""
+"""Exact ground truth of a synthetic scene: poses without noise, radial depth, object ids, and new views."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _STREAMS = ("path", "poses", "furniture", "points", "pose noise", "exposure")
 
 
 class SyntheticTruth:
-    """The world of a configuration, and questions to it. Lengths in and out are world units.
+    """World of a synthetic scene. Lengths in and out are world units.
 
     >>> truth = SyntheticTruth(SyntheticOptions(width=16, train_views=2, test_views=0))
     >>> view = View("anywhere", truth.exact_pose("000"), 16, 8)
@@ -34,47 +34,47 @@ class SyntheticTruth:
         if options.objects is None:
             options = replace(options, objects=blueprint.objects)
         self.options = options
-        reach, walk = options.reach, blueprint.walk
+        radius, walk = options.path_radius, blueprint.walk
         if not isinstance(walk, paths.Walk):
             walk = walk(options)
-        if reach is not None:
-            walk = replace(walk, half=(reach, reach), waypoints=())
+        if radius is not None:
+            walk = replace(walk, half=(radius, radius), waypoints=())
         path = paths.curve(walk, options.path or blueprint.path, self.random("path"))
         self.poses = paths.poses(options, path, self.random("poses"))  # [n, 4, 4] metres, exact
         self.world: World = blueprint.furnish(options, path, self.random("furniture"))
 
     def random(self, stream: str) -> np.random.Generator:
-        """Random numbers for one purpose, so that a change of one knob leaves everything else as it was."""
+        """Return the generator of one purpose, so that options do not change unrelated random numbers."""
         return np.random.default_rng((self.options.seed, _STREAMS.index(stream)))
 
     @property
     def names(self) -> list[str]:
-        """Names of all views in order along the path."""
+        """Return the names of all views in order along the path."""
         return [f"{index:03d}" for index in range(len(self.poses))]
 
     def exact_pose(self, name: str) -> Tensor:
-        """cam_from_world [4, 4] float64 of a view as its image was taken, in world units."""
+        """Return the exact cam_from_world [4, 4] float64 of a view, in world units."""
         if name not in self.names:
             raise DataError(f"unknown view {name!r}; known: {self.names[0]} to {self.names[-1]}")
         return torch.from_numpy(self.to_world(self.poses[self.names.index(name)]))
 
     def depth(self, view: View) -> Tensor:
-        """Distance [H, W] float64 from the camera to the surface at pixel centres, in world units; inf = sky."""
+        """Return distances [H, W] float64 to the surface at pixel centres, in world units; inf = sky."""
         distance, _ = camera.trace(self.world, self._pose(view), view.width)
         return torch.from_numpy(distance * self.options.world_scale)
 
     def object_id(self, view: View) -> Tensor:
-        """Index [H, W] int16 of the shape at pixel centres; -1 = sky."""
+        """Return the shape indices [H, W] int16 at pixel centres; -1 = sky."""
         return torch.from_numpy(camera.trace(self.world, self._pose(view), view.width)[1])
 
     def image(self, view: View) -> Tensor:
-        """The panorama [H, W, 3] uint8 of a view at any pose, without exposure changes."""
+        """Render the panorama [H, W, 3] uint8 of a view at any pose, without exposure changes."""
         pose = self._pose(view)
         return torch.from_numpy(camera.draw(self.world, pose, view.width, self.options.samples, self.options.seed))
 
     @cached_property
     def median_depth(self) -> float:
-        """Median over views of the median finite distance, in metres."""
+        """Return the median over views of the median finite distance, in metres."""
         medians = []
         for pose in self.poses[:: max(1, len(self.poses) // 8)]:
             distance, _ = camera.trace(self.world, pose, 64)
@@ -83,7 +83,7 @@ class SyntheticTruth:
 
     @cached_property
     def given_poses(self) -> Array:
-        """The poses [n, 4, 4] that methods are given, in world units: noise on training views if asked for."""
+        """Return the poses [n, 4, 4] of the scene in world units, with pose noise on training views."""
         rng = self.random("pose noise")
         shift = self.options.pose_noise_translation * self.median_depth if self.options.pose_noise_translation else 0.0
         angle = np.radians(self.options.pose_noise_rotation)
@@ -98,36 +98,36 @@ class SyntheticTruth:
         return np.stack([self.to_world(pose) for pose in given])
 
     def to_world(self, pose: Array) -> Array:
-        """A pose in metres as a pose in the scaled and turned world."""
+        """Convert a pose in metres to the scaled and rotated world."""
         moved = pose.copy()
-        moved[:3, :3] = pose[:3, :3] @ self._turn.T
+        moved[:3, :3] = pose[:3, :3] @ self._world_rotation.T
         moved[:3, 3] *= self.options.world_scale
         return moved
 
     def points_to_world(self, points: Array) -> Array:
-        """Points [P, 3] in metres in the scaled and turned world."""
-        return self.options.world_scale * points @ self._turn.T
+        """Convert points [P, 3] in metres to the scaled and rotated world."""
+        return self.options.world_scale * points @ self._world_rotation.T
 
     @cached_property
-    def _turn(self) -> Array:
+    def _world_rotation(self) -> Array:
         x, y, z = np.radians(self.options.world_rotation)
         return _rotation(np.array((0, 0, z))) @ _rotation(np.array((0, y, 0))) @ _rotation(np.array((x, 0, 0)))
 
     def _pose(self, view: View) -> Array:
-        """The exact pose in metres: of the image, if the view is one of the scene's, else as the view says."""
+        """Return a view's pose in metres, without noise if it is a view of the scene."""
         pose = view.cam_from_world.detach().cpu().double().numpy()
         if view.name in self.names:
             index = self.names.index(view.name)
             if np.array_equal(pose, self.given_poses[index]):
                 return self.poses[index]
         back = pose.copy()
-        back[:3, :3] = pose[:3, :3] @ self._turn
+        back[:3, :3] = pose[:3, :3] @ self._world_rotation
         back[:3, 3] /= self.options.world_scale
         return back
 
 
 def _rotation(vector: Array) -> Array:
-    """Rotation matrix [3, 3] about `vector` [3] by its length in radians (Rodrigues)."""
+    """Return the rotation [3, 3] about `vector` [3] by its length in radians (Rodrigues)."""
     angle = float(np.linalg.norm(vector))
     if angle == 0:
         return np.eye(3)

@@ -1,4 +1,9 @@
-"""World."""
+"""Synthetic worlds: shapes and light, and the colour along a ray.
+
+Flat faces (of rooms and the ground) have light maps: the direct light with true soft shadows, and the openness to
+ambient light (ambient occlusion), the same from all views. Other shapes are lit without shadows, and darkened near the
+floor. Mirror-like materials show one reflection.
+"""
 
 from __future__ import annotations
 
@@ -14,27 +19,27 @@ from padgs.data.synthetic.textures import Array, Color, bilinear
 # (origins [3, n], directions [3, n], candidates) -> distance [n] of the first hit
 FirstHit = Callable[[Array, Array, Sequence[int]], Array]
 
-_REACH = 0.9  # metres within which things darken their surroundings
+_OCCLUSION_RADIUS = 0.9  # metres
 _LAMP_SAMPLES, _OPEN_SAMPLES = 8, 12
-_TILE = 16  # texels; rays of a tile share the list of shapes that can be in their way
+_TILE = 16  # texels; rays of a tile share a list of candidate shapes
 
 
 @dataclass(frozen=True)
 class Light:
-    """Lamps (position, strength), their colour, and the colour of the light from everywhere."""
+    """Lamps (position, strength), their colour, and the ambient colour."""
 
     lamps: tuple[tuple[Point, float], ...]
     color: Color = (1.0, 0.95, 0.86)
     ambient: Color = (0.46, 0.48, 0.52)
-    size: float = 0.25  # radius of a lamp: softness of its shadows
+    size: float = 0.25  # radius of a lamp, which softens shadows
 
     def direct(self, points: Array, normal: Array) -> Array:
-        """Unshadowed direct light [n] on points [3, n] with the given normals."""
+        """Return the unshadowed direct light [n] on points [3, n] with the given normals."""
         return np.sum([lambert(points, normal, np.asarray(lamp), power) for lamp, power in self.lamps], axis=0)
 
 
 def lambert(points: Array, normal: Array, lamp: Array, power: float) -> Array:
-    """Light [n] of one lamp at [3]: cosine law, and a falloff that is gentler than nature's."""
+    """Return the light [n] of one lamp at [3]: cosine law, with a slower falloff than in nature."""
     toward = lamp.astype(points.dtype).reshape(3, 1) - points
     far = np.sqrt((toward * toward).sum(0))
     return power * np.maximum((toward * normal).sum(0) / far, 0) / (1 + 0.25 * far)
@@ -42,14 +47,14 @@ def lambert(points: Array, normal: Array, lamp: Array, power: float) -> Array:
 
 @dataclass(frozen=True)
 class LightMap:
-    """Direct light and openness [rows, columns] over a flat face of the given size in metres."""
+    """Direct light and openness [rows, columns] over a flat face of a size in metres."""
 
     direct: Array
     openness: Array
     size: tuple[float, float]
 
     def at(self, uv: Array) -> tuple[Array, Array]:
-        """Direct light [n] and openness [n] at texture coordinates [2, n]; beyond the face, that of its edge."""
+        """Return direct light [n] and openness [n] at texture coordinates [2, n], clamped to the face."""
         rows, columns = self.direct.shape
         x = np.clip((uv[0] / self.size[0] + 0.5) * columns - 0.5, 0, columns - 1.001)
         y = np.clip((uv[1] / self.size[1] + 0.5) * rows - 0.5, 0, rows - 1.001)
@@ -57,15 +62,15 @@ class LightMap:
 
 
 def bake(flat: Flat, face: int, light: Light, bounds: tuple[Array, Array], casts: Array, hit: FirstHit) -> LightMap:
-    """The light map of one face.
+    """Compute the light map of a face.
 
     Args:
-        flat: the shape with the face.
-        face: which of its faces.
+        flat: the shape.
+        face: index of the face.
         light: the lamps.
         bounds: centres [k, 3] and radii [k] of all shapes.
-        casts: [k] bool, which of them throw shadows.
-        hit: nearest hit of rays with some of the shapes.
+        casts: [k] bool, whether a shape casts shadows.
+        hit: nearest hit of rays among some shapes.
     """
     width, height = flat.size(face)
     columns, rows = (int(np.ceil(extent / flat.texel / 2)) * 2 + 1 for extent in (width, height))  # odd: not periodic
@@ -109,7 +114,7 @@ def _direct(
 
 def _openness(points: Array, normal: Array, bounds: tuple[Array, Array], hit: FirstHit) -> Array:
     middle, spread = _ball(points)
-    near = np.flatnonzero(np.linalg.norm(bounds[0] - middle, axis=1) < bounds[1] + spread + _REACH).tolist()
+    near = np.flatnonzero(np.linalg.norm(bounds[0] - middle, axis=1) < bounds[1] + spread + _OCCLUSION_RADIUS).tolist()
     up = normal[:, 0]
     first = np.roll(np.abs(np.round(up)), 1)
     second = np.cross(up, first)
@@ -118,23 +123,23 @@ def _openness(points: Array, normal: Array, bounds: tuple[Array, Array], hit: Fi
     ways = np.outer(first, radius * np.cos(angle)) + np.outer(second, radius * np.sin(angle))
     ways += np.outer(up, np.sqrt(1 - radius**2))
     start, rays = _all_pairs(points + np.float32(2e-3) * normal, ways.astype(np.float32))
-    free = np.minimum(hit(start, rays, near) / _REACH, 1)
+    free = np.minimum(hit(start, rays, near) / _OCCLUSION_RADIUS, 1)
     return free.reshape(points.shape[1], -1).mean(1)
 
 
 def _all_pairs(first: Array, second: Array) -> tuple[Array, Array]:
-    """Columns of [3, n] and [3, k], each with each: twice [3, n * k]."""
+    """Return all pairs of the columns of [3, n] and [3, k]: twice [3, n * k]."""
     return np.repeat(first, second.shape[1], axis=1), np.tile(second, first.shape[1])
 
 
 def _ball(points: Array) -> tuple[Array, float]:
-    """Centre [3] and radius of a ball around points [3, n]."""
+    """Return centre [3] and radius of a ball around points [3, n]."""
     middle = points.mean(1).astype(np.float64)
     return middle, float(np.sqrt(((points - middle[:, None]) ** 2).sum(0).max()))
 
 
 def sphere_points(count: int) -> Array:
-    """Evenly spread unit vectors [count, 3]: a golden spiral."""
+    """Return evenly spread unit vectors [count, 3]: a golden spiral."""
     z = 1 - (2 * np.arange(count) + 1) / count
     angle = np.arange(count) * (np.pi * (3 - np.sqrt(5)))
     radius = np.sqrt(1 - z * z)
@@ -142,7 +147,7 @@ def sphere_points(count: int) -> Array:
 
 
 def _smooth(table: Array) -> Array:
-    """A 3 x 3 binomial blur: hides that shadows come from a few samples."""
+    """Apply a 3 x 3 binomial blur, which hides the noise of few shadow samples."""
     for _ in range(2):
         padded = np.pad(table, ((1, 1), (0, 0)), mode="edge")
         table = ((padded[:-2] + padded[2:]) / 4 + table / 2).T
@@ -154,7 +159,7 @@ SKY = -1  # object id of a ray that hits nothing
 
 @dataclass
 class World:
-    """Shapes in a fixed order (the index is the object id), light, and the sky for rays that leave."""
+    """Shapes in a fixed order (the index is the object id), light, and sky."""
 
     shapes: tuple[Shape, ...]
     light: Light
@@ -170,12 +175,12 @@ class World:
                     self.light_maps[index, face] = light_map
 
     def nearest(self, origin: Array, direction: Array, candidates: Sequence[int] | None = None) -> tuple[Array, Array]:
-        """Distance [n] (inf where nothing is hit) and object id [n] (SKY there) of the first hit.
+        """Return distance [n] (inf if nothing is hit) and object id [n] (then SKY) of the first hit.
 
         Args:
             origin: [3, 1] or [3, n] metres.
             direction: [3, n] unit, float32 or float64.
-            candidates: shapes to try; all of them if None.
+            candidates: indices of shapes to test; all if None.
         """
         distance = np.full(direction.shape[1], np.inf, direction.dtype)
         object_id = np.full(direction.shape[1], SKY, np.int16)
@@ -189,13 +194,13 @@ class World:
     def color(
         self, origin: Array, direction: Array, candidates: Sequence[int] | None = None, *, reflect: bool = True
     ) -> Array:
-        """Colour [3, n] float32 seen along rays [3, n] float32 from [3, 1] or [3, n], best a narrow bundle.
+        """Return colours [3, n] float32 along rays [3, n] float32; fastest for narrow bundles.
 
         Args:
-            origin: metres.
-            direction: unit.
-            candidates: shapes to try; those that the bundle can hit if None.
-            reflect: whether mirror-like surfaces show what they reflect.
+            origin: [3, 1] or [3, n] metres.
+            direction: [3, n] unit.
+            candidates: indices of shapes to test; None selects those that the bundle can hit.
+            reflect: whether mirror-like surfaces show reflections.
         """
         if candidates is None:
             candidates = self._within(origin, direction)
@@ -210,7 +215,7 @@ class World:
         return seen
 
     def _within(self, origin: Array, direction: Array) -> list[int]:
-        """Shapes that a bundle of rays may hit: those whose bounding sphere meets the cone around it."""
+        """Return the shapes whose bounding sphere meets the cone around a bundle of rays."""
         middle = origin.mean(1)
         spread = float(np.sqrt(((origin - middle[:, None]) ** 2).sum(0).max()))
         axis = direction.mean(1)
@@ -227,7 +232,7 @@ class World:
 
     @cached_property
     def _bounds(self) -> tuple[Array, Array]:
-        """Centres [k, 3] and radii [k] of spheres around all shapes; infinite around what surrounds the camera."""
+        """Return centres [k, 3] and radii [k] of all bounding spheres; infinite if a shape surrounds the camera."""
         bounds = [shape.bounds or ((0.0, 0.0, 0.0), np.inf) for shape in self.shapes]
         return np.array([center for center, _ in bounds]), np.array([radius for _, radius in bounds])
 
@@ -265,7 +270,7 @@ class World:
 
 
 def _groups(labels: Array) -> Iterator[tuple[int, Array | slice]]:
-    """Each label that occurs, and where; a slice of everything where it is the only one."""
+    """Yield each label and its positions; a full slice if there is only one label."""
     low, high = int(labels.min()), int(labels.max())
     if low == high:
         yield low, slice(None)

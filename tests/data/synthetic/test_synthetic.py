@@ -106,10 +106,10 @@ def test_load_takes_name_width_and_knobs_from_the_data_options():
         ({"outliers": 1.0}, "share"),
         ({"world_scale": 0.0}, "world_scale 0.0"),
         ({"point_noise": float("nan")}, "finite"),
-        ({"reach": 0.0}, "reach 0.0 is not a finite length"),
+        ({"path_radius": 0.0}, "path_radius 0.0 is not a finite length"),
         ({"horizon": float("inf")}, "horizon inf is not a finite length"),
         ({"path": "zigzag"}, "known: cross, line, roaming"),
-        ({"objects": 2000}, "no place"),
+        ({"objects": 2000}, "no free position"),
     ],
 )
 def test_bad_knobs_are_refused(knobs, message):
@@ -139,9 +139,9 @@ def test_mountains_stand_where_they_are_asked_to(horizon):
     assert 0.85 * horizon < farthest < 1.25 * horizon
 
 
-@pytest.mark.parametrize(("scene", "rooms"), [("two_rooms", 2), ("enfilade", 2), ("enfilade", 5)])
+@pytest.mark.parametrize(("scene", "rooms"), [("two_rooms", 2), ("room_chain", 2), ("room_chain", 5)])
 def test_rooms_hide_most_of_one_another(scene, rooms):
-    asked = {"rooms": rooms} if scene == "enfilade" else {}
+    asked = {"rooms": rooms} if scene == "room_chain" else {}
     truth, _ = depths(scene, 16, train_views=8 * rooms, test_views=0, **asked)
     rng = np.random.default_rng(0)
     middles = 5.0 * (np.arange(rooms) - (rooms - 1) / 2)
@@ -161,14 +161,14 @@ def test_rooms_hide_most_of_one_another(scene, rooms):
 
 @pytest.mark.parametrize("rooms", [1, 2, 5])
 @pytest.mark.parametrize("path", ["roaming", "cross", "line"])
-def test_cameras_of_an_enfilade_stand_clear_of_its_walls(rooms, path):
-    _, views = depths("enfilade", 64, rooms=rooms, path=path, train_views=6 * rooms, test_views=0)
+def test_cameras_of_a_room_chain_keep_away_from_walls(rooms, path):
+    _, views = depths("room_chain", 64, rooms=rooms, path=path, train_views=6 * rooms, test_views=0)
     assert min(depth.min() for depth, _ in views) > 0.25
 
 
-def test_only_an_enfilade_has_rooms_to_choose():
-    assert SyntheticOptions("enfilade", rooms=3).title == "synthetic-enfilade-of-3"
-    for scene, rooms in (("room", 2), ("enfilade", 0)):
+def test_only_a_room_chain_has_a_number_of_rooms():
+    assert SyntheticOptions("room_chain", rooms=3).title == "synthetic-room_chain-of-3"
+    for scene, rooms in (("room", 2), ("room_chain", 0)):
         with pytest.raises(DataError, match="rooms is"):
             SyntheticOptions(scene, rooms=rooms)
 

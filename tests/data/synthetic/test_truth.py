@@ -40,7 +40,7 @@ def test_scaling_and_turning_the_world_changes_no_pixel():
 @pytest.mark.parametrize("scene", ["bare_room", "two_rooms"])  # the second has a route of its own
 def test_a_path_reaches_as_far_as_asked(scene):
     poses = SyntheticTruth(
-        SyntheticOptions(**SMALL | {"scene": scene, "path": "cross", "reach": 0.5, "train_views": 40})
+        SyntheticOptions(**SMALL | {"scene": scene, "path": "cross", "path_radius": 0.5, "train_views": 40})
     ).poses
     middle = poses[:, :3, :3].transpose(0, 2, 1) @ -poses[:, :3, 3:]
     across = middle[:, :2, 0].max(0) - middle[:, :2, 0].min(0)
@@ -85,7 +85,7 @@ def test_any_other_pose_is_taken_as_it_is():
 
 
 def test_exposure_brightens_training_views_only():
-    plain, exposed = generate(SyntheticOptions(**SMALL)), generate(SyntheticOptions(**SMALL, exposure=1.0))
+    plain, exposed = generate(SyntheticOptions(**SMALL)), generate(SyntheticOptions(**SMALL, exposure_range=1.0))
     gains = [
         math.log2((b.image().clamp(max=0.95).median() / a.image().median()).item())
         for a, b in zip(plain.train, exposed.train, strict=True)

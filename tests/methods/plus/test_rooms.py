@@ -22,7 +22,7 @@ def scene_of(name: str, count: int = 1):
     return generate(
         SyntheticOptions(
             scene=name,
-            rooms=count if name == "enfilade" else None,
+            rooms=count if name == "room_chain" else None,
             width=16,
             samples=1,
             train_views=views,
@@ -33,7 +33,7 @@ def scene_of(name: str, count: int = 1):
 
 
 def test_more_rooms_are_more_and_one_is_one():
-    one, two, five = (rooms(scene_of("enfilade", count)) for count in (1, 2, 5))
+    one, two, five = (rooms(scene_of("room_chain", count)) for count in (1, 2, 5))
     assert one == 1.0 < two < five
     assert 1.5 < five < 5
 
@@ -45,12 +45,12 @@ def test_furniture_and_trees_make_no_room(name):
 
 @pytest.mark.parametrize(("condition", "level"), [("world_scale", 3), ("world_offset", 2), ("world_rotation", 3)])
 def test_the_world_may_be_anywhere(condition, level):
-    scene = scene_of("enfilade", 3)
+    scene = scene_of("room_chain", 3)
     assert rooms(StressOptions(condition, level).apply(scene, 0)) == pytest.approx(rooms(scene), rel=0.1)
 
 
 def test_points_that_are_none_count_as_nothing():
-    scene = scene_of("enfilade", 2)
+    scene = scene_of("room_chain", 2)
     lost = replace(scene, points=torch.cat((scene.points, torch.full((9, 3), torch.nan))))
     assert rooms(lost) == pytest.approx(rooms(scene), rel=0.01)
     assert rooms(replace(scene, points=scene.points[:0])) == 1.0
@@ -60,7 +60,7 @@ def test_points_that_are_none_count_as_nothing():
 
 def test_a_row_of_rooms_may_have_more_gaussians_than_one():
     """With as many points and views, the row begins with more of them."""
-    row = scene_of("enfilade", 5)
+    row = scene_of("room_chain", 5)
     near = row.train[0].center
     one = replace(row, points=near + 0.3 * torch.nn.functional.normalize(row.points - near, dim=-1))
     method = PlusMethod(PlusOptions(sky_share=0.0, fill_share=0.0))
