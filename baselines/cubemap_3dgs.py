@@ -18,8 +18,7 @@ from padgs.data.perspectives import perspective_scene, solid_angle, square_lens
 from padgs.geometry.camera import Panorama, Pinhole
 from padgs.methods.splats.method import SplatMethod, refuse_polar_threshold
 from padgs.methods.splats.trainee import SplatTrainee
-from padgs.render import RenderOptions
-from padgs.render.config import RenderConfig
+from padgs.render import RenderConfig, RenderOptions
 from padgs.render.contract import check_camera
 from padgs.render.cubemap import FACES, FINENESS
 from padgs.scene import Scene, View

@@ -10,7 +10,7 @@ from padgs.methods.egonerf.model import EgoNeRF
 from padgs.methods.egonerf.options import EgoNeRFOptions
 from padgs.methods.egonerf.ray_trainer import RayTrainer
 from padgs.methods.egonerf.trainee import EgoNeRFTrainee, EgoNeRFTraining
-from padgs.render.config import RenderConfig
+from padgs.render import RenderConfig
 from padgs.scene import Scene
 from padgs.training.budget import Budget
 from padgs.training.loop import Stage

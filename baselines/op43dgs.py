@@ -7,7 +7,7 @@ code, which grow with the distance of a Gaussian in scene units, and the memory 
 from __future__ import annotations
 
 from padgs.methods.splats.method import SplatMethod
-from padgs.render.config import RenderConfig
+from padgs.render import RenderConfig
 
 
 class OP43DGSMethod(SplatMethod):

@@ -19,7 +19,7 @@ from padgs.geometry.lens import AXES
 from padgs.methods.calibration.dual_lens import DualLens
 from padgs.methods.calibration.splats import CalibratedMethod
 from padgs.methods.splats.method import SplatOptions, refuse_polar_threshold
-from padgs.render.config import RenderConfig
+from padgs.render import RenderConfig
 from padgs.render.contract import check_camera
 from padgs.scene import Scene
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from padgs.methods.splats.method import SplatMethod, SplatOptions
-from padgs.render.config import RenderConfig
+from padgs.render import RenderConfig
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,8 @@ import pytest
 from composed import composed, expanded, first_and_last_job, jobs
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
-from padgs.baselines import METHODS
-from padgs.reports.unranked import MENDS
 
+from padgs.baselines import METHODS
 from padgs.data.datasets import DATASETS
 from padgs.data.perturb import CONDITIONS
 from padgs.data.synthetic.options import SyntheticOptions
@@ -26,7 +25,8 @@ from padgs.multirun.composition import composing, configuration
 from padgs.multirun.launchers import missing_plugin
 from padgs.multirun.overrides import expand, lenient, quoted
 from padgs.registry import lookup
-from padgs.render.config import RenderConfig
+from padgs.render import RenderConfig
+from padgs.reports.unranked import MENDS
 from padgs.runs.config import RunOptions, TrainConfig
 from padgs.runs.tracking.tracker import TrackingOptions
 from padgs.runs.typed import ConfigError

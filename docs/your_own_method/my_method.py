@@ -10,7 +10,7 @@ import torch
 from padgs.checks import check
 from padgs.methods.splats.method import SplatMethod, SplatOptions
 from padgs.methods.splats.trainee import SplatTrainee
-from padgs.render.config import RenderConfig
+from padgs.render import RenderConfig
 from padgs.scene import Scene
 
 

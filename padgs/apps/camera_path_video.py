@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 from torch import Tensor
 
-from padgs.evaluation.pictures import depth_picture, eight_bit
+from padgs.evaluation.images import depth_image, to_uint8
 from padgs.extras import installing
 from padgs.render import Rendering
 from padgs.replacing import replacing
@@ -67,9 +67,9 @@ def write_film(
             puts = [stack.enter_context(_folder(place)) for place in places]
         for number, view in enumerate(views):
             rendering = draw(view)
-            puts[0](eight_bit(rendering.image))
+            puts[0](to_uint8(rendering.image))
             if depth:
-                puts[1](depth_picture(rendering, unit) if film else _sixteen_bit(rendering.depth / unit))
+                puts[1](depth_image(rendering, unit) if film else _sixteen_bit(rendering.depth / unit))
             progress(number + 1)
     return places
 

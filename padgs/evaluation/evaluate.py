@@ -1,4 +1,4 @@
-"""Score renders of test views under a protocol."""
+"""Evaluation of renders of test views under a protocol."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from padgs.results import Scores
 from padgs.scene import View
 from padgs.training.failure import Failure
 
-Marks = dict[str, float | None]  # metric -> value; None = missing (no weights, or no pixel that counts)
-Also = Callable[[View, Rendering], Marks]  # numbers of a view that take more than its image
-OnView = Callable[[View, Tensor, Tensor], None]  # view, truth, image: [H, W, 3] in [0, 1], as they were compared
+Metrics = dict[str, float | None]  # metric -> value; None = missing (no LPIPS weights, or no weighted pixel)
+ExtraMetrics = Callable[[View, Rendering], Metrics]  # metrics that need more than the image
+OnView = Callable[[View, Tensor, Tensor], None]  # view, truth, image: [H, W, 3] in [0, 1], as compared
 
 
 def evaluate(
@@ -28,16 +28,16 @@ def evaluate(
     protocol: Protocol,
     *,
     on_view: OnView | None = None,
-    also: Also | None = None,
+    extra: ExtraMetrics | None = None,
 ) -> Scores:
-    """Render each view and compare it with its image.
+    """Render each view and compare it with its ground truth.
 
     Args:
-        render: a trained method's `render`.
+        render: `render` of a trained method.
         views: the test views; each has an image, and may have a mask.
-        protocol: the rules.
-        on_view: called with each view, its truth and its render (clamped, 8-bit, not cropped), to save pictures.
-        also: gives more marks of each view.
+        protocol: metrics, weights and crop.
+        on_view: called with each view, its truth and its render (clamped, 8-bit, not cropped), to save images.
+        extra: computes further metrics of each view.
 
     Raises:
         ValueError: no views, a view without an image, or a render of another size than its view.
@@ -45,49 +45,49 @@ def evaluate(
     """
     if not views:
         raise ValueError("no test views to evaluate; give the scene a test split")
-    marks: dict[str, Marks] = {}
-    notes: dict[str, None] = {}  # as keys: each once, in order
+    metrics: dict[str, Metrics] = {}
+    notes: dict[str, None] = {}  # keys: each once, in order
     with torch.no_grad():
         for view in views:
             rendering = render(view)
-            image = as_stored(checked(rendering.image, view))
+            image = quantized(checked(rendering.image, view))
             truth = view.image(dtype=image.dtype, device=image.device)
             mask = view.mask(dtype=image.dtype, device=image.device)
-            marks[view.name] = score(image, truth, mask, protocol, notes)
-            if also is not None:
-                marks[view.name] |= also(view, rendering)
+            metrics[view.name] = score(image, truth, mask, protocol, notes)
+            if extra is not None:
+                metrics[view.name] |= extra(view, rendering)
             if on_view is not None:
                 on_view(view, truth, image)
-    return Scores(asdict(protocol), mean_marks(list(marks.values())), marks, tuple(notes))
+    return Scores(asdict(protocol), mean_metrics(list(metrics.values())), metrics, tuple(notes))
 
 
 def score(
     image: Tensor, truth: Tensor, mask: Tensor | None, protocol: Protocol, notes: dict[str, None] | None = None
-) -> Marks:
-    """The protocol's metrics of one image [H, W, 3] against the truth, with a weight [H, W] per pixel or None.
+) -> Metrics:
+    """Return the metrics of one image [H, W, 3] against the truth, with a weight [H, W] per pixel or None.
 
-    Why LPIPS is missing, where it is, is added to `notes`.
+    If LPIPS is missing, the reason is added to `notes`.
     """
     rows = protocol.rows(image.shape[0])
     if protocol.solid_angle:
-        mask = weight_of(mask, image, protocol)
+        mask = cropped_mask(mask, image, protocol)
     elif rows < image.shape[0]:
         image, truth, mask = image[:rows], truth[:rows], None if mask is None else mask[:rows]
-    marks: Marks = {name: known(METRICS[name](image, truth, mask)) for name in protocol.metrics}
+    metrics: Metrics = {name: finite_or_none(METRICS[name](image, truth, mask)) for name in protocol.metrics}
     if protocol.lpips_name is not None:
         try:
-            marks[protocol.lpips_name] = known(_lpips(image, truth, mask, protocol))
+            metrics[protocol.lpips_name] = finite_or_none(_lpips(image, truth, mask, protocol))
         except LpipsUnavailable as reason:
-            marks[protocol.lpips_name] = None
+            metrics[protocol.lpips_name] = None
             if notes is not None:
                 notes[f"{protocol.lpips_name} is missing: {reason}"] = None
-    return marks
+    return metrics
 
 
-def weight_of(mask: Tensor | None, image: Tensor, protocol: Protocol) -> Tensor | None:
-    """A mask [H, W] or None, with the rows of an image [H, W, 3] hidden that do not count.
+def cropped_mask(mask: Tensor | None, image: Tensor, protocol: Protocol) -> Tensor | None:
+    """Return the mask [H, W] with the rows below the protocol's crop set to 0; None if nothing is masked.
 
-    Hidden, not cut off: latitude is a matter of the whole image.
+    They are masked, not cut off, because latitude refers to the whole image.
     """
     rows = protocol.rows(image.shape[0])
     if rows == image.shape[0]:
@@ -96,30 +96,30 @@ def weight_of(mask: Tensor | None, image: Tensor, protocol: Protocol) -> Tensor 
     return counts[:, None] * (torch.ones_like(image[..., 0]) if mask is None else mask)
 
 
-def mean_marks(views: Sequence[Marks]) -> Marks:
-    """Mean of each metric over the views that have it; None where none has.
+def mean_metrics(views: Sequence[Metrics]) -> Metrics:
+    """Return the mean of each metric over the views that have it; None if none has.
 
-    >>> mean_marks([{"psnr": 20.0, "seam": None}, {"psnr": 30.0, "seam": None}])
+    >>> mean_metrics([{"psnr": 20.0, "seam": None}, {"psnr": 30.0, "seam": None}])
     {'psnr': 25.0, 'seam': None}
     """
-    mean: Marks = {}
+    mean: Metrics = {}
     for name in views[0]:
-        present = [value for marks in views if (value := marks[name]) is not None]
+        present = [value for metrics in views if (value := metrics[name]) is not None]
         mean[name] = sum(present) / len(present) if present else None
     return mean
 
 
-def as_stored(image: Tensor) -> Tensor:
-    """The image as an 8-bit file would give it back: clamped to [0, 1], rounded to 1/255."""
+def quantized(image: Tensor) -> Tensor:
+    """Return the image as stored in an 8-bit file: clamped to [0, 1], rounded to 1/255."""
     return (image.clamp(0, 1) * 255).round() / 255
 
 
 def checked(image: Tensor, view: View) -> Tensor:
-    """The image, if it is one of this view that can be scored.
+    """Return the image if it can be scored as a render of this view.
 
     Raises:
-        ValueError: another size than the view's.
-        Failure: non-finite values; clamping would turn them into black and score that.
+        ValueError: its size is not that of the view.
+        Failure: non-finite values; clamping would turn them into black.
     """
     if tuple(image.shape) != (view.height, view.width, 3):
         raise ValueError(
@@ -138,7 +138,7 @@ def _lpips(image: Tensor, truth: Tensor, mask: Tensor | None, protocol: Protocol
     return weighted_lpips(image, truth, sphere_weight(image, mask), mask=mask, net=net, inputs=inputs)
 
 
-def known(metric: Tensor) -> float | None:
-    """A metric as a number; None where no pixel counts."""
+def finite_or_none(metric: Tensor) -> float | None:
+    """Return a metric as a number; None if no pixel has a weight."""
     value = metric.item()
-    return None if value != value else value  # images are finite, so NaN only says that no pixel counts
+    return None if value != value else value  # images are finite, so only weights that sum to 0 give NaN

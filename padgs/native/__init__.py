@@ -1,5 +1,5 @@
-"""The compiled code and how it is called: drawing, decoding, the loss, and the ceilings of a machine."""
+"""Compiled code and its calls: rendering, decoding, loss, and the peak rates of a machine."""
 
 from padgs.native import cpu, cuda
 
-LIBRARIES = {"cpu": cpu, "cuda": cuda}  # by the type of the devices whose tensors they take
+LIBRARIES = {"cpu": cpu, "cuda": cuda}  # by torch device type

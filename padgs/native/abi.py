@@ -1,6 +1,6 @@
-"""The structures that the native libraries take, as `csrc/abi.h` has them: plain C, pointers and sizes.
+"""The structures that the native libraries take, as in `csrc/abi.h`: plain C, pointers and sizes.
 
-A structure is called as it is there, in the namespace padgs, unless it says otherwise.
+Names are those of namespace padgs in `csrc/abi.h` unless a docstring says otherwise.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ from torch import Tensor
 
 Pointer = ctypes.c_void_p
 Int32, Int64 = ctypes.c_int32, ctypes.c_int64
-MOMENTS = 16  # floats per (Gaussian, tile) instance
-ABSOLUTE_MOMENT = 14  # the one with the sum of absolute pulls
-REMOVAL = 4  # floats per instance about its removal: changes of error and image, sum and largest contribution
+GRADIENT_SUMS = 16  # floats per (Gaussian, tile) instance in the backward pass
+ABSGRAD_SUM = 14  # index of the absolute positional gradient among them
+REMOVAL = 4  # floats per instance of leave-one-out: changes of error and image, sum and largest contribution
 
 
 def fields(kind: type, *names: str) -> list[tuple[str, type]]:
-    """Members of a structure that are of one type."""
+    """Return members of a structure that have one type."""
     return [(name, kind) for name in names]
 
 
@@ -44,12 +44,12 @@ class TileGrid(ctypes.Structure):
 class Inputs(ctypes.Structure):
     _fields_ = [
         ("count", Int64),
-        *fields(Pointer, "means", "quats", "scales", "opacities", "colors", "probe"),
+        *fields(Pointer, "means", "quats", "scales", "opacities", "colors", "mean_offsets"),
     ]
 
 
 class Gradients(ctypes.Structure):
-    _fields_ = fields(Pointer, "means", "quats", "scales", "opacities", "colors", "probe", "pose")
+    _fields_ = fields(Pointer, "means", "quats", "scales", "opacities", "colors", "mean_offsets", "pose")
 
 
 class RayPointers(ctypes.Structure):
@@ -72,7 +72,7 @@ class BlendGradientArguments(ctypes.Structure):
     _fields_ = [
         ("forward", BlendArguments),
         *fields(Pointer, "grad_image", "grad_transmittance", "grad_depth", "moments", "grad_rays"),
-        ("absolute", Int32),
+        ("absgrad", Int32),
     ]
 
 
@@ -145,7 +145,7 @@ class AngularSizeArguments(ctypes.Structure):
 
 
 def pointer(tensor: Tensor | None) -> int | None:
-    """Address of a contiguous tensor, or None."""
+    """Return the address of a contiguous tensor, or None."""
     if tensor is None:
         return None
     assert tensor.is_contiguous(), f"native code takes contiguous tensors, got strides {tensor.stride()}"

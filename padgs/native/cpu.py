@@ -1,4 +1,4 @@
-"""libpadgs_cpu: tiles, SIMD, OpenMP (`csrc/cpu`); importing this module loads nothing."""
+"""libpadgs_cpu: tiles, SIMD, OpenMP (`csrc/cpu`). Importing this module loads nothing."""
 
 from __future__ import annotations
 
@@ -22,8 +22,7 @@ from padgs.native.abi import (
     RoughnessArguments,
     SplatArguments,
 )
-from padgs.native.loading import declared, opened
-from padgs.native.watch import Watchable
+from padgs.native.loading import Library, declare, find_library
 
 STRUCTURES = (
     *(NativeCamera, Inputs, Gradients, BlendGradientArguments),
@@ -59,19 +58,18 @@ SIGNATURES = {
 
 
 @functools.cache
-def library() -> Watchable:
-    """The loaded CPU library.
+def library() -> Library:
+    """Return the loaded CPU library.
 
     Raises:
-        OSError: it was not built (no compiler at install time), does not load, or was built from other sources; the
-            message says where it was sought.
+        OSError: it was not built (no compiler at install time), does not load, or was built from other sources.
     """
-    return declared(opened("padgs_cpu", "a C++ compiler"), SIGNATURES, "padgs_structure_bytes", STRUCTURES)
+    return declare(find_library("padgs_cpu", "a C++ compiler"), SIGNATURES, "padgs_structure_bytes", STRUCTURES)
 
 
 @functools.cache
 def available() -> bool:
-    """Whether the native CPU library is built and loads."""
+    """Return whether the native CPU library is built and loads."""
     try:
         library()
     except OSError:
@@ -80,10 +78,10 @@ def available() -> bool:
 
 
 def works_on(_: torch.device) -> bool:
-    """Whether the library is there; every CPU can run it."""
+    """Return whether the library is available; every CPU can run it."""
     return available()
 
 
 def require(_: torch.device) -> None:
-    """Raise OSError, as `library` does, where it is not there."""
+    """Raise OSError, as `library` does, if the library is not available."""
     library()

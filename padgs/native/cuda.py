@@ -1,7 +1,7 @@
-"""libpadgs_cuda and how to call it, with the structures of `csrc/cuda/arguments.h`; importing this loads nothing.
+"""libpadgs_cuda: its structures (`csrc/cuda/arguments.h`) and calls. Importing this module loads nothing.
 
-The library holds kernels and a CUDA runtime of its own. Pointers to memory of the device and a stream go in; nothing is
-allocated and nothing waits.
+The library contains kernels and its own CUDA runtime. It takes pointers to memory of the device and a stream; it
+allocates nothing and never waits.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import functools
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from padgs.native.abi import (
     DecodeArguments,
@@ -26,8 +27,7 @@ from padgs.native.abi import (
     SplatArguments,
     fields,
 )
-from padgs.native.loading import declared, opened
-from padgs.native.watch import Watchable
+from padgs.native.loading import Library, declare, find_library
 
 OUT_OF_MEMORY = 2  # cudaErrorMemoryAllocation
 NOT_COMPILED_FOR = (98, 209, 222)  # no such kernel, no image for this device, PTX newer than the driver
@@ -99,7 +99,7 @@ class BlendGradientInputs(ctypes.Structure):
         *fields(Pointer, "moments", "grad_rays", "order", "slot_start"),
         ("visible", Int64),
         ("totals", Pointer),
-        ("absolute", Int32),
+        ("absgrad", Int32),
     ]
 
 
@@ -185,33 +185,33 @@ SIGNATURES: dict[str, tuple[list, Any]] = {
 
 
 @functools.cache
-def library() -> Watchable:
-    """The loaded library.
+def library() -> Library:
+    """Return the loaded library.
 
     Raises:
-        OSError: it was not built (no nvcc when padgs was installed), does not load, was built from other sources, or by
-            a compiler that the driver is too old for.
+        OSError: it was not built (no nvcc at install time), does not load, was built from other sources, or by a
+            compiler that is too new for the driver.
     """
-    loaded = declared(opened("padgs_cuda", "nvcc and a GPU"), SIGNATURES, "padgs_cuda_structure_bytes", STRUCTURES)
+    loaded = declare(find_library("padgs_cuda", "nvcc and a GPU"), SIGNATURES, "padgs_cuda_structure_bytes", STRUCTURES)
     refuse_old_driver(loaded)
     return loaded
 
 
-def refuse_old_driver(loaded: Watchable) -> None:
-    """Raise OSError where there is a driver, but one of an older major version of CUDA than the library's runtime."""
+def refuse_old_driver(loaded: Library) -> None:
+    """Raise OSError if the driver has an older major version of CUDA than the runtime of the library."""
     driver, built_with = Int32(), Int32()
     loaded.padgs_cuda_versions(ctypes.byref(driver), ctypes.byref(built_with))
     if 0 < driver.value // 1000 < built_with.value // 1000:
         has, wants = (f"{version.value // 1000}.{version.value % 1000 // 10}" for version in (driver, built_with))
         raise OSError(
-            f"libpadgs_cuda was compiled by CUDA {wants}, and the driver here knows CUDA {has}; update the driver, "
-            f"install padgs where nvcc is of CUDA {has} or older, or render with backend=torch"
+            f"libpadgs_cuda was compiled by CUDA {wants}, but the driver supports CUDA {has}; update the driver, "
+            f"install padgs with nvcc of CUDA {has} or older, or render with backend=torch"
         )
 
 
 @functools.cache
 def available() -> bool:
-    """Whether the library is built, loads and fits the driver; a GPU that can run it is another question."""
+    """Return whether the library is built, loads and fits the driver, with or without a GPU that can run it."""
     try:
         library()
     except OSError:
@@ -220,7 +220,7 @@ def available() -> bool:
 
 
 def works_on(device: torch.device) -> bool:
-    """Whether the library is there, and was compiled for this GPU."""
+    """Return whether the library is available and was compiled for this GPU."""
     try:
         require(device)
     except (OSError, RuntimeError):
@@ -229,7 +229,7 @@ def works_on(device: torch.device) -> bool:
 
 
 def require(device: torch.device) -> None:
-    """Say why nothing can be drawn on this device, if so.
+    """Raise an error if nothing can be rendered on this device.
 
     Raises:
         OSError: as `library` does.
@@ -240,12 +240,12 @@ def require(device: torch.device) -> None:
 
 
 def device_type() -> str:
-    """Where the library wants its tensors, in torch's words: cuda."""
+    """Return the torch device type of the library's tensors: cuda."""
     return library().padgs_cuda_device_type().decode()
 
 
 def queue(device: torch.device) -> Queue:
-    """The stream of a device that torch works on at present, after a look whether the kernels can run there.
+    """Return the current torch stream of a device, after checking that the kernels can run there.
 
     Raises:
         RuntimeError: the library was not compiled for this device, or the device does not answer.
@@ -276,19 +276,39 @@ def check_device(index: int) -> None:
 
 
 def call(name: str, where: Queue, *arguments: Any) -> None:
-    """Call a function of the library that returns a cudaError_t; structures go by reference.
+    """Call a function of the library that returns a cudaError_t; structures are passed by reference.
 
     Raises:
         torch.cuda.OutOfMemoryError: the device has no memory left.
-        RuntimeError: any other error of CUDA; those of kernels may be reported later than they happen.
+        RuntimeError: any other CUDA error; errors of kernels may be reported later than they happen.
     """
     references = (ctypes.byref(a) if isinstance(a, ctypes.Structure) else a for a in arguments)
     raise_for(getattr(library(), name)(ctypes.byref(where), *references), name)
 
 
 def raise_for(code: int, name: str) -> None:
-    """Raise what an error code stands for; 0 stands for nothing."""
+    """Raise the exception of an error code; return for code 0."""
     if code == 0:
         return
     message = f"{name}: CUDA error {code}, {library().padgs_cuda_error(code).decode()}"
     raise torch.cuda.OutOfMemoryError(message) if code == OUT_OF_MEMORY else RuntimeError(message)
+
+
+class HostCopy:
+    """Integers on their way from a device to the host; neither waits for the other until they are used."""
+
+    def __init__(self, values: Tensor) -> None:
+        self._event = None
+        device = values.device
+        if device.type == "cuda":
+            pinned = torch.empty(values.shape, dtype=values.dtype, device="cpu", pin_memory=True)
+            values = pinned.copy_(values, non_blocking=True)
+            self._event = torch.cuda.Event()
+            self._event.record(torch.cuda.current_stream(device))
+        self._values = values
+
+    def values(self) -> list[int]:
+        """Return the integers; waits until the device has computed them."""
+        if self._event is not None:
+            self._event.synchronize()
+        return self._values.tolist()

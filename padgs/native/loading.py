@@ -1,4 +1,4 @@
-"""Finding and loading a native library, and refusing one of another version."""
+"""Find and load a native library, refuse one of another version, and time its calls on request."""
 
 from __future__ import annotations
 
@@ -6,20 +6,51 @@ import ctypes
 import importlib.util
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch  # noqa: F401 - first: the library then shares torch's OpenMP threads and thread count
 
-from padgs.native.watch import Watchable
+Stage = Callable[[str], AbstractContextManager[object]]  # name of a function -> context of its call
+
+_stages: list[Stage] = []  # the last one is active
 
 
-def opened(stem: str, needs: str) -> ctypes.CDLL:
-    """The library lib`stem` of this package, or of the folder PADGS_LIBRARY_DIR while someone works on the kernels.
+@contextmanager
+def call_hook(stage: Stage) -> Iterator[None]:
+    """Make every call of a native library within `stage(name of the function)`, for timing."""
+    _stages.append(stage)
+    try:
+        yield
+    finally:
+        _stages.pop()
+
+
+class Library:
+    """A loaded native library whose calls respect `call_hook`."""
+
+    def __init__(self, loaded: ctypes.CDLL) -> None:
+        self._loaded = loaded
+
+    def __getattr__(self, name: str) -> Any:
+        function = getattr(self._loaded, name)
+        if not _stages:
+            return function
+
+        def call(*arguments: Any) -> Any:
+            with _stages[-1](name):
+                return function(*arguments)
+
+        return call
+
+
+def find_library(stem: str, requirement: str) -> ctypes.CDLL:
+    """Load lib`stem` from this package, or from the folder PADGS_LIBRARY_DIR for work on the kernels.
 
     Raises:
-        OSError: it is not there, because there was no `needs` when padgs was installed, or does not load.
+        OSError: it is missing, because there was no `requirement` when padgs was installed, or does not load.
     """
     suffix = {"darwin": ".dylib", "win32": ".dll"}.get(sys.platform, ".so")
     name = ("" if sys.platform == "win32" else "lib") + stem + suffix
@@ -30,7 +61,7 @@ def opened(stem: str, needs: str) -> ctypes.CDLL:
         if (folder / name).exists():
             return ctypes.CDLL(str(folder / name))
     raise OSError(
-        f"{name} not found in {', '.join(map(str, folders))}; install padgs where there is {needs}, "
+        f"{name} not found in {', '.join(map(str, folders))}; install padgs where there is {requirement}, "
         "or render with backend=torch"
     )
 
@@ -40,10 +71,10 @@ def _package_folders() -> list[str]:
     return list(spec.submodule_search_locations or []) if spec else []
 
 
-def declared(
+def declare(
     loaded: ctypes.CDLL, signatures: Mapping[str, tuple[list, Any]], bytes_of: str, structures: Sequence[type]
-) -> Watchable:
-    """The library with the types of its functions set, if it is one of ours and of this version.
+) -> Library:
+    """Set the types of the functions of a library after checking that it has this version.
 
     Raises:
         OSError: a function is missing, or a structure of the library has another size.
@@ -53,7 +84,7 @@ def declared(
             raise OSError(f"{loaded._name} is of another version, without {name}; build it again")
         function = getattr(loaded, name)
         function.argtypes, function.restype = arguments, result
-    for index, structure in enumerate(structures):  # what is laid out differently would be read as nonsense
+    for index, structure in enumerate(structures):  # another layout would be read as nonsense
         if getattr(loaded, bytes_of)(index) != ctypes.sizeof(structure):
             raise OSError(f"{loaded._name} is of another version, with another {structure.__name__}; build it again")
-    return Watchable(loaded)
+    return Library(loaded)

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from padgs.evaluation.pictures import eight_bit
+from padgs.evaluation.images import to_uint8
 from padgs.need.calibration import PERCEPTION, QUALITY
 from padgs.need.files import files
 from padgs.need.plan import Step, against, degrees, knee, loss, smallest
@@ -141,4 +141,4 @@ def _side_by_side(search: Search, path: Path) -> None:
     view = search.run.scene.test[len(search.run.scene.test) // 2]
     steps = (search.model_of(smallest(search.steps, epsilon)) for epsilon in NEED_PICTURED)
     images = [view.image(), *(model.render(view).image for model in (search.run.method, *steps))]
-    Image.fromarray(np.concatenate([eight_bit(image) for image in images], axis=1)).save(path)
+    Image.fromarray(np.concatenate([to_uint8(image) for image in images], axis=1)).save(path)

@@ -1,20 +1,22 @@
-"""Rendering: one function, several backends. `render(gaussians, view)` is all that models and methods call.
+"""Rendering: one function, several backends. Models and methods call `render(gaussians, view)`.
 
-Backends are entries of `BACKENDS`; each is a `padgs.render.contract.Backend`. The torch one is the definition.
+Backends are the entries of `BACKENDS`; each is a `padgs.render.contract.Backend`. Backend torch is the definition.
 """
 
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 from functools import cache
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from padgs.checks import check_known
 from padgs.gaussians import Gaussians
 from padgs.registry import lookup
-from padgs.render.contract import Backend, Rendering, RenderOptions, Request, check_inputs
+from padgs.render.contract import LOW_PASS_KINDS, Backend, Rendering, RenderOptions, Request, check_inputs
 from padgs.render.cubemap import rasterize_cubemap
 from padgs.scene import View
 
@@ -23,8 +25,29 @@ BACKENDS = {
     "cpu": "padgs.render.backends.cpu:rasterize",
     "cuda": "padgs.render.backends.cuda:rasterize",
 }
+NEAR_UNITS = ("scene", "world")
 
-__all__ = ["BACKENDS", "RenderOptions", "Rendering", "render", "request_of", "resolve_backend"]
+__all__ = ["BACKENDS", "RenderConfig", "RenderOptions", "Rendering", "make_request", "render", "resolve_backend"]
+
+
+@dataclass(frozen=True)
+class RenderConfig(RenderOptions):
+    """The `render` group of the configuration: `RenderOptions` with lengths relative to the scene."""
+
+    near: float = 0.01  # in `near_unit`
+    near_unit: str = "scene"  # scene: multiples of Scene.scale; world: world units, as the published code
+    backend: str = "auto"  # a name of `BACKENDS`, or auto
+
+    def __post_init__(self) -> None:
+        check_known(self, projection=LOW_PASS_KINDS, near_unit=NEAR_UNITS, backend=("auto", *BACKENDS))
+        super().__post_init__()
+
+    def options(self, scene_scale: float) -> RenderOptions:
+        """Return the renderer options for a scene whose scale is `scene_scale` world units."""
+        values: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(RenderOptions)}
+        if self.near_unit == "scene":
+            values["near"] *= scene_scale
+        return RenderOptions(**values)
 
 
 def render(
@@ -33,63 +56,64 @@ def render(
     options: RenderOptions = RenderOptions(),  # noqa: B008 - frozen dataclass
     *,
     background: Tensor | None = None,
-    probe: Tensor | None = None,
-    absolute_probe: Tensor | None = None,
+    mean_offsets: Tensor | None = None,
+    absgrad: Tensor | None = None,
     backend: str = "auto",
     check_values: bool = False,
 ) -> Rendering:
-    """Render the Gaussians as the view sees them.
+    """Render the Gaussians from the camera of the view.
 
     Args:
         gaussians: N Gaussians in the world frame, float32 (any backend) or float64 (torch only).
-        view: pose and image size.
-        options: projection, bounds, culling; whether a panorama is drawn at once or as a cubemap.
-        background: [3] RGB behind everything; black if not given.
-        probe: [N, 2] zeros that move the projected means, in normalised image units (x and y each run over 2 across
-            the image, as in 3DGS); its gradient after `backward` is the densification signal.
-        absolute_probe: [N] zeros that change nothing; projection ray. After `backward` its gradient is the sum over the
-            pixels of |dL/dmean| by way of each alone, which do not cancel (`padgs.render.absolute`).
-        backend: a name of `BACKENDS`, or auto: cpu or cuda for float32 tensors that are there, if the library for it is
-            built, else torch (and a warning, once, if that is because the library is missing).
-        check_values: also check that all numbers are sane; a pass over the tensors, meant for tests and debugging.
+        view: pose and camera.
+        options: projection, bounds, culling; whether a panorama is rendered directly or as a cubemap.
+        background: [3] RGB; black if not given.
+        mean_offsets: [N, 2] added to the projected means, in normalised image units (x and y each span 2 across the
+            image, as in 3DGS). For zeros, the gradient after `backward` is the positional gradient of densification.
+        absgrad: [N] zeros that change nothing; projection ray only. The gradient after `backward` is the sum over the
+            pixels of |dL/dmean| through each pixel alone, which do not cancel (`with_absgrad` of backend torch).
+        backend: a name of `BACKENDS`, or auto: cpu or cuda, by the device, for float32 tensors if the library is built;
+            torch otherwise (with one warning if the library is missing).
+        check_values: also check all values; a pass over the tensors, for tests and debugging.
 
     Raises:
         ValueError: unknown backend, or inputs that break the contract.
     """
-    request = request_of(gaussians, view, options, background, probe, absolute_probe, check_values=check_values)
+    request = make_request(gaussians, view, options, background, mean_offsets, absgrad, check_values=check_values)
     rasterize: Backend = lookup(BACKENDS, resolve_backend(backend, gaussians.means), "backend")
     return rasterize_cubemap(rasterize, request) if options.cubemap else rasterize(request)
 
 
-def request_of(
+def make_request(
     gaussians: Gaussians,
     view: View,
     options: RenderOptions,
     background: Tensor | None = None,
-    probe: Tensor | None = None,
-    absolute_probe: Tensor | None = None,
+    mean_offsets: Tensor | None = None,
+    absgrad: Tensor | None = None,
     *,
     check_values: bool = False,
 ) -> Request:
-    """What a backend is asked for, from the arguments of `render`.
+    """Return the input of a backend for the arguments of `render`.
 
     Raises:
-        ValueError: they break the contract.
+        ValueError: the arguments break the contract.
     """
     means = gaussians.means
     cam_from_world = view.cam_from_world.to(device=means.device, dtype=means.dtype)
     if background is None:
         background = means.new_zeros(3)
-    request = Request(gaussians, cam_from_world, view.camera, options, background, probe, absolute_probe)
+    request = Request(gaussians, cam_from_world, view.camera, options, background, mean_offsets, absgrad)
     check_inputs(request, check_values=check_values)
     if options.pixel_bias:
         bias = 2 * options.pixel_bias / means.new_tensor([view.camera.width, view.camera.height])
-        request = replace(request, probe=bias.expand(len(means), 2) if probe is None else probe + bias)
+        offsets = bias.expand(len(means), 2) if mean_offsets is None else mean_offsets + bias
+        request = replace(request, mean_offsets=offsets)
     return request
 
 
 def resolve_backend(backend: str, means: Tensor) -> str:
-    """The backend that `auto` stands for, given the tensors to draw; other names are returned as they are."""
+    """Return the backend that `auto` selects for these tensors; other names are returned unchanged."""
     if backend != "auto":
         return backend
     from padgs.native import LIBRARIES
@@ -99,12 +123,12 @@ def resolve_backend(backend: str, means: Tensor) -> str:
         return "torch"
     if library.works_on(means.device):
         return means.device.type
-    _say_that_native_is_missing(means.device)
+    _warn_missing_library(means.device)
     return "torch"
 
 
 @cache  # once in a process for each device, whatever the filters of the warnings module say
-def _say_that_native_is_missing(device: torch.device) -> None:
+def _warn_missing_library(device: torch.device) -> None:
     from padgs.native import LIBRARIES
 
     try:

@@ -5,7 +5,7 @@ squared distance q >= 0 given by the projection; alpha = min(0.99, opacity * exp
 skipped. Gaussians are blended front to back by the radial distance of their mean (ties by index), and a pixel stops
 *before* the Gaussian that would bring its transmittance below 1e-4. Where alpha is limited to 0.99 its derivative is 0.
 Means nearer than 1e-15 or farther than 1e15 world units are culled too: float32 has no squares of them.
-That is blending "sorted"; "hybrid" shares all but the order and the stop, see `padgs.render.hybrid`.
+That is blending "sorted"; "hybrid" shares all but the order and the stop, see `padgs.render.backends.torch`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ CORE_SIZE, MAX_CORE_SIZE = 16, 256
 BLENDINGS = ("sorted", "hybrid")
 BOUNDS = ("exact", "square")
 NEAR_CULLS = ("mean", "ellipsoid")
-LOW_PASS_KINDS = {  # of each projection, its natural one first; `padgs.render.low_pass` says what they are
+LOW_PASS_KINDS = {  # of each projection, its natural one first; `padgs.render.projection` says what they are
     "erp": ("pixels", "angular", "solid"),
     "pinhole": ("pixels", "angular", "solid"),
     "tangent": ("angular", "solid", "fixed"),
@@ -127,8 +127,8 @@ class Request:
     camera: Camera  # which direction each pixel looks
     options: RenderOptions
     background: Tensor  # [3]
-    probe: Tensor | None = None  # [N, 2], and the next [N]: see `padgs.render.render`
-    absolute_probe: Tensor | None = None
+    mean_offsets: Tensor | None = None  # [N, 2], and the next [N]: see `padgs.render.render`
+    absgrad: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -176,12 +176,12 @@ def check_inputs(request: Request, *, check_values: bool) -> None:
         "cam_from_world": (request.cam_from_world, (4, 4)),
         "background": (request.background, (3,)),
     }
-    if request.probe is not None:
-        shapes["probe"] = (request.probe, (count, 2))
-    if request.absolute_probe is not None:
-        shapes["absolute_probe"] = (request.absolute_probe, (count,))
+    if request.mean_offsets is not None:
+        shapes["mean_offsets"] = (request.mean_offsets, (count, 2))
+    if request.absgrad is not None:
+        shapes["absgrad"] = (request.absgrad, (count,))
         if options.projection != "ray":
-            raise ValueError(f"absolute_probe is made for projection 'ray', not {options.projection!r}; leave it out")
+            raise ValueError(f"absgrad is made for projection 'ray', not {options.projection!r}; leave it out")
     dtype, device = gaussians.means.dtype, gaussians.means.device
     if dtype not in (torch.float32, torch.float64):
         raise ValueError(f"means has dtype {dtype}; renderers take torch.float32 or torch.float64")

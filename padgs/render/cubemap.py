@@ -1,10 +1,9 @@
-"""A panorama through six pinhole faces: how perspective renderers are commonly taken to the sphere.
+"""Panoramas from six pinhole faces, the common way to use a perspective renderer on the sphere.
 
-The faces of a cube around the camera are drawn one by one, a little wider than 90 degrees, and each pixel of the
-panorama is interpolated within the one face that it looks through. Order is by radial distance, so the faces agree on
-it. Projection `ray` gives one and the same image on all faces, up to interpolation; `pinhole` flattens a Gaussian onto
-the plane of each face, so that its footprint changes a little from face to face: the seams of published cube-map
-baselines, which no resampling removes.
+The faces of a cube around the camera are rendered one by one, a little wider than 90 degrees, and each pixel of the
+panorama is interpolated within the face that its ray meets. Gaussians are sorted by radial distance, so all faces agree
+on the order. Projection `ray` gives the same image on all faces, up to interpolation; `pinhole` flattens a Gaussian
+onto the plane of each face, so its footprint changes from face to face: the seams of published cubemap baselines.
 """
 
 from __future__ import annotations
@@ -21,11 +20,11 @@ from padgs.geometry.camera import Panorama, Pinhole
 from padgs.geometry.panorama import rays
 from padgs.render.contract import Backend, Rendering, Request
 from padgs.render.projection import camera_frame
-from padgs.render.projective import shift_of_probe
+from padgs.render.projective import mean_shift
 
-FINENESS = 2  # pixels per radian at the middle of a face, where it is coarsest, over those of the panorama's horizon
+FINENESS = 2  # pixels per radian at the centre of a face, where it is coarsest, relative to the panorama's horizon
 
-# face_from_camera: turned and looked through, each face is a camera like any other (x right, y down, z forward).
+# face_from_camera; each face is an ordinary camera (x right, y down, z forward).
 FACES = torch.tensor(
     [
         [[1, 0, 0], [0, 1, 0], [0, 0, 1]],  # front, z
@@ -40,16 +39,16 @@ FACES = torch.tensor(
 
 
 def face_camera(panorama: Panorama, face_size: int | None = None) -> Pinhole:
-    """The camera of all six faces: 90 degrees, and at least a pixel more at each border.
+    """Return the camera of all six faces: 90 degrees, and at least a pixel more at each border.
 
-    A bilinear sample at the very edge of a face needs the pixel beyond it; with that pixel drawn by the same face, two
-    faces that meet differ by interpolation alone.
+    A bilinear sample at the edge of a face needs the pixel beyond it; because the same face renders that pixel,
+    neighbouring faces differ by interpolation alone.
 
     Args:
-        panorama: what the faces will be resampled to.
+        panorama: the panorama to resample to.
         face_size: pixels across 90 degrees. If not given, the centre of a face has `FINENESS` times the pixels per
-            radian of the panorama, W / 2 pi (H / pi where that is more). With as many, W / pi across, faces have all
-            the pixels it takes, but interpolating between them blurs (docs/projections.md).
+            radian of the panorama, W / 2 pi or H / pi, the larger. With the same resolution, W / pi pixels across,
+            interpolation would blur (docs/projections.md).
     """
     focal = FINENESS * max(panorama.width / (2 * pi), panorama.height / pi) if face_size is None else face_size / 2
     size = 2 * (ceil(focal) + 1)
@@ -57,26 +56,25 @@ def face_camera(panorama: Panorama, face_size: int | None = None) -> Pinhole:
 
 
 def rasterize_cubemap(rasterize: Backend, request: Request) -> Rendering:
-    """Draw a panorama with a backend's perspective views; low-pass filters are of the size of its own pixels."""
+    """Render a panorama from perspective views of a backend; low-pass filters keep the size of the panorama's pixels."""
     gaussians, cam_from_world, camera = request.gaussians, request.cam_from_world, request.camera
-    assert isinstance(camera, Panorama), type(camera)  # `check_inputs` has seen to it
-    if request.probe is not None:  # it is given in units of the panorama, so it moves the means, once for all faces
-        shift = shift_of_probe(camera_frame(request)[0], request.probe)
+    assert isinstance(camera, Panorama), type(camera)  # guaranteed by `check_inputs`
+    if request.mean_offsets is not None:  # in units of the panorama, so they move the means, once for all faces
+        shift = mean_shift(camera_frame(request)[0], request.mean_offsets)
         gaussians = replace(gaussians, means=gaussians.means + shift @ cam_from_world[:3, :3])
     lens = face_camera(camera, request.options.face_size)
     turns = _turns(cam_from_world.dtype, cam_from_world.device)
     options = replace(request.options, cubemap=False, face_size=None).on_finer_pixels(lens.focal / camera.focal)
-    each = replace(request, gaussians=gaussians, camera=lens, options=options, probe=None)
+    each = replace(request, gaussians=gaussians, camera=lens, options=options, mean_offsets=None)
     faces = [rasterize(replace(each, cam_from_world=turn @ cam_from_world)) for turn in turns]
     return panorama_from_faces(faces, camera, lens)
 
 
 def panorama_from_faces(faces: list[Rendering], panorama: Panorama, lens: Pinhole) -> Rendering:
-    """Six renderings as one of the panorama, differentiable by what the faces are differentiable by.
+    """Resample the renderings of six faces to a panorama, differentiably.
 
-    Depth is radial and therefore the same number on every face; what is interpolated is depth times coverage, and
-    coverage, so that depths are not mixed with the zeros of empty pixels. Counters are sums over the faces, but for
-    `gaussians` and `visible`.
+    Depth is radial, so faces agree on it; depth times coverage is interpolated, so that depths do not mix with the
+    zeros of empty pixels. Counters are sums over the faces, except `gaussians` and `visible`.
     """
     like = faces[0].image
     pixels, weights = _corners(panorama, lens, like.device)
@@ -94,10 +92,10 @@ def panorama_from_faces(faces: list[Rendering], panorama: Panorama, lens: Pinhol
 
 
 class SummedCounters(Mapping[str, int]):
-    """Of several drawings of the same Gaussians; added up, which waits for a GPU, when somebody asks."""
+    """Counters of several renderings of the same Gaussians; summed, which waits for a GPU, on access."""
 
     def __init__(self, parts: Sequence[Rendering], visible: Tensor) -> None:
-        """`visible` [N]: which Gaussians can be seen in any of the parts."""
+        """Keep the counters of the parts, and `visible` [N], the Gaussians visible in any part."""
         self._of_parts, self._visible = [part.counters for part in parts], visible
 
     def __getitem__(self, name: str) -> int:
@@ -114,7 +112,7 @@ class SummedCounters(Mapping[str, int]):
 
 @lru_cache(maxsize=16)
 def _turns(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """From the camera to each face, [6, 4, 4]."""
+    """Return the transforms from the camera to each face, [6, 4, 4]."""
     turns = torch.eye(4, dtype=dtype).repeat(6, 1, 1)
     turns[:, :3, :3] = FACES
     return turns.to(device)
@@ -122,7 +120,7 @@ def _turns(dtype: torch.dtype, device: torch.device) -> Tensor:
 
 @lru_cache(maxsize=16)
 def _corners(panorama: Panorama, lens: Pinhole, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Where a panorama's pixels look: four pixels [H W, 4] int64 of the stacked faces, and their weights [H W, 4]."""
+    """Return for each pixel of a panorama four pixels [H W, 4] int64 of the stacked faces, and weights [H W, 4]."""
     directions = rays(panorama.width, panorama.height, dtype=torch.float64).view(-1, 3)
     ahead = directions @ FACES[:, 2].T  # [H W, 6] cosine to the axis of each face
     face = ahead.argmax(-1)

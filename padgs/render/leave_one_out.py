@@ -1,12 +1,12 @@
-"""What an image would lose with each of its Gaussians alone: exactly, from one pass like the backward of blending.
+"""Leave-one-out scores: the change of the error of one image when a single Gaussian is removed, for all in one pass.
 
-Removing a Gaussian changes a pixel by dC = alpha / (1 - alpha) B - w c: its own colour c with the weight w = alpha T is
-gone, and what lies behind it, blended to B with the background, shines through. With the residual r = image - target
-the squared error changes by ||dC||^2 + 2 <r, dC>. That is no estimate, but where a pixel stops, because less than 1e-4
-of the light would be left: then others may stop it instead.
+Removing a Gaussian changes a pixel by dC = alpha / (1 - alpha) B - w c: its colour c with the weight w = alpha T goes,
+and B, the blend of everything behind it with the background, shows through. With the residual r = image - target the
+squared error changes by ||dC||^2 + 2 <r, dC>. This is exact, except where a pixel stops because less than 1e-4 of the
+transmittance would be left: another Gaussian may then stop it instead.
 
-What others prune by (opacity, size, contribution, curvature of the loss) says how much a Gaussian shows; this says what
-its absence costs. A negative change is a Gaussian that does harm.
+Other importance scores (opacity, size, contribution, curvature of the loss) measure how visible a Gaussian is; this one
+measures the cost of its absence. A negative score is a Gaussian that increases the error.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from torch import Tensor
 
 from padgs.gaussians import Gaussians
 from padgs.registry import lookup
-from padgs.render import request_of, resolve_backend
+from padgs.render import make_request, resolve_backend
 from padgs.render.backends.torch import blocks, fragments, sorted_weights
 from padgs.render.contract import CORE_SIZE, Removals, RenderOptions, Request
 from padgs.render.projection import project
@@ -27,7 +27,7 @@ from padgs.scene import View
 
 Backend = Callable[[Request, Tensor, Tensor], Removals]  # target [H, W, 3], weight [H, W] of each squared error
 BACKENDS = {
-    "torch": "padgs.render.leave_one_out:define",
+    "torch": "padgs.render.leave_one_out:score",
     "cpu": "padgs.render.backends.cpu:leave_one_out",
     "cuda": "padgs.render.backends.cuda:leave_one_out",
 }
@@ -43,20 +43,17 @@ def leave_one_out(
     *,
     backend: str = "auto",
 ) -> Removals:
-    """Score N Gaussians by one view, drawn before black.
+    """Score N Gaussians by one view with a black background.
 
-    Hybrid blending, where who is in order depends on
-    who is there, is scored as if it were sorted, and a cubemap as the panorama that its faces make, by rays; these
-    changes are estimates.
+    Hybrid blending is scored as if it were sorted, and a cubemap as a panorama by rays; these scores are estimates.
 
     Args:
         gaussians: N Gaussians.
         view: pose and image size.
-        target: [H, W, 3], what it should look like.
-        weight: [H, W] or [H, 1] of the pixels, >= 0 and not 0 everywhere; only ratios matter.
-        options: how it is drawn.
-        backend: torch, cpu, cuda, or auto, as for `padgs.render.render`; what is on a GPU without a library for it is
-            scored on the CPU.
+        target: [H, W, 3], the ground truth.
+        weight: [H, W] or [H, 1] of the pixels, >= 0 and not all 0; only ratios matter.
+        options: as for `padgs.render.render`.
+        backend: as for `padgs.render.render`; auto scores tensors of a GPU on the CPU if the library for it is missing.
 
     Raises:
         ValueError: unknown backend, a target of another size than the view, or inputs that break the contract.
@@ -69,22 +66,22 @@ def leave_one_out(
         options = replace(options, blending="sorted", core_size=CORE_SIZE)
     if options.cubemap:
         options = replace(options, cubemap=False, face_size=None, projection="ray", low_pass_kind="auto")
-    request = request_of(gaussians, view, options)
+    request = make_request(gaussians, view, options)
     if target.shape != (view.camera.height, view.camera.width, 3):
         raise ValueError(
-            f"the target has {list(target.shape)} numbers, but a view of {view.camera.width}x{view.camera.height} has "
-            f"[{view.camera.height}, {view.camera.width}, 3]; give it in the size of the view"
+            f"the target has shape {list(target.shape)}, but the view is {view.camera.width}x{view.camera.height}; it must be "
+            f"[{view.camera.height}, {view.camera.width}, 3]"
         )
     target = target.to(gaussians.means)
     weight = weight.to(target).expand(target.shape[:2])
     weight = (weight / weight.double().sum()).to(target).contiguous()
-    score: Backend = lookup(BACKENDS, resolved, "backend")
-    found = score(request, target.contiguous(), weight)
+    backend_score: Backend = lookup(BACKENDS, resolved, "backend")
+    found = backend_score(request, target.contiguous(), weight)
     return replace(found, error=found.error / 3, change=found.change / 3)  # means over channels
 
 
-def define(request: Request, target: Tensor, weight: Tensor) -> Removals:
-    """The readable one, and the definition of what others must compute: every pixel against every visible Gaussian."""
+def score(request: Request, target: Tensor, weight: Tensor) -> Removals:
+    """Score by brute force, every pixel against every visible Gaussian: the definition of what backends compute."""
     gaussians, camera, background = request.gaussians, request.camera, request.background
     footprints = project(request)
     order = torch.argsort(footprints.depths, stable=True)
@@ -98,7 +95,7 @@ def define(request: Request, target: Tensor, weight: Tensor) -> Removals:
         shown, left = sorted_weights(alpha)  # [P, K], [P]
         parts = shown[..., None] * colors  # [P, K, 3]
         image = parts.sum(1) + left[:, None] * background
-        behind = image[:, None] - parts.cumsum(1)  # each Gaussian and all in front of it taken away
+        behind = image[:, None] - parts.cumsum(1)  # without each Gaussian and all in front of it
         change = (alpha / (1 - alpha))[..., None] * behind - parts
         change = torch.where((shown > 0)[..., None], change, 0)
         residual = (image - target[rows, columns])[:, None]

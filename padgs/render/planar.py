@@ -1,6 +1,6 @@
-"""Planar footprints (torch): a 2D Gaussian in pixels, through the Jacobian of the camera at the mean (Eq. 3, 5).
+"""Planar footprints (torch): a 2D Gaussian in pixels, by the Jacobian of the camera at the mean (Eq. 3, 5).
 
-erp is the chart model of OmniGS, ODGS and PaD-GS; pinhole is the one of ordinary 3D Gaussian splatting.
+erp is the projection of OmniGS, ODGS and PaD-GS; pinhole that of 3D Gaussian splatting.
 """
 
 from __future__ import annotations
@@ -13,12 +13,18 @@ from torch import Tensor
 from padgs.geometry.camera import Panorama, Pinhole
 from padgs.geometry.panorama import longitude_latitude, pixel_from_angles, projection_jacobian
 from padgs.render.contract import ALPHA_MIN, Request
-from padgs.render.low_pass import low_pass_of, widened
-from padgs.render.projection import Footprints, camera_frame, is_sound, plane_moments
+from padgs.render.projection import (
+    Footprints,
+    camera_frame,
+    is_sound,
+    low_pass_filtered,
+    low_pass_of,
+    plane_covariance,
+)
 from padgs.render.published_bounds import is_on_image, square_boxes
 
-MIN_COS_LATITUDE = 1e-4  # nearer to the axis than 0.006 degrees an erp footprint is undefined: its width is 1 / cos
-SLOPE_LIMIT = 1.3  # pinhole: slopes in the Jacobian are limited to this times the half field of view
+MIN_COS_LATITUDE = 1e-4  # within 0.006 degrees of the axis an erp footprint is undefined: its width is 1 / cos
+SLOPE_LIMIT = 1.3  # pinhole: limit of slopes in the Jacobian, as a multiple of the half field of view
 
 
 @dataclass(frozen=True)
@@ -28,12 +34,12 @@ class PlanarFootprints(Footprints):
     boxes: Tensor  # [N, 4]; columns not reduced mod W
     centers: Tensor  # [N, 2] (u, v)
     whitening: Tensor  # [N, 3] (a, b, c) of the Cholesky factor K = [[a, b], [0, c]] of the inverse S^-1 = K^T K
-    turn: float  # pixels after which columns repeat (the width, with wrap), or infinity
+    turn: float  # period of the columns in pixels (the width, with wrap), or infinity
 
     def squared_distance(self, indices: Tensor, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
-        """q = |K delta|^2, delta from the nearest copy of the centre across the seam.
+        """Return q = |K delta|^2, with delta from the nearest copy of the centre across the seam.
 
-        Written out, as A du^2 + 2 B du dv + C dv^2, it would cancel far from the centre of a long oblique footprint.
+        Expanded to A du^2 + 2 B du dv + C dv^2 it would cancel far from the centre of a long oblique footprint.
         """
         centers, boxes = self.centers[indices], self.boxes[indices]
         dv = rows[:, None] + 0.5 - centers[:, 1]
@@ -50,13 +56,13 @@ class PlanarFootprints(Footprints):
 
 
 def project_erp(request: Request) -> PlanarFootprints:
-    """Chart model: mean through Eq. 6-7, covariance through their Jacobian (Eq. 3, 5)."""
+    """Project to the ERP image: means by Eq. 6-7, covariances by their Jacobian (Eq. 3, 5)."""
     camera, options = request.camera, request.options
     means, orientations = camera_frame(request)
-    request = replace(request, gaussians=widened(request.gaussians, means, low_pass_of(options, camera)))
+    request = replace(request, gaussians=low_pass_filtered(request.gaussians, means, low_pass_of(options, camera)))
     squared_radius = (means * means).sum(-1).detach()
     in_front = squared_radius > options.near**2
-    # Next to the axis the chart has no derivative worth the name; such a footprint is held constant.
+    # Next to the axis the derivative diverges; such a footprint is constant to autograd.
     near_axis = (means[:, 0] ** 2 + means[:, 2] ** 2).detach() < MIN_COS_LATITUDE**2 * squared_radius
     means = torch.where(near_axis[:, None], means.detach(), means)
     centers = pixel_from_angles(*longitude_latitude(means), camera.width, camera.height)
@@ -65,11 +71,11 @@ def project_erp(request: Request) -> PlanarFootprints:
 
 
 def project_pinhole(request: Request) -> PlanarFootprints:
-    """The perspective model of 3D Gaussian splatting: u = fx x / z + cx, Jacobian with limited slopes."""
+    """Project as 3D Gaussian splatting does: u = fx x / z + cx, Jacobian with limited slopes."""
     camera, options = request.camera, request.options
-    assert isinstance(camera, Pinhole), type(camera)  # `check_inputs` has seen to it
+    assert isinstance(camera, Pinhole), type(camera)  # guaranteed by `check_inputs`
     means, orientations = camera_frame(request)
-    request = replace(request, gaussians=widened(request.gaussians, means, low_pass_of(options, camera)))
+    request = replace(request, gaussians=low_pass_filtered(request.gaussians, means, low_pass_of(options, camera)))
     in_front = means[:, 2].detach() > options.near
     x, y, z = means.unbind(-1)
     centers = torch.stack((camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy), dim=-1)
@@ -86,10 +92,10 @@ def _footprints(
     request: Request, means: Tensor, orientations: Tensor, centers: Tensor, jacobian: Tensor, in_front: Tensor
 ) -> PlanarFootprints:
     gaussians, camera, options = request.gaussians, request.camera, request.options
-    if request.probe is not None:
-        centers = centers + request.probe * centers.new_tensor([camera.width / 2, camera.height / 2])
+    if request.mean_offsets is not None:
+        centers = centers + request.mean_offsets * centers.new_tensor([camera.width / 2, camera.height / 2])
     half_covariance = jacobian @ (orientations * gaussians.scales[:, None, :])  # [N, 2, 3]
-    var_u, cov_uv, var_v, determinant = plane_moments(half_covariance, low_pass_of(options, camera).own)
+    var_u, cov_uv, var_v, determinant = plane_covariance(half_covariance, low_pass_of(options, camera).in_plane)
     a = torch.sqrt(var_v / determinant)
     whitening = torch.stack((a, -a * (cov_uv / var_v), torch.rsqrt(var_v)), dim=-1)
     covariance = torch.stack((var_u, cov_uv, var_v), dim=-1).detach()
@@ -105,7 +111,7 @@ def _footprints(
 
 
 def _exact_boxes(centers: Tensor, covariance: Tensor, opacities: Tensor) -> Tensor:
-    """Pixels [N, 4] that can have alpha >= 1/255: `bounds=exact`, the default.
+    """Return the pixels [N, 4] that can have alpha >= 1/255: `bounds=exact`, the default.
 
     opacity exp(-q / 2) >= 1/255 is the ellipse q <= k with k = 2 ln(255 opacity); its box has half widths sqrt(k var).
     """

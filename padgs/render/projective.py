@@ -1,8 +1,7 @@
-"""Projective footprints (torch): models that work with the ray of a pixel, so that any camera will do.
+"""Projective footprints (torch): they take the ray of a pixel, so they work with any camera and have no pole or seam.
 
 tangent: the Gaussian flattened onto the tangent plane of the sphere at its mean (OP43DGS).
 ray: the largest value of the 3D Gaussian along the ray (SPaGS).
-Neither knows of charts: no pole, no seam.
 """
 
 from __future__ import annotations
@@ -15,21 +14,27 @@ from torch import Tensor
 
 from padgs.geometry.camera import Camera, Panorama
 from padgs.render.contract import ALPHA_MIN, Request
-from padgs.render.low_pass import low_pass_of, widened
-from padgs.render.projection import Footprints, camera_frame, is_sound, plane_moments
+from padgs.render.projection import (
+    Footprints,
+    camera_frame,
+    is_sound,
+    low_pass_filtered,
+    low_pass_of,
+    plane_covariance,
+)
 from padgs.render.published_bounds import is_on_image, tangent_boxes
 
 
 @dataclass(frozen=True)
 class TangentFootprints(Footprints):
-    """Projected Gaussians on their tangent planes."""
+    """Gaussians projected to their tangent planes."""
 
     normals: Tensor  # [N, 3] direction of the mean
     whitening: Tensor  # [N, 2, 3] L: q = |L d|^2 / (n.d)^2
     rays: Tensor  # [H, W, 3]
 
     def squared_distance(self, indices: Tensor, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
-        """q = tau^T S^-1 tau with tau = E d / (n.d), on the mean's side of the camera."""
+        """Return q = tau^T S^-1 tau with tau = E d / (n.d), on the side of the camera where the mean is."""
         d = self.rays[rows, columns]  # [P, 3]
         ahead = d @ self.normals[indices].T  # [P, K]
         inside = ahead.detach() > 0
@@ -44,7 +49,7 @@ class TangentFootprints(Footprints):
 
 @dataclass(frozen=True)
 class RayFootprints(Footprints):
-    """Projected Gaussians as the ray meets them."""
+    """Gaussians in the camera frame, evaluated along rays."""
 
     means: Tensor  # [N, 3] camera frame
     whitening: Tensor  # [N, 3, 3] M^-1 with Sigma = M M^T
@@ -52,24 +57,24 @@ class RayFootprints(Footprints):
     near: float
 
     def squared_distance(self, indices: Tensor, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
-        """q = |o - t w|^2 with o = M^-1 mean, w = M^-1 d, and t = o.w / w.w where the ray meets its maximum."""
-        o, w, t = self._meeting(indices, rows, columns)
+        """Return q = |o - t w|^2 with o = M^-1 mean, w = M^-1 d, and t = o.w / w.w, the distance of the maximum."""
+        o, w, t = self._maximum(indices, rows, columns)
         offset = o - t[..., None] * w
         return (offset * offset).sum(-1), t.detach() > self.near
 
     def distance(self, indices: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
-        """t, where the ray meets its maximum."""
+        """Return t, the distance of the maximum along the ray."""
         with torch.no_grad():
-            return self._meeting(indices, rows, columns)[2]
+            return self._maximum(indices, rows, columns)[2]
 
     def slope(self, indices: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
-        """2 |M^-T (o - t w)|: the derivative by way of t vanishes, because there the ray meets the maximum."""
+        """Return 2 |M^-T (o - t w)|; the derivative through t vanishes at the maximum."""
         with torch.no_grad():
-            o, w, t = self._meeting(indices, rows, columns)
+            o, w, t = self._maximum(indices, rows, columns)
             return 2 * torch.einsum("kic,pki->pkc", self.whitening[indices], o - t[..., None] * w).norm(dim=-1)
 
-    def _meeting(self, indices: Tensor, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """o [K, 3], w [P, K, 3] and t [P, K]."""
+    def _maximum(self, indices: Tensor, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return o [K, 3], w [P, K, 3] and t [P, K]."""
         whitening = self.whitening[indices]
         o = torch.einsum("kic,kc->ki", whitening, self.means[indices])
         w = torch.einsum("kic,pc->pki", whitening, self.rays[rows, columns])
@@ -77,19 +82,19 @@ class RayFootprints(Footprints):
 
 
 def project_tangent(request: Request) -> TangentFootprints:
-    """S = E Sigma E^T / r^2 (+ the angular low-pass) on the tangent plane spanned by E."""
+    """Project to the tangent plane spanned by E: S = E Sigma E^T / r^2 (+ the angular low-pass)."""
     camera, options = request.camera, request.options
     means, orientations = camera_frame(request)
     in_front = (means * means).sum(-1).detach() > options.near**2
-    means = _probed(means, request.probe)
+    means = _shifted(means, request.mean_offsets)
     low_pass = low_pass_of(options, camera)
-    gaussians, low_pass = widened(request.gaussians, means, low_pass), low_pass.own
+    gaussians, low_pass = low_pass_filtered(request.gaussians, means, low_pass), low_pass.in_plane
     radius = means.norm(dim=-1)
     normal = means / radius[:, None]
     tangent = _tangent_basis(normal)  # [N, 2, 3]
     spread = orientations * gaussians.scales[:, None, :]
     half = tangent @ spread / radius[:, None, None]  # [N, 2, 3]
-    var_0, covariance, _, determinant = plane_moments(half, low_pass)
+    var_0, covariance, _, determinant = plane_covariance(half, low_pass)
     # L = C^-1 E with the Cholesky factor C of S: its first row is E_0 / c, its second orthogonal to it under S.
     first = tangent[:, 0] / torch.sqrt(var_0)[:, None]
     second = (tangent[:, 1] - (covariance / var_0)[:, None] * tangent[:, 0]) / torch.sqrt(determinant / var_0)[:, None]
@@ -103,16 +108,16 @@ def project_tangent(request: Request) -> TangentFootprints:
 
 
 def project_ray(request: Request) -> RayFootprints:
-    """M^-1 = diag(1 / scale) R^T; not drawn from inside, that is where |M^-1 mean|^2 <= k = 2 ln(255 opacity).
+    """Project to rays: M^-1 = diag(1 / scale) R^T. Cull Gaussians that contain the camera: |M^-1 mean|^2 <= k.
 
-    With near_cull=ellipsoid neither where the ellipsoid of what is drawn reaches the plane n.x = near, n the direction
-    of the mean: r - sqrt(k n^T Sigma n) <= near (SPaGS).
+    k = 2 ln(255 opacity) bounds the drawn ellipsoid. With near_cull=ellipsoid, also cull where that ellipsoid reaches
+    the plane n.x = near, n the direction of the mean: r - sqrt(k n^T Sigma n) <= near (SPaGS).
     """
     camera, options = request.camera, request.options
     means, orientations = camera_frame(request)
     in_front = (means * means).sum(-1).detach() > options.near**2
-    means = _probed(means, request.probe)
-    gaussians = widened(request.gaussians, means, low_pass_of(options, camera))
+    means = _shifted(means, request.mean_offsets)
+    gaussians = low_pass_filtered(request.gaussians, means, low_pass_of(options, camera))
     radius, opacities = means.norm(dim=-1), gaussians.opacities
     whitening = orientations.transpose(-1, -2) / gaussians.scales[:, :, None]
     distance = (torch.einsum("kic,kc->ki", whitening, means) ** 2).sum(-1).detach()
@@ -126,21 +131,21 @@ def project_ray(request: Request) -> RayFootprints:
     return RayFootprints(opacities, radius, visible, None, means, whitening, _rays(camera, means), options.near)
 
 
-def shift_of_probe(means: Tensor, probe: Tensor) -> Tensor:
-    """What a probe adds to camera-frame means, [N, 3], on their sphere: as on a panorama of 2 x 2 units."""
+def mean_shift(means: Tensor, mean_offsets: Tensor) -> Tensor:
+    """Return the shift [N, 3] of camera-frame means along their sphere for offsets on a panorama of 2 x 2 units."""
     x, y, z = means.detach().unbind(-1)
     rho = torch.sqrt(x * x + z * z)
     east = torch.stack((z, torch.zeros_like(x), -x), dim=-1)  # of length rho = r cos(latitude)
     down = torch.stack((-x * y, rho * rho, -y * z), dim=-1) / rho.clamp(min=1e-30)[:, None]  # of length r
-    return probe[:, :1] * pi * east + probe[:, 1:] * (pi / 2) * down
+    return mean_offsets[:, :1] * pi * east + mean_offsets[:, 1:] * (pi / 2) * down
 
 
-def _probed(means: Tensor, probe: Tensor | None) -> Tensor:
-    return means if probe is None else means + shift_of_probe(means, probe)
+def _shifted(means: Tensor, mean_offsets: Tensor | None) -> Tensor:
+    return means if mean_offsets is None else means + mean_shift(means, mean_offsets)
 
 
 def _tangent_basis(normals: Tensor) -> Tensor:
-    """Two orthonormal rows [N, 2, 3] orthogonal to each normal; which ones does not matter."""
+    """Return two arbitrary orthonormal rows [N, 2, 3] orthogonal to each normal."""
     axis = torch.nn.functional.one_hot(normals.abs().argmin(-1), 3).to(normals)
     first = torch.nn.functional.normalize(torch.linalg.cross(normals, axis), dim=-1)
     return torch.stack((first, torch.linalg.cross(normals, first)), dim=-2)

@@ -16,7 +16,7 @@ from padgs.data.perturb import StressOptions
 from padgs.data.synthetic.options import SyntheticOptions
 from padgs.evaluation.protocols import PROTOCOLS, Protocol, protocol_from_options
 from padgs.registry import lookup
-from padgs.render.config import RenderConfig
+from padgs.render import RenderConfig
 from padgs.runs.device import DEVICES
 from padgs.runs.identity import Labels
 from padgs.runs.start import Start

@@ -7,7 +7,7 @@ import warnings
 import torch
 
 from padgs.native import cuda
-from padgs.render.config import RenderConfig
+from padgs.render import RenderConfig
 
 DEVICES = ("auto", "cpu", "cuda")
 

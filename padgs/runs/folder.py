@@ -19,7 +19,7 @@ from PIL import Image
 from torch import Tensor
 
 from padgs import results
-from padgs.evaluation.pictures import comparison
+from padgs.evaluation.images import comparison_image
 from padgs.replacing import replace_file
 from padgs.results import Result
 from padgs.runs import checkpoint
@@ -147,7 +147,7 @@ class RunFolder:
     def save_picture(self, view: View, truth: Tensor, image: Tensor) -> None:
         """Save truth | render | error of a view; images [H, W, 3]."""
         with self._writing():
-            Image.fromarray(comparison(truth, image)).save(self.renders / results.picture_name(view.name))
+            Image.fromarray(comparison_image(truth, image)).save(self.renders / results.picture_name(view.name))
 
     @contextmanager
     def _writing(self) -> Iterator[None]:

@@ -9,10 +9,9 @@ from itertools import cycle, islice
 from typing import Any
 
 from padgs.clock import summary, timed
-from padgs.evaluation import geometry
-from padgs.evaluation.evaluate import Marks, OnView, as_stored, evaluate, known, weight_of
+from padgs.evaluation.diagnostics import diagnose, oracle, pole_gap
+from padgs.evaluation.evaluate import Metrics, OnView, cropped_mask, evaluate, finite_or_none, quantized
 from padgs.evaluation.metrics import mean_color, psnr, ws_psnr_fitted
-from padgs.evaluation.pole_gap import oracle, pole_gap
 from padgs.evaluation.protocols import Protocol
 from padgs.geometry.panorama import row_latitudes
 from padgs.render import Rendering
@@ -42,20 +41,20 @@ def evaluated(method: Method, scene: Scene, protocol: Protocol, on_view: OnView 
 
 
 def stability(method: Method, scene: Scene, protocol: Protocol, on_view: OnView | None) -> Scores:
-    """The same, and besides: geometry (`padgs.evaluation.geometry`), the WS-PSNR of one colour, of training views, and
-    after colours were fitted, and the pole gap of an oracle (`padgs.evaluation.pole_gap`).
+    """The same, and besides: geometry (`padgs.evaluation.diagnostics`), the WS-PSNR of one colour, of training views, and
+    after colours were fitted, and the pole gap of an oracle (`padgs.evaluation.diagnostics`).
     """
 
-    def also(view: View, rendering: Rendering) -> Marks:
-        truth, image = view.image(device=rendering.image.device), as_stored(rendering.image)
-        mask = weight_of(view.mask(device=image.device), image, protocol)
+    def also(view: View, rendering: Rendering) -> Metrics:
+        truth, image = view.image(device=rendering.image.device), quantized(rendering.image)
+        mask = cropped_mask(view.mask(device=image.device), image, protocol)
         marks = {"ws_psnr_one_color": mean_color(truth, mask), "ws_psnr_fitted": ws_psnr_fitted(image, truth, mask)}
         if view.lens is None and (blurred := oracle(image, truth, mask)) is not None:
             marks["pole_gap_oracle"] = pole_gap(blurred, truth, mask)
-        marks = {"pole_gap_oracle": None, **{name: known(mark) for name, mark in marks.items()}}
-        return {**marks, **geometry.of_view(method.render, view, rendering)}
+        marks = {"pole_gap_oracle": None, **{name: finite_or_none(mark) for name, mark in marks.items()}}
+        return {**marks, **diagnose(method.render, view, rendering)}
 
-    found = evaluate(method.render, scene.test, protocol, on_view=on_view, also=also)
+    found = evaluate(method.render, scene.test, protocol, on_view=on_view, extra=also)
     seen = scene.train[:: max(1, len(scene.train) // len(scene.test))]
     own = evaluate(method.render, seen, protocol).metrics["ws_psnr"]
     return replace(found, metrics={**found.metrics, "ws_psnr_training": own})
@@ -66,7 +65,7 @@ def quality_of_one_color(scene: Scene, protocol: Protocol) -> float:
 
     def quality(view: View) -> float:
         truth = view.image()
-        return mean_color(truth, weight_of(view.mask(), truth, protocol)).item()
+        return mean_color(truth, cropped_mask(view.mask(), truth, protocol)).item()
 
     return sum(map(quality, scene.test)) / len(scene.test)
 

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from padgs.evaluation.bands import BANDS
+from padgs.evaluation import BANDS
 from padgs.results import Result
 from padgs.runs.live import compact, duration
 from padgs.runs.terminal import printable, say

@@ -16,8 +16,7 @@ from typing import Any, ClassVar
 import torch
 
 from padgs.geometry.camera import Panorama
-from padgs.render import Rendering
-from padgs.render.config import RenderConfig
+from padgs.render import RenderConfig, Rendering
 from padgs.render.contract import check_camera
 from padgs.scene import Scene, View
 from padgs.training.budget import Budget

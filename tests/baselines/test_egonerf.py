@@ -9,7 +9,7 @@ from padgs.baselines.egonerf import EgoNeRFMethod, EgoNeRFMethodOptions
 from padgs.data.synthetic import SyntheticOptions, generate
 from padgs.methods.egonerf.model import EgoNeRF
 from padgs.methods.egonerf.trainee import EgoNeRFTrainee
-from padgs.render.config import RenderConfig
+from padgs.render import RenderConfig
 from padgs.runs.session import build
 from padgs.scene import Scene, View
 from padgs.training.budget import Budget

@@ -11,7 +11,7 @@ from padgs.baselines.omnigs import OmniGSMethod
 from padgs.methods.splats.method import SplatOptions
 from padgs.native import cpu
 from padgs.registry import lookup
-from padgs.render.config import RenderConfig
+from padgs.render import RenderConfig
 from padgs.runs import checkpoint
 from padgs.scene import Scene, View
 from padgs.training.budget import Budget

@@ -17,7 +17,7 @@ from padgs.data.perspectives import solid_angle
 from padgs.geometry.camera import Panorama
 from padgs.geometry.panorama import rays
 from padgs.registry import lookup
-from padgs.render.config import RenderConfig
+from padgs.render import RenderConfig
 from padgs.training.budget import Budget
 from padgs.training.options import TrainOptions
 

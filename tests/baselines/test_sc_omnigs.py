@@ -12,7 +12,7 @@ from padgs.evaluation.metrics import psnr
 from padgs.gaussians import rotation_matrices
 from padgs.methods.calibration.align import Similarity, align
 from padgs.methods.splats.method import SplatOptions
-from padgs.render.config import RenderConfig
+from padgs.render import RenderConfig
 from padgs.scene import Scene
 from padgs.training.budget import Budget
 from padgs.training.options import TrainOptions

@@ -9,8 +9,7 @@ from padgs.data.synthetic import SyntheticOptions, SyntheticTruth, generate
 from padgs.evaluation.metrics import seam, ws_psnr
 from padgs.methods.calibration.dual_lens import DualLens
 from padgs.methods.splats.method import SplatMethod, SplatOptions
-from padgs.render import RenderOptions, render
-from padgs.render.config import RenderConfig
+from padgs.render import RenderConfig, RenderOptions, render
 from padgs.scene import Scene, View
 from padgs.training.budget import Budget
 from padgs.training.trainee import Drawing

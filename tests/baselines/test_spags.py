@@ -18,10 +18,9 @@ from padgs.methods.splats.trainee import SplatTrainee
 from padgs.native import cpu
 from padgs.native.abi import Inputs, pointer
 from padgs.registry import lookup
-from padgs.render import RenderOptions
-from padgs.render.backends.cpu_tiles import Projected
-from padgs.render.backends.native_camera import native_camera
-from padgs.render.config import RenderConfig
+from padgs.render import RenderConfig, RenderOptions
+from padgs.render.backends.cpu import Projected
+from padgs.render.backends.native import native_camera
 from padgs.scene import Scene
 from padgs.training.budget import Budget
 

@@ -6,7 +6,7 @@ import torch
 from PIL import Image
 
 from padgs.evaluation import evaluate as module
-from padgs.evaluation.evaluate import as_stored, evaluate, mean_marks, score
+from padgs.evaluation.evaluate import evaluate, mean_metrics, quantized, score
 from padgs.evaluation.lpips_weights import LpipsUnavailable
 from padgs.evaluation.metrics import METRICS, psnr, ssim, ws_psnr
 from padgs.evaluation.protocols import PAPER_360ROAM, PROTOCOLS, protocol_from_options
@@ -83,7 +83,7 @@ def test_means_and_pictures_of_several_views(image, pixels):
     assert [arguments[0] for arguments in seen] == views
     for seen_view, truth, shown in seen:
         assert torch.equal(truth, seen_view.image())
-        assert torch.equal(shown, as_stored(shown)) and shown.min() >= 0 and shown.max() <= 1
+        assert torch.equal(shown, quantized(shown)) and shown.min() >= 0 and shown.max() <= 1
         assert evaluation.views[seen_view.name]["psnr"] == psnr(shown, truth).item()
     a, b = (evaluation.views[name]["psnr"] for name in "ab")
     assert evaluation.metrics["psnr"] == pytest.approx((a + b) / 2)
@@ -103,7 +103,7 @@ def test_what_a_mask_hides_changes_nothing_in_any_protocol(image, pixels, genera
 
 
 def test_paper_cuts_the_bottom_off_and_sphere_hides_it(image, pixels):
-    truth, stored = pixels / 255, as_stored(image)
+    truth, stored = pixels / 255, quantized(image)
     rows = PAPER_360ROAM.rows(H)
     assert rows == 29  # 32 x 959 / 1024 = 29.97
     paper = score(stored, truth, None, protocol_from_options("paper", lpips="none", bottom_crop=65 / 1024))
@@ -122,7 +122,7 @@ def test_a_band_that_no_pixel_counts_in_is_missing_and_does_not_spoil_the_mean(i
     evaluation = evaluate(lambda _: rendering(image), views, SPHERE)
     assert evaluation.views["a"]["ws_psnr_nadir"] is None
     assert evaluation.metrics["ws_psnr_nadir"] == evaluation.views["b"]["ws_psnr_nadir"]
-    assert mean_marks([{"x": None}, {"x": None}]) == {"x": None}
+    assert mean_metrics([{"x": None}, {"x": None}]) == {"x": None}
 
 
 def test_missing_lpips_is_said_once_and_the_rest_stands(image, pixels, monkeypatch):
@@ -134,7 +134,7 @@ def test_missing_lpips_is_said_once_and_the_rest_stands(image, pixels, monkeypat
     evaluation = evaluate(lambda _: rendering(image), views, PROTOCOLS["paper"])
     assert evaluation.notes == ("lpips_vgg_01 is missing: no weights for LPIPS vgg",)
     assert evaluation.metrics["lpips_vgg_01"] is None
-    assert evaluation.metrics["psnr"] == pytest.approx(psnr(as_stored(image), pixels / 255).item())
+    assert evaluation.metrics["psnr"] == pytest.approx(psnr(quantized(image), pixels / 255).item())
 
 
 def test_renders_that_cannot_be_scored(image, pixels):

@@ -5,7 +5,7 @@ import pytest
 import torch
 from tiny_scene import tiny_scene, truth
 
-from padgs.evaluation.geometry import depth_error, depth_within, floaters, least_extent, of_view, yaw_error
+from padgs.evaluation.diagnostics import depth_error, depth_within, diagnose, floaters, least_extent, yaw_error
 from padgs.evaluation.metrics import mean_color
 from padgs.geometry.distortion import solid_angle_weight
 from padgs.render import Rendering, RenderOptions, render
@@ -66,9 +66,9 @@ def test_a_view_without_depth_or_that_is_no_panorama_has_marks_that_are_missing(
     view = tiny_scene().test[0]
     image = torch.zeros(16, 32, 3)
     rendering = Rendering(image, torch.zeros(16, 32), SURFACE, torch.ones(1, dtype=torch.bool))
-    marks = of_view(lambda _: rendering, view, rendering)
+    marks = diagnose(lambda _: rendering, view, rendering)
     assert marks["yaw_error"] == 0 and marks["depth_error"] is None and marks["floaters"] is None
-    known = of_view(lambda _: rendering, replace(view, load_depth=lambda: SURFACE), rendering)
+    known = diagnose(lambda _: rendering, replace(view, load_depth=lambda: SURFACE), rendering)
     assert (known["depth_error"], known["depth_within"], known["floaters"]) == (0, 1, 0)
     assert known["least_extent"] == pytest.approx(1) and marks["least_extent"] is None
 

@@ -3,8 +3,8 @@ import math
 import pytest
 import torch
 
+from padgs.evaluation.diagnostics import blurred, oracle, pole_gap
 from padgs.evaluation.metrics import ws_psnr
-from padgs.evaluation.pole_gap import blurred, oracle, pole_gap
 from padgs.geometry.panorama import rays, row_latitudes, sample
 
 WIDTH, HEIGHT = 192, 96

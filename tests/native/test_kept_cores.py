@@ -27,8 +27,10 @@ def test_going_back_twice_gives_the_same(backend: str, generator: torch.Generato
 @pytest.fixture
 def kept(monkeypatch: pytest.MonkeyPatch) -> list:
     """What forward passes of the CPU keep for backward."""
-    found, of = [], cpu_backend._Cores.of
-    monkeypatch.setattr(cpu_backend._Cores, "of", lambda *arguments: found.append(of(*arguments)) or found[-1])
+    found, allocate = [], cpu_backend._Cores.allocate
+    monkeypatch.setattr(
+        cpu_backend._Cores, "allocate", lambda *arguments: found.append(allocate(*arguments)) or found[-1]
+    )
     return found
 
 

@@ -48,7 +48,7 @@ print("padgs.native" in sys.modules, "padgs_cpu" in open("/proc/self/maps").read
 @pytest.fixture
 def missing_library(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
     """As on a machine where nothing was compiled."""
-    caches = (cpu.library, cpu.available, package._say_that_native_is_missing)
+    caches = (cpu.library, cpu.available, package._warn_missing_library)
     monkeypatch.setenv("PADGS_LIBRARY_DIR", str(tmp_path))
     monkeypatch.setattr(loading, "_package_folders", lambda: [str(tmp_path / "padgs" / "render")])
     for cached in caches:

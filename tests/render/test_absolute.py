@@ -19,14 +19,14 @@ each_blending = pytest.mark.parametrize("blending", BLENDINGS)
 
 
 def pulls(gaussians: Gaussians, view: View, options: RenderOptions, weights: Tensor, backend: str) -> Tensor:
-    """The gradient [N] of an absolute probe for the outputs [H, W, 3 to 5] times the weights."""
+    """The gradient [N] of an absolute mean_offsets for the outputs [H, W, 3 to 5] times the weights."""
     dtype = gaussians.means.dtype
-    probe = torch.zeros(len(gaussians), dtype=dtype, requires_grad=True)
-    rendering = render(gaussians, view, options, absolute_probe=probe, backend=backend)
+    mean_offsets = torch.zeros(len(gaussians), dtype=dtype, requires_grad=True)
+    rendering = render(gaussians, view, options, absgrad=mean_offsets, backend=backend)
     outputs = torch.cat((rendering.image, rendering.transmittance[..., None], rendering.depth[..., None]), dim=-1)
     (outputs[..., : weights.shape[-1]] * weights.to(dtype)).sum().backward()
-    assert probe.grad is not None
-    return probe.grad
+    assert mean_offsets.grad is not None
+    return mean_offsets.grad
 
 
 @each_blending
@@ -79,7 +79,7 @@ def test_together_with_a_table_of_rays_that_is_learned(backend: str, dtype: torc
 
 @each_engine
 def test_is_per_length_and_changes_no_other_gradient(backend: str, dtype: torch.dtype, generator: torch.Generator):
-    """Twice the world, half the pull; and the probe leaves images and the gradients of all else as they are."""
+    """Twice the world, half the pull; and the mean_offsets leaves images and the gradients of all else as they are."""
     gaussians, view = mixture(5, generator).to(dtype), View("v", identity_pose(), 40, 20)
     options, weights = RenderOptions(projection="ray"), torch.rand(20, 40, 3, generator=generator).double()
     twice = replace(gaussians, means=2 * gaussians.means, scales=2 * gaussians.scales)
@@ -87,9 +87,9 @@ def test_is_per_length_and_changes_no_other_gradient(backend: str, dtype: torch.
     torch.testing.assert_close(pulls(twice, view, options, weights, backend), 0.5 * once, rtol=1e-4, atol=1e-6)
 
     gradients = []
-    for probe in (None, torch.zeros(len(gaussians), dtype=dtype, requires_grad=True)):
+    for mean_offsets in (None, torch.zeros(len(gaussians), dtype=dtype, requires_grad=True)):
         means = gaussians.means.clone().requires_grad_()
-        drawn = render(replace(gaussians, means=means), view, options, absolute_probe=probe, backend=backend)
+        drawn = render(replace(gaussians, means=means), view, options, absgrad=mean_offsets, backend=backend)
         (drawn.image * weights.to(dtype)).sum().backward()
         gradients.append((drawn.image, means.grad))
     assert torch.equal(gradients[0][0], gradients[1][0])
@@ -98,11 +98,11 @@ def test_is_per_length_and_changes_no_other_gradient(backend: str, dtype: torch.
 
 def test_refuses_other_projections_and_shapes(generator: torch.Generator):
     gaussians, view = mixture(2, generator), View("v", identity_pose(), 16, 8)
-    probe = torch.zeros(len(gaussians), dtype=torch.float64)
-    with pytest.raises(ValueError, match="absolute_probe is made for projection 'ray', not 'erp'"):
-        render(gaussians, view, RenderOptions(), absolute_probe=probe)
-    with pytest.raises(ValueError, match=r"absolute_probe has shape \(1,\)"):
-        render(gaussians, view, RenderOptions(projection="ray"), absolute_probe=probe[:1])
+    mean_offsets = torch.zeros(len(gaussians), dtype=torch.float64)
+    with pytest.raises(ValueError, match="absgrad is made for projection 'ray', not 'erp'"):
+        render(gaussians, view, RenderOptions(), absgrad=mean_offsets)
+    with pytest.raises(ValueError, match=r"absgrad has shape \(1,\)"):
+        render(gaussians, view, RenderOptions(projection="ray"), absgrad=mean_offsets[:1])
 
 
 def test_faces_of_a_cube_pull_together(generator: torch.Generator):

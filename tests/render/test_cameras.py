@@ -23,7 +23,7 @@ from padgs.gaussians import Gaussians
 from padgs.geometry.camera import Camera, Panorama, Pinhole, RayTable
 from padgs.geometry.panorama import project as pixel_of
 from padgs.render import RenderOptions, render
-from padgs.render.backends.native_camera import native_rays
+from padgs.render.backends.native import native_rays
 
 each_free = pytest.mark.parametrize("projection", ("tangent", "ray"))  # free of charts: any camera will do
 

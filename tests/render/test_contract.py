@@ -62,8 +62,8 @@ def test_background_probe_and_pose_are_checked(gaussians: Gaussians):
         render(gaussians, VIEW, background=torch.zeros(4))
     with pytest.raises(ValueError, match="background has dtype torch.float64 but means has torch.float32"):
         render(gaussians, VIEW, background=torch.zeros(3, dtype=torch.float64))
-    with pytest.raises(ValueError, match=r"probe has shape \(5, 3\); with 5 means it must be \(5, 2\)"):
-        render(gaussians, VIEW, probe=torch.zeros(5, 3))
+    with pytest.raises(ValueError, match=r"mean_offsets has shape \(5, 3\); with 5 means it must be \(5, 2\)"):
+        render(gaussians, VIEW, mean_offsets=torch.zeros(5, 3))
     with pytest.raises(ValueError, match=r"cam_from_world has shape \(3, 4\)"):
         render(gaussians, VIEW.at(identity_pose()[:3]))
 
@@ -105,8 +105,8 @@ def test_bad_poses_backgrounds_and_probes_are_named_when_checked(gaussians: Gaus
         render(gaussians, VIEW.at(lost), check_values=True)
     with pytest.raises(ValueError, match="background holds 3 non-finite values"):
         render(gaussians, VIEW, background=torch.full((3,), float("nan")), check_values=True)
-    with pytest.raises(ValueError, match="probe holds 10 non-finite values"):
-        render(gaussians, VIEW, probe=torch.full((5, 2), float("inf")), check_values=True)
+    with pytest.raises(ValueError, match="mean_offsets holds 10 non-finite values"):
+        render(gaussians, VIEW, mean_offsets=torch.full((5, 2), float("inf")), check_values=True)
 
 
 def test_unknown_names_list_the_known_ones(gaussians: Gaussians):
@@ -254,7 +254,7 @@ def test_no_gaussians_are_the_background(projection: str, lens: str, backend: st
         *(torch.zeros(0, *shape, dtype=dtype, requires_grad=True) for shape in ((3,), (4,), (3,), (), (3,)))
     )
     background = torch.tensor([0.25, 0.5, 0.75], dtype=dtype, requires_grad=True)
-    extra = {"background": background, "probe": torch.zeros(0, 2, dtype=dtype), "backend": backend}
+    extra = {"background": background, "mean_offsets": torch.zeros(0, 2, dtype=dtype), "backend": backend}
     view = view_of(camera_of(lens, 32, 16))
     rendering = render(nothing, view, RenderOptions(projection), check_values=True, **extra)
     assert torch.equal(rendering.image, background.expand(16, 32, 3))

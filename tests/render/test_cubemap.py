@@ -23,8 +23,7 @@ from render_cases import (
 from padgs.gaussians import Gaussians
 from padgs.geometry.camera import Panorama, Pinhole
 from padgs.geometry.panorama import rays
-from padgs.render import Rendering, RenderOptions, render
-from padgs.render.config import RenderConfig
+from padgs.render import RenderConfig, Rendering, RenderOptions, render
 from padgs.render.cubemap import FACES, FINENESS, _corners, face_camera, panorama_from_faces
 from padgs.scene import View
 
@@ -169,16 +168,16 @@ def test_native_faces_match_the_definition(projection: str, generator):
     found = {}
     for backend, dtype in (("torch", torch.float64), ("cpu", torch.float32)):
         inputs, eye = leaves(gaussians, dtype), pose.to(dtype, copy=True).requires_grad_()
-        probe = torch.zeros(25, 2, dtype=dtype, requires_grad=True)
+        mean_offsets = torch.zeros(25, 2, dtype=dtype, requires_grad=True)
         options = RenderOptions(projection=projection, cubemap=True, near=0.05)
-        rendering = render(inputs, View("v", eye, 72, 36), options, backend=backend, probe=probe)
+        rendering = render(inputs, View("v", eye, 72, 36), options, backend=backend, mean_offsets=mean_offsets)
         outputs = torch.cat(
             (rendering.image, rendering.transmittance[..., None], 0.1 * rendering.depth[..., None]), dim=-1
         )
         (outputs * weight).sum().backward()
         gradients = {name: getattr(inputs, name).grad for name in INPUTS}
         turn = eye.grad[:3, :3] @ eye.detach()[:3, :3].T  # by a small rotation: the part that is antisymmetric
-        gradients |= {"shift": eye.grad[:3, 3:], "turn": turn - turn.T, "probe": probe.grad}
+        gradients |= {"shift": eye.grad[:3, 3:], "turn": turn - turn.T, "mean_offsets": mean_offsets.grad}
         found[backend] = rendering, gradients
     (expected, expected_gradients), (actual, gradients) = found["torch"], found["cpu"]
     assert ((actual.image - expected.image).abs().amax(-1) > 2e-5).double().mean() < 5e-3  # pairs at the cut may flip
@@ -226,14 +225,14 @@ def test_gradients_are_the_slope(projection: str, generator):
         colors=torch.rand(count, 3, generator=generator, dtype=torch.float64),
     )
     inputs, pose = leaves(gaussians, torch.float64), identity_pose().requires_grad_()
-    probe = torch.zeros(count, 2, dtype=torch.float64, requires_grad=True)
-    variables = {**vars(inputs), "pose": pose, "probe": probe}
+    mean_offsets = torch.zeros(count, 2, dtype=torch.float64, requires_grad=True)
+    variables = {**vars(inputs), "pose": pose, "mean_offsets": mean_offsets}
     weight = torch.rand(6, 12, 5, generator=generator, dtype=torch.float64)
     options = RenderOptions(projection=projection, cubemap=True)
 
     def value(changed: dict) -> torch.Tensor:
         drawn = Gaussians(**{name: changed[name] for name in INPUTS})
-        rendering = render(drawn, View("v", changed["pose"], 12, 6), options, probe=changed["probe"])
+        rendering = render(drawn, View("v", changed["pose"], 12, 6), options, mean_offsets=changed["mean_offsets"])
         outputs = torch.cat((rendering.image, rendering.transmittance[..., None], rendering.depth[..., None]), dim=-1)
         return (outputs * weight).sum()
 
@@ -256,10 +255,12 @@ def test_the_probe_means_the_same_as_on_the_panorama(backend: str, dtype: torch.
     for place in ("middle of a face", "edge", "corner"):
         signals = []
         for cubemap in (False, True):
-            probe = torch.zeros(1, 2, dtype=dtype, requires_grad=True)
+            mean_offsets = torch.zeros(1, 2, dtype=dtype, requires_grad=True)
             options = RenderOptions(projection="ray", cubemap=cubemap)
-            rendering = draw(broad(place), 128, 64, backend=backend, dtype=dtype, options=options, probe=probe)
-            (signal,) = torch.autograd.grad((rendering.image * weight).sum(), probe)
+            rendering = draw(
+                broad(place), 128, 64, backend=backend, dtype=dtype, options=options, mean_offsets=mean_offsets
+            )
+            (signal,) = torch.autograd.grad((rendering.image * weight).sum(), mean_offsets)
             signals.append(signal)
         assert (signals[0] - signals[1]).norm() < 0.03 * signals[0].norm(), place
 

@@ -7,9 +7,8 @@ import torch
 from hybrid_reference import one_pixel
 from torch import Tensor
 
-from padgs.render import RenderOptions
-from padgs.render.config import RenderConfig
-from padgs.render.hybrid import hybrid_weights
+from padgs.render import RenderConfig, RenderOptions
+from padgs.render.backends.torch import hybrid_weights
 
 
 def random_fragments(pixels: int, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:

@@ -121,16 +121,16 @@ def run(
     """A rendering, and the gradients by every input of its outputs [H, W, 5] times the weights."""
     inputs = leaves(gaussians, dtype)
     background = BACKGROUND.to(dtype, copy=True).requires_grad_()
-    probe = torch.zeros(len(gaussians), 2, dtype=dtype, requires_grad=True)
+    mean_offsets = torch.zeros(len(gaussians), 2, dtype=dtype, requires_grad=True)
     twist = torch.zeros(6, dtype=dtype, requires_grad=True)  # rigid motions: other matrices are no poses
     turn = rotation_matrices(torch.cat((torch.ones_like(twist[:1]), 0.5 * twist[:3])))
     moved = torch.cat((turn @ pose[:3, :3].to(dtype), pose[:3, 3:].to(dtype) + twist[3:, None]), dim=1)
-    found = {**vars(inputs), "background": background, "probe": probe, "twist": twist}
+    found = {**vars(inputs), "background": background, "mean_offsets": mean_offsets, "twist": twist}
     if isinstance(camera, RayTable):
         found["table"] = camera.table.to(dtype, copy=True).requires_grad_()
         camera = RayTable(found["table"], camera.focal)
     view = View("v", torch.cat((moved, pose[3:].to(dtype))), camera.width, camera.height, lens=camera)
-    rendering = render(inputs, view, options, background=background, probe=probe, backend=backend)
+    rendering = render(inputs, view, options, background=background, mean_offsets=mean_offsets, backend=backend)
     outputs = torch.cat((rendering.image, rendering.transmittance[..., None], rendering.depth[..., None]), dim=-1)
     (outputs * weights.to(dtype)).sum().backward()
     return rendering, {name: leaf.grad for name, leaf in found.items()}

@@ -87,7 +87,9 @@ def test_targets_are_taken_in_any_type_and_in_the_size_of_the_view_only():
     usual = leave_one_out(gaussians, view, target, weight, SHARP, backend="cpu")
     doubled = leave_one_out(gaussians, view, target.double(), weight.double(), SHARP, backend="cpu")
     assert torch.equal(usual.error, doubled.error) and usual.error.any()
-    with pytest.raises(ValueError, match=r"target has \[4, 16, 3\] numbers, but a view of 16x8 has \[8, 16, 3\]"):
+    with pytest.raises(
+        ValueError, match=r"target has shape \[4, 16, 3\], but the view is 16x8; it must be \[8, 16, 3\]"
+    ):
         leave_one_out(gaussians, view, target[:4], weight[:4], SHARP, backend="cpu")
 
 

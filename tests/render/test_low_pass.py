@@ -15,8 +15,7 @@ from padgs.geometry.camera import Camera, Panorama, Pinhole
 from padgs.geometry.panorama import direction
 from padgs.native import cpu
 from padgs.native.abi import NativeCamera
-from padgs.render import RenderOptions, render
-from padgs.render.config import RenderConfig
+from padgs.render import RenderConfig, RenderOptions, render
 from padgs.render.contract import ALPHA_MIN, LOW_PASS_KINDS, PUBLISHED_FOCAL
 from padgs.render.planar import PlanarFootprints
 from padgs.render.projection import PROJECTIONS
@@ -145,12 +144,12 @@ def test_native_matches_the_definition(projection: str, kind: str, generator):
     found = {}
     for backend, dtype in (("torch", torch.float64), ("cpu", torch.float32)):
         inputs, eye = leaves(gaussians, dtype), pose.to(dtype, copy=True).requires_grad_()
-        probe = torch.zeros(75, 2, dtype=dtype, requires_grad=True)
+        mean_offsets = torch.zeros(75, 2, dtype=dtype, requires_grad=True)
         view = View("v", eye, camera.width, camera.height, lens=camera)
-        rendering = render(inputs, view, options, backend=backend, probe=probe, check_values=True)
+        rendering = render(inputs, view, options, backend=backend, mean_offsets=mean_offsets, check_values=True)
         (rendering.image * weight).sum().backward()
         gradients = {name: getattr(inputs, name).grad for name in INPUTS}
-        gradients |= {"shift": eye.grad[:3, 3:], "probe": probe.grad}
+        gradients |= {"shift": eye.grad[:3, 3:], "mean_offsets": mean_offsets.grad}
         found[backend] = rendering, gradients
     (expected, expected_gradients), (actual, gradients) = found["torch"], found["cpu"]
     assert expected.counters["visible"] >= 5

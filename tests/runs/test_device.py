@@ -7,7 +7,7 @@ from rich.console import Console
 from tiny_scene import tiny_scene
 
 from padgs.native import cuda
-from padgs.render.config import RenderConfig
+from padgs.render import RenderConfig
 from padgs.runs import session
 from padgs.runs.config import RunOptions
 from padgs.runs.device import chosen

@@ -11,8 +11,7 @@ from padgs.methods.splats.clone_split import CloneSplitOptions
 from padgs.methods.splats.model import Splats
 from padgs.methods.splats.trainee import SplatTrainee
 from padgs.registry import lookup
-from padgs.render import Rendering
-from padgs.render.config import RenderConfig
+from padgs.render import RenderConfig, Rendering
 from padgs.scene import View
 from padgs.training.budget import Budget
 from padgs.training.loop import Trainer

@@ -9,7 +9,7 @@ from padgs.geometry.camera import perspective
 from padgs.methods.splats.clone_split import CloneSplitOptions
 from padgs.methods.splats.model import Splats
 from padgs.methods.splats.trainee import SplatTrainee
-from padgs.render.config import RenderConfig
+from padgs.render import RenderConfig
 from padgs.scene import View
 from padgs.training.worth import LEAST, Worth, most_wanted, needed, worth
 

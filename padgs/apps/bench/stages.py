@@ -15,7 +15,7 @@ from typing import Any
 from padgs.apps.bench.workload import Workload
 from padgs.clock import summary
 from padgs.methods.anchors.growth import GrowthOptions
-from padgs.native.watch import watched
+from padgs.native.loading import call_hook
 
 STAGES = {
     "target": "read the panorama, as floats",
@@ -99,7 +99,7 @@ class StageClock:
         self._since = now
 
     def native_call(self, name: str) -> AbstractContextManager[object]:
-        """A stage for `padgs.native.watch.watched`."""
+        """A stage for `padgs.native.loading.call_hook`."""
         return self.stage(NATIVE_CALLS[name]) if name in NATIVE_CALLS else nullcontext()
 
 
@@ -107,7 +107,7 @@ def measured(work: Workload, rounds: int, warm_up: int) -> StageClock:
     """Rounds of the trainer, one iteration each."""
     clock = StageClock()
     records = work.trainer(stage=clock.stage).records()
-    with watched(clock.native_call):
+    with call_hook(clock.native_call):
         for _ in range(warm_up + rounds):
             with clock.stage("rest"):
                 next(records)

@@ -11,8 +11,8 @@ from torch import Tensor
 from padgs.gaussians import Gaussians
 from padgs.native.abi import Inputs, pointer
 from padgs.render import RenderOptions
-from padgs.render.backends.cpu_tiles import Projected
-from padgs.render.backends.native_camera import native_camera
+from padgs.render.backends.cpu import Projected
+from padgs.render.backends.native import native_camera
 from padgs.scene import View
 
 BANDS = ((0, 30), (30, 60), (60, 75), (75, 85), (85, 90))  # degrees of absolute latitude

@@ -12,7 +12,7 @@ import torch
 from padgs import clock
 from padgs.native import cuda
 from padgs.native.abi import Pointer
-from padgs.native.watch import watched
+from padgs.native.loading import call_hook
 
 QUEUED = {name for name, (arguments, _) in cuda.SIGNATURES.items() if arguments[:2] == [Pointer, Pointer]}
 
@@ -61,5 +61,5 @@ def calls_watched(line: Timeline) -> Iterator[list[tuple[str, Any, Any]]]:
         if name in QUEUED:
             marks.append((name.removeprefix("padgs_cuda_"), start, line.mark()))
 
-    with watched(stage):
+    with call_hook(stage):
         yield marks

@@ -21,8 +21,7 @@ from padgs.methods.anchors.trainee import AnchorTrainee, LearningRates
 from padgs.methods.splats.clone_split import CloneSplitOptions
 from padgs.methods.splats.model import Splats
 from padgs.methods.splats.trainee import SplatTrainee
-from padgs.render import RenderOptions
-from padgs.render.config import RenderConfig
+from padgs.render import RenderConfig, RenderOptions
 from padgs.scene import Scene, View
 from padgs.training.budget import Budget
 from padgs.training.loop import Stage, Trainer

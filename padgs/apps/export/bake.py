@@ -13,15 +13,14 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from padgs.evaluation.evaluate import as_stored
+from padgs.evaluation.evaluate import quantized
 from padgs.gaussians import Gaussians, rotation_matrices
 from padgs.geometry import harmonics
 from padgs.methods.anchors.model import PaDGS
 from padgs.methods.splats.clone_split import CloneSplitOptions
 from padgs.methods.splats.model import Splats
 from padgs.methods.splats.trainee import SplatTrainee
-from padgs.render import Rendering, RenderOptions, render
-from padgs.render.config import RenderConfig
+from padgs.render import RenderConfig, Rendering, RenderOptions, render
 from padgs.scene import Scene, View
 from padgs.training.budget import Budget
 from padgs.training.extent import ExtentOptions
@@ -183,5 +182,5 @@ class _Picture:
 
     def __call__(self) -> Tensor:
         if self._pixels is None:
-            self._pixels = (as_stored(self._show(self._view).image) * 255).to(torch.uint8)
+            self._pixels = (quantized(self._show(self._view).image) * 255).to(torch.uint8)
         return self._pixels

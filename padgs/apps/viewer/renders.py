@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from padgs.evaluation.pictures import depth_picture, eight_bit, error_picture
+from padgs.evaluation.images import depth_image, error_image, to_uint8
 from padgs.geometry.camera import Panorama, Pinhole, perspective
 from padgs.geometry.panorama import sample
 from padgs.methods.anchors.trainee import AnchorTrainee
@@ -95,9 +95,9 @@ class Gallery:
         else:
             rendering = self._method(full, look.crop).render(view)
             drawn = (
-                eight_bit(rendering.image)
+                to_uint8(rendering.image)
                 if look.layer == "colours"
-                else depth_picture(rendering, self.run.scene.scale)
+                else depth_image(rendering, self.run.scene.scale)
             )
         return drawn if isinstance(lens, Pinhole) else _framed(drawn, max(2, round(share * height)))
 
@@ -132,7 +132,7 @@ class Gallery:
         view = next(view for view in (*scene.train, *scene.test) if view.name == name)
         image = self.run.method.render(view).image
         truth, mask = view.image(device=image.device), view.mask(device=image.device)
-        return error_picture(image if mask is None else torch.lerp(truth, image, mask[..., None]), truth).copy()
+        return error_image(image if mask is None else torch.lerp(truth, image, mask[..., None]), truth).copy()
 
 
 def cropped(method: Method, crop: Box) -> Method:

@@ -15,7 +15,7 @@ from padgs.geometry.distortion import OMEGA_AXES, distortion, opacity_factor, po
 from padgs.methods.anchors.decoder import Decoder, SeenAnchors, decode_gaussians, decode_within, decodes_within
 from padgs.methods.anchors.grid import anchors_from_points, automatic_voxel_size, initial_log_scales
 from padgs.methods.anchors.precision import PRECISIONS
-from padgs.native.reading import Reading
+from padgs.native.cuda import HostCopy
 from padgs.scene import Scene, View
 from padgs.training.rows import load_rows
 
@@ -66,7 +66,7 @@ class Decoded:
     gaussians: Gaussians  # N, opacities modulated
     slots: Tensor  # [N] int64 ascending, anchor K + k
     raw_opacities: Tensor  # [A, K] in (-1, 1), before selection and modulation
-    counted: Reading | None = None  # N, where `gaussians` and `slots` have rows for another number, see `PaDGS.decode`
+    counted: HostCopy | None = None  # N, where `gaussians` and `slots` have rows for another number, see `PaDGS.decode`
 
     def count(self) -> int:
         """N; waits for it if it is not there yet."""
@@ -175,7 +175,7 @@ class PaDGS(nn.Module):
         if room is None or not decodes_within(anchors, precision):
             return Decoded(*decode_gaussians(weights, anchors, precision))
         gaussians, slots, raw_opacities, count = decode_within(weights, anchors, room, precision)
-        return Decoded(gaussians, slots, raw_opacities, Reading(count))
+        return Decoded(gaussians, slots, raw_opacities, HostCopy(count))
 
     def show(self, view: View) -> Gaussians:
         """The same for `padgs.render.backends.captured`: A K Gaussians, of which those that are not selected are zeros.

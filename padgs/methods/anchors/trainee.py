@@ -126,7 +126,7 @@ class AnchorTrainee:
 
     def _rendered(self, decoded: Decoded, view: View) -> tuple[Rendering, Tensor]:
         probe = decoded.gaussians.means.new_zeros(len(decoded.slots), 2, requires_grad=True)
-        return render(decoded.gaussians, view, self._options, probe=probe, backend=self._backend), probe
+        return render(decoded.gaussians, view, self._options, mean_offsets=probe, backend=self._backend), probe
 
     def observe(self, drawing: Drawing, iteration: int) -> None:
         """Collect opacities and image-plane gradients."""

@@ -20,7 +20,7 @@ from padgs.methods.plus.trainee import PlusTrainee, counted_pixels
 from padgs.methods.splats.method import SplatMethod, fewest
 from padgs.methods.splats.model import Splats
 from padgs.methods.splats.trainee import SplatTrainee
-from padgs.render.config import RenderConfig
+from padgs.render import RenderConfig
 from padgs.scene import Scene
 from padgs.training.budget import Budget
 from padgs.training.loop import Stage, Trainer

@@ -16,7 +16,7 @@ from padgs.methods.plus.smoothness import roughness
 from padgs.methods.splats.model import TINY, Splats
 from padgs.methods.splats.nearest import cameras_of, finest_pixels, no_finer
 from padgs.methods.splats.trainee import SplatTrainee
-from padgs.render.config import RenderConfig
+from padgs.render import RenderConfig
 from padgs.scene import View
 from padgs.training.schedule import ParameterGroup
 from padgs.training.trainee import Drawing, State

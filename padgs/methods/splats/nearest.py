@@ -19,7 +19,7 @@ from torch import Tensor
 
 from padgs.gaussians import Gaussians
 from padgs.methods.splats.model import Splats
-from padgs.render.low_pass import wider
+from padgs.render.projection import widened_scales
 from padgs.scene import View
 
 # Of a pixel: views that overlap resolve more than each of them alone. At four times the pixels of training 0.6 to 0.8
@@ -53,7 +53,7 @@ def no_finer(gaussians: Gaussians, view: View, pixels: Tensor, variance: float) 
     out.
     """
     own = (gaussians.means - view.center.to(gaussians.means)).norm(dim=-1) / view.camera.focal
-    wide, share = wider(gaussians.scales, variance * ((RESOLVED * pixels).square() - own * own).clamp(min=0))
+    wide, share = widened_scales(gaussians.scales, variance * ((RESOLVED * pixels).square() - own * own).clamp(min=0))
     return replace(gaussians, scales=wide, opacities=gaussians.opacities * share)
 
 
@@ -77,7 +77,7 @@ class PixelFilter:
 
     def __call__(self, gaussians: Gaussians) -> Gaussians:
         """The Gaussians wider, and fainter as their volume grows."""
-        wide, share = wider(gaussians.scales, self.variances)
+        wide, share = widened_scales(gaussians.scales, self.variances)
         return replace(gaussians, scales=wide, opacities=gaussians.opacities * share)
 
 
@@ -90,7 +90,7 @@ def smoothed(splats: Splats, cameras: Tensor, variance: float) -> Splats:
 @torch.no_grad()
 def widened(splats: Splats, variances: Tensor) -> Splats:
     """Splats with variances [N] more each way, and fainter as their volume grows."""
-    wide, share = wider(splats.log_scales.exp(), variances)
+    wide, share = widened_scales(splats.log_scales.exp(), variances)
     new = copy.deepcopy(splats)
     opacity_logits = torch.logit(torch.sigmoid(splats.opacity_logits) * share, eps=1e-6)
     new.load(splats.rows() | {"log_scales": wide.log(), "opacity_logits": opacity_logits})

@@ -4,7 +4,7 @@ That gradient is the densification signal of `padgs.methods.splats.clone_split`.
 normalised image units (3DGS, OmniGS). space: on the mean itself, in units of half its distance from the camera, so that
 no projection is involved: 0.5 * distance * |dL/dmean|, the pull by way of colours that depend on the direction included
 (SPaGS). space_absolute: that, and the pulls of all pixels one by one, which do not cancel: 0.5 * distance *
-sum |dL/dmean|, by way of the footprints alone (`padgs.render.absolute`).
+sum |dL/dmean|, by way of the footprints alone (`padgs.render.backends.torch`).
 """
 
 from __future__ import annotations
@@ -47,11 +47,11 @@ def render_probed(
     if signal == "image":
         probe = means.new_zeros(len(means), 2, requires_grad=True) if probe is None else probe
         gaussians = change(splats.gaussians(view))
-        return render(gaussians, view, options, probe=probe, backend=backend), gaussians, probe
+        return render(gaussians, view, options, mean_offsets=probe, backend=backend), gaussians, probe
     if signal not in SIGNALS:
         raise ValueError(f"unknown signal {signal!r}; known: {', '.join(SIGNALS)}")
     absolute = signal == "space_absolute"
     probe = means.new_zeros(len(means), 4 if absolute else 3, requires_grad=True) if probe is None else probe
     gaussians, pulls = splats.probed(view, probe)
     gaussians = change(gaussians)
-    return render(gaussians, view, options, absolute_probe=pulls, backend=backend), gaussians, probe
+    return render(gaussians, view, options, absgrad=pulls, backend=backend), gaussians, probe

@@ -15,10 +15,9 @@ from padgs.methods.splats.clone_split import MIN_DENSIFY_EVERY, CloneSplit, Clon
 from padgs.methods.splats.model import Splats
 from padgs.methods.splats.nearest import PixelFilter, cameras_of, finest_pixels, widened
 from padgs.methods.splats.probes import render_probed
-from padgs.render import Rendering, RenderOptions, render
-from padgs.render.config import RenderConfig
+from padgs.render import RenderConfig, Rendering, RenderOptions, render
 from padgs.render.contract import ALPHA_MIN
-from padgs.render.low_pass import wider
+from padgs.render.projection import widened_scales
 from padgs.scene import View
 from padgs.training.rows import keep_rows
 from padgs.training.schedule import Constant, LogLinear, ParameterGroup, scaled
@@ -268,7 +267,7 @@ class SplatTrainee:
         if self._config.resolved_low_pass_kind == "solid":
             pixels += self._config.low_pass
         squared = finest_pixels(splats.means, cameras_of(self._views)).square()
-        return torch.sigmoid(splats.opacity_logits) * wider(splats.log_scales.exp(), pixels * squared)[1]
+        return torch.sigmoid(splats.opacity_logits) * widened_scales(splats.log_scales.exp(), pixels * squared)[1]
 
     def render_options(self, view: View) -> RenderOptions:
         """How a view is drawn."""

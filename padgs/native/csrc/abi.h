@@ -51,14 +51,14 @@ struct alignas(16) Footprint {
   float depth;
   float red, green, blue;
 };
-static_assert(sizeof(Footprint) == 64, "padgs/render/backends/cpu_tiles.py allocates 16 floats per footprint");
+static_assert(sizeof(Footprint) == 64, "padgs/render/backends/cpu.py allocates 16 floats per footprint");
 
 // Pixels that a footprint can reach: rows [row, row_end), columns [column, column_end) and, beyond the seam,
 // [0, second_end) with second_end <= column. Nothing where row == row_end.
 struct PixelBox {
   int32_t column, column_end, second_end, row, row_end;
 };
-static_assert(sizeof(PixelBox) == 20, "padgs/render/backends/cpu_tiles.py allocates 5 integers per box");
+static_assert(sizeof(PixelBox) == 20, "padgs/render/backends/cpu.py allocates 5 integers per box");
 
 // Tiles: rows of 16 pixels; in a row of level l a tile is 16 2^l pixels wide.
 struct TileGrid {
@@ -74,7 +74,7 @@ struct Instance {
   uint32_t slot;                             // where its moments go
   uint8_t row, row_end, column, column_end;  // of patches, from the tile's corner; ends are exclusive
 };
-static_assert(sizeof(Instance) == 12, "padgs/render/backends/cpu_tiles.py allocates 3 integers per instance");
+static_assert(sizeof(Instance) == 12, "padgs/render/backends/cpu.py allocates 3 integers per instance");
 
 struct Inputs {
   int64_t count;

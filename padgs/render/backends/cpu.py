@@ -1,12 +1,13 @@
 """The native CPU rasterizer: tiles, SIMD, OpenMP (csrc/cpu). float32 only.
 
 Results do not depend on the number of threads: tiles write their own pixels, every (Gaussian, tile) instance has its
-own slot for the moments of the backward pass, and the slots of a Gaussian are summed in order.
+own slot for the gradient sums of the backward pass, and the slots of a Gaussian are summed in order.
 """
 
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -14,18 +15,28 @@ from torch import Tensor
 
 from padgs.native import cpu
 from padgs.native.abi import (
-    MOMENTS,
+    GRADIENT_SUMS,
     REMOVAL,
     BlendArguments,
     BlendGradientArguments,
     Gradients,
     Inputs,
     LeaveOneOutArguments,
+    NativeCamera,
+    TileGrid,
     pointer,
 )
-from padgs.render.backends.cpu_tiles import Projected, Strip
-from padgs.render.backends.native import NativeImage, Pixels, Upstream, rasterize_as, score_as
-from padgs.render.backends.native_camera import native_camera, native_rays
+from padgs.render.backends.native import (
+    TILE,
+    NativeImage,
+    Pixels,
+    Upstream,
+    native_camera,
+    native_rays,
+    rasterize_as,
+    score_as,
+    strip_cuts,
+)
 from padgs.render.contract import Removals, Rendering, Request
 from padgs.render.published_bounds import check_memory
 
@@ -34,11 +45,21 @@ def rasterize(request: Request) -> Rendering:
     """Render on the CPU.
 
     Raises:
-        ValueError: tensors that the library cannot take, or a projection that it does not know.
+        ValueError: the library does not take these tensors or this projection.
         OSError: the library was not built.
     """
     _check(request.gaussians.means)
-    return rasterize_as(_Drawing(request), request)
+    return rasterize_as(_Image(request), request)
+
+
+def leave_one_out(request: Request, target: Tensor, weight: Tensor) -> Removals:
+    """Return leave-one-out scores, computed on the CPU; sorted blending only.
+
+    Raises:
+        ValueError, OSError: as `rasterize` does.
+    """
+    _check(request.gaussians.means)
+    return score_as(_Image(request), request, target, weight)
 
 
 def _check(means: Tensor) -> None:
@@ -49,25 +70,80 @@ def _check(means: Tensor) -> None:
         )
 
 
-def leave_one_out(request: Request, target: Tensor, weight: Tensor) -> Removals:
-    """Score on the CPU; sorted blending only.
+class Strip:
+    """Tile lists of some rows of tiles (csrc/cpu/bin.cpp)."""
 
-    Raises:
-        ValueError, OSError: as `rasterize` does.
+    def __init__(self, projected: Projected, first_row: int, end_row: int) -> None:
+        camera, count = projected.camera, len(projected.boxes)
+        columns = -(-camera.width // TILE)
+        per_row = -(-columns // (1 << projected.level[first_row:end_row].long()))
+        self._row_start = torch.cat((torch.zeros(1, dtype=torch.int64), per_row.cumsum(0)))
+        self._level = projected.level
+        self.tiles = int(self._row_start[-1])
+        self.grid = TileGrid(
+            camera.width, camera.height, first_row, end_row, pointer(self._level), pointer(self._row_start)
+        )
+        self.slot_start = torch.empty(count + 1, dtype=torch.int64)
+        self.tile_start = torch.empty(self.tiles + 1, dtype=torch.int64)
+        self.instances = torch.empty(int(projected.per_row[first_row:end_row].sum()), 3, dtype=torch.int32)
+        cpu.library().padgs_bin(
+            pointer(projected.boxes),
+            count,
+            pointer(projected.order),
+            projected.visible,
+            ctypes.byref(self.grid),
+            pointer(self.slot_start),
+            pointer(self.tile_start),
+            pointer(self.instances),
+        )
+
+
+class Projected:
+    """All Gaussians projected to one view, in depth order, with the number of instances in each row of tiles.
+
+    The number of (Gaussian, tile) instances is known before anything of that size is allocated. If it exceeds the
+    limit, the image is rendered in strips of tile rows.
     """
-    _check(request.gaussians.means)
-    return score_as(_Drawing(request), request, target, weight)
+
+    def __init__(self, camera: NativeCamera, inputs: Inputs, max_instances: int) -> None:
+        library, count = cpu.library(), inputs.count
+        rows = -(-camera.height // TILE)
+        self.camera = camera
+        self.footprints = torch.empty(count, 16)
+        self.boxes = torch.empty(count, 5, dtype=torch.int32)
+        library.padgs_project(ctypes.byref(camera), ctypes.byref(inputs), pointer(self.footprints), pointer(self.boxes))
+        self.order = torch.empty(count, dtype=torch.int32)
+        self.visible = library.padgs_depth_order(
+            pointer(self.footprints), pointer(self.boxes), count, pointer(self.order)
+        )
+        self.level = torch.empty(rows, dtype=torch.int32)
+        library.padgs_tile_levels(ctypes.byref(camera), pointer(self.level))
+        self.per_row = torch.empty(rows, dtype=torch.int64)
+        library.padgs_count_instances(pointer(self.boxes), count, pointer(self.level), rows, pointer(self.per_row))
+        self.instances = int(self.per_row.sum())
+        self._cuts = strip_cuts(self.per_row.tolist(), max_instances)
+        self._only: Strip | None = None
+
+    def strips(self) -> Iterator[Strip]:
+        """Yield the strips from top to bottom; a single one is kept for the backward pass, several are not."""
+        if len(self._cuts) == 2:
+            if self._only is None:
+                self._only = Strip(self, *self._cuts)
+            yield self._only
+            return
+        for first, end in zip(self._cuts, self._cuts[1:], strict=False):
+            yield Strip(self, first, end)
 
 
 @dataclass
 class _Cores:
-    """What hybrid blending of a strip leaves to its backward pass, see csrc/cpu/kept_cores.h."""
+    """Cores of hybrid blending of a strip, kept for the backward pass (csrc/cpu/kept_cores.h)."""
 
-    words: Tensor  # [most that could be needed] int32; the system lends memory for those that are used
+    words: Tensor  # int32, of the largest possible size; the system provides memory only for the used part
     start: Tensor  # [tiles + 1] int64
 
     @staticmethod
-    def of(strip: Strip, arguments: BlendArguments) -> _Cores:
+    def allocate(strip: Strip, arguments: BlendArguments) -> _Cores:
         words = cpu.library().padgs_core_words(ctypes.byref(arguments))
         return _Cores(torch.empty(words, dtype=torch.int32), torch.zeros(strip.tiles + 1, dtype=torch.int64))
 
@@ -75,7 +151,7 @@ class _Cores:
         arguments.cores, arguments.core_start = pointer(self.words), pointer(self.start)
 
 
-class _Drawing(NativeImage):
+class _Image(NativeImage):
     def draw(self, inputs: Inputs, pose: Tensor, background: Tensor, *, differentiated: bool) -> tuple[Pixels, Tensor]:
         camera, options = self.camera, self.options
         self._projected = Projected(native_camera(pose, camera, options), inputs, options.max_instances)
@@ -83,14 +159,14 @@ class _Drawing(NativeImage):
         self.rays = native_rays(camera)
         size = (camera.height, camera.width)
         pixels = (torch.empty(*size, 3), torch.empty(size), torch.empty(size))
-        self._last = torch.empty(size, dtype=torch.int32)  # where each pixel's last contribution is
+        self._last = torch.empty(size, dtype=torch.int32)  # position of the last contribution to each pixel
         pairs = torch.zeros(2, dtype=torch.int64)
-        self._cores: list[_Cores] = []  # of each strip where they are kept
+        self._cores: list[_Cores] = []  # of each strip, if kept
         for strip in self._projected.strips():
             pair_counts = torch.empty(strip.tiles, 2, dtype=torch.int64)
             arguments = self._blend_arguments(strip, background, pixels, pair_counts)
             if differentiated and options.blending == "hybrid":
-                self._cores.append(_Cores.of(strip, arguments))
+                self._cores.append(_Cores.allocate(strip, arguments))
                 self._cores[-1].join(arguments)
             cpu.library().padgs_blend_forward(ctypes.byref(arguments))
             pairs += pair_counts.sum(0)
@@ -104,18 +180,18 @@ class _Drawing(NativeImage):
         visible = self._projected.boxes[:, 3] < self._projected.boxes[:, 4]
         return pixels, visible
 
-    def moments(self, pixels: Pixels, background: Tensor, upstream: Upstream) -> Tensor:
+    def gradient_sums(self, pixels: Pixels, background: Tensor, upstream: Upstream) -> Tensor:
         count = len(self._projected.boxes)
-        totals = torch.zeros(count, MOMENTS)
+        totals = torch.zeros(count, GRADIENT_SUMS)
         for number, strip in enumerate(self._projected.strips()):
             forward = self._blend_arguments(strip, background, pixels, None)
             if self._cores:
                 self._cores[number].join(forward)
-            moments = torch.empty(len(strip.instances), MOMENTS)
-            grads = (upstream.image, upstream.transmittance, upstream.depth, moments, upstream.rays)
-            arguments = BlendGradientArguments(forward, *map(pointer, grads), upstream.absolute)
+            sums = torch.empty(len(strip.instances), GRADIENT_SUMS)
+            grads = (upstream.image, upstream.transmittance, upstream.depth, sums, upstream.rays)
+            arguments = BlendGradientArguments(forward, *map(pointer, grads), upstream.absgrad)
             cpu.library().padgs_blend_backward(ctypes.byref(arguments))
-            cpu.library().padgs_sum_moments(pointer(moments), pointer(strip.slot_start), count, pointer(totals))
+            cpu.library().padgs_sum_moments(pointer(sums), pointer(strip.slot_start), count, pointer(totals))
         return totals
 
     def removals(self, pixels: Pixels, background: Tensor, target: Tensor, weight: Tensor) -> Removals:
@@ -133,21 +209,21 @@ class _Drawing(NativeImage):
         return Removals(error, change, contribution, peak)
 
     def project_backward(
-        self, inputs: Inputs, pose: Tensor, moments: Tensor, gradients: list[Tensor | None], *, needs_pose: bool
+        self, inputs: Inputs, pose: Tensor, sums: Tensor, gradients: list[Tensor | None], *, needs_pose: bool
     ) -> Tensor | None:
-        of_pose = torch.zeros(12, dtype=torch.float64) if needs_pose else None
+        pose_gradient = torch.zeros(12, dtype=torch.float64) if needs_pose else None
         cpu.library().padgs_project_backward(
             ctypes.byref(self._projected.camera),
             ctypes.byref(inputs),
-            pointer(moments),
-            ctypes.byref(Gradients(*map(pointer, (*gradients, of_pose)))),
+            pointer(sums),
+            ctypes.byref(Gradients(*map(pointer, (*gradients, pose_gradient)))),
         )
-        return of_pose
+        return pose_gradient
 
     def _blend_arguments(
         self, strip: Strip, background: Tensor, pixels: Pixels, pair_counts: Tensor | None
     ) -> BlendArguments:
-        """Of both blending passes; the tensors must outlive the call."""
+        """Return the arguments of both blending passes; the tensors must outlive the call."""
         projected, options = self._projected, self.options
         lists = (projected.footprints, strip.tile_start, strip.instances, background)
         outputs = (*pixels, self._last, pair_counts)

@@ -1,10 +1,11 @@
 """The native GPU rasterizer (csrc/cuda). float32 only.
 
-The same results, bit by bit, from the same device and build: no float is added atomically, and sorts are stable.
+Results of one device and build are bit-identical: no float is added atomically, and sorts are stable.
 """
 
 from __future__ import annotations
 
+import ctypes
 import functools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -15,17 +16,27 @@ from torch import Tensor
 
 from padgs.geometry.camera import Camera
 from padgs.native import cuda
-from padgs.native.abi import MOMENTS, REMOVAL, Gradients, Inputs, pointer
-from padgs.native.reading import Reading
-from padgs.render.backends.cuda_tiles import MAX_INSTANCES, DeviceProjected, DeviceStrip
-from padgs.render.backends.native import NativeImage, Pixels, Upstream, rasterize_as, score_as
-from padgs.render.backends.native_camera import NativeRays, native_camera, native_rays
+from padgs.native.abi import GRADIENT_SUMS, REMOVAL, Gradients, Inputs, NativeCamera, pointer
+from padgs.native.cuda import HostCopy, Queue, SortArguments, TileTable
+from padgs.render.backends.native import (
+    TILE,
+    NativeImage,
+    NativeRays,
+    Pixels,
+    Upstream,
+    native_camera,
+    native_rays,
+    rasterize_as,
+    score_as,
+    strip_cuts,
+)
 from padgs.render.contract import Removals, Rendering, RenderOptions, Request
 from padgs.render.published_bounds import check_memory
 
 IDENTITY = torch.eye(4)
-HEADROOM = 1.3  # room for so many times the instances of the last image of this size
-_rooms: dict[tuple, int] = {}  # device, width and height -> room for the next
+MAX_INSTANCES = (1 << 31) - 1 - 512  # of one strip: positions in its lists, and a batch behind, are 32-bit integers
+HEADROOM = 1.3  # capacity for an image, as a multiple of the instances of the last image of this size
+_capacities: dict[tuple, int] = {}  # device, width and height -> capacity for the next image
 FLOATS = functools.partial(torch.empty, dtype=torch.float32)
 INTEGERS = functools.partial(torch.empty, dtype=torch.int32)
 
@@ -34,17 +45,17 @@ def rasterize(request: Request) -> Rendering:
     """Render on the GPU that holds the tensors.
 
     Raises:
-        ValueError: tensors, or options, that the library cannot take.
+        ValueError: the library does not take these tensors or options.
         OSError: the library was not built.
         RuntimeError: the library was not compiled for this GPU.
         torch.cuda.OutOfMemoryError: the GPU has too little memory; `options.max_instances` makes the strips smaller.
     """
     check(request.gaussians.means)
-    return rasterize_as(_Drawing(request), request)
+    return rasterize_as(_Image(request), request)
 
 
 def check(means: Tensor) -> None:
-    """Refuse what the library cannot draw, and say what can.
+    """Refuse tensors that the library cannot render.
 
     Raises:
         ValueError, OSError: as `rasterize` does.
@@ -58,17 +69,141 @@ def check(means: Tensor) -> None:
 
 
 def leave_one_out(request: Request, target: Tensor, weight: Tensor) -> Removals:
-    """Score on the GPU that holds the tensors; sorted blending only.
+    """Return leave-one-out scores, computed on the GPU that holds the tensors; sorted blending only.
 
     Raises:
         ValueError, OSError, RuntimeError: as `rasterize` does.
     """
     check(request.gaussians.means)
-    return score_as(_Drawing(request), request, target, weight)
+    return score_as(_Image(request), request, target, weight)
+
+
+class DeviceStrip:
+    """Tile lists of some rows of tiles, in the memory of a GPU."""
+
+    def __init__(self, projected: DeviceProjected, first_row: int, end_row: int) -> None:
+        device = projected.order.device
+        self.tiles = (end_row - first_row) * -(-projected.camera.width // TILE)
+        self.instances = projected.capacity if projected.capacity else sum(projected.per_row[first_row:end_row])
+        if self.instances > MAX_INSTANCES:
+            raise ValueError(
+                f"one row of tiles has {self.instances:,} (Gaussian, tile) instances; a list holds at most "
+                f"{MAX_INSTANCES:,}. Draw fewer or smaller Gaussians, or with backend=cpu"
+            )
+        integers = functools.partial(INTEGERS, device=device)
+        self.slot_start = integers(projected.visible + 1)
+        self.reaches = integers(self.instances, 2)
+        self.slots = integers(self.instances)
+        self.tile_start = integers(self.tiles + 1)
+        self.table = projected.table(first_row, end_row)
+        counts = integers(projected.visible + 1)
+        sort = Sorter(projected.queue, self.instances, device, summed=len(counts))
+        largest = self.tiles if projected.capacity else max(self.tiles - 1, 1)
+        if projected.capacity:  # unused instances have a key behind that of the last tile
+            sort.keys.fill_(largest)
+            sort.values.zero_()
+        arguments = cuda.BinArguments(
+            self.table,
+            pointer(projected.boxes),
+            pointer(projected.order),
+            projected.visible,
+            pointer(counts),
+            pointer(self.slot_start),
+            pointer(self.reaches),
+            sort.arguments(self.slots, bits=largest.bit_length()),
+            pointer(self.tile_start),
+        )
+        cuda.call("padgs_cuda_bin", projected.queue, arguments, self.tiles)
+
+
+class Sorter:
+    """Keys, values and scratch memory of one stable sort, and of a sum."""
+
+    def __init__(self, queue: Queue, count: int, device: torch.device, *, summed: int = 0) -> None:
+        self.queue, self.count = queue, count
+        self.keys = INTEGERS(count, device=device)
+        self.sorted_keys, self.values = torch.empty_like(self.keys), torch.empty_like(self.keys)
+        scratch = cuda.library().padgs_cuda_scratch_bytes(ctypes.byref(queue), max(count, summed, 1))
+        cuda.raise_for(max(-scratch, 0), "padgs_cuda_scratch_bytes")
+        self.scratch = torch.empty(max(scratch, 1), dtype=torch.uint8, device=device)
+
+    def arguments(self, sorted_values: Tensor, bits: int) -> SortArguments:
+        """Return the arguments for the library; the tensors must outlive the call."""
+        buffers = (self.keys, self.sorted_keys, self.values, sorted_values)
+        return SortArguments(pointer(self.scratch), len(self.scratch), self.count, *map(pointer, buffers), bits)
+
+
+class DeviceProjected:
+    """All Gaussians projected to one view, in depth order, with the number of instances in each row of tiles.
+
+    The host reads one thing back: the number of instances in each row of tiles, before memory for them is allocated.
+    With a given capacity it does not wait for that: invisible Gaussians are then skipped instead of left out.
+    """
+
+    def __init__(
+        self, camera: NativeCamera, pose: Tensor, inputs: Inputs, max_instances: int, *, capacity: int = 0
+    ) -> None:
+        """Project, sort, count; waits for the device once, unless a capacity is given.
+
+        Args:
+            camera: its own pose is not used.
+            pose: [4, 4] on the device, contiguous.
+            inputs: on the device.
+            max_instances: of a strip.
+            capacity: number of instances to allocate in a single strip without reading their number back; `counts`
+                holds it on the device. 0: allocate the exact number.
+        """
+        device, count = pose.device, inputs.count
+        self.queue = cuda.queue(device)
+        self.camera = camera
+        rows = -(-camera.height // TILE)
+        self.footprints = FLOATS(count, 16, device=device)
+        self.boxes = INTEGERS(count, 5, device=device)
+        self.order = INTEGERS(count, device=device)
+        self.per_row: list[int] = []
+        self._only: DeviceStrip | None = None
+        sort = Sorter(self.queue, count, device)
+        self.counts = torch.zeros(rows + 1, dtype=torch.int64, device=device)
+        outputs = (self.footprints, self.boxes, sort.keys, sort.values)
+        table = self.table(0, rows)
+        arguments = cuda.ProjectArguments(
+            camera, pointer(pose), inputs, *map(pointer, outputs), table, pointer(self.counts)
+        )
+        cuda.call("padgs_cuda_project", self.queue, arguments)
+        cuda.call("padgs_cuda_sort", self.queue, sort.arguments(self.order, bits=32))
+        self.capacity, self.visible = capacity, count
+        self._cuts = [0, rows]
+        if not capacity:
+            *self.per_row, self.visible = self.counts.tolist()
+            self._cuts = strip_cuts(self.per_row, min(max_instances, MAX_INSTANCES))
+
+    def fits(self, counts: list[int]) -> bool:
+        """Return whether the capacity was enough for all instances; `counts` are the values of `self.counts`."""
+        *self.per_row, self.visible = counts
+        return self.instances <= self.capacity
+
+    @property
+    def instances(self) -> int:
+        """Return the number of instances of all rows; known after the host read it."""
+        return sum(self.per_row)
+
+    def table(self, first_row: int, end_row: int) -> TileTable:
+        """Return some rows of tiles for the library."""
+        return TileTable(self.camera.width, self.camera.height, first_row, end_row)
+
+    def strips(self) -> Iterator[DeviceStrip]:
+        """Yield the strips from top to bottom; a single one is kept for the backward pass, several are not."""
+        if len(self._cuts) == 2:
+            if self._only is None:
+                self._only = DeviceStrip(self, *self._cuts)
+            yield self._only
+            return
+        for first, end in zip(self._cuts, self._cuts[1:], strict=False):
+            yield DeviceStrip(self, first, end)
 
 
 class Counters(Mapping[str, int]):
-    """How many of what. Pairs are added up on the device and read, which waits for it, when somebody asks."""
+    """Counters of a rendering; pairs are summed on the device and read, which waits for it, on first access."""
 
     def __init__(self, pairs: Tensor, **known: int) -> None:
         self._known = known
@@ -90,19 +225,21 @@ class Counters(Mapping[str, int]):
 
 @dataclass
 class Outputs:
-    """What blending writes, and needs again to go back."""
+    """The outputs of blending, which the backward pass needs too."""
 
     image: Tensor  # [H, W, 3]
     transmittance: Tensor  # [H, W]
     depth: Tensor  # [H, W]
-    last: Tensor | None  # [H, W] int32, sorted blending: where each pixel's last contribution is
+    last: Tensor | None  # [H, W] int32, sorted blending: position of the last contribution
     core_size: int  # of hybrid blending, or 0
-    core: Tensor | None  # [H, W, core_size] int32, hybrid blending that is to be differentiated: see csrc/cuda/core.h
+    core: Tensor | None  # [H, W, core_size] int32, hybrid blending with gradients: see csrc/cuda/core.h
     tails: Tensor | None  # [H, W, 6], as core
 
     @staticmethod
-    def of(camera: Camera, options: RenderOptions, device: torch.device, *, differentiated: bool = False) -> Outputs:
-        """Room for one image."""
+    def allocate(
+        camera: Camera, options: RenderOptions, device: torch.device, *, differentiated: bool = False
+    ) -> Outputs:
+        """Allocate the outputs of one image."""
         size, hybrid = (camera.height, camera.width), options.blending == "hybrid"
         core_size = options.core_size if hybrid else 0
         kept = hybrid and differentiated
@@ -118,48 +255,48 @@ class Outputs:
         )
 
 
-class _Drawing(NativeImage):
+class _Image(NativeImage):
     def draw(self, inputs: Inputs, pose: Tensor, background: Tensor, *, differentiated: bool) -> tuple[Pixels, Tensor]:
         camera, options, device = self.camera, self.options, pose.device
         self.rays = native_rays(camera, device)
-        outputs = Outputs.of(camera, options, device, differentiated=differentiated)
-        native, alike = native_camera(IDENTITY, camera, options), (device, camera.width, camera.height)
+        outputs = Outputs.allocate(camera, options, device, differentiated=differentiated)
+        native, key = native_camera(IDENTITY, camera, options), (device, camera.width, camera.height)
         limit = min(options.max_instances, MAX_INSTANCES)
-        room = _rooms.get(alike, 0) if options.memory_cap is None else 0
-        if not 0 < room <= limit:
-            room = 0
+        capacity = _capacities.get(key, 0) if options.memory_cap is None else 0
+        if not 0 < capacity <= limit:
+            capacity = 0
         while True:
-            self._projected = DeviceProjected(native, pose, inputs, options.max_instances, room=room)
-            counts = Reading(self._projected.counts) if room else None
+            self._projected = DeviceProjected(native, pose, inputs, options.max_instances, capacity=capacity)
+            counts = HostCopy(self._projected.counts) if capacity else None
             if counts is None:
                 check_memory(self._projected.instances, options)
             pairs = blend(self._projected, self.rays, background, outputs)
             if counts is None or self._projected.fits(counts.values()):
                 break
-            room = 0
+            capacity = 0
         instances = self._projected.instances
-        wanted = max(int(HEADROOM * instances) + 1, room * 15 // 16)
-        _rooms[alike] = min(wanted, limit) if instances <= limit else 0  # 0: strips, which count as they go
+        wanted = max(int(HEADROOM * instances) + 1, capacity * 15 // 16)
+        _capacities[key] = min(wanted, limit) if instances <= limit else 0  # 0: strips need the exact number
         self._kept = (outputs.last, outputs.core_size, outputs.core, outputs.tails)
         known = {"visible": self._projected.visible, "instances": self._projected.instances}
         self.counters = Counters(pairs, gaussians=inputs.count, **known)
         visible = self._projected.boxes[:, 3] < self._projected.boxes[:, 4]
         return (outputs.image, outputs.transmittance, outputs.depth), visible
 
-    def moments(self, pixels: Pixels, background: Tensor, upstream: Upstream) -> Tensor:
+    def gradient_sums(self, pixels: Pixels, background: Tensor, upstream: Upstream) -> Tensor:
         projected, outputs = self._projected, Outputs(*pixels, *self._kept)
         device, size, hybrid = background.device, outputs.depth.shape, outputs.core_size > 0
-        totals = torch.zeros(len(projected.order), MOMENTS, dtype=torch.float32, device=device)
+        totals = torch.zeros(len(projected.order), GRADIENT_SUMS, dtype=torch.float32, device=device)
         core_gradients = FLOATS(*size, outputs.core_size, 2, device=device) if hybrid else None
         for strip in projected.strips():
-            moments = FLOATS(strip.instances, MOMENTS, device=device)
+            sums = FLOATS(strip.instances, GRADIENT_SUMS, device=device)
             arguments = cuda.BlendGradientInputs(
                 _blend_inputs(projected, strip, self.rays, background, outputs, None),
                 *map(pointer, (upstream.image, upstream.transmittance, upstream.depth)),
-                *map(pointer, (core_gradients, moments, upstream.rays, projected.order, strip.slot_start)),
+                *map(pointer, (core_gradients, sums, upstream.rays, projected.order, strip.slot_start)),
                 projected.visible,
                 pointer(totals),
-                upstream.absolute,
+                upstream.absgrad,
             )
             cuda.call("padgs_cuda_blend_backward", projected.queue, arguments)
         return totals
@@ -170,12 +307,12 @@ class _Drawing(NativeImage):
         peak = torch.zeros(len(projected.order), device=device)
         drawn = projected.order[: projected.visible].long()
         for strip in projected.strips():
-            found = torch.zeros(strip.instances, REMOVAL, device=device)  # what no instance fills is read, too
+            found = torch.zeros(strip.instances, REMOVAL, device=device)  # slots that no instance fills are read, too
             forward = _blend_inputs(projected, strip, self.rays, background, outputs, None)
             arguments = cuda.RemovalInputs(forward, *map(pointer, (target, weight, found)))
             cuda.call("padgs_cuda_leave_one_out", projected.queue, arguments)
             starts = strip.slot_start[: projected.visible + 1].long()
-            # Not by atomic additions, whose order differs from time to time; a Gaussian is in `drawn` once.
+            # Atomic additions would not be deterministic; a Gaussian is in `drawn` once.
             of_slots = functools.partial(torch.segment_reduce, offsets=starts, axis=0, initial=0, unsafe=True)
             sums[drawn] += of_slots(found[:, :-1].double(), "sum")
             peak[drawn] = torch.maximum(peak[drawn], of_slots(found[:, -1].contiguous(), "max"))
@@ -183,19 +320,19 @@ class _Drawing(NativeImage):
         return Removals(error, change, contribution, peak)
 
     def project_backward(
-        self, inputs: Inputs, pose: Tensor, moments: Tensor, gradients: list[Tensor | None], *, needs_pose: bool
+        self, inputs: Inputs, pose: Tensor, sums: Tensor, gradients: list[Tensor | None], *, needs_pose: bool
     ) -> Tensor | None:
         blocks = cuda.library().padgs_cuda_pose_blocks(inputs.count)
-        of_pose = torch.empty(blocks, 12, dtype=torch.float64, device=pose.device) if needs_pose else None
-        out = Gradients(*map(pointer, (*gradients, of_pose)))
+        pose_gradient = torch.empty(blocks, 12, dtype=torch.float64, device=pose.device) if needs_pose else None
+        out = Gradients(*map(pointer, (*gradients, pose_gradient)))
         projected = self._projected
-        arguments = cuda.ProjectGradientArguments(projected.camera, pointer(pose), inputs, pointer(moments), out)
+        arguments = cuda.ProjectGradientArguments(projected.camera, pointer(pose), inputs, pointer(sums), out)
         cuda.call("padgs_cuda_project_backward", projected.queue, arguments)
-        return None if of_pose is None else of_pose.sum(0)
+        return None if pose_gradient is None else pose_gradient.sum(0)
 
 
 def blend(projected: DeviceProjected, rays: NativeRays, background: Tensor, outputs: Outputs) -> Tensor:
-    """Fill the outputs; returns how many pairs were evaluated, and how many contributed, [2] int64."""
+    """Fill the outputs; return how many pairs were evaluated, and how many contributed, [2] int64."""
     pairs = torch.zeros(2, dtype=torch.int64, device=background.device)
     for strip in projected.strips():
         pair_counts = INTEGERS(strip.tiles, 2, device=background.device)
@@ -208,7 +345,7 @@ def blend(projected: DeviceProjected, rays: NativeRays, background: Tensor, outp
 def _blend_inputs(
     projected: DeviceProjected, strip: DeviceStrip, rays: Any, background: Tensor, outputs: Outputs, pair_counts
 ) -> cuda.BlendInputs:
-    """Arguments of both directions; the tensors must outlive the call."""
+    """Return the arguments of both blending passes; the tensors must outlive the call."""
     camera = projected.camera
     lists = (projected.footprints, strip.tile_start, strip.slots, strip.reaches, background)
     written = (outputs.image, outputs.transmittance, outputs.depth, outputs.last, outputs.core, outputs.tails)

@@ -1,41 +1,66 @@
-"""What the native rasterizers have in common: one `torch.autograd.Function`, with a drawing of either library inside.
+"""The common part of the native rasterizers: cameras and rays for the libraries, and one `torch.autograd.Function`.
 
-What an image can be differentiated by, what is kept for the backward pass, and how the gradients of pose, background
-and rays come about is said here. float32 only.
+Defines the inputs with gradients, the tensors kept for the backward pass, and the gradients of pose, background and
+rays. float32 only.
 """
 
 from __future__ import annotations
 
+import ctypes
+import functools
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, MutableMapping
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from torch.utils.weak import WeakTensorKeyDictionary
 
-from padgs.geometry.camera import RayTable
-from padgs.native.abi import ABSOLUTE_MOMENT, Inputs, pointer
-from padgs.render.backends.native_camera import NativeRays
-from padgs.render.contract import Removals, Rendering, Request
+from padgs.geometry.camera import Camera, Panorama, Pinhole, RayTable
+from padgs.geometry.panorama import row_latitudes
+from padgs.native.abi import ABSGRAD_SUM, Inputs, NativeCamera, RayPointers, pointer
+from padgs.render.contract import Removals, Rendering, RenderOptions, Request
+from padgs.render.projection import low_pass_of
 
+TILE = 16  # pixels
+CPU = torch.device("cpu")
+MAX_DEVIATION = 0.3  # radians; with rays further from those of a panorama, the bounds of a panorama exclude little
+SLACK = 1e-5  # radians; rounding must never cost a contribution
+CHUNK = 16  # pixels; rows of ray tables are padded to whole chunks
+PROJECTIONS = ("erp", "pinhole", "tangent", "ray")  # numbered as in csrc/abi.h
+MODELS = (Panorama, Pinhole, RayTable)
 Pixels = tuple[Tensor, Tensor, Tensor]  # image [H, W, 3], transmittance [H, W], depth [H, W]
 
 
+class NativeRays(NamedTuple):
+    """The tensors that a `RayPointers` points to."""
+
+    column_sine: Tensor | None = None  # [padded W]
+    column_cosine: Tensor | None = None
+    row_sine: Tensor | None = None  # [H]
+    row_cosine: Tensor | None = None
+    table: Tensor | None = None  # [H, 3, padded W]
+
+    def native(self) -> RayPointers:
+        """Return pointers to the tensors, which must outlive them."""
+        return RayPointers(*map(pointer, self))
+
+
 class Upstream(NamedTuple):
-    """What going back starts with, and the one gradient that is filled on the way."""
+    """Gradients of the pixels, and the gradient of the rays, which the backward pass adds to."""
 
     image: Tensor
     transmittance: Tensor | None
     depth: Tensor | None
     rays: Tensor | None  # zeros of the shape of the table; added to
-    absolute: bool  # whether the absolute signal is asked for
+    absgrad: bool  # whether to compute the absolute positional gradient
 
 
 class NativeImage(ABC):
-    """One image of a native library, and what going back takes besides its pixels, which autograd keeps.
+    """One image of a native library, with everything that its backward pass needs besides the pixels.
 
-    (Pixels refer to the drawing, by way of autograd; if it referred to them, neither would be freed.)
+    Autograd keeps the pixels, and they refer to this object; a reference back would keep both alive.
     """
 
     counters: Mapping[str, int]
@@ -46,99 +71,196 @@ class NativeImage(ABC):
 
     @abstractmethod
     def draw(self, inputs: Inputs, pose: Tensor, background: Tensor, *, differentiated: bool) -> tuple[Pixels, Tensor]:
-        """The pixels, and which Gaussians [N] bool are visible; sets `counters` and `rays`."""
+        """Return the pixels, and which Gaussians are visible, [N] bool; sets `counters` and `rays`."""
 
     @abstractmethod
-    def moments(self, pixels: Pixels, background: Tensor, upstream: Upstream) -> Tensor:
-        """Moments [N, MOMENTS] of all Gaussians, from the gradients of the pixels."""
+    def gradient_sums(self, pixels: Pixels, background: Tensor, upstream: Upstream) -> Tensor:
+        """Return the sums over pixels [N, GRADIENT_SUMS] from which `project_backward` computes gradients."""
 
     @abstractmethod
     def project_backward(
-        self, inputs: Inputs, pose: Tensor, moments: Tensor, gradients: list[Tensor | None], *, needs_pose: bool
+        self, inputs: Inputs, pose: Tensor, sums: Tensor, gradients: list[Tensor | None], *, needs_pose: bool
     ) -> Tensor | None:
-        """Fill the gradients of means, quats, scales, opacities, colors and probe; returns that of the pose, [12]."""
+        """Fill the gradients of means, quats, scales, opacities, colors, mean_offsets; return that of the pose [12]."""
 
     @abstractmethod
     def removals(self, pixels: Pixels, background: Tensor, target: Tensor, weight: Tensor) -> Removals:
-        """What each Gaussian's removal does to the pixels of sorted blending; `weight` [H, W] sums to 1."""
+        """Return the leave-one-out scores of sorted blending; `weight` [H, W] sums to 1."""
 
 
 class Leaves(NamedTuple):
-    """What an image can be differentiated by, in the order in which autograd sees it; or one flag for each of them."""
+    """The inputs with gradients, in the order of the autograd function; or a flag for each."""
 
     means: Any
     quats: Any
     scales: Any
     opacities: Any
     colors: Any
-    probe: Any = None
-    absolute_probe: Any = None
+    mean_offsets: Any = None
+    absgrad: Any = None
     cam_from_world: Any = None
     background: Any = None
     table: Any = None  # of the camera's rays
 
 
-def rasterize_as(drawing: NativeImage, request: Request) -> Rendering:
-    """Fill the drawing with what is requested, differentiably."""
+def rasterize_as(image: NativeImage, request: Request) -> Rendering:
+    """Render the request with a native image, differentiably."""
     leaves = Leaves(
         **vars(request.gaussians),
-        probe=request.probe,
-        absolute_probe=request.absolute_probe,
+        mean_offsets=request.mean_offsets,
+        absgrad=request.absgrad,
         cam_from_world=request.cam_from_world,
         background=request.background,
         table=request.camera.table if isinstance(request.camera, RayTable) else None,
     )
-    grad_enabled = torch.is_grad_enabled()  # never inside
-    image, transmittance, depth, visible = _Rasterize.apply(drawing, grad_enabled, *leaves)
-    return Rendering(image, transmittance, depth, visible, drawing.counters)
+    grad_enabled = torch.is_grad_enabled()  # always false inside `apply`
+    color, transmittance, depth, visible = _Rasterize.apply(image, grad_enabled, *leaves)
+    return Rendering(color, transmittance, depth, visible, image.counters)
 
 
-def score_as(drawing: NativeImage, request: Request, target: Tensor, weight: Tensor) -> Removals:
-    """Draw what is requested, and score each Gaussian by it; no gradients."""
+def score_as(image: NativeImage, request: Request, target: Tensor, weight: Tensor) -> Removals:
+    """Render the request with a native image, and return its leave-one-out scores; no gradients."""
     attributes = [tensor.contiguous() for tensor in vars(request.gaussians).values()]
-    probe = None if request.probe is None else request.probe.contiguous()
+    mean_offsets = None if request.mean_offsets is None else request.mean_offsets.contiguous()
     pose, background = request.cam_from_world.contiguous(), request.background.contiguous()
-    inputs = Inputs(len(request.gaussians), *map(pointer, (*attributes, probe)))
-    pixels, _ = drawing.draw(inputs, pose, background, differentiated=False)
-    return drawing.removals(pixels, background, target, weight)
+    inputs = Inputs(len(request.gaussians), *map(pointer, (*attributes, mean_offsets)))
+    pixels, _ = image.draw(inputs, pose, background, differentiated=False)
+    return image.removals(pixels, background, target, weight)
 
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, drawing: NativeImage, grad_enabled: bool, *leaves: Tensor | None):
+    def forward(ctx: Any, native_image: NativeImage, grad_enabled: bool, *leaves: Tensor | None):
         named = Leaves(*leaves)
         attributes = [None if t is None else t.detach().contiguous() for t in named[:6]]
         pose, background = (t.detach().contiguous() for t in (named.cam_from_world, named.background))
         inputs = Inputs(len(named.means), *map(pointer, attributes))
         differentiated = grad_enabled and any(ctx.needs_input_grad)
-        pixels, visible = drawing.draw(inputs, pose, background, differentiated=differentiated)
+        pixels, visible = native_image.draw(inputs, pose, background, differentiated=differentiated)
         ctx.mark_non_differentiable(visible)
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(*attributes, pose, background, *pixels)
-        ctx.drawing = drawing
+        ctx.native_image = native_image
         return *pixels, visible
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_image: Tensor | None, grad_transmittance, grad_depth, _):
         *attributes, pose, background, image, transmittance, depth = ctx.saved_tensors
-        drawing, needs = ctx.drawing, Leaves(*ctx.needs_input_grad[2:])
+        native_image, needs = ctx.native_image, Leaves(*ctx.needs_input_grad[2:])
         grad_image = torch.zeros_like(image) if grad_image is None else grad_image.contiguous()
         grad_transmittance, grad_depth = (g if g is None else g.contiguous() for g in (grad_transmittance, grad_depth))
-        grad_rays = torch.zeros_like(drawing.rays.table) if needs.table else None
-        upstream = Upstream(grad_image, grad_transmittance, grad_depth, grad_rays, needs.absolute_probe)
-        moments = drawing.moments((image, transmittance, depth), background, upstream)
-        inputs = Inputs(len(moments), *map(pointer, attributes))
+        grad_rays = torch.zeros_like(native_image.rays.table) if needs.table else None
+        upstream = Upstream(grad_image, grad_transmittance, grad_depth, grad_rays, needs.absgrad)
+        sums = native_image.gradient_sums((image, transmittance, depth), background, upstream)
+        inputs = Inputs(len(sums), *map(pointer, attributes))
         gradients = [None if t is None else torch.empty_like(t) for t in attributes]
-        of_pose = drawing.project_backward(inputs, pose, moments, gradients, needs_pose=needs.cam_from_world)
+        pose_gradient = native_image.project_backward(inputs, pose, sums, gradients, needs_pose=needs.cam_from_world)
         leaves = Leaves(*gradients)
-        if needs.absolute_probe:
-            leaves = leaves._replace(absolute_probe=moments[:, ABSOLUTE_MOMENT].clone())
-        if of_pose is not None:
+        if needs.absgrad:
+            leaves = leaves._replace(absgrad=sums[:, ABSGRAD_SUM].clone())
+        if pose_gradient is not None:
             leaves = leaves._replace(cam_from_world=torch.zeros_like(pose))
-            leaves.cam_from_world[:3] = of_pose.view(3, 4).to(pose.dtype)
+            leaves.cam_from_world[:3] = pose_gradient.view(3, 4).to(pose.dtype)
         if needs.background:
             leaves = leaves._replace(background=(grad_image * transmittance[..., None]).sum((0, 1)))
         if grad_rays is not None:
             leaves = leaves._replace(table=grad_rays[:, :, : image.shape[1]].permute(0, 2, 1))
         return None, None, *leaves
+
+
+def strip_cuts(per_row: list[int], max_instances: int) -> list[int]:
+    """Return the rows of tiles at which to cut so that no strip of several rows exceeds the limit."""
+    cuts, inside = [0], 0
+    for row, instances in enumerate(per_row):
+        if inside and inside + instances > max_instances:
+            cuts.append(row)
+            inside = 0
+        inside += instances
+    return [*cuts, len(per_row)]
+
+
+def native_camera(cam_from_world: Tensor, camera: Camera, options: RenderOptions) -> NativeCamera:
+    """Return pose, camera and options in one structure.
+
+    Raises:
+        ValueError: the library does not know the projection.
+    """
+    if options.projection not in PROJECTIONS:
+        raise ValueError(
+            f"the native libraries do not know projection {options.projection!r}; known: {', '.join(PROJECTIONS)}"
+        )
+    low_pass, off_panorama = low_pass_of(options, camera), _off_panorama(camera)
+    lens = (camera.fx, camera.fy, camera.cx, camera.cy) if isinstance(camera, Pinhole) else (0.0, 0.0, 0.0, 0.0)
+    return NativeCamera(
+        camera.width,
+        camera.height,
+        PROJECTIONS.index(options.projection),
+        MODELS.index(type(camera)),
+        (ctypes.c_float * 12)(*cam_from_world[:3].detach().reshape(-1).tolist()),
+        options.near,
+        low_pass.in_plane,
+        off_panorama >= 0 or (isinstance(camera, Panorama) and (options.wrap or options.projection != "erp")),
+        options.bounds == "square",
+        *lens,
+        low_pass.widen,
+        off_panorama,
+        low_pass.compensate,
+        options.near_cull == "ellipsoid",
+    )
+
+
+def _off_panorama(camera: Camera) -> float:
+    """Return the largest angle in radians between the rays of a table and a panorama, or -1 if it is large.
+
+    A table that is nearly a panorama has the bounds of a panorama; any other has none.
+    """
+    if not isinstance(camera, RayTable):
+        return -1.0
+    known = _off_panoramas.get(camera.table)
+    if known is None or known[0] != camera.table._version:
+        table = camera.table.detach().float()
+        chord = (table - _panorama_rays(camera.width, camera.height, table.device)).norm(dim=-1)
+        angle = 2 * torch.asin((chord.max() / 2).clamp(max=1)).item() + SLACK  # waits for a GPU, once for a table
+        known = _off_panoramas[camera.table] = camera.table._version, angle if angle < MAX_DEVIATION else -1.0
+    return known[1]
+
+
+# table -> its version, and the angle
+_off_panoramas: MutableMapping[Tensor, tuple[int, float]] = WeakTensorKeyDictionary()
+
+
+@functools.lru_cache(maxsize=4)
+def _panorama_rays(width: int, height: int, device: torch.device) -> Tensor:
+    return Panorama(width, height).rays(dtype=torch.float32).to(device)
+
+
+def native_rays(camera: Camera, device: torch.device = CPU) -> NativeRays:
+    """Return the directions of the pixels; computed once for a camera and device, and again after a table changed."""
+    if not isinstance(camera, RayTable):
+        return _formula_rays(camera, device)
+    state, known = (camera.table._version, device), _padded_tables.get(camera.table)
+    if known is None or known[0] != state:
+        padded = _padded_table(camera.table.detach().to(device, torch.float32))
+        known = _padded_tables[camera.table] = state, padded
+    return NativeRays(table=known[1])
+
+
+# table -> its version and device, and the padded table
+_padded_tables: MutableMapping[Tensor, tuple[tuple[int, torch.device], Tensor]] = WeakTensorKeyDictionary()
+
+
+@functools.lru_cache(maxsize=16)
+def _formula_rays(camera: Panorama | Pinhole, device: torch.device) -> NativeRays:
+    if isinstance(camera, Pinhole):
+        return NativeRays(table=_padded_table(camera.rays()).to(device, torch.float32))
+    padded = -(-camera.width // CHUNK) * CHUNK
+    longitude = ((torch.arange(padded, dtype=torch.float64) + 0.5) / camera.width - 0.5) * (2 * torch.pi)
+    latitude = row_latitudes(camera.height, dtype=torch.float64)
+    angles = (longitude.sin(), longitude.cos(), latitude.sin(), latitude.cos())
+    return NativeRays(*(values.to(device, torch.float32) for values in angles))
+
+
+def _padded_table(rays: Tensor) -> Tensor:
+    padding = -rays.shape[1] % CHUNK  # copies of the last column are valid directions
+    return torch.nn.functional.pad(rays.permute(0, 2, 1), (0, padding), mode="replicate").contiguous()

@@ -1,19 +1,28 @@
-"""The readable rasterizer, and the definition of what all others must compute. float32 or float64, any device.
+"""The readable rasterizer, which defines what all backends compute. float32 or float64, any device.
 
-Pixels are processed in blocks, and blocks are computed again for the backward pass, so that memory stays bounded: a
+Pixels are processed in blocks, and blocks are computed again in the backward pass, so that memory stays bounded: a
 block holds (pixels x N) squared distances.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 from torch.utils.checkpoint import checkpoint
 
 from padgs.geometry.camera import Camera
-from padgs.render.absolute import with_absolute_pull
-from padgs.render.contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Rendering, RenderOptions, Request
-from padgs.render.hybrid import hybrid_weights
+from padgs.render.contract import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    CORE_ALPHA_MIN,
+    TRANSMITTANCE_MIN,
+    Rendering,
+    RenderOptions,
+    Request,
+)
 from padgs.render.projection import Footprints, project
 from padgs.render.published_bounds import check_memory, instances
 
@@ -31,7 +40,7 @@ def rasterize(request: Request) -> Rendering:
     parts = []
     places = blocks(camera, len(order), background.device)
     for rows, columns in places:
-        arguments = (footprints, gaussians.colors, background, order, rows, columns, options, request.absolute_probe)
+        arguments = (footprints, gaussians.colors, background, order, rows, columns, options, request.absgrad)
         if len(places) > 1 and torch.is_grad_enabled():
             parts.append(checkpoint(_blend, *arguments, use_reentrant=False, preserve_rng_state=False))
         else:
@@ -54,7 +63,7 @@ def rasterize(request: Request) -> Rendering:
 
 
 def blocks(camera: Camera, count: int, device: torch.device | str = "cpu") -> list[tuple[Tensor, Tensor]]:
-    """Rows and columns of all pixels, in blocks small enough to hold each against `count` Gaussians."""
+    """Return rows and columns of all pixels, in blocks small enough to hold each against `count` Gaussians."""
     pixels = torch.arange(camera.height * camera.width, device=device)
     size = max(1, PAIRS_PER_BLOCK // max(1, count))
     return [(torch.div(some, camera.width, rounding_mode="floor"), some % camera.width) for some in pixels.split(size)]
@@ -68,10 +77,10 @@ def _blend(
     rows: Tensor,
     columns: Tensor,
     options: RenderOptions,
-    absolute_probe: Tensor | None,
+    absgrad: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor, int]:
-    """Colour [P, 3], transmittance [P] and depth [P] of some pixels, and how many pairs contribute (Eq. 4)."""
-    alpha = fragments(footprints, order, rows, columns, absolute_probe)
+    """Return colour [P, 3], transmittance [P], depth [P] and the number of contributing pairs of P pixels (Eq. 4)."""
+    alpha = fragments(footprints, order, rows, columns, absgrad)
     if options.blending == "hybrid":
         weights, transmittance = hybrid_weights(alpha, footprints.distance(order, rows, columns), options.core_size)
     else:
@@ -84,20 +93,86 @@ def _blend(
 
 
 def fragments(
-    footprints: Footprints, order: Tensor, rows: Tensor, columns: Tensor, absolute_probe: Tensor | None = None
+    footprints: Footprints, order: Tensor, rows: Tensor, columns: Tensor, absgrad: Tensor | None = None
 ) -> Tensor:
-    """Alpha [P, K] of K Gaussians in some order at some pixels; 0 where nothing is drawn."""
+    """Return alpha [P, K] of K Gaussians in a given order at P pixels; 0 where nothing is drawn."""
     q, inside = footprints.squared_distance(order, rows, columns)  # [P, K] each
-    if absolute_probe is not None:
-        q = with_absolute_pull(q, footprints.slope(order, rows, columns), absolute_probe[order])
+    if absgrad is not None:
+        q = with_absgrad(q, footprints.slope(order, rows, columns), absgrad[order])
     alpha = (footprints.opacities[order] * torch.exp(-0.5 * q)).clamp(max=ALPHA_MAX)
     return torch.where(inside & (alpha.detach() >= ALPHA_MIN), alpha, torch.zeros_like(alpha))
 
 
 def sorted_weights(alpha: Tensor) -> tuple[Tensor, Tensor]:
-    """Weights [P, K] of fragments [P, K] that are in order, and what is left [P]."""
+    """Return the weights [P, K] of fragments sorted front to back, and the transmittance [P]."""
     running = torch.cumprod(1 - alpha.detach(), dim=-1) >= TRANSMITTANCE_MIN
     alpha = torch.where(running, alpha, torch.zeros_like(alpha))
     after = torch.cumprod(1 - alpha, dim=-1)
     after = torch.cat((alpha.new_ones(len(alpha), 1), after), dim=-1)  # transmittance before each and behind the last
     return alpha * after[:, :-1], after[:, -1]
+
+
+def hybrid_weights(alpha: Tensor, distance: Tensor, core_size: int) -> tuple[Tensor, Tensor]:
+    """Return the weights of fragments under hybrid transparency, and the transmittance (SPaGS).
+
+    The core is the `core_size` nearest fragments with alpha >= 0.05, blended front to back until less than 1e-4 is
+    left, which then counts as 0. All others are the tail. With T the transmittance of the core, Z and Q the sum of
+    alpha and the product of 1 - alpha over the tail, the tail lies behind the core as one layer of opacity 1 - Q with
+    the mean colour weighted by alpha: a tail fragment has the weight T (1 - Q) alpha / Z. The choice of the core is a
+    constant to autograd. Fragments are sorted along the ray of the pixel, so that nothing pops when the order of the
+    means changes; the price is a tail without order.
+
+    Args:
+        alpha: [P, K] of every pixel and Gaussian, 0 where nothing is drawn.
+        distance: [P, K] along the ray, without gradient; the first in the list wins ties.
+        core_size: at least 1.
+
+    Returns:
+        weights [P, K] >= 0 and transmittance [P], which sum to 1 (to within 1e-4 where the core ended early).
+    """
+    solid = alpha.detach() >= CORE_ALPHA_MIN
+    key = torch.where(solid, distance, torch.full_like(distance, torch.inf))
+    nearest = torch.argsort(key, dim=-1, stable=True)[:, :core_size]
+    in_core = torch.zeros_like(solid).scatter(1, nearest, solid.gather(1, nearest))
+    none = torch.zeros_like(alpha)
+
+    core = torch.where(in_core, alpha, none).gather(1, nearest)  # front to back
+    after = torch.cumprod(1 - core, dim=-1)
+    after = torch.where(after.detach() >= TRANSMITTANCE_MIN, after, torch.zeros_like(after))
+    after = torch.cat((alpha.new_ones(len(alpha), 1), after), dim=-1)  # before each and behind the last
+    core_weights = none.scatter(1, nearest, core * after[:, :-1])
+    through = after[:, -1]
+
+    tail = torch.where(in_core, none, alpha)
+    left = torch.prod(1 - tail, dim=-1)
+    total = tail.sum(-1)  # 0, or at least 1/255 as every fragment is
+    share = through * (1 - left) / torch.where(total > 0, total, torch.ones_like(total))
+    return core_weights + tail * share[:, None], through * left
+
+
+def with_absgrad(q: Tensor, slope: Tensor, absgrad: Tensor) -> Tensor:
+    """Return q; the backward pass sets the gradient of `absgrad` to the absolute positional gradient.
+
+    The gradient of a mean is a sum over pixels, in which opposite gradients of a Gaussian that should be split cancel.
+    The absolute one is the sum of norms, sum over pixels p of |dL/dq_p| |dq_p/dmean|. AbsGS and Gaussian Opacity Fields
+    sum absolute values of each image coordinate instead; norms do not depend on the axes.
+
+    Args:
+        q: [P, K] squared distances of pixels and Gaussians.
+        slope: [P, K] |dq/dmean| without gradient, per world unit.
+        absgrad: [K], any values.
+    """
+    return _WithAbsgrad.apply(q, slope, absgrad)
+
+
+class _WithAbsgrad(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, q: Tensor, slope: Tensor, _absgrad: Tensor) -> Tensor:
+        ctx.save_for_backward(slope)
+        return q.view_as(q)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_q: Tensor):
+        (slope,) = ctx.saved_tensors
+        return grad_q, None, (grad_q.abs() * slope).sum(0)

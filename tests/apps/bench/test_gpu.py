@@ -15,7 +15,7 @@ from padgs.apps.bench.workload import OPTIONS, SIZES, build
 from padgs.cli.commands import app
 from padgs.methods.splats.trainee import SplatTrainee
 from padgs.native import cpu
-from padgs.native.watch import Watchable
+from padgs.native.loading import Library
 from padgs.render import render
 
 needs_native = pytest.mark.skipif(not cpu.available(), reason="the native library is not built")
@@ -136,7 +136,7 @@ def test_targets_are_judged_for_the_size_that_they_are_stated_for():
 
 
 def test_calls_of_the_library_are_charged_to_stages():
-    library = Watchable(SimpleNamespace(padgs_cuda_bin=lambda: 0, padgs_cuda_pose_blocks=lambda: 1))
+    library = Library(SimpleNamespace(padgs_cuda_bin=lambda: 0, padgs_cuda_pose_blocks=lambda: 1))
     with timeline.calls_watched(timeline.Timeline(torch.device("cpu"))) as marks:
         assert (library.padgs_cuda_bin(), library.padgs_cuda_pose_blocks()) == (0, 1)
     ((name, start, end),) = marks  # the other one asks the host

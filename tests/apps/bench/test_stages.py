@@ -7,7 +7,7 @@ import pytest
 from padgs.apps.bench import stages
 from padgs.apps.bench.stages import STAGES, StageClock, amortised
 from padgs.native import cpu
-from padgs.native.watch import Watchable, watched
+from padgs.native.loading import Library, call_hook
 
 
 @pytest.fixture
@@ -63,9 +63,9 @@ def test_a_stage_that_fails_is_left(tick):
 
 
 def test_native_calls_are_charged_to_their_stages(tick):
-    library = Watchable(SimpleNamespace(padgs_bin=lambda x: (tick(3), x)[1], padgs_isa=lambda: b"none"))
+    library = Library(SimpleNamespace(padgs_bin=lambda x: (tick(3), x)[1], padgs_isa=lambda: b"none"))
     clock = StageClock()
-    with watched(clock.native_call), clock.stage("draw"):
+    with call_hook(clock.native_call), clock.stage("draw"):
         assert library.padgs_bin(7) == 7
         assert library.padgs_isa() == b"none"
     library.padgs_bin(7)  # nobody watches any more

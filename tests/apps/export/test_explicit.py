@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from padgs.baselines.sc_omnigs import aligned, carried
 from plyfile import PlyData
 from tiny_run import tiny_run
 from typer.testing import CliRunner
@@ -12,6 +11,7 @@ from typer.testing import CliRunner
 import padgs
 from padgs.apps.export.explicit import exported
 from padgs.apps.export.splat_file import read_splats
+from padgs.baselines.sc_omnigs import aligned, carried
 from padgs.cli.commands import app
 from padgs.data.cloud import read_ply
 from padgs.evaluation.evaluate import evaluate

@@ -7,7 +7,7 @@ from tiny_run import tiny_run
 
 import padgs
 from padgs.apps.viewer.renders import Gallery, Look, beside
-from padgs.evaluation.pictures import eight_bit
+from padgs.evaluation.images import to_uint8
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,7 @@ def test_a_panorama_is_the_runs_own_picture_in_the_middle(gallery):
     view = gallery.run.scene.train[1]
     picture = gallery.picture(Look("panorama"), view.cam_from_world, 32, 24)
     assert picture.shape == (24, 32, 3) and picture[:4].max() == picture[20:].max() == 0
-    assert np.array_equal(picture[4:20], eight_bit(gallery.run.method.render(view).image))
+    assert np.array_equal(picture[4:20], to_uint8(gallery.run.method.render(view).image))
     high = gallery.picture(Look("panorama"), view.cam_from_world, 32, 8)
     assert high.shape == (8, 16, 3), "no wider than its height allows"
 

@@ -8,7 +8,7 @@ from composed import composed
 from tiny_scene import tiny_scene
 
 from padgs.data.perturb import StressOptions
-from padgs.evaluation.geometry import yaw_error
+from padgs.evaluation.diagnostics import yaw_error
 from padgs.geometry.distortion import distortion, polar_axis
 from padgs.runs.session import build
 from padgs.scene import Scene

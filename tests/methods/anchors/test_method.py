@@ -9,7 +9,7 @@ from padgs.geometry.panorama import rays
 from padgs.methods.anchors.method import PaDGSMethod, PaDGSMethodOptions
 from padgs.methods.anchors.model import PaDGS
 from padgs.methods.anchors.trainee import LearningRates
-from padgs.render.config import RenderConfig
+from padgs.render import RenderConfig
 from padgs.scene import Scene, View
 from padgs.training.budget import Budget
 from padgs.training.options import TrainOptions

@@ -17,7 +17,7 @@ VIEW = tiny_scene().train[3]
 def drawer(gaussians: Gaussians, projection: str = "ray", backend: str = "torch"):
     def draw(view: View, probe: torch.Tensor | None = None) -> Drawing:
         probe = gaussians.means.new_zeros(len(gaussians), 2, requires_grad=True) if probe is None else probe
-        rendering = render(gaussians, view, RenderOptions(projection), probe=probe, backend=backend)
+        rendering = render(gaussians, view, RenderOptions(projection), mean_offsets=probe, backend=backend)
         return Drawing(rendering, probe, gaussians, torch.arange(len(gaussians)))
 
     return draw

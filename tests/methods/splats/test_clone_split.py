@@ -8,7 +8,7 @@ from padgs.gaussians import rotation_matrices
 from padgs.methods.splats.clone_split import SHRINK, CloneSplit, CloneSplitOptions
 from padgs.methods.splats.model import Splats
 from padgs.methods.splats.trainee import SplatTrainee
-from padgs.render.config import RenderConfig
+from padgs.render import RenderConfig
 from padgs.scene import View
 
 LARGE, SMALL = 0.5, 0.005  # scales above and below percent_dense x extent = 0.01

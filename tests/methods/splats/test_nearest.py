@@ -9,7 +9,7 @@ from padgs.methods.plus.method import PlusMethod
 from padgs.methods.plus.options import PlusOptions
 from padgs.methods.splats.nearest import RESOLVED, cameras_of, finest_pixels, no_finer
 from padgs.render import render
-from padgs.render.low_pass import LowPass, widened
+from padgs.render.projection import LowPass, low_pass_filtered
 from padgs.scene import View
 from padgs.training.budget import Budget
 
@@ -38,7 +38,7 @@ def test_the_filter_of_a_view_on_top_makes_that_of_the_larger_pixel(trained):
     distances = (gaussians.means - view.center.float()).norm(dim=-1)
     own = distances / view.camera.focal
     pixels = own * torch.linspace(0.5, 3, len(own))
-    seen = widened(
+    seen = low_pass_filtered(
         no_finer(gaussians, view, pixels, variance),
         gaussians.means - view.center.float(),
         LowPass(0.0, variance / view.camera.focal**2, compensate=True),

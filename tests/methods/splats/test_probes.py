@@ -15,8 +15,7 @@ from padgs.methods.splats.method import SplatMethod, SplatOptions
 from padgs.methods.splats.model import Splats
 from padgs.methods.splats.probes import render_probed
 from padgs.methods.splats.trainee import SplatTrainee
-from padgs.render import RenderOptions, render
-from padgs.render.config import RenderConfig
+from padgs.render import RenderConfig, RenderOptions, render
 from padgs.scene import View
 
 RAY = RenderOptions(projection="ray")
@@ -123,7 +122,7 @@ def test_the_absolute_signal_is_half_the_distance_times_the_pulls_of_all_pixels(
     assert torch.equal(probes[0], probes[1][:, :3])
 
     pulls = torch.zeros(30, dtype=torch.float64, requires_grad=True)
-    (weight * render(gaussians, view, RAY, absolute_probe=pulls).image).sum().backward()
+    (weight * render(gaussians, view, RAY, absgrad=pulls).image).sum().backward()
     distance = (gaussians.means.detach() @ view.cam_from_world[:3, :3].T + view.cam_from_world[:3, 3]).norm(dim=-1)
     assert pulls.grad is not None and (pulls.grad > 0).sum() > 20
     assert torch.allclose(probes[1][:, 3], 0.5 * distance * pulls.grad, rtol=1e-9, atol=1e-14)

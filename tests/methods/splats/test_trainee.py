@@ -11,7 +11,7 @@ from padgs.methods.splats.clone_split import CloneSplitOptions
 from padgs.methods.splats.method import SplatMethod
 from padgs.methods.splats.model import Splats
 from padgs.methods.splats.trainee import SplatTrainee
-from padgs.render.config import RenderConfig
+from padgs.render import RenderConfig
 from padgs.runs.session import build
 from padgs.scene import Scene
 from padgs.training.budget import Budget

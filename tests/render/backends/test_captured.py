@@ -1,4 +1,4 @@
-"""Frames with room for a chosen number of instances against ordinary ones; recorded on a GPU, else just done again."""
+"""Frames with a given capacity against ordinary frames; recorded on a GPU, run again without one."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from padgs.render import Rendering, RenderOptions
 from padgs.render.backends import captured
 from padgs.render.backends import cuda as cuda_backend
 from padgs.render.backends.captured import CapturedRender
-from padgs.render.backends.cuda_tiles import DeviceProjected, DeviceStrip
-from padgs.render.backends.native_camera import native_camera
+from padgs.render.backends.cuda import DeviceProjected, DeviceStrip
+from padgs.render.backends.native import native_camera
 from padgs.render.contract import Request
 from padgs.scene import View
 
@@ -84,7 +84,7 @@ def assert_same(actual: Rendering, expected: Rendering) -> None:
 )
 def test_every_bit_is_that_of_an_ordinary_frame(options, lens, generator: torch.Generator, recorded: list[int]):
     gaussians, view = scene_of(generator), view_of(camera_of(lens, 72, 36), random_pose(generator, shift=0.1))
-    draw = CapturedRender(lambda _: gaussians, view, options, room=20_000)
+    draw = CapturedRender(lambda _: gaussians, view, options, capacity=20_000)
     frames = []
     for _ in range(3):
         pose = random_pose(generator, shift=0.1)
@@ -94,7 +94,7 @@ def test_every_bit_is_that_of_an_ordinary_frame(options, lens, generator: torch.
     counts = {expected.counters["instances"] for _, expected in frames}
     assert len(counts) > 1 or lens == "fisheye"  # which may look anywhere: all tiles list all Gaussians
     assert not torch.equal(frames[0][0].image, frames[1][0].image)
-    assert len(recorded) == 1 and draw.room == 20_000
+    assert len(recorded) == 1 and draw.capacity == 20_000
 
 
 @pytest.mark.usefixtures("dirty_memory")
@@ -103,11 +103,11 @@ def test_too_little_room_is_noticed_and_made(missing: int | str, generator: torc
     gaussians, view = scene_of(generator), view_of(camera_of("panorama", 72, 36))
     expected = ordinary(gaussians, view, RenderOptions())
     instances = expected.counters["instances"]
-    room = 1 if isinstance(missing, str) else instances - missing
-    draw = CapturedRender(lambda _: gaussians, view, room=room)
+    capacity = 1 if isinstance(missing, str) else instances - missing
+    draw = CapturedRender(lambda _: gaussians, view, capacity=capacity)
     assert_same(draw(view.cam_from_world), expected)
-    assert len(recorded) == (1 if room == instances else 2)
-    assert draw.room == (instances if room == instances else int(1.5 * instances) + 1)
+    assert len(recorded) == (1 if capacity == instances else 2)
+    assert draw.capacity == (instances if capacity == instances else int(1.5 * instances) + 1)
     assert_same(draw(view.cam_from_world), expected)
     assert len(recorded) < 3
 
@@ -123,7 +123,7 @@ def test_poses_and_backgrounds_may_lie_in_memory_in_any_order(generator: torch.G
 def test_the_room_is_for_the_first_pose_and_half_as_much_again(generator: torch.Generator):
     gaussians, view = scene_of(generator), view_of(camera_of("panorama", 72, 36))
     draw = CapturedRender(lambda _: gaussians, view)
-    assert draw.room == int(1.5 * ordinary(gaussians, view, RenderOptions()).counters["instances"]) + 1
+    assert draw.capacity == int(1.5 * ordinary(gaussians, view, RenderOptions()).counters["instances"]) + 1
 
 
 def test_what_a_view_shows_is_recorded_too_and_tensors_are_taken_by_reference(generator: torch.Generator):
@@ -153,7 +153,7 @@ def test_anchors_are_decoded_within_the_recording(omega_axis: str, generator: to
         for parameter in (model.features, model.offsets):
             parameter.copy_(torch.randn(parameter.shape, generator=generator))
         view = view_of(camera_of("panorama", 72, 36))
-        draw = CapturedRender(model.show, view, room=10_000)
+        draw = CapturedRender(model.show, view, capacity=10_000)
         counts = set()
         for _ in range(2):
             pose = random_pose(generator, shift=1)
@@ -231,7 +231,7 @@ def test_more_than_a_strip_is_refused_when_counted_and_when_drawn(generator: tor
     message = r"has \d+ \(Gaussian, tile\) instances; max_instances=30 draws them in strips, .* Raise max_instances"
     with pytest.raises(ValueError, match=message):
         CapturedRender(lambda _: gaussians, view, RenderOptions(max_instances=30))
-    draw = CapturedRender(lambda _: gaussians, view, RenderOptions(max_instances=30), room=20)
+    draw = CapturedRender(lambda _: gaussians, view, RenderOptions(max_instances=30), capacity=20)
     for _ in range(2):
         with pytest.raises(ValueError, match=message):
             draw(view.cam_from_world)
@@ -242,9 +242,9 @@ def test_what_cannot_be_recorded_is_refused(generator: torch.Generator):
     for options in (RenderOptions("tangent", cubemap=True), RenderOptions(pixel_bias=0.5)):
         with pytest.raises(ValueError, match="cubemap or pixel_bias cannot be recorded; draw them with padgs"):
             CapturedRender(lambda _: gaussians, view, options)
-    for room in (0, 11):
-        with pytest.raises(ValueError, match=f"room is {room}; it must be for 1 to 10 instances"):
-            CapturedRender(lambda _: gaussians, view, RenderOptions(max_instances=10), room=room)
+    for capacity in (0, 11):
+        with pytest.raises(ValueError, match=f"capacity is {capacity}; it must be 1 to 10 instances"):
+            CapturedRender(lambda _: gaussians, view, RenderOptions(max_instances=10), capacity=capacity)
     with pytest.raises(ValueError, match="takes float32 tensors on a GPU, got torch.float64"):
         CapturedRender(lambda _: gaussians.to(torch.float64), view)
     with pytest.raises(ValueError, match=r"cam_from_world has shape \(3, 4\); it must be \(4, 4\)"):
@@ -254,10 +254,10 @@ def test_what_cannot_be_recorded_is_refused(generator: torch.Generator):
 @pytest.mark.usefixtures("dirty_memory")
 def test_more_instances_than_32_bits_count_leave_the_first_ones_in_place():
     """Slots of Gaussians far back must not begin again at 0, where they would be written over the first."""
-    side, count, room = 8192, 16_400, 100
+    side, count, capacity = 8192, 16_400, 100
     view = DeviceProjected.__new__(DeviceProjected)
     view.camera = native_camera(cuda_backend.IDENTITY, camera_of("pinhole", side, side), RenderOptions("pinhole"))
-    view.queue, view.room, view.visible = cuda.queue(DEVICE), room, count
+    view.queue, view.capacity, view.visible = cuda.queue(DEVICE), capacity, count
     view.boxes = torch.tensor([0, side, 0, 0, side], dtype=torch.int32, device=DEVICE).repeat(count, 1)
     view.order = torch.arange(count, dtype=torch.int32, device=DEVICE)
     strip = DeviceStrip(view, 0, side // 16)
@@ -265,4 +265,4 @@ def test_more_instances_than_32_bits_count_leave_the_first_ones_in_place():
     wanted = (strip.tiles * torch.arange(count + 1)).clamp(max=2**31 - 1)
     assert torch.equal(strip.slot_start.cpu().long(), wanted)
     assert (strip.reaches[:, 0] == 0).all()
-    assert torch.equal(strip.tile_start.cpu().long(), torch.arange(strip.tiles + 1).clamp(max=room))
+    assert torch.equal(strip.tile_start.cpu().long(), torch.arange(strip.tiles + 1).clamp(max=capacity))

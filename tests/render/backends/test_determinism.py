@@ -42,12 +42,12 @@ def drawn(name: str, count: int = 250, size: tuple[int, int] = (250, 125)) -> di
     inputs, camera = type(gaussians)(**leaf), camera_of(lens, *size)
     leaf["pose"] = random_pose(generator, shift=0.1).float().requires_grad_()
     leaf["background"] = torch.full((3,), 0.5, requires_grad=True)
-    leaf["probe"] = torch.zeros(len(gaussians), 2, requires_grad=True)
+    leaf["mean_offsets"] = torch.zeros(len(gaussians), 2, requires_grad=True)
     if isinstance(camera, RayTable):
         leaf["rays"] = camera.table.float().requires_grad_()
         camera = RayTable(leaf["rays"], camera.focal)
     view, options = view_of(camera, leaf["pose"]), RenderOptions(projection, **settings)
-    extra = {"background": leaf["background"], "probe": leaf["probe"], "backend": "cpu"}
+    extra = {"background": leaf["background"], "mean_offsets": leaf["mean_offsets"], "backend": "cpu"}
     rendering = render(inputs, view, options, **extra)
     outputs = {key: getattr(rendering, key) for key in ("image", "transmittance", "depth")}
     loss = sum((value * torch.randn(value.shape, generator=generator)).sum() for value in outputs.values())

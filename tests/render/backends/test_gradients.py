@@ -87,7 +87,7 @@ def steps_of(gaussians: Gaussians, projection: str) -> dict[str, Tensor]:
         "scales": gaussians.scales,
         "opacities": gaussians.opacities,
         "colors": torch.ones_like(gaussians.colors),
-        "probe": torch.full((len(gaussians), 2), 0.05, dtype=torch.float64),
+        "mean_offsets": torch.full((len(gaussians), 2), 0.05, dtype=torch.float64),
         "twist": smallest * torch.cat((torch.ones(3), radius.min() * torch.ones(3))).double(),
         "background": torch.ones(3, dtype=torch.float64),
         "rays": torch.full((HEIGHT, WIDTH, 3), smallest, dtype=torch.float64),
@@ -110,7 +110,7 @@ class Scene:
         }
         self.inputs = {
             **{name: tensor.detach() for name, tensor in vars(leaves(self.gaussians, dtype)).items()},
-            "probe": torch.zeros(len(self.gaussians), 2, dtype=dtype),
+            "mean_offsets": torch.zeros(len(self.gaussians), 2, dtype=dtype),
             "twist": torch.zeros(6, dtype=dtype),
             "background": torch.tensor([0.2, 0.7, 0.4], dtype=dtype),
         }
@@ -121,7 +121,7 @@ class Scene:
         model = Gaussians(**{name: values[name] for name in vars(self.gaussians)})
         camera = RayTable(values["rays"], self.camera.focal) if "rays" in values else self.camera
         view = view_of(camera, tangent_pose(identity_pose().to(values["twist"].dtype), values["twist"]))
-        extra = {"probe": values["probe"], "background": values["background"], "backend": backend}
+        extra = {"mean_offsets": values["mean_offsets"], "background": values["background"], "backend": backend}
         rendering = render(model, view, self.options, **extra)
         return sum((getattr(rendering, name).double() * weight).sum() for name, weight in self.weights.items())
 
@@ -186,7 +186,7 @@ def test_every_input_receives_a_gradient(projection: str, lens: str, backend: st
         **vars(inputs),
         "pose": pose.to(dtype).requires_grad_(),
         "background": torch.full((3,), 0.5, dtype=dtype, requires_grad=True),
-        "probe": torch.zeros(20, 2, dtype=dtype, requires_grad=True),
+        "mean_offsets": torch.zeros(20, 2, dtype=dtype, requires_grad=True),
     }
     if isinstance(camera, RayTable):
         everything["rays"] = camera.table.to(dtype).requires_grad_()
@@ -196,7 +196,10 @@ def test_every_input_receives_a_gradient(projection: str, lens: str, backend: st
         "transmittance": set(everything) - {"colors", "background"},
         "depth": set(everything) - {"colors", "background"},
     }
-    view, extra = view_of(camera, everything["pose"]), {name: everything[name] for name in ("background", "probe")}
+    view, extra = (
+        view_of(camera, everything["pose"]),
+        {name: everything[name] for name in ("background", "mean_offsets")},
+    )
     for output, expected in reached.items():
         value = getattr(render(inputs, view, RenderOptions(projection), backend=backend, **extra), output)
         weight = torch.randn(value.shape, generator=generator, dtype=torch.float64).to(dtype)

@@ -50,12 +50,12 @@ def run(gaussians, size, lens, options, weights, *, pose, backend, dtype) -> tup
     extra = {
         "pose": pose.to(dtype, copy=True).requires_grad_(),
         "background": torch.tensor([0.3, 0.6, 0.9], dtype=dtype, requires_grad=True),
-        "probe": torch.zeros(len(gaussians), 2, dtype=dtype, requires_grad=True),
+        "mean_offsets": torch.zeros(len(gaussians), 2, dtype=dtype, requires_grad=True),
     }
     if isinstance(camera, RayTable):
         extra["rays"] = camera.table.to(dtype, copy=True).requires_grad_()
         camera = RayTable(extra["rays"], camera.focal)
-    arguments = {"background": extra["background"], "probe": extra["probe"], "backend": backend}
+    arguments = {"background": extra["background"], "mean_offsets": extra["mean_offsets"], "backend": backend}
     rendering = render(inputs, view_of(camera, extra["pose"]), options, **arguments)
     sum((getattr(rendering, name) * weight.to(dtype)).sum() for name, weight in weights.items()).backward()
     gradients = {name: leaf.grad for name, leaf in {**vars(inputs), **extra}.items()}

@@ -126,22 +126,24 @@ def test_gradcheck(output: str, projection: str, wrap: bool):
     inputs = leaves(gaussians, torch.float64)
     pose = identity_pose()
     background = torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64, requires_grad=True)
-    probe = torch.zeros(3, 2, dtype=torch.float64, requires_grad=True)
+    mean_offsets = torch.zeros(3, 2, dtype=torch.float64, requires_grad=True)
 
-    def drawn(means, quats, scales, opacities, colors, top, background, probe):
+    def drawn(means, quats, scales, opacities, colors, top, background, mean_offsets):
         moved = torch.cat((top, pose[3:]))
         rendering = render(
             Gaussians(means, quats, scales, opacities, colors),
             View("v", moved, 12, 6),
             RenderOptions(projection, wrap=wrap),
             background=background,
-            probe=probe,
+            mean_offsets=mean_offsets,
             backend="torch",
         )
         return getattr(rendering, output)
 
     leaf_pose = pose[:3].clone().requires_grad_()
-    assert torch.autograd.gradcheck(drawn, (*vars(inputs).values(), leaf_pose, background, probe), eps=1e-7, atol=1e-5)
+    assert torch.autograd.gradcheck(
+        drawn, (*vars(inputs).values(), leaf_pose, background, mean_offsets), eps=1e-7, atol=1e-5
+    )
 
 
 def test_depth_follows_the_mean_and_transmittance_the_opacity():
@@ -155,15 +157,15 @@ def test_depth_follows_the_mean_and_transmittance_the_opacity():
 
 
 def test_the_probe_moves_a_footprint_like_the_mean():
-    """Its unit is half an image: the gradient in pixels is the gradient by the probe over W / 2 and H / 2."""
+    """Its unit is half an image: the gradient in pixels is the gradient by the mean_offsets over W / 2 and H / 2."""
     gaussians = gaussians_of("ordinary", 1, torch.Generator().manual_seed(4))
     view = View("v", identity_pose(), 64, 32)
-    probe = torch.zeros(1, 2, dtype=torch.float64)
-    reference = render(gaussians, view, probe=probe, backend="torch").image
+    mean_offsets = torch.zeros(1, 2, dtype=torch.float64)
+    reference = render(gaussians, view, mean_offsets=mean_offsets, backend="torch").image
     for axis, size in ((0, 64), (1, 32)):
-        moved = probe.clone()
+        moved = mean_offsets.clone()
         moved[0, axis] = 3 / (size / 2)  # three pixels
-        shifted = render(gaussians, view, probe=moved, backend="torch").image
+        shifted = render(gaussians, view, mean_offsets=moved, backend="torch").image
         torch.testing.assert_close(shifted, torch.roll(reference, 3, dims=1 - axis), atol=1e-9, rtol=0)
 
 

@@ -10,8 +10,8 @@ from padgs.gaussians import Gaussians
 from padgs.geometry.camera import Camera
 from padgs.native.abi import Inputs, pointer
 from padgs.render import RenderOptions
-from padgs.render.backends.cpu_tiles import TILE, Projected
-from padgs.render.backends.native_camera import native_camera
+from padgs.render.backends.cpu import TILE, Projected
+from padgs.render.backends.native import native_camera
 
 
 def projected(gaussians: Gaussians, camera: Camera, options: RenderOptions, pose: Tensor) -> Projected:

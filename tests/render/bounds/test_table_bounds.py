@@ -7,7 +7,7 @@ from render_cases import mixture, needs_native, random_pose, view_of
 from padgs.geometry.camera import Panorama, RayTable
 from padgs.geometry.lens import axis_direction, bend
 from padgs.render import RenderOptions, render
-from padgs.render.backends.native_camera import native_camera
+from padgs.render.backends.native import native_camera
 
 OPTIONS = RenderOptions("ray")
 

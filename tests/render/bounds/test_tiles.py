@@ -29,7 +29,7 @@ from render_cases import (
 
 from padgs.geometry.camera import Panorama
 from padgs.render import RenderOptions, render
-from padgs.render.backends.cpu_tiles import TILE
+from padgs.render.backends.cpu import TILE
 from padgs.render.contract import ALPHA_MIN
 
 few = settings(max_examples=10, deadline=None, derandomize=True, database=None)

@@ -41,7 +41,7 @@ real_library = cuda.library
 def emulated_library() -> ctypes.CDLL:
     """The kernels compiled for the host; seconds, once in a process."""
     loaded = compiled("padgs_cuda", sorted(SOURCES.glob("*.cu")))
-    return loading.declared(loaded, cuda.SIGNATURES, "padgs_cuda_structure_bytes", cuda.STRUCTURES)
+    return loading.declare(loaded, cuda.SIGNATURES, "padgs_cuda_structure_bytes", cuda.STRUCTURES)
 
 
 @functools.cache

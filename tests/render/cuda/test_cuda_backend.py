@@ -20,7 +20,7 @@ from padgs.gaussians import Gaussians
 from padgs.native import cuda, loading
 from padgs.render import Rendering, RenderOptions, render
 from padgs.render.backends import cuda as cuda_backend
-from padgs.render.backends import cuda_tiles, native_camera
+from padgs.render.backends import native as native_backend
 from padgs.render.leave_one_out import leave_one_out
 from padgs.training.failure import is_out_of_memory
 
@@ -165,8 +165,8 @@ def test_what_is_drawn_does_not_depend_on_what_a_compiler_fuses(projection, lens
 
 @pytest.fixture(autouse=True)
 def no_image_before(monkeypatch: pytest.MonkeyPatch):
-    """Every test begins without a last image, of whose size room for the next is taken."""
-    monkeypatch.setattr(cuda_backend, "_rooms", {})
+    """Every test begins without a last image, of whose size capacity for the next is taken."""
+    monkeypatch.setattr(cuda_backend, "_capacities", {})
 
 
 @pytest.mark.parametrize("blending", ["sorted", "hybrid"])
@@ -187,14 +187,14 @@ def test_room_of_the_last_image_changes_nothing_and_too_little_is_noticed(
     outputs = ("image", "transmittance", "depth", "visible")
     assert_same_bits(drawn(gaussians, (72, 36), options), usual, outputs)
     assert rooms == [count, int(1.3 * count) + 1]
-    for (_, *size), room in list(cuda_backend._rooms.items()):
-        assert size == [72, 36] and room == int(1.3 * count) + 1
-    cuda_backend._rooms = dict.fromkeys(cuda_backend._rooms, count - 1)
+    for (_, *size), capacity in list(cuda_backend._capacities.items()):
+        assert size == [72, 36] and capacity == int(1.3 * count) + 1
+    cuda_backend._capacities = dict.fromkeys(cuda_backend._capacities, count - 1)
     assert_same_bits(drawn(gaussians, (72, 36), options), usual, outputs)
     assert rooms[2:] == [count - 1, count]  # drawn again
     assert_same_bits(drawn(gaussians, (72, 36), replace(options, max_instances=count)), usual, outputs)
-    assert rooms[4:] == [count]  # the room would be for more than may be
-    assert {*cuda_backend._rooms.values()} == {count}  # the next has as much as may be
+    assert rooms[4:] == [count]  # the capacity would be for more than may be
+    assert {*cuda_backend._capacities.values()} == {count}  # the next has as much as may be
 
 
 @pytest.mark.parametrize("blending", ["sorted", "hybrid"])
@@ -259,7 +259,7 @@ def test_other_dtypes_and_places_are_refused(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_more_instances_than_a_list_can_hold_are_refused(generator, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(cuda_tiles, "MAX_INSTANCES", 10)
+    monkeypatch.setattr(cuda_backend, "MAX_INSTANCES", 10)
     message = r"one row of tiles has \d+ \(Gaussian, tile\) instances; a list holds at most 10. Draw fewer"
     with pytest.raises(ValueError, match=message):
         drawn(crowd(200, generator), (72, 36), RenderOptions())
@@ -299,17 +299,17 @@ def looked_for_anew(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     found = cuda.available
     monkeypatch.setattr(cuda, "library", cuda_engine.real_library.__wrapped__)
     found.cache_clear()
-    package._say_that_native_is_missing.cache_clear()
+    package._warn_missing_library.cache_clear()
     yield
     found.cache_clear()
 
 
 @pytest.mark.usefixtures("looked_for_anew")
 def test_a_driver_that_is_too_old_means_torch_and_says_so(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(cuda, "opened", lambda *_: None)
-    monkeypatch.setattr(cuda, "declared", lambda *_: versions_of(12080, 13000))
+    monkeypatch.setattr(cuda, "find_library", lambda *_: None)
+    monkeypatch.setattr(cuda, "declare", lambda *_: versions_of(12080, 13000))
     means = SimpleNamespace(device=torch.device("cuda"), dtype=torch.float32)
-    with pytest.warns(UserWarning, match=r"compiled by CUDA 13\.0, and the driver here knows CUDA 12\.8; update"):
+    with pytest.warns(UserWarning, match=r"compiled by CUDA 13\.0, but the driver supports CUDA 12\.8; update"):
         assert package.resolve_backend("auto", means) == "torch"
 
 
@@ -324,16 +324,16 @@ def versions_of(driver: int, built_with: int) -> SimpleNamespace:
 @pytest.mark.parametrize("lens", ["panorama", "pinhole"])
 def test_the_default_dtype_of_torch_changes_nothing(lens: str, blending: str, generator: torch.Generator):
     gaussians, options = crowd(40, generator), RenderOptions("ray", **blended(blending, 3))
-    native_camera._formula_rays.cache_clear()
+    native_backend._formula_rays.cache_clear()
     usual = drawn(gaussians, (40, 20), options, lens=lens)
-    native_camera._formula_rays.cache_clear()
+    native_backend._formula_rays.cache_clear()
     weights = torch.get_default_dtype()
     try:
         torch.set_default_dtype(torch.float64)
         doubled = drawn(gaussians, (40, 20), options, lens=lens, weights=weights)
     finally:
         torch.set_default_dtype(weights)
-        native_camera._formula_rays.cache_clear()
+        native_backend._formula_rays.cache_clear()
     assert torch.equal(usual[0].image, doubled[0].image)
     assert all(torch.equal(gradient, doubled[1][name]) for name, gradient in usual[1].items())
 

@@ -21,7 +21,7 @@ from padgs.methods.anchors.decoder import (
 )
 from padgs.methods.anchors.gpu_decoder import decode_on_gpu
 from padgs.methods.anchors.precision import OF_GRADIENTS, PRECISIONS, reduced
-from padgs.native.watch import watched
+from padgs.native.loading import call_hook
 
 pytestmark = [*cuda_engine.marks()]
 DEVICE = "cuda" if cuda_engine.ON_GPU else "cpu"
@@ -103,7 +103,7 @@ def products_of_ours():
             called.append(name.split("_")[-1])
         yield
 
-    with watched(stage):
+    with call_hook(stage):
         yield called
 
 

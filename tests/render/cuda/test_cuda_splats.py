@@ -32,16 +32,16 @@ def splats_of(count: int, stored: int, active: int, generator: torch.Generator) 
 
 def seen(splats: Splats, width: int, how: str, monkeypatch: pytest.MonkeyPatch) -> list[Tensor]:
     """Values and gradients, by kernels or by the definition."""
-    probe = 0.1 * torch.ones(len(splats), width, device=DEVICE).cumsum(-1).requires_grad_() if width else None
+    mean_offsets = 0.1 * torch.ones(len(splats), width, device=DEVICE).cumsum(-1).requires_grad_() if width else None
     with monkeypatch.context() as patch:
         patch.setattr(cpu_splats, "fits", lambda *_: False)
         patch.setattr(gpu_splats, "fits", lambda *_: how == "kernels")
-        gaussians, pulls = splats.probed(VIEW, probe)
+        gaussians, pulls = splats.probed(VIEW, mean_offsets)
     values = [gaussians.means, gaussians.scales, gaussians.opacities, gaussians.colors]
     values += [] if pulls is None else [pulls]
     generator = torch.Generator().manual_seed(0)
     upstream = [torch.randn(value.shape, generator=generator).to(DEVICE) for value in values]
-    leaves = [*splats.parameters(), *([] if probe is None else [probe])]
+    leaves = [*splats.parameters(), *([] if mean_offsets is None else [mean_offsets])]
     gradients = torch.autograd.grad(values, leaves, upstream, allow_unused=True)
     return [*values, *(torch.zeros((), device=DEVICE) if one is None else one for one in gradients)]
 

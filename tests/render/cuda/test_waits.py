@@ -1,6 +1,6 @@
 """How often the host waits while a method trains with the kernels: those of the emulation, on a GPU that is not there.
 
-Numbers that are read beside the drawing (`Reading`) are no wait: the device goes on with what it has.
+Numbers that are read beside the drawing (`HostCopy`) are no wait: the device goes on with what it has.
 """
 
 from __future__ import annotations
@@ -26,11 +26,10 @@ from padgs.methods.splats.model import Splats
 from padgs.methods.splats.probes import SIGNALS
 from padgs.methods.splats.trainee import SplatTrainee
 from padgs.native import LIBRARIES, cuda
-from padgs.native.reading import Reading
-from padgs.native.watch import Stage, watched
-from padgs.render import RenderOptions
+from padgs.native.cuda import HostCopy
+from padgs.native.loading import Stage, call_hook
+from padgs.render import RenderConfig, RenderOptions
 from padgs.render.backends import cuda as cuda_backend
-from padgs.render.config import RenderConfig
 from padgs.training.budget import Budget
 from padgs.training.loop import Trainer
 from padgs.training.native_loss import EVALUATIONS
@@ -45,8 +44,8 @@ def kernels_are_there(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(cuda, "device_type", lambda: GPU.type)
     monkeypatch.setitem(LIBRARIES, GPU.type, cuda)
     monkeypatch.setitem(EVALUATIONS, GPU.type, EVALUATIONS["cuda"])
-    monkeypatch.setattr(Reading, "values", lambda reading: reading._values.held.tolist())
-    monkeypatch.setattr(cuda_backend, "_rooms", {})
+    monkeypatch.setattr(HostCopy, "values", lambda reading: reading._values.held.tolist())
+    monkeypatch.setattr(cuda_backend, "_capacities", {})
 
 
 def trained(precision: str) -> tuple[Trainer, list[Counter[str]]]:
@@ -120,7 +119,7 @@ def test_an_iteration_of_explicit_gaussians_waits_for_nothing(signal: str):
     splats = Splats(seen.means, seen.scales.log(), seen.colors, degree=3)
     splats.active_degree = 3
     options, config = CloneSplitOptions(signal=signal), RenderConfig("ray", backend="cuda")
-    with pretended_gpu() as waits, watched(stage_of(called := [])):
+    with pretended_gpu() as waits, call_hook(stage_of(called := [])):
         trainee = SplatTrainee(splats.to(GPU), options, config, extent=1.0, iterations=30_000)
         trainer = Trainer(trainee, resident(work.scene, GPU), Budget(30_000))
         waited = steps_of(trainer, waits)

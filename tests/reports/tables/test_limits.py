@@ -1,10 +1,10 @@
 from dataclasses import replace
 
 from made_up import failed, gathered, of_experiment
-from padgs.reports.limits import LIMITS, MADE_FOR
-from padgs.reports.tables.limits import limits
 
 from padgs.data.perturb import CONDITIONS
+from padgs.reports.limits import LIMITS, MADE_FOR
+from padgs.reports.tables.limits import limits
 from padgs.results import Scores
 
 RULES = {"name": "stability", "lpips": "none", "lpips_inputs": "11", "bottom_crop": 0.0}

@@ -3,10 +3,10 @@ from dataclasses import replace
 import pytest
 from made_up import RULES, failed, gathered, result, small
 from omegaconf import OmegaConf
+
 from padgs.reports.tables.table import MISSING, ReportError
 from padgs.reports.tables.variants import PARTS, QUIRKS, RUNGS, WITHOUT, ladder, quirks, table3
 from padgs.reports.writers import markdown
-
 from padgs.results import Scores
 
 FOUR = [

@@ -6,11 +6,11 @@ from dataclasses import replace
 import pytest
 import torch
 from composed import composed
-from padgs.baselines.omnigs import OmniGSMethod
 from states import assert_same_but_time
 from tiny_scene import tiny_scene, truth
 from torch import nn
 
+from padgs.baselines.omnigs import OmniGSMethod
 from padgs.data.perturb import StressOptions
 from padgs.data.perturb.images import change_pixels
 from padgs.render import RenderOptions, render
@@ -53,7 +53,7 @@ class Truth:
 
     def draw(self, view: View) -> Drawing:
         probe = torch.zeros(8, 2, requires_grad=True)
-        rendering = render(truth(), view, RenderOptions(), probe=probe)
+        rendering = render(truth(), view, RenderOptions(), mean_offsets=probe)
         return Drawing(rendering, probe, truth(), torch.arange(8))
 
     def observe(self, drawing: Drawing, iteration: int) -> None: ...

@@ -1,5 +1,5 @@
 // Hybrid blending: each pixel keeps its K nearest fragments in order and blends the rest as one layer behind them. The
-// definition is padgs/render/hybrid.py. The tile lists may be in any order; front to back is fast.
+// definition is padgs/render/backends/torch.py. The tile lists may be in any order; front to back is fast.
 //
 // Forward collects the fragments of each patch, and keeps who is in the core. Backward turns the core into layers, one
 // for each instance that is in it, in the order of the list, and then visits the list.

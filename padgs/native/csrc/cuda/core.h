@@ -1,5 +1,5 @@
 // The fragments of one pixel for hybrid blending: the nearest few in order, and sums over all others; fragments.h keeps
-// those of sixteen for the CPU. The definition is padgs/render/hybrid.py.
+// those of sixteen for the CPU. The definition is padgs/render/backends/torch.py.
 #pragma once
 
 #include "../abi.h"

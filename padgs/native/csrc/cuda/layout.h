@@ -23,7 +23,7 @@ struct alignas(8) Reach {
   int32_t gaussian;
   uint8_t row, row_end, column, column_end;  // from the tile's corner; ends are exclusive
 };
-static_assert(sizeof(Reach) == 8, "padgs/render/backends/cuda_tiles.py allocates 2 integers per instance");
+static_assert(sizeof(Reach) == 8, "padgs/render/backends/cuda.py allocates 2 integers per instance");
 
 PADGS_HD int runs_in_row(const PixelBox &box, Run *runs) {
   return runs_in_row(box.column, box.column_end, box.second_end, kTileShift, runs);
