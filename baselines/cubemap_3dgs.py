@@ -82,7 +82,7 @@ class Cubemap3DGSMethod(SplatMethod):
                 )
         refuse_polar_threshold(self.options, "perspective views have no poles")
         super()._refuse_impossible()
-        check_camera(self.lens(Panorama(8, 4)), of_cut_views(self.render_config.options(scene_unit=1.0)))
+        check_camera(self.lens(Panorama(8, 4)), of_cut_views(self.render_config.options(scene_scale=1.0)))
 
     def turns(self) -> Tensor:
         """Rotations [K, 3, 3] from a panorama's camera frame to those of the views."""

@@ -53,7 +53,7 @@ class Seam360GSMethod(CalibratedMethod):
 
     def _refuse_impossible(self) -> None:
         super()._refuse_impossible()
-        check_camera(RayTable(torch.zeros(1, 1, 3), focal=1.0), self.render_config.options(scene_unit=1.0))
+        check_camera(RayTable(torch.zeros(1, 1, 3), focal=1.0), self.render_config.options(scene_scale=1.0))
         refuse_polar_threshold(self.options, "a view is made of two, each by a lens of its own")
 
     def _as_given(self, scene: Scene) -> DualLens:

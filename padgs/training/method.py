@@ -187,7 +187,7 @@ class Method(ABC):
 
     def _refuse_impossible(self) -> None:
         """Refuse what no scene could be trained or drawn with; subclasses know more."""
-        check_camera(Panorama(8, 4), self.render_config.options(scene_unit=1.0))
+        check_camera(Panorama(8, 4), self.render_config.options(scene_scale=1.0))
 
     def refuse_budget(self, budget: Budget) -> None:
         """Refuse what cannot be trained for so long, or so large, on any scene; subclasses know more.

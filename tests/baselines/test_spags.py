@@ -25,7 +25,7 @@ from padgs.scene import Scene
 from padgs.training.budget import Budget
 
 WIDTH, HEIGHT = 2048, 1024
-OPTIONS = SPaGSMethod.RENDER.options(scene_unit=1.0)
+OPTIONS = SPaGSMethod.RENDER.options(scene_scale=1.0)
 
 
 @pytest.fixture(scope="module")
