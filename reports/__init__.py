@@ -40,7 +40,7 @@ REPORTS: Mapping[str, Report] = {
     "limits": Report("padgs.reports.tables.limits:limits", ("stress",)),
     "capacity": Report("padgs.reports.tables.capacity:capacity", ("capacity",)),
     "need": Report("padgs.reports.tables.need:need", ("need",)),
-    "need_chart": Report("padgs.reports.charts.need_chart:charts", ("need",)),
+    "smallest_chart": Report("padgs.reports.charts.smallest_chart:charts", ("need",)),
     "runs": Report("padgs.reports.tables.runs:runs"),
     "chart": Report("padgs.reports.charts.trade_off_chart:charts", ("pareto", *OF_AN_ORDER, *OF_ALL_METHODS)),
     "gallery": Report("padgs.reports.charts.gallery:charts", ("equal_time", *OF_AN_ORDER, *OF_ALL_METHODS)),

@@ -13,7 +13,7 @@ from padgs.results import file_name
 WRITERS = {"md": markdown.text, "tex": latex.text, "csv": csv_text.text}
 
 
-def files(made: Table | Page | Chart | Sequence[Table | Chart] | str) -> Iterator[tuple[str, bytes]]:
+def files(made: Table | Page | Chart | Sequence[Table | Chart] | str, svg: bool = False) -> Iterator[tuple[str, bytes]]:
     """The files of a table, a chart or a page, or of several; none of a table that has nothing in it.
 
     Names of charts are those of scenes and sweeps, which may come from elsewhere; a file is in its folder all the same.
@@ -27,10 +27,11 @@ def files(made: Table | Page | Chart | Sequence[Table | Chart] | str) -> Iterato
             yield f"{made.name}.{extension}", text(made).encode()
     elif isinstance(made, Chart):
         name = file_name(made.name)
-        yield f"{name}.svg", made.svg.encode()
         yield f"{name}.png", made.png
+        if svg:
+            yield f"{name}.svg", made.svg.encode()
         if made.numbers is not None:
             yield f"{name}.csv", csv_text.of_frame(made.numbers).encode()
     else:
         for part in made:
-            yield from files(part)
+            yield from files(part, svg)

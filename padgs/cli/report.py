@@ -32,11 +32,12 @@ def report(
     collect: Annotated[
         bool, typer.Option(help="add the runs to OUT/results.jsonl first, and report on all in it")
     ] = False,
+    svg: Annotated[bool, typer.Option(help="write charts as SVG, too")] = False,
     strict: Annotated[
         bool, typer.Option(help="exit code 1 if a result file cannot be used, or results must not stand together")
     ] = False,
 ) -> None:
-    """Make tables (Markdown, LaTeX, CSV), charts (SVG, PNG, CSV) and a page (HTML) from result files."""
+    """Make tables (Markdown, LaTeX, CSV), charts (PNG, CSV) and a page (HTML) from result files."""
     if what not in (*REPORTS, ALL):
         raise ReportError(f"unknown report {what!r}; known: {', '.join(sorted(REPORTS))}, {ALL}")
     source = Path(runs)
@@ -67,7 +68,7 @@ def report(
     single = what != ALL
     for name in [what] if single else REPORTS:
         try:
-            texts = dict(files(gathered.report(name)))
+            texts = dict(files(gathered.report(name), svg))
         except ReportError as error:
             refused += 1
             show(f"{'error' if single or strict else 'left out'}: {name}: {error}", sys.stderr)

@@ -1,1 +1,1 @@
-"""Curves and points, and how they are drawn."""
+"""Charts of results, with matplotlib."""

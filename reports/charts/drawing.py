@@ -1,24 +1,51 @@
-"""How charts look, and how they are written: SVG whose markers say their numbers when pointed at, and PNG."""
+"""The style of charts, one colour per method on white and on black, and the formats PNG and SVG."""
 
 from __future__ import annotations
 
-import html
 import io
-import math
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from functools import wraps
+from dataclasses import dataclass
+from functools import cached_property, wraps
 from textwrap import wrap
 from typing import Any, ParamSpec, TypeVar
 
 from pandas import DataFrame
 
-from padgs.reports.charts.palette import GRID, INK, PAPER, dark_rules
+from padgs.reports.methods import method_of
 
 P = ParamSpec("P")
 T = TypeVar("T")
+# Pairs of colours: on white, and on black where readers have a dark screen. The first five are Okabe and Ito's, which
+# colour-blind readers can tell apart. Only PaD-GS and padgs+ are pink.
+FAMILIES = {
+    "egonerf": ("#e69f00", "#e69f00"),
+    "op43dgs": ("#56b4e9", "#7cc8f2"),
+    "odgs": ("#009e73", "#1fb98c"),
+    "omnigs": ("#d55e00", "#ee7d2b"),
+    "spags": ("#0072b2", "#3f92e0"),
+    "padgs": ("#cc79a7", "#e08fbd"),
+    "padgs_plus": ("#b0005e", "#ff4fa3"),
+    "cubemap_3dgs": ("#333333", "#d5d9e0"),
+    "crops_3dgs": ("#8c6d31", "#c2a05c"),
+    "sc_omnigs": ("#7f7f7f", "#9aa0aa"),
+    "seam360gs": ("#332288", "#9d92ee"),
+}
+OTHERS = (("#44aa99", "#44aa99"), ("#999933", "#b3b34a"), ("#882255", "#cc6f9c"))
+INK = ("#1d2330", "#e4e8ef")
+SOFT = ("#5b6475", "#a3acbc")
+GRID = ("#e3e6eb", "#333a46")
+MARGIN_COLOR = ("#f1f3f6", "#20262f")  # behind marks of values beyond the axis
+PAPER = ("#ffffff", "#171b22")
+COLORS = tuple(light for light, _ in (*FAMILIES.values(), *OTHERS))
+ALPHA = {"main": 0.95, "variant": 0.45, "release": 0.6}  # role of a preset -> opacity of its marks
+OURS = ("padgs", "padgs_plus")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*")
+IMAGE_WIDTH = 512  # maximum pixels of an image in a chart
+DPI = 110
+TITLE_SIZE, SMALL_TITLE_SIZE, NARROW = 10.5, 9.0, 5.0  # points; the small one in figures of up to NARROW inches
+LETTERS = 126  # letters per inch at a font size of one point
+TIP = "tip:"  # prefix of a gid that holds a tooltip
 STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",  # text stays text
     "font.size": 9,
@@ -32,47 +59,47 @@ STYLE: dict[Any, Any] = {
     "legend.frameon": False,
     "figure.facecolor": PAPER[0],
     "axes.facecolor": "none",
-    "text.color": INK[0],
-    "axes.labelcolor": INK[0],
-    "axes.edgecolor": INK[0],
-    "xtick.color": INK[0],
-    "ytick.color": INK[0],
-    "text.parse_math": False,  # a name with a $ in it is a name
+    **dict.fromkeys(("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), INK[0]),
+    "text.parse_math": False,  # a $ in a name is a $
 }
-DPI = 110
-TITLE, SMALL_TITLE = 10.5, 9.0  # points, in figures of up to NARROW inches the second
-NARROW = 5.0
-LETTERS = 126  # of a point's height that fit into an inch
-
-
-@dataclass
-class Tips:
-    """What markers say when pointed at; `add` gives the id that the marker's `gid` must be set to."""
-
-    texts: dict[str, str] = field(default_factory=dict)
-
-    def add(self, text: str) -> str:
-        """Keep a text and name it."""
-        name = f"tip-{len(self.texts)}"
-        self.texts[name] = text
-        return name
 
 
 @dataclass(frozen=True)
 class Chart:
-    """A finished chart in both formats, with the numbers in it. The SVG turns dark where the reader's screen is."""
+    """A drawn figure, its notes, and its numbers for a CSV file."""
 
     name: str  # file name without extension
     title: str
-    svg: str
-    png: bytes
+    figure: Any
     notes: tuple[str, ...] = ()
-    numbers: DataFrame | None = None  # None: they are in no file
-    narrow: str = ""  # the SVG for the width of a phone; empty where there is none
+    numbers: DataFrame | None = None
+
+    @cached_property
+    def png(self) -> bytes:
+        """The figure on white paper."""
+        data = io.BytesIO()
+        self.figure.savefig(data, format="png", dpi=DPI, metadata={"Software": None})
+        return data.getvalue()
+
+    @cached_property
+    def svg(self) -> str:
+        """The figure with tooltips, dark on dark screens; equal charts give equal text, others share no id with it."""
+        from matplotlib import rc_context
+
+        text = io.StringIO()
+        with rc_context({**STYLE, "svg.hashsalt": f"padgs {self.name}"}):
+            self.figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
+        dark = text.getvalue().replace("</style>", f"\n{dark_rules()}</style>", 1)
+        return re.sub(rf'<g id="{TIP}([^"]*)">', r'<g class="tip"><title>\1</title>', dark)
+
+
+def tip(text: str) -> str:
+    """Return the `gid` of an artist that shows a tooltip in SVG files."""
+    return TIP + text
 
 
 def styled(draw: Callable[P, T]) -> Callable[P, T]:
-    """Let a function that draws use `STYLE`, which matplotlib reads whenever something is added to a figure."""
+    """Run a drawing function with `STYLE`, which matplotlib reads whenever something is added to a figure."""
 
     @wraps(draw)
     def in_style(*arguments: P.args, **named: P.kwargs) -> T:
@@ -85,58 +112,49 @@ def styled(draw: Callable[P, T]) -> Callable[P, T]:
 
 
 def figure(columns: int, rows: int, width: float = 3.0, height: float = 2.6) -> tuple[Any, Any]:
-    """A figure with a grid of axes [rows, columns]; inches per panel."""
+    """Return a figure with axes [rows, columns] of this size in inches."""
     from matplotlib.figure import Figure
 
     made = Figure(figsize=(columns * width, rows * height), layout="constrained")
     return made, made.subplots(rows, columns, squeeze=False)
 
 
-def dress(axis: Any, values: Sequence[float], log_from: float = math.inf) -> None:
-    """Ticks of an axis for these values: 20k and not 20000; logarithmic where their ratio is at least `log_from`."""
-    from matplotlib.ticker import EngFormatter, LogLocator, NullLocator
-
-    known = [value for value in values if math.isfinite(value)]
-    if not known:
-        return
-    if min(known) > 0 and max(known) / min(known) >= log_from:
-        getattr(axis.axes, f"set_{axis.axis_name}scale")("log")
-        wide = max(known) / min(known) > 30
-        axis.set_major_locator(LogLocator(subs=(1.0,) if wide else (1.0, 2.0, 5.0)))
-        axis.set_minor_locator(NullLocator())
-        axis.set_major_formatter(EngFormatter(sep="") if max(known) >= 1e4 else "{x:g}")
-    elif max(known) >= 1e4:
-        axis.set_major_formatter(EngFormatter(sep=""))
-
-
 def lay_out(made: Any, title: str) -> None:
-    """Write the title and find the layout, once for all files; what is drawn after this has fixed axes to refer to."""
-    size = TITLE if made.get_figwidth() > NARROW else SMALL_TITLE
+    """Write the title and fix the layout, so that later additions can refer to positions in the figure."""
+    size = TITLE_SIZE if made.get_figwidth() > NARROW else SMALL_TITLE_SIZE
     letters = int(LETTERS * made.get_figwidth() / size)
     made.suptitle("\n".join(part for line in title.split("\n") for part in wrap(line, letters)), fontsize=size)
     made.draw_without_rendering()
     made.set_layout_engine("none")
 
 
-def svg(made: Any, name: str, tips: Tips) -> str:
-    """A figure as text. The same numbers give the same text; figures of other names or widths share no id with it."""
-    from matplotlib import rc_context
-
-    text = io.StringIO()
-    with rc_context({"svg.hashsalt": f"padgs {name} {made.get_figwidth():g}"}):
-        made.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
-    return _with_tips(text.getvalue().replace("</style>", f"\n{dark_rules()}</style>", 1), tips)
+def show_image(panel: Any, image: Any, title: str) -> None:
+    """Show an image of at most `IMAGE_WIDTH` pixels with a title."""
+    image.thumbnail((IMAGE_WIDTH, IMAGE_WIDTH))
+    panel.imshow(image)
+    panel.set_title(title)
 
 
-def png(made: Any) -> bytes:
-    """A figure as pixels, on white paper."""
-    data = io.BytesIO()
-    made.savefig(data, format="png", dpi=DPI, metadata={"Software": None})
-    return data.getvalue()
+def color_of(preset: str, presets: Sequence[str]) -> str:
+    """Return the colour of a preset's method on white; methods without one get theirs by their order in `presets`."""
+    if method_of(preset) in FAMILIES:
+        return FAMILIES[method_of(preset)][0]
+    others = [name for name in dict.fromkeys(map(method_of, (*presets, preset))) if name not in FAMILIES]
+    return OTHERS[others.index(method_of(preset)) % len(OTHERS)][0]
 
 
-def _with_tips(svg: str, tips: Tips) -> str:
-    def said(match: re.Match[str]) -> str:
-        return f'<g class="tip"><title>{html.escape(tips.texts[match[1]])}</title>'
+def weight_of(preset: str, role: str) -> str:
+    """Return the font weight of a preset's label: bold for main presets of ours, faint for variants and releases."""
+    return "faint" if role != "main" else "bold" if method_of(preset) in OURS else "normal"
 
-    return re.sub(r'<g id="(tip-\d+)">', said, svg)
+
+def dark_rules() -> str:
+    """Return CSS that replaces all colours on dark screens; programs that ignore the rules show white paper."""
+    pairs = dict((*FAMILIES.values(), *OTHERS, INK, SOFT, GRID, MARGIN_COLOR, PAPER))
+    rules = [
+        f'[style*="{what}: {light}"]{{{what}:{dark}!important}}'
+        for light, dark in pairs.items()
+        for what in ("fill", "stroke")
+        if light != dark
+    ]
+    return f"@media (prefers-color-scheme: dark){{{''.join(rules)}}}"

@@ -1,114 +1,129 @@
-"""Where names stand beside their marks: never on another name, never outside, where they can on nothing at all."""
+"""Labels beside the marks of a chart: never on each other or outside the axes, off marks and lines if possible."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from padgs.reports.charts.drawing import INK, SOFT
+
 GAPS = (2.0, 5.0, 9.0, 14.0, 20.0, 28.0, 38.0, 50.0, 65.0, 85.0, 110.0, 140.0, 180.0)  # pixels from the mark's edge
 DIRECTIONS = 24
-ROUNDS = 6  # in which each name looks for a better place among the others
-BESIDE = 7.0  # pixels between a mark and its name
-CLEARANCE = 1.5  # pixels between two names, and between a name and a line
-# What is worth how many pixels of distance:
-ON_A_MARK = 0.8  # a square pixel of another mark, hidden
-ON_A_LINE = 4.0  # a point of a line, struck through
-LED = 12.0  # a leader, which a name further than `BESIDE` from its mark needs
-ACROSS = 60.0  # a leader that crosses a mark or a name
-ASTRAY = 10.0  # to stand nearer to another mark
-BELOW_LEFT = 2.0  # not to stand right of the mark and above
+BESIDE = 7.0  # pixels between a mark and its label; a label further away has a leader line
+CLEARANCE = 1.5  # pixels around a label
+STEP = 5.0  # pixels between two points of a line that labels avoid
+FONT_SIZES = {"bold": 9.0, "normal": 8.5, "faint": 7.0}  # points, by weight
+# Costs in pixels of distance:
+ON_A_MARK, ON_A_LINE = 0.8, 4.0  # a covered square pixel of another mark; a covered point of a line
+LEADER, CROSSING = 12.0, 60.0  # a leader line; a leader line across a mark or a label
+NEARER_TO_ANOTHER, BELOW_LEFT = 10.0, 2.0  # nearer to another mark; not to the right and above
+
+Line = Sequence[tuple[float, float]]  # corners in data coordinates
 
 
 @dataclass(frozen=True)
-class Named:
-    """A mark that wants a name; pixels, x to the right and y up."""
+class Label:
+    """The text of a mark at a point in data coordinates, with the radius of the mark in points."""
 
+    text: str
     at: tuple[float, float]
     radius: float
-    size: tuple[float, float]  # of the name: width, height
+    weight: str  # key of `FONT_SIZES`
 
 
-def place(
-    named: Sequence[Named],
-    inside: tuple[float, float, float, float],
-    marks: Sequence[tuple[float, float, float]],
-    lines: Sequence[tuple[float, float]] = (),
-) -> list[tuple[float, float] | None]:
-    """The middle of each name in pixels; None for a name that finds no room without touching another.
+def write_labels(
+    panel: Any, labels: Sequence[Label], marks: Sequence[tuple[float, float, float]], lines: Sequence[Line] = ()
+) -> list[Any]:
+    """Write labels one after the other, each at its cheapest place, and return the texts that found one.
 
-    Names choose one after the other, so the important ones come first; then all look again, a few times, until none
-    finds a better place. Nothing is random.
+    Positions are fractions of the figure, so its layout must be fixed, and all file formats agree.
 
     Args:
-        named: the marks with names.
-        inside: left, bottom, right and top of where names may stand.
-        marks: x, y and radius of everything that should not be covered, those of `named` included.
-        lines: points along lines, about as dense as a letter is wide.
+        panel: matplotlib axes.
+        labels: the important ones first.
+        marks: x, y (data) and radius (points) of all marks, with and without a label.
+        lines: lines that labels should not cover.
     """
-    choices = [_candidates(one, inside, np.array(marks), np.array(lines).reshape(-1, 2)) for one in named]
-    chosen: list[int | None] = [None] * len(named)
-    for _ in range(ROUNDS):
-        before = list(chosen)
-        for index, (candidates, costs) in enumerate(choices):
-            others = [choices[i][0][best] for i, best in enumerate(chosen) if i != index and best is not None]
-            boxes = np.array(others).reshape(-1, 4)
-            total = costs + ACROSS * _crossed(_leaders(candidates, named[index]), boxes).sum(1)
-            total[_overlap(candidates, boxes, CLEARANCE).any(1)] = np.inf
-            chosen[index] = int(total.argmin()) if np.isfinite(total).any() else None
-        if chosen == before:
-            break
-    middles = [
-        None if best is None else boxes[best].reshape(2, 2).mean(0)
-        for best, (boxes, _) in zip(chosen, choices, strict=True)
-    ]
-    return [None if middle is None else (float(middle[0]), float(middle[1])) for middle in middles]
+    figure, points = panel.figure, panel.figure.dpi / 72
+    to_pixels, to_figure = panel.transData.transform, figure.transFigure.inverted().transform
+    discs = np.array([(*to_pixels((x, y)), radius * points) for x, y, radius in marks])
+    avoided = np.concatenate([np.zeros((0, 2)), *(_along(to_pixels(line)) for line in lines)])
+    inside = panel.get_window_extent().padded(-CLEARANCE)
+    taken, written = np.zeros((0, 4)), []
+    for label in labels:
+        soft = label.weight == "faint"
+        text = figure.text(0.5, 0.5, label.text, fontsize=FONT_SIZES[label.weight], color=(SOFT if soft else INK)[0])
+        text.set(ha="center", va="center", linespacing=1.05, zorder=6, weight="normal" if soft else label.weight)
+        extent, at, radius = text.get_window_extent(), to_pixels(label.at), label.radius * points
+        boxes, costs = _candidates(at, radius, np.array([extent.width, extent.height]))
+        within = (boxes[:, :2] >= inside.min).all(1) & (boxes[:, 2:] <= inside.max).all(1)
+        boxes, costs = boxes[within & ~_overlap(boxes, taken).any(1)], costs[within & ~_overlap(boxes, taken).any(1)]
+        if not len(boxes):
+            text.remove()
+            continue
+        starts, ends = _leaders(boxes, at, radius)
+        costs = costs + _obstruction(boxes, starts, ends, discs, at, taken) + ON_A_LINE * _covered(boxes, avoided)
+        best = int(costs.argmin())
+        taken = np.concatenate([taken, boxes[best : best + 1] + np.array([-1, -1, 1, 1]) * CLEARANCE])
+        text.set_position(to_figure(boxes[best].reshape(2, 2).mean(0)))
+        if np.linalg.norm(ends[best] - starts[best]) > BESIDE:
+            leader = np.stack([starts[best], ends[best]])
+            avoided = np.concatenate([avoided, _along(leader)])
+            panel.plot(*panel.transData.inverted().transform(leader).T, color=SOFT[0], linewidth=0.5, zorder=1.6)
+        written.append(text)
+    return written
 
 
-def _candidates(
-    one: Named, inside: tuple[float, float, float, float], marks: NDArray, lines: NDArray
-) -> tuple[NDArray, NDArray]:
-    """Boxes [n, 4] as left, bottom, right, top around a mark that stay inside, and what each costs [n]."""
-    (x, y), (width, height) = one.at, one.size
-    angles = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
-    gaps = np.repeat(GAPS, DIRECTIONS)
-    cos, sin = np.tile(np.cos(angles), len(GAPS)), np.tile(np.sin(angles), len(GAPS))
-    # The middle of a box that moves around the mark's disc without touching it: a rectangle with round corners.
-    x = x + (one.radius + gaps) * cos + width / 2 * np.clip(1.5 * cos, -1, 1)
-    y = y + (one.radius + gaps) * sin + height / 2 * np.clip(1.5 * sin, -1, 1)
-    boxes = np.stack([x - width / 2, y - height / 2, x + width / 2, y + height / 2], 1)
-    kept = (boxes[:, :2] >= inside[:2]).all(1) & (boxes[:, 2:] <= inside[2:]).all(1)
-    boxes, cost = boxes[kept], (gaps + LED * (gaps > BESIDE) + BELOW_LEFT * (2 - cos - sin))[kept]
-    discs = np.stack([marks[:, 0] - marks[:, 2], marks[:, 1] - marks[:, 2], *(marks[:, :2] + marks[:, 2:]).T], 1)
-    cost += ON_A_MARK * _overlap(boxes, discs).sum(1)
-    struck = (lines >= boxes[:, None, :2] - CLEARANCE).all(2) & (lines <= boxes[:, None, 2:] + CLEARANCE).all(2)
-    cost += ON_A_LINE * struck.sum(1)
-    others = (marks[:, :2] != one.at).any(1)
-    distances = np.linalg.norm(np.clip(marks[:, :2], boxes[:, None, :2], boxes[:, None, 2:]) - marks[:, :2], axis=2)
-    edges = np.where(others, distances - marks[:, 2], np.inf).min(1, initial=np.inf)
-    cost += ASTRAY * (edges < distances[:, ~others].min(1, initial=np.inf) - one.radius)
-    return boxes, cost + ACROSS * _crossed(_leaders(boxes, one), discs[others]).sum(1)
+def _candidates(at: NDArray, radius: float, size: NDArray) -> tuple[NDArray, NDArray]:
+    """Return boxes [n, 4] (left, bottom, right, top) around a mark, and the costs [n] of their distances."""
+    gaps, angles = np.repeat(GAPS, DIRECTIONS), np.tile(np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS), len(GAPS))
+    direction = np.stack([np.cos(angles), np.sin(angles)], 1)
+    # The middle of a box that moves around the disc of the mark without touching it.
+    middles = at + (radius + gaps)[:, None] * direction + size / 2 * np.clip(1.5 * direction, -1, 1)
+    boxes = np.concatenate([middles - size / 2, middles + size / 2], 1)
+    return boxes, gaps + LEADER * (gaps > BESIDE) + BELOW_LEFT * (2 - direction.sum(1))
 
 
-def _overlap(boxes: NDArray, others: NDArray, clearance: float = 0.0) -> NDArray:
-    """The areas [n, m] that boxes [n, 4] share with others [m, 4], which are that much larger on each side."""
-    low = np.maximum(boxes[:, None, :2], others[None, :, :2] - clearance)
-    high = np.minimum(boxes[:, None, 2:], others[None, :, 2:] + clearance)
-    return np.clip(high - low, 0, None).prod(2)
+def _leaders(boxes: NDArray, at: NDArray, radius: float) -> tuple[NDArray, NDArray]:
+    """Return the starts [n, 2] at the edge of a mark and the ends [n, 2] of the shortest lines to the boxes."""
+    ends = np.clip(at, boxes[:, :2], boxes[:, 2:])
+    distance = np.linalg.norm(ends - at, axis=1, keepdims=True)
+    return at + (ends - at) * np.minimum(radius / np.maximum(distance, 1e-9), 1), ends
 
 
-def _leaders(boxes: NDArray, one: Named) -> NDArray:
-    """Points [n, k, 2] on the way from the edge of a mark to the nearest point of each box."""
-    ends = np.clip(one.at, boxes[:, :2], boxes[:, 2:])
-    distance = np.linalg.norm(ends - one.at, axis=1, keepdims=True)
-    starts = one.at + (ends - one.at) * np.minimum(one.radius / np.maximum(distance, 1e-9), 1)
-    return starts[:, None] + (ends - starts)[:, None] * np.linspace(0.1, 0.9, 9)[:, None]
+def _obstruction(
+    boxes: NDArray, starts: NDArray, ends: NDArray, discs: NDArray, at: NDArray, taken: NDArray
+) -> NDArray:
+    """Return the costs [n] of covering other marks, of standing nearer to another, and of leaders across them."""
+    others = discs[(discs[:, :2] != at).any(1)]
+    squares = np.concatenate([others[:, :2] - others[:, 2:], others[:, :2] + others[:, 2:]], 1)
+    gaps = np.clip(others[:, :2], boxes[:, None, :2], boxes[:, None, 2:]) - others[:, :2]
+    nearest = (np.linalg.norm(gaps, axis=2) - others[:, 2]).min(1, initial=np.inf)
+    on_leaders = starts[:, None] + (ends - starts)[:, None] * np.linspace(0.1, 0.9, 9)[:, None]
+    obstacles = np.concatenate([squares, taken])
+    through = (on_leaders[:, :, None] >= obstacles[:, :2]) & (on_leaders[:, :, None] <= obstacles[:, 2:])
+    costs = ON_A_MARK * _overlap(boxes, squares).sum(1) + CROSSING * through.all(3).any(1).sum(1)
+    return costs + NEARER_TO_ANOTHER * (nearest < np.linalg.norm(ends - starts, axis=1))
 
 
-def _crossed(leaders: NDArray, boxes: NDArray) -> NDArray:
-    """Which leaders [n, k, 2] pass through which boxes [m, 4]."""
-    points = leaders[:, :, None]
-    within = (points >= boxes[:, :2]) & (points <= boxes[:, 2:])
-    return np.any(np.all(within, axis=3), axis=1)
+def _overlap(boxes: NDArray, others: NDArray) -> NDArray:
+    """Return the areas [n, m] that boxes [n, 4] share with others [m, 4]."""
+    shared = np.minimum(boxes[:, None, 2:], others[:, 2:]) - np.maximum(boxes[:, None, :2], others[:, :2])
+    return np.clip(shared, 0, None).prod(2)
+
+
+def _covered(boxes: NDArray, points: NDArray) -> NDArray:
+    """Return how many points [m, 2] each box [n, 4] covers [n]."""
+    return ((points >= boxes[:, None, :2] - CLEARANCE) & (points <= boxes[:, None, 2:] + CLEARANCE)).all(2).sum(1)
+
+
+def _along(corners: NDArray) -> NDArray:
+    """Return points [n, 2] at most `STEP` apart on a line through corners [m, 2]."""
+    steps = np.linalg.norm(np.diff(corners, axis=0), axis=1) / STEP
+    counts = np.maximum(steps.astype(int), 1)
+    pieces = [np.linspace(*ends, count + 1) for *ends, count in zip(corners, corners[1:], counts, strict=False)]
+    return np.concatenate(pieces) if pieces else np.zeros((0, 2))

@@ -1,75 +1,196 @@
-"""The picture of a sweep."""
+"""Charts of sweeps: each quantity over the key that was swept, a curve per scene and preset, bars over seeds."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
-from padgs.reports.charts.drawing import MARKERS, Chart, Tips, dress, figure, lay_out, png, styled, svg
-from padgs.reports.charts.palette import COLORS, SOFT
-from padgs.reports.charts.sweeps import Line, Sweep, sweeps
-from padgs.reports.gathered import Gathered
-from padgs.reports.measures import Measure
+from pandas import DataFrame
 
+from padgs.reports import methods
+from padgs.reports.charts.axis import Axis, spans
+from padgs.reports.charts.drawing import COLORS, MARKERS, SOFT, Chart, figure, lay_out, styled, tip
+from padgs.reports.conditions import OF_A_POINT, OF_A_SWEEP, footnotes, refuse_mixture
+from padgs.reports.frame import by_place, grouped
+from padgs.reports.gathered import Gathered, of_a_table
+from padgs.reports.measures import Measure, costs, marks, quantity
+from padgs.reports.request import Request
+from padgs.reports.scenes import Place
+from padgs.reports.settings import Setting, is_number, settings, sort_key
+from padgs.reports.tables.cells import over_seeds
+from padgs.reports.tables.table import Cell
+from padgs.results import BY_ITSELF
+
+MAX_AD_HOC_KEYS = 2  # runs without an experiment that differ in more keys are no sweep
+SHOWN_COSTS = ("gaussians", "train_seconds", "frame_ms")
 COLUMNS = 3
-LOGARITHMIC = 20  # from this ratio of the largest to the smallest value on
+LOG_RATIO = 20  # largest over smallest value, from which an axis is logarithmic
 PAPER_CHOICES = {"method.tau": 0.9, "train.lambda_l1": 0.8, "method.offsets": 10, "method.features": 32}
 
 
+@dataclass(frozen=True)
+class Curve:
+    """A preset on a scene, with the values of other swept keys."""
+
+    place: Place
+    preset: str
+    fixed: str  # values of other swept keys
+    key: str  # dotted key along x; empty if settings only have names
+    points: tuple[tuple[Any, list[Cell]], ...]  # x, a cell for each measure of the sweep
+
+    @property
+    def title(self) -> str:
+        """Scene, preset and fixed values."""
+        return ", ".join(part for part in (self.place.label, methods.title(self.preset), self.fixed) if part)
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A sweep and its curves."""
+
+    name: str  # for example tau@cpu
+    curves: tuple[Curve, ...]
+    measures: tuple[Measure, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def key(self) -> str:
+        """The dotted key along x if all curves share it, else empty."""
+        keys = {curve.key for curve in self.curves}
+        return keys.pop() if len(keys) == 1 else ""
+
+    @property
+    def numbers(self) -> DataFrame:
+        """A row per quantity of each point, with all digits."""
+        rows = []
+        for curve in self.curves:
+            where = {"sweep": self.name, "dataset": curve.place.dataset, "scene": curve.place.label}
+            where |= {"preset": curve.preset, "line": curve.fixed, "key": curve.key}
+            for x, cells in curve.points:
+                for measure, cell in zip(self.measures, cells, strict=True):
+                    rows.append({**where, "x": x, "quantity": measure.column.title, **cell.numbers})
+        return DataFrame(rows, dtype=object).rename(columns={"value": "mean"})
+
+
 def charts(gathered: Gathered) -> list[Chart]:
-    """A picture of each sweep."""
+    """Return a chart of each sweep."""
     return [chart(sweep) for sweep in sweeps(gathered)]
+
+
+def sweeps(gathered: Gathered) -> list[Sweep]:
+    """Return the sweeps in which a preset was run on a scene in several settings, ad-hoc runs included.
+
+    Experiments of tables are left out, unless the request names one.
+
+    Raises:
+        ReportError: unknown metric, or results that differ in protocol, machine or data.
+    """
+    request, runs = gathered.request, gathered.asked_for
+    measures = _measures(request, runs)
+    known = sorted(runs["experiments"].explode().dropna().unique())
+    names = [name for name in known if (request.means(name) if request.experiment else not of_a_table(name))]
+    found = []
+    for name in names:
+        own = runs.loc[[name in of for of in runs["experiments"]]]
+        curves, drawn = [], {}
+        for place, there in by_place(own).items():
+            parts = list(_curves(there, MAX_AD_HOC_KEYS if name == BY_ITSELF else None))
+            if not parts:
+                continue
+            refuse_mixture(there, request, f"{name}, {place.title}", OF_A_SWEEP)
+            drawn[place.title] = there
+            for preset, fixed, key, points in parts:
+                for _, setting in points:
+                    refuse_mixture(setting.runs, request, f"{name}, {place.title}, {setting.title}", OF_A_POINT)
+                cells = tuple((x, over_seeds(setting.runs, measures)) for x, setting in points)
+                curves.append(Curve(place, preset, fixed, key, cells))
+        if curves:
+            found.append(Sweep(name, tuple(curves), measures, tuple(footnotes(drawn, request.protocol))))
+    return found
 
 
 @styled
 def chart(sweep: Sweep) -> Chart:
-    """A panel for each quantity; the dotted line is the paper's choice."""
-    rows = -(-len(sweep.measures) // COLUMNS)
-    made, axes = figure(min(COLUMNS, len(sweep.measures)), rows, 3.6)
-    tips = Tips()
+    """Return a panel for each quantity; a dotted line marks the paper's value."""
+    made, axes = figure(min(COLUMNS, len(sweep.measures)), -(-len(sweep.measures) // COLUMNS), 3.6)
     for index, (panel, measure) in enumerate(zip(axes.flat, sweep.measures, strict=False)):
-        for number, line in enumerate(sweep.lines):
-            _draw(panel, line, index, measure, number, tips)
-        _dress(panel, sweep, index, measure)
+        _set_axes(panel, sweep, index, measure)
+        for number, curve in enumerate(sweep.curves):
+            _draw(panel, curve, index, measure, number)
     for panel in axes.flat[len(sweep.measures) :]:
         panel.set_axis_off()
     handles, labels = axes[0, 0].get_legend_handles_labels()
     if handles:
         made.legend(handles, labels, loc="outside lower center", ncols=3)
-    title = f"{sweep.title}: mean and standard deviation over seeds"
+    name = "without a name" if sweep.name == BY_ITSELF else sweep.name
+    title = f"Sweep {name}: mean and standard deviation over seeds"
     lay_out(made, title)
-    return Chart(sweep.file_name, title, svg(made, sweep.file_name, tips), png(made), sweep.notes, sweep.numbers)
+    return Chart(f"sweep_{sweep.name.replace('@', '_')}", title, made, sweep.notes, sweep.numbers)
 
 
-def _draw(panel: Any, line: Line, index: int, measure: Measure, number: int, tips: Tips) -> None:
-    color = COLORS[number % len(COLORS)]
-    cells = [(x, cells[index]) for x, cells in line.points]
-    there = [(x, c) for x, c in cells if c.value is not None]
-    xs, values = [x for x, _ in there], [c.value for _, c in there]
-    connected = "-" if all(isinstance(x, (int, float)) for x in xs) else ""
-    panel.errorbar(
-        xs, values, yerr=[c.std or 0.0 for _, c in there], color=color, linestyle=connected, linewidth=1.2, capsize=2.5
-    )
-    for x, c in there:
-        text = f"{line.title}\n{x}: {c.text(measure.column)}"
-        panel.plot([x], [c.value], MARKERS[number % len(MARKERS)], color=color, markersize=5, gid=tips.add(text))
-    panel.plot([], [], MARKERS[number % len(MARKERS)], color=color, linestyle=connected or "none", label=line.title)
-    for x, c in cells:
-        if c.status:  # at the bottom edge, whatever the scale
-            failed = panel.get_xaxis_transform()
-            tip = tips.add(f"{line.title}\n{x}: {c.status.upper()}")
-            panel.plot([x], [0.03], "x", color=color, transform=failed, clip_on=False, gid=tip)
-            panel.annotate(c.status.upper(), (x, 0.05), xycoords=failed, fontsize=6, color=color, ha="center")
+def _measures(request: Request, runs: DataFrame) -> tuple[Measure, ...]:
+    if request.metrics:
+        return tuple(quantity(name, request.protocol, runs) for name in request.metrics)
+    usual = (*marks(request.protocol), *costs(*SHOWN_COSTS))
+    return tuple(measure for measure in usual if measure.name in runs and runs[measure.name].notna().any())
 
 
-def _dress(panel: Any, sweep: Sweep, index: int, measure: Measure) -> None:
-    xs = [x for line in sweep.lines for x, _ in line.points]
-    values = [value for line in sweep.lines for _, cells in line.points if (value := cells[index].value) is not None]
-    dress(panel.yaxis, values)
+def _curves(runs: DataFrame, max_keys: int | None) -> Iterator[tuple[str, str, str, list[tuple[Any, Setting]]]]:
+    """Yield preset, fixed values, key along x and points of the curves of a scene.
+
+    Presets in a single setting, or in settings that differ in more than `max_keys` keys, have no curve.
+    """
+    for (preset, variant), own in grouped(runs, "preset", "variant"):
+        found = settings(own)
+        keys = list(found[0].changed)
+        if len(found) < 2 or (max_keys is not None and len(keys) > max_keys):
+            continue
+        numeric = [key for key in keys if all(is_number(setting.changed[key]) for setting in found)]
+        if len(keys) > 2 or not numeric:
+            yield preset, variant, "", [(_values(setting, keys), setting) for setting in found]
+            continue
+        along = numeric[0]
+        others = [key for key in keys if key != along]
+        for fixed in dict.fromkeys(_values(setting, others) for setting in found):
+            points = [(setting.changed[along], setting) for setting in found if _values(setting, others) == fixed]
+            words = ", ".join(part for part in (variant, fixed) if part)
+            yield preset, words, along, sorted(points, key=lambda point: sort_key(point[0]))
+
+
+def _values(setting: Setting, keys: Sequence[str]) -> str:
+    return ", ".join(f"{key.rpartition('.')[2]} {setting.changed[key]}" for key in keys)
+
+
+def _set_axes(panel: Any, sweep: Sweep, index: int, measure: Measure) -> None:
+    xs = [x for curve in sweep.curves for x, _ in curve.points]
+    cells = [cells[index] for curve in sweep.curves for _, cells in curve.points if cells[index].value is not None]
+    ends = [cell.value + sign * (cell.std or 0.0) for cell in cells for sign in (-1, 1)]
+    Axis.of(ends).apply(panel.yaxis)
     panel.set_title(measure.column.heading, fontsize=9)
     panel.set_xlabel(sweep.key or "setting")
     if not all(isinstance(x, (int, float)) for x in xs):
         panel.tick_params(axis="x", labelrotation=20)
         return
-    dress(panel.xaxis, xs, log_from=LOGARITHMIC)
+    Axis.of(xs, spans(xs, LOG_RATIO)).apply(panel.xaxis)
     if sweep.key in PAPER_CHOICES:
         panel.axvline(PAPER_CHOICES[sweep.key], color=SOFT[0], linestyle=":", linewidth=1)
+
+
+def _draw(panel: Any, curve: Curve, index: int, measure: Measure, number: int) -> None:
+    color, marker = COLORS[number % len(COLORS)], MARKERS[number % len(MARKERS)]
+    cells = [(x, cells[index]) for x, cells in curve.points]
+    there = [(x, c) for x, c in cells if c.value is not None]
+    xs, values, stds = [x for x, _ in there], [c.value for _, c in there], [c.std or 0.0 for _, c in there]
+    connected = "-" if all(isinstance(x, (int, float)) for x in xs) else ""
+    panel.errorbar(xs, values, yerr=stds, color=color, linestyle=connected, linewidth=1.2, capsize=2.5)
+    for x, c in there:
+        gid = tip(f"{curve.title}\n{x}: {c.text(measure.column)}")
+        panel.plot([x], [c.value], marker, color=color, markersize=5, gid=gid)
+    panel.plot([], [], marker, color=color, linestyle=connected or "none", label=curve.title)
+    for x, c in cells:
+        if c.status:  # at the bottom edge, on any scale
+            bottom, status = panel.get_xaxis_transform(), c.status.upper()
+            gid = tip(f"{curve.title}\n{x}: {status}")
+            panel.plot([x], [0.03], "x", color=color, transform=bottom, clip_on=False, gid=gid)
+            panel.annotate(status, (x, 0.05), xycoords=bottom, fontsize=6, color=color, ha="center")

@@ -1,4 +1,4 @@
-"""Speed against accuracy: a point for each method and setting of a scene, or of the scenes that all finished."""
+"""Speed against accuracy: a point per method and setting of a scene, or mean over finished scenes."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ QUALITIES = (
 
 @dataclass(frozen=True)
 class Point:
-    """A method in one setting, and its numbers by the title of their column."""
+    """A setting of a preset and its numbers."""
 
     title: str
     preset: str
-    numbers: dict[str, Cell]
+    numbers: dict[str, Cell]  # title of a column -> number
 
     @property
     def gaussians(self) -> float:
-        """How many; 0 in a method without any."""
+        """The number of Gaussians; 0 for methods without any."""
         return self.numbers["Gaussians"].value or 0.0
 
     def value(self, measure: Measure) -> float | None:
-        """Its number, if that has a place on an axis."""
+        """Return a finite number, or None."""
         value = self.numbers[measure.column.title].value
         return value if value is not None and math.isfinite(value) else None
 
@@ -52,47 +52,43 @@ class Point:
 class TradeOff:
     """All points of one chart."""
 
-    name: str  # of the file
+    name: str  # file name without extension
     title: str
-    qualities: tuple[Measure, ...]  # two: one where more is better, one where less is
+    quality: Measure
     points: tuple[Point, ...]
     runs: DataFrame
     notes: tuple[str, ...]
 
     def role(self, preset: str) -> str:
-        """What a preset is among the others: "release", a released program with its quirks; "main", the one that stands
-        for its method, which is that with the method's name or else the first; "variant", any other.
+        """Return "release" for a released program with its deviations, "main" for the preset that stands for its method
+        (it has the method's name, or is the first), else "variant".
         """
-        if _is_released(preset):
+        if _is_release(preset):
             return "release"
         method = methods.method_of(preset)
-        kin = [p.preset for p in self.points if methods.method_of(p.preset) == method and not _is_released(p.preset)]
+        kin = [p.preset for p in self.points if methods.method_of(p.preset) == method and not _is_release(p.preset)]
         return "main" if preset == (method if method in kin else [*kin, preset][0]) else "variant"
 
     @property
     def on_cpu(self) -> bool:
-        """Whether CPU time says how long training takes: it is known of all runs, and none had a GPU.
-
-        Other programs on the machine change it less than they change the time on the clock.
-        """
+        """Whether to show CPU time, which other programs disturb less: all runs have it, and none used a GPU."""
         own = self.runs.loc[self.runs["ok"]]
         return bool(own["cpu_seconds"].notna().all() and own["peak_gpu_gigabytes"].isna().all())
 
     @cached_property
     def unranked(self) -> Collection[str]:
-        """Presets that are shown but compete with none, see `padgs.reports.unranked`."""
+        """Presets that are shown without competing, see `padgs.reports.unranked`."""
         return unranked(self.runs)
 
     def corrected(self, point: Point) -> Point | None:
-        """The twin of a released program: the corrected method in the same setting; None if it is not there."""
+        """Return the corrected method in the same setting as a released program, if there is one."""
         preset = methods.published_as(point.preset)
         title = point.title.replace(methods.title(point.preset), methods.title(preset), 1)
-        twins = [p for p in self.points if (p.preset, p.title) == (preset, title) and p is not point]
-        return twins[0] if twins else None
+        return next((p for p in self.points if (p.preset, p.title) == (preset, title) and p is not point), None)
 
     @property
     def numbers(self) -> DataFrame:
-        """A row for each number of each point, all digits."""
+        """A row per number of each point, with all digits."""
         rows = [
             {"chart": self.name, "setting": point.title, "preset": point.preset, "quantity": title, **cell.numbers}
             for point in self.points
@@ -103,17 +99,16 @@ class TradeOff:
 
 
 def trade_offs(gathered: Gathered) -> list[TradeOff]:
-    """A chart for each data set of the paper that was run, and for each other scene; a warning where scenes have no
-    mean.
+    """Return a chart for each data set of the paper and for each other scene; warn where no scene is complete.
 
     Raises:
-        ReportError: results of one chart that were not made, scored and timed alike.
+        ReportError: the results of a chart differ in protocol, resolution, learning rates, data or machine.
     """
     runs = gathered.chosen("chart")
     groups: dict[str, dict[Place, DataFrame]] = {}
     for place, own in by_place(runs.loc[runs["variant"] == ""]).items():
         name = place.dataset if place.published and not place.apart else place.label
-        if name in groups and not place.published:  # scenes of two data sets, or a scene called like a data set
+        if name in groups and not place.published:  # two scenes, or a scene and a data set, of one name
             name = f"{name}_{place.dataset or 'capture'}"
         groups.setdefault(name, {})[place] = own
     found, warnings = [], []
@@ -126,12 +121,12 @@ def trade_offs(gathered: Gathered) -> list[TradeOff]:
             found.append(made)
         elif len(group) > 1:
             warnings.append(f"{made.name}: no scene was finished in all settings, so there is no mean; --where chooses")
-    gathered.warnings.extend(warnings)  # at the end: whoever raises a Mixture is called again
+    gathered.warnings.extend(warnings)  # after the loop, as a Mixture calls this function again
     return found
 
 
 def pareto(points: Sequence[tuple[float, float]], higher_is_better: bool) -> list[tuple[float, float]]:
-    """The points (cost, quality) that no other beats in both, from cheap to dear.
+    """Return the points (cost, quality) that no other point beats in both, by rising cost.
 
     >>> pareto([(1, 20.0), (2, 19.0), (3, 25.0)], higher_is_better=True)
     [(1, 20.0), (3, 25.0)]
@@ -144,23 +139,22 @@ def pareto(points: Sequence[tuple[float, float]], higher_is_better: bool) -> lis
     return front
 
 
-def _is_released(preset: str) -> bool:
+def _is_release(preset: str) -> bool:
     return methods.published_as(preset) != preset
 
 
 def _trade_off(name: str, group: Mapping[Place, DataFrame], request: Request) -> TradeOff:
-    qualities = tuple(measure for measure in QUALITIES if measure.name.startswith(f"{request.protocol}/"))
-    found = settings(pd.concat(group.values()))  # of all scenes: a mean is one of the same setting on each
+    measures = (*(measure for measure in QUALITIES if measure.name.startswith(f"{request.protocol}/")), *COSTS)
+    found = settings(pd.concat(group.values()))
     for setting in found:
         refuse_mixture(setting.runs, request, f"{name}, {setting.title}", OF_A_MEAN)
     found = [setting for setting in found if setting.runs["ok"].any()]
     finished = [p for p in group if all((one.runs["ok"] & (one.runs["place"] == p)).any() for one in found)]
     if len(group) == 1:
-        finished = list(group)  # who failed there has no point
+        finished = list(group)  # a setting that failed has no point
     first, scenes = next(iter(group)), [place.scene for place in finished]
     points = []
     for setting in found if finished else ():
-        measures = (*qualities, *COSTS)
         cells = over_scenes(setting.runs, scenes, measures)
         if any(cell.value is not None for cell in cells):
             titles = [measure.column.title for measure in measures]
@@ -170,10 +164,10 @@ def _trade_off(name: str, group: Mapping[Place, DataFrame], request: Request) ->
         what += f", mean over its scenes {', '.join(scenes)}"
     shown = pd.concat([group[place] for place in finished]) if finished else group[first].iloc[:0]
     notes = footnotes({what: shown}, request.protocol)
-    return TradeOff(f"chart_{name}", what, qualities, tuple(points), shown, tuple(notes))
+    return TradeOff(f"chart_{name}", what, measures[0], tuple(points), shown, tuple(notes))
 
 
 def _protocol(runs: DataFrame) -> str:
-    """The sphere's; that of the paper where nothing was scored on the sphere."""
+    """Return "sphere", or "paper" if no run was scored on the sphere."""
     there = [m.name for m in QUALITIES if m.name in runs and runs[m.name].notna().any()]
     return there[0].partition("/")[0] if there else "sphere"

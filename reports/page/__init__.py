@@ -1,1 +1,1 @@
-"""The page with everything in one file."""
+"""The page of all reports."""

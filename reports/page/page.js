@@ -1,9 +1,9 @@
 "use strict";
-// Sorting, tooltips, and the choice of pictures; the rest is done by the libraries above.
+// Sorting, tooltips, and the choice of test views; the libraries above do the rest.
 
 for (const table of document.querySelectorAll("table.sortable")) new Tablesort(table);
 
-// SVG titles are slow to appear and cannot be styled: show them at once, beside the pointer.
+// Titles of SVG elements appear late and cannot be styled: show them at once, beside the pointer.
 const tip = document.getElementById("tip");
 for (const mark of document.querySelectorAll(".tip")) {
   const title = mark.querySelector("title");
@@ -21,7 +21,7 @@ document.addEventListener("pointermove", (event) => {
 
 const data = JSON.parse(document.getElementById("data").textContent);
 const urls = [];
-function url(number) { // a blob and not the text itself, so that a picture is decoded once and the viewer may load it
+function url(number) { // a blob, so that an image is decoded once and the viewer may load it
   if (!urls[number]) {
     const bytes = Uint8Array.from(atob(data.images[number]), (character) => character.charCodeAt(0));
     urls[number] = URL.createObjectURL(new Blob([bytes], { type: "image/jpeg" }));
@@ -40,7 +40,7 @@ if (data.scenes.length) {
     list.replaceChildren(...titles.map((title, index) => new Option(title, index)));
     list.selectedIndex = Math.max(0, titles.findIndex((title) => name(title) === name(before ?? "")));
   };
-  const name = (title) => title.replace(/, PSNR [\d.]+ dB$/, ""); // the mark behind a method differs from view to view
+  const name = (title) => title.replace(/, PSNR [\d.]+ dB$/, ""); // the PSNR behind a method differs between views
 
   const scene = () => data.scenes[select.scene.selectedIndex];
   const view = () => scene().views[select.view.selectedIndex];
@@ -48,7 +48,7 @@ if (data.scenes.length) {
 
   function compare() {
     const shown = {
-      truth: [view().truth, "truth"],
+      truth: [view().truth, "ground truth"],
       render: [method().render, method().title],
       error: [method().error, "error"],
     };
@@ -71,7 +71,7 @@ if (data.scenes.length) {
     window.viewers = viewers;
   }
 
-  // Whichever of the two is used leads; the other follows, inertia included.
+  // The viewer that is used leads; the other follows, inertia included.
   let leader = 0;
   panels.forEach((panel, index) => {
     for (const event of ["pointerdown", "wheel", "keydown"]) {

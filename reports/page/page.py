@@ -1,19 +1,27 @@
-"""One page with everything, in one file that needs no network: tables that sort, charts, pictures and a 360° viewer."""
+"""All reports in one file that needs no network: tables that sort, charts, test views and a 360° viewer."""
 
 from __future__ import annotations
 
+import base64
+import io
 import json
-from dataclasses import replace
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 from pandas import DataFrame
+from PIL import Image
 
 from padgs.reports import REPORTS
 from padgs.reports.charts.drawing import Chart
+from padgs.reports.frame import by_place
 from padgs.reports.gathered import Gathered
-from padgs.reports.page.pictures import album
+from padgs.reports.pictures import picture_names, split
+from padgs.reports.settings import Setting, settings
 from padgs.reports.tables.beside_paper import OF_THE_PAPER
 from padgs.reports.tables.ranking import BEST, emphasis
 from padgs.reports.tables.table import Block, Cell, ReportError, Table
@@ -21,44 +29,119 @@ from padgs.reports.tables.table import Block, Cell, ReportError, Table
 HERE = Path(__file__).resolve().parent
 SCRIPTS = ("pannellum.js", "tablesort.min.js", "tablesort.number.min.js", "img-comparison-slider.js")
 STYLES = ("pannellum.css", "img-comparison-slider.css")
-LOWEST = "-1e99"  # where a cell without a number is sorted
+LOWEST = "-1e99"  # sort key of a cell without a number
+IMAGE_WIDTH = 1024  # maximum pixels of an embedded panorama
+JPEG_QUALITY = 80
+MAX_VIEWS = 3  # per scene
+MAX_FILES = 90  # renders opened for a page; scenes that no longer fit are left out and named
+
+
+@dataclass
+class Album:
+    """Test views of scenes, and the images that they refer to by number."""
+
+    images: list[str] = field(default_factory=list)  # JPEG in base64
+    scenes: list[dict[str, Any]] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
+
+    def add(self, image: Image.Image, width: int = IMAGE_WIDTH) -> int:
+        """Keep an image of at most `width` pixels and return its number."""
+        if image.width > width:
+            image = image.resize((width, round(width * image.height / image.width)), Image.Resampling.BOX)
+        file = io.BytesIO()
+        image.convert("RGB").save(file, "JPEG", quality=JPEG_QUALITY)
+        self.images.append(base64.b64encode(file.getvalue()).decode())
+        return len(self.images) - 1
 
 
 def html(gathered: Gathered) -> str:
-    """The page with all other reports."""
+    """Return the page with all other reports; a refused report is named at the top."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     environment = Environment(
         loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
+    made: dict[str, list[Any]] = {}
     refused: list[str] = []
-    made = {name: _attempt(gathered, name, refused) for name in REPORTS if name not in ("html", "gallery")}
-    parts = [part for report in made.values() for part in (report if isinstance(report, list) else [report])]
-    tables = [table for part in parts if isinstance(part, Table) and (table := _measured(part)).blocks]
-    maps = [part for part in made["stability"] or () if isinstance(part, Chart)]
-    pictures = album(gathered)
+    for name in REPORTS:
+        try:
+            report = gathered.report(name) if name not in ("html", "gallery") else []
+        except ReportError as error:
+            refused.append(str(error))
+            report = []
+        made[name] = report if isinstance(report, list) else [report]
+    tables = [part for parts in made.values() for part in parts if isinstance(part, Table)]
+    views = album(gathered)
     return environment.get_template("page.html.j2").render(
         facts=_facts(gathered.runs),
         problems=[*gathered.left_out, *refused, *gathered.warnings],
-        tables=[_table(table) for table in tables],
-        maps=[_chart(chart) for chart in maps],
-        charts=[_chart(chart) for name in ("chart", "need_chart") for chart in made[name] or ()],
-        sweeps=[_chart(chart) for chart in made["sweep"] or ()],
-        pictures=pictures,
-        data=_script(json.dumps({"images": pictures.images, "scenes": pictures.scenes})),
+        tables=[_table(shown) for table in tables if (shown := _measured(table)).blocks],
+        maps=_charts(made["stability"]),
+        charts=_charts([*made["chart"], *made["smallest_chart"]]),
+        sweeps=_charts(made["sweep"]),
+        views=views,
+        data=json.dumps({"images": views.images, "scenes": views.scenes}).replace("<", "\\u003c"),  # no end of script
         styles="\n".join([*(_vendored(name) for name in STYLES), (HERE / "page.css").read_text()]),
         scripts=[*(_vendored(name) for name in SCRIPTS), (HERE / "page.js").read_text()],
         notice=_vendored("NOTICE.md"),
     )
 
 
-def _attempt(gathered: Gathered, name: str, refused: list[str]) -> Any:
-    """A report that can be made; else None, with the reason kept for the page."""
-    try:
-        return gathered.report(name)
-    except ReportError as error:
-        refused.append(str(error))
-        return None
+def album(gathered: Gathered) -> Album:
+    """Return a few views of each scene, of all settings of methods and rows of ablations; one seed is enough."""
+    runs, parts = gathered.chosen("table1"), gathered.chosen("table3")
+    own = pd.concat([runs, parts.loc[parts["variant"] != ""]]).drop_duplicates("run")
+    own = own.loc[own["pictures"].map(picture_names).map(len) > 0]
+    groups = {place: sorted(settings(runs), key=_mean_psnr, reverse=True) for place, runs in by_place(own).items()}
+    groups = dict(sorted(groups.items(), key=lambda group: bool(group[0].dataset)))  # the user's captures first
+    count = min(MAX_VIEWS, max(1, MAX_FILES // max(1, sum(map(len, groups.values())))))
+    made, opened = Album(), 0
+    for place, shown in groups.items():
+        names = _spread(picture_names(shown[0].runs["pictures"].iloc[0]), count)
+        opened += len(shown) * len(names)
+        if opened > MAX_FILES:
+            made.left_out.append(place.title)
+            continue
+        views = [view for name in names if (view := _view(made, shown, name))["methods"]]
+        if views:
+            made.scenes.append({"title": place.title, "views": views})
+    return made
+
+
+def _mean_psnr(setting: Setting) -> float:
+    known = [psnr for views in setting.runs["view_psnr"] for psnr in views.values()]
+    return sum(known) / len(known) if known else -math.inf
+
+
+def _view(made: Album, shown: Sequence[Setting], name: str) -> dict[str, Any]:
+    view: dict[str, Any] = {"title": Path(name).stem, "truth": None, "methods": []}
+    for setting in shown:
+        runs = setting.runs.loc[[(folder / name).is_file() for folder in setting.runs["pictures"]]]
+        if runs.empty:
+            continue
+        run = runs.iloc[0]
+        try:
+            truth, render, error = split(run["pictures"] / name, 3)
+        except OSError:
+            continue  # an incomplete file of a killed run
+        if view["truth"] is None:
+            view["truth"] = made.add(truth)
+        images = {"render": made.add(render), "error": made.add(error, IMAGE_WIDTH // 2)}
+        psnr = run["view_psnr"].get(name)
+        metric = "" if psnr is None else f", PSNR {psnr:.2f} dB"
+        view["methods"].append({"title": f"{setting.title}{metric}", **images})
+    return view
+
+
+def _spread(names: Sequence[str], count: int) -> list[str]:
+    """Return so many names evenly from the first to the last, so that a path is seen from several positions.
+
+    >>> _spread("abcde", 3), _spread("abcde", 1), _spread("ab", 3)
+    (['a', 'c', 'e'], ['a'], ['a', 'b'])
+    """
+    if len(names) <= count:
+        return list(names)
+    return [names[round(i * (len(names) - 1) / max(1, count - 1))] for i in range(count)]
 
 
 def _facts(runs: DataFrame) -> list[tuple[str, str]]:
@@ -69,7 +152,7 @@ def _facts(runs: DataFrame) -> list[tuple[str, str]]:
 
 
 def _measured(table: Table) -> Table:
-    """A table without the blocks in which nothing but published numbers stand: of data sets that were not run."""
+    """Return a table without the blocks that have only published numbers."""
     ours = [index for index, column in enumerate(table.columns) if column.title not in OF_THE_PAPER]
     blocks = (
         block for block in table.blocks if any(row.cells[index] != Cell() for row in block.rows for index in ours)
@@ -78,13 +161,9 @@ def _measured(table: Table) -> Table:
 
 
 def _table(table: Table) -> dict[str, Any]:
-    return {
-        "name": table.name,
-        "title": table.title,
-        "corner": table.corner,
-        "blocks": [_block(table.alone(block, every=True)) for block in table.blocks],
-        "notes": table.notes,
-    }
+    blocks = [_block(table.alone(block, every=True)) for block in table.blocks]
+    named = {"name": table.name, "title": table.title, "corner": table.corner}
+    return {**named, "blocks": blocks, "notes": table.notes}
 
 
 def _block(table: Table) -> dict[str, Any]:
@@ -103,32 +182,18 @@ def _rows(table: Table, block: Block) -> list[dict[str, Any]]:
     rows = []
     for number, row in enumerate(block.rows):
         title, *texts = row.texts(table.columns)
-        cells = [
-            {"text": words, "sort": _sort(cell), "mark": _mark(rank.get(number))}
-            for words, cell, rank in zip(texts, row.cells, ranks, strict=True)
-        ]
+        cells = []
+        for text, cell, rank in zip(texts, row.cells, ranks, strict=True):
+            style = "" if number not in rank else "best" if rank[number] == BEST else "second"
+            cells.append({"text": text, "sort": LOWEST if cell.value is None else f"{cell.value:.9f}", "style": style})
         rows.append({"title": title, "cells": cells})
     return rows
 
 
-def _sort(cell: Cell) -> str:
-    return LOWEST if cell.value is None else f"{cell.value:.9f}"
-
-
-def _mark(rank: str | None) -> str:
-    return "" if rank is None else "best" if rank == BEST else "second"
-
-
-def _chart(chart: Chart) -> dict[str, Any]:
-    """A chart for a page, and for a phone where it has such a picture."""
-    sizes = {"wide": chart.svg, "narrow": chart.narrow} if chart.narrow else {"": chart.svg}
-    pictures = {size: svg[svg.index("<svg") :] for size, svg in sizes.items()}  # the lines before are for a file
-    return {"title": chart.title, "pictures": pictures, "notes": chart.notes}
-
-
-def _script(text: str) -> str:
-    """JSON that cannot end the script element around it."""
-    return text.replace("<", "\\u003c")
+def _charts(parts: Sequence[Any]) -> list[dict[str, Any]]:
+    charts = [part for part in parts if isinstance(part, Chart)]
+    # The lines before <svg are for a file.
+    return [{"title": one.title, "svg": one.svg[one.svg.index("<svg") :], "notes": one.notes} for one in charts]
 
 
 def _vendored(name: str) -> str:

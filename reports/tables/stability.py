@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from padgs.reports import methods
-from padgs.reports.charts import heat_map, survival_chart
+from padgs.reports.charts import robustness_chart
 from padgs.reports.charts.drawing import Chart
 from padgs.reports.conditions import footnotes
 from padgs.reports.gathered import Gathered
@@ -33,6 +33,7 @@ NOTES = (
     f"all conditions but {', '.join(sorted(NOT_SCORED))}, and missing for a method that was not put under all of them "
     "that others were put under on the scene.",
 )
+CHARTS = (robustness_chart.heat_map, robustness_chart.speed_and_accuracy)
 
 
 def stability(gathered: Gathered) -> list[Table | Chart]:
@@ -58,7 +59,7 @@ def stability(gathered: Gathered) -> list[Table | Chart]:
         tuple(blocks),
         (*footnotes(runs_of, "stability"), *NOTES),
     )
-    return [table, *(draw(*one) for one in found.items() for draw in (heat_map.chart, survival_chart.chart))]
+    return [table, *(draw(*one) for one in found.items() for draw in CHARTS)]
 
 
 def _scores(columns: Sequence[Survivor | None]) -> tuple[Row, ...]:

@@ -70,7 +70,7 @@ def test_no_name_in_a_result_leads_out_of_the_folder(tmp_path):
         results.write(result("", seed=seed, **change), runs / str(seed))
     done = report("all", runs, "--out", out)
     assert "'../../../x' is no name that this program gives" in done.output and "'../x' is no name" in done.output
-    assert (out / "chart_..-..-x.svg").is_file()
+    assert (out / "chart_..-..-x.png").is_file()
     assert {path for path in tmp_path.rglob("*") if path.is_file() and "runs" not in path.parts} == {*out.glob("*")}
 
 
@@ -120,13 +120,10 @@ def test_everything_at_once(tmp_path):
     written = {path.name for path in (tmp_path / "out").iterdir()}
     made = ("table1", "table2", "table3", "table4", "methods", "runs")
     tables = {f"{name}.{extension}" for name in made for extension in ("md", "tex", "csv")}
-    charts = {f"{name}.{e}" for name in ("chart_synthetic-room", "sweep_tau_cpu") for e in ("svg", "png", "csv")}
-    assert written == tables | charts | {
-        "time_synthetic-room.svg",
-        "time_synthetic-room.png",
-        "report.html",
-        "findings.md",
-    }
+    charts = {f"{name}.{e}" for name in ("chart_synthetic-room", "sweep_tau_cpu") for e in ("png", "csv")}
+    assert written == tables | charts | {"time_synthetic-room.png", "report.html", "findings.md"}
+    assert report("sweep", runs, "--out", tmp_path / "svg", "--svg").exit_code == 0
+    assert (tmp_path / "svg" / "sweep_tau_cpu.svg").is_file()
 
 
 def test_what_is_refused_does_not_keep_the_rest_back(tmp_path):

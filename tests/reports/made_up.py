@@ -10,7 +10,7 @@ from PIL import Image
 
 from padgs import results
 from padgs.reports import published
-from padgs.reports.charts.panel import Panel
+from padgs.reports.charts.trade_off_chart import Panel
 from padgs.reports.frame import frame
 from padgs.reports.gathered import Gathered
 from padgs.reports.request import Request

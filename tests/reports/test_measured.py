@@ -1,13 +1,12 @@
 """The committed tables are those of the committed runs: nobody typed a number."""
 
-from itertools import product
 from pathlib import Path
 
 import pytest
 from made_up import assert_apart
 
 from padgs.reports import REPORTS, store
-from padgs.reports.charts import sweeps, trade_off, trade_off_chart
+from padgs.reports.charts import trade_off, trade_off_chart
 from padgs.reports.charts.drawing import Chart
 from padgs.reports.files import files
 from padgs.reports.frame import frame
@@ -47,18 +46,17 @@ def test_the_findings_come_out_again(root, found):
 
 
 def test_the_points_of_all_charts_come_out_again(measured, found, all_trade_offs):
-    made = {f"{sweep.file_name}.csv": csv_text.of_frame(sweep.numbers) for sweep in sweeps.sweeps(found)}
+    made = {}
     heat_maps = (part for part in found.report("stability") if isinstance(part, Chart))
-    for chart in (*all_trade_offs.values(), *heat_maps, *found.report("need_chart")):
+    for chart in (*all_trade_offs.values(), *heat_maps, *found.report("sweep"), *found.report("smallest_chart")):
         made[f"{chart.name}.csv"] = csv_text.of_frame(chart.numbers)
     committed = {p.name: p.read_text() for p in measured.glob("*.csv") if p.stem not in TABLES}
     assert committed == made
 
 
 def test_names_in_the_charts_do_not_touch(all_trade_offs):
-    sizes = (trade_off_chart.WIDE, trade_off_chart.NARROW)
-    for chart, size in product(all_trade_offs.values(), sizes):
-        for panel, texts in trade_off_chart.drawn(chart, size)[2]:
+    for chart in all_trade_offs.values():
+        for panel, texts in trade_off_chart.draw(chart)[1]:
             assert_apart(panel, texts)
             named = {text.get_text().split("\n")[0] for text in texts}
             assert {short(m.point.title, m.point.preset) for m in panel.marks if m.role != "release"} <= named

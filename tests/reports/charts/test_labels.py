@@ -1,53 +1,51 @@
 import numpy as np
 import pytest
+from made_up import assert_apart
 
-from padgs.reports.charts.labels import Named, place
+from padgs.reports.charts.drawing import figure, lay_out
+from padgs.reports.charts.labels import BESIDE, Label, write_labels
 
-INSIDE = (50.0, 40.0, 500.0, 360.0)
-
-
-def boxes(named, middles) -> np.ndarray:
-    """Left, bottom, right, top of each name."""
-    middles, sizes = np.array(middles), np.array([one.size for one in named])
-    return np.concatenate([middles - sizes / 2, middles + sizes / 2], 1)
+RADIUS = 5.0  # points
 
 
-def touching(found: np.ndarray) -> list[tuple[int, int]]:
-    return [
-        (i, j)
-        for i in range(len(found))
-        for j in range(i)
-        if (np.maximum(found[i, :2], found[j, :2]) < np.minimum(found[i, 2:], found[j, 2:])).all()
-    ]
+@pytest.fixture
+def panel():
+    made, axes = figure(1, 1, 5.0, 4.0)
+    axes[0, 0].set(xlim=(0, 1), ylim=(0, 1))
+    lay_out(made, "title")
+    return axes[0, 0]
+
+
+def write(panel, positions, texts, marks=(), lines=()):
+    labels = [Label(text, at, RADIUS, "normal") for at, text in zip(positions, texts, strict=True)]
+    return write_labels(panel, labels, [(*at, RADIUS) for at in (*positions, *marks)], lines)
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_twenty_names_of_marks_in_a_heap_touch_neither_each_other_nor_the_edge(seed):
+def test_labels_of_a_crowd_touch_neither_each_other_nor_the_edge(panel, seed):
     rng = np.random.default_rng(seed)
-    at = rng.normal((275, 200), (90, 60), (20, 2)).clip(INSIDE[:2], INSIDE[2:])
-    named = [Named((x, y), 7.0, (width, 12.0)) for (x, y), width in zip(at, rng.uniform(30, 110, 20), strict=True)]
-    marks = [(*one.at, one.radius) for one in named]
-    middles = place(named, INSIDE, marks)
-    assert None not in middles and middles == place(named, INSIDE, marks), "all have room, and the same each time"
-    found = boxes(named, middles)
-    assert touching(found) == []
-    assert (found[:, :2] >= INSIDE[:2]).all() and (found[:, 2:] <= INSIDE[2:]).all()
+    positions = [tuple(at) for at in rng.normal(0.5, 0.2, (20, 2)).clip(0, 1)]
+    texts = write(panel, positions, [f"method{'x' * n}" for n in rng.integers(1, 9, 20)])
+    assert len(texts) == 20
+    assert_apart(panel, texts)
 
 
-def test_a_name_stands_beside_its_mark_and_makes_way_for_other_marks_and_lines():
-    one = Named((200.0, 200.0), 7.0, (60.0, 12.0))
-    (alone,) = place([one], INSIDE, [(200, 200, 7)])
-    (shy,) = place([one], INSIDE, [(200, 200, 7), (*alone, 9)])
-    (free,) = place([one], INSIDE, [(200, 200, 7)], [(x, alone[1]) for x in range(200, 260, 5)])
-    for middle in (alone, shy, free):
-        gap = np.linalg.norm(np.clip((0, 0), *(np.subtract(middle, one.at) + [[-30, -6], [30, 6]]))) - 7
-        assert 0 <= gap < 8
-    left, bottom, right, top = boxes([one], [shy])[0]
-    assert not (left < alone[0] < right and bottom < alone[1] < top)
-    assert abs(free[1] - alone[1]) > 6
+def test_a_label_stands_beside_its_mark_off_other_marks_and_lines(panel):
+    def extent(marks=(), lines=()):
+        (text,) = write(panel, [(0.5, 0.5)], ["PaD-GS"], marks, lines)
+        return text.get_window_extent()
+
+    free = extent()
+    occupied = tuple(panel.transData.inverted().transform(((free.x0 + free.x1) / 2, (free.y0 + free.y1) / 2)))
+    at = panel.transData.transform((0.5, 0.5))
+    beside_mark, beside_line = extent(marks=[occupied]), extent(lines=[[(0.5, occupied[1]), (0.8, occupied[1])]])
+    for box in (free, beside_mark, beside_line):
+        nearest = np.clip(at, box.min, box.max)
+        assert 0 <= np.linalg.norm(nearest - at) - RADIUS * panel.figure.dpi / 72 <= BESIDE
+    assert not beside_mark.contains(*panel.transData.transform(occupied))
+    assert not beside_line.containsy(panel.transData.transform(occupied)[1])
 
 
-def test_where_there_is_no_room_the_first_has_its_name():
-    named = [Named((20.0, 20.0), 3.0, (30.0, 12.0))] * 3
-    found = place(named, (0.0, 0.0, 45.0, 40.0), [(20, 20, 3)])
-    assert found[0] is not None and found[2] is None
+def test_a_label_without_room_is_left_out(panel):
+    written = write(panel, [(0.5, 0.5)] * 2, ["wider than the axes " * 10, "short"])
+    assert [text.get_text() for text in written] == ["short"]

@@ -30,7 +30,7 @@ def test_a_point_for_each_method_and_setting():
     }
 
 
-def test_who_failed_has_no_point():
+def test_a_failed_method_has_no_point():
     outdoor = next(chart for chart in trade_offs(gathered(compared())) if "outdoor" in chart.name)
     assert {point.preset for point in outdoor.points} == set(METHODS) - {"op43dgs"}
 
@@ -54,12 +54,6 @@ def test_where_no_scene_is_finished_in_all_settings_there_is_no_chart_but_a_warn
     assert trade_offs(of) == [] and "chart_roam360: no scene was finished in all settings" in "".join(of.warnings)
 
 
-def test_times_of_two_machines_do_not_share_a_chart():
-    first, *others = compared()
-    with pytest.raises(ReportError, match="differ in machine"):
-        trade_offs(gathered([replace(first, machine={"gpu": "H200"}), *others]))
-
-
 def test_no_point_of_the_front_is_beaten():
     points = [(1.0, 20.0), (1.0, 21.0), (2.0, 20.5), (3.0, 24.0), (4.0, 24.0)]
     assert pareto(points, higher_is_better=True) == [(1.0, 21.0), (3.0, 24.0)]
@@ -78,8 +72,10 @@ def test_lengths_are_not_mixed_in_a_mean_over_scenes():
         trade_offs(gathered(runs))
 
 
-def test_rules_of_the_protocol_that_is_shown_are_not_mixed():
+def test_settings_of_the_protocol_that_is_shown_and_machines_are_not_mixed():
     first, *others = compared()
+    with pytest.raises(ReportError, match="differ in machine"):
+        trade_offs(gathered([replace(first, machine={"gpu": "H200"}), *others]))
     sphere = replace(first.scores["sphere"], protocol=first.scores["sphere"].protocol | {"bottom_crop": 0.1})
     with pytest.raises(ReportError, match="differ in protocol"):
         trade_offs(gathered([replace(first, scores=first.scores | {"sphere": sphere}), *others]))
@@ -90,7 +86,7 @@ def test_scenes_of_two_data_sets_may_have_one_name():
     assert [chart.name for chart in charts] == ["chart_room", "chart_room_synthetic"]
 
 
-def test_who_stands_for_a_method_and_who_is_the_twin_of_a_release():
+def test_roles_of_presets_and_corrected_methods_of_releases():
     presets = ("odgs", "odgs_release", "egonerf_small", "padgs", "padgs_ray", "padgs_plus", "spags_release", "mine")
     (chart,) = trade_offs(gathered([small(25.0 + i, 1 + i, method=name) for i, name in enumerate(presets)]))
     roles = {preset: chart.role(preset) for preset in presets}

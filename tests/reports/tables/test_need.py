@@ -6,7 +6,7 @@ import pytest
 from made_up import gathered, small
 from PIL import Image
 
-from padgs.reports.charts.need_chart import charts
+from padgs.reports.charts.smallest_chart import charts
 from padgs.reports.needs import curves, gain, ratio, searched
 from padgs.reports.tables.need import need
 from padgs.reports.tables.table import ReportError
@@ -121,9 +121,9 @@ def test_curves_are_compared_where_both_are():
 
 def test_the_chart_has_a_point_for_each_size_and_all_numbers():
     (chart,) = charts(gathered(runs()))
-    assert chart.name == "need_synthetic-room_512x256_1500-iterations" and chart.png.startswith(b"\x89PNG")
+    assert chart.name == "smallest_synthetic-room_512x256_1500-iterations" and chart.png.startswith(b"\x89PNG")
     assert chart.numbers is not None and len(chart.numbers) == 2 * len(SIZES)
-    assert list(chart.numbers["needed for"])[:4] == ["0.05", "0.1", "0.25 0.5", "1"]
+    assert list(chart.numbers["smallest for"])[:4] == ["0.05", "0.1", "0.25 0.5", "1"]
     assert "4000 Gaussians" in chart.svg and "lost 0.65 dB" in chart.svg
 
 
@@ -131,7 +131,7 @@ def test_charts_of_scenes_of_two_data_sets_have_names_of_their_own():
     datasets = ("", "omniblender")
     made = [small(30.0, scene="room", dataset=one, run=f"of-{one}", need=found(30.0)) for one in datasets]
     names = [chart.name for chart in charts(gathered(made))]
-    assert names == ["need_room_512x256_1500-iterations", "need_room_omniblender_512x256_1500-iterations"]
+    assert names == ["smallest_room_512x256_1500-iterations", "smallest_room_omniblender_512x256_1500-iterations"]
 
 
 def test_a_test_view_is_shown_at_each_size_where_there_is_a_picture_of_it(tmp_path):
@@ -140,7 +140,7 @@ def test_a_test_view_is_shown_at_each_size_where_there_is_a_picture_of_it(tmp_pa
     Image.new("RGB", (4 * 32, 16), "red").save(tmp_path / "need.png")
     found.runs["pictures"] = [tmp_path / "renders"] * len(found.runs)
     _, pictures = charts(found)
-    assert pictures.name.endswith("_pictures") and "all: 8000 Gaussians" in pictures.svg
+    assert pictures.name.endswith("_renders") and "all: 8000 Gaussians" in pictures.svg
     assert "0.1 dB: 4000" in pictures.svg and "1 dB: 1000" in pictures.svg
 
 

@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 from made_up import failed, gathered, of_experiment
 
-from padgs.reports.charts.heat_map import GLYPHS
+from padgs.reports.charts.robustness_chart import STATUS_LETTERS
 from padgs.reports.frame import frame
 from padgs.reports.gathered import Gathered
 from padgs.reports.page import page
@@ -140,7 +140,7 @@ def test_runs_that_differ_in_more_are_refused():
 
 
 def test_every_outcome_has_a_letter_of_its_own():
-    assert set(GLYPHS) == set(STATUSES) - {"ok"} and len(set(GLYPHS.values())) == len(GLYPHS)
+    assert set(STATUS_LETTERS) == set(STATUSES) - {"ok"} and len(set(STATUS_LETTERS.values())) == len(STATUS_LETTERS)
 
 
 def test_it_is_written_and_stands_on_the_page():
@@ -149,7 +149,7 @@ def test_it_is_written_and_stands_on_the_page():
     assert "pose_noise 2: keeps 0.40; WS-PSNR 16.00 dB, 22.00 without" in chart.svg and ">V<" in chart.svg
     assert "V diverged" in chart.svg and "exploded" not in chart.svg and chart.png.startswith(b"\x89PNG")
     assert chart.numbers is not None and len(chart.numbers) == 6
-    assert survival.numbers is not None and survival.name == "survival-synthetic-room-512x256"
+    assert survival.numbers is not None and survival.name == "robustness-synthetic-room-512x256"
     assert dict(survival.numbers.set_index("preset")["score"])["omnigs"] == pytest.approx(0.575)
     assert "| 0.00 [DIVERGED] |" in markdown.text(table) and "DIVERGED" in latex.text(table)
     html = page.html(gathered(runs()))
@@ -180,4 +180,4 @@ def test_a_cell_opens_the_picture_of_its_worst_view(tmp_path):
     _, chart, _ = stability(Gathered(frame(shown)))
     assert (tmp_path / picture_name("b")).resolve().as_uri() in chart.svg
     assert (tmp_path / picture_name("a")).resolve().as_uri() not in chart.svg
-    assert "opens the picture" in chart.notes[1] and "file:" not in stability(gathered(runs()))[1].svg
+    assert "opens its worst view" in chart.notes[1] and "file:" not in stability(gathered(runs()))[1].svg

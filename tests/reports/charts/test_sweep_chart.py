@@ -6,7 +6,7 @@ import pytest
 from made_up import compared, gathered, small, swept
 
 from padgs.reports.charts import sweep_chart
-from padgs.reports.charts.sweeps import sweeps
+from padgs.reports.charts.sweep_chart import sweeps
 from padgs.reports.tables.table import ReportError
 from padgs.reports.writers import csv_text
 
@@ -17,9 +17,9 @@ def rows(sweep) -> list[dict[str, str]]:
 
 def test_a_curve_for_each_scene_along_the_key_that_differs():
     (sweep,) = sweeps(gathered([*swept("tau"), *compared()], protocol="sphere"))
-    assert (sweep.name, sweep.key, sweep.file_name) == ("tau@cpu", "method.tau", "sweep_tau_cpu")
-    assert [line.place.scene for line in sweep.lines] == ["synthetic-outdoor", "synthetic-room"]
-    assert [x for x, _ in sweep.lines[0].points] == [0.0, 0.5, 0.9, 1.0]
+    assert (sweep.name, sweep.key) == ("tau@cpu", "method.tau")
+    assert [curve.place.scene for curve in sweep.curves] == ["synthetic-outdoor", "synthetic-room"]
+    assert [x for x, _ in sweep.curves[0].points] == [0.0, 0.5, 0.9, 1.0]
 
 
 def test_points_are_means_over_seeds_with_their_spread():
@@ -40,17 +40,17 @@ def test_two_keys_give_a_line_for_each_value_of_the_second():
     ]
     (sweep,) = sweeps(gathered(grid))
     assert sweep.key == "method.features" or sweep.key == "method.offsets"
-    assert {len(line.points) for line in sweep.lines} in ({2}, {3})
-    assert all(line.fixed for line in sweep.lines)
+    assert {len(curve.points) for curve in sweep.curves} in ({2}, {3})
+    assert all(curve.fixed for curve in sweep.curves)
 
 
-def test_settings_without_numbers_have_names():
+def test_settings_without_numeric_keys_have_names():
     projections = [
         small(25 + i, 1 + i, experiments=("projections",), config={"render": {"projection": name}})
         for i, name in enumerate(("tangent", "erp"))
     ]
     (sweep,) = sweeps(gathered(projections))
-    assert sweep.key == "" and [x for x, _ in sweep.lines[0].points] == ["projection erp", "projection tangent"]
+    assert sweep.key == "" and [x for x, _ in sweep.curves[0].points] == ["projection erp", "projection tangent"]
     assert "projection tangent" in sweep_chart.chart(sweep).svg
 
 
@@ -79,36 +79,32 @@ def test_the_experiment_chooses():
     assert [sweep.name for sweep in sweeps(gathered(runs, experiment="tau@cpu"))] == ["tau@cpu"]
 
 
-def test_rules_are_not_mixed_along_a_curve():
+def test_protocols_are_not_mixed_along_a_curve_nor_data_in_a_point():
     first, *others = swept("tau")
     other = replace(first, scores={"paper": replace(first.scores["paper"], protocol={"lpips": "alex"})})
     with pytest.raises(ReportError, match="tau@cpu, .*differ in protocol"):
         sweeps(gathered([other, *others]))
+    with pytest.raises(ReportError, match="tau@cpu, .*tau 0.0: results differ in data"):
+        sweeps(gathered([first, replace(first, fingerprint="other", run="other"), *others]))
 
 
-def test_the_picture_has_words_that_can_be_read_and_markers_that_say_their_numbers():
-    (sweep,) = sweeps(gathered(swept("tau"), protocol="sphere"))
-    chart = sweep_chart.chart(sweep)
-    assert ">method.tau<" in chart.svg and "WS-PSNR" in chart.svg and chart.png.startswith(b"\x89PNG")
+def test_a_chart_has_readable_text_and_tooltips_with_numbers():
+    (chart,) = sweep_chart.charts(gathered(swept("tau"), protocol="sphere"))
+    assert chart.name == "sweep_tau_cpu" and chart.png.startswith(b"\x89PNG")
+    assert ">method.tau<" in chart.svg and "WS-PSNR" in chart.svg
     assert "<title>synthetic-room, PaD-GS\n0.9: 24.70 ± 0.10 (n=3)</title>" in chart.svg
 
 
-def test_lengths_of_the_chart_are_a_sweep_only_if_asked_for():
+def test_experiments_of_charts_are_a_sweep_only_if_requested():
     lengths = [small(25.0, 1.0 + n, experiments=("pareto",), config={"train": {"iterations": n}}) for n in (1, 2)]
     assert sweeps(gathered(lengths)) == []
     assert [sweep.key for sweep in sweeps(gathered(lengths, experiment="pareto"))] == ["train.iterations"]
 
 
-def test_runs_on_other_data_are_no_other_seed_of_a_point():
-    first, *others = swept("tau")
-    with pytest.raises(ReportError, match="tau@cpu, .*tau 0.0: results differ in data"):
-        sweeps(gathered([first, replace(first, fingerprint="other", run="other"), *others]))
-
-
-def test_there_is_no_panel_for_what_nobody_measured():
+def test_a_metric_without_values_has_no_panel():
     def without(one):
-        marks = {key: value for key, value in one.scores["paper"].metrics.items() if "lpips" not in key}
-        return replace(one, scores={"paper": replace(one.scores["paper"], metrics=marks)})
+        metrics = {key: value for key, value in one.scores["paper"].metrics.items() if "lpips" not in key}
+        return replace(one, scores={"paper": replace(one.scores["paper"], metrics=metrics)})
 
     (sweep,) = sweeps(gathered([without(one) for one in swept(seeds=1)]))
     assert [measure.name for measure in sweep.measures if "/" in measure.name] == ["paper/ssim", "paper/psnr"]

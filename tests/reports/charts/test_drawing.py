@@ -1,19 +1,16 @@
 import re
 
 import pytest
-from made_up import compared, small, swept, write
+from made_up import compared, gathered, small, swept
 
 from padgs import baselines
-from padgs.reports import store
-from padgs.reports.charts import sweep_chart, trade_off_chart
-from padgs.reports.charts.palette import BEYOND, FAMILIES, GRID, INK, OTHERS, PAPER, SOFT, color_of, dark_rules
-from padgs.reports.frame import frame
-from padgs.reports.gathered import Gathered
+from padgs.reports.charts import drawing, sweep_chart, trade_off_chart
+from padgs.reports.charts.drawing import FAMILIES, INK, OTHERS, PAPER, SOFT, color_of, dark_rules
 from padgs.reports.methods import method_of
 
 
 def contrast(one: str, other: str) -> float:
-    """Of two colours, as the Web Content Accessibility Guidelines define it."""
+    """Contrast of two colours, as defined by the Web Content Accessibility Guidelines."""
 
     def luminance(color: str) -> float:
         parts = [int(color[i : i + 2], 16) / 255 for i in (1, 3, 5)]
@@ -24,7 +21,7 @@ def contrast(one: str, other: str) -> float:
     return (light + 0.05) / (dark + 0.05)
 
 
-def test_every_method_has_a_colour_of_its_own_that_is_seen_on_both_papers(root):
+def test_every_method_has_its_own_colour_visible_on_white_and_black(root):
     presets = {*baselines.OURS, *(path.stem for path in (root / "conf" / "method").glob("*.yaml"))}
     assert {method_of(preset) for preset in presets} <= FAMILIES.keys(), "give new methods a line in FAMILIES"
     for paper, colors in zip(PAPER, zip(*FAMILIES.values(), *OTHERS, strict=True), strict=True):
@@ -33,28 +30,28 @@ def test_every_method_has_a_colour_of_its_own_that_is_seen_on_both_papers(root):
     assert min(contrast(*pair) for pair in zip(SOFT, PAPER, strict=True)) > 4.5
 
 
-def test_a_method_has_its_colour_whatever_else_is_there():
+def test_the_colour_of_a_method_does_not_depend_on_others():
     assert color_of("padgs_ray", ["omnigs", "padgs_ray"]) == color_of("padgs", []) != color_of("padgs_plus", [])
     assert color_of("yours", ["mine", "yours"]) != color_of("mine", ["mine", "yours"]) != color_of("padgs", [])
 
 
 @pytest.fixture(scope="module")
-def drawn(tmp_path_factory):
+def svgs():
     runs = [*compared(["synthetic-room"], seeds=1)[3:], small(24.0, method="mine", experiments=("all_methods",))]
     runs += swept(values=(0.5, 0.9, 1.0), scenes=["synthetic-room"], seeds=2)
-    logged = Gathered(frame(store.read(write(runs, tmp_path_factory.mktemp("runs")))[0]))
-    return [*trade_off_chart.charts(logged), *sweep_chart.charts(logged)]
+    return [chart.svg for of in (trade_off_chart, sweep_chart) for chart in of.charts(gathered(runs))]
 
 
-def test_all_that_is_drawn_for_white_paper_turns_where_the_screen_is_dark(drawn):
-    known = dict((*FAMILIES.values(), *OTHERS, INK, SOFT, GRID, BEYOND, PAPER))
-    for svg in (svg for chart in drawn for svg in (chart.svg, chart.narrow) if svg):
+def test_all_colours_are_replaced_on_dark_screens(svgs):
+    pairs = (drawing.INK, drawing.SOFT, drawing.GRID, drawing.MARGIN_COLOR, drawing.PAPER)
+    known = dict((*FAMILIES.values(), *OTHERS, *pairs))
+    for svg in svgs:
         assert dark_rules() in svg
         body = svg.split("</style>", 1)[1]
         assert {found.lower() for found in re.findall(r"(?:fill|stroke): (#\w+)", body)} <= known.keys()
 
 
-def test_pictures_on_one_page_share_no_names_of_things(drawn):
-    ids = [set(re.findall(r' id="([a-z]+[0-9a-f]{10})"', svg)) for c in drawn for svg in (c.svg, c.narrow) if svg]
-    assert len(ids) == 5 and min(map(len, ids)) > 0
+def test_charts_on_one_page_share_no_ids(svgs):
+    ids = [set(re.findall(r' id="([a-z]+[0-9a-f]{10})"', svg)) for svg in svgs]
+    assert len(ids) == 2 and min(map(len, ids)) > 0
     assert sum(map(len, ids)) == len(set().union(*ids))

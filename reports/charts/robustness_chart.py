@@ -1,0 +1,133 @@
+"""Charts of robustness: what methods keep under stress, beside their speed and accuracy without it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from pandas import DataFrame
+
+from padgs.reports import methods
+from padgs.reports.charts.axis import Axis
+from padgs.reports.charts.drawing import INK, Chart, figure, lay_out, styled, tip, weight_of
+from padgs.reports.charts.labels import Label, write_labels
+from padgs.reports.survival import QUALITY, Stress, Survivor, in_order
+from padgs.reports.tables.table import MISSING, Cell
+
+STATUS_LETTERS = {
+    "oom": "M",
+    "timeout": "T",
+    "nan": "N",
+    "diverged": "V",
+    "collapsed": "C",
+    "exploded": "E",
+    "degenerate": "D",
+    "silent": "S",
+    "rejected": "R",
+}
+COLORS = "cividis"  # dark where nothing is left; readable for colour-blind readers
+LIGHT, DARK = "#fafafa", "#101010"  # numbers on dark and on bright cells
+WIDTH, HEIGHT, BORDER = 0.46, 0.36, (2.3, 2.2)  # inches of a cell, and beside and above all cells
+AREA = 160.0  # points^2 of a mark
+
+
+@styled
+def heat_map(title: str, survivors: Sequence[Survivor]) -> Chart:
+    """Return a row per method and a column per condition: retention as colour, failures as letters."""
+    stresses = in_order(survivors)
+    made, axes = figure(1, 1, BORDER[0] + WIDTH * len(stresses), BORDER[1] + HEIGHT * len(survivors))
+    own, rows, linked = axes[0][0], [], False
+    for row, one in enumerate(survivors):
+        for column, stress in enumerate(stresses):
+            if (cell := one.retention.get(stress)) is not None:
+                url = _worst_view(one.runs[stress])
+                linked = linked or url is not None
+                _draw_cell(own, column, row, cell, _cell_tip(one, stress, cell), url)
+                where = {"scene": title, "preset": one.preset, "condition": stress[0], "level": stress[1]}
+                rows.append({**where, **cell.numbers})
+    own.set_xlim(0, len(stresses))
+    own.set_ylim(len(survivors), 0)
+    names = [f"{name} {level}" for name, level in stresses]
+    own.set_xticks([n + 0.5 for n in range(len(stresses))], names, rotation=60, ha="left")
+    own.xaxis.tick_top()
+    titles = [methods.short(methods.title(one.preset), one.preset) for one in survivors]
+    own.set_yticks([n + 0.5 for n in range(len(survivors))], titles)
+    own.tick_params(length=0)
+    own.grid(False)
+    own.spines[:].set_visible(False)
+    seen = {status for one in survivors for cell in one.retention.values() for status in cell.status.split()}
+    letters = ", ".join(f"{letter} {status}" for status, letter in STATUS_LETTERS.items() if status in seen)
+    own.set_xlabel(f"1: keeps everything, 0: one colour{f'; {letters}' if letters else ''}", fontsize=8)
+    lay_out(made, f"What methods keep under stress\n{title}")
+    notes = ("Each cell: the distance to one colour, as a share of the method's own without stress.",)
+    notes += ("A cell opens its worst view, truth | render | error, if the folder of the run has it.",) * linked
+    return Chart(f"stability-{survivors[0].place}", title, made, notes, DataFrame(rows))
+
+
+@styled
+def speed_and_accuracy(title: str, survivors: Sequence[Survivor]) -> Chart:
+    """Return quality over training time without stress, with the stability score as fill, hollow if there is none."""
+    import matplotlib
+    from matplotlib.cm import ScalarMappable
+
+    on_cpu = all(one.rest["cpu_seconds"].notna().all() for one in survivors)
+    time, words = ("cpu_seconds", "training time on the CPU") if on_cpu else ("train_seconds", "training time")
+    points = [(one.rest[time].mean(), one.rest[QUALITY].mean()) for one in survivors]
+    made, axes = figure(1, 1, 5.6, 4.4)
+    own, rows, labels = axes[0][0], [], []
+    Axis.of([cost for cost, _ in points], True).apply(own.xaxis)
+    Axis.of([quality for _, quality in points]).apply(own.yaxis)
+    own.set_xlabel(f"{words} without stress, s ↓")
+    own.set_ylabel("WS-PSNR without stress, dB ↑")
+    for one, (cost, quality) in zip(survivors, points, strict=True):
+        name, score = methods.title(one.preset), _share(one.score)
+        text = f"{name}\n{quality:.2f} dB in {cost:.1f} s; score {score}, worst quartile {_share(one.worst_quartile)}"
+        color = "none" if one.score is None else matplotlib.colormaps[COLORS](one.score)
+        look = {"s": AREA, "facecolors": [color], "edgecolors": INK[0], "linewidths": 0.8, "zorder": 3}
+        own.scatter(cost, quality, gid=tip(text), **look)
+        text = f"{methods.short(name, one.preset)}\n{score}"
+        labels.append(Label(text, (cost, quality), math.sqrt(AREA) / 2, weight_of(one.preset, "main")))
+        numbers = {time: cost, "ws_psnr": quality, "score": one.score, "worst_quartile": one.worst_quartile}
+        rows.append({"scene": title, "preset": one.preset, **numbers})
+    what = "stability score: mean of what is kept under stress ↑"
+    made.colorbar(ScalarMappable(cmap=COLORS), ax=own, label=what, aspect=30)
+    lay_out(made, f"Speed, accuracy and stability\n{title}")
+    write_labels(own, labels, [(*label.at, label.radius) for label in labels])
+    return Chart(f"robustness-{survivors[0].place}", title, made, numbers=DataFrame(rows))
+
+
+def _worst_view(runs: DataFrame) -> str | None:
+    """Return the address of the render with the lowest PSNR of all runs of a cell, if there is one."""
+    shown = [
+        (psnr, path)
+        for folder, psnrs in zip(runs["pictures"], runs["view_psnr"], strict=True)
+        for name, psnr in psnrs.items()
+        if folder is not None and (path := folder / name).is_file()
+    ]
+    return min(shown)[1].resolve().as_uri() if shown else None
+
+
+def _draw_cell(axes: Any, column: int, row: int, cell: Cell, text: str, url: str | None) -> None:
+    import matplotlib
+    from matplotlib.patches import Rectangle
+
+    value = cell.value or 0.0
+    look = {"facecolor": matplotlib.colormaps[COLORS](value), "edgecolor": "none", "gid": tip(text), "url": url}
+    axes.add_patch(Rectangle((column + 0.03, row + 0.04), 0.94, 0.92, **look))
+    letters = "".join(STATUS_LETTERS[status] for status in cell.status.split())
+    look = {"color": DARK if value > 0.55 else LIGHT, "fontweight": "bold" if letters else "normal", "url": url}
+    shown, middle = letters or f"{value:.2f}".lstrip("0"), (column + 0.5, row + 0.5)
+    axes.text(*middle, shown, ha="center", va="center_baseline", fontsize=8, **look)
+
+
+def _cell_tip(one: Survivor, stress: Stress, cell: Cell) -> str:
+    runs = one.runs[stress]
+    parts = [f"{methods.title(one.preset)}, {stress[0]} {stress[1]}: keeps {cell.value or 0:.2f}"]
+    if runs[QUALITY].notna().any():
+        parts.append(f"WS-PSNR {runs[QUALITY].mean():.2f} dB, {one.rest[QUALITY].mean():.2f} without")
+    return "; ".join([*parts, *([cell.status] if cell.status else [])])
+
+
+def _share(value: float | None) -> str:
+    return MISSING if value is None else f"{value:.2f}"
