@@ -116,10 +116,10 @@ def different_keys(first: dict, second: dict, where: str = "") -> set[str]:
 
 def test_what_the_command_line_sweeps_multiplies_with_the_file_or_replaces_it():
     with composing() as loader:
-        params = {"method.tau": "0.5,0.9", "+scene": "glob(synthetic_ro*)", "seed": "0,1,2"}
+        params = {"method.tau": "0.5,0.9", "+scene": "glob(synthetic_out*)", "seed": "0,1,2"}
         found = expand(params, ["++seed=7,8", "+sweep=tau"], loader)
     assert found == [
-        [f"++method.tau={tau}", "+scene=synthetic_room", f"++seed={seed}", "+sweep=tau"]
+        [f"++method.tau={tau}", "+scene=synthetic_outdoor", f"++seed={seed}", "+sweep=tau"]
         for tau in (0.5, 0.9)
         for seed in (7, 8)
     ]

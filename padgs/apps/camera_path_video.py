@@ -1,4 +1,9 @@
-"""Camera-path videos: an .mp4 (H.264) or a folder of PNGs, in colour, with depth beside it."""
+"""Camera-path videos: an .mp4 (H.264) or a folder of PNGs, of colours and optionally depth.
+
+Panoramic .mp4 files carry Google's Spherical Video V1 metadata: a box of XML in the video track. An .mp4 is a tree of
+boxes, each 4 bytes of size, 4 of type, and content. Appending to the track moves no data that is addressed by position,
+because the index (`moov`) is the last box.
+"""
 
 from __future__ import annotations
 
@@ -20,58 +25,60 @@ from padgs.render import Rendering
 from padgs.replacing import replacing
 from padgs.scene import View
 
-Put = Callable[[np.ndarray], None]  # takes the next frame, [H, W, 3] uint8
-DEPTH_STEPS = 1000  # of a 16-bit depth picture, in the unit of the scene
-# What an .mp4 holds and says so: players that are not told take large films to be BT.709, small ones to be BT.601.
+WriteFrame = Callable[[np.ndarray], None]  # of [H, W, 3] uint8, or [H, W] uint16
+DEPTH_STEPS = 1000  # of 16-bit depth, per scene scale
+# Stated explicitly: by default, players take large videos to be BT.709, and small ones to be BT.601.
 COLOURS = {"colorspace": "bt709", "color_primaries": "bt709", "color_trc": "bt709", "color_range": "tv"}
 
 
-def write_film(
+def write_video(
     to: Path,
     views: Sequence[View],
-    draw: Callable[[View], Rendering],
+    render: Callable[[View], Rendering],
     *,
     fps: float,
-    unit: float,
+    scene_scale: float,
     depth: bool = False,
     spherical: bool = False,
     progress: Callable[[int], None] = lambda done: None,
 ) -> list[Path]:
-    """Draw the views and write them, in order.
+    """Render views and write them in order.
 
     Args:
-        to: *.mp4, or a folder for PNGs, where they appear once all are drawn. A film that is there is replaced once the
-            new one is complete.
-        views, draw: what is drawn, and who does it.
+        to: *.mp4, or a folder for PNGs. Files appear, and an existing video is replaced, when all frames are written.
+        views: one per frame.
+        render: renders a view.
         fps: frames per second of an .mp4.
-        unit: of the scene, which depths are shown and stored in.
-        depth: write depth too: for films one of colours, bright is near; for PNGs 16 bits, `DEPTH_STEPS` to a unit.
-        spherical: the views are panoramas, and players of an .mp4 shall know.
-        progress: called with the number of frames that are done.
+        scene_scale: unit of depths.
+        depth: also write depth: as colours in an .mp4 (bright is near), as 16 bits in PNGs (`DEPTH_STEPS` per scale).
+        spherical: mark an .mp4 as a panorama.
+        progress: called with the number of written frames.
 
     Returns:
-        What was written: films, or folders.
+        Written videos or folders.
 
     Raises:
-        ValueError: a file of another kind, the extra `video` is not installed, or sides that H.264 does not take.
-        OSError: it cannot be written.
+        ValueError: another file format, the extra `video` is not installed, or sides that H.264 does not support.
+        OSError: the output cannot be written.
     """
-    film = to.suffix.lower() == ".mp4"
-    if to.suffix and not film and not to.is_dir():
-        raise ValueError(f"{to} is no .mp4, and films are written as nothing else; a folder for PNGs has no ending")
-    places = [to, to.with_name(f"{to.stem}-depth{to.suffix}")] if depth else [to]
+    is_mp4 = to.suffix.lower() == ".mp4"
+    if to.suffix and not is_mp4 and not to.is_dir():
+        raise ValueError(f"{to} is not an .mp4, the only video format; a folder for PNGs must have no suffix")
+    outputs = [to, to.with_name(f"{to.stem}-depth{to.suffix}")] if depth else [to]
     with ExitStack() as stack:
-        if film:
-            puts = [stack.enter_context(_film(place, views[0], fps, spherical)) for place in places]
+        if is_mp4:
+            writers = [stack.enter_context(_mp4(path, views[0], fps, spherical)) for path in outputs]
         else:
-            puts = [stack.enter_context(_folder(place)) for place in places]
+            writers = [stack.enter_context(_png_folder(path)) for path in outputs]
         for number, view in enumerate(views):
-            rendering = draw(view)
-            puts[0](to_uint8(rendering.image))
+            rendering = render(view)
+            writers[0](to_uint8(rendering.image))
             if depth:
-                puts[1](depth_image(rendering, unit) if film else _sixteen_bit(rendering.depth / unit))
+                writers[1](
+                    depth_image(rendering, scene_scale) if is_mp4 else _sixteen_bit(rendering.depth / scene_scale)
+                )
             progress(number + 1)
-    return places
+    return outputs
 
 
 def _sixteen_bit(depth: Tensor) -> np.ndarray:
@@ -79,42 +86,44 @@ def _sixteen_bit(depth: Tensor) -> np.ndarray:
 
 
 @contextmanager
-def _folder(place: Path) -> Iterator[Put]:
-    place.mkdir(parents=True, exist_ok=True)
-    if stale := next(place.glob("*.png"), None):
-        raise ValueError(f"{place} holds pictures already, such as {stale.name}; name another folder with --to")
+def _png_folder(path: Path) -> Iterator[WriteFrame]:
+    path.mkdir(parents=True, exist_ok=True)
+    if stale := next(path.glob("*.png"), None):
+        raise ValueError(f"{path} already holds images, such as {stale.name}; choose another folder with --to")
     numbers = iter(range(1, 1 << 30))
-    with TemporaryDirectory(prefix=".", dir=place) as draft:  # pictures of a film that is cut off would bar the next
+    with TemporaryDirectory(prefix=".", dir=path) as draft:  # an interrupted call must not block the next
 
-        def put(frame: np.ndarray) -> None:
+        def write(frame: np.ndarray) -> None:
             Image.fromarray(frame).save(Path(draft) / f"{next(numbers):05d}.png")
 
-        yield put
-        for picture in sorted(Path(draft).iterdir()):
-            picture.replace(place / picture.name)
+        yield write
+        for image in sorted(Path(draft).iterdir()):
+            image.replace(path / image.name)
 
 
 @contextmanager
-def _film(place: Path, view: View, fps: float, spherical: bool) -> Iterator[Put]:
+def _mp4(path: Path, view: View, fps: float, spherical: bool) -> Iterator[WriteFrame]:
     if view.width % 2 or view.height % 2:
-        raise ValueError(f"frames are {view.width}x{view.height}; H.264 takes even sides only, or name a folder")
+        raise ValueError(
+            f"frames are {view.width}x{view.height}; H.264 supports even sides only: choose even sides, or a folder"
+        )
     try:
         import av
     except ImportError as error:
-        raise ValueError(f"writing {place} needs PyAV: {installing('video')}; a folder for PNGs does not") from error
-    place.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(place) as draft:
-        with av.open(str(draft), "w") as film:
+        raise ValueError(f"writing {path} needs PyAV: {installing('video')}; a folder for PNGs does not") from error
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as draft:
+        with av.open(str(draft), "w") as video:
             options = {"crf": "18", **COLOURS}
-            stream = film.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000), options=options)
+            stream = video.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000), options=options)
             stream.width, stream.height, stream.pix_fmt = view.width, view.height, "yuv420p"
 
-            def put(frame: np.ndarray) -> None:
-                picture = av.VideoFrame.from_ndarray(frame, format="rgb24")
-                film.mux(stream.encode(picture.reformat(format="yuv420p", dst_colorspace="ITU709")))
+            def write(frame: np.ndarray) -> None:
+                image = av.VideoFrame.from_ndarray(frame, format="rgb24")
+                video.mux(stream.encode(image.reformat(format="yuv420p", dst_colorspace="ITU709")))
 
-            yield put
-            film.mux(stream.encode())  # what the encoder still holds back
+            yield write
+            video.mux(stream.encode())  # flush the encoder
         if spherical:
             mark_spherical(draft)
 
@@ -128,25 +137,25 @@ XML = (
 )
 
 
-def mark_spherical(film: Path) -> None:
-    """Mark an .mp4 of one track as an equirectangular panorama, in place.
+def mark_spherical(video: Path) -> None:
+    """Mark an .mp4 with one track as an equirectangular panorama, in place.
 
     Raises:
-        ValueError: its last box is not the index, or the index has no track.
+        ValueError: the last box is not the index, or the index has no track.
     """
-    with film.open("r+b") as file:
+    with video.open("r+b") as file:
         found = (b"", 0, 0)
         end = file.seek(0, 2)
         start = 0
         while start < end:
             file.seek(start)
             size, kind = struct.unpack(">I4s", file.read(8))
-            if size == 1:  # 64 bits of it follow
+            if size == 1:  # a 64-bit size follows
                 (size,) = struct.unpack(">Q", file.read(8))
             found, start = (kind, start, size), start + (size or end - start)
         kind, start, size = found
         if kind != b"moov":
-            raise ValueError(f"{film} ends with a box {kind.decode('latin1')!r}; it must be the index, moov")
+            raise ValueError(f"{video} ends with a box {kind.decode('latin1')!r}; it must end with the index, moov")
         file.seek(start)
         index = file.read(size)
         file.seek(start)
@@ -154,7 +163,7 @@ def mark_spherical(film: Path) -> None:
 
 
 def _with_box(index: bytes) -> bytes:
-    """The index with the box at the end of its first track."""
+    """Append the box to the first track of the index."""
     position = 8
     while position < len(index):
         size, kind = struct.unpack_from(">I4s", index, position)
@@ -165,4 +174,4 @@ def _with_box(index: bytes) -> bytes:
             whole = index[4:position] + track + index[position + size :]
             return struct.pack(">I", len(whole) + 4) + whole
         position += size
-    raise ValueError("the film has no track")
+    raise ValueError("the video has no track; encode it again")

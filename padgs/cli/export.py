@@ -21,7 +21,9 @@ def export(
     smooth: Annotated[
         bool, typer.Option("--smooth", help="as wide as photographs saw them, for viewers; .html always is")
     ] = False,
-    lessons: Annotated[int | None, typer.Option(help="iterations of PaD-GS's baked anchors; 300 if not said")] = None,
+    distillation_steps: Annotated[
+        int | None, typer.Option(help="iterations that refine the baked anchors of PaD-GS; default 300")
+    ] = None,
     data: DataPath = None,
 ) -> None:
     """Write a run's Gaussians, by default into its folder as splats.ply (--points: points.ply).
@@ -35,28 +37,28 @@ def export(
 
     from rich.console import Console
 
-    from padgs.apps.export.explicit import LESSONS, exported, point_cloud
-    from padgs.apps.export.splat_file import refuse_impossible, seconds_to_write, write_splats
+    from padgs.apps.export.explicit import DISTILLATION_STEPS, export_run, point_cloud
+    from padgs.apps.export.splat_file import check_suffix, estimate_seconds, write_splats
     from padgs.data.cloud import write_ply
 
-    lessons = LESSONS if lessons is None else lessons
+    steps = DISTILLATION_STEPS if distillation_steps is None else distillation_steps
     path = Path(to) if to else Path(run) / ("points.ply" if points else "splats.ply")
     if points and path.suffixes != [".ply"]:
         raise ValueError(f"{path} is no plain .ply, which point clouds are written as")
-    refuse_impossible(path)
+    check_suffix(path)
     with Console().status("opening the run") as status:
         trained = opened(run, data)
         with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
         with naming_data(run):
-            found = exported(
+            found = export_run(
                 trained,
-                lessons=lessons,
-                stand_up=upright or path.suffix == ".html",
+                distillation_steps=steps,
+                upright=upright or path.suffix == ".html",
                 smooth=smooth or path.suffix == ".html",
-                progress=lambda done: status.update(f"lesson {done} of {lessons}"),
+                progress=lambda done: status.update(f"distillation step {done} of {steps}"),
             )
-        if not points and (seconds := seconds_to_write(path, found.splats)) > LONG:
+        if not points and (seconds := estimate_seconds(path, found.splats)) > LONG:
             show(f"{path.name}: its harmonics take some {seconds / 60:.0f} minutes; a .spz or .ply takes seconds")
         status.update(f"writing {path}")
         with writing(path):
@@ -65,7 +67,7 @@ def export(
                 write_ply(path, cloud)
                 what = f"{len(cloud.points)} points"
             else:
-                write_splats(path, found.splats, found.notes, begin=found.begin)
+                write_splats(path, found.splats, found.notes, start=found.start)
                 what = f"{len(found.splats)} Gaussians"
     show("\n".join(f"  {note}" for note in found.notes))
     show(f"{path}: {what}, {path.stat().st_size / 1e6:.1f} MB")

@@ -1,4 +1,4 @@
-"""`padgs render`: a film, or pictures, along a path through what a run has learned."""
+"""`padgs render`: a video, or images, along a camera path through a run."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from padgs.cli.refusing import refusing
 @refusing(ValueError, OSError)
 def render(
     run: Run,
-    to: Annotated[str, typer.Option(help="an .mp4, or a folder for PNGs; its own folder's film.mp4 if not said")] = "",
+    to: Annotated[str, typer.Option(help="an .mp4, or a folder for PNGs; default: video.mp4 in the run's folder")] = "",
     path: Annotated[
         str, typer.Option(help="cameras, orbit, dolly, or a JSON: keyframes, nerfstudio's path")
     ] = "cameras",
@@ -28,13 +28,13 @@ def render(
     depth: Annotated[bool, typer.Option("--depth", help="also write depth, beside the colours")] = False,
     data: DataPath = None,
 ) -> None:
-    """Write a film (or PNGs) along a path, as panoramas, which players show as such, or in perspective."""
+    """Write a video (or PNGs) along a path, as panoramas, which players recognise, or in perspective."""
     from pathlib import Path
 
     import torch
     from rich.console import Console
 
-    from padgs.apps.camera_path_video import write_film
+    from padgs.apps.camera_path_video import write_video
     from padgs.data.camera_paths import PATHS, gravity, read_path
     from padgs.data.formats.transforms import transforms_file
     from padgs.geometry.camera import Panorama, perspective
@@ -46,7 +46,7 @@ def render(
         raise ValueError("--fov and --height are of perspective pictures: add --camera perspective")
     if not (fps > 0 and (seconds is None or seconds > 0)):
         wrong = f"--fps is {fps:g}" if seconds is None or seconds > 0 else f"--seconds is {seconds:g}"
-        raise ValueError(f"{wrong}, which makes a film without a frame; it must be > 0")
+        raise ValueError(f"{wrong}, which makes a video without frames; it must be > 0")
     with Console().status("opening the run") as status:
         found = opened(run, data)
         with naming_data(run):
@@ -69,17 +69,17 @@ def render(
             View(f"frame {number}", pose.to(trained.cam_from_world), lens.width, lens.height, lens=lens)
             for number, pose in enumerate(poses)
         ]
-        film = Path(to) if to else found.folder / "film.mp4"
-        with writing(film):
-            places = write_film(
-                film,
+        output = Path(to) if to else found.folder / "video.mp4"
+        with writing(output):
+            outputs = write_video(
+                output,
                 views,
                 found.through(lens).render,
                 fps=fps,
-                unit=scene.scale,
+                scene_scale=scene.scale,
                 depth=depth,
                 spherical=camera == "panorama",
                 progress=lambda done: status.update(f"frame {done} of {len(views)}"),
             )
-    for place in places:
-        print(f"{place}: {len(views)} frames of {lens.width}x{lens.height}")
+    for written in outputs:
+        print(f"{written}: {len(views)} frames of {lens.width}x{lens.height}")

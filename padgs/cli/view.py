@@ -36,11 +36,11 @@ def view(
             opened(folder, data)  # says what is wrong before a page stands
 
     def of_one_scene() -> list[OpenedRun]:
-        from padgs.apps.viewer.process import await_checkpoint
+        from padgs.apps.viewer.process import wait_for_checkpoint
 
         runs, names = [], []
         for folder in folders:
-            await_checkpoint(folder)
+            wait_for_checkpoint(folder)
             runs.append(found := opened(folder, data))
             with naming_data(folder):
                 names.append(found.scene.name)

@@ -14,7 +14,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from rich.console import Console
 
-from padgs.apps.viewer.process import shown
+from padgs.apps.viewer.process import serve_training
 from padgs.multirun.board import CRASHED, ELSEWHERE, REFUSED, STOPPED, Board, BoardEntry
 from padgs.multirun.composition import typed_config
 from padgs.multirun.finished import FinishedJobs
@@ -96,7 +96,9 @@ def done(config: RunConfig, console: Console, watch: Watch) -> Result:
     session = Session(config, console, watch)
     if config.need == "on":
         set_apart(session.scene.train)  # refuses too few views before hours of training
-    page = shown(session.folder.path, config.data.path, config.run.device) if config.run.view else nullcontext()
+    page = (
+        serve_training(session.folder.path, config.data.path, config.run.device) if config.run.view else nullcontext()
+    )
     with page:
         result = session.run()
     if config.need == "on" and result.ok:

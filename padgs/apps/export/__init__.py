@@ -1,1 +1,1 @@
-"""A trained model as a file that other programs open."""
+"""Export of trained models to files of explicit Gaussians."""

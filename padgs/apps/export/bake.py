@@ -1,8 +1,8 @@
-"""PaD-GS baked: anchors, decoded anew for each view, as explicit Gaussians that are the same for all views.
+"""Baking of PaD-GS: view-dependent anchors become explicit Gaussians, which are the same for all views.
 
-What a Gaussian is seen as differs by camera; each camera counts by how much of its picture the Gaussian makes up.
-Opacity and covariance become weighted means, colour the harmonics that fit the seen colours best. What then differs is
-taught: the explicit Gaussians train for a while on pictures of the anchors, with no photograph and no held-out view.
+The attributes of a decoded Gaussian differ by view; each view is weighted by the Gaussian's contribution to its image.
+Opacity and covariance are weighted means; colours are spherical harmonics fitted by least squares. The result is
+refined by distillation: it is trained on renders of the anchors, without photographs and test views.
 """
 
 from __future__ import annotations
@@ -29,43 +29,43 @@ from padgs.training.options import TrainOptions
 from padgs.training.trainee import Drawing
 
 DEGREE = 3
-FITTED_DEGREE = 1  # by least squares; equations of more take gigabytes, and gain nothing after the lessons
-VIEWS = 64  # training cameras and places between them that are baked from
-SPREAD = 0.3  # how far such a place lies off the line between two cameras, in distances of those
-RIDGE = 1e-2  # on coefficients that depend on the direction, beside the weight of what was seen
-SHOWS = 0.05  # pixels that a Gaussian must make up in all views together, or it is dropped
-MOST_OPAQUE = 0.995  # logits are finite
-FLATTEST = 1e-4  # smallest scale of a Gaussian, in its largest
-LESSON = TrainOptions()
+FITTED_DEGREE = 1  # by least squares; higher degrees take gigabytes, and gain nothing after distillation
+VIEWS = 64  # training cameras and positions between them
+SPREAD = 0.3  # standard deviation of such positions from the line between two cameras, relative to its length
+RIDGE = 1e-2  # regularisation of direction-dependent coefficients, relative to a Gaussian's total weight
+MIN_PIXELS = 0.05  # contribution over all views below which a Gaussian is dropped
+MAX_OPACITY = 0.995  # keeps logits finite
+MIN_FLATNESS = 1e-4  # smallest scale of a Gaussian relative to its largest
+DISTILLATION = TrainOptions()
 
 
-def cameras_around(views: Sequence[View], count: int = VIEWS) -> list[View]:
-    """Up to `count` cameras: the given ones evenly chosen, and as many again or more at random places between them.
+def sample_cameras(views: Sequence[View], count: int = VIEWS) -> list[View]:
+    """Return `count` cameras: at most half from the given views, the rest at random positions between them.
 
-    Always the same for the same views. Those between have the turn of a given one, and no pixels.
+    Deterministic. Positions between two views have the rotation of one of them, and no pixels.
     """
     random = torch.Generator().manual_seed(0)
     chosen = list(views[:: max(1, -(-len(views) // (count // 2)))])
     centers = torch.stack([view.center for view in views]).cpu()
     while len(chosen) < count:
         one, other = torch.randint(len(views), (2,), generator=random).tolist()
-        way = centers[other] - centers[one]
-        aside = SPREAD * way.norm() * torch.randn(3, generator=random, dtype=way.dtype)
-        place = centers[one] + torch.rand((), generator=random) * way + aside
+        line = centers[other] - centers[one]
+        offset = SPREAD * line.norm() * torch.randn(3, generator=random, dtype=line.dtype)
+        position = centers[one] + torch.rand((), generator=random) * line + offset
         pose = views[one].cam_from_world.clone()
-        pose[:3, 3] = -pose[:3, :3] @ place.to(pose)
+        pose[:3, 3] = -pose[:3, :3] @ position.to(pose)
         chosen.append(replace(views[one].at(pose), name=f"between-{len(chosen)}"))
     return chosen
 
 
 @torch.no_grad()
-def baked(model: PaDGS, views: Sequence[View], options: RenderOptions, backend: str, unit: float) -> Splats:
-    """The explicit Gaussians nearest to what these views show of the anchors; those that show in none are dropped.
+def bake(model: PaDGS, views: Sequence[View], options: RenderOptions, backend: str, unit: float) -> Splats:
+    """Return the explicit Gaussians that fit the anchors best in these views; invisible Gaussians are dropped.
 
     Args:
-        model: the anchors, N = A K Gaussians.
-        views: from where they are looked at.
-        options, backend: how they are drawn.
+        model: A anchors with K Gaussians each.
+        views: sampled views.
+        options, backend: of the renderer.
         unit: of the scene, in world units.
     """
     count = len(model) * model.options.offsets
@@ -78,7 +78,7 @@ def baked(model: PaDGS, views: Sequence[View], options: RenderOptions, backend: 
         drawn, slots = decoded.gaussians, decoded.slots
         pixels = contributions(drawn, view, options, backend)
         shown.index_add_(0, slots, pixels)
-        within = pixels / drawn.opacities  # of the Gaussian's footprint, what nothing hides
+        within = pixels / drawn.opacities  # visible area of the footprint, in pixels
         seen.index_add_(0, slots, within)
         opacity.index_add_(0, slots, pixels)
         axes = rotation_matrices(drawn.quats) * drawn.scales[:, None]
@@ -88,12 +88,12 @@ def baked(model: PaDGS, views: Sequence[View], options: RenderOptions, backend: 
         weighted = pixels[:, None] * values
         normal.index_add_(0, slots, weighted[:, :, None] * values[:, None])
         colour.index_add_(0, slots, weighted[:, :, None] * (drawn.colors - 0.5)[:, None])
-    keep = (shown > SHOWS).nonzero()[:, 0]
+    keep = (shown > MIN_PIXELS).nonzero()[:, 0]
     ridge = RIDGE * torch.eye(size).to(shown)
     ridge[0, 0] = 0
     coefficients = torch.linalg.solve(normal[keep] + shown[keep, None, None] * ridge, colour[keep])
     scales, quats = axes_of((covariance[keep] / seen[keep, None]).view(-1, 3, 3))
-    opacities = (opacity[keep] / seen[keep]).clamp(1 / 255, MOST_OPAQUE)
+    opacities = (opacity[keep] / seen[keep]).clamp(1 / 255, MAX_OPACITY)
     blank = Splats(zeros(0, 3), zeros(0, 3), zeros(0, 3), degree=DEGREE, unit=unit)
     rest = zeros(len(keep), (DEGREE + 1) ** 2 - 1, 3)
     rest[:, : size - 1] = coefficients[:, 1:]
@@ -112,9 +112,9 @@ def baked(model: PaDGS, views: Sequence[View], options: RenderOptions, backend: 
 
 
 def contributions(gaussians: Gaussians, view: View, options: RenderOptions, backend: str) -> Tensor:
-    """How many pixels of the view each Gaussian makes up, [N]: the sum of its blending weights.
+    """Return the sum of each Gaussian's blending weights over the pixels of a view, [N].
 
-    It is the derivative of the image's sum by the Gaussian's colour.
+    It is the derivative of the image's sum with respect to the Gaussian's colour.
     """
     with torch.enable_grad():
         colors = gaussians.colors.detach().requires_grad_()
@@ -124,63 +124,63 @@ def contributions(gaussians: Gaussians, view: View, options: RenderOptions, back
 
 
 def axes_of(covariances: Tensor) -> tuple[Tensor, Tensor]:
-    """Scales [N, 3] and quaternions (w, x, y, z) [N, 4] of covariances [N, 3, 3]; the inverse of R diag(s)^2 R^T."""
+    """Decompose covariances [N, 3, 3] = R diag(s)^2 R^T into scales s [N, 3] and quaternions (w, x, y, z) [N, 4]."""
     from scipy.spatial.transform import Rotation
 
-    # On the CPU, for a GPU takes kilobytes for each, and refuses more than two million.
+    # On the CPU: GPUs take kilobytes per matrix, and fail for more than two million.
     squares, axes = torch.linalg.eigh(covariances.double().cpu())
-    axes[:, :, 0] *= torch.linalg.det(axes)[:, None]  # no mirror
-    scales = squares.clamp(min=squares[:, -1:] * FLATTEST**2).sqrt()
+    axes[:, :, 0] *= torch.linalg.det(axes)[:, None]  # right-handed
+    scales = squares.clamp(min=squares[:, -1:] * MIN_FLATNESS**2).sqrt()
     quats = torch.from_numpy(Rotation.from_matrix(axes.numpy()).as_quat()).roll(1, -1)
     return scales.to(covariances), quats.to(covariances)
 
 
-class Pupil(SplatTrainee):
-    """Splats that neither grow nor lose any, with all of their harmonics from the start."""
+class FixedCountSplats(SplatTrainee):
+    """Splats without densification and pruning, with all harmonics active."""
 
     def __init__(self, splats: Splats, config: RenderConfig, extent: float, iterations: int) -> None:
-        """Learning rates are those of 3DGS for a run of `iterations`."""
+        """Use the learning rates of 3DGS for a run of `iterations`."""
         super().__init__(splats, CloneSplitOptions(), config, extent=extent, iterations=iterations)
 
     def observe(self, drawing: Drawing, iteration: int) -> None:
-        """Nothing needs to be known."""
+        """Record nothing."""
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
-        """Nothing grows."""
+        """Change nothing."""
         return ()
 
 
-def teach(
+def distill(
     splats: Splats,
-    show: Callable[[View], Rendering],
+    render_teacher: Callable[[View], Rendering],
     scene: Scene,
     config: RenderConfig,
     steps: int,
     progress: Callable[[int], None] = lambda done: None,
 ) -> None:
-    """Train splats, in place, on pictures of another model.
+    """Train splats, in place, on renders of another model.
 
     Args:
-        splats: what is trained.
-        show: what they shall look like.
-        scene: whose training views are looked at; their photographs are not.
-        config: how splats are drawn.
+        splats: student.
+        render_teacher: renders the target of a view.
+        scene: its training views are rendered; their images are not used.
+        config: of the student's renderer.
         steps: iterations.
-        progress: called with the number of those that are done.
+        progress: called with the number of completed iterations.
     """
-    lessons = tuple(replace(view, load_pixels=_Picture(show, view), load_mask=None) for view in scene.train)
-    pupil = Pupil(splats, config, ExtentOptions().extent_of(scene), steps)
-    for record in Trainer(pupil, replace(scene, train=lessons), Budget(steps), LESSON).records():
+    targets = tuple(replace(view, load_pixels=_Target(render_teacher, view), load_mask=None) for view in scene.train)
+    student = FixedCountSplats(splats, config, ExtentOptions().extent_of(scene), steps)
+    for record in Trainer(student, replace(scene, train=targets), Budget(steps), DISTILLATION).records():
         progress(record.iteration)
 
 
-class _Picture:
-    """The pixels of a view as a model shows it, [H, W, 3] uint8, drawn when they are first asked for."""
+class _Target:
+    """Lazily rendered pixels of a view, [H, W, 3] uint8."""
 
-    def __init__(self, show: Callable[[View], Rendering], view: View) -> None:
-        self._show, self._view, self._pixels = show, view, None
+    def __init__(self, render: Callable[[View], Rendering], view: View) -> None:
+        self._render, self._view, self._pixels = render, view, None
 
     def __call__(self) -> Tensor:
         if self._pixels is None:
-            self._pixels = (quantized(self._show(self._view).image) * 255).to(torch.uint8)
+            self._pixels = (quantized(self._render(self._view).image) * 255).to(torch.uint8)
         return self._pixels

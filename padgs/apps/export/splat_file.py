@@ -1,9 +1,9 @@
-"""Explicit Gaussians as files: the PLY of 3DGS, written and read; other formats by way of splat-transform.
+"""Files of explicit Gaussians: the PLY of 3DGS, written and read; other formats through splat-transform.
 
-A PLY holds per Gaussian x y z, nx ny nz (0; the viewer of 3DGS, SIBR, counts on them), f_dc_0..2, f_rest_0.. (all
-coefficients of red, then of green, then of blue), opacity (a logit), scale_0..2 (logarithms) and rot_0..3 (w, x, y, z),
-as float32: what `Splats` holds, number for number. Harmonics have the degree of the model: programs that expect
-degree 3 are to be told (`--sh_degree` of 3DGS), for filled up with zeros small files would be three times as large.
+A PLY holds per Gaussian x y z, nx ny nz (0; required by SIBR, the viewer of 3DGS), f_dc_0..2, f_rest_0.. (all
+coefficients of red, then green, then blue), opacity (logit), scale_0..2 (logarithms) and rot_0..3 (w, x, y, z), as
+float32: the parameters of `Splats`. Harmonics have the degree of the model; programs that expect degree 3 need an
+option (`--sh_degree` of 3DGS). Padding with zeros would make small files three times as large.
 """
 
 from __future__ import annotations
@@ -27,27 +27,27 @@ from padgs.methods.splats.model import Splats
 from padgs.replacing import replacing
 
 CONVERTER = "splat-transform"
-CONVERTED = (".compressed.ply", ".sog", ".spz", ".html")  # endings that the converter writes
-WITH_A_PALETTE = (".sog", ".html")  # of harmonics: the converter compares each Gaussian's with each of the palette
-COMPARISON = 7e-8  # seconds, on one core; 100 000 Gaussians take 8 minutes
-_PLACE, _NORMAL, _COLOR = ("x", "y", "z"), ("nx", "ny", "nz"), ("f_dc_0", "f_dc_1", "f_dc_2")
+CONVERTED = (".compressed.ply", ".sog", ".spz", ".html")  # suffixes that the converter writes
+WITH_PALETTE = (".sog", ".html")  # the converter compares harmonics of all Gaussians with all of a palette
+COMPARISON_SECONDS = 7e-8  # on one core; 100 000 Gaussians take 8 minutes
+_POSITION, _NORMAL, _COLOR = ("x", "y", "z"), ("nx", "ny", "nz"), ("f_dc_0", "f_dc_1", "f_dc_2")
 _LAST = ("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
-_NEEDED = (*_PLACE, *_COLOR, *_LAST)
+_NEEDED = (*_POSITION, *_COLOR, *_LAST)
 
 
-def write_splats(path: Path, splats: Splats, comments: Sequence[str] = (), *, begin: Tensor | None = None) -> None:
-    """Write Gaussians to a file whose ending says the format.
+def write_splats(path: Path, splats: Splats, comments: Sequence[str] = (), *, start: Tensor | None = None) -> None:
+    """Write Gaussians to a file; its suffix chooses the format.
 
     Args:
-        path: *.ply, or one of `CONVERTED`; a file that is there is replaced once the new one is complete.
-        splats: what is written, only the harmonics in use.
-        comments: lines of a PLY's header; what is not ASCII is escaped.
-        begin: [2, 3] where the viewer of an .html begins, and what it looks at; None: where it likes.
+        path: *.ply, or one of `CONVERTED`; an existing file is replaced when the new one is complete.
+        splats: Gaussians, of which only active harmonics are written.
+        comments: lines of a PLY header; non-ASCII characters are escaped.
+        start: [2, 3] initial position and target of the viewer in an .html; None: its default.
 
     Raises:
-        ValueError: an unknown ending, or the converter is not installed or fails.
+        ValueError: unknown suffix, or the converter is not installed or fails.
     """
-    refuse_impossible(path)
+    check_suffix(path)
     if not path.name.endswith(CONVERTED):
         _write_ply(path, splats, comments)
         return
@@ -55,61 +55,61 @@ def write_splats(path: Path, splats: Splats, comments: Sequence[str] = (), *, be
         plain = Path(folder) / "splats.ply"
         _write_ply(plain, splats, comments)
         settings = []
-        if begin is not None and path.suffix == ".html":
-            (Path(folder) / "viewer.json").write_text(json.dumps(_viewer(begin)))
+        if start is not None and path.suffix == ".html":
+            (Path(folder) / "viewer.json").write_text(json.dumps(_viewer_settings(start)))
             settings = ["--viewer-settings", str(Path(folder) / "viewer.json")]
         _convert(plain, path, *settings)
 
 
-def _viewer(begin: Tensor) -> dict[str, Any]:
-    """Settings of SuperSplat's viewer, whose world is that of the file turned by half a circle about z."""
-    position, target = (begin.double() * torch.tensor([-1.0, -1.0, 1.0])).tolist()
+def _viewer_settings(start: Tensor) -> dict[str, Any]:
+    """Return settings of SuperSplat's viewer, whose world is the file's rotated by 180 degrees about z."""
+    position, target = (start.double() * torch.tensor([-1.0, -1.0, 1.0])).tolist()
     camera = {"position": position, "target": target, "fov": 75, "startAnim": "none"}
     return {"camera": camera, "background": {"color": [0, 0, 0]}, "animTracks": []}
 
 
 def _convert(source: Path, target: Path, *more: str) -> None:
-    # One round over the palette of .sog and .html: 27 000 Gaussians take 26 s, ten rounds 226 s, for 0.01 dB more.
-    how = ["--quiet", "--overwrite", "--gpu", "cpu", "--iterations", "1"]
+    # One iteration over the palette of .sog and .html: 27 000 Gaussians take 26 s; ten take 226 s and gain 0.01 dB.
+    options = ["--quiet", "--overwrite", "--gpu", "cpu", "--iterations", "1"]
     with replacing(target) as draft:
-        command = [CONVERTER, *how, *more, str(source.resolve()), str(draft.resolve())]
+        command = [CONVERTER, *options, *more, str(source.resolve()), str(draft.resolve())]
         done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
         if done.returncode:
-            raise ValueError(f"{CONVERTER} could not make {target} of {source}: {done.stdout.strip()[-500:]}")
+            raise ValueError(f"{CONVERTER} could not convert {source} to {target}: {done.stdout.strip()[-500:]}")
 
 
-def seconds_to_write(path: Path, splats: Splats) -> float:
-    """How long the converter compares harmonics, roughly; 0 for formats that keep them as they are."""
-    if path.suffix not in WITH_A_PALETTE or splats.active_degree == 0:
+def estimate_seconds(path: Path, splats: Splats) -> float:
+    """Estimate the time that the converter compares harmonics; 0 for formats without a palette."""
+    if path.suffix not in WITH_PALETTE or splats.active_degree == 0:
         return 0.0
-    palette = min(1 << 16, 1 << int(math.log2(max(1, len(splats)))))  # as long as splat-transform makes it
-    return COMPARISON * len(splats) * palette
+    palette = min(1 << 16, 1 << int(math.log2(max(1, len(splats)))))  # as in splat-transform
+    return COMPARISON_SECONDS * len(splats) * palette
 
 
-def refuse_impossible(path: Path) -> None:
-    """Say early what `write_splats` would say late.
+def check_suffix(path: Path) -> None:
+    """Check early that `write_splats` supports a file.
 
     Raises:
-        ValueError: as there.
+        ValueError: unknown suffix, or the converter is not installed.
     """
     if not path.name.endswith((".ply", *CONVERTED)):
-        raise ValueError(f"{path} ends in none of the known formats: .ply, {', '.join(CONVERTED)}")
+        raise ValueError(f"{path} has an unknown format; known: .ply, {', '.join(CONVERTED)}")
     if path.name.endswith(CONVERTED) and shutil.which(CONVERTER) is None:
         raise ValueError(
-            f"writing {path.name} takes {CONVERTER}, which is not installed: npm install -g @playcanvas/{CONVERTER}; "
-            "or write a .ply, which it and most viewers read"
+            f"writing {path.name} needs {CONVERTER}, which is not installed: npm install -g @playcanvas/{CONVERTER}; "
+            "or write a .ply, which most viewers read"
         )
 
 
 def read_splats(path: Path, *, unit: float = 1.0) -> Splats:
-    """The Gaussians of a file; `unit` is the scene's unit of length, which the file does not say.
+    """Read Gaussians from a file; `unit` is the scene scale, which files do not contain.
 
     Raises:
-        DataError: no readable PLY, or not one of Gaussians.
-        ValueError: one of `CONVERTED`, but the converter is not installed or fails.
+        DataError: no readable PLY of Gaussians.
+        ValueError: a file in `CONVERTED`, and the converter is not installed or fails.
     """
     if path.name.endswith(CONVERTED):
-        refuse_impossible(path)
+        check_suffix(path)
         with tempfile.TemporaryDirectory() as folder:
             plain = Path(folder) / "splats.ply"
             _convert(path, plain)
@@ -153,9 +153,9 @@ def _write_ply(path: Path, splats: Splats, comments: Sequence[str]) -> None:
     normals = torch.zeros_like(splats.means)
     rows = (splats.means, normals, splats.sh_dc, rest, splats.opacity_logits[:, None], splats.log_scales, splats.quats)
     table = torch.cat(rows, dim=1).detach().float().cpu().contiguous().numpy()
-    names = (*_PLACE, *_NORMAL, *_COLOR, *(f"f_rest_{number}" for number in range(rest.shape[1])), *_LAST)
+    names = (*_POSITION, *_NORMAL, *_COLOR, *(f"f_rest_{number}" for number in range(rest.shape[1])), *_LAST)
     vertex = table.view([(name, "<f4") for name in names])[:, 0]
-    # Comments stand behind the count, which SIBR reads from the third line; names may be of any script, PLY is ASCII.
+    # Comments follow the count, which SIBR reads from the third line. PLY headers are ASCII.
     lines = [line.encode("unicode_escape").decode() for line in comments]
     with replacing(path) as draft:
         PlyData([PlyElement.describe(vertex, "vertex", comments=lines)], byte_order="<").write(str(draft))

@@ -1,1 +1,1 @@
-"""A run to walk through in the browser, drawn by our own renderer."""
+"""Interactive viewer of runs in the browser, rendered by padgs."""

@@ -1,4 +1,4 @@
-"""Pages."""
+"""Pages of the viewer: controls and a render thread for each browser, and updates from training."""
 
 from __future__ import annotations
 
@@ -14,139 +14,139 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from padgs.apps.viewer.renders import CAMERAS, LAYERS, Box, Gallery, Look, beside
-from padgs.apps.viewer.server import Serving
+from padgs.apps.viewer.renders import CAMERAS, LAYERS, Box, RunRenderer, ViewOptions, side_by_side
+from padgs.apps.viewer.server import Server
 from padgs.data.camera_paths import gravity
 from padgs.runs.opened import OpenedRun
 from padgs.scene import View
 
-STILL = 0.2  # seconds without a change, after which the full resolution is drawn
-FRAME = 0.06  # seconds that a frame may take while something changes; resolution follows
-COARSEST = 0.125  # share of the full width and height
+IDLE_SECONDS = 0.2  # without a change, after which the full resolution is rendered
+FRAME_SECONDS = 0.06  # target while something changes; the resolution adapts
+MIN_RESOLUTION = 0.125  # factor on width and height
 WIDTHS = ("512", "768", "1024", "1536", "2048")
 BOTH = "side by side"
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What a page shows next."""
+class PageState:
+    """Controls and camera of a page."""
 
-    look: Look
+    options: ViewOptions
     cam_from_world: Tensor  # [4, 4]
     width: int
     height: int
-    galleries: tuple[Gallery, ...]
+    renderers: tuple[RunRenderer, ...]
 
-    def drawn(self, share: float) -> np.ndarray:
-        """The picture at a share of its full width and height."""
-        width = self.width // len(self.galleries)
-        pictures = [
-            gallery.picture(self.look, self.cam_from_world, width, self.height, share) for gallery in self.galleries
+    def render(self, resolution: float) -> np.ndarray:
+        """Render the image at a fraction of its full width and height."""
+        width = self.width // len(self.renderers)
+        images = [
+            renderer.render(self.options, self.cam_from_world, width, self.height, resolution)
+            for renderer in self.renderers
         ]
-        return pictures[0] if len(pictures) == 1 else beside(*pictures)
+        return images[0] if len(images) == 1 else side_by_side(*images)
 
 
 class Page:
-    """A client of viser with its controls; `start` draws for it until it leaves."""
+    """Controls and render thread of a viser client."""
 
     def __init__(
-        self, client: Any, galleries: Sequence[Gallery], box: Box, drawing: threading.Lock, *, may_stop: bool
+        self, client: Any, renderers: Sequence[RunRenderer], box: Box, lock: threading.Lock, *, may_stop: bool
     ) -> None:
-        """Lay out the controls.
+        """Add the controls.
 
         Args:
             client: a `viser.ClientHandle`.
-            galleries: one run, or two.
-            box: what is cropped to at first.
-            drawing: held while a picture is drawn: pages share the processor.
-            may_stop: whether it may end training, the only thing that a page can do to a run.
+            renderers: of one run, or two.
+            box: initial crop.
+            lock: held while rendering, because pages share the processor.
+            may_stop: whether the page may stop training.
         """
-        self._client, self._galleries, self._drawing = client, tuple(galleries), drawing
-        self._changed, self._left = threading.Event(), threading.Event()
-        self._thread = threading.Thread(target=self._draw, daemon=True, name="padgs page")
-        scene = galleries[0].run.scene
+        self._client, self._renderers, self._lock = client, tuple(renderers), lock
+        self._changed, self._closed = threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=self._render_loop, daemon=True, name="padgs page")
+        scene = renderers[0].run.scene
         self._views = {view.name: view for view in (*scene.train, *scene.test)}
         gui = client.gui
-        self._facts = gui.add_markdown("drawing the first picture")
+        self._summary = gui.add_markdown("rendering the first image")
         self._camera = gui.add_dropdown("camera", CAMERAS)
         self._layer = gui.add_dropdown("show", LAYERS)
-        folders = [gallery.run.folder.name for gallery in galleries]
+        folders = [renderer.run.folder.name for renderer in renderers]
         names = folders if len(folders) == 1 else [f"{number}: {name}" for number, name in enumerate(folders, 1)]
-        self._named = dict(zip(names, self._galleries, strict=True))
-        self._which = gui.add_dropdown("run", names if len(names) == 1 else (*names, BOTH))
+        self._by_name = dict(zip(names, self._renderers, strict=True))
+        self._run = gui.add_dropdown("run", names if len(names) == 1 else (*names, BOTH))
         self._fov = gui.add_slider("degrees across", min=20, max=140, step=1, initial_value=75)
         self._width = gui.add_dropdown("pixels across", WIDTHS, initial_value="1024")
-        self._goal = gui.add_dropdown("go to", ("", *self._views))
+        self._target = gui.add_dropdown("go to", ("", *self._views))
         self._frusta_shown = gui.add_checkbox("cameras", initial_value=False)
-        if any(gallery.run.result is None for gallery in galleries):
-            follow = gui.add_checkbox("follow training", initial_value=any(gallery.follows for gallery in galleries))
+        if any(renderer.run.result is None for renderer in renderers):
+            is_following = any(renderer.is_following for renderer in renderers)
+            follow = gui.add_checkbox("follow training", initial_value=is_following)
             follow.on_update(lambda _: self._follow(follow.value))
             if may_stop:
-                gui.add_button("stop and score", hint="end training now").on_click(
-                    lambda _: self._ask_whether_to_stop()
-                )
+                gui.add_button("stop and score", hint="end training now").on_click(lambda _: self._confirm_stop())
         with gui.add_folder("crop", expand_by_default=False):
-            able = all(gallery.crops for gallery in galleries)
-            self._crop = gui.add_checkbox("crop", initial_value=False, disabled=not able)
+            can_crop = all(renderer.can_crop for renderer in renderers)
+            self._crop = gui.add_checkbox("crop", initial_value=False, disabled=not can_crop)
             step = float(np.ptp(box, axis=0).max() / 200)
             self._low, self._high = (
                 gui.add_vector3(name, tuple(float(f"{step * round(c / step):.6g}") for c in corner), step=step)
                 for name, corner in zip(("lowest", "highest"), box, strict=True)
             )
         self._frusta = [self._frustum(view) for view in self._views.values()]
-        for control in (self._camera, self._layer, self._which, self._fov, self._width, self._frusta_shown):
-            control.on_update(self.renew)
+        for control in (self._camera, self._layer, self._run, self._fov, self._width, self._frusta_shown):
+            control.on_update(self.redraw)
         for control in (self._crop, self._low, self._high):
-            control.on_update(self.renew)
-        self._goal.on_update(lambda _: self.go_to(self._views[self._goal.value]) if self._goal.value else None)
-        client.camera.on_update(self.renew)
+            control.on_update(self.redraw)
+        self._target.on_update(lambda _: self.go_to(self._views[self._target.value]) if self._target.value else None)
+        client.camera.on_update(self.redraw)
         client.camera.near, client.camera.far = 1e-3 * scene.scale, 1e3 * scene.scale
 
     def start(self) -> None:
-        """Draw, in a thread of its own, whatever is asked for next."""
+        """Start the render thread."""
         self._changed.set()
         self._thread.start()
 
-    def renew(self, _: object = None) -> None:
-        """Draw again: something has changed."""
+    def redraw(self, _: object = None) -> None:
+        """Render again, because something has changed."""
         self._changed.set()
 
-    def leave(self) -> None:
-        """Stop drawing; returns when it has stopped."""
-        self._left.set()
+    def close(self) -> None:
+        """Stop the render thread, and wait for it."""
+        self._closed.set()
         self._changed.set()
         self._thread.join()
 
     def go_to(self, view: View) -> None:
-        """Stand where a photograph was taken, and look along its middle."""
+        """Move the camera to a view of the scene."""
         world_from_cam = view.cam_from_world[:3, :3].mT.cpu().numpy()
         with self._client.atomic():
             self._client.camera.position = view.center.cpu().numpy()
             self._client.camera.wxyz = wxyz_of(world_from_cam)
 
-    def asked(self) -> Asked:
-        """What the controls and the camera say now."""
+    def state(self) -> PageState:
+        """Return the state of controls and camera."""
         crop: Box | None = (self._low.value, self._high.value) if self._crop.value else None
-        look = Look(self._camera.value, self._layer.value, float(self._fov.value), crop)
+        options = ViewOptions(self._camera.value, self._layer.value, float(self._fov.value), crop)
         camera = self._client.camera
         world_from_cam = matrix_of(camera.wxyz)
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = world_from_cam.T, -world_from_cam.T @ camera.position
         width, height = sides(int(self._width.value), camera.aspect)
-        shown = self._galleries if self._which.value == BOTH else (self._named[self._which.value],)
-        return Asked(look, torch.from_numpy(pose), width, height, shown)
+        renderers = self._renderers if self._run.value == BOTH else (self._by_name[self._run.value],)
+        return PageState(options, torch.from_numpy(pose), width, height, renderers)
 
-    def _follow(self, follows: bool) -> None:
-        for gallery in self._galleries:  # of all pages
-            gallery.follows = follows
+    def _follow(self, is_following: bool) -> None:
+        for renderer in self._renderers:  # shared by all pages
+            renderer.is_following = is_following
 
-    def _ask_whether_to_stop(self) -> None:
+    def _confirm_stop(self) -> None:
         gui = self._client.gui
-        with gui.add_modal("End training now?") as question:
-            gui.add_markdown("It fades out and is scored after fewer iterations than planned.")
-            end, go_on = gui.add_button("end training"), gui.add_button("go on training")
-        end.on_click(lambda _: [gallery.stop() for gallery in self._galleries])
-        for answer in (end, go_on):
+        with gui.add_modal("Stop training now?") as question:
+            gui.add_markdown("The schedule ends early, and the model is scored after fewer iterations than planned.")
+            stop, resume = gui.add_button("stop training"), gui.add_button("continue training")
+        stop.on_click(lambda _: [renderer.stop() for renderer in self._renderers])
+        for answer in (stop, resume):
             answer.on_click(lambda _: question.close())
 
     def _frustum(self, view: View) -> Any:
@@ -154,7 +154,7 @@ class Page:
             f"/cameras/{view.name}",
             fov=1.0,
             aspect=1.5,
-            scale=0.05 * self._galleries[0].run.scene.scale,
+            scale=0.05 * self._renderers[0].run.scene.scale,
             thickness=1.5,
             thickness_units="screen",
             color=(40, 120, 220),
@@ -165,60 +165,61 @@ class Page:
         frustum.on_click(lambda _: self.go_to(view))
         return frustum
 
-    def _draw(self) -> None:
-        share, full = 0.5, False
-        while not self._left.is_set():
-            if not self._changed.wait(STILL) and full:
+    def _render_loop(self) -> None:
+        resolution, full = 0.5, False
+        while not self._closed.is_set():
+            if not self._changed.wait(IDLE_SECONDS) and full:
                 continue
             full = not self._changed.is_set()
             self._changed.clear()
             try:
-                seconds = self._put(self.asked(), 1.0 if full else share)
-            except Exception as error:  # of any method: said on the page, which goes on
-                if self._left.is_set():
+                seconds = self._update(self.state(), 1.0 if full else resolution)
+            except Exception as error:  # of any method; shown on the page, which continues
+                if self._closed.is_set():
                     return
-                self._facts.content = f"**{type(error).__name__}**: {error}"
+                self._summary.content = f"**{type(error).__name__}**: {error}"
                 continue
             if not full:
-                share = min(1.0, max(COARSEST, share * (FRAME / max(seconds, 1e-3)) ** 0.5))
+                change = (FRAME_SECONDS / max(seconds, 1e-3)) ** 0.5
+                resolution = min(1.0, max(MIN_RESOLUTION, resolution * change))
 
-    def _put(self, asked: Asked, share: float) -> float:
-        """Draw and send a picture; the seconds that drawing took."""
-        with self._drawing:
+    def _update(self, state: PageState, resolution: float) -> float:
+        """Render and send an image; returns the seconds of rendering."""
+        with self._lock:
             start = time.perf_counter()
-            picture = asked.drawn(share)
+            image = state.render(resolution)
             seconds = time.perf_counter() - start
         camera = self._client.camera
-        whole = asked.look.camera == "perspective" and len(asked.galleries) == 1
+        has_overlay = state.options.camera == "perspective" and len(state.renderers) == 1
         with self._client.atomic():
-            if whole:  # what lies over the picture is seen by the same lens
-                camera.fov = 2 * np.arctan(np.tan(np.radians(asked.look.fov) / 2) * asked.height / asked.width)
+            if has_overlay:  # frusta are drawn by viser with the same lens
+                camera.fov = 2 * np.arctan(np.tan(np.radians(state.options.fov) / 2) * state.height / state.width)
             for frustum in self._frusta:
-                frustum.visible = bool(self._frusta_shown.value) and whole
-            self._client.scene.set_background_image(picture, format="jpeg", jpeg_quality=90 if share == 1 else 60)
-            facts = f"{1000 * seconds:.0f} ms, {picture.shape[1]}x{picture.shape[0]}"
-            if asked.look.layer == "error":
-                facts += f"; error of {asked.galleries[0].nearest(asked.cam_from_world).name}"
-            self._facts.content = "  \n".join((*(gallery.facts for gallery in asked.galleries), facts))
+                frustum.visible = bool(self._frusta_shown.value) and has_overlay
+            self._client.scene.set_background_image(image, format="jpeg", jpeg_quality=90 if resolution == 1 else 60)
+            text = f"{1000 * seconds:.0f} ms, {image.shape[1]}x{image.shape[0]}"
+            if state.options.layer == "error":
+                text += f"; error of {state.renderers[0].nearest(state.cam_from_world).name}"
+            self._summary.content = "  \n".join((*(renderer.summary for renderer in state.renderers), text))
         return seconds
 
 
 def wxyz_of(matrix: np.ndarray) -> np.ndarray:
-    """The quaternion [4] of a rotation [3, 3]."""
+    """Return the quaternion [4] of a rotation [3, 3]."""
     from viser.transforms import SO3
 
     return SO3.from_matrix(matrix).wxyz
 
 
 def matrix_of(wxyz: np.ndarray) -> np.ndarray:
-    """The rotation [3, 3] of a quaternion [4]."""
+    """Return the rotation [3, 3] of a quaternion [4]."""
     from viser.transforms import SO3
 
     return SO3(wxyz).as_matrix()
 
 
 def sides(longer: int, aspect: float) -> tuple[int, int]:
-    """Width and height of a picture, at least 2, whose longer side is given: a phone may stand.
+    """Return width and height, at least 2, of an image with a given longer side and aspect ratio.
 
     >>> sides(1024, 1.6), sides(1024, 0.5)
     ((1024, 640), (512, 1024))
@@ -227,76 +228,78 @@ def sides(longer: int, aspect: float) -> tuple[int, int]:
     return (longer, shorter) if aspect >= 1 else (shorter, longer)
 
 
-EVERY = 1.0  # seconds between two looks at whether there is a newer checkpoint
+UPDATE_SECONDS = 1.0  # between searches for a newer checkpoint
 
 
 @contextmanager
-def showing(server: Serving, runs: Sequence[OpenedRun]) -> Iterator[dict[int, Page]]:
-    """Show one run, or two to compare, in the browsers that are there and those that come, until the context ends.
-    They change nothing, but may end training where only this machine is served.
+def show_runs(server: Server, runs: Sequence[OpenedRun]) -> Iterator[dict[int, Page]]:
+    """Show one run, or two to compare, in all connected browsers until the context ends.
 
-    A run in training is shown as its last checkpoint has it, and followed.
+    Runs in training are shown from their last checkpoint, and followed. Pages can stop training if the server is local,
+    and change nothing else.
 
     Args:
-        server: of `serving`.
-        runs: of one scene, the first one's.
+        server: of `start_server`.
+        runs: of the same scene.
 
     Returns:
-        The page of each client that is there, by its number.
+        The page of each connected client, by its number.
 
     Raises:
-        DataError: the data set is not where it was.
+        DataError: the data set is missing.
     """
-    warnings.filterwarnings("ignore", message="Queued .* on a closed connection")  # a page left while it was drawn for
-    galleries, scene, viser = [Gallery(run) for run in runs], runs[0].scene, server.viser
+    warnings.filterwarnings(
+        "ignore", message="Queued .* on a closed connection"
+    )  # a browser was closed while rendering
+    renderers, scene, viser = [RunRenderer(run) for run in runs], runs[0].scene, server.viser
     up = np.array(gravity(torch.stack([view.cam_from_world for view in scene.train])).up)
     viser.scene.set_up_direction(up)
     viser.gui.set_panel_label(f"padgs: {scene.name}")
     first = scene.train[len(scene.train) // 2]
     center = first.center.cpu().numpy()
-    ahead = center + 0.3 * scene.scale * first.cam_from_world[2, :3].cpu().numpy()
-    viser.initial_camera.position, viser.initial_camera.look_at, viser.initial_camera.up = center, ahead, up
-    box, drawing = box_of(scene.points), threading.Lock()
+    target = center + 0.3 * scene.scale * first.cam_from_world[2, :3].cpu().numpy()
+    viser.initial_camera.position, viser.initial_camera.look_at, viser.initial_camera.up = center, target, up
+    box, lock = crop_box(scene.points), threading.Lock()
     pages: dict[int, Page] = {}
 
     @viser.on_client_connect
     def _(client: Any) -> None:
-        with client.atomic():  # one that was there before the runs were has been somewhere else
-            client.camera.up_direction, client.camera.position, client.camera.look_at = up, center, ahead
-        page = pages[client.client_id] = Page(client, galleries, box, drawing, may_stop=server.is_local)
+        with client.atomic():  # it may have connected before the runs were loaded
+            client.camera.up_direction, client.camera.position, client.camera.look_at = up, center, target
+        page = pages[client.client_id] = Page(client, renderers, box, lock, may_stop=server.is_local)
         page.start()
 
     @viser.on_client_disconnect
     def _(client: Any) -> None:
         if page := pages.pop(client.client_id, None):
-            page.leave()
+            page.close()
 
     ended = threading.Event()
-    follower = threading.Thread(target=_follow, args=(galleries, pages, drawing, ended), daemon=True, name="padgs view")
-    follower.start()
+    updates = threading.Thread(target=_update, args=(renderers, pages, lock, ended), daemon=True, name="padgs view")
+    updates.start()
     try:
         yield pages
     finally:
         ended.set()
-        follower.join()
+        updates.join()
         for page in list(pages.values()):
-            page.leave()
+            page.close()
 
 
-def _follow(
-    galleries: Sequence[Gallery], pages: dict[int, Page], drawing: threading.Lock, ended: threading.Event
+def _update(
+    renderers: Sequence[RunRenderer], pages: dict[int, Page], lock: threading.Lock, ended: threading.Event
 ) -> None:
-    """Until the end, let pages draw again whenever training has come further."""
-    while not ended.wait(EVERY):
-        with drawing:
-            news = [gallery.follow() for gallery in galleries]
-        if any(news):
+    """Redraw all pages whenever training has written a checkpoint."""
+    while not ended.wait(UPDATE_SECONDS):
+        with lock:
+            changed = [renderer.update() for renderer in renderers]
+        if any(changed):
             for page in list(pages.values()):
-                page.renew()
+                page.redraw()
 
 
-def box_of(points: torch.Tensor) -> Box:
-    """A box around nearly all of the points [P, 3]."""
+def crop_box(points: torch.Tensor) -> Box:
+    """Return a box around 98 % of the points [P, 3] along each axis."""
     some = points[:: max(1, len(points) // 100_000)].double()
     low, high = (some.quantile(share, dim=0).tolist() for share in (0.01, 0.99))
     return (low[0], low[1], low[2]), (high[0], high[1], high[2])

@@ -1,4 +1,4 @@
-"""What a page shows of a run: a picture for each thing that it may ask for. Knows no page."""
+"""Renders of a run for the viewer: colours, depth or error, cropped, from any pose."""
 
 from __future__ import annotations
 
@@ -24,110 +24,114 @@ Box = tuple[tuple[float, float, float], tuple[float, float, float]]  # lowest an
 
 
 @dataclass(frozen=True)
-class Look:
-    """What is asked for, but for the place and the size."""
+class ViewOptions:
+    """Options of a render, except for pose and size."""
 
     camera: str = "perspective"  # a name of `CAMERAS`
-    layer: str = "colours"  # a name of `LAYERS`; error: of the nearest photograph, from where that was taken
-    fov: float = 75.0  # degrees across a perspective picture
-    crop: Box | None = None  # what lies outside is not drawn
+    layer: str = "colours"  # a name of `LAYERS`; error: at the nearest view of the scene
+    fov: float = 75.0  # horizontal degrees of a perspective camera
+    crop: Box | None = None  # Gaussians outside are not rendered
 
 
-class Gallery:
-    """The pictures of one run, finished or in training.
+class RunRenderer:
+    """Renderer of a run, finished or in training.
 
     Attributes:
-        run: whose.
-        follows: whether `follow` takes over what training makes of it.
+        run: the run.
+        is_following: whether `update` loads newer checkpoints.
     """
 
     def __init__(self, run: OpenedRun) -> None:
-        """Prepare; nothing is drawn yet."""
-        self.run, self.follows, self._trouble = run, run.result is None, ""
-        self._method = lru_cache(maxsize=2)(self._prepared)
-        self._error = lru_cache(maxsize=8)(self._error_of)
+        """Prepare the caches."""
+        self.run, self.is_following, self._failure = run, run.result is None, ""
+        self._method = lru_cache(maxsize=2)(self._method_for)
+        self._error = lru_cache(maxsize=8)(self._error_image)
 
     @property
-    def crops(self) -> bool:
-        """Whether what the run has learned has places, so that it can be cropped."""
+    def can_crop(self) -> bool:
+        """Return whether the model has positions, by which it can be cropped."""
         return isinstance(self.run.method.trainee, (SplatTrainee, AnchorTrainee))
 
     @property
-    def facts(self) -> str:
-        """What the run consists of, and how far it is, for people."""
+    def summary(self) -> str:
+        """Return the size of the model and the progress of its training, as text."""
         counts = ", ".join(f"{count} {name}" for name, count in self.run.method.size().counts.items())
-        facts = counts if self.run.result is not None else f"{counts} after {self.run.iteration} iterations"
-        return f"{facts}; not followed: {self._trouble}" if self._trouble else facts
+        text = counts if self.run.result is not None else f"{counts} after {self.run.iteration} iterations"
+        return f"{text}; cannot follow: {self._failure}" if self._failure else text
 
     def stop(self) -> None:
-        """Ask a run in training to end now and be scored; nothing to one that is finished."""
+        """Request that a run in training stops and is scored; does nothing to a finished run."""
         files = self.run.files
         if files.result() is None:
             files.stop.touch()
 
-    def follow(self) -> bool:
-        """Show what training has come to since, or why that cannot be shown; whether there is anything new."""
-        trouble, run = "", None
+    def update(self) -> bool:
+        """Load a newer checkpoint, or record why that failed; returns whether anything changed."""
+        failure, run = "", None
         try:
-            run = self.run.renewed() if self.follows else None
-        except Exception as error:  # often for a moment only, where the next checkpoint takes its place
-            trouble = str(error)
-        changed, self._trouble = trouble != self._trouble, trouble
+            run = self.run.renewed() if self.is_following else None
+        except Exception as error:  # often temporary, while the next checkpoint is written
+            failure = str(error)
+        changed, self._failure = failure != self._failure, failure
         if run is not None:
             self.run = run
             self._method.cache_clear()
             self._error.cache_clear()
         return changed or run is not None
 
-    def picture(self, look: Look, cam_from_world: Tensor, width: int, height: int, share: float = 1.0) -> np.ndarray:
-        """The picture [h, w, 3] uint8, of the shape that is asked for.
+    def render(
+        self, options: ViewOptions, cam_from_world: Tensor, width: int, height: int, resolution: float = 1.0
+    ) -> np.ndarray:
+        """Render an image [h, w, 3] uint8.
 
         Args:
-            look: what is shown.
-            cam_from_world: [4, 4] from where.
-            width, height: pixels at full resolution; a panorama leaves some of them black.
-            share: of width and height that are drawn; filters stay those of the full resolution, or grow.
+            options: of the render.
+            cam_from_world: [4, 4].
+            width, height: pixels at full resolution; panoramas are padded with black.
+            resolution: factor on width and height; low-pass filters stay those of the full resolution, or grow.
         """
-        full, lens = (self._lens(look, max(2, round(s * width)), max(2, round(s * height))) for s in (1.0, share))
+        full, lens = (
+            self._lens(options, max(2, round(s * width)), max(2, round(s * height))) for s in (1.0, resolution)
+        )
         view = View("page", cam_from_world, lens.width, lens.height, lens=lens)
-        if look.layer == "error":
-            drawn = self._error_from(view)
+        if options.layer == "error":
+            image = self._error_from(view)
         else:
-            rendering = self._method(full, look.crop).render(view)
-            drawn = (
+            rendering = self._method(full, options.crop).render(view)
+            image = (
                 to_uint8(rendering.image)
-                if look.layer == "colours"
+                if options.layer == "colours"
                 else depth_image(rendering, self.run.scene.scale)
             )
-        return drawn if isinstance(lens, Pinhole) else _framed(drawn, max(2, round(share * height)))
+        return image if isinstance(lens, Pinhole) else _pad_to(image, max(2, round(resolution * height)))
 
     def nearest(self, cam_from_world: Tensor) -> View:
-        """The photograph that was taken nearest to a pose."""
+        """Return the view of the scene that is nearest to a pose."""
         center = View("", cam_from_world, 1, 1).center
         views = (*self.run.scene.train, *self.run.scene.test)
         return min(views, key=lambda view: (view.center - center.to(view.center)).norm().item())
 
     @staticmethod
-    def _lens(look: Look, width: int, height: int) -> Panorama | Pinhole:
-        if look.camera == "perspective":
-            return perspective(width, height, look.fov)
+    def _lens(options: ViewOptions, width: int, height: int) -> Panorama | Pinhole:
+        if options.camera == "perspective":
+            return perspective(width, height, options.fov)
         height = min(height, width // 2)
         return Panorama(2 * height, height)
 
-    def _prepared(self, full: Panorama | Pinhole, crop: Box | None) -> Method:
+    def _method_for(self, full: Panorama | Pinhole, crop: Box | None) -> Method:
         method = self.run.through(full)
-        if crop is None or not self.crops:
+        if crop is None or not self.can_crop:
             return method
-        return cropped(method.drawn_with(method.render_config), crop)
+        return crop_model(method.drawn_with(method.render_config), crop)
 
     def _error_from(self, view: View) -> np.ndarray:
-        """The error of the nearest photograph, in the directions that a view has."""
-        taken = self.nearest(view.cam_from_world)
-        error = torch.from_numpy(self._error(taken.name)).float()
-        turn = (taken.cam_from_world[:3, :3] @ view.cam_from_world[:3, :3].mT.to(taken.cam_from_world)).float().cpu()
-        return sample(error, view.camera.rays() @ turn.mT).round().byte().numpy()
+        """Return the error image of the nearest view of the scene, resampled to the directions of a view."""
+        nearest = self.nearest(view.cam_from_world)
+        error = torch.from_numpy(self._error(nearest.name)).float()
+        rotation = nearest.cam_from_world[:3, :3] @ view.cam_from_world[:3, :3].mT.to(nearest.cam_from_world)
+        return sample(error, view.camera.rays() @ rotation.float().cpu().mT).round().byte().numpy()
 
-    def _error_of(self, name: str) -> np.ndarray:
+    def _error_image(self, name: str) -> np.ndarray:
         scene = self.run.scene
         view = next(view for view in (*scene.train, *scene.test) if view.name == name)
         image = self.run.method.render(view).image
@@ -135,21 +139,21 @@ class Gallery:
         return error_image(image if mask is None else torch.lerp(truth, image, mask[..., None]), truth).copy()
 
 
-def cropped(method: Method, crop: Box) -> Method:
-    """The method without all that lies outside of a box, in place; only good for drawing."""
+def crop_model(method: Method, crop: Box) -> Method:
+    """Remove all Gaussians or anchors outside a box, in place; the method can then only render."""
     trainee = method.trainee
-    places = trainee.model.positions if isinstance(trainee, AnchorTrainee) else trainee.splats.means
-    low, high = (places.new_tensor(corner) for corner in crop)
-    trainee.keep(((places >= low) & (places <= high)).all(-1))
+    positions = trainee.model.positions if isinstance(trainee, AnchorTrainee) else trainee.splats.means
+    low, high = (positions.new_tensor(corner) for corner in crop)
+    trainee.keep(((positions >= low) & (positions <= high)).all(-1))
     return method
 
 
-def beside(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Two pictures of one height side by side, with a line between them."""
+def side_by_side(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Join two images of one height, with a white line between them."""
     return np.concatenate((left, np.full_like(left[:, :2], 255), right), axis=1)
 
 
-def _framed(picture: np.ndarray, height: int) -> np.ndarray:
-    """A picture in the middle of a black one of another height."""
-    room = height - len(picture)
-    return np.pad(picture, ((room // 2, room - room // 2), (0, 0), (0, 0)))
+def _pad_to(image: np.ndarray, height: int) -> np.ndarray:
+    """Pad an image with black rows to a height, centred."""
+    rows = height - len(image)
+    return np.pad(image, ((rows // 2, rows - rows // 2), (0, 0), (0, 0)))

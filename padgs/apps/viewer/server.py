@@ -1,6 +1,6 @@
-"""The server that pages come from: viser, on this machine alone unless another address is given.
+"""Web server of the viewer: viser, by default for this machine only.
 
-Imports nothing of torch: browsers load their page while that, and the runs, are still being loaded.
+Imports no torch, so that browsers can load the page while torch and the runs are loading.
 """
 
 from __future__ import annotations
@@ -15,55 +15,55 @@ from typing import Any
 from padgs.extras import installing
 
 LOCAL, PORT = "127.0.0.1", 8080
-EVERYWHERE = "0.0.0.0"  # any address of this machine
+ALL_INTERFACES = "0.0.0.0"
 
 
 @dataclass(frozen=True)
-class Serving:
-    """A server at work; `padgs.apps.viewer.pages.showing` gives it something to show."""
+class Server:
+    """A running server; `padgs.apps.viewer.pages.show_runs` adds the runs."""
 
-    address: str  # for a browser
+    address: str  # URL
     viser: Any  # the `viser.ViserServer`
-    is_local: bool  # whether only this machine is served
+    is_local: bool  # whether it serves only this machine
 
 
 @contextmanager
-def serving(*, host: str = LOCAL, port: int = PORT) -> Iterator[Serving]:
+def start_server(*, host: str = LOCAL, port: int = PORT) -> Iterator[Server]:
     """Serve empty pages to any number of browsers, until the context ends.
 
     Args:
-        host: `LOCAL` is this machine alone.
-        port: the first to try; the next free one is taken.
+        host: `LOCAL` serves this machine only.
+        port: the first port to try; the next free one is used.
 
     Raises:
         ValueError: the extra `view` is not installed.
-        OSError: the address cannot be served.
+        OSError: the address cannot be used.
     """
     viser = viser_module()
-    with redirect_stdout(None):  # it draws a box around addresses, whatever `verbose` says
+    with redirect_stdout(None):  # viser prints addresses even if not verbose
         server = viser.ViserServer(host=host, port=port, label="padgs", verbose=False)
-    server.gui.configure_theme(dark_mode=True, show_share_button=False)  # sharing would go through a stranger's server
+    server.gui.configure_theme(dark_mode=True, show_share_button=False)  # sharing uses an external server
     local = host in (LOCAL, "localhost")
-    name = "localhost" if local else own_address() if host == EVERYWHERE else host
+    name = "localhost" if local else network_address() if host == ALL_INTERFACES else host
     try:
-        yield Serving(f"http://{name}:{server.get_port()}", server, local)
+        yield Server(f"http://{name}:{server.get_port()}", server, local)
     finally:
         with redirect_stdout(None):
             server.stop()
 
 
-def own_address() -> str:
-    """What others in the network call this machine; localhost where there is no network."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as way:
+def network_address() -> str:
+    """Return this machine's address in the network; localhost without a network."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
-            way.connect(("192.0.2.1", 9))  # no machine has this address: the way out is looked up, nothing is sent
+            probe.connect(("192.0.2.1", 9))  # a reserved address; only looks up the route, sends nothing
         except OSError:
             return "localhost"
-        return way.getsockname()[0]
+        return probe.getsockname()[0]
 
 
 def viser_module() -> ModuleType:
-    """The package that serves.
+    """Import viser.
 
     Raises:
         ValueError: it is not installed.

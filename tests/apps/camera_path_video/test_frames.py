@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from padgs.apps.camera_path_video import write_film
+from padgs.apps.camera_path_video import write_video
 from padgs.scene import View
 
 av = pytest.importorskip("av", reason="PyAV, the extra `video`, is not installed")
@@ -16,7 +16,7 @@ VIEW = View("a", torch.eye(4, dtype=torch.float64), 64, 32)
 
 
 def test_players_are_told_the_colours_that_a_film_has(tmp_path):
-    write_film(tmp_path / "a.mp4", [VIEW], lambda view: SHOWN, fps=10, unit=1)
+    write_video(tmp_path / "a.mp4", [VIEW], lambda view: SHOWN, fps=10, scene_scale=1)
     with av.open(str(tmp_path / "a.mp4")) as film:
         stream = film.streams.video[0]
         assert (stream.colorspace, stream.color_primaries, stream.color_trc) == (1, 1, 1), "all BT.709"
@@ -31,7 +31,7 @@ def test_a_film_that_is_cut_off_leaves_the_earlier_one(tmp_path):
 
     (tmp_path / "a.mp4").write_text("the earlier one")
     with pytest.raises(KeyboardInterrupt):
-        write_film(tmp_path / "a.mp4", 100 * [VIEW], lambda view: SHOWN, fps=10, unit=1, progress=stop)
+        write_video(tmp_path / "a.mp4", 100 * [VIEW], lambda view: SHOWN, fps=10, scene_scale=1, progress=stop)
     assert [path.read_text() for path in tmp_path.iterdir()] == ["the earlier one"]
 
 
@@ -40,6 +40,6 @@ def test_pictures_that_are_cut_off_do_not_bar_the_next(tmp_path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        write_film(tmp_path / "frames", 2 * [VIEW], lambda view: SHOWN, fps=10, unit=1, progress=stop)
-    write_film(tmp_path / "frames", 2 * [VIEW], lambda view: SHOWN, fps=10, unit=1)
+        write_video(tmp_path / "frames", 2 * [VIEW], lambda view: SHOWN, fps=10, scene_scale=1, progress=stop)
+    write_video(tmp_path / "frames", 2 * [VIEW], lambda view: SHOWN, fps=10, scene_scale=1)
     assert sorted(path.name for path in (tmp_path / "frames").iterdir()) == ["00001.png", "00002.png"]

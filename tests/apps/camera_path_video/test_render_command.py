@@ -82,8 +82,8 @@ def test_a_perspective_picture_shows_what_the_panorama_shows_there(folder, tmp_p
     ("arguments", "message"),
     [
         (("--camera", "fisheye"), "unknown camera 'fisheye'; known: panorama, perspective"),
-        (("--fps", "0"), "--fps is 0, which makes a film without a frame; it must be > 0"),
-        (("--seconds", "0"), "--seconds is 0, which makes a film"),
+        (("--fps", "0"), "--fps is 0, which makes a video without frames; it must be > 0"),
+        (("--seconds", "0"), "--seconds is 0, which makes a video"),
         (("--height", "9"), "are of perspective pictures: add --camera perspective"),
         (("--path", "spiral"), "the path spiral does not exist; known: cameras, orbit, dolly"),
         (("--camera", "perspective", "--fov", "180"), "across 180 degrees"),
@@ -97,7 +97,7 @@ def test_what_cannot_be_rendered_says_why(arguments, message, folder, tmp_path):
 def test_pictures_are_not_mixed_with_others(folder, tmp_path):
     arguments = (str(folder), "--to", str(tmp_path / "f"), "--seconds", "0.1", "--fps", "20")
     assert render(*arguments).exit_code == 0
-    assert "holds pictures already" in render(*arguments).stderr
+    assert "already holds images" in render(*arguments).stderr
 
 
 def test_another_place_or_other_data_can_be_named(folder, tmp_path):
@@ -110,5 +110,5 @@ def test_another_place_or_other_data_can_be_named(folder, tmp_path):
 
 def test_films_of_other_kinds_are_refused_before_anything_is_drawn(folder, tmp_path):
     said = render(str(folder), "--to", str(tmp_path / "x.avi"))
-    assert said.exit_code == 1 and "x.avi is no .mp4" in " ".join(said.output.split())
+    assert said.exit_code == 1 and "x.avi is not an .mp4" in " ".join(said.output.split())
     assert not list(tmp_path.iterdir())

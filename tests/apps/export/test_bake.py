@@ -4,7 +4,7 @@ import pytest
 import torch
 from tiny_scene import tiny_scene, truth
 
-from padgs.apps.export.bake import axes_of, baked, cameras_around, contributions, teach
+from padgs.apps.export.bake import axes_of, bake, contributions, distill, sample_cameras
 from padgs.gaussians import rotation_matrices
 from padgs.methods.anchors.method import PaDGSMethod
 from padgs.methods.splats.model import Splats
@@ -33,7 +33,7 @@ def decibels(method: PaDGSMethod, splats: Splats) -> float:
 def test_baked_anchors_look_like_the_method(trained):
     scene = tiny_scene()
     options = trained.render_config.options(scene.scale)
-    splats = baked(trained.trainee.model, cameras_around(scene.train, 16), options, "auto", scene.scale)
+    splats = bake(trained.trainee.model, sample_cameras(scene.train, 16), options, "auto", scene.scale)
     assert decibels(trained, splats) > 35
     assert 0 < len(splats) < trained.size().counts["gaussians"], "what never shows is dropped"
 
@@ -41,20 +41,20 @@ def test_baked_anchors_look_like_the_method(trained):
 def test_lessons_bring_them_nearer(trained):
     scene = tiny_scene()
     options = trained.render_config.options(scene.scale)
-    splats = baked(trained.trainee.model, scene.train, options, "auto", scene.scale)
+    splats = bake(trained.trainee.model, scene.train, options, "auto", scene.scale)
     splats.sh_dc.data += 0.5
     first, done = decibels(trained, splats), []
-    teach(splats, trained.render, scene, trained.render_config, 60, done.append)
+    distill(splats, trained.render, scene, trained.render_config, 60, done.append)
     assert done == list(range(1, 61)) and decibels(trained, splats) > first + 6
 
 
 def test_cameras_in_one_place_teach_as_well(trained):
     scene = tiny_scene()
     options = trained.render_config.options(scene.scale)
-    splats = baked(trained.trainee.model, scene.train, options, "auto", scene.scale)
+    splats = bake(trained.trainee.model, scene.train, options, "auto", scene.scale)
     before = splats.means.clone()
     alone = replace(scene, train=tuple(view.at(scene.train[0].cam_from_world) for view in scene.train))
-    teach(splats, trained.render, alone, trained.render_config, 5)
+    distill(splats, trained.render, alone, trained.render_config, 5)
     assert not torch.equal(splats.means, before)
 
 
@@ -80,11 +80,11 @@ def test_axes_are_those_of_the_covariance(generator):
 
 def test_places_around_the_cameras_are_always_the_same_and_start_with_them():
     views = tiny_scene().train
-    found = cameras_around(views, 12)
+    found = sample_cameras(views, 12)
     assert len(found) == 12 and all(new is old for new, old in zip(found, views, strict=False))
-    again = cameras_around(views, 12)
+    again = sample_cameras(views, 12)
     assert all(torch.equal(a.cam_from_world, b.cam_from_world) for a, b in zip(found, again, strict=True))
     spread = torch.stack([view.center for view in found])
     assert spread.isfinite().all() and spread.abs().max() < 3
     many = [views[0]] * 100
-    assert len(cameras_around(many, 12)) == 12, "of many cameras some"
+    assert len(sample_cameras(many, 12)) == 12, "of many cameras some"

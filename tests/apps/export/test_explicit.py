@@ -9,7 +9,7 @@ from tiny_run import tiny_run
 from typer.testing import CliRunner
 
 import padgs
-from padgs.apps.export.explicit import exported
+from padgs.apps.export.explicit import export_run
 from padgs.apps.export.splat_file import read_splats
 from padgs.baselines.sc_omnigs import aligned, carried
 from padgs.cli.commands import app
@@ -47,16 +47,16 @@ def test_an_exported_run_scores_as_it_did(splat_run):
 
 def test_gaussians_are_exported_as_they_are_without_the_data(splat_run, tmp_path):
     said = export(str(splat_run), "--data", str(tmp_path / "gone"), "--to", str(tmp_path / "a.ply"))
-    assert said.exit_code == 0 and "the data set is not where it was" in said.output
+    assert said.exit_code == 0 and "the data set is missing" in said.output
     assert len(read_splats(tmp_path / "a.ply")) == len(padgs.load_run(splat_run).method.trainee.splats)
 
 
 def test_for_viewers_gaussians_are_as_wide_as_the_finest_view_draws_them(splat_run, tmp_path):
     said = export(str(splat_run), "--smooth", "--to", str(tmp_path / "smooth.ply"))
-    assert said.exit_code == 0 and "as wide as the finest training view drew it" in " ".join(said.output.split())
+    assert said.exit_code == 0 and "including the 3D smoothing filter" in " ".join(said.output.split())
     run = padgs.load_run(splat_run)
     view, options = run.scene.train[0], run.config.render.options(run.scene.scale)
-    exact, smooth = (exported(run, smooth=wanted).splats for wanted in (False, True))
+    exact, smooth = (export_run(run, smooth=wanted).splats for wanted in (False, True))
     written = read_splats(tmp_path / "smooth.ply", unit=run.scene.scale)
     assert torch.allclose(written.log_scales, smooth.log_scales, atol=1e-5)
     without_filter = replace(options, low_pass=0.0)
@@ -73,7 +73,7 @@ def test_refined_poses_do_not_move_the_world(tmp_path_factory):
     with torch.no_grad():
         for correction in poses.parameters():
             correction += 0.02 * torch.randn(correction.shape, generator=torch.Generator().manual_seed(1))
-    splats, view = exported(run).splats, run.scene.test[0]
+    splats, view = export_run(run).splats, run.scene.test[0]
     carried_view = view.at(carried(view.cam_from_world, aligned(poses)[0]))
     options = run.config.render.options(run.scene.scale)
     own = run.method.trainee.render(carried_view).image
@@ -93,7 +93,7 @@ def test_points_and_upright_worlds(splat_run, tmp_path):
 
 def test_anchors_are_baked_and_the_loss_is_said_and_written(tmp_path_factory, tmp_path):
     folder = tiny_run(tmp_path_factory, "method=padgs_small", "train.iterations=60")
-    said = export(str(folder), "--to", str(tmp_path / "a.ply"), "--lessons", "40")
+    said = export(str(folder), "--to", str(tmp_path / "a.ply"), "--distillation-steps", "40")
     assert said.exit_code == 0, said.output
     (line,) = [line for line in PlyData.read(str(tmp_path / "a.ply"))["vertex"].comments if line.startswith("baked")]
     assert line in said.output and "WS-PSNR of the test views" in line
@@ -104,7 +104,7 @@ def test_what_cannot_be_exported_says_why(tmp_path_factory, tmp_path, splat_run)
     folder = tiny_run(tmp_path_factory, "method=egonerf_small", "train.iterations=2")
     (tmp_path / "file").touch()
     for arguments, message in (
-        ((str(folder),), "egonerf has no Gaussians to export; padgs render and padgs view"),
+        ((str(folder),), "egonerf has no Gaussians to export; use padgs render or padgs view"),
         ((str(tmp_path / "RUNX"),), "has no config.yaml"),
         ((str(splat_run), "--to", "a.obj"), "none of the known formats"),
         ((str(splat_run), "--points", "--to", str(tmp_path / "a.compressed.ply")), "is no plain .ply"),

@@ -8,7 +8,7 @@ from plyfile import PlyData
 from random_splats import random_splats
 
 from padgs.apps.export import splat_file
-from padgs.apps.export.splat_file import read_splats, seconds_to_write, write_splats
+from padgs.apps.export.splat_file import estimate_seconds, read_splats, write_splats
 from padgs.data.capture import Cloud, DataError
 from padgs.data.cloud import write_ply
 from padgs.methods.splats.model import Splats
@@ -49,7 +49,7 @@ def test_the_header_is_what_the_viewer_of_3dgs_counts_on(tmp_path, generator):
 
 def test_files_that_are_none_are_refused(tmp_path, generator):
     splats = random_splats(0, generator)
-    with pytest.raises(ValueError, match=r"a.obj ends in none of the known formats: .ply, .compressed.ply"):
+    with pytest.raises(ValueError, match=r"a.obj has an unknown format; known: .ply, .compressed.ply"):
         write_splats(tmp_path / "a.obj", splats)
     write_ply(tmp_path / "cloud.ply", Cloud(torch.zeros(2, 3), None))
     with pytest.raises(DataError, match="has no property f_dc_0; Gaussians of 3DGS have x, y, z"):
@@ -69,10 +69,10 @@ def test_without_the_converter_the_way_out_is_said(tmp_path, generator, monkeypa
 
 def test_what_takes_minutes_is_known_beforehand():
     splats = Splats(torch.zeros(100_000, 3), torch.zeros(100_000, 3), torch.zeros(100_000, 3), degree=2, unit=1.0)
-    assert seconds_to_write(Path("a.sog"), splats) == 0, "no harmonics in use"
+    assert estimate_seconds(Path("a.sog"), splats) == 0, "no harmonics in use"
     splats.active_degree = 2
-    assert 400 < seconds_to_write(Path("a.sog"), splats) == seconds_to_write(Path("a.html"), splats) < 550  # took 476
-    assert {seconds_to_write(Path(name), splats) for name in ("a.ply", "a.compressed.ply", "a.spz")} == {0}
+    assert 400 < estimate_seconds(Path("a.sog"), splats) == estimate_seconds(Path("a.html"), splats) < 550  # took 476
+    assert {estimate_seconds(Path(name), splats) for name in ("a.ply", "a.compressed.ply", "a.spz")} == {0}
 
 
 @pytest.mark.skipif(shutil.which(splat_file.CONVERTER) is None, reason="splat-transform is not installed")
@@ -94,7 +94,7 @@ def test_a_page_begins_where_a_photograph_was_taken(tmp_path, generator, monkeyp
     (tmp_path / splat_file.CONVERTER).chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
     begin = torch.tensor([[1.0, 2.0, 3.0], [1.0, 2.0, 4.0]])
-    write_splats(tmp_path / "a.html", random_splats(0, generator), begin=begin)
+    write_splats(tmp_path / "a.html", random_splats(0, generator), start=begin)
     camera = json.loads((tmp_path / "a.html").read_text())["camera"]
     assert (camera["position"], camera["target"]) == ([-1, -2, 3], [-1, -2, 4]), "its y is up, and its x is left"
 
@@ -105,7 +105,7 @@ def test_a_converter_that_fails_is_quoted_and_leaves_the_earlier_file(tmp_path, 
     (tmp_path / splat_file.CONVERTER).chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
     (tmp_path / "a.spz").write_text("the earlier one")
-    with pytest.raises(ValueError, match="could not make .*a.spz of .*: no room left"):
+    with pytest.raises(ValueError, match="could not convert .* to .*a.spz: no room left"):
         write_splats(tmp_path / "a.spz", random_splats(0, generator))
     assert (tmp_path / "a.spz").read_text() == "the earlier one"
     assert {path.name for path in tmp_path.iterdir()} == {"a.spz", splat_file.CONVERTER}

@@ -10,8 +10,8 @@ from tiny_run import tiny_run
 from typer.testing import CliRunner
 
 import padgs
-from padgs.apps.viewer.pages import BOTH, box_of, showing
-from padgs.apps.viewer.server import serving
+from padgs.apps.viewer.pages import BOTH, crop_box, show_runs
+from padgs.apps.viewer.server import start_server
 from padgs.cli.commands import app
 from padgs.extras import installing
 from padgs.scene import View
@@ -37,7 +37,7 @@ def until(condition) -> None:
 
 @WITH_VISER
 def test_the_page_is_served_here_only_and_ends(run):
-    with serving(port=8400) as server, showing(server, [run]):
+    with start_server(port=8400) as server, show_runs(server, [run]):
         assert server.is_local and server.address.startswith("http://localhost:")
         assert b"<html" in urlopen(server.address, timeout=20).read()[:500]
     with pytest.raises(OSError, match="refused"):
@@ -46,7 +46,7 @@ def test_the_page_is_served_here_only_and_ends(run):
 
 @WITH_VISER
 def test_a_page_for_the_network_has_an_address_that_others_can_open():
-    with serving(host="0.0.0.0", port=8410) as server:
+    with start_server(host="0.0.0.0", port=8410) as server:
         assert not server.is_local and "0.0.0.0" not in server.address
         assert b"<html" in urlopen(server.address, timeout=20).read()[:500]
 
@@ -56,23 +56,23 @@ def test_a_page_for_the_network_has_an_address_that_others_can_open():
 @in_chromium
 def test_a_browser_shows_all_that_can_be_asked_for(run, tmp_path):
     """Controls are set from here, as the page would; what they do is seen on the page."""
-    with serving(port=8420) as server, visiting(server.address) as visit, showing(server, [run, run]) as pages:
+    with start_server(port=8420) as server, visiting(server.address) as visit, show_runs(server, [run, run]) as pages:
         until(lambda: pages)
         (page,) = pages.values()
         page._width.value = "512"
         middle = run.scene.train[len(run.scene.train) // 2]
-        until(lambda: (View("", page.asked().cam_from_world, 1, 1).center - middle.center).norm() < 1e-4)
+        until(lambda: (View("", page.state().cam_from_world, 1, 1).center - middle.center).norm() < 1e-4)
 
         def shows(*texts: str) -> None:
-            until(lambda: all(text in page._facts.content for text in ("51", *texts)))
-            words = page._facts.content.split()[0]  # how many Gaussians
+            until(lambda: all(text in page._summary.content for text in ("51", *texts)))
+            words = page._summary.content.split()[0]  # how many Gaussians
             visit.wait(f"document.body.innerText.includes({words!r})")
 
         shows("gaussians", " ms")
-        page._which.value = BOTH
-        until(lambda: len(page.asked().galleries) == 2)
+        page._run.value = BOTH
+        until(lambda: len(page.state().renderers) == 2)
         shows()
-        page._which.value = next(iter(page._named))
+        page._run.value = next(iter(page._by_name))
         page._layer.value = "error"
         shows("error of")
         page._layer.value, page._camera.value = "depth", "panorama"
@@ -80,13 +80,13 @@ def test_a_browser_shows_all_that_can_be_asked_for(run, tmp_path):
         shows()
         view = run.scene.test[0]
         page.go_to(view)
-        until(lambda: abs(page.asked().cam_from_world - view.cam_from_world).max() < 1e-6)
+        until(lambda: abs(page.state().cam_from_world - view.cam_from_world).max() < 1e-6)
         page._layer.value, page._camera.value = "colours", "perspective"
         page._fov.value = 60
-        until(lambda: page.asked().look.fov == 60)
-        before = page.asked().cam_from_world
+        until(lambda: page.state().options.fov == 60)
+        before = page.state().cam_from_world
         visit.drag("canvas[data-engine]", 80, 30)
-        until(lambda: abs(page.asked().cam_from_world - before).max() > 1e-3)
+        until(lambda: abs(page.state().cam_from_world - before).max() > 1e-3)
         visit.page.screenshot(path=tmp_path / "page.png")
         assert (tmp_path / "page.png").stat().st_size > 10_000
         assert [text for text in visit.complaints if "THREE.Clock" not in text and "WebSocket" not in text] == []
@@ -105,6 +105,6 @@ def test_a_folder_that_is_no_run_is_refused(run, tmp_path):
 
 def test_the_box_holds_nearly_all_points(run):
     points = run.scene.points
-    low, high = (points.new_tensor(corner) for corner in box_of(points))
+    low, high = (points.new_tensor(corner) for corner in crop_box(points))
     inside = ((points >= low) & (points <= high)).all(-1).float().mean()
     assert 0.9 < inside < 1

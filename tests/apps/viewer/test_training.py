@@ -18,10 +18,10 @@ from tiny_run import tiny_run
 import padgs
 from padgs import results
 from padgs.apps.viewer import pages
-from padgs.apps.viewer.pages import showing
-from padgs.apps.viewer.process import await_checkpoint, shown
-from padgs.apps.viewer.renders import Gallery, Look
-from padgs.apps.viewer.server import LOCAL, serving
+from padgs.apps.viewer.pages import show_runs
+from padgs.apps.viewer.process import serve_training, wait_for_checkpoint
+from padgs.apps.viewer.renders import RunRenderer, ViewOptions
+from padgs.apps.viewer.server import LOCAL, start_server
 from padgs.extras import installing
 from padgs.runs import checkpoint
 from padgs.runs.config import WATCHED, RunOptions
@@ -55,43 +55,43 @@ def train_on(folder: Path) -> None:
 
 
 def test_a_run_in_training_is_followed_until_told_not_to(folder):
-    gallery = Gallery(padgs.load_run(folder, device="cpu"))
-    scene, pose = gallery.run.scene, gallery.run.scene.train[0].cam_from_world
+    renderer = RunRenderer(padgs.load_run(folder, device="cpu"))
+    scene, pose = renderer.run.scene, renderer.run.scene.train[0].cam_from_world
 
     def picture() -> np.ndarray:
-        return gallery.picture(Look("panorama"), pose, 32, 16)
+        return renderer.render(ViewOptions("panorama"), pose, 32, 16)
 
     first = picture()
-    assert "after 30 iterations" in gallery.facts and not gallery.follow()
+    assert "after 30 iterations" in renderer.summary and not renderer.update()
     train_on(folder)
-    assert gallery.follow() and "after 40 iterations" in gallery.facts
+    assert renderer.update() and "after 40 iterations" in renderer.summary
     assert not np.array_equal(picture(), first)
-    assert gallery.run.scene is scene, "the scene is not loaded again"
-    gallery.follows = False
+    assert renderer.run.scene is scene, "the scene is not loaded again"
+    renderer.is_following = False
     train_on(folder)
-    assert not gallery.follow() and "after 40 iterations" in gallery.facts
-    gallery.follows = True
-    assert gallery.follow() and "after 50 iterations" in gallery.facts
+    assert not renderer.update() and "after 40 iterations" in renderer.summary
+    renderer.is_following = True
+    assert renderer.update() and "after 50 iterations" in renderer.summary
     (folder / "checkpoint" / checkpoint.MANIFEST).write_text("{")
-    assert gallery.follow() and "not followed" in gallery.facts and not gallery.follow()
-    assert "after 50 iterations" in gallery.facts and picture().std() > 0, "what cannot be read changes no picture"
-    gallery.follows = False
-    assert gallery.follow() and "not followed" not in gallery.facts
+    assert renderer.update() and "cannot follow" in renderer.summary and not renderer.update()
+    assert "after 50 iterations" in renderer.summary and picture().std() > 0, "what cannot be read changes no picture"
+    renderer.is_following = False
+    assert renderer.update() and "cannot follow" not in renderer.summary
 
 
 def test_a_finished_run_is_not_followed(tmp_path_factory):
-    gallery = Gallery(padgs.load_run(tiny_run(tmp_path_factory), device="cpu"))
-    assert not gallery.follows and "iterations" not in gallery.facts
-    gallery.stop()
-    assert not gallery.run.files.stop.exists(), "nor ended: the next run of that name would end at once"
+    renderer = RunRenderer(padgs.load_run(tiny_run(tmp_path_factory), device="cpu"))
+    assert not renderer.is_following and "iterations" not in renderer.summary
+    renderer.stop()
+    assert not renderer.run.files.stop.exists(), "nor ended: the next run of that name would end at once"
 
 
 def test_the_end_of_training_is_seen(folder, tmp_path_factory):
-    gallery = Gallery(padgs.load_run(folder, device="cpu"))
+    renderer = RunRenderer(padgs.load_run(folder, device="cpu"))
     shutil.copy(tiny_run(tmp_path_factory) / results.FILE_NAME, folder)
-    gallery.stop()
-    assert not gallery.run.files.stop.exists(), "it has ended, although the page does not say so yet"
-    assert gallery.follow() and "iterations" not in gallery.facts and not gallery.follow()
+    renderer.stop()
+    assert not renderer.run.files.stop.exists(), "it has ended, although the page does not say so yet"
+    assert renderer.update() and "iterations" not in renderer.summary and not renderer.update()
 
 
 @WITH_VISER
@@ -100,17 +100,17 @@ def test_the_end_of_training_is_seen(folder, tmp_path_factory):
 @pytest.mark.parametrize("host", [LOCAL, "0.0.0.0"])
 def test_training_is_ended_from_a_page_on_this_machine_only(folder, host):
     run = padgs.load_run(folder, device="cpu")
-    with serving(host=host, port=8460) as server, showing(server, [run]), visiting(server.address) as visit:
+    with start_server(host=host, port=8460) as server, show_runs(server, [run]), visiting(server.address) as visit:
         visit.wait("document.body.innerText.includes('follow training')")
         if host != LOCAL:
             visit.page.wait_for_timeout(500)
             assert "stop and score" not in visit.page.inner_text("body")
             return
-        for answer in ("go on training", "end training"):
+        for answer in ("continue training", "stop training"):
             assert not (folder / "stop").exists()
             visit.page.get_by_role("button", name="stop and score").click()
             visit.page.get_by_role("button", name=answer).click()
-            visit.wait("!document.body.innerText.includes('End training now?')")
+            visit.wait("!document.body.innerText.includes('Stop training now?')")
         end = time.monotonic() + 20
         while not (folder / "stop").exists():
             assert time.monotonic() < end, "training was not asked to end"
@@ -123,18 +123,18 @@ class Renewed:
 
     asked: threading.Event = field(default_factory=threading.Event)
 
-    def renew(self) -> None:
+    def redraw(self) -> None:
         self.asked.set()
 
-    def leave(self) -> None:
+    def close(self) -> None:
         """Nothing to end."""
 
 
 @WITH_VISER
 def test_pages_draw_again_when_training_has_come_further(folder, monkeypatch):
-    monkeypatch.setattr(pages, "EVERY", 0.05)
+    monkeypatch.setattr(pages, "UPDATE_SECONDS", 0.05)
     page = Renewed()
-    with serving(port=8440) as server, showing(server, [padgs.load_run(folder, device="cpu")]) as there:
+    with start_server(port=8440) as server, show_runs(server, [padgs.load_run(folder, device="cpu")]) as there:
         there[-1] = page
         assert not page.asked.wait(0.3)
         train_on(folder)
@@ -142,12 +142,12 @@ def test_pages_draw_again_when_training_has_come_further(folder, monkeypatch):
 
 
 def test_the_first_checkpoint_is_waited_for(folder, tmp_path, capsys):
-    await_checkpoint(folder)
-    await_checkpoint(tmp_path / "nothing")
+    wait_for_checkpoint(folder)
+    wait_for_checkpoint(tmp_path / "nothing")
     assert not capsys.readouterr().out
     moved = (folder / "checkpoint").rename(tmp_path / "elsewhere")
     with RunFolder(folder).locked():  # as training does
-        waiting = threading.Thread(target=await_checkpoint, args=(folder,), daemon=True)
+        waiting = threading.Thread(target=wait_for_checkpoint, args=(folder,), daemon=True)
         waiting.start()
         waiting.join(0.2)
         assert waiting.is_alive()
@@ -159,14 +159,14 @@ def test_the_first_checkpoint_is_waited_for(folder, tmp_path, capsys):
 
 def test_a_run_that_was_killed_before_its_first_checkpoint_is_not_waited_for(folder):
     shutil.rmtree(folder / "checkpoint")
-    with pytest.raises(ValueError, match="nobody trains it; start the same padgs-run again"):
-        await_checkpoint(folder)
+    with pytest.raises(ValueError, match="no process trains it; start the same padgs-run again"):
+        wait_for_checkpoint(folder)
 
 
 def test_a_run_that_failed_before_its_first_checkpoint_is_not_waited_for(folder):
     shutil.rmtree(folder / "checkpoint")
     (folder / results.FILE_NAME).write_text("{}")
-    waiting = threading.Thread(target=await_checkpoint, args=(folder,), daemon=True)
+    waiting = threading.Thread(target=wait_for_checkpoint, args=(folder,), daemon=True)
     waiting.start()
     waiting.join(30)
     assert not waiting.is_alive()
@@ -174,7 +174,7 @@ def test_a_run_that_failed_before_its_first_checkpoint_is_not_waited_for(folder)
 
 @WITH_VISER
 def test_a_run_is_shown_beside_its_training_and_no_longer(folder, capfd):
-    with shown(folder, None, "cpu"):
+    with serve_training(folder, None, "cpu"):
         said, end = "", time.monotonic() + 60
         while "http" not in said:
             assert time.monotonic() < end, "no address was said"
@@ -188,7 +188,7 @@ def test_a_run_is_shown_beside_its_training_and_no_longer(folder, capfd):
 
 def test_without_viser_no_training_begins(folder, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(ValueError, match=re.escape(installing("view"))), shown(folder, None, "cpu"):
+    with pytest.raises(ValueError, match=re.escape(installing("view"))), serve_training(folder, None, "cpu"):
         raise AssertionError("it began")
 
 

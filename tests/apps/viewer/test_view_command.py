@@ -34,9 +34,9 @@ def test_a_page_of_this_machine_alone_is_opened_where_there_is_a_screen(monkeypa
     visited, shown = [], []
     server = SimpleNamespace(address="http://here", is_local=local, viser=MagicMock())
     monkeypatch.setattr(process.webbrowser, "open", visited.append)
-    monkeypatch.setattr(process, "serving", lambda **_: nullcontext(server))
-    monkeypatch.setattr(process, "is_wanted", lambda: False)
-    monkeypatch.setattr(pages, "showing", lambda _, runs: nullcontext(shown.extend(runs)))
+    monkeypatch.setattr(process, "start_server", lambda **_: nullcontext(server))
+    monkeypatch.setattr(process, "parent_is_alive", lambda: False)
+    monkeypatch.setattr(pages, "show_runs", lambda _, runs: nullcontext(shown.extend(runs)))
     process.serve(lambda: [*visited, "a run"], browse=browse)
     assert shown == [*opens * ["http://here"], "a run"], "browsers load the page while the run is being opened"
 
