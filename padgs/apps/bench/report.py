@@ -1,35 +1,27 @@
-"""Everything that `padgs bench` measures, as one dict that goes into JSON as it is. Times are in seconds.
+"""All measurements of `padgs bench` as one dict for JSON, on the CPU and on a GPU alike. Times are in seconds.
 
-schema         version of this layout
-machine        hardware, versions, commit and date (`padgs.clock.machine`), instruction set, load average
-options        of the command
-ceilings       fma (FLOP/s) and triad (byte/s), before and after all else: see `padgs.apps.bench.ceilings.Ceiling`
-noise          how far wall and CPU time are apart where they should agree: "parallel", "single" and the larger,
-               "worst"; 0 is none, `limit` is what is tolerated
-noisy          worst > limit: other programs took the processors, and no number here should be published
-sizes          name -> one workload:
-  width, height, gaussians (asked for), views
-  counters     what the renderer counted, ratios of these, anchors, parameters, sizes of the Gaussians in pixels
-  stages       stage of `padgs.apps.bench.stages.STAGES` -> {wall, cpu: {median, p95, min}} per iteration; where there
-               is a cost model also operations, bytes, floor (CPU seconds), bound, fraction (floor / least CPU)
-  stage_sum    the iteration that the stages are parts of, without adapt
-  iteration    `padgs.training.loop.Trainer`, undisturbed;  iteration_1_thread: the same on one thread
-  adapt_event  growing and pruning once; the stage adapt is its share of one iteration
-  frame        decode and draw without gradients
-  render       draw fixed Gaussians and go back to their gradients
-  rates        evaluated pairs per CPU second, forward and backward
-  peak_bytes   resident memory of the process: at the start, drawing frames, training
-decode_10k     decoding 10 000 anchors forward
-bounds         tiles per Gaussian by latitude: see `padgs.apps.bench.tile_counts`
-ratios         see `padgs.apps.bench.ratios`, and threads: one thread against all
-isas           instruction set -> render, if asked for
-targets        see `padgs.apps.bench.goals`
+schema      version of this layout
+noise       worst: how far times are apart that should agree; on the CPU wall and CPU time, on a GPU the 95th percentile
+            and the median of iterations; limit: the tolerated value
+noisy       worst > limit: other programs ran meanwhile, and the numbers should not be published
+machine     hardware, versions, commit and date (`padgs.clock.machine`), instruction set or GPU architectures
+options     of the command
+ceilings    arithmetic (FLOP/s), memory (byte/s), crowding: see `padgs.apps.bench.ceilings.Ceilings`
+sizes       name -> one workload:
+  width, height, gaussians (requested), views
+  counters    of the renderer, with ratios, anchors, parameters, and sizes of Gaussians in pixels
+  stages      stage -> seconds in one iteration (least CPU seconds of all threads; of a GPU kernel the mean), on the CPU
+              wall, and floor and bound for stages with a cost model; on a GPU calls
+  floor       sum of the least seconds of the stages at the ceilings
+  iteration   of `padgs.training.loop.Trainer`, {wall, cpu: {median, p95, min}}; iteration_1_thread on the CPU
+  frame       decode and render without gradients
+  peak_bytes  memory at the peak of frames and of training: of the process, or of torch's allocator on a GPU
+tiles       tiles per Gaussian by latitude, on the CPU: see `padgs.apps.bench.tile_counts`
 """
 
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -37,31 +29,33 @@ from typing import Any
 import torch
 
 from padgs import clock
-from padgs.apps.bench import goals, isas, ratios, tile_counts
-from padgs.apps.bench.ceilings import Ceiling, measure_ceilings
-from padgs.apps.bench.cost import add_floors
-from padgs.apps.bench.sized import measure_size
-from padgs.apps.bench.workload import SIZES, Size, build, refuse_unknown
-from padgs.native import cpu
+from padgs.apps.bench.ceilings import add_floors, measure_ceilings
+from padgs.apps.bench.stages import WARM_UP, stages_of
+from padgs.apps.bench.tile_counts import tiles_by_latitude
+from padgs.apps.bench.workload import OPTIONS, SIZES, Size, Workload, build, sigma_quantiles
+from padgs.native import cpu, cuda
+from padgs.render import Rendering, render
 
-SCHEMA = 1
+SCHEMA = 2
 NOISE_LIMIT = 0.25
-DECODED_ANCHORS = 10_000  # the number that the target for decoding is stated for
+MANY_GAUSSIANS, FEW_REPEATS = 500_000, 3  # on the CPU: maximum repeats of workloads with so many Gaussians
 
 
 @dataclass(frozen=True)
 class BenchOptions:
-    """What to measure and how often."""
+    """Sizes, device and repeats of the measurements."""
 
     sizes: tuple[str, ...] = ("small", "medium")
     repeats: int = 10
-    threads: int | None = None  # None: one for each core that this process may use
+    device: str = "cpu"
+    threads: int | None = None  # None: one per core that this process may use
     seed: int = 0
-    isas: bool = False  # also on each instruction set
     ceiling_seconds: float = 0.4
 
     def __post_init__(self) -> None:
-        refuse_unknown(self.sizes)
+        unknown = [name for name in self.sizes if name not in SIZES]
+        if unknown or not self.sizes:
+            raise ValueError(f"unknown size {', '.join(unknown) or '(none)'}; known: {', '.join(SIZES)}")
         for name in ("repeats", "threads"):
             value = getattr(self, name)
             if value is not None and value < 1:
@@ -71,71 +65,99 @@ class BenchOptions:
 QUICK = BenchOptions(sizes=("quick",), repeats=3, ceiling_seconds=0.05)
 
 
-def measure_all(options: BenchOptions, progress: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
-    """Measure; `progress` is told what is being measured. The layout of the result is described above.
+def measure_all(
+    options: BenchOptions,
+    progress: Callable[[str], None] = lambda _: None,
+    keep: Callable[[dict[str, Any]], None] = lambda _: None,
+) -> dict[str, Any]:
+    """Measure and return the report described above.
+
+    Args:
+        options: sizes, device and repeats.
+        progress: called with what is being measured.
+        keep: called with the unfinished report after each size, so that a time limit loses little.
 
     Raises:
-        OSError: the native library is not there.
+        OSError: the native library of the CPU is missing.
+        ValueError: the device is a GPU, and torch finds none.
     """
-    cpu.library()
+    device = torch.device(options.device)
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise ValueError("--device cuda, but torch finds no GPU with a driver here; see docs/cuda.md")
     with clock.threads(options.threads or clock.machine()["cores"]):
-        return _measure_all(options, progress)
-
-
-def _measure_all(options: BenchOptions, progress: Callable[[str], None]) -> dict[str, Any]:
-    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
-    isa = cpu.library().padgs_isa().decode()
-    progress("the machine's ceilings")
-    before = measure_ceilings(options.ceiling_seconds)
-    sizes = {}
-    for name in options.sizes:
-        sizes[name] = measure_size(
-            SIZES[name], options.repeats, options.seed, lambda what, n=name: progress(f"{n}: {what}")
-        )
-    progress("tiles by latitude")
-    tiles = tile_counts.tiles_by_latitude(count=50_000 if options.repeats > QUICK.repeats else 20_000)
-    progress("decoding 10 000 anchors")
-    small = build(Size(256, 128, 5 * DECODED_ANCHORS), options.seed)
-    with torch.no_grad():
-        decode = clock.measure(lambda: small.model.decode(small.view), repeats=options.repeats)
-    progress("the same work in two ways")
-    # The largest size up to the medium one, if any: beyond it, doing things in several ways takes too long.
-    reference = next(name for name in ("medium", "small", "quick", "large") if name in options.sizes)
-    pairs = ratios.ratios(build(SIZES[reference], options.seed), build(SIZES["quick"], options.seed), options.repeats)
-    report: dict[str, Any] = {
-        "schema": SCHEMA,
-        "machine": {**clock.machine(), "isa": isa, "load": load},
-        "options": dataclasses.asdict(options),
-        "reference": reference,
-        "sizes": sizes,
-        "decode_10k": decode,
-        "bounds": tiles,
-        "ratios": pairs,
-    }
-    if options.isas:
-        progress("each instruction set")
-        report["isas"] = isas.by_instruction_set(SIZES[reference], options.repeats, options.seed)
-    progress("the machine's ceilings, once more")
-    _judge(report, before, measure_ceilings(options.ceiling_seconds))
-    return report
-
-
-def _judge(report: dict[str, Any], before: dict[str, Ceiling], after: dict[str, Ceiling]) -> None:
-    """What can only be said at the end: how fast the machine is, how noisy it was, which targets are met."""
-    best = {name: max(before[name], after[name], key=lambda c: c.per_cpu_second) for name in before}
-    report["ceilings"] = {name: dataclasses.asdict(ceiling) for name, ceiling in best.items()}
+        progress("the ceilings of this machine")
+        ceilings = measure_ceilings(device, options.ceiling_seconds)
+        report: dict[str, Any] = {
+            "schema": SCHEMA,
+            "machine": {**clock.machine(device), "compiled_for": _compiled_for(device)},
+            "options": dataclasses.asdict(options),
+            "sizes": {},
+        }
+        for name in options.sizes:
+            progress(f"size {name}")
+            report["sizes"][name] = measure_size(SIZES[name], options, device)
+            keep(report)
+        if device.type == "cpu":
+            progress("tiles by latitude")
+            report["tiles"] = tiles_by_latitude(count=50_000 if options.repeats > QUICK.repeats else 20_000)
+        ceilings = ceilings.best(measure_ceilings(device, options.ceiling_seconds))
     for size in report["sizes"].values():
-        add_floors(size, best)
-    single = [size["iteration_1_thread"] for size in report["sizes"].values()]
-    noise = {
-        "limit": NOISE_LIMIT,
-        "parallel": max(before["fma"].crowding, after["fma"].crowding),
-        "single": max(timing["wall"]["median"] / timing["cpu"]["median"] - 1 for timing in single),
+        add_floors(size, ceilings)
+    worst = max([ceilings.crowding, *map(_disagreement, report["sizes"].values())])
+    noise = {"noise": {"worst": worst, "limit": NOISE_LIMIT}, "noisy": worst > NOISE_LIMIT}
+    return noise | report | {"ceilings": dataclasses.asdict(ceilings)}
+
+
+def measure_size(size: Size, options: BenchOptions, device: torch.device) -> dict[str, Any]:
+    """Return the entry of a workload in the report, without floors."""
+    on_cpu = device.type == "cpu"
+    repeats = min(options.repeats, FEW_REPEATS) if on_cpu and size.gaussians >= MANY_GAUSSIANS else options.repeats
+    clock.reset_peak_memory(device)
+    work = build(size, options.seed).to(device)
+    frame = clock.measure(lambda: _frame(work), repeats=repeats, device=device)
+    peak = {"frame": _peak_bytes(device)}
+    records = work.trainer().records()
+    entry = {"frame": frame}
+    entry["iteration"] = clock.measure(lambda: next(records), repeats=repeats, warm_up=WARM_UP, device=device)
+    peak["training"] = _peak_bytes(device)
+    if on_cpu:
+        with clock.threads(1):
+            entry["iteration_1_thread"] = clock.measure(lambda: next(records), repeats=repeats, warm_up=1)
+    stages = stages_of(work, repeats, device)
+    return {**dataclasses.asdict(size), "counters": _counters(work), "stages": stages, **entry, "peak_bytes": peak}
+
+
+def _disagreement(size: dict[str, Any]) -> float:
+    """Return by how much times of a size are apart that agree on an idle machine."""
+    if "iteration_1_thread" in size:
+        return size["iteration_1_thread"]["wall"]["median"] / size["iteration_1_thread"]["cpu"]["median"] - 1
+    return size["iteration"]["wall"]["p95"] / size["iteration"]["wall"]["median"] - 1
+
+
+def _compiled_for(device: torch.device) -> str | None:
+    if device.type == "cpu":
+        return cpu.library().padgs_isa().decode()
+    return cuda.library().padgs_cuda_architectures().decode() if cuda.available() else None
+
+
+def _peak_bytes(device: torch.device) -> int:
+    return clock.peak_memory(device)["host" if device.type == "cpu" else "device"]
+
+
+def _frame(work: Workload) -> Rendering:
+    with torch.no_grad():
+        return render(work.model.decode(work.view).gaussians, work.view, OPTIONS)
+
+
+def _counters(work: Workload) -> dict[str, Any]:
+    counted, pixels = _frame(work).counters, work.size.width * work.size.height
+    return {
+        "anchors": len(work.model),
+        "parameters": sum(p.numel() for p in work.model.parameters()),
+        **counted,
+        "evaluated_per_pixel": counted["evaluated"] / pixels,
+        "contributing_per_pixel": counted["contributing"] / pixels,
+        "evaluated_per_contributing": counted["evaluated"] / max(1, counted["contributing"]),
+        "tiles_per_gaussian": counted["instances"] / max(1, counted["visible"]),
+        "sigma": sigma_quantiles(work),
     }
-    noise["worst"] = max(noise["parallel"], noise["single"])
-    report["noise"], report["noisy"] = noise, noise["worst"] > NOISE_LIMIT
-    work = report["sizes"][report["reference"]]
-    report["ratios"]["threads"] = ratios.compared(
-        "1 thread", f"{report['machine']['threads']} threads", work["iteration_1_thread"], work["iteration"]
-    )
-    report["targets"] = goals.judge(report)

@@ -1,63 +1,61 @@
-"""One training iteration, taken apart: who had the processor when.
+"""The stages of a training iteration: by wall and CPU time on the CPU, by kernels on a GPU.
 
-Stages nest, and a stage is charged only while no inner one runs, so together they are the whole iteration. The outer
-ones are those of `padgs.training.loop`; native calls are told apart within them.
+On the CPU stages nest, and a stage is charged only while no inner one runs, so that together they are the whole
+iteration. `padgs.training.loop` has the outer stages; native calls are inner ones.
 """
 
 from __future__ import annotations
 
 import copy
+import re
 import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
 
+import torch
+
+from padgs import clock
 from padgs.apps.bench.workload import Workload
-from padgs.clock import summary
 from padgs.methods.anchors.growth import GrowthOptions
 from padgs.native.loading import call_hook
 
 STAGES = {
-    "target": "read the panorama, as floats",
-    "decode": "anchors to Gaussians, natively",
+    "target": "read the panorama as floats",
+    "decode": "anchors to Gaussians",
     "project": "Gaussians to footprints and their bounds",
     "sort": "depth order, counting and binning of tile instances",
     "blend": "footprints to pixels",
-    "draw": "drawing around its native calls: allocation, checks",
-    "loss": "L1, SSIM and what penalties are native, with their gradients",
-    "blend_backward": "pixels to moments of the footprints, and their sums",
-    "project_backward": "moments to gradients of the Gaussians",
+    "draw": "rendering around its native calls: allocation, checks",
+    "loss": "L1, SSIM and native penalties, with their gradients",
+    "blend_backward": "gradients of pixels to sums over footprints",
+    "project_backward": "sums over footprints to gradients of Gaussians",
     "decode_backward": "gradients of anchors and networks",
     "backward": "autograd around the native calls",
     "observe": "densification statistics",
     "optimiser": "Adam",
-    "adapt": "growing and pruning, its share of one iteration",
+    "adapt": "densification and pruning, as a share of one iteration",
     "rest": "between the stages",
 }
 NATIVE_CALLS = {
-    "padgs_decode_select": "decode",
-    "padgs_decode_place": "decode",
+    **dict.fromkeys(("padgs_decode_select", "padgs_decode_place"), "decode"),
     "padgs_project": "project",
-    "padgs_depth_order": "sort",
-    "padgs_tile_levels": "sort",
-    "padgs_count_instances": "sort",
-    "padgs_bin": "sort",
+    **dict.fromkeys(("padgs_depth_order", "padgs_tile_levels", "padgs_count_instances", "padgs_bin"), "sort"),
     "padgs_blend_forward": "blend",
-    "padgs_angular_size": "loss",
-    "padgs_photometric_loss": "loss",
-    "padgs_roughness": "loss",
-    "padgs_blend_backward": "blend_backward",
-    "padgs_sum_moments": "blend_backward",
+    **dict.fromkeys(("padgs_angular_size", "padgs_photometric_loss", "padgs_roughness"), "loss"),
+    **dict.fromkeys(("padgs_blend_backward", "padgs_sum_moments"), "blend_backward"),
     "padgs_project_backward": "project_backward",
     "padgs_decode_backward": "decode_backward",
 }
+WARM_UP = 2  # iterations before those that are measured
+DENSIFICATIONS = 2  # measured steps of densification
 
 
 class StageClock:
     """Wall and CPU seconds by stage.
 
     Attributes:
-        rounds: stage -> (wall, CPU) of every finished round.
+        rounds: for each finished iteration, stage -> (wall, CPU) seconds.
     """
 
     def __init__(self) -> None:
@@ -68,7 +66,7 @@ class StageClock:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Charge what happens inside to a stage, except what inner stages are charged with."""
+        """Charge the time inside to a stage, except that of inner stages."""
         self._charge()
         self._running.append(name)
         try:
@@ -77,19 +75,23 @@ class StageClock:
             self._charge()
             self._running.pop()
 
+    def native_call(self, name: str) -> AbstractContextManager[object]:
+        """Return the stage of a native call, for `padgs.native.loading.call_hook`."""
+        return self.stage(NATIVE_CALLS[name]) if name in NATIVE_CALLS else nullcontext()
+
     def finish_round(self) -> None:
-        """Close one round; the next starts from zero."""
+        """Close an iteration; the next one starts from zero."""
         self.rounds.append(self._spent)
         self._spent = {}
 
-    def stages(self) -> dict[str, dict[str, Any]]:
-        """Stage -> {"wall", "cpu"} summaries over the rounds, in the layout of `padgs.clock.measure`."""
-        names = [name for name in STAGES if any(name in spent for spent in self.rounds)]
-        return {name: _summaries([spent.get(name, (0.0, 0.0)) for spent in self.rounds]) for name in names}
-
-    def total(self) -> dict[str, Any]:
-        """The same of whole rounds."""
-        return _summaries([(sum(w for w, _ in r.values()), sum(c for _, c in r.values())) for r in self.rounds])
+    def stages(self) -> dict[str, dict[str, float]]:
+        """Return stage -> least CPU "seconds" and least "wall" seconds of all iterations."""
+        found = {}
+        for name in STAGES:
+            if spent := [one[name] for one in self.rounds if name in one]:
+                wall, cpu = map(min, zip(*spent, strict=True))
+                found[name] = {"seconds": cpu, "wall": wall}
+        return found
 
     def _charge(self) -> None:
         now = (time.perf_counter(), time.process_time())
@@ -98,42 +100,57 @@ class StageClock:
             self._spent[self._running[-1]] = (wall + now[0] - self._since[0], cpu + now[1] - self._since[1])
         self._since = now
 
-    def native_call(self, name: str) -> AbstractContextManager[object]:
-        """A stage for `padgs.native.loading.call_hook`."""
-        return self.stage(NATIVE_CALLS[name]) if name in NATIVE_CALLS else nullcontext()
 
-
-def measured(work: Workload, rounds: int, warm_up: int) -> StageClock:
-    """Rounds of the trainer, one iteration each."""
-    clock = StageClock()
-    records = work.trainer(stage=clock.stage).records()
-    with call_hook(clock.native_call):
-        for _ in range(warm_up + rounds):
-            with clock.stage("rest"):
+def cpu_stages(work: Workload, rounds: int) -> dict[str, dict[str, float]]:
+    """Return the least CPU and wall seconds of each stage; densification is spread over the iterations between two."""
+    stages, densification = StageClock(), StageClock()
+    records = work.trainer(stage=stages.stage).records()
+    with call_hook(stages.native_call):
+        for _ in range(WARM_UP + rounds):
+            with stages.stage("rest"):
                 next(records)
-            clock.finish_round()
-    del clock.rounds[:warm_up]
-    return clock
-
-
-def growing(work: Workload, rounds: int) -> dict[str, Any]:
-    """What growing and pruning once takes, each time in the first iteration of a copy."""
-    clock = StageClock()
-    for _ in range(rounds):
-        next(copy.deepcopy(work).trainer(grows=True, stage=clock.stage).records())
-        clock.finish_round()
-    return clock.stages()["adapt"]
-
-
-def amortised(adapt: dict[str, Any]) -> dict[str, Any]:
-    """The share that one iteration has in the cost of growing and pruning, as often as published."""
+            stages.finish_round()
+    del stages.rounds[:WARM_UP]
+    for _ in range(DENSIFICATIONS):
+        next(copy.deepcopy(work).trainer(grows=True, stage=densification.stage).records())
+        densification.finish_round()
     every = GrowthOptions().grow_every
-    return {
-        key: {name: seconds / every for name, seconds in value.items()} if isinstance(value, dict) else value
-        for key, value in adapt.items()
-    }
+    adapt = {name: seconds / every for name, seconds in densification.stages()["adapt"].items()}
+    found = stages.stages() | {"adapt": adapt}
+    return {name: found[name] for name in STAGES}
 
 
-def _summaries(rounds: list[tuple[float, float]]) -> dict[str, Any]:
-    wall, cpu = zip(*rounds, strict=True)
-    return {"repeats": len(rounds), "wall": summary(list(wall)), "cpu": summary(list(cpu))}
+def device_stages(work: Workload, rounds: int, device: torch.device) -> dict[str, dict[str, float]]:
+    """Return kernel -> "seconds" on the device and "calls" in an iteration, by torch.profiler, the slowest first."""
+    from torch.profiler import ProfilerActivity, profile
+
+    records = work.trainer().records()
+    for _ in range(WARM_UP):
+        next(records)
+    activities = [ProfilerActivity.CPU, *([ProfilerActivity.CUDA] if device.type == "cuda" else [])]
+    with profile(activities=activities) as profiler:
+        for _ in range(rounds):
+            next(records)
+        clock.synchronise(device)
+    found: dict[str, dict[str, float]] = {}
+    for event in profiler.key_averages():
+        if event.device_type.name.lower() == device.type and not getattr(event, "is_user_annotation", False):
+            micros = event.self_cpu_time_total if device.type == "cpu" else event.self_device_time_total
+            entry = found.setdefault(kernel_name(event.key), {"seconds": 0.0, "calls": 0.0})
+            entry["seconds"] += micros / 1e6 / rounds
+            entry["calls"] += event.count / rounds
+    return dict(sorted(found.items(), key=lambda item: -item[1]["seconds"]))
+
+
+def kernel_name(signature: str) -> str:
+    """Return a kernel's name without return type, template arguments and parameters.
+
+    >>> kernel_name("void padgs::blend_kernel<16, true>(Arguments)"), kernel_name("Memcpy HtoD (Pinned -> Device)")
+    ('padgs::blend_kernel', 'Memcpy HtoD')
+    """
+    return re.split(r"[<(]", signature.removeprefix("void "))[0].strip() or signature
+
+
+def stages_of(work: Workload, rounds: int, device: torch.device) -> dict[str, dict[str, Any]]:
+    """Return the stages of an iteration on a device."""
+    return cpu_stages(work, rounds) if device.type == "cpu" else device_stages(work, rounds, device)

@@ -1,4 +1,4 @@
-"""How many tiles a Gaussian is listed in, by latitude: our bounds beside the published ones."""
+"""Tiles per Gaussian by latitude: exact bounds beside the published ones."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from padgs.render.backends.native import native_camera
 from padgs.scene import View
 
 BANDS = ((0, 30), (30, 60), (60, 75), (75, 85), (85, 90))  # degrees of absolute latitude
-SIGMA = 4.0  # pixels of the equator
+SIGMA = 4.0  # pixels at the equator
 OPACITY = 0.2
 BOUNDS = {
     "exact": RenderOptions(low_pass=0.0),
@@ -25,9 +25,9 @@ BOUNDS = {
 
 
 def tiles_by_latitude(width: int = 2048, height: int = 1024, count: int = 50_000, seed: int = 0) -> dict[str, Any]:
-    """Mean and maximum of tiles per Gaussian, over all and by band of latitude, for equal isotropic Gaussians.
+    """Return mean and maximum of tiles per Gaussian, of all and by band of latitude.
 
-    Directions are uniform on the sphere; sizes are `SIGMA`, opacities `OPACITY`.
+    The Gaussians are isotropic with `SIGMA` and `OPACITY`, in directions uniform on the sphere.
     """
     generator = torch.Generator().manual_seed(seed)
     directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
@@ -35,15 +35,13 @@ def tiles_by_latitude(width: int = 2048, height: int = 1024, count: int = 50_000
     report: dict[str, Any] = {"sigma": SIGMA, "opacity": OPACITY, "width": width, "height": height, "count": count}
     for name, options in BOUNDS.items():
         tiles = tiles_per_gaussian(spheres(directions, SIGMA, width), width, height, options).double()
-        report[name] = _statistics(tiles)
-        report[name]["bands"] = {
-            f"{low}-{high}": _statistics(tiles[(latitude >= low) & (latitude < high)]) for low, high in BANDS
-        }
+        bands = {f"{low}-{high}": _statistics(tiles[(latitude >= low) & (latitude < high)]) for low, high in BANDS}
+        report[name] = {**_statistics(tiles), "bands": bands}
     return report
 
 
 def spheres(directions: Tensor, sigma: float, width: int) -> Gaussians:
-    """Isotropic Gaussians at distance 1 in directions [N, 3] of the camera at the origin; sigma in equator pixels."""
+    """Return isotropic Gaussians at distance 1 in directions [N, 3] from the origin; sigma in pixels at the equator."""
     count = len(directions)
     return Gaussians(
         means=directions,
@@ -55,7 +53,7 @@ def spheres(directions: Tensor, sigma: float, width: int) -> Gaussians:
 
 
 def tiles_per_gaussian(gaussians: Gaussians, width: int, height: int, options: RenderOptions) -> Tensor:
-    """Tile instances [N] of each Gaussian, seen by a panorama at the origin."""
+    """Return the tile instances [N] of each Gaussian in a panorama at the origin."""
     camera = View("origin", torch.eye(4, dtype=torch.float64), width, height).camera
     tensors = [tensor.contiguous() for tensor in vars(gaussians).values()]
     inputs = Inputs(len(gaussians), *map(pointer, tensors), None)
@@ -65,6 +63,4 @@ def tiles_per_gaussian(gaussians: Gaussians, width: int, height: int, options: R
 
 
 def _statistics(tiles: Tensor) -> dict[str, Any]:
-    if not len(tiles):
-        return {"mean": None, "max": None}
-    return {"mean": float(tiles.mean()), "max": int(tiles.max())}
+    return {"mean": float(tiles.mean()), "max": int(tiles.max())} if len(tiles) else {"mean": None, "max": None}

@@ -1,16 +1,15 @@
-"""What is timed: a PaD-GS model that decodes to a stated number of Gaussians of a stated size, seeded.
+"""The timed workload: a seeded PaD-GS model with a stated number and size of Gaussians, and panoramas of noise.
 
 The defaults are near what training gives. A model trained on real panoramas (3 000 iterations, 512x256, 62 k
-Gaussians) had 60 contributing pairs per pixel, 3.0 evaluated for each of them, 2.7 tiles per Gaussian and a median
-opacity of 0.15; these Gaussians, 100 k at 512x256, have 40, 3.8, 2.0 and 0.15.
+Gaussians) had 60 contributing pairs per pixel, 3.0 evaluated pairs per contributing one, 2.7 tiles per Gaussian and a
+median opacity of 0.15; these Gaussians, 100 k at 512x256, have 40, 3.8, 2.0 and 0.15.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -18,24 +17,20 @@ from torch import Tensor
 from padgs.methods.anchors.growth import GrowthOptions
 from padgs.methods.anchors.model import PaDGS
 from padgs.methods.anchors.trainee import AnchorTrainee, LearningRates
-from padgs.methods.splats.clone_split import CloneSplitOptions
-from padgs.methods.splats.model import Splats
-from padgs.methods.splats.trainee import SplatTrainee
-from padgs.render import RenderConfig, RenderOptions
+from padgs.render import RenderOptions
 from padgs.scene import Scene, View
 from padgs.training.budget import Budget
 from padgs.training.loop import Stage, Trainer
-from padgs.training.schedule import Constant, ParameterGroup
 
-NEAREST, FURTHEST = 1.0, 4.0  # distances of anchors, world units, uniform
-SIGMA = 0.7  # median size of a Gaussian's axis, in pixels of the equator
-SHRINKAGE = 0.44  # what the covariance network leaves of an axis, as far as the median of all is concerned
-LOG_SIGMA_DEVIATION = 0.8  # of each axis, between anchors; the covariance network adds its own
-OFFSET = 4.0  # distance between an anchor and its Gaussians, pixels of the equator
+NEAREST, FURTHEST = 1.0, 4.0  # uniform distances of anchors, world units
+SIGMA = 0.7  # median size of a Gaussian's axis, in pixels at the equator
+SHRINKAGE = 0.44  # median factor of the covariance network on an axis
+LOG_SIGMA_DEVIATION = 0.8  # of each axis between anchors; the covariance network adds to it
+OFFSET = 4.0  # distance between an anchor and its Gaussians, pixels at the equator
 RAW_DEVIATIONS = {"opacity": 0.35, "color": 1.0, "covariance": 1.0}  # of the networks' outputs before tanh or sigmoid
 OPTIONS = RenderOptions(near=0.01)
 NEVER = 1 << 40  # iterations
-LEAST = (1e-30, 1e-30)  # a learning rate that changes no float32, for schedules that have no 0
+LEAST = (1e-30, 1e-30)  # a learning rate that changes no float32, for schedules that cannot be 0
 STILL = LearningRates(
     offset_rate=LEAST,
     offset_rate_unit="scene",
@@ -47,11 +42,11 @@ STILL = LearningRates(
 
 @dataclass(frozen=True)
 class Size:
-    """How much work."""
+    """Size of a workload."""
 
     width: int
     height: int
-    gaussians: int  # about so many are decoded
+    gaussians: int  # approximate number that is decoded
     views: int = 1
 
 
@@ -63,16 +58,9 @@ SIZES = {
 }
 
 
-def refuse_unknown(sizes: Sequence[str]) -> None:
-    """Raise ValueError for names that are none of `SIZES`, or none at all."""
-    unknown = [name for name in sizes if name not in SIZES]
-    if unknown or not sizes:
-        raise ValueError(f"unknown size {', '.join(unknown) or '(none)'}; known: {', '.join(SIZES)}")
-
-
 @dataclass(frozen=True)
 class Workload:
-    """A model and the panoramas, of noise, that it is compared with."""
+    """A model, and panoramas of noise as ground truth."""
 
     size: Size
     model: PaDGS
@@ -84,11 +72,11 @@ class Workload:
         return self.scene.train[0]
 
     def trainer(self, options: RenderOptions = OPTIONS, *, grows: bool = False, stage: Stage = nullcontext) -> Trainer:
-        """The real one. Nothing learns, so that all iterations have the same work; the optimiser does all of its own.
+        """Return a trainer with learning rates near 0, so that all iterations do the same work.
 
         Args:
-            options: how the model is drawn.
-            grows: act on the statistics of every iteration; else they are collected and never acted on.
+            options: of the renderer.
+            grows: densify in every iteration; otherwise statistics are collected and never used.
             stage: see `Trainer`.
         """
         grow_from = 0 if grows else NEVER
@@ -96,29 +84,14 @@ class Workload:
         trainee = AnchorTrainee(self.model, options, growth=growth, rates=STILL, extent=1.0, iterations=NEVER)
         return Trainer(trainee, self.scene, Budget(NEVER), stage=stage)
 
-    def explicit_trainer(self, options: RenderOptions = OPTIONS) -> Trainer:
-        """That of the Gaussians of the first view, each for itself with harmonics of all degrees; nothing learns."""
-        with torch.no_grad():
-            seen = self.model.decode(self.view).gaussians
-        splats = Splats(seen.means, seen.scales.log(), seen.colors)
-        splats.opacity_logits.data, splats.quats.data = seen.opacities.logit(), seen.quats
-        splats.active_degree = splats.degree
-        config = RenderConfig(**asdict(options))
-        return Trainer(
-            StillSplats(splats, CloneSplitOptions(), config, extent=1.0, iterations=NEVER), self.scene, Budget(NEVER)
-        )
-
-
-class StillSplats(SplatTrainee):
-    """Splats that stay as they are, though the optimiser does all of its work."""
-
-    def groups(self, means_speed: float = 1.0) -> list[ParameterGroup]:
-        """All parameters."""
-        return [replace(group, learning_rate=Constant(0.0)) for group in super().groups(means_speed)]
+    def to(self, device: torch.device) -> Workload:
+        """Move the model to a device, and return a workload whose poses and panoramas are there, too."""
+        self.model.to(device)
+        return replace(self, scene=resident(self.scene, device))
 
 
 def build(size: Size, seed: int = 0) -> Workload:
-    """Anchors all around the camera, in directions uniform on the sphere; half of their Gaussians are selected."""
+    """Return anchors in directions uniform on the sphere; half of their Gaussians are selected."""
     generator = torch.Generator().manual_seed(seed)
     per_anchor = 10 * 0.5
     count = max(1, round(size.gaussians / per_anchor))
@@ -139,8 +112,20 @@ def build(size: Size, seed: int = 0) -> Workload:
     return Workload(size, model, scene)
 
 
+def resident(scene: Scene, device: torch.device) -> Scene:
+    """Return a scene with poses and panoramas (as bytes) on a device, as a run trains on it."""
+
+    def held(view: View) -> View:
+        assert view.load_pixels is not None, view.name
+        pixels = view.load_pixels().to(device)
+        return replace(view, load_pixels=lambda: pixels)
+
+    moved = scene.to(device)
+    return replace(moved, train=tuple(map(held, moved.train)))
+
+
 def sigma_quantiles(workload: Workload) -> dict[str, float]:
-    """Sizes of the decoded Gaussians (geometric mean of the axes) in pixels of the equator."""
+    """Return quantiles of the decoded sizes (geometric mean of the axes) in pixels at the equator."""
     with torch.no_grad():
         gaussians = workload.model.decode(workload.view).gaussians
         angle = gaussians.scales.log().mean(-1).exp() / gaussians.means.norm(dim=-1)
@@ -155,7 +140,7 @@ def _view(name: str, size: Size, generator: torch.Generator) -> View:
 
 
 def _spread_outputs(model: PaDGS, view: View) -> None:
-    """Give every output of the networks a median of 0 over the anchors, and the deviation of `RAW_DEVIATIONS`."""
+    """Set every output of the networks to a median of 0 over the anchors and a deviation of `RAW_DEVIATIONS`."""
     direction, distance, omega = model.seen_from(view)
     inputs = torch.cat((model.features, direction, distance[:, None], omega[:, None]), dim=-1)
     for name, head in model.decoder.weights()._asdict().items():

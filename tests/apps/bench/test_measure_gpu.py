@@ -1,4 +1,4 @@
-"""reports/measure_gpu.sh with programs that only pretend: what it does in which order, and where it goes on."""
+"""reports/measure_gpu.sh with fake programs: the order of its steps, and where it continues."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from pathlib import Path
 
 import pytest
 
-SCRIPT = Path(__file__).parents[2] / "reports" / "measure_gpu.sh"
+SCRIPT = Path(__file__).parents[3] / "reports" / "measure_gpu.sh"
 PYTHON = f"""#!/bin/sh
 case "$*" in
   *"-m pytest"*) echo "tests $TOOL" >> "$CALLS"; test -z "$BROKEN" ;;
   *"bench --device cuda"*)
     echo bench >> "$CALLS"
     for out; do :; done  # the last argument
-    echo '{{"machine": {{"gpu": "Some GPU"}}}}' > "$out/bench_gpu.json" ;;
+    echo '{{"machine": {{"gpu": "Some GPU"}}}}' > "$out/bench.json" ;;
   *) exec {sys.executable} "$@" ;;
 esac
 """
@@ -26,18 +26,18 @@ esac
 
 @pytest.fixture
 def measure(tmp_path: Path):
-    """Run the script; returns its last line, and the calls that it made [(what)]."""
+    """Run the script and return its last line and the calls that it made."""
     (tmp_path / "reports").mkdir()
     shutil.copy(SCRIPT, tmp_path / "reports")
     (tmp_path / "build/gpu/padgs").mkdir(parents=True)
     calls, programs = tmp_path / "calls", tmp_path / "programs"
     programs.mkdir()
-    pretended = {
+    fakes = {
         "python": PYTHON,
         "cmake": '#!/bin/sh\necho "cmake $1" >> "$CALLS"\ntest "$1" != "$BROKEN"\n',
         "compute-sanitizer": '#!/bin/sh\nexport TOOL=$2\nshift 4\nexec "$@"\n',
     }
-    for name, text in pretended.items():
+    for name, text in fakes.items():
         (programs / name).write_text(text)
         (programs / name).chmod(0o755)
 
@@ -54,7 +54,7 @@ def measure(tmp_path: Path):
     return run
 
 
-def test_the_benchmark_comes_first_and_what_is_done_is_not_done_again(measure, tmp_path: Path):
+def test_the_benchmark_comes_first_and_finished_steps_are_skipped(measure, tmp_path: Path):
     line, calls = measure("build", "bench")
     assert calls == ["cmake -S", "cmake --build", "bench"]
     assert line.startswith("verified: build bench; not verified: kernels (not run), tests (not run), memcheck")
@@ -69,14 +69,14 @@ def test_the_benchmark_comes_first_and_what_is_done_is_not_done_again(measure, t
     assert json.loads((tmp_path / "reports/measured/some-gpu.json").read_text())["steps"]["racecheck"] == "ok"
 
 
-def test_what_fails_is_said_and_tried_again(measure):
+def test_failed_steps_are_named_and_repeated(measure):
     line, _ = measure("build", "bench", "kernels", "tests", BROKEN="yes")
     assert "verified: build bench; not verified: kernels (failed (1)), tests (failed (1))" in line
     line, calls = measure("tests")
     assert calls == ["tests "] and line.startswith("verified: build bench tests;")
 
 
-def test_a_build_that_could_not_be_configured_is_none(measure):
+def test_a_failed_configuration_ends_the_build(measure):
     line, calls = measure("build", BROKEN="-S")
     assert calls == ["cmake -S"] and "not verified: build (failed (1))" in line
 

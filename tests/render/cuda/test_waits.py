@@ -16,8 +16,7 @@ import torch
 from pretended_gpu import GPU, pretended_gpu
 from torch import Tensor
 
-from padgs.apps.bench.on_device import resident
-from padgs.apps.bench.workload import Size, build
+from padgs.apps.bench.workload import Size, build, resident
 from padgs.methods.anchors.growth import GrowthOptions
 from padgs.methods.anchors.precision import PRECISIONS
 from padgs.methods.anchors.trainee import AnchorTrainee, LearningRates
