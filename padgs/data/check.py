@@ -101,7 +101,8 @@ def check(
     report.median_depth = median_depth(poses, scene.points)
     report.masked = {view.name: 1 - mask.mean().item() for view in views if (mask := view.mask()) is not None}
     _check_leaks(scene, capture, report)
-    _check_movement(poses, report)
+    if report.path_length == 0 and len(poses) > 1:
+        report.problems.append("all cameras have the same centre; depth cannot be learned")
     if damaged:  # the fit needs readable pixels
         return report
     _check_fit(capture, scene, report)
@@ -165,11 +166,6 @@ def _check_leaks(scene: Scene, capture: Capture, report: Report) -> None:
             f"{len(names)} test views are within {LEAK_DISTANCE:.0%} of the median depth of a training view "
             f"({listed(names)}); they test memory more than synthesis"
         )
-
-
-def _check_movement(poses: Tensor, report: Report) -> None:
-    if report.path_length == 0 and len(poses) > 1:
-        report.problems.append("all cameras have the same centre; depth cannot be learned")
 
 
 def _check_fit(capture: Capture, scene: Scene, report: Report) -> None:

@@ -23,22 +23,22 @@ class Dataset:
     contents: str  # of a scene's folder
 
 
+_ROAM360 = (
+    "bar", "base", "cafe", "canteen", "center", "center1", "corridor", "innovation", "lab", "library", "office"
+)  # fmt: skip
+_RICOH360 = (
+    "bricks", "bridge", "bridge_under", "cat_tower", "center", "farm", "flower", "gallery_chair", "gallery_park",
+    "gallery_pillar", "garden", "poster"
+)  # fmt: skip
+_OMNIBLENDER = (
+    "archiviz-flat", "barbershop", "bistro_bike", "bistro_square", "classroom", "fisher-hut", "lone_monk", "LOU",
+    "pavilion_midday_chair", "pavilion_midday_pond", "restroom"
+)  # fmt: skip
+
 DATASETS = {
     "roam360": Dataset(
         title="360Roam",
-        scenes=(
-            "bar",
-            "base",
-            "cafe",
-            "canteen",
-            "center",
-            "center1",
-            "corridor",
-            "innovation",
-            "lab",
-            "library",
-            "office",
-        ),
+        scenes=_ROAM360,
         width=2048,
         mask="rows:959/1024",
         source="its authors, https://huajianup.github.io/research/360Roam/ (it may not be redistributed)",
@@ -46,20 +46,7 @@ DATASETS = {
     ),
     "ricoh360": Dataset(
         title="Ricoh360",
-        scenes=(
-            "bricks",
-            "bridge",
-            "bridge_under",
-            "cat_tower",
-            "center",
-            "farm",
-            "flower",
-            "gallery_chair",
-            "gallery_park",
-            "gallery_pillar",
-            "garden",
-            "poster",
-        ),
+        scenes=_RICOH360,
         width=1920,
         mask="none",
         source="the 'Data' link of github.com/changwoonchoi/EgoNeRF",
@@ -67,19 +54,7 @@ DATASETS = {
     ),
     "omniblender": Dataset(
         title="OmniBlender",
-        scenes=(
-            "archiviz-flat",
-            "barbershop",
-            "bistro_bike",
-            "bistro_square",
-            "classroom",
-            "fisher-hut",
-            "lone_monk",
-            "LOU",
-            "pavilion_midday_chair",
-            "pavilion_midday_pond",
-            "restroom",
-        ),
+        scenes=_OMNIBLENDER,
         width=2000,
         mask="none",
         source="the 'Data' link of github.com/changwoonchoi/EgoNeRF",

@@ -64,7 +64,7 @@ def inspect(path: Path, *, mask: bool = False) -> ImageFile:
         raise DataError(f"{path} is CMYK; convert it to RGB")
     refuse_other_shapes(width, height, path)
     if _looks_cut(data) or has_alpha:
-        _decode(BytesIO(data), path, "L" if mask else "RGB")
+        _decode(data, path, "L" if mask else "RGB")
     return ImageFile(path, width, height, hashlib.sha256(data).hexdigest())
 
 
@@ -87,7 +87,7 @@ def decode(path: Path, mode: str = "RGB") -> NDArray[np.uint8]:
     Raises:
         DataError: the file is truncated, damaged, or partly transparent.
     """
-    return _decode(BytesIO(read_bytes(path)), path, mode)
+    return _decode(read_bytes(path), path, mode)
 
 
 def save_png(pixels: Tensor, path: Path) -> None:
@@ -96,13 +96,13 @@ def save_png(pixels: Tensor, path: Path) -> None:
     Image.fromarray(pixels.round().to(torch.uint8).cpu().numpy()).save(path)
 
 
-def _decode(file: BytesIO, path: Path, mode: str) -> NDArray[np.uint8]:
+def _decode(data: bytes, path: Path, mode: str) -> NDArray[np.uint8]:
     try:
-        with Image.open(file) as image:
+        with Image.open(BytesIO(data)) as image:
             image.load()
             transparent = "A" in image.getbands() and np.asarray(image.getchannel("A")).min() < 255
             pixels = np.array(_eight_bit(image).convert(mode))
-            cut = _misses_pixels(image, file.getvalue(), pixels)
+            cut = _misses_pixels(image, data, pixels)
     except (OSError, SyntaxError, ValueError) as error:
         raise DataError(f"{path} is cut short or damaged ({error}); copy it again or remove it") from error
     if cut:

@@ -84,28 +84,6 @@ def rotation_from_vector(vector: Tensor, where: str) -> Tensor:
     return torch.linalg.matrix_exp(cross)
 
 
-def quaternion_from_rotation(rotation: Tensor) -> Tensor:
-    """Return the quaternion (w, x, y, z), w >= 0, of a rotation [3, 3], as an eigenvector, without special cases.
-
-    Source: I. Bar-Itzhack, "New method for extracting the quaternion from a rotation matrix", 2000.
-    """
-    m = rotation.double()
-    k = torch.zeros(4, 4, dtype=torch.float64)
-    k[:3, :3] = m + m.T - m.trace() * torch.eye(3, dtype=torch.float64)
-    k[:3, 3] = k[3, :3] = torch.stack((m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]))
-    k[3, 3] = m.trace()
-    quaternion = torch.linalg.eigh(k)[1][:, -1].roll(1)
-    return -quaternion if quaternion[0] < 0 else quaternion
-
-
-def vector_from_rotation(rotation: Tensor) -> Tensor:
-    """Return the rotation vector [3], of length at most pi, of a rotation [3, 3]."""
-    quaternion = quaternion_from_rotation(rotation)
-    sine = quaternion[1:].norm()
-    half = torch.atan2(sine, quaternion[0])
-    return quaternion[1:] * (2.0 if sine < 1e-12 else 2 * half / sine)
-
-
 def checked_rotation(rotation: Tensor, where: str) -> Tensor:
     """Return the rotation nearest to a [3, 3] matrix, which must be one up to rounding, as float64.
 

@@ -13,7 +13,7 @@ import torch
 from padgs.data.capture import Cloud, DataError, Frame, Tracks
 from padgs.data.cloud import write_ply
 from padgs.data.formats.colmap import pycolmap_module
-from padgs.data.formats.poses import OPENCV_FROM_OPENGL, quaternion_from_rotation, vector_from_rotation
+from padgs.data.formats.poses import OPENCV_FROM_OPENGL
 from padgs.data.splits import LISTS
 
 
@@ -107,13 +107,15 @@ def write_openmvg(content: Content, folder: Path) -> None:
 
 def write_opensfm(content: Content, folder: Path) -> None:
     """Write `reconstruction.json` with one reconstruction, and the lists."""
+    from scipy.spatial.transform import Rotation
+
     cameras, shots = {}, {}
     for frame in content.frames:
         width, height = _size(frame)
         camera = f"panorama {width} {height} spherical"
         cameras[camera] = {"projection_type": "spherical", "width": width, "height": height}
         shots[frame.name] = {
-            "rotation": vector_from_rotation(frame.cam_from_world[:3, :3]).tolist(),
+            "rotation": Rotation.from_matrix(frame.cam_from_world[:3, :3].numpy()).as_rotvec().tolist(),
             "translation": frame.cam_from_world[:3, 3].tolist(),
             "camera": camera,
         }
@@ -143,6 +145,8 @@ def write_roam360(content: Content, folder: Path) -> None:
 
 def write_ricoh360(content: Content, folder: Path) -> None:
     """Write COLMAP text files to output_dir/colmap, and the lists (without extensions)."""
+    from scipy.spatial.transform import Rotation
+
     model = folder / "output_dir" / "colmap"
     model.mkdir(parents=True)
     width, height = _size(content.frames[0])
@@ -151,8 +155,8 @@ def write_ricoh360(content: Content, folder: Path) -> None:
     with (model / "images.txt").open("w", encoding="utf-8") as file:
         file.write(header)
         for i, frame in enumerate(content.frames):
-            quaternion = quaternion_from_rotation(frame.cam_from_world[:3, :3])
-            pose = " ".join(repr(x) for x in [*quaternion.tolist(), *frame.cam_from_world[:3, 3].tolist()])
+            x, y, z, w = Rotation.from_matrix(frame.cam_from_world[:3, :3].numpy()).as_quat(canonical=True).tolist()
+            pose = " ".join(repr(value) for value in [w, x, y, z, *frame.cam_from_world[:3, 3].tolist()])
             file.write(f"{i} {pose} 0 {frame.name}\n\n")
     with (model / "points3D.txt").open("w", encoding="utf-8") as file:
         file.write(header)
