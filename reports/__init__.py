@@ -1,8 +1,9 @@
-"""Tables, charts and a page from finished runs. Nothing here trains, renders or imports torch; every number comes from
-a `result.json`, from the log beside it, or from the file of published numbers.
+"""Tables, charts and a page from finished runs, without torch. Every number comes from a `result.json`, from the log
+beside it, or from the file of published numbers.
 
-`frame` puts all runs into one data frame, a row a run. A report is a function of `Gathered`, that frame and what is
-asked of it, and gives a `Table`, a list of `Chart`s or a page; `files` writes any of them down.
+`frame` puts all runs into one data frame, a row a run. A report is a function of a `selection.RunSet` (that frame and a
+request) that returns a `Table`, a list of `Chart`s or a page; `writers` turns them into files. Tables are data in
+`specs`, and `build` makes them.
 """
 
 from __future__ import annotations
@@ -13,38 +14,41 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Report:
-    """What can be asked for."""
+    """An entry of `padgs report`."""
 
-    function: str  # "package.module:function", imported when it is wanted
-    experiments: tuple[str, ...] = ()  # of conf/experiment that are run for it; none for sweeps and lists of all runs
+    function: str  # "package.module:function", and an argument; imported when needed
+    experiments: tuple[str, ...] = ()  # of conf/experiment, run for it; none for sweeps and lists of all runs
 
 
-OF_AN_ORDER = ("order", "photographs", "parallax")
-OF_ALL_METHODS = ("table1_360roam", "table2_ricoh360", "table4_efficiency", "all_methods")
+QUALITY_ORDER = ("order", "photographs", "parallax")
+ALL_METHODS = ("table1_360roam", "table2_ricoh360", "table4_efficiency", "all_methods")
 
+_TABLES = {  # of padgs.reports.specs -> experiments
+    "table1": ALL_METHODS,
+    "table2": ALL_METHODS,
+    "table3": ("ablation", "ablation_bar", "ablation_cat_tower"),
+    "table4": ALL_METHODS,
+    "methods": (*ALL_METHODS, "calibration"),
+    "equal_time": ("equal_time",),
+    "ladder": ("ladder",),
+    "deviations": ("deviations",),
+    "order": (*QUALITY_ORDER, "pixel_constants"),
+    "length": ("length",),
+    "learning_rates": ("learning_rates",),
+    "modulation": ("modulation",),
+    "plus_ablation": ("plus_ablation",),
+    "capacity": ("capacity",),
+    "runs": (),
+}
 REPORTS: Mapping[str, Report] = {
-    "table1": Report("padgs.reports.tables.tables_of_methods:table1", OF_ALL_METHODS),
-    "table2": Report("padgs.reports.tables.tables_of_methods:table2", OF_ALL_METHODS),
-    "table3": Report("padgs.reports.tables.variants:table3", ("ablation", "ablation_bar", "ablation_cat_tower")),
-    "table4": Report("padgs.reports.tables.tables_of_methods:table4", OF_ALL_METHODS),
-    "methods": Report("padgs.reports.tables.side_by_side:methods", (*OF_ALL_METHODS, "calibration")),
-    "equal_time": Report("padgs.reports.tables.side_by_side:equal_time", ("equal_time",)),
-    "ladder": Report("padgs.reports.tables.variants:ladder", ("ladder",)),
-    "quirks": Report("padgs.reports.tables.variants:quirks", ("deviations",)),
-    "order": Report("padgs.reports.tables.order:order", (*OF_AN_ORDER, "pixel_constants")),
-    "length": Report("padgs.reports.tables.length:length", ("length",)),
-    "learning_rates": Report("padgs.reports.tables.learning_rates:learning_rates", ("learning_rates",)),
-    "modulation": Report("padgs.reports.tables.modulation:modulation", ("modulation",)),
-    "plus_ablation": Report("padgs.reports.tables.variants:plus_ablation", ("plus_ablation",)),
-    "stability": Report("padgs.reports.tables.stability:stability", ("stress",)),
-    "limits": Report("padgs.reports.tables.limits:limits", ("stress",)),
-    "capacity": Report("padgs.reports.tables.capacity:capacity", ("capacity",)),
-    "need": Report("padgs.reports.tables.need:need", ("need",)),
+    **{name: Report(f"padgs.reports.build:table {name}", experiments) for name, experiments in _TABLES.items()},
+    "stability": Report("padgs.reports.robustness:stability", ("stress",)),
+    "limits": Report("padgs.reports.robustness:limits", ("stress",)),
+    "need": Report("padgs.reports.smallest:table", ("need",)),
     "smallest_chart": Report("padgs.reports.charts.smallest_chart:charts", ("need",)),
-    "runs": Report("padgs.reports.tables.runs:runs"),
-    "chart": Report("padgs.reports.charts.trade_off_chart:charts", ("pareto", *OF_AN_ORDER, *OF_ALL_METHODS)),
-    "gallery": Report("padgs.reports.charts.gallery:charts", ("equal_time", *OF_AN_ORDER, *OF_ALL_METHODS)),
+    "chart": Report("padgs.reports.charts.trade_off_chart:charts", ("pareto", *QUALITY_ORDER, *ALL_METHODS)),
+    "gallery": Report("padgs.reports.charts.gallery:charts", ("equal_time", *QUALITY_ORDER, *ALL_METHODS)),
     "sweep": Report("padgs.reports.charts.sweep_chart:charts"),
-    "findings": Report("padgs.reports.findings.page:findings"),
+    "findings": Report("padgs.reports.claims:findings"),
     "html": Report("padgs.reports.page.page:html"),
 }

@@ -1,54 +1,72 @@
-"""Under what conditions numbers were made: what runs of one block must share, and what stands under a table."""
+"""Conditions under which numbers were made: shared within a block, named below a table, and decisive for ranking."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 
 import pandas as pd
 from pandas import DataFrame
 
+from padgs.reports.frame import CONFIG
 from padgs.reports.methods import name, title
-from padgs.reports.mixtures import Mixture
-from padgs.reports.request import Request
+from padgs.reports.selection import Mixture, Request
+from padgs.reports.table import UNRANKED
 
-# Columns of the frame; the protocol's are its rules.
-CONDITIONS = ("protocol", "resolution", "length", "learning_rates", "data")
+# Columns of the frame; "protocol" stands for its rules.
 OF_A_DATA_SET = ("protocol", "resolution", "length", "learning_rates")  # scenes may differ, rules may not
+CONDITIONS = (*OF_A_DATA_SET, "data")
+OF_TIMES = (*CONDITIONS, "machine")
+OF_PARTS = tuple(what for what in OF_TIMES if what != "learning_rates")  # an ablation may change the rates
 OF_A_SWEEP = ("protocol", "machine")  # all else shows as a changed key
 OF_A_POINT = ("data",)  # the folder of the data is no part of a setting
 OF_A_CHART = ("protocol", "resolution", "learning_rates", "data", "machine")
 OF_A_MEAN = (*OF_A_DATA_SET, "machine")  # of one setting over the scenes of a data set
-OF_TIMES = (*CONDITIONS, "machine")
-OF_PARTS = tuple(what for what in OF_TIMES if what != "learning_rates")  # which may be what a method is without
-PUBLISHED_LENGTHS = {"egonerf": 100_000}  # iterations; of the others 30 000, which tables of the paper have
+PUBLISHED_LENGTHS = {"egonerf": 100_000}  # iterations; other methods have 30 000
 PUBLISHED_WIDTH = 1920  # pixels; the narrowest panoramas of the paper
-PUBLISHED_PIXELS = {  # preset -> what of it means something else in narrower panoramas
+PUBLISHED_PIXELS = {  # preset -> constant in pixels that means something else in narrower panoramas
     "op43dgs_release": "has a low-pass of 0.12 square pixels at a width of 2048, and of 0.0076 at 512",
     "odgs_release": "draws half a pixel off, which is 0.09 degrees at a width of 2048, and 0.35 at 512",
 }
+LEAST_SHARE = 0.5  # of the images that another method of the block has seen, for a method to be ranked
+CALIBRATES = {  # method -> keys of data.generator for the errors that it corrects; in photographs they are unknown
+    "sc_omnigs": ("pose_noise_translation", "pose_noise_rotation"),
+    "seam360gs": ("lens_gap", "lens_k1"),
+}
+FEWER_IMAGES = "for it saw less than half as much of the training images as another method of its table"
+NOTHING_TO_CORRECT = (
+    "for it is made after an abstract, and nothing is known here of what it mends (noise of the training poses; two "
+    "lenses apart); +experiment=calibration compares it where it is"
+)
+
+
+@dataclass(frozen=True)
+class Reason:
+    """Reason why a preset is not ranked in a block."""
+
+    why: str
+    numbers: str = ""
 
 
 def refuse_mixture(runs: DataFrame, request: Request, where: str, conditions: Iterable[str] = CONDITIONS) -> None:
-    """Runs of one block must have been made and scored alike.
-
-    Raises:
-        Mixture: they were not, and the request does not say that this is meant.
-    """
+    """Raise Mixture if runs of one block differ in a condition, unless the request allows it."""
     for what in () if request.mix else conditions:
         values = _values(runs, what, request.protocol).drop_duplicates()
         if len(values) > 1:
             examples = "; ".join(
                 f"{value} in {run}" for value, run in zip(values, runs["run"][values.index], strict=True)
             )
-            told = f"{where}: results differ in {what} ({examples})"
             column = _column(what, request.protocol)
+            told = f"{where}: results differ in {what} ({examples})"
             raise Mixture(told, "choose with --where, or say --mix if this is meant", runs, [column])
 
 
-def footnotes(blocks: Mapping[str, DataFrame], protocol: str) -> list[str]:
-    """Protocol with all its rules, resolution, length, learning rates, seeds, code version and machine of the runs
-    of blocks, in a sentence for all blocks that share them.
-    """
+def footnotes(blocks: Mapping[str, DataFrame], *protocols: str) -> list[str]:
+    """Return a sentence with the conditions of the runs, for all blocks that share them, under each protocol."""
+    return [note for protocol in protocols for note in _footnotes(blocks, protocol)]
+
+
+def _footnotes(blocks: Mapping[str, DataFrame], protocol: str) -> list[str]:
     titles: dict[str, list[str]] = {}
     for block, runs in blocks.items():
         titles.setdefault(_sentence(runs, protocol), []).append(block)
@@ -56,10 +74,10 @@ def footnotes(blocks: Mapping[str, DataFrame], protocol: str) -> list[str]:
     for method, length in PUBLISHED_LENGTHS.items():
         if any(((runs["method"] == method) & (runs["iterations"] < length)).any() for runs in blocks.values()):
             notes.append(f"{name(method)} is published with {length} iterations.")
-    for preset, what in PUBLISHED_PIXELS.items():
+    for preset, constant in PUBLISHED_PIXELS.items():
         sizes = (size for runs in blocks.values() for size in runs["resolution"][runs["preset"] == preset])
         if any(int(size.partition("x")[0]) < PUBLISHED_WIDTH for size in sizes):
-            notes.append(f"{title(preset)} {what}.")
+            notes.append(f"{title(preset)} {constant}.")
     return notes
 
 
@@ -75,10 +93,41 @@ def _sentence(runs: DataFrame, protocol: str) -> str:
 
 
 def _values(runs: DataFrame, what: str, protocol: str) -> pd.Series:
-    """A condition of each run; one that was never scored under a protocol contradicts none of its rules."""
+    """Return a condition of each run that has it; a run without scores under a protocol contradicts no rule."""
     column = _column(what, protocol)
     return runs[column].dropna() if column in runs else pd.Series(dtype=object)
 
 
 def _column(what: str, protocol: str) -> str:
     return f"{protocol} rules" if what == "protocol" else what
+
+
+def unranked(runs: DataFrame, *, equal_images: bool = True) -> dict[str, Reason]:
+    """Return preset -> reason, for the presets of a block whose numbers must not be ranked.
+
+    Args:
+        runs: all runs of the block.
+        equal_images: whether methods are compared after equally many images; otherwise after equal time.
+    """
+    found: dict[str, Reason] = {}
+    seen = runs.loc[runs["ok"]].groupby("preset")["images"].mean()
+    for preset, images in seen[seen < LEAST_SHARE * seen.max()].items() if equal_images else ():
+        found[str(preset)] = Reason(FEWER_IMAGES, f"{images:.0f} of {seen.max():.0f} images")
+    for method, keys in CALIBRATES.items():
+        own = runs.loc[runs["method"] == method]
+        errors = own.reindex(columns=[f"{CONFIG}data.generator.{key}" for key in keys]).fillna(0).astype(bool)
+        corrected = errors.any(axis=1) & (own["dataset"] == "synthetic")  # other data ignore the generator's keys
+        found |= dict.fromkeys(own.loc[~corrected, "preset"], Reason(NOTHING_TO_CORRECT))
+    return found
+
+
+def unranked_notes(blocks: Iterable[Mapping[str, Reason]]) -> list[str]:
+    """Return a sentence for each reason, with the titles of all presets concerned."""
+    concerned: dict[str, dict[str, dict[str, None]]] = {}
+    for preset, reason in (pair for block in blocks for pair in block.items()):
+        concerned.setdefault(reason.why, {}).setdefault(title(preset), {})[reason.numbers] = None
+    found = []
+    for why, titles in sorted(concerned.items()):
+        named = [f"{name} ({', '.join(numbers)})" if any(numbers) else name for name, numbers in titles.items()]
+        found.append(f"{UNRANKED} Not ranked: {'; '.join(named)}: {why}.")
+    return found

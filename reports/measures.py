@@ -1,4 +1,4 @@
-"""What is compared between methods: a number of each run, how it is read, and what the paper calls it."""
+"""Numbers of runs that reports compare, with their columns and the paper's names for them."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import Any
 from pandas import DataFrame
 
 from padgs.reports import published
-from padgs.reports.tables.table import Column, ReportError
+from padgs.reports.table import Column, ReportError
 from padgs.results import higher_is_better
 
-PAPER_METRICS = ("ssim", "psnr", "lpips")  # the order of the paper's tables
-PROTOCOL_METRICS = {  # protocol -> the metric that stands for each of PAPER_METRICS
+PAPER_METRICS = ("ssim", "psnr", "lpips")  # in the order of the paper's tables
+PROTOCOL_METRICS = {  # protocol -> its counterpart of each of PAPER_METRICS
     "paper": {"ssim": "ssim", "psnr": "psnr", "lpips": "lpips_vgg_01"},
     "sphere": {"ssim": "ws_ssim", "psnr": "ws_psnr", "lpips": "ws_lpips_alex"},
 }
@@ -50,53 +50,38 @@ COSTS = {
 }
 
 
-def costs(*names: str, **how: Any) -> tuple[Measure, ...]:
-    """Some of `COSTS`; `how` says what is different about their columns."""
-    return tuple(replace(COSTS[name], column=replace(COSTS[name].column, **how)) for name in names)
+def costs(*names: str, **changes: Any) -> tuple[Measure, ...]:
+    """Return some of `COSTS`, with changes to their columns."""
+    return tuple(replace(COSTS[name], column=replace(COSTS[name].column, **changes)) for name in names)
 
 
-def known_costs(runs: DataFrame, *names: str, **how: Any) -> tuple[Measure, ...]:
-    """Those of some of `COSTS` that are known of any of the runs; tables of the others have no column for them."""
-    return costs(*(name for name in names if name in runs and runs[name].notna().any()), **how)
+def metric(protocol: str, name: str, group: str = "", **changes: Any) -> Measure:
+    """Return a metric under a protocol, with changes to its column.
 
-
-def gpu_memory(runs: DataFrame, **how: Any) -> tuple[Measure, ...]:
-    """The memory of the GPU, if it is known of any of the runs."""
-    return known_costs(runs, "peak_gpu_gigabytes", **how)
-
-
-def alone(measure: Measure) -> Measure:
-    """The measure with nothing of the paper beside it."""
-    return replace(measure, published=None, difference=False)
-
-
-def mark(protocol: str, metric: str, group: str = "") -> Measure:
-    """A metric under a protocol.
-
-    >>> mark("sphere", "ws_psnr_pole").column.heading, mark("paper", "lpips_vgg_01").column.heading
+    >>> metric("sphere", "ws_psnr_pole").column.heading, metric("paper", "lpips_vgg_01").column.heading
     ('WS-PSNR pole ↑', 'LPIPS VGG [0, 1] ↓')
     """
-    title = " ".join(TITLES.get(word, word) for word in metric.split("_")).replace("WS ", "WS-")
-    column = Column(title, 2 if "psnr" in metric else 3, higher_is_better(metric), group=group)
-    return Measure(f"{protocol}/{metric}", column)
+    title = " ".join(TITLES.get(word, word) for word in name.split("_")).replace("WS ", "WS-")
+    column = Column(title, 2 if "psnr" in name else 3, higher_is_better(name), group=group)
+    return Measure(f"{protocol}/{name}", replace(column, **changes))
 
 
-def marks(protocol: str) -> tuple[Measure, ...]:
-    """SSIM, PSNR and LPIPS of a protocol, or what stands for them there.
+def metrics(protocol: str) -> tuple[Measure, ...]:
+    """Return SSIM, PSNR and LPIPS of a protocol, or their counterparts.
 
     Raises:
         ReportError: no such protocol; the message lists the known ones.
     """
     if protocol not in PROTOCOL_METRICS:
         raise ReportError(f"unknown protocol {protocol!r}; known: {', '.join(PROTOCOL_METRICS)}")
-    ours = {name: mark(protocol, PROTOCOL_METRICS[protocol][name], name.upper()) for name in PAPER_METRICS}
+    ours = {name: metric(protocol, PROTOCOL_METRICS[protocol][name], name.upper()) for name in PAPER_METRICS}
     if protocol != published.PROTOCOL:
         return tuple(ours.values())
     return tuple(replace(measure, published=name, difference=True) for name, measure in ours.items())
 
 
 def quantity(name: str, protocol: str, runs: DataFrame) -> Measure:
-    """A metric that runs have under a protocol, or a cost, by its name.
+    """Return a metric that runs have under a protocol, or a cost, by its name.
 
     Raises:
         ReportError: no such name; the message lists the known ones.
@@ -105,4 +90,4 @@ def quantity(name: str, protocol: str, runs: DataFrame) -> Measure:
     if name not in (*known, *COSTS):
         names = ", ".join((*known, *COSTS))
         raise ReportError(f"unknown metric {name!r}; known under protocol {protocol}: {names}")
-    return COSTS[name] if name in COSTS else mark(protocol, name)
+    return COSTS[name] if name in COSTS else metric(protocol, name)

@@ -1,4 +1,4 @@
-"""How methods and their presets are called in tables, and in what order: the paper's, then the others."""
+"""Titles of methods and presets in reports, and their order: the paper's, then the others."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ TITLES = {
     "sc_omnigs": "SC-OmniGS",
     "seam360gs": "Seam360GS",
 }
-# preset -> what ours is, where it is neither the published method alone nor a preset that says so by its name
+# preset -> how ours differs from the published program, where the name of the preset does not say it
 STATUS = {
     **dict.fromkeys(("op43dgs", "odgs", "omnigs"), "corrected"),  # the releases, without their mistakes
     **dict.fromkeys(("op43dgs_release", "odgs_release"), "as released, gradients corrected"),
@@ -29,7 +29,7 @@ STATUS = {
 
 
 def method_of(preset: str) -> str:
-    """The method of a preset: the longest known name that it begins with, else itself.
+    """Return the method of a preset: the longest known name that it begins with, else the preset.
 
     >>> method_of("odgs_release"), method_of("padgs_plus"), method_of("my_own")
     ('odgs', 'padgs_plus', 'my_own')
@@ -39,12 +39,12 @@ def method_of(preset: str) -> str:
 
 
 def name(method: str) -> str:
-    """What the authors call their method; that of the configuration where there is no other."""
+    """Return the authors' name of a method, or else its name in the configuration."""
     return TITLES.get(method, method)
 
 
 def title(preset: str) -> str:
-    """What ours is called: the authors' name with what sets ours apart from their program, or with the preset.
+    """Return the authors' name with what distinguishes ours from their program, or with the preset.
 
     >>> title("padgs"), title("odgs"), title("padgs_ray"), title("mine")
     ('PaD-GS', 'ODGS, corrected', 'PaD-GS, ray', 'mine')
@@ -54,19 +54,19 @@ def title(preset: str) -> str:
     return ", ".join(part for part in (name(method), rest) if part)
 
 
-def short(title_of_one: str, preset: str) -> str:
-    """A title that begins with the preset's own, for a mark in a chart: without what a table says of its status.
+def short(long_title: str, preset: str) -> str:
+    """Shorten a title that begins with the preset's own, for a marker in a chart: without its status.
 
     >>> short("ODGS, corrected, iterations 300", "odgs"), short(title("odgs_release"), "odgs_release")
     ('ODGS, iterations 300', 'ODGS, release')
     """
     method = method_of(preset)
     rest = preset.removeprefix(method).replace("_", " ").replace(" ", ", ", 1)
-    return title_of_one.replace(title(preset), name(method) + rest, 1)
+    return long_title.replace(title(preset), name(method) + rest, 1)
 
 
 def ordered(presets: Iterable[str]) -> list[str]:
-    """Each preset once, in the order of the tables.
+    """Return each preset once, in the order of the tables.
 
     >>> ordered(["mine", "padgs", "odgs_release", "odgs", "mine"])
     ['odgs', 'odgs_release', 'padgs', 'mine']
@@ -76,7 +76,7 @@ def ordered(presets: Iterable[str]) -> list[str]:
 
 
 def published_as(preset: str) -> str:
-    """The method of the paper whose numbers a preset may stand beside: its own, or that of the released program.
+    """Return the method of the paper whose numbers a preset may stand beside, for releases that of the program.
 
     >>> published_as("odgs_release"), published_as("egonerf_small")
     ('odgs', 'egonerf_small')

@@ -1,4 +1,4 @@
-"""The numbers of the paper, as data: `baselines/published.csv` holds Tables 1-4 cell by cell."""
+"""Numbers of the paper's Tables 1-4 (`baselines/published.csv`), and the scenes that tables are about."""
 
 from __future__ import annotations
 
@@ -7,16 +7,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-PROTOCOL = "paper"  # the only one under which ours may stand beside these
-DATASETS = {"roam360": "360roam", "ricoh360": "ricoh360"}  # our names -> theirs
-TITLES = {"roam360": "360Roam", "ricoh360": "Ricoh360"}  # of other data sets the scene says enough
-SCENES = {"center_1": "center1"}  # the paper's names -> those of the folders, where they differ
-MISSING = "missing"
+PROTOCOL = "paper"  # the only protocol under which ours may stand beside published numbers
+DATASETS = {"roam360": "360roam", "ricoh360": "ricoh360"}  # our names -> names in the file
+TITLES = {"roam360": "360Roam", "ricoh360": "Ricoh360"}
+SCENES = {"center_1": "center1"}  # names in the file -> names of the folders, where they differ
+AVERAGE = "average"
+BUILT_IN = "synthetic"  # data set of the generated scenes; their names begin with it
+OUTDOOR_WORDS = ("outdoor", "garden")  # in names of scenes outside the data sets that belong to Table 2
 
 
 @dataclass(frozen=True)
 class Key:
-    """Where a published number stands."""
+    """Position of a published number."""
 
     table: int
     dataset: str
@@ -33,11 +35,66 @@ class Published:
     status: str  # ok, oom, missing
 
 
+@dataclass(frozen=True)
+class Place:
+    """A scene of a data set, as results name them."""
+
+    dataset: str
+    scene: str
+    apart: str = ""  # condition that separates its runs from others of the scene
+
+    @property
+    def published(self) -> bool:
+        """True if the paper has numbers of the data set."""
+        return self.dataset in DATASETS
+
+    @property
+    def outdoor(self) -> bool:
+        """True if the scene belongs beside the outdoor scenes of Ricoh360."""
+        return self.dataset == "ricoh360" or any(word in self.scene for word in OUTDOOR_WORDS)
+
+    @property
+    def label(self) -> str:
+        """Name of the scene, and the condition that separates its runs."""
+        return ", ".join(filter(None, (self.scene, self.apart)))
+
+    @property
+    def heading(self) -> str:
+        """Title without origin.
+
+        >>> Place("roam360", "bar").heading, Place("", "flat").heading
+        ('360Roam, bar', 'flat')
+        """
+        return f"{TITLES[self.dataset]}, {self.label}" if self.published else self.label
+
+    @property
+    def title(self) -> str:
+        """Title with origin, so that no stand-in is taken for a scene of the paper."""
+        if self.published:
+            return self.heading
+        if not self.dataset:
+            return f"{self.label} (a capture that is no scene of the paper)"
+        origin = "built in, generated" if self.dataset == BUILT_IN else f"of {self.dataset}"
+        return f"{self.label} ({origin}; no scene of the paper)"
+
+    @property
+    def stem(self) -> str:
+        """Unique label for file names: with the data set, unless the name of the scene says it."""
+        implied = BUILT_IN if self.scene.startswith(f"{BUILT_IN}-") else ""
+        return self.label if self.dataset == implied else f"{self.label}_{self.dataset or 'capture'}"
+
+    @property
+    def rank(self) -> tuple[int, str, str, str]:
+        """Sort key: scenes of the paper first, then by name."""
+        order = list(DATASETS)
+        return (order.index(self.dataset) if self.published else len(order), self.dataset, self.scene, self.apart)
+
+
 def load(path: Path | None = None) -> Mapping[Key, Published]:
-    """All published numbers.
+    """Return all published numbers.
 
     Raises:
-        FileNotFoundError: the file is not where the package ships it.
+        FileNotFoundError: the file is missing from the package.
     """
     with (path or default_path()).open(newline="") as file:
         return {
@@ -48,27 +105,18 @@ def load(path: Path | None = None) -> Mapping[Key, Published]:
         }
 
 
-def row(numbers: Mapping[Key, Published], table: int, dataset: str, scene: str, method: str) -> dict[str, Published]:
-    """Metric -> number, of a method on a scene of a data set, as we call it; empty where the paper has none."""
-    where = (table, DATASETS.get(dataset), scene, method)
+def row(numbers: Mapping[Key, Published], table: int, place: Place, method: str) -> dict[str, Published]:
+    """Return metric -> number of a method on a scene; empty where the paper has none."""
+    where = (table, DATASETS.get(place.dataset), place.scene, method)
     return {k.metric: n for k, n in numbers.items() if (k.table, k.dataset, k.scene, k.method) == where}
 
 
 def scenes(numbers: Mapping[Key, Published], dataset: str) -> list[str]:
-    """The folders of the scenes of a data set, as the paper calls it, in the paper's order."""
+    """Return the folder names of a data set's scenes, in the paper's order; `dataset` as the paper calls it."""
     found = dict.fromkeys(key.scene for key in numbers if key.dataset == dataset and key.table < 3)
-    return [scene for scene in found if scene != "average"]
-
-
-def scene_title(dataset: str, scene: str) -> str:
-    """What a scene is called in a table.
-
-    >>> scene_title("roam360", "bar"), scene_title("", "flat")
-    ('360Roam, bar', 'flat')
-    """
-    return f"{TITLES[dataset]}, {scene}" if dataset in TITLES else scene
+    return [scene for scene in found if scene != AVERAGE]
 
 
 def default_path() -> Path:
-    """Where the file lies: beside the baselines, in a checkout and in an installed package alike."""
+    """Return the path of the file, in a checkout and in an installed package."""
     return Path(__file__).resolve().parent.parent / "baselines" / "published.csv"

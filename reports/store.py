@@ -1,7 +1,7 @@
-"""Where finished runs are read from: a folder of run folders, or a store, which is one file with a line for each run.
+"""Finished runs, read from a folder of run folders or from a store, which is one file with a line for each run.
 
-A line is the content of the `result.json` with its digest, and under `log` the PSNR of a held-out view that the run
-measured while it was training. Pictures are not stored.
+A line is the content of the `result.json` with its digest, and under `log` the PSNR of a held-out view during training.
+Pictures are not stored.
 """
 
 from __future__ import annotations
@@ -14,37 +14,39 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from PIL import Image
+
 from padgs import results
 from padgs.replacing import replace_file
 from padgs.results import Result, ResultError
 
 FILE_NAME = "results.jsonl"
 LOGGED = ("iteration", "seconds", "psnr")  # seconds of training so far; dB
-LOGGED_SINCE = ("polar_transmittance",)  # see padgs.runs.scoring.probe; older runs did not measure it
+LOGGED_BY_SOME = ("polar_transmittance",)  # measured for PaD-GS only
 NO_LOG: Mapping[str, Sequence[float]] = {name: () for name in LOGGED}
 
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run, and what it left beside its result."""
+    """A finished run: result, log, and folder of pictures."""
 
     result: Result
     log: Mapping[str, Sequence[float]] = field(default_factory=lambda: NO_LOG)  # name of `LOGGED` -> its values
     document: Mapping[str, Any] | None = None  # content of the result file
-    pictures: Path | None = None  # folder of truth | render | error of each test view; None in a store
+    pictures: Path | None = None  # folder of ground truth | render | error of each test view; None in a store
 
 
 def read(source: Path) -> tuple[list[Run], list[ResultError]]:
-    """The runs of a folder or a store in the order of their names, and why others were left out.
+    """Return the runs of a folder or a store in the order of their names, and an error for each unusable one.
 
     Raises:
         ResultError: the store cannot be read at all.
     """
     if source.is_file():
         lines = enumerate(results.file_content(source).splitlines(), start=1)
-        loads = [partial(_of_line, line, f"{source}:{number}") for number, line in lines]
+        loads = [partial(_from_line, line, f"{source}:{number}") for number, line in lines]
     else:
-        loads = [partial(_of_folder, path) for path in sorted(source.glob(f"*/{results.FILE_NAME}"))]
+        loads = [partial(_from_folder, path) for path in sorted(source.glob(f"*/{results.FILE_NAME}"))]
     runs: list[Run] = []
     errors: list[ResultError] = []
     for load in loads:
@@ -56,37 +58,54 @@ def read(source: Path) -> tuple[list[Run], list[ResultError]]:
 
 
 def add(runs: Iterable[Run], store: Path) -> list[Run]:
-    """Put runs into a store, each in the place of what it holds of the same name; returns all that are there then.
+    """Add runs to a store, replacing those of the same name; return all runs in it.
 
     Raises:
-        ResultError: a line of the store is damaged; it would be lost.
-        OSError: the store cannot be written; an older one stays.
+        ResultError: a line of the store is damaged, and would be lost.
+        OSError: the store cannot be written; the old one stays.
     """
-    there, damaged = read(store) if store.exists() else ([], [])
+    stored, damaged = read(store) if store.exists() else ([], [])
     if damaged:
         raise damaged[0]
-    by_name = {run.result.run: run for run in (*there, *runs)}
-    together = [by_name[name] for name in sorted(by_name)]
-    lines = ({**(run.document or results.encoded(run.result)), "log": run.log} for run in together)
+    by_name = {run.result.run: run for run in (*stored, *runs)}
+    merged = [by_name[name] for name in sorted(by_name)]
+    lines = ({**(run.document or results.encoded(run.result)), "log": run.log} for run in merged)
     texts = (json.dumps(line, separators=(",", ":"), allow_nan=False) for line in lines)
     replace_file(store, "".join(f"{text}\n" for text in texts).encode())
-    return together
+    return merged
 
 
-def _of_line(line: bytes, where: str) -> Run:
+def picture_names(folder: Path | None) -> list[str]:
+    """Return the sorted names of a run's pictures of test views; none in a store."""
+    return [] if folder is None else sorted(path.name for path in folder.glob("*.png"))
+
+
+def split_picture(path: Path, count: int) -> list[Image.Image]:
+    """Return `count` parts of equal width that lie side by side in a picture.
+
+    Raises:
+        OSError: the picture is missing or truncated.
+    """
+    with Image.open(path) as picture:
+        picture.load()
+        width = picture.width // count
+        return [picture.crop((part * width, 0, (part + 1) * width, picture.height)) for part in range(count)]
+
+
+def _from_line(line: bytes, where: str) -> Run:
     document = results.parsed(line, where)
     log = document.pop("log", None)
-    if not isinstance(log, dict) or not {*LOGGED} <= log.keys() <= {*LOGGED, *LOGGED_SINCE}:
+    if not isinstance(log, dict) or not {*LOGGED} <= log.keys() <= {*LOGGED, *LOGGED_BY_SOME}:
         raise ResultError(f"{where} has no log of {', '.join(LOGGED)}; delete it and collect the run again")
     return Run(results.decoded(document, where), log, document)
 
 
-def _of_folder(file: Path) -> Run:
+def _from_folder(file: Path) -> Run:
     document = results.parsed(results.file_content(file), str(file))
     probes = [line for line in results.log_lines(file.parent) if all(_is_finite(line.get(name)) for name in LOGGED)]
     log = {name: [probe[name] for probe in probes] for name in LOGGED}
     log |= {
-        name: [probe[name] for probe in probes] for name in LOGGED_SINCE if probes and all(name in p for p in probes)
+        name: [probe[name] for probe in probes] for name in LOGGED_BY_SOME if probes and all(name in p for p in probes)
     }
     return Run(results.decoded(document, str(file)), log, document, file.parent / results.PICTURES)
 

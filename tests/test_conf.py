@@ -26,7 +26,7 @@ from padgs.multirun.launchers import missing_plugin
 from padgs.multirun.overrides import expand, lenient, quoted
 from padgs.registry import lookup
 from padgs.render import RenderConfig
-from padgs.reports.unranked import MENDS
+from padgs.reports.conditions import CALIBRATES
 from padgs.runs.config import RunOptions, TrainConfig
 from padgs.runs.tracking.tracker import TrackingOptions
 from padgs.runs.typed import ConfigError
@@ -310,7 +310,7 @@ def test_every_deviation_is_a_part_of_its_release_and_changes_something():
 def test_calibration_is_compared_where_its_claims_can_show_and_where_not():
     """Each scene is one that the tables know as such, and the three methods see the same one."""
     found = jobs("+experiment=calibration", "scale=cpu")
-    knobs = {key: {job.data.generator.get(key, 0) > 0 for job in found} for keys in MENDS.values() for key in keys}
+    knobs = {key: {job.data.generator.get(key, 0) > 0 for job in found} for keys in CALIBRATES.values() for key in keys}
     assert all(there == {True, False} for there in knobs.values())
     methods_of: dict[str, list[str]] = {}
     for job in found:

@@ -13,7 +13,7 @@ import typer
 from padgs.cli.refusing import refusing, show
 from padgs.replacing import replace_file
 from padgs.reports import REPORTS, store
-from padgs.reports.tables.table import ReportError
+from padgs.reports.table import ReportError
 from padgs.results import ASKED, FILE_NAME, ResultError
 
 ALL = "all"
@@ -44,10 +44,9 @@ def report(
     if not source.exists():
         raise ReportError(f"there is no folder {source}; give the folder of the runs after the name of the report")
     target = Path(out) if out else (source if source.is_dir() else source.parent) / "reports"
-    from padgs.reports.files import files  # pandas, which other commands need not wait for
     from padgs.reports.frame import frame
-    from padgs.reports.gathered import Gathered
-    from padgs.reports.request import Request
+    from padgs.reports.selection import Request, RunSet
+    from padgs.reports.writers import files  # pandas, which other commands need not wait for
 
     request = Request(protocol, mix, strict, tuple(metric or ()), experiment, dict(map(_pair, where or [])))
     found, broken = store.read(source)
@@ -61,14 +60,14 @@ def report(
         single_run = (source / FILE_NAME).is_file()
         hint = f"{source} is one run: give {source.resolve().parent}" if single_run else "give a folder of run folders"
         raise ReportError(f"no result that can be used is in {source}; {hint}")
-    gathered = Gathered(frame(found), request, tuple(map(str, broken)))
+    run_set = RunSet(frame(found), request, tuple(map(str, broken)))
     if early := [run.result.run for run in found if run.result.ended == ASKED]:
-        gathered.warnings.append(f"asked to stop before their end, and so in no table but `runs`: {', '.join(early)}")
+        run_set.warnings.append(f"asked to stop before their end, and so in no table but `runs`: {', '.join(early)}")
     refused = 0
     single = what != ALL
     for name in [what] if single else REPORTS:
         try:
-            texts = dict(files(gathered.report(name), svg))
+            texts = dict(files(run_set.report(name), svg))
         except ReportError as error:
             refused += 1
             show(f"{'error' if single or strict else 'left out'}: {name}: {error}", sys.stderr)
@@ -82,7 +81,7 @@ def report(
         if what == name and f"{name}.md" in texts:
             show(texts[f"{name}.md"].decode())
     print(f"{len(found)} results, {len(broken)} left out; see {target}", file=sys.stderr)
-    for warning in gathered.warnings:
+    for warning in run_set.warnings:
         show(f"warning: {warning}", sys.stderr)
     if (refused and (single or strict)) or (strict and broken):
         raise typer.Exit(1)

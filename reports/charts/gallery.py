@@ -12,29 +12,29 @@ from padgs.reports import methods
 from padgs.reports.charts.drawing import Chart, figure, lay_out, show_image, styled
 from padgs.reports.conditions import footnotes, refuse_mixture
 from padgs.reports.frame import by_conditions
-from padgs.reports.gathered import Gathered
-from padgs.reports.pictures import picture_names, split
+from padgs.reports.selection import RunSet
+from padgs.reports.store import picture_names, split_picture
 from padgs.results import file_name
 
 COLUMNS = 3
 
 
-def charts(gathered: Gathered) -> list[Chart]:
+def charts(run_set: RunSet) -> list[Chart]:
     """Return a sheet for each scene, resolution and length with renders of test views; one seed is enough.
 
     Raises:
         ReportError: the results of a sheet differ in protocol or data.
     """
-    runs, found = gathered.chosen("gallery"), []
+    runs, found = run_set.chosen("gallery"), []
     runs = runs.loc[runs["ok"] & (runs["variant"] == "") & (runs["pictures"].map(picture_names).map(len) > 0)]
     for where, own in by_conditions(runs, "resolution", "length").items():
-        refuse_mixture(own, gathered.request, where, ("protocol", "data"))
+        refuse_mixture(own, run_set.request, where, ("protocol", "data"))
         own = own.sort_values("seed", kind="stable").drop_duplicates("preset")
         shared = sorted(set.intersection(*(set(picture_names(folder)) for folder in own["pictures"])))
         if shared and (images := _images(own, view := shared[len(shared) // 2])):
             name = file_name(f"gallery_{own['place'].iloc[0].stem}_{own['resolution'].iloc[0]}_{own['length'].iloc[0]}")
             title = f"{where}\ntest view {Path(view).stem}, with the PSNR of this view"
-            found.append(_sheet(name, title, images, tuple(footnotes({where: own}, gathered.request.protocol))))
+            found.append(_sheet(name, title, images, tuple(footnotes({where: own}, run_set.request.protocol))))
     return found
 
 
@@ -43,7 +43,7 @@ def _images(runs: DataFrame, view: str) -> list[tuple[str, Image.Image]]:
     truth, renders = None, []
     for _, run in runs.iterrows():
         try:
-            truth, render, _ = split(run["pictures"] / view, 3)
+            truth, render, _ = split_picture(run["pictures"] / view, 3)
         except OSError:
             continue  # an incomplete file of a killed run
         psnr, title = run["view_psnr"].get(view), methods.title(run["preset"])

@@ -12,8 +12,8 @@ from padgs.reports import methods
 from padgs.reports.charts.axis import Axis
 from padgs.reports.charts.drawing import INK, Chart, figure, lay_out, styled, tip, weight_of
 from padgs.reports.charts.labels import Label, write_labels
-from padgs.reports.survival import QUALITY, Stress, Survivor, in_order
-from padgs.reports.tables.table import MISSING, Cell
+from padgs.reports.robustness import QUALITY, Stress, StressedMethod, all_stress
+from padgs.reports.table import MISSING, Cell
 
 STATUS_LETTERS = {
     "oom": "M",
@@ -33,54 +33,54 @@ AREA = 160.0  # points^2 of a mark
 
 
 @styled
-def heat_map(title: str, survivors: Sequence[Survivor]) -> Chart:
+def heat_map(title: str, stressed: Sequence[StressedMethod]) -> Chart:
     """Return a row per method and a column per condition: retention as colour, failures as letters."""
-    stresses = in_order(survivors)
-    made, axes = figure(1, 1, BORDER[0] + WIDTH * len(stresses), BORDER[1] + HEIGHT * len(survivors))
+    stresses = all_stress(stressed)
+    made, axes = figure(1, 1, BORDER[0] + WIDTH * len(stresses), BORDER[1] + HEIGHT * len(stressed))
     own, rows, linked = axes[0][0], [], False
-    for row, one in enumerate(survivors):
+    for row, one in enumerate(stressed):
         for column, stress in enumerate(stresses):
-            if (cell := one.retention.get(stress)) is not None:
+            if (cell := one.robustness.get(stress)) is not None:
                 url = _worst_view(one.runs[stress])
                 linked = linked or url is not None
                 _draw_cell(own, column, row, cell, _cell_tip(one, stress, cell), url)
                 where = {"scene": title, "preset": one.preset, "condition": stress[0], "level": stress[1]}
                 rows.append({**where, **cell.numbers})
     own.set_xlim(0, len(stresses))
-    own.set_ylim(len(survivors), 0)
+    own.set_ylim(len(stressed), 0)
     names = [f"{name} {level}" for name, level in stresses]
     own.set_xticks([n + 0.5 for n in range(len(stresses))], names, rotation=60, ha="left")
     own.xaxis.tick_top()
-    titles = [methods.short(methods.title(one.preset), one.preset) for one in survivors]
-    own.set_yticks([n + 0.5 for n in range(len(survivors))], titles)
+    titles = [methods.short(methods.title(one.preset), one.preset) for one in stressed]
+    own.set_yticks([n + 0.5 for n in range(len(stressed))], titles)
     own.tick_params(length=0)
     own.grid(False)
     own.spines[:].set_visible(False)
-    seen = {status for one in survivors for cell in one.retention.values() for status in cell.status.split()}
+    seen = {status for one in stressed for cell in one.robustness.values() for status in cell.status.split()}
     letters = ", ".join(f"{letter} {status}" for status, letter in STATUS_LETTERS.items() if status in seen)
     own.set_xlabel(f"1: keeps everything, 0: one colour{f'; {letters}' if letters else ''}", fontsize=8)
     lay_out(made, f"What methods keep under stress\n{title}")
     notes = ("Each cell: the distance to one colour, as a share of the method's own without stress.",)
     notes += ("A cell opens its worst view, truth | render | error, if the folder of the run has it.",) * linked
-    return Chart(f"stability-{survivors[0].place}", title, made, notes, DataFrame(rows))
+    return Chart(f"stability-{stressed[0].place}", title, made, notes, DataFrame(rows))
 
 
 @styled
-def speed_and_accuracy(title: str, survivors: Sequence[Survivor]) -> Chart:
+def speed_and_accuracy(title: str, stressed: Sequence[StressedMethod]) -> Chart:
     """Return quality over training time without stress, with the stability score as fill, hollow if there is none."""
     import matplotlib
     from matplotlib.cm import ScalarMappable
 
-    on_cpu = all(one.rest["cpu_seconds"].notna().all() for one in survivors)
+    on_cpu = all(one.reference["cpu_seconds"].notna().all() for one in stressed)
     time, words = ("cpu_seconds", "training time on the CPU") if on_cpu else ("train_seconds", "training time")
-    points = [(one.rest[time].mean(), one.rest[QUALITY].mean()) for one in survivors]
+    points = [(one.reference[time].mean(), one.reference[QUALITY].mean()) for one in stressed]
     made, axes = figure(1, 1, 5.6, 4.4)
     own, rows, labels = axes[0][0], [], []
     Axis.of([cost for cost, _ in points], True).apply(own.xaxis)
     Axis.of([quality for _, quality in points]).apply(own.yaxis)
     own.set_xlabel(f"{words} without stress, s ↓")
     own.set_ylabel("WS-PSNR without stress, dB ↑")
-    for one, (cost, quality) in zip(survivors, points, strict=True):
+    for one, (cost, quality) in zip(stressed, points, strict=True):
         name, score = methods.title(one.preset), _share(one.score)
         text = f"{name}\n{quality:.2f} dB in {cost:.1f} s; score {score}, worst quartile {_share(one.worst_quartile)}"
         color = "none" if one.score is None else matplotlib.colormaps[COLORS](one.score)
@@ -94,7 +94,7 @@ def speed_and_accuracy(title: str, survivors: Sequence[Survivor]) -> Chart:
     made.colorbar(ScalarMappable(cmap=COLORS), ax=own, label=what, aspect=30)
     lay_out(made, f"Speed, accuracy and stability\n{title}")
     write_labels(own, labels, [(*label.at, label.radius) for label in labels])
-    return Chart(f"robustness-{survivors[0].place}", title, made, numbers=DataFrame(rows))
+    return Chart(f"robustness-{stressed[0].place}", title, made, numbers=DataFrame(rows))
 
 
 def _worst_view(runs: DataFrame) -> str | None:
@@ -121,11 +121,11 @@ def _draw_cell(axes: Any, column: int, row: int, cell: Cell, text: str, url: str
     axes.text(*middle, shown, ha="center", va="center_baseline", fontsize=8, **look)
 
 
-def _cell_tip(one: Survivor, stress: Stress, cell: Cell) -> str:
+def _cell_tip(one: StressedMethod, stress: Stress, cell: Cell) -> str:
     runs = one.runs[stress]
     parts = [f"{methods.title(one.preset)}, {stress[0]} {stress[1]}: keeps {cell.value or 0:.2f}"]
     if runs[QUALITY].notna().any():
-        parts.append(f"WS-PSNR {runs[QUALITY].mean():.2f} dB, {one.rest[QUALITY].mean():.2f} without")
+        parts.append(f"WS-PSNR {runs[QUALITY].mean():.2f} dB, {one.reference[QUALITY].mean():.2f} without")
     return "; ".join([*parts, *([cell.status] if cell.status else [])])
 
 

@@ -11,9 +11,9 @@ from padgs.reports.charts.axis import Axis, spans
 from padgs.reports.charts.drawing import INK, MARKERS, Chart, color_of, figure, lay_out, show_image, styled, tip
 from padgs.reports.conditions import OF_TIMES, footnotes, refuse_mixture
 from padgs.reports.frame import by_conditions
-from padgs.reports.gathered import Gathered
-from padgs.reports.needs import Curve, by_method, curves, searched
-from padgs.reports.pictures import split
+from padgs.reports.selection import RunSet
+from padgs.reports.smallest import Curve, by_method, curves, searched
+from padgs.reports.store import split_picture
 from padgs.results import NEED_PICTURED, file_name
 
 PANELS = (
@@ -25,17 +25,17 @@ LOSSES = tuple(f"{loss:g}" for loss in NEED_PICTURED)  # dB, marked in the chart
 LOG_RATIO = 1.5  # largest over smallest size, from which an axis is logarithmic
 
 
-def charts(gathered: Gathered) -> list[Chart]:
+def charts(run_set: RunSet) -> list[Chart]:
     """Return a chart for each scene with a search for the smallest model, and one of test views if there are renders.
 
     Raises:
         ReportError: the results of a chart differ in protocol, resolution, length, learning rates, data or machine.
     """
     found = []
-    for title, own in by_conditions(searched(gathered), "resolution", "length").items():
-        refuse_mixture(own, gathered.request, title, OF_TIMES)
+    for title, own in by_conditions(searched(run_set), "resolution", "length").items():
+        refuse_mixture(own, run_set.request, title, OF_TIMES)
         name = file_name(f"smallest_{own['place'].iloc[0].stem}_{own['resolution'].iloc[0]}_{own['length'].iloc[0]}")
-        notes = tuple(footnotes({title: own}, gathered.request.protocol))
+        notes = tuple(footnotes({title: own}, run_set.request.protocol))
         found.append(_chart(name, title, curves(own), notes))
         if rendered := [curve for curve in curves(own) if curve.picture is not None]:
             found.append(_renders(f"{name}_renders", title, rendered, notes))
@@ -74,7 +74,7 @@ def _renders(name: str, title: str, found: list[Curve], notes: tuple[str, ...]) 
         steps = [curve.found["steps"][0], *(curve.needs[loss] for loss in LOSSES)]
         words = [curve.title, f"all: {steps[0]['blended']} Gaussians"]
         words += [f"{loss} dB: {step['blended']}" for loss, step in zip(LOSSES, steps[1:], strict=True)]
-        for panel, part, text in zip(row, split(curve.picture, 4), words, strict=True):
+        for panel, part, text in zip(row, split_picture(curve.picture, 4), words, strict=True):
             show_image(panel, part, text)
             panel.set_axis_off()
     what = f"{title}\na test view: ground truth, whole model, and the smallest that lose {' and '.join(LOSSES)} dB"

@@ -13,13 +13,11 @@ from padgs.reports.charts.axis import Axis, spans
 from padgs.reports.charts.drawing import COLORS, MARKERS, SOFT, Chart, figure, lay_out, styled, tip
 from padgs.reports.conditions import OF_A_POINT, OF_A_SWEEP, footnotes, refuse_mixture
 from padgs.reports.frame import by_place, grouped
-from padgs.reports.gathered import Gathered, of_a_table
-from padgs.reports.measures import Measure, costs, marks, quantity
-from padgs.reports.request import Request
-from padgs.reports.scenes import Place
-from padgs.reports.settings import Setting, is_number, settings, sort_key
-from padgs.reports.tables.cells import over_seeds
-from padgs.reports.tables.table import Cell
+from padgs.reports.measures import Measure, costs, metrics, quantity
+from padgs.reports.published import Place
+from padgs.reports.selection import Request, RunSet, Setting, is_number, of_a_table, settings, sort_key
+from padgs.reports.statistics import over_seeds
+from padgs.reports.table import Cell
 from padgs.results import BY_ITSELF
 
 MAX_AD_HOC_KEYS = 2  # runs without an experiment that differ in more keys are no sweep
@@ -73,12 +71,12 @@ class Sweep:
         return DataFrame(rows, dtype=object).rename(columns={"value": "mean"})
 
 
-def charts(gathered: Gathered) -> list[Chart]:
+def charts(run_set: RunSet) -> list[Chart]:
     """Return a chart of each sweep."""
-    return [chart(sweep) for sweep in sweeps(gathered)]
+    return [chart(sweep) for sweep in sweeps(run_set)]
 
 
-def sweeps(gathered: Gathered) -> list[Sweep]:
+def sweeps(run_set: RunSet) -> list[Sweep]:
     """Return the sweeps in which a preset was run on a scene in several settings, ad-hoc runs included.
 
     Experiments of tables are left out, unless the request names one.
@@ -86,10 +84,10 @@ def sweeps(gathered: Gathered) -> list[Sweep]:
     Raises:
         ReportError: unknown metric, or results that differ in protocol, machine or data.
     """
-    request, runs = gathered.request, gathered.asked_for
+    request, runs = run_set.request, run_set.requested
     measures = _measures(request, runs)
     known = sorted(runs["experiments"].explode().dropna().unique())
-    names = [name for name in known if (request.means(name) if request.experiment else not of_a_table(name))]
+    names = [name for name in known if (request.matches(name) if request.experiment else not of_a_table(name))]
     found = []
     for name in names:
         own = runs.loc[[name in of for of in runs["experiments"]]]
@@ -132,7 +130,7 @@ def chart(sweep: Sweep) -> Chart:
 def _measures(request: Request, runs: DataFrame) -> tuple[Measure, ...]:
     if request.metrics:
         return tuple(quantity(name, request.protocol, runs) for name in request.metrics)
-    usual = (*marks(request.protocol), *costs(*SHOWN_COSTS))
+    usual = (*metrics(request.protocol), *costs(*SHOWN_COSTS))
     return tuple(measure for measure in usual if measure.name in runs and runs[measure.name].notna().any())
 
 

@@ -13,7 +13,7 @@ from padgs.reports.charts.axis import Axis
 from padgs.reports.charts.drawing import ALPHA, Chart, color_of, figure, lay_out, styled, tip, weight_of
 from padgs.reports.charts.labels import Label, write_labels
 from padgs.reports.charts.trade_off import TradeOff
-from padgs.reports.settings import settings
+from padgs.reports.selection import settings
 
 SIZE = (10.6, 4.2)  # inches
 LOOKS: dict[str, dict[str, Any]] = {  # role of a preset -> look of its line

@@ -11,21 +11,18 @@ import pandas as pd
 from pandas import DataFrame
 
 from padgs.reports import methods, published
-from padgs.reports.conditions import OF_A_CHART, OF_A_MEAN, footnotes, refuse_mixture
+from padgs.reports.conditions import OF_A_CHART, OF_A_MEAN, footnotes, refuse_mixture, unranked
 from padgs.reports.frame import by_place
-from padgs.reports.gathered import Gathered
-from padgs.reports.measures import Measure, costs, mark
-from padgs.reports.request import Request
-from padgs.reports.scenes import Place
-from padgs.reports.settings import settings
-from padgs.reports.tables.cells import over_scenes
-from padgs.reports.tables.table import Cell
-from padgs.reports.unranked import unranked
+from padgs.reports.measures import Measure, costs, metric
+from padgs.reports.published import Place
+from padgs.reports.selection import Request, RunSet, settings
+from padgs.reports.statistics import over_scenes
+from padgs.reports.table import Cell
 
 COSTS = costs("frame_ms", "train_seconds", "cpu_seconds", "gaussians", "megabytes")
 QUALITIES = (
-    *(mark("sphere", metric) for metric in ("ws_psnr", "ws_lpips_alex")),
-    *(mark("paper", metric) for metric in ("psnr", "lpips_vgg_01")),
+    *(metric("sphere", name) for name in ("ws_psnr", "ws_lpips_alex")),
+    *(metric("paper", name) for name in ("psnr", "lpips_vgg_01")),
 )
 
 
@@ -98,13 +95,13 @@ class TradeOff:
         return DataFrame(rows, dtype=object).drop(columns="status").rename(columns={"value": "mean"})
 
 
-def trade_offs(gathered: Gathered) -> list[TradeOff]:
+def trade_offs(run_set: RunSet) -> list[TradeOff]:
     """Return a chart for each data set of the paper and for each other scene; warn where no scene is complete.
 
     Raises:
         ReportError: the results of a chart differ in protocol, resolution, learning rates, data or machine.
     """
-    runs = gathered.chosen("chart")
+    runs = run_set.chosen("chart")
     groups: dict[str, dict[Place, DataFrame]] = {}
     for place, own in by_place(runs.loc[runs["variant"] == ""]).items():
         name = place.dataset if place.published and not place.apart else place.label
@@ -113,7 +110,7 @@ def trade_offs(gathered: Gathered) -> list[TradeOff]:
         groups.setdefault(name, {})[place] = own
     found, warnings = [], []
     for name, group in groups.items():
-        shown = replace(gathered.request, protocol=_protocol(pd.concat(group.values())))
+        shown = replace(run_set.request, protocol=_protocol(pd.concat(group.values())))
         for place, own in group.items():
             refuse_mixture(own, shown, place.title, OF_A_CHART)
         made = _trade_off(name, group, shown)
@@ -121,7 +118,7 @@ def trade_offs(gathered: Gathered) -> list[TradeOff]:
             found.append(made)
         elif len(group) > 1:
             warnings.append(f"{made.name}: no scene was finished in all settings, so there is no mean; --where chooses")
-    gathered.warnings.extend(warnings)  # after the loop, as a Mixture calls this function again
+    run_set.warnings.extend(warnings)  # after the loop, as a Mixture calls this function again
     return found
 
 

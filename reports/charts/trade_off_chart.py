@@ -27,8 +27,8 @@ from padgs.reports.charts.drawing import (
 )
 from padgs.reports.charts.labels import Label, Line, write_labels
 from padgs.reports.charts.trade_off import Point, TradeOff, pareto, trade_offs
-from padgs.reports.gathered import Gathered
 from padgs.reports.measures import COSTS, Measure
+from padgs.reports.selection import RunSet
 
 FRAME_TIME = ("frame_ms", "time per frame", "ms")  # cost, words, unit
 TRAINING_TIME, CPU_TIME = ("train_seconds", "training time", "s"), ("cpu_seconds", "training time on the CPU", "s")
@@ -145,9 +145,9 @@ class Panel:
         return along + ([[(x, y - y_std), (x, y + y_std)]] if y_std and not y_side else [])
 
 
-def charts(gathered: Gathered) -> list[Chart]:
+def charts(run_set: RunSet) -> list[Chart]:
     """Return speed against accuracy, and quality over training time for runs with a log."""
-    made = [drawn for trade_off in trade_offs(gathered) for drawn in (chart(trade_off), time_chart.chart(trade_off))]
+    made = [drawn for trade_off in trade_offs(run_set) for drawn in (chart(trade_off), time_chart.chart(trade_off))]
     return [drawn for drawn in made if drawn is not None]
 
 

@@ -17,14 +17,13 @@ from pandas import DataFrame
 from PIL import Image
 
 from padgs.reports import REPORTS
+from padgs.reports.build import PAPER_COLUMNS
 from padgs.reports.charts.drawing import Chart
 from padgs.reports.frame import by_place
-from padgs.reports.gathered import Gathered
-from padgs.reports.pictures import picture_names, split
-from padgs.reports.settings import Setting, settings
-from padgs.reports.tables.beside_paper import OF_THE_PAPER
-from padgs.reports.tables.ranking import BEST, emphasis
-from padgs.reports.tables.table import Block, Cell, ReportError, Table
+from padgs.reports.selection import RunSet, Setting, settings
+from padgs.reports.statistics import BEST, emphasis
+from padgs.reports.store import picture_names, split_picture
+from padgs.reports.table import Block, Cell, ReportError, Table
 
 HERE = Path(__file__).resolve().parent
 SCRIPTS = ("pannellum.js", "tablesort.min.js", "tablesort.number.min.js", "img-comparison-slider.js")
@@ -54,7 +53,7 @@ class Album:
         return len(self.images) - 1
 
 
-def html(gathered: Gathered) -> str:
+def html(run_set: RunSet) -> str:
     """Return the page with all other reports; a refused report is named at the top."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
@@ -65,16 +64,16 @@ def html(gathered: Gathered) -> str:
     refused: list[str] = []
     for name in REPORTS:
         try:
-            report = gathered.report(name) if name not in ("html", "gallery") else []
+            report = run_set.report(name) if name not in ("html", "gallery") else []
         except ReportError as error:
             refused.append(str(error))
             report = []
         made[name] = report if isinstance(report, list) else [report]
     tables = [part for parts in made.values() for part in parts if isinstance(part, Table)]
-    views = album(gathered)
+    views = album(run_set)
     return environment.get_template("page.html.j2").render(
-        facts=_facts(gathered.runs),
-        problems=[*gathered.left_out, *refused, *gathered.warnings],
+        facts=_facts(run_set.runs),
+        problems=[*run_set.left_out, *refused, *run_set.warnings],
         tables=[_table(shown) for table in tables if (shown := _measured(table)).blocks],
         maps=_charts(made["stability"]),
         charts=_charts([*made["chart"], *made["smallest_chart"]]),
@@ -87,9 +86,9 @@ def html(gathered: Gathered) -> str:
     )
 
 
-def album(gathered: Gathered) -> Album:
+def album(run_set: RunSet) -> Album:
     """Return a few views of each scene, of all settings of methods and rows of ablations; one seed is enough."""
-    runs, parts = gathered.chosen("table1"), gathered.chosen("table3")
+    runs, parts = run_set.chosen("table1"), run_set.chosen("table3")
     own = pd.concat([runs, parts.loc[parts["variant"] != ""]]).drop_duplicates("run")
     own = own.loc[own["pictures"].map(picture_names).map(len) > 0]
     groups = {place: sorted(settings(runs), key=_mean_psnr, reverse=True) for place, runs in by_place(own).items()}
@@ -121,7 +120,7 @@ def _view(made: Album, shown: Sequence[Setting], name: str) -> dict[str, Any]:
             continue
         run = runs.iloc[0]
         try:
-            truth, render, error = split(run["pictures"] / name, 3)
+            truth, render, error = split_picture(run["pictures"] / name, 3)
         except OSError:
             continue  # an incomplete file of a killed run
         if view["truth"] is None:
@@ -153,7 +152,7 @@ def _facts(runs: DataFrame) -> list[tuple[str, str]]:
 
 def _measured(table: Table) -> Table:
     """Return a table without the blocks that have only published numbers."""
-    ours = [index for index, column in enumerate(table.columns) if column.title not in OF_THE_PAPER]
+    ours = [index for index, column in enumerate(table.columns) if column.title not in PAPER_COLUMNS]
     blocks = (
         block for block in table.blocks if any(row.cells[index] != Cell() for row in block.rows for index in ours)
     )
@@ -161,7 +160,7 @@ def _measured(table: Table) -> Table:
 
 
 def _table(table: Table) -> dict[str, Any]:
-    blocks = [_block(table.alone(block, every=True)) for block in table.blocks]
+    blocks = [_block(table.single(block, drop_empty=True)) for block in table.blocks]
     named = {"name": table.name, "title": table.title, "corner": table.corner}
     return {**named, "blocks": blocks, "notes": table.notes}
 

@@ -104,7 +104,7 @@ def test_a_folder_that_is_not_there(tmp_path):
 
 
 def test_reports_need_no_torch(root):
-    code = "import sys, padgs.reports.files; sys.exit('torch' in sys.modules)"
+    code = "import sys, padgs.reports.writers; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], cwd=root).returncode == 0
 
 

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,10 @@ from PIL import Image
 
 from padgs import results
 from padgs.reports import published
+from padgs.reports.build import table
 from padgs.reports.charts.trade_off_chart import Panel
 from padgs.reports.frame import frame
-from padgs.reports.gathered import Gathered
-from padgs.reports.request import Request
+from padgs.reports.selection import Request, RunSet
 from padgs.reports.store import Run
 from padgs.results import Result, Scores
 
@@ -193,9 +194,14 @@ def picture(one: Result, run: Path, width: int = 128) -> None:
         Image.fromarray((255 * three).astype("uint8")).save(run / "renders" / f"view{view}.png")
 
 
-def gathered(results_: list[Result], **asked: Any) -> Gathered:
+def run_set(results_: list[Result], **asked: Any) -> RunSet:
     """What a report is made from, of runs that left nothing but their results."""
-    return Gathered(frame(map(Run, results_)), Request(**asked))
+    return RunSet(frame(map(Run, results_)), Request(**asked))
+
+
+def builder(name: str):
+    """A function that builds a table of `specs`, and refuses mixtures."""
+    return partial(table, name=name)
 
 
 def assert_apart(panel: Panel, texts: list[Any]) -> None:

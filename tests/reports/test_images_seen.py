@@ -4,7 +4,7 @@ import pytest
 import torch
 from made_up import result
 
-from padgs.reports.images_seen import images_seen
+from padgs.reports.frame import images_seen
 from padgs.scene import View
 from padgs.training.views.sizes import Sizes
 

@@ -1,37 +1,36 @@
 import pytest
-from made_up import gathered, small
+from made_up import run_set, small
 from pandas import DataFrame
 
-from padgs.reports.mixtures import Mixture, apart
-from padgs.reports.settings import one_setting
+from padgs.reports.selection import Mixture, one_setting, separate
 
 
 def refused(*options) -> tuple[DataFrame, Mixture]:
     """Runs of a method with these options, a seed each, and why they are no setting."""
     configs = [{"method": own, "seed": seed} for seed, own in enumerate(options)]
-    runs = gathered([small(25.0, seed=config["seed"], config=config) for config in configs]).runs
+    runs = run_set([small(25.0, seed=config["seed"], config=config) for config in configs]).runs
     with pytest.raises(Mixture) as caught:
         one_setting(runs, "room", "preset")
     return runs, caught.value
 
 
 def test_a_key_that_is_not_set_is_a_difference():
-    assert apart(*refused({}, {"share": 0.3}))["preset"].tolist() == ["padgs_share not set", "padgs_share 0.3"]
+    assert separate(*refused({}, {"share": 0.3}))["preset"].tolist() == ["padgs_share not set", "padgs_share 0.3"]
 
 
 def test_values_may_be_lists():
     rates = [0.1, 0.2], [0.1, 0.3], 0.1
-    names = apart(*refused(*({"rate": rate} for rate in rates)))["preset"].tolist()
+    names = separate(*refused(*({"rate": rate} for rate in rates)))["preset"].tolist()
     assert names == [f"padgs_rate {rate}" for rate in rates]
 
 
 def test_what_no_words_tell_apart_is_refused_for_good():
     runs, mixture = refused({"share": 1}, {"share": "1"})
     with pytest.raises(Mixture, match="differ in method.share"):
-        apart(runs, mixture)
+        separate(runs, mixture)
 
 
 def test_seeds_from_before_and_after_a_key_existed_have_rows_of_their_own():
-    of = gathered([small(25.0, seed=seed, config={"method": own}) for seed, own in enumerate(({}, {"share": 0.3}))])
+    of = run_set([small(25.0, seed=seed, config={"method": own}) for seed, own in enumerate(({}, {"share": 0.3}))])
     assert [row.title for row in of.report("methods").blocks[0].rows] == ["PaD-GS, share 0.3", "PaD-GS, share not set"]
     assert "differ in method.share" in "".join(of.warnings)

@@ -1,4 +1,4 @@
-from padgs.reports.scenes import Place
+from padgs.reports.published import Place
 
 
 def test_no_two_places_share_a_title_or_a_name_of_files():

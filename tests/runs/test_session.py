@@ -19,7 +19,7 @@ from padgs.data.capture import DataError
 from padgs.methods.anchors.method import PaDGSMethod
 from padgs.reports import store
 from padgs.reports.frame import frame
-from padgs.reports.gathered import Gathered
+from padgs.reports.selection import RunSet
 from padgs.runs import checkpoint, session
 from padgs.runs.checkpoint import CheckpointError
 from padgs.runs.folder import RunFolder, RunFolderError
@@ -327,7 +327,7 @@ def test_a_run_of_a_sweep_that_is_asked_for_by_itself_stands_in_tables(config):
     for seed in range(2):
         run(replace(config, labels=Labels("padgs"), seed=seed))
     found, _ = store.read(Path(config.run.folder))
-    rows = Gathered(frame(found)).chosen("methods")
+    rows = RunSet(frame(found)).chosen("methods")
     assert sorted(rows["seed"]) == [0, 1] and set(rows["experiments"]) == {("by_itself",), ("by_itself", "tau")}
 
 

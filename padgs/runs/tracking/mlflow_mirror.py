@@ -12,10 +12,8 @@ from omegaconf import OmegaConf
 
 from padgs import results
 from padgs.reports.frame import frame
-from padgs.reports.gathered import Gathered
-from padgs.reports.request import Request
+from padgs.reports.selection import Request, RunSet
 from padgs.reports.store import Run
-from padgs.reports.tables.runs import runs
 from padgs.reports.writers import csv_text, markdown
 from padgs.results import Result
 
@@ -112,9 +110,9 @@ class Mirror:
         self._client.set_terminated(identity, "FINISHED" if result.ok else "FAILED")
 
     def _log_table(self, identity: str, found: Sequence[Result]) -> None:
-        table = runs(Gathered(frame(map(Run, found)), Request(mix=True)))
-        self._client.log_text(identity, markdown.text(table), "tables/runs.md")
-        self._client.log_text(identity, csv_text.text(table), "tables/runs.csv")
+        table = RunSet(frame(map(Run, found)), Request(mix=True)).report("runs")
+        self._client.log_text(identity, markdown(table), "tables/runs.md")
+        self._client.log_text(identity, csv_text(table), "tables/runs.csv")
 
 
 def final_numbers(result: Result) -> dict[str, float]:

@@ -1,7 +1,7 @@
 import re
 
 import pytest
-from made_up import compared, gathered, small, swept
+from made_up import compared, run_set, small, swept
 
 from padgs import baselines
 from padgs.reports.charts import drawing, sweep_chart, trade_off_chart
@@ -39,7 +39,7 @@ def test_the_colour_of_a_method_does_not_depend_on_others():
 def svgs():
     runs = [*compared(["synthetic-room"], seeds=1)[3:], small(24.0, method="mine", experiments=("all_methods",))]
     runs += swept(values=(0.5, 0.9, 1.0), scenes=["synthetic-room"], seeds=2)
-    return [chart.svg for of in (trade_off_chart, sweep_chart) for chart in of.charts(gathered(runs))]
+    return [chart.svg for of in (trade_off_chart, sweep_chart) for chart in of.charts(run_set(runs))]
 
 
 def test_all_colours_are_replaced_on_dark_screens(svgs):

@@ -7,12 +7,12 @@ from made_up import compared, small, write
 from padgs.reports import store
 from padgs.reports.charts import gallery
 from padgs.reports.frame import frame
-from padgs.reports.gathered import Gathered
+from padgs.reports.selection import RunSet
 from padgs.results import Scores
 
 
 def sheets(folder):
-    return gallery.charts(Gathered(frame(store.read(folder)[0])))
+    return gallery.charts(RunSet(frame(store.read(folder)[0])))
 
 
 def test_each_scene_has_a_sheet_with_each_method_once_by_falling_psnr(tmp_path):

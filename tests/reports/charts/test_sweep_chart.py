@@ -3,27 +3,26 @@ import io
 from dataclasses import replace
 
 import pytest
-from made_up import compared, gathered, small, swept
+from made_up import compared, run_set, small, swept
 
 from padgs.reports.charts import sweep_chart
 from padgs.reports.charts.sweep_chart import sweeps
-from padgs.reports.tables.table import ReportError
-from padgs.reports.writers import csv_text
+from padgs.reports.table import ReportError
 
 
 def rows(sweep) -> list[dict[str, str]]:
-    return list(csv.DictReader(io.StringIO(csv_text.of_frame(sweep.numbers))))
+    return list(csv.DictReader(io.StringIO(sweep.numbers.to_csv(index=False))))
 
 
 def test_a_curve_for_each_scene_along_the_key_that_differs():
-    (sweep,) = sweeps(gathered([*swept("tau"), *compared()], protocol="sphere"))
+    (sweep,) = sweeps(run_set([*swept("tau"), *compared()], protocol="sphere"))
     assert (sweep.name, sweep.key) == ("tau@cpu", "method.tau")
     assert [curve.place.scene for curve in sweep.curves] == ["synthetic-outdoor", "synthetic-room"]
     assert [x for x, _ in sweep.curves[0].points] == [0.0, 0.5, 0.9, 1.0]
 
 
 def test_points_are_means_over_seeds_with_their_spread():
-    (sweep,) = sweeps(gathered(swept("tau"), protocol="sphere"))
+    (sweep,) = sweeps(run_set(swept("tau"), protocol="sphere"))
     at = {(r["scene"], r["x"], r["quantity"]): r for r in rows(sweep)}
     best = at["synthetic-room", "0.9", "WS-PSNR"]
     assert float(best["mean"]) == pytest.approx(25 + 0.1 - 0.4) and best["n"] == "3"
@@ -38,7 +37,7 @@ def test_two_keys_give_a_line_for_each_value_of_the_second():
         for features in (16, 32, 64)
         if (method := {"offsets": offsets, "features": features})
     ]
-    (sweep,) = sweeps(gathered(grid))
+    (sweep,) = sweeps(run_set(grid))
     assert sweep.key == "method.features" or sweep.key == "method.offsets"
     assert {len(curve.points) for curve in sweep.curves} in ({2}, {3})
     assert all(curve.fixed for curve in sweep.curves)
@@ -49,47 +48,47 @@ def test_settings_without_numeric_keys_have_names():
         small(25 + i, 1 + i, experiments=("projections",), config={"render": {"projection": name}})
         for i, name in enumerate(("tangent", "erp"))
     ]
-    (sweep,) = sweeps(gathered(projections))
+    (sweep,) = sweeps(run_set(projections))
     assert sweep.key == "" and [x for x, _ in sweep.curves[0].points] == ["projection erp", "projection tangent"]
     assert "projection tangent" in sweep_chart.chart(sweep).svg
 
 
 def test_an_experiment_in_one_setting_is_no_sweep():
-    assert sweeps(gathered(compared())) == []
+    assert sweeps(run_set(compared())) == []
 
 
 def test_a_failed_point_says_so():
     runs = [replace(r, status="nan", scores={}) if r.config["method"]["tau"] == 1.0 else r for r in swept("tau")]
-    (sweep,) = sweeps(gathered(runs, metrics=("ssim",)))
+    (sweep,) = sweeps(run_set(runs, metrics=("ssim",)))
     failed = [r for r in rows(sweep) if r["x"] == "1.0"]
     assert {(r["mean"], r["status"]) for r in failed} == {("", "nan")}
     assert ">NAN<" in sweep_chart.chart(sweep).svg
 
 
 def test_metrics_are_chosen_by_name_and_unknown_ones_list_the_known():
-    (sweep,) = sweeps(gathered(swept("tau"), protocol="sphere", metrics=("ws_psnr", "frame_ms")))
+    (sweep,) = sweeps(run_set(swept("tau"), protocol="sphere", metrics=("ws_psnr", "frame_ms")))
     assert [measure.column.title for measure in sweep.measures] == ["WS-PSNR", "ms per frame"]
     with pytest.raises(ReportError, match="unknown metric 'psrn'; known under protocol paper: psnr, ssim, .*frame_ms"):
-        sweeps(gathered(swept("tau"), metrics=("psrn",)))
+        sweeps(run_set(swept("tau"), metrics=("psrn",)))
 
 
 def test_the_experiment_chooses():
     runs = [*swept("tau"), *swept("lambda_l1")]
-    assert [sweep.name for sweep in sweeps(gathered(runs))] == ["lambda_l1@cpu", "tau@cpu"]
-    assert [sweep.name for sweep in sweeps(gathered(runs, experiment="tau@cpu"))] == ["tau@cpu"]
+    assert [sweep.name for sweep in sweeps(run_set(runs))] == ["lambda_l1@cpu", "tau@cpu"]
+    assert [sweep.name for sweep in sweeps(run_set(runs, experiment="tau@cpu"))] == ["tau@cpu"]
 
 
 def test_protocols_are_not_mixed_along_a_curve_nor_data_in_a_point():
     first, *others = swept("tau")
     other = replace(first, scores={"paper": replace(first.scores["paper"], protocol={"lpips": "alex"})})
     with pytest.raises(ReportError, match="tau@cpu, .*differ in protocol"):
-        sweeps(gathered([other, *others]))
+        sweeps(run_set([other, *others]))
     with pytest.raises(ReportError, match="tau@cpu, .*tau 0.0: results differ in data"):
-        sweeps(gathered([first, replace(first, fingerprint="other", run="other"), *others]))
+        sweeps(run_set([first, replace(first, fingerprint="other", run="other"), *others]))
 
 
 def test_a_chart_has_readable_text_and_tooltips_with_numbers():
-    (chart,) = sweep_chart.charts(gathered(swept("tau"), protocol="sphere"))
+    (chart,) = sweep_chart.charts(run_set(swept("tau"), protocol="sphere"))
     assert chart.name == "sweep_tau_cpu" and chart.png.startswith(b"\x89PNG")
     assert ">method.tau<" in chart.svg and "WS-PSNR" in chart.svg
     assert "<title>synthetic-room, PaD-GS\n0.9: 24.70 ± 0.10 (n=3)</title>" in chart.svg
@@ -97,8 +96,8 @@ def test_a_chart_has_readable_text_and_tooltips_with_numbers():
 
 def test_experiments_of_charts_are_a_sweep_only_if_requested():
     lengths = [small(25.0, 1.0 + n, experiments=("pareto",), config={"train": {"iterations": n}}) for n in (1, 2)]
-    assert sweeps(gathered(lengths)) == []
-    assert [sweep.key for sweep in sweeps(gathered(lengths, experiment="pareto"))] == ["train.iterations"]
+    assert sweeps(run_set(lengths)) == []
+    assert [sweep.key for sweep in sweeps(run_set(lengths, experiment="pareto"))] == ["train.iterations"]
 
 
 def test_a_metric_without_values_has_no_panel():
@@ -106,5 +105,5 @@ def test_a_metric_without_values_has_no_panel():
         metrics = {key: value for key, value in one.scores["paper"].metrics.items() if "lpips" not in key}
         return replace(one, scores={"paper": replace(one.scores["paper"], metrics=metrics)})
 
-    (sweep,) = sweeps(gathered([without(one) for one in swept(seeds=1)]))
+    (sweep,) = sweeps(run_set([without(one) for one in swept(seeds=1)]))
     assert [measure.name for measure in sweep.measures if "/" in measure.name] == ["paper/ssim", "paper/psnr"]

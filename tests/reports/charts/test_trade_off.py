@@ -3,24 +3,23 @@ import io
 from dataclasses import replace
 
 import pytest
-from made_up import METHODS, compared, data_set, gathered, small
+from made_up import METHODS, compared, data_set, run_set, small
 
 from padgs.reports.charts.trade_off import pareto, trade_offs
-from padgs.reports.tables.table import ReportError
-from padgs.reports.writers import csv_text
+from padgs.reports.table import ReportError
 
 CHANGED = (("padgs", True), ("omnigs", False))  # method, whether on the scene bar
 
 
 def numbers(chart) -> dict[tuple[str, str], float]:
-    lines = csv.DictReader(io.StringIO(csv_text.of_frame(chart.numbers)))
+    lines = csv.DictReader(io.StringIO(chart.numbers.to_csv(index=False)))
     return {(line["setting"], line["quantity"]): float(line["mean"]) for line in lines}
 
 
 def test_a_point_for_each_method_and_setting():
     config = {"train": {"iterations": 3000}, "method": {"tau": 0.9}}
     longer = [small(28.0, 3.0, experiments=("pareto@cpu",), iterations=3000, config=config)]
-    room = next(chart for chart in trade_offs(gathered([*compared(), *longer])) if chart.name == "chart_synthetic-room")
+    room = next(chart for chart in trade_offs(run_set([*compared(), *longer])) if chart.name == "chart_synthetic-room")
     found = numbers(room)
     assert found["ODGS, corrected", "WS-PSNR"] == pytest.approx(22 + 1.6 + 0.05 - 0.4)
     assert found["ODGS, corrected", "ms per frame"] == pytest.approx(40 * 1.1)
@@ -31,7 +30,7 @@ def test_a_point_for_each_method_and_setting():
 
 
 def test_a_failed_method_has_no_point():
-    outdoor = next(chart for chart in trade_offs(gathered(compared())) if "outdoor" in chart.name)
+    outdoor = next(chart for chart in trade_offs(run_set(compared())) if "outdoor" in chart.name)
     assert {point.preset for point in outdoor.points} == set(METHODS) - {"op43dgs"}
 
 
@@ -40,7 +39,7 @@ def test_a_data_set_is_averaged_over_the_scenes_that_all_finished():
         replace(r, status="oom", scores={}) if (r.scene, r.method) == ("bar", "padgs") else r
         for r in data_set("roam360")
     ]
-    (chart,) = trade_offs(gathered(runs))
+    (chart,) = trade_offs(run_set(runs))
     assert "mean over its scenes base, cafe" in chart.title
     assert numbers(chart)["OmniGS, corrected", "PSNR"] == pytest.approx(20 + 5.5)  # scenes 1..10
 
@@ -50,7 +49,7 @@ def test_a_data_set_is_averaged_over_the_scenes_that_all_finished():
 )
 def test_where_no_scene_is_finished_in_all_settings_there_is_no_chart_but_a_warning(change):
     runs = [replace(r, **change) if (r.method, r.scene == "bar") in CHANGED else r for r in data_set("roam360")]
-    of = gathered(runs)
+    of = run_set(runs)
     assert trade_offs(of) == [] and "chart_roam360: no scene was finished in all settings" in "".join(of.warnings)
 
 
@@ -62,33 +61,33 @@ def test_no_point_of_the_front_is_beaten():
 
 def test_a_method_that_never_finishes_does_not_empty_the_chart():
     runs = [replace(r, status="oom", scores={}) if r.method == "padgs" else r for r in data_set("roam360")]
-    (chart,) = trade_offs(gathered(runs))
+    (chart,) = trade_offs(run_set(runs))
     assert "scenes bar, base" in chart.title and [point.preset for point in chart.points] == ["omnigs"]
 
 
 def test_lengths_are_not_mixed_in_a_mean_over_scenes():
     runs = [replace(r, iterations=7000) if r.scene == "bar" else r for r in data_set("roam360")]
     with pytest.raises(ReportError, match="roam360, OmniGS, corrected: results differ in length"):
-        trade_offs(gathered(runs))
+        trade_offs(run_set(runs))
 
 
 def test_settings_of_the_protocol_that_is_shown_and_machines_are_not_mixed():
     first, *others = compared()
     with pytest.raises(ReportError, match="differ in machine"):
-        trade_offs(gathered([replace(first, machine={"gpu": "H200"}), *others]))
+        trade_offs(run_set([replace(first, machine={"gpu": "H200"}), *others]))
     sphere = replace(first.scores["sphere"], protocol=first.scores["sphere"].protocol | {"bottom_crop": 0.1})
     with pytest.raises(ReportError, match="differ in protocol"):
-        trade_offs(gathered([replace(first, scores=first.scores | {"sphere": sphere}), *others]))
+        trade_offs(run_set([replace(first, scores=first.scores | {"sphere": sphere}), *others]))
 
 
 def test_scenes_of_two_data_sets_may_have_one_name():
-    charts = trade_offs(gathered([small(25.0, scene="room"), small(26.0, scene="room", dataset="")]))
+    charts = trade_offs(run_set([small(25.0, scene="room"), small(26.0, scene="room", dataset="")]))
     assert [chart.name for chart in charts] == ["chart_room", "chart_room_synthetic"]
 
 
 def test_roles_of_presets_and_corrected_methods_of_releases():
     presets = ("odgs", "odgs_release", "egonerf_small", "padgs", "padgs_ray", "padgs_plus", "spags_release", "mine")
-    (chart,) = trade_offs(gathered([small(25.0 + i, 1 + i, method=name) for i, name in enumerate(presets)]))
+    (chart,) = trade_offs(run_set([small(25.0 + i, 1 + i, method=name) for i, name in enumerate(presets)]))
     roles = {preset: chart.role(preset) for preset in presets}
     assert {preset for preset, role in roles.items() if role == "release"} == {"odgs_release", "spags_release"}
     assert {preset for preset, role in roles.items() if role == "variant"} == {"padgs_ray"}

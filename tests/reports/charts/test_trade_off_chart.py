@@ -2,19 +2,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_up import assert_apart, compared, gathered, small, write
+from made_up import assert_apart, compared, run_set, small, write
 
 from padgs.reports import store
 from padgs.reports.charts import time_chart
 from padgs.reports.charts.trade_off import trade_offs
 from padgs.reports.charts.trade_off_chart import LARGEST, charts, draw
 from padgs.reports.frame import frame
-from padgs.reports.gathered import Gathered
 from padgs.reports.methods import short
+from padgs.reports.selection import RunSet
 
 
 def one(runs):
-    (made,) = trade_offs(gathered(runs))
+    (made,) = trade_offs(run_set(runs))
     return made
 
 
@@ -80,7 +80,7 @@ def test_the_area_is_the_number_of_gaussians_and_bars_are_the_spread():
 
 
 def test_a_mark_has_a_tooltip_with_its_numbers():
-    (made,) = charts(gathered(compared(["synthetic-room"])))
+    (made,) = charts(run_set(compared(["synthetic-room"])))
     assert "<title>PaD-GS\nWS-PSNR: 25.65\n" in made.svg and ">PaD-GS<" in made.svg
     assert ">time per frame, ms ↓<" in made.svg and made.png.startswith(b"\x89PNG")
 
@@ -88,7 +88,7 @@ def test_a_mark_has_a_tooltip_with_its_numbers():
 def test_quality_over_training_time_comes_from_the_logs(tmp_path):
     runs = compared(["synthetic-room"], seeds=2)
     runs.append(replace(small(20.0, method="mine", experiments=("all_methods",)), status="oom"))
-    (logged,) = trade_offs(Gathered(frame(store.read(write(runs, tmp_path))[0])))
+    (logged,) = trade_offs(RunSet(frame(store.read(write(runs, tmp_path))[0])))
     chart = time_chart.chart(logged)
     assert chart.name == "time_synthetic-room" and ">PaD-GS<" in chart.svg and ">mine<" in chart.svg
     assert "<title>PaD-GS\n25.52 dB after 200 s</title>" in chart.svg  # 26.05 of two seeds - 8 / 15 at the last probe

@@ -4,13 +4,12 @@ from dataclasses import replace
 
 import pytest
 from chromium import in_chromium, visiting
-from made_up import compared, data_set, failed, gathered, small, swept, write
+from made_up import compared, data_set, failed, run_set, small, swept, write
 
 from padgs.reports import store
 from padgs.reports.frame import frame
-from padgs.reports.gathered import Gathered
 from padgs.reports.page import page
-from padgs.reports.request import Request
+from padgs.reports.selection import Request, RunSet
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +21,7 @@ def runs(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def html(runs) -> str:
-    return page.html(Gathered(runs, Request(), ("runs/x/result.json was edited",)))
+    return page.html(RunSet(runs, Request(), ("runs/x/result.json was edited",)))
 
 
 def test_it_needs_nothing_from_outside(html):
@@ -42,47 +41,47 @@ def test_it_has_the_tables_the_charts_and_what_was_left_out(html):
 def test_names_are_text_and_not_markup():
     evil = "</script><b-x>$a_b"
     texts = {"scene": evil, "code_version": evil, "finished": evil, "machine": {"gpu": evil}}
-    html = page.html(gathered([small(25.0, method="<i-x>", **texts), replace(failed(evil, "oom"), reason=evil)]))
+    html = page.html(run_set([small(25.0, method="<i-x>", **texts), replace(failed(evil, "oom"), reason=evil)]))
     assert "<b-x>" not in html and "<i-x>" not in html and html.count("&lt;b-x&gt;$a_b") > 10
 
 
 def test_runs_without_renders_give_a_page_without_views():
-    html = page.html(gathered([failed("", "oom")]))
+    html = page.html(run_set([failed("", "oom")]))
     assert 'id="slider"' not in html and "OOM" in html
 
 
 def test_a_refused_table_is_named_and_the_others_are_there():
     first, *others = data_set("roam360")
-    html = page.html(gathered([replace(first, machine={"gpu": "H200"}), *others], strict=True))
+    html = page.html(run_set([replace(first, machine={"gpu": "H200"}), *others], strict=True))
     assert "differ in machine" in html and 'id="table1"' in html and 'id="table4"' not in html
 
 
 def test_the_users_captures_and_the_best_method_come_first(tmp_path):
     own = [replace(one, dataset="", scene="z-flat", run=f"own{one.run}") for one in compared(["synthetic-room"], 1)]
     write([*compared(["synthetic-room"], 1), *own], tmp_path, pictures=True)
-    first, second = page.album(Gathered(frame(store.read(tmp_path)[0]))).scenes
+    first, second = page.album(RunSet(frame(store.read(tmp_path)[0]))).scenes
     assert first["title"].startswith("z-flat") and second["title"].startswith("synthetic-room")
     psnr = [float(method["title"].split()[-2]) for method in first["views"][0]["methods"]]
     assert psnr == sorted(psnr, reverse=True) and len(psnr) == 6
 
 
 def test_the_number_of_files_is_bounded(runs, monkeypatch):
-    made = page.album(Gathered(runs))
+    made = page.album(RunSet(runs))
     (scene,) = made.scenes
     assert [view["title"] for view in scene["views"]] == ["view0", "view1"]
     assert [method["title"] for method in scene["views"][0]["methods"]][0] == "PaD-GS, PSNR 26.00 dB"
     assert len(made.images) == 2 * (1 + 2 * 6) and max(map(len, made.images)) < 10_000
     monkeypatch.setattr(page, "MAX_FILES", 6)
-    assert [len(scene["views"]) for scene in page.album(Gathered(runs)).scenes] == [1]
+    assert [len(scene["views"]) for scene in page.album(RunSet(runs)).scenes] == [1]
     monkeypatch.setattr(page, "MAX_FILES", 5)
-    assert page.album(Gathered(runs)).left_out == ["synthetic-room (built in, generated; no scene of the paper)"]
+    assert page.album(RunSet(runs)).left_out == ["synthetic-room (built in, generated; no scene of the paper)"]
 
 
 def test_an_incomplete_file_is_left_out(tmp_path):
     runs = frame(store.read(write(compared(["synthetic-room"], seeds=1)[:2], tmp_path, pictures=True))[0])
     broken = runs["pictures"][0] / "view0.png"
     broken.write_bytes(broken.read_bytes()[:300])
-    first, second = page.album(Gathered(runs)).scenes[0]["views"]
+    first, second = page.album(RunSet(runs)).scenes[0]["views"]
     assert (len(first["methods"]), len(second["methods"])) == (1, 2)
 
 

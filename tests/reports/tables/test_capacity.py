@@ -3,9 +3,10 @@
 from dataclasses import replace
 
 import pytest
-from made_up import gathered, of_experiment
+from made_up import builder, of_experiment, run_set
 
-from padgs.reports.tables.capacity import capacity
+capacity = builder("capacity")
+
 
 PSNR = {("omnigs", 20_000): 24.0, ("omnigs", 50_000): 26.0, ("odgs", 20_000): 25.0, ("odgs", 50_000): 25.5}
 
@@ -21,10 +22,10 @@ def runs():
 
 
 def test_a_block_for_each_number_of_gaussians_the_fewest_first():
-    fewest, most = capacity(gathered(runs())).blocks
+    fewest, most = capacity(run_set(runs())).blocks
     assert fewest.title.endswith("at most 20 000 Gaussians") and most.title.endswith("at most 50 000 Gaussians")
     for block, count in ((fewest, 20_000), (most, 50_000)):
-        columns = [column.title for column in capacity(gathered(runs())).columns]
+        columns = [column.title for column in capacity(run_set(runs())).columns]
         for row, preset in zip(block.rows, ("odgs", "omnigs"), strict=True):
             assert row.cells[columns.index("PSNR")].value == pytest.approx(PSNR[preset, count] + 0.05)
             assert row.cells[columns.index("Gaussians")].value == count - 0.5
@@ -36,8 +37,8 @@ def test_runs_without_a_number_and_those_that_were_stopped_are_left_out():
         replace(odd, run=f"{asked}", config={**odd.config, "budget": {"gaussians": asked}}) for asked in ("auto", None)
     ]
     stopped = replace(runs()[0], run="stopped", seed=9, variant="stopped after 9 iterations")
-    assert capacity(gathered([*runs(), *odd, stopped])) == capacity(gathered(runs()))
+    assert capacity(run_set([*runs(), *odd, stopped])) == capacity(run_set(runs()))
 
 
 def test_nothing_was_run():
-    assert not capacity(gathered([of_experiment("order", 20.0)])).blocks
+    assert not capacity(run_set([of_experiment("order", 20.0)])).blocks

@@ -2,10 +2,12 @@ import math
 from dataclasses import replace
 
 import pytest
-from made_up import gathered, of_experiment
+from made_up import builder, of_experiment, run_set
 
-from padgs.reports.tables.learning_rates import law, learning_rates
+from padgs.reports.frame import law
 from padgs.training.schedule import Pace
+
+learning_rates = builder("learning_rates")
 
 FACTORS, LENGTHS = (1.0, 2.0, 4.0, 8.0), (400, 1600, 6400)
 
@@ -32,7 +34,7 @@ def runs(best):
     [(lambda n: min(FACTORS, key=lambda f: abs(math.log(f / law(n)))), (0, 0, 0)), (lambda n: 2, (-2, -1, 0))],
 )
 def test_the_law_loses_what_lies_between_its_factor_and_the_best(best, losses):
-    table = learning_rates(gathered(runs(best)))
+    table = learning_rates(run_set(runs(best)))
     factors, lost = table.blocks
     assert [row.title for row in factors.rows] == ["× 1", "× 2", "× 4", "× 8"]
     assert factors.rows[1].cells[0].value == pytest.approx(25 - abs(math.log2(2 / best(400))) - 0.35)
@@ -46,7 +48,7 @@ def test_a_run_that_was_stopped_or_failed_before_its_first_iteration_is_no_seed(
     stopped = replace(made[0], run="stopped", seed=9, variant="stopped after 9 iterations")
     rates = {"train": {"learning_rates": "run"}}
     failed = replace(made[0], run="failed", iterations=0, status="oom", scores={}, config=rates)
-    assert learning_rates(gathered([*made, stopped, failed])) == learning_rates(gathered(made))
+    assert learning_rates(run_set([*made, stopped, failed])) == learning_rates(run_set(made))
 
 
 @pytest.mark.parametrize("iterations", [1, 400, 1600, 6400, 30_000, 100_000])
@@ -55,4 +57,4 @@ def test_the_law_is_that_of_training(iterations):
 
 
 def test_without_runs_there_is_no_block():
-    assert learning_rates(gathered([])).blocks == ()
+    assert learning_rates(run_set([])).blocks == ()

@@ -1,8 +1,9 @@
 import pytest
-from made_up import gathered, of_experiment
+from made_up import builder, of_experiment, run_set
 
 from padgs.reports.methods import title
-from padgs.reports.tables.length import length
+
+length = builder("length")
 
 FINAL = {"omnigs": 27.0, "odgs": 28.0, "spags": 29.0, "op43dgs": 26.0}
 SHORT = {"omnigs": 24.0, "odgs": 23.0, "spags": 22.0, "op43dgs": 25.0}  # the reverse
@@ -20,7 +21,7 @@ def runs():
 
 
 def test_a_column_for_each_length_and_choice_of_rates_and_the_order_beside_that_of_the_longest():
-    table = length(gathered(runs()))
+    table = length(run_set(runs()))
     titles = [column.title for column in table.columns]
     assert titles[0] == "500 iterations, published rates" and titles[3] == "500 iterations, rates for the run"
     methods, correlation = table.blocks
@@ -29,14 +30,14 @@ def test_a_column_for_each_length_and_choice_of_rates_and_the_order_beside_that_
 
 
 def test_the_least_length_that_has_the_order_of_the_longest():
-    notes = "\n".join(length(gathered(runs())).notes)
+    notes = "\n".join(length(run_set(runs())).notes)
     assert "published rates: from 1500 iterations on" in notes and "rates for the run: from 500 iterations on" in notes
     assert "published rates: from 7000 iterations on" in "\n".join(
-        length(gathered([run for run in runs() if run.iterations != 1500])).notes
+        length(run_set([run for run in runs() if run.iterations != 1500])).notes
     )
 
 
 def test_runs_from_before_there_was_a_choice_have_the_published_rates():
     old = [of_experiment("length", psnr, preset=preset) for preset, psnr in FINAL.items()]
-    assert [column.title for column in length(gathered(old)).columns] == ["1500 iterations, published rates"]
-    assert length(gathered([])).blocks == ()
+    assert [column.title for column in length(run_set(old)).columns] == ["1500 iterations, published rates"]
+    assert length(run_set([])).blocks == ()

@@ -1,15 +1,14 @@
 from dataclasses import replace
 
-from made_up import failed, gathered, of_experiment
+from made_up import failed, of_experiment, run_set
 
 from padgs.data.perturb import CONDITIONS
-from padgs.reports.limits import LIMITS, MADE_FOR
-from padgs.reports.tables.limits import limits
+from padgs.reports.robustness import LIMITS, LIMITS_ARE_FOR, limits
 from padgs.results import Scores
 
 RULES = {"name": "stability", "lpips": "none", "lpips_inputs": "11", "bottom_crop": 0.0}
 MARKS = {"ws_psnr_one_color": 12.0, "seam": 1.0, "depth_error": 0.05}
-SIZE, ITERATIONS = MADE_FOR
+SIZE, ITERATIONS = LIMITS_ARE_FOR
 WIDTH, HEIGHT = map(int, SIZE.split("x"))
 
 
@@ -30,7 +29,7 @@ def run(preset: str, quality: float, condition: str = "", level: int = 0, seed: 
 
 
 def cells(*runs):
-    table = limits(gathered(list(runs)))
+    table = limits(run_set(list(runs)))
     (block,) = table.blocks
     heads = [column.title for column in table.columns]
     return {row.title: dict(zip(heads, row.texts(table.columns)[1:], strict=True)) for row in block.rows}
@@ -78,11 +77,11 @@ def test_seeds_are_compared_with_their_own_and_failures_are_told():
 def test_runs_of_other_sizes_and_lengths_have_no_limits():
     rest, noisy = run("omnigs", 22.0), run("omnigs", 21.6, "pose_noise", 1)
     for other in ({"width": 128, "height": 64}, {"iterations": 250}):
-        assert limits(gathered([replace(rest, **other), replace(noisy, **other)])).blocks == ()
-    assert limits(gathered([failed("", "oom")])).blocks == ()
+        assert limits(run_set([replace(rest, **other), replace(noisy, **other)])).blocks == ()
+    assert limits(run_set([failed("", "oom")])).blocks == ()
 
 
 def test_limits_are_of_known_conditions_and_their_levels():
     for name, limit in LIMITS.items():
-        assert 1 <= len(limit.levels) <= len(CONDITIONS[name].levels)
-        assert list(limit.levels) == sorted(limit.levels)
+        allowed = limit.get("allowed", [])
+        assert len(allowed) <= len(CONDITIONS[name].levels) and allowed == sorted(allowed)

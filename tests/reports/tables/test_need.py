@@ -3,13 +3,13 @@
 from dataclasses import replace
 
 import pytest
-from made_up import gathered, small
+from made_up import run_set, small
 from PIL import Image
 
 from padgs.reports.charts.smallest_chart import charts
-from padgs.reports.needs import curves, gain, ratio, searched
-from padgs.reports.tables.need import need
-from padgs.reports.tables.table import ReportError
+from padgs.reports.smallest import curves, gain, ratio, searched
+from padgs.reports.smallest import table as need
+from padgs.reports.table import ReportError
 from padgs.reports.writers import markdown
 
 SIZES = (8000, 4000, 2000, 1000)
@@ -55,18 +55,18 @@ def runs() -> list:
 
 
 def test_a_row_for_each_search_with_its_needs():
-    text = markdown.text(need(gathered(runs())))
+    text = markdown(need(run_set(runs())))
     row = next(line for line in text.splitlines() if line.startswith("| OmniGS"))
     assert [cell.strip("* ") for cell in row.split("|")][2:8] == ["8000", *("8000", "4000", "2000", "2000", "1000")][:6]
     assert "| 0.40 |" in row and "ODGS" not in text
-    assert need(gathered(runs()[2:])).blocks == () and charts(gathered(runs()[2:])) == []
+    assert need(run_set(runs()[2:])).blocks == () and charts(run_set(runs()[2:])) == []
 
 
 def test_seeds_of_a_method_share_a_row_and_an_entry_of_the_legend():
     again = [replace(one, seed=1, run=f"{one.run}_1") for one in runs()[:2]]
     sizes = again[1].need["steps"][0] | {"blended": 6000}
     again[1] = replace(again[1], need=again[1].need | {"steps": [sizes, *again[1].need["steps"][1:]]})
-    seeds = gathered([*runs(), *again])
+    seeds = run_set([*runs(), *again])
     (block,) = need(seeds).blocks
     columns = need(seeds).columns
     texts = {row.title: row.texts(columns)[:2] for row in block.rows}
@@ -88,39 +88,39 @@ def kept(loss: str, degree: int | None = None, tau: float = 0.9, seed: int = 0):
 
 def test_a_search_has_one_row_whatever_it_kept_and_rows_have_names_of_their_own():
     other, stated = kept("1"), kept("0.1", degree=1)
-    (curve,) = curves(searched(gathered([other, stated])))
+    (curve,) = curves(searched(run_set([other, stated])))
     assert curve.title == "PaD-GS" and curve.file is not None
-    assert len(curves(searched(gathered([other])))) == 1
-    seeds = [curve.title for curve in curves(searched(gathered([kept("0.1", seed=1), stated])))]
+    assert len(curves(searched(run_set([other])))) == 1
+    seeds = [curve.title for curve in curves(searched(run_set([kept("0.1", seed=1), stated])))]
     assert seeds == ["PaD-GS, seed 0", "PaD-GS, seed 1"]
-    settings = [curve.title for curve in curves(searched(gathered([stated, kept("1", tau=0.0), other])))]
+    settings = [curve.title for curve in curves(searched(run_set([stated, kept("1", tau=0.0), other])))]
     assert settings == ["PaD-GS, tau 0.0", "PaD-GS, tau 0.9"]
 
 
 def test_a_share_has_no_better_end_and_times_of_two_machines_are_not_compared():
-    assert "share for 0.1 dB" in [column.heading for column in need(gathered(runs())).columns]
+    assert "share for 0.1 dB" in [column.heading for column in need(run_set(runs())).columns]
     first, second, _ = runs()
-    elsewhere = gathered([first, replace(second, machine={"gpu": "H200"})])
+    elsewhere = run_set([first, replace(second, machine={"gpu": "H200"})])
     for build in (need, charts):
         with pytest.raises(ReportError, match="differ in machine"):
             build(elsewhere)
 
 
 def test_curves_are_compared_where_both_are():
-    ours, other = curves(searched(gathered(runs())))
+    ours, other = curves(searched(run_set(runs())))
     assert gain(ours, other) == pytest.approx(1.0) and gain(ours, ours) == 0
     assert ratio(ours, ours) == 1 and ratio(ours, other) is None, "they share no quality"
     halved = [small(30.0, method="odgs", need=found(30.0)), small(30.0, method="omnigs", need=found(30.0))]
     for step in halved[0].need["steps"]:
         step["blended"] //= 2
-    first, second = curves(searched(gathered(halved)))
+    first, second = curves(searched(run_set(halved)))
     assert {first.preset: ratio(first, second), second.preset: ratio(second, first)} == pytest.approx(
         {"odgs": 0.5, "omnigs": 2.0}
     )
 
 
 def test_the_chart_has_a_point_for_each_size_and_all_numbers():
-    (chart,) = charts(gathered(runs()))
+    (chart,) = charts(run_set(runs()))
     assert chart.name == "smallest_synthetic-room_512x256_1500-iterations" and chart.png.startswith(b"\x89PNG")
     assert chart.numbers is not None and len(chart.numbers) == 2 * len(SIZES)
     assert list(chart.numbers["smallest for"])[:4] == ["0.05", "0.1", "0.25 0.5", "1"]
@@ -130,12 +130,12 @@ def test_the_chart_has_a_point_for_each_size_and_all_numbers():
 def test_charts_of_scenes_of_two_data_sets_have_names_of_their_own():
     datasets = ("", "omniblender")
     made = [small(30.0, scene="room", dataset=one, run=f"of-{one}", need=found(30.0)) for one in datasets]
-    names = [chart.name for chart in charts(gathered(made))]
+    names = [chart.name for chart in charts(run_set(made))]
     assert names == ["smallest_room_512x256_1500-iterations", "smallest_room_omniblender_512x256_1500-iterations"]
 
 
 def test_a_test_view_is_shown_at_each_size_where_there_is_a_picture_of_it(tmp_path):
-    found = gathered(runs())
+    found = run_set(runs())
     assert len(charts(found)) == 1
     Image.new("RGB", (4 * 32, 16), "red").save(tmp_path / "need.png")
     found.runs["pictures"] = [tmp_path / "renders"] * len(found.runs)
@@ -145,11 +145,11 @@ def test_a_test_view_is_shown_at_each_size_where_there_is_a_picture_of_it(tmp_pa
 
 
 def test_degree_and_file_are_those_for_a_tenth_of_a_decibel():
-    (old,) = curves(searched(gathered(runs()[:1])))
+    (old,) = curves(searched(run_set(runs()[:1])))
     assert old.degree is None and old.file is None
     steps = [{"degree": 2, "objections": {"0.1": []}}, {"degree": 1, "objections": {"0.1": ["a view falls"]}}]
     files = [{"file": "a", "bytes": 5, "kept": False}, {"file": "b", "bytes": 4, "kept": True}]
     run = runs()[0]
     more = {"degrees": {"0.1": steps}, "kept": {"epsilon": 0.1}, "files": files}
-    (curve,) = curves(searched(gathered([replace(run, need=run.need | more)])))
+    (curve,) = curves(searched(run_set([replace(run, need=run.need | more)])))
     assert curve.degree == 2 and curve.file == files[1]

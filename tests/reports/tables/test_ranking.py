@@ -3,19 +3,11 @@ from itertools import pairwise
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.special import stdtrit
 from scipy.stats import ttest_ind_from_stats
 
-from padgs.reports.tables.ranking import (
-    BEST,
-    CONFIDENCE,
-    SECOND,
-    better_rows,
-    emphasis,
-    places,
-    pooled_variance,
-    quantile,
-)
-from padgs.reports.tables.table import Block, Cell, Column, Row, shown
+from padgs.reports.statistics import BEST, CONFIDENCE, SECOND, better_rows, emphasis, places, pooled_variance
+from padgs.reports.table import Block, Cell, Column, Row, format_number
 
 PSNR, LPIPS, COUNT = Column("PSNR", 2, True), Column("LPIPS", 3, False), Column("Gaussians", 0)
 
@@ -42,7 +34,7 @@ def test_what_prints_the_same_shares_a_place():
 
 def test_means_are_tested_as_they_are_and_not_as_they_print():
     for far, expected in ((0.99, set()), (1.01, {1})):
-        cells = {0: Cell(25.0, 0.4, 4), 1: Cell(25.0 + far * quantile(6) * 0.4 / 2**0.5, 0.4, 4)}
+        cells = {0: Cell(25.0, 0.4, 4), 1: Cell(25.0 + far * stdtrit(6, 0.975) * 0.4 / 2**0.5, 0.4, 4)}
         assert better_rows(cells, Column("", 0, True))[0] == expected
 
 
@@ -67,7 +59,7 @@ def test_rows_share_a_place_exactly_as_long_as_no_test_separates_them(numbers, c
         test = ttest_ind_from_stats(
             first.value, first.std, first.count, second.value, second.std, second.count, equal_var=False
         )
-        differ = shown(first.value, column) != shown(second.value, column)
+        differ = format_number(first.value, column) != format_number(second.value, column)
         assert (i in better[j] or j in better[i]) == (differ and test.pvalue < 1 - CONFIDENCE)
 
 
@@ -82,7 +74,7 @@ def test_single_runs_scatter_as_the_seeds_of_the_other_rows():
     pooled = Cell(20.0, 0.1, 3), Cell(21.0, 0.3, 2)
     variance, freedom = pooled_variance(pooled)
     assert (variance, freedom) == (pytest.approx((2 * 0.01 + 0.09) / 3), 3)
-    apart = quantile(freedom) * (2 * variance) ** 0.5  # one estimate for both, with its degrees of freedom
+    apart = stdtrit(freedom, 0.975) * (2 * variance) ** 0.5  # one estimate for both, with its degrees of freedom
     for far, expected in ((0.95 * apart, set()), (1.05 * apart, {1})):
         cells = dict(enumerate((Cell(25.0), Cell(25.0 + far), *pooled)))
         assert better_rows(cells, Column("", 6, True))[0] == expected

@@ -3,13 +3,16 @@
 from dataclasses import replace
 
 import pytest
-from made_up import compared, gathered, small
+from made_up import builder, compared, run_set, small
 
-from padgs.reports.tables.ranking import BEST, SECOND, emphasis
-from padgs.reports.tables.side_by_side import equal_time, methods
-from padgs.reports.tables.table import ReportError, Table
-from padgs.reports.tables.tables_of_methods import table1, table4
+from padgs.reports.statistics import BEST, SECOND, emphasis
+from padgs.reports.table import ReportError, Table
 from padgs.reports.writers import markdown
+
+equal_time = builder("equal_time")
+methods = builder("methods")
+table1 = builder("table1")
+table4 = builder("table4")
 
 
 def columns(table: Table) -> list[str]:
@@ -37,7 +40,7 @@ def trained(method: str, seconds: float, iterations: int, psnr: float = 25.0, **
 
 
 def test_every_method_with_all_that_is_measured():
-    table = methods(gathered(compared(seeds=2)))
+    table = methods(run_set(compared(seeds=2)))
     assert [block.title.split()[0] for block in table.blocks] == ["synthetic-outdoor", "synthetic-room"]
     assert {"PSNR", "SSIM", "WS-PSNR", "WS-PSNR pole", "seam", "training s", "ms per frame", "MB"} <= {*columns(table)}
     assert "seam" in [column.heading for column in table.columns], "best at 1: neither more nor less of it is better"
@@ -54,14 +57,14 @@ def seen_less(**others):
 
 
 def test_who_saw_far_fewer_pixels_is_shown_and_not_ranked():
-    of = gathered([seen_less(), small(25), small(24, 2.0, method="omnigs")])
+    of = run_set([seen_less(), small(25), small(24, 2.0, method="omnigs")])
     table = methods(of)
     assert value(table, "synthetic-room", "EgoNeRF, small", "PSNR") == 30, "the best, at the smallest costs"
     assert value(table, "synthetic-room", "EgoNeRF, small", "images seen") == pytest.approx(1500 * 1024 / (512 * 256))
     assert value(table, "synthetic-room", "PaD-GS", "images seen") == 1500
     assert ranks(table, "synthetic-room") == {"EgoNeRF, small": set(), "OmniGS, corrected": {SECOND}, "PaD-GS": {BEST}}
     reason = "Not ranked: EgoNeRF, small (12 of 1500 images): for it saw less than half"
-    text = markdown.text(table)
+    text = markdown(table)
     assert "| EgoNeRF, small † |" in text and "| PaD-GS |" in text and f"- † {reason}" in text
     for build in (table1, table4):
         other = build(of)
@@ -71,8 +74,8 @@ def test_who_saw_far_fewer_pixels_is_shown_and_not_ranked():
 def test_after_equal_time_who_saw_fewer_pixels_is_ranked():
     slow = trained("egonerf", 100, 1500, 30, preset="egonerf_small")
     slow = replace(slow, config={**slow.config, "method": {"rays": 1024}})
-    table = equal_time(gathered([trained("padgs", 100, 900), trained("omnigs", 100, 900, 24), slow]))
-    assert BEST in ranks(table, "synthetic-room")["EgoNeRF, small"] and "Not ranked" not in markdown.text(table)
+    table = equal_time(run_set([trained("padgs", 100, 900), trained("omnigs", 100, 900, 24), slow]))
+    assert BEST in ranks(table, "synthetic-room")["EgoNeRF, small"] and "Not ranked" not in markdown(table)
 
 
 @pytest.mark.parametrize(
@@ -82,7 +85,7 @@ def test_after_equal_time_who_saw_fewer_pixels_is_ranked():
 def test_what_calibrates_is_ranked_where_there_is_something_to_calibrate(method, knob):
     def ranked(dataset="synthetic", **generator) -> bool:
         own = {"config": {"data": {"generator": {"scene": "room", **generator}}, "seed": 0}, "dataset": dataset}
-        table = methods(gathered([small(20, 1.0, **own), small(30, 0.5, method=method, **own)]))
+        table = methods(run_set([small(20, 1.0, **own), small(30, 0.5, method=method, **own)]))
         (mine,) = {row.title for row in table.blocks[0].rows} - {"PaD-GS"}
         assert "after the abstract" in mine
         noted = [note for note in table.notes if "+experiment=calibration compares it where it is" in note]
@@ -99,30 +102,30 @@ def test_what_calibrates_is_ranked_where_there_is_something_to_calibrate(method,
 def test_what_a_method_started_from_and_its_processor_time_have_columns():
     old, new = small(24, method="omnigs"), small(25)
     counts, timing = {**new.counts, "start": 72_000}, {**new.timing, "cpu_seconds": 57.0}
-    table = methods(gathered([old, replace(new, counts=counts, timing=timing)]))
+    table = methods(run_set([old, replace(new, counts=counts, timing=timing)]))
     assert [value(table, "synthetic-room", "PaD-GS", name) for name in ("started from", "CPU s")] == [72_000, 57]
     assert value(table, "synthetic-room", "OmniGS, corrected", "started from") is None
-    assert "CPU s" not in columns(methods(gathered([old]))) and "started from" in columns(methods(gathered([old])))
+    assert "CPU s" not in columns(methods(run_set([old]))) and "started from" in columns(methods(run_set([old])))
 
 
 def test_learning_rates_are_named_and_not_mixed():
     rates = {"train": {"iterations": 1500, "learning_rates": "run"}, "seed": 0}
     scaled, old = small(25, config=rates), small(24, method="omnigs")
-    assert any("learning rates run, seeds" in note for note in methods(gathered([scaled])).notes)
-    assert any("learning rates published, seeds" in note for note in methods(gathered([old])).notes)
+    assert any("learning rates run, seeds" in note for note in methods(run_set([scaled])).notes)
+    assert any("learning rates published, seeds" in note for note in methods(run_set([old])).notes)
     with pytest.raises(ReportError, match="differ in learning_rates"):
-        methods(gathered([scaled, old]))
+        methods(run_set([scaled, old]))
 
 
 def test_runs_of_different_lengths_do_not_stand_together():
     with pytest.raises(ReportError, match="differ in length"):
-        methods(gathered([small(25), small(26, method="omnigs", iterations=3000)]))
+        methods(run_set([small(25), small(26, method="omnigs", iterations=3000)]))
 
 
 def test_after_each_time_methods_stand_beside_each_other():
     short = [trained("padgs", 20, 250, 20), trained("omnigs", 20, 300, 21)]
     long = [trained("padgs", 60, 700, 26), trained("omnigs", 60, 900, 27)]
-    table = equal_time(gathered([*short, *long]))
+    table = equal_time(run_set([*short, *long]))
     place = "synthetic-room (built in, generated; no scene of the paper)"
     assert [block.title for block in table.blocks] == [f"{place}, 512x256, {s} s of CPU time" for s in (20, 60)]
     for block, *expected in ((f"{place}, 512x256, 20", 250, 20), (f"{place}, 512x256, 60", 700, 26)):
@@ -133,14 +136,14 @@ def test_times_of_different_machines_do_not_stand_together():
     runs = [trained("padgs", 100, 900), trained("omnigs", 100, 900, machine={"cores": 64, "cpu": "B", "torch": "2"})]
     for build in (methods, equal_time):
         with pytest.raises(ReportError, match="differ in machine"):
-            build(gathered(runs))
-        assert build(gathered(runs, mix=True)).blocks
+            build(run_set(runs))
+        assert build(run_set(runs, mix=True)).blocks
 
 
 def test_a_scene_of_two_data_sets_has_a_block_for_each():
     runs = [trained("padgs", 100, 900, scene="classroom", dataset=dataset) for dataset in ("", "omniblender")]
     for build in (methods, equal_time):
-        capture, rendered = (block.title for block in build(gathered(runs)).blocks)
+        capture, rendered = (block.title for block in build(run_set(runs)).blocks)
         assert capture.startswith("classroom (a capture that is no scene of the paper)")
         assert rendered.startswith("classroom (of omniblender; no scene of the paper)")
 
@@ -148,18 +151,18 @@ def test_a_scene_of_two_data_sets_has_a_block_for_each():
 def test_a_run_that_was_stopped_is_no_seed():
     runs = [trained("padgs", 100, 900, 25), trained("omnigs", 100, 900, 24)]
     stopped = replace(runs[0], run="stopped", seed=9, variant="stopped after 90 iterations")
-    assert equal_time(gathered([*runs, stopped])) == equal_time(gathered(runs))
+    assert equal_time(run_set([*runs, stopped])) == equal_time(run_set(runs))
 
 
 def test_seeds_may_differ_in_what_they_did_in_the_time_but_in_no_setting():
     runs = [trained("padgs", 100, 900, 25), trained("padgs", 100, 950, 27, seed=1)]
-    assert value(equal_time(gathered(runs)), "synthetic-room", "PaD-GS", "PSNR") == pytest.approx(26)
+    assert value(equal_time(run_set(runs)), "synthetic-room", "PaD-GS", "PSNR") == pytest.approx(26)
     other = replace(runs[1], config={**runs[1].config, "method": {"sh_degree": 0}})
     with pytest.raises(ReportError, match="differ in method.sh_degree"):
-        equal_time(gathered([runs[0], other]))
+        equal_time(run_set([runs[0], other]))
 
 
 def test_a_method_that_failed_shows_its_status():
     late = replace(trained("odgs", 100, 900), status="timeout", scores={})
-    table = equal_time(gathered([trained("padgs", 100, 900), late]))
+    table = equal_time(run_set([trained("padgs", 100, 900), late]))
     assert next(r for r in table.blocks[0].rows if r.title == "ODGS, corrected").cells[0].status == "timeout"

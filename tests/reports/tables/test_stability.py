@@ -1,16 +1,15 @@
 from dataclasses import replace
 
 import pytest
-from made_up import failed, gathered, of_experiment
+from made_up import failed, of_experiment, run_set
 
 from padgs.reports.charts.robustness_chart import STATUS_LETTERS
 from padgs.reports.frame import frame
-from padgs.reports.gathered import Gathered
 from padgs.reports.page import page
+from padgs.reports.robustness import stability, stressed_methods
+from padgs.reports.selection import RunSet
 from padgs.reports.store import Run
-from padgs.reports.survival import survivors
-from padgs.reports.tables.stability import stability
-from padgs.reports.tables.table import ReportError
+from padgs.reports.table import ReportError
 from padgs.reports.writers import latex, markdown
 from padgs.results import STATUSES, Scores, picture_name
 
@@ -57,8 +56,8 @@ def cells(table, title: str) -> dict[str, dict[str, str]]:
 
 
 def test_what_is_kept_is_the_share_above_one_colour():
-    table, *_ = stability(gathered(runs()))
-    kept = cells(table, "Retention")
+    table, *_ = stability(run_set(runs()))
+    kept = cells(table, "Robustness")
     assert kept["pose_noise 1"] == {"PaD-GS": "0.52", "OmniGS, corrected": "0.90"}
     assert kept["pose_noise 2"] == {"PaD-GS": "–", "OmniGS, corrected": "0.40"}
     assert kept["seam 1"] == {"PaD-GS": "–", "OmniGS, corrected": "0.00 [DIVERGED]"}
@@ -67,7 +66,7 @@ def test_what_is_kept_is_the_share_above_one_colour():
 
 
 def test_scores_and_where_it_breaks():
-    table, *_ = stability(gathered([*runs(), *rest()]))
+    table, *_ = stability(run_set([*runs(), *rest()]))
     scores, breaks = cells(table, "synthetic-room"), cells(table, "Breaks at level")
     # OmniGS: pose noise keeps (0.9 + 0.4) / 2, the seam (0 + 1) / 2; the worst quarter of two conditions is one
     omnigs = {row: of["OmniGS, corrected"] for row, of in scores.items()}
@@ -88,7 +87,7 @@ def test_the_pole_gap_is_told_with_what_the_scene_itself_has_of_it():
         first, *others = runs()
         marks = first.scores["stability"].metrics | gap | oracle
         measured = replace(first, scores={"stability": Scores(RULES, marks, {"a": marks})})
-        scores = cells(stability(gathered([measured, *others]))[0], "synthetic-room")
+        scores = cells(stability(run_set([measured, *others]))[0], "synthetic-room")
         assert scores["unstressed: equator above poles, dB"] == {"PaD-GS": "–", "OmniGS, corrected": "4.00"}
         beyond = scores.get("unstressed: the same, above a truth blurred alike, dB")
         assert (beyond and beyond["OmniGS, corrected"]) == row
@@ -96,7 +95,7 @@ def test_the_pole_gap_is_told_with_what_the_scene_itself_has_of_it():
 
 def test_who_was_spared_something_has_no_score_and_stands_last():
     for spared in (runs(), [*runs(), rest()[0]]):
-        table, _, chart = stability(gathered(spared))
+        table, _, chart = stability(run_set(spared))
         assert [column.title for column in table.columns] == ["OmniGS, corrected", "PaD-GS"]
         scores = cells(table, "synthetic-room")
         for row in ("stability score", "worst quartile", "failure rate"):
@@ -108,35 +107,38 @@ def test_what_means_nothing_to_some_methods_is_told_and_neither_scored_nor_count
     both = [*runs(), *rest()]
     told = [run("padgs", 12.0, "precision", 1)]  # PaD-GS alone has networks
     told.append(replace(run("padgs", 12.0, "capacity", 1), status="rejected"))  # and cannot be told a number
-    with_it, without = (cells(stability(gathered(of))[0], "synthetic-room") for of in ([*both, *told], both))
+    with_it, without = (cells(stability(run_set(of))[0], "synthetic-room") for of in ([*both, *told], both))
     assert with_it == without
-    kept = cells(stability(gathered([*both, *told]))[0], "Retention")
+    kept = cells(stability(run_set([*both, *told]))[0], "Robustness")
     assert kept["precision 1"]["PaD-GS"] == "0.00" and kept["capacity 1"]["PaD-GS"] == "0.00 [REJECTED]"
 
 
 def test_a_run_that_was_stopped_is_neither_a_seed_nor_a_reference():
     names = ("stopped after 9 iterations", "pose_noise 1, stopped after 9 iterations")
     stopped = [replace(one, run="stopped", seed=9, variant=name) for one, name in zip(runs(), names, strict=False)]
-    assert stability(gathered([*runs(), *stopped]))[0] == stability(gathered(runs()))[0]
+    assert stability(run_set([*runs(), *stopped]))[0] == stability(run_set(runs()))[0]
 
 
 def test_files_of_scenes_of_two_data_sets_have_names_of_their_own():
     made = [replace(one, scene="room", dataset=dataset) for dataset in ("", "omniblender") for one in runs()]
-    assert [one.place for one, *_ in survivors(gathered(made)).values()] == ["room-512x256", "room_omniblender-512x256"]
+    assert [one.place for one, *_ in stressed_methods(run_set(made)).values()] == [
+        "room-512x256",
+        "room_omniblender-512x256",
+    ]
 
 
 def test_seeds_are_compared_with_their_own():
     first, *others = runs(seed=1)
     lower = replace(first, scores={"stability": Scores(RULES, {"ws_psnr": 17.0, "ws_psnr_one_color": 12.0}, {})})
-    table, *_ = stability(gathered([*runs(), lower, *others]))
-    assert cells(table, "Retention")["pose_noise 2"]["OmniGS, corrected"] == "0.60 ± 0.28"  # 4 of 10, and 4 of 5
+    table, *_ = stability(run_set([*runs(), lower, *others]))
+    assert cells(table, "Robustness")["pose_noise 2"]["OmniGS, corrected"] == "0.60 ± 0.28"  # 4 of 10, and 4 of 5
 
 
 def test_runs_that_differ_in_more_are_refused():
     other = runs()[1]
     other = replace(other, run="other", config=other.config | {"method": {"tau": 0.1}})
     with pytest.raises(ReportError, match=r"differ in method.tau"):
-        stability(gathered([*runs(), other]))
+        stability(run_set([*runs(), other]))
 
 
 def test_every_outcome_has_a_letter_of_its_own():
@@ -144,29 +146,29 @@ def test_every_outcome_has_a_letter_of_its_own():
 
 
 def test_it_is_written_and_stands_on_the_page():
-    table, chart, survival = stability(gathered(runs()))
+    table, chart, survival = stability(run_set(runs()))
     assert chart.name == "stability-synthetic-room-512x256"
     assert "pose_noise 2: keeps 0.40; WS-PSNR 16.00 dB, 22.00 without" in chart.svg and ">V<" in chart.svg
     assert "V diverged" in chart.svg and "exploded" not in chart.svg and chart.png.startswith(b"\x89PNG")
     assert chart.numbers is not None and len(chart.numbers) == 6
     assert survival.numbers is not None and survival.name == "robustness-synthetic-room-512x256"
     assert dict(survival.numbers.set_index("preset")["score"])["omnigs"] == pytest.approx(0.575)
-    assert "| 0.00 [DIVERGED] |" in markdown.text(table) and "DIVERGED" in latex.text(table)
-    html = page.html(gathered(runs()))
+    assert "| 0.00 [DIVERGED] |" in markdown(table) and "DIVERGED" in latex(table)
+    html = page.html(run_set(runs()))
     assert 'id="stability"' in html and 'id="heat_maps"' in html
 
 
 def test_the_name_of_a_condition_is_text_and_not_markup():
     evil = "</script><b-x>"
     made = [run("omnigs", 22.0), run("omnigs", 21.0, evil, 1)]
-    table, *charts = stability(gathered(made))
-    assert "<b-x>" not in markdown.text(table) and all("<b-x>" not in chart.svg for chart in charts)
-    html = page.html(gathered(made))
+    table, *charts = stability(run_set(made))
+    assert "<b-x>" not in markdown(table) and all("<b-x>" not in chart.svg for chart in charts)
+    html = page.html(run_set(made))
     assert "<b-x>" not in html and "&lt;b-x&gt; 1" in html
 
 
 def test_without_such_runs_there_is_nothing():
-    (table,) = stability(gathered([failed("", "oom")]))
+    (table,) = stability(run_set([failed("", "oom")]))
     assert table.blocks == ()
 
 
@@ -177,7 +179,7 @@ def test_a_cell_opens_the_picture_of_its_worst_view(tmp_path):
     for name in views:
         (tmp_path / picture_name(name)).touch()
     shown = [Run(run("omnigs", 22.0)), Run(made, pictures=tmp_path)]
-    _, chart, _ = stability(Gathered(frame(shown)))
+    _, chart, _ = stability(RunSet(frame(shown)))
     assert (tmp_path / picture_name("b")).resolve().as_uri() in chart.svg
     assert (tmp_path / picture_name("a")).resolve().as_uri() not in chart.svg
-    assert "opens its worst view" in chart.notes[1] and "file:" not in stability(gathered(runs()))[1].svg
+    assert "opens its worst view" in chart.notes[1] and "file:" not in stability(run_set(runs()))[1].svg

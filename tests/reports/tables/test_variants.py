@@ -1,13 +1,17 @@
 from dataclasses import replace
 
 import pytest
-from made_up import RULES, failed, gathered, result, small
+from made_up import RULES, builder, failed, result, run_set, small
 from omegaconf import OmegaConf
 
-from padgs.reports.tables.table import MISSING, ReportError
-from padgs.reports.tables.variants import PARTS, QUIRKS, RUNGS, WITHOUT, ladder, quirks, table3
+from padgs.reports.specs import DEVIATIONS, PARTS, RUNGS, WITHOUT
+from padgs.reports.table import MISSING, ReportError
 from padgs.reports.writers import markdown
 from padgs.results import Scores
+
+ladder = builder("ladder")
+quirks = builder("deviations")
+table3 = builder("table3")
 
 FOUR = [
     result("baseline", psnr=22.30, ssim=0.786, lpips=0.257),
@@ -19,7 +23,7 @@ FOUR = [
 
 def lines(results, **request) -> list[list[str]]:
     """Cells of the rows of 360Roam, bar, as Markdown."""
-    text = markdown.text(table3(gathered(results, **request)))
+    text = markdown(table3(run_set(results, **request)))
     block = text.split("### ")[1]
     assert block.startswith("360Roam, bar")
     return [[cell.strip() for cell in line.split("|")[1:-1]] for line in block.splitlines() if line.startswith("|")][2:]
@@ -30,7 +34,7 @@ def lines(results, **request) -> list[list[str]]:
     [
         ("ablation", {**PARTS, **RUNGS}),
         ("plus_ablation", WITHOUT),
-        ("deviation", {variant: title for titles in QUIRKS.values() for variant, title in titles.items()}),
+        ("deviation", {variant: title for titles in DEVIATIONS.values() for variant, title in titles.items()}),
     ],
 )
 def test_each_variant_that_can_be_run_has_a_row(root, table, titles):
@@ -62,7 +66,7 @@ def test_missing_and_failed_cells_say_so():
 
 
 def test_without_any_result_the_published_numbers_remain():
-    text = markdown.text(table3(gathered([])))
+    text = markdown(table3(run_set([])))
     assert "24.92" in text and "Ricoh360, cat\\_tower: not run" in text
 
 
@@ -85,12 +89,12 @@ def test_a_seed_that_failed_is_not_hidden():
 
 def test_any_scene_gets_a_block_and_needs_no_published_numbers():
     room = [replace(row, dataset="synthetic", scene="synthetic-room") for row in FOUR]
-    text = markdown.text(table3(gathered(room)))
+    text = markdown(table3(run_set(room)))
     assert "### synthetic-room" in text and "| Baseline | 0.786 | 22.30 | 0.257 |" in text
 
 
 def test_the_footnote_says_how_the_numbers_were_made():
-    text = markdown.text(table3(gathered(FOUR)))
+    text = markdown(table3(run_set(FOUR)))
     note = next(line for line in text.splitlines() if line.startswith("- 360Roam, bar"))
     for words in (
         "paper, LPIPS-vgg fed [0, 1]",
@@ -117,14 +121,14 @@ def test_the_footnote_says_how_the_numbers_were_made():
 )
 def test_what_was_made_otherwise_is_not_compared_unless_told(other, what):
     with pytest.raises(ReportError, match=f"360Roam, bar: results differ in {what} .*--where.*--mix"):
-        table3(gathered([FOUR[0], other]))
-    table3(gathered([FOUR[0], other], mix=True))
+        table3(run_set([FOUR[0], other]))
+    table3(run_set([FOUR[0], other], mix=True))
 
 
 def test_two_settings_never_share_a_cell_and_where_chooses_between_them():
     other = replace(FOUR[3], config={**FOUR[3].config, "method": {"tau": 0.5}}, run="other", seed=1)
     with pytest.raises(ReportError, match="differ in method.tau"):
-        table3(gathered([FOUR[3], other], mix=True))
+        table3(run_set([FOUR[3], other], mix=True))
     assert lines([FOUR[3], other], where={"method.tau": "0.5"})[3][4] == "23.50"
 
 
@@ -132,24 +136,24 @@ def test_an_unknown_key_lists_its_neighbours():
     with pytest.raises(
         ReportError, match="unknown key 'train.its'; known in run bar_padgs_full_0: train.iterations, method.tau"
     ):
-        table3(gathered(FOUR[3:], where={"train.its": "3"}))
+        table3(run_set(FOUR[3:], where={"train.its": "3"}))
 
 
 def test_an_unknown_protocol_lists_the_known():
     with pytest.raises(ReportError, match="unknown protocol 'flat'; known: paper, sphere"):
-        table3(gathered([], protocol="flat"))
+        table3(run_set([], protocol="flat"))
 
 
 def test_marks_of_the_sphere_are_not_put_beside_published_ones():
     marks = {"ws_psnr": 25.0, "ws_ssim": 0.8, "ws_lpips_alex": 0.2}
     sphere = replace(result("full"), scores={"sphere": Scores(RULES, marks, {})})
-    text = markdown.text(table3(gathered([sphere], protocol="sphere")))
+    text = markdown(table3(run_set([sphere], protocol="sphere")))
     assert "| + DAGD + DAOM + M | 0.800 | 25.00 | 0.200 |" in text and "paper" not in text.split("- 360Roam")[0]
 
 
 def test_a_row_for_each_rung_with_what_it_costs():
     rungs = [replace(small(24 + i, 1 + i), variant=variant) for i, variant in enumerate(RUNGS)]
-    text = markdown.text(ladder(gathered([*rungs[:3], result("full")])))
+    text = markdown(ladder(run_set([*rungs[:3], result("full")])))
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("| A")]
     assert [row[0][:2] for row in rows] == [f"A{i}" for i in range(7)]
     assert [row[2] for row in rows] == ["24.00", "<ins>25.00</ins>", "**26.00**", "–", "–", "–", "–"]
@@ -157,13 +161,13 @@ def test_a_row_for_each_rung_with_what_it_costs():
 
 
 def test_without_a_ladder_there_is_no_block():
-    assert ladder(gathered([result("full")])).blocks == ()
+    assert ladder(run_set([result("full")])).blocks == ()
 
 
 def test_times_of_two_machines_are_not_compared():
     rungs = [replace(small(24 + i), variant=variant) for i, variant in enumerate(("a0_pano_3dgs", "a1_anchors"))]
     with pytest.raises(ReportError, match="differ in machine"):
-        ladder(gathered([rungs[0], replace(rungs[1], machine={"gpu": "H200"})]))
+        ladder(run_set([rungs[0], replace(rungs[1], machine={"gpu": "H200"})]))
 
 
 def quirky(**psnr: float):
@@ -174,16 +178,16 @@ def quirky(**psnr: float):
 
 
 def test_each_quirk_beside_the_method_as_described():
-    table = quirks(gathered(quirky(odgs=25.0, odgs_bias=24.25, odgs_all=22.0, padgs=26.0)))
+    table = quirks(run_set(quirky(odgs=25.0, odgs_bias=24.25, odgs_all=22.0, padgs=26.0)))
     assert [block.title.partition(",")[0] for block in table.blocks] == ["ODGS", "PaD-GS"]
     change = [column.title for column in table.columns].index("Δ")
     found = {row.title: row.cells[change].value for row in table.blocks[0].rows}
     assert found["as described"] == 0 and found["half a pixel off"] == pytest.approx(-0.75)
     assert found["as released"] == pytest.approx(-3) and found["extent + 100"] is None
-    assert quirks(gathered([small(25)])).blocks == ()
+    assert quirks(run_set([small(25)])).blocks == ()
 
 
 def test_what_was_measured_otherwise_does_not_stand_beside():
     first, second = quirky(odgs=25.0, odgs_bias=24.25)
     with pytest.raises(ReportError, match="differ in length"):
-        quirks(gathered([first, replace(second, iterations=7)]))
+        quirks(run_set([first, replace(second, iterations=7)]))

@@ -1,8 +1,8 @@
-"""What `padgs need` found of runs: a curve of quality over size each, with the need for each loss on it."""
+"""Smallest models of a quality (`padgs need`): curves of quality over size, and the table `need`."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,9 +11,11 @@ import numpy as np
 import pandas as pd
 from pandas import DataFrame
 
-from padgs.reports.frame import CONFIG
-from padgs.reports.gathered import Gathered
-from padgs.reports.settings import settings
+from padgs.reports.conditions import OF_TIMES, footnotes, refuse_mixture
+from padgs.reports.frame import CONFIG, by_conditions
+from padgs.reports.selection import RunSet, settings
+from padgs.reports.statistics import mean_cell
+from padgs.reports.table import Block, Cell, Column, Row, Table
 from padgs.results import NEED_LOSSES, NEED_PICTURE, NEED_STATED
 
 EPSILONS = tuple(f"{loss:g}" for loss in NEED_LOSSES)  # dB, as results name them
@@ -67,11 +69,11 @@ class Curve:
         return steps[0]["test_ws_psnr"] - (control["test_ws_psnr"] - step["test_ws_psnr"])
 
 
-def searched(gathered: Gathered) -> DataFrame:
+def searched(run_set: RunSet) -> DataFrame:
     """The runs that `padgs need` made, one of each search, though it keeps one for each loss that it is asked for: that
     for `STATED`, if there is one. Each has a setting of its own, that of the run that was searched.
     """
-    runs = gathered.asked_for
+    runs = run_set.requested
     runs = runs.loc[runs["need"].map(bool)]
     degrees = [_trained_degree(run) for _, run in runs.iterrows()]
     runs = runs.assign(
@@ -129,6 +131,34 @@ def ratio(ours: Curve, other: Curve) -> float | None:
     return None if difference is None else 2.0**difference
 
 
+def table(run_set: RunSet) -> Table:
+    """Return a block for each scene, resolution and length, and a row for each method whose runs were searched.
+
+    Raises:
+        ReportError: results that must not stand together.
+    """
+    blocks, runs_of = [], {}
+    for title, own in by_conditions(searched(run_set), "resolution", "length").items():
+        refuse_mixture(own, run_set.request, title, OF_TIMES)
+        found = by_method(curves(own))
+        first = next(iter(found.values()))
+        rows = (
+            Row(method, tuple(_over_seeds(seeds, first, of) for of in COLUMNS.values()))
+            for method, seeds in found.items()
+        )
+        blocks.append(Block(title, tuple(rows)))
+        runs_of[title] = own
+    notes = (*footnotes(runs_of, run_set.request.protocol), *NOTES) if blocks else ()
+    return Table("need", "How many Gaussians a scene needs", "Method", tuple(COLUMNS), tuple(blocks), notes)
+
+
+def _over_seeds(seeds: Sequence[Curve], first: Sequence[Curve], of: Callable[[Curve, Curve], float | None]) -> Cell:
+    """A number of the runs of a method, each beside that of the first method with its seed, if there is one."""
+    beside = {one.seed: one for one in first}
+    values = [of(one, beside.get(one.seed, first[0])) for one in seeds]
+    return mean_cell([value for value in values if value is not None])
+
+
 def _is_stated(found: Mapping[str, Any]) -> bool:
     """Whether the model that a search kept is that for `STATED`."""
     return found.get("kept", {}).get("epsilon") == NEED_STATED
@@ -157,3 +187,35 @@ def _mean_difference(ours: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarra
     at = np.unique([low, *inner, high])
     difference = np.interp(at, *ours) - np.interp(at, *other)
     return float(np.sum((difference[1:] + difference[:-1]) / 2 * np.diff(at)) / (high - low))
+
+
+COLUMNS: dict[Column, Callable[[Curve, Curve], float | None]] = {
+    Column("Gaussians blended", 0): lambda own, _: own.found["steps"][0]["blended"],
+    **{
+        Column(f"needed for {epsilon} dB", 0, False): lambda own, _, e=epsilon: own.needs[e]["blended"]
+        for epsilon in EPSILONS
+    },
+    Column(f"share for {STATED} dB", 2): lambda own, _: own.needs[STATED]["rows"] / own.found["rows"],
+    Column("knee", 0): lambda own, _: None if own.knee is None else own.knee["blended"],
+    Column(f"MB for {STATED} dB", 2, False): lambda own, _: own.needs[STATED]["bytes"] / 1e6,
+    Column(f"degree for {STATED} dB", 0, False): lambda own, _: own.degree,
+    Column(f"MB of its file, {STATED} dB", 2, False): lambda own, _: (
+        None if own.file is None else own.file["bytes"] / 1e6
+    ),
+    Column(f"least ms of a frame for {STATED} dB", 1, False): lambda own, _: own.needs[STATED]["frame_ms"],
+    Column(f"WS-PSNR for {STATED} dB", 2, True): lambda own, _: own.quality_of(own.needs[STATED]),
+    Column("WS-PSNR of all", 2, True): lambda own, _: own.quality_of(own.found["steps"][0]),
+    Column("dB at equal N against the first", 2, signed=True): gain,
+    Column("N at equal dB over the first's", 2): ratio,
+    Column("CPU s of the search", 0): lambda own, _: own.found["cpu_seconds"],
+}
+NOTES = (
+    "Needed: the smallest model as good as one that was refined as often and lost nothing, on views taken from the "
+    "training: WS-PSNR by at most so many dB with 95 % confidence, each latitude band by twice and each view by five "
+    "times that, LPIPS by 0.005. WS-PSNR: of the test views, which decide nothing, less what was lost there against a "
+    "model refined as often. Not searched: offsets an anchor, features.",
+    "Degree and file: of the model for that need, with as few harmonics and as small a file as lose no more against it "
+    "with all of them and in full; the file was written, read back and measured.",
+    "Knee: the largest model below which a halving costs more than 0.1 dB. Beside the first: means over what both "
+    "curves share.",
+)

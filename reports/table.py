@@ -1,62 +1,62 @@
-"""What a table is before anyone writes it down: columns, blocks of rows, cells that may be missing, and footnotes."""
+"""A table as data: columns, blocks of rows, cells that may be missing, and footnotes."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 MISSING = "–"
-UNRANKED = "†"  # after the title of a row whose numbers compete with no other's; a note says why
+UNRANKED = "†"  # after the title of a row that competes with no other; a note says why
 
 
 class ReportError(ValueError):
-    """A table that must not be made from these results; the message says why and what to do."""
+    """A report cannot be made from these results; the message says why and what to do."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """How the numbers of a column are read."""
+    """Title, format and direction of a column."""
 
     title: str
     decimals: int
     higher_is_better: bool | None = None  # None: neither end is best
     signed: bool = False  # a difference: always with its sign
     group: str = ""  # heading over neighbouring columns
-    optional: bool = False  # left out of a block that has nothing in it, where blocks stand as tables of their own
+    optional: bool = False  # dropped from a block in which it is empty
 
     @property
     def heading(self) -> str:
-        """The title with an arrow towards the better end."""
+        """Title with an arrow towards the better end."""
         return self.title + {True: " ↑", False: " ↓", None: ""}[self.higher_is_better]
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A number with its spread over seeds, or the reason why there is none."""
+    """A number with its standard deviation over seeds, or the reason why it is missing."""
 
     value: float | None = None
-    std: float | None = None  # over seeds; None for a single run
-    count: int = 1
+    std: float | None = None  # None for a single run
+    count: int = 1  # of seeds
     status: str = ""  # of failed runs: oom, nan, ...
-    ranked: bool = True  # whether it may stand out among the others of its column
+    ranked: bool = True  # False: shown, but never highlighted
 
     @property
     def numbers(self) -> dict[str, Any]:
-        """All that it knows, for a file of numbers."""
+        """Fields of a line of a CSV file."""
         count = None if self.value is None else self.count
         return {"value": self.value, "std": self.std, "n": count, "status": self.status}
 
     def text(self, column: Column, *, counted: bool = True) -> str:
-        """What stands in the cell, without emphasis; `counted`: with the number of seeds.
+        """Return the text of the cell without emphasis; `counted`: with the number of seeds.
 
         >>> Cell(26.018, 0.04, 5).text(Column("PSNR", 2)), Cell(status="oom").text(Column("PSNR", 2))
         ('26.02 ± 0.04 (n=5)', 'OOM')
         """
         if self.value is None:
             return self.status.upper() or MISSING
-        text = shown(self.value, column)
+        text = format_number(self.value, column)
         if self.std is not None:
             text += f" ± {self.std:.{column.decimals}f}" + (f" (n={self.count})" if counted else "")
         return text + (f" [{self.status.upper()}]" if self.status else "")
@@ -64,13 +64,13 @@ class Cell:
 
 @dataclass(frozen=True)
 class Row:
-    """One line; a cell for each column."""
+    """A line with a cell for each column."""
 
     title: str
     cells: tuple[Cell, ...]
 
     def texts(self, columns: Sequence[Column]) -> list[str]:
-        """The title and the cells as they stand; the number of seeds is said once where all spreads are over as many.
+        """Return title and cells as text; a number of seeds that all cells share moves to the title.
 
         >>> Row("PaD-GS", (Cell(26.018, 0.04, 5), Cell(0.8, 0.01, 5))).texts([Column("PSNR", 2), Column("SSIM", 3)])
         ['PaD-GS (n=5)', '26.02 ± 0.04', '0.800 ± 0.010']
@@ -88,10 +88,10 @@ class Block:
 
     title: str
     rows: tuple[Row, ...]
-    signed: bool = False  # differences or correlations: numbers have their sign, and none is the best
+    signed: bool = False  # differences or correlations: with signs, and without a best
 
-    def reads(self, columns: Sequence[Column]) -> tuple[Column, ...]:
-        """The columns of the table as they are meant here."""
+    def columns(self, columns: Sequence[Column]) -> tuple[Column, ...]:
+        """Return the table's columns as they apply to this block."""
         if not self.signed:
             return tuple(columns)
         return tuple(replace(column, signed=True, higher_is_better=None) for column in columns)
@@ -101,27 +101,27 @@ class Block:
 class Table:
     """A whole table; `corner` is the heading over the titles of the rows."""
 
-    name: str  # table3; the file name and the LaTeX label
+    name: str  # file name and LaTeX label
     title: str
     corner: str
     columns: tuple[Column, ...]
     blocks: tuple[Block, ...]
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
 
-    def alone(self, block: Block, *, every: bool = False) -> Table:
-        """One block as a table of its own, without the optional columns (or `every` column) that it has nothing in."""
+    def single(self, block: Block, *, drop_empty: bool = False) -> Table:
+        """Return one block as a table without empty optional columns, or with `drop_empty` without any empty column."""
         kept = [
             index
             for index, column in enumerate(self.columns)
-            if not (column.optional or every) or any(row.cells[index] != Cell() for row in block.rows)
+            if not (column.optional or drop_empty) or any(row.cells[index] != Cell() for row in block.rows)
         ]
         rows = tuple(Row(row.title, tuple(row.cells[index] for index in kept)) for row in block.rows)
-        columns = block.reads([self.columns[index] for index in kept])
+        columns = block.columns([self.columns[index] for index in kept])
         return replace(self, columns=columns, blocks=(replace(block, rows=rows),))
 
 
-def shown(value: float, column: Column) -> str:
-    """A number as it stands in a column."""
+def format_number(value: float, column: Column) -> str:
+    """Return a number as text in the format of a column."""
     if not math.isfinite(value):
         return str(value)
     return f"{value:{'+' if column.signed else ''}.{column.decimals}f}"

@@ -1,0 +1,331 @@
+"""The builder of all tables in `padgs.reports.specs`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import pandas as pd
+from pandas import DataFrame
+
+from padgs.reports import REPORTS, methods, published
+from padgs.reports.conditions import Reason, footnotes, refuse_mixture, unranked, unranked_notes
+from padgs.reports.frame import LARGEST_FACTOR, PUBLISHED_ITERATIONS, by_conditions, by_place, grouped, law
+from padgs.reports.measures import Measure
+from padgs.reports.published import AVERAGE, Place, Published
+from padgs.reports.selection import RunSet, experiment_of, one_setting, refuse_differences, settings
+from padgs.reports.specs import SPECS
+from padgs.reports.statistics import (
+    better_rows,
+    cells_by_value,
+    mean_cell,
+    numbers_of,
+    over_scenes,
+    over_seeds,
+    places,
+    unrank,
+)
+from padgs.reports.table import Block, Cell, Column, Row, Table
+
+PAPER_COLUMNS = ("paper", "Δ")  # titles of the columns that published numbers add
+IF_KNOWN = ("cpu_seconds", "peak_gpu_gigabytes")  # no column if no run has a number
+RATES = {"published": "published rates", "run": "rates for the run"}
+
+
+def table(run_set: RunSet, name: str) -> Table:
+    """Return the table of a name in `SPECS`.
+
+    Raises:
+        ReportError: results that must not stand together.
+    """
+    return (_Pivot if SPECS[name].pivot else _Builder)(run_set, name).build()
+
+
+class _Builder:
+    """Blocks of rows, with a column for each measure."""
+
+    def __init__(self, run_set: RunSet, name: str) -> None:
+        self.name, self.spec, self.request = name, SPECS[name], run_set.request
+        self.runs = self._select(run_set)
+        self.protocols = self.spec.protocols or (self.request.protocol,)
+        self.paper = published.load() if self.spec.paper and self.request.protocol == published.PROTOCOL else {}
+        known = self.runs.columns[self.runs.notna().any()]
+        measures = self.spec.measures(self.request.protocol)
+        self.measures = [measure for measure in measures if measure.name in known or measure.name not in IF_KNOWN]
+        self.shown: dict[str, DataFrame] = {}  # title of a block -> its runs
+        self.aside: list[Mapping[str, Reason]] = []  # presets that are not ranked, of each block
+
+    def build(self) -> Table:
+        blocks: dict[str, list[Block]] = {dataset: [] for dataset in self.spec.paper if self.spec.averages}
+        for title, place, runs in self._groups():
+            refuse_mixture(runs, self.request, title, self.spec.conditions)
+            self.shown[title] = runs
+            blocks.setdefault(place.dataset if self.spec.averages else "", []).extend(self._blocks(title, place, runs))
+        notes = []
+        for dataset in self.spec.paper if self.spec.averages else ():
+            scenes = published.scenes(self.paper or published.load(), published.DATASETS[dataset])
+            blocks[dataset].append(self._average(dataset, scenes))
+            done = {place.scene for place in self.runs["place"] if place.dataset == dataset}
+            if missing := [scene for scene in scenes if scene not in done]:
+                notes.append(f"{published.TITLES[dataset]}, not run: {', '.join(missing)}.")
+        notes += footnotes(self.shown, *self.protocols)
+        if self.paper:
+            delta = "; Δ = ours - paper" if any(measure.difference for measure in self.measures) else ""
+            notes.append(f"Columns 'paper': published numbers, from one RTX 3090 Ti{delta}.")
+        notes += [*unranked_notes(self.aside), *filter(None, [self.spec.difference]), *self.spec.notes]
+        all_blocks = tuple(block for of in blocks.values() for block in of)
+        return Table(self.name, self.spec.title, self.spec.corner, self._columns(), all_blocks, tuple(notes))
+
+    def _select(self, run_set: RunSet) -> DataFrame:
+        spec = self.spec
+        if not REPORTS[self.name].experiments:
+            return run_set.requested
+        runs = run_set.chosen(self.name) if spec.fallback else run_set.of_experiments(*REPORTS[self.name].experiments)
+        if spec.rows == "variant":
+            runs = runs.loc[runs["variant"].isin([variant for titles in spec.titles.values() for variant in titles])]
+        elif spec.rows != "setting":  # rows of an ablation and runs that were stopped by hand are not methods
+            runs = runs.loc[runs["variant"] == ""]
+        if spec.outdoor is not None:
+            runs = runs.loc[[place.outdoor is spec.outdoor for place in runs["place"]]]
+        return spec.prepare(runs)
+
+    def _groups(self) -> Iterator[tuple[str, Place, DataFrame]]:
+        """Yield title, scene and runs of each block."""
+        spec = self.spec
+        if not spec.blocks:
+            for place, runs in {**dict.fromkeys(spec.always, self.runs.iloc[:0]), **by_place(self.runs)}.items():
+                yield place.title, place, runs
+        for experiment in REPORTS[self.name].experiments if spec.by_experiment else ("",):
+            own = self.runs.loc[
+                [not experiment or experiment in map(experiment_of, of) for of in self.runs["experiments"]]
+            ]
+            for title, runs in by_conditions(own, *spec.blocks).items() if spec.blocks and len(own) else ():
+                yield f"{experiment}: {title}" if experiment else title, runs["place"].iloc[0], runs
+
+    def _blocks(self, title: str, place: Place, runs: DataFrame) -> Iterator[Block]:
+        spec = self.spec
+        if spec.equal_images is not None:
+            self.aside.append(unranked(runs, equal_images=spec.equal_images))
+        if spec.rows == "run":
+            yield Block(title, tuple(self._each_run(runs)))
+        elif spec.rows == "setting":
+            yield Block(title, self._ranked(runs, title))
+        for method, titles in (
+            spec.titles.items() or (("", self._titles(place, runs)),) if spec.rows not in ("run", "setting") else ()
+        ):
+            aside = self.aside[-1] if self.aside else ()
+            cells = cells_by_value(runs, spec.rows, titles, title, self.measures, aside)
+            if spec.difference and not runs[spec.rows].isin(titles).any():
+                continue
+            rows = self._rows(place, titles, cells)
+            yield Block(f"{methods.name(method)}, {title}" if spec.difference else title, rows)
+        if spec.effects:
+            yield Block(f"Effects, {title}", tuple(self._effects(runs)), signed=True)
+
+    def _columns(self) -> tuple[Column, ...]:
+        found = [Column("rank", 0)] if self.spec.by_rank else []
+        for measure in self.measures:
+            ours = measure.column
+            found.append(ours)
+            if self.paper and measure.published:
+                decimals = ours.decimals if measure.difference else min(ours.decimals, 2)
+                found.append(Column(PAPER_COLUMNS[0], decimals, ours.higher_is_better, group=ours.group, optional=True))
+                if measure.difference:
+                    found.append(Column(PAPER_COLUMNS[1], ours.decimals, signed=True, group=ours.group, optional=True))
+            if self.spec.difference and _is_psnr(measure):
+                found.append(Column("Δ", 2, signed=True))
+        return tuple(found)
+
+    def _titles(self, place: Place, runs: DataFrame) -> dict[str, str]:
+        """Return preset -> title of those that were run, and of methods with published numbers."""
+        where = (self.spec.paper.get(place.dataset), published.DATASETS.get(place.dataset), place.scene)
+        known = (key.method for key in self.paper if (key.table, key.dataset, key.scene) == where)
+        run = set(runs["preset"])
+        presets = methods.ordered((*known, *run))
+        return {preset: methods.title(preset) if preset in run else methods.name(preset) for preset in presets}
+
+    def _rows(self, place: Place, titles: Mapping[str, str], cells: Mapping[str, Sequence[Cell]]) -> tuple[Row, ...]:
+        """Return a row for each value, with published numbers and differences."""
+        first, rows = next(iter(cells.values()), ()), []
+        for value, ours in cells.items():
+            method = f"padgs/{value}" if self.spec.rows == "variant" else methods.published_as(value)
+            theirs = published.row(self.paper, self.spec.paper.get(place.dataset, 0), place, method)
+            row: list[Cell] = []
+            for index, (measure, cell) in enumerate(zip(self.measures, ours, strict=True)):
+                row.append(cell)
+                if self.paper and measure.published:
+                    row.append(_published(theirs.get(measure.published)))
+                    if measure.difference:
+                        row.append(_difference(cell, row[-1]))
+                if self.spec.difference and _is_psnr(measure):
+                    row.append(_difference(cell, first[index]))
+            rows.append(Row(titles[value], tuple(row)))
+        return tuple(rows)
+
+    def _average(self, dataset: str, scenes: Sequence[str]) -> Block:
+        """Return a block with the mean over the scenes of a data set."""
+        title, place = published.TITLES[dataset], Place(dataset, AVERAGE)
+        runs = self.runs.loc[[(of.dataset, of.apart) == (dataset, "") for of in self.runs["place"]]]
+        refuse_mixture(runs, self.request, title, [what for what in self.spec.conditions if what != "data"])
+        self.aside.append(unranked(runs))
+        titles, cells = self._titles(place, runs), {}
+        for preset, words in titles.items():
+            alike = runs.loc[runs["preset"] == preset]
+            refuse_differences(alike, f"{title}, {words}", "preset")
+            ours = over_scenes(alike, scenes, self.measures)
+            cells[preset] = unrank(ours) if preset in self.aside[-1] else ours
+        return Block(f"{title}, average over its {len(scenes)} scenes", self._rows(place, titles, cells))
+
+    def _ranked(self, runs: DataFrame, where: str) -> tuple[Row, ...]:
+        """Return a row for each setting, the best first, those without a number last."""
+        found = [
+            (one.title, over_seeds(one_setting(one.runs, f"{where}, {one.title}"), self.measures))
+            for one in settings(runs)
+        ]
+        found.sort(key=lambda row: (row[1][0].value is None, -(row[1][0].value or 0.0)))
+        cells = {i: row[0] for i, (_, row) in enumerate(found) if row[0].value is not None}
+        shared = places(cells, self.measures[0].column)
+        ranks = {i: Cell(1 + sum(map(len, shared[:place]))) for place, rows in enumerate(shared) for i in rows}
+        return tuple(Row(title, (ranks.get(i, Cell()), *row)) for i, (title, row) in enumerate(found))
+
+    def _each_run(self, runs: DataFrame) -> Iterator[Row]:
+        for one in settings(runs):
+            for index, seed, run in one.runs[["seed", "run"]].itertuples():
+                title = ", ".join([one.preset, *one.apart, f"seed {seed}", run.rpartition("_")[2]])
+                yield Row(title, tuple(over_seeds(runs.loc[[index]], self.measures)))
+
+    def _effects(self, runs: DataFrame) -> Iterator[Row]:
+        """Yield linear combinations of the rows, taken within each seed."""
+        (titles,) = self.spec.titles.values()
+        groups = (runs.loc[runs[self.spec.rows] == value] for value in titles)
+        by_seed = [numbers_of(own, self.measures).set_axis(own.loc[own["ok"], "seed"]) for own in groups]
+        for title, weights in self.spec.effects.items():
+            first, *others = (weight * numbers for weight, numbers in zip(weights, by_seed, strict=True))
+            sums = sum(others, first)
+            yield Row(title, tuple(mean_cell(sums[column].dropna().tolist()) for column in sums))
+
+
+class _Pivot(_Builder):
+    """A column for each length of training; rows are methods (`length`) or factors on the rates (`learning_rates`)."""
+
+    def build(self) -> Table:
+        spec, (measure,) = self.spec, self.measures
+        keys = sorted({*self.runs[list(spec.pivot)].itertuples(index=False, name=None)})
+        blocks: list[Block] = []
+        notes: list[str] = []
+        for title, _, runs in self._groups():
+            refuse_mixture(runs, self.request, title, spec.conditions)
+            self.shown[title] = runs
+            add = self._factors if spec.pivot == ("iterations",) else self._lengths
+            blocks += add(title, runs, keys, notes)
+        lengths = [f"{key[-1]} iterations" for key in keys]
+        headings = [
+            ", ".join([words, *(RATES[rates] for rates in key[:-1])]) for key, words in zip(keys, lengths, strict=True)
+        ]
+        if spec.pivot == ("iterations",):
+            says = ", ".join(f"× {law(n):.2f} after {n}" for (n,) in keys)
+            notes.append(
+                f"The law, √({PUBLISHED_ITERATIONS} / iterations) and at most {LARGEST_FACTOR:g}, says {says} "
+                "iterations. Its loss is the difference, seed by seed, of the factor nearest to it (by their ratio) "
+                "from the one with the best mean."
+            )
+        columns = tuple(Column(heading, 2, measure.column.higher_is_better) for heading in headings)
+        notes = [*footnotes(self.shown, *self.protocols), *notes, *spec.notes]
+        return Table(self.name, spec.title, spec.corner, columns, tuple(blocks), tuple(notes))
+
+    def _cells(self, runs: DataFrame, where: str, *columns: str) -> dict[Any, dict[Any, tuple[Cell, DataFrame]]]:
+        """Return first column -> values of the others -> mean over seeds, and the runs."""
+        found: dict[Any, dict[Any, tuple[Cell, DataFrame]]] = {}
+        for (row, *key), own in grouped(runs, *columns):
+            own = one_setting(own, f"{where}, {', '.join(map(str, (row, *key)))}")
+            found.setdefault(row, {})[tuple(key)] = over_seeds(own, self.measures)[0], own
+        return found
+
+    def _factors(self, title: str, runs: DataFrame, keys: Sequence[Any], notes: list[str]) -> list[Block]:
+        """Return a block for each method, and one with the loss by the law."""
+        blocks, losses = [], []
+        for preset in methods.ordered(runs["preset"]):
+            where = f"{methods.title(preset)}, {title}"
+            cells = self._cells(runs.loc[runs["preset"] == preset], where, "rate_factor", "iterations")
+            rows = (Row(f"× {f:g}", tuple(cells[f].get(key, (Cell(),))[0] for key in keys)) for f in sorted(cells))
+            blocks.append(Block(where, tuple(rows)))
+            of_lengths = ({factor: of[key] for factor, of in cells.items() if key in of} for key in keys)
+            losses.append(Row(methods.title(preset), tuple(map(self._loss, keys, of_lengths))))
+        return [*blocks, Block(f"What the law loses, {title}", tuple(losses), signed=True)]
+
+    def _loss(self, key: tuple[int], factors: Mapping[float, tuple[Cell, DataFrame]]) -> Cell:
+        means = {factor: cell.value for factor, (cell, _) in factors.items() if cell.value is not None}
+        if not means:
+            return Cell()
+        near = min(means, key=lambda factor: abs(math.log(factor / law(key[0]))))
+        best = max(means, key=lambda factor: means[factor])
+        column = self.measures[0].name
+        ours, others = (factors[f][1].query("ok").set_index("seed")[column].astype(float) for f in (near, best))
+        return mean_cell((ours - others).dropna().tolist())
+
+    def _lengths(self, title: str, runs: DataFrame, keys: Sequence[Any], notes: list[str]) -> list[Block]:
+        """Return a block of methods, and Kendall's rank correlation (tau-b) with the longest training."""
+        cells = self._cells(runs, title, "preset", *self.spec.pivot)
+        cells = {preset: {key: cell for key, (cell, _) in cells[preset].items()} for preset in methods.ordered(cells)}
+        rows = (Row(methods.title(of), tuple(own.get(key, Cell()) for key in keys)) for of, own in cells.items())
+        correlations = []
+        for key in keys:
+            longest = self._longest(cells, key[0])
+            both = pd.DataFrame(
+                {at: {of: own[at].value for of, own in cells.items() if at in own} for at in {key, longest}},
+                dtype=float,
+            ).dropna()
+            known = key in both and len(both) > 1
+            correlations.append(Cell(float(both[key].corr(both[longest], method="kendall"))) if known else Cell())
+        notes += [f"{title}, {note}" for rates in RATES if (note := self._earliest(cells, rates))]
+        correlation = Row("Kendall's rank correlation", tuple(correlations))
+        order = Block(f"Order beside that after the longest training, {title}", (correlation,), signed=True)
+        return [Block(title, tuple(rows)), order]
+
+    @staticmethod
+    def _longest(cells: Mapping[str, Mapping[Any, Cell]], rates: str) -> tuple[str, int]:
+        """Return the key of the longest training, at best with the same rates: after 30 000 iterations both are one."""
+        return max((key for own in cells.values() for key in own), key=lambda key: (key[1], key[0] == rates))
+
+    def _earliest(self, cells: Mapping[str, Mapping[Any, Cell]], rates: str) -> str:
+        """Say from which length on methods have the order of the longest, where seeds separate them."""
+        lengths = sorted({n for own in cells.values() for of, n in own if of == rates}, reverse=True)
+        if not lengths:
+            return ""
+        end = self._longest(cells, rates)
+        longest = {of: own[end] for of, own in cells.items() if end in own and own[end].value is not None}
+        names, since = list(longest), None
+        better = better_rows(dict(enumerate(longest.values())), self.measures[0].column)
+        pairs = [(names[i], names[j]) for i, of in better.items() for j in of]  # worse, better
+        for n in lengths:
+            here = {of: own[rates, n].value for of, own in cells.items() if (rates, n) in own}
+            values = [(here.get(worse), here.get(better)) for worse, better in pairs]
+            if any(low is not None and high is not None and low >= high for low, high in values):
+                break
+            since = n
+        if not pairs:
+            return f"{RATES[rates]}: seeds separate nothing after the longest."
+        if since is None:
+            return f"{RATES[rates]}: no length has the order of the longest."
+        if any(cell.count > 1 for cell in longest.values()):
+            return (
+                f"{RATES[rates]}: from {since} iterations on, all that seeds separate after the longest has its order."
+            )
+        return f"{RATES[rates]}: from {since} iterations on, the order is that of the longest (one seed each)."
+
+
+def _is_psnr(measure: Measure) -> bool:
+    return measure.column.group == "PSNR"
+
+
+def _published(number: Published | None) -> Cell:
+    if number is None or number.status == "missing":
+        return Cell()
+    return Cell(number.value, status="" if number.status == "ok" else number.status)
+
+
+def _difference(ours: Cell, theirs: Cell) -> Cell:
+    if ours.value is None or theirs.value is None:
+        return Cell()
+    return Cell(ours.value - theirs.value)

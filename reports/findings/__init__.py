@@ -1,1 +1,0 @@
-"""What the paper claims, judged by what was measured here: claims as data, rules that judge them, a page."""

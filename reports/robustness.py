@@ -1,0 +1,284 @@
+"""Robustness of methods under stress (`+experiment=stress`): tables `stability` and `limits`.
+
+The robustness under a condition is (Q - Q1) / (Q0 - Q1_0) within [0, 1]. Q is WS-PSNR of the protocol `stability`, Q1
+that of one colour for the whole image, and Q0 and Q1_0 are those of the same run without the condition. A failed run
+has 0.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence, Set
+from dataclasses import dataclass, replace
+from functools import cached_property
+from importlib.resources import files
+
+import pandas as pd
+import yaml
+from pandas import DataFrame
+
+from padgs.reports import methods
+from padgs.reports.charts.drawing import Chart
+from padgs.reports.conditions import footnotes, refuse_mixture
+from padgs.reports.frame import CONFIG, by_conditions, grouped
+from padgs.reports.selection import RunSet, one_setting, refuse_differences
+from padgs.reports.statistics import mean_cell
+from padgs.reports.table import Block, Cell, Column, Row, Table
+from padgs.results import file_name
+
+CONDITION, LEVEL = f"{CONFIG}stress.condition", f"{CONFIG}stress.level"
+PROTOCOL = "stability"
+QUALITY, ONE_COLOR = f"{PROTOCOL}/ws_psnr", f"{PROTOCOL}/ws_psnr_one_color"
+EQUATOR, POLE = f"{PROTOCOL}/ws_psnr_equator", f"{PROTOCOL}/ws_psnr_pole"
+SHARED = ("resolution", "learning_rates", "data", "machine")
+# Shown but not scored: some methods have no such option, or the condition makes the scene easier.
+NOT_SCORED = {"precision", "capacity", "textureless"}
+HALF = 0.5  # a condition breaks a method below this robustness
+LIMITS = yaml.safe_load(files("padgs").joinpath("data/perturb/conditions.yaml").read_text("utf-8"))
+LIMITS_ARE_FOR = ("256x128", 1500)  # resolution, and iterations without stress
+BEYOND = "beyond"
+UNITS = {"seam": "seam", "depth_error": "depth error", "ws_psnr_fitted": "dB after a fit of colours", "ws_psnr": "dB"}
+UNSTRESSED = {  # title -> column of the frame, and columns that are subtracted from it
+    "WS-PSNR, dB": (QUALITY,),
+    "training views above test views, dB": (f"{PROTOCOL}/ws_psnr_training", QUALITY),
+    "equator above poles, dB": (EQUATOR, POLE),
+    "the same, above a truth blurred alike, dB": (EQUATOR, POLE, f"{PROTOCOL}/pole_gap_oracle"),
+    "seam": (f"{PROTOCOL}/seam",),
+    "yaw error": (f"{PROTOCOL}/yaw_error",),
+    "depth error (AbsRel)": (f"{PROTOCOL}/depth_error",),
+    "floaters": (f"{PROTOCOL}/floaters",),
+}
+STABILITY_NOTES = (
+    "Robustness: how far above one colour for the image a run stays under a condition, as a share of the same "
+    "method and seed without it, within [0, 1]; 0 for a run that failed. Level 1 is mild, 3 is severe.",
+    f"A method breaks at the first level where it keeps less than {HALF:g} or a run fails; – where it does not.",
+    "Score: the mean over conditions of the mean over their levels. Worst quartile: that of the worst quarter of the "
+    "conditions; columns stand in its order on the first scene, the best first. Both, and the failure rate, are over "
+    f"all conditions but {', '.join(sorted(NOT_SCORED))}, and missing for a method that was not run under all "
+    "conditions of the scene.",
+)
+LIMITS_NOTES = (
+    "dB: WS-PSNR without the condition less that with it, of the same seed; after a fit of colours: each view with the "
+    "gain and the offset of each channel that bring it nearest to the truth. Other rows: the metric itself.",
+    "BEYOND: more than is allowed, which is for runs of a method that is meant to be robust; – in the first column: no "
+    "limit.",
+)
+
+Stress = tuple[str, int]  # condition, level
+
+
+@dataclass(frozen=True)
+class StressedMethod:
+    """A method on a scene, with and without stress."""
+
+    preset: str
+    runs: Mapping[Stress, DataFrame]  # a run a seed
+    reference: DataFrame  # runs without stress
+    missing: Set[Stress] = frozenset()  # stress that other methods of the scene were run under, and this was not
+
+    @cached_property
+    def robustness(self) -> dict[Stress, Cell]:
+        """Robustness under each condition and level, with the status of failed runs."""
+        return {stress: self._robustness(own) for stress, own in self.runs.items()}
+
+    def _robustness(self, runs: DataFrame) -> Cell:
+        above = (self.reference[QUALITY] - self.reference[ONE_COLOR]).set_axis(self.reference["seed"])
+        without = runs["seed"].map(above).fillna(above.mean())  # a seed without reference has the mean of the others
+        shares = ((runs[QUALITY] - runs[ONE_COLOR]) / without).clip(0, 1).where(runs["ok"], 0.0)
+        return mean_cell(shares.tolist(), _failures(runs))
+
+    @property
+    def place(self) -> str:
+        """Scene and resolution, as a part of file names."""
+        first = self.reference.iloc[0]
+        return file_name(f"{first['place'].stem}-{first['resolution']}")
+
+    @property
+    def conditions(self) -> list[str]:
+        """Conditions in the order of the runs."""
+        return list(dict.fromkeys(condition for condition, _ in self.runs))
+
+    def levels(self, condition: str) -> dict[int, Cell]:
+        """Return level -> robustness under a condition."""
+        return {level: cell for (name, level), cell in sorted(self.robustness.items()) if name == condition}
+
+    def breakdown(self, condition: str) -> int | None:
+        """Return the first level below `HALF` or with a failed run; None if there is none."""
+        broken = (n for n, cell in self.levels(condition).items() if cell.status or (cell.value or 0) < HALF)
+        return next(broken, None)
+
+    @property
+    def means(self) -> list[float]:
+        """Mean robustness over the levels of each condition, the worst first; empty if any stress is missing."""
+        cells = [self.levels(condition).values() for condition in {condition for condition, _ in self._scored}]
+        return sorted(math.fsum(cell.value or 0.0 for cell in of) / len(of) for of in cells)
+
+    @property
+    def score(self) -> float | None:
+        """Mean over the conditions."""
+        return mean_cell(self.means).value
+
+    @property
+    def worst_quartile(self) -> float | None:
+        """Mean over the worst quarter of the conditions, at least one."""
+        return mean_cell(self.means[: max(1, len(self.means) // 4)]).value
+
+    @property
+    def failure_rate(self) -> float | None:
+        """Share of failed runs under scored conditions; None if any stress is missing."""
+        return float(1 - pd.concat([runs["ok"] for runs in self._scored.values()]).mean()) if self._scored else None
+
+    @property
+    def _scored(self) -> dict[Stress, DataFrame]:
+        return {} if self.missing else {of: runs for of, runs in self.runs.items() if of[0] not in NOT_SCORED}
+
+
+def stressed_methods(run_set: RunSet) -> dict[str, list[StressedMethod]]:
+    """Return title of a scene -> methods run with and without stress, sorted by worst quartile, incomplete ones last.
+
+    Raises:
+        ReportError: results that must not stand together.
+    """
+    runs, found = run_set.of_experiments("stress"), {}
+    if not {CONDITION, QUALITY, ONE_COLOR} <= {*runs}:
+        return found
+    stress = zip(runs[CONDITION], runs[LEVEL], strict=True)
+    names = ["" if condition is None else f"{condition} {level}" for condition, level in stress]
+    runs = runs.loc[runs["variant"] == names]  # other variants were stopped by hand, or are rows of an ablation
+    for title, own in by_conditions(runs, "resolution").items():
+        refuse_mixture(own, run_set.request, title, SHARED)
+        made = [one for preset in methods.ordered(own["preset"]) if (one := _stressed_method(own, preset, title))]
+        if made:
+            every = {stress for one in made for stress in one.runs if stress[0] not in NOT_SCORED}
+            made = [replace(one, missing=every - one.runs.keys()) for one in made]
+            found[title] = sorted(made, key=lambda one: math.inf if one.missing else -(one.worst_quartile or 0.0))
+    return found
+
+
+def all_stress(stressed: Sequence[StressedMethod]) -> list[Stress]:
+    """Return the conditions and levels of some methods, each once, the levels of a condition together."""
+    conditions = list(dict.fromkeys(condition for one in stressed for condition in one.conditions))
+    return sorted({stress for one in stressed for stress in one.runs}, key=lambda s: (conditions.index(s[0]), s[1]))
+
+
+def stability(run_set: RunSet) -> list[Table | Chart]:
+    """Return a table with three blocks for each scene, and for each a heat map and a chart of robustness over time.
+
+    Raises:
+        ReportError: results that must not stand together.
+    """
+    from padgs.reports.charts.robustness_chart import heat_map, speed_and_accuracy  # they import this module
+
+    found = stressed_methods(run_set)
+    presets = list(dict.fromkeys(one.preset for those in found.values() for one in those))
+    blocks = []
+    for title, those in found.items():
+        row = _row_maker(presets, those)
+        scores = [
+            row("stability score", lambda one: Cell(one.score)),
+            row("worst quartile", lambda one: Cell(one.worst_quartile)),
+            row("failure rate", lambda one: Cell(one.failure_rate)),
+        ]
+        unstressed = (
+            row(f"unstressed: {name}", lambda one, of=of: _unstressed(one, *of)) for name, of in UNSTRESSED.items()
+        )
+        known = [made for made in unstressed if any(cell.value is not None for cell in made.cells)]
+        kept = [row(f"{of[0]} {of[1]}", lambda one, of=of: one.robustness.get(of, Cell())) for of in all_stress(those)]
+        conditions = dict.fromkeys(condition for one in those for condition in one.conditions)
+        breaks = [row(of, lambda one, of=of: Cell(status=str(one.breakdown(of) or ""))) for of in conditions]
+        blocks += [
+            Block(title, (*scores, *known)),
+            Block(f"Robustness, {title}", tuple(kept)),
+            Block(f"Breaks at level, {title}", tuple(breaks)),
+        ]
+    columns = tuple(Column(methods.title(preset), 2) for preset in presets)
+    notes = (*footnotes(_references(run_set, found), PROTOCOL), *STABILITY_NOTES)
+    table = Table("stability", "Robustness of methods under stress", "Condition", columns, tuple(blocks), notes)
+    return [table, *(draw(*one) for one in found.items() for draw in (heat_map, speed_and_accuracy))]
+
+
+def limits(run_set: RunSet) -> Table:
+    """Return what methods lose under stress beside what is allowed, for scenes with the size and length of the limits.
+
+    Raises:
+        ReportError: results that must not stand together.
+    """
+    found = {title: [one for one in those if _has_limits(one)] for title, those in stressed_methods(run_set).items()}
+    found = {title: those for title, those in found.items() if those}
+    presets = list(dict.fromkeys(one.preset for those in found.values() for one in those))
+    blocks = []
+    for title, those in found.items():
+        row, rows = _row_maker(presets, those), []
+        for condition, level in all_stress(those):
+            limit = LIMITS.get(condition, {})
+            metric, levels = limit.get("metric", "ws_psnr"), limit.get("allowed", ())
+            allowed = levels[level - 1] if level <= len(levels) else None
+            lost = row(
+                f"{condition} {level}, {UNITS[metric]}",
+                lambda one, of=(condition, level), metric=metric, allowed=allowed: _lost(one, of, metric, allowed),
+            )
+            rows.append(Row(lost.title, (Cell(allowed), *lost.cells)))
+        blocks.append(Block(title, tuple(rows)))
+    columns = (Column("allowed", 2), *(Column(methods.title(preset), 2) for preset in presets))
+    notes = (*footnotes(_references(run_set, found), PROTOCOL), *LIMITS_NOTES)
+    return Table(
+        "limits", "Losses of methods under stress, and their limits", "Condition", columns, tuple(blocks), notes
+    )
+
+
+def _row_maker(presets: Sequence[str], stressed: Sequence[StressedMethod]) -> Callable[..., Row]:
+    by_preset = {one.preset: one for one in stressed}
+
+    def row(title: str, cell: Callable[[StressedMethod], Cell]) -> Row:
+        return Row(title, tuple(cell(by_preset[preset]) if preset in by_preset else Cell() for preset in presets))
+
+    return row
+
+
+def _references(run_set: RunSet, found: Mapping[str, Sequence[StressedMethod]]) -> dict[str, DataFrame]:
+    return {
+        f"{title}, without stress": run_set.runs.loc[sorted(i for one in those for i in one.reference.index)]
+        for title, those in found.items()
+    }
+
+
+def _stressed_method(runs: DataFrame, preset: str, where: str) -> StressedMethod | None:
+    own, where = runs.loc[runs["preset"] == preset], f"{where}, {methods.title(preset)}"
+    refuse_differences(own.drop(columns=[CONDITION, LEVEL]), where)
+    reference, stressed = own.loc[own[CONDITION].isna() & own["ok"]], own.loc[own[CONDITION].notna()]
+    cells = {
+        (condition, int(level)): one_setting(alike, f"{where}, {condition} {level}")
+        for (condition, level), alike in grouped(stressed, CONDITION, LEVEL)
+    }
+    return StressedMethod(preset, cells, one_setting(reference, where)) if cells and len(reference) else None
+
+
+def _has_limits(one: StressedMethod) -> bool:
+    size, iterations = LIMITS_ARE_FOR
+    return bool(((one.reference["resolution"] == size) & (one.reference["iterations"] == iterations)).all())
+
+
+def _unstressed(one: StressedMethod, name: str, *others: str) -> Cell:
+    if not {name, *others} <= {*one.reference}:
+        return Cell()
+    return mean_cell((one.reference[name] - one.reference[[*others]].sum(axis=1, skipna=False)).dropna().tolist())
+
+
+def _lost(one: StressedMethod, stress: Stress, metric: str, allowed: float | None) -> Cell:
+    """Return the mean over seeds, with the status of failed runs, and `BEYOND` if it is more than allowed."""
+    runs, column = one.runs.get(stress), f"{PROTOCOL}/{metric}"
+    if runs is None:
+        return Cell()
+    if column not in runs or column not in one.reference:
+        return Cell(status=_failures(runs))
+    ok, reference = runs.loc[runs["ok"]], one.reference.set_index("seed")[column]
+    values = ok[column].astype(float)
+    if "psnr" in metric:  # others are errors, and no loss
+        values = ok["seed"].map(reference).fillna(reference.mean()).astype(float) - values
+    cell = mean_cell(values.dropna().tolist(), _failures(runs))
+    over = allowed is not None and cell.value is not None and cell.value > allowed
+    return replace(cell, status=" ".join(filter(None, (cell.status, BEYOND if over else ""))))
+
+
+def _failures(runs: DataFrame) -> str:
+    return " ".join(runs.loc[~runs["ok"], "status"].unique())

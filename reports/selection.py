@@ -1,0 +1,272 @@
+"""Runs for a report: the request, the settings among the runs, and what happens to runs that must not be mixed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from importlib import import_module
+from typing import Any
+
+import pandas as pd
+from pandas import DataFrame
+
+from padgs.reports import REPORTS, methods
+from padgs.reports.frame import CONFIG, decides, grouped
+from padgs.reports.measures import metrics
+from padgs.reports.published import Place
+from padgs.reports.table import ReportError
+from padgs.results import BY_ITSELF
+
+LABELS = {"learning_rates": "learning rates ", "data": "data "}  # for columns whose values need one
+
+
+class Mixture(ReportError):
+    """Runs of one cell or block differ in what they should share."""
+
+    def __init__(
+        self, what: str, advice: str, runs: DataFrame, columns: Sequence[str], apart_in: str = "place"
+    ) -> None:
+        """Keep the runs and the columns that differ.
+
+        Args:
+            what: the difference in words.
+            advice: what the user can do.
+            runs: all runs concerned.
+            columns: columns of the frame in which they differ.
+            apart_in: column that can separate them: place for blocks of their own, preset for rows.
+        """
+        super().__init__(f"{what}; {advice}")
+        self.what, self.runs, self.columns, self.apart_in = what, runs, list(columns), apart_in
+
+
+@dataclass(frozen=True)
+class Request:
+    """Options of `padgs report`."""
+
+    protocol: str = "paper"
+    mix: bool = False  # allow different rules, sizes and run lengths in one block
+    strict: bool = False  # refuse mixtures; otherwise they are separated
+    metrics: tuple[str, ...] = ()  # of the curves of sweeps; empty: those of the protocol, and costs
+    experiment: str = ""  # only runs of this experiment or sweep, with or without its scale
+    where: Mapping[str, str] = field(default_factory=dict)  # dotted configuration key -> value
+
+    def matches(self, name: str) -> bool:
+        """Return whether an experiment of this name is requested.
+
+        >>> Request(experiment="tau").matches("tau@cpu"), Request(experiment="tau@full").matches("tau@cpu")
+        (True, False)
+        """
+        return self.experiment in (name, experiment_of(name))
+
+
+@dataclass(frozen=True)
+class RunSet:
+    """Finished runs and a request. Reports are made once and kept; everything raises ReportError if refused."""
+
+    runs: DataFrame  # see `padgs.reports.frame`
+    request: Request = Request()
+    left_out: Sequence[str] = ()  # reasons why result files could not be used
+    warnings: list[str] = field(default_factory=list)  # of the reports made so far
+    _made: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse unknown protocols, experiments and keys at once."""
+        metrics(self.request.protocol)
+        select(self.runs, self.request)
+
+    @property
+    def requested(self) -> DataFrame:
+        """Runs that the request selects."""
+        return select(self.runs, self.request)
+
+    def report(self, name: str) -> Any:
+        """Return a report; runs that must not be mixed are separated, unless the request is strict."""
+        if name not in self._made:
+            function, _, argument = REPORTS[name].function.partition(" ")
+            module, _, function = function.partition(":")
+            self._made[name] = self._separated(name, getattr(import_module(module), function), *argument.split())
+        return self._made[name]
+
+    def _separated(self, name: str, function: Callable[..., Any], *arguments: str) -> Any:
+        run_set, told = self, dict[str, None]()
+        while True:
+            try:
+                made = function(run_set, *arguments)
+            except Mixture as mixture:
+                if self.request.strict:
+                    raise
+                told[mixture.what] = None
+                run_set = replace(run_set, runs=separate(run_set.runs, mixture), _made={})
+                continue
+            self.warnings.extend(f"{name}: {what}, so they stand apart; --where chooses" for what in told)
+            return made
+
+    def chosen(self, name: str) -> DataFrame:
+        """Return the runs for a report: of the requested experiment, else scene by scene of the report's own
+        experiments, else ad hoc runs, else all.
+
+        A folder may hold sweeps and trials, which would otherwise compete for the cells of the table.
+        """
+        runs = self.requested
+        if self.request.experiment:
+            return runs
+        own = self.of_experiments(*REPORTS[name].experiments)
+        free = runs.loc[~runs["place"].isin(own["place"]) & (runs["experiments"].map(lambda of: BY_ITSELF in of))]
+        return runs.loc[[*own.index, *free.index]] if len(own) + len(free) else runs
+
+    def of_experiments(self, *names: str) -> DataFrame:
+        """Return the runs of some experiments or sweeps, at any scale."""
+        runs = self.requested
+        return runs.loc[[not set(names).isdisjoint(map(experiment_of, of)) for of in runs["experiments"]]]
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Runs of a preset that differ in nothing but the seed."""
+
+    preset: str
+    variant: str
+    changed: Mapping[str, Any]  # dotted key -> value, of the keys in which the settings of this preset differ
+    runs: DataFrame
+
+    @property
+    def title(self) -> str:
+        """Title of the preset, variant, and changed keys."""
+        return ", ".join([methods.title(self.preset), *self.apart])
+
+    @property
+    def apart(self) -> list[str]:
+        """Variant, if any, and changed keys."""
+        changed = [f"{key.rpartition('.')[2]} {value}" for key, value in self.changed.items()]
+        return [self.variant, *changed] if self.variant else changed
+
+
+def select(runs: DataFrame, request: Request) -> DataFrame:
+    """Return the runs that a request selects.
+
+    Raises:
+        ReportError: no run has the experiment or a key of the request; the message lists the known ones.
+    """
+    every, known = runs, sorted(set(runs["experiments"].explode().dropna()))
+    if request.experiment:
+        if not any(map(request.matches, known)):
+            raise ReportError(f"unknown experiment {request.experiment!r}; known: {', '.join(known) or 'none'}")
+        runs = runs.loc[[any(map(request.matches, of)) for of in runs["experiments"]]]
+    for key, value in request.where.items() if len(every) else ():
+        column = f"{CONFIG}{key}"
+        if column not in every or every[column].isna().all():
+            first = every.iloc[0]
+            keys = [name.removeprefix(CONFIG) for name in first.index[first.notna()] if name.startswith(CONFIG)]
+            raise ReportError(f"unknown key {key!r}; known in run {first['run']}: {', '.join(keys)}")
+        runs = runs.loc[runs[column].map(str) == value]
+        if runs.empty:
+            values = ", ".join(sorted(set(every[column].dropna().map(str))))
+            raise ReportError(f"no run has {key}={value}; runs have {values}")
+    return runs
+
+
+def experiment_of(name: str) -> str:
+    """Return the experiment without its scale.
+
+    >>> experiment_of("tau@cpu")
+    'tau'
+    """
+    return name.partition("@")[0]
+
+
+def of_a_table(experiment: str) -> bool:
+    """Return whether an experiment belongs to a table or chart, and is no sweep.
+
+    >>> of_a_table("table1_360roam@cpu"), of_a_table("tau@cpu")
+    (True, False)
+    """
+    return any(experiment_of(experiment) in report.experiments for report in REPORTS.values())
+
+
+def settings(runs: DataFrame) -> list[Setting]:
+    """Return the settings among the runs of one scene, in the order of the methods and of the changed values."""
+    found = []
+    for preset in methods.ordered(runs["preset"]):
+        own = runs.loc[runs["preset"] == preset]
+        keys = [key for key in differing_keys(own.loc[own["variant"] == own["variant"].iloc[0]]) if key != "variant"]
+        made = [
+            Setting(preset, variant, {key: group[CONFIG + key].iloc[0] for key in keys}, group)
+            for (variant, _), group in grouped(own, "variant", "setting")
+        ]
+        found += sorted(made, key=lambda setting: (setting.variant, [sort_key(v) for v in setting.changed.values()]))
+    return found
+
+
+def one_setting(runs: DataFrame, where: str, apart_in: str = "place") -> DataFrame:
+    """Return the runs of one cell, sorted by seed; `apart_in`: see `Mixture`.
+
+    Raises:
+        Mixture: they differ in more than the seed, so that their mean would mean nothing.
+        ReportError: two runs have the same setting and seed.
+    """
+    ordered = runs.sort_values("seed", kind="stable")
+    refuse_differences(ordered, where, apart_in)
+    for _, same in grouped(ordered, "seed"):
+        if len(same) > 1:
+            first, second, *_ = same["run"]
+            raise ReportError(f"{where}: runs {first} and {second} are the same setting; delete one of them")
+    return ordered
+
+
+def refuse_differences(runs: DataFrame, where: str, apart_in: str = "place") -> None:
+    """Raise Mixture if runs differ in more than the seed and keys without effect; `apart_in`: see `Mixture`."""
+    every = differing_keys(runs)
+    for other in range(1, len(runs)) if every else ():
+        two = runs.iloc[[0, other]]
+        if keys := differing_keys(two):
+            what = f"{where}: runs {' and '.join(two['run'])} differ in {', '.join(keys)}"
+            columns = [CONFIG + key for key in every]
+            raise Mixture(what, f"choose one with --where {keys[0]}=...", runs, columns, apart_in)
+
+
+def differing_keys(runs: DataFrame) -> list[str]:
+    """Return the dotted keys in which configurations differ, without seeds and keys without effect."""
+    keys = [name.removeprefix(CONFIG) for name in runs if name.startswith(CONFIG)]
+    keys = [key for key in keys if decides(key)]
+    values = runs[[CONFIG + key for key in keys]].to_numpy()
+    return [key for key, column in zip(keys, values.T, strict=True) if any(value != column[0] for value in column)]
+
+
+def separate(runs: DataFrame, mixture: Mixture) -> DataFrame:
+    """Return all runs, those of a mixture with their differences behind the name of the scene or preset.
+
+    Raises:
+        Mixture: the same one, if their differences have the same words.
+    """
+    own = runs.loc[mixture.runs.index]
+    words = [", ".join(of) for of in zip(*(_words(column, own[column]) for column in mixture.columns), strict=True)]
+    names = [_with(name, of) for name, of in zip(own[mixture.apart_in], words, strict=True)]
+    if len(set(names)) == own[mixture.apart_in].nunique():
+        raise mixture
+    found = runs.copy()
+    found.loc[own.index, mixture.apart_in] = pd.Series(names, index=own.index, dtype=object)
+    return found
+
+
+def sort_key(value: Any) -> tuple[bool, float, str]:
+    """Return a key that sorts numbers by size, then everything else by name."""
+    return (not is_number(value), float(value) if is_number(value) else 0.0, "" if is_number(value) else str(value))
+
+
+def is_number(value: Any) -> bool:
+    """Return whether a value has a position on an axis; True and False have none."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _words(column: str, values: pd.Series) -> pd.Series:
+    """Return the words for each run; a missing condition gets the most frequent words, for it contradicts none."""
+    if column.startswith(CONFIG):
+        return values.map(lambda value: f"{column.rpartition('.')[2]} {'not set' if value is None else value}")
+    words = values.map(lambda value: f"{LABELS.get(column, '')}{value}", na_action="ignore")
+    return words.fillna(words.mode().iloc[0])
+
+
+def _with(name: Place | str, words: str) -> Place | str:
+    if isinstance(name, Place):
+        return replace(name, apart=", ".join(filter(None, (name.apart, words))))
+    return f"{name}_{words}"

@@ -1,1 +1,0 @@
-"""Tables as data: which results stand in which cell."""

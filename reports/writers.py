@@ -1,0 +1,176 @@
+"""Files of a report: Markdown, LaTeX and CSV of tables, PNG, SVG and CSV of charts, and pages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+
+from pandas import DataFrame
+
+from padgs.reports.charts.drawing import Chart
+from padgs.reports.statistics import BEST, emphasis
+from padgs.reports.table import Table
+from padgs.results import file_name
+
+SPECIAL = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+SPECIAL |= {character: f"\\{character}" for character in "&%$#_{}"}
+SPECIAL |= {"↑": r"$\uparrow$", "↓": r"$\downarrow$", "Δ": r"$\Delta$", "±": r"$\pm$", "–": "--", "×": r"$\times$"}
+SPECIAL |= {"†": r"\dag{}", "τ": r"$\tau$", "√": r"$\surd$"}
+LATEX_COMMANDS = {None: "{}", BEST: r"\textbf{{{}}}"}
+MARKDOWN_MARKS = {None: "{}", BEST: "**{}**"}
+COLUMNS_OF_A_PAGE = 12  # upright
+
+
+@dataclass(frozen=True)
+class Page:
+    """A text that is written as it is."""
+
+    name: str  # of the file
+    text: str
+
+
+def files(made: Table | Page | Chart | Sequence[Table | Chart] | str, svg: bool = False) -> Iterator[tuple[str, bytes]]:
+    """Yield name and content of each file of a report, with `svg` also charts as SVG; none of an empty table.
+
+    Names of scenes and sweeps are made safe: no file leaves its folder.
+    """
+    if isinstance(made, str):
+        yield "report.html", made.encode()
+    elif isinstance(made, Page):
+        yield made.name, made.text.encode()
+    elif isinstance(made, Table):
+        for extension, write in (("md", markdown), ("tex", latex), ("csv", csv_text)) if made.blocks else ():
+            yield f"{made.name}.{extension}", write(made).encode()
+    elif isinstance(made, Chart):
+        name = file_name(made.name)
+        yield f"{name}.png", made.png
+        if svg:
+            yield f"{name}.svg", made.svg.encode()
+        if made.numbers is not None:
+            yield f"{name}.csv", made.numbers.to_csv(index=False, lineterminator="\n").encode()
+    else:
+        for part in made:
+            yield from files(part, svg)
+
+
+def rows_of(table: Table) -> list[tuple[str, list[tuple[str, str | None]]]]:
+    """Return title, and (text, rank) of each cell, of the rows of a table with one block."""
+    (block,) = table.blocks
+    ranks = [emphasis(block, index, table.columns) for index in range(len(table.columns))]
+    found = []
+    for number, row in enumerate(block.rows):
+        title, *texts = row.texts(table.columns)
+        found.append((title, [(text, rank.get(number)) for text, rank in zip(texts, ranks, strict=True)]))
+    return found
+
+
+def markdown(table: Table) -> str:
+    """Return GitHub Markdown, a table a block, with the best number of each column bold and the second underlined."""
+    parts = [f"## {_plain(table.title)}"]
+    for block in table.blocks:
+        single = table.single(block)
+        lines = [
+            [table.corner, *(column.heading for column in single.columns)],
+            ["---", *["---:"] * len(single.columns)],
+        ]
+        for title, cells in rows_of(single):
+            marked = (MARKDOWN_MARKS.get(rank, "<ins>{}</ins>").format(_escaped(text)) for text, rank in cells)
+            lines.append([_escaped(title), *marked])
+        parts.append("\n".join([f"### {_plain(block.title)}\n", *(f"| {' | '.join(line)} |" for line in lines)]))
+    if table.notes:
+        parts.append("\n".join(f"- {_escaped(note)}" for note in table.notes))
+    return "\n\n".join(parts) + "\n"
+
+
+def latex(table: Table) -> str:
+    """Return LaTeX with booktabs, a `table` a block, shrunk to the page, with the notes below the last one."""
+    wide = len(table.columns) > COLUMNS_OF_A_PAGE
+    lines = [f"% needs \\usepackage{{adjustbox, booktabs{', pdflscape' if wide else ''}}}"]
+    for number, block in enumerate(table.blocks):
+        single = table.single(block)
+        label = f"tab:{table.name}" + (f"-{number + 1}" if number else "")
+        lines += [
+            *([r"\begin{landscape}"] if wide else []),
+            r"\begin{table}",
+            r"  \centering",
+            f"  \\caption{{{escaped(table.title)}: {escaped(block.title)}}}\\label{{{label}}}",
+            r"  \begin{adjustbox}{max totalsize={\linewidth}{0.9\textheight}}",
+            f"  \\begin{{tabular}}{{l{'r' * len(single.columns)}}}",
+            r"    \toprule",
+            *_headings(single),
+            r"    \midrule",
+        ]
+        for title, cells in rows_of(single):
+            shown = (LATEX_COMMANDS.get(rank, r"\underline{{{}}}").format(_number(text)) for text, rank in cells)
+            lines.append(_line([escaped(title), *shown]))
+        lines += [r"    \bottomrule", r"  \end{tabular}", r"  \end{adjustbox}", r"\end{table}"]
+        lines += [r"\end{landscape}"] if wide else [r"\clearpage"]
+    notes = (f"\\noindent {escaped(note)}\\par" for note in table.notes)
+    return "\n".join([*lines, r"\begingroup\footnotesize", *notes, r"\endgroup"]) + "\n"
+
+
+def csv_text(table: Table) -> str:
+    """Return CSV with a line for each cell and all digits."""
+    return csv_rows(table).to_csv(index=False, lineterminator="\n")
+
+
+def csv_rows(table: Table) -> DataFrame:
+    """Return a row for each cell; `value` is empty where there is no number, and `status` says why."""
+    rows = []
+    for block in table.blocks:
+        columns = block.columns(table.columns)
+        ranks = [emphasis(block, index, columns) for index in range(len(columns))]
+        for number, row in enumerate(block.rows):
+            for cell, column, rank in zip(row.cells, columns, ranks, strict=True):
+                place = {"table": table.name, "block": block.title, "row": row.title}
+                place |= {"group": column.group, "column": column.title}
+                rows.append({**place, **cell.numbers, "rank": rank.get(number, "")})
+    return DataFrame(rows, dtype=object)
+
+
+def escaped(words: str) -> str:
+    """Return text that LaTeX prints as it is.
+
+    >>> escaped("50 % of a_b ↑")
+    '50 \\\\% of a\\\\_b $\\\\uparrow$'
+    """
+    return "".join(SPECIAL.get(character, character) for character in _printable(words))
+
+
+def _headings(table: Table) -> list[str]:
+    lines, first = [], 2
+    groups = [(group, len(list(columns))) for group, columns in groupby(table.columns, lambda column: column.group)]
+    if any(group for group, _ in groups):
+        cells, rules = [""], ""
+        for group, size in groups:
+            cells.append(f"\\multicolumn{{{size}}}{{c}}{{{escaped(group)}}}")
+            rules += f"\\cmidrule(lr){{{first}-{first + size - 1}}}" if group else ""
+            first += size
+        lines += [_line(cells), f"    {rules}"]
+    return [*lines, _line([escaped(table.corner), *(escaped(column.heading) for column in table.columns)])]
+
+
+def _number(shown: str) -> str:
+    mean, plus_minus, spread = shown.partition(" ± ")
+    text = f"${mean[0]}${mean[1:]}" if mean[:1] in ("+", "-") else escaped(mean)
+    return f"{text}{{\\tiny\\,$\\pm$\\,{escaped(spread)}}}" if plus_minus else text
+
+
+def _line(cells: list[str]) -> str:
+    guard = "{}" if cells[0][:1] in ("[", "*") else ""  # otherwise the end of the line above takes it as an argument
+    return f"    {guard}{' & '.join(cells)} \\\\"
+
+
+def _printable(words: str) -> str:
+    """Replace control characters, which a terminal obeys, and line breaks, which end a caption."""
+    return "".join(c if c.isprintable() else " " for c in words)
+
+
+def _plain(words: str) -> str:
+    """Return one line without HTML."""
+    return _printable(words).replace("<", "&lt;")
+
+
+def _escaped(words: str) -> str:
+    return _plain(words).replace("|", "\\|").replace("*", "\\*").replace("_", "\\_")
