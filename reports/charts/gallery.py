@@ -41,7 +41,7 @@ def charts(run_set: RunSet) -> list[Chart]:
 def _images(runs: DataFrame, view: str) -> list[tuple[str, Image.Image]]:
     """Return titles and images of a view: ground truth, then renders by falling PSNR; none if no file can be read."""
     truth, renders = None, []
-    for _, run in runs.iterrows():
+    for run in runs.to_dict("records"):
         try:
             truth, render, _ = split_picture(run["pictures"] / view, 3)
         except OSError:

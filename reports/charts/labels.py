@@ -106,7 +106,7 @@ def _obstruction(
     on_leaders = starts[:, None] + (ends - starts)[:, None] * np.linspace(0.1, 0.9, 9)[:, None]
     obstacles = np.concatenate([squares, taken])
     through = (on_leaders[:, :, None] >= obstacles[:, :2]) & (on_leaders[:, :, None] <= obstacles[:, 2:])
-    costs = ON_A_MARK * _overlap(boxes, squares).sum(1) + CROSSING * through.all(3).any(1).sum(1)
+    costs = ON_A_MARK * _overlap(boxes, squares).sum(1) + CROSSING * np.any(np.all(through, axis=3), axis=1).sum(1)
     return costs + NEARER_TO_ANOTHER * (nearest < np.linalg.norm(ends - starts, axis=1))
 
 
@@ -125,5 +125,5 @@ def _along(corners: NDArray) -> NDArray:
     """Return points [n, 2] at most `STEP` apart on a line through corners [m, 2]."""
     steps = np.linalg.norm(np.diff(corners, axis=0), axis=1) / STEP
     counts = np.maximum(steps.astype(int), 1)
-    pieces = [np.linspace(*ends, count + 1) for *ends, count in zip(corners, corners[1:], counts, strict=False)]
+    pieces = [np.linspace(a, b, count + 1) for a, b, count in zip(corners, corners[1:], counts, strict=False)]
     return np.concatenate(pieces) if pieces else np.zeros((0, 2))

@@ -162,8 +162,8 @@ def _values(setting: Setting, keys: Sequence[str]) -> str:
 
 def _set_axes(panel: Any, sweep: Sweep, index: int, measure: Measure) -> None:
     xs = [x for curve in sweep.curves for x, _ in curve.points]
-    cells = [cells[index] for curve in sweep.curves for _, cells in curve.points if cells[index].value is not None]
-    ends = [cell.value + sign * (cell.std or 0.0) for cell in cells for sign in (-1, 1)]
+    cells = [cells[index] for curve in sweep.curves for _, cells in curve.points]
+    ends = [c.value + sign * (c.std or 0.0) for c in cells if c.value is not None for sign in (-1, 1)]
     Axis.of(ends).apply(panel.yaxis)
     panel.set_title(measure.column.heading, fontsize=9)
     panel.set_xlabel(sweep.key or "setting")

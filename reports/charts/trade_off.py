@@ -68,7 +68,7 @@ class TradeOff:
 
     @property
     def on_cpu(self) -> bool:
-        """Whether to show CPU time, which other programs disturb less: all runs have it, and none used a GPU."""
+        """True if CPU time is shown, which other programs disturb less: all runs have it, and none used a GPU."""
         own = self.runs.loc[self.runs["ok"]]
         return bool(own["cpu_seconds"].notna().all() and own["peak_gpu_gigabytes"].isna().all())
 

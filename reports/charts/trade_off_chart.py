@@ -141,7 +141,7 @@ class Panel:
         measures = (self.cost, self.trade_off.quality)
         x_std, y_std = (mark.point.numbers[measure.column.title].std for measure in measures)
         (x, y), (x_side, y_side) = mark.at, mark.sides
-        along = [[(max(x - x_std, x / 10), y), (x + x_std, y)]] if x_std and not x_side else []
+        along: list[Line] = [[(max(x - x_std, x / 10), y), (x + x_std, y)]] if x_std and not x_side else []
         return along + ([[(x, y - y_std), (x, y + y_std)]] if y_std and not y_side else [])
 
 
