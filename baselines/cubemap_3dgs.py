@@ -22,10 +22,10 @@ from padgs.render import RenderConfig, RenderOptions
 from padgs.render.contract import check_camera
 from padgs.render.cubemap import FACES, FINENESS
 from padgs.scene import Scene, View
-from padgs.training.budget import Budget
+from padgs.training.corrections import GIVEN, LEARNED
 from padgs.training.loop import Record, Stage, Trainer
-from padgs.training.trainee import Trainee
-from padgs.training.views.corrections import GIVEN, LEARNED
+from padgs.training.model import Model
+from padgs.training.options import Budget
 
 
 def of_cut_views(options: RenderOptions) -> RenderOptions:
@@ -100,5 +100,6 @@ class Cubemap3DGSMethod(SplatMethod):
         times_seen = len(self.turns()) * solid_angle(lens) / (4 * math.pi)
         return max(1, round(len(cut.train) / len(scene.train) / times_seen))
 
-    def _trained_by(self, trainee: Trainee, scene: Scene, budget: Budget, stage: Stage) -> Trainer:
+    def build_trainer(self, trainee: Model, scene: Scene, budget: Budget, stage: Stage) -> Trainer:
+        """See `Method.build_trainer`."""
         return Trainer(trainee, scene, budget, self.train_options, self.seed, views_each=self._views_each, stage=stage)

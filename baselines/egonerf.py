@@ -12,11 +12,10 @@ from padgs.methods.egonerf.ray_trainer import RayTrainer
 from padgs.methods.egonerf.trainee import EgoNeRFTrainee, EgoNeRFTraining
 from padgs.render import RenderConfig
 from padgs.scene import Scene
-from padgs.training.budget import Budget
 from padgs.training.loop import Stage
 from padgs.training.method import Method
-from padgs.training.options import TrainOptions
-from padgs.training.trainee import State
+from padgs.training.model import State
+from padgs.training.options import Budget, TrainOptions
 
 BACKENDS = ("auto", "torch")
 
@@ -57,17 +56,20 @@ class EgoNeRFMethod(Method):
         """There is nothing to leave out."""
         raise ValueError("egonerf has no Gaussians that could be left out, as need does; take a method that has")
 
-    def _start(self, scene: Scene, iterations: int) -> EgoNeRFTrainee:
+    def build_model(self, scene: Scene, iterations: int) -> EgoNeRFTrainee:
+        """See `Method.build_model`."""
         return EgoNeRFTrainee(EgoNeRF.from_scene(scene, self.options, self.seed), self.options, iterations)
 
-    def _blank(self, state: State) -> EgoNeRFTrainee:
+    def restore(self, state: State) -> EgoNeRFTrainee:
+        """See `Method.restore`."""
         stored = state.of_model()
         centre = torch.tensor(stored.values["centre"], dtype=torch.float64)
         model = EgoNeRF(self.options, centre, *(stored.values[name] for name in ("unit", "travel", "kind")))
         model = model.to(next(iter(stored.tensors.values())).device)
         return EgoNeRFTrainee(model, self.options, self.options.environment_pretraining + 1)
 
-    def _trained_by(self, trainee: EgoNeRFTrainee, scene: Scene, budget: Budget, stage: Stage) -> RayTrainer:
+    def build_trainer(self, trainee: EgoNeRFTrainee, scene: Scene, budget: Budget, stage: Stage) -> RayTrainer:
+        """See `Method.build_trainer`."""
         return RayTrainer(trainee, scene, budget, self.train_options, self.seed, rays=self.options.rays, stage=stage)
 
     def _refuse_impossible(self) -> None:

@@ -23,12 +23,12 @@ from padgs.methods.calibration.splats import CalibratedMethod, Calibration
 from padgs.methods.splats.method import SplatOptions
 from padgs.render import Rendering
 from padgs.scene import Scene, View
+from padgs.training.corrections import PoseRates, PoseRefinement
 from padgs.training.loss import pixel_weight
+from padgs.training.model import State, TrainingRender
 from padgs.training.options import TrainOptions
 from padgs.training.schedule import Constant, ParameterGroup
 from padgs.training.targets import Target
-from padgs.training.trainee import Drawing, State
-from padgs.training.views.poses import PoseRates, PoseRefinement
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class SelfCalibration(Calibration):
             ParameterGroup("camera_offsets", (camera.offsets,), Constant(options.distortion_rate), paced=False),
         ]
 
-    def draw(self, draw: Callable[..., Drawing], view: View) -> Drawing:
+    def draw(self, draw: Callable[..., TrainingRender], view: View) -> TrainingRender:
         """The ideal panorama at the refined pose; the photograph is resampled to it."""
         drawing, options = draw(self.poses.refined(view)), self._options
         penalty = options.roughness_weight * self.camera.roughness()
@@ -124,7 +124,7 @@ class SCOmniGSMethod(CalibratedMethod):
         Raises:
             ValueError: a view of another size than the training views.
         """
-        trainee, calibration = self.trainee, self.trainee.calibration
+        trainee, calibration = self.model, self.model.calibration
         poses, camera = calibration.poses, calibration.camera
         if (view.width, view.height) != (camera.width, camera.height):
             raise ValueError(

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from padgs.data import load as load_scene
     from padgs.geometry.distortion import distortion_map
     from padgs.multirun.composition import make_method
-    from padgs.runs.opened import draw, load_run
-    from padgs.training.budget import Budget
+    from padgs.runs.load import draw, load_run
+    from padgs.training.options import Budget
 
 # Threads that wait for the next parallel piece of work must sleep, not spin: on a machine with other work on it,
 # spinning made training 20 times slower. Has to be said before torch loads its OpenMP runtime.
@@ -30,9 +30,9 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 _HOMES = {
     "load_scene": ("padgs.data", "load"),
     "make_method": ("padgs.multirun.composition", "make_method"),
-    "Budget": ("padgs.training.budget", "Budget"),
-    "draw": ("padgs.runs.opened", "draw"),
-    "load_run": ("padgs.runs.opened", "load_run"),
+    "Budget": ("padgs.training.options", "Budget"),
+    "draw": ("padgs.runs.load", "draw"),
+    "load_run": ("padgs.runs.load", "load_run"),
     "distortion_map": ("padgs.geometry.distortion", "distortion_map"),
 }
 __all__ = ["Budget", "distortion_map", "draw", "load_run", "load_scene", "make_method"]

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
-from typing import Any
+import sys
+import types
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import MISSING, fields, is_dataclass
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 
 def check(options: object, rule: str, holds: Callable[[Any], bool], *names: str) -> None:
@@ -28,3 +31,117 @@ def check_known(options: object, **known: Collection[str]) -> None:
         value = getattr(options, name)
         if value not in names:
             raise ValueError(f"unknown {name} {value!r}; known: {', '.join(names)}")
+
+
+T = TypeVar("T")
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot be used; the message names the key, the value and what is known."""
+
+
+def typed(kind: type[T], values: Mapping[str, Any], where: str = "") -> T:
+    """An instance of the dataclass `kind` with some of its fields set, nested dataclasses included.
+
+    Args:
+        kind: a dataclass; its checks in `__post_init__` run.
+        values: field -> value; fields that are left out keep their defaults.
+        where: key of `values` in the whole configuration, for messages.
+
+    Raises:
+        ConfigError: unknown keys (the known ones are listed), missing ones, or values of another type.
+
+    >>> from dataclasses import dataclass
+    >>> @dataclass
+    ... class Range:
+    ...     first: float
+    ...     last: float = 1.0
+    >>> typed(Range, {"first": 0})
+    Range(first=0.0, last=1.0)
+    """
+    hints = get_type_hints(kind)
+    known = [field.name for field in fields(kind) if field.init]  # type: ignore[arg-type]
+    unknown = [key for key in values if key not in known]
+    if unknown:
+        raise ConfigError(f"unknown key {_join(where, unknown[0])}; known: {', '.join(_join(where, k) for k in known)}")
+    required = [f.name for f in fields(kind) if f.default is MISSING and f.default_factory is MISSING]  # type: ignore[arg-type]
+    missing = [name for name in required if name not in values]
+    if missing:
+        raise ConfigError(f"{_join(where, missing[0])} is not set")
+    try:
+        return kind(**{key: _value(hints[key], value, _join(where, key)) for key, value in values.items()})
+    except ConfigError:
+        raise
+    except ValueError as error:
+        raise ConfigError(f"{where}: {error}" if where else str(error)) from error
+
+
+def _value(kind: Any, value: Any, where: str) -> Any:
+    origin = get_origin(kind)
+    if kind is Any:
+        return value
+    if origin in (Union, types.UnionType):
+        return _first_fit(get_args(kind), value, where)
+    if is_dataclass(kind) and isinstance(value, Mapping):
+        return typed(kind, value, where)  # type: ignore[arg-type]
+    if isinstance(origin, type) and issubclass(origin, Mapping) and isinstance(value, Mapping):
+        item = get_args(kind)[1]
+        return {str(key): _value(item, entry, _join(where, str(key))) for key, entry in value.items()}
+    if origin is tuple and isinstance(value, Sequence) and not isinstance(value, str):
+        return _tuple(get_args(kind), value, where)
+    if kind is type(None) and value is None:
+        return None
+    if kind is bool and isinstance(value, bool):
+        return value
+    if kind is str and isinstance(value, str):
+        if any(0xD800 <= ord(character) < 0xE000 for character in value):
+            raise ConfigError(f"{where} is {value!r}, which is not Unicode; rename what it names")
+        return value
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        if not -sys.float_info.max <= value <= sys.float_info.max:
+            raise ConfigError(f"{where} is {value}; it must be finite")
+        if kind is float or kind is int and value == int(value):
+            return kind(value)
+    raise ConfigError(f"{where} is {value!r}; it must be {_name(kind)}")
+
+
+def _first_fit(kinds: tuple[Any, ...], value: Any, where: str) -> Any:
+    if type(value) in kinds:
+        return _value(type(value), value, where)
+    for kind in kinds:
+        try:
+            return _value(kind, value, where)
+        except ConfigError:
+            if is_dataclass(kind) and isinstance(value, Mapping):
+                raise  # what is wrong inside says more than that nothing fits
+    raise ConfigError(f"{where} is {value!r}; it must be {' or '.join(_name(kind) for kind in kinds)}")
+
+
+def _tuple(kinds: tuple[Any, ...], value: Sequence[Any], where: str) -> tuple[Any, ...]:
+    if len(kinds) == 2 and kinds[1] is Ellipsis:
+        kinds = (kinds[0],) * len(value)
+    if len(kinds) != len(value):
+        raise ConfigError(f"{where} is {list(value)}; it must have {len(kinds)} entries")
+    return tuple(_value(kind, entry, f"{where}[{i}]") for i, (kind, entry) in enumerate(zip(kinds, value, strict=True)))
+
+
+def _name(kind: Any) -> str:
+    names = {type(None): "null", bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
+    if is_dataclass(kind) or get_origin(kind) is Mapping:
+        return "a group of keys"
+    return names.get(kind) or getattr(kind, "__name__", str(kind))
+
+
+def _join(where: str, key: str) -> str:
+    return f"{where}.{key}" if where else key
+
+
+def install_command(extra: str) -> str:
+    """Return the command that installs an extra of pyproject.toml for the running Python.
+
+    >>> install_command("video").partition(" -m ")[2]
+    "pip install 'padgs[video]'"
+    """
+    import shlex
+
+    return shlex.join([sys.executable, "-m", "pip", "install", f"padgs[{extra}]"])

@@ -22,10 +22,19 @@ from typing import Any, TypeVar
 
 import torch
 
-from padgs.stopwatch import Lap
-
 T = TypeVar("T")
 Device = torch.device | str
+
+
+class Lap:
+    """Wall and CPU time since construction."""
+
+    def __init__(self) -> None:
+        self._wall, self._cpu = time.perf_counter(), time.process_time()
+
+    def seconds(self) -> tuple[float, float]:
+        """Return (wall, CPU) seconds since construction; CPU time is summed over all threads of the process."""
+        return time.perf_counter() - self._wall, time.process_time() - self._cpu
 
 
 def synchronise(device: Device = "cpu") -> None:

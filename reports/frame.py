@@ -18,13 +18,13 @@ from pandas import DataFrame
 
 from padgs.reports.published import Place
 from padgs.reports.store import Run
-from padgs.results import BY_ITSELF, DECIDE_NOTHING, Result, Scores, picture_name
+from padgs.results import AD_HOC, DECIDE_NOTHING, Result, Scores, picture_name
 
 CONFIG = "config."  # prefix of a dotted key
 WITHOUT_EFFECT = ("seed", *DECIDE_NOTHING)  # keys that make no other setting; a section stands for all its keys
 INPUT_RANGES = {"01": "[0, 1]", "11": "[-1, 1]"}
 PUBLISHED_ITERATIONS, LARGEST_FACTOR = 30_000, 8.0
-LEAST_WIDTH = 512  # pixels of views that are made smaller, as in `padgs.training.views.sizes`, without torch
+LEAST_WIDTH = 512  # pixels of views that are made smaller, as in `padgs.training.targets`, without torch
 
 
 def frame(runs: Iterable[Run]) -> DataFrame:
@@ -196,7 +196,7 @@ FACTS: Mapping[str, Callable[[Result], Any]] = {
             *("code_version", "finished", "need"),
         )
     },
-    "experiments": lambda result: result.experiments or (BY_ITSELF,),
+    "experiments": lambda result: result.experiments or (AD_HOC,),
     "place": lambda result: Place(result.dataset, result.scene),
     "resolution": lambda result: f"{result.width}x{result.height}",
     "data": lambda result: result.fingerprint[:10],

@@ -15,7 +15,7 @@ from padgs.reports.frame import CONFIG, decides, grouped
 from padgs.reports.measures import metrics
 from padgs.reports.published import Place
 from padgs.reports.table import ReportError
-from padgs.results import BY_ITSELF
+from padgs.results import AD_HOC
 
 LABELS = {"learning_rates": "learning rates ", "data": "data "}  # for columns whose values need one
 
@@ -111,7 +111,7 @@ class RunSet:
         if self.request.experiment:
             return runs
         own = self.of_experiments(*REPORTS[name].experiments)
-        free = runs.loc[~runs["place"].isin(own["place"]) & (runs["experiments"].map(lambda of: BY_ITSELF in of))]
+        free = runs.loc[~runs["place"].isin(own["place"]) & (runs["experiments"].map(lambda of: AD_HOC in of))]
         return runs.loc[[*own.index, *free.index]] if len(own) + len(free) else runs
 
     def of_experiments(self, *names: str) -> DataFrame:

@@ -17,7 +17,7 @@ from typing import Any
 from PIL import Image
 
 from padgs import results
-from padgs.replacing import replace_file
+from padgs.files import write_atomically
 from padgs.results import Result, ResultError
 
 FILE_NAME = "results.jsonl"
@@ -58,7 +58,7 @@ def read(source: Path) -> tuple[list[Run], list[ResultError]]:
 
 
 def add(runs: Iterable[Run], store: Path) -> list[Run]:
-    """Add runs to a store, replacing those of the same name; return all runs in it.
+    """Add runs to a store, atomic_path those of the same name; return all runs in it.
 
     Raises:
         ResultError: a line of the store is damaged, and would be lost.
@@ -71,7 +71,7 @@ def add(runs: Iterable[Run], store: Path) -> list[Run]:
     merged = [by_name[name] for name in sorted(by_name)]
     lines = ({**(run.document or results.encoded(run.result)), "log": run.log} for run in merged)
     texts = (json.dumps(line, separators=(",", ":"), allow_nan=False) for line in lines)
-    replace_file(store, "".join(f"{text}\n" for text in texts).encode())
+    write_atomically(store, "".join(f"{text}\n" for text in texts).encode())
     return merged
 
 

@@ -27,7 +27,8 @@ from processes import SMALLEST
 from padgs import results
 from padgs.cli.commands import app
 from padgs.multirun import job, run, sweeper  # noqa: F401 - before the first fork
-from padgs.runs import checkpoint, session  # noqa: F401
+from padgs.runs import checkpoint
+from padgs.runs import run as pipeline  # noqa: F401
 
 TINY = [*SMALLEST, "train.iterations=60", "run.checkpoint_every=5", "run.probe_every=20", "tracking=none"]
 TIMES = re.compile(r'"(cpu_)?seconds": [0-9.]+')

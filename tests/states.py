@@ -2,7 +2,7 @@
 
 import torch
 
-from padgs.training.trainee import State
+from padgs.training.model import State
 
 TIMES = {"seconds": 0, "cpu_seconds": 0, "step_seconds": 0}
 

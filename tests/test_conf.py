@@ -11,6 +11,7 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
 from padgs.baselines import METHODS
+from padgs.checks import ConfigError
 from padgs.data.datasets import DATASETS
 from padgs.data.perturb import CONDITIONS
 from padgs.data.synthetic.options import SyntheticOptions
@@ -29,7 +30,6 @@ from padgs.render import RenderConfig
 from padgs.reports.conditions import CALIBRATES
 from padgs.runs.config import RunOptions, TrainConfig
 from padgs.runs.tracking.tracker import TrackingOptions
-from padgs.runs.typed import ConfigError
 from padgs.training.options import TrainOptions
 
 CONF = Path(__file__).resolve().parent.parent / "conf"

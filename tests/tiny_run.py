@@ -6,7 +6,7 @@ import pytest
 from rich.console import Console
 
 from padgs.multirun.composition import composing, configuration
-from padgs.runs.session import Session
+from padgs.runs.run import run
 
 SETTINGS = [
     "train.iterations=30",
@@ -29,5 +29,5 @@ def tiny_run(factory: pytest.TempPathFactory, *settings: str) -> Path:
         runs = factory.mktemp("runs")
         with composing():
             config = configuration(["method=omnigs", *SETTINGS, *settings, f"run.folder={runs}"])
-        Session(config, Console(quiet=True)).run()
+        run(config, Console(quiet=True))
     return next(path.parent for path in runs.glob("*/result.json"))

@@ -31,8 +31,9 @@ class MyMethod(SplatMethod):
     Options = MyOptions
     RENDER = RenderConfig(projection="ray")
 
-    def _start(self, scene: Scene, iterations: int) -> SplatTrainee:
-        trainee = super()._start(scene, iterations)
+    def build_model(self, scene: Scene, iterations: int) -> SplatTrainee:
+        """See `Method.build_model`."""
+        trainee = super().build_model(scene, iterations)
         with torch.no_grad():
             trainee.splats.log_scales -= math.log(self.options.thinner)
         return trainee

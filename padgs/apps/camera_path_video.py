@@ -19,10 +19,10 @@ import numpy as np
 from PIL import Image
 from torch import Tensor
 
+from padgs.checks import install_command
 from padgs.evaluation.images import depth_image, to_uint8
-from padgs.extras import installing
+from padgs.files import atomic_path
 from padgs.render import Rendering
-from padgs.replacing import replacing
 from padgs.scene import View
 
 WriteFrame = Callable[[np.ndarray], None]  # of [H, W, 3] uint8, or [H, W] uint16
@@ -110,9 +110,11 @@ def _mp4(path: Path, view: View, fps: float, spherical: bool) -> Iterator[WriteF
     try:
         import av
     except ImportError as error:
-        raise ValueError(f"writing {path} needs PyAV: {installing('video')}; a folder for PNGs does not") from error
+        raise ValueError(
+            f"writing {path} needs PyAV: {install_command('video')}; a folder for PNGs does not"
+        ) from error
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as draft:
+    with atomic_path(path) as draft:
         with av.open(str(draft), "w") as video:
             options = {"crf": "18", **COLOURS}
             stream = video.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000), options=options)

@@ -28,7 +28,7 @@ def bench(
 
     from padgs.apps.bench.report import QUICK, BenchOptions, measure_all
     from padgs.apps.bench.tables import lines
-    from padgs.replacing import replace_file
+    from padgs.files import write_atomically
 
     usual = QUICK if quick else BenchOptions(repeats=10 if device == "cpu" else 50)
     sizes = (*usual.sizes, "large") if full else usual.sizes
@@ -39,7 +39,7 @@ def bench(
     file.parent.mkdir(parents=True, exist_ok=True)  # before minutes of measuring, not after
 
     def keep(report: dict) -> None:
-        replace_file(file, json.dumps(report, indent=1, allow_nan=False).encode())
+        write_atomically(file, json.dumps(report, indent=1, allow_nan=False).encode())
 
     with console.status("measuring") as status:
         report = measure_all(options, lambda what: status.update(f"measuring {what}"), keep)

@@ -24,7 +24,7 @@ def need(
 
     from padgs.need.entry import search
     from padgs.runs.interrupt import INTERRUPTED, Interrupted
-    from padgs.runs.opened import load_run
+    from padgs.runs.load import load_run
 
     console = Console(highlight=False, soft_wrap=True)
     try:

@@ -10,21 +10,21 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from padgs.runs.opened import OpenedRun
+    from padgs.runs.load import LoadedRun
 
 Run = Annotated[str, typer.Argument(help="folder of a run, finished or not, as padgs-run names it at its end")]
 DataPath = Annotated[str | None, typer.Option("--data", help="where its data set is now, if not where it was")]
 
 
-def opened(run: str, data: str | None) -> OpenedRun:
+def opened(run: str, data: str | None) -> LoadedRun:
     """The run of a folder.
 
     Raises:
         ValueError, OSError: it cannot be opened.
     """
     from padgs.runs.checkpoint import CheckpointError
-    from padgs.runs.folder import RunFolderError
-    from padgs.runs.opened import load_run
+    from padgs.runs.load import load_run
+    from padgs.runs.store import RunFolderError
 
     try:
         return load_run(run, data_path=data)

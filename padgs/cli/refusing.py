@@ -9,7 +9,7 @@ from typing import TextIO
 
 import typer
 
-from padgs.runs.terminal import printable
+from padgs.runs.console import printable
 
 
 def show(text: str, stream: TextIO | None = None) -> None:

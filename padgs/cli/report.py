@@ -11,10 +11,10 @@ from typing import Annotated
 import typer
 
 from padgs.cli.refusing import refusing, show
-from padgs.replacing import replace_file
+from padgs.files import write_atomically
 from padgs.reports import REPORTS, store
 from padgs.reports.table import ReportError
-from padgs.results import ASKED, FILE_NAME, ResultError
+from padgs.results import FILE_NAME, STOP_REQUESTED, ResultError
 
 ALL = "all"
 
@@ -61,7 +61,7 @@ def report(
         hint = f"{source} is one run: give {source.resolve().parent}" if single_run else "give a folder of run folders"
         raise ReportError(f"no result that can be used is in {source}; {hint}")
     run_set = RunSet(frame(found), request, tuple(map(str, broken)))
-    if early := [run.result.run for run in found if run.result.ended == ASKED]:
+    if early := [run.result.run for run in found if run.result.ended == STOP_REQUESTED]:
         run_set.warnings.append(f"asked to stop before their end, and so in no table but `runs`: {', '.join(early)}")
     refused = 0
     single = what != ALL
@@ -77,7 +77,7 @@ def report(
         with _writing_to(target):
             for file, content in texts.items():
                 (target / file).parent.mkdir(parents=True, exist_ok=True)
-                replace_file(target / file, content)
+                write_atomically(target / file, content)
         if what == name and f"{name}.md" in texts:
             show(texts[f"{name}.md"].decode())
     print(f"{len(found)} results, {len(broken)} left out; see {target}", file=sys.stderr)

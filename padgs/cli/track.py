@@ -27,7 +27,7 @@ def track(
         show(f"left out: {error}")
     asked, trackers = TrackingOptions("mlflow", uri or None), dict[str, Tracker]()
     for folder, result in found.items():
-        experiment = " ".join(name for name in result.experiments if name != results.BY_ITSELF)
+        experiment = " ".join(name for name in result.experiments if name != results.AD_HOC)
         if experiment not in trackers:
             trackers[experiment] = Tracker(asked, Path(runs), experiment, show)
         trackers[experiment].update(folder)

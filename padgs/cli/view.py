@@ -12,7 +12,7 @@ from padgs.cli.opening import DataPath, Run, naming_data, opened
 from padgs.cli.refusing import refusing
 
 if TYPE_CHECKING:
-    from padgs.runs.opened import OpenedRun
+    from padgs.runs.load import LoadedRun
 
 
 @refusing(ValueError, OSError)
@@ -35,7 +35,7 @@ def view(
         if not (Path(folder) / results.CONFIG_NAME).is_file():
             opened(folder, data)  # says what is wrong before a page stands
 
-    def of_one_scene() -> list[OpenedRun]:
+    def of_one_scene() -> list[LoadedRun]:
         from padgs.apps.viewer.process import wait_for_checkpoint
 
         runs, names = [], []

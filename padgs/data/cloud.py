@@ -11,7 +11,7 @@ from torch import Tensor
 
 from padgs.data.camera_paths import centers
 from padgs.data.capture import Capture, Cloud, DataError, color_bytes
-from padgs.replacing import replacing
+from padgs.files import atomic_path
 
 _COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 
@@ -66,7 +66,7 @@ def write_ply(path: Path, cloud: Cloud) -> None:
         columns += [*cloud.colors.T.numpy()]
         fields += [(channel, "u1") for channel in _COLORS[0]]
     vertex = np.rec.fromarrays(columns, dtype=fields)
-    with replacing(path) as draft:
+    with atomic_path(path) as draft:
         PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(draft))
 
 

@@ -15,7 +15,7 @@ from padgs.evaluation.protocols import Protocol
 from padgs.render import Rendering
 from padgs.results import Scores
 from padgs.scene import View
-from padgs.training.failure import Failure
+from padgs.training.health import Failure
 
 Metrics = dict[str, float | None]  # metric -> value; None = missing (no LPIPS weights, or no weighted pixel)
 ExtraMetrics = Callable[[View, Rendering], Metrics]  # metrics that need more than the image

@@ -65,7 +65,7 @@ PROTOCOLS = {
         lpips_inputs="11",
         solid_angle=True,
     ),
-    # Signs of failed training; `padgs.runs.scoring` adds diagnostics, and scores of training views and of one colour.
+    # Signs of failed training; `padgs.evaluation.scoring` adds diagnostics, and scores of training views and of one colour.
     "stability": Protocol(
         "stability",
         ("ws_psnr", "ws_psnr_equator", "ws_psnr_pole", "seam"),

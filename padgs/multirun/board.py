@@ -13,9 +13,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TextIO
 
-from padgs.replacing import replace_file
+from padgs.files import write_atomically
 from padgs.results import STATUSES
-from padgs.runs.session import Watch
+from padgs.runs.run import Callback
 
 WAITING, RUNNING, OK = "waiting", "running", "ok"
 # Ends of a job beside the statuses of results, without any:
@@ -58,7 +58,7 @@ class Board:
         """Say what a job does; a full disk must not end it, so nothing is raised."""
         with suppress(OSError):
             self.folder.mkdir(parents=True, exist_ok=True)
-            replace_file(self._path(job), json.dumps(asdict(state)).encode())
+            write_atomically(self._path(job), json.dumps(asdict(state)).encode())
 
     def read(self, job: int) -> JobState:
         """What a job does; waiting, if it has not said anything."""
@@ -89,7 +89,7 @@ class Board:
         return self.folder / f"{job:05d}.json"
 
 
-class BoardEntry(Watch):
+class BoardEntry(Callback):
     """Writes what a job does on the board of its multirun."""
 
     def __init__(self, board: Board, number: int) -> None:

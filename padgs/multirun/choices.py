@@ -18,7 +18,7 @@ from padgs.multirun.overrides import root
 from padgs.registry import lookup
 from padgs.render import RenderConfig
 from padgs.runs.config import default_fields, method_fields
-from padgs.runs.terminal import say
+from padgs.runs.console import say
 from padgs.training.options import TrainOptions
 
 

@@ -15,8 +15,8 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from padgs.multirun.choices import register_choices
 from padgs.multirun.overrides import lenient, quoted, root
 from padgs.runs.config import DEFAULT_METHOD, RunConfig, config_from_values
-from padgs.runs.identity import labels
-from padgs.runs.session import build
+from padgs.runs.run import build_method
+from padgs.runs.store import labels
 from padgs.training.method import Method
 
 
@@ -65,4 +65,4 @@ def make_method(name: str = DEFAULT_METHOD, *settings: str) -> Method:
         HydraException: there is no such method.
     """
     with composing():
-        return build(configuration([f"method={name}", *settings]))
+        return build_method(configuration([f"method={name}", *settings]))

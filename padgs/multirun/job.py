@@ -22,15 +22,13 @@ from padgs.need.entry import search
 from padgs.results import NEED_STATED, Result
 from padgs.runs.checkpoint import CheckpointError
 from padgs.runs.config import RunConfig
-from padgs.runs.folder import RunFolderError
+from padgs.runs.console import say
 from padgs.runs.interrupt import Interrupted
-from padgs.runs.lock import RunBusy
-from padgs.runs.opened import load_run
-from padgs.runs.session import Session, Watch
-from padgs.runs.terminal import say
+from padgs.runs.load import load_run
+from padgs.runs.run import Callback, load_scene, run, start
+from padgs.runs.store import RunBusy, RunFolderError, RunStore
 from padgs.runs.tracking.tracker import SECONDS_BETWEEN_LOOKS, Tracker
-from padgs.training.failure import Failure
-from padgs.training.stopping import set_apart
+from padgs.training.health import Failure, validation_split
 
 # A traceback would only hide what these say. Failure is one of a search for needs: those of training are results.
 EXPECTED = (ValueError, OSError, Failure, CheckpointError, RunFolderError, RunBusy)
@@ -91,20 +89,19 @@ def _data_of(config: RunConfig) -> str | None:
     return None if config.data.path is None else str(Path(config.data.path).absolute())
 
 
-def done(config: RunConfig, console: Console, watch: Watch) -> Result:
+def done(config: RunConfig, console: Console, callback: Callback) -> Result:
     """Do what is missing of a run, and of the search for what its scene needs, if that is asked for."""
-    session = Session(config, console, watch)
+    scene = load_scene(config, start(config))
+    folder = RunStore.of(config, scene).path
     if config.need == "on":
-        set_apart(session.scene.train)  # refuses too few views before hours of training
-    page = (
-        serve_training(session.folder.path, config.data.path, config.run.device) if config.run.view else nullcontext()
-    )
+        validation_split(scene.train)  # refuses too few views before hours of training
+    page = serve_training(folder, config.data.path, config.run.device) if config.run.view else nullcontext()
     with page:
-        result = session.run()
+        result = run(config, console, callback, scene)
     if config.need == "on" and result.ok:
-        run = load_run(session.folder.path, data_path=config.data.path, device=config.run.device)
-        run.scene = session.scene  # whose panoramas are loaded
-        search(run, NEED_STATED, console, watch.stop_requested)
+        finished = load_run(folder, data_path=config.data.path, device=config.run.device)
+        finished.scene = scene  # whose panoramas are loaded
+        search(finished, NEED_STATED, console, callback.stop_requested)
     return result
 
 
@@ -118,7 +115,7 @@ def in_own_process(hydra: DictConfig | HydraConf) -> bool:
     return not str(hydra.launcher._target_).endswith("BasicLauncher")
 
 
-class TrackedRun(Watch):
+class TrackedRun(Callback):
     """Mirrors the only run of a process, now and then."""
 
     def __init__(self, tracker: Tracker) -> None:

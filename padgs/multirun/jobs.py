@@ -16,19 +16,18 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from padgs import results
+from padgs.checks import typed
 from padgs.multirun.board import CRASHED, ELSEWHERE, KILLED, REFUSED, RUNNING, Board, JobState
 from padgs.multirun.finished import FinishedJobs
 from padgs.multirun.job import complain, in_own_process
 from padgs.multirun.launchers import patient
 from padgs.multirun.overview import Overview, share_done, shown
 from padgs.results import Result, ResultError
-from padgs.runs.folder import RunFolder, cannot_write
-from padgs.runs.identity import labels
+from padgs.runs.console import say
 from padgs.runs.interrupt import Interrupt, Interrupted
-from padgs.runs.outcome import RETRIED
-from padgs.runs.terminal import say
+from padgs.runs.run import RETRIED
+from padgs.runs.store import RunStore, cannot_write, labels
 from padgs.runs.tracking.tracker import SECONDS_BETWEEN_LOOKS, Tracker, TrackingOptions
-from padgs.runs.typed import typed
 
 ATTEMPTS = 2  # of a job whose process died: it may have been the fault of another one
 
@@ -181,7 +180,7 @@ class Multirun:
 
     def _result(self, state: JobState) -> Result | None:
         with suppress(ResultError):
-            return RunFolder(self.runs / state.run).result() if state.run else None
+            return RunStore(self.runs / state.run).result() if state.run else None
 
     def _say(self, text: str) -> None:
         say(self._console, text)

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from padgs.extras import installing
+from padgs.checks import install_command
 
 PACKAGES = {  # choice of conf/launcher -> module of its plugin, extra of pyproject.toml
     "local": ("hydra_plugins.hydra_joblib_launcher", "launchers"),
@@ -29,7 +29,7 @@ def missing_plugin(arguments: Sequence[str]) -> str | None:
         except ModuleNotFoundError:  # there are no plugins at all
             found = False
         if not found:
-            return f"launcher={name} needs {module.partition('.')[2]}: {installing(extra)}"
+            return f"launcher={name} needs {module.partition('.')[2]}: {install_command(extra)}"
     return None
 
 

@@ -16,7 +16,7 @@ from rich.text import Text
 
 from padgs import results
 from padgs.multirun.board import ELSEWHERE, OK, RUNNING, STOPPED, WAITING, JobState
-from padgs.runs.live import Display, duration
+from padgs.runs.console import Display, duration
 
 SECONDS_BETWEEN_LOOKS = 1.0
 SECONDS_BETWEEN_LINES = 30.0  # where there is no terminal

@@ -18,7 +18,7 @@ def main() -> None:
     try:
         sys.exit(_run(arguments))
     except KeyboardInterrupt as stopped:
-        from padgs.runs.terminal import printable
+        from padgs.runs.console import printable
 
         advice = f"{str(stopped) or 'stopped'}; to go on: {shlex.join(['padgs-run', *arguments])}"
         print(printable(advice), file=sys.stderr)
@@ -37,7 +37,7 @@ def _run(arguments: Sequence[str]) -> int:
     if folder := only_run(arguments):
         from rich.console import Console
 
-        from padgs.runs.summary import show_result
+        from padgs.runs.console import show_result
 
         console = Console()
         console.print("finished before, nothing to do")

@@ -16,12 +16,12 @@ from hydra.plugins.sweeper import Sweeper
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
+from padgs.checks import typed
 from padgs.multirun.board import REFUSED
 from padgs.multirun.job import complain, job_of_many
 from padgs.multirun.jobs import Multirun
 from padgs.multirun.overrides import expand
 from padgs.runs.config import RunOptions
-from padgs.runs.typed import typed
 
 ENDS: Counter[str] = Counter()  # how the runs of the last multirun ended; Hydra's main returns nothing
 

@@ -9,7 +9,7 @@ from padgs.evaluation.metrics import BANDS
 from padgs.evaluation.protocols import PROTOCOLS
 from padgs.results import Scores
 from padgs.scene import View
-from padgs.training.stopping import set_apart
+from padgs.training.health import validation_split
 
 RULES = PROTOCOLS["sphere"]
 QUALITY, PERCEPTION = "ws_psnr", RULES.lpips_name
@@ -24,7 +24,7 @@ def calibration_split(views: Sequence[View]) -> tuple[tuple[View, ...], tuple[Vi
     Raises:
         ValueError: there are too few for both.
     """
-    apart = set_apart(views)
+    apart = validation_split(views)
     left = tuple(view for number, view in enumerate(views) if number not in apart)
     return tuple(views[number] for number in apart), left
 

@@ -9,11 +9,11 @@ from rich.console import Console
 from padgs.need.outcome import keep
 from padgs.need.search import Search
 from padgs.need.summary import show
-from padgs.runs.opened import OpenedRun
-from padgs.runs.terminal import say
+from padgs.runs.console import say
+from padgs.runs.load import LoadedRun
 
 
-def search(run: OpenedRun, epsilon: float, console: Console, asked: Callable[[], bool] = lambda: False) -> None:
+def search(run: LoadedRun, epsilon: float, console: Console, asked: Callable[[], bool] = lambda: False) -> None:
     """Search, keep what may lose epsilon dB beside the run, and say what was found.
 
     Args:
@@ -28,7 +28,7 @@ def search(run: OpenedRun, epsilon: float, console: Console, asked: Callable[[],
         Interrupted, Failure, CheckpointError, RunFolderError: as `padgs.need.outcome.keep` does.
     """
     run.refuse_other_data()
-    with run.files.locked():
+    with run.files:
         kept = keep(Search(run, console.print, asked), epsilon)
     show(kept.need, console)
     say(console, run.folder.resolve().with_name(kept.run), "bold")

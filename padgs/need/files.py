@@ -10,7 +10,7 @@ import torch
 from padgs.need import tiers
 from padgs.need.calibration import QUALITY, differences, objections
 from padgs.need.search import Search
-from padgs.training.trainee import Prunable
+from padgs.training.model import Prunable
 
 NAME = "model"  # of the file, before what its tier adds
 

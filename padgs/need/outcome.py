@@ -14,17 +14,16 @@ import torch
 from PIL import Image
 
 from padgs.evaluation.images import to_uint8
+from padgs.evaluation.scoring import frame_times, score
 from padgs.need.calibration import PERCEPTION, QUALITY
 from padgs.need.files import files
 from padgs.need.plan import Step, against, degrees, knee, loss, smallest
 from padgs.need.search import Search
 from padgs.results import NEED_LOSSES, NEED_PICTURE, NEED_PICTURED, Result
-from padgs.runs.folder import PROGRESS, Progress, RunFolder
-from padgs.runs.identity import config_hash, identity
-from padgs.runs.scoring import frame_times, scores
-from padgs.runs.session import build
-from padgs.training.optimiser import ADAM
-from padgs.training.trainee import MODEL, State
+from padgs.runs.run import build_method
+from padgs.runs.store import PROGRESS, Progress, RunStore, config_hash, identity
+from padgs.training.model import MODEL, State
+from padgs.training.optimizer import ADAM
 
 EXPERIMENT = "need"
 
@@ -88,18 +87,18 @@ def keep(search: Search, epsilon: float) -> Result:
         values["method"] = {**values["method"], "sh_degree": step.degree}
         options = replace(options, sh_degree=step.degree)
     path = run.folder.resolve().with_name(f"{run.result.run}_need-{epsilon:g}")  # whatever its folder is called now
-    folder = RunFolder(path, identity(values, run.result.fingerprint))
+    folder = RunStore(path, identity(values, run.result.fingerprint))
     before = folder.result()
     if before is not None and _is_same(before.need, found):
         return before
     trained, (model, refined) = run.method.state(), search.kept(number)
-    of_model, method = model.state(), build(replace(run.config, options=options))
+    of_model, method = model.state(), build_method(replace(run.config, options=options))
     # Adam's moments are those of the rows of the run, not of the pruned model's.
     kept = {n: t for n, t in trained.tensors.items() if not n.startswith((MODEL, ADAM))}
     tensors = kept | {f"{MODEL}{name}": tensor for name, tensor in of_model.tensors.items()}
     method.load_state(State(tensors, {**trained.values, "model": of_model.values}))
     size = model.size()
-    with folder.locked():
+    with folder:
         folder.prepare(values)
         folder.save(method, Progress(**trained.values[PROGRESS]))
         scene, timing = run.scene, dict(run.result.timing)
@@ -108,8 +107,8 @@ def keep(search: Search, epsilon: float) -> Result:
                 timing[name] += found[name.removeprefix("train_")] + last
         tested = {}
         if scene.test:
-            timing |= frame_times(method, scene)
-            tested = {"scores": scores(method, scene, run.config.protocols, folder.save_picture)}
+            timing |= frame_times(method.render, scene)
+            tested = {"scores": score(method.render, scene, run.config.protocols, folder.save_image)}
             _side_by_side(search, path / NEED_PICTURE)
         start = {name: run.result.counts[name] for name in ("start",) if name in run.result.counts}
         made: Result = replace(

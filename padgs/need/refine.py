@@ -9,9 +9,9 @@ import torch
 
 from padgs.render import Rendering
 from padgs.scene import View
+from padgs.training.model import Prunable, Size, State, TrainingRender
 from padgs.training.options import TrainOptions
 from padgs.training.schedule import Pace, ParameterGroup
-from padgs.training.trainee import Drawing, Prunable, Size, State
 
 SHARE = 0.04  # of the iterations of the run, in a refinement
 REPLAYED = 0.2  # share of the run, at its end, whose learning rates a refinement goes through again
@@ -36,11 +36,11 @@ class Refining:
 
         return rate
 
-    def draw(self, view: View) -> Drawing:
+    def draw(self, view: View) -> TrainingRender:
         """As the model does."""
         return self._model.draw(view)
 
-    def observe(self, drawing: Drawing, iteration: int) -> None:
+    def observe(self, drawing: TrainingRender, iteration: int) -> None:
         """Nothing grows, so nothing is noted."""
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ from itertools import cycle, islice
 
 import torch
 
-from padgs.clock import timed
+from padgs.clock import Lap, timed
 from padgs.evaluation.evaluate import evaluate
 from padgs.methods.splats.trainee import SplatTrainee
 from padgs.need import refine
@@ -19,12 +19,11 @@ from padgs.need.steps import StepsFolder
 from padgs.results import Scores
 from padgs.runs import checkpoint
 from padgs.runs.interrupt import Interrupt, Interrupted
-from padgs.runs.opened import OpenedRun
+from padgs.runs.load import LoadedRun
 from padgs.scene import View
-from padgs.stopwatch import Lap
-from padgs.training.budget import Budget
 from padgs.training.loop import Trainer
-from padgs.training.trainee import Prunable, State
+from padgs.training.model import Prunable, State
+from padgs.training.options import Budget
 from padgs.training.worth import most_wanted, worth
 
 FOLDER = "need"  # in that of the run
@@ -45,7 +44,7 @@ class Search:
 
     def __init__(
         self,
-        run: OpenedRun,
+        run: LoadedRun,
         say: Callable[[str], None] = lambda text: None,
         asked: Callable[[], bool] = lambda: False,
     ) -> None:

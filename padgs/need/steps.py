@@ -12,7 +12,7 @@ import torch
 from padgs.need.plan import Step
 from padgs.results import Scores
 from padgs.runs import checkpoint
-from padgs.training.trainee import State
+from padgs.training.model import State
 
 STEP, BEGUN, OF = "step", "begun", "of"  # values of a checkpoint: the numbers of a step, what was begun, of what model
 

@@ -9,7 +9,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from padgs.runs.summary import MISSING, number
+from padgs.runs.console import MISSING, number
 
 
 def show(need: Mapping[str, Any], console: Console) -> None:

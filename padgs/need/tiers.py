@@ -20,7 +20,7 @@ from padgs.methods.anchors.model import PaDGS
 from padgs.methods.anchors.trainee import AnchorTrainee
 from padgs.methods.splats.model import Splats
 from padgs.methods.splats.trainee import SplatTrainee
-from padgs.training.trainee import Prunable
+from padgs.training.model import Prunable
 
 Model = Splats | PaDGS
 WHOLE, HALF, BYTE = ".float32.npz", ".float16.npz", ".8bit.npz"  # endings of our own

@@ -3,35 +3,43 @@
 Standard library only, so that reports need nothing else.
 """
 
-from padgs.results.deciding import DECIDE_NOTHING, OF_THE_MACHINE, decisive
 from padgs.results.file import (
+    CONFIG_NAME,
     FILE_NAME,
+    LOG_NAME,
+    NEED_PICTURE,
+    PICTURES,
     ResultError,
     decoded,
     encoded,
     file_content,
+    file_name,
+    log_lines,
     parsed,
+    picture_name,
     read,
     read_all,
     write,
 )
-from padgs.results.folder import CONFIG_NAME, LOG_NAME, NEED_PICTURE, PICTURES, file_name, log_lines, picture_name
 from padgs.results.result import (
-    ASKED,
-    BY_ITSELF,
+    AD_HOC,
+    DECIDE_NOTHING,
     NEED_LOSSES,
     NEED_PICTURED,
     NEED_STATED,
+    OF_THE_MACHINE,
     STATUSES,
+    STOP_REQUESTED,
     Result,
     Scores,
+    decisive,
     higher_is_better,
     joined,
 )
 
 __all__ = [
-    "ASKED",
-    "BY_ITSELF",
+    "STOP_REQUESTED",
+    "AD_HOC",
     "CONFIG_NAME",
     "DECIDE_NOTHING",
     "FILE_NAME",

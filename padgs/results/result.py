@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,8 +18,10 @@ STATUSES = {
     "timeout": "the time limit came before the last iteration",
     "rejected": "the input was refused with a clear error",
 }
-ASKED = "asked to stop and score"  # why a run ended, where no setting says so: it is no seed of one that ran on
-BY_ITSELF = "by_itself"  # among experiments: a command without any asked for the run as well
+STOP_REQUESTED = (
+    "asked to stop and score"  # why a run ended, where no setting says so: it is no seed of one that ran on
+)
+AD_HOC = "ad_hoc"  # among experiments: a command without any requested the run as well
 HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "lpips": False}  # of every metric with the word in it
 NEED_LOSSES = (0.05, 0.1, 0.25, 0.5, 1.0)  # dB, for each of which `padgs need` finds the smallest model
 NEED_STATED = 0.1  # of these, the one that is put into one number, and whose model is kept if no other is asked for
@@ -58,7 +60,7 @@ class Result:
     fingerprint: str  # of the data
     finished: str  # UTC, ISO 8601
     reason: str = ""  # why a run failed
-    ended: str = ""  # why a run that ended well left out a part of its schedule, see `padgs.training.stopping`
+    ended: str = ""  # why a run that ended well left out a part of its schedule, see `padgs.training.health`
     scores: dict[str, Scores] = field(default_factory=dict)  # protocol -> marks
     timing: dict[str, float] = field(default_factory=dict)  # train_seconds, render_ms_median, render_ms_p95, ...
     counts: dict[str, int] = field(default_factory=dict)  # anchors, gaussians, ...
@@ -84,10 +86,10 @@ def joined(first: Iterable[str], second: Iterable[str]) -> tuple[str, ...]:
     """The experiments of a run that two commands asked for; none of a run that was asked for by itself alone.
 
     >>> joined(("tau",), ("table1",)), joined((), ("tau",)), joined((), ())
-    (('table1', 'tau'), ('by_itself', 'tau'), ())
+    (('table1', 'tau'), ("ad_hoc", "tau"), ())
     """
-    names = {*(tuple(first) or (BY_ITSELF,)), *(tuple(second) or (BY_ITSELF,))}
-    return () if names == {BY_ITSELF} else tuple(sorted(names))
+    names = {*(tuple(first) or (AD_HOC,)), *(tuple(second) or (AD_HOC,))}
+    return () if names == {AD_HOC} else tuple(sorted(names))
 
 
 def higher_is_better(metric: str) -> bool | None:
@@ -97,3 +99,23 @@ def higher_is_better(metric: str) -> bool | None:
     (True, False, None)
     """
     return next((HIGHER_IS_BETTER[word] for word in metric.split("_") if word in HIGHER_IS_BETTER), None)
+
+
+# Keys that no trained number depends on but by rounding: of the machine, and the others. What was
+# read is said by the fingerprint of the data; scoring comes after training; a monitor changes no number, but may end a
+# run. `data.device` is in files of old runs only.
+OF_THE_MACHINE = ("run", "render.max_instances", "data.cache_bytes", "data.prefetch_threads")
+DECIDE_NOTHING = (*OF_THE_MACHINE, "data.path", "init.run", "protocol", "train.monitor")
+
+
+def decisive(config: Mapping[str, Any], where: str = "") -> dict[str, Any]:
+    """A configuration without the keys that decide nothing.
+
+    >>> decisive({"seed": 0, "run": {"threads": 2}, "data": {"path": "/x", "width": 64}})
+    {'seed': 0, 'data': {'width': 64}}
+    """
+    return {
+        key: decisive(value, f"{where}{key}.") if isinstance(value, Mapping) else value
+        for key, value in config.items()
+        if f"{where}{key}" not in DECIDE_NOTHING
+    }

@@ -1,7 +1,7 @@
 """A `State` as a folder: tensors in safetensors, values in JSON; nothing in it is ever executed.
 
 `state.json` names the file of tensors with its size and SHA-256, says which run it is of, and ends with a SHA-256 of
-itself. The tensors are written first, under a new name, and replacing `state.json` is the one step that makes the new
+itself. The tensors are written first, under a new name, and atomic_path `state.json` is the one step that makes the new
 checkpoint count. So at every moment, whatever is killed or full, the folder holds one complete checkpoint: the old one
 or the new one.
 """
@@ -19,11 +19,11 @@ from typing import Any
 import safetensors.torch
 import torch
 
-from padgs.replacing import replace_file
-from padgs.training.failure import is_out_of_memory
-from padgs.training.trainee import State
+from padgs.files import write_atomically
+from padgs.training.health import is_out_of_memory
+from padgs.training.model import State
 
-FORMAT = 2
+FORMAT = 1
 MANIFEST = "state.json"
 TENSORS = re.compile(r"tensors-[0-9a-f]{16}\.safetensors")
 WAY_OUT = "delete the checkpoint folder to start this run from the beginning"
@@ -48,12 +48,12 @@ def digest(folder: Path) -> str:
 
 
 def save(state: State, folder: Path, run: Mapping[str, str] | None = None) -> None:
-    """Write a checkpoint, replacing the one in the folder, which stays whole until the new one is.
+    """Write a checkpoint, atomic_path the one in the folder, which stays whole until the new one is.
 
     Args:
         state: of a method.
         folder: of the checkpoint.
-        run: which one it is of, as `padgs.runs.identity.identity` says.
+        run: which one it is of, as `padgs.runs.store.identity` says.
 
     Raises:
         CheckpointError: the disk is full, the folder is read-only, ...; the previous checkpoint is untouched.
@@ -67,8 +67,8 @@ def save(state: State, folder: Path, run: Mapping[str, str] | None = None) -> No
     text = json.dumps({**manifest, "manifest_sha256": _digest(manifest)}, indent=1).encode()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        replace_file(folder / name, content)
-        replace_file(folder / MANIFEST, text)
+        write_atomically(folder / name, content)
+        write_atomically(folder / MANIFEST, text)
     except OSError as error:
         raise CheckpointError(
             f"cannot write checkpoint {folder}: {error.strerror or error}; the previous one, if any, is still whole. "

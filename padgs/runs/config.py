@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from padgs.baselines import METHODS
-from padgs.checks import check, check_known
+from padgs.checks import ConfigError, check, check_known, typed
 from padgs.data import LOADERS
 from padgs.data.capture import DataOptions, DataSettings
 from padgs.data.datasets import DATASETS
@@ -18,12 +18,10 @@ from padgs.evaluation.protocols import PROTOCOLS, Protocol, protocol_from_option
 from padgs.registry import lookup
 from padgs.render import RenderConfig
 from padgs.runs.device import DEVICES
-from padgs.runs.identity import Labels
-from padgs.runs.start import Start
+from padgs.runs.store import Labels
 from padgs.runs.tracking.tracker import TrackingOptions
-from padgs.runs.typed import ConfigError, typed
-from padgs.training.budget import Budget
-from padgs.training.options import TrainOptions
+from padgs.runs.warm_start import WarmStart
+from padgs.training.options import Budget, TrainOptions
 from padgs.training.schedule import PUBLISHED_ITERATIONS
 
 DEFAULT_METHOD = "padgs_plus"  # as conf/config.yaml says
@@ -32,8 +30,6 @@ NEEDS = ("off", "on")
 IMAGES_ON = ("device", "cpu")
 WATCHED = 5.0  # seconds between checkpoints at most, where somebody watches
 CONTINUED = "continued"  # the word for runs with `init` in tables
-# Keys of `train` that older runs do not have; they did what is the default.
-LATER = ("exposures", "poses", "guard_gradients", "guard_scales")
 
 
 @dataclass(frozen=True)
@@ -139,7 +135,7 @@ class Settings:
     tracking: TrackingOptions = TrackingOptions()
     variant: str = ""  # name of this setting within an experiment, such as a row of the ablation
     seed: int = 0  # of the order of views and of all that is random in training
-    init: Start | None = None  # folder of a finished run of the method and scene: training begins with its model
+    init: WarmStart | None = None  # folder of a finished run of the method and scene: training begins with its model
     retry: str = "none"  # which finished runs are done again: a name of RETRIES
     need: str = "off"  # on: a run that ended well is searched for its smallest model, as padgs need does
 
@@ -178,15 +174,13 @@ class RunConfig(Settings):
         Stress, a budget, what is learned of views and what the run begins with are there only if there are any: ids of
         runs without are what they were before.
         """
-        usual = asdict(TrainConfig())
-        train = {key: value for key, value in asdict(self.train).items() if key not in LATER or value != usual[key]}
         stress = {"stress": asdict(self.stress)} if self.stress.title else {}
         return {
             **({"budget": budget} if (budget := self.budget.asked()) else {}),
             "data": asdict(self.data),
             "method": {"name": self.method, **asdict(self.options)},
             "render": asdict(self.render),
-            "train": train,
+            "train": asdict(self.train),
             "protocol": {name: asdict(protocol) for name, protocol in self.protocols.items()},
             "run": asdict(self.run),
             **stress,
@@ -205,14 +199,9 @@ def config_from_values(values: Mapping[str, Any], labels: Labels = Labels()) -> 
     known = (*default_fields(), "method", "protocol")
     if unknown := [key for key in values if key not in known]:
         raise ConfigError(f"unknown key {unknown[0]}; known: {', '.join(known)}")
-    if "device" in _group(values, "data"):  # a key until run.device decided alone
-        raise ConfigError(
-            "data.device is no key any more: run.device says where a run trains and keeps its panoramas; "
-            "run.images_on=cpu keeps them in main memory while it trains on a GPU"
-        )
     name = str(_group(values, "method").get("name", DEFAULT_METHOD))
-    if isinstance(values.get("init"), str):  # on command lines; in files of runs it is what `Start.of` made of that
-        values = {**values, "init": asdict(Start.of(values["init"], name))}
+    if isinstance(values.get("init"), str):  # on command lines; in files of runs it is what `WarmStart.of` made of that
+        values = {**values, "init": asdict(WarmStart.of(values["init"], name))}
     settings = typed(Settings, {key: value for key, value in values.items() if key not in ("method", "protocol")})
     method = {key: value for key, value in _group(values, "method").items() if key != "name"}
     protocols = _group(values, "protocol")
@@ -255,12 +244,3 @@ def default_fields() -> dict[str, Any]:
 def method_fields(name: str) -> dict[str, Any]:
     """The keys of `method` with their defaults for one method."""
     return {"name": name, **asdict(lookup(METHODS, name, "method").Options())}
-
-
-def known_to(method: Mapping[str, Any]) -> dict[str, Any]:
-    """The `method` group of a finished run without the keys that its method does not have any more.
-
-    What they decided is in the model.
-    """
-    known = method_fields(method["name"])
-    return {key: value for key, value in method.items() if key in known}

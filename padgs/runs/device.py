@@ -1,4 +1,4 @@
-"""Where a run trains, renders and is scored: everything follows the tensors of its scene and of its checkpoint."""
+"""The device of a run: training, rendering and scoring follow the tensors of its scene and checkpoint."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from padgs.render import RenderConfig
 DEVICES = ("auto", "cpu", "cuda")
 
 
-def chosen(name: str, render: RenderConfig) -> torch.device:
-    """The device that `run.device` stands for; auto, its default, is a GPU that can draw this, else the CPU.
+def choose_device(name: str, render: RenderConfig) -> torch.device:
+    """Return the device for `run.device`; auto is a GPU that can render these settings, else the CPU.
 
-    Warns where a GPU is left alone because the library for it is not there, or was not compiled for it.
+    Warns if a GPU is not used because its library is missing or was not compiled for it.
 
     Raises:
-        ValueError: cuda where torch finds no GPU, or backend cuda on the CPU.
-        OSError: backend cuda, whose library is not built.
+        ValueError: cuda without a GPU, or backend cuda on the CPU.
+        OSError: the library of backend cuda is not built.
     """
     if (name == "cuda" or render.backend == "cuda") and not torch.cuda.is_available():
         why = "torch finds no GPU with a working driver" if torch.version.cuda else "this torch is built without CUDA"
         wish, way_out = ("run.device", "cpu or auto") if name == "cuda" else ("render.backend", "auto, cpu or torch")
-        raise ValueError(f"{wish}=cuda, but {why}; mend that, or set {wish}={way_out}")
+        raise ValueError(f"{wish}=cuda, but {why}; correct that, or set {wish}={way_out}")
     if render.backend == "cuda":
         if name == "cpu":
-            raise ValueError("render.backend=cuda draws on a GPU only, not with run.device=cpu; set run.device=auto")
+            raise ValueError("render.backend=cuda renders on a GPU only, not with run.device=cpu; set run.device=auto")
         cuda.library()
     if not torch.cuda.is_available() or name == "cpu":
         return torch.device("cpu")

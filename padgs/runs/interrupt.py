@@ -1,6 +1,6 @@
-"""What signals mean to a run. Ctrl-C: finish the step, write the checkpoint, then stop; a second one: now.
+"""Signals of a run: Ctrl-C or SIGTERM write the checkpoint and stop, a second one stops at once.
 
-SIGUSR1, which any number may be sent of, means to training: enough, end well and score.
+SIGUSR1 requests that training ends early and is scored.
 """
 
 from __future__ import annotations
@@ -11,33 +11,31 @@ from collections.abc import Callable
 from types import FrameType
 
 INTERRUPTED = 130  # exit code of a command that a signal ended
-SIGNALS = (signal.SIGINT, signal.SIGTERM)  # SIGTERM is what cluster schedulers send before they kill
-ENOUGH = (signal.SIGUSR1,)
+SIGNALS = (signal.SIGINT, signal.SIGTERM)  # cluster schedulers send SIGTERM before they kill
+STOP_SIGNALS = (signal.SIGUSR1,)  # may come any number of times
 
 
 class Interrupted(KeyboardInterrupt):
-    """A run was stopped from outside; the message says what is safe. Not an error, so that nothing takes it for one."""
+    """A run was stopped from outside; the message says what is safe. No `Exception`, so that no handler takes it."""
 
 
 class Interrupt:
-    """While this context lasts, a signal only sets `requested`; its owner looks there when it is safe to stop."""
+    """Context in which signals only set `requested`; its owner reads that when it is safe to stop."""
 
-    def __init__(
-        self, asked: Callable[[], bool] = lambda: False, signals: tuple[signal.Signals, ...] = SIGNALS
-    ) -> None:
-        """Not requested yet; `asked` is another way to request it."""
-        self._signalled, self._asked, self._signals = False, asked, signals
-        self._before: dict[int, object] = {}
+    def __init__(self, also: Callable[[], bool] = lambda: False, signals: tuple[signal.Signals, ...] = SIGNALS) -> None:
+        """Watch `signals`; `also` is another way to request."""
+        self._signalled, self._also, self._signals = False, also, signals
+        self._previous: dict[int, object] = {}
 
     @property
     def requested(self) -> bool:
         """Whether to stop."""
-        return self._signalled or self._asked()
+        return self._signalled or self._also()
 
     def __enter__(self) -> Interrupt:
-        """Take over the signals; only the main thread can, elsewhere they keep their meaning."""
+        """Take over the signals; threads other than the main one cannot, and leave them as they are."""
         if threading.current_thread() is threading.main_thread():
-            self._before = {number: signal.signal(number, self._request) for number in self._signals}
+            self._previous = {number: signal.signal(number, self._request) for number in self._signals}
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -45,10 +43,10 @@ class Interrupt:
 
     def _request(self, number: int, frame: FrameType | None) -> None:
         self._signalled = True
-        if number not in ENOUGH:
+        if number not in STOP_SIGNALS:
             self._restore()
 
     def _restore(self) -> None:
-        for number, handler in self._before.items():
+        for number, handler in self._previous.items():
             signal.signal(number, handler)  # type: ignore[arg-type]
-        self._before = {}
+        self._previous = {}

@@ -1,7 +1,7 @@
-"""The training loop: from a photograph to a step of the optimiser, again and again.
+"""The training loop: from a photograph to a step of the optimizer, again and again.
 
 One iteration draws one training view (or several, where a panorama is cut into them), compares it with its photograph,
-goes back to the gradients, lets the trainee note where they are large, steps Adam, and lets the trainee grow or prune.
+goes back to the gradients, lets the model note where they are large, steps Adam, and lets the model grow or prune.
 Knows no files.
 """
 
@@ -17,21 +17,29 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from padgs.clock import Lap
 from padgs.scene import Scene
-from padgs.stopwatch import Lap
-from padgs.training.budget import Budget
-from padgs.training.failure import Failure, is_out_of_memory, memory_reason
-from padgs.training.guard import Guard
+from padgs.training.corrections import LEARNED, Corrections
+from padgs.training.health import (
+    FADE,
+    GAIN,
+    PATIENCE,
+    Failure,
+    Guard,
+    Monitor,
+    Plateau,
+    is_out_of_memory,
+    memory_reason,
+    quality,
+    validation_split,
+)
 from padgs.training.loss import photometric_loss
-from padgs.training.monitor import Monitor
-from padgs.training.optimiser import Optimiser
-from padgs.training.options import TrainOptions
-from padgs.training.order import Order, ViewOrder
+from padgs.training.model import MODEL, Model, State
+from padgs.training.optimizer import Optimizer
+from padgs.training.options import Budget, TrainOptions
 from padgs.training.schedule import Pace
-from padgs.training.stopping import FADE, GAIN, PATIENCE, Plateau, quality, set_apart
-from padgs.training.trainee import MODEL, State, Trainee
-from padgs.training.views.corrections import LEARNED, Corrections
-from padgs.training.views.sizes import Sizes
+from padgs.training.targets import Sizes
+from padgs.training.view_order import Order, ViewOrder
 
 READ_EVERY = 10  # iterations: losses are read from a GPU as often as runs log them, while their time is counted
 VIEWS = "views/"  # prefix of the corrections of views in the state of a trainer
@@ -40,7 +48,7 @@ Stage = Callable[[str], AbstractContextManager[object]]  # entered with the name
 
 @dataclass(frozen=True)
 class Record:
-    """One training iteration, after the optimiser step."""
+    """One training iteration, after the optimizer step."""
 
     iteration: int  # 1 for the first step
     progress: float  # share of the schedule, 1 for the last step
@@ -52,14 +60,14 @@ class Record:
 
 
 class Trainer:
-    """Optimises a trainee on the training views of a scene, by default one random view per iteration.
+    """Optimises a model on the training views of a scene, by default one random view per iteration.
 
     Attributes:
         iteration, seconds, cpu_seconds: steps that were taken, and what they took.
         schedule: iterations that the schedule is written for.
         moment: the one of them that the last step stood for; not `iteration` in budgets of seconds only.
         step_seconds: what the last step took, on the clock of the budget.
-        start: how many Gaussians, anchors or other parts the trainee had at the beginning.
+        start: how many Gaussians, anchors or other parts the model had at the beginning.
         skipped, ended: iterations of the schedule that were left out by `stop`, and why; 0 and empty without.
 
     Between two records `state` holds all that continuing bit-identically needs (on the CPU); `load_state` goes back
@@ -74,7 +82,7 @@ class Trainer:
 
     def __init__(
         self,
-        trainee: Trainee,
+        model: Model,
         scene: Scene,
         budget: Budget,
         options: TrainOptions = TrainOptions(),  # noqa: B008 - frozen dataclass
@@ -87,9 +95,9 @@ class Trainer:
         """Prepare; nothing is drawn yet.
 
         Args:
-            trainee, scene, budget, options, seed: what is trained, on what, for how long and how.
+            model, scene, budget, options, seed: what is trained, on what, for how long and how.
             views_each: views that an iteration draws one after the other, before Adam steps on the sum of their losses.
-            coarse_share: of the run, in which views are smaller than they are, see `padgs.training.views.sizes`.
+            coarse_share: of the run, in which views are smaller than they are, see `padgs.training.targets`.
             stage: for whoever wants to know what an iteration spends its time on.
 
         Raises:
@@ -99,25 +107,25 @@ class Trainer:
         self.ended = ""
         self.schedule = budget.iterations
         self.seconds = self.cpu_seconds = self.step_seconds = 0.0
-        self.start = next(iter(trainee.counts().values()))
-        self._trainee, self._scene, self._budget, self._options, self._stage = trainee, scene, budget, options, stage
+        self.start = next(iter(model.counts().values()))
+        self._model, self._scene, self._budget, self._options, self._stage = model, scene, budget, options, stage
         self._views_each = views_each
         learned = {name: getattr(options, name) == LEARNED for name in ("exposures", "poses")}
         self._corrections = Corrections(scene, **learned)
-        groups = trainee.groups()
+        groups = model.groups()
         self._corrections.to(groups[0].parameters[0].device)
         groups = [*groups, *self._corrections.groups(budget.iterations)]
-        self._optimiser = Optimiser(groups, self._pace(1, 1), options.check_every, **self.ADAM)
+        self._optimizer = Optimizer(groups, self._pace(1, 1), options.check_every, **self.ADAM)
         self._guard = Guard(groups, scene, gradients=options.guard_gradients, scales=options.guard_scales)
-        self._sizes = Sizes(scene.train, options.weight, self._optimiser.device, coarse_share)
-        apart = set_apart(scene.train) if budget.stop == "auto" else ()
+        self._sizes = Sizes(scene.train, options.weight, self._optimizer.device, coarse_share)
+        apart = validation_split(scene.train) if budget.stop == "auto" else ()
         self._calibration = [scene.train[number] for number in apart]
         self._plateau = Plateau(budget.iterations)
         self._fade = min(round((1 - FADE) * budget.iterations), budget.iterations - 1)  # one step at least ends a run
         self._views = ViewOrder(scene, seed, apart)
         self._order: Order = self._views
         pixels = sum(view.width * view.height for view in scene.train)
-        self._monitor = Monitor(budget.iterations, max(trainee.counts().values()), pixels) if options.monitor else None
+        self._monitor = Monitor(budget.iterations, max(model.counts().values()), pixels) if options.monitor else None
 
     def records(self) -> Iterator[Record]:
         """Train to the end of the budget, yielding a record after each iteration.
@@ -144,16 +152,16 @@ class Trainer:
                 raise Failure("oom", f"out of memory at iteration {iteration}: {memory_reason(error)}") from error
             self._watch(loss, iteration)
             if moment == budget.iterations:
-                self._optimiser.refuse_non_finite(self._optimiser.parameters(), iteration)
+                self._optimizer.refuse_non_finite(self._optimizer.parameters(), iteration)
             self.iteration, self.moment, before = iteration, moment, self.spent
             events += self._stopped_by_itself()
-            wall, cpu = lap.seconds(self.seconds / self.cpu_seconds if self.cpu_seconds else 1.0)
+            wall, cpu = lap.seconds()
             self.seconds, self.cpu_seconds = self.seconds + wall, self.cpu_seconds + cpu
             self.step_seconds = self.spent - before
             progress = moment / budget.iterations
             yield Record(iteration, progress, loss, self.seconds, self.cpu_seconds, counts, events)
 
-    def stop(self, why: str) -> bool:
+    def request_stop(self, why: str) -> bool:
         """Leave out the schedule up to its last `FADE`, between two records; returns whether anything was left.
 
         What would have come at moments that are left out does not come.
@@ -171,9 +179,9 @@ class Trainer:
         if self.moment >= self._fade:
             self._views.take_all()
         elif self._calibration and self._plateau.is_due(self.moment):
-            value = quality(self._trainee.render, self._calibration)
-            if self._plateau.reached(value, max(self._trainee.counts().values()), self.moment):
-                self.stop(f"less than {GAIN} dB were gained within {PATIENCE:.0%} of the schedule")
+            value = quality(self._model.render, self._calibration)
+            if self._plateau.reached(value, max(self._model.counts().values()), self.moment):
+                self.request_stop(f"less than {GAIN} dB were gained within {PATIENCE:.0%} of the schedule")
                 return (f"stopping: {self.ended}",)
         return ()
 
@@ -193,20 +201,20 @@ class Trainer:
 
     def _step(self, iteration: int, moment: int) -> tuple[float | Tensor, dict[str, int], tuple[str, ...]]:
         """One iteration. Returns loss (a mean over its views), counts and events of its record."""
-        trainee, optimiser, stage = self._trainee, self._optimiser, self._stage
+        model, optimizer, stage = self._model, self._optimizer, self._stage
         losses, drawn = zip(*(self._pull(iteration, moment) for _ in range(self._views_each)), strict=True)
-        optimiser.check(iteration, moment)
-        optimiser.pace = self._pace(iteration, moment)
-        with stage("optimiser"):
-            optimiser.step(moment)
+        optimizer.check(iteration, moment)
+        optimizer.pace = self._pace(iteration, moment)
+        with stage("optimizer"):
+            optimizer.step(moment)
             self._guard.bound()
             self._corrections.centre()
         with stage("adapt"), torch.no_grad():
             passed = range(self.moment + 1, moment + 1)  # all that comes at a moment of the schedule comes once
-            events = tuple(event for one in passed for event in trainee.adapt(one, optimiser.adam))
-        if optimiser.is_checked(iteration) or moment == self._budget.iterations:
+            events = tuple(event for one in passed for event in model.adapt(one, optimizer.adam))
+        if optimizer.is_checked(iteration) or moment == self._budget.iterations:
             events += self._guard.look(iteration)
-        return sum(losses) / len(losses), {**trainee.counts(), "drawn": max(drawn)}, events
+        return sum(losses) / len(losses), {**model.counts(), "drawn": max(drawn)}, events
 
     def _watch(self, loss: float | Tensor, iteration: int) -> None:
         """Have the monitor look at an iteration."""
@@ -214,23 +222,23 @@ class Trainer:
             return
         if isinstance(loss, float):  # known without waiting for a GPU
             self._monitor.loss(loss, iteration)
-        self._monitor.counts(self._trainee.counts(), iteration)
-        if self._optimiser.is_checked(iteration):
-            self._monitor.gradients(self._optimiser.silent, iteration)
+        self._monitor.counts(self._model.counts(), iteration)
+        if self._optimizer.is_checked(iteration):
+            self._monitor.gradients(self._optimizer.silent, iteration)
 
     def _pull(self, iteration: int, moment: int) -> tuple[float | Tensor, int]:
         """Draw the next view and add its gradients. Returns its loss, and how many Gaussians were drawn."""
-        trainee, optimiser, stage, options = self._trainee, self._optimiser, self._stage, self._options
+        model, optimizer, stage, options = self._model, self._optimizer, self._stage, self._options
         with stage("target"):
             index = self._views.next()
             self._scene.train[self._views.upcoming()].prefetch()
             views, targets = self._sizes.at(moment / self.schedule)
             target = targets[index]
         with stage("draw"):
-            drawing = trainee.draw(self._corrections.posed(views[index]))
+            drawing = model.draw(self._corrections.posed(views[index]))
             image = self._corrections.exposed(drawing.rendering.image, index)
         if len(drawing.gaussians) == 0:
-            optimiser.refuse_non_finite(optimiser.parameters(), iteration)  # a NaN shows nothing either
+            optimizer.refuse_non_finite(optimizer.parameters(), iteration)  # a NaN shows nothing either
             raise Failure("collapsed", f"no Gaussian is left to draw at iteration {iteration}")
         with stage("loss"):
             if drawing.photo is not None:
@@ -248,21 +256,21 @@ class Trainer:
             value = self._read(loss, iteration)
         if isinstance(value, float) and not math.isfinite(value):
             inputs = {field.name: getattr(drawing.gaussians, field.name) for field in fields(drawing.gaussians)}
-            optimiser.refuse_non_finite({**optimiser.parameters(), **inputs, "image": image, "loss": loss}, iteration)
-        if self._monitor is not None and optimiser.is_checked(iteration):
+            optimizer.refuse_non_finite({**optimizer.parameters(), **inputs, "image": image, "loss": loss}, iteration)
+        if self._monitor is not None and optimizer.is_checked(iteration):
             self._monitor.picture(drawing, target.image, iteration)
         with stage("backward"):
             loss.backward()
             self._guard.clean(drawing.probe)
-        if self._monitor is not None and optimiser.is_checked(iteration):
+        if self._monitor is not None and optimizer.is_checked(iteration):
             self._monitor.probe(drawing.probe.grad, iteration)
         with stage("observe"), torch.no_grad():
-            trainee.observe(drawing, moment)
+            model.observe(drawing, moment)
         return value, len(drawing.gaussians)  # and the graph is gone before rows of its leaves come and go
 
     def _read(self, loss: Tensor, iteration: int) -> float | Tensor:
         """The loss as a number. On a GPU, which the host has to wait for, not each time."""
-        if loss.device.type == "cpu" or iteration % READ_EVERY == 0 or self._optimiser.is_checked(iteration):
+        if loss.device.type == "cpu" or iteration % READ_EVERY == 0 or self._optimizer.is_checked(iteration):
             return loss.item()
         return loss.detach()
 
@@ -271,12 +279,12 @@ class Trainer:
         self._corrections.load_state_dict(state.under(VIEWS), strict=False)
 
     def state(self) -> State:
-        """Copies of model, optimiser, statistics, random state and data order; to be taken between two records."""
-        model, order = self._trainee.state(), self._order.state()
-        tensors = {f"{MODEL}{name}": tensor for name, tensor in model.tensors.items()}
+        """Copies of model, optimizer, statistics, random state and data order; to be taken between two records."""
+        own, order = self._model.state(), self._order.state()
+        tensors = {f"{MODEL}{name}": tensor for name, tensor in own.tensors.items()}
         tensors |= {f"{VIEWS}{name}": tensor for name, tensor in self._corrections.state_dict().items()}
-        tensors |= self._optimiser.tensors() | {"random/torch": torch.get_rng_state()} | order.tensors
-        values = {"model": model.values, **{name: getattr(self, name) for name in self.PROGRESS}, **order.values}
+        tensors |= self._optimizer.tensors() | {"random/torch": torch.get_rng_state()} | order.tensors
+        values = {"model": own.values, **{name: getattr(self, name) for name in self.PROGRESS}, **order.values}
         values["guard"] = self._guard.state
         if self._monitor is not None:
             values["monitor"] = copy.deepcopy(self._monitor.state)
@@ -285,15 +293,15 @@ class Trainer:
         return State({name: tensor.detach().clone() for name, tensor in tensors.items()}, values)
 
     def load_state(self, state: State) -> None:
-        """Go on where `state` was taken; trainee, scene, budget and options must be those of that run.
+        """Go on where `state` was taken; model, scene, budget and options must be those of that run.
 
         Raises:
             ValueError: the state is of a run on other data.
         """
         self._order.load(state)
-        self._trainee.load_state(state.of_model())
+        self._model.load_state(state.of_model())
         self._corrections.load_state_dict(state.under(VIEWS))
-        self._optimiser.load(state)
+        self._optimizer.load(state)
         torch.set_rng_state(state.tensors["random/torch"].cpu())
         before = {"moment": state.values["iteration"], "schedule": self.schedule, "step_seconds": 0.0}
         before |= {"skipped": 0, "ended": ""}

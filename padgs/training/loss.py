@@ -7,13 +7,18 @@ perfect agreement.
 
 from __future__ import annotations
 
+import ctypes
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from padgs.geometry.distortion import end_row_weight, solid_angle_weight
-from padgs.training.native_loss import fits, fused_photometric_loss
+from padgs.native import LIBRARIES, cpu, cuda
+from padgs.native.abi import LossArguments, pointer
 
 WINDOW, SIGMA = 11, 1.5  # SSIM window in pixels
 C1, C2 = 0.01**2, 0.03**2
@@ -32,7 +37,7 @@ ROW_WEIGHTS = {
 
 
 @dataclass(frozen=True)
-class TargetMoments:
+class SSIMStatistics:
     """What the SSIM window sees of the target alone; computed once per view instead of once per iteration."""
 
     mean: Tensor  # [H, W, C]
@@ -46,7 +51,7 @@ def photometric_loss(
     lambda_l1: float = 0.8,
     *,
     normalisation: str = "mean",
-    moments: TargetMoments | None = None,
+    moments: SSIMStatistics | None = None,
 ) -> Tensor:
     """Eq. 16, a scalar; differentiable by `image`, and by `target` where that asks for a gradient.
 
@@ -56,7 +61,7 @@ def photometric_loss(
         weight: [H, W], or [H, 1] where all pixels of a row weigh the same; >= 0, not 0 everywhere.
         lambda_l1: lambda of Eq. 16.
         normalisation: mean divides by 3 sum(W); channel_sum by sum(W), as the released code does (3 x the mean).
-        moments: `target_moments(target)`, if already known; they stop the gradient by the target.
+        moments: `ssim_statistics(target)`, if already known; they stop the gradient by the target.
 
     Raises:
         ValueError: unknown normalisation.
@@ -75,7 +80,12 @@ def photometric_loss(
 
 
 def define_loss(
-    image: Tensor, target: Tensor, weight: Tensor, lambda_l1: float, total: Tensor, moments: TargetMoments | None = None
+    image: Tensor,
+    target: Tensor,
+    weight: Tensor,
+    lambda_l1: float,
+    total: Tensor,
+    moments: SSIMStatistics | None = None,
 ) -> Tensor:
     """`photometric_loss` in torch, for any dtype and device; `total` is what the weighted sum is divided by."""
     per_channel = lambda_l1 * (image - target).abs() + (1 - lambda_l1) * (1 - ssim_map(image, target, moments))
@@ -105,22 +115,22 @@ def pixel_weight(
     return rows * mask.to(rows)
 
 
-def ssim_map(image: Tensor, target: Tensor, moments: TargetMoments | None = None) -> Tensor:
+def ssim_map(image: Tensor, target: Tensor, moments: SSIMStatistics | None = None) -> Tensor:
     """Structural similarity per pixel and channel, [H, W, C]; zeros outside the image, no wrap.
 
     Variances are E[x^2] - E[x]^2 under the window. Arguments as in `photometric_loss`.
     """
-    moments = target_moments(target) if moments is None else moments
+    moments = ssim_statistics(target) if moments is None else moments
     mean_image, mean_square, mean_product = window_mean(torch.stack((image, image * image, image * target)))
     cross, squares = mean_image * moments.mean, mean_image * mean_image
     similarity = (2 * cross + C1) * (2 * (mean_product - cross) + C2)
     return similarity / ((squares + moments.mean**2 + C1) * (mean_square - squares + moments.variance + C2))
 
 
-def target_moments(target: Tensor) -> TargetMoments:
+def ssim_statistics(target: Tensor) -> SSIMStatistics:
     """Mean and variance of a target [H, W, C] under the SSIM window."""
     mean, mean_square = window_mean(torch.stack((target, target * target)))
-    return TargetMoments(mean, mean_square - mean * mean)
+    return SSIMStatistics(mean, mean_square - mean * mean)
 
 
 def window_mean(images: Tensor) -> Tensor:
@@ -151,3 +161,79 @@ def _blur(images: Tensor, dim: int) -> Tensor:
         result.narrow(dim, 0, size - step).add_(images.narrow(dim, step, size - step), alpha=taps[half + step])
         result.narrow(dim, step, size - step).add_(images.narrow(dim, 0, size - step), alpha=taps[half - step])
     return result
+
+
+def fits(image: Tensor) -> bool:
+    """Whether a native loss takes this image: float32, three channels, and the library of its device is there."""
+    library = LIBRARIES.get(image.device.type)
+    if library is None or image.dtype != torch.float32 or image.shape[-1] != 3:
+        return False
+    return library.works_on(image.device)
+
+
+def fused_photometric_loss(image: Tensor, target: Tensor, weight: Tensor, lambda_l1: float, total: Tensor) -> Tensor:
+    """Eq. 16 over float32 tensors on one device, a scalar; differentiable by `image`.
+
+    Args:
+        image, target: [H, W, 3].
+        weight: [H, W] or [H, 1].
+        lambda_l1: lambda of Eq. 16.
+        total: what the weighted sum over pixels and channels is divided by, a scalar.
+
+    Raises:
+        ValueError: a target of another shape or type than the image, or tensors on several devices.
+    """
+    if (target.shape, target.dtype) != (image.shape, image.dtype):  # memory is all that the library sees of them
+        raise ValueError(
+            f"the target is {target.dtype} of {list(target.shape)}, the image {image.dtype} of {list(image.shape)}; "
+            "give both alike"
+        )
+    devices = {str(tensor.device): None for tensor in (image, target, weight, total)}
+    if len(devices) > 1:
+        raise ValueError(f"image, target, weight and total are on {', '.join(devices)}; bring them to one device")
+    return _FusedLoss.apply(image, target, weight, lambda_l1, total, EVALUATIONS[image.device.type])
+
+
+class _FusedLoss(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, image: Tensor, target: Tensor, weight: Tensor, lambda_l1: float, total: Tensor, evaluate: Callable
+    ) -> Tensor:
+        height, width, _ = image.shape
+        image, target = image.contiguous(), target.contiguous()
+        weight = weight.to(torch.float32).expand(height, width)
+        ctx.gradient = torch.empty_like(image) if ctx.needs_input_grad[0] else None
+        arguments = LossArguments(width, height, pointer(image), pointer(target), weight.data_ptr(), *weight.stride())
+        arguments.lambda_l1, arguments.gradient = lambda_l1, pointer(ctx.gradient)
+        return evaluate(arguments, image, total)
+
+    @staticmethod
+    def backward(ctx: Any, grad_loss: Tensor):
+        return ctx.gradient * grad_loss, None, None, None, None, None
+
+
+def _on_cpu(arguments: LossArguments, image: Tensor, total: Tensor) -> Tensor:
+    arguments.normalizer, arguments.workspace = 1 / float(total), pointer(_workspace(*image.shape[:2]))
+    return image.new_tensor(cpu.library().padgs_photometric_loss(ctypes.byref(arguments)))
+
+
+@functools.lru_cache(maxsize=2)
+def _workspace(height: int, width: int) -> Tensor:
+    # Kept between iterations: fresh memory costs more in page faults than the loss does in arithmetic. Python threads
+    # would share it: one at a time may train.
+    return torch.zeros(cpu.library().padgs_loss_workspace(height, width), dtype=torch.float32)
+
+
+def _on_gpu(arguments: LossArguments, image: Tensor, total: Tensor) -> Tensor:
+    """The host waits for nothing: what to divide by stays on the device, and so does the loss."""
+    height, width, _ = image.shape
+    total = total.to(torch.float32)
+    partials = None if arguments.gradient is None else image.new_empty(3, height, width, 3)
+    sums = image.new_empty(cuda.library().padgs_cuda_loss_blocks(height, width))
+    arguments.workspace = pointer(partials)
+    device_arguments = cuda.DeviceLossArguments(arguments, pointer(total), pointer(sums))
+    cuda.call("padgs_cuda_photometric_loss", cuda.queue(image.device), device_arguments)
+    return (sums.sum(dtype=torch.float64) / total).to(torch.float32)
+
+
+EVALUATIONS = {"cpu": _on_cpu, "cuda": _on_gpu}  # by the type of the device

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from padgs.geometry.camera import Panorama
 from padgs.scene import View
-from padgs.training.loss import TargetMoments, pixel_weight, target_moments
-from padgs.training.native_loss import fits
+from padgs.training.loss import SSIMStatistics, fits, pixel_weight, ssim_statistics
 
 CACHE_BYTES = 1 << 29  # weights and moments of views beyond this are computed again at every iteration
 
@@ -22,7 +23,7 @@ class Target:
 
     image: Tensor  # [H, W, 3]
     weight: Tensor  # [H, W] or [H, 1]
-    moments: TargetMoments | None  # None where the loss does without
+    moments: SSIMStatistics | None  # None where the loss does without
 
 
 class Targets(Sequence[Target]):
@@ -32,7 +33,7 @@ class Targets(Sequence[Target]):
         """Load nothing yet; `weight` is a name of `padgs.training.loss.ROW_WEIGHTS`."""
         self._views, self._weight, self._device = views, weight, device
         self._weights: dict[int, Tensor] = {}
-        self._moments: dict[int, TargetMoments] = {}
+        self._moments: dict[int, SSIMStatistics] = {}
         self._bytes_left = CACHE_BYTES
 
     def __len__(self) -> int:
@@ -55,10 +56,10 @@ class Targets(Sequence[Target]):
             self._weights[index] = weight
         return weight
 
-    def _moments_of(self, index: int, image: Tensor) -> TargetMoments:
+    def _moments_of(self, index: int, image: Tensor) -> SSIMStatistics:
         if index in self._moments:
             return self._moments[index]
-        moments = target_moments(image)
+        moments = ssim_statistics(image)
         if self._keeps(2 * image.nbytes):
             self._moments[index] = moments
         return moments
@@ -103,3 +104,53 @@ def _fitting(view: View, what: str, pixels: Tensor) -> Tensor:
     if (height, width) != (view.height, view.width):
         raise ValueError(f"{what} of view {view.name!r} is {width}x{height}; the view is {view.width}x{view.height}")
     return pixels
+
+
+LEAST_WIDTH = 512  # pixels; smaller panoramas gain nothing by beginning smaller still
+
+
+class Sizes:
+    """Views and their targets, by how much of a run is done.
+
+    They have their own size from `coarse_share` of the run on; half of it before, a quarter of it in the first half of
+    that time, and so on, as long as all are panoramas of `LEAST_WIDTH` or more.
+    """
+
+    def __init__(self, views: Sequence[View], weight: str, device: torch.device, coarse_share: float) -> None:
+        """Load nothing yet; `weight` is a name of `padgs.training.loss.ROW_WEIGHTS`."""
+        self._coarse_share, self._levels = coarse_share, [(views, Targets(views, weight, device))]
+        while views and all(view.lens is None and view.width >= 2 * LEAST_WIDTH for view in views):
+            views = [halved(view) for view in views]
+            self._levels.append((views, Targets(views, weight, device)))
+
+    def halvings(self, progress: float) -> int:
+        """How often views are halved in a step after which so much of the run is done, in (0, 1]."""
+        if progress >= self._coarse_share:
+            return 0
+        return min(math.ceil(math.log2(self._coarse_share / progress)), len(self._levels) - 1)
+
+    def at(self, progress: float) -> tuple[Sequence[View], Targets]:
+        """What such a step draws."""
+        return self._levels[self.halvings(progress)]
+
+
+def halved(view: View) -> View:
+    """The same panorama at half the width and height, each pixel the mean of those that it covers."""
+    width, height = view.width // 2, view.height // 2
+
+    def reduced(load: Callable[[], Tensor]) -> Tensor:
+        image = load()
+        planes = image.float().reshape(view.height, view.width, -1).permute(2, 0, 1)
+        small = interpolate(planes[None], (height, width), mode="area")[0].permute(1, 2, 0)
+        small = small.round().to(image.dtype) if image.dtype == torch.uint8 else small
+        return small.reshape(height, width, *image.shape[2:]).contiguous()
+
+    pixels, mask = view.load_pixels, view.load_mask
+    return replace(
+        view,
+        width=width,
+        height=height,
+        load_pixels=None if pixels is None else lambda: reduced(pixels),
+        load_mask=None if mask is None else lambda: reduced(mask),
+        load_depth=None,
+    )

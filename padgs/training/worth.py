@@ -12,8 +12,8 @@ from torch import Tensor
 from padgs.render.contract import ALPHA_MIN
 from padgs.render.leave_one_out import leave_one_out
 from padgs.scene import View
+from padgs.training.model import Prunable
 from padgs.training.targets import even_weight, image_of
-from padgs.training.trainee import Prunable
 
 LEAST = 0.1  # share of the rows that stays in one step, whatever they are worth
 

@@ -18,7 +18,7 @@ from padgs.reports.published import Place
 from padgs.reports.selection import Request, RunSet, Setting, is_number, of_a_table, settings, sort_key
 from padgs.reports.statistics import over_seeds
 from padgs.reports.table import Cell
-from padgs.results import BY_ITSELF
+from padgs.results import AD_HOC
 
 MAX_AD_HOC_KEYS = 2  # runs without an experiment that differ in more keys are no sweep
 SHOWN_COSTS = ("gaussians", "train_seconds", "frame_ms")
@@ -93,7 +93,7 @@ def sweeps(run_set: RunSet) -> list[Sweep]:
         own = runs.loc[[name in of for of in runs["experiments"]]]
         curves, drawn = [], {}
         for place, there in by_place(own).items():
-            parts = list(_curves(there, MAX_AD_HOC_KEYS if name == BY_ITSELF else None))
+            parts = list(_curves(there, MAX_AD_HOC_KEYS if name == AD_HOC else None))
             if not parts:
                 continue
             refuse_mixture(there, request, f"{name}, {place.title}", OF_A_SWEEP)
@@ -121,7 +121,7 @@ def chart(sweep: Sweep) -> Chart:
     handles, labels = axes[0, 0].get_legend_handles_labels()
     if handles:
         made.legend(handles, labels, loc="outside lower center", ncols=3)
-    name = "without a name" if sweep.name == BY_ITSELF else sweep.name
+    name = "without a name" if sweep.name == AD_HOC else sweep.name
     title = f"Sweep {name}: mean and standard deviation over seeds"
     lay_out(made, title)
     return Chart(f"sweep_{sweep.name.replace('@', '_')}", title, made, sweep.notes, sweep.numbers)

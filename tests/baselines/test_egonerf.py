@@ -10,10 +10,9 @@ from padgs.data.synthetic import SyntheticOptions, generate
 from padgs.methods.egonerf.model import EgoNeRF
 from padgs.methods.egonerf.trainee import EgoNeRFTrainee
 from padgs.render import RenderConfig
-from padgs.runs.session import build
+from padgs.runs.run import build_method
 from padgs.scene import Scene, View
-from padgs.training.budget import Budget
-from padgs.training.options import TrainOptions
+from padgs.training.options import Budget, TrainOptions
 
 SMALL = EgoNeRFMethodOptions(
     radial_nodes=16,
@@ -62,7 +61,7 @@ def test_the_room_is_learned(room):
 
 
 def test_the_small_setting_has_less_than_a_million_parameters():
-    scene, small = tiny_scene(), build(composed("method=egonerf_small"))
+    scene, small = tiny_scene(), build_method(composed("method=egonerf_small"))
     next(small.fit(scene, Budget(1)))
     assert small.size().parameters <= 1_000_000
     assert small.size().bytes == 4 * small.size().parameters
@@ -148,7 +147,7 @@ def test_variation_smooths_the_planes():
     for weight in (0.0, 1e4):
         trained = method(density_variation=weight, appearance_variation=0.0)
         list(trained.fit(scene, Budget(20)))
-        roughness.append(trained.trainee.model.density.variation().item())
+        roughness.append(trained.model.model.density.variation().item())
     assert roughness[1] < 0.5 * roughness[0]
 
 
@@ -169,7 +168,7 @@ def test_adam_gets_the_published_betas_and_rates_that_fall_to_a_tenth():
     trained = method()
     records, rates = trained.fit(tiny_scene(), Budget(4)), []
     for _ in records:
-        (*groups, environment) = trained._trainer._optimiser.adam.param_groups
+        (*groups, environment) = trained._trainer._optimizer.adam.param_groups
         assert {group["betas"] for group in (*groups, environment)} == {(0.9, 0.99)}
         rates.append((groups[0]["lr"], environment["lr"]))
     expected = [0.1 ** (iteration / 4) for iteration in range(1, 5)]
@@ -183,9 +182,9 @@ def test_the_environment_can_learn_alone_first():
     records, moved, rates = trained.fit(tiny_scene(), Budget(7)), [], []
     before = {name: value.clone() for name, value in EgoNeRF.from_scene(tiny_scene(), SMALL).named_parameters()}
     for _ in records:
-        now = dict(trained.trainee.model.named_parameters())
+        now = dict(trained.model.model.named_parameters())
         moved.append({name for name, value in now.items() if not torch.equal(value, before[name])})
-        rates.append([group["lr"] for group in trained._trainer._optimiser.adam.param_groups][::3])
+        rates.append([group["lr"] for group in trained._trainer._optimizer.adam.param_groups][::3])
         before = {name: value.clone() for name, value in now.items()}
     assert moved[:3] == 3 * [{"environment.emission"}]
     assert all(names == before.keys() for names in moved[3:])
@@ -205,7 +204,7 @@ def test_alone_the_environment_becomes_the_mean_panorama(room):
     rays = room.train[0].camera.rays().reshape(-1, 3)
     directions = torch.cat([rays @ rotation for rotation in rotations])
     up = directions[:, 2] > 0.7
-    learned = trained.trainee.model.environment(directions[up]).mean(0)
+    learned = trained.model.model.environment(directions[up]).mean(0)
     assert torch.allclose(learned, colors[up].mean(0), atol=0.05)
 
 

@@ -17,11 +17,11 @@ from padgs.baselines import METHODS, OURS
 from padgs.data.synthetic import SCENES, SyntheticOptions, generate
 from padgs.runs import checkpoint
 from padgs.runs.config import RunConfig
-from padgs.runs.session import build
+from padgs.runs.run import build_method
 from padgs.scene import Scene
-from padgs.training.budget import Budget
 from padgs.training.loop import Record
 from padgs.training.method import Method
+from padgs.training.options import Budget
 
 WIDTH = 32
 STEPS = 20
@@ -63,7 +63,7 @@ def config_of(setting: str) -> RunConfig:
 
 
 def method_of(setting: str) -> Method:
-    return build(config_of(setting))
+    return build_method(config_of(setting))
 
 
 def trained(setting: str, scene: Scene, steps: int = STEPS) -> tuple[Method, list[Record]]:

@@ -14,9 +14,9 @@ from padgs.registry import lookup
 from padgs.render import RenderConfig
 from padgs.runs import checkpoint
 from padgs.scene import Scene, View
-from padgs.training.budget import Budget
-from padgs.training.failure import Failure
-from padgs.training.trainee import State
+from padgs.training.health import Failure
+from padgs.training.model import State
+from padgs.training.options import Budget
 
 ITERATIONS = 120  # densifies at 50, and goes through all degrees
 

@@ -10,13 +10,14 @@ from composed import composed
 from pretended_gpu import GPU, pretended_gpu
 
 from padgs.data.synthetic import SyntheticOptions, generate
-from padgs.runs import checkpoint, scoring
-from padgs.runs.scoring import frame_times, scores
-from padgs.runs.session import build
+from padgs.evaluation import scoring
+from padgs.evaluation.scoring import frame_times, score
+from padgs.runs import checkpoint
+from padgs.runs.run import build_method
 from padgs.scene import Scene
-from padgs.training.budget import Budget
-from padgs.training.failure import Failure
-from padgs.training.trainee import State
+from padgs.training.health import Failure
+from padgs.training.model import State
+from padgs.training.options import Budget
 
 STEPS, CHECK_EVERY = 8, 5
 LONGER = {"padgs_plus": 12}  # which grows in eight rounds, however short the run, and chooses in a ninth
@@ -69,7 +70,7 @@ def test_every_method_lives_where_its_scene_is(setting, scene, tmp_path, monkeyp
     common = f"train.check_every={CHECK_EVERY}", "train.learning_rates=published", "render.backend=torch"
     config = composed(f"method={setting}", *overrides, *common)
     steps = LONGER.get(setting, STEPS)
-    method, losses, waited, events = build(config), [], [], []
+    method, losses, waited, events = build_method(config), [], [], []
     with pretended_gpu() as waits:
         there = scene.to(GPU)
         for record in method.fit(there, Budget(steps)):
@@ -78,11 +79,11 @@ def test_every_method_lives_where_its_scene_is(setting, scene, tmp_path, monkeyp
             losses.append(record.loss)
             events += record.events
         image = method.render(there.test[0]).image
-        marks = scores(method, there, config.protocols, None)
-        assert frame_times(method, there)["render_ms_min"] > 0
+        marks = score(method.render, there, config.protocols, None)
+        assert frame_times(method.render, there)["render_ms_min"] > 0
         state = method.state()
         checkpoint.save(state, tmp_path)
-        again = build(config)
+        again = build_method(config)
         again.load_state(checkpoint.load(tmp_path, GPU))
         assert torch.equal(again.render(there.test[0]).image, image)
         list(again.fit(there, Budget(steps + 1)))
@@ -93,12 +94,12 @@ def test_every_method_lives_where_its_scene_is(setting, scene, tmp_path, monkeyp
     assert any("grew" in event or "cloned" in event for event in events) == ("egonerf" not in setting)
     assert min(waited) == waits_each, f"the host waits in every iteration: {waited}"
 
-    here = build(config)
+    here = build_method(config)
     here.load_state(checkpoint.load(tmp_path))
     assert torch.allclose(here.render(scene.test[0]).image, image.held, atol=1e-4)
-    assert marks.keys() == scores(here, scene, config.protocols, None).keys()
+    assert marks.keys() == score(here.render, scene, config.protocols, None).keys()
     list(here.fit(scene, Budget(steps + 1)))
-    fresh = [float(record.loss) for record in build(config).fit(scene, Budget(steps))]
+    fresh = [float(record.loss) for record in build_method(config).fit(scene, Budget(steps))]
     assert [float(loss) for loss in losses[:3]] == pytest.approx(fresh[:3], rel=1e-3)
     # Later a Gaussian at a threshold may be cloned here and not there: sums of float32 differ between processors.
     assert sum(map(float, losses)) == pytest.approx(sum(fresh), rel=3e-2)
@@ -106,11 +107,11 @@ def test_every_method_lives_where_its_scene_is(setting, scene, tmp_path, monkeyp
 
 def test_a_nan_is_found_at_the_next_check(scene):
     config = composed("method=omnigs", *SPLATS, f"train.check_every={CHECK_EVERY}", "render.backend=torch")
-    method = build(config)
+    method = build_method(config)
     with pretended_gpu():
         records = method.fit(scene.to(GPU), Budget(STEPS))
         next(records)
-        method.trainee.splats.sh_dc.data[:] = float("nan")
+        method.model.splats.sh_dc.data[:] = float("nan")
         with pytest.raises(Failure, match=f"is nan at iteration {CHECK_EVERY}") as failure:
             list(records)
     assert failure.value.status == "nan"

@@ -12,9 +12,9 @@ from tiny_scene import tiny_scene
 
 from padgs import results
 from padgs.baselines.op43dgs import OP43DGSMethod
-from padgs.runs import session
+from padgs.runs import run as pipeline
 from padgs.scene import Scene, View
-from padgs.training.budget import Budget
+from padgs.training.options import Budget
 
 
 @pytest.fixture(autouse=True)
@@ -59,9 +59,9 @@ def test_the_release_differs_by_its_quirks_only():
 
 
 def run(setting: str, scene: Scene, folder, monkeypatch, *overrides: str) -> results.Result:
-    monkeypatch.setattr(session.data, "load", lambda path, format, options: scene)
+    monkeypatch.setattr(pipeline.data, "load", lambda path, format, options: scene)
     tiny = (f"run.folder={folder}", "train.iterations=4", "protocol=paper", "protocol.paper.lpips=none")
-    return session.Session(composed(f"method={setting}", *tiny, *overrides), Console(file=io.StringIO())).run()
+    return pipeline.run(composed(f"method={setting}", *tiny, *overrides), Console(file=io.StringIO()))
 
 
 @pytest.mark.slow

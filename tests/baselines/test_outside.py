@@ -13,7 +13,7 @@ from padgs import baselines
 from padgs.baselines import METHODS, clash, distribution, outside
 from padgs.multirun.choices import register_choices
 from padgs.runs.config import config_from_values
-from padgs.runs.outcome import begun
+from padgs.runs.run import initial_result
 
 
 @pytest.fixture
@@ -65,5 +65,5 @@ def test_a_method_that_cannot_be_imported_is_said_once_and_left_out(monkeypatch,
 
 def test_results_say_which_package_they_are_of(installed):
     config = config_from_values({"method": {"name": "my_method"}, "protocol": {"paper": {}}})
-    assert begun(config, tiny_scene(), "run").code_version.endswith(" my-method 0.1")
+    assert initial_result(config, tiny_scene(), "run").code_version.endswith(" my-method 0.1")
     assert distribution("padgs") == ""

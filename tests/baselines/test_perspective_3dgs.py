@@ -18,8 +18,7 @@ from padgs.geometry.camera import Panorama
 from padgs.geometry.panorama import rays
 from padgs.registry import lookup
 from padgs.render import RenderConfig
-from padgs.training.budget import Budget
-from padgs.training.options import TrainOptions
+from padgs.training.options import Budget, TrainOptions
 
 PANORAMA = Panorama(256, 128)
 METHOD = {"cubemap_3dgs": Cubemap3DGSMethod, "crops_3dgs": Crops3DGSMethod}
@@ -69,7 +68,7 @@ def test_an_iteration_sees_as_much_as_one_of_a_panoramic_method(name, views):
     assert views * solid_angle(method.lens(PANORAMA)) == pytest.approx(4 * math.pi, rel=1 / 16)
     seen = []
     method.fit(scene, Budget(1))
-    draw, method.trainee.draw = method.trainee.draw, lambda view: seen.append(view.name) or draw(view)
+    draw, method.model.draw = method.model.draw, lambda view: seen.append(view.name) or draw(view)
     list(method._trainer.records())
     assert len(seen) == len(set(seen)) == views
 
@@ -84,7 +83,7 @@ def test_cut_views_are_twice_as_fine_with_filters_of_the_panoramas_size(name):
     method.fit(scene, Budget(1))
     (cut, *_), panorama = method._trainer._scene.train, scene.test[0]
     assert cut.camera.focal == pytest.approx(2 * panorama.camera.focal, rel=0.03)
-    low_pass = [method.trainee.render_options(view).low_pass for view in (cut, panorama)]
+    low_pass = [method.model.render_options(view).low_pass for view in (cut, panorama)]
     assert low_pass == [pytest.approx(4 * 0.3), 0.3]
 
 

@@ -14,10 +14,9 @@ from padgs.methods.calibration.align import Similarity, align
 from padgs.methods.splats.method import SplatOptions
 from padgs.render import RenderConfig
 from padgs.scene import Scene
-from padgs.training.budget import Budget
-from padgs.training.options import TrainOptions
+from padgs.training.corrections import PoseRates
+from padgs.training.options import Budget, TrainOptions
 from padgs.training.targets import Targets
-from padgs.training.views.poses import PoseRates
 
 TORCH = RenderConfig(backend="torch")
 
@@ -28,7 +27,7 @@ def scene() -> Scene:
 
 
 def calibration_of(method: SCOmniGSMethod):
-    return method.trainee.calibration
+    return method.model.calibration
 
 
 def test_the_first_step_is_that_of_omnigs_to_the_bit(scene):
@@ -117,7 +116,7 @@ def test_published_learning_rates_of_the_poses_and_ours_of_the_camera(scene):
     method, steps = SCOmniGSMethod(render=TORCH), 400
     next(method.fit(scene, Budget(steps)))
     poses, camera = calibration_of(method).poses, calibration_of(method).camera
-    groups = {group.name: group for group in method.trainee.groups()}
+    groups = {group.name: group for group in method.model.groups()}
     ends = {  # rates at the start and at the end, and what has them
         "pose_quaternions": (1e-2, 1.6e-4, poses.quaternions),
         "pose_shifts": (1e-2, 6e-3, poses.shifts),
@@ -132,7 +131,7 @@ def test_published_learning_rates_of_the_poses_and_ours_of_the_camera(scene):
         assert rate(steps) == pytest.approx(last), name
         assert [id(p) for p in groups[name].parameters] == [id(p) for p in parameters], name
     held = [id(p) for group in groups.values() for p in group.parameters]
-    everything = [*calibration_of(method).parameters(), *method.trainee.splats.parameters()]
+    everything = [*calibration_of(method).parameters(), *method.model.splats.parameters()]
     assert sorted(held) == sorted(id(p) for p in everything)
 
 

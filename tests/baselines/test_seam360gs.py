@@ -11,8 +11,8 @@ from padgs.methods.calibration.dual_lens import DualLens
 from padgs.methods.splats.method import SplatMethod, SplatOptions
 from padgs.render import RenderConfig, RenderOptions, render
 from padgs.scene import Scene, View
-from padgs.training.budget import Budget
-from padgs.training.trainee import Drawing
+from padgs.training.model import TrainingRender
+from padgs.training.options import Budget
 
 TORCH = RenderConfig(projection="ray", backend="torch")
 
@@ -23,7 +23,7 @@ def scene() -> Scene:
 
 
 def lenses_of(method: Seam360GSMethod):
-    return method.trainee.calibration
+    return method.model.calibration
 
 
 def test_an_ideal_camera_starts_as_one(scene):
@@ -48,9 +48,9 @@ def photographed(gap: float, bending: tuple[float, float]) -> Scene:
         lenses.gap.fill_(gap)
         lenses.coefficients[:, 0] = torch.tensor(bending)
 
-    def draw(view: View, probe: torch.Tensor | None = None) -> Drawing:
+    def draw(view: View, probe: torch.Tensor | None = None) -> TrainingRender:
         rendering = render(seen, view, RenderOptions("ray"), backend="torch")
-        return Drawing(rendering, torch.zeros(0), seen, torch.zeros(0))
+        return TrainingRender(rendering, torch.zeros(0), seen, torch.zeros(0))
 
     @torch.no_grad()
     def taken(view: View) -> View:
@@ -70,8 +70,8 @@ def test_lenses_are_found_and_the_test_camera_is_ideal(sign):
     records = method.fit(scene, Budget(60))
     next(records)
     with torch.no_grad():
-        method.trainee.splats.log_scales.copy_(truth().scales.log())
-        method.trainee.splats.opacity_logits.copy_(torch.logit(truth().opacities))
+        method.model.splats.log_scales.copy_(truth().scales.log())
+        method.model.splats.opacity_logits.copy_(torch.logit(truth().opacities))
     *_, last = records
     lenses = lenses_of(method)
     assert lenses.gap.item() == pytest.approx(gap, rel=0.3)  # measured: 13 %
@@ -86,7 +86,7 @@ def test_lenses_are_found_and_the_test_camera_is_ideal(sign):
 def test_learning_rates_of_the_lenses_fall_to_a_tenth(scene):
     method, steps = Seam360GSMethod(render=TORCH), 400
     next(method.fit(scene, Budget(steps)))
-    groups = {group.name: group for group in method.trainee.groups()}
+    groups = {group.name: group for group in method.model.groups()}
     for name, parameter in (("lens_gap", lenses_of(method).gap), ("lens_coefficients", lenses_of(method).coefficients)):
         rate = groups[name].learning_rate
         assert rate(0) == pytest.approx(1e-3), name

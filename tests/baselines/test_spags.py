@@ -22,7 +22,7 @@ from padgs.render import RenderConfig, RenderOptions
 from padgs.render.backends.cpu import Projected
 from padgs.render.backends.native import native_camera
 from padgs.scene import Scene
-from padgs.training.budget import Budget
+from padgs.training.options import Budget
 
 WIDTH, HEIGHT = 2048, 1024
 OPTIONS = SPaGSMethod.RENDER.options(scene_scale=1.0)

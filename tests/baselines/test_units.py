@@ -10,7 +10,7 @@ from padgs.baselines import METHODS
 from padgs.methods.splats.method import SplatMethod
 from padgs.registry import lookup
 from padgs.scene import Scene, View
-from padgs.training.budget import Budget
+from padgs.training.options import Budget
 
 LARGER = 64.0  # a power of two: lengths are multiplied exactly, and what differs is the rounding of logarithms
 STEPS = 20
@@ -36,7 +36,7 @@ def trained(name: str, scene: Scene) -> tuple[torch.Tensor, torch.Tensor, list[f
     method = kind(train=replace(kind.TRAIN, learning_rates="published"))
     losses = [float(record.loss) for record in method.fit(scene, Budget(STEPS))]
     image = method.render(scene.test[0]).image
-    return method.trainee.splats.means.detach() - scene.points, image, losses
+    return method.model.splats.means.detach() - scene.points, image, losses
 
 
 @pytest.mark.parametrize("name", EXPLICIT)

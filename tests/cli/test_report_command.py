@@ -43,7 +43,7 @@ def test_a_folder_without_results_is_refused_and_left_alone(runs, tmp_path):
 
 def test_runs_that_were_asked_to_stop_are_named(runs):
     (runs / "early").mkdir()
-    early = replace(result("", run="early_1"), variant="stopped after 9 iterations", ended=results.ASKED)
+    early = replace(result("", run="early_1"), variant="stopped after 9 iterations", ended=results.STOP_REQUESTED)
     results.write(early, runs / "early")
     done = report("table3", runs)
     assert done.exit_code == 0 and "in no table but `runs`: early_1" in " ".join(done.stderr.split())
@@ -90,7 +90,7 @@ def test_a_terminal_obeys_nothing_in_a_name(tmp_path):
         (["sweep", "--metric", "x"], "unknown metric 'x'; known under protocol paper: psnr, ssim"),
         (["sweep"], "nothing to show for sweep"),
         (["runs", "--protocol", "x"], "unknown protocol 'x'; known: paper, sphere"),
-        (["html", "--experiment", "x"], "unknown experiment 'x'; known: by_itself"),
+        (["html", "--experiment", "x"], "unknown experiment 'x'; known: ad_hoc"),
     ],
 )
 def test_what_is_wrong_is_said(runs, arguments, message):
@@ -148,7 +148,7 @@ def test_trials_of_all_kinds_stand_in_blocks_and_rows_of_their_own(tmp_path):
 def test_runs_without_an_experiment_are_a_sweep_where_they_differ_in_a_key(tmp_path):
     write([replace(one, experiments=()) for one in swept(scenes=["synthetic-room"], seeds=1)], tmp_path / "runs")
     assert report("sweep", tmp_path / "runs", "--metric", "psnr").exit_code == 0
-    assert "tau" in (tmp_path / "runs" / "reports" / "sweep_by_itself.csv").read_text()
+    assert "tau" in (tmp_path / "runs" / "reports" / "sweep_ad_hoc.csv").read_text()
 
 
 def test_an_experiment_is_known_without_its_scale_and_where_says_what_there_is(tmp_path):

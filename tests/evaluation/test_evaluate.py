@@ -12,7 +12,7 @@ from padgs.evaluation.metrics import METRICS, psnr, ssim, ws_psnr
 from padgs.evaluation.protocols import PAPER_360ROAM, PROTOCOLS, protocol_from_options
 from padgs.render import Rendering
 from padgs.scene import View
-from padgs.training.failure import Failure
+from padgs.training.health import Failure
 
 H, W = 32, 64
 PAPER = protocol_from_options("paper", lpips="none")

@@ -5,7 +5,7 @@ import pytest
 from padgs.multirun import job
 from padgs.multirun.board import REFUSED
 from padgs.multirun.job import TrackedRun
-from padgs.training.failure import Failure
+from padgs.training.health import Failure
 
 
 def test_a_run_in_progress_is_not_looked_at_all_the_time(tmp_path, monkeypatch):

@@ -7,7 +7,7 @@ from rich.console import Console
 
 import padgs
 from padgs.multirun.composition import composing, configuration
-from padgs.runs.session import Session
+from padgs.runs.run import run
 
 SETTINGS = (
     "train.iterations=60",
@@ -43,7 +43,7 @@ def trained(tmp_path_factory):
                 runs = tmp_path_factory.mktemp("runs")
                 with composing():
                     config = configuration([*SETTINGS, *settings, f"run.folder={runs}"])
-                Session(config, Console(quiet=True)).run()
+                run(config, Console(quiet=True))
                 found[settings] = next(path.parent for path in runs.glob("*/result.json"))
         return found[settings]
 

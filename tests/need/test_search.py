@@ -11,6 +11,7 @@ from states import assert_same_but_time
 from typer.testing import CliRunner
 
 import padgs
+from padgs.checks import ConfigError
 from padgs.cli.commands import app
 from padgs.data.perturb import StressOptions
 from padgs.multirun import job
@@ -23,10 +24,9 @@ from padgs.need.summary import show
 from padgs.results import read
 from padgs.runs.checkpoint import CheckpointError
 from padgs.runs.interrupt import Interrupt, Interrupted
-from padgs.runs.session import Watch
-from padgs.runs.typed import ConfigError
+from padgs.runs.run import Callback
 from padgs.training.loop import Trainer
-from padgs.training.trainee import State
+from padgs.training.model import State
 from padgs.training.worth import most_wanted, worth
 
 METHODS = ("method=omnigs", "method=padgs")
@@ -146,7 +146,7 @@ def test_the_pruned_model_is_a_run_that_opens_and_has_the_whole_front(opened, me
     again = Search(opened(method))
     assert len(again.steps) == len(search.steps) + 1
     assert keep(again, 1.0) == result, "what was kept before stays"
-    assert_same_but_time(again.kept(number)[0].state(), pruned.method.trainee.state())
+    assert_same_but_time(again.kept(number)[0].state(), pruned.method.model.state())
     with (console := Console(width=200)).capture() as shown:
         show(result.need, console)
     assert "kept for 1 dB" in shown.get()
@@ -240,7 +240,7 @@ def test_a_need_changes_nothing_of_the_run_and_is_told_at_its_end(settings, tmp_
     with composing():
         config = configuration(settings)
         assert config.values() == configuration([*settings, "need=off"]).values()
-    result = job.done(config, Console(width=400), Watch())
+    result = job.done(config, Console(width=400), Callback())
     told = capsys.readouterr().out
     assert "0.1 dB" in told and f"{result.run}_need-0.1" in told
     kept = read(tmp_path / f"{result.run}_need-0.1" / "result.json")
@@ -256,7 +256,7 @@ def test_the_lowest_degree_that_is_good_enough_is_kept(opened, monkeypatch):
     smallest_degree = search.steps[search.complete(1.0)]
     assert smallest_degree.degree == 0 and result.config["method"]["sh_degree"] == 0
     pruned = padgs.load_run(run.folder.with_name(result.run), device="cpu")
-    assert pruned.method.trainee.splats.sh_rest.shape[1] == 0 and pruned.result == result
+    assert pruned.method.model.splats.sh_rest.shape[1] == 0 and pruned.result == result
     assert [step["degree"] for step in result.need["degrees"]["1"]] == [3, 2, 1, 0]
 
 
@@ -271,7 +271,7 @@ def test_the_smallest_good_file_stays_and_shows_what_is_said_of_it(opened):
     assert byte["bytes"] < half["bytes"] < exact["bytes"] and exact["loss"] == 0
     folder = run.folder.with_name(result.run)
     assert [path.name for path in folder.glob("model.*")] == [file["file"]]
-    model = padgs.load_run(folder, device="cpu").method.trainee
+    model = padgs.load_run(folder, device="cpu").method.model
     tiers.read(folder / file["file"], tiers.model_of(model))
     assert search.scored(model)[1]["ws_psnr"] == pytest.approx(file["test_ws_psnr"], abs=1e-6)
     assert (folder / file["file"]).stat().st_size == file["bytes"]

@@ -6,7 +6,7 @@ from made_up import result
 
 from padgs.reports.frame import images_seen
 from padgs.scene import View
-from padgs.training.views.sizes import Sizes
+from padgs.training.targets import Sizes
 
 
 def test_rays_count_as_pixels_and_all_else_as_whole_panoramas():

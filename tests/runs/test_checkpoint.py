@@ -8,7 +8,7 @@ import torch
 
 from padgs.runs import checkpoint
 from padgs.runs.checkpoint import CheckpointError
-from padgs.training.trainee import State
+from padgs.training.model import State
 
 
 def example(seed: int = 0) -> State:
@@ -168,14 +168,14 @@ def test_full_disk_leaves_the_previous_checkpoint_whole(tmp_path):
 
 def test_kill_between_the_two_files_keeps_the_old_checkpoint(tmp_path, monkeypatch):
     checkpoint.save(example(0), tmp_path)
-    write = checkpoint.replace_file
+    write = checkpoint.write_atomically
 
     def killed_before_manifest(path, content):
         if path.name == "state.json":
             raise KeyboardInterrupt
         write(path, content)
 
-    monkeypatch.setattr(checkpoint, "replace_file", killed_before_manifest)
+    monkeypatch.setattr(checkpoint, "write_atomically", killed_before_manifest)
     with pytest.raises(KeyboardInterrupt):
         checkpoint.save(example(1), tmp_path)
     assert_same(checkpoint.load(tmp_path), example(0))

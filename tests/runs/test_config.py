@@ -3,8 +3,8 @@
 import pytest
 from composed import configuration
 
+from padgs.checks import ConfigError
 from padgs.multirun.composition import composing
-from padgs.runs.typed import ConfigError
 
 MEANINGLESS = {
     "render.near=inf": "render.near is inf; it must be finite",

@@ -6,13 +6,13 @@ from composed import composed
 from rich.console import Console
 from tiny_scene import tiny_scene
 
+from padgs.checks import ConfigError
 from padgs.native import cuda
 from padgs.render import RenderConfig
-from padgs.runs import session
+from padgs.runs import run as pipeline
 from padgs.runs.config import RunOptions
-from padgs.runs.device import chosen
-from padgs.runs.session import Session
-from padgs.runs.typed import ConfigError
+from padgs.runs.device import choose_device
+from padgs.runs.run import run
 
 GPU = torch.device("cuda", 0)
 
@@ -26,41 +26,45 @@ def with_gpu(monkeypatch):
 
 def test_without_a_gpu_auto_is_the_cpu_and_cuda_is_refused(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert chosen("auto", RenderConfig()) == chosen("cpu", RenderConfig()) == torch.device("cpu")
+    assert choose_device("auto", RenderConfig()) == choose_device("cpu", RenderConfig()) == torch.device("cpu")
     with pytest.raises(ValueError, match="run.device=cuda, but .*set run.device=cpu or auto"):
-        chosen("cuda", RenderConfig())
+        choose_device("cuda", RenderConfig())
 
 
 def test_without_a_gpu_its_backend_is_refused(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     for device in ("auto", "cpu"):
         with pytest.raises(ValueError, match="render.backend=cuda, but .*set render.backend=auto, cpu or torch"):
-            chosen(device, RenderConfig(backend="cuda"))
+            choose_device(device, RenderConfig(backend="cuda"))
 
 
 @pytest.mark.usefixtures("with_gpu")
 def test_the_backend_of_a_gpu_is_refused_on_the_cpu_and_where_it_is_not_built(monkeypatch):
     monkeypatch.setattr(cuda, "library", lambda: None)
-    assert chosen("auto", RenderConfig(backend="cuda")) == chosen("cuda", RenderConfig(backend="cuda")) == GPU
+    assert (
+        choose_device("auto", RenderConfig(backend="cuda"))
+        == choose_device("cuda", RenderConfig(backend="cuda"))
+        == GPU
+    )
     with pytest.raises(ValueError, match="render.backend=cuda draws on a GPU only, .*set run.device=auto"):
-        chosen("cpu", RenderConfig(backend="cuda"))
+        choose_device("cpu", RenderConfig(backend="cuda"))
 
     def missing():
         raise OSError("libpadgs_cuda.so not found")
 
     monkeypatch.setattr(cuda, "library", missing)
     with pytest.raises(OSError, match="libpadgs_cuda.so not found"):
-        chosen("auto", RenderConfig(backend="cuda"))
+        choose_device("auto", RenderConfig(backend="cuda"))
 
 
 @pytest.mark.usefixtures("with_gpu")
 def test_with_a_gpu_auto_is_the_gpu_where_that_can_draw():
-    assert chosen("auto", RenderConfig()) == chosen("cuda", RenderConfig()) == GPU
-    assert chosen("auto", RenderConfig(projection="ray", blending="hybrid")) == GPU
-    assert chosen("cpu", RenderConfig()).type == "cpu"
+    assert choose_device("auto", RenderConfig()) == choose_device("cuda", RenderConfig()) == GPU
+    assert choose_device("auto", RenderConfig(projection="ray", blending="hybrid")) == GPU
+    assert choose_device("cpu", RenderConfig()).type == "cpu"
     for elsewhere in (RenderConfig(backend="cpu"), RenderConfig(backend="torch")):
-        assert chosen("auto", elsewhere).type == "cpu"
-        assert chosen("cuda", elsewhere) == GPU
+        assert choose_device("auto", elsewhere).type == "cpu"
+        assert choose_device("cuda", elsewhere) == GPU
 
 
 @pytest.mark.usefixtures("with_gpu")
@@ -71,8 +75,8 @@ def test_without_a_library_for_it_a_gpu_is_left_alone_and_that_is_said(monkeypat
 
     monkeypatch.setattr(cuda, "require", missing)
     with pytest.warns(UserWarning, match=f"a GPU is here, but the CPU is used: {error}"):
-        assert chosen("auto", RenderConfig()).type == "cpu"
-    assert chosen("cuda", RenderConfig()) == GPU, "by torch"
+        assert choose_device("auto", RenderConfig()).type == "cpu"
+    assert choose_device("cuda", RenderConfig()) == GPU, "by torch"
 
 
 def test_an_unknown_place_is_refused():
@@ -84,16 +88,16 @@ def test_an_unknown_place_is_refused():
 
 def test_panoramas_are_kept_where_the_run_trains_or_in_main_memory(monkeypatch, root):
     monkeypatch.setenv("PADGS_ROOT", str(root))
-    monkeypatch.setattr(session, "chosen", lambda name, render: torch.device("meta"))
+    monkeypatch.setattr(pipeline, "choose_device", lambda name, render: torch.device("meta"))
     places = []
 
     def load(path, format, options):
         places.append(options.device)
         return tiny_scene()
 
-    monkeypatch.setattr(session.data, "load", load)
+    monkeypatch.setattr(pipeline.data, "load", load)
     for setting in ("run.images_on=device", "run.images_on=cpu"):
-        Session(composed(setting), Console(file=io.StringIO()))
+        run(composed(setting), Console(file=io.StringIO()))
     assert places == ["meta", "cpu"]
 
 

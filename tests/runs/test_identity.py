@@ -3,8 +3,7 @@ from composed import composed
 from omegaconf import OmegaConf
 
 from padgs import results
-from padgs.runs.folder import RunFolder
-from padgs.runs.identity import config_hash, run_id
+from padgs.runs.store import RunStore, config_hash, run_id
 
 
 @pytest.fixture(autouse=True)
@@ -72,6 +71,6 @@ def test_what_a_machine_decided_in_old_runs_is_no_part_of_it():
 
 def test_the_hash_of_a_configuration_survives_its_file(tmp_path):
     values = composed("method=padgs", "method.tau=0.5", "method.offset_rate=[0.02,1e-5]").values()
-    RunFolder(tmp_path).prepare(values)
+    RunStore(tmp_path).prepare(values)
     stored = OmegaConf.to_container(OmegaConf.load(tmp_path / results.CONFIG_NAME))
     assert config_hash(stored) == config_hash(values)

@@ -2,15 +2,15 @@ import io
 
 from rich.console import Console
 
-from padgs.runs import live
-from padgs.runs.live import LiveLine
+from padgs.runs import console as run_console
+from padgs.runs.console import LiveLine
 from padgs.training.loop import Record
 
 
 def lines(monkeypatch, *, terminal: bool, seconds_per_iteration: float = 2.0, iterations: int = 12) -> str:
     """What is shown of a run that takes so long."""
     now = [0.0]
-    monkeypatch.setattr(live.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(run_console.time, "monotonic", lambda: now[0])
     out = io.StringIO()
     console = Console(file=out, force_terminal=terminal, width=200, color_system=None)
     with LiveLine(console) as line:

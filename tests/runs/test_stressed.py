@@ -12,11 +12,10 @@ from rich.console import Console
 from tiny_scene import tiny_scene
 
 from padgs.evaluation.protocols import Protocol
+from padgs.evaluation.scoring import constant_color_quality
 from padgs.results import Scores
-from padgs.runs import session
-from padgs.runs.outcome import judged
-from padgs.runs.scoring import quality_of_one_color
-from padgs.runs.session import Session
+from padgs.runs import run as pipeline
+from padgs.runs.run import judge
 from padgs.scene import Scene
 
 
@@ -32,7 +31,7 @@ def with_depth(distance: float) -> Scene:
 @pytest.fixture(autouse=True)
 def tiny(monkeypatch, root):
     monkeypatch.setenv("PADGS_ROOT", str(root))
-    monkeypatch.setattr(session.data, "load", lambda path, format, options: with_depth(3.0))
+    monkeypatch.setattr(pipeline.data, "load", lambda path, format, options: with_depth(3.0))
 
 
 @pytest.fixture
@@ -41,7 +40,7 @@ def run(tmp_path):
         small = ("train.iterations=120", "train.check_every=20", "method=omnigs", "protocol=stability")
         config = composed(f"run.folder={tmp_path}/runs", *small, *settings)
         out = io.StringIO()
-        return Session(config, Console(file=out, width=200)).run(), out.getvalue()
+        return pipeline.run(config, Console(file=out, width=200)), out.getvalue()
 
     return ran
 
@@ -75,7 +74,7 @@ def test_rates_a_thousand_times_as_high_never_end_well(run, method):
 
 
 def test_wrong_depths_are_degenerate(run, monkeypatch):
-    monkeypatch.setattr(session.data, "load", lambda path, format, options: with_depth(0.3))
+    monkeypatch.setattr(pipeline.data, "load", lambda path, format, options: with_depth(0.3))
     made, said = run()
     assert made.status == "degenerate" and "(AbsRel), more than 50%" in made.reason
     assert made.scores["stability"].metrics["depth_error"] > 0.5 and "degenerate" in said
@@ -95,10 +94,10 @@ def test_wrong_depths_are_degenerate(run, monkeypatch):
 def test_results_are_judged_by_what_they_show(better, depth_error, least_extent, iterations, status):
     """Worse than one colour, under any protocol; depths where they are known."""
     scene, protocol = tiny_scene(), Protocol("half", ("ws_psnr",), "none", "11", solid_angle=True, bottom_crop=0.5)
-    one_color = quality_of_one_color(scene, protocol)
-    assert one_color != quality_of_one_color(scene, replace(protocol, bottom_crop=0.0))
+    one_color = constant_color_quality(scene, protocol)
+    assert one_color != constant_color_quality(scene, replace(protocol, bottom_crop=0.0))
     marks = {"ws_psnr": one_color + better, "depth_error": depth_error, "least_extent": least_extent}
     made = replace(result(), scores={"half": Scores(asdict(protocol), marks, {})})
-    assert judged(made, scene, iterations).status == status
-    assert judged(replace(made, status="timeout"), scene, iterations).status == "timeout"
-    assert judged(result(), scene, iterations).ok, "without marks"
+    assert judge(made, scene, iterations).status == status
+    assert judge(replace(made, status="timeout"), scene, iterations).status == "timeout"
+    assert judge(result(), scene, iterations).ok, "without marks"

@@ -8,8 +8,7 @@ from made_up import result
 from rich.console import Console
 from tiny_scene import tiny_scene
 
-from padgs.runs.summary import introduce, show_result
-from padgs.runs.terminal import say
+from padgs.runs.console import introduce, say, show_result
 
 TEXT = "[bold]a[/b] [/x] \x1b[2J \x1b]0;t\x07 \udce9"
 SHOWN = r"[bold]a[/b] [/x] \x1b[2J \x1b]0;t\x07 \udce9"

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from padgs.runs.typed import ConfigError, typed
+from padgs.checks import ConfigError, typed
 
 
 @dataclass(frozen=True)

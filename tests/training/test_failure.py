@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from padgs.training.failure import first_non_finite, is_out_of_memory
+from padgs.training.health import first_non_finite, is_out_of_memory
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), float("-inf")])

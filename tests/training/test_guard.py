@@ -9,10 +9,9 @@ from states import assert_same_but_time
 from tiny_scene import tiny_scene
 from torch import nn
 
-from padgs.runs.session import build
-from padgs.training.budget import Budget
-from padgs.training.failure import Failure
-from padgs.training.guard import ANISOTROPY, SMALLEST, Guard
+from padgs.runs.run import build_method
+from padgs.training.health import ANISOTROPY, SMALLEST, Failure, Guard
+from padgs.training.options import Budget
 from padgs.training.schedule import Constant, ParameterGroup
 
 
@@ -40,9 +39,9 @@ TOLD = "left out {} rows whose gradients were not finite"
 
 def begun(preset: str, name: str, rows: slice, *settings: str, steps: int = 6):
     """A method whose first step has gradients that are NaN, and its records to come."""
-    method = build(composed(f"method={preset}", *settings))
+    method = build_method(composed(f"method={preset}", *settings))
     records = method.fit(tiny_scene(), Budget(steps))
-    Poison({group.name: group.parameters[0] for group in method.trainee.groups()}[name], rows)
+    Poison({group.name: group.parameters[0] for group in method.model.groups()}[name], rows)
     return method, records
 
 
@@ -70,7 +69,7 @@ def test_many_bad_rows_and_bad_networks_end_a_run(preset, name, count):
 def test_a_resumed_run_forgets_no_bad_row(count):
     method, records = begun("omnigs", "means", slice(0, count), "train.check_every=4", *GUARDED)
     next(records)
-    other = build(composed("method=omnigs", "train.check_every=4", *GUARDED))
+    other = build_method(composed("method=omnigs", "train.check_every=4", *GUARDED))
     other.load_state(method.state())
     rest = other.fit(tiny_scene(), Budget(6))
     if count == 1:
@@ -84,7 +83,7 @@ def test_a_resumed_run_forgets_no_bad_row(count):
 def test_a_guard_without_cause_changes_nothing(preset):
     states = []
     for settings in ((), ("train.guard_gradients=true", "train.guard_scales=true")):
-        method = build(composed(f"method={preset}", *settings))
+        method = build_method(composed(f"method={preset}", *settings))
         list(method.fit(tiny_scene(), Budget(5)))
         states.append(method.state())
         states[-1].values.pop("guard")

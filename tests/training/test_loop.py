@@ -8,17 +8,16 @@ from states import assert_same_but_time
 from tiny_scene import tiny_scene
 from torch import Tensor, nn
 
-from padgs import stopwatch
+from padgs import clock
 from padgs.gaussians import Gaussians
 from padgs.render import Rendering
 from padgs.scene import View
 from padgs.training import schedule as schedules
-from padgs.training.budget import Budget
-from padgs.training.failure import Failure
+from padgs.training.health import Failure
 from padgs.training.loop import Trainer
-from padgs.training.options import TrainOptions
+from padgs.training.model import State, TrainingRender
+from padgs.training.options import Budget, TrainOptions
 from padgs.training.schedule import Constant, LogLinear, ParameterGroup
-from padgs.training.trainee import Drawing, State
 
 
 class Flat:
@@ -36,7 +35,7 @@ class Flat:
     def groups(self) -> list[ParameterGroup]:
         return [ParameterGroup("color", (self.color,), self.rates)]
 
-    def draw(self, view: View) -> Drawing:
+    def draw(self, view: View) -> TrainingRender:
         self.calls.append("draw")
         self.views.append(view.name)
         noise = torch.rand(view.height, view.width, 1, generator=self.noise) * torch.rand(1)
@@ -45,9 +44,11 @@ class Flat:
         probe = torch.zeros(self.drawn, 2, requires_grad=True)
         drawn = Gaussians(*(torch.zeros(self.drawn, *shape) for shape in ((3,), (4,), (3,), (), (3,))))
         visible = torch.ones(self.drawn, dtype=torch.bool)
-        return Drawing(Rendering(image + probe.sum(), flat, flat, visible), probe, drawn, torch.arange(self.drawn))
+        return TrainingRender(
+            Rendering(image + probe.sum(), flat, flat, visible), probe, drawn, torch.arange(self.drawn)
+        )
 
-    def observe(self, drawing: Drawing, iteration: int) -> None:
+    def observe(self, drawing: TrainingRender, iteration: int) -> None:
         self.calls.append("observe")
         assert drawing.probe.grad is not None
         self.statistic = self.statistic + drawing.probe.grad.sum()
@@ -116,11 +117,11 @@ def test_an_iteration_may_draw_several_views_before_adam_steps_on_the_sum_of_the
     losses = [(color - view.image()).abs().mean() for view in scene.train]
     assert record.loss == pytest.approx(sum(losses).item() / 5, rel=1e-5)
     (gradient,) = torch.autograd.grad(sum(losses), color)
-    moments = run._optimiser.adam.state[model.color]
+    moments = run._optimizer.adam.state[model.color]
     assert torch.allclose(moments["exp_avg"], 0.1 * gradient, rtol=1e-4, atol=1e-7)
 
 
-def plain(drawing: Drawing, color: Tensor) -> Drawing:
+def plain(drawing: TrainingRender, color: Tensor) -> TrainingRender:
     """The same without noise."""
     image = color + 0 * drawing.rendering.image.detach() + drawing.probe.sum()
     return replace(drawing, rendering=replace(drawing.rendering, image=image))
@@ -182,7 +183,7 @@ class Poisoned(Flat):
         super().__init__()
         self.place = place
 
-    def draw(self, view: View) -> Drawing:
+    def draw(self, view: View) -> TrainingRender:
         drawing = super().draw(view)
         if len(self.views) != 7:
             return drawing
@@ -294,7 +295,7 @@ class Clock:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, first: float = TICK, growth: float = 1.0) -> None:
         self.now, self._step, self._growth = 0.0, first, growth
         for name in ("perf_counter", "process_time"):
-            monkeypatch.setattr(stopwatch.time, name, lambda: self.now)
+            monkeypatch.setattr(clock.time, name, lambda: self.now)
 
     def tick(self) -> None:
         self.now, self._step = self.now + self._step, self._step * self._growth
@@ -307,7 +308,7 @@ class Timed(Flat):
         super().__init__()
         self.clock, self.moments = clock, list[int]()
 
-    def draw(self, view: View, probe: Tensor | None = None) -> Drawing:
+    def draw(self, view: View, probe: Tensor | None = None) -> TrainingRender:
         self.clock.tick()
         return super().draw(view)
 
@@ -340,7 +341,7 @@ def test_a_budget_of_seconds_ends_on_time_and_goes_once_through_the_whole_schedu
     for record in records:
         assert record.progress == pytest.approx(record.seconds / seconds, abs=0.05 + 1 / schedule)
     fitting = schedules.Pace.of("run", len(records)).factor
-    assert run._optimiser.pace.factor == pytest.approx(fitting, rel=0.05), "rates fit the steps that were taken"
+    assert run._optimizer.pace.factor == pytest.approx(fitting, rel=0.05), "rates fit the steps that were taken"
     assert [record.progress == 1 for record in records] == [False] * (len(records) - 1) + [True]
 
 

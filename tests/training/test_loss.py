@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from padgs.geometry.distortion import solid_angle_weight
-from padgs.training.loss import photometric_loss, pixel_weight, ssim_map, target_moments, window_mean
+from padgs.training.loss import photometric_loss, pixel_weight, ssim_map, ssim_statistics, window_mean
 
 CASES = ("metrics_a", "metrics_b")
 
@@ -88,7 +88,7 @@ def test_derivative_against_finite_differences(generator):
 def test_known_moments_change_nothing(generator):
     image, target = torch.rand(2, 16, 32, 3, generator=generator)
     weight = pixel_weight("solid_angle", 16)
-    with_moments = photometric_loss(image, target, weight, moments=target_moments(target))
+    with_moments = photometric_loss(image, target, weight, moments=ssim_statistics(target))
     assert torch.equal(with_moments, photometric_loss(image, target, weight))
 
 

@@ -8,11 +8,10 @@ from padgs.gaussians import Gaussians
 from padgs.methods.splats.method import SplatMethod
 from padgs.render import Rendering
 from padgs.results import STATUSES
-from padgs.training.failure import Failure
+from padgs.training.health import Failure, Monitor
 from padgs.training.loop import Budget
-from padgs.training.monitor import Monitor
+from padgs.training.model import TrainingRender
 from padgs.training.options import TrainOptions
-from padgs.training.trainee import Drawing
 
 ITERATIONS = 1000
 
@@ -37,13 +36,15 @@ def losses(of):
     return lambda iteration: watch.loss(of(iteration), iteration)
 
 
-def drawing(image: torch.Tensor, *, transmittance: float = 0.2, scale: float = 0.1, large: int = 0) -> Drawing:
+def drawing(image: torch.Tensor, *, transmittance: float = 0.2, scale: float = 0.1, large: int = 0) -> TrainingRender:
     means = torch.randn(200, 3, generator=torch.Generator().manual_seed(1))
     scales = torch.full((200, 3), 0.1)
     scales[:large] = scale
     gaussians = Gaussians(means, torch.ones(200, 4), scales, torch.ones(200), torch.ones(200, 3))
     flat = torch.full(image.shape[:2], transmittance)
-    return Drawing(Rendering(image, flat, flat, torch.ones(200, dtype=torch.bool)), means, gaussians, torch.arange(200))
+    return TrainingRender(
+        Rendering(image, flat, flat, torch.ones(200, dtype=torch.bool)), means, gaussians, torch.arange(200)
+    )
 
 
 def test_a_loss_that_rises_and_stays_has_diverged():
@@ -183,8 +184,9 @@ def test_a_resumed_run_is_compared_with_the_model_that_it_began_with():
 class Deaf(SplatMethod):
     """A method whose rotations nothing pulls at."""
 
-    def _start(self, scene, iterations):
-        trainee = super()._start(scene, iterations)
+    def build_model(self, scene, iterations):
+        """See `Method.build_model`."""
+        trainee = super().build_model(scene, iterations)
         draw = trainee.draw
 
         def without(view, probe=None):

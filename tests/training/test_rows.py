@@ -2,11 +2,11 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from padgs.training.rows import append_rows, keep_rows
+from padgs.training.optimizer import append_rows, keep_rows
 
 
 def trained(count: int, generator: torch.Generator) -> tuple[dict[str, nn.Parameter], torch.optim.Adam, nn.Parameter]:
-    """Two parameters with rows, one without, an optimiser with moments in all of them."""
+    """Two parameters with rows, one without, an optimizer with moments in all of them."""
     parameters = {
         "a": nn.Parameter(torch.randn(count, 3, generator=generator)),
         "b": nn.Parameter(torch.randn(count, generator=generator)),

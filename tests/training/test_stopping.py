@@ -13,10 +13,10 @@ from padgs.methods.splats.trainee import SplatTrainee
 from padgs.registry import lookup
 from padgs.render import RenderConfig, Rendering
 from padgs.scene import View
-from padgs.training.budget import Budget
+from padgs.training.health import FADE, Plateau, quality, validation_split
 from padgs.training.loop import Trainer
-from padgs.training.order import ViewOrder
-from padgs.training.stopping import FADE, Plateau, quality, set_apart
+from padgs.training.options import Budget
+from padgs.training.view_order import ViewOrder
 
 ITERATIONS = 100
 
@@ -71,7 +71,7 @@ def test_a_plateau_is_where_the_average_gains_nothing_and_not_before():
 def test_views_set_apart_come_back_when_rates_fade(scene, monkeypatch):
     monkeypatch.setattr(Plateau, "reached", lambda self, value, parts, moment: moment > 49)
     run = trainer(scene)
-    apart = {scene.train[number].name for number in set_apart(scene.train)}
+    apart = {scene.train[number].name for number in validation_split(scene.train)}
     records = list(run.records())
     trainee = run._trainee
     stopped = next(number for number, record in enumerate(records) if any("stopping" in e for e in record.events))
@@ -83,7 +83,7 @@ def test_views_set_apart_come_back_when_rates_fade(scene, monkeypatch):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_they_come_back_within_the_epoch_that_runs(scene, seed):
-    apart = set_apart(scene.train)
+    apart = validation_split(scene.train)
     order = ViewOrder(scene, seed, apart)
     drawn = [order.next()]
     order.take_all()
@@ -97,7 +97,7 @@ def test_they_come_back_within_the_epoch_that_runs(scene, seed):
 def test_the_shortest_runs_end_well_when_they_are_stopped(scene, iterations):
     run, progress = Trainer(Counted(scene), scene, Budget(iterations), seed=1), 0.0
     for record in run.records():
-        run.stop("asked")
+        run.request_stop("asked")
         progress = record.progress
     assert progress == 1
 
@@ -106,10 +106,10 @@ def test_rates_never_rise_when_a_run_is_stopped(scene):
     run = trainer(scene, "end")
     rates = []
     for record in run.records():
-        rates.append([group["lr"] for group in run._optimiser.adam.param_groups])
+        rates.append([group["lr"] for group in run._optimizer.adam.param_groups])
         if record.iteration == 70:
-            assert run.stop("asked")
-    assert not run.stop("asked again"), "it is over"
+            assert run.request_stop("asked")
+    assert not run.request_stop("asked again"), "it is over"
     for before, now in zip(rates[:-1], rates[1:], strict=True):
         assert all(rate <= last for rate, last in zip(now, before, strict=True))
 

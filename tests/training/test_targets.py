@@ -3,7 +3,7 @@ import torch
 
 import padgs.training.targets
 from padgs.scene import View
-from padgs.training.loss import target_moments
+from padgs.training.loss import ssim_statistics
 from padgs.training.targets import Targets
 
 
@@ -28,7 +28,7 @@ def test_image_weight_and_moments():
     assert torch.equal(target.image, PIXELS / 255)
     assert torch.equal(target.weight, mask)
     assert target.moments is not None
-    assert torch.equal(target.moments.mean, target_moments(PIXELS / 255).mean)
+    assert torch.equal(target.moments.mean, ssim_statistics(PIXELS / 255).mean)
 
 
 def test_moments_are_kept_only_while_there_is_room(monkeypatch):

@@ -84,7 +84,7 @@ def costs(size: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
         "blend_backward": (2 * BLEND_BACKWARD_LANES * pairs, (76 + 128) * instances + 36 * pixels),
         "project_backward": (1000 * gaussians, 200 * gaussians),
         "decode_backward": (2 * decode, 568 * anchors + 112 * gaussians),
-        "optimiser": (ADAM_OPERATIONS * scalars, ADAM_BYTES * scalars),
+        "optimizer": (ADAM_OPERATIONS * scalars, ADAM_BYTES * scalars),
     }
 
 

@@ -33,7 +33,7 @@ STAGES = {
     "decode_backward": "gradients of anchors and networks",
     "backward": "autograd around the native calls",
     "observe": "densification statistics",
-    "optimiser": "Adam",
+    "optimizer": "Adam",
     "adapt": "densification and pruning, as a share of one iteration",
     "rest": "between the stages",
 }

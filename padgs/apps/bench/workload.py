@@ -19,8 +19,8 @@ from padgs.methods.anchors.model import PaDGS
 from padgs.methods.anchors.trainee import AnchorTrainee, LearningRates
 from padgs.render import RenderOptions
 from padgs.scene import Scene, View
-from padgs.training.budget import Budget
 from padgs.training.loop import Stage, Trainer
+from padgs.training.options import Budget
 
 NEAREST, FURTHEST = 1.0, 4.0  # uniform distances of anchors, world units
 SIGMA = 0.7  # median size of a Gaussian's axis, in pixels at the equator

@@ -22,11 +22,10 @@ from padgs.methods.splats.model import Splats
 from padgs.methods.splats.trainee import SplatTrainee
 from padgs.render import RenderConfig, Rendering, RenderOptions, render
 from padgs.scene import Scene, View
-from padgs.training.budget import Budget
-from padgs.training.extent import ExtentOptions
+from padgs.training.initial_points import ExtentOptions
 from padgs.training.loop import Trainer
-from padgs.training.options import TrainOptions
-from padgs.training.trainee import Drawing
+from padgs.training.model import TrainingRender
+from padgs.training.options import Budget, TrainOptions
 
 DEGREE = 3
 FITTED_DEGREE = 1  # by least squares; higher degrees take gigabytes, and gain nothing after distillation
@@ -142,7 +141,7 @@ class FixedCountSplats(SplatTrainee):
         """Use the learning rates of 3DGS for a run of `iterations`."""
         super().__init__(splats, CloneSplitOptions(), config, extent=extent, iterations=iterations)
 
-    def observe(self, drawing: Drawing, iteration: int) -> None:
+    def observe(self, drawing: TrainingRender, iteration: int) -> None:
         """Record nothing."""
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:

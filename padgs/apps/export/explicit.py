@@ -22,7 +22,7 @@ from padgs.methods.splats.model import Splats
 from padgs.methods.splats.nearest import cameras_of, smoothed
 from padgs.methods.splats.trainee import SplatTrainee
 from padgs.render import Rendering, render
-from padgs.runs.opened import OpenedRun
+from padgs.runs.load import LoadedRun
 from padgs.scene import View
 
 DISTILLATION_STEPS = 300
@@ -40,7 +40,7 @@ class Exported:
 
 
 def export_run(
-    run: OpenedRun,
+    run: LoadedRun,
     *,
     distillation_steps: int = DISTILLATION_STEPS,
     upright: bool = False,
@@ -61,13 +61,13 @@ def export_run(
         ValueError: the run has no Gaussians.
         DataError: the data set is missing, and needed for more than Gaussians as trained.
     """
-    trainee = run.method.trainee
+    trainee = run.method.model
     config = run.config.render
     notes = [f"padgs {padgs.__version__}, run {run.folder.name}"]
     if isinstance(trainee, SplatTrainee):
         splats = trainee.baked()
         if isinstance(run.method, SCOmniGSMethod):  # trained in the world of its refined poses
-            splats = transform_splats(splats, aligned(run.method.trainee.calibration.poses)[0].inverse())
+            splats = transform_splats(splats, aligned(run.method.model.calibration.poses)[0].inverse())
         notes.append("Gaussians as trained")
         if smooth and config.low_pass > 0 and config.resolved_low_pass_kind == "solid":
             splats = smoothed(splats, cameras_of(run.scene.train), config.low_pass)
@@ -107,11 +107,11 @@ def _central_camera(views: Sequence[View], scale: float) -> Tensor:
     return torch.stack((centres[number], centres[number] + scale * forward))
 
 
-def _bake_and_distill(run: OpenedRun, steps: int, progress: Callable[[int], None]) -> tuple[Splats, str]:
+def _bake_and_distill(run: LoadedRun, steps: int, progress: Callable[[int], None]) -> tuple[Splats, str]:
     scene, config, method = run.scene, run.config.render, run.method
     options = config.options(scene.scale)
     views = sample_cameras(scene.train)
-    splats = bake(method.trainee.model, views, options, config.backend, scene.scale)
+    splats = bake(method.model.model, views, options, config.backend, scene.scale)
     if steps:
         distill(splats, method.render, replace(scene, train=tuple(views)), config, steps, progress)
 

@@ -23,8 +23,8 @@ from torch import Tensor
 
 from padgs.data.capture import DataError
 from padgs.data.cloud import read_vertices
+from padgs.files import atomic_path
 from padgs.methods.splats.model import Splats
-from padgs.replacing import replacing
 
 CONVERTER = "splat-transform"
 CONVERTED = (".compressed.ply", ".sog", ".spz", ".html")  # suffixes that the converter writes
@@ -71,7 +71,7 @@ def _viewer_settings(start: Tensor) -> dict[str, Any]:
 def _convert(source: Path, target: Path, *more: str) -> None:
     # One iteration over the palette of .sog and .html: 27 000 Gaussians take 26 s; ten take 226 s and gain 0.01 dB.
     options = ["--quiet", "--overwrite", "--gpu", "cpu", "--iterations", "1"]
-    with replacing(target) as draft:
+    with atomic_path(target) as draft:
         command = [CONVERTER, *options, *more, str(source.resolve()), str(draft.resolve())]
         done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
         if done.returncode:
@@ -157,5 +157,5 @@ def _write_ply(path: Path, splats: Splats, comments: Sequence[str]) -> None:
     vertex = table.view([(name, "<f4") for name in names])[:, 0]
     # Comments follow the count, which SIBR reads from the third line. PLY headers are ASCII.
     lines = [line.encode("unicode_escape").decode() for line in comments]
-    with replacing(path) as draft:
+    with atomic_path(path) as draft:
         PlyData([PlyElement.describe(vertex, "vertex", comments=lines)], byte_order="<").write(str(draft))

@@ -17,7 +17,7 @@ from torch import Tensor
 from padgs.apps.viewer.renders import CAMERAS, LAYERS, Box, RunRenderer, ViewOptions, side_by_side
 from padgs.apps.viewer.server import Server
 from padgs.data.camera_paths import gravity
-from padgs.runs.opened import OpenedRun
+from padgs.runs.load import LoadedRun
 from padgs.scene import View
 
 IDLE_SECONDS = 0.2  # without a change, after which the full resolution is rendered
@@ -232,7 +232,7 @@ UPDATE_SECONDS = 1.0  # between searches for a newer checkpoint
 
 
 @contextmanager
-def show_runs(server: Server, runs: Sequence[OpenedRun]) -> Iterator[dict[int, Page]]:
+def show_runs(server: Server, runs: Sequence[LoadedRun]) -> Iterator[dict[int, Page]]:
     """Show one run, or two to compare, in all connected browsers until the context ends.
 
     Runs in training are shown from their last checkpoint, and followed. Pages can stop training if the server is local,

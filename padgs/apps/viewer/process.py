@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING
 from padgs.apps.viewer.server import LOCAL, PORT, start_server, viser_module
 
 if TYPE_CHECKING:
-    from padgs.runs.opened import OpenedRun
+    from padgs.runs.load import LoadedRun
 
 POLL_SECONDS = 0.5
 STOP_SECONDS = 5.0  # until a server that does not stop is killed
 
 
 def serve(
-    load_runs: Callable[[], Sequence[OpenedRun]], *, host: str = LOCAL, port: int = PORT, browse: bool = False
+    load_runs: Callable[[], Sequence[LoadedRun]], *, host: str = LOCAL, port: int = PORT, browse: bool = False
 ) -> None:
     """Serve a page, print its address, and show runs until Ctrl-C, or until the parent process ends.
 
@@ -86,7 +86,7 @@ def serve_training(folder: Path, data_path: str | None, device: str) -> Iterator
 
 
 def _show(folder: Path, data_path: str | None, device: str) -> None:
-    from padgs.runs.opened import load_run
+    from padgs.runs.load import load_run
 
     with suppress(KeyboardInterrupt):
         wait_for_checkpoint(folder)
@@ -101,9 +101,9 @@ def wait_for_checkpoint(folder: str | Path) -> None:
     """
     from padgs import results
     from padgs.runs import checkpoint
-    from padgs.runs.folder import RunFolder
+    from padgs.runs.store import RunStore
 
-    files, printed, is_child = RunFolder(Path(folder)), False, parent_process() is not None
+    files, printed, is_child = RunStore(Path(folder)), False, parent_process() is not None
 
     def is_decided() -> bool:
         return checkpoint.exists(files.checkpoint) or (files.path / results.FILE_NAME).exists()
@@ -112,20 +112,9 @@ def wait_for_checkpoint(folder: str | Path) -> None:
         if not is_child and not (files.path / results.CONFIG_NAME).is_file():
             return
         # A parent that trains may not hold the lock yet; a run may have ended since the first test.
-        if not is_child and _is_unlocked(files.path) and not is_decided():
+        if not is_child and not files.is_busy and not is_decided():
             raise ValueError(f"{folder} has no checkpoint, and no process trains it; start the same padgs-run again")
         if not printed:
             print(f"waiting for the first checkpoint of {folder}  (Ctrl-C ends it)", flush=True)
         printed = True
         time.sleep(POLL_SECONDS)
-
-
-def _is_unlocked(folder: Path) -> bool:
-    """Return whether no process trains a run, as far as its lock tells."""
-    from padgs.runs.lock import RunBusy, held
-
-    try:
-        with held(folder):
-            return True
-    except (RunBusy, OSError):  # OSError: no permission to lock the folder
-        return False

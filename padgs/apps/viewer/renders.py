@@ -14,7 +14,7 @@ from padgs.geometry.camera import Panorama, Pinhole, perspective
 from padgs.geometry.panorama import sample
 from padgs.methods.anchors.trainee import AnchorTrainee
 from padgs.methods.splats.trainee import SplatTrainee
-from padgs.runs.opened import OpenedRun
+from padgs.runs.load import LoadedRun
 from padgs.scene import View
 from padgs.training.method import Method
 
@@ -41,7 +41,7 @@ class RunRenderer:
         is_following: whether `update` loads newer checkpoints.
     """
 
-    def __init__(self, run: OpenedRun) -> None:
+    def __init__(self, run: LoadedRun) -> None:
         """Prepare the caches."""
         self.run, self.is_following, self._failure = run, run.result is None, ""
         self._method = lru_cache(maxsize=2)(self._method_for)
@@ -50,7 +50,7 @@ class RunRenderer:
     @property
     def can_crop(self) -> bool:
         """Return whether the model has positions, by which it can be cropped."""
-        return isinstance(self.run.method.trainee, (SplatTrainee, AnchorTrainee))
+        return isinstance(self.run.method.model, (SplatTrainee, AnchorTrainee))
 
     @property
     def summary(self) -> str:
@@ -122,7 +122,7 @@ class RunRenderer:
         method = self.run.through(full)
         if crop is None or not self.can_crop:
             return method
-        return crop_model(method.drawn_with(method.render_config), crop)
+        return crop_model(method.with_renderer(method.render_config), crop)
 
     def _error_from(self, view: View) -> np.ndarray:
         """Return the error image of the nearest view of the scene, resampled to the directions of a view."""
@@ -141,7 +141,7 @@ class RunRenderer:
 
 def crop_model(method: Method, crop: Box) -> Method:
     """Remove all Gaussians or anchors outside a box, in place; the method can then only render."""
-    trainee = method.trainee
+    trainee = method.model
     positions = trainee.model.positions if isinstance(trainee, AnchorTrainee) else trainee.splats.means
     low, high = (positions.new_tensor(corner) for corner in crop)
     trainee.keep(((positions >= low) & (positions <= high)).all(-1))

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
-from padgs.extras import installing
+from padgs.checks import install_command
 
 LOCAL, PORT = "127.0.0.1", 8080
 ALL_INTERFACES = "0.0.0.0"
@@ -71,5 +71,5 @@ def viser_module() -> ModuleType:
     try:
         import viser
     except ImportError as error:
-        raise ValueError(f"the viewer needs viser: {installing('view')}") from error
+        raise ValueError(f"the viewer needs viser: {install_command('view')}") from error
     return viser

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from padgs.scene import Scene
-from padgs.training.cloud import refuse_unusable, squared_spacing
+from padgs.training.initial_points import refuse_unusable, squared_spacing
 
 
 def automatic_voxel_size(scene: Scene, pixels: float) -> float:

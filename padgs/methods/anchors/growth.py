@@ -14,8 +14,8 @@ from torch import Tensor
 from padgs.checks import check
 from padgs.methods.anchors.grid import cells_from_points, occupied, points_from_cells, unique_cells
 from padgs.methods.anchors.model import PaDGS
-from padgs.training.failure import Failure
-from padgs.training.rows import append_rows, keep_rows
+from padgs.training.health import Failure
+from padgs.training.optimizer import append_rows, keep_rows
 from padgs.training.schedule import scaled
 
 MIN_GROW_EVERY = 50  # iterations; below it `eligible_share` asks for too few views to average over

@@ -14,11 +14,11 @@ from padgs.methods.anchors.growth import GrowthOptions
 from padgs.methods.anchors.model import PaDGS, PaDGSOptions
 from padgs.methods.anchors.trainee import AnchorTrainee, LearningRates
 from padgs.scene import Scene
-from padgs.training.budget import Budget
 from padgs.training.loop import Record, Stage
 from padgs.training.method import Method
+from padgs.training.model import State
+from padgs.training.options import Budget
 from padgs.training.schedule import PUBLISHED_ITERATIONS
-from padgs.training.trainee import State
 
 
 @dataclass(frozen=True)
@@ -64,12 +64,14 @@ class PaDGSMethod(Method):
                 "them by method.max_anchors and method.voxel_pixels, or prune a trained run by padgs need"
             )
 
-    def _start(self, scene: Scene, iterations: int) -> AnchorTrainee:
+    def build_model(self, scene: Scene, iterations: int) -> AnchorTrainee:
+        """See `Method.build_model`."""
         extent = self.options.extent_of(scene)
         extent /= scene.scale if self.options.offset_rate_unit == "scene" else 1.0
         return self._trainee_of(PaDGS.from_scene(scene, self.options, seed=self.seed), extent, iterations)
 
-    def _blank(self, state: State) -> AnchorTrainee:
+    def restore(self, state: State) -> AnchorTrainee:
+        """See `Method.restore`."""
         stored = state.of_model()
         positions, log_scales = stored.tensors["positions"], stored.tensors["log_scales"]
         unit, voxel_size = stored.values["unit"], stored.values["voxel_size"]

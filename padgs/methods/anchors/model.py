@@ -17,7 +17,7 @@ from padgs.methods.anchors.grid import anchors_from_points, automatic_voxel_size
 from padgs.methods.anchors.precision import PRECISIONS
 from padgs.native.cuda import HostCopy
 from padgs.scene import Scene, View
-from padgs.training.rows import load_rows
+from padgs.training.optimizer import load_rows
 
 OMEGA_INPUTS = ("sin2", "cos")
 DISTANCE_UNITS = ("scene", "world")
@@ -139,7 +139,7 @@ class PaDGS(nn.Module):
         """Take over what `state_dict` of another model gave; the number of anchors may differ.
 
         Raises:
-            ValueError: as `padgs.training.rows.load_rows` does.
+            ValueError: as `padgs.training.optimizer.load_rows` does.
         """
         load_rows(self, tensors, ("positions", *self.rows()))
         self.positions = tensors["positions"].to(self.positions).clone()

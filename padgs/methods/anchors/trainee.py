@@ -13,9 +13,9 @@ from padgs.methods.anchors.growth import Growth, GrowthOptions
 from padgs.methods.anchors.model import Decoded, PaDGS
 from padgs.render import Rendering, RenderOptions, render, resolve_backend
 from padgs.scene import View
-from padgs.training.extent import ExtentOptions
+from padgs.training.initial_points import ExtentOptions
+from padgs.training.model import Parts, Size, State, TrainingRender
 from padgs.training.schedule import Constant, LogLinear, ParameterGroup
-from padgs.training.trainee import Drawing, Parts, Size, State
 
 OFFSET_RATE_UNITS = ("scene", "world")
 HEADROOM = 1.3  # room for so many times the Gaussians that the last view showed
@@ -59,7 +59,7 @@ class LearningRates(ExtentOptions):
 
 
 @dataclass(frozen=True)
-class AnchorDrawing(Drawing):
+class AnchorDrawing(TrainingRender):
     """A drawing that remembers the opacities of all anchors, which decide what is pruned.
 
     Its probe may have more rows than there are Gaussians; the first are theirs.
@@ -69,7 +69,7 @@ class AnchorDrawing(Drawing):
 
 
 class AnchorTrainee:
-    """A PaD-GS model with its growth; a `padgs.training.trainee.Trainee`.
+    """A PaD-GS model with its growth; a `padgs.training.model.Model`.
 
     Attributes:
         model, growth: what is trained, and what densifies it.
@@ -128,7 +128,7 @@ class AnchorTrainee:
         probe = decoded.gaussians.means.new_zeros(len(decoded.slots), 2, requires_grad=True)
         return render(decoded.gaussians, view, self._options, mean_offsets=probe, backend=self._backend), probe
 
-    def observe(self, drawing: Drawing, iteration: int) -> None:
+    def observe(self, drawing: TrainingRender, iteration: int) -> None:
         """Collect opacities and image-plane gradients."""
         assert isinstance(drawing, AnchorDrawing), type(drawing)
         gradient = drawing.probe.grad if drawing.probe.grad is not None else torch.zeros_like(drawing.probe)

@@ -21,8 +21,8 @@ from padgs.methods.calibration.splats import Calibration
 from padgs.render import Rendering
 from padgs.render.cubemap import SummedCounters
 from padgs.scene import View
+from padgs.training.model import TrainingRender
 from padgs.training.schedule import LogLinear, ParameterGroup
-from padgs.training.trainee import Drawing
 
 DECAY = 0.1  # learning rates fall to this share over a run
 
@@ -103,7 +103,7 @@ class DualLens(Calibration):
             both.append(replace(view, cam_from_world=pose, lens=RayTable(table, focal)))
         return both[0], both[1]
 
-    def draw(self, draw: Callable[..., Drawing], view: View) -> Drawing:
+    def draw(self, draw: Callable[..., TrainingRender], view: View) -> TrainingRender:
         """The panorama as this camera stitches it; `draw(view, probe)` draws what one lens sees."""
         first, second = self.lenses(view)
         front = draw(first)

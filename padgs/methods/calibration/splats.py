@@ -13,9 +13,9 @@ from padgs.methods.splats.method import SplatMethod
 from padgs.methods.splats.model import Splats
 from padgs.methods.splats.trainee import SplatTrainee
 from padgs.scene import Scene, View
-from padgs.training.budget import Budget
+from padgs.training.model import Parts, Size, State, TrainingRender
+from padgs.training.options import Budget
 from padgs.training.schedule import ParameterGroup
-from padgs.training.trainee import Drawing, Parts, Size, State
 
 PREFIX = "calibration/"  # of its tensors in a state
 
@@ -28,7 +28,7 @@ class Calibration(nn.Module, ABC):
         """Its parameters and their learning rates in a run of `iterations`."""
 
     @abstractmethod
-    def draw(self, draw: Callable[..., Drawing], view: View) -> Drawing:
+    def draw(self, draw: Callable[..., TrainingRender], view: View) -> TrainingRender:
         """Draw a training view as its camera takes it; `draw(view, probe=None)` draws as an ideal camera does."""
 
     @abstractmethod
@@ -67,7 +67,7 @@ class CalibratedTrainee(SplatTrainee):
             "that does not calibrate"
         )
 
-    def draw(self, view: View) -> Drawing:
+    def draw(self, view: View) -> TrainingRender:
         """Render all Gaussians as the camera of the view takes them, differentiably."""
         return self.calibration.draw(super().draw, view)
 
@@ -122,13 +122,15 @@ class CalibratedMethod(SplatMethod):
                 "here; set it to a number or null"
             )
 
-    def _start(self, scene: Scene, iterations: int) -> SplatTrainee:
+    def build_model(self, scene: Scene, iterations: int) -> SplatTrainee:
+        """See `Method.build_model`."""
         self._calibration = self._as_given(scene)
-        return super()._start(scene, iterations)
+        return super().build_model(scene, iterations)
 
-    def _blank(self, state: State) -> SplatTrainee:
+    def restore(self, state: State) -> SplatTrainee:
+        """See `Method.restore`."""
         self._calibration = self._as_stored(state.of_model().values["calibration"])
-        return super()._blank(state)
+        return super().restore(state)
 
     def _trainee_of(self, splats: Splats, *args: Any, **more: Any) -> SplatTrainee:
         self._calibration.to(splats.means.device)

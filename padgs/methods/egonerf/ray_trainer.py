@@ -9,14 +9,13 @@ from typing import Any, ClassVar, cast
 import torch
 from torch import Tensor
 
+from padgs.clock import Lap
 from padgs.methods.egonerf.ray_pixels import RayPixels
 from padgs.methods.egonerf.trainee import EgoNeRFTrainee
 from padgs.scene import Scene
-from padgs.stopwatch import Lap
-from padgs.training.budget import Budget
 from padgs.training.loop import Stage, Trainer
-from padgs.training.options import TrainOptions
-from padgs.training.trainee import Trainee
+from padgs.training.model import Model
+from padgs.training.options import Budget, TrainOptions
 
 
 class RayTrainer(Trainer):
@@ -51,15 +50,15 @@ class RayTrainer(Trainer):
             ValueError: the pixels of a view cannot be used.
         """
         # Rays are all that it draws, so of a trainee it has what does not depend on views.
-        super().__init__(cast(Trainee, trainee), scene, budget, options, seed, stage=stage)
+        super().__init__(cast(Model, trainee), scene, budget, options, seed, stage=stage)
         self._tracer, self._rays = trainee, rays
         lap = Lap()
-        self._pixels = RayPixels(scene.train, options.weight, self._optimiser.device, seed)
+        self._pixels = RayPixels(scene.train, options.weight, self._optimizer.device, seed)
         self._order = self._pixels
         self.seconds, self.cpu_seconds = lap.seconds()  # reading images is training, as where they are read one by one
 
     def _step(self, iteration: int, moment: int) -> tuple[float | Tensor, dict[str, int], tuple[str, ...]]:
-        tracer, optimiser, generator = self._tracer, self._optimiser, self._pixels.generator
+        tracer, optimizer, generator = self._tracer, self._optimizer, self._pixels.generator
         with self._stage("target"):
             rays = self._pixels.draw(self._rays)
         value = rays.weight.new_zeros((), dtype=torch.float64)
@@ -72,15 +71,15 @@ class RayTrainer(Trainer):
             value += loss.detach()
             read = self._read(value, iteration)
             if isinstance(read, float) and not math.isfinite(read):
-                optimiser.refuse_non_finite({**optimiser.parameters(), "image": image, "loss": loss}, iteration)
+                optimizer.refuse_non_finite({**optimizer.parameters(), "image": image, "loss": loss}, iteration)
             with self._stage("backward"):
                 loss.backward()
         with self._stage("backward"):
             extra = tracer.regularisation(moment)
             if extra is not None:
                 extra.backward()
-        optimiser.check(iteration, moment)
-        with self._stage("optimiser"):
-            optimiser.step(moment)
+        optimizer.check(iteration, moment)
+        with self._stage("optimizer"):
+            optimizer.step(moment)
         events = (tracer.summary(),) if iteration == 1 else ()
         return self._read(value, iteration), {**tracer.counts(), "rays": self._rays}, events

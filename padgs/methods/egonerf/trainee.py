@@ -12,8 +12,8 @@ from padgs.checks import check
 from padgs.methods.egonerf.model import EgoNeRF
 from padgs.render import Rendering
 from padgs.scene import View
+from padgs.training.model import Size, State
 from padgs.training.schedule import LogLinear, ParameterGroup
-from padgs.training.trainee import Size, State
 
 VARIATION_FACTOR = 1e-2  # published, on both weights
 

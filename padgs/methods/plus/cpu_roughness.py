@@ -63,5 +63,5 @@ class _Roughness(torch.autograd.Function):
 
 @functools.lru_cache(maxsize=2)
 def _workspace(height: int, width: int) -> Tensor:
-    # Kept as that of `padgs.training.native_loss` is, so only one thread at a time may train.
+    # Kept as that of `padgs.training.loss` is, so only one thread at a time may train.
     return torch.zeros(cpu.library().padgs_roughness_workspace(height, width), dtype=torch.float32)

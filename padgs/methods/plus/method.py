@@ -22,10 +22,9 @@ from padgs.methods.splats.model import Splats
 from padgs.methods.splats.trainee import SplatTrainee
 from padgs.render import RenderConfig
 from padgs.scene import Scene
-from padgs.training.budget import Budget
 from padgs.training.loop import Stage, Trainer
-from padgs.training.options import TrainOptions
-from padgs.training.trainee import Trainee
+from padgs.training.model import Model
+from padgs.training.options import Budget, TrainOptions
 
 PIXEL = 0.1  # square pixels; a pixel is the mean over a square, whose variance is 1/12
 
@@ -51,7 +50,7 @@ class PlusMethod(SplatMethod):
     @property
     def is_drawn_no_finer(self) -> bool:
         """See `padgs.methods.splats.nearest`; checkpoints of earlier versions do not know the training views."""
-        return self.trainee.is_drawn_no_finer
+        return self.model.is_drawn_no_finer
 
     _sought: tuple[Scene, int, Scene, torch.Tensor] | None = None  # what `_filled` found last
 
@@ -61,14 +60,15 @@ class PlusMethod(SplatMethod):
         They are sought once for a rehearsal and for its run, and not where the model comes from elsewhere.
         """
         generator = torch.Generator().manual_seed(self.seed)
-        if self._loaded is not None or self._given is not None:
+        if self._loaded_state is not None or self._warm_start_state is not None:
             return scene, generator
         if self._sought is None or self._sought[0] is not scene or self._sought[1] != count:
             self._sought = scene, count, filled(scene, count, generator=generator), generator.get_state()
         generator.set_state(self._sought[3])
         return self._sought[2], generator
 
-    def _start(self, scene: Scene, iterations: int) -> SplatTrainee:
+    def build_model(self, scene: Scene, iterations: int) -> SplatTrainee:
+        """See `Method.build_model`."""
         options, pixels = self.options, rooms(scene) * counted_pixels(scene.train[0])
         start, limit = (_within(share, pixels) for share in (options.start_share, options.limit_share))
         limit = fewest(options.max_gaussians, limit if self._target is None else self._target)
@@ -90,7 +90,8 @@ class PlusMethod(SplatMethod):
             splats.load({name: torch.cat((own, sky.rows()[name])) for name, own in splats.rows().items()})
         return self._trainee_of(splats, options.extent_of(scene), iterations, scene.train, limit=limit)
 
-    def _trained_by(self, trainee: Trainee, scene: Scene, budget: Budget, stage: Stage) -> Trainer:
+    def build_trainer(self, trainee: Model, scene: Scene, budget: Budget, stage: Stage) -> Trainer:
+        """See `Method.build_trainer`."""
         share = self.options.coarse_share
         return Trainer(trainee, scene, budget, self.train_options, self.seed, coarse_share=share, stage=stage)
 

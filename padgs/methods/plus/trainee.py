@@ -18,8 +18,8 @@ from padgs.methods.splats.nearest import cameras_of, finest_pixels, no_finer
 from padgs.methods.splats.trainee import SplatTrainee
 from padgs.render import RenderConfig
 from padgs.scene import View
+from padgs.training.model import State, TrainingRender
 from padgs.training.schedule import ParameterGroup
-from padgs.training.trainee import Drawing, State
 
 DEGREE_SHARE = 0.1  # of the run, after which the next SH degree comes into use
 AVERAGED_FROM = 0.9  # share of the run after which parameters are averaged, and all Gaussians drawn
@@ -76,7 +76,7 @@ class PlusTrainee(SplatTrainee):
         """A degree more each tenth of the run."""
         return int(iteration / (DEGREE_SHARE * self.iterations))
 
-    def draw(self, view: View, probe: Tensor | None = None) -> Drawing:
+    def draw(self, view: View, probe: Tensor | None = None) -> TrainingRender:
         """Render all Gaussians, differentiably; large ones and rough surfaces are penalised, as the view sees them."""
         drawing, options, penalties = super().draw(view, probe), self.options, []
         near = max(self.render_options(view).near, TINY * self.splats.unit)  # that may be 0, as the depth of nothing is

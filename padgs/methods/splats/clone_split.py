@@ -18,7 +18,7 @@ from padgs.checks import check, check_known
 from padgs.gaussians import rotation_matrices
 from padgs.methods.splats.model import Splats
 from padgs.methods.splats.probes import SIGNALS
-from padgs.training.rows import append_rows, forget_moments, keep_rows
+from padgs.training.optimizer import append_rows, forget_moments, keep_rows
 from padgs.training.schedule import scaled
 
 MIN_DENSIFY_EVERY = 50  # iterations; the mean gradient over fewer views is mostly noise

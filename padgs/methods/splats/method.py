@@ -19,11 +19,10 @@ from padgs.methods.splats.clone_split import CloneSplitOptions
 from padgs.methods.splats.model import Splats
 from padgs.methods.splats.trainee import SplatTrainee
 from padgs.scene import Scene, View
-from padgs.training.budget import AUTO
-from padgs.training.extent import ExtentOptions
+from padgs.training.initial_points import ExtentOptions
 from padgs.training.method import Method
-from padgs.training.options import TrainOptions
-from padgs.training.trainee import State
+from padgs.training.model import State
+from padgs.training.options import AUTO, TrainOptions
 
 REMOVAL_PSNR = 44.0  # dB, under budget.gaussians=auto; see `padgs.training.worth.needed`
 
@@ -74,7 +73,8 @@ class SplatMethod(Method):
                 "set method.signal=space"
             )
 
-    def _start(self, scene: Scene, iterations: int) -> SplatTrainee:
+    def build_model(self, scene: Scene, iterations: int) -> SplatTrainee:
+        """See `Method.build_model`."""
         options = self.options
         generator = torch.Generator().manual_seed(self.seed)
         most = fewest(options.max_gaussians, self._target)
@@ -91,7 +91,8 @@ class SplatMethod(Method):
         """Of the changes, each alone, by what is taken away a round after growth, dB; None if nothing is."""
         return REMOVAL_PSNR if self._gaussians == AUTO else None
 
-    def _blank(self, state: State) -> SplatTrainee:
+    def restore(self, state: State) -> SplatTrainee:
+        """See `Method.restore`."""
         stored = state.of_model()
         values, empty = stored.values, stored.tensors["splats/means"][:0]
         splats = Splats(empty, empty, empty, degree=self.options.sh_degree, unit=values["unit"])

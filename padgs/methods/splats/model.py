@@ -12,8 +12,8 @@ from padgs.gaussians import Gaussians
 from padgs.geometry import harmonics as spherical_harmonics
 from padgs.methods.splats import cpu_splats, gpu_splats
 from padgs.scene import Scene, View
-from padgs.training.cloud import refuse_unusable, squared_spacing
-from padgs.training.rows import load_rows
+from padgs.training.initial_points import refuse_unusable, squared_spacing
+from padgs.training.optimizer import load_rows
 
 INITIAL_OPACITY = 0.1
 SMALLEST_SCALE = 1e-4  # initial scale of coinciding points, in scene units
@@ -102,7 +102,7 @@ class Splats(nn.Module):
         return dict(self.named_parameters())
 
     def truncate(self, degree: int) -> None:
-        """Leave out the harmonics above a degree; no optimiser may hold them."""
+        """Leave out the harmonics above a degree; no optimizer may hold them."""
         self.degree, self.active_degree = degree, min(degree, self.active_degree)
         self.sh_rest.data, self.sh_rest.grad = self.sh_rest.data[:, : (degree + 1) ** 2 - 1].contiguous(), None
 
@@ -110,7 +110,7 @@ class Splats(nn.Module):
         """Take over what `state_dict` of another model gave; the number of Gaussians may differ.
 
         Raises:
-            ValueError: as `padgs.training.rows.load_rows` does.
+            ValueError: as `padgs.training.optimizer.load_rows` does.
         """
         load_rows(self, tensors, self.rows())
 

@@ -19,9 +19,9 @@ from padgs.render import RenderConfig, Rendering, RenderOptions, render
 from padgs.render.contract import ALPHA_MIN
 from padgs.render.projection import widened_scales
 from padgs.scene import View
-from padgs.training.rows import keep_rows
+from padgs.training.model import Parts, Size, State, TrainingRender
+from padgs.training.optimizer import keep_rows
 from padgs.training.schedule import Constant, LogLinear, ParameterGroup, scaled
-from padgs.training.trainee import Drawing, Parts, Size, State
 from padgs.training.worth import most_wanted, worth
 
 VARIANCES = "filter/variances"  # of the filter, in a state
@@ -96,7 +96,7 @@ class SplatTrainee:
         rows = splats.rows()
         return [ParameterGroup(name, (rows[name],), rate, is_of_rows=True) for name, rate in rates.items()]
 
-    def draw(self, view: View, probe: Tensor | None = None) -> Drawing:
+    def draw(self, view: View, probe: Tensor | None = None) -> TrainingRender:
         """Render all Gaussians, differentiably.
 
         `probe` is that of another drawing of the same Gaussians, for views that are made of several.
@@ -111,13 +111,13 @@ class SplatTrainee:
             change=self._in_training,
             backend=self._config.backend,
         )
-        return Drawing(rendering, probe, gaussians, torch.arange(len(probe), device=probe.device))
+        return TrainingRender(rendering, probe, gaussians, torch.arange(len(probe), device=probe.device))
 
     def _in_training(self, gaussians: Gaussians) -> Gaussians:
         """All Gaussians as the next drawing of the training has them."""
         return gaussians if self._filter is None else self._filter(gaussians)
 
-    def observe(self, drawing: Drawing, iteration: int) -> None:
+    def observe(self, drawing: TrainingRender, iteration: int) -> None:
         """Note how hard each Gaussian was pulled."""
         assert drawing.probe.grad is not None and self._drawn is not None, "observe is called after draw and backward"
         cos_latitudes = None
@@ -196,7 +196,7 @@ class SplatTrainee:
             self._filter.variances = self._filter.variances[rows]
 
     def truncate(self, degree: int) -> None:
-        """Leave out the harmonics above a degree; of all that has them, but no optimiser."""
+        """Leave out the harmonics above a degree; of all that has them, but no optimizer."""
         self.splats.truncate(degree)
 
     @torch.no_grad()

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING
 
 from filelock import FileLock
 
-from padgs.checks import check_known
-from padgs.extras import installing
+from padgs.checks import check_known, install_command
 from padgs.results import Result
 
 if TYPE_CHECKING:
@@ -75,7 +74,7 @@ class Tracker:
         if self.on and importlib.util.find_spec("mlflow") is None:
             self.on = False
             if options.asked:
-                say(f"runs are not mirrored into mlflow: {installing('mlflow')}, or set tracking=none")
+                say(f"runs are not mirrored into mlflow: {install_command('mlflow')}, or set tracking=none")
 
     @property
     def uri(self) -> str:

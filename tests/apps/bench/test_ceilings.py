@@ -31,7 +31,7 @@ def test_the_slower_of_the_two_binds(cost, floor):
 def test_floors_stand_beside_stages_with_a_cost_model_and_kernels_have_none():
     measured = size(parameters=100, evaluated=1)
     add_floors(measured, CEILINGS)
-    assert measured["stages"]["optimiser"] == {"seconds": 40.0, "floor": 280, "bound": "memory"}
+    assert measured["stages"]["optimizer"] == {"seconds": 40.0, "floor": 280, "bound": "memory"}
     assert measured["stages"]["rest"] == {"seconds": 40.0}
     assert measured["floor"] == pytest.approx(280 + 2 * (28 + 63) / 100)
     kernels = size(parameters=100, evaluated=1) | {"stages": {"blend_kernel": {"seconds": 1.0}}}

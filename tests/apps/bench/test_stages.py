@@ -36,10 +36,10 @@ def test_an_inner_stage_is_not_charged_to_the_outer_one(tick):
         with clock.stage("blend_backward"):
             tick(20)
     tick(1000)  # in no stage
-    with clock.stage("optimiser"):
+    with clock.stage("optimizer"):
         tick(4)
     clock.finish_round()
-    assert clock.rounds == [{"backward": (3, 6), "blend_backward": (30, 60), "optimiser": (4, 8)}]
+    assert clock.rounds == [{"backward": (3, 6), "blend_backward": (30, 60), "optimizer": (4, 8)}]
 
 
 def test_the_least_time_of_all_iterations_counts(tick):

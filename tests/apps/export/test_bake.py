@@ -9,7 +9,7 @@ from padgs.gaussians import rotation_matrices
 from padgs.methods.anchors.method import PaDGSMethod
 from padgs.methods.splats.model import Splats
 from padgs.render import RenderOptions, render
-from padgs.training.budget import Budget
+from padgs.training.options import Budget
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def decibels(method: PaDGSMethod, splats: Splats) -> float:
 def test_baked_anchors_look_like_the_method(trained):
     scene = tiny_scene()
     options = trained.render_config.options(scene.scale)
-    splats = bake(trained.trainee.model, sample_cameras(scene.train, 16), options, "auto", scene.scale)
+    splats = bake(trained.model.model, sample_cameras(scene.train, 16), options, "auto", scene.scale)
     assert decibels(trained, splats) > 35
     assert 0 < len(splats) < trained.size().counts["gaussians"], "what never shows is dropped"
 
@@ -41,7 +41,7 @@ def test_baked_anchors_look_like_the_method(trained):
 def test_lessons_bring_them_nearer(trained):
     scene = tiny_scene()
     options = trained.render_config.options(scene.scale)
-    splats = bake(trained.trainee.model, scene.train, options, "auto", scene.scale)
+    splats = bake(trained.model.model, scene.train, options, "auto", scene.scale)
     splats.sh_dc.data += 0.5
     first, done = decibels(trained, splats), []
     distill(splats, trained.render, scene, trained.render_config, 60, done.append)
@@ -51,7 +51,7 @@ def test_lessons_bring_them_nearer(trained):
 def test_cameras_in_one_place_teach_as_well(trained):
     scene = tiny_scene()
     options = trained.render_config.options(scene.scale)
-    splats = bake(trained.trainee.model, scene.train, options, "auto", scene.scale)
+    splats = bake(trained.model.model, scene.train, options, "auto", scene.scale)
     before = splats.means.clone()
     alone = replace(scene, train=tuple(view.at(scene.train[0].cam_from_world) for view in scene.train))
     distill(splats, trained.render, alone, trained.render_config, 5)

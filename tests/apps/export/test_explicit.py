@@ -37,7 +37,7 @@ def test_an_exported_run_scores_as_it_did(splat_run):
     splats = read_splats(splat_run / "splats.ply", unit=run.scene.scale)
     options = run.config.render.options(run.scene.scale)
     again = evaluate(lambda view: render(splats.gaussians(view), view, options), run.scene.test, RULES)
-    plain = run.method.trainee.splats
+    plain = run.method.model.splats
     same = evaluate(lambda view: render(plain.gaussians(view), view, options), run.scene.test, RULES)
     own = evaluate(run.method.render, run.scene.test, RULES)
     assert again.metrics["ws_psnr"] == pytest.approx(same.metrics["ws_psnr"], abs=1e-6)
@@ -48,7 +48,7 @@ def test_an_exported_run_scores_as_it_did(splat_run):
 def test_gaussians_are_exported_as_they_are_without_the_data(splat_run, tmp_path):
     said = export(str(splat_run), "--data", str(tmp_path / "gone"), "--to", str(tmp_path / "a.ply"))
     assert said.exit_code == 0 and "the data set is missing" in said.output
-    assert len(read_splats(tmp_path / "a.ply")) == len(padgs.load_run(splat_run).method.trainee.splats)
+    assert len(read_splats(tmp_path / "a.ply")) == len(padgs.load_run(splat_run).method.model.splats)
 
 
 def test_for_viewers_gaussians_are_as_wide_as_the_finest_view_draws_them(splat_run, tmp_path):
@@ -60,7 +60,7 @@ def test_for_viewers_gaussians_are_as_wide_as_the_finest_view_draws_them(splat_r
     written = read_splats(tmp_path / "smooth.ply", unit=run.scene.scale)
     assert torch.allclose(written.log_scales, smooth.log_scales, atol=1e-5)
     without_filter = replace(options, low_pass=0.0)
-    drawn = run.method.trainee.render(view).image
+    drawn = run.method.model.render(view).image
     errors = [
         (render(splats.gaussians(view), view, without_filter).image - drawn).abs().mean() for splats in (exact, smooth)
     ]
@@ -69,16 +69,16 @@ def test_for_viewers_gaussians_are_as_wide_as_the_finest_view_draws_them(splat_r
 
 def test_refined_poses_do_not_move_the_world(tmp_path_factory):
     run = padgs.load_run(tiny_run(tmp_path_factory, "method=sc_omnigs", "data.generator.train_views=4"))
-    poses = run.method.trainee.calibration.poses
+    poses = run.method.model.calibration.poses
     with torch.no_grad():
         for correction in poses.parameters():
             correction += 0.02 * torch.randn(correction.shape, generator=torch.Generator().manual_seed(1))
     splats, view = export_run(run).splats, run.scene.test[0]
     carried_view = view.at(carried(view.cam_from_world, aligned(poses)[0]))
     options = run.config.render.options(run.scene.scale)
-    own = run.method.trainee.render(carried_view).image
+    own = run.method.model.render(carried_view).image
     assert torch.allclose(render(splats.gaussians(view), view, options).image, own, atol=0.02)
-    assert (run.method.trainee.render(view).image - own).abs().max() > 0.05, "it is another world"
+    assert (run.method.model.render(view).image - own).abs().max() > 0.05, "it is another world"
 
 
 def test_points_and_upright_worlds(splat_run, tmp_path):
@@ -87,7 +87,7 @@ def test_points_and_upright_worlds(splat_run, tmp_path):
     assert len(cloud.points) > 10 and cloud.colors is not None
     assert export(str(splat_run), "--upright", "--to", str(tmp_path / "u.ply")).exit_code == 0
     assert any("-y is up" in line for line in PlyData.read(str(tmp_path / "u.ply"))["vertex"].comments)
-    up, plain = read_splats(tmp_path / "u.ply").means, padgs.load_run(splat_run).method.trainee.splats.means
+    up, plain = read_splats(tmp_path / "u.ply").means, padgs.load_run(splat_run).method.model.splats.means
     assert torch.allclose(-up[:, 1], plain[:, 2], atol=1e-4), "z is up in the built-in room"
 
 

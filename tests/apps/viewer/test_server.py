@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 import padgs
 from padgs.apps.viewer.pages import BOTH, crop_box, show_runs
 from padgs.apps.viewer.server import start_server
+from padgs.checks import install_command
 from padgs.cli.commands import app
-from padgs.extras import installing
 from padgs.scene import View
 
 try:
@@ -95,7 +95,7 @@ def test_a_browser_shows_all_that_can_be_asked_for(run, tmp_path):
 def test_without_viser_the_way_out_is_said(run, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     said = CliRunner().invoke(app, ["view", str(run.folder)])
-    assert said.exit_code == 1 and installing("view") in said.stderr
+    assert said.exit_code == 1 and install_command("view") in said.stderr
 
 
 def test_a_folder_that_is_no_run_is_refused(run, tmp_path):

@@ -22,11 +22,11 @@ from padgs.apps.viewer.pages import show_runs
 from padgs.apps.viewer.process import serve_training, wait_for_checkpoint
 from padgs.apps.viewer.renders import RunRenderer, ViewOptions
 from padgs.apps.viewer.server import LOCAL, start_server
-from padgs.extras import installing
+from padgs.checks import install_command
 from padgs.runs import checkpoint
 from padgs.runs.config import WATCHED, RunOptions
-from padgs.runs.folder import RunFolder
-from padgs.training.trainee import State
+from padgs.runs.store import RunStore
+from padgs.training.model import State
 
 try:
     import viser
@@ -146,7 +146,7 @@ def test_the_first_checkpoint_is_waited_for(folder, tmp_path, capsys):
     wait_for_checkpoint(tmp_path / "nothing")
     assert not capsys.readouterr().out
     moved = (folder / "checkpoint").rename(tmp_path / "elsewhere")
-    with RunFolder(folder).locked():  # as training does
+    with RunStore(folder):  # as training does
         waiting = threading.Thread(target=wait_for_checkpoint, args=(folder,), daemon=True)
         waiting.start()
         waiting.join(0.2)
@@ -188,7 +188,7 @@ def test_a_run_is_shown_beside_its_training_and_no_longer(folder, capfd):
 
 def test_without_viser_no_training_begins(folder, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(ValueError, match=re.escape(installing("view"))), serve_training(folder, None, "cpu"):
+    with pytest.raises(ValueError, match=re.escape(install_command("view"))), serve_training(folder, None, "cpu"):
         raise AssertionError("it began")
 
 

@@ -10,7 +10,7 @@ from padgs.data.synthetic import SyntheticOptions, SyntheticTruth, generate
 from padgs.evaluation.metrics import psnr
 from padgs.geometry.camera import Pinhole
 from padgs.runs.config import config_from_values
-from padgs.runs.identity import run_id
+from padgs.runs.store import run_id
 from padgs.scene import Scene
 
 OPTIONS = SyntheticOptions("room", 64, train_views=9, test_views=1, samples=1, points=1000, outliers=0.0)

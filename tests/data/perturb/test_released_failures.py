@@ -10,9 +10,9 @@ from tiny_scene import tiny_scene
 from padgs.data.perturb import StressOptions
 from padgs.evaluation.diagnostics import yaw_error
 from padgs.geometry.distortion import distortion, polar_axis
-from padgs.runs.session import build
+from padgs.runs.run import build_method
 from padgs.scene import Scene
-from padgs.training.failure import Failure
+from padgs.training.health import Failure
 from padgs.training.loop import Budget
 from padgs.training.method import Method
 
@@ -23,7 +23,7 @@ def padgs_root(monkeypatch, root):
 
 
 def trained(preset: str, scene: Scene, iterations: int = 3) -> Method:
-    method = build(composed(f"method={preset}"))
+    method = build_method(composed(f"method={preset}"))
     list(method.fit(scene, Budget(iterations)))
     return method
 

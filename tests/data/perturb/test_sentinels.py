@@ -9,9 +9,9 @@ import pytest
 import torch
 from composed import composed
 
-from padgs.runs.scoring import scores
-from padgs.runs.session import build, scene_of
-from padgs.training.failure import Failure
+from padgs.evaluation.scoring import score
+from padgs.runs.run import build_method, load_scene
+from padgs.training.health import Failure
 from padgs.training.schedule import FASTEST
 
 pytestmark = pytest.mark.slow
@@ -31,9 +31,9 @@ def quality(condition: str = "none", level: int = 1, *more: str) -> dict[str, An
     stress = (f"stress.condition={condition}", f"stress.level={level}")
     config = composed(*SMALL, *LENGTH, "protocol=stability", "protocol.stability.lpips=none", *stress, *more)
     torch.manual_seed(0)
-    scene, method = scene_of(config, torch.device("cpu")), build(config)
+    scene, method = load_scene(config, torch.device("cpu")), build_method(config)
     list(method.fit(scene, config.time))
-    found = scores(method, scene, config.protocols, None)["stability"].metrics
+    found = score(method.render, scene, config.protocols, None)["stability"].metrics
     return {**found, "gaussians": method.size().counts["gaussians"]}
 
 

@@ -9,7 +9,7 @@ import torch
 from padgs import load_scene
 from padgs.methods.anchors.growth import PUBLISHED_THRESHOLD, Growth, GrowthOptions, find_seeds
 from padgs.methods.anchors.model import PaDGS, PaDGSOptions
-from padgs.training.failure import Failure
+from padgs.training.health import Failure
 
 VOXEL = 0.5
 PUBLISHED = GrowthOptions(gradient_threshold=PUBLISHED_THRESHOLD, log_scale_cap=0.05, max_anchors=None)

@@ -11,8 +11,7 @@ from padgs.methods.anchors.model import PaDGS
 from padgs.methods.anchors.trainee import LearningRates
 from padgs.render import RenderConfig
 from padgs.scene import Scene, View
-from padgs.training.budget import Budget
-from padgs.training.options import TrainOptions
+from padgs.training.options import Budget, TrainOptions
 
 WIDTH, HEIGHT = 48, 24
 EAGER = PaDGSMethodOptions(  # growth early and often, so that a short run has it
@@ -109,7 +108,7 @@ def test_seeds_matter_and_repeat():
 def test_size_is_what_is_stored(long_run):
     method, records = long_run
     size, anchors = method.size(), records[-1].counts["anchors"]
-    networks = sum(p.numel() for p in method.trainee.model.decoder.parameters())
+    networks = sum(p.numel() for p in method.model.model.decoder.parameters())
     assert size.counts == {"anchors": anchors, "gaussians": 4 * anchors}
     assert size.parameters == anchors * (32 + 4 * 3 + 6) + networks
     assert size.bytes == 4 * (size.parameters + 3 * anchors)
@@ -144,7 +143,7 @@ def test_a_single_camera_can_still_place_gaussians():
     alone = replace(world, train=world.train[:1])
     method = PaDGSMethod(replace(EAGER, offset_rate_unit="scene"), TORCH)
     next(method.fit(alone, Budget(100)))
-    assert method.trainee.groups()[0].learning_rate(0) == pytest.approx(0.01 * EAGER.min_extent)
+    assert method.model.groups()[0].learning_rate(0) == pytest.approx(0.01 * EAGER.min_extent)
 
 
 @pytest.mark.parametrize(

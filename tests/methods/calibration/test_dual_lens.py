@@ -9,16 +9,16 @@ from padgs.geometry.camera import Panorama, Pinhole, RayTable
 from padgs.methods.calibration.dual_lens import DualLens
 from padgs.render import RenderOptions, render
 from padgs.scene import View
-from padgs.training.trainee import Drawing
+from padgs.training.model import TrainingRender
 
 VIEW = tiny_scene().train[3]
 
 
 def drawer(gaussians: Gaussians, projection: str = "ray", backend: str = "torch"):
-    def draw(view: View, probe: torch.Tensor | None = None) -> Drawing:
+    def draw(view: View, probe: torch.Tensor | None = None) -> TrainingRender:
         probe = gaussians.means.new_zeros(len(gaussians), 2, requires_grad=True) if probe is None else probe
         rendering = render(gaussians, view, RenderOptions(projection), mean_offsets=probe, backend=backend)
-        return Drawing(rendering, probe, gaussians, torch.arange(len(gaussians)))
+        return TrainingRender(rendering, probe, gaussians, torch.arange(len(gaussians)))
 
     return draw
 

@@ -10,9 +10,9 @@ from torch.nn.functional import normalize, softplus
 from padgs.geometry.camera import Pinhole, RayTable
 from padgs.methods.egonerf.model import EgoNeRF
 from padgs.methods.egonerf.options import Constants, EgoNeRFOptions
-from padgs.runs.session import build
+from padgs.runs.run import build_method
 from padgs.scene import Scene, View
-from padgs.training.budget import Budget
+from padgs.training.options import Budget
 
 SMALL = EgoNeRFOptions(
     radial_nodes=16,
@@ -276,7 +276,7 @@ def test_options_that_make_no_model_are_named(changes, reason):
 def test_the_small_setting_keeps_its_promises_of_time(monkeypatch, root):
     """500 steps of 1024 rays in 3 minutes and 256x128 in 20 s on 2 cores: twice that in processor time."""
     monkeypatch.setenv("PADGS_ROOT", str(root))
-    scene, small = tiny_scene(), build(composed("method=egonerf_small"))
+    scene, small = tiny_scene(), build_method(composed("method=egonerf_small"))
     records = small.fit(scene, Budget(500))
     for _ in range(5):
         next(records)

@@ -8,11 +8,10 @@ from torch import Tensor, nn
 
 from padgs.methods.egonerf.ray_trainer import RayTrainer
 from padgs.scene import Scene
-from padgs.training.budget import Budget
-from padgs.training.failure import Failure
-from padgs.training.options import TrainOptions
+from padgs.training.health import Failure
+from padgs.training.model import State
+from padgs.training.options import Budget, TrainOptions
 from padgs.training.schedule import Constant, ParameterGroup
-from padgs.training.trainee import State
 
 
 class Flat:

@@ -14,7 +14,7 @@ from padgs.methods.plus.options import PlusOptions
 from padgs.methods.plus.sky import fibonacci_sphere
 from padgs.methods.plus.trainee import counted_pixels
 from padgs.scene import Scene
-from padgs.training.budget import Budget
+from padgs.training.options import Budget
 
 RADIUS = 4.0
 COUNT = 2000
@@ -121,7 +121,7 @@ def test_padgs_plus_starts_from_what_it_asks_for():
     asked = round(PlusOptions().fill_share * counted_pixels(scene.train[0]))
     for share, count in ((PlusOptions().fill_share, asked), (0.0, 8)):
         method = PlusMethod(PlusOptions(fill_share=share, sky_share=0.0), seed=0)
-        started = len(method._start(scene, 10).splats)
+        started = len(method.build_model(scene, 10).splats)
         assert count <= started < count + len(scene.train)
 
 
@@ -146,7 +146,7 @@ def test_points_are_sought_once_for_a_run_and_not_where_it_goes_on(monkeypatch):
     list(first.fit(scene, Budget(10_000, seconds=0.3)))  # rehearses
     assert len(sought) == 1
     model = first.resumed(scene, 100).splats
-    assert len(sought) == 1 and torch.equal(model.means, first.trainee.splats.means)
+    assert len(sought) == 1 and torch.equal(model.means, first.model.splats.means)
     for again in (PlusMethod(seed=3), PlusMethod(seed=3)):
         list(again.fit(scene, Budget(2)))
     assert len(sought) == 3
@@ -154,7 +154,7 @@ def test_points_are_sought_once_for_a_run_and_not_where_it_goes_on(monkeypatch):
     resumed.load_state(again.state())
     list(resumed.fit(scene, Budget(4)))
     begun = PlusMethod(seed=3)
-    begun.begin_with(again.state())
+    begun.warm_start(again.state())
     list(begun.fit(scene, Budget(2)))
     assert len(sought) == 3
 
@@ -162,6 +162,6 @@ def test_points_are_sought_once_for_a_run_and_not_where_it_goes_on(monkeypatch):
 def test_a_rehearsal_changes_nothing_of_the_points_that_a_run_begins_with():
     scene, one = dome(40), PlusMethod(seed=3)
     first, second, other = (
-        method._start(scene, length).splats for method, length in ((one, 9), (one, 20), (PlusMethod(seed=3), 20))
+        method.build_model(scene, length).splats for method, length in ((one, 9), (one, 20), (PlusMethod(seed=3), 20))
     )
     assert torch.equal(first.means, second.means) and torch.equal(second.means, other.means)

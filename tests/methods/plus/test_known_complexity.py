@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from padgs.multirun.composition import composing, configuration
-from padgs.runs.session import build, scene_of
+from padgs.runs.run import build_method, load_scene
 
 SMALL = ("width=128", "train_views=24", "test_views=2", "samples=4")
 OBJECTS = ("scene=white_room", "objects=16")
@@ -22,7 +22,7 @@ def taken(tmp_path_factory):
                 patch.setenv("PADGS_CACHE", str(tmp_path_factory.getbasetemp() / "rooms"))
                 config = configuration([*generator, "budget=auto", "train.iterations=600", "tracking=none"])
                 torch.manual_seed(config.seed)
-                method, scene = build(config), scene_of(config, torch.device("cpu"))
+                method, scene = build_method(config), load_scene(config, torch.device("cpu"))
                 known[keys] = [record.counts["gaussians"] for record in method.fit(scene, config.time)][-1]
         return known[keys]
 

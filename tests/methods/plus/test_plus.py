@@ -10,7 +10,7 @@ import torch
 from states import assert_same_but_time
 from tiny_scene import tiny_scene
 
-from padgs import stopwatch
+from padgs import clock
 from padgs.geometry.distortion import solid_angle_weight
 from padgs.methods.plus.method import PlusMethod
 from padgs.methods.plus.options import GROWN, PLENTY, ROUNDS, PlusOptions, between_rounds
@@ -18,9 +18,9 @@ from padgs.methods.plus.smoothness import roughness
 from padgs.methods.plus.trainee import FEWEST_PIXELS, counted_pixels
 from padgs.methods.splats.method import SplatMethod
 from padgs.scene import Scene
-from padgs.training.budget import Budget
-from padgs.training.failure import Failure
+from padgs.training.health import Failure
 from padgs.training.loop import Record
+from padgs.training.options import Budget
 from padgs.training.worth import needed, worth
 
 OPTIONS = PlusOptions(gradient_threshold=1e-6, start_share=None, limit_share=None, fill_share=0.0)
@@ -62,7 +62,7 @@ def test_the_threshold_of_growth_falls_with_the_width_of_a_pixel_where_views_are
     def threshold(width):
         scene = tiny_scene()
         views = tuple(replace(view, width=width, height=width // 2) for view in scene.train)
-        trainee = PlusMethod(PlusOptions(fill_share=0.0))._start(replace(scene, train=views), 30_000)
+        trainee = PlusMethod(PlusOptions(fill_share=0.0)).build_model(replace(scene, train=views), 30_000)
         return trainee.densifier.options.gradient_threshold
 
     pixels = [2 * w * w / 2 / math.pi for w in (64, 256, 512, 1024)]
@@ -82,7 +82,7 @@ def test_what_is_kept_after_growth_is_what_the_views_would_miss():
         method = PlusMethod(replace(OPTIONS, removal_psnr=psnr, drop_share=0.0))
         for record in islice(method.fit(tiny, Budget(100)), 9 * between_rounds(100)):
             before = record.counts["gaussians"]
-        trained.append(method.trainee)
+        trained.append(method.model)
         assert method.render(tiny.test[0]).image.isfinite().all(), "at once"
     whole, chosen = (trainee.splats.means for trainee in trained)
     found = worth(trained[0], tiny.train)
@@ -106,7 +106,7 @@ def test_a_run_that_is_stopped_before_the_choice_makes_it_at_once_if_a_budget_as
         counts.append(record.counts["gaussians"])
         events += [record.iteration for event in record.events if "would miss most" in event]
         if record.iteration == 30:
-            assert whole.stop("asked")
+            assert whole.request_stop("asked")
             again.load_state(whole.state())
     assert events == chosen and (counts[30] == counts[-1] < counts[29]) == bool(chosen)
     assert gaussians != 150 or counts[-1] == 150
@@ -132,7 +132,7 @@ def test_a_tight_budget_leaves_room_for_the_sky_and_for_growth():
     scene = replace(tiny, points=points, point_colors=tiny.point_colors[:1].expand(400, 3))
     method = PlusMethod(OPTIONS)
     method.fit(scene, Budget(64, gaussians=100))
-    far = method.trainee.splats.means.norm(dim=-1) > 2 * points.norm(dim=-1).max()
+    far = method.model.splats.means.norm(dim=-1) > 2 * points.norm(dim=-1).max()
     assert (~far).sum() == math.ceil(200 / 1.5) and far.sum() > 20
     assert method.start < 200
 
@@ -140,8 +140,8 @@ def test_a_tight_budget_leaves_room_for_the_sky_and_for_growth():
 def test_a_run_of_seconds_rehearses_ends_on_time_and_resumes_bit_identically(monkeypatch):
     def fitted(method: PlusMethod) -> Iterator[Record]:
         ticks = count()
-        monkeypatch.setattr(stopwatch.time, "perf_counter", lambda: next(ticks) / 64)  # so each step takes as long
-        monkeypatch.setattr(stopwatch.time, "process_time", lambda: 0.0)
+        monkeypatch.setattr(clock.time, "perf_counter", lambda: next(ticks) / 64)  # so each step takes as long
+        monkeypatch.setattr(clock.time, "process_time", lambda: 0.0)
         return method.fit(tiny_scene(), Budget(1, seconds=60 / 64))
 
     torch.manual_seed(5)
@@ -201,8 +201,8 @@ def test_it_starts_with_a_share_of_the_pixels_and_stays_below_another():
 def test_the_penalty_is_the_mean_size_as_the_view_sees_it():
     method, scene = PlusMethod(replace(OPTIONS, size_weight=0.7, smoothness_weight=0.0)), tiny_scene()
     next(method.fit(scene, Budget(10)))
-    drawing = method.trainee.draw(scene.train[1])
-    splats, centre = method.trainee.splats, scene.train[1].center
+    drawing = method.model.draw(scene.train[1])
+    splats, centre = method.model.splats, scene.train[1].center
     angles = torch.exp(splats.log_scales) / (splats.means - centre).norm(dim=-1, keepdim=True)
     assert drawing.penalty.item() == pytest.approx(0.7 * angles.mean().item())
     (gradient,) = torch.autograd.grad(drawing.penalty, splats.means, allow_unused=True)
@@ -219,11 +219,11 @@ def test_the_penalty_asks_for_smooth_surfaces_of_what_is_drawn():
     method, scene = PlusMethod(replace(OPTIONS, size_weight=0.0, smoothness_weight=0.3)), tiny_scene()
     next(method.fit(scene, Budget(10)))
     view = scene.train[1]
-    drawing = method.trainee.draw(view)
-    rough = roughness(drawing.rendering, view.camera, near=method.trainee.render_options(view).near)
+    drawing = method.model.draw(view)
+    rough = roughness(drawing.rendering, view.camera, near=method.model.render_options(view).near)
     assert drawing.penalty.item() == pytest.approx(0.3 * rough.item()) and rough > 0
     drawing.penalty.backward()
-    assert method.trainee.splats.means.grad.any() and method.trainee.splats.log_scales.grad.any()
+    assert method.model.splats.means.grad.any() and method.model.splats.log_scales.grad.any()
 
 
 def test_the_fewer_pixels_a_gaussian_has_the_more_of_them_a_drawing_leaves_out():
@@ -250,9 +250,9 @@ def test_a_drawing_of_the_training_leaves_some_out_and_shows_more_of_the_others(
     scene = crowded_scene()
     method, view = PlusMethod(replace(OPTIONS, drop_share=0.25)), scene.train[0]
     list(islice(method.fit(scene, Budget(20)), done))
-    drawings = [method.trainee.draw(view) for _ in range(60)]
+    drawings = [method.model.draw(view) for _ in range(60)]
     drawn = torch.stack([drawing.gaussians.opacities for drawing in drawings])
-    whole = method.trainee.splats.gaussians(view).opacities
+    whole = method.model.splats.gaussians(view).opacities
     assert (drawn == 0).float().mean().item() == pytest.approx(share, abs=0.01)
     assert torch.allclose(drawn.amax(0), (whole / (1 - share)).clamp(max=1)), "as much is seen on average"
     drawings[0].rendering.image.sum().backward()
@@ -272,17 +272,17 @@ def test_what_is_left_out_is_the_same_after_an_interruption(at):
 
 def test_degrees_come_each_tenth_and_means_are_faster_than_those_of_3dgs():
     method, scene = PlusMethod(replace(OPTIONS, means_speed=3.0, initial_opacity=0.3, initial_scale=0.5)), tiny_scene()
-    degrees = {r.iteration: method.trainee.splats.active_degree for r in method.fit(scene, Budget(100))}
+    degrees = {r.iteration: method.model.splats.active_degree for r in method.fit(scene, Budget(100))}
     assert [degrees[i] for i in (8, 9, 18, 19, 100)] == [0, 1, 1, 2, 2]  # as the next iteration will draw
     usual, ours = SplatMethod(), PlusMethod(replace(OPTIONS, initial_opacity=0.3, initial_scale=0.5, sky_share=0.0))
     for started in (usual, ours):
         started.fit(scene, Budget(100))
-    rates = [{g.name: g.learning_rate(50) for g in m.trainee.groups()} for m in (usual, method)]
+    rates = [{g.name: g.learning_rate(50) for g in m.model.groups()} for m in (usual, method)]
     assert {name: rate / rates[0][name] for name, rate in rates[1].items()} == pytest.approx(
         dict.fromkeys(rates[0], 1.0) | {"means": 3.0}
     )
-    assert torch.allclose(torch.sigmoid(ours.trainee.splats.opacity_logits), torch.tensor(0.3))
-    torch.testing.assert_close(ours.trainee.splats.log_scales.exp(), 0.5 * usual.trainee.splats.log_scales.exp())
+    assert torch.allclose(torch.sigmoid(ours.model.splats.opacity_logits), torch.tensor(0.3))
+    torch.testing.assert_close(ours.model.splats.log_scales.exp(), 0.5 * usual.model.splats.log_scales.exp())
 
 
 def test_resumed_while_it_averages_it_ends_the_same():
@@ -299,7 +299,7 @@ def test_the_end_is_the_mean_of_the_last_states():
     for share in (0.0, 0.1):
         method = PlusMethod(replace(OPTIONS, average_share=share))
         for record in method.fit(tiny_scene(), Budget(40)):
-            states[share, record.iteration] = method.trainee.splats.means.detach().clone()
+            states[share, record.iteration] = method.model.splats.means.detach().clone()
             averaged = bool(method.state().under("model/average/"))
             assert averaged == (share > 0 and 37 <= record.iteration < 40)
     assert torch.equal(states[0.0, 39], states[0.1, 39])  # training itself does not notice

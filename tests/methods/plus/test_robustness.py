@@ -7,7 +7,7 @@ from padgs.data.synthetic import generate
 from padgs.data.synthetic.options import SyntheticOptions
 from padgs.evaluation.metrics import ws_psnr
 from padgs.methods.plus.method import PlusMethod
-from padgs.training.budget import Budget
+from padgs.training.options import Budget
 
 pytestmark = pytest.mark.slow
 NOISE = 0.25  # dB: of seeds, and of fitting twelve small views for long

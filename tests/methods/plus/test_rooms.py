@@ -64,5 +64,5 @@ def test_a_row_of_rooms_may_have_more_gaussians_than_one():
     near = row.train[0].center
     one = replace(row, points=near + 0.3 * torch.nn.functional.normalize(row.points - near, dim=-1))
     method = PlusMethod(PlusOptions(sky_share=0.0, fill_share=0.0))
-    starts = [len(method._start(scene, 100).splats) for scene in (one, row)]
+    starts = [len(method.build_model(scene, 100).splats) for scene in (one, row)]
     assert starts[1] == pytest.approx(rooms(row) * starts[0], rel=0.01)

@@ -6,7 +6,7 @@ from tiny_scene import tiny_scene
 from padgs.baselines import METHODS
 from padgs.multirun.composition import make_method
 from padgs.registry import lookup
-from padgs.training.budget import Budget
+from padgs.training.options import Budget
 
 
 @pytest.mark.parametrize("name", ["omnigs", "spags", "cubemap_3dgs"])
@@ -17,7 +17,7 @@ def test_what_nobody_would_see_goes_once_when_growth_is_over(name):
         counts.append(record.counts["gaussians"])
         events += [(record.iteration, event) for event in record.events if "would miss most" in event]
     ((iteration, event),) = events
-    assert iteration == method.trainee.densifier.options.densify_until + 49
+    assert iteration == method.model.densifier.options.densify_until + 49
     assert event.startswith(f"kept {counts[iteration - 1]} of {counts[iteration - 2]} Gaussians")
     assert counts[iteration - 1] < counts[iteration - 2]
 

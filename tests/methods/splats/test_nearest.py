@@ -11,7 +11,7 @@ from padgs.methods.splats.nearest import RESOLVED, cameras_of, finest_pixels, no
 from padgs.render import render
 from padgs.render.projection import LowPass, low_pass_filtered
 from padgs.scene import View
-from padgs.training.budget import Budget
+from padgs.training.options import Budget
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def test_the_finest_pixel_is_that_of_the_nearest_camera_or_of_the_sharpest():
 
 def test_the_filter_of_a_view_on_top_makes_that_of_the_larger_pixel(trained):
     view, variance = tiny_scene().train[0], 0.1
-    gaussians = trained.trainee.splats.gaussians(view)
+    gaussians = trained.model.splats.gaussians(view)
     distances = (gaussians.means - view.center.float()).norm(dim=-1)
     own = distances / view.camera.focal
     pixels = own * torch.linspace(0.5, 3, len(own))
@@ -49,7 +49,7 @@ def test_the_filter_of_a_view_on_top_makes_that_of_the_larger_pixel(trained):
 
 
 def test_training_views_are_drawn_as_they_were_trained_and_closer_ones_wider(trained):
-    trainee, scene = trained.trainee, tiny_scene()
+    trainee, scene = trained.model, tiny_scene()
 
     def plainly(view: View):
         return render(trainee.splats.gaussians(view), view, trainee.render_options(view)).image
@@ -70,16 +70,16 @@ def test_a_loaded_model_knows_its_cameras_and_forgets_pixels_with_the_gaussians_
     loaded = PlusMethod(PlusOptions(start_share=None))
     loaded.load_state(trained.state())
     assert torch.equal(loaded.render(view).image, trained.render(view).image)
-    kept = torch.arange(len(loaded.trainee.splats)) % 2 == 0
-    loaded.trainee.keep(kept)
-    pixels = finest_pixels(loaded.trainee.splats.means, cameras_of(tiny_scene().train))
-    wider = no_finer(loaded.trainee.splats.gaussians(view), view, pixels, loaded.render_config.low_pass)
-    drawn = render(wider, view, loaded.trainee.render_options(view)).image
+    kept = torch.arange(len(loaded.model.splats)) % 2 == 0
+    loaded.model.keep(kept)
+    pixels = finest_pixels(loaded.model.splats.means, cameras_of(tiny_scene().train))
+    wider = no_finer(loaded.model.splats.gaussians(view), view, pixels, loaded.render_config.low_pass)
+    drawn = render(wider, view, loaded.model.render_options(view)).image
     assert torch.equal(loaded.render(view).image, drawn)
 
 
 def test_a_model_in_another_order_is_drawn_the_same(trained):
-    view, trainee = close_up(tiny_scene().train[0]), trained.trainee
+    view, trainee = close_up(tiny_scene().train[0]), trained.model
     before, stored = trainee.render(view).image, trainee.splats.state_dict()
     rows = {name: tensor.flip(0) if name in trainee.splats.rows() else tensor for name, tensor in stored.items()}
     trainee.splats.load(rows)

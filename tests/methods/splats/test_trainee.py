@@ -12,10 +12,10 @@ from padgs.methods.splats.method import SplatMethod
 from padgs.methods.splats.model import Splats
 from padgs.methods.splats.trainee import SplatTrainee
 from padgs.render import RenderConfig
-from padgs.runs.session import build
+from padgs.runs.run import build_method
 from padgs.scene import Scene
-from padgs.training.budget import Budget
-from padgs.training.extent import ExtentOptions
+from padgs.training.initial_points import ExtentOptions
+from padgs.training.options import Budget
 from padgs.training.schedule import PUBLISHED_ITERATIONS
 
 EXTENT = 7.0
@@ -74,7 +74,7 @@ def test_published_learning_rates(iterations):
 def test_adam_is_that_of_3dgs():
     method = SplatMethod(render=RenderConfig(backend="torch"))
     next(method.fit(tiny_scene(), Budget(10)))
-    for settings in method._trainer._optimiser.adam.param_groups:
+    for settings in method._trainer._optimizer.adam.param_groups:
         assert (settings["betas"], settings["eps"], settings["weight_decay"]) == ((0.9, 0.999), 1e-15, 0)
 
 
@@ -112,12 +112,12 @@ def test_releases_measure_with_the_extent_of_their_cameras_however_little_they_m
     monkeypatch.setenv("PADGS_ROOT", str(root))
     config, scene = composed(f"method={release}"), travelling(tiny_scene(), 0.1)
     assert 0 < scene.extent < 0.05 * scene.scale
-    method = build(config)
+    method = build_method(config)
     method.fit(scene, Budget(1))
     published = 0.01 if release == "padgs_release" else 1.6e-4
-    assert method.trainee.groups()[0].learning_rate(0) == pytest.approx(published * scene.extent, rel=1e-6)
+    assert method.model.groups()[0].learning_rate(0) == pytest.approx(published * scene.extent, rel=1e-6)
     with pytest.raises(ValueError, match=r"stand in one place, so their extent is 0 .* set method\.min_extent to a"):
-        build(config).fit(travelling(scene, 0.0), Budget(1))
+        build_method(config).fit(travelling(scene, 0.0), Budget(1))
 
 
 def test_the_least_that_counts_as_a_move():
@@ -134,7 +134,7 @@ def test_the_least_that_counts_as_a_move():
 def test_a_method_trains_means_at_the_rate_of_its_scene(scene):
     method = SplatMethod(render=RenderConfig(backend="torch"))
     next(method.fit(scene, Budget(10)))
-    means = next(group for group in method.trainee.groups() if group.name == "means")
+    means = next(group for group in method.model.groups() if group.name == "means")
     extent = ExtentOptions(0.1).extent_of(scene)
     assert means.learning_rate(0) == pytest.approx(1.6e-4 * extent)
-    assert method.trainee.densifier.extent == extent
+    assert method.model.densifier.extent == extent

@@ -22,7 +22,7 @@ from padgs.render import Rendering, RenderOptions, render
 from padgs.render.backends import cuda as cuda_backend
 from padgs.render.backends import native as native_backend
 from padgs.render.leave_one_out import leave_one_out
-from padgs.training.failure import is_out_of_memory
+from padgs.training.health import is_out_of_memory
 
 pytestmark = [*cuda_engine.marks()]
 

@@ -6,9 +6,8 @@ import cuda_engine
 import pytest
 import torch
 
-from padgs.training import native_loss
-from padgs.training.loss import photometric_loss, pixel_weight
-from padgs.training.native_loss import fused_photometric_loss
+from padgs.training import loss as training_loss
+from padgs.training.loss import fused_photometric_loss, photometric_loss, pixel_weight
 
 pytestmark = [*cuda_engine.marks()]
 DEVICE = "cuda" if cuda_engine.ON_GPU else "cpu"
@@ -17,7 +16,7 @@ DEVICE = "cuda" if cuda_engine.ON_GPU else "cpu"
 @pytest.fixture(autouse=True)
 def emulated(monkeypatch: pytest.MonkeyPatch) -> None:
     """The emulation works on tensors of the CPU."""
-    monkeypatch.setitem(native_loss.EVALUATIONS, DEVICE, native_loss.EVALUATIONS["cuda"])
+    monkeypatch.setitem(training_loss.EVALUATIONS, DEVICE, training_loss.EVALUATIONS["cuda"])
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (5, 7), (17, 33), (24, 48), (50, 70)])

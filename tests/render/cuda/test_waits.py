@@ -29,9 +29,9 @@ from padgs.native.cuda import HostCopy
 from padgs.native.loading import Stage, call_hook
 from padgs.render import RenderConfig, RenderOptions
 from padgs.render.backends import cuda as cuda_backend
-from padgs.training.budget import Budget
 from padgs.training.loop import Trainer
-from padgs.training.native_loss import EVALUATIONS
+from padgs.training.loss import EVALUATIONS
+from padgs.training.options import Budget
 
 pytestmark = pytest.mark.skipif(cuda_engine.ON_GPU or cuda_engine.COMPILER is None, reason="for the emulation")
 SIZE = Size(32, 16, 100, views=3)

@@ -7,8 +7,8 @@ from filelock import FileLock
 from typer.testing import CliRunner
 
 from padgs import results
+from padgs.checks import install_command
 from padgs.cli.commands import app
-from padgs.extras import installing
 from padgs.results import Result, Scores
 from padgs.runs.tracking import tracker as tracking
 from padgs.runs.tracking.mlflow_mirror import batches
@@ -60,7 +60,7 @@ def test_without_mlflow_one_line_says_so_to_who_asked_for_it(tmp_path, said, mon
     tracker.update(make_run(tmp_path))
     tracker.finish([], 0)
     assert not tracker.on and len(said) == lines
-    assert all(installing("mlflow") in line and "tracking=none" in line for line in said)
+    assert all(install_command("mlflow") in line and "tracking=none" in line for line in said)
 
 
 def test_an_unknown_kind_is_refused():

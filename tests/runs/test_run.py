@@ -16,29 +16,28 @@ from tiny_scene import HEIGHT, WIDTH, tiny_scene
 
 from padgs import results
 from padgs.data.capture import DataError
+from padgs.evaluation.scoring import probe
 from padgs.methods.anchors.method import PaDGSMethod
 from padgs.reports import store
 from padgs.reports.frame import frame
 from padgs.reports.selection import RunSet
-from padgs.runs import checkpoint, session
+from padgs.runs import checkpoint
+from padgs.runs import run as pipeline
 from padgs.runs.checkpoint import CheckpointError
-from padgs.runs.folder import RunFolder, RunFolderError
-from padgs.runs.identity import Labels
 from padgs.runs.interrupt import Interrupted
-from padgs.runs.lock import RunBusy
-from padgs.runs.scoring import probe
-from padgs.runs.session import Session, Watch, build, scene_of
-from padgs.training.failure import Failure
+from padgs.runs.run import Callback, build_method, load_scene
+from padgs.runs.store import Labels, RunBusy, RunFolderError, RunStore
+from padgs.training.health import Failure
 
 ITERATIONS = 12
 SMALL = ("method=padgs", "protocol=paper", "protocol.paper.lpips=none", "render.backend=torch")
-PACKAGE = Path(session.__file__).parents[1]
+PACKAGE = Path(pipeline.__file__).parents[1]
 
 
 @pytest.fixture(autouse=True)
 def tiny(monkeypatch, root):
     monkeypatch.setenv("PADGS_ROOT", str(root))
-    monkeypatch.setattr(session.data, "load", lambda path, format, options: tiny_scene())
+    monkeypatch.setattr(pipeline.data, "load", lambda path, format, options: tiny_scene())
 
 
 @pytest.fixture
@@ -54,12 +53,12 @@ def config(tmp_path):
 
 def run(config) -> tuple[results.Result, str]:
     out = io.StringIO()
-    return Session(config, Console(file=out, width=200)).run(), out.getvalue()
+    return pipeline.run(config, Console(file=out, width=200)), out.getvalue()
 
 
-def folder_of(config) -> RunFolder:
+def folder_of(config) -> RunStore:
     (path,) = Path(config.run.folder).iterdir()
-    return RunFolder(path)
+    return RunStore(path)
 
 
 def test_a_run_leaves_all_its_files_and_says_where(config):
@@ -87,7 +86,7 @@ def test_a_run_leaves_all_its_files_and_says_where(config):
 def test_the_memory_of_the_device_that_trains_is_in_the_result(config, monkeypatch):
     asked = []
     peak = {"host": 3 * 10**9, "device": 2 * 10**9}
-    monkeypatch.setattr(session.clock, "peak_memory", lambda device: asked.append(device) or peak)
+    monkeypatch.setattr(pipeline.clock, "peak_memory", lambda device: asked.append(device) or peak)
     result, said = run(config)
     assert asked == [torch.device("cpu")]  # where the scene is
     assert (result.peak_memory_bytes, result.peak_device_memory_bytes) == (3 * 10**9, 2 * 10**9)
@@ -100,9 +99,9 @@ def test_the_log_has_losses_and_the_held_out_view(config):
     assert [line["iteration"] for line in lines] == [2, 4, 5, 6, 8, 10, 12]
     probed = [line for line in lines if "psnr" in line]
     assert [line["iteration"] for line in probed] == [5, 10, 12]
-    method = build(config)
+    method = build_method(config)
     folder_of(config).resume(method)
-    last = probe(method, scene_of(config, torch.device("cpu")).test[0])
+    last = probe(method.render, load_scene(config, torch.device("cpu")).test[0])
     assert last == {name: probed[-1][name] for name in ("psnr", "polar_transmittance")}
 
 
@@ -110,7 +109,7 @@ def test_the_log_has_losses_and_the_held_out_view(config):
 def test_a_run_that_is_asked_to_stop_and_score_fades_and_ends_well(config, how):
     """The last two of twelve iterations are what it fades in."""
 
-    class Asking(Watch):
+    class Asking(Callback):
         looks = 0
 
         def started(self, folder: Path) -> None:
@@ -126,7 +125,7 @@ def test_a_run_that_is_asked_to_stop_and_score_fades_and_ends_well(config, how):
             return False
 
     said = io.StringIO()
-    result = Session(config, Console(file=said, width=200), Asking()).run()
+    result = pipeline.run(config, Console(file=said, width=200), Asking())
     assert result.status == "ok" and result.ended == "asked to stop and score"
     assert result.iterations_done == 6 and result.variant == "stopped after 6 iterations"
     assert result.scores["paper"].metrics["psnr"] is not None and "after 6 iterations: asked" in said.getvalue()
@@ -164,14 +163,14 @@ def test_without_its_checkpoint_a_finished_run_is_not_scored_anew(config):
 
 def stop_at(iteration: int, monkeypatch, how) -> None:
     """Do `how` right after an iteration was shown."""
-    update = session.LiveLine.update
+    update = pipeline.LiveLine.update
 
     def stopping(self, record, psnr):
         update(self, record, psnr)
         if record.iteration == iteration:
             how()
 
-    monkeypatch.setattr(session.LiveLine, "update", stopping)
+    monkeypatch.setattr(pipeline.LiveLine, "update", stopping)
 
 
 def test_ctrl_c_finishes_the_step_and_the_next_start_ends_bit_identically(config, monkeypatch, tmp_path):
@@ -308,7 +307,7 @@ def test_a_run_that_another_process_works_on_is_left_alone(config):
     first, _ = run(config)
     folder = folder_of(config)
     (folder.path / "result.json").unlink()
-    with folder.locked(), pytest.raises(RunBusy, match=f"worked on by process {os.getpid()} on .* since"):
+    with folder, pytest.raises(RunBusy, match=f"worked on by process {os.getpid()} on .* since"):
         run(config)
     assert run(config)[0].scores == first.scores
 
@@ -328,7 +327,7 @@ def test_a_run_of_a_sweep_that_is_asked_for_by_itself_stands_in_tables(config):
         run(replace(config, labels=Labels("padgs"), seed=seed))
     found, _ = store.read(Path(config.run.folder))
     rows = RunSet(frame(found)).chosen("methods")
-    assert sorted(rows["seed"]) == [0, 1] and set(rows["experiments"]) == {("by_itself",), ("by_itself", "tau")}
+    assert sorted(rows["seed"]) == [0, 1] and set(rows["experiments"]) == {("ad_hoc",), ("ad_hoc", "tau")}
 
 
 def test_an_error_of_ours_is_no_result(config, monkeypatch):

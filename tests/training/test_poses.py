@@ -7,7 +7,7 @@ from tiny_scene import tiny_scene, truth
 
 from padgs.methods.calibration.align import align
 from padgs.render import RenderOptions, render
-from padgs.training.views.poses import PoseRefinement
+from padgs.training.corrections import PoseRefinement
 
 VIEWS = tiny_scene().train
 

@@ -11,10 +11,10 @@ from padgs.methods.plus.method import PlusMethod
 from padgs.methods.plus.options import PlusOptions
 from padgs.render import RenderOptions, render
 from padgs.scene import View
-from padgs.training.budget import Budget
-from padgs.training.monitor import FIRST
-from padgs.training.views import sizes
-from padgs.training.views.sizes import Sizes, halved
+from padgs.training import targets as training_targets
+from padgs.training.health import FIRST
+from padgs.training.options import Budget
+from padgs.training.targets import Sizes, halved
 
 OPTIONS = PlusOptions()
 
@@ -55,7 +55,7 @@ def test_sizes_that_are_odd_leave_no_direction_out():
 
 
 def test_views_double_until_a_share_of_the_run(monkeypatch):
-    monkeypatch.setattr(sizes, "LEAST_WIDTH", 8)
+    monkeypatch.setattr(training_targets, "LEAST_WIDTH", 8)
     found = sized(0.4, made(32, 16), made(32, 16))
     widths = [found.at(progress)[0][1].width for progress in (0.01, 0.19, 0.2, 0.21, 0.39, 0.4, 1)]
     assert widths == [8, 8, 16, 16, 16, 32, 32]
@@ -74,12 +74,12 @@ def test_small_panoramas_and_perspective_views_keep_their_size():
 
 
 def test_padgs_plus_begins_with_small_views_and_resumes_bit_identically(monkeypatch):
-    monkeypatch.setattr(sizes, "LEAST_WIDTH", WIDTH // 2)
+    monkeypatch.setattr(training_targets, "LEAST_WIDTH", WIDTH // 2)
     method = PlusMethod(OPTIONS)
     whole = method.fit(tiny_scene(), Budget(20))
     drawn = []
-    plain = method.trainee.draw
-    monkeypatch.setattr(method.trainee, "draw", lambda view: drawn.append((view.width, view.height)) or plain(view))
+    plain = method.model.draw
+    monkeypatch.setattr(method.model, "draw", lambda view: drawn.append((view.width, view.height)) or plain(view))
     records = list(whole)
     monitor = method.state().values["monitor"]
     assert monitor["first"] == 6 + FIRST, "losses of small views are no measure for those of large ones"
@@ -94,12 +94,12 @@ def test_padgs_plus_begins_with_small_views_and_resumes_bit_identically(monkeypa
 
 
 def test_a_run_that_is_stopped_while_views_are_small_ends_on_large_ones_and_has_not_diverged(monkeypatch):
-    monkeypatch.setattr(sizes, "LEAST_WIDTH", WIDTH // 2)
+    monkeypatch.setattr(training_targets, "LEAST_WIDTH", WIDTH // 2)
     method, ended = PlusMethod(OPTIONS), 0
     for record in method.fit(tiny_scene(), Budget(100)):
         if record.iteration == 10:
             assert method.state().values["monitor"]["halvings"] == 1
-            assert method.stop("enough")
+            assert method.request_stop("enough")
             ended = record.iteration
     monitor = method.state().values["monitor"]
     assert monitor["halvings"] == 0 and monitor["first"] == ended + 1 + FIRST

@@ -13,14 +13,14 @@ from tiny_scene import tiny_scene
 import padgs
 from padgs import results
 from padgs.baselines import METHODS
+from padgs.checks import ConfigError
 from padgs.multirun.composition import composing, configuration
 from padgs.registry import lookup
 from padgs.runs import checkpoint
 from padgs.runs.interrupt import Interrupted
-from padgs.runs.session import Session, Watch
-from padgs.runs.typed import ConfigError
-from padgs.training.budget import Budget
-from padgs.training.options import TrainOptions
+from padgs.runs.run import Callback, load_scene, run
+from padgs.runs.store import RunStore
+from padgs.training.options import Budget, TrainOptions
 
 SMALL_GRIDS = {"radial_nodes": 8, "polar_nodes": 8, "azimuth_nodes": 16, "density_components": 2}
 SMALL_GRIDS |= {
@@ -48,33 +48,35 @@ def config(runs, *settings):
         return configuration(["method=omnigs", *SETTINGS, "run.log_every=1", *settings, f"run.folder={runs}"])
 
 
-def session(runs, *settings, watch=Watch()):  # noqa: B008 - no state
-    return Session(config(runs, *settings), Console(quiet=True), watch)
+def started(runs, *settings, callback=Callback()):  # noqa: B008 - no state
+    return run(config(runs, *settings), Console(quiet=True), callback)
 
 
 def test_it_begins_with_the_model_at_another_width_too(base, tmp_path):
     before, first = results.read(base / "result.json"), next(results.log_lines(base))
-    own = session(tmp_path, f"init={base}", "data.width=64")
-    result = own.run()
+    result = started(tmp_path, f"init={base}", "data.width=64")
     assert result.ok and result.counts["start"] == before.counts["gaussians"], result.reason
     assert result.iterations_done == 30 and result.variant == "continued" and result.width == 64
-    lines = list(results.log_lines(own.folder.path))
+    lines = list(results.log_lines(tmp_path / result.run))
     assert lines[0]["progress"] < 0.1 and lines[0]["loss"] < first["loss"]
-    run = padgs.load_run(own.folder.path, device="cpu")
-    assert run.config.init is not None and run.config.init.run == str(base), "the file of the run says so"
+    loaded = padgs.load_run(tmp_path / result.run, device="cpu")
+    assert loaded.config.init is not None and loaded.config.init.run == str(base), "the file of the run says so"
 
 
 @pytest.mark.slow
 def test_it_is_known_by_the_checkpoint_wherever_that_is(base, tmp_path):
     shutil.copytree(base, tmp_path / "moved")
-    names = [session(tmp_path, *more).folder.path.name for more in ((f"init={base}",), (f"init={tmp_path}/moved",), ())]
+    names = []
+    for more in ((f"init={base}",), (f"init={tmp_path}/moved",), ()):
+        composed = config(tmp_path, *more)
+        names.append(RunStore.of(composed, load_scene(composed, torch.device("cpu"))).path.name)
     assert names[0] == names[1] != names[2]
     assert "init" not in config(tmp_path).values(), "runs without are called what they were before"
 
 
 @pytest.mark.slow
 def test_an_interrupted_one_goes_on_to_the_same_end(base, tmp_path):
-    class Impatient(Watch):
+    class Impatient(Callback):
         def __init__(self):
             self.asked = 0
 
@@ -82,27 +84,30 @@ def test_an_interrupted_one_goes_on_to_the_same_end(base, tmp_path):
             self.asked += 1
             return self.asked > 12
 
-    whole, parts = (session(tmp_path / name, f"init={base}") for name in ("whole", "parts"))
-    whole.run()
+    whole = started(tmp_path / "whole", f"init={base}")
     with pytest.raises(Interrupted):
-        session(tmp_path / "parts", f"init={base}", watch=Impatient()).run()
-    assert parts.run().ok
-    assert_same_but_time(*(_without_progress(one) for one in (whole, parts)))
+        started(tmp_path / "parts", f"init={base}", callback=Impatient())
+    assert started(tmp_path / "parts", f"init={base}").ok
+    assert_same_but_time(*(_without_progress(tmp_path / name / whole.run) for name in ("whole", "parts")))
 
 
-def _without_progress(one):
-    state = checkpoint.load(one.folder.checkpoint)
+def _without_progress(folder):
+    state = checkpoint.load(folder / "checkpoint")
     return replace(state, values={key: value for key, value in state.values.items() if key != "progress"})
 
 
 @pytest.mark.parametrize(
     "spoil, settings, message",
     [
-        (lambda run: shutil.rmtree(run), (), "is no folder of a run; give one of which padgs-run has shown the scores"),
+        (
+            lambda run: shutil.rmtree(run),
+            (),
+            "is no folder of a run; give a run of which padgs-run has shown the scores",
+        ),
         (lambda run: (run / "result.json").unlink(), (), "is not finished"),
         (lambda run: shutil.rmtree(run / "checkpoint"), (), "cannot read .*state.json"),
         (lambda run: _failed(run), (), r"ended with status nan \(why\), so its model is of no use"),
-        (lambda run: None, ("method=odgs",), "is a run of omnigs, whose model is nothing for odgs; set method=omnigs"),
+        (lambda run: None, ("method=odgs",), "is a run of omnigs, whose model does not fit odgs; set method=omnigs"),
     ],
 )
 def test_what_is_no_such_run_is_refused_at_composition(base, tmp_path, spoil, settings, message):
@@ -118,30 +123,29 @@ def _failed(run):
 
 @pytest.mark.slow
 def test_other_data_and_another_checkpoint_are_refused_before_training(base, tmp_path):
-    other = session(tmp_path / "runs", f"init={base}", "data.generator.points=100")
     with pytest.raises(ConfigError, match="trained on other data: .* only data.width may differ"):
-        other.run()
-    assert not (other.folder.path / "config.yaml").exists()
+        started(tmp_path / "runs", f"init={base}", "data.generator.points=100")
+    assert not list((tmp_path / "runs").glob("*/config.yaml"))
     with pytest.raises(ConfigError, match="was trained under stress none, and this run is under .*few_views"):
-        session(tmp_path / "runs", f"init={base}", "stress.condition=few_views").run()
+        started(tmp_path / "runs", f"init={base}", "stress.condition=few_views")
     shutil.copytree(base, tmp_path / "run")
-    own = session(tmp_path / "runs", f"init={tmp_path}/run")
+    composed = config(tmp_path / "runs", f"init={tmp_path}/run")
     state = checkpoint.load(tmp_path / "run" / "checkpoint")
     state.tensors["model/splats/means"] += 1
     checkpoint.save(state, tmp_path / "run" / "checkpoint")
     with pytest.raises(ConfigError, match="has changed since"):
-        own.run()
+        run(composed, Console(quiet=True))
 
 
 @pytest.mark.parametrize(
     "setting, message",
     [
-        ("method.sh_degree=1", "the model to begin with is nothing for these options"),
-        ("budget.gaussians=5", "budget.gaussians is 5, but the model to begin with has"),
+        ("method.sh_degree=1", "the model of the warm start does not fit these options"),
+        ("budget.gaussians=5", "budget.gaussians is 5, but the model of the warm start has"),
     ],
 )
 def test_what_the_model_cannot_do_is_a_rejected_run(base, tmp_path, setting, message):
-    result = session(tmp_path, f"init={base}", setting).run()
+    result = started(tmp_path, f"init={base}", setting)
     assert result.status == "rejected" and message in result.reason
 
 
@@ -151,7 +155,7 @@ def test_every_family_begins_with_the_very_model(name):
     options = kind.Options(**(SMALL_GRIDS if name == "egonerf" else {}))
     first, second = kind(options), kind(options)
     list(first.fit(scene, Budget(4)))
-    second.begin_with(first.state())
+    second.warm_start(first.state())
     records = second.fit(scene, Budget(4))
     assert torch.equal(second.render(scene.test[0]).image, first.render(scene.test[0]).image)
     assert [record.iteration for record in records] == [1, 2, 3, 4]
@@ -166,7 +170,7 @@ def test_exposures_that_both_learn_are_taken_over():
     gains = first.state().under("views/")["exposures.log_gains.0"]
     for train, expected in ((learned, gains), (TrainOptions(weight="uniform"), None)):
         second = kind(train=train)
-        second.begin_with(first.state())
+        second.warm_start(first.state())
         second.fit(scene, Budget(10))
         taken = second.state().under("views/").get("exposures.log_gains.0")
         assert taken is None if expected is None else torch.equal(taken, expected) and expected.any()

@@ -9,7 +9,7 @@ from pathlib import Path
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
+def atomic_path(path: Path) -> Iterator[Path]:
     """A hidden place beside `path`, of the same ending, to write to: it becomes `path` at the end, or nothing is left.
 
     Raises:
@@ -23,7 +23,7 @@ def replacing(path: Path) -> Iterator[Path]:
         draft.unlink(missing_ok=True)
 
 
-def replace_file(path: Path, content: bytes) -> None:
+def write_atomically(path: Path, content: bytes) -> None:
     """Write a file atomically: under a temporary name, forced to the disk, then renamed; or leave nothing behind."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:

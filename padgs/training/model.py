@@ -1,6 +1,6 @@
 """What can be trained: a model with its densifier and its learning rates, as the loop sees them.
 
-Each family has one: `padgs.methods.anchors.trainee` (PaD-GS), `padgs.methods.splats.trainee` (3DGS). That of EgoNeRF casts rays instead
+Each family has one: `padgs.methods.anchors.trainee` (PaD-GS), `padgs.methods.splats.trainee` (3DGS). EgoNeRF casts rays instead
 of drawing views, so it has a trainer of its own (`padgs.methods.egonerf.ray_trainer`).
 """
 
@@ -53,7 +53,7 @@ class Size:
 
 
 @dataclass(frozen=True)
-class Drawing:
+class TrainingRender:
     """What a model drew of one view, with all that the densification statistics need after `backward`."""
 
     rendering: Rendering
@@ -65,7 +65,7 @@ class Drawing:
     photo: Callable[[Target], Target] | None = None  # brings the training image to where it was drawn; differentiable
 
 
-class Trainee(Protocol):
+class Model(Protocol):
     """A model in training.
 
     `load_state` must make it what `state` was taken of, sizes included, and may replace the data of parameters but not
@@ -76,16 +76,16 @@ class Trainee(Protocol):
         """All learnable parameters, each in exactly one group, with their learning rates in this run."""
         ...
 
-    def draw(self, view: View) -> Drawing:
+    def draw(self, view: View) -> TrainingRender:
         """Render a view, differentiably."""
         ...
 
-    def observe(self, drawing: Drawing, iteration: int) -> None:
-        """Collect statistics; called after `backward` and before the optimiser step."""
+    def observe(self, drawing: TrainingRender, iteration: int) -> None:
+        """Collect statistics; called after `backward` and before the optimizer step."""
         ...
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
-        """Grow and prune where it is time to; called after the optimiser step. Returns events for the record."""
+        """Grow and prune where it is time to; called after the optimizer step. Returns events for the record."""
         ...
 
     def render(self, view: View) -> Rendering:
@@ -101,7 +101,7 @@ class Trainee(Protocol):
         ...
 
     def state(self) -> State:
-        """Parameters, statistics and random state, without the optimiser; not copies."""
+        """Parameters, statistics and random state, without the optimizer; not copies."""
         ...
 
     def load_state(self, state: State) -> None:
@@ -124,7 +124,7 @@ class Parts:
 
 
 @runtime_checkable
-class Prunable(Trainee, Protocol):
+class Prunable(Model, Protocol):
     """A model of Gaussians whose rows, single Gaussians or anchors, can be taken away."""
 
     def parts(self, view: View) -> Parts:
@@ -132,5 +132,5 @@ class Prunable(Trainee, Protocol):
         ...
 
     def keep(self, rows: Tensor) -> None:
-        """Keep these rows only, [N] bool, or row numbers in ascending order; of all that has rows, but no optimiser."""
+        """Keep these rows only, [N] bool, or row numbers in ascending order; of all that has rows, but no optimizer."""
         ...

@@ -15,8 +15,7 @@ from padgs.geometry.camera import Panorama, perspective
 from padgs.geometry.panorama import sample
 from padgs.results import read
 from padgs.runs import checkpoint
-from padgs.runs.folder import RunFolderError
-from padgs.runs.identity import config_hash
+from padgs.runs.store import RunFolderError, config_hash
 
 
 @pytest.fixture(scope="module")

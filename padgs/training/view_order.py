@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from padgs.scene import Scene
-from padgs.training.trainee import State
+from padgs.training.model import State
 
 
 class Order(Protocol):

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor, nn
 
 from padgs.gaussians import rotation_matrices
-from padgs.scene import View
-from padgs.training.schedule import LogLinear, ParameterGroup
+from padgs.scene import Scene, View
+from padgs.training.schedule import Constant, LogLinear, ParameterGroup
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ SMALL = PoseRates(rotation=1e-3, rotation_end=1e-5, translation=2e-3, translatio
 class PoseRefinement(nn.Module):
     """Corrections of the poses of named views.
 
-    Each view has parameters of its own, so that the optimiser's moments of a view rest while other views are drawn.
+    Each view has parameters of its own, so that the optimizer's moments of a view rest while other views are drawn.
 
     Attributes:
         names: of the V views.
@@ -127,3 +127,78 @@ class PoseRefinement(nn.Module):
 def _each(rotations: Tensor, vectors: Tensor) -> Tensor:
     """Rotations [V, 3, 3] times vectors [V, 3] or [3]."""
     return (rotations @ vectors[..., None])[..., 0]
+
+
+RATE = 3e-3  # of log-gains; at the end still so much, for what is frozen early is wrong
+OFFSET_RATE = RATE / 5  # of offsets, in colours from 0 to 1
+
+
+class Exposures(nn.Module):
+    """Of V views, by their numbers; see `padgs.training.corrections.Corrections`.
+
+    Each view has parameters of its own, so that the optimizer's moments of a view rest while other views are drawn.
+
+    Attributes:
+        log_gains, offsets: V times [3], of the colour channels.
+    """
+
+    def __init__(self, views: int) -> None:
+        """No correction yet."""
+        super().__init__()
+        self.log_gains, self.offsets = (nn.ParameterList([torch.zeros(3) for _ in range(views)]) for _ in range(2))
+
+    def groups(self) -> list[ParameterGroup]:
+        """Learning rates, at the pace of the run as those of the model that they follow."""
+        return [
+            ParameterGroup("exposure_log_gains", tuple(self.log_gains), Constant(RATE)),
+            ParameterGroup("exposure_offsets", tuple(self.offsets), Constant(OFFSET_RATE)),
+        ]
+
+    def exposed(self, image: Tensor, index: int) -> Tensor:
+        """An image [H, W, 3] as view `index` would show it; differentiable."""
+        return image * self.log_gains[index].exp() + self.offsets[index]
+
+    @torch.no_grad()
+    def centre(self) -> None:
+        """Take the mean out again; called after each step."""
+        for of_views in (self.log_gains, self.offsets):
+            mean = torch.stack(list(of_views)).mean(0)
+            for own in of_views:
+                own -= mean
+
+
+GIVEN, LEARNED = "given", "learned"
+CHOICES = (GIVEN, LEARNED)  # of exposures, and of poses
+
+
+class Corrections(nn.Module):
+    """Corrections of the training views of a scene; without parameters where nothing is corrected."""
+
+    def __init__(self, scene: Scene, *, exposures: bool, poses: bool) -> None:
+        """No correction yet.
+
+        Raises:
+            ValueError: poses shall learn, but two views have one name.
+        """
+        super().__init__()
+        self.exposures = Exposures(len(scene.train)) if exposures else None
+        self.poses = PoseRefinement.of(scene.train, unit=scene.scale) if poses else None
+
+    def groups(self, iterations: int) -> list[ParameterGroup]:
+        """All parameters, with their learning rates in a run of `iterations`."""
+        exposures = [] if self.exposures is None else self.exposures.groups()
+        return exposures + ([] if self.poses is None else self.poses.groups(SMALL, iterations))
+
+    def posed(self, view: View) -> View:
+        """A training view where it is taken to have been; differentiable."""
+        return view if self.poses is None else self.poses.refined(view)
+
+    def exposed(self, image: Tensor, index: int) -> Tensor:
+        """What was drawn of training view `index`, [H, W, 3], as its photograph was exposed; differentiable."""
+        return image if self.exposures is None else self.exposures.exposed(image, index)
+
+    def centre(self) -> None:
+        """Have all corrections together change nothing; called after each step of the optimizer."""
+        for part in (self.exposures, self.poses):
+            if part is not None:
+                part.centre()

@@ -1,0 +1,98 @@
+"""Score a trained method on the test views under protocols, and time its rendering."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from itertools import cycle, islice
+from typing import Any
+
+from padgs.clock import summary, timed
+from padgs.evaluation.diagnostics import diagnose, oracle, pole_gap
+from padgs.evaluation.evaluate import Metrics, OnView, cropped_mask, evaluate, finite_or_none, quantized
+from padgs.evaluation.metrics import mean_color, psnr, ws_psnr_fitted
+from padgs.evaluation.protocols import Protocol
+from padgs.geometry.panorama import row_latitudes
+from padgs.render import Rendering
+from padgs.results import Scores
+from padgs.scene import Scene, View
+
+POLAR = 85.0  # degrees
+STABILITY = "stability"  # the protocol with more than image metrics
+FRAMES = 10  # rendered at least for timing, and each test view once
+Render = Callable[[View], Rendering]
+
+
+def score(
+    render: Render, scene: Scene, protocols: Mapping[str, Protocol], save_image: OnView | None
+) -> dict[str, Scores]:
+    """Return the scores of the test views under each protocol; images are saved under the first one."""
+    scores: dict[str, Scores] = {}
+    for name, protocol in protocols.items():
+        on_view = None if scores else save_image
+        if name == STABILITY:
+            scores[name] = _stability(render, scene, protocol, on_view)
+        else:
+            scores[name] = evaluate(render, scene.test, protocol, on_view=on_view)
+    return scores
+
+
+def _stability(render: Render, scene: Scene, protocol: Protocol, on_view: OnView | None) -> Scores:
+    """Return the scores under the stability protocol.
+
+    Besides image metrics: `padgs.evaluation.diagnostics`, and WS-PSNR of one constant colour, after fitting colours,
+    and of training views.
+    """
+
+    def more(view: View, rendering: Rendering) -> Metrics:
+        truth, image = view.image(device=rendering.image.device), quantized(rendering.image)
+        mask = cropped_mask(view.mask(device=image.device), image, protocol)
+        marks = {"ws_psnr_one_color": mean_color(truth, mask), "ws_psnr_fitted": ws_psnr_fitted(image, truth, mask)}
+        if view.lens is None and (blurred := oracle(image, truth, mask)) is not None:
+            marks["pole_gap_oracle"] = pole_gap(blurred, truth, mask)
+        marks = {"pole_gap_oracle": None, **{name: finite_or_none(mark) for name, mark in marks.items()}}
+        return {**marks, **diagnose(render, view, rendering)}
+
+    scores = evaluate(render, scene.test, protocol, on_view=on_view, extra=more)
+    training = scene.train[:: max(1, len(scene.train) // len(scene.test))]
+    ws_psnr = evaluate(render, training, protocol).metrics["ws_psnr"]
+    return replace(scores, metrics={**scores.metrics, "ws_psnr_training": ws_psnr})
+
+
+def constant_color_quality(scene: Scene, protocol: Protocol) -> float:
+    """Return the mean WS-PSNR (dB) of test views that are replaced by their mean colour."""
+
+    def quality(view: View) -> float:
+        truth = view.image()
+        return mean_color(truth, cropped_mask(view.mask(), truth, protocol)).item()
+
+    return sum(map(quality, scene.test)) / len(scene.test)
+
+
+def probe(render: Render, view: View) -> dict[str, float]:
+    """Measure one test view during training.
+
+    Returns:
+        psnr: dB, over all pixels that the mask lets through.
+        polar_transmittance: mean share of the background in rows beyond `POLAR` degrees of latitude (at least the
+            first and the last row), where modulated opacities may let it through.
+    """
+    rendering = render(view)
+    image = rendering.image.clamp(0, 1)
+    like: dict[str, Any] = {"dtype": image.dtype, "device": image.device}
+    latitudes = row_latitudes(view.height, device=image.device).abs()
+    polar = latitudes >= min(math.radians(POLAR), latitudes.max().item())
+    return {
+        "psnr": psnr(image, view.image(**like), view.mask(**like)).item(),
+        "polar_transmittance": rendering.transmittance[polar].mean().item(),
+    }
+
+
+def frame_times(render: Render, scene: Scene) -> dict[str, float]:
+    """Return statistics of milliseconds per rendered test view, decoding included, after one warm-up view."""
+    render(scene.test[0])
+    views = islice(cycle(scene.test), max(FRAMES, len(scene.test)))
+    device = scene.points.device
+    times = summary([timed(lambda view=view: render(view), device)[1] for view in views])
+    return {f"render_ms_{name}": 1000 * seconds for name, seconds in times.items()}

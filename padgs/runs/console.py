@@ -1,0 +1,220 @@
+"""Text on a terminal: whatever names and messages hold is shown, and neither obeyed by it nor taken for markup."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from typing import TYPE_CHECKING, TypeVar
+
+from rich.console import Console, RenderableType
+from rich.live import Live
+from rich.text import Text
+
+if TYPE_CHECKING:
+    from padgs.training.loop import Record
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from padgs.evaluation import BANDS
+from padgs.results import Result
+
+if TYPE_CHECKING:
+    from padgs.runs.config import RunConfig
+    from padgs.scene import Scene
+
+
+def say(console: Console, text: object, style: str = "") -> None:
+    """Print lines as they are, of any length."""
+    console.print(Text(printable(str(text)), style), soft_wrap=True)
+
+
+def printable(text: str) -> str:
+    r"""The text with escapes for what a terminal would obey, and for what no encoding has.
+
+    >>> printable("caf\u00e9 \x1b[2J \udce9")
+    'café \\x1b[2J \\udce9'
+    """
+    shown = "".join(c if c.isprintable() or c in "\n\t" or ord(c) > 0xFF else f"\\x{ord(c):02x}" for c in text)
+    return shown.encode("utf-8", "backslashreplace").decode()
+
+
+REDRAWS_PER_SECOND = 5
+SECONDS_BETWEEN_LINES = 10.0  # where there is no terminal
+RECENT = 64  # records that the speed is taken from
+
+D = TypeVar("D", bound="Display")
+
+
+class Display:
+    """A place on the console for what changes; the last picture stays."""
+
+    def __init__(self, console: Console, *, redraw: float, line: float) -> None:
+        """Show something new after `redraw` seconds in a terminal, after `line` seconds elsewhere."""
+        self._console = console
+        self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
+        self._interval = line if self._live is None else redraw
+        self._shown = 0.0
+
+    def __enter__(self: D) -> D:
+        self._shown = time.monotonic()
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    @property
+    def is_due(self) -> bool:
+        """Whether what is shown is old."""
+        return time.monotonic() - self._shown >= self._interval
+
+    def show(self, line: str, picture: RenderableType | None = None) -> None:
+        """Show a line, or in a terminal what says more."""
+        self._shown = time.monotonic()
+        if self._live is not None:
+            self._live.update(picture or Text(line, no_wrap=True, overflow="ellipsis"), refresh=True)
+        else:
+            self._console.print(line, highlight=False, soft_wrap=True)
+
+
+class LiveLine(Display):
+    """Of one run: iteration and share of the run, loss, held-out PSNR, counts, speed and the time that is left."""
+
+    def __init__(self, console: Console) -> None:
+        super().__init__(console, redraw=1 / REDRAWS_PER_SECOND, line=SECONDS_BETWEEN_LINES)
+        self._times: deque[tuple[int, float, float]] = deque(maxlen=RECENT)
+        self._psnr: float | None = None
+
+    def update(self, record: Record, psnr: float | None) -> None:
+        """Take in a record and, where it was measured, the PSNR of the held-out view."""
+        self._times.append((record.iteration, record.progress, time.monotonic()))
+        self._psnr = self._psnr if psnr is None else psnr
+        if self.is_due or len(self._times) == 1 or record.progress == 1:
+            self.show(self._line(record))
+
+    def _line(self, record: Record) -> str:
+        parts = [f"{record.iteration} ({record.progress:.0%})", f"loss {float(record.loss):.4f}"]
+        if self._psnr is not None:
+            parts.append(f"PSNR {self._psnr:.2f}")
+        parts += [f"{name} {compact(count)}" for name, count in record.counts.items()]
+        (first, behind, start), (latest, share, end) = self._times[0], self._times[-1]
+        if share > behind:
+            parts += [f"{(latest - first) / max(end - start, 1e-9):.1f} it/s"]
+            parts += [f"ETA {duration((1 - share) / (share - behind) * (end - start))}"]
+        return "  ".join(parts)
+
+
+def compact(count: int) -> str:
+    """A count in few characters.
+
+    >>> [compact(n) for n in (987, 12_345, 123_456, 2_345_678)]
+    ['987', '12.3k', '123k', '2.35M']
+    """
+    if count < 1000:
+        return str(count)
+    return f"{count / 1000:.3g}k" if count < 999_500 else f"{count / 1e6:.3g}M"
+
+
+def duration(seconds: float) -> str:
+    """A duration as people write it.
+
+    >>> [duration(s) for s in (7, 72, 3723)]
+    ['0:07', '1:12', '1:02:03']
+    """
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
+
+
+MISSING = "–"
+MEANINGS = {  # word of a metric -> what it says, with an arrow towards the better end
+    "psnr": "↑ dB",
+    "ssim": "↑ likeness of structure",
+    "lpips": "↓ perceptual distance",
+    "seam": "error at ±180° over elsewhere, best 1",
+}
+
+
+def introduce(config: RunConfig, scene: Scene, folder: Path, console: Console) -> None:
+    """Print what is trained on what, the notes of the loader, and where the files will be."""
+    view = scene.train[0]
+    what = f"{config.preset}{f' ({config.row})' if config.row else ''} on {scene.name}"
+    views = f"{len(scene.train)} training and {len(scene.test)} test views of {view.width}x{view.height}"
+    rest = f": {views}, {len(scene.points)} points, {config.time}, on {scene.points.device}"
+    console.print(Text(printable(what), "bold"), rest, sep="", highlight=False, soft_wrap=True)
+    for note in (*scene.notes, folder):
+        say(console, f"  {note}", "dim")
+
+
+def show_result(result: Result, folder: Path, console: Console) -> None:
+    """Print the marks of a run, what it cost, and where its files are."""
+    if not result.ok:
+        reason = printable(result.reason) or "stopped early"
+        console.print(Text.assemble((result.status, "bold red"), f": {reason}"), soft_wrap=True)
+    if result.ended:
+        say(console, f"stopped early, after {result.iterations_done} iterations: {printable(result.ended)}", "yellow")
+    if result.scores:
+        console.print(marks(result))
+    for note in dict.fromkeys(note for scores in result.scores.values() for note in scores.notes):
+        say(console, note, "yellow")
+    costs = [f"{compact(count)} {name}" for name, count in result.counts.items()]
+    costs.append(f"{result.model_bytes / 1e6:.1f} MB")
+    if "train_seconds" in result.timing:
+        costs.append(f"trained {duration(result.timing['train_seconds'])}")
+    if "render_ms_median" in result.timing:
+        costs.append(f"{result.timing['render_ms_median']:.1f} ms per frame")
+    costs.append(f"peak memory {result.peak_memory_bytes / 1e9:.2f} GB")
+    if result.peak_device_memory_bytes is not None:
+        costs.append(f"{result.peak_device_memory_bytes / 1e9:.2f} GB on the GPU")
+    say(console, ", ".join(costs))
+    say(console, folder, "bold")
+
+
+def marks(result: Result) -> Table:
+    """One row per metric, one column per protocol, and what the metric says."""
+    table = Table("metric", box=SIMPLE_HEAD)
+    for protocol in result.scores:
+        table.add_column(protocol, justify="right")
+    table.add_column(style="dim")
+    for metric in dict.fromkeys(name for scores in result.scores.values() for name in scores.metrics):
+        values = [scores.metrics.get(metric) for scores in result.scores.values()]
+        table.add_row(metric, *(number(metric, value) for value in values), meaning(metric))
+    return table
+
+
+def meaning(metric: str) -> str:
+    """What a metric says, in a line, with an arrow towards its better end.
+
+    >>> meaning("ws_psnr_pole"), meaning("lpips_vgg_01")
+    ('↑ dB, 75 to 90° up and down', '↓ perceptual distance')
+    """
+    words = metric.split("_")
+    quantity = next((text for word, text in MEANINGS.items() if word in words), "")
+    band = BANDS.get(words[-1])
+    where = _where(band) if band else "by solid angle" if words[0] == "ws" else ""
+    return ", ".join(filter(None, (quantity, where)))
+
+
+def number(metric: str, value: float | None) -> str:
+    """A mark as tables show it: decibels with two decimals, all else with three.
+
+    >>> number("ws_psnr", 24.256), number("ssim", 0.5), number("lpips_vgg", None)
+    ('24.26', '0.500', '–')
+    """
+    if value is None:
+        return MISSING
+    return f"{value:.2f}" if "psnr" in metric else f"{value:.3f}"
+
+
+def _where(band: Sequence[tuple[int, int]]) -> str:
+    first, last = band[-1]
+    if first == -last:
+        return f"within {last}° of the horizon"
+    low, high = sorted((abs(first), abs(last)))
+    return f"{low} to {high}° {'up and down' if len(band) > 1 else 'up' if last < 0 else 'down'}"

@@ -1,0 +1,216 @@
+"""Load a run from Python: its method, scene and scores, and renders as arrays; finished or not."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from omegaconf import OmegaConf
+from yaml import YAMLError
+
+from padgs import results
+from padgs.data.camera_paths import interpolate_poses
+from padgs.data.capture import DataError
+from padgs.evaluation.protocols import PROTOCOLS
+from padgs.evaluation.scoring import score
+from padgs.geometry.camera import Camera, Panorama, Pinhole
+from padgs.results import Result, Scores
+from padgs.runs import checkpoint
+from padgs.runs.config import RunConfig, config_from_values
+from padgs.runs.device import choose_device
+from padgs.runs.run import build_method, load_scene
+from padgs.runs.store import PROGRESS, Progress, RunFolderError, RunStore, config_hash
+from padgs.scene import Scene, View
+from padgs.training.method import Method
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A render as float32 arrays."""
+
+    image: np.ndarray  # [H, W, 3] colours in [0, 1]
+    depth: np.ndarray  # [H, W] mean distance by contribution, world units; 0 where nothing is drawn
+    alpha: np.ndarray  # [H, W] in [0, 1]; 1 hides the background
+
+
+def draw(method: Method, view: View) -> Picture:
+    """Render a view of a trained method as arrays.
+
+    Raises:
+        RuntimeError: the method has no model yet.
+    """
+    rendering = method.render(view)
+    image, depth = rendering.image.clamp(0, 1), rendering.depth
+    return Picture(*(tensor.float().cpu().numpy() for tensor in (image, depth, 1 - rendering.transmittance)))
+
+
+@dataclass
+class LoadedRun:
+    """A run folder in memory, as `load_run` returns it."""
+
+    folder: Path
+    config: RunConfig
+    method: Method  # loaded from the last checkpoint
+    result: Result | None  # None if the run is not finished
+    iteration: int  # of the last checkpoint
+    digest: str  # of the last checkpoint
+
+    @property
+    def files(self) -> RunStore:
+        """The files of the run."""
+        return RunStore(self.folder)
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The scene that the run was trained on, loaded at first access.
+
+        Warns if the data have changed since: poses and units may differ from the model's.
+
+        Raises:
+            DataError: the data have moved; `load_run(folder, data_path=...)` says where they are.
+        """
+        scene = load_scene(self.config, choose_device(self.config.run.device, self.config.render))
+        if not self._was_trained_on(scene):
+            warnings.warn(f"{self.folder} was trained on other data than {self._place} holds", stacklevel=3)
+        return scene
+
+    def refuse_other_data(self) -> None:
+        """Refuse a data set that has changed since training.
+
+        Raises:
+            DataError: it has changed.
+        """
+        if not self._was_trained_on(self.scene):
+            raise DataError(
+                f"{self.folder} was trained on other data than {self._place} holds; pass the right folder with --data, "
+                "or train again on these data"
+            )
+
+    @property
+    def _place(self) -> str:
+        return str(self.config.data.path or "the generator")
+
+    def _was_trained_on(self, scene: Scene) -> bool:
+        return self.result is None or self.result.fingerprint == scene.fingerprint
+
+    @property
+    def scores(self) -> dict[str, Scores]:
+        """Protocol -> scores of the test views, as in `result.json`; empty if the run is not finished."""
+        return self.result.scores if self.result is not None else {}
+
+    def renewed(self) -> LoadedRun | None:
+        """Return the run as training has left it since, on the same scene; None if nothing has changed.
+
+        Raises:
+            CheckpointError: the checkpoint cannot be read, perhaps because a new one is being written.
+            RunFolderError, ResultError, OSError: another file cannot be read.
+        """
+        if checkpoint.digest(self.files.checkpoint) == self.digest and self.files.result() == self.result:
+            return None
+        run = load_run(self.folder, data_path=self.config.data.path, device=self.config.run.device)
+        if "scene" in self.__dict__:  # loaded already
+            run.scene = self.scene
+        return run
+
+    def render(self, view: View) -> Picture:
+        """Render a view of the run's scene, or the same camera elsewhere: `view.at(cam_from_world)`."""
+        return draw(self.method, view)
+
+    def score(self, protocol: str) -> Scores:
+        """Score the test views under a protocol of the run or a built-in one.
+
+        Raises:
+            ValueError: unknown protocol, or there are no test views.
+        """
+        rules = {**PROTOCOLS, **self.config.protocols}
+        if protocol not in rules:
+            raise ValueError(f"unknown protocol {protocol!r}; known: {', '.join(rules)}")
+        return score(self.method.render, self.scene, {protocol: rules[protocol]}, None)[protocol]
+
+    def camera_path(self, frames: int) -> list[View]:
+        """Return `frames` views along a path through the training cameras in their order, evenly spaced in number.
+
+        Raises:
+            ValueError: fewer than two training views or frames.
+        """
+        views = self.scene.train
+        if len(views) < 2 or frames < 2:
+            raise ValueError(f"a path of {frames} frames through {len(views)} views; it takes at least two of both")
+        poses = interpolate_poses(
+            torch.stack([view.cam_from_world for view in views]), np.linspace(0, len(views) - 1, frames)
+        )
+        return [
+            replace(views[0].at(pose.to(views[0].cam_from_world)), name=f"frame-{number:05d}")
+            for number, pose in enumerate(poses)
+        ]
+
+    def through(self, camera: Camera) -> Method:
+        """Return a method that can render this camera: the run's own, or a copy with other render settings.
+
+        If the camera has finer pixels than training had, low-pass filters keep their angle, because Gaussians were
+        never seen between those pixels; methods with a smoothing filter of their own need no such change. Projections
+        of whole panoramas are replaced by `pinhole` for a perspective camera.
+        """
+        settings, trained = self.config.render, self.scene.train[0].camera
+        if isinstance(camera, Pinhole):
+            panoramic = settings.projection == "erp" or settings.cubemap
+            angular = panoramic and settings.low_pass_kind in ("auto", "pixels")
+            settings = replace(
+                settings,
+                projection="pinhole" if panoramic else settings.projection,
+                low_pass_kind="angular" if angular else settings.low_pass_kind,
+                cubemap=False,
+                face_size=None,
+                pixel_bias=0.0,
+                bounds="exact",
+                wrap=True,
+                memory_cap=None,
+            )
+        finer = max(1.0, camera.focal / trained.focal)
+        if not isinstance(camera, Panorama):
+            finer /= self.method.CUT_FINENESS
+        if not (settings.low_pass_kind == "fixed" or self.method.is_drawn_no_finer):
+            settings = replace(settings, low_pass=settings.low_pass * finer**2)
+        return self.method if settings == self.config.render else self.method.with_renderer(settings)
+
+
+def load_run(folder: str | Path, *, data_path: str | Path | None = None, device: str = "auto") -> LoadedRun:
+    """Load a run folder.
+
+    Args:
+        folder: with `config.yaml` and `checkpoint/`, as `padgs-run` writes them.
+        data_path: folder of the data set if it has moved.
+        device: auto, cpu or cuda.
+
+    Raises:
+        RunFolderError: not a run folder, or without a checkpoint.
+        CheckpointError, ResultError, ConfigError: a file is damaged or of another version.
+        ValueError, OSError: the device does not exist or cannot render this.
+    """
+    store = RunStore(Path(folder))
+    settings = store.path / results.CONFIG_NAME
+    if not settings.is_file() or not store.has_checkpoint:
+        raise RunFolderError(
+            f"{folder} has no {'checkpoint' if settings.is_file() else settings.name}; give the folder of one run, as "
+            "padgs-run names it at its end"
+        )
+    try:
+        values: Any = OmegaConf.to_container(OmegaConf.load(settings))
+        run = {"configuration": config_hash(values)}  # the data are not read
+        values["data"]["path"] = values["data"]["path"] if data_path is None else str(data_path)
+        values["run"]["device"] = device
+    except (YAMLError, ValueError, LookupError, TypeError, AttributeError) as error:
+        raise RunFolderError(f"{settings} is not a configuration of padgs-run ({error}); restore it") from error
+    config = config_from_values(values)
+    method = build_method(config)
+    digest = checkpoint.digest(store.checkpoint)
+    state = checkpoint.load(store.checkpoint, choose_device(device, config.render), run)
+    with checkpoint.understood(store.checkpoint):
+        method.load_state(state)
+        iteration = Progress(**state.values[PROGRESS]).iteration
+    return LoadedRun(store.path, config, method, store.result(), iteration, digest)

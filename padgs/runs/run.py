@@ -1,0 +1,340 @@
+"""One run, from its configuration to `result.json`: load the scene, train, score, write.
+
+A run that was interrupted resumes from its checkpoint; a finished run is shown again, or scored under new protocols.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import asdict, replace
+from datetime import datetime, timezone
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+
+from padgs import clock, data, results
+from padgs.baselines import METHODS, distribution
+from padgs.data.capture import DataError
+from padgs.evaluation.protocols import Protocol
+from padgs.evaluation.scoring import constant_color_quality, frame_times, probe, score
+from padgs.registry import lookup
+from padgs.results import STATUSES, STOP_REQUESTED, Result
+from padgs.runs.config import RunConfig
+from padgs.runs.console import LiveLine, introduce, say, show_result
+from padgs.runs.device import choose_device
+from padgs.runs.interrupt import STOP_SIGNALS, Interrupt, Interrupted
+from padgs.runs.store import Progress, RunFolderError, RunStore, config_hash
+from padgs.scene import Scene
+from padgs.training.health import Failure, is_out_of_memory, memory_reason
+from padgs.training.loop import Record
+from padgs.training.method import Method
+
+MAX_DEPTH_ERROR = 0.5  # AbsRel; more is degenerate
+MIN_THICKNESS = 0.01  # of all surfaces along their thinnest axis, relative to the true one; less is degenerate
+MIN_ITERATIONS = 50  # a shorter run is not judged by its quality
+RETRIED = STATUSES.keys() - {"ok", "timeout"}  # statuses that retry=failed starts again
+
+
+class Callback:
+    """Follows a run and may stop it; this one does nothing."""
+
+    def started(self, folder: Path) -> None:
+        """Take note of the run folder, before anything is written there."""
+
+    def saved(self, folder: Path) -> None:
+        """Take note of a new checkpoint; the log is up to date."""
+
+    def stop_requested(self) -> bool:
+        """Return whether the run should write its checkpoint and stop."""
+        return False
+
+
+def run(
+    config: RunConfig,
+    console: Console,
+    callback: Callback = Callback(),  # noqa: B008 - no state
+    scene: Scene | None = None,
+) -> Result:
+    """Do what is missing of a run, and show its result.
+
+    Args:
+        config: the run.
+        console: receives progress and the result.
+        callback: is told of the folder and of checkpoints.
+        scene: as `load_scene(config, start(config))` returns it; loaded if None.
+
+    Raises:
+        DataError: the input cannot be used.
+        ResultError, CheckpointError, RunFolderError: files of the run cannot be read or written.
+        RunBusy: another process works on this run.
+        Interrupted: stopped from outside; starting the run again resumes it.
+    """
+    scene = load_scene(config, start(config)) if scene is None else scene
+    store = RunStore.of(config, scene)
+    callback.started(store.path)
+    introduce(config, scene, store.path, console)
+    result = store.result()
+    if result is None or _is_incomplete(config, result):
+        with store:
+            result = store.result()  # another process may have finished it in the meantime
+            if result is not None and _is_retried(config, result):
+                store.forget(result)
+                result = None
+            if result is None:
+                result = train(config, scene, store, console, callback)
+            else:
+                result = _complete(config, scene, store, result, console)
+    else:
+        advice = "; it failed, retry=failed starts it again" if result.status in RETRIED else ""
+        say(console, f"finished before, nothing to do{advice}")
+    show_result(result, store.path, console)
+    return result
+
+
+def start(config: RunConfig) -> torch.device:
+    """Set threads and seed of the process, reset its peak memory, and return the device of the run."""
+    if config.run.threads_per_job is not None:
+        torch.set_num_threads(config.run.threads_per_job)
+    torch.manual_seed(config.seed)
+    device = choose_device(config.run.device, config.render)
+    clock.reset_peak_memory(device)
+    return device
+
+
+def load_scene(config: RunConfig, device: torch.device) -> Scene:
+    """Load the scene of a run onto a device, under the run's stress; images are kept where `run.images_on` says.
+
+    Raises:
+        DataError: the input cannot be used.
+        ValueError: the stress condition cannot be applied to it.
+    """
+    images_on = str(device) if config.run.images_on == "device" else config.run.images_on
+    scene = data.load(config.data.path, config.data.format, config.data.options(images_on))
+    return config.stress.apply(scene, config.seed).recentered().to(device)
+
+
+def build_method(config: RunConfig) -> Method:
+    """Return the untrained method of a run."""
+    return lookup(METHODS, config.method, "method")(config.options, config.render, config.train, seed=config.seed)
+
+
+def train(config: RunConfig, scene: Scene, store: RunStore, console: Console, callback: Callback) -> Result:
+    """Train to the end of the budget, resuming from a checkpoint if there is one; score, and write the result.
+
+    The last checkpoint holds the trained method. Failures of the training are results with their status.
+
+    Raises:
+        Interrupted: stopped from outside; the checkpoint was written.
+        DataError: an image cannot be read any more; the last checkpoint stands.
+        CheckpointError, RunFolderError: files cannot be read or written.
+        ConfigError: the run of the warm start does not fit this scene.
+    """
+    method = build_method(config)
+    if config.init is not None and not store.has_checkpoint:
+        stress, device = config.values().get("stress"), scene.points.device
+        at_width = partial(_fingerprint_at, config, device)
+        method.warm_start(config.init.state(scene.fingerprint, at_width, device, stress))
+    store.prepare(config.values())
+    progress = store.resume(method, scene.points.device)
+    if progress.iteration:
+        say(console, f"resuming after iteration {progress.iteration}")
+    result = initial_result(config, scene, store.path.name)
+    saved_at, saved = time.monotonic(), progress
+    try:
+        with (
+            Interrupt(callback.stop_requested) as interrupt,
+            Interrupt(store.stop.exists, STOP_SIGNALS) as stop,
+            LiveLine(console) as line,
+        ):
+            for record in method.fit(scene, config.time):
+                progress = Progress(record.iteration, record.seconds, record.cpu_seconds, record.progress)
+                line.update(record, _log(config, scene, store, record, method))
+                interrupted = interrupt.requested
+                ending = stop.requested and not method.ended and method.request_stop(STOP_REQUESTED)
+                if interrupted or ending or _is_checkpoint_due(config, record, saved_at):
+                    store.save(method, progress)
+                    callback.saved(store.path)
+                    saved_at, saved = time.monotonic(), progress
+                if interrupted and record.progress < 1:
+                    raise Interrupted(f"stopped after iteration {record.iteration}, the checkpoint is written")
+            if saved != progress:
+                store.save(method, progress)
+        result = replace(result, **_trained(method, scene, progress))
+        if scene.test:
+            save_image = store.save_image if config.run.pictures else None
+            timing = result.timing | frame_times(method.render, scene)
+            result = replace(result, timing=timing, scores=score(method.render, scene, config.protocols, save_image))
+            result = judge(result, scene, progress.iteration)
+    except (Interrupted, DataError):  # an image that cannot be read may be there again: the run has not failed
+        raise
+    except KeyboardInterrupt as error:
+        raise Interrupted("stopped at once, the last checkpoint stands") from error
+    except (Failure, ValueError, MemoryError, RuntimeError) as error:
+        status, reason = _status(error)
+        result = replace(result, status=status, reason=reason, **_peak_memory(scene))
+    if result.ended == STOP_REQUESTED:
+        title = (config.row, f"stopped after {progress.iteration} iterations")
+        result = replace(result, variant=", ".join(filter(None, title)))
+    return store.finish(
+        replace(
+            result,
+            iterations=progress.iteration if config.budget.seconds is not None else result.iterations,
+            iterations_done=progress.iteration,
+            finished=datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        )
+    )
+
+
+def initial_result(config: RunConfig, scene: Scene, run: str) -> Result:
+    """Return the result of a run before its first iteration, with status ok."""
+    view = (scene.test or scene.train)[0]
+    machine = clock.machine(scene.points.device)
+    code = (machine["padgs"], (machine["commit"] or "")[:10], distribution(config.method))
+    values = config.values()
+    return Result(
+        run=run,
+        status="ok",
+        method=config.method,
+        preset=config.preset,
+        variant=config.row,
+        dataset=config.data.dataset or ("" if config.data.path else "synthetic"),
+        scene=scene.name,
+        width=view.width,
+        height=view.height,
+        iterations=config.train.iterations,
+        iterations_done=0,
+        seed=config.seed,
+        code_version=" ".join(filter(None, code)) or "unknown",
+        machine=machine,
+        config_hash=config_hash(values),
+        fingerprint=scene.fingerprint,
+        finished="",
+        config=values,
+        experiments=config.labels.experiments,
+    )
+
+
+def _log(config: RunConfig, scene: Scene, store: RunStore, record: Record, method: Method) -> float | None:
+    """Log an iteration if that is due; return the PSNR of the held-out view if it was measured."""
+    last = record.progress == 1
+    due = bool(scene.test) and (last or record.iteration % config.run.probe_every == 0)
+    probed = probe(method.render, scene.test[len(scene.test) // 2]) if due else {}
+    if last or due or record.events or record.iteration % config.run.log_every == 0:
+        store.log(record, probed)
+    return probed.get("psnr")
+
+
+def _is_checkpoint_due(config: RunConfig, record: Record, saved_at: float) -> bool:
+    """Return whether to write a checkpoint, the last one having been written at `saved_at` (monotonic seconds)."""
+    every = config.run.checkpoint_every
+    if every is not None and record.iteration % every == 0:
+        return True
+    return time.monotonic() - saved_at > config.run.seconds_between_checkpoints
+
+
+def _fingerprint_at(config: RunConfig, device: torch.device, width: int | None) -> str:
+    """Return the fingerprint of the run's scene at another image width."""
+    return load_scene(replace(config, data=replace(config.data, width=width)), device).fingerprint
+
+
+def _trained(method: Method, scene: Scene, progress: Progress) -> dict[str, Any]:
+    """Return the fields of a result that describe a trained method."""
+    size = method.size()
+    initial = {"start": method.start} if "gaussians" in size.counts else {}
+    return {
+        "status": "ok" if progress.share == 1 else "timeout",
+        "counts": {**size.counts, "parameters": size.parameters, **initial},
+        "model_bytes": size.bytes,
+        "ended": method.ended,
+        "timing": {"train_seconds": progress.seconds, "cpu_seconds": progress.cpu_seconds},
+        **_peak_memory(scene),  # of training: scoring has networks of its own
+    }
+
+
+def _peak_memory(scene: Scene) -> dict[str, int | None]:
+    peak = clock.peak_memory(scene.points.device)
+    return {"peak_memory_bytes": peak["host"], "peak_device_memory_bytes": peak["device"]}
+
+
+def _status(error: Exception) -> tuple[str, str]:
+    """Return status and reason of a run that an error ended; errors that no status stands for are raised again."""
+    if isinstance(error, Failure):
+        return error.status, str(error)
+    if isinstance(error, ValueError):
+        return "rejected", str(error)
+    if is_out_of_memory(error):
+        return "oom", f"out of memory: {memory_reason(error)}"
+    raise error
+
+
+def judge(result: Result, scene: Scene, iterations: int) -> Result:
+    """Return the result with status diverged or degenerate if the scores of its test views say so.
+
+    Diverged: WS-PSNR below that of one constant colour. Degenerate: depth or thickness of surfaces are wrong.
+    """
+    if not result.ok:
+        return result
+    metrics: dict[str, float | None] = {}
+    for scores in result.scores.values():
+        metrics |= scores.metrics
+        quality = scores.metrics.get("ws_psnr")
+        if quality is None or iterations < MIN_ITERATIONS:
+            continue
+        if quality < (constant := constant_color_quality(scene, Protocol(**scores.protocol))):
+            reason = f"WS-PSNR {quality:.2f} dB, and one colour for all would have {constant:.2f} dB"
+            return replace(result, status="diverged", reason=reason)
+    depth, thickness = metrics.get("depth_error"), metrics.get("least_extent")
+    if depth is not None and depth > MAX_DEPTH_ERROR:
+        reason = f"depths are off by {depth:.0%} on average (AbsRel), more than {MAX_DEPTH_ERROR:.0%}"
+        return replace(result, status="degenerate", reason=reason)
+    if thickness is not None and thickness < MIN_THICKNESS:
+        reason = (
+            f"surfaces are {thickness:.2%} as thick as the true ones along some axis, less than {MIN_THICKNESS:.0%}"
+        )
+        return replace(result, status="degenerate", reason=reason)
+    return result
+
+
+def _is_incomplete(config: RunConfig, result: Result) -> bool:
+    return _is_retried(config, result) or bool(_unscored(config, result)) or _experiments(config, result) is not None
+
+
+def _is_retried(config: RunConfig, result: Result) -> bool:
+    return result.status in RETRIED and config.retry == "failed"
+
+
+def _experiments(config: RunConfig, result: Result) -> tuple[str, ...] | None:
+    """Return the experiments of a finished run including those that request it here; None if none is new."""
+    joined = results.joined(result.experiments, config.labels.experiments)
+    return None if joined == result.experiments else joined
+
+
+def _unscored(config: RunConfig, result: Result) -> dict[str, Protocol]:
+    """Return the protocols under whose exact rules a run that ended well has no scores."""
+
+    def is_scored(name: str, protocol: Protocol) -> bool:
+        rules = json.dumps(asdict(protocol), sort_keys=True)
+        return name in result.scores and rules == json.dumps(result.scores[name].protocol, sort_keys=True)
+
+    return {name: rules for name, rules in config.protocols.items() if result.ok and not is_scored(name, rules)}
+
+
+def _complete(config: RunConfig, scene: Scene, store: RunStore, result: Result, console: Console) -> Result:
+    """Add missing scores and experiments to a finished run."""
+    complete = replace(result, experiments=_experiments(config, result) or result.experiments)
+    if unscored := _unscored(config, result):
+        say(console, "finished before; only the new protocol is missing")
+        if not store.has_checkpoint:  # an untrained method would be scored
+            raise RunFolderError(
+                f"{store.path} has a result but no checkpoint any more, so it cannot be scored under other "
+                f"rules of {', '.join(unscored)}; keep the old rules, or delete the folder to train again"
+            )
+        method = build_method(config)
+        store.resume(method, scene.points.device)
+        scores = {**result.scores, **score(method.render, scene, unscored, None)}
+        complete = judge(replace(complete, scores=scores), scene, result.iterations_done)
+    return result if complete == result else store.finish(complete)

@@ -1,0 +1,282 @@
+"""The files of one run, its lock and its identity.
+
+A run folder holds config.yaml, log.jsonl, checkpoint/, renders/, and result.json, which is written last. A file `stop`
+in it requests that training ends early and is scored.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import shutil
+import socket
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from filelock import FileLock, Timeout
+from omegaconf import OmegaConf
+from PIL import Image
+from torch import Tensor
+
+from padgs import results
+from padgs.evaluation.images import comparison_image
+from padgs.files import write_atomically
+from padgs.results import Result, decisive
+from padgs.runs import checkpoint
+from padgs.scene import Scene, View
+from padgs.training.loop import Record
+from padgs.training.method import Method
+from padgs.training.model import State
+
+if TYPE_CHECKING:
+    from padgs.runs.config import RunConfig
+
+PROGRESS = "progress"  # key of `Progress` in a checkpoint
+HASH_DIGITS = 10
+LOCK, OWNER = ".lock", ".owner.json"
+
+
+class RunFolderError(RuntimeError):
+    """The run folder cannot be written; the message names the file, the reason and the way out."""
+
+
+class RunBusy(RuntimeError):
+    """Another process works on this run; the message says which."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Progress of training."""
+
+    iteration: int = 0
+    seconds: float = 0.0  # training time
+    cpu_seconds: float = 0.0
+    share: float = 0.0  # of the schedule
+
+
+class RunStore:
+    """Reads and writes the files of one run; as a context manager, it holds the lock of the run folder."""
+
+    def __init__(self, path: Path, run: Mapping[str, str] | None = None) -> None:
+        """Open a run folder; nothing is written yet.
+
+        Args:
+            path: the folder.
+            run: `identity` that its checkpoint must have; None reads checkpoints of any run.
+        """
+        self.path, self._run = path, run
+        self.checkpoint = path / "checkpoint"
+        self.renders = path / results.PICTURES
+        self.stop = path / "stop"
+        self._log = path / results.LOG_NAME
+        self._lock = FileLock(path / LOCK)
+
+    @classmethod
+    def of(cls, config: RunConfig, scene: Scene) -> RunStore:
+        """Return the store of a run."""
+        values = config.values()
+        name = run_id(values, scene.name, scene.fingerprint, config.preset)
+        return cls(Path(config.run.folder) / name, identity(values, scene.fingerprint))
+
+    def __enter__(self) -> RunStore:
+        """Make the folder and lock it, without waiting.
+
+        The kernel's lock on an open file is free as soon as its process dies. On file systems without such locks,
+        `filelock` falls back to the existence of the file and takes over from dead processes of this host.
+
+        Raises:
+            RunBusy: another process holds the lock.
+            RunFolderError: the folder cannot be written.
+        """
+        owner = self.path / OWNER
+        with self._writing():
+            self.path.mkdir(parents=True, exist_ok=True)
+            try:
+                self._lock.acquire(timeout=0)
+            except Timeout as error:
+                raise RunBusy(f"{self.path} is being worked on by {self._owner()}; it is left alone") from error
+            try:
+                now = datetime.now(timezone.utc).isoformat(timespec="seconds")
+                owner.write_text(json.dumps({"host": socket.gethostname(), "pid": os.getpid(), "since": now}))
+            except OSError:
+                self._lock.release()
+                raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Release the lock."""
+        with suppress(OSError):
+            (self.path / OWNER).unlink()
+        self._lock.release()
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether another process holds the lock."""
+        try:
+            self._lock.acquire(timeout=0)
+        except OSError:  # a `Timeout`, or a folder that cannot be locked from here
+            return True
+        self._lock.release()
+        return False
+
+    @property
+    def has_checkpoint(self) -> bool:
+        """Whether there is a checkpoint, sound or not."""
+        return checkpoint.exists(self.checkpoint)
+
+    def prepare(self, values: Mapping[str, Any]) -> None:
+        """Make the folder and write config.yaml.
+
+        Raises:
+            RunFolderError: it cannot be written.
+        """
+        with self._writing():
+            self.renders.mkdir(parents=True, exist_ok=True)
+            content = OmegaConf.to_yaml(OmegaConf.create(dict(values))).encode()
+            write_atomically(self.path / results.CONFIG_NAME, content)
+
+    def result(self) -> Result | None:
+        """Return the result if the run is finished.
+
+        Raises:
+            ResultError: the file cannot be used.
+        """
+        path = self.path / results.FILE_NAME
+        return results.read(path) if path.exists() else None
+
+    def finish(self, result: Result) -> Result:
+        """Write result.json, which finishes the run; return the result as later readers see it."""
+        with self._writing():
+            path = results.write(result, self.path)
+            self.stop.unlink(missing_ok=True)  # it would stop the next start
+        return results.read(path)
+
+    def forget(self, result: Result) -> None:
+        """Let a failed run start again; after oom, from its checkpoint."""
+        with self._writing():
+            if result.status != "oom":
+                shutil.rmtree(self.checkpoint, ignore_errors=True)
+            self.stop.unlink(missing_ok=True)
+            (self.path / results.FILE_NAME).unlink()
+
+    def log(self, record: Record, probed: Mapping[str, float]) -> None:
+        """Append a line to log.jsonl; `probed` holds the metrics of the held-out view, empty if not measured."""
+        line: dict[str, Any] = {"iteration": record.iteration, "progress": round(record.progress, 6)}
+        line |= {"loss": float(record.loss), "seconds": round(record.seconds, 4), **record.counts, **probed}
+        if record.events:
+            line["events"] = list(record.events)
+        with self._writing(), self._log.open("a") as file:
+            file.write(json.dumps(line) + "\n")
+
+    def save(self, method: Method, progress: Progress) -> None:
+        """Write the checkpoint.
+
+        Raises:
+            CheckpointError: it cannot be written; the previous one stands.
+        """
+        state = method.state()
+        checkpoint.save(State(state.tensors, {**state.values, PROGRESS: asdict(progress)}), self.checkpoint, self._run)
+
+    def resume(self, method: Method, device: torch.device | str = "cpu") -> Progress:
+        """Load the checkpoint into a method, on a device; return its progress, or none without a checkpoint.
+
+        Log lines of later iterations are dropped, as those iterations come again; so is a line cut by a kill.
+
+        Raises:
+            CheckpointError: the checkpoint is damaged or of another run.
+        """
+        progress = Progress()
+        if self.has_checkpoint:
+            state = checkpoint.load(self.checkpoint, device, self._run)
+            with checkpoint.understood(self.checkpoint):
+                method.load_state(state)
+                progress = Progress(**state.values[PROGRESS])
+        if self._log.exists():
+            kept = [line for line in results.log_lines(self.path) if line["iteration"] <= progress.iteration]
+            with self._writing():
+                write_atomically(self._log, "".join(json.dumps(line) + "\n" for line in kept).encode())
+        return progress
+
+    def save_image(self, view: View, truth: Tensor, image: Tensor) -> None:
+        """Save ground truth | render | error of a view side by side; images [H, W, 3]."""
+        with self._writing():
+            Image.fromarray(comparison_image(truth, image)).save(self.renders / results.picture_name(view.name))
+
+    def _owner(self) -> str:
+        try:
+            owner: dict[str, Any] = json.loads((self.path / OWNER).read_text())
+            return f"process {owner['pid']} on {owner['host']} since {owner['since']}"
+        except (OSError, ValueError, KeyError, TypeError):
+            return "another process"
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise cannot_write(self.path, error) from error
+
+
+def cannot_write(path: Path, error: OSError) -> RunFolderError:
+    """Return the error to raise if a run folder or a file beside it cannot be written."""
+    return RunFolderError(
+        f"cannot write run folder {path}: {error.strerror or error}; "
+        "make room, correct the permissions, or set run.folder to another place"
+    )
+
+
+def config_hash(values: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of the configuration keys that numbers depend on.
+
+    Args:
+        values: `RunConfig.values()`; typed, so that 1 and 1.0 of a float field are the same.
+    """
+    return hashlib.sha256(json.dumps(decisive(values), sort_keys=True).encode()).hexdigest()
+
+
+def identity(values: Mapping[str, Any], fingerprint: str) -> dict[str, str]:
+    """Return the identity of a run, which its checkpoint states."""
+    return {"configuration": config_hash(values), "data set": fingerprint}
+
+
+def run_id(values: Mapping[str, Any], scene: str, fingerprint: str, preset: str = "") -> str:
+    """Return the name of a run: scene, preset and variant, and a hash of configuration and data.
+
+    Two runs have the same id exactly if they must produce the same numbers.
+
+    >>> values = {"data": {"path": "/x"}, "method": {"name": "padgs"}, "variant": "no m", "seed": 0}
+    >>> run_id(values, "bar", "f00d")
+    'bar_padgs_no-m_37d2ecb9bc'
+    """
+    digest = hashlib.sha256(f"{config_hash(values)}|{fingerprint}".encode()).hexdigest()
+    stress = "-".join(map(str, values.get("stress", {}).values()))
+    words = [scene, preset or values["method"]["name"], values["variant"], stress]
+    readable = [re.sub(r"[^A-Za-z0-9.-]+", "-", word).strip("-.") for word in words]
+    return "_".join([*(word for word in readable if word), digest[:HASH_DIGITS]])
+
+
+@dataclass(frozen=True)
+class Labels:
+    """Names under which a run was requested; not part of its configuration hash."""
+
+    preset: str = ""  # choice of `method`; empty = the method's own name
+    experiments: tuple[str, ...] = ()  # experiment and sweep, with "@scale" unless the scale is full; sorted
+
+
+def labels(choices: Mapping[str, object]) -> Labels:
+    """Return the labels of a job, from the choices that Hydra composed it of.
+
+    >>> labels({"method": "odgs_release", "experiment": "ablation", "sweep": "seeds", "scale": "cpu"})
+    Labels(preset='odgs_release', experiments=('ablation@cpu', 'seeds@cpu'))
+    """
+    names = [str(choices[group]) for group in ("experiment", "sweep") if choices.get(group)]
+    scale = choices.get("scale") or "full"
+    suffix = "" if scale == "full" else f"@{scale}"
+    return Labels(str(choices.get("method") or ""), tuple(sorted(f"{name}{suffix}" for name in names)))

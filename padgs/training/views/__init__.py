@@ -1,1 +1,0 @@
-"""What training learns of the views themselves, whatever the method: their exposures and poses."""
