@@ -26,7 +26,7 @@ from processes import SMALLEST
 
 from padgs import results
 from padgs.cli.commands import app
-from padgs.multirun import job, run, sweeper  # noqa: F401 - before the first fork
+from padgs.multirun import job, run, sweep  # noqa: F401 - before the first fork
 from padgs.runs import checkpoint
 from padgs.runs import run as pipeline  # noqa: F401
 

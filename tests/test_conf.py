@@ -21,9 +21,9 @@ from padgs.methods.anchors.method import PaDGSMethodOptions
 from padgs.methods.anchors.model import PaDGSOptions
 from padgs.methods.plus.method import PlusMethod
 from padgs.methods.plus.options import PlusOptions
-from padgs.multirun.choices import method_choices, variant_choices
+from padgs.multirun.composition import method_choices, variant_choices
 from padgs.multirun.composition import composing, configuration
-from padgs.multirun.launchers import missing_plugin
+from padgs.multirun.overrides import missing_plugin
 from padgs.multirun.overrides import expand, lenient, quoted
 from padgs.registry import lookup
 from padgs.render import RenderConfig

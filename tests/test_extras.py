@@ -2,7 +2,7 @@
 
 import sys
 
-from padgs.multirun.launchers import missing_plugin
+from padgs.multirun.overrides import missing_plugin
 
 
 def test_what_is_missing_is_installed_for_the_python_that_misses_it(monkeypatch):

@@ -14,7 +14,7 @@ from composed import first_and_last_job
 from typer.main import get_command
 
 from padgs.cli.commands import app
-from padgs.multirun.launchers import missing_plugin
+from padgs.multirun.overrides import missing_plugin
 from padgs.reports import REPORTS
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -1,1 +1,1 @@
-"""What Hydra is told, and many runs at once: sweeps, jobs, and looking on."""
+"""`padgs-run`: single runs and sweeps, composed by Hydra and run by its launchers."""

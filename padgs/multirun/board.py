@@ -1,50 +1,50 @@
-"""The jobs of one multirun as files in a shared folder: what each of them does, wherever it runs.
+"""Files that say what each job of a multirun does, wherever it runs, and the line that sums them up.
 
-`<run.folder>/.multirun/<start>/` holds one small file per job, which only that job writes, and `stop`, which asks all
-of them to stop. Nothing else couples a job to its parent, so it may run on any machine that sees the folder.
+`<run.folder>/.multirun/START/` holds one small file per job, which only that job writes, and `stop`, which asks all
+jobs to stop. Nothing else couples a job to its parent, so it may run on any machine that sees the folder.
 """
 
 from __future__ import annotations
 
 import json
 import time
+from collections import Counter
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TextIO
 
+from padgs import results
 from padgs.files import write_atomically
-from padgs.results import STATUSES
+from padgs.runs.console import duration
 from padgs.runs.run import Callback
 
 WAITING, RUNNING, OK = "waiting", "running", "ok"
-# Ends of a job beside the statuses of results, without any:
+# A job ends with a status of `padgs.results.STATUSES`, or without a result:
 REFUSED = "refused"  # the configuration or the data cannot be used; there is no run
-CRASHED = "crashed"  # an error of ours; the traceback is in the job's output
+CRASHED = "crashed"  # by an error in the program; the traceback is in the job's output
 KILLED = "killed"  # its process died
 ELSEWHERE = "elsewhere"  # another process works on this run
-STOPPED = "stopped"  # it was asked to, and wrote its checkpoint
-SECONDS_BETWEEN_LOOKS = 1.0  # for `stop`
+STOPPED = "stopped"  # on request, after it wrote its checkpoint
+UNFINISHED = (RUNNING, WAITING, ELSEWHERE, STOPPED)  # neither done nor failed
+SECONDS_BETWEEN_LOOKS = 1.0  # at `stop`
+TAIL = 1000  # bytes at the end of a log that hold its last line
 
 
 @dataclass(frozen=True)
 class JobState:
-    """What is known of a job."""
+    """State of one job."""
 
     status: str = WAITING
-    run: str = ""  # its run folder, once it is known
+    run: str = ""  # name of its run folder, once it is known
     reason: str = ""  # why it failed
     data: str | None = None  # folder of the data set, absolute; None for a generated scene
 
     @property
     def ended(self) -> bool:
-        """Whether nothing more is to be expected."""
+        """True if the job does nothing more."""
         return self.status not in (WAITING, RUNNING)
-
-    @property
-    def finished(self) -> bool:
-        """Whether there is a result, good or bad."""
-        return self.status in STATUSES
 
 
 class Board:
@@ -55,31 +55,31 @@ class Board:
         self._looked, self._stop = -float("inf"), False
 
     def write(self, job: int, state: JobState) -> None:
-        """Say what a job does; a full disk must not end it, so nothing is raised."""
+        """Write the state of a job; a full disk must not end the job, so nothing is raised."""
         with suppress(OSError):
             self.folder.mkdir(parents=True, exist_ok=True)
             write_atomically(self._path(job), json.dumps(asdict(state)).encode())
 
     def read(self, job: int) -> JobState:
-        """What a job does; waiting, if it has not said anything."""
+        """Return the state of a job; waiting, if it has written none."""
         try:
             return JobState(**json.loads(self._path(job).read_bytes()))
         except (OSError, ValueError, TypeError):
             return JobState()
 
     def output(self, job: int) -> TextIO:
-        """Where a job in a process of its own says what it would say on the screen; close it."""
+        """Open the file for the screen output of a job in a process of its own; the caller closes it."""
         self.folder.mkdir(parents=True, exist_ok=True)
         return (self.folder / f"{job:05d}.log").open("a", buffering=1)
 
     def request_stop(self) -> None:
-        """Ask all jobs to write their checkpoints and stop, and those that wait not to start."""
+        """Ask running jobs to write their checkpoints and stop, and waiting jobs not to start."""
         self.folder.mkdir(parents=True, exist_ok=True)
         (self.folder / "stop").touch()
         self._stop = True
 
     def stop_requested(self) -> bool:
-        """Whether that was asked; the file system is not asked more often than once a second."""
+        """Return whether a stop was requested; looks at the file system at most once a second."""
         now = time.monotonic()
         if not self._stop and now - self._looked >= SECONDS_BETWEEN_LOOKS:
             self._looked, self._stop = now, (self.folder / "stop").exists()
@@ -90,7 +90,7 @@ class Board:
 
 
 class BoardEntry(Callback):
-    """Writes what a job does on the board of its multirun."""
+    """Callback of a run that writes the state of its job."""
 
     def __init__(self, board: Board, number: int) -> None:
         self.data: str | None = None  # folder of the data set
@@ -98,16 +98,51 @@ class BoardEntry(Callback):
         self._board.write(number, self._state)
 
     def started(self, folder: Path) -> None:
-        """The run is known."""
+        """Write the name of the run folder."""
         self._state = replace(self._state, run=folder.name, data=self.data)
         self._board.write(self._number, self._state)
 
     def stop_requested(self) -> bool:
-        """Whether the multirun is to stop."""
+        """Return whether the multirun is to stop."""
         return self._board.stop_requested()
 
     def end(self, status: str, reason: str = "") -> str:
-        """The job has ended; returns the status."""
+        """Write and return the status that the job ended with."""
         self._state = replace(self._state, status=status, reason=reason)
         self._board.write(self._number, self._state)
         return status
+
+
+def status_line(
+    before: Counter[str], states: Collection[JobState], seconds: float, progress: Mapping[int, float] | None = None
+) -> str:
+    """Sum up a multirun in one line.
+
+    Args:
+        before: status -> number of runs that were finished when it started.
+        states: of the jobs.
+        seconds: since the start.
+        progress: job -> share of its training in [0, 1], of running jobs.
+
+    >>> states = [JobState("ok"), JobState("nan"), JobState("running"), JobState()]
+    >>> status_line(Counter(ok=2), states, 60.0, {2: 0.5})
+    '3 of 6 done (2 before), 1 failed (nan), 1 running, 1 waiting, ETA 0:36'
+    """
+    counts = before + Counter(state.status for state in states)
+    total, done, earlier = counts.total(), counts.pop(OK, 0), before[OK]
+    parts = [f"{done} of {total} done" + (f" ({earlier} before)" if earlier else "")]
+    unfinished = {name: counts.pop(name, 0) for name in UNFINISHED}
+    if counts.total():
+        statuses = [name if number == 1 else f"{number} {name}" for name, number in counts.most_common()]
+        parts.append(f"{counts.total()} failed ({', '.join(statuses)})")
+    parts += [f"{number} {name}" for name, number in unfinished.items() if number]
+    left, trained = unfinished[RUNNING] + unfinished[WAITING], sum((progress or {}).values())
+    ran = sum(state.status in results.STATUSES for state in states) + trained
+    if left and ran:  # all runs counted alike
+        parts.append(f"ETA {duration(seconds * (left - trained) / ran)}")
+    return ", ".join(parts)
+
+
+def share_done(run: Path) -> float:
+    """Return the share of its training that a run has completed, by the last line of its log; 0 without a log."""
+    return max((line.get("progress", 0.0) for line in results.log_lines(run, TAIL)), default=0.0)

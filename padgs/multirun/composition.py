@@ -1,68 +1,211 @@
-"""What Hydra makes of a command line, without running it."""
+"""Compose configurations with Hydra, from files, tables and everything that the program knows by name."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_dir
 from hydra.core.config_loader import ConfigLoader
+from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
+from rich.console import Console
 
-from padgs.multirun.choices import register_choices
+from padgs.baselines import METHODS, OURS, distribution
+from padgs.data.datasets import DATASETS
+from padgs.data.synthetic.options import SCENES
 from padgs.multirun.overrides import lenient, quoted, root
-from padgs.runs.config import DEFAULT_METHOD, RunConfig, config_from_values
+from padgs.registry import lookup
+from padgs.render import RenderConfig
+from padgs.runs.config import DEFAULT_METHOD, RunConfig, config_from_values, default_fields, method_fields
+from padgs.runs.console import say
 from padgs.runs.run import build_method
 from padgs.runs.store import labels
 from padgs.training.method import Method
+from padgs.training.options import TrainOptions
 
 
 @contextmanager
 def composing() -> Iterator[ConfigLoader]:
-    """Within it `configuration` can be called; yields what knows the choices of groups."""
+    """Initialize Hydra for the functions below while the context lasts; yields the loader of configurations."""
     os.environ.setdefault("PADGS_ROOT", str(root()))
     register_choices()
     with initialize_config_dir(str(root() / "conf"), version_base="1.3"):
         yield GlobalHydra.instance().config_loader()
 
 
-def configuration(settings: Sequence[str]) -> RunConfig:
-    """The typed configuration of `padgs-run SETTINGS`, which is no multirun; to be called within `composing`.
+def single_run(arguments: Sequence[str]) -> tuple[DictConfig, Mapping[str, object]]:
+    """Compose a command line that is no multirun.
+
+    Returns:
+        The configuration without the keys of Hydra; group -> choice.
 
     Raises:
-        ConfigError: an unknown key or name, or a value of the wrong type.
-        HydraException: no such choice, or no sentence of Hydra's grammar.
+        HydraException: an unknown choice, or a violation of Hydra's grammar.
     """
-    config = compose("config", lenient(quoted(settings)), return_hydra_config=True)
+    config = compose("config", lenient(quoted(arguments)), return_hydra_config=True)
     choices = config.hydra.runtime.choices
     with open_dict(config):
         del config["hydra"]
-    return typed_config(config, choices)
+    return config, choices
+
+
+def multirun(arguments: Sequence[str], *extra: str) -> DictConfig | None:
+    """Compose a command line without what it sweeps; None if it is no multirun.
+
+    Args:
+        arguments: of the command line.
+        extra: overrides to add, in Hydra's grammar.
+
+    Raises:
+        HydraException: as above.
+    """
+    hydra = GlobalHydra.instance().hydra
+    assert hydra is not None, "call within `composing`"
+    forced = {"-m", "--multirun"} & {*arguments}
+    settings = [text for text in lenient(quoted(arguments)) if text not in forced]
+    mode = ["hydra.mode=MULTIRUN"] if forced else []
+    config = hydra.compose_config(
+        "config", [*settings, *extra, *mode], RunMode.MULTIRUN, from_shell=False, with_log_configuration=False
+    )
+    return config if config.hydra.mode == RunMode.MULTIRUN else None
+
+
+def configuration(settings: Sequence[str]) -> RunConfig:
+    """Return the typed configuration of `padgs-run SETTINGS`, no multirun; call it within `composing`.
+
+    Raises:
+        ConfigError: an unknown key or name, or a value of the wrong type.
+        HydraException: an unknown choice, or a violation of Hydra's grammar.
+    """
+    return typed_config(*single_run(settings))
 
 
 def typed_config(composed: DictConfig, choices: Mapping[str, object]) -> RunConfig:
-    """The configuration of a run, from what Hydra composed of these choices.
+    """Return the typed configuration of what Hydra composed from these choices.
 
     Raises:
-        ConfigError: as above.
+        ConfigError: an unknown key or name, or a value of the wrong type.
     """
     values: Any = OmegaConf.to_container(composed, resolve=True)
     return config_from_values(values, labels(choices))
 
 
 def make_method(name: str = DEFAULT_METHOD, *settings: str) -> Method:
-    """An untrained method, as `padgs-run method=NAME SETTINGS` would train it.
+    """Return an untrained method, as `padgs-run method=NAME SETTINGS` would train it.
 
     Args:
         name: a choice of `method`: any that the README lists.
         settings: as on the command line, of its options, rendering, loss or seed: "method.sh_degree=1", "seed=2".
 
     Raises:
-        ConfigError: an unknown key, or a value that it cannot have.
-        HydraException: there is no such method.
+        ConfigError: an unknown key, or an invalid value.
+        HydraException: an unknown method.
     """
     with composing():
         return build_method(configuration([f"method={name}", *settings]))
+
+
+def register_choices() -> None:
+    """Register the keys and defaults of dataclasses with Hydra, and the choices of groups that have no file.
+
+    A method of another package that cannot be imported is reported once and removed from METHODS.
+    """
+    store = ConfigStore.instance()
+    store.store(name="fields", node=default_fields())
+    for method in [*METHODS]:
+        try:
+            keys, nodes = method_fields(method), [*method_choices(method)]
+        except Exception as error:  # of any kind: that package is not ours
+            if method in OURS:
+                raise
+            del METHODS[method]
+            why = f"{type(error).__name__}: {error}; repair {distribution(method)}, or uninstall it"
+            say(Console(stderr=True), f"method={method} is left out ({why})", "yellow")
+            continue
+        store.store(group="fields/method", name=method, node=keys)
+        for group, node in nodes:
+            store.store(group=group, name=method, node=node, package="_global_")
+    for group, rows in {"scene": scene_choices(), **variant_choices(), **set_choices()}.items():
+        for name, node in rows.items():
+            store.store(group=group, name=name, node=node, package="_global_")
+
+
+def method_choices(name: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield group and node of `method=NAME`, and of its own render and train settings, if it has any.
+
+    These are choices as well, so that render=... and train=... on a command line replace them. A method with a file in
+    conf/method has none.
+
+    >>> list(method_choices("op43dgs"))[0]
+    ('render', {'render': {'projection': 'tangent'}})
+    """
+    if (root() / "conf" / "method" / f"{name}.yaml").exists():
+        return
+    kind = lookup(METHODS, name, "method")
+    defaults: list[Any] = [f"/fields/method/{name}@method"]
+    for group, own, usual in (("render", kind.RENDER, RenderConfig()), ("train", kind.TRAIN, TrainOptions())):
+        changes = {key: value for key, value in asdict(own).items() if value != getattr(usual, key)}
+        if changes:
+            yield group, {group: changes}
+            defaults.append({f"override /{group}": name})
+    yield "method", {"defaults": defaults}
+
+
+def scene_choices() -> dict[str, dict[str, Any]]:
+    """Return name -> node of `+scene=`; named DATASET_SCENE, so that a sweep can take `+scene=glob(roam360_*)`.
+
+    >>> scene_choices()["ricoh360_cat_tower"]
+    {'defaults': [{'override /data': 'ricoh360'}], 'data': {'path': 'data/ricoh360/cat_tower'}}
+    >>> scene_choices()["synthetic_outdoor"]
+    {'defaults': [{'override /data': 'synthetic'}], 'data': {'generator': {'scene': 'outdoor'}}}
+    """
+    values = {f"synthetic_{scene}": ("synthetic", {"generator": {"scene": scene}}) for scene in SCENES} | {
+        f"{name}_{scene}": (name, {"path": f"data/{known.title.casefold()}/{scene}"})
+        for name, known in DATASETS.items()
+        for scene in known.scenes
+    }
+    return {name: {"defaults": [{"override /data": data}], "data": keys} for name, (data, keys) in values.items()}
+
+
+def variant_choices() -> dict[str, dict[str, dict[str, Any]]]:
+    """Return group -> name -> node for each table in `conf/variants`.
+
+    >>> variant_choices()["ablation"]["a2_distance"]
+    {'defaults': ['a1_anchors'], 'variant': 'a2_distance', 'method': {'use_distance': True}}
+    """
+
+    def node(name: str, row: dict[str, Any]) -> dict[str, Any]:
+        extended = [row["from"]] if "from" in row else []
+        chosen = [{f"override /{group}": choice} for group, choice in row.get("choose", {}).items()]
+        return {"defaults": [*extended, *chosen], "variant": name, **row.get("set", {})}
+
+    tables = sorted((root() / "conf" / "variants").glob("*.yaml"))
+    return {path.stem: {name: node(name, row) for name, row in _table(path).items()} for path in tables}
+
+
+def set_choices() -> dict[str, dict[str, dict[str, Any]]]:
+    """Return group -> NAME_SCALE -> node for each list of scenes, methods or lengths in `conf/sets.yaml`.
+
+    >>> set_choices()["scene_set"]["bar_cpu"]
+    {'hydra': {'sweeper': {'params': {'+scene': 'synthetic_room'}}}}
+    """
+    return {
+        group: {
+            f"{name}_{scale}": {"hydra": {"sweeper": {"params": {rows["key"]: values}}}}
+            for name, by_scale in rows.items()
+            if name != "key"
+            for scale, values in by_scale.items()
+        }
+        for group, rows in _table(root() / "conf" / "sets.yaml").items()
+    }
+
+
+def _table(path: Path) -> dict[str, dict[str, Any]]:
+    return OmegaConf.to_container(OmegaConf.load(path))  # type: ignore[return-value]

@@ -1,10 +1,11 @@
-"""One job of Hydra: the only run of a process, or one of a multirun, in the process that launched it or another one."""
+"""One run as a job: the only one of a process, or one of a multirun, in the process that launched it or another one."""
 
 from __future__ import annotations
 
 import os
 import time
 import traceback
+from collections.abc import Mapping
 from contextlib import ExitStack, nullcontext
 from functools import partial
 from pathlib import Path
@@ -12,12 +13,12 @@ from pathlib import Path
 from hydra.conf import HydraConf
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
 from padgs.apps.viewer.process import serve_training
 from padgs.multirun.board import CRASHED, ELSEWHERE, REFUSED, STOPPED, Board, BoardEntry
 from padgs.multirun.composition import typed_config
-from padgs.multirun.finished import FinishedJobs
 from padgs.need.entry import search
 from padgs.results import NEED_STATED, Result
 from padgs.runs.checkpoint import CheckpointError
@@ -30,34 +31,31 @@ from padgs.runs.store import RunBusy, RunFolderError, RunStore
 from padgs.runs.tracking.tracker import SECONDS_BETWEEN_LOOKS, Tracker
 from padgs.training.health import Failure, validation_split
 
-# A traceback would only hide what these say. Failure is one of a search for needs: those of training are results.
-EXPECTED = (ValueError, OSError, Failure, CheckpointError, RunFolderError, RunBusy)
-ARGUMENTS: list[str] = []  # of the command line, by which a finished run is known again
-ENDS: list[str] = []  # how the job ended that was this process's only one; Hydra's main returns nothing
+# Errors whose message suffices without a traceback. Failures of training are results; this is one of a later search.
+EXPECTED = (ValueError, OSError, OmegaConfBaseException, Failure, CheckpointError, RunFolderError, RunBusy)
 
 
-def only_job(composed: DictConfig) -> None:
-    """Run what Hydra composed; how it ended, a status of `padgs.results` or refused, is added to `ENDS`."""
+def only_job(composed: DictConfig, choices: Mapping[str, object]) -> str:
+    """Do the only run of a process and return its status, one of `padgs.results.STATUSES` or refused."""
     try:
-        config, console = typed_config(composed, HydraConfig.get().runtime.choices), Console()
+        config, console = typed_config(composed, choices), Console()
         dimly = partial(say, console, style="dim")
         tracker = Tracker(config.tracking, Path(config.run.folder), " ".join(config.labels.experiments), dimly)
-        result = done(config, console, TrackedRun(tracker))
-        ENDS.append(result.status)
+        result = complete(config, console, TrackedRun(tracker))
         tracker.update(Path(config.run.folder) / result.run)
-        FinishedJobs(Path(config.run.folder)).add(ARGUMENTS, result.run, result.status, _data_of(config))
+        return result.status
     except EXPECTED as error:
         if os.environ.get("HYDRA_FULL_ERROR"):
             raise
         complain(str(error))
-        ENDS.append(REFUSED)
+        return REFUSED
 
 
 def job_of_many(composed: DictConfig) -> str:
-    """The same within a multirun; raises nothing but an interruption, so that the other jobs go on.
+    """Do one run of a multirun; raises nothing but an interruption, so that the other jobs go on.
 
     Returns:
-        How it ended: a status of `padgs.results`, or one of `padgs.multirun.board`.
+        Its status, one of `padgs.results.STATUSES` or of `padgs.multirun.board`.
     """
     hydra = HydraConfig.get()
     board = Board(Path(hydra.sweep.dir))
@@ -69,8 +67,8 @@ def job_of_many(composed: DictConfig) -> str:
             if entry.stop_requested():
                 raise Interrupted("not started")
             config = typed_config(composed, hydra.runtime.choices)
-            entry.data = _data_of(config)
-            result = done(config, console, entry)
+            entry.data = None if config.data.path is None else str(Path(config.data.path).absolute())
+            result = complete(config, console, entry)
             return entry.end(result.status, result.reason)
         except KeyboardInterrupt as error:
             entry.end(STOPPED, str(error))
@@ -84,13 +82,8 @@ def job_of_many(composed: DictConfig) -> str:
             return entry.end(CRASHED, f"{type(error).__name__}: {error}")
 
 
-def _data_of(config: RunConfig) -> str | None:
-    """The folder of its data set, absolute; None for a generated scene."""
-    return None if config.data.path is None else str(Path(config.data.path).absolute())
-
-
-def done(config: RunConfig, console: Console, callback: Callback) -> Result:
-    """Do what is missing of a run, and of the search for what its scene needs, if that is asked for."""
+def complete(config: RunConfig, console: Console, callback: Callback) -> Result:
+    """Do the missing part of a run, and of the search for its smallest model if that is requested."""
     scene = load_scene(config, start(config))
     folder = RunStore.of(config, scene).path
     if config.need == "on":
@@ -106,23 +99,23 @@ def done(config: RunConfig, console: Console, callback: Callback) -> Result:
 
 
 def complain(message: str) -> None:
-    """Say what is wrong, on the error stream."""
+    """Print an error on the error stream."""
     say(Console(stderr=True), f"error: {message}", "red")
 
 
 def in_own_process(hydra: DictConfig | HydraConf) -> bool:
-    """Whether jobs run in other processes than the one that launches them."""
+    """Return whether the launcher runs jobs in other processes than its own."""
     return not str(hydra.launcher._target_).endswith("BasicLauncher")
 
 
 class TrackedRun(Callback):
-    """Mirrors the only run of a process, now and then."""
+    """Callback that mirrors the only run of a process from time to time."""
 
     def __init__(self, tracker: Tracker) -> None:
         self._tracker, self._looked = tracker, time.monotonic()
 
     def saved(self, folder: Path) -> None:
-        """The log is up to date."""
+        """Mirror the run, whose log is up to date."""
         if time.monotonic() - self._looked >= SECONDS_BETWEEN_LOOKS:
             self._tracker.update(folder)
             self._looked = time.monotonic()

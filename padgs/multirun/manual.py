@@ -1,4 +1,4 @@
-"""`padgs-run --help`: every key with its default and its meaning, which is the comment of the field that it is."""
+"""`padgs-run --help`: every key with its default and its meaning, the comment of its field."""
 
 from __future__ import annotations
 
@@ -12,63 +12,55 @@ from typing import Any
 
 from padgs.baselines import METHODS
 from padgs.data.synthetic.options import SyntheticOptions
-from padgs.multirun.choices import scene_choices
-from padgs.multirun.composition import composing, configuration
+from padgs.multirun.composition import composing, configuration, scene_choices
 from padgs.multirun.overrides import root
 from padgs.runs.config import Settings
 
 USAGE = """\
 padgs-run [KEY=VALUE ...]     one run, scored; by default padgs+ on a built-in room
 padgs-run -m KEY=A,B ...      one run for each value; lists multiply
-padgs-run --cfg job           the configuration, not run
-padgs-run --help method=NAME  this text, with the keys of that method
-padgs-run --version           and stop; --hydra-help says what else Hydra understands
+padgs-run --cfg job           print the configuration, run nothing
+padgs-run --help method=NAME  print this text, with the keys of that method
+padgs-run --version           print the version; --hydra-help lists further options
 """
-CHOSEN = (
-    *("method", "experiment", "sweep", "scene", "data", "protocol"),
-    *("render", "budget", "scale", "launcher", "tracking"),
-)
-# The comment above a field, its name, and the comment beside it, which may go on below.
+GROUPS = ("method", "+experiment", "+sweep", "+scene", "data", "protocol", "render", "budget", "+scale")
+GROUPS += ("launcher", "tracking")
+# The comment above a field, its name, and the comment beside it with its following lines.
 COMMENTED = re.compile(r"^((?:    # .*\n)*)    (\w+): [^#\n]*?(?:  # (.*(?:\n {5,}# .*)*))?$", re.MULTILINE)
-ADDED = ("experiment", "sweep", "scene", "scale")  # groups that only a + brings in
 
 
 def manual(arguments: Sequence[str], width: int | None = None) -> str:
-    """The text for a command line and a terminal of so many columns, by default the one that there is.
+    """Return the help text for a command line and a terminal of `width` columns, by default the current one.
 
     Raises:
-        HydraException: there is no method of the name that it says.
+        HydraException: an unknown method.
     """
-    chosen = [text for text in arguments if text.startswith("method=")]
     with composing():
-        config = configuration(chosen)
+        config = configuration([text for text in arguments if text.startswith("method=")])
     width = width or min(shutil.get_terminal_size().columns, 120)
     lines = [USAGE, "Choices:"]
-    for group, names in choices().items():
-        lines += textwrap.wrap(", ".join(names), width, initial_indent=f"  {group}=", subsequent_indent=" " * 6)
+    for group in GROUPS:
+        folder = root() / ("sweeps" if group == "+sweep" else "conf") / group.lstrip("+")
+        registered = {"method": METHODS, "+scene": scene_choices()}.get(group, ())
+        names = ", ".join(sorted({path.stem for path in folder.glob("*.yaml")} | {*registered}))
+        lines += textwrap.wrap(names, width, initial_indent=f"  {group}=", subsequent_indent=" " * 6)
     lines += ["", f"Keys, with their defaults under method={config.preset}:"]
-    common = {field.name: getattr(config, field.name) for field in fields(Settings)}
-    for key, value, meaning in (*keys(Settings(**common)), *keys(config.options, "method.")):
+    common = Settings(**{field.name: getattr(config, field.name) for field in fields(Settings)})
+    for key, value, meaning in (*keys(common), *keys(config.options, "method.")):
         shown = "null" if value is None else str(value).lower() if isinstance(value, bool) else value
-        head = f"  {key}={shown}"
-        lines += textwrap.wrap(f"{head:<34}  {meaning}".rstrip(), width, subsequent_indent=" " * 36)
+        line = f"{f'  {key}={shown}':<34}  {meaning}".rstrip()
+        lines += textwrap.wrap(line, width, subsequent_indent=" " * 36)
     return "\n".join(lines)
 
 
-def choices() -> dict[str, list[str]]:
-    """Group, with the + that it may need -> the names in it."""
-    found, made = {}, {"method": METHODS, "scene": scene_choices()}
-    for group in CHOSEN:
-        folder = root() / ("sweeps" if group == "sweep" else "conf") / group
-        names = {path.stem for path in folder.glob("*.yaml")} | {*made.get(group, ())}
-        if names:
-            found[f"+{group}" if group in ADDED else group] = sorted(names)
-    return found
-
-
 def keys(options: Any, where: str = "") -> Iterator[tuple[str, Any, str]]:
-    """Dotted key, default and meaning of each field of a dataclass, those of nested ones in their place."""
-    said = meanings(type(options))
+    """Yield dotted key, default and meaning of each field of a dataclass and of nested dataclasses."""
+    meanings = {
+        field: " ".join(re.sub(r"\s*# ", " ", above + beside).split())
+        for base in reversed(type(options).__mro__[:-1])
+        for above, field, beside in COMMENTED.findall(inspect.getsource(base))
+        if above + beside
+    }
     for field in fields(options):
         value = getattr(options, field.name)
         if is_dataclass(value):
@@ -76,14 +68,4 @@ def keys(options: Any, where: str = "") -> Iterator[tuple[str, Any, str]]:
         elif field.name == "generator" and isinstance(value, Mapping):
             yield from keys(SyntheticOptions(), f"{where}{field.name}.")
         elif field.init:
-            yield f"{where}{field.name}", value, said.get(field.name, "")
-
-
-def meanings(kind: type) -> dict[str, str]:
-    """Field -> the comment above it or on its line, in a dataclass or in what it derives from."""
-    found: dict[str, str] = {}
-    for base in reversed(kind.__mro__[:-1]):
-        for above, field, beside in COMMENTED.findall(inspect.getsource(base)):
-            if said := " ".join(re.sub(r"\s*# ", " ", above + beside).split()):
-                found[field] = said
-    return found
+            yield f"{where}{field.name}", value, meanings.get(field.name, "")

@@ -1,27 +1,37 @@
-"""Command lines on their way to Hydra: what it is told, and the jobs that a multirun consists of."""
+"""Translate command lines into overrides for Hydra, and expand a sweep into the overrides of its jobs."""
 
 from __future__ import annotations
 
+import importlib.util
 import itertools
 import os
 import re
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from hydra.core.config_loader import ConfigLoader
+from hydra.core.config_loader import ConfigLoader
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Quote, QuotedString
 
-# Keys that name files, with what is said of them; what Hydra is to read in it: nothing, null, quotes, groups, calls;
-# one of several names.
+from padgs.checks import install_command
+
+PLUGINS = {  # choice of conf/launcher -> module of its plugin, extra of pyproject.toml
+    "local": ("hydra_plugins.hydra_joblib_launcher", "launchers"),
+    "slurm": ("hydra_plugins.hydra_submitit_launcher", "launchers"),
+    "submitit": ("hydra_plugins.hydra_submitit_launcher", "launchers"),
+    "ray": ("hydra_plugins.hydra_ray_launcher", "ray"),
+}
+# Keys that name files, and their values; values in Hydra's grammar: nothing, null, quotes, dictionaries, calls;
+# one name of a list.
 FILES = re.compile(r"(\+*(?:data\.(?:path|images|points|mask)|run\.folder|init)=)(.*)", re.DOTALL)
 GRAMMAR = re.compile(r"|null|(['\"]).*\1|\{.*\}|(choice|glob|shuffle|sort|tag)\(.*\)", re.DOTALL)
 ONE_OF_SEVERAL = re.compile(r"\"[^\"]*\"|'[^']*'|[^,]+")
 
 
 def root() -> Path:
-    """The folder that holds `conf/` and `sweeps/`: the package where it is installed, else the checkout.
+    """Return the folder of `conf/` and `sweeps/`: the package if it is installed, else the checkout.
 
     Hydra resolves relative paths against the importing module, which a console script does not have.
     """
@@ -30,7 +40,7 @@ def root() -> Path:
 
 
 def options_first(arguments: Sequence[str]) -> list[str]:
-    """Options and their values before settings: Hydra's parser refuses settings on both sides of an option.
+    """Move options and their values before settings: Hydra's parser refuses settings on both sides of an option.
 
     >>> options_first(["method=padgs", "-m", "seed=0,1", "--cfg", "job"])
     ['-m', '--cfg', 'job', 'method=padgs', 'seed=0,1']
@@ -40,9 +50,9 @@ def options_first(arguments: Sequence[str]) -> list[str]:
 
 
 def lenient(arguments: Sequence[str]) -> list[str]:
-    """Let unknown keys pass Hydra, so that `config_from_values` refuses them and lists the known ones.
+    """Force unknown keys past Hydra, so that `config_from_values` refuses them and lists the known ones.
 
-    `scale` is a group that experiments bring along; without an experiment it is added.
+    Experiments choose a `scale`; without an experiment that group is added.
 
     >>> lenient(["method=padgs", "train.iteration=5", "+experiment=smoke", "-m", "seed=1,2"])
     ['method=padgs', '++train.iteration=5', '+experiment=smoke', '-m', '++seed=1,2']
@@ -63,16 +73,16 @@ def lenient(arguments: Sequence[str]) -> list[str]:
 
 
 def quoted(arguments: Sequence[str]) -> list[str]:
-    """Quote names of files, so that they may have any characters; a ~ is the home folder, as a shell would have it.
+    """Quote names of files, so that they may have any characters; a leading ~ is the home folder, as in a shell.
 
-    Commas part several names in a multirun, and belong to the name elsewhere.
+    In a multirun, commas separate names; elsewhere they belong to the name.
 
     >>> quoted(["data.path=Flat (2), old", "seed=1"])
     ['data.path="Flat (2), old"', 'seed=1']
     >>> quoted(["-m", "data.path=Flat (2),old", "++init=null"])
     ['-m', 'data.path="Flat (2)","old"', '++init=null']
     """
-    several = _is_multirun(arguments)
+    several = is_multirun(arguments)
 
     def in_quotes(argument: str) -> str:
         found = FILES.fullmatch(argument)
@@ -87,15 +97,13 @@ def quoted(arguments: Sequence[str]) -> list[str]:
 
 
 def _quoted(name: str) -> str:
-    from hydra.core.override_parser.types import Quote, QuotedString  # not to recognise a finished run
-
     if GRAMMAR.fullmatch(name):
         return name
     return QuotedString(os.path.expanduser(name), Quote.double).with_quotes()
 
 
-def _is_multirun(arguments: Sequence[str]) -> bool:
-    """Whether a command line may start several runs, so that commas part values."""
+def is_multirun(arguments: Sequence[str]) -> bool:
+    """Return whether a command line may start several runs, so that commas separate values."""
     return any(re.match(r"-m$|--multirun$|\+*(experiment|sweep)=", text) for text in arguments)
 
 
@@ -104,24 +112,19 @@ def _groups() -> set[str]:
     return {path.stem for path in (*folders, *(root() / "conf" / "variants").iterdir())}
 
 
-def conflict(arguments: Sequence[str]) -> str | None:
-    """What is wrong with a command line that says two things at once, nothing, or takes a group for a value; None if
-    none is.
+def problem(arguments: Sequence[str]) -> str | None:
+    """Return an error message for a command line that sets something twice or sets no key; None if it is fine.
 
-    >>> conflict(["photographs", "seed=1"])
+    >>> problem(["photographs", "seed=1"])
     'photographs is no setting: these are KEY=VALUE, e.g. data.path=photographs; see padgs-run --help'
-    >>> conflict(["seed=1", "-m", "method=padgs", "++seed=2"])
+    >>> problem(["seed=1", "-m", "method=padgs", "++seed=2"])
     'seed is set twice, by seed=1 and ++seed=2; keep one of them'
-    >>> conflict(["+sweep=tau,seeds"])
-    '+sweep=tau,seeds: one sweep at a time, because each says itself what is swept'
-    >>> conflict(["seed=0,1"])
-    'seed=0,1 is a list of runs, which needs -m: padgs-run -m seed=0,1'
-    >>> conflict(["protocol=null"])
-    'protocol=null: protocol is a group of settings, chosen by name, e.g. protocol=both'
-    >>> conflict(["+scene=roam360_bar", "launcher=slurm"])
+    >>> problem(["+sweep=tau,seeds"])
+    '+sweep=tau,seeds: one sweep at a time, because each names what it sweeps'
+    >>> problem(["+scene=roam360_bar", "launcher=slurm"])
     'launcher=slurm launches the jobs of a multirun; for this run: padgs-run -m +scene=roam360_bar launcher=slurm'
-    >>> conflict(["+sweep=tau", "run.jobs=4"])
-    'run.jobs=4 takes a launcher that runs several jobs at a time, e.g. launcher=local'
+    >>> problem(["+sweep=tau", "run.jobs=4"])
+    'run.jobs=4 requires a launcher that runs several jobs at a time, e.g. launcher=local'
     """
     settings: dict[str, str] = {}
     before = ""
@@ -136,36 +139,45 @@ def conflict(arguments: Sequence[str]) -> str | None:
         if key in settings:
             return f"{key} is set twice, by {settings[key]} and {argument}; keep one of them"
         if key in ("experiment", "sweep") and ("," in value or "(" in value):
-            return f"{argument}: one {key} at a time, because each says itself what is swept"
+            return f"{argument}: one {key} at a time, because each names what it sweeps"
         if key in _groups() and re.fullmatch(r"null|~|true|false|[-+.\d]*", value, re.IGNORECASE):
-            known = sorted(path.stem for path in (root() / "conf" / key).glob("*.yaml"))
-            example = f", e.g. {key}={known[0]}" if known else ""
-            return f"{argument}: {key} is a group of settings, chosen by name{example}"
+            return f"{argument}: {key} is a group of settings, chosen by name; see padgs-run --help"
         settings[key] = argument
     launcher = settings.get("launcher", "=none").partition("=")[2]
+    only_shown = any(argument.startswith("-") for argument in arguments)  # by an option such as --cfg
+    if launcher != "none" and not is_multirun(arguments) and not only_shown:
+        command = f"padgs-run -m {shlex.join(arguments)}"
+        return f"launcher={launcher} launches the jobs of a multirun; for this run: {command}"
     jobs = settings.get("run.jobs", "=1").partition("=")[2]
-    if not _is_multirun(arguments):
-        for argument in settings.values():
-            if not FILES.match(argument) and re.fullmatch(r"[^\[{('\"]*,.*", argument.partition("=")[2]):
-                return f"{argument} is a list of runs, which needs -m: padgs-run -m {shlex.join(arguments)}"
-        only_asks = any(argument.startswith("-") for argument in arguments)  # such as --cfg
-        if launcher != "none" and not only_asks:
-            command = f"padgs-run -m {shlex.join(arguments)}"
-            return f"launcher={launcher} launches the jobs of a multirun; for this run: {command}"
     if jobs != "1" and launcher == "none" and "hydra/launcher" not in settings:
-        return f"run.jobs={jobs} takes a launcher that runs several jobs at a time, e.g. launcher=local"
+        return f"run.jobs={jobs} requires a launcher that runs several jobs at a time, e.g. launcher=local"
+    return None
+
+
+def missing_plugin(arguments: Sequence[str]) -> str | None:
+    """Return the command that installs the plugin of the launcher in a command line; None if nothing is missing.
+
+    >>> missing_plugin(["method=padgs", "seed=0,1"])
+    """
+    for name in (argument.partition("=")[2] for argument in arguments if argument.startswith("launcher=")):
+        module, extra = PLUGINS.get(name, ("padgs", ""))
+        try:
+            found = importlib.util.find_spec(module) is not None
+        except ModuleNotFoundError:  # there is no plugin at all
+            found = False
+        if not found:
+            return f"launcher={name} needs {module.partition('.')[2]}: {install_command(extra)}"
     return None
 
 
 def expand(params: Mapping[str, Any], arguments: Sequence[str], loader: ConfigLoader) -> list[list[str]]:
-    """The overrides of every job: all combinations of what is swept.
+    """Return the overrides of each job: all combinations of the swept values.
 
     Args:
-        params: `hydra.sweeper.params`, key -> values as they would stand on a command line.
-        arguments: of the command line; a key that is there replaces the same key of `params`.
-        loader: knows the choices of groups, for `glob(...)`.
+        params: `hydra.sweeper.params`, key -> values in the grammar of the command line.
+        arguments: of the command line; they replace the same keys of `params`.
+        loader: lists the choices of groups, for `glob(...)`.
     """
-    from hydra.core.override_parser.overrides_parser import OverridesParser  # not to recognise a finished run
 
     swept = lenient([f"{key}={values}" for key, values in params.items() if values is not None])
     choices: dict[str, list[str]] = {}

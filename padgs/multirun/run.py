@@ -14,7 +14,7 @@ from padgs.runs.interrupt import INTERRUPTED
 def main() -> None:
     """Entry point of `padgs-run`; exit code 0, 1 if any run failed, 130 if stopped by Ctrl-C."""
     arguments = sys.argv[1:]
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # what schedulers send is told apart from a crash
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # schedulers send it; it is no crash
     try:
         sys.exit(_run(arguments))
     except KeyboardInterrupt as stopped:
@@ -26,56 +26,62 @@ def main() -> None:
 
 
 def _run(arguments: Sequence[str]) -> int:
-    """Exit code. What takes time to import is imported here, so that Ctrl-C is answered from the beginning."""
+    """Return the exit code. Slow modules are imported here, so that Ctrl-C is answered from the beginning."""
     import padgs
-    from padgs import results
-    from padgs.multirun.finished import FOLDER, only_run
 
     if "--version" in arguments:
         print(f"padgs {padgs.__version__}")
         return 0
-    if folder := only_run(arguments):
-        from rich.console import Console
-
-        from padgs.runs.console import show_result
-
-        console = Console()
-        console.print("finished before, nothing to do")
-        show_result(results.read(folder / results.FILE_NAME), folder, console)
-        return 0
     from datetime import datetime
 
-    import hydra
     from hydra.errors import HydraException
 
     from padgs.baselines import clash
-    from padgs.multirun import job, sweeper
+    from padgs.multirun import job
     from padgs.multirun.board import OK
-    from padgs.multirun.choices import register_choices
-    from padgs.multirun.launchers import missing_plugin
+    from padgs.multirun.composition import composing, multirun, single_run
+    from padgs.multirun.finished import FOLDER
     from padgs.multirun.manual import manual
-    from padgs.multirun.overrides import conflict, lenient, options_first, quoted, root
+    from padgs.multirun.overrides import missing_plugin, problem
+    from padgs.multirun.sweep import sweep
 
-    if {"--help", "-h"} & {*arguments}:
-        try:
+    try:
+        if {"--help", "-h"} & {*arguments}:
             print(manual(arguments))
-        except HydraException as error:
-            job.complain(str(error))
+            return 0
+        if error := problem(arguments) or missing_plugin(arguments) or clash():
+            job.complain(error)
             return 1
-        return 0
-    os.environ.setdefault("PADGS_ROOT", str(root()))
-    if problem := conflict(arguments) or missing_plugin(arguments) or clash():
-        job.complain(problem)
+        if any(argument.startswith("-") and argument not in ("-m", "--multirun") for argument in arguments):
+            _let_hydra_answer(arguments)
+            return 0
+        with composing() as loader:
+            start = f"{datetime.now():%Y%m%d-%H%M%S}-{os.getpid()}"
+            if config := multirun(arguments, f"hydra.sweep.dir=${{run.folder}}/{FOLDER}/{start}"):
+                ends = {*sweep(config, loader)}
+            else:
+                ends = {job.only_job(*single_run(arguments))}
+    except HydraException as error:
+        job.complain("\n".join(map(str, filter(None, (error, error.__cause__)))))
         return 1
+    return 0 if ends <= {OK} else 1
+
+
+def _let_hydra_answer(arguments: Sequence[str]) -> None:
+    """Answer options of Hydra such as --cfg job, which run nothing."""
+    import hydra
+
+    from padgs.multirun.composition import register_choices
+    from padgs.multirun.overrides import lenient, options_first, quoted, root
+
+    def refuse(_: object) -> None:
+        raise SystemExit("this option of Hydra is not supported by padgs-run; see padgs-run --help")
+
+    os.environ.setdefault("PADGS_ROOT", str(root()))
     register_choices()
-    sweeper.register()
-    completing = {"-sc", "--shell_completion"} & {*arguments}
-    job.ARGUMENTS[:] = arguments
-    start = f"{datetime.now():%Y%m%d-%H%M%S}-{os.getpid()}"
-    if not completing:
-        sys.argv[1:] = [*options_first(lenient(quoted(arguments))), f"hydra.sweep.dir=${{run.folder}}/{FOLDER}/{start}"]
-    hydra.main(version_base="1.3", config_path=str(root() / "conf"), config_name="config")(job.only_job)()
-    return 0 if {*job.ENDS, *sweeper.ENDS} <= {OK} else 1
+    if not {"-sc", "--shell_completion"} & {*arguments}:
+        sys.argv[1:] = options_first(lenient(quoted(arguments)))
+    hydra.main(version_base="1.3", config_path=str(root() / "conf"), config_name="config")(refuse)()
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from tiny_scene import tiny_scene
 import padgs
 from padgs import baselines
 from padgs.baselines import METHODS, clash, distribution, outside
-from padgs.multirun.choices import register_choices
+from padgs.multirun.composition import register_choices
 from padgs.runs.config import config_from_values
 from padgs.runs.run import initial_result
 

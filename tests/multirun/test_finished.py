@@ -1,6 +1,4 @@
 import json
-import subprocess
-import sys
 
 import pytest
 
@@ -70,20 +68,20 @@ def test_data_that_changed_are_looked_at(runs, tmp_path, name):
 
 
 def test_other_sources_are_looked_at(runs, monkeypatch):
-    monkeypatch.setattr(finished, "_sources", lambda: "other")
+    monkeypatch.setattr(finished, "_sources", lambda: ("other",))
     assert FinishedJobs(runs).status(JOB) is None
 
 
-def test_other_sources_of_another_package_are_looked_at(runs, tmp_path, monkeypatch):
-    (tmp_path / "plugged_in.py").write_text("RATE = 1")
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(finished, "outside", lambda: {"plugged": "plugged_in:Method", "gone": "no_such.x:Method"})
+def test_another_version_of_a_package_with_a_method_is_looked_up(runs, monkeypatch):
+    versions = {"plugged": "plug 1.0"}
+    monkeypatch.setattr(finished.baselines, "outside", lambda: {"plugged": "plugged_in:Method"})
+    monkeypatch.setattr(finished.baselines, "distribution", versions.get)
     finished._sources.cache_clear()
     FinishedJobs(runs).add(JOB, "room_padgs_1", "ok", None)
-    (tmp_path / "plugged_in.py").write_text("RATE = 2")
-    assert FinishedJobs(runs).status(JOB) == "ok", "a process looks once"
+    assert FinishedJobs(runs).status(JOB) == "ok"
+    versions["plugged"] = "plug 1.1"
     finished._sources.cache_clear()
-    assert FinishedJobs(runs).status(JOB) is None and "plugged_in" not in sys.modules
+    assert FinishedJobs(runs).status(JOB) is None
     finished._sources.cache_clear()
 
 
@@ -91,19 +89,3 @@ def test_a_cut_line_costs_only_its_own_job(runs):
     path = runs / ".multirun" / "finished.jsonl"
     path.write_text('{"job": "cut\n' + path.read_text() + json.dumps(["no", "entry"]))
     assert FinishedJobs(runs).status(JOB) == "ok"
-
-
-def test_the_only_run_of_a_command_is_known_without_loading_anything(runs, monkeypatch):
-    command = ["+experiment=smoke", f"run.folder={runs}"]
-    assert finished.only_run(command) is None
-    FinishedJobs(runs).add(command, "room_padgs_1", "ok", None)
-    assert finished.only_run(command) == runs / "room_padgs_1"
-    assert finished.only_run([*command, "--cfg"]) is None and finished.only_run([*command, "seed=1"]) is None
-    FinishedJobs(runs).add(command, "room_padgs_1", "nan", None)
-    assert finished.only_run(command) is None, "a failed one is looked at: retry=failed may start it again"
-    home = ["+experiment=smoke", "run.folder=~/runs"]
-    monkeypatch.setenv("HOME", str(runs.parent))
-    FinishedJobs(runs).add(home, "room_padgs_1", "ok", None)
-    assert finished.only_run(home) == runs / "room_padgs_1"
-    code = "import sys, padgs.multirun.run; assert not {'torch', 'hydra', 'numpy'} & set(sys.modules), 'slow'"
-    subprocess.run([sys.executable, "-c", code], check=True)

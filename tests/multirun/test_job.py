@@ -1,6 +1,5 @@
-from types import SimpleNamespace
-
 import pytest
+from omegaconf import OmegaConf
 
 from padgs.multirun import job
 from padgs.multirun.board import REFUSED
@@ -19,14 +18,11 @@ def test_a_run_in_progress_is_not_looked_at_all_the_time(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("error", [Failure("oom", "no memory for a search"), ValueError("no such data")])
-def test_what_is_expected_to_go_wrong_is_said_without_a_traceback(monkeypatch, capsys, error):
+def test_expected_errors_are_reported_without_a_traceback(monkeypatch, capsys, error):
     def fail(*_):
         raise error
 
-    hydra = SimpleNamespace(runtime=SimpleNamespace(choices={}))
-    monkeypatch.setattr(job, "HydraConfig", SimpleNamespace(get=lambda: hydra))
     monkeypatch.setattr(job, "typed_config", fail)
-    monkeypatch.setattr(job, "ENDS", [])
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
-    job.only_job(None)
-    assert job.ENDS == [REFUSED] and capsys.readouterr().err == f"error: {error}\n"
+    assert job.only_job(OmegaConf.create(), {}) == REFUSED
+    assert capsys.readouterr().err == f"error: {error}\n"

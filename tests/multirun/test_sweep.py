@@ -9,9 +9,9 @@ import pytest
 from omegaconf import OmegaConf
 from rich.console import Console
 
-from padgs.multirun import overview
+from padgs.multirun import sweep
 from padgs.multirun.board import Board, JobState
-from padgs.multirun.jobs import Multirun
+from padgs.multirun.sweep import Multirun
 from padgs.runs.interrupt import Interrupted
 
 IN_PROCESS = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"
@@ -57,8 +57,8 @@ class Start:
         try:
             self.multirun.run(self, batch_size)
         finally:
-            seen = self.multirun.close()
-        return dict(seen.counts)
+            counts = self.multirun.close()
+        return dict(counts)
 
 
 @pytest.mark.parametrize("target", [IN_PROCESS, ELSEWHERE])
@@ -187,11 +187,11 @@ class Interrupts(Start):
 
 
 def test_ctrl_c_lets_running_jobs_stop_by_themselves(tmp_path, monkeypatch):
-    monkeypatch.setattr(overview, "SECONDS_BETWEEN_LOOKS", 0.01)
+    monkeypatch.setattr(sweep, "SECONDS_BETWEEN_TICKS", 0.01)
     start = Interrupts(tmp_path, 1, ELSEWHERE)
     with pytest.raises(Interrupted, match="running jobs wrote their checkpoints"):
         start.counts()
-    assert dict(start.multirun.look().counts) == {"ok": 1, "stopped": 2}
+    assert dict(start.multirun.counts()) == {"ok": 1, "stopped": 2}
     again = Start(tmp_path, 2, ELSEWHERE)
     assert again.counts() == {"ok": 3} and again.launched == ["++seed=1", "++seed=2"]
 

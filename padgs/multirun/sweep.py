@@ -1,0 +1,294 @@
+"""A multirun: find the missing jobs of a sweep, launch them with a launcher of Hydra, and follow them to their ends.
+
+In place of Hydra's sweepers: finished jobs are skipped without being composed, an error of one job ends no other, one
+line sums up all jobs while they run, and Ctrl-C lets running jobs write their checkpoints.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from itertools import repeat
+from pathlib import Path
+from typing import Any
+
+from hydra._internal.callbacks import Callbacks
+from hydra.core.config_loader import ConfigLoader
+from hydra.core.plugins import Plugins
+from hydra.core.singleton import Singleton
+from hydra.types import HydraContext
+from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
+
+from padgs import results
+from padgs.checks import typed
+from padgs.multirun.board import (
+    CRASHED,
+    ELSEWHERE,
+    KILLED,
+    REFUSED,
+    RUNNING,
+    Board,
+    JobState,
+    share_done,
+    status_line,
+)
+from padgs.multirun.finished import FinishedJobs
+from padgs.multirun.job import complain, in_own_process, job_of_many
+from padgs.multirun.overrides import expand
+from padgs.results import Result, ResultError
+from padgs.runs.config import RunOptions
+from padgs.runs.console import Display, say
+from padgs.runs.interrupt import Interrupt, Interrupted
+from padgs.runs.run import RETRIED
+from padgs.runs.store import RunStore, cannot_write, labels
+from padgs.runs.tracking.tracker import SECONDS_BETWEEN_LOOKS, Tracker, TrackingOptions
+
+ATTEMPTS = 2  # of a job whose process died: another job may have caused it
+SECONDS_BETWEEN_TICKS = 1.0
+SECONDS_BETWEEN_LINES = 30.0  # without a terminal
+
+
+def sweep(config: DictConfig, loader: ConfigLoader) -> Counter[str]:
+    """Do the missing part of a multirun: each combination of the swept values once.
+
+    Args:
+        config: composed by Hydra without the swept values.
+        loader: composes the jobs.
+
+    Returns:
+        Status -> number of jobs, those finished before included.
+
+    Raises:
+        Interrupted: stopped from outside; the same command continues.
+    """
+    try:
+        typed(RunOptions, OmegaConf.to_container(config.run, resolve=True), "run")  # type: ignore[arg-type]
+        jobs = expand(config.hydra.sweeper.params or {}, config.hydra.overrides.task, loader)
+        multirun = Multirun(config, jobs, Console())
+    except ValueError as error:
+        complain(str(error))
+        return Counter([REFUSED])
+    _refuse_unknown_choices(multirun.jobs, config, loader)
+    context = HydraContext(config_loader=loader, callbacks=Callbacks())
+    launcher = Plugins.instance().instantiate_launcher(hydra_context=context, task_function=job_of_many, config=config)
+    try:
+        multirun.run(launcher, config.hydra.sweeper.get("max_batch_size"))
+    finally:
+        counts = multirun.close()
+    return counts
+
+
+def _refuse_unknown_choices(jobs: list[list[str]], config: DictConfig, loader: ConfigLoader) -> None:
+    """Compose some jobs in which every choice of a group occurs; Hydra raises an error for the first unknown one."""
+    composed: set[str] = set()
+    for job in jobs:
+        choices = {setting for setting in job if not setting.startswith("++")}
+        if not choices <= composed:
+            loader.load_sweep_config(config, job)
+            composed |= choices
+
+
+class Multirun:
+    """The missing jobs of a sweep and their states."""
+
+    def __init__(self, config: DictConfig, jobs: Sequence[list[str]], console: Console) -> None:
+        """Look up which of the jobs are finished.
+
+        Args:
+            config: composed by Hydra without the swept values.
+            jobs: the overrides of each job.
+            console: for the status line.
+        """
+        self.runs = Path(config.run.folder)
+        self.board = Board(Path(config.hydra.sweep.dir))
+        self._in_process = not in_own_process(config.hydra)
+        self._console, self._finished = console, FinishedJobs(self.runs)
+        statuses = [self._finished.status(job) for job in jobs]
+        if config.retry == "failed":
+            statuses = [None if status in RETRIED else status for status in statuses]
+        self.before = Counter(status for status in statuses if status is not None)
+        self.jobs = [list(job) for job, status in zip(jobs, statuses, strict=True) if status is None]
+        self.states = {index: JobState() for index in range(len(self.jobs))}
+        self._numbers = dict.fromkeys(self.states, -1)  # of jobs on the board; a new one at each attempt
+        self._reasons: set[str] = set()  # printed errors
+        names = " ".join(labels(config.hydra.runtime.choices).experiments)
+        digest = hashlib.sha256(repr(sorted(map(sorted, jobs))).encode()).hexdigest()[:8]
+        options = typed(TrackingOptions, config.tracking if self.jobs else {"kind": "none"}, "tracking")
+        self._tracker = Tracker(options, self.runs, names, self._say, f"{names or 'multirun'} {digest}")
+        self._tracked: set[int] = set()  # jobs whose end is mirrored
+        self._began = self._looked = time.monotonic()
+
+    def run(self, launcher: Any, batch_size: int | None) -> None:
+        """Launch the missing jobs.
+
+        Args:
+            launcher: of Hydra, set up.
+            batch_size: number of jobs to launch at a time; None: all.
+
+        Raises:
+            Interrupted: stopped from outside, after running jobs wrote their checkpoints.
+        """
+        if self.before and self.jobs:
+            self._say(self.line())
+        waiting, attempts, launched = list(self.states), Counter[int](), 0
+        try:
+            self.board.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            reason = str(cannot_write(self.board.folder, error))
+            while waiting:
+                self._end(waiting.pop(), JobState(REFUSED, reason=reason))
+        while waiting:
+            size = 1 if self._in_process else batch_size or len(waiting)
+            batch, waiting = waiting[:size], waiting[size:]
+            self._numbers |= {index: launched + position for position, index in enumerate(batch)}
+            error = self._launch(launcher, [self.jobs[index] for index in batch], launched)
+            launched += len(batch)
+            self._follow(batch)
+            if self.board.stop_requested():
+                raise Interrupted("stopped, running jobs wrote their checkpoints")
+            left = [index for index in batch if not self.states[index].ended]
+            attempts.update([index for index in left if self.states[index].status == RUNNING] or left)
+            lost = {index for index in left if self._in_process or attempts[index] >= ATTEMPTS}
+            for index in lost:
+                status = REFUSED if self._in_process else KILLED
+                reason = f"a job ended without a status: {error or f'check the free space in {self.runs}'}"
+                self._end(index, replace(self.states[index], status=status, reason=reason))
+            waiting += [index for index in left if index not in lost]
+            self._track()
+            if self._in_process and waiting and any(self.states[index].status != REFUSED for index in batch):
+                self._say(self.line())
+
+    def counts(self) -> Counter[str]:
+        """Return status -> number of jobs, those finished before included."""
+        return self.before + Counter(state.status for state in self.states.values())
+
+    def line(self) -> str:
+        """Read the board and sum it up."""
+        self._follow(index for index, state in self.states.items() if not state.ended and self._numbers[index] >= 0)
+        states = self.states.items()
+        running = {index: state.run for index, state in states if state.status == RUNNING and state.run}
+        progress = {index: share_done(self.runs / run) for index, run in running.items()}
+        return status_line(self.before, [*self.states.values()], time.monotonic() - self._began, progress)
+
+    def close(self) -> Counter[str]:
+        """Print how the jobs ended; delete the board unless it explains a crash or jobs still need it."""
+        for index, state in self.states.items():
+            if state.status == ELSEWHERE and (result := self._result(state)):  # the other process has finished it
+                self._end(index, replace(state, status=result.status))
+        self._say(self.line())
+        self._track()
+        counts, found = self.counts(), [result for state in self.states.values() if (result := self._result(state))]
+        self._tracker.finish(found, len(self.states))
+        if RETRIED & {*counts}:
+            self._say("failed runs are kept as they are; retry=failed starts them again")
+        alive = any(self._numbers[index] >= 0 and not state.ended for index, state in self.states.items())
+        if not self._in_process and alive:  # after a second Ctrl-C: `stop` is there, and files of submitit
+            self._say(f"jobs may still be running; their files and output are in {self.board.folder}")
+        elif not self._in_process and {CRASHED, KILLED} & {*counts}:
+            self._say(f"the output of crashed jobs is in {self.board.folder}")
+        else:
+            shutil.rmtree(self.board.folder, ignore_errors=True)
+        return counts
+
+    def _launch(self, launcher: Any, jobs: list[list[str]], first_number: int) -> Exception | None:
+        """Run jobs to their ends; return the error of the launcher, if any."""
+        try:
+            if self._in_process:
+                launcher.launch(jobs, initial_job_idx=first_number)
+                return None
+            display = Display(self._console, redraw=0.0, line=SECONDS_BETWEEN_LINES)
+            with Interrupt() as stop, display, repeated(lambda: self._tick(stop, display)):
+                launch(launcher, jobs, first_number)
+                self._tick(stop, display)
+        except Exception as error:
+            return error  # of the launcher or a worker process: jobs themselves raise nothing
+        return None
+
+    def _tick(self, stop: Interrupt, display: Display) -> None:
+        if stop.requested:
+            self.board.request_stop()
+        elif time.monotonic() - self._looked >= SECONDS_BETWEEN_LOOKS:
+            self._track()
+        if display.is_due:
+            display.show(self.line())
+
+    def _track(self) -> None:
+        """Mirror runs that are running or have ended since the last time."""
+        self._looked = time.monotonic()
+        for index, state in list(self.states.items()):
+            if index not in self._tracked and state.run and (self.runs / state.run / results.CONFIG_NAME).exists():
+                self._tracker.update(self.runs / state.run)
+                if state.ended:
+                    self._tracked.add(index)
+
+    def _follow(self, indices: Iterable[int]) -> None:
+        """Read the states of jobs from the board."""
+        for index in list(indices):
+            state = self.board.read(self._numbers[index])
+            if state != self.states[index]:
+                self._end(index, state)
+
+    def _end(self, index: int, state: JobState) -> None:
+        self.states[index] = state
+        if state.status in (REFUSED, CRASHED, KILLED, ELSEWHERE) and state.reason not in self._reasons:
+            self._reasons.add(state.reason)  # once: a missing data set is missing for all rows of a table
+            complain(state.reason)
+        if state.status in results.STATUSES and state.run:
+            self._finished.add(self.jobs[index], state.run, state.status, state.data)
+
+    def _result(self, state: JobState) -> Result | None:
+        with suppress(ResultError):
+            return RunStore(self.runs / state.run).result() if state.run else None
+
+    def _say(self, text: str) -> None:
+        say(self._console, text)
+
+
+def launch(launcher: Any, jobs: list[list[str]], first_number: int) -> None:
+    """Run jobs with a launcher of Hydra and wait for all of them, even if the process of one has died.
+
+    The launchers of submitit raise the error of the first dead job and leave the others unobserved, so their jobs are
+    submitted here in the same way.
+    """
+    if "submitit" not in type(launcher).__module__:
+        launcher.launch(jobs, initial_job_idx=first_number)
+        return
+    import submitit
+    from hydra_plugins.hydra_submitit_launcher.config import BaseQueueConf
+
+    cluster, parameters = launcher._EXECUTOR, dict(launcher.params)
+    folder, timeouts = parameters.pop("submitit_folder"), parameters.pop("max_num_timeout", None)
+    kept = {} if timeouts is None else {f"{cluster}_max_num_timeout": timeouts}
+    executor = submitit.AutoExecutor(folder=folder, cluster=cluster, **kept)
+    common = OmegaConf.structured(BaseQueueConf)
+    executor.update_parameters(**{key if key in common else f"{cluster}_{key}": parameters[key] for key in parameters})
+    ids = (f"job_id_for_{first_number + position}" for position in range(len(jobs)))
+    state, key = repeat(Singleton.get_state(), len(jobs)), repeat("hydra.sweep.dir", len(jobs))
+    for job in executor.map_array(launcher, jobs, key, range(first_number, first_number + len(jobs)), ids, state):
+        with suppress(Exception):  # a job without results died; the board tells which
+            job.results()
+
+
+@contextmanager
+def repeated(action: Callable[[], None]) -> Iterator[None]:
+    """Call a function every second in a thread while the context lasts."""
+    over = threading.Event()
+
+    def repeat_action() -> None:
+        while not over.wait(SECONDS_BETWEEN_TICKS):
+            action()
+
+    thread = threading.Thread(target=repeat_action, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()

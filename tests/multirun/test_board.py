@@ -1,0 +1,73 @@
+import io
+import time
+from collections import Counter
+
+import pytest
+from rich.console import Console
+
+from padgs.multirun import sweep
+from padgs.multirun.board import Board, JobState, share_done, status_line
+from padgs.multirun.sweep import Display, repeated
+
+
+def line(*statuses: str, before: dict[str, int] | None = None, progress: dict[int, float] | None = None) -> str:
+    return status_line(Counter(before or {}), [JobState(status) for status in statuses], 100.0, progress)
+
+
+def test_counts_add_up():
+    text = line("ok", "oom", "crashed", "oom", "running", "waiting", "elsewhere", before={"ok": 3, "nan": 1})
+    assert text.startswith("4 of 11 done (3 before), 4 failed (2 oom, ")
+    assert "1 running, 1 waiting, 1 elsewhere" in text
+
+
+@pytest.mark.parametrize(
+    ("statuses", "progress", "eta"),
+    [
+        (("waiting", "running"), {}, None),
+        (("ok", "waiting", "waiting"), {}, "3:20"),
+        (("ok", "running", "running"), {1: 0.5, 2: 0.5}, "0:50"),
+        (("ok", "nan"), {}, None),
+    ],
+)
+def test_the_remaining_time_follows_from_the_speed_since_the_start(statuses, progress, eta):
+    text = line(*statuses, progress=progress)
+    assert text.endswith(f", ETA {eta}") if eta else "ETA" not in text
+
+
+def test_progress_is_that_of_the_last_whole_line_of_the_log(tmp_path):
+    assert share_done(tmp_path) == 0
+    lines = (f'{{"iteration": {n}, "progress": {n / 200}}}\n' for n in range(1, 200))
+    (tmp_path / "log.jsonl").write_text("".join(lines))
+    assert share_done(tmp_path) == 199 / 200
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_the_line_is_shown_while_jobs_run(monkeypatch, terminal):
+    monkeypatch.setattr(sweep, "SECONDS_BETWEEN_TICKS", 0.01)
+    out, shown = io.StringIO(), []
+    with Display(Console(file=out, width=100, force_terminal=terminal), redraw=0.0, line=0.05) as display:
+
+        def tick() -> None:
+            if display.is_due:
+                shown.append(display.show("1 of 2 done"))
+
+        with repeated(tick):
+            time.sleep(0.3)
+    assert shown and "1 of 2 done" in out.getvalue()
+
+
+def test_the_board_returns_what_jobs_wrote(tmp_path):
+    board = Board(tmp_path / "board")
+    assert board.read(3) == JobState() and not board.stop_requested()
+    board.write(3, JobState("running", "room", data="/data"))
+    assert Board(tmp_path / "board").read(3) == JobState("running", "room", data="/data")
+    (board.folder / "00004.json").write_text('{"status": "ok", "ru')
+    assert board.read(4) == JobState()
+
+
+def test_a_stop_reaches_other_processes(tmp_path, monkeypatch):
+    mine, theirs = Board(tmp_path), Board(tmp_path)
+    assert not theirs.stop_requested()
+    mine.request_stop()
+    monkeypatch.setattr(theirs, "_looked", -float("inf"))  # a second later
+    assert theirs.stop_requested()
