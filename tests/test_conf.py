@@ -21,10 +21,8 @@ from padgs.methods.anchors.method import PaDGSMethodOptions
 from padgs.methods.anchors.model import PaDGSOptions
 from padgs.methods.plus.method import PlusMethod
 from padgs.methods.plus.options import PlusOptions
-from padgs.multirun.composition import method_choices, variant_choices
-from padgs.multirun.composition import composing, configuration
-from padgs.multirun.overrides import missing_plugin
-from padgs.multirun.overrides import expand, lenient, quoted
+from padgs.multirun.composition import composing, configuration, method_choices, variant_choices
+from padgs.multirun.overrides import expand, lenient, missing_plugin, quoted
 from padgs.registry import lookup
 from padgs.render import RenderConfig
 from padgs.reports.conditions import CALIBRATES
