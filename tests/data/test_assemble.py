@@ -1,4 +1,4 @@
-"""What is decided when a scene is put together: sizes, names, points, notes, fingerprint."""
+"""Assembly of scenes: sizes, names, points, notes and fingerprints."""
 
 import re
 import shutil
@@ -31,7 +31,7 @@ def test_reducing_keeps_poses_and_points(folder: Path) -> None:
         load(folder, width=128)
 
 
-def test_the_fingerprint_follows_content_and_not_place(folder: Path) -> None:
+def test_the_fingerprint_depends_on_content_only(folder: Path) -> None:
     first = load(folder).fingerprint
     moved = folder.with_name("elsewhere")
     shutil.copytree(folder, moved)
@@ -48,7 +48,7 @@ def test_the_fingerprint_follows_content_and_not_place(folder: Path) -> None:
     assert len(changed - {first}) == 4
 
 
-def test_a_georeferenced_capture_is_the_same_scene_elsewhere(world: World, folder: Path, tmp_path: Path) -> None:
+def test_georeferenced_captures_are_recentered(world: World, folder: Path, tmp_path: Path) -> None:
     utm = np.array([691_000.0, 5_334_000.0, 520.0])
     write_colmap_text(replace(world, centers=world.centers + utm, points=world.points + utm), tmp_path / "utm")
     near, far = load(folder), load(tmp_path / "utm")
@@ -68,14 +68,14 @@ def test_images_and_cameras_of_different_size(folder: Path) -> None:
         load(folder)
 
 
-def test_clashing_names(folder: Path) -> None:
+def test_names_that_differ_in_case_only_are_refused(folder: Path) -> None:
     lines = (folder / "sparse/0/images.txt").read_text()
     (folder / "sparse/0/images.txt").write_text(lines.replace("pano_03.png", "PANO_02.jpg"))
     with pytest.raises(DataError, match="'PANO_02.jpg' and 'pano_02.png' would share one name"):
         load(folder)
 
 
-def test_points_from_elsewhere(folder: Path) -> None:
+def test_random_points_and_missing_files(folder: Path) -> None:
     scene = load(folder, points="random")
     spread = torch.stack([view.center for view in (*scene.train, *scene.test)])
     distance = (scene.points.double() - spread.mean(0)).norm(dim=1) / (spread - spread.mean(0)).norm(dim=1).max()
@@ -85,12 +85,12 @@ def test_points_from_elsewhere(folder: Path) -> None:
         load(folder, points="absent.ply")
 
 
-def test_the_folder_in_which_one_stands_has_a_name(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_working_directory_has_a_name(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
     assert load(".").name == load(folder).name == "scene"
 
 
-def test_nothing_where_a_scene_should_be(tmp_path: Path) -> None:
+def test_missing_scenes_and_unknown_formats_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"absent does not exist; give the folder of"):
         load(tmp_path / "absent")
     (tmp_path / "photo.jpg").touch()
@@ -100,7 +100,7 @@ def test_nothing_where_a_scene_should_be(tmp_path: Path) -> None:
         load(tmp_path, "colmpa")
 
 
-def test_an_absent_public_data_set_says_how_to_get_it(tmp_path: Path) -> None:
+def test_missing_published_data_sets_name_their_source(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"360Roam is missing.*huajianup.* put it into .*360Roam, .*pose_c2w.json"):
         load(tmp_path / "360Roam" / "bar")
     (tmp_path / "Ricoh360").mkdir()
@@ -140,6 +140,11 @@ def test_every_loader_can_be_imported() -> None:
 
 
 @pytest.mark.parametrize(("path", "format"), [(None, "auto"), (None, "synthetic"), ("nowhere", "synthetic")])
-def test_a_scene_that_is_generated_needs_no_path(path: str | None, format: str) -> None:
+def test_generated_scenes_need_no_path(path: str | None, format: str) -> None:
     with pytest.raises(DataError, match=f"unknown synthetic scene '{path or 'cloud castle'}'"):
         load(path, format, generator={"scene": "cloud castle"})
+
+
+def test_a_data_set_needs_a_path():
+    with pytest.raises(DataError, match=r"data.path is not set; .* \+scene=roam360_bar"):
+        load(dataset="roam360")

@@ -1,14 +1,20 @@
-"""Every kind of file that is not a panorama is refused by name, with the rule and a remedy."""
+"""Image files: checks, decoding, and detection of dual-fisheye images."""
 
+import math
 import os
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from fixtures import World, write_colmap_text
 from PIL import Image
 
-from padgs.data.capture import DataError
-from padgs.data.images import decode, inspect
+from padgs.data import DataError
+from padgs.data.check import check
+from padgs.data.images import decode, inspect, is_dual_fisheye
+from padgs.data.prepare.sources import find_source
+from padgs.geometry.panorama import sample
 
 PIXELS = np.random.default_rng(3).integers(0, 256, (64, 128, 3), dtype=np.uint8)
 
@@ -50,7 +56,7 @@ def test_transparent_pixels_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("extension", ["jpg", "png"])
 @pytest.mark.parametrize("share", [0.3, 0.7, 0.98])
-def test_truncated_files_are_found_when_looked_at(extension: str, share: float, tmp_path: Path) -> None:
+def test_truncated_files_are_refused_by_inspect(extension: str, share: float, tmp_path: Path) -> None:
     path = _save(tmp_path / f"a.{extension}", Image.fromarray(PIXELS))
     data = path.read_bytes()
     path.write_bytes(data[: int(share * len(data))])
@@ -59,7 +65,7 @@ def test_truncated_files_are_found_when_looked_at(extension: str, share: float, 
 
 
 @pytest.mark.parametrize("options", [{}, {"progressive": True}, {"subsampling": 0}], ids=str)
-def test_a_jpeg_that_is_cut_is_found_when_decoded_although_it_has_an_end(options, tmp_path: Path) -> None:
+def test_truncated_jpegs_with_an_end_marker_are_refused_by_decode(options, tmp_path: Path) -> None:
     path = tmp_path / "a.jpg"
     Image.fromarray(PIXELS).save(path, **options)
     whole = path.read_bytes()
@@ -70,14 +76,14 @@ def test_a_jpeg_that_is_cut_is_found_when_decoded_although_it_has_an_end(options
         decode(path)
 
 
-def test_a_grey_nadir_is_no_cut(tmp_path: Path) -> None:
+def test_a_grey_nadir_is_not_taken_as_truncation(tmp_path: Path) -> None:
     pixels = PIXELS.copy()
     pixels[-20:] = 128
     Image.fromarray(pixels).save(tmp_path / "a.jpg")
     assert (decode(tmp_path / "a.jpg")[-1] == 128).all()
 
 
-def test_a_thumbnail_does_not_hide_a_truncated_jpeg_nor_trailing_bytes_a_whole_one(tmp_path: Path) -> None:
+def test_thumbnails_and_trailing_bytes_do_not_mislead_the_truncation_test(tmp_path: Path) -> None:
     path = _save(tmp_path / "a.jpg", Image.fromarray(PIXELS))
     thumbnail = b"\xff\xd8 a small image \xff\xda and its end \xff\xd9"
     data = path.read_bytes()
@@ -101,7 +107,7 @@ def test_a_thumbnail_does_not_hide_a_truncated_jpeg_nor_trailing_bytes_a_whole_o
         ("one-off.png", Image.fromarray(PIXELS[:63]), "one-off.png is 128x63, which is not 2:1"),
     ],
 )
-def test_what_is_not_an_eight_bit_colour_panorama(name: str, image: Image.Image, message: str, tmp_path: Path) -> None:
+def test_other_modes_and_shapes_are_refused(name: str, image: Image.Image, message: str, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=message):
         inspect(_save(tmp_path / name, image))
 
@@ -136,7 +142,7 @@ def test_orientation_flags(flag: int, fine: bool, extension: str, tmp_path: Path
             inspect(path)
 
 
-def test_not_an_image_empty_absent_and_forbidden(tmp_path: Path) -> None:
+def test_unreadable_files_are_refused(tmp_path: Path) -> None:
     text, empty, forbidden = tmp_path / "a.jpg", tmp_path / "b.jpg", tmp_path / "c.jpg"
     text.write_text("<html>404</html>")
     empty.touch()
@@ -152,3 +158,47 @@ def test_not_an_image_empty_absent_and_forbidden(tmp_path: Path) -> None:
         _save(forbidden, Image.fromarray(PIXELS)).chmod(0)
         with pytest.raises(DataError, match=r"c.jpg cannot be read \(Permission denied\); check its permissions"):
             inspect(forbidden)
+
+
+FISHEYE_SIZE = 96
+FISHEYE_FIELD = math.radians(190)  # of each lens
+
+
+def dual_fisheye(panorama: np.ndarray, *, noise: int = 6, radius: float = 1.0) -> np.ndarray:
+    """Project a panorama to two equidistant fisheye lenses, forward and backward; [S, 2 S, 3] uint8."""
+    step = (torch.arange(FISHEYE_SIZE) + 0.5) / FISHEYE_SIZE * 2 - 1
+    down, right = torch.meshgrid(step, step, indexing="ij")
+    distance = torch.hypot(right, down) / radius
+    angle = distance * FISHEYE_FIELD / 2
+    across = angle.sin() / distance / radius
+    rays = torch.stack((right * across, down * across, angle.cos()), dim=-1)
+    halves = [rays, rays * torch.tensor([-1.0, 1.0, -1.0])]
+    image = torch.from_numpy(panorama).float() / 255
+    seen = torch.cat([sample(image, half) * (distance <= 1)[..., None] for half in halves], dim=1)
+    random = np.random.default_rng(0).integers(0, noise, (FISHEYE_SIZE, 2 * FISHEYE_SIZE, 1))
+    return (seen.numpy() * 255 + random).clip(0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("radius", [0.94, 1.0, 1.04])
+def test_dual_fisheye_images_are_detected(radius: float, world: World) -> None:
+    assert is_dual_fisheye(dual_fisheye(world.images[0], radius=radius))
+
+
+def test_panoramas_are_not_taken_as_dual_fisheye(world: World) -> None:
+    night = (world.images[0] * 0.05).astype(np.uint8)
+    capped = world.images[0].copy()
+    capped[:8] = capped[-8:] = 0  # what a stitcher leaves where no lens looked
+    one = dual_fisheye(world.images[0])
+    one[:, FISHEYE_SIZE:] = world.images[0][0, 0]
+    for image in (*world.images, night, capped, np.zeros_like(night), one):
+        assert not is_dual_fisheye(image)
+
+
+def test_prepare_and_check_refuse_dual_fisheye_images(world: World, tmp_path: Path) -> None:
+    for name in world.names:
+        Image.fromarray(dual_fisheye(world.images[0])).save(tmp_path / f"{name}.jpg", quality=80)
+    with pytest.raises(DataError, match=r"pano_00.jpg shows two circles side by side.* Stitch it with the program"):
+        find_source(tmp_path, "auto")
+    write_colmap_text(world, tmp_path / "posed")
+    (tmp_path / "pano_02.jpg").rename(tmp_path / "posed/images/pano_02.png")
+    assert any("pano_02.png shows two circles" in problem for problem in check(tmp_path / "posed").problems)

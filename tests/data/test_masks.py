@@ -27,7 +27,7 @@ def _mask(path: Path, hidden_rows: int = 8, size: tuple[int, int] = (64, 32)) ->
     Image.fromarray(mask).save(path)
 
 
-def test_the_rule_of_360roam() -> None:
+def test_row_weights_scale_with_the_height() -> None:
     assert torch.equal(row_weights(959, 1024, 1024)[:, 0], (torch.arange(1024) < 959).float())
     half = row_weights(959, 1024, 512)[:, 0]
     assert half[478:481].tolist() == [1.0, 0.5, 0.0]
@@ -61,7 +61,7 @@ def test_grey_values_are_weights_and_rows_multiply(folder: Path) -> None:
     assert load(folder, mask="rows:16/32").train[0].mask().sum() == 16 * 64
 
 
-def test_pixels_stay_as_they_are(folder: Path, world: World) -> None:
+def test_masks_do_not_change_pixels(folder: Path, world: World) -> None:
     _mask(folder / "mask.png")
     view = load(folder).train[0]
     assert torch.equal(view.load_pixels(), torch.from_numpy(world.images[world.names.index(view.name)]))
@@ -76,7 +76,7 @@ def test_a_mask_changes_the_fingerprint(folder: Path) -> None:
     assert load(folder, mask="none").fingerprint == plain
 
 
-def test_a_mask_must_show_a_part_of_the_sphere(folder: Path) -> None:
+def test_masks_that_hide_almost_everything_are_refused(folder: Path) -> None:
     mask = np.zeros((32, 64), np.uint8)
     mask[16, 3] = 255
     Image.fromarray(mask).save(folder / "pixel.png")
@@ -89,7 +89,7 @@ def test_a_mask_must_show_a_part_of_the_sphere(folder: Path) -> None:
         load(folder, mask="ones.png")
 
 
-def test_a_mask_may_lie_where_one_stands(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_masks_relative_to_the_working_directory(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _mask(folder / "desk" / "hands.png")
     monkeypatch.chdir(folder / "desk")
     assert load(folder, mask="hands.png").train[0].mask() is not None
@@ -99,7 +99,7 @@ def test_a_mask_may_lie_where_one_stands(folder: Path, monkeypatch: pytest.Monke
     assert load(folder, mask=str(folder / "hands.png")).train[0].mask() is not None
 
 
-def test_masks_are_written_without_all_of_them_in_memory(tmp_path: Path) -> None:
+def test_writing_masks_keeps_two_in_memory(tmp_path: Path) -> None:
     made: list[weakref.ref] = []
     alive: list[int] = []
 

@@ -34,7 +34,7 @@ def test_ascii_and_float_colours(world: World, tmp_path: Path) -> None:
         read_ply(tmp_path / "b.ply")
 
 
-def test_garbage(world: World, tmp_path: Path) -> None:
+def test_invalid_files_are_refused(world: World, tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
     with pytest.raises(DataError, match="a.ply does not exist"):
         read_ply(path)
@@ -54,7 +54,7 @@ def test_garbage(world: World, tmp_path: Path) -> None:
         read_ply(path)
 
 
-def test_huge_counts_do_not_take_the_memory(tmp_path: Path) -> None:
+def test_huge_counts_do_not_allocate_memory(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
     header = "ply\nformat binary_little_endian 1.0\nelement vertex 99999999999999\nproperty float x\nend_header\n"
     path.write_bytes(header.encode() + b"1234")

@@ -25,13 +25,13 @@ def _lists(folder: Path, train: str | None, test: str | None) -> Path:
     ],
     ids=["full names", "stems", "windows", "other folders"],
 )
-def test_lists_in_every_spelling(train: str, test: str, tmp_path: Path) -> None:
+def test_list_files_in_all_notations(train: str, test: str, tmp_path: Path) -> None:
     split = split_frames(NAMES, _lists(tmp_path, train, test))
     assert (split.train, split.test) == ((0, 1, 3), (2, 4))
     assert split.notes == ("split: train.txt and test.txt",)
 
 
-def test_one_list_leaves_the_other_side_the_rest(tmp_path: Path) -> None:
+def test_a_missing_list_is_completed(tmp_path: Path) -> None:
     split = split_frames(NAMES, _lists(tmp_path, None, "b"))
     assert (split.train, split.test) == ((0, 2, 3, 4), (1,))
     assert "there is no train list; all views missing from the test list are used" in split.notes
@@ -45,7 +45,7 @@ def test_every_kth(tmp_path: Path) -> None:
     assert (len(everything.train), everything.test) == (17, ())
 
 
-def test_what_the_format_states_comes_before_files(tmp_path: Path) -> None:
+def test_the_split_of_the_format_takes_precedence(tmp_path: Path) -> None:
     _lists(tmp_path, "a", "b")
     stated = {"train": ("c.jpg",), "test": ("sub/d.png",)}
     assert split_frames(NAMES, tmp_path, stated=stated).train == (2,)
@@ -89,7 +89,7 @@ def test_too_few_views_and_no_lists(tmp_path: Path) -> None:
         split_frames(NAMES, tmp_path, mode="files")
 
 
-def test_lists_that_are_not_text(tmp_path: Path) -> None:
+def test_list_files_must_be_utf8(tmp_path: Path) -> None:
     (tmp_path / "train.txt").write_bytes(b"\xff\xfe\x00\x81")
     with pytest.raises(DataError, match="train.txt cannot be read as UTF-8 text"):
         read_list(tmp_path / "train.txt")

@@ -30,7 +30,7 @@ def decibels(method: PaDGSMethod, splats: Splats) -> float:
     return -10 * torch.stack(errors).mean().log10().item()
 
 
-def test_baked_anchors_look_like_the_method(trained):
+def test_baked_anchors_resemble_the_method(trained):
     scene = tiny_scene()
     options = trained.render_config.options(scene.scale)
     splats = bake(trained.model.model, sample_cameras(scene.train, 16), options, "auto", scene.scale)
@@ -38,7 +38,7 @@ def test_baked_anchors_look_like_the_method(trained):
     assert 0 < len(splats) < trained.size().counts["gaussians"], "what never shows is dropped"
 
 
-def test_lessons_bring_them_nearer(trained):
+def test_distillation_reduces_the_error(trained):
     scene = tiny_scene()
     options = trained.render_config.options(scene.scale)
     splats = bake(trained.model.model, scene.train, options, "auto", scene.scale)
@@ -48,7 +48,7 @@ def test_lessons_bring_them_nearer(trained):
     assert done == list(range(1, 61)) and decibels(trained, splats) > first + 6
 
 
-def test_cameras_in_one_place_teach_as_well(trained):
+def test_distillation_works_with_one_camera_centre(trained):
     scene = tiny_scene()
     options = trained.render_config.options(scene.scale)
     splats = bake(trained.model.model, scene.train, options, "auto", scene.scale)
@@ -58,7 +58,7 @@ def test_cameras_in_one_place_teach_as_well(trained):
     assert not torch.equal(splats.means, before)
 
 
-def test_contributions_are_the_pixels_that_a_gaussian_makes_up():
+def test_contributions_are_sums_of_blending_weights():
     view = tiny_scene().train[0]
     found = contributions(truth(), view, RenderOptions(), "auto")
     drawn = render(truth(), view, RenderOptions())
@@ -66,7 +66,7 @@ def test_contributions_are_the_pixels_that_a_gaussian_makes_up():
     assert (found > 0).all()
 
 
-def test_axes_are_those_of_the_covariance(generator):
+def test_axes_of_covariances(generator):
     scales = torch.rand(200, 3, generator=generator) + 0.01
     quats = torch.nn.functional.normalize(torch.randn(200, 4, generator=generator), dim=-1)
     axes = rotation_matrices(quats) * scales[:, None]
@@ -78,7 +78,7 @@ def test_axes_are_those_of_the_covariance(generator):
     assert flat.min() > 0, "a scale of nothing has no logarithm"
 
 
-def test_places_around_the_cameras_are_always_the_same_and_start_with_them():
+def test_sampled_cameras_are_deterministic_and_start_with_the_views():
     views = tiny_scene().train
     found = sample_cameras(views, 12)
     assert len(found) == 12 and all(new is old for new, old in zip(found, views, strict=False))

@@ -1,22 +1,28 @@
-"""The command, from a run to a file and back."""
+"""`padgs export`: from a run to a file and back; transforms of Gaussians."""
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 from plyfile import PlyData
+from random_splats import random_splats
+from scipy.spatial.transform import Rotation
 from tiny_run import tiny_run
+from tiny_scene import tiny_scene
 from typer.testing import CliRunner
 
 import padgs
-from padgs.apps.export.explicit import export_run
+from padgs.apps.export.explicit import export_run, harmonics_rotation, transform_splats, upright_rotation
 from padgs.apps.export.splat_file import read_splats
 from padgs.baselines.sc_omnigs import aligned, carried
 from padgs.cli.commands import app
 from padgs.data.cloud import read_ply
 from padgs.evaluation.evaluate import evaluate
 from padgs.evaluation.protocols import protocol_from_options
-from padgs.render import render
+from padgs.geometry import harmonics
+from padgs.methods.calibration.align import Similarity
+from padgs.render import RenderOptions, render
 
 RULES = protocol_from_options("sphere", lpips="none", metrics=["ws_psnr"])
 
@@ -30,7 +36,7 @@ def splat_run(tmp_path_factory):
     return tiny_run(tmp_path_factory, "method=padgs_plus")
 
 
-def test_an_exported_run_scores_as_it_did(splat_run):
+def test_an_exported_run_scores_like_the_run(splat_run):
     said = export(str(splat_run))
     assert said.exit_code == 0 and "Gaussians as trained" in said.output
     run = padgs.load_run(splat_run)
@@ -45,13 +51,13 @@ def test_an_exported_run_scores_as_it_did(splat_run):
     (splat_run / "splats.ply").unlink()
 
 
-def test_gaussians_are_exported_as_they_are_without_the_data(splat_run, tmp_path):
+def test_gaussians_are_exported_without_the_data_set(splat_run, tmp_path):
     said = export(str(splat_run), "--data", str(tmp_path / "gone"), "--to", str(tmp_path / "a.ply"))
     assert said.exit_code == 0 and "the data set is missing" in said.output
     assert len(read_splats(tmp_path / "a.ply")) == len(padgs.load_run(splat_run).method.model.splats)
 
 
-def test_for_viewers_gaussians_are_as_wide_as_the_finest_view_draws_them(splat_run, tmp_path):
+def test_smooth_includes_the_3d_smoothing_filter(splat_run, tmp_path):
     said = export(str(splat_run), "--smooth", "--to", str(tmp_path / "smooth.ply"))
     assert said.exit_code == 0 and "including the 3D smoothing filter" in " ".join(said.output.split())
     run = padgs.load_run(splat_run)
@@ -67,7 +73,7 @@ def test_for_viewers_gaussians_are_as_wide_as_the_finest_view_draws_them(splat_r
     assert errors[1] < 0.5 * errors[0], "without the filter the smooth ones look more like the run"
 
 
-def test_refined_poses_do_not_move_the_world(tmp_path_factory):
+def test_refined_poses_are_aligned_with_the_scene(tmp_path_factory):
     run = padgs.load_run(tiny_run(tmp_path_factory, "method=sc_omnigs", "data.generator.train_views=4"))
     poses = run.method.model.calibration.poses
     with torch.no_grad():
@@ -91,7 +97,7 @@ def test_points_and_upright_worlds(splat_run, tmp_path):
     assert torch.allclose(-up[:, 1], plain[:, 2], atol=1e-4), "z is up in the built-in room"
 
 
-def test_anchors_are_baked_and_the_loss_is_said_and_written(tmp_path_factory, tmp_path):
+def test_anchors_are_baked_and_the_loss_is_reported(tmp_path_factory, tmp_path):
     folder = tiny_run(tmp_path_factory, "method=padgs_small", "train.iterations=60")
     said = export(str(folder), "--to", str(tmp_path / "a.ply"), "--distillation-steps", "40")
     assert said.exit_code == 0, said.output
@@ -100,13 +106,13 @@ def test_anchors_are_baked_and_the_loss_is_said_and_written(tmp_path_factory, tm
     assert len(read_splats(tmp_path / "a.ply")) > 0
 
 
-def test_what_cannot_be_exported_says_why(tmp_path_factory, tmp_path, splat_run):
+def test_methods_without_gaussians_are_refused(tmp_path_factory, tmp_path, splat_run):
     folder = tiny_run(tmp_path_factory, "method=egonerf_small", "train.iterations=2")
     (tmp_path / "file").touch()
     for arguments, message in (
         ((str(folder),), "egonerf has no Gaussians to export; use padgs render or padgs view"),
         ((str(tmp_path / "RUNX"),), "has no config.yaml"),
-        ((str(splat_run), "--to", "a.obj"), "none of the known formats"),
+        ((str(splat_run), "--to", "a.obj"), "has an unknown format"),
         ((str(splat_run), "--points", "--to", str(tmp_path / "a.compressed.ply")), "is no plain .ply"),
         ((str(splat_run), "--to", str(tmp_path / "file" / "a.ply")), "name another place with --to"),
         ((str(splat_run), "--upright", "--to", str(tmp_path / "a.ply"), "--data", "gone"), f"data of {splat_run}"),
@@ -114,3 +120,37 @@ def test_what_cannot_be_exported_says_why(tmp_path_factory, tmp_path, splat_run)
         said = export(*arguments)
         assert said.exit_code == 1 and message in said.output + said.stderr
     assert not (tmp_path / "RUNX").exists(), "a name that was misspelt"
+
+
+def test_moved_gaussians_look_the_same_from_moved_cameras(generator):
+    splats = random_splats(3, generator)
+    splats.log_scales.data -= 1.5
+    turn = torch.from_numpy(Rotation.from_rotvec([0.5, -1.2, 0.3]).as_matrix())
+    similarity = Similarity(1.7, turn, torch.tensor([0.3, -2.0, 5.0], dtype=torch.float64))
+    view = tiny_scene().train[3]
+    pose = view.cam_from_world.clone()
+    pose[:3, :3] = view.cam_from_world[:3, :3] @ turn.T
+    pose[:3, 3] = -pose[:3, :3] @ similarity(view.center)
+    before = render(splats.gaussians(view), view, RenderOptions())
+    new = transform_splats(splats, similarity)
+    after = render(new.gaussians(view.at(pose)), view.at(pose), RenderOptions())
+    assert torch.allclose(after.image, before.image, atol=2e-3) and before.image.std() > 0.1
+    assert math.isclose(new.unit, 1.7 * splats.unit)
+    back = transform_splats(new, similarity.inverse())
+    for name in ("means", "log_scales", "sh_dc", "sh_rest"):
+        assert torch.allclose(back.rows()[name], splats.rows()[name], atol=1e-4), name
+
+
+def test_turned_harmonics_are_the_function_turned(generator):
+    turn = torch.from_numpy(Rotation.random(random_state=3).as_matrix())
+    directions = torch.nn.functional.normalize(torch.randn(9, 3, generator=generator, dtype=torch.float64), dim=-1)
+    coefficients = torch.randn(16, generator=generator, dtype=torch.float64)
+    before = harmonics.basis(directions, 3) @ coefficients
+    after = harmonics.basis(directions @ turn.T, 3) @ harmonics_rotation(turn, 3) @ coefficients
+    assert torch.allclose(after, before, atol=1e-9)
+
+
+def test_upright_turns_up_against_down():
+    for up in ([0.0, 0.0, 1.0], [0.6, 0.0, -0.8], [0.0, 1.0, 0.0]):
+        turned = upright_rotation(torch.tensor(up, dtype=torch.float64))(torch.tensor(up, dtype=torch.float64))
+        assert torch.allclose(turned, torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64), atol=1e-9)

@@ -47,7 +47,7 @@ def test_the_header_is_what_the_viewer_of_3dgs_counts_on(tmp_path, generator):
     assert first == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
 
 
-def test_files_that_are_none_are_refused(tmp_path, generator):
+def test_invalid_files_are_refused(tmp_path, generator):
     splats = random_splats(0, generator)
     with pytest.raises(ValueError, match=r"a.obj has an unknown format; known: .ply, .compressed.ply"):
         write_splats(tmp_path / "a.obj", splats)
@@ -99,7 +99,7 @@ def test_a_page_begins_where_a_photograph_was_taken(tmp_path, generator, monkeyp
     assert (camera["position"], camera["target"]) == ([-1, -2, 3], [-1, -2, 4]), "its y is up, and its x is left"
 
 
-def test_a_converter_that_fails_is_quoted_and_leaves_the_earlier_file(tmp_path, generator, monkeypatch):
+def test_a_failing_converter_is_quoted_and_keeps_the_earlier_file(tmp_path, generator, monkeypatch):
     script = "#!/bin/sh\nwhile [ $# -gt 1 ]; do shift; done\necho half >$1\necho no room left\nexit 3\n"
     (tmp_path / splat_file.CONVERTER).write_text(script)
     (tmp_path / splat_file.CONVERTER).chmod(0o755)

@@ -36,7 +36,7 @@ def until(condition) -> None:
 
 
 @WITH_VISER
-def test_the_page_is_served_here_only_and_ends(run):
+def test_the_page_is_local_and_ends(run):
     with start_server(port=8400) as server, show_runs(server, [run]):
         assert server.is_local and server.address.startswith("http://localhost:")
         assert b"<html" in urlopen(server.address, timeout=20).read()[:500]
@@ -45,7 +45,7 @@ def test_the_page_is_served_here_only_and_ends(run):
 
 
 @WITH_VISER
-def test_a_page_for_the_network_has_an_address_that_others_can_open():
+def test_network_pages_have_a_network_address():
     with start_server(host="0.0.0.0", port=8410) as server:
         assert not server.is_local and "0.0.0.0" not in server.address
         assert b"<html" in urlopen(server.address, timeout=20).read()[:500]
@@ -54,7 +54,7 @@ def test_a_page_for_the_network_has_an_address_that_others_can_open():
 @WITH_VISER
 @pytest.mark.slow
 @in_chromium
-def test_a_browser_shows_all_that_can_be_asked_for(run, tmp_path):
+def test_a_browser_shows_all_controls(run, tmp_path):
     """Controls are set from here, as the page would; what they do is seen on the page."""
     with start_server(port=8420) as server, visiting(server.address) as visit, show_runs(server, [run, run]) as pages:
         until(lambda: pages)
@@ -92,18 +92,18 @@ def test_a_browser_shows_all_that_can_be_asked_for(run, tmp_path):
         assert [text for text in visit.complaints if "THREE.Clock" not in text and "WebSocket" not in text] == []
 
 
-def test_without_viser_the_way_out_is_said(run, monkeypatch):
+def test_missing_viser_is_reported(run, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     said = CliRunner().invoke(app, ["view", str(run.folder)])
     assert said.exit_code == 1 and install_command("view") in said.stderr
 
 
-def test_a_folder_that_is_no_run_is_refused(run, tmp_path):
+def test_other_folders_are_refused(run, tmp_path):
     said = CliRunner().invoke(app, ["view", str(run.folder), "--beside", str(tmp_path)])
     assert said.exit_code == 1 and "has no config.yaml" in said.stderr
 
 
-def test_the_box_holds_nearly_all_points(run):
+def test_the_crop_box_contains_most_points(run):
     points = run.scene.points
     low, high = (points.new_tensor(corner) for corner in crop_box(points))
     inside = ((points >= low) & (points <= high)).all(-1).float().mean()

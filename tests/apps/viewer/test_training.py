@@ -54,7 +54,7 @@ def train_on(folder: Path) -> None:
     checkpoint.save(State(tensors, {**before.values, "progress": progress}), place, run)
 
 
-def test_a_run_in_training_is_followed_until_told_not_to(folder):
+def test_training_is_followed_if_enabled(folder):
     renderer = RunRenderer(padgs.load_run(folder, device="cpu"))
     scene, pose = renderer.run.scene, renderer.run.scene.train[0].cam_from_world
 
@@ -86,7 +86,7 @@ def test_a_finished_run_is_not_followed(tmp_path_factory):
     assert not renderer.run.files.stop.exists(), "nor ended: the next run of that name would end at once"
 
 
-def test_the_end_of_training_is_seen(folder, tmp_path_factory):
+def test_the_end_of_training_is_detected(folder, tmp_path_factory):
     renderer = RunRenderer(padgs.load_run(folder, device="cpu"))
     shutil.copy(tiny_run(tmp_path_factory) / results.FILE_NAME, folder)
     renderer.stop()
@@ -98,7 +98,7 @@ def test_the_end_of_training_is_seen(folder, tmp_path_factory):
 @pytest.mark.slow
 @in_chromium
 @pytest.mark.parametrize("host", [LOCAL, "0.0.0.0"])
-def test_training_is_ended_from_a_page_on_this_machine_only(folder, host):
+def test_only_local_pages_can_stop_training(folder, host):
     run = padgs.load_run(folder, device="cpu")
     with start_server(host=host, port=8460) as server, show_runs(server, [run]), visiting(server.address) as visit:
         visit.wait("document.body.innerText.includes('follow training')")
@@ -131,7 +131,7 @@ class Renewed:
 
 
 @WITH_VISER
-def test_pages_draw_again_when_training_has_come_further(folder, monkeypatch):
+def test_pages_redraw_after_a_checkpoint(folder, monkeypatch):
     monkeypatch.setattr(pages, "UPDATE_SECONDS", 0.05)
     page = Renewed()
     with start_server(port=8440) as server, show_runs(server, [padgs.load_run(folder, device="cpu")]) as there:
@@ -141,7 +141,7 @@ def test_pages_draw_again_when_training_has_come_further(folder, monkeypatch):
         assert page.asked.wait(30)
 
 
-def test_the_first_checkpoint_is_waited_for(folder, tmp_path, capsys):
+def test_wait_for_the_first_checkpoint(folder, tmp_path, capsys):
     wait_for_checkpoint(folder)
     wait_for_checkpoint(tmp_path / "nothing")
     assert not capsys.readouterr().out
@@ -157,13 +157,13 @@ def test_the_first_checkpoint_is_waited_for(folder, tmp_path, capsys):
     assert capsys.readouterr().out.count("waiting for the first checkpoint") == 1
 
 
-def test_a_run_that_was_killed_before_its_first_checkpoint_is_not_waited_for(folder):
+def test_a_killed_run_without_checkpoint_is_refused(folder):
     shutil.rmtree(folder / "checkpoint")
     with pytest.raises(ValueError, match="no process trains it; start the same padgs-run again"):
         wait_for_checkpoint(folder)
 
 
-def test_a_run_that_failed_before_its_first_checkpoint_is_not_waited_for(folder):
+def test_a_failed_run_without_checkpoint_ends_waiting(folder):
     shutil.rmtree(folder / "checkpoint")
     (folder / results.FILE_NAME).write_text("{}")
     waiting = threading.Thread(target=wait_for_checkpoint, args=(folder,), daemon=True)
@@ -173,7 +173,7 @@ def test_a_run_that_failed_before_its_first_checkpoint_is_not_waited_for(folder)
 
 
 @WITH_VISER
-def test_a_run_is_shown_beside_its_training_and_no_longer(folder, capfd):
+def test_a_run_is_served_while_it_trains(folder, capfd):
     with serve_training(folder, None, "cpu"):
         said, end = "", time.monotonic() + 60
         while "http" not in said:
@@ -186,13 +186,13 @@ def test_a_run_is_shown_beside_its_training_and_no_longer(folder, capfd):
         urlopen(address, timeout=5)
 
 
-def test_without_viser_no_training_begins(folder, monkeypatch):
+def test_training_with_a_page_needs_viser(folder, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(ValueError, match=re.escape(install_command("view"))), serve_training(folder, None, "cpu"):
         raise AssertionError("it began")
 
 
-def test_who_watches_sees_something_every_few_seconds():
+def test_viewing_shortens_the_checkpoint_interval():
     assert RunOptions().seconds_between_checkpoints == 60
     assert RunOptions(view=True).seconds_between_checkpoints == WATCHED
     assert RunOptions(view=True, checkpoint_seconds=1).seconds_between_checkpoints == 1

@@ -21,7 +21,7 @@ def no_handlers(monkeypatch):
     monkeypatch.setattr(process.signal, "signal", lambda *_: None)
 
 
-def test_runs_of_two_scenes_are_not_shown_beside_each_other(tmp_path_factory):
+def test_runs_of_different_scenes_are_refused(tmp_path_factory):
     runs = [str(tiny_run(tmp_path_factory, f"data.generator.scene={scene}")) for scene in ("room", "white_room")]
     said = CliRunner().invoke(app, ["view", runs[0], "--beside", runs[1]])
     assert said.exit_code == 1 and "are of two scenes" in " ".join(said.output.split())
@@ -30,7 +30,7 @@ def test_runs_of_two_scenes_are_not_shown_beside_each_other(tmp_path_factory):
 
 
 @pytest.mark.parametrize(("local", "browse", "opens"), [(True, True, 1), (True, False, 0), (False, True, 0)])
-def test_a_page_of_this_machine_alone_is_opened_where_there_is_a_screen(monkeypatch, local, browse, opens):
+def test_local_pages_are_opened_in_a_browser(monkeypatch, local, browse, opens):
     visited, shown = [], []
     server = SimpleNamespace(address="http://here", is_local=local, viser=MagicMock())
     monkeypatch.setattr(process.webbrowser, "open", visited.append)
@@ -41,12 +41,12 @@ def test_a_page_of_this_machine_alone_is_opened_where_there_is_a_screen(monkeypa
     assert shown == [*opens * ["http://here"], "a run"], "browsers load the page while the run is being opened"
 
 
-def test_a_page_stands_before_anything_of_torch_is_loaded():
+def test_the_page_is_served_before_torch_is_loaded():
     code = "import sys, viser, padgs.cli.view, padgs.apps.viewer.process; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-def test_a_screen_is_one_with_windows_on_this_machine(monkeypatch):
+def test_a_screen_is_graphical_and_local(monkeypatch):
     monkeypatch.setattr(process.sys, "stdout", SimpleNamespace(isatty=lambda: True))
     monkeypatch.setattr(process.sys, "platform", "linux")
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "SSH_CONNECTION"):

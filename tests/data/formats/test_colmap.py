@@ -10,30 +10,6 @@ from fixtures import World, write_colmap_binary, write_colmap_text
 from padgs.data import DataError, load, read
 from padgs.geometry.panorama import project
 
-LAYOUTS = {
-    "text": write_colmap_text,
-    "alias": lambda world, folder: write_colmap_text(world, folder, "SPHERICAL"),
-    "binary": write_colmap_binary,
-    "without rigs": lambda world, folder: write_colmap_binary(world, folder, rigs=False),
-}
-
-
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_every_layout_gives_the_exact_scene(layout: str, world: World, tmp_path: Path) -> None:
-    LAYOUTS[layout](world, tmp_path)
-    scene = load(tmp_path)
-    assert [view.name for view in scene.train] == list(world.train)
-    assert [view.name for view in scene.test] == list(world.test)
-    torch.testing.assert_close(scene.points, torch.from_numpy(world.points).float())
-    assert torch.equal(scene.point_colors, torch.from_numpy(world.colors))
-    for view in (*scene.train, *scene.test):
-        i = world.names.index(view.name)
-        torch.testing.assert_close(
-            view.cam_from_world[:3, :3], torch.from_numpy(world.rotations[i]), atol=1e-12, rtol=0
-        )
-        torch.testing.assert_close(view.center, torch.from_numpy(world.centers[i]), atol=1e-12, rtol=0)
-        assert torch.equal(view.load_pixels(), torch.from_numpy(world.images[i]))
-
 
 def test_tracks_reproject(world: World, tmp_path: Path) -> None:
     write_colmap_binary(world, tmp_path)
@@ -51,7 +27,7 @@ def test_names_with_spaces_and_accents(world: World, tmp_path: Path) -> None:
     assert load(folder).train[0].name == f"{world.train[0]} n° 1"
 
 
-def test_an_image_without_pose_is_reported_and_a_pose_without_image_refused(world: World, tmp_path: Path) -> None:
+def test_images_without_pose_are_reported_and_poses_without_image_refused(world: World, tmp_path: Path) -> None:
     write_colmap_text(world, tmp_path)
     shutil.copy(tmp_path / "images" / "pano_00.png", tmp_path / "images" / "extra.png")
     assert any("1 images have no pose" in note and "extra.png" in note for note in load(tmp_path).notes)
@@ -60,7 +36,7 @@ def test_an_image_without_pose_is_reported_and_a_pose_without_image_refused(worl
         load(tmp_path)
 
 
-def test_case_of_a_file_name(world: World, tmp_path: Path) -> None:
+def test_names_that_differ_in_case_are_reported(world: World, tmp_path: Path) -> None:
     write_colmap_text(world, tmp_path)
     (tmp_path / "images" / "pano_03.png").rename(tmp_path / "images" / "Pano_03.PNG")
     with pytest.raises(DataError, match="there is 'Pano_03.PNG', which differs in case: rename it"):

@@ -7,20 +7,27 @@ from typing import Any
 
 import pytest
 import torch
-from fixtures import WRITERS, World, paint, write_transforms
+from fixtures import WRITERS, World, paint, write_colmap_binary, write_colmap_text, write_transforms
 
 from padgs.data import DataError, load, read
 from padgs.data.formats.transforms import transforms_file
 from padgs.geometry.panorama import rays
 from padgs.scene import Scene
 
+LAYOUTS = {
+    **WRITERS,
+    "colmap text": write_colmap_text,
+    "colmap SPHERICAL": lambda world, folder: write_colmap_text(world, folder, "SPHERICAL"),
+    "colmap without rigs": lambda world, folder: write_colmap_binary(world, folder, rigs=False),
+}
 
-@pytest.mark.parametrize("name", WRITERS)
-def test_the_scene_is_exact(name: str, world: World, tmp_path: Path) -> None:
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_scenes_are_read_exactly(name: str, world: World, tmp_path: Path) -> None:
     folder = tmp_path / "ein Ordner ünd mehr"
-    WRITERS[name](world, folder)
+    LAYOUTS[name](world, folder)
     scene = load(folder)
-    assert scene.notes[0].startswith(f"format: {name}, detected by ")
+    assert scene.notes[0].startswith(f"format: {name.split()[0]}, detected by ")
     assert [view.name for view in scene.train] == list(world.train)
     assert [view.name for view in scene.test] == list(world.test)
     for view in (*scene.train, *scene.test):
@@ -41,7 +48,7 @@ def test_the_scene_is_exact(name: str, world: World, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_what_a_view_shows_is_what_is_there(name: str, world: World, tmp_path: Path) -> None:
+def test_pixels_agree_with_the_poses(name: str, world: World, tmp_path: Path) -> None:
     """Points along the rays of padgs, from the poses as loaded, have the colours of the pixels."""
     WRITERS[name](world, tmp_path / "scene")
     view = load(tmp_path / "scene").train[1]
@@ -73,14 +80,14 @@ def test_360roam_is_masked_and_reduced(world: World, tmp_path: Path) -> None:
     assert load(tmp_path / "bar", width=512).train[0].width == 512
 
 
-def test_ricoh360_uses_its_mask_and_not_as_a_view(world: World, tmp_path: Path) -> None:
+def test_ricoh360_reads_its_mask(world: World, tmp_path: Path) -> None:
     WRITERS["ricoh360"](world, tmp_path / "bricks")
     scene = load(tmp_path / "bricks")
     assert "mask" not in [view.name for view in (*scene.train, *scene.test)]
     assert scene.train[0].mask().eq(1).all()  # type: ignore[union-attr]
 
 
-def test_a_pair_of_transforms(world: World, tmp_path: Path) -> None:
+def test_pairs_of_transforms_files(world: World, tmp_path: Path) -> None:
     """transforms_train.json and transforms_test.json, file names without extension, as Blender's exporters write."""
     whole = _written(world, tmp_path)
     for side, names in (("train", world.train), ("test", world.test)):
@@ -93,7 +100,7 @@ def test_a_pair_of_transforms(world: World, tmp_path: Path) -> None:
     assert [view.name for view in scene.test] == list(world.test) and len(scene.points) == len(world.points)
 
 
-def test_masks_that_transforms_names(world: World, tmp_path: Path) -> None:
+def test_masks_named_in_transforms(world: World, tmp_path: Path) -> None:
     from PIL import Image
 
     def name_masks(meta: dict[str, Any]) -> None:
@@ -193,7 +200,7 @@ def test_files_that_are_not_json(name: str, file: str, world: World, tmp_path: P
         ("roam360", "pose_c2w.json", '"pano_01.jpg"', '"pano_00.jpg"', "pano_00.jpg is both a train and a test view"),
     ],
 )
-def test_other_formats_name_what_is_wrong(
+def test_errors_in_other_formats_are_named(
     name: str, file: str, old: str, new: str, message: str, world: World, tmp_path: Path
 ) -> None:
     WRITERS[name](world, tmp_path / "scene")

@@ -46,7 +46,7 @@ def changed(document: Any, at: tuple[Any, ...], value: Any) -> Any:
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_values_of_other_types_are_no_tracebacks(name: str, small: World, tmp_path: Path) -> None:
+def test_values_of_other_types_raise_data_errors(name: str, small: World, tmp_path: Path) -> None:
     WRITERS[name](small, tmp_path / "scene")
     file = tmp_path / "scene" / FILES[name]
     document = json.loads(file.read_text())
@@ -77,7 +77,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("name", "at", "value", "message"), WRONG)
-def test_what_is_wrong_is_named(name: str, at, value, message: str, small: World, tmp_path: Path) -> None:
+def test_errors_name_the_position(name: str, at, value, message: str, small: World, tmp_path: Path) -> None:
     WRITERS[name](small, tmp_path / "scene")
     file = tmp_path / "scene" / FILES[name]
     file.write_text(json.dumps(changed(json.loads(file.read_text()), at, value)))
@@ -85,7 +85,7 @@ def test_what_is_wrong_is_named(name: str, at, value, message: str, small: World
         load(tmp_path / "scene", name)
 
 
-def test_openmvg_cannot_name_another_folder(small: World, tmp_path: Path) -> None:
+def test_openmvg_cannot_reach_other_folders(small: World, tmp_path: Path) -> None:
     """What `root_path` says is of another machine; its last name may stand beside the file."""
     WRITERS["openmvg"](small, tmp_path / "scene")
     (tmp_path / "scene" / "images").rename(tmp_path / "elsewhere")
@@ -107,7 +107,7 @@ def test_openmvg_cannot_name_another_folder(small: World, tmp_path: Path) -> Non
         (slice(5, 6), ["1e308"], r"contains 1e\+308; nothing farther than 1e\+15 .* can be rendered"),
     ],
 )
-def test_poses_of_colmap_that_are_none(column, value, message, small: World, tmp_path: Path) -> None:
+def test_invalid_colmap_poses_are_refused(column, value, message, small: World, tmp_path: Path) -> None:
     write_colmap_text(small, tmp_path)
     file = tmp_path / "sparse" / "0" / "images.txt"
     lines = [line.split(" ") if line.endswith("pano_00.png") else [line] for line in file.read_text().split("\n")]
@@ -118,7 +118,7 @@ def test_poses_of_colmap_that_are_none(column, value, message, small: World, tmp
         load(tmp_path)
 
 
-def test_a_camera_of_colmap_without_pixels(small: World, tmp_path: Path) -> None:
+def test_colmap_cameras_without_pixels_are_refused(small: World, tmp_path: Path) -> None:
     write_colmap_text(small, tmp_path)
     file = tmp_path / "sparse" / "0" / "cameras.txt"
     file.write_text(file.read_text().replace(" 16 8", " 0 0"))

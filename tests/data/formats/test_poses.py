@@ -22,7 +22,7 @@ numbers = st.floats(-3, 3, allow_nan=False)
 
 @settings(max_examples=50, deadline=None)
 @given(st.tuples(numbers, numbers, numbers), st.tuples(numbers, numbers, numbers))
-def test_vector_and_quaternion_are_the_same_rotation_and_the_centre_is_kept(vector, center) -> None:
+def test_rotation_vectors_quaternions_and_centres_agree(vector, center) -> None:
     angle = math.sqrt(sum(x * x for x in vector))
     sine = math.sin(angle / 2) / angle if angle > 1e-12 else 0.5
     quaternion = torch.tensor([math.cos(angle / 2), *(sine * x for x in vector)], dtype=torch.float64)
@@ -46,7 +46,7 @@ def test_an_opengl_camera_looks_along_minus_z_with_y_up() -> None:
     assert (pose @ ahead_and_up).tolist() == [0.0, -1.0, 5.0, 1.0]
 
 
-def test_rounding_is_forgiven_and_repaired() -> None:
+def test_rounded_rotations_are_accepted_and_repaired() -> None:
     exact = rotation_from_vector(torch.tensor([0.3, -1.1, 2.0], dtype=torch.float64), "here")
     repaired = checked_rotation((exact * 1e4).round() / 1e4, "here")
     torch.testing.assert_close(repaired @ repaired.T, torch.eye(3, dtype=torch.float64), atol=1e-14, rtol=0)
@@ -65,7 +65,7 @@ def test_rounding_is_forgiven_and_repaired() -> None:
         (torch.eye(2), r"shape \[2, 2\]; it must be 3x3"),
     ],
 )
-def test_what_is_not_a_rotation(matrix: torch.Tensor, message: str) -> None:
+def test_invalid_rotations_are_refused(matrix: torch.Tensor, message: str) -> None:
     with pytest.raises(DataError, match=message):
         checked_rotation(matrix, "here")
 

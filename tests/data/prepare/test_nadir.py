@@ -20,7 +20,7 @@ app.command()(mask)
 
 
 @pytest.mark.parametrize("images", ["", "images"])
-def test_prepare_finds_it_and_takes_no_preview_for_a_panorama(images: str, world: World, tmp_path: Path) -> None:
+def test_prepare_uses_the_mask_and_ignores_the_preview(images: str, world: World, tmp_path: Path) -> None:
     write_images(world, tmp_path / "shoot" / images)
     done = CliRunner().invoke(app, [str(tmp_path / "shoot"), "--below", "45"])
     assert done.exit_code == 0 and "mask.png for 6 panoramas" in done.output, done.output
@@ -33,14 +33,14 @@ def test_prepare_finds_it_and_takes_no_preview_for_a_panorama(images: str, world
         assert preview.size == (64, 32) and red > blue + 50
 
 
-def test_a_data_set_is_loaded_with_it(world: World, tmp_path: Path) -> None:
+def test_load_uses_the_mask(world: World, tmp_path: Path) -> None:
     write_colmap_text(world, tmp_path)
     write_nadir_mask(tmp_path, 60)
     use = load(tmp_path).train[0].mask()
     assert use is not None and use.mean() == pytest.approx(150 / 180, abs=0.01)
 
 
-def test_masks_of_single_images_are_not_put_out_of_use(world: World, tmp_path: Path) -> None:
+def test_per_image_masks_are_not_replaced(world: World, tmp_path: Path) -> None:
     write_transforms(world, tmp_path / "posed")
     meta = json.loads((tmp_path / "posed" / "transforms.json").read_text())
     meta["frames"][2]["mask_path"] = "hands/pano_02.png"
@@ -56,7 +56,7 @@ def test_masks_of_single_images_are_not_put_out_of_use(world: World, tmp_path: P
     assert not list(tmp_path.rglob("mask.png"))
 
 
-def test_nothing_is_overwritten_unasked_and_nonsense_refused(world: World, tmp_path: Path) -> None:
+def test_existing_masks_and_invalid_input_are_refused(world: World, tmp_path: Path) -> None:
     write_images(world, tmp_path / "shoot")
     Image.fromarray(np.full((32, 64), 255, np.uint8)).save(tmp_path / "shoot" / "mask.png")
     with pytest.raises(DataError, match=r"mask.png exists; .* --overwrite"):

@@ -53,7 +53,7 @@ def differences(folder, reference):
     return left.distance, left.degrees, path_length(exact)
 
 
-def test_what_is_finished_is_not_done_again(scene, prepared):
+def test_a_finished_result_is_reused(scene, prepared):
     result, out, _ = prepared
     written = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
     again = prepare(scene[1], out, PrepareOptions(threads=2))
@@ -94,7 +94,7 @@ def test_progress_counts_up_to_all(prepared):
 
 
 @pytest.mark.slow
-def test_an_interrupted_call_goes_on_and_ends_the_same(scene, prepared, tmp_path):
+def test_an_interrupted_call_resumes_with_the_same_result(scene, prepared, tmp_path):
     """On one thread: with several, how busy the machine is may decide the last bits of poses."""
     out = tmp_path / "done"
 
@@ -133,7 +133,7 @@ def test_other_input_starts_over(scene, tmp_path):
     assert (work / "stale").exists()  # the same input and options: kept
 
 
-def test_masked_pixels_have_no_features_and_the_mask_comes_along(scene, tmp_path, monkeypatch):
+def test_masked_pixels_have_no_features_and_the_mask_is_copied(scene, tmp_path, monkeypatch):
     """Of a video: its frames are gone in the end, so that only the file of the mask tells that it is another one."""
     frames = scene[1].glob("pano*.png")
     monkeypatch.setattr(
@@ -180,7 +180,7 @@ def noise(folder, count=2):
     return folder
 
 
-def test_nothing_to_place(tmp_path, monkeypatch):
+def test_unrelated_images_alone_are_refused(tmp_path, monkeypatch):
     asked = []
     monkeypatch.setattr(pipeline, "threads_for", lambda *size: asked.append(size) or 1)
     with pytest.raises(DataError, match="no relative pose was found for any two of the 2 panoramas"):
@@ -189,7 +189,7 @@ def test_nothing_to_place(tmp_path, monkeypatch):
     assert asked == [(128, 64)]
 
 
-def test_made_among_its_panoramas_it_is_no_input_afterwards(scene, tmp_path):
+def test_a_result_inside_its_source_is_not_read_as_input(scene, tmp_path):
     """Of panoramas in a format that pycolmap does not read."""
     for index in range(3):
         Image.open(scene[1] / f"pano 00{index}.png").save(tmp_path / f"{index}.webp", lossless=True)
@@ -200,7 +200,7 @@ def test_made_among_its_panoramas_it_is_no_input_afterwards(scene, tmp_path):
     assert prepare(tmp_path, tmp_path / "flat", PrepareOptions(threads=1)) == replace(result, seconds={})
 
 
-def test_what_pycolmap_raises_is_said_with_what_to_do(tmp_path, monkeypatch):
+def test_errors_of_pycolmap_are_reported_with_a_remedy(tmp_path, monkeypatch):
     def run(tell=lambda step, done, total: None):
         prepare(source, tmp_path / "out", PrepareOptions(threads=1), tell)
 
@@ -257,7 +257,7 @@ def test_bad_input_is_refused(scene, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "accurate"), [("flat", False), ("garden", False), ("garden", True)])
-def test_models_of_real_panoramas_are_reproduced(shared, tmp_path, name, accurate):
+def test_poses_of_real_panoramas_are_reproduced(shared, tmp_path, name, accurate):
     given = shared / "data" / name
     prepare(given / "images", tmp_path / "out", PrepareOptions(accurate=accurate))  # finds mask.png beside images/
     frames = padgs.data.read(given).frames
@@ -268,7 +268,7 @@ def test_models_of_real_panoramas_are_reproduced(shared, tmp_path, name, accurat
 
 
 @pytest.mark.slow
-def test_the_accurate_mode_finds_exact_poses_too(scene, tmp_path):
+def test_accurate_mode_finds_exact_poses(scene, tmp_path):
     prepare(scene[1], tmp_path / "out", PrepareOptions(accurate=True))
     reference = {f"pano {view.name}.png": view.cam_from_world for view in scene[0].train}
     distance, degrees, _ = differences(tmp_path / "out", reference)

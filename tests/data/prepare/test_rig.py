@@ -9,7 +9,7 @@ from padgs.data.prepare import rig
 from padgs.geometry.panorama import direction, project, rays
 
 
-def test_views_are_rotations_that_look_where_they_should():
+def test_rig_views_are_rotations():
     rotations = rig.cam_from_pano()
     assert rotations.shape == (12, 3, 3)
     torch.testing.assert_close(rotations @ rotations.mT, torch.eye(3, dtype=torch.float64).expand(12, 3, 3))
@@ -21,7 +21,7 @@ def test_views_are_rotations_that_look_where_they_should():
     assert (rotations[:, 1, 1] > 0).all()  # no view hangs upside down
 
 
-def test_every_direction_has_one_owner_which_sees_it():
+def test_every_direction_belongs_to_one_view():
     every = rays(256, 128, dtype=torch.float64)
     owners = torch.stack([rig.owned(index, every) for index in range(12)])
     assert (owners.sum(0) == 1).all()
@@ -34,7 +34,7 @@ def test_every_direction_has_one_owner_which_sees_it():
     assert seen[latitude.abs() < 70].all()
 
 
-def test_a_view_shows_what_is_in_its_directions():
+def test_rig_views_resample_the_panorama():
     """The panorama's colour is a smooth function of direction; so must be the view's, seam and poles included."""
 
     def color(directions):
@@ -46,12 +46,6 @@ def test_a_view_shows_what_is_in_its_directions():
         pano_rays = rig.view_lens(512).rays(dtype=torch.float64) @ rotation
         difference = (rig.resample(image, pano_rays).int() - color(pano_rays).int()).abs()
         assert difference.max() <= 2
-
-
-def test_resampling_at_pixel_centres_changes_nothing():
-    generator = torch.Generator().manual_seed(0)
-    image = torch.randint(0, 256, (16, 32, 3), dtype=torch.uint8, generator=generator)
-    assert torch.equal(rig.resample(image, rays(32, 16, dtype=torch.float64)), image)
 
 
 def test_views_keep_the_resolution_of_the_horizon():

@@ -34,7 +34,7 @@ def test_depth_and_ids_of_a_ball_in_an_empty_room():
     assert share == pytest.approx((1 - np.sqrt(15) / 4) / 2, rel=0.01)
 
 
-def test_rays_that_leave_see_the_sky():
+def test_rays_without_a_hit_see_the_sky():
     skin = (Material(plain((0.5, 0.5, 0.5))),)
     blue = np.array([[0.0], [0.2], [1.0]], np.float32)
     world = World((Sphere((3, 0, 0), 1, skin),), Light((((0, 0, 9), 1.0),)), sky=lambda d: np.tile(blue, d.shape[1]))
@@ -46,7 +46,7 @@ def test_rays_that_leave_see_the_sky():
 
 
 @pytest.mark.parametrize("shift", [1, 40, 127])
-def test_turning_by_whole_pixels_shifts_the_image(room, shift):
+def test_rotating_by_whole_pixels_shifts_the_image(room, shift):
     """Longitude grows to the right, headings to the left: turning left by one pixel moves the image right by one."""
     pose, width = room.poses[2], 256
     turn = 2 * np.pi * shift / width
@@ -58,7 +58,7 @@ def test_turning_by_whole_pixels_shifts_the_image(room, shift):
     assert (difference > 1).mean() < 0.003
 
 
-def test_the_seam_is_like_any_other_pair_of_columns(room):
+def test_the_seam_is_continuous(room):
     """Mean over views, rows weighted by area: the step across the seam is an ordinary step."""
     weight = np.cos(((np.arange(64) + 0.5) / 64 - 0.5) * np.pi)[:, None]
     steps = []
@@ -77,13 +77,13 @@ def test_more_samples_converge(room):
     assert error[2] < 7  # of 255; at 64 x 32 a pixel holds whole patterns
 
 
-def test_drawing_does_not_depend_on_threads(room, monkeypatch):
+def test_rendering_does_not_depend_on_threads(room, monkeypatch):
     several = camera.draw(room.world, room.poses[0], 128, 4)
     monkeypatch.setattr(camera, "workers", lambda: 1)
     np.testing.assert_array_equal(camera.draw(room.world, room.poses[0], 128, 4), several)
 
 
-def test_two_views_agree_on_what_both_see(room):
+def test_views_agree_on_common_surfaces(room):
     """A surface point that another camera sees at the distance it should has the same colour there."""
     first, second = room.poses[1], room.poses[2]
     width = 128
@@ -106,7 +106,7 @@ def test_two_views_agree_on_what_both_see(room):
     assert (difference > 0.02).mean() < 0.01  # at edges within the texture
 
 
-def test_culling_loses_nothing(room):
+def test_culling_does_not_change_colours(room):
     """Colours with the shapes that a bundle can hit equal those with all shapes tried."""
     pose, world = room.poses[3], room.world
     rows, columns = np.indices((24, 24))

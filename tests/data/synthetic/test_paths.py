@@ -44,7 +44,7 @@ def test_poses_are_rigid(heading):
         assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)
 
 
-def test_the_path_is_looked_along():
+def test_heading_path_looks_along_the_path():
     options = SyntheticOptions(train_views=40, test_views=0)
     path = curve(WALK, "line", np.random.default_rng(0))
     along = poses(options, path, np.random.default_rng(1))

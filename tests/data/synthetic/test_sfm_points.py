@@ -52,7 +52,7 @@ def test_noise_is_relative_to_the_distance():
     assert 0.01 * np.sqrt((nearest**2).mean()) < spread < 0.01 * np.sqrt((farthest**2).mean())
 
 
-def test_outliers_are_as_many_as_asked():
+def test_outliers_have_the_given_share():
     truth, _, points, _ = cloud(point_noise=0.0, outliers=0.2)
     assert len(points) == 3000
     off = np.min([np.abs(np.subtract(*seen_by(truth, pose, points))) for pose in truth.poses], axis=0) > 0.01
@@ -68,7 +68,7 @@ def test_points_follow_texture():
     assert truth.world.sky is None
 
 
-def test_no_points_without_anything_to_see():
+def test_worlds_without_surfaces_are_refused():
     options = SyntheticOptions(width=16, train_views=2, test_views=0, points=10)
     truth = SyntheticTruth(options)
     truth.world.shapes = ()

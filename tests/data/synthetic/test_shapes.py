@@ -1,10 +1,11 @@
-"""Every solid by distances known in advance, and by where its hits lie."""
+"""Shapes by known distances, and light maps by known lamps."""
 
 import numpy as np
 import pytest
 
 from padgs.data.synthetic.shapes import Box, Ground, Material, Ring, Rod, Room, Sphere
 from padgs.data.synthetic.textures import plain
+from padgs.data.synthetic.world import Light, World, lambert, sphere_points
 
 SKIN = (Material(plain((0.5, 0.5, 0.5))),)
 
@@ -78,7 +79,7 @@ def test_hits_lie_on_the_surface_and_face_the_camera(name):
 
 
 @pytest.mark.parametrize("name", SOLIDS)
-def test_bounding_spheres_hold_the_shape(name):
+def test_bounding_spheres_contain_the_shape(name):
     shape, _ = SOLIDS[name]
     if shape.bounds is None:
         pytest.skip("surrounds the camera")
@@ -89,7 +90,7 @@ def test_bounding_spheres_hold_the_shape(name):
     assert np.linalg.norm(points - at(*center), axis=0).max() <= radius + 1e-9
 
 
-def test_single_precision_stays_single_and_agrees():
+def test_single_precision_is_preserved_and_accurate():
     """A float64 that slips in doubles the time of drawing; a thin far rod is where float32 could fail."""
     thin = Rod((-5, 8, 1), (5, 8, 1), 0.006, SKIN)
     center = np.linspace(0.9, 1.1, 4001)
@@ -115,7 +116,7 @@ def test_point_at_inverts_the_texture_coordinates(face):
     assert (surface.face == face).all()
 
 
-def test_writing_on_walls_is_not_mirrored():
+def test_textures_are_not_mirrored():
     """Seen from the middle of a room, or from outside a box, u grows to the right and v upwards."""
     room, box = Room((-1, -1, -1), (1, 1, 1), SKIN), Box((0, 0, 0), (1, 1, 1), SKIN)
     for forward in ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)):
@@ -125,3 +126,44 @@ def test_writing_on_walls_is_not_mirrored():
             uv = shape.surface(points).uv
             np.testing.assert_allclose(uv[:, 1] - uv[:, 0], (0.1, 0), atol=1e-12)
             np.testing.assert_allclose(uv[:, 2] - uv[:, 0], (0, 0.1), atol=1e-12)
+
+
+SKIN = (Material(plain((0.5, 0.5, 0.5))),)
+LIGHT = Light((((0.0, 0.0, 2.0), 1.0),), size=0.1)
+
+
+def test_unoccluded_light_maps_equal_the_lamp():
+    ground = World((Ground(SKIN),), LIGHT).light_maps[0, 0]
+    uv = np.array([[0.0, 1.5, -3.0], [0.0, 2.0, 4.0]], np.float32)
+    direct, openness = ground.at(uv)
+    points = np.concatenate((uv, np.zeros((1, 3), np.float32)))
+    up = np.array([[0.0], [0.0], [1.0]], np.float32)
+    np.testing.assert_allclose(direct, lambert(points, up, np.array((0, 0, 2.0)), 1.0), atol=5e-3)
+    assert direct[0] == pytest.approx(1 / 1.5, abs=5e-3)  # straight below: 1 / (1 + 2 / 4)
+    np.testing.assert_allclose(openness, 1, atol=1e-6)
+
+
+def test_shadows_have_the_right_size_and_soft_edges():
+    """A 1 m plate at half the lamp's height throws a 2 m shadow."""
+    plate = Box((0, 0, 1.0), (0.5, 0.5, 0.01), SKIN)
+    ground = World((Ground(SKIN), plate), LIGHT).light_maps[0, 0]
+    across = np.stack((np.linspace(0, 3, 61), np.zeros(61))).astype(np.float32)
+    direct, _ = ground.at(across)
+    free = World((Ground(SKIN),), LIGHT).light_maps[0, 0].at(across)[0]
+    ratio = direct / free
+    assert ratio[:14].max() < 0.01  # x < 0.7
+    assert ratio[30:].min() > 0.99  # x > 1.5
+    assert abs(np.interp(0.5, ratio, across[0]) - 1.0) < 0.1
+
+
+def test_corners_are_darker_than_the_middle_of_a_floor():
+    room = World((Room((-2, -2, 0), (2, 2, 3), SKIN),), LIGHT)
+    openness = room.light_maps[0, 4].at(np.array([[0.0, 1.95, 1.95], [0.0, 0.0, 1.95]], np.float32))[1]
+    assert openness[0] > 0.95 > openness[1] + 0.2 > openness[2] + 0.3
+
+
+def test_sphere_points_are_even():
+    points = sphere_points(64)
+    np.testing.assert_allclose(np.linalg.norm(points, axis=1), 1, atol=1e-12)
+    np.testing.assert_allclose(points.mean(0), 0, atol=0.02)
+    np.testing.assert_allclose(points.T @ points / 64, np.eye(3) / 3, atol=0.02)

@@ -53,7 +53,7 @@ def test_cache_gives_identical_scenes(tmp_path):
     same(first, generate(options))  # drawn again
 
 
-def test_damaged_cache_is_made_anew(tmp_path):
+def test_a_damaged_cache_is_regenerated(tmp_path):
     options = SyntheticOptions(**TINY)
     first = generate(options)
     table = next(tmp_path.rglob("scene.npz"))
@@ -64,7 +64,7 @@ def test_damaged_cache_is_made_anew(tmp_path):
     assert cache.read(options) is not None
 
 
-def test_a_cache_that_cannot_be_written_is_done_without(tmp_path, monkeypatch):
+def test_scenes_generate_without_a_writable_cache(tmp_path, monkeypatch):
     expected = generate(SyntheticOptions(**TINY))
     (tmp_path / "file").write_text("not a folder")
     monkeypatch.setenv("PADGS_CACHE", str(tmp_path / "file"))
@@ -74,20 +74,16 @@ def test_a_cache_that_cannot_be_written_is_done_without(tmp_path, monkeypatch):
     same(scene, expected)
 
 
-def test_every_knob_changes_the_key():
-    base = SyntheticOptions(**TINY)
-    assert cache.key(base) == cache.key(SyntheticOptions(**TINY))
-    others = [SyntheticOptions(**TINY, seed=1), SyntheticOptions(**(TINY | {"points": 301}))]
-    assert len({cache.key(options) for options in (base, *others)}) == 3
-
-
-def test_seeds_differ():
-    first, second = (generate(SyntheticOptions(**TINY, seed=seed)) for seed in (0, 1))
+def test_options_and_seeds_change_the_key_and_the_scene():
+    base, points = SyntheticOptions(**TINY), SyntheticOptions(**(TINY | {"points": 301}))
+    seed = SyntheticOptions(**TINY, seed=1)
+    assert len({cache.key(options) for options in (base, SyntheticOptions(**TINY), points, seed)}) == 3
+    first, second = generate(base), generate(seed)
     assert first.fingerprint != second.fingerprint
     assert not torch.equal(first.train[0].cam_from_world, second.train[0].cam_from_world)
 
 
-def test_load_takes_name_width_and_knobs_from_the_data_options():
+def test_load_uses_the_data_options():
     scene = load("outdoor", DataOptions(width=32, generator={"train_views": 3, "test_views": 1, "points": 100}))
     assert scene.name == "synthetic-outdoor"
     assert (len(scene.train), scene.train[0].width, scene.train[0].height) == (3, 32, 16)
@@ -112,7 +108,7 @@ def test_load_takes_name_width_and_knobs_from_the_data_options():
         ({"objects": 2000}, "no free position"),
     ],
 )
-def test_bad_knobs_are_refused(knobs, message):
+def test_invalid_options_are_refused(knobs, message):
     with pytest.raises(DataError, match=message):
         SyntheticTruth(SyntheticOptions(**knobs))
 
@@ -133,14 +129,14 @@ def test_outdoor_spans_three_orders_of_magnitude_and_has_sky():
 
 
 @pytest.mark.parametrize("horizon", [30, 3000])
-def test_mountains_stand_where_they_are_asked_to(horizon):
+def test_mountains_are_at_the_given_distance(horizon):
     _, views = depths("outdoor", 64, horizon=horizon, train_views=2, test_views=0)
     farthest = max(depth[np.isfinite(depth)].max() for depth, _ in views)
     assert 0.85 * horizon < farthest < 1.25 * horizon
 
 
 @pytest.mark.parametrize(("scene", "rooms"), [("two_rooms", 2), ("room_chain", 2), ("room_chain", 5)])
-def test_rooms_hide_most_of_one_another(scene, rooms):
+def test_rooms_occlude_each_other(scene, rooms):
     asked = {"rooms": rooms} if scene == "room_chain" else {}
     truth, _ = depths(scene, 16, train_views=8 * rooms, test_views=0, **asked)
     rng = np.random.default_rng(0)
@@ -173,7 +169,7 @@ def test_only_a_room_chain_has_a_number_of_rooms():
             SyntheticOptions(scene, rooms=rooms)
 
 
-def test_rods_pass_over_and_under_the_cameras_of_pole_torture():
+def test_pole_torture_has_rods_above_and_below_the_cameras():
     truth, views = depths("pole_torture")
     thin = [depth[[0, -1]].min(axis=1) for depth, _ in views]
     assert np.mean([rows[0] < 1.2 for rows in thin]) > 0.4  # the ceiling is 1.4 m above

@@ -26,7 +26,7 @@ TEXTURES = {
 
 
 @pytest.mark.parametrize("name", TEXTURES)
-def test_colours_are_finite_single_precision_and_nearly_in_range(name):
+def test_colours_are_float32_and_in_range(name):
     uv = np.random.default_rng(1).uniform(-3, 3, (2, 5000)).astype(np.float32)
     color = TEXTURES[name](uv)
     assert color.shape == (3, 5000)
@@ -45,19 +45,19 @@ def test_bilinear_is_exact_at_texels_linear_between_and_periodic():
     np.testing.assert_allclose(tx.bilinear(odd, np.array([3.5]), np.array([1.25])), [9.75])
 
 
-def test_a_higher_frequency_is_the_same_texture_closer_together():
+def test_scaled_textures_have_a_higher_frequency():
     uv = np.random.default_rng(2).uniform(-1, 1, (2, 500)).astype(np.float32)
     texture = TEXTURES["bricks"]
     np.testing.assert_array_equal(tx.scaled(texture, 4.0)(uv), texture(4 * uv))
 
 
-def test_a_siemens_star_has_as_many_spokes_as_asked():
+def test_a_siemens_star_has_the_given_number_of_spokes():
     angle = np.linspace(-np.pi, np.pi, 20_001)[:-1]
     ring = tx.siemens_star((0, 0, 0), (1, 1, 1), 12, 1.0)(0.3 * np.stack((np.cos(angle), np.sin(angle))))[0]
     assert (np.diff(np.append(ring, ring[0])) > 0.5).sum() == 12
 
 
-def test_patches_lie_where_they_were_put():
+def test_framed_patches_have_the_given_position():
     color = TEXTURES["framed"](np.array([[0.2, 0.2, -0.5], [0.1, 0.48, 0.1]], np.float32))
     np.testing.assert_allclose(color[:, 0], B, atol=1e-6)
     np.testing.assert_allclose(color[:, 1], B, atol=1e-6)

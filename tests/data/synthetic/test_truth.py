@@ -1,4 +1,4 @@
-"""Exact truth under every knob that changes what methods are given."""
+"""Ground truth of synthetic scenes under every option that changes the training data."""
 
 import math
 
@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from padgs.data import DataError
 from padgs.data.synthetic import SyntheticOptions, SyntheticTruth, generate
+from padgs.data.synthetic.camera import center, draw, draw_stitched
 from padgs.scene import View
 
 SMALL = {"scene": "bare_room", "width": 64, "train_views": 4, "test_views": 2, "points": 300, "samples": 4}
@@ -17,7 +19,7 @@ def own_cache(tmp_path, monkeypatch):
     monkeypatch.setenv("PADGS_CACHE", str(tmp_path))
 
 
-def test_scaling_and_turning_the_world_changes_no_pixel():
+def test_world_scale_and_rotation_change_no_pixel():
     plain = SyntheticOptions(**SMALL)
     moved = SyntheticOptions(**SMALL, world_scale=100.0, world_rotation=(20.0, -35.0, 50.0))
     scene, other = generate(plain), generate(moved)
@@ -38,7 +40,7 @@ def test_scaling_and_turning_the_world_changes_no_pixel():
 
 
 @pytest.mark.parametrize("scene", ["bare_room", "two_rooms"])  # the second has a route of its own
-def test_a_path_reaches_as_far_as_asked(scene):
+def test_paths_have_the_given_radius(scene):
     poses = SyntheticTruth(
         SyntheticOptions(**SMALL | {"scene": scene, "path": "cross", "path_radius": 0.5, "train_views": 40})
     ).poses
@@ -54,7 +56,7 @@ def test_world_rotation_is_about_x_then_y_then_z():
     torch.testing.assert_close(up_in_camera, torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64))
 
 
-def test_pose_noise_moves_training_poses_only_and_the_truth_knows():
+def test_pose_noise_affects_training_poses_only():
     options = SyntheticOptions(
         **(SMALL | {"width": 16, "train_views": 40}), pose_noise_translation=0.01, pose_noise_rotation=0.5
     )
@@ -75,7 +77,7 @@ def test_pose_noise_moves_training_poses_only_and_the_truth_knows():
         assert torch.equal(view.cam_from_world, exact.cam_from_world)
 
 
-def test_any_other_pose_is_taken_as_it_is():
+def test_truth_renders_any_pose():
     truth = SyntheticTruth(SyntheticOptions(**SMALL, world_scale=10.0))
     pose = truth.exact_pose("001").clone()
     pose[:3, 3] -= pose[:3, :3] @ torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64)  # up by 0.2 m
@@ -84,7 +86,7 @@ def test_any_other_pose_is_taken_as_it_is():
     assert truth.image(View("new", pose, 64, 32)).shape == (32, 64, 3)
 
 
-def test_exposure_brightens_training_views_only():
+def test_exposure_affects_training_views_only():
     plain, exposed = generate(SyntheticOptions(**SMALL)), generate(SyntheticOptions(**SMALL, exposure_range=1.0))
     gains = [
         math.log2((b.image().clamp(max=0.95).median() / a.image().median()).item())
@@ -95,7 +97,7 @@ def test_exposure_brightens_training_views_only():
     assert all(torch.equal(a.image(), b.image()) for a, b in zip(plain.test, exposed.test, strict=True))
 
 
-def test_one_knob_leaves_everything_else_alone():
+def test_options_do_not_change_unrelated_data():
     base, denser = generate(SyntheticOptions(**SMALL)), generate(SyntheticOptions(**(SMALL | {"points": 500})))
     for view, same in zip(base.train, denser.train, strict=True):
         assert torch.equal(view.image(), same.image())
@@ -106,3 +108,38 @@ def test_one_knob_leaves_everything_else_alone():
 def test_unknown_view():
     with pytest.raises(ValueError, match="unknown view 'x'; known: 000 to 005"):
         SyntheticTruth(SyntheticOptions(**SMALL)).exact_pose("x")
+
+
+def test_lenses_without_a_gap_equal_one_camera():
+    truth = SyntheticTruth(options := SyntheticOptions(**SMALL))
+    stitched = draw_stitched(truth.world, truth.poses[0], 0.0, options, 1.0)
+    plain = draw(truth.world, truth.poses[0], 64, 4, 0)
+    assert np.abs(stitched.astype(int) - plain).max() <= 1  # bends by 0 in float64, where the plain one has float32
+
+
+def test_each_half_is_rendered_from_its_lens():
+    options = SyntheticOptions(**SMALL, lens_blend=0.0)
+    truth = SyntheticTruth(options)
+    stitched = draw_stitched(truth.world, truth.poses[0], 0.2, options, 1.0)
+    for sign, columns in ((1, slice(17, 47)), (-1, slice(0, 15))):
+        pose = truth.poses[0].copy()
+        pose[2, 3] -= sign * 0.1
+        alone = draw(truth.world, pose, 64, 4, 0)
+        assert np.abs(stitched[:, columns].astype(int) - alone[:, columns]).max() <= 1
+        assert np.linalg.norm(center(pose) - center(truth.poses[0])) == pytest.approx(0.1)
+
+
+def test_lenses_affect_training_views_only():
+    plain = generate(SyntheticOptions(**SMALL))
+    stitched = generate(SyntheticOptions(**SMALL, lens_gap=0.05, lens_k1=0.02))
+    assert (plain.name, stitched.name) == ("synthetic-bare_room", "synthetic-bare_room-two-lenses")
+    assert all(torch.equal(a.image(), b.image()) for a, b in zip(plain.test, stitched.test, strict=True))
+    for a, b in zip(plain.train, stitched.train, strict=True):
+        assert torch.equal(a.cam_from_world, b.cam_from_world)
+        assert (a.image() - b.image()).abs().mean() > 0.005
+
+
+@pytest.mark.parametrize("knobs", [{"lens_gap": -0.1}, {"lens_blend": 90.0}, {"lens_k1": 0.5}])
+def test_invalid_lenses_are_refused(knobs):
+    with pytest.raises(DataError, match=next(iter(knobs))):
+        SyntheticOptions(**SMALL, **knobs)

@@ -1,14 +1,19 @@
-"""A wrong reading of the poses is recognised, and the right one named."""
+"""Pose conventions and exposures estimated from points and images."""
 
 from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
-from fixtures import World
+from fixtures import World, write_colmap_text
 from torch import Tensor
 
+from padgs.cli.check import lines
 from padgs.data.capture import Tracks
-from padgs.data.conventions import colour_fit, known_conventions, reprojection_error, track_fit
+from padgs.data.check import check
+from padgs.data.conventions import colour_fit, exposure_gains, known_conventions, reprojection_error, track_fit
 from padgs.geometry.panorama import project
 
 FLIP = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
@@ -38,7 +43,7 @@ MISREADINGS: dict[str, tuple[Callable[[Tensor], Tensor], str]] = {
 
 
 @pytest.mark.parametrize("case", MISREADINGS)
-def test_colours_tell(case: str, world: World) -> None:
+def test_colours_identify_the_convention(case: str, world: World) -> None:
     misread, words = MISREADINGS[case]
     images = torch.stack([torch.from_numpy(image) for image in world.images])
     points, colors = torch.from_numpy(world.points), torch.from_numpy(world.colors)
@@ -50,7 +55,7 @@ def test_colours_tell(case: str, world: World) -> None:
 
 
 @pytest.mark.parametrize("case", MISREADINGS)
-def test_observations_tell(case: str, world: World) -> None:
+def test_observations_identify_the_convention(case: str, world: World) -> None:
     misread, words = MISREADINGS[case]
     points, poses = torch.from_numpy(world.points), _poses(world)
     frame = torch.arange(6).repeat_interleave(60)
@@ -64,7 +69,7 @@ def test_observations_tell(case: str, world: World) -> None:
     assert case == "none" or -fits[0].score > 1
 
 
-def test_errors_are_angles_and_take_the_short_way() -> None:
+def test_reprojection_errors_wrap_and_shrink_near_poles() -> None:
     behind = torch.tensor([[-1e-4, 0.0, -1.0]], dtype=torch.float64)  # at the left edge of the image
     assert reprojection_error(behind, torch.tensor([[63.9, 16.0]], dtype=torch.float64), 64, 32) < 0.2
     high = torch.tensor([[0.0, -1.0, 1e-3]], dtype=torch.float64)  # next to the pole a column more means little
@@ -72,7 +77,7 @@ def test_errors_are_angles_and_take_the_short_way() -> None:
     assert reprojection_error(high, straight + torch.tensor([[10.0, 0.0]]), 64, 32) < 0.02
 
 
-def test_every_reading_is_another() -> None:
+def test_conventions_are_distinct() -> None:
     words = [convention.words for convention in known_conventions()]
     assert len(set(words)) == len(words) == 5 * 48 + 47
 
@@ -95,3 +100,26 @@ def _matches(pattern: str, words: str) -> bool:
     import re
 
     return re.search(pattern, words) is not None
+
+
+STOPS = np.array([0.0, -0.5, 0.3, -0.2, 0.0, 0.1])
+
+
+def exposed(world: World) -> World:
+    images = (image / 2 * 2.0**stop for image, stop in zip(world.images, STOPS, strict=True))
+    return replace(world, images=tuple(image.round().astype(np.uint8) for image in images))
+
+
+def test_gains_are_robust_to_hidden_points(world: World) -> None:
+    poses = torch.stack([torch.from_numpy(np.linalg.inv(world.world_from_cam(i))) for i in range(6)])
+    images = torch.stack([torch.from_numpy(image) for image in exposed(world).images])
+    images[2, :, :20] = images[2, :, 20:40]  # something stands before what the others show
+    gains = exposure_gains(poses, images, torch.from_numpy(world.points))
+    assert np.abs(gains.numpy() - (STOPS - np.median(STOPS))).max() < 0.05
+
+
+def test_check_warns_of_uneven_exposures(world: World, tmp_path: Path) -> None:
+    write_colmap_text(exposed(world), tmp_path)
+    report = check(tmp_path)
+    assert any("(pano_02); train with train.exposures=learned" in note for note in report.notes), report.notes
+    assert report.problems == [] and any("exposures      differ by a factor of 1." in line for line in lines(report))

@@ -1,4 +1,4 @@
-"""What the machine has left: threads by its free memory, a full disk, disks without links."""
+"""Resources of the machine: threads by free memory, full disks, and file systems without links."""
 
 import errno
 import os
@@ -9,7 +9,7 @@ import pytest
 from padgs.data.prepare import work
 
 
-def test_threads_are_as_many_as_free_memory_allows(monkeypatch):
+def test_threads_are_limited_by_free_memory(monkeypatch):
     assert work.free_memory() > 50_000_000
     monkeypatch.setattr(os, "cpu_count", lambda: 12)
     free = {"bytes": 2_000_000_000}
@@ -22,7 +22,7 @@ def test_threads_are_as_many_as_free_memory_allows(monkeypatch):
     assert work.threads_for(2048, 1024) == 1
 
 
-def test_free_memory_without_what_linux_tells(monkeypatch):
+def test_free_memory_without_proc(monkeypatch):
     def absent(*args, **kwargs):
         raise FileNotFoundError
 
@@ -32,7 +32,7 @@ def test_free_memory_without_what_linux_tells(monkeypatch):
     assert work.free_memory() is None
 
 
-def test_a_disk_without_links_gets_copies(tmp_path, monkeypatch):
+def test_files_are_copied_on_file_systems_without_links(tmp_path, monkeypatch):
     """By what such disks answer: EPERM."""
     original = tmp_path / "original.png"
     original.write_bytes(b"a picture")

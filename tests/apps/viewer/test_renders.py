@@ -20,7 +20,7 @@ def anchors(tmp_path_factory) -> RunRenderer:
     return RunRenderer(padgs.load_run(tiny_run(tmp_path_factory, "method=padgs_small"), device="cpu"))
 
 
-def test_a_panorama_is_the_runs_own_picture_in_the_middle(renderer):
+def test_panoramas_are_padded_renders_of_the_run(renderer):
     view = renderer.run.scene.train[1]
     picture = renderer.render(ViewOptions("panorama"), view.cam_from_world, 32, 24)
     assert picture.shape == (24, 32, 3) and picture[:4].max() == picture[20:].max() == 0
@@ -31,7 +31,7 @@ def test_a_panorama_is_the_runs_own_picture_in_the_middle(renderer):
 
 @pytest.mark.parametrize("camera", ["perspective", "panorama"])
 @pytest.mark.parametrize("layer", ["colours", "depth", "error"])
-def test_every_layer_is_shown_by_every_camera_at_every_share(renderer, anchors, camera, layer):
+def test_all_layers_cameras_and_resolutions(renderer, anchors, camera, layer):
     for shown in (renderer, anchors):
         pose = shown.run.scene.train[0].cam_from_world
         full = shown.render(ViewOptions(camera, layer), pose, 40, 20)
@@ -39,7 +39,7 @@ def test_every_layer_is_shown_by_every_camera_at_every_share(renderer, anchors, 
         assert shown.render(ViewOptions(camera, layer), pose, 40, 20, resolution=0.25).shape == (5, 10, 3)
 
 
-def test_the_error_is_that_of_the_nearest_photograph_and_none_where_masked(renderer):
+def test_the_error_is_that_of_the_nearest_view_without_masked_pixels(renderer):
     run = renderer.run
     view = run.scene.test[0]
     near = view.cam_from_world.clone()
@@ -53,7 +53,7 @@ def test_the_error_is_that_of_the_nearest_photograph_and_none_where_masked(rende
     assert RunRenderer(blind).render(ViewOptions("panorama", "error"), view.cam_from_world, 32, 16)[..., 1].max() == 0
 
 
-def test_what_is_cropped_away_is_not_drawn(renderer, anchors):
+def test_cropped_gaussians_are_not_rendered(renderer, anchors):
     for shown in (renderer, anchors):
         view, far = shown.run.scene.train[0], ((1e6,) * 3, (2e6,) * 3)
         assert shown.can_crop
@@ -63,6 +63,6 @@ def test_what_is_cropped_away_is_not_drawn(renderer, anchors):
         assert shown.run.method.render(view).image.max() > 0, "the run itself is left as it is"
 
 
-def test_two_stand_side_by_side():
+def test_side_by_side():
     found = side_by_side(np.zeros((4, 6, 3), np.uint8), np.full((4, 6, 3), 7, np.uint8))
     assert found.shape == (4, 14, 3) and found[0, 0, 0] == 0 and found[0, 7, 0] == 255 and found[0, 13, 0] == 7

@@ -1,4 +1,4 @@
-"""`padgs check` on every fixture, on real input, and on broken copies: each is caught, and by name."""
+"""`padgs check` on sound, real and damaged data sets."""
 
 import json
 import re
@@ -26,7 +26,7 @@ app.command()(convert_command.convert)
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_sound_data_sets_pass(name: str, world: World, tmp_path: Path) -> None:
+def test_valid_data_sets_pass(name: str, world: World, tmp_path: Path) -> None:
     WRITERS[name](world, tmp_path / "scene")
     report = check(tmp_path / "scene", overlay=tmp_path / "look.png")
     assert report.problems == [] and report.suggestion is None
@@ -46,7 +46,9 @@ def test_sound_data_sets_pass(name: str, world: World, tmp_path: Path) -> None:
     ("name", "up", "off_axis", "tilt", "reprojection"),
     [("flat", "-y", 34.7, 0.3, 0.20), ("garden", "-y", 34.9, 2.1, 0.26), ("room", "+z", 0.0, 0.0, None)],
 )
-def test_real_input(name: str, up: str, off_axis: float, tilt: float, reprojection: float | None, shared: Path) -> None:
+def test_real_data_sets_pass(
+    name: str, up: str, off_axis: float, tilt: float, reprojection: float | None, shared: Path
+) -> None:
     report = check(shared / "data" / name)
     assert report.problems == [] and report.suggestion is None and report.gravity is not None
     assert report.gravity.axis == up
@@ -64,11 +66,8 @@ def _save(folder: Path, name: str, pixels: np.ndarray) -> None:
     Image.fromarray(pixels).save(folder / name)
 
 
-WIDE = np.zeros((32, 60, 3), np.uint8)
-
-
-def _cut(folder: Path) -> None:
-    """A picture that ends early, although as a whole one does; only its pixels tell."""
+def _truncate(folder: Path) -> None:
+    """Truncate an image, but keep the end marker."""
     path, whole = folder / "images/pano_02.png", BytesIO()
     Image.open(path).save(whole, "JPEG", quality=95)
     path.write_bytes(whole.getvalue()[: len(whole.getvalue()) // 2] + b"\xff\xd9")
@@ -76,40 +75,26 @@ def _cut(folder: Path) -> None:
 
 BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
     "image missing": (lambda f: (f / "images/pano_02.png").unlink(), "1 of 6 poses have no image in .*: pano_02.png"),
-    "image cut": (
+    "image damaged": (
         lambda f: (f / "images/pano_02.png").write_bytes(b"\x89PNG\r\n\x1a\n"),
-        "pano_02.png is not an image",
+        "pano_02.png is not an im",
     ),
-    "image cut with an end": (_cut, "pano_02.png is cut short, although it has an end marker"),
-    "image transparent": (
-        lambda f: _save(f, "images/pano_02.png", np.full((32, 64, 4), 9, np.uint8)),
-        "pano_02.png has transparent pixels",
-    ),
-    "not 2:1": (lambda f: _save(f, "images/pano_03.png", WIDE), "pano_03.png is 60x32, which is not 2:1"),
-    "mask of another size": (lambda f: _save(f, "mask.png", WIDE[:30]), "mask.png is 60x30 but pano_00.png is 64x32"),
+    "image truncated": (_truncate, "pano_02.png is cut short, although it has an end marker"),
+    "not 2:1": (lambda f: _save(f, "images/pano_03.png", np.zeros((32, 60, 3), np.uint8)), "60x32, which is not 2:1"),
     "mask hides all": (lambda f: _save(f, "mask.png", np.zeros((32, 64), np.uint8)), "mask.png hides every pixel"),
-    "list names absent": (
-        lambda f: _edit(f, "test.txt", lambda t: t + "nobody\n"),
-        "names images that do not exist: nobody",
-    ),
     "lists overlap": (lambda f: shutil.copy(f / "train.txt", f / "test.txt"), "train and test list overlap: pano_00"),
-    "list escapes": (lambda f: _edit(f, "train.txt", lambda t: t + "../../x\n"), "'../../x'; names must be relative"),
     "same image twice": (
         lambda f: shutil.copy(f / "images/pano_00.png", f / "images/pano_01.png"),
         "the test view pano_01 is the same image as the training view pano_00",
     ),
     "empty cloud": (lambda f: (f / "sparse/0/points3D.txt").write_text("\n"), "holds no points; training starts"),
-    "other camera": (
-        lambda f: _edit(f, "sparse/0/cameras.txt", lambda t: re.sub("1 EQ.*", "1 PINHOLE 64 32 9 9 32 16", t)),
-        "has a PINHOLE camera",
-    ),
     "binary garbage": (lambda f: (f / "sparse/0/images.bin").write_bytes(b"\x07" * 99), "lacks cameras.bin"),
-    "other axes": (lambda f: _turn(f), "colours correlate by -?0.* and by 0.9. under another convention"),
+    "other axes": (lambda f: _rotate_points(f), "colours correlate by -?0.* and by 0.9. under another convention"),
 }
 
 
 @pytest.mark.parametrize("case", BROKEN)
-def test_broken_copies_are_caught(case: str, world: World, tmp_path: Path) -> None:
+def test_damaged_data_sets_are_reported(case: str, world: World, tmp_path: Path) -> None:
     spoil, message = BROKEN[case]
     write_colmap_text(world, tmp_path)
     spoil(tmp_path)
@@ -118,9 +103,9 @@ def test_broken_copies_are_caught(case: str, world: World, tmp_path: Path) -> No
     assert all("Traceback" not in problem for problem in report.problems)
 
 
-def test_all_problems_are_told_at_once(world: World, tmp_path: Path) -> None:
+def test_all_problems_are_reported_at_once(world: World, tmp_path: Path) -> None:
     write_colmap_text(world, tmp_path)
-    for case in ("image cut", "not 2:1", "lists overlap", "mask hides all"):
+    for case in ("image damaged", "not 2:1", "lists overlap", "mask hides all"):
         BROKEN[case][0](tmp_path)
     problems = "\n".join(check(tmp_path).problems)
     assert "pano_02.png is not an image" in problems and "pano_03.png is 60x32" in problems
@@ -130,30 +115,23 @@ def test_all_problems_are_told_at_once(world: World, tmp_path: Path) -> None:
     assert "overlap" in problems and "hides every pixel" in problems
 
 
-def test_a_wrong_convention_in_a_transforms_file(world: World, tmp_path: Path) -> None:
-    """Poses written for a camera with y down and z forward, into a format whose cameras have y up and z backward."""
+@pytest.mark.parametrize(
+    ("origin", "matrix", "suggestion"),
+    [
+        ((0, 0, 0), lambda pose: pose, "use (x, -y, -z) as (x, y, z), the convention of OpenGL"),
+        ((1e5, -2e5, 3e4), lambda pose: np.linalg.inv(pose) @ np.diag([1, -1, -1, 1]), "invert them"),
+    ],
+)
+def test_wrong_pose_conventions_are_recognised(origin, matrix, suggestion, world: World, tmp_path: Path) -> None:
+    world = replace(world, centers=world.centers + origin, points=world.points + origin)
     write_transforms(world, tmp_path)
     meta = json.loads((tmp_path / "transforms.json").read_text())
     for i, frame in enumerate(meta["frames"]):
-        frame["transform_matrix"] = world.world_from_cam(i).tolist()
+        frame["transform_matrix"] = matrix(world.world_from_cam(i)).tolist()
     (tmp_path / "transforms.json").write_text(json.dumps(meta))
     report = check(tmp_path)
-    assert (
-        report.suggestion is not None and "use (x, -y, -z) as (x, y, z), the convention of OpenGL" in report.suggestion
-    )
+    assert report.suggestion is not None and suggestion in report.suggestion
     assert report.colour_correlation is not None and report.colour_correlation < 0.5
-
-
-def test_misread_poses_are_told_far_from_the_origin_as_well(world: World, tmp_path: Path) -> None:
-    far = np.array([1e5, -2e5, 3e4])
-    world = replace(world, centers=world.centers + far, points=world.points + far)
-    write_transforms(world, tmp_path)
-    meta = json.loads((tmp_path / "transforms.json").read_text())
-    for i, frame in enumerate(meta["frames"]):
-        frame["transform_matrix"] = (np.linalg.inv(world.world_from_cam(i)) @ np.diag([1, -1, -1, 1])).tolist()
-    (tmp_path / "transforms.json").write_text(json.dumps(meta))
-    suggestion = check(tmp_path).suggestion
-    assert suggestion is not None and "invert them" in suggestion
 
 
 def test_the_command(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -188,11 +166,11 @@ def test_the_convert_command(world: World, tmp_path: Path) -> None:
     )
 
 
-def _turn(folder: Path) -> None:
-    """Points in a z-up world, poses in a y-down one."""
+def _rotate_points(folder: Path) -> None:
+    """Rotate the points, but not the poses, to a z-up world."""
 
-    def turned(text: str) -> str:
+    def rotated(text: str) -> str:
         rows = [line.split() for line in text.splitlines() if not line.startswith("#")]
         return "\n".join(" ".join([row[0], row[1], row[3], repr(-float(row[2])), *row[4:]]) for row in rows) + "\n"
 
-    _edit(folder, "sparse/0/points3D.txt", turned)
+    _edit(folder, "sparse/0/points3D.txt", rotated)

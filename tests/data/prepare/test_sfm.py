@@ -1,20 +1,22 @@
-"""Pairs to match."""
+"""Pairs to match, and level worlds."""
 
 import pytest
+import torch
 
 from padgs.data import DataError
+from padgs.data.prepare.pipeline import rotation_between
 from padgs.data.prepare.sfm import EXHAUSTIVE_UP_TO, image_pairs
 
 NAMES = [f"{index:04d}" for index in range(500)]
 
 
-def test_few_images_are_all_paired():
+def test_few_images_are_paired_exhaustively():
     pairs = image_pairs(NAMES[:EXHAUSTIVE_UP_TO])
     assert len(pairs) == len(set(pairs)) == EXHAUSTIVE_UP_TO * (EXHAUSTIVE_UP_TO - 1) // 2
     assert image_pairs(NAMES[:200], "exhaustive")[-1] == ("0198", "0199")
 
 
-def test_many_images_are_paired_with_neighbours_and_some_far_ones():
+def test_many_images_are_paired_sequentially_with_loop_closure():
     pairs = set(image_pairs(NAMES))
     assert len(pairs) < 20 * len(NAMES)
     assert all(a < b for a, b in pairs)
@@ -28,7 +30,7 @@ def test_order_of_names_does_not_matter():
     assert image_pairs(NAMES[::-1]) == image_pairs(NAMES)
 
 
-def test_numbers_without_leading_zeros_count_by_their_value():
+def test_names_are_sorted_naturally():
     pairs = image_pairs([f"pano{number}.jpg" for number in range(1, 121)], "sequential")
     assert ("pano9.jpg", "pano10.jpg") in pairs and ("pano10.jpg", "pano100.jpg") not in pairs
 
@@ -36,3 +38,13 @@ def test_numbers_without_leading_zeros_count_by_their_value():
 def test_unknown_kind():
     with pytest.raises(DataError, match="unknown kind of pairs 'all'; known: auto, exhaustive, sequential"):
         image_pairs(NAMES, "all")
+
+
+def test_rotation_between_is_the_smallest_rotation_to_z():
+    for vector in ((0.0, 0.0, 1.0), (0.0, 0.0, -1.0), (0.6, 0.0, 0.8), (-0.48, 0.64, -0.6)):
+        up = torch.tensor(vector, dtype=torch.float64)
+        rotation = rotation_between(up)
+        torch.testing.assert_close(rotation @ up, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+        torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3, dtype=torch.float64))
+        assert torch.linalg.det(rotation).item() == pytest.approx(1.0)
+        assert (rotation.trace().item() - 1) / 2 == pytest.approx(vector[2], abs=1e-9)  # cosine of its angle

@@ -1,21 +1,61 @@
-"""The command, from a run to a film."""
+"""Camera-path videos: encoding, spherical metadata, and `padgs render`."""
 
 import struct
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from tiny_run import tiny_run
 from typer.testing import CliRunner
 
+from padgs.apps.camera_path_video import write_video
 from padgs.cli.commands import app
+from padgs.scene import View
 
 try:
+    import av
     import imageio.plugins.pyav
     import imageio.v3 as imageio
 except ImportError:
     imageio = None
 WITH_VIDEO = pytest.mark.skipif(imageio is None, reason="the extra `video` is not installed")
+COLOURS = torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.0, 0.0]])
+SHOWN = SimpleNamespace(image=COLOURS.repeat_interleave(16, 0).expand(32, 64, 3))  # a column of each
+VIEW = View("a", torch.eye(4, dtype=torch.float64), 64, 32)
+
+
+@WITH_VIDEO
+def test_videos_state_their_color_space(tmp_path):
+    write_video(tmp_path / "a.mp4", [VIEW], lambda view: SHOWN, fps=10, scene_scale=1)
+    with av.open(str(tmp_path / "a.mp4")) as video:
+        stream = video.streams.video[0]
+        assert (stream.colorspace, stream.color_primaries, stream.color_trc) == (1, 1, 1), "all BT.709"
+        picture = next(video.decode(stream)).to_ndarray(format="rgb24", src_colorspace="ITU709")
+    assert np.abs(picture[16, 8::16] - 255 * COLOURS.numpy()).max() < 6
+
+
+@WITH_VIDEO
+def test_an_interrupted_video_keeps_the_earlier_one(tmp_path):
+    def stop(done):
+        if done == 99:  # when the encoder, which looks ahead, has written some
+            raise KeyboardInterrupt
+
+    (tmp_path / "a.mp4").write_text("the earlier one")
+    with pytest.raises(KeyboardInterrupt):
+        write_video(tmp_path / "a.mp4", 100 * [VIEW], lambda view: SHOWN, fps=10, scene_scale=1, progress=stop)
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["the earlier one"]
+
+
+def test_interrupted_images_do_not_block_the_next_call(tmp_path):
+    def stop(done):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_video(tmp_path / "frames", 2 * [VIEW], lambda view: SHOWN, fps=10, scene_scale=1, progress=stop)
+    write_video(tmp_path / "frames", 2 * [VIEW], lambda view: SHOWN, fps=10, scene_scale=1)
+    assert sorted(path.name for path in (tmp_path / "frames").iterdir()) == ["00001.png", "00002.png"]
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +68,7 @@ def render(*arguments: str):
 
 
 def boxes(data: bytes) -> list[tuple[bytes, bytes]]:
-    """Type and content of each box in a row of them."""
+    """Return type and content of consecutive boxes."""
     found, at = [], 0
     while at < len(data):
         size, kind = struct.unpack_from(">I4s", data, at)
@@ -39,7 +79,7 @@ def boxes(data: bytes) -> list[tuple[bytes, bytes]]:
 
 
 @WITH_VIDEO
-def test_a_film_of_panoramas_says_so_and_plays(folder, tmp_path):
+def test_a_panoramic_video_plays_and_has_spherical_metadata(folder, tmp_path):
     said = render(str(folder), "--to", str(tmp_path / "new" / "a.mp4"), "--seconds", "0.5", "--fps", "10", "--depth")
     assert said.exit_code == 0 and "5 frames of 32x16" in said.output, said.output
     for name in ("a.mp4", "a-depth.mp4"):
@@ -52,15 +92,15 @@ def test_a_film_of_panoramas_says_so_and_plays(folder, tmp_path):
 
 
 @WITH_VIDEO
-def test_a_film_in_perspective_is_no_panorama(folder, tmp_path):
+def test_a_perspective_video_has_no_spherical_metadata(folder, tmp_path):
     arguments = ("--camera", "perspective", "--width", "32", "--seconds", "0.2", "--fps", "10", "--path", "orbit")
     assert render(str(folder), *arguments, "--to", str(tmp_path / "a.mp4")).exit_code == 0
     assert b"GSpherical" not in (tmp_path / "a.mp4").read_bytes()
     assert render(str(folder), *arguments, "--height", "17", "--to", str(tmp_path / "b.mp4")).exit_code == 1
 
 
-def test_a_perspective_picture_shows_what_the_panorama_shows_there(folder, tmp_path):
-    """Both look along the same axis; the middle of the former is the middle of the latter, at another size."""
+def test_a_perspective_render_agrees_with_the_panorama(folder, tmp_path):
+    """Compare the centres of both, which look along the same axis."""
     same = ("--path", "dolly", "--seconds", "0.1", "--fps", "20", "--depth")
     assert render(str(folder), *same, "--to", str(tmp_path / "p")).exit_code == 0
     focal_of_panorama = 32 / (2 * np.pi)
@@ -89,18 +129,18 @@ def test_a_perspective_picture_shows_what_the_panorama_shows_there(folder, tmp_p
         (("--camera", "perspective", "--fov", "180"), "across 180 degrees"),
     ],
 )
-def test_what_cannot_be_rendered_says_why(arguments, message, folder, tmp_path):
+def test_invalid_options_are_refused(arguments, message, folder, tmp_path):
     said = render(str(folder), *arguments, "--to", str(tmp_path / "frames"))
     assert said.exit_code == 1 and message in " ".join((said.output + said.stderr).split())
 
 
-def test_pictures_are_not_mixed_with_others(folder, tmp_path):
+def test_a_folder_with_images_is_refused(folder, tmp_path):
     arguments = (str(folder), "--to", str(tmp_path / "f"), "--seconds", "0.1", "--fps", "20")
     assert render(*arguments).exit_code == 0
     assert "already holds images" in render(*arguments).stderr
 
 
-def test_another_place_or_other_data_can_be_named(folder, tmp_path):
+def test_errors_name_the_option_for_output_and_data(folder, tmp_path):
     (tmp_path / "file").touch()
     said = render(str(folder), "--to", str(tmp_path / "file"), "--seconds", "0.1", "--fps", "20")
     assert said.exit_code == 1 and f"cannot write {tmp_path}/file: " in said.stderr and "with --to" in said.stderr
@@ -108,7 +148,7 @@ def test_another_place_or_other_data_can_be_named(folder, tmp_path):
     assert said.exit_code == 1 and f"it is the data of {folder}: if it has moved" in said.stderr
 
 
-def test_films_of_other_kinds_are_refused_before_anything_is_drawn(folder, tmp_path):
+def test_other_video_formats_are_refused(folder, tmp_path):
     said = render(str(folder), "--to", str(tmp_path / "x.avi"))
     assert said.exit_code == 1 and "x.avi is not an .mp4" in " ".join(said.output.split())
     assert not list(tmp_path.iterdir())
