@@ -9,7 +9,7 @@ options     of the command
 ceilings    arithmetic (FLOP/s), memory (byte/s), crowding: see `padgs.apps.bench.ceilings.Ceilings`
 sizes       name -> one workload:
   width, height, gaussians (requested), views
-  counters    of the renderer, with ratios, anchors, parameters, and sizes of Gaussians in pixels
+  counters    of the renderer, with ratios, anchors, parameters, and the median size of Gaussians in pixels
   stages      stage -> seconds in one iteration (least CPU seconds of all threads; of a GPU kernel the mean), on the CPU
               wall, and floor and bound for stages with a cost model; on a GPU calls
   floor       sum of the least seconds of the stages at the ceilings
@@ -30,9 +30,9 @@ import torch
 
 from padgs import clock
 from padgs.apps.bench.ceilings import add_floors, measure_ceilings
-from padgs.apps.bench.stages import WARM_UP, stages_of
+from padgs.apps.bench.stages import WARM_UP, cpu_stages, device_stages
 from padgs.apps.bench.tile_counts import tiles_by_latitude
-from padgs.apps.bench.workload import OPTIONS, SIZES, Size, Workload, build, sigma_quantiles
+from padgs.apps.bench.workload import OPTIONS, SIZES, Size, Workload, build, median_sigma
 from padgs.native import cpu, cuda
 from padgs.render import Rendering, render
 
@@ -123,7 +123,7 @@ def measure_size(size: Size, options: BenchOptions, device: torch.device) -> dic
     if on_cpu:
         with clock.threads(1):
             entry["iteration_1_thread"] = clock.measure(lambda: next(records), repeats=repeats, warm_up=1)
-    stages = stages_of(work, repeats, device)
+    stages = cpu_stages(work, repeats) if on_cpu else device_stages(work, repeats, device)
     return {**dataclasses.asdict(size), "counters": _counters(work), "stages": stages, **entry, "peak_bytes": peak}
 
 
@@ -159,5 +159,5 @@ def _counters(work: Workload) -> dict[str, Any]:
         "contributing_per_pixel": counted["contributing"] / pixels,
         "evaluated_per_contributing": counted["evaluated"] / max(1, counted["contributing"]),
         "tiles_per_gaussian": counted["instances"] / max(1, counted["visible"]),
-        "sigma": sigma_quantiles(work),
+        "median_sigma": median_sigma(work),
     }

@@ -11,7 +11,6 @@ import re
 import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from typing import Any
 
 import torch
 
@@ -149,8 +148,3 @@ def kernel_name(signature: str) -> str:
     ('padgs::blend_kernel', 'Memcpy HtoD')
     """
     return re.split(r"[<(]", signature.removeprefix("void "))[0].strip() or signature
-
-
-def stages_of(work: Workload, rounds: int, device: torch.device) -> dict[str, dict[str, Any]]:
-    """Return the stages of an iteration on a device."""
-    return cpu_stages(work, rounds) if device.type == "cpu" else device_stages(work, rounds, device)

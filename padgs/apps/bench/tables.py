@@ -58,7 +58,7 @@ def _counters(size: dict[str, Any]) -> str:
     c, peak = size["counters"], size["peak_bytes"]
     return (
         f"  {c['anchors']:,} anchors, {c['gaussians']:,} Gaussians ({c['visible']:,} visible, median size "
-        f"{c['sigma']['p50']:.2f} px), {c['instances']:,} instances = {c['tiles_per_gaussian']:.2f} tiles each\n"
+        f"{c['median_sigma']:.2f} px), {c['instances']:,} instances = {c['tiles_per_gaussian']:.2f} tiles each\n"
         f"  pairs per pixel: {c['evaluated_per_pixel']:.1f} evaluated, {c['contributing_per_pixel']:.1f} contributing\n"
         f"  peak memory: {peak['frame'] / 1e6:.0f} MB for frames, {peak['training'] / 1e6:.0f} MB for training\n"
     )

@@ -71,17 +71,16 @@ class Workload:
         """The first view."""
         return self.scene.train[0]
 
-    def trainer(self, options: RenderOptions = OPTIONS, *, grows: bool = False, stage: Stage = nullcontext) -> Trainer:
+    def trainer(self, *, grows: bool = False, stage: Stage = nullcontext) -> Trainer:
         """Return a trainer with learning rates near 0, so that all iterations do the same work.
 
         Args:
-            options: of the renderer.
             grows: densify in every iteration; otherwise statistics are collected and never used.
             stage: see `Trainer`.
         """
         grow_from = 0 if grows else NEVER
         growth = GrowthOptions(statistics_from=0, grow_from=grow_from, grow_until=NEVER, grow_every=1 if grows else 100)
-        trainee = AnchorTrainee(self.model, options, growth=growth, rates=STILL, extent=1.0, iterations=NEVER)
+        trainee = AnchorTrainee(self.model, OPTIONS, growth=growth, rates=STILL, extent=1.0, iterations=NEVER)
         return Trainer(trainee, self.scene, Budget(NEVER), stage=stage)
 
     def to(self, device: torch.device) -> Workload:
@@ -124,13 +123,12 @@ def resident(scene: Scene, device: torch.device) -> Scene:
     return replace(moved, train=tuple(map(held, moved.train)))
 
 
-def sigma_quantiles(workload: Workload) -> dict[str, float]:
-    """Return quantiles of the decoded sizes (geometric mean of the axes) in pixels at the equator."""
+def median_sigma(workload: Workload) -> float:
+    """Return the median of the decoded sizes (geometric mean of the axes), in pixels at the equator."""
     with torch.no_grad():
         gaussians = workload.model.decode(workload.view).gaussians
-        angle = gaussians.scales.log().mean(-1).exp() / gaussians.means.norm(dim=-1)
-    pixels = (angle * workload.size.width / (2 * math.pi)).sort().values
-    return {f"p{percent}": float(pixels[percent * (len(pixels) - 1) // 100]) for percent in (5, 50, 95)}
+        angles = gaussians.scales.log().mean(-1).exp() / gaussians.means.norm(dim=-1)
+    return float(angles.median()) * workload.size.width / (2 * math.pi)
 
 
 def _view(name: str, size: Size, generator: torch.Generator) -> View:

@@ -70,7 +70,7 @@ def test_noise_is_stated_first(bench):
 
 @needs_library
 def test_a_gpu_has_the_same_report_with_kernels_and_what_is_measured_is_kept(monkeypatch):
-    monkeypatch.setattr(report, "stages_of", lambda *_: {"blend_kernel": {"seconds": 0.5, "calls": 2.0}})
+    monkeypatch.setattr(report, "cpu_stages", lambda *_: {"blend_kernel": {"seconds": 0.5, "calls": 2.0}})
     monkeypatch.setitem(SIZES, "quick", Size(32, 16, 50))
     kept = []
     made = report.measure_all(replace(QUICK, repeats=1), keep=lambda made: kept.append(json.dumps(made)))
