@@ -39,7 +39,6 @@ MARGIN_COLOR = ("#f1f3f6", "#20262f")  # behind marks of values beyond the axis
 PAPER = ("#ffffff", "#171b22")
 COLORS = tuple(light for light, _ in (*FAMILIES.values(), *OTHERS))
 ALPHA = {"main": 0.95, "variant": 0.45, "release": 0.6}  # role of a preset -> opacity of its marks
-OURS = ("padgs", "padgs_plus")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*")
 IMAGE_WIDTH = 512  # maximum pixels of an image in a chart
 DPI = 110
@@ -141,11 +140,6 @@ def color_of(preset: str, presets: Sequence[str]) -> str:
         return FAMILIES[method_of(preset)][0]
     others = [name for name in dict.fromkeys(map(method_of, (*presets, preset))) if name not in FAMILIES]
     return OTHERS[others.index(method_of(preset)) % len(OTHERS)][0]
-
-
-def weight_of(preset: str, role: str) -> str:
-    """Return the font weight of a preset's label: bold for main presets of ours, faint for variants and releases."""
-    return "faint" if role != "main" else "bold" if method_of(preset) in OURS else "normal"
 
 
 def dark_rules() -> str:

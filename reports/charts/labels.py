@@ -10,12 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from padgs.reports.charts.drawing import INK, SOFT
+from padgs.reports.methods import method_of
 
 GAPS = (2.0, 5.0, 9.0, 14.0, 20.0, 28.0, 38.0, 50.0, 65.0, 85.0, 110.0, 140.0, 180.0)  # pixels from the mark's edge
 DIRECTIONS = 24
 BESIDE = 7.0  # pixels between a mark and its label; a label further away has a leader line
 CLEARANCE = 1.5  # pixels around a label
 STEP = 5.0  # pixels between two points of a line that labels avoid
+OURS = ("padgs", "padgs_plus")  # methods with bold labels
 FONT_SIZES = {"bold": 9.0, "normal": 8.5, "faint": 7.0}  # points, by weight
 # Costs in pixels of distance:
 ON_A_MARK, ON_A_LINE = 0.8, 4.0  # a covered square pixel of another mark; a covered point of a line
@@ -60,8 +62,9 @@ def write_labels(
         text.set(ha="center", va="center", linespacing=1.05, zorder=6, weight="normal" if soft else label.weight)
         extent, at, radius = text.get_window_extent(), to_pixels(label.at), label.radius * points
         boxes, costs = _candidates(at, radius, np.array([extent.width, extent.height]))
-        within = (boxes[:, :2] >= inside.min).all(1) & (boxes[:, 2:] <= inside.max).all(1)
-        boxes, costs = boxes[within & ~_overlap(boxes, taken).any(1)], costs[within & ~_overlap(boxes, taken).any(1)]
+        free = (boxes[:, :2] >= inside.min).all(1) & (boxes[:, 2:] <= inside.max).all(1)
+        free &= ~_overlap(boxes, taken).any(1)
+        boxes, costs = boxes[free], costs[free]
         if not len(boxes):
             text.remove()
             continue
@@ -76,6 +79,11 @@ def write_labels(
             panel.plot(*panel.transData.inverted().transform(leader).T, color=SOFT[0], linewidth=0.5, zorder=1.6)
         written.append(text)
     return written
+
+
+def weight_of(preset: str, role: str) -> str:
+    """Return the font weight of a preset's label: bold for main presets of ours, faint for variants and releases."""
+    return "faint" if role != "main" else "bold" if method_of(preset) in OURS else "normal"
 
 
 def _candidates(at: NDArray, radius: float, size: NDArray) -> tuple[NDArray, NDArray]:

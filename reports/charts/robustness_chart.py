@@ -10,21 +10,14 @@ from pandas import DataFrame
 
 from padgs.reports import methods
 from padgs.reports.charts.axis import Axis
-from padgs.reports.charts.drawing import INK, Chart, figure, lay_out, styled, tip, weight_of
-from padgs.reports.charts.labels import Label, write_labels
+from padgs.reports.charts.drawing import INK, Chart, figure, lay_out, styled, tip
+from padgs.reports.charts.labels import Label, weight_of, write_labels
 from padgs.reports.robustness import QUALITY, Stress, StressedMethod, all_stress
 from padgs.reports.table import MISSING, Cell
 
 STATUS_LETTERS = {
-    "oom": "M",
-    "timeout": "T",
-    "nan": "N",
-    "diverged": "V",
-    "collapsed": "C",
-    "exploded": "E",
-    "degenerate": "D",
-    "silent": "S",
-    "rejected": "R",
+    **{"oom": "M", "timeout": "T", "nan": "N", "diverged": "V", "collapsed": "C"},
+    **{"exploded": "E", "degenerate": "D", "silent": "S", "rejected": "R"},
 }
 COLORS = "cividis"  # dark where nothing is left; readable for colour-blind readers
 LIGHT, DARK = "#fafafa", "#101010"  # numbers on dark and on bright cells

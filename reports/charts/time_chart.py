@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from padgs.reports import methods
 from padgs.reports.charts.axis import Axis
-from padgs.reports.charts.drawing import ALPHA, Chart, color_of, figure, lay_out, styled, tip, weight_of
-from padgs.reports.charts.labels import Label, write_labels
+from padgs.reports.charts.drawing import ALPHA, Chart, color_of, figure, lay_out, styled, tip
+from padgs.reports.charts.labels import Label, weight_of, write_labels
 from padgs.reports.charts.trade_off import TradeOff
-from padgs.reports.selection import settings
+from padgs.reports.selection import Setting, settings
 
 SIZE = (10.6, 4.2)  # inches
 LOOKS: dict[str, dict[str, Any]] = {  # role of a preset -> look of its line
@@ -23,16 +21,6 @@ LOOKS: dict[str, dict[str, Any]] = {  # role of a preset -> look of its line
 }
 MARKERS = {-1: "v", 0: "o", 1: "^"}  # end of the axis that the last point lies beyond -> its marker
 RADIUS = 2.5  # points, of the mark at the end of a run
-
-
-@dataclass(frozen=True)
-class Curve:
-    """Held-out PSNR of a setting, as means over its runs, evaluation by evaluation."""
-
-    title: str
-    preset: str
-    seconds: Sequence[float]
-    psnr: Sequence[float]
 
 
 @styled
@@ -45,25 +33,24 @@ def chart(trade_off: TradeOff) -> Chart | None:
     if not curves:
         return None
     made, axes = figure(1, 1, *SIZE)
-    panel, presets = axes[0, 0], [curve.preset for curve in curves]
-    x_axis = Axis.of([s for curve in curves for s in curve.seconds if s > 0], logarithmic=True)
-    y_axis = Axis.of([value for curve in curves for value in curve.psnr[len(curve.psnr) // 2 :]], worse=-1)
+    panel, presets = axes[0, 0], [setting.preset for setting, _, _ in curves]
+    x_axis = Axis.of([s for _, seconds, _ in curves for s in seconds if s > 0], logarithmic=True)
+    y_axis = Axis.of([value for _, _, psnr in curves for value in psnr[len(psnr) // 2 :]], worse=-1)
     x_axis.apply(panel.xaxis)
     y_axis.apply(panel.yaxis)
     labels, marks, lines = [], [], []
-    for curve in curves:
-        role = trade_off.role(curve.preset)
-        look = {"color": color_of(curve.preset, presets), "alpha": ALPHA[role]} | LOOKS[role]
-        panel.plot(curve.seconds, curve.psnr, **look)
-        seconds, psnr = curve.seconds[-1], curve.psnr[-1]
-        side, end = y_axis.side(psnr), (seconds, y_axis.position(psnr))
-        gid = tip(f"{curve.title}\n{psnr:.2f} dB after {seconds:.0f} s")
+    for setting, seconds, psnr in curves:
+        title, preset, role = setting.title, setting.preset, trade_off.role(setting.preset)
+        look = {"color": color_of(preset, presets), "alpha": ALPHA[role]} | LOOKS[role]
+        panel.plot(seconds, psnr, **look)
+        side, end = y_axis.side(psnr[-1]), (seconds[-1], y_axis.position(psnr[-1]))
+        gid = tip(f"{title}\n{psnr[-1]:.2f} dB after {seconds[-1]:.0f} s")
         panel.plot(*end, **look, marker=MARKERS[side], markersize=2 * RADIUS, clip_on=False, gid=gid)
         marks.append((*end, RADIUS))
-        lines.append([(s, value) for s, value in zip(curve.seconds, curve.psnr, strict=True) if s > 0])
+        lines.append([(s, value) for s, value in zip(seconds, psnr, strict=True) if s > 0])
         if role != "release" or side:
-            text = methods.short(curve.title, curve.preset) + (f"\n{psnr:.1f} dB" if side else "")
-            labels.append(Label(text, end, RADIUS, weight_of(curve.preset, role)))
+            text = methods.short(title, preset) + (f"\n{psnr[-1]:.1f} dB" if side else "")
+            labels.append(Label(text, end, RADIUS, weight_of(preset, role)))
     panel.set_xlabel("training time in seconds, evaluations not counted")
     panel.set_ylabel("PSNR of a held-out view, dB ↑")
     title = f"{trade_off.title}\nquality over training time, dashed: as released"
@@ -72,7 +59,8 @@ def chart(trade_off: TradeOff) -> Chart | None:
     return Chart(trade_off.name.replace("chart_", "time_", 1), title, made, trade_off.notes)
 
 
-def _curves(trade_off: TradeOff) -> list[Curve]:
+def _curves(trade_off: TradeOff) -> list[tuple[Setting, list[float], list[float]]]:
+    """Return seconds and PSNR of each setting, evaluation by evaluation, as means over its runs with a complete log."""
     found = []
     for setting in settings(trade_off.runs):
         logs = [log for log in setting.runs["log"] if log["psnr"]]
@@ -80,5 +68,5 @@ def _curves(trade_off: TradeOff) -> list[Curve]:
         complete = [log for log in logs if len(log["psnr"]) == count]  # a run that was cut short would cut the mean
         if complete:
             seconds, psnr = (np.mean([log[name] for log in complete], 0).tolist() for name in ("seconds", "psnr"))
-            found.append(Curve(setting.title, setting.preset, seconds, psnr))
+            found.append((setting, seconds, psnr))
     return found

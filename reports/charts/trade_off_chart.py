@@ -12,20 +12,8 @@ from typing import Any
 from padgs.reports import methods
 from padgs.reports.charts import time_chart
 from padgs.reports.charts.axis import Axis
-from padgs.reports.charts.drawing import (
-    ALPHA,
-    INK,
-    PAPER,
-    SOFT,
-    Chart,
-    color_of,
-    figure,
-    lay_out,
-    styled,
-    tip,
-    weight_of,
-)
-from padgs.reports.charts.labels import Label, Line, write_labels
+from padgs.reports.charts.drawing import ALPHA, INK, PAPER, SOFT, Chart, color_of, figure, lay_out, styled, tip
+from padgs.reports.charts.labels import Label, Line, weight_of, write_labels
 from padgs.reports.charts.trade_off import Point, TradeOff, pareto, trade_offs
 from padgs.reports.measures import COSTS, Measure
 from padgs.reports.selection import RunSet
