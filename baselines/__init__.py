@@ -1,6 +1,6 @@
-"""The methods that are compared, one file each; PaD-GS, which they are compared with, has a room (padgs/methods/anchors).
+"""Registry of the compared methods, one file each; PaD-GS and padgs_plus are packages of `padgs.methods`.
 
-Packages elsewhere add theirs by entry points, see docs/your_own_method.
+Other packages add methods by entry points, see docs/your_own_method.
 """
 
 from importlib.metadata import entry_points

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from padgs.data.perspectives import perspective_scene, solid_angle, square_lens
 from padgs.geometry.camera import Panorama, Pinhole
-from padgs.methods.splats.method import SplatMethod, refuse_polar_threshold
-from padgs.methods.splats.trainee import SplatTrainee
+from padgs.methods.splats.method import SplatMethod
+from padgs.methods.splats.model import SplatModel
 from padgs.render import RenderConfig, RenderOptions
 from padgs.render.contract import check_camera
 from padgs.render.cubemap import FACES, FINENESS
@@ -33,7 +33,7 @@ def of_cut_views(options: RenderOptions) -> RenderOptions:
     return replace(options, cubemap=False, face_size=None).on_finer_pixels(FINENESS)
 
 
-class CutTrainee(SplatTrainee):
+class CutModel(SplatModel):
     """Splats that train on views cut out of panoramas, and finer than those."""
 
     def render_options(self, view: View) -> RenderOptions:
@@ -47,7 +47,7 @@ class CutTrainee(SplatTrainee):
 class Cubemap3DGSMethod(SplatMethod):
     """See `padgs.training.method.Method`."""
 
-    TRAINEE = CutTrainee
+    MODEL = CutModel
     CUT_FINENESS = FINENESS
     RENDER = RenderConfig(projection="pinhole", cubemap=True)
     _views_each = 1  # training views of an iteration; of the scene of `fit`
@@ -80,7 +80,6 @@ class Cubemap3DGSMethod(SplatMethod):
                     f"train.{learned} is {LEARNED}, but each of the views that are cut from one photograph would learn "
                     f"its own; leave it at {GIVEN}, or take omnigs"
                 )
-        refuse_polar_threshold(self.options, "perspective views have no poles")
         super()._refuse_impossible()
         check_camera(self.lens(Panorama(8, 4)), of_cut_views(self.render_config.options(scene_scale=1.0)))
 

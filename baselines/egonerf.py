@@ -6,16 +6,16 @@ from dataclasses import dataclass, fields, replace
 
 import torch
 
-from padgs.methods.egonerf.model import EgoNeRF
-from padgs.methods.egonerf.options import EgoNeRFOptions
-from padgs.methods.egonerf.ray_trainer import RayTrainer
-from padgs.methods.egonerf.trainee import EgoNeRFTrainee, EgoNeRFTraining
+from padgs.methods.egonerf.field import EgoNeRF
+from padgs.methods.egonerf.model import EgoNeRFModel, RayTrainer
+from padgs.methods.egonerf.options import EgoNeRFOptions, EgoNeRFTraining
 from padgs.render import RenderConfig
 from padgs.scene import Scene
+from padgs.training.options import Budget
 from padgs.training.loop import Stage
 from padgs.training.method import Method
+from padgs.training.options import TrainOptions
 from padgs.training.model import State
-from padgs.training.options import Budget, TrainOptions
 
 BACKENDS = ("auto", "torch")
 
@@ -56,20 +56,17 @@ class EgoNeRFMethod(Method):
         """There is nothing to leave out."""
         raise ValueError("egonerf has no Gaussians that could be left out, as need does; take a method that has")
 
-    def build_model(self, scene: Scene, iterations: int) -> EgoNeRFTrainee:
-        """See `Method.build_model`."""
-        return EgoNeRFTrainee(EgoNeRF.from_scene(scene, self.options, self.seed), self.options, iterations)
+    def build_model(self, scene: Scene, iterations: int) -> EgoNeRFModel:
+        return EgoNeRFModel(EgoNeRF.from_scene(scene, self.options, self.seed), self.options, iterations)
 
-    def restore(self, state: State) -> EgoNeRFTrainee:
-        """See `Method.restore`."""
+    def restore(self, state: State) -> EgoNeRFModel:
         stored = state.of_model()
         centre = torch.tensor(stored.values["centre"], dtype=torch.float64)
         model = EgoNeRF(self.options, centre, *(stored.values[name] for name in ("unit", "travel", "kind")))
         model = model.to(next(iter(stored.tensors.values())).device)
-        return EgoNeRFTrainee(model, self.options, self.options.environment_pretraining + 1)
+        return EgoNeRFModel(model, self.options, self.options.environment_pretraining + 1)
 
-    def build_trainer(self, trainee: EgoNeRFTrainee, scene: Scene, budget: Budget, stage: Stage) -> RayTrainer:
-        """See `Method.build_trainer`."""
+    def build_trainer(self, trainee: EgoNeRFModel, scene: Scene, budget: Budget, stage: Stage) -> RayTrainer:
         return RayTrainer(trainee, scene, budget, self.train_options, self.seed, rays=self.options.rays, stage=stage)
 
     def _refuse_impossible(self) -> None:

@@ -1,25 +1,68 @@
-"""ODGS: explicit 3D Gaussians on the tangent plane of each mean, scaled to the pixels of the panorama.
+"""ODGS (Lee et al. 2024): explicit Gaussians on the tangent plane of each mean, scaled to the pixels of the panorama.
 
-That footprint is the one through the Jacobian of the panorama (tests/baselines/test_odgs.py), so the method renders
-with projection `erp`. What is its own is a densification with half the threshold of 3DGS, which may rise towards the
-poles (`polar_threshold`). conf/method/odgs_release.yaml has what its released code does otherwise.
+This footprint equals the one through the Jacobian of the panorama (tests/baselines/test_odgs.py), so the method renders
+with projection `erp`. Its densification has half the threshold of 3DGS.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Any
 
+from padgs.checks import check
+from padgs.gaussians import Gaussians
 from padgs.methods.splats.method import SplatMethod, SplatOptions
+from padgs.methods.splats.model import SplatModel
+from padgs.render import Rendering
+from padgs.scene import View
 
 
 @dataclass(frozen=True)
 class ODGSOptions(SplatOptions):
-    """As published, where the threshold is the same at all latitudes."""
+    """As published; the last two options are deviations of the released code (conf/method/odgs_release.yaml)."""
 
     gradient_threshold: float = 1e-4
+    pixel_bias: float = 0.0  # pixels that means are rendered too far right and down; released: 0.5
+    extent_margin: float = 0.0  # world units added to the extent that sizes are compared with; released: 100
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(self, "finite", math.isfinite, "pixel_bias")
+        check(self, ">= 0 and finite", lambda margin: 0 <= margin < math.inf, "extent_margin")
+
+
+class ODGSModel(SplatModel):
+    """Splats with the deviations of the released code."""
+
+    def __init__(self, *args: Any, pixel_bias: float, extent_margin: float, **kwargs: Any) -> None:
+        """Take arguments of `SplatModel` and the two options of `ODGSOptions`."""
+        super().__init__(*args, **kwargs)
+        self.densifier.extent += extent_margin
+        self._pixel_bias = pixel_bias
+
+    def _rendered(self, gaussians: Gaussians, view: View, **offsets: Any) -> Rendering:
+        if self._pixel_bias:
+            means, given = gaussians.means, offsets.get("mean_offsets")
+            bias = 2 * self._pixel_bias / means.new_tensor([view.camera.width, view.camera.height])
+            offsets["mean_offsets"] = bias.expand(len(means), 2) if given is None else given + bias
+        return super()._rendered(gaussians, view, **offsets)
 
 
 class ODGSMethod(SplatMethod):
     """See `padgs.training.method.Method`."""
 
     Options = ODGSOptions
+    MODEL = ODGSModel
+
+    def _model_of(self, *args: Any, **more: Any) -> SplatModel:
+        options = self.options
+        return super()._model_of(*args, pixel_bias=options.pixel_bias, extent_margin=options.extent_margin, **more)
+
+    def _refuse_impossible(self) -> None:
+        super()._refuse_impossible()
+        if self.options.pixel_bias and self.render_config.projection != "erp":
+            raise ValueError(
+                f"method.pixel_bias is a deviation of render.projection=erp, not {self.render_config.projection}; "
+                "set method.pixel_bias=0"
+            )

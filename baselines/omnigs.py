@@ -1,7 +1,7 @@
-"""OmniGS: explicit 3D Gaussians with spherical harmonics, drawn through the Jacobian of the panorama.
+"""OmniGS (Li et al. 2025): explicit Gaussians with spherical harmonics, rendered through the Jacobian of the panorama.
 
-Also the first row of the ablation (Table 3). The defaults of all explicit Gaussians are the method as described;
-conf/method/omnigs_release.yaml switches on what its released code does otherwise.
+It is also the first row of the ablation (Table 3). conf/method/omnigs_release.yaml has the deviations of its released
+code.
 """
 
 from __future__ import annotations

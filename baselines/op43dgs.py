@@ -1,16 +1,76 @@
-"""OP43DGS ("optimal projection"): explicit 3D Gaussians, each drawn on the tangent plane of the sphere at its mean.
+"""OP43DGS ("optimal projection", Huang et al. 2024): explicit Gaussians on the tangent plane of the sphere at a mean.
 
-With exact bounds, this is the method as it should be. conf/method/op43dgs_release.yaml has the bounds of its released
-code, which grow with the distance of a Gaussian in scene units, and the memory that it then runs out of.
+conf/method/op43dgs_release.yaml has the deviations of its released code: bounds that grow with the distance of a
+Gaussian in world units, a low-pass that does not depend on the image size, and the memory that both exhaust.
 """
 
 from __future__ import annotations
 
-from padgs.methods.splats.method import SplatMethod
-from padgs.render import RenderConfig
+from dataclasses import dataclass, replace
+from typing import Any
+
+from padgs.checks import check
+from padgs.gaussians import Gaussians
+from padgs.methods.splats.method import SplatMethod, SplatOptions
+from padgs.methods.splats.model import SplatModel
+from padgs.render import RenderConfig, Rendering, RenderOptions
+from padgs.scene import View
+
+RELEASED_FOCAL = 512  # pixels per radian of its tangent planes, whatever the image
+INSTANCE_BYTES = 24  # per (Gaussian, tile) pair: a key of 8 bytes and a value of 4, before and after sorting
+
+
+@dataclass(frozen=True)
+class OP43DGSOptions(SplatOptions):
+    """As published; the options here are deviations of the released code."""
+
+    fixed_low_pass: bool = False  # render.low_pass is in pixels of `RELEASED_FOCAL`
+    memory_cap: int | None = None  # bytes for all (Gaussian, tile) pairs of an image; None: unlimited
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(self, "at least 1 byte, or none", lambda cap: cap is None or cap >= 1, "memory_cap")
+
+
+class OP43DGSModel(SplatModel):
+    """Splats with the deviations of the released code."""
+
+    def __init__(self, *args: Any, fixed_low_pass: bool, memory_cap: int | None, **kwargs: Any) -> None:
+        """Take arguments of `SplatModel` and the options of `OP43DGSOptions`."""
+        super().__init__(*args, **kwargs)
+        self._fixed_low_pass, self._memory_cap = fixed_low_pass, memory_cap
+
+    def render_options(self, view: View) -> RenderOptions:
+        """Return the renderer options for a view."""
+        options = super().render_options(view)
+        if not self._fixed_low_pass:
+            return options
+        return replace(options, low_pass=options.low_pass * (view.camera.focal / RELEASED_FOCAL) ** 2)
+
+    def _rendered(self, gaussians: Gaussians, view: View, **offsets: Any) -> Rendering:
+        rendering = super()._rendered(gaussians, view, **offsets)
+        instances = rendering.counters.get("instances", 0) if self._memory_cap is not None else 0
+        needed = instances * INSTANCE_BYTES
+        if self._memory_cap is not None and needed > self._memory_cap:
+            raise MemoryError(
+                f"{instances:,} (Gaussian, tile) instances of {INSTANCE_BYTES} bytes are {needed:,} bytes at once; "
+                f"memory_cap is {self._memory_cap:,}"
+            )
+        return rendering
 
 
 class OP43DGSMethod(SplatMethod):
     """See `padgs.training.method.Method`."""
 
+    Options = OP43DGSOptions
+    MODEL = OP43DGSModel
     RENDER = RenderConfig(projection="tangent")
+
+    @property
+    def has_smoothing_filter(self) -> bool:
+        """True if the low-pass is the same angle for every camera."""
+        return self.options.fixed_low_pass
+
+    def _model_of(self, *args: Any, **more: Any) -> SplatModel:
+        options = self.options
+        return super()._model_of(*args, fixed_low_pass=options.fixed_low_pass, memory_cap=options.memory_cap, **more)

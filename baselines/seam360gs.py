@@ -18,7 +18,7 @@ from padgs.geometry.camera import RayTable
 from padgs.geometry.lens import AXES
 from padgs.methods.calibration.dual_lens import DualLens
 from padgs.methods.calibration.splats import CalibratedMethod
-from padgs.methods.splats.method import SplatOptions, refuse_polar_threshold
+from padgs.methods.splats.method import SplatOptions
 from padgs.render import RenderConfig
 from padgs.render.contract import check_camera
 from padgs.scene import Scene
@@ -54,7 +54,6 @@ class Seam360GSMethod(CalibratedMethod):
     def _refuse_impossible(self) -> None:
         super()._refuse_impossible()
         check_camera(RayTable(torch.zeros(1, 1, 3), focal=1.0), self.render_config.options(scene_scale=1.0))
-        refuse_polar_threshold(self.options, "a view is made of two, each by a lens of its own")
 
     def _as_given(self, scene: Scene) -> DualLens:
         return self._as_stored({"unit": scene.scale})

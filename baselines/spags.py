@@ -1,8 +1,7 @@
-"""SPaGS: explicit Gaussians seen exactly along each ray, blended without sorting, densified by their 3D gradient.
+"""SPaGS (Li et al. 2025): explicit Gaussians evaluated exactly along each ray, blended without sorting.
 
-What is its own: projection `ray`, hybrid transparency, a Gaussian that reaches the near sphere is not drawn at all (how
-it renders, `RENDER`); the 3D filter of its training views (variance 0.2 (r / f)^2), and a densification signal that
-knows no image plane. spags_sorted blends in the order of the means instead.
+Also its own: a Gaussian that reaches the near sphere is culled as a whole, a 3D smoothing filter of the training views
+(variance 0.2 (r / f)^2), and densification by the gradient in space. spags_sorted blends in the order of the means.
 """
 
 from __future__ import annotations
@@ -15,15 +14,15 @@ from padgs.render import RenderConfig
 
 @dataclass(frozen=True)
 class SPaGSOptions(SplatOptions):
-    """The published schedule; `opacity_decay` is what two copies of the code have."""
+    """The published schedule; `opacity_decay` is the value in two copies of the code."""
 
     densify_from: int = 200
-    signal: str = "space_absolute"
+    positional_gradient: str = "space_absolute"
     gradient_threshold: float = 5e-5
     sample_clones: bool = True
     reset_opacity: float = 0.1
     opacity_decay: float = 0.001
-    filter_pixels: float = 0.2
+    smoothing_filter: float = 0.2
 
 
 class SPaGSMethod(SplatMethod):

@@ -3,7 +3,7 @@
 import torch
 from tiny_scene import tiny_scene
 
-from padgs.methods.splats.model import Splats
+from padgs.methods.splats.splats import Splats
 
 
 def random_splats(degree: int, generator: torch.Generator) -> Splats:

@@ -18,9 +18,9 @@ from padgs.data.synthetic.options import SyntheticOptions
 from padgs.evaluation.protocols import PROTOCOLS, ROAM_360_BOTTOM_CROP
 from padgs.methods.anchors.growth import PUBLISHED_THRESHOLD
 from padgs.methods.anchors.method import PaDGSMethodOptions
-from padgs.methods.anchors.model import PaDGSOptions
+from padgs.methods.anchors.anchors import PaDGSOptions
 from padgs.methods.plus.method import PlusMethod
-from padgs.methods.plus.options import PlusOptions
+from padgs.methods.plus.method import PlusOptions
 from padgs.multirun.composition import composing, configuration, method_choices, variant_choices
 from padgs.multirun.overrides import expand, lenient, missing_plugin, quoted
 from padgs.registry import lookup

@@ -150,7 +150,7 @@ def test_the_packages_form_few_levels_with_few_edges():
     [
         ("padgs.geometry.lens", "from padgs.scene import View", "core is above geometry"),
         ("padgs.geometry.lens", "def f():\n    from padgs import training", "training is above geometry"),
-        ("padgs.render.contract", "from padgs.methods.anchors.model import PaDGS", "methods is above render"),
+        ("padgs.render.contract", "from padgs.methods.anchors.anchors import PaDGS", "methods is above render"),
         ("padgs.shiny.module", "import torch", "padgs.shiny.module is in no layer"),
         ("padgs.training.loop", "import hydra", "only padgs.multirun and padgs.cli import hydra"),
         ("padgs.baselines.odgs", "from baselines.spags import SPaGSMethod", "import padgs.baselines.spags"),

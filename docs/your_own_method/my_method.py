@@ -9,7 +9,7 @@ import torch
 
 from padgs.checks import check
 from padgs.methods.splats.method import SplatMethod, SplatOptions
-from padgs.methods.splats.trainee import SplatTrainee
+from padgs.methods.splats.model import SplatModel
 from padgs.render import RenderConfig
 from padgs.scene import Scene
 
@@ -31,7 +31,7 @@ class MyMethod(SplatMethod):
     Options = MyOptions
     RENDER = RenderConfig(projection="ray")
 
-    def build_model(self, scene: Scene, iterations: int) -> SplatTrainee:
+    def build_model(self, scene: Scene, iterations: int) -> SplatModel:
         """See `Method.build_model`."""
         trainee = super().build_model(scene, iterations)
         with torch.no_grad():

@@ -10,7 +10,7 @@ import torch
 
 from padgs.clock import Lap, timed
 from padgs.evaluation.evaluate import evaluate
-from padgs.methods.splats.trainee import SplatTrainee
+from padgs.methods.splats.model import SplatModel
 from padgs.need import refine
 from padgs.need.calibration import RULES, calibration_split
 from padgs.need.plan import Plan, Step, loss, narrowest, plan, plan_degree, smallest
@@ -24,7 +24,7 @@ from padgs.scene import View
 from padgs.training.loop import Trainer
 from padgs.training.model import Prunable, State
 from padgs.training.options import Budget
-from padgs.training.worth import most_wanted, worth
+from padgs.methods.splats.importance import most_important, importance_scores
 
 FOLDER = "need"  # in that of the run
 FRAMES = 10  # timed; the smallest time counts, since other programs only add to it
@@ -79,7 +79,7 @@ class Search:
             self._say(f"{len(self.steps)} steps were made before")
         self._make_all(lambda: plan(self.steps))
         number = smallest(self.steps, epsilon)
-        if isinstance(self._model, SplatTrainee):
+        if isinstance(self._model, SplatModel):
             degree = self._model.splats.degree
             self._make_all(lambda: plan_degree(self.steps, number, degree, epsilon))
         return narrowest(self.steps, number, epsilon)
@@ -116,7 +116,7 @@ class Search:
     def model_of(self, number: int) -> Prunable:
         """The model of a step."""
         model, state = self._resumed(), self.folder.state(number, self._device)
-        if isinstance(model, SplatTrainee) and (degree := self.steps[number].degree) is not None:
+        if isinstance(model, SplatModel) and (degree := self.steps[number].degree) is not None:
             model.truncate(degree)
         model.load_state(State(state.tensors, state.values["model"]))
         return model
@@ -144,13 +144,13 @@ class Search:
         lap, before, number = Lap(), (0.0, 0.0), len(self.steps)
         model = self._model if wanted.parent is None else self.model_of(wanted.parent)
         if wanted.kind == "waste":
-            shown = worth(model, self.run.scene.train).peak > 0
+            shown = importance_scores(model, self.run.scene.train).peak > 0
             model.keep(shown)
         else:
-            if isinstance(model, SplatTrainee) and wanted.degree is not None:
+            if isinstance(model, SplatModel) and wanted.degree is not None:
                 model.truncate(wanted.degree)
             if wanted.rows is not None:
-                model.keep(most_wanted(worth(model, self.run.scene.train), wanted.rows))
+                model.keep(most_important(importance_scores(model, self.run.scene.train), wanted.rows))
             before = self._refine(model, self._views, f"step {number}: {wanted}", number, stop)
         step = self._measured(model, wanted)
         seconds, cpu_seconds = _in_all(before, lap)
@@ -196,7 +196,7 @@ class Search:
             parent=wanted.parent,
             depth=0 if wanted.parent is None else self.steps[wanted.parent].depth + 1,
             rows=next(iter(model.counts().values())),
-            blended=worth(model, scene.train).blended,
+            blended=importance_scores(model, scene.train).blended,
             bytes=model.size().bytes,
             frame_ms=1000 * min(times),
             marks=marks,

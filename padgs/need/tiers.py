@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 
 from padgs.apps.export.splat_file import CONVERTED, CONVERTER, read_splats, write_splats
-from padgs.methods.anchors.model import PaDGS
-from padgs.methods.anchors.trainee import AnchorTrainee
-from padgs.methods.splats.model import Splats
-from padgs.methods.splats.trainee import SplatTrainee
+from padgs.methods.anchors.anchors import PaDGS
+from padgs.methods.anchors.model import AnchorModel
+from padgs.methods.splats.splats import Splats
+from padgs.methods.splats.model import SplatModel
 from padgs.training.model import Prunable
 
 Model = Splats | PaDGS
@@ -44,9 +44,9 @@ def model_of(trainee: Prunable) -> Model:
         TypeError: it is of a kind that has no files here.
     """
     match trainee:
-        case SplatTrainee():
+        case SplatModel():
             return trainee.splats
-        case AnchorTrainee():
+        case AnchorModel():
             return trainee.model
     raise TypeError(f"{type(trainee).__name__} has no files to compare: those of splats and of anchors have")
 

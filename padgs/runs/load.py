@@ -174,7 +174,7 @@ class LoadedRun:
         finer = max(1.0, camera.focal / trained.focal)
         if not isinstance(camera, Panorama):
             finer /= self.method.CUT_FINENESS
-        if not (settings.low_pass_kind == "fixed" or self.method.is_drawn_no_finer):
+        if not (settings.low_pass_kind == "fixed" or self.method.has_smoothing_filter):
             settings = replace(settings, low_pass=settings.low_pass * finer**2)
         return self.method if settings == self.config.render else self.method.with_renderer(settings)
 

@@ -198,7 +198,7 @@ class Method(ABC):
         return model
 
     @property
-    def is_drawn_no_finer(self) -> bool:
+    def has_smoothing_filter(self) -> bool:
         """Whether the model is drawn no finer than its training views were by itself, whatever the filter of a view."""
         return False
 

@@ -7,12 +7,13 @@ from tiny_scene import tiny_scene
 
 from padgs.baselines.egonerf import EgoNeRFMethod, EgoNeRFMethodOptions
 from padgs.data.synthetic import SyntheticOptions, generate
-from padgs.methods.egonerf.model import EgoNeRF
-from padgs.methods.egonerf.trainee import EgoNeRFTrainee
+from padgs.methods.egonerf.field import EgoNeRF
+from padgs.methods.egonerf.model import EgoNeRFModel
 from padgs.render import RenderConfig
-from padgs.runs.run import build_method
+from padgs.runs.session import build
 from padgs.scene import Scene, View
-from padgs.training.options import Budget, TrainOptions
+from padgs.training.options import Budget
+from padgs.training.options import TrainOptions
 
 SMALL = EgoNeRFMethodOptions(
     radial_nodes=16,
@@ -61,7 +62,7 @@ def test_the_room_is_learned(room):
 
 
 def test_the_small_setting_has_less_than_a_million_parameters():
-    scene, small = tiny_scene(), build_method(composed("method=egonerf_small"))
+    scene, small = tiny_scene(), build(composed("method=egonerf_small"))
     next(small.fit(scene, Budget(1)))
     assert small.size().parameters <= 1_000_000
     assert small.size().bytes == 4 * small.size().parameters
@@ -147,13 +148,13 @@ def test_variation_smooths_the_planes():
     for weight in (0.0, 1e4):
         trained = method(density_variation=weight, appearance_variation=0.0)
         list(trained.fit(scene, Budget(20)))
-        roughness.append(trained.model.model.density.variation().item())
+        roughness.append(trained.model.field.density.variation().item())
     assert roughness[1] < 0.5 * roughness[0]
 
 
 def test_published_learning_rates():
     model = EgoNeRF.from_scene(tiny_scene(), SMALL)
-    groups = {group.name: group for group in EgoNeRFTrainee(model, SMALL, 100_000).groups()}
+    groups = {group.name: group for group in EgoNeRFModel(model, SMALL, 100_000).groups()}
     starts = {"density": 0.02, "appearance": 0.02, "shader": 1e-3, "environment": 5e-3}
     assert groups.keys() == starts.keys()
     for name, start in starts.items():
@@ -182,7 +183,7 @@ def test_the_environment_can_learn_alone_first():
     records, moved, rates = trained.fit(tiny_scene(), Budget(7)), [], []
     before = {name: value.clone() for name, value in EgoNeRF.from_scene(tiny_scene(), SMALL).named_parameters()}
     for _ in records:
-        now = dict(trained.model.model.named_parameters())
+        now = dict(trained.model.field.named_parameters())
         moved.append({name for name, value in now.items() if not torch.equal(value, before[name])})
         rates.append([group["lr"] for group in trained._trainer._optimizer.adam.param_groups][::3])
         before = {name: value.clone() for name, value in now.items()}
@@ -204,7 +205,7 @@ def test_alone_the_environment_becomes_the_mean_panorama(room):
     rays = room.train[0].camera.rays().reshape(-1, 3)
     directions = torch.cat([rays @ rotation for rotation in rotations])
     up = directions[:, 2] > 0.7
-    learned = trained.model.model.environment(directions[up]).mean(0)
+    learned = trained.model.field.environment(directions[up]).mean(0)
     assert torch.allclose(learned, colors[up].mean(0), atol=0.05)
 
 
@@ -225,7 +226,7 @@ def test_published_weights_of_the_variation_fall_like_the_rates():
         for plane in model.appearance.planes:
             plane.mul_(3)  # at first both vary alike, and could be mistaken for one another
     density, appearance = model.density.variation().item(), model.appearance.variation().item()
-    trainable = EgoNeRFTrainee(model, SMALL, 100_000)
+    trainable = EgoNeRFModel(model, SMALL, 100_000)
     for iteration, share in ((0, 1.0), (50_000, 0.1**0.5), (100_000, 0.1)):
         expected = 1e-2 * share * (0.1 * density + 0.01 * appearance)
         assert trainable.regularisation(iteration).item() == pytest.approx(expected, rel=1e-5)

@@ -8,10 +8,11 @@ import torch
 from composed import composed
 from torch import Tensor
 
-from padgs.baselines.odgs import ODGSOptions
+from padgs.baselines.odgs import ODGSMethod, ODGSModel, ODGSOptions
 from padgs.gaussians import Gaussians
 from padgs.geometry.panorama import direction, longitude_latitude, projection_jacobian
-from padgs.render import RenderOptions, render
+from padgs.methods.splats.splats import Splats
+from padgs.render import RenderConfig
 from padgs.scene import View
 
 
@@ -58,12 +59,19 @@ def test_the_method_is_omnigs_with_half_the_threshold(padgs_root):
     assert omnigs.options.gradient_threshold == 2e-4
 
 
-def test_the_release_differs_by_its_quirks_only(padgs_root):
+def test_the_release_differs_by_its_deviations_only(padgs_root):
     odgs, release = composed("method=odgs"), composed("method=odgs_release")
-    quirks = {"sh_degree": 0, "extent_margin": 100.0, "prune_by_extent": True, "min_extent": 0.0, "max_gaussians": None}
-    assert release.options == replace(odgs.options, **quirks)
-    assert release.render == replace(composed("method=padgs", "render=released").render, pixel_bias=0.5)
+    deviations = {"sh_degree": 0, "extent_margin": 100.0, "pixel_bias": 0.5, "prune_by_extent": True}
+    assert release.options == replace(odgs.options, **deviations, min_extent=0.0, max_gaussians=None)
+    assert release.render == composed("method=padgs", "render=released").render
     assert release.train == odgs.train
+
+
+def model_of(gaussians: Gaussians, **deviations: float) -> ODGSModel:
+    splats = Splats(gaussians.means, gaussians.scales.log(), gaussians.colors, degree=0)
+    splats.opacity_logits.data = torch.logit(gaussians.opacities)
+    deviations = {"pixel_bias": 0.0, "extent_margin": 0.0} | deviations
+    return ODGSModel(splats, ODGSOptions(), RenderConfig(near=0.0), extent=1.0, iterations=100, **deviations)
 
 
 def test_means_of_the_release_are_half_a_pixel_off():
@@ -78,11 +86,23 @@ def test_means_of_the_release_are_half_a_pixel_off():
         colors=torch.eye(3),
     )
     view = View("v", torch.eye(4, dtype=torch.float64), width, height)
-    centred, moved = (render(gaussians, view, RenderOptions(pixel_bias=bias)).image for bias in (0.0, 1.0))
+    centred, moved, half = (model_of(gaussians, pixel_bias=bias).render(view).image for bias in (0.0, 1.0, 0.5))
     torch.testing.assert_close(moved, centred.roll((1, 1), (0, 1)), rtol=1e-4, atol=1e-5)
-    half = render(gaussians, view, RenderOptions(pixel_bias=0.5)).image
     for number, (u, v) in enumerate(pixels.long().tolist()):
         block = half[v : v + 2, u : u + 2, number]
         torch.testing.assert_close(block, block[:1, :1].expand(2, 2), rtol=1e-3, atol=1e-4)  # centred between four
-    with pytest.raises(ValueError, match="pixel_bias is a defect of projection 'erp', not of 'ray'"):
-        RenderOptions("ray", pixel_bias=0.5)
+    drawing = model_of(gaussians, pixel_bias=0.5).draw(view)
+    assert torch.equal(drawing.rendering.image, half) and not drawing.probe.any()
+    with pytest.raises(ValueError, match=r"pixel_bias is a deviation of render\.projection=erp, not ray"):
+        ODGSMethod(ODGSOptions(pixel_bias=0.5), RenderConfig("ray"))
+
+
+def test_a_margin_on_the_extent_clones_what_would_be_split():
+    for margin, expected in ((0.0, "cloned 0, split 1"), (100.0, "cloned 1, split 0")):
+        model = model_of(
+            Gaussians(*(torch.ones(1, n) for n in (3, 4, 3)), torch.full((1,), 0.5), torch.ones(1, 3)),
+            extent_margin=margin,
+        )
+        optimizer = torch.optim.Adam(model.splats.parameters())
+        model.densifier.observe(torch.tensor([[1.0, 0.0]]), torch.tensor([True]), 1)
+        assert model.densifier.adapt(50, optimizer)[0].startswith(expected)

@@ -147,19 +147,12 @@ def test_seeds_differ_and_repeat(scene):
     assert torch.equal(means[0], means[1]) and not torch.equal(means[0], means[2])
 
 
-def test_released_bugs_are_off_unless_asked_for(root, monkeypatch):
+def test_the_release_differs_by_its_deviations_only(root, monkeypatch):
     monkeypatch.setenv("PADGS_ROOT", str(root))
     described, released = (composed(f"method={name}") for name in ("omnigs", "omnigs_release"))
-    assert not any((described.options.released_start, described.options.released_reset))
     assert described.render == RenderConfig() and released.render == composed("method=padgs", "render=released").render
-    quirks = {
-        "released_start": True,
-        "released_reset": True,
-        "prune_by_extent_from": 0,
-        "min_extent": 0.0,
-        "max_gaussians": None,
-    }
-    assert released.options == replace(described.options, **quirks)
+    deviations = {"densify_from": 0, "reset_opacity": 1.0, "prune_by_extent_from": 0}
+    assert released.options == replace(described.options, **deviations, min_extent=0.0, max_gaussians=None)
     assert described.train == released.train and released.train.weight == "uniform"
 
 

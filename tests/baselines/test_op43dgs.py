@@ -1,6 +1,7 @@
 """OP43DGS: corrected it is a method like others; as released it runs out of memory where a scene is far away."""
 
 import io
+import math
 import re
 from dataclasses import replace
 
@@ -11,8 +12,8 @@ from rich.console import Console
 from tiny_scene import tiny_scene
 
 from padgs import results
-from padgs.baselines.op43dgs import OP43DGSMethod
-from padgs.runs import run as pipeline
+from padgs.baselines.op43dgs import OP43DGSMethod, OP43DGSOptions
+from padgs.runs import session
 from padgs.scene import Scene, View
 from padgs.training.options import Budget
 
@@ -50,24 +51,37 @@ def scene_of(distance: float) -> Scene:
     return Scene(f"{distance:g}", train, test, distance * near.points, near.point_colors, fingerprint=f"{distance:g}")
 
 
-def test_the_release_differs_by_its_quirks_only():
+def test_the_release_differs_by_its_deviations_only():
     described, release = composed("method=op43dgs"), composed("method=op43dgs_release")
-    published = replace(composed("method=padgs", "render=released").render, projection="tangent", low_pass_kind="fixed")
-    assert release.render == replace(published, memory_cap=24 * 2**30)
-    assert release.options == replace(described.options, prune_by_extent=True, min_extent=0.0, max_gaussians=None)
+    assert release.render == replace(composed("method=padgs", "render=released").render, projection="tangent")
+    deviations = {"fixed_low_pass": True, "memory_cap": 24 * 2**30, "prune_by_extent": True}
+    assert release.options == replace(described.options, **deviations, min_extent=0.0, max_gaussians=None)
     assert release.train == described.train
 
 
+@pytest.mark.parametrize("width", [64, 3217])
+def test_the_low_pass_of_the_release_is_the_same_angle_for_every_image(width):
+    scene, angles = tiny_scene(), {}
+    for fixed in (False, True):
+        method = OP43DGSMethod(OP43DGSOptions(fixed_low_pass=fixed))
+        method.fit(scene, Budget(1))
+        view = View("v", torch.eye(4, dtype=torch.float64), width, width // 2)
+        angles[fixed] = method.model.render_options(view).low_pass / view.camera.focal**2
+        assert method.has_smoothing_filter == fixed, "closer views of the release need no wider filter"
+    assert angles[True] == pytest.approx(0.3 / 512**2)
+    assert angles[False] == pytest.approx(0.3 / (width / (2 * math.pi)) ** 2)
+
+
 def run(setting: str, scene: Scene, folder, monkeypatch, *overrides: str) -> results.Result:
-    monkeypatch.setattr(pipeline.data, "load", lambda path, format, options: scene)
+    monkeypatch.setattr(session.data, "load", lambda path, format, options: scene)
     tiny = (f"run.folder={folder}", "train.iterations=4", "protocol=paper", "protocol.paper.lpips=none")
-    return pipeline.run(composed(f"method={setting}", *tiny, *overrides), Console(file=io.StringIO()))
+    return session.Session(composed(f"method={setting}", *tiny, *overrides), Console(file=io.StringIO())).run()
 
 
 @pytest.mark.slow
 def test_far_away_the_release_ends_as_oom_with_the_numbers(tmp_path, monkeypatch):
     """The same picture, a hundred times as far and as large. What the corrected method needs is in its own tests."""
-    near, far, cap = scene_of(1), scene_of(100), "render.memory_cap=60000"
+    near, far, cap = scene_of(1), scene_of(100), "method.memory_cap=60000"
     assert run("op43dgs_release", near, tmp_path, monkeypatch, cap).status == "ok"
     failed = run("op43dgs_release", far, tmp_path, monkeypatch, cap)
     assert failed.status == "oom" and failed.iterations_done == 0 and failed.scores == {}

@@ -105,14 +105,6 @@ def test_a_weight_of_latitudes_is_refused(name):
 
 
 @each_method
-def test_a_threshold_that_follows_the_latitude_is_refused(name):
-    with pytest.raises(
-        ValueError, match=r"polar_threshold is 0\.001, but perspective views have no poles; set it to null"
-    ):
-        METHOD[name](METHOD[name].Options(polar_threshold=1e-3))
-
-
-@each_method
 def test_a_renderer_that_cannot_draw_held_out_panoramas_is_refused_before_training(name):
     with pytest.raises(ValueError, match="pinhole cannot draw the held-out panoramas at once; set render.cubemap=true"):
         METHOD[name](render=RenderConfig(projection="pinhole"))

@@ -11,8 +11,8 @@ from padgs.methods.calibration.dual_lens import DualLens
 from padgs.methods.splats.method import SplatMethod, SplatOptions
 from padgs.render import RenderConfig, RenderOptions, render
 from padgs.scene import Scene, View
-from padgs.training.model import TrainingRender
 from padgs.training.options import Budget
+from padgs.training.model import TrainingRender
 
 TORCH = RenderConfig(projection="ray", backend="torch")
 
@@ -48,7 +48,7 @@ def photographed(gap: float, bending: tuple[float, float]) -> Scene:
         lenses.gap.fill_(gap)
         lenses.coefficients[:, 0] = torch.tensor(bending)
 
-    def draw(view: View, probe: torch.Tensor | None = None) -> TrainingRender:
+    def draw(view: View, mean_offsets: torch.Tensor | None = None) -> TrainingRender:
         rendering = render(seen, view, RenderOptions("ray"), backend="torch")
         return TrainingRender(rendering, torch.zeros(0), seen, torch.zeros(0))
 
@@ -99,11 +99,6 @@ def test_learning_rates_of_the_lenses_fall_to_a_tenth(scene):
 def test_charts_cannot_draw_lenses():
     with pytest.raises(ValueError, match="projection 'erp' is made for a Panorama camera, not a RayTable"):
         Seam360GSMethod(render=RenderConfig(backend="torch"))
-
-
-def test_a_threshold_that_follows_the_latitude_is_refused():
-    with pytest.raises(ValueError, match=r"polar_threshold is 0\.001, but a view is made of two.*; set it to null"):
-        Seam360GSMethod(Seam360GSOptions(polar_threshold=1e-3), TORCH)
 
 
 def test_a_rate_of_nothing_is_refused():

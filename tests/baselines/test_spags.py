@@ -13,8 +13,8 @@ from padgs.baselines import METHODS
 from padgs.baselines.spags import SPaGSMethod, SPaGSOptions
 from padgs.gaussians import Gaussians, rotation_matrices
 from padgs.geometry.camera import Panorama
-from padgs.methods.splats.model import Splats
-from padgs.methods.splats.trainee import SplatTrainee
+from padgs.methods.splats.model import SplatModel
+from padgs.methods.splats.splats import Splats
 from padgs.native import cpu
 from padgs.native.abi import Inputs, pointer
 from padgs.registry import lookup
@@ -47,23 +47,27 @@ def test_is_registered_and_configured(monkeypatch, root):
 def test_the_published_schedule():
     options = SPaGSOptions()
     assert (options.densify_from, options.densify_until, options.densify_every) == (200, 15_000, 100)
-    assert (options.signal, options.gradient_threshold, options.min_opacity) == ("space_absolute", 5e-5, 0.005)
+    assert (options.positional_gradient, options.gradient_threshold, options.min_opacity) == (
+        "space_absolute",
+        5e-5,
+        0.005,
+    )
     assert (options.reset_every, options.reset_opacity, options.opacity_decay) == (3000, 0.1, 0.001)
-    assert options.filter_pixels == 0.2
+    assert options.smoothing_filter == 0.2
     assert not options.prune_by_extent and options.sh_degree == 3
 
 
-def trainee_of(scene: Scene, iterations: int = 100) -> SplatTrainee:
+def trainee_of(scene: Scene, iterations: int = 100) -> SplatModel:
     splats = Splats.from_scene(scene, generator=torch.Generator().manual_seed(0))
     options = SPaGSOptions()
-    return SplatTrainee(
+    return SplatModel(
         splats,
         options,
         SPaGSMethod.RENDER,
         extent=1.0,
         iterations=iterations,
         views=scene.train,
-        filter_pixels=options.filter_pixels,
+        smoothing_filter=options.smoothing_filter,
     )
 
 
@@ -111,7 +115,9 @@ def test_what_is_too_faint_to_be_seen_is_no_part_of_the_model_and_was_in_no_imag
     image, count = trainee.render(scene.test[0]).image, len(trainee.splats)
     events = trainee.adapt(100, torch.optim.Adam(trainee.splats.parameters()))
     left_out = count - len(trainee.splats)
-    assert 0 < left_out <= (count + 1) // 2 and any(f"left out {left_out} Gaussians" in event for event in events)
+    assert 0 < left_out <= (count + 1) // 2 and any(
+        f"pruned {left_out} invisible Gaussians" in event for event in events
+    )
     assert torch.equal(trainee.render(scene.test[0]).image, image)
 
 

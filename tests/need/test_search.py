@@ -27,7 +27,7 @@ from padgs.runs.interrupt import Interrupt, Interrupted
 from padgs.runs.run import Callback
 from padgs.training.loop import Trainer
 from padgs.training.model import State
-from padgs.training.worth import most_wanted, worth
+from padgs.methods.splats.importance import most_important, importance_scores
 
 METHODS = ("method=omnigs", "method=padgs")
 
@@ -160,7 +160,7 @@ def test_the_pruned_model_is_a_run_that_opens_and_has_the_whole_front(opened, me
 def test_waste_is_what_no_training_view_shows(opened, method):
     run = opened(method)
     model, views = run.method.resumed(run.scene, 60), run.scene.train
-    found = worth(model, views)
+    found = importance_scores(model, views)
     pictures = [model.render(view).image for view in views]
     rows = int((found.peak > 0).sum())
     model.keep(found.peak > 0)
@@ -174,12 +174,12 @@ def test_waste_is_what_no_training_view_shows(opened, method):
 def test_the_rows_that_are_kept_are_those_whose_removal_changes_most(opened):
     run = opened("method=omnigs")
     model = run.method.resumed(run.scene, 60)
-    found = worth(model, run.scene.train[:2])
-    kept = most_wanted(found, 20)
+    found = importance_scores(model, run.scene.train[:2])
+    kept = most_important(found, 20)
     assert len(kept) == 20 and found.change[kept].min() >= found.change.sort(descending=True).values[20]
     assert torch.equal(kept, kept.sort().values)
     with pytest.raises(ValueError, match="no views"):
-        worth(model, ())
+        importance_scores(model, ())
 
 
 def test_steps_of_another_model_are_refused(opened):

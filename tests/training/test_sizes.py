@@ -7,8 +7,7 @@ from states import assert_same_but_time
 from tiny_scene import HEIGHT, WIDTH, tiny_scene, truth
 
 from padgs.geometry.camera import Pinhole
-from padgs.methods.plus.method import PlusMethod
-from padgs.methods.plus.options import PlusOptions
+from padgs.methods.plus.method import PlusMethod, PlusOptions
 from padgs.render import RenderOptions, render
 from padgs.scene import View
 from padgs.training import targets as training_targets

@@ -7,9 +7,9 @@ from tiny_scene import HEIGHT, WIDTH, tiny_scene
 from torch import Tensor
 
 from padgs.baselines import METHODS
-from padgs.methods.splats.clone_split import CloneSplitOptions
-from padgs.methods.splats.model import Splats
-from padgs.methods.splats.trainee import SplatTrainee
+from padgs.methods.splats.densification import DensificationOptions
+from padgs.methods.splats.model import SplatModel
+from padgs.methods.splats.splats import Splats
 from padgs.registry import lookup
 from padgs.render import RenderConfig, Rendering
 from padgs.scene import View
@@ -21,12 +21,12 @@ from padgs.training.view_order import ViewOrder
 ITERATIONS = 100
 
 
-class Counted(SplatTrainee):
+class Counted(SplatModel):
     """Notes the views that are drawn, and which moments of the schedule come."""
 
     def __init__(self, scene) -> None:
         splats = Splats.from_scene(scene, degree=0, generator=torch.Generator().manual_seed(0))
-        super().__init__(splats, CloneSplitOptions(), RenderConfig(), extent=1.0, iterations=ITERATIONS)
+        super().__init__(splats, DensificationOptions(), RenderConfig(), extent=1.0, iterations=ITERATIONS)
         self.drawn, self.moments = [], []
 
     def draw(self, view: View, probe: Tensor | None = None):

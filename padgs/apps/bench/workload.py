@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from padgs.methods.anchors.growth import GrowthOptions
-from padgs.methods.anchors.model import PaDGS
-from padgs.methods.anchors.trainee import AnchorTrainee, LearningRates
+from padgs.methods.anchors.anchors import PaDGS
+from padgs.methods.anchors.model import AnchorModel, LearningRates
 from padgs.render import RenderOptions
 from padgs.scene import Scene, View
 from padgs.training.loop import Stage, Trainer
@@ -80,7 +80,7 @@ class Workload:
         """
         grow_from = 0 if grows else NEVER
         growth = GrowthOptions(statistics_from=0, grow_from=grow_from, grow_until=NEVER, grow_every=1 if grows else 100)
-        trainee = AnchorTrainee(self.model, OPTIONS, growth=growth, rates=STILL, extent=1.0, iterations=NEVER)
+        trainee = AnchorModel(self.model, OPTIONS, growth=growth, rates=STILL, extent=1.0, iterations=NEVER)
         return Trainer(trainee, self.scene, Budget(NEVER), stage=stage)
 
     def to(self, device: torch.device) -> Workload:

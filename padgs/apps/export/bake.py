@@ -16,10 +16,10 @@ from torch import Tensor
 from padgs.evaluation.evaluate import quantized
 from padgs.gaussians import Gaussians, rotation_matrices
 from padgs.geometry import harmonics
-from padgs.methods.anchors.model import PaDGS
-from padgs.methods.splats.clone_split import CloneSplitOptions
-from padgs.methods.splats.model import Splats
-from padgs.methods.splats.trainee import SplatTrainee
+from padgs.methods.anchors.anchors import PaDGS
+from padgs.methods.splats.densification import DensificationOptions
+from padgs.methods.splats.splats import Splats
+from padgs.methods.splats.model import SplatModel
 from padgs.render import RenderConfig, Rendering, RenderOptions, render
 from padgs.scene import Scene, View
 from padgs.training.initial_points import ExtentOptions
@@ -134,12 +134,12 @@ def axes_of(covariances: Tensor) -> tuple[Tensor, Tensor]:
     return scales.to(covariances), quats.to(covariances)
 
 
-class FixedCountSplats(SplatTrainee):
+class FixedCountSplats(SplatModel):
     """Splats without densification and pruning, with all harmonics active."""
 
     def __init__(self, splats: Splats, config: RenderConfig, extent: float, iterations: int) -> None:
         """Use the learning rates of 3DGS for a run of `iterations`."""
-        super().__init__(splats, CloneSplitOptions(), config, extent=extent, iterations=iterations)
+        super().__init__(splats, DensificationOptions(), config, extent=extent, iterations=iterations)
 
     def observe(self, drawing: TrainingRender, iteration: int) -> None:
         """Record nothing."""

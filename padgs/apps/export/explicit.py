@@ -16,11 +16,11 @@ from padgs.data.capture import Cloud, DataError
 from padgs.evaluation.evaluate import evaluate
 from padgs.evaluation.protocols import PROTOCOLS
 from padgs.geometry import harmonics
-from padgs.methods.anchors.trainee import AnchorTrainee
+from padgs.methods.anchors.model import AnchorModel
 from padgs.methods.calibration.align import Similarity
-from padgs.methods.splats.model import Splats
-from padgs.methods.splats.nearest import cameras_of, smoothed
-from padgs.methods.splats.trainee import SplatTrainee
+from padgs.methods.splats.splats import Splats
+from padgs.methods.splats.smoothing_filter import cameras_of, smoothed
+from padgs.methods.splats.model import SplatModel
 from padgs.render import Rendering, render
 from padgs.runs.load import LoadedRun
 from padgs.scene import View
@@ -53,7 +53,7 @@ def export_run(
         run: of any method with Gaussians.
         distillation_steps: iterations in which baked anchors are trained on renders of the run.
         upright: rotate the world so that the cameras' up is -y, as viewers expect.
-        smooth: include the 3D smoothing filter (`padgs.methods.splats.nearest`) in the scales, if the run has one;
+        smooth: include the 3D smoothing filter (`padgs.methods.splats.smoothing_filter`) in the scales, if the run has one;
             viewers have no such filter, and show sharp Gaussians as needles.
         progress: called with the number of completed distillation steps.
 
@@ -64,7 +64,7 @@ def export_run(
     trainee = run.method.model
     config = run.config.render
     notes = [f"padgs {padgs.__version__}, run {run.folder.name}"]
-    if isinstance(trainee, SplatTrainee):
+    if isinstance(trainee, SplatModel):
         splats = trainee.baked()
         if isinstance(run.method, SCOmniGSMethod):  # trained in the world of its refined poses
             splats = transform_splats(splats, aligned(run.method.model.calibration.poses)[0].inverse())
@@ -72,7 +72,7 @@ def export_run(
         if smooth and config.low_pass > 0 and config.resolved_low_pass_kind == "solid":
             splats = smoothed(splats, cameras_of(run.scene.train), config.low_pass)
             notes[-1] = "Gaussians as trained, including the 3D smoothing filter"
-    elif isinstance(trainee, AnchorTrainee):
+    elif isinstance(trainee, AnchorModel):
         splats, loss = _bake_and_distill(run, distillation_steps, progress)
         notes.append(loss)
     else:
@@ -152,7 +152,7 @@ def transform_splats(splats: Splats, new_from_old: Similarity) -> Splats:
     )
     sh = harmonics_rotation(rotation, splats.degree) @ torch.cat((splats.sh_dc[:, None], splats.sh_rest), dim=1)
     empty = splats.means[:0]
-    new = Splats(empty, empty, empty, degree=splats.degree, unit=splats.unit * new_from_old.scale)
+    new = Splats(empty, empty, empty, degree=splats.degree, unit=splats.scene_scale * new_from_old.scale)
     new.load(
         {
             "means": new_from_old(splats.means.to(new_from_old.rotation)).to(splats.means),

@@ -24,7 +24,7 @@ from torch import Tensor
 from padgs.data.capture import DataError
 from padgs.data.cloud import read_vertices
 from padgs.files import atomic_path
-from padgs.methods.splats.model import Splats
+from padgs.methods.splats.splats import Splats
 
 CONVERTER = "splat-transform"
 CONVERTED = (".compressed.ply", ".sog", ".spz", ".html")  # suffixes that the converter writes
@@ -128,7 +128,7 @@ def read_splats(path: Path, *, unit: float = 1.0) -> Splats:
         return torch.from_numpy(np.stack([np.asarray(vertex[name], np.float32) for name in wanted], axis=1))
 
     empty = torch.zeros(0, 3)
-    splats = Splats(empty, empty, empty, degree=degree, unit=unit)
+    splats = Splats(empty, empty, empty, degree=degree, scene_scale=unit)
     count = len(vertex["x"])
     sh_rest = columns(*(f"f_rest_{n}" for n in range(rest))) if rest else torch.zeros(count, 0)
     splats.load(

@@ -12,8 +12,8 @@ from torch import Tensor
 from padgs.evaluation.images import depth_image, error_image, to_uint8
 from padgs.geometry.camera import Panorama, Pinhole, perspective
 from padgs.geometry.panorama import sample
-from padgs.methods.anchors.trainee import AnchorTrainee
-from padgs.methods.splats.trainee import SplatTrainee
+from padgs.methods.anchors.model import AnchorModel
+from padgs.methods.splats.model import SplatModel
 from padgs.runs.load import LoadedRun
 from padgs.scene import View
 from padgs.training.method import Method
@@ -50,7 +50,7 @@ class RunRenderer:
     @property
     def can_crop(self) -> bool:
         """Return whether the model has positions, by which it can be cropped."""
-        return isinstance(self.run.method.model, (SplatTrainee, AnchorTrainee))
+        return isinstance(self.run.method.model, (SplatModel, AnchorModel))
 
     @property
     def summary(self) -> str:
@@ -142,7 +142,7 @@ class RunRenderer:
 def crop_model(method: Method, crop: Box) -> Method:
     """Remove all Gaussians or anchors outside a box, in place; the method can then only render."""
     trainee = method.model
-    positions = trainee.model.positions if isinstance(trainee, AnchorTrainee) else trainee.splats.means
+    positions = trainee.anchors.positions if isinstance(trainee, AnchorModel) else trainee.splats.means
     low, high = (positions.new_tensor(corner) for corner in crop)
     trainee.keep(((positions >= low) & (positions <= high)).all(-1))
     return method

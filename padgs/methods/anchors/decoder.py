@@ -1,8 +1,8 @@
 """The decoder: three small networks that turn an anchor as seen from a camera into K Gaussians (paper Eq. 13-14).
 
-`decode_gaussians` is a pure function of tensors. Where a native library can do it (float32 on the CPU, any precision on
-a GPU) that is called; `define_gaussians` is the definition that it has to match. Precision is a matter of the networks'
-products alone: what becomes of their outputs is computed in the tensors' own type.
+`decode_gaussians` is a pure function of tensors. It calls a native library if there is one (float32 on the CPU, any
+precision on a GPU); `define_gaussians` is the definition. A reduced precision concerns the products of the networks
+only.
 """
 
 from __future__ import annotations
@@ -15,12 +15,17 @@ import torch
 from torch import Tensor, nn
 
 from padgs.gaussians import Gaussians
-from padgs.methods.anchors.cpu_decoder import COLOR_VALUES, COVARIANCE_VALUES, OPACITY_VALUES, decode_on_cpu
-from padgs.methods.anchors.gpu_decoder import decode_on_gpu
-from padgs.methods.anchors.precision import linear, reduced
+from padgs.methods.anchors.native_decoder import (
+    COLOR_VALUES,
+    COVARIANCE_VALUES,
+    OPACITY_VALUES,
+    decode_on_cpu,
+    decode_on_gpu,
+)
+from padgs.methods.anchors.precision import linear, reduced_dtype
 from padgs.native import LIBRARIES, cpu, cuda
 
-SORT_OUT_BELOW = 0.9  # share of anchors with a positive opacity
+FILTER_BELOW = 0.9  # share of anchors with a positive opacity
 
 
 class Head(NamedTuple):
@@ -32,7 +37,7 @@ class Head(NamedTuple):
     b2: Tensor  # [O]
 
     def __call__(self, inputs: Tensor, dtype: torch.dtype | None = None) -> Tensor:
-        """Outputs [A, O] for inputs [A, I]; products in a reduced type, see `padgs.methods.anchors.precision`."""
+        """Return outputs [A, O] for inputs [A, I]; products in `dtype`, see `padgs.methods.anchors.precision`."""
         hidden = torch.relu(linear(inputs, self.w1, self.b1, dtype))
         return linear(hidden, self.w2, self.b2, dtype)
 
@@ -49,15 +54,15 @@ class SeenAnchors(NamedTuple):
     """A anchors as a camera sees them; differentiable by features, offsets and log-scales."""
 
     features: Tensor  # [A, C]
-    seen: Tensor  # [A, I - C] direction from the camera, and distance and distortion if they are inputs
+    seen: Tensor  # [A, I - C] direction from the camera; distance and distortion if they are inputs
     positions: Tensor  # [A, 3] world
     offsets: Tensor  # [A, K, 3] in units of the anchor's scale
     log_scales: Tensor  # [A, 6]; the first three scale the offsets, the last three the Gaussians
-    attenuation: Tensor  # [A], what Eq. 15 multiplies opacities by
+    attenuation: Tensor  # [A] factor on opacities (Eq. 15)
 
 
 class Attributes(NamedTuple):
-    """What the networks say, for the N selected of the A K Gaussians, in the order of their slots."""
+    """Network outputs for the N selected of A K Gaussians, in the order of their slots."""
 
     raw_opacities: Tensor  # [A, K] in (-1, 1), all of them; a Gaussian is selected where this is positive
     slots: Tensor  # [N] int64 ascending, anchor K + k
@@ -70,21 +75,21 @@ class Attributes(NamedTuple):
 def decode(weights: DecoderWeights, inputs: Tensor, dtype: torch.dtype | None = None) -> Attributes:
     """Decode anchors (Eq. 13): opacity by tanh, colour and shrinkage by sigmoid.
 
-    Opacity comes first; the other two networks, nine tenths of the work, see only anchors with a positive one. The
-    values of the others are never used, so the result is exact. Where few anchors are dead, sorting them out costs more
-    than it saves, and all are decoded.
+    The opacity network comes first; the other two, nine tenths of the work, see only anchors with a positive opacity.
+    Other outputs are never used, so the result is exact. If most anchors have one, all are decoded, which is faster
+    than filtering.
 
     Args:
         weights: the three networks.
         inputs: [A, I], one row per anchor.
-        dtype: what the networks' products are taken in, see `padgs.methods.anchors.precision`.
+        dtype: of the networks' products, see `padgs.methods.anchors.precision`.
     """
     raw_opacities = torch.tanh(weights.opacity(inputs, dtype))  # [A, K]
     count, offsets = raw_opacities.shape
     selected = raw_opacities.detach() > 0
     alive = selected.any(-1).nonzero()[:, 0]  # [B]
     slots = selected.view(-1).nonzero()[:, 0]
-    if len(alive) < SORT_OUT_BELOW * count:
+    if len(alive) < FILTER_BELOW * count:
         inputs = take_rows(inputs, alive)
         decoded_slots = selected[alive].view(-1).nonzero()[:, 0]  # [N] rows among the B K decoded Gaussians
     else:
@@ -105,13 +110,15 @@ def decode(weights: DecoderWeights, inputs: Tensor, dtype: torch.dtype | None = 
 def decode_gaussians(
     weights: DecoderWeights, anchors: SeenAnchors, precision: str = "float32"
 ) -> tuple[Gaussians, Tensor, Tensor]:
-    """The selected Gaussians of all anchors (Eq. 13-15); differentiable by weights, features, offsets and log-scales.
+    """Return the selected Gaussians of all anchors (Eq. 13-15).
+
+    Differentiable by weights, features, offsets and log-scales.
 
     Args:
         weights: the three networks, of I inputs.
         anchors: what is decoded.
-        precision: of the networks' products, a name of `padgs.methods.anchors.precision.PRECISIONS`. Others than float32 are
-            made for GPUs; on the CPU they are slower.
+        precision: of the networks' products, a name of `padgs.methods.anchors.precision.PRECISIONS`; reduced ones are
+            made for GPUs and slower on the CPU.
 
     Returns:
         N Gaussians in the order of their slots; slots [N] int64, anchor K + k; raw opacities [A, K] without gradient.
@@ -124,29 +131,28 @@ def decode_gaussians(
         return define_gaussians(weights, anchors, precision)
     flat = tuple(tensor for head in weights for tensor in head)
     if library is cuda:
-        *values, slots, raw, _ = decode_on_gpu(flat, *anchors, dtype=reduced(precision))
+        *values, slots, raw, _ = decode_on_gpu(flat, *anchors, dtype=reduced_dtype(precision))
     else:
         *values, slots, raw = decode_on_cpu(flat, *anchors)
     return Gaussians(*values), slots, raw
 
 
-def decodes_within(anchors: SeenAnchors, precision: str = "float32") -> bool:
-    """Whether `decode_within` takes these tensors: float32 on a GPU that the library works on."""
+def supports_capacity(anchors: SeenAnchors, precision: str = "float32") -> bool:
+    """Return whether `decode_with_capacity` takes these tensors: float32 on a GPU with the library."""
     return _library_for(anchors, precision) is cuda
 
 
-def decode_within(
-    weights: DecoderWeights, anchors: SeenAnchors, room: int, precision: str = "float32"
+def decode_with_capacity(
+    weights: DecoderWeights, anchors: SeenAnchors, capacity: int, precision: str = "float32"
 ) -> tuple[Gaussians, Tensor, Tensor, Tensor]:
-    """`decode_gaussians` without the host waiting for how many are selected.
+    """Return `decode_gaussians` in a fixed number of rows, so that the host need not wait for N.
 
     Args:
-        weights, anchors, precision: as there.
-        room: there are so many Gaussians, or all A K if those are fewer: first the selected ones, as far as there is
-            room, behind them zeros, which nobody draws.
+        weights, anchors, precision: as for `decode_gaussians`.
+        capacity: rows, at most A K: the selected Gaussians up to the capacity, then zeros, which are culled.
 
     Returns:
-        What is returned there, the slots of the zeros being those of others that are not selected; N, [1] int64.
+        As `decode_gaussians`, with zeros at slots of Gaussians that are not selected; N, [1] int64.
 
     Raises:
         ValueError: tensors that are not float32 on a GPU, or an unknown precision.
@@ -155,18 +161,18 @@ def decode_within(
     features = anchors.features
     if features.dtype != torch.float32 or features.device.type != cuda.device_type():
         raise ValueError(
-            f"only a GPU decodes without counting, and float32; got {features.dtype} on {features.device}. Convert "
+            f"decoding with a capacity takes float32 on a GPU; got {features.dtype} on {features.device}. Convert "
             "them, or use decode_gaussians"
         )
     flat = tuple(tensor for head in weights for tensor in head)
-    room = min(room, anchors.offsets[..., 0].numel())
-    *values, slots, raw, count = decode_on_gpu(flat, *anchors, dtype=reduced(precision), room=room)
+    capacity = min(capacity, anchors.offsets[..., 0].numel())
+    *values, slots, raw, count = decode_on_gpu(flat, *anchors, dtype=reduced_dtype(precision), capacity=capacity)
     return Gaussians(*values), slots, raw, count
 
 
 def _library_for(anchors: SeenAnchors, precision: str) -> ModuleType | None:
-    """What decodes these tensors; None: torch does."""
-    dtype, library = reduced(precision), LIBRARIES.get(anchors.features.device.type)
+    """Return the library that decodes these tensors; None: torch."""
+    dtype, library = reduced_dtype(precision), LIBRARIES.get(anchors.features.device.type)
     no_reduced_types = dtype is not None and library is cpu
     if library is None or no_reduced_types or anchors.features.dtype != torch.float32:
         return None
@@ -176,39 +182,39 @@ def _library_for(anchors: SeenAnchors, precision: str) -> ModuleType | None:
 def define_gaussians(
     weights: DecoderWeights, anchors: SeenAnchors, precision: str = "float32"
 ) -> tuple[Gaussians, Tensor, Tensor]:
-    """`decode_gaussians` in torch, for any dtype, precision and device."""
-    said = decode(weights, torch.cat((anchors.features, anchors.seen), dim=-1), reduced(precision))
-    rows = said.slots // anchors.offsets.shape[1]
+    """Compute `decode_gaussians` in torch, for any dtype, precision and device."""
+    attributes = decode(weights, torch.cat((anchors.features, anchors.seen), dim=-1), reduced_dtype(precision))
+    rows = attributes.slots // anchors.offsets.shape[1]
     reach, size = take_rows(torch.exp(anchors.log_scales), rows).split((3, 3), dim=-1)
     gaussians = Gaussians(
-        means=take_rows(anchors.positions, rows) + reach * take_rows(anchors.offsets.view(-1, 3), said.slots),
-        quats=said.quats,
-        scales=size * said.shrinkage,
-        opacities=said.opacities * anchors.attenuation[rows],
-        colors=said.colors,
+        means=take_rows(anchors.positions, rows) + reach * take_rows(anchors.offsets.view(-1, 3), attributes.slots),
+        quats=attributes.quats,
+        scales=size * attributes.shrinkage,
+        opacities=attributes.opacities * anchors.attenuation[rows],
+        colors=attributes.colors,
     )
-    return gaussians, said.slots, said.raw_opacities.detach()
+    return gaussians, attributes.slots, attributes.raw_opacities.detach()
 
 
 def take_rows(table: Tensor, rows: Tensor) -> Tensor:
-    """Rows [N, D] of a table [R, D]; a gather, because on CPUs its backward is several times faster than indexing's."""
+    """Return rows [N, D] of a table [R, D] by gather, whose backward is several times faster on CPUs than indexing."""
     return table.gather(0, rows[:, None].expand(-1, table.shape[1]))
 
 
 class Decoder(nn.Module):
-    """Owns the weights of the three networks, initialised as torch.nn.Linear does."""
+    """Weights of the three networks, initialised as torch.nn.Linear."""
 
     def __init__(
         self, inputs: int, offsets: int, hidden: int = 32, *, generator: torch.Generator | None = None
     ) -> None:
-        """Networks from `inputs` values per anchor to `offsets` Gaussians, with one hidden layer of `hidden` units."""
+        """Build networks from `inputs` values per anchor to `offsets` Gaussians, with one hidden layer."""
         super().__init__()
         self.opacity = _layers(inputs, hidden, OPACITY_VALUES * offsets, generator)
         self.color = _layers(inputs, hidden, COLOR_VALUES * offsets, generator)
         self.covariance = _layers(inputs, hidden, COVARIANCE_VALUES * offsets, generator)
 
     def weights(self) -> DecoderWeights:
-        """The weights as `decode` takes them."""
+        """Return the weights as `decode` takes them."""
         return DecoderWeights(Head(**self.opacity), Head(**self.color), Head(**self.covariance))
 
 

@@ -1,201 +1,187 @@
-"""PaD-GS: anchors, and the Gaussians that they become as seen from a camera (paper Eq. 13-15)."""
+"""PaD-GS in training: anchors, growth and learning rates as one trainable model."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from padgs.checks import check, check_known
-from padgs.gaussians import Gaussians
-from padgs.geometry.distortion import OMEGA_AXES, distortion, opacity_factor, polar_axis
-from padgs.methods.anchors.decoder import Decoder, SeenAnchors, decode_gaussians, decode_within, decodes_within
-from padgs.methods.anchors.grid import anchors_from_points, automatic_voxel_size, initial_log_scales
-from padgs.methods.anchors.precision import PRECISIONS
-from padgs.native.cuda import HostCopy
-from padgs.scene import Scene, View
-from padgs.training.optimizer import load_rows
+from padgs.methods.anchors.anchors import Decoded, PaDGS
+from padgs.methods.anchors.growth import Growth, GrowthOptions
+from padgs.render import Rendering, RenderOptions, render, resolve_backend
+from padgs.scene import View
+from padgs.training.initial_points import ExtentOptions
+from padgs.training.schedule import Constant, LogLinear, ParameterGroup
+from padgs.training.model import TrainingRender, Parts, Size, State
 
-OMEGA_INPUTS = ("sin2", "cos")
-DISTANCE_UNITS = ("scene", "world")
-TINY = 1e-6  # scene units; keeps directions finite for a camera exactly on an anchor
+OFFSET_RATE_UNITS = ("scene", "world")
+HEADROOM = 1.3  # capacity for the next view, in Gaussians of the last view
 
 
 @dataclass(frozen=True)
-class PaDGSOptions:
-    """The model. The defaults are the paper as written; conf/method/padgs_release.yaml is its released code."""
+class LearningRates(ExtentOptions):
+    """Learning rates of Adam; pairs are start and end of a log-linear decay over the run."""
 
-    features: int = 32  # C, learned values per anchor
-    offsets: int = 10  # K, Gaussians per anchor
-    hidden: int = 32  # width of the hidden layer of each network
-    precision: str = "float32"  # of the networks' products: float32, or bfloat16 or float16, which are for GPUs
-    tau: float = 0.9  # Eq. 15; 0 turns opacity modulation off
-    use_distance: bool = True  # distance camera - anchor as network input
-    use_distortion: bool = True  # distortion degree as network input (DAGD)
-    omega_axis: str = "camera_y"  # the latitude's axis: camera_y | world_z
-    omega_input: str = "sin2"  # what the networks see: sin2 = Omega | cos = sqrt(1 - Omega)
-    max_modulated_omega: float = 1.0  # limit of Omega in Eq. 15
-    distance_unit: str = "scene"  # distances as input are in Scene.scale, or in units of the world
-    voxel_size: float | str = "auto"  # world units, as the paper states it for its data sets; auto: `voxel_pixels`
-    voxel_pixels: float = 0.1  # ... at the median depth, with voxel_size auto: below a pixel, as the paper's voxels are
+    offset_rate: tuple[float, float] = (0.01, 0.0001)  # times the camera extent in `offset_rate_unit`
+    offset_rate_unit: str = "world"  # world: as released | scene: `Scene.scale`, independent of world units
+    feature_rate: float = 0.0075  # of anchor features
+    log_scale_rate: float = 0.007  # of anchor scales
+    opacity_rate: tuple[float, float] = (0.002, 2e-5)  # of the opacity network
+    color_rate: tuple[float, float] = (0.008, 5e-5)  # of the colour network
+    covariance_rate: tuple[float, float] = (0.004, 0.004)  # of the network of scales and rotations
 
     def __post_init__(self) -> None:
-        check_known(self, omega_axis=OMEGA_AXES, omega_input=OMEGA_INPUTS)
-        check_known(self, distance_unit=DISTANCE_UNITS, precision=PRECISIONS)
-        check(self, "at least 1", lambda count: count >= 1, "features", "offsets", "hidden")
-        check(self, "in [0, 1], or opacities turn negative at the poles", lambda tau: 0 <= tau <= 1, "tau")
-        check(self, "> 0 and finite", lambda pixels: 0 < pixels < math.inf, "voxel_pixels")
-        if isinstance(self.voxel_size, str) and self.voxel_size != "auto":
-            raise ValueError(f"unknown voxel_size {self.voxel_size!r}; known: auto, or a length in world units")
-        rule = "a length > 0 in world units, or auto"
-        check(self, rule, lambda size: size == "auto" or 0 < size < math.inf, "voxel_size")
+        check_known(self, offset_rate_unit=OFFSET_RATE_UNITS)
+        pairs = ("offset_rate", "opacity_rate", "color_rate", "covariance_rate")
+        check(self, "two rates > 0", lambda pair: all(0 < rate < math.inf for rate in pair), *pairs)
+        check(self, ">= 0 and finite", lambda rate: 0 <= rate < math.inf, "feature_rate", "log_scale_rate")
+        super().__post_init__()
 
-    @property
-    def inputs(self) -> int:
-        """Number of network inputs: features, direction 3, distance, distortion; 37 in the paper."""
-        return self.features + 3 + self.use_distance + self.use_distortion
+    def groups(self, model: PaDGS, extent: float, iterations: int) -> list[ParameterGroup]:
+        """Return parameter groups for a run of `iterations`; `extent` in `offset_rate_unit`."""
+        first, last = self.offset_rate
+        groups = [
+            ParameterGroup(name, (getattr(model, name),), rate, is_of_rows=True)
+            for name, rate in (
+                ("offsets", LogLinear(extent * first, extent * last, iterations)),
+                ("features", Constant(self.feature_rate)),
+                ("log_scales", Constant(self.log_scale_rate)),
+            )
+        ]
+        for head in ("opacity", "color", "covariance"):
+            weights = tuple(getattr(model.decoder, head).values())
+            first, last = getattr(self, f"{head}_rate")
+            groups.append(ParameterGroup(head, weights, LogLinear(first, last, iterations)))
+        return groups
 
 
 @dataclass(frozen=True)
-class Decoded:
-    """What the model shows to one camera: N selected of the A K Gaussians."""
+class AnchorRender(TrainingRender):
+    """Training render with the raw opacities of all anchors, which pruning needs.
 
-    gaussians: Gaussians  # N, opacities modulated
-    slots: Tensor  # [N] int64 ascending, anchor K + k
-    raw_opacities: Tensor  # [A, K] in (-1, 1), before selection and modulation
-    counted: HostCopy | None = None  # N, where `gaussians` and `slots` have rows for another number, see `PaDGS.decode`
-
-    def count(self) -> int:
-        """N; waits for it if it is not there yet."""
-        return len(self.slots) if self.counted is None else self.counted.values()[0]
-
-
-class PaDGS(nn.Module):
-    """Anchors with K Gaussians each. Positions are a buffer: they are never learned and carry no gradient.
-
-    Attributes:
-        positions: [A, 3] world.
-        features: [A, C].
-        offsets: [A, K, 3] in units of the anchor's scale.
-        log_scales: [A, 6]; the first three scale the offsets, the last three the Gaussians; world units.
-        decoder: the networks.
-        voxel_size: spacing of the grid that anchors live on, world units.
-        unit: what distances are divided by before the networks see them, world units.
+    The mean offsets may have more rows than there are Gaussians; the first N belong to them.
     """
 
-    positions: Tensor
+    raw_opacities: Tensor  # [A, K]
+
+
+class AnchorModel:
+    """A PaD-GS model with its growth; a `padgs.training.model.Model`.
+
+    Attributes:
+        anchors: the parameters.
+        growth: adds and removes anchors.
+    """
 
     def __init__(
         self,
-        positions: Tensor,
-        log_scales: Tensor,
-        options: PaDGSOptions = PaDGSOptions(),
+        anchors: PaDGS,
+        options: RenderOptions,
+        backend: str = "auto",
         *,
-        voxel_size: float,
-        unit: float = 1.0,
-        generator: torch.Generator | None = None,
+        growth: GrowthOptions = GrowthOptions(),  # noqa: B008 - frozen
+        rates: LearningRates = LearningRates(),
+        extent: float,
+        iterations: int,
+        seed: int = 0,
     ) -> None:
-        """A model with all Gaussians on their anchors [A, 3], log-scales [A, 6], and random networks."""
-        super().__init__()
-        count = len(positions)
-        self.options, self.voxel_size, self.unit = options, voxel_size, unit
-        self.register_buffer("positions", positions)
-        self.features = nn.Parameter(positions.new_zeros(count, options.features))
-        self.offsets = nn.Parameter(positions.new_zeros(count, options.offsets, 3))
-        self.log_scales = nn.Parameter(log_scales)
-        decoder = Decoder(options.inputs, options.offsets, options.hidden, generator=generator)
-        self.decoder = decoder.to(positions.device)
-
-    @classmethod
-    def from_scene(cls, scene: Scene, options: PaDGSOptions = PaDGSOptions(), *, seed: int = 0) -> PaDGS:
-        """The untrained model of a scene: its point cloud on a grid.
-
-        Raises:
-            ValueError: the point cloud is empty or not finite.
-        """
-        automatic = automatic_voxel_size(scene, options.voxel_pixels)
-        voxel_size = automatic if options.voxel_size == "auto" else float(options.voxel_size)
-        positions = anchors_from_points(scene.points, voxel_size)
-        return cls(
-            positions,
-            initial_log_scales(positions, voxel_size),
-            options,
-            voxel_size=voxel_size,
-            unit=scene.scale if options.distance_unit == "scene" else 1.0,
-            generator=torch.Generator().manual_seed(seed),
-        )
-
-    def __len__(self) -> int:
-        return len(self.positions)
-
-    def rows(self) -> dict[str, nn.Parameter]:
-        """The parameters that have one row per anchor."""
-        return {"offsets": self.offsets, "features": self.features, "log_scales": self.log_scales}
-
-    def load(self, tensors: Mapping[str, Tensor]) -> None:
-        """Take over what `state_dict` of another model gave; the number of anchors may differ.
-
-        Raises:
-            ValueError: as `padgs.training.optimizer.load_rows` does.
-        """
-        load_rows(self, tensors, ("positions", *self.rows()))
-        self.positions = tensors["positions"].to(self.positions).clone()
-
-    @torch.no_grad()
-    def centers(self) -> Tensor:
-        """Means [A K, 3] of all Gaussians in the world frame, selected or not, without gradient (Eq. 14)."""
-        reach = torch.exp(self.log_scales[:, None, :3])
-        return (self.positions[:, None] + reach * self.offsets).view(-1, 3)
-
-    @torch.no_grad()
-    def seen_from(self, view: View) -> tuple[Tensor, Tensor, Tensor]:
-        """Anchors as a camera sees them; constants of the view, so without gradient.
-
-        Returns:
-            direction [A, 3] camera -> anchor in the world frame; distance [A] in `unit`; distortion degree Omega [A].
-        """
-        ray = self.positions - view.center.to(self.positions)
-        distance = torch.sqrt((ray * ray).sum(-1) + (TINY * self.unit) ** 2)
-        direction = ray / distance[:, None]
-        axis = polar_axis(self.options.omega_axis, view.cam_from_world.to(self.positions))
-        return direction, distance / self.unit, distortion(direction, axis)
-
-    def decode(self, view: View, room: int | None = None) -> Decoded:
-        """The Gaussians that this view shows (Eq. 13-15).
+        """Wrap anchors.
 
         Args:
-            view: from where.
-            room: on a GPU, decode so many rows without waiting for N: zeros, which nobody draws, are behind the N, and
-                if there are fewer rows than N, the last are missing. Elsewhere, and with None, there are N.
+            anchors: the parameters.
+            options, backend: how the model is rendered.
+            growth: of the run, see `GrowthOptions.for_run`.
+            rates: learning rates.
+            extent: of the cameras, in `rates.offset_rate_unit`.
+            iterations: of the run.
+            seed: of the random choices of growth.
         """
-        weights, anchors, precision = self.decoder.weights(), self.as_seen(view), self.options.precision
-        if room is None or not decodes_within(anchors, precision):
-            return Decoded(*decode_gaussians(weights, anchors, precision))
-        gaussians, slots, raw_opacities, count = decode_within(weights, anchors, room, precision)
-        return Decoded(gaussians, slots, raw_opacities, HostCopy(count))
+        self.anchors, self.growth = anchors, Growth(anchors, growth, seed=seed)
+        self._options, self._backend = options, backend
+        self._rates, self._extent, self._iterations = rates, extent, iterations
+        self._capacity = 0  # of the next view, in Gaussians; 0: unknown
 
-    def show(self, view: View) -> Gaussians:
-        """The same for `padgs.render.backends.captured`: A K Gaussians, of which those that are not selected are zeros.
+    def groups(self) -> list[ParameterGroup]:
+        """Return all learnable parameters; positions of anchors are not learned."""
+        return self._rates.groups(self.anchors, self._extent, self._iterations)
 
-        Raises:
-            ValueError, OSError: as `padgs.methods.anchors.decoder.decode_within` does.
+    def draw(self, view: View) -> AnchorRender:
+        """Decode the anchors for the view and render them, differentiably.
+
+        On backend cuda the capacity of the last view spares waiting for the number of Gaussians, which is read while
+        they are rendered. If the capacity was too small, everything is repeated.
         """
-        everything = self.offsets[..., 0].numel()
-        return decode_within(self.decoder.weights(), self.as_seen(view), everything, self.options.precision)[0]
+        ahead = resolve_backend(self._backend, self.anchors.positions) == "cuda"
+        decoded = self.anchors.decode(view, (self._capacity if ahead else 0) or None)
+        rendering, probe = self._rendered(decoded, view)
+        if decoded.count() > len(decoded.slots):
+            decoded = self.anchors.decode(view)
+            rendering, probe = self._rendered(decoded, view)
+        count = decoded.count()
+        self._capacity = max(int(HEADROOM * count) + 1, self._capacity * 15 // 16)
+        drawn = replace(rendering, visible=rendering.visible[:count])
+        return AnchorRender(drawn, probe, decoded.gaussians.first(count), decoded.slots[:count], decoded.raw_opacities)
 
-    def as_seen(self, view: View) -> SeenAnchors:
-        """What is decoded."""
-        options = self.options
-        direction, distance, omega = self.seen_from(view)
-        seen = [direction]
-        if options.use_distance:
-            seen.append(distance[:, None])
-        if options.use_distortion:
-            seen_omega = omega if options.omega_input == "sin2" else torch.sqrt((1 - omega).clamp(min=0))
-            seen.append(seen_omega[:, None])
-        attenuation = opacity_factor(omega, options.tau, options.max_modulated_omega)
-        seen = torch.cat(seen, dim=-1)
-        return SeenAnchors(self.features, seen, self.positions, self.offsets, self.log_scales, attenuation)
+    def _rendered(self, decoded: Decoded, view: View) -> tuple[Rendering, Tensor]:
+        probe = decoded.gaussians.means.new_zeros(len(decoded.slots), 2, requires_grad=True)
+        return render(decoded.gaussians, view, self._options, mean_offsets=probe, backend=self._backend), probe
+
+    def observe(self, drawing: TrainingRender, iteration: int) -> None:
+        """Collect opacities and positional gradients."""
+        assert isinstance(drawing, AnchorRender), type(drawing)
+        gradient = drawing.probe.grad if drawing.probe.grad is not None else torch.zeros_like(drawing.probe)
+        gradient = gradient[: len(drawing.slots)]
+        self.growth.observe(drawing.raw_opacities, drawing.slots, gradient, drawing.rendering.visible, iteration)
+
+    def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
+        """Grow and prune anchors."""
+        return self.growth.adapt(iteration, optimizer)
+
+    def parts(self, view: View) -> Parts:
+        """Return the Gaussians decoded for the view; an anchor with its Gaussians is a row."""
+        decoded = self.anchors.decode(view)
+        return Parts(decoded.gaussians, decoded.slots, self.anchors.options.offsets, self._options)
+
+    def keep(self, rows: Tensor) -> None:
+        """Keep these anchors only."""
+        self.growth.keep(rows, None)
+
+    @torch.no_grad()
+    def render(self, view: View) -> Rendering:
+        """Render a view without gradients."""
+        return render(self.anchors.decode(view).gaussians, view, self._options, backend=self._backend)
+
+    def counts(self) -> dict[str, int]:
+        """Return the number of anchors."""
+        return {"anchors": len(self.anchors)}
+
+    def size(self) -> Size:
+        """Return the numbers of anchors and Gaussians, and the bytes of the stored model."""
+        anchors = self.anchors
+        counts = {"anchors": len(anchors), "gaussians": len(anchors) * anchors.options.offsets}
+        return Size.of(counts, anchors.parameters(), stored=anchors.state_dict().values())
+
+    def state(self) -> State:
+        """Return parameters, growth statistics and random state; not copies."""
+        growth = {f"growth/{name}": values for name, values in self.growth.statistics.items()}
+        values = {"voxel_size": self.anchors.voxel_size, "distance_scale": self.anchors.distance_scale}
+        return State(
+            {**self.anchors.state_dict(), **growth, "random/growth": self.growth.generator.get_state()}, values
+        )
+
+    def load_state(self, state: State) -> None:
+        """Restore the model that `state` was taken of, whatever its number of anchors."""
+        self.load_model(state)
+        for name in self.growth.statistics:
+            self.growth.statistics[name] = state.tensors[f"growth/{name}"].to(self.anchors.positions.device, copy=True)
+        self.growth.generator.set_state(state.tensors["random/growth"].cpu())
+
+    def load_model(self, state: State) -> None:
+        """Load anchors and networks only; growth starts anew."""
+        self.anchors.load(state.tensors)
+        self.anchors.voxel_size = state.values["voxel_size"]
+        self.anchors.distance_scale = state.values["distance_scale"]
+        self.growth.reset_statistics()

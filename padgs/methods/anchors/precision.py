@@ -1,11 +1,9 @@
-"""Matrix products of small networks in a reduced floating-point type: what tensor cores are for.
+"""Matrix products of the networks in a reduced floating-point type, for tensor cores.
 
 Parameters and results stay float32; operands are rounded for the product, which is summed in float32 and rounded once.
-(Where torch multiplies on a GPU, partial sums may be rounded too:
-`torch.backends.cuda.matmul.allow_bf16_reduced_precision_reduction`, on by default, and the same for float16. The
-kernels of `padgs.methods.anchors.fused_decoder` round none, and sum gradients without rounding the result.)
-Products of gradients are taken in bfloat16 whatever the type: those of a mean over pixels are smaller than float16's
-numbers begin.
+torch on a GPU may round partial sums too (`torch.backends.cuda.matmul.allow_bf16_reduced_precision_reduction`, on by
+default); the kernels of `padgs.methods.anchors.native_decoder` do not. Products of gradients are always taken in
+bfloat16: gradients of a mean over pixels are below the smallest numbers of float16.
 """
 
 from __future__ import annotations
@@ -17,11 +15,11 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 PRECISIONS = ("float32", "bfloat16", "float16")
-OF_GRADIENTS = torch.bfloat16
+GRADIENT_TYPE = torch.bfloat16
 
 
-def reduced(precision: str) -> torch.dtype | None:
-    """The type that a precision stands for; None for float32, which is to say the tensors' own.
+def reduced_dtype(precision: str) -> torch.dtype | None:
+    """Return the type of a precision; None for float32, the tensors' own type.
 
     Raises:
         ValueError: an unknown precision; the message lists the known ones.
@@ -32,11 +30,11 @@ def reduced(precision: str) -> torch.dtype | None:
 
 
 def linear(inputs: Tensor, weight: Tensor, bias: Tensor, dtype: torch.dtype | None) -> Tensor:
-    """Inputs [A, I] through a layer of weight [O, I] and bias [O]; differentiable by all three.
+    """Apply a layer of weight [O, I] and bias [O] to inputs [A, I]; differentiable by all three.
 
     Args:
-        inputs, weight, bias: of one type, which is the result's too.
-        dtype: what the product is taken in; None: as they are.
+        inputs, weight, bias: of one type, which is also the type of the result.
+        dtype: of the product; None: the type of the inputs.
     """
     if dtype is None:
         return torch.addmm(bias, inputs, weight.T)
@@ -52,6 +50,6 @@ class _ReducedLinear(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor):
-        inputs, weight = (tensor.to(OF_GRADIENTS) for tensor in ctx.saved_tensors)
-        rounded = grad.to(OF_GRADIENTS)
+        inputs, weight = (tensor.to(GRADIENT_TYPE) for tensor in ctx.saved_tensors)
+        rounded = grad.to(GRADIENT_TYPE)
         return (rounded @ weight).to(grad.dtype), (rounded.T @ inputs).to(grad.dtype), grad.sum(0), None

@@ -107,7 +107,7 @@ class DualLens(Calibration):
         """The panorama as this camera stitches it; `draw(view, probe)` draws what one lens sees."""
         first, second = self.lenses(view)
         front = draw(first)
-        back = draw(second, probe=front.probe)  # one probe: both lenses pull at the same Gaussians
+        back = draw(second, mean_offsets=front.probe)  # one probe: both lenses pull at the same Gaussians
         assert isinstance(view.camera, Panorama)
         _, weight = _sphere(view.camera, self._axis_name, self.blend, self.gap.device)
         return replace(front, rendering=stitched(front.rendering, back.rendering, weight))

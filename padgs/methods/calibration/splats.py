@@ -7,15 +7,15 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from padgs.methods.splats.method import SplatMethod
-from padgs.methods.splats.model import Splats
-from padgs.methods.splats.trainee import SplatTrainee
+from padgs.methods.splats.model import SplatModel
+from padgs.methods.splats.splats import Splats
 from padgs.scene import Scene, View
-from padgs.training.model import Parts, Size, State, TrainingRender
 from padgs.training.options import Budget
 from padgs.training.schedule import ParameterGroup
+from padgs.training.model import TrainingRender, Parts, Size, State
 
 PREFIX = "calibration/"  # of its tensors in a state
 
@@ -44,11 +44,11 @@ class Calibration(nn.Module, ABC):
         """What building it again takes besides the options, as JSON can hold it."""
 
 
-class CalibratedTrainee(SplatTrainee):
+class CalibratedModel(SplatModel):
     """Splats that are drawn through a calibration in training; `render` stays that of an ideal camera."""
 
     def __init__(self, *args: Any, calibration: Calibration, **kwargs: Any) -> None:
-        """Arguments as for `SplatTrainee`, and the calibration that is optimised along with the splats."""
+        """Arguments as for `SplatModel`, and the calibration that is optimised along with the splats."""
         super().__init__(*args, **kwargs)
         self.calibration = calibration
 
@@ -67,7 +67,7 @@ class CalibratedTrainee(SplatTrainee):
             "that does not calibrate"
         )
 
-    def draw(self, view: View) -> TrainingRender:
+    def draw(self, view: View, mean_offsets: Tensor | None = None) -> TrainingRender:
         """Render all Gaussians as the camera of the view takes them, differentiably."""
         return self.calibration.draw(super().draw, view)
 
@@ -98,7 +98,7 @@ class CalibratedTrainee(SplatTrainee):
 class CalibratedMethod(SplatMethod):
     """A method whose cameras learn, too; a subclass says which calibration they have."""
 
-    TRAINEE = CalibratedTrainee
+    MODEL = CalibratedModel
     _calibration: Calibration  # what the next trainee is made with
 
     @abstractmethod
@@ -122,16 +122,14 @@ class CalibratedMethod(SplatMethod):
                 "here; set it to a number or null"
             )
 
-    def build_model(self, scene: Scene, iterations: int) -> SplatTrainee:
-        """See `Method.build_model`."""
+    def build_model(self, scene: Scene, iterations: int) -> SplatModel:
         self._calibration = self._as_given(scene)
         return super().build_model(scene, iterations)
 
-    def restore(self, state: State) -> SplatTrainee:
-        """See `Method.restore`."""
+    def restore(self, state: State) -> SplatModel:
         self._calibration = self._as_stored(state.of_model().values["calibration"])
         return super().restore(state)
 
-    def _trainee_of(self, splats: Splats, *args: Any, **more: Any) -> SplatTrainee:
+    def _model_of(self, splats: Splats, *args: Any, **more: Any) -> SplatModel:
         self._calibration.to(splats.means.device)
-        return super()._trainee_of(splats, *args, calibration=self._calibration, **more)
+        return super()._model_of(splats, *args, calibration=self._calibration, **more)

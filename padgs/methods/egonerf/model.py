@@ -1,153 +1,188 @@
-"""EgoNeRF: rays in, colours out."""
+"""EgoNeRF in training: a radiance field with learning rates, and the trainer that draws random rays."""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Callable
+from contextlib import nullcontext
+from typing import Any, ClassVar, cast
 
 import torch
-from torch import Tensor, nn
-from torch.nn import functional
+from torch import Tensor
 
-from padgs.methods.egonerf import surroundings
-from padgs.methods.egonerf.environment import EnvironmentMap
-from padgs.methods.egonerf.options import EgoNeRFOptions
-from padgs.methods.egonerf.plane_lines import (
-    Factors,
-    GridPosition,
-    PlaneLines,
-    density_feature,
-    grid_position,
-    products,
-)
-from padgs.methods.egonerf.radii import exponential_nodes
-from padgs.methods.egonerf.ray_samples import interval_lengths, jittered, refined, visible_shares
-from padgs.methods.egonerf.shading import Shader
+from padgs.methods.egonerf.field import EgoNeRF
+from padgs.methods.egonerf.options import EgoNeRFTraining
+from padgs.methods.egonerf.rays import RayPixels
 from padgs.render import Rendering
 from padgs.scene import Scene, View
+from padgs.clock import Lap
+from padgs.training.options import Budget
+from padgs.training.loop import Stage, Trainer
+from padgs.training.options import TrainOptions
+from padgs.training.schedule import LogLinear, ParameterGroup
+from padgs.training.model import Size, State, Model
+
+VARIATION_FACTOR = 1e-2  # published, on both weights of the total variation
 
 
-class RayColors(NamedTuple):
-    """What B rays see."""
+class EgoNeRFModel:
+    """An EgoNeRF with the schedule of a run; trained by `RayTrainer`."""
 
-    color: Tensor  # [B, 3]
-    transmittance: Tensor  # [B], what is left for the environment
-    depth: Tensor  # [B] model units: mean distance weighted by contribution; 0 where nothing contributes
+    def __init__(self, field: EgoNeRF, options: EgoNeRFTraining, iterations: int) -> None:
+        """Wrap a radiance field for a run of `iterations`.
+
+        Raises:
+            ValueError: pretraining leaves no iteration for the grids, or there is no environment map.
+        """
+        self.field, self._options, self._iterations = field, options, iterations
+        options.refuse_length(iterations)
+        alone = options.environment_pretraining
+        if alone and field.environment is None:
+            raise ValueError(
+                f"environment_pretraining is {alone}, but {field.kind}s there is no environment; set "
+                "environment_pretraining=0, environment=true or surroundings=outdoor"
+            )
+
+    @property
+    def rays_at_once(self) -> int:
+        """Rays in one pass."""
+        return self.field.options.rays_at_once
+
+    def groups(self) -> list[ParameterGroup]:
+        """Return all parameters with their learning rates."""
+        field, options = self.field, self._options
+        groups = [
+            ParameterGroup("density", tuple(field.density.parameters()), self._decaying(options.grid_rate)),
+            ParameterGroup("appearance", tuple(field.appearance.parameters()), self._decaying(options.grid_rate)),
+            ParameterGroup("shader", tuple(field.shader.parameters()), self._decaying(options.network_rate)),
+        ]
+        if field.environment is not None:
+            together = self._decaying(options.environment_rate)
+
+            def rate(iteration: int) -> float:
+                return options.pretraining_rate if self._pretrains(iteration) else together(iteration)
+
+            groups.append(ParameterGroup("environment", tuple(field.environment.parameters()), rate))
+        return groups
+
+    def colors(self, origins: Tensor, directions: Tensor, generator: torch.Generator, iteration: int) -> Tensor:
+        """Return colours [B, 3] of rays in the world with jittered samples; in pretraining, of the environment map."""
+        if self.field.environment is not None and self._pretrains(iteration):
+            return self.field.environment(directions)
+        return self.field.trace(self.field.from_world(origins), directions, generator).color
+
+    def regularisation(self, iteration: int) -> Tensor | None:
+        """Return the weighted total variation of the planes; its weight decays like the learning rates."""
+        options = self._options
+        if self._pretrains(iteration):
+            return None
+        if options.density_variation == 0 and options.appearance_variation == 0:
+            return None
+        weighted = (
+            options.density_variation * self.field.density.variation()
+            + options.appearance_variation * self.field.appearance.variation()
+        )
+        return VARIATION_FACTOR * self._decaying(1.0)(iteration) * weighted
+
+    def counts(self) -> dict[str, int]:
+        """Return the number of parameters."""
+        return {"parameters": sum(p.numel() for p in self.field.parameters())}
+
+    def render(self, view: View) -> Rendering:
+        """Render a view without gradients."""
+        return self.field.render(view)
+
+    def summary(self) -> str:
+        """Return the surroundings and constants as a sentence."""
+        values = self.field.constants._asdict().items()
+        return f"{self.field.kind} constants: {', '.join(f'{name} {value}' for name, value in values)}"
+
+    def size(self) -> Size:
+        """Return parameters and their bytes."""
+        return Size.of({}, self.field.parameters(), stored=self.field.parameters())
+
+    def state(self) -> State:
+        """Return the parameters and the frame of the model; not copies."""
+        field = self.field
+        values = {"unit": field.unit, "travel": field.travel, "kind": field.kind, "centre": field.centre.tolist()}
+        return State(dict(field.state_dict()), values)
+
+    def load_state(self, state: State) -> None:
+        """Load the parameters of a model of the same size and frame."""
+        self.load_model(state)
+
+    def load_model(self, state: State) -> None:
+        """Load the parameters; there is no further state."""
+        self.field.load_state_dict(state.tensors)
+
+    def _pretrains(self, iteration: int) -> bool:
+        return 0 < iteration <= self._options.environment_pretraining
+
+    def _decaying(self, rate: float) -> Callable[[int], float]:
+        """Return a schedule: 0 in pretraining, then exponential decay from `rate`."""
+        alone = self._options.environment_pretraining
+        decay = LogLinear(rate, rate * self._options.rate_decay, self._iterations - alone)
+        return lambda iteration: 0.0 if self._pretrains(iteration) else decay(iteration - alone)
 
 
-class EgoNeRF(nn.Module):
-    """The radiance field. Positions inside are (world - centre) / unit.
+class RayTrainer(Trainer):
+    """Trainer on the mean squared error of random rays from all views; records hold the loss without regularisation."""
 
-    Attributes:
-        centre: [3] float64, mean camera position in the world.
-        unit: world units to one unit of the model.
-        travel: how far cameras get from the centre, in units of the model; the grids reach `far` beyond it.
-        kind: of the surroundings, indoor or outdoor.
-        constants: theirs, or given.
-    """
+    ADAM: ClassVar[dict[str, Any]] = {"betas": (0.9, 0.99), "eps": 1e-8}
 
-    centre: Tensor
-
-    def __init__(self, options: EgoNeRFOptions, centre: Tensor, unit: float, travel: float, kind: str) -> None:
-        """Grids of noise; random numbers are torch's own."""
-        super().__init__()
-        self.options, self.unit, self.travel, self.kind = options, unit, travel, kind
-        self.constants = constants = options.constants(kind)
-        self.register_buffer("centre", centre.double(), persistent=False)
-        shape = {"radius": options.radial_nodes, "polar": options.polar_nodes, "azimuth": options.azimuth_nodes}
-        self.density = PlaneLines(options.density_components, shape)
-        self.appearance = PlaneLines(options.appearance_components, shape)
-        self.shader = Shader(options)
-        self.environment = EnvironmentMap(options.environment_height) if constants.environment else None
-        # Half the diagonal of a cube around all that rays can reach, as published.
-        reach = math.sqrt(3) * (travel + constants.far)
-        first, samples = constants.first_radius, options.coarse_samples
-        self.register_buffer("nodes", exponential_nodes(first, reach, options.radial_nodes).float(), persistent=False)
-        distances = constants.near + exponential_nodes(first, constants.far - constants.near, samples)
-        self.register_buffer("distances", distances.float(), persistent=False)
-
-    @classmethod
-    def from_scene(cls, scene: Scene, options: EgoNeRFOptions, seed: int = 0) -> EgoNeRF:
-        """An untrained model around the mean of the training cameras, on the device of the scene's points."""
-        unit = scene.scale if options.length_unit == "scene" else 1.0
-        centers = torch.stack([view.center for view in scene.train]).double().cpu()
-        centre = centers.mean(0)
-        travel = (centers - centre).norm(dim=-1).max().item() / unit
-        kind = surroundings.of_scene(scene) if options.surroundings == "auto" else options.surroundings
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            model = cls(options, centre, unit, travel, kind)
-        return model.to(scene.points.device)
-
-    def trace(self, origins: Tensor, directions: Tensor, generator: torch.Generator | None = None) -> RayColors:
-        """Colours of rays, differentiable by the parameters.
+    def __init__(
+        self,
+        trainee: EgoNeRFModel,
+        scene: Scene,
+        budget: Budget,
+        options: TrainOptions,
+        seed: int = 0,
+        *,
+        rays: int,
+        stage: Stage = nullcontext,
+    ) -> None:
+        """Load all pixels.
 
         Args:
-            origins: [B, 3] in units of the model.
-            directions: [B, 3] unit.
-            generator: jitters the samples, in training; without one they lie where they lie.
+            trainee, scene, budget, stage: as for `Trainer`.
+            options: weight of pixels and interval of checks.
+            seed: of rays and jitter.
+            rays: per iteration.
+
+        Raises:
+            ValueError: the pixels of a view cannot be used.
         """
-        distances = self._sample(origins, directions, generator)
-        at = self._at(origins, directions, distances)
-        depths = self._optical_depths(self.density.factors(), at, distances)
-        weights, residual = visible_shares(depths)
-        color = self._shade(at, directions, weights)
-        if self.environment is not None:
-            color = color + residual[:, None] * self.environment(directions)
-        contribution = weights.sum(-1)
-        depth = (weights * distances).sum(-1) / contribution.clamp(min=torch.finfo(weights.dtype).tiny)
-        return RayColors(color, residual, depth)
+        # The model has only those members of `Model` that do not depend on views.
+        super().__init__(cast(Model, trainee), scene, budget, options, seed, stage=stage)
+        self._model, self._rays = trainee, rays
+        lap = Lap()
+        self._pixels = RayPixels(scene.train, options.weight, self._optimizer.device, seed)
+        self._order = self._pixels
+        self.seconds, self.cpu_seconds = lap.seconds()  # reading images counts as training
 
-    @torch.no_grad()
-    def render(self, view: View) -> Rendering:
-        """An image of a view with any camera, in passes of bounded memory."""
-        camera, nodes = view.camera, self.get_buffer("nodes")
-        rotation = view.cam_from_world[:3, :3].to(nodes)
-        directions = camera.rays(dtype=nodes.dtype, device=nodes.device).reshape(-1, 3) @ rotation
-        origin = self.from_world(view.center)
-        passes = [self.trace(origin.expand_as(part), part) for part in directions.split(self.options.rays_at_once)]
-        color, transmittance, depth = (torch.cat(parts) for parts in zip(*passes, strict=True))
-        size = (view.height, view.width)
-        return Rendering(
-            color.view(*size, 3),
-            transmittance.view(size),
-            depth.view(size) * self.unit,
-            torch.zeros(0, dtype=torch.bool, device=nodes.device),  # there are no Gaussians to be seen
-            {"rays": len(directions), "samples": len(directions) * self.options.samples},
-        )
-
-    def from_world(self, points: Tensor) -> Tensor:
-        """Positions [..., 3] in units of the model of points in the world, on the model's device."""
-        return ((points.to(self.centre) - self.centre) / self.unit).to(self.get_buffer("nodes"))
-
-    @torch.no_grad()
-    def _sample(self, origins: Tensor, directions: Tensor, generator: torch.Generator | None) -> Tensor:
-        """Distances [B, coarse + fine], increasing."""
-        count, coarse = self.options.fine_samples, self.get_buffer("distances")
-        first = coarse.expand(len(origins), -1)
-        within = coarse.new_full((len(origins), count), 0.5)  # which place of each quantile
-        if generator is not None:
-            first = jittered(first, torch.rand(first.shape, generator=generator).to(coarse))
-            within = torch.rand(within.shape, generator=generator).to(coarse)
-        at = self._at(origins, directions, first)
-        weights, _ = visible_shares(self._optical_depths(self.density.coarse(), at, first))
-        second = refined(first, weights, (torch.arange(count, device=coarse.device).to(coarse) + within) / count)
-        return torch.cat((first, second), dim=-1).sort(dim=-1).values
-
-    def _at(self, origins: Tensor, directions: Tensor, distances: Tensor) -> GridPosition:
-        points = origins[:, None] + distances[..., None] * directions[:, None]
-        return grid_position(points.reshape(-1, 3), self.get_buffer("nodes"))
-
-    def _optical_depths(self, factors: Factors, at: GridPosition, distances: Tensor) -> Tensor:
-        feature = density_feature(factors, at).view(distances.shape)
-        density = functional.softplus(feature + self.constants.density_shift)
-        return density * interval_lengths(distances) * self.constants.distance_scale
-
-    def _shade(self, at: GridPosition, directions: Tensor, weights: Tensor) -> Tensor:
-        """Colours [B, 3] of all samples together."""
-        rays, samples = weights.shape
-        counts = (weights.detach().reshape(-1) >= self.options.min_weight).nonzero().squeeze(-1)
-        ray = counts // samples
-        at = at.where(counts)
-        color = self.shader(products(self.appearance.factors(), at), at.chart, directions[ray])
-        return color.new_zeros(rays, 3).index_add(0, ray, color * weights.reshape(-1)[counts, None])
+    def _step(self, iteration: int, moment: int) -> tuple[float | Tensor, dict[str, int], tuple[str, ...]]:
+        model, optimizer, generator = self._model, self._optimizer, self._pixels.generator
+        with self._stage("target"):
+            rays = self._pixels.draw(self._rays)
+        value = rays.weight.new_zeros((), dtype=torch.float64)
+        total = 3 * rays.weight.sum()
+        for part in torch.arange(self._rays, device=total.device).split(model.rays_at_once):
+            with self._stage("draw"):
+                image = model.colors(rays.origins[part], rays.directions[part], generator, moment)
+            error = (image - rays.color[part]).square() * rays.weight[part, None]
+            loss = error.sum() / total
+            value += loss.detach()
+            read = self._read(value, iteration)
+            if isinstance(read, float) and not math.isfinite(read):
+                optimizer.refuse_non_finite({**optimizer.parameters(), "image": image, "loss": loss}, iteration)
+            with self._stage("backward"):
+                loss.backward()
+        with self._stage("backward"):
+            extra = model.regularisation(moment)
+            if extra is not None:
+                extra.backward()
+        optimizer.check(iteration, moment)
+        with self._stage("optimizer"):
+            optimizer.step(moment)
+        events = (model.summary(),) if iteration == 1 else ()
+        return self._read(value, iteration), {**model.counts(), "rays": self._rays}, events

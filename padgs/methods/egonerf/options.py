@@ -1,4 +1,4 @@
-"""The sizes and lengths of an EgoNeRF. The defaults are the published ones, except where it says ours."""
+"""Options of EgoNeRF: model and training. Defaults are the published values unless marked as ours."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ LENGTH_UNITS = ("scene", "world")
 
 
 class Constants(NamedTuple):
-    """What is published with other values indoors than outdoors."""
+    """Constants whose published values differ between indoor and outdoor scenes."""
 
     density_shift: float  # density = softplus(feature + shift)
     distance_scale: float  # optical depth = density x scale x length
     near: float
     far: float
-    first_radius: float  # of the radial nodes, and the shortest interval between nodes or between first samples
-    environment: bool  # whether a picture of the sphere lies behind everything; else it is black
+    first_radius: float  # of the radial nodes, and the shortest interval between nodes or coarse samples
+    environment: bool  # environment map as background; else black
 
     def in_units_of(self, unit: float) -> Constants:
-        """The same model, with lengths in units of `unit`."""
+        """Return the constants with lengths in units of `unit`."""
         near, far, first_radius = self.near / unit, self.far / unit, self.first_radius / unit
         return self._replace(distance_scale=self.distance_scale * unit, near=near, far=far, first_radius=first_radius)
 
 
-# In world units, of Ricoh360 and of the rooms of OmniBlender; ours: how large the scene's unit of such scenes is.
+# World units of Ricoh360 and of the rooms of OmniBlender; ours: the scene scale of such scenes.
 PUBLISHED = {
     "outdoor": (Constants(-10.0, 25.0, 0.1, 300.0, 0.05, True), 5.0),
     "indoor": (Constants(-8.0, 25.0, 0.01, 15.0, 0.03, False), 2.5),
@@ -35,29 +35,29 @@ PUBLISHED = {
 
 @dataclass(frozen=True)
 class EgoNeRFOptions:
-    """The model. All lengths are in `length_unit`; None: the published value for the surroundings."""
+    """The model. Lengths are in `length_unit`; None: the published value for the surroundings."""
 
     radial_nodes: int = 150  # of each chart
-    polar_nodes: int = 172  # ... in polar angle
-    azimuth_nodes: int = 516  # ... in azimuth
+    polar_nodes: int = 172  # of each chart
+    azimuth_nodes: int = 516  # of each chart
     density_components: int = 16  # of each mode
     appearance_components: int = 48  # of each mode
-    features: int = 27  # what the basis makes of the appearance
-    hidden: int = 128  # width of the network's two hidden layers
-    feature_frequencies: int = 2  # of the encoding of features, for the network
-    direction_frequencies: int = 2  # ... of directions
+    features: int = 27  # appearance features of the basis
+    hidden: int = 128  # width of the two hidden layers
+    feature_frequencies: int = 2  # of the positional encoding of features
+    direction_frequencies: int = 2  # of the positional encoding of directions
     coarse_samples: int = 128  # of each ray
-    fine_samples: int = 128  # ... and more where those found something
-    min_weight: float = 0.0  # ours: samples that contribute less are not shaded, their share is black
-    length_unit: str = "scene"  # ours: Scene.scale, so the world's units do not matter | world: as published
-    surroundings: str = "auto"  # indoor | outdoor | auto: as the cloud says, see `surroundings.of_scene`
+    fine_samples: int = 128  # importance samples of each ray
+    min_weight: float = 0.0  # ours: samples with smaller weights are not shaded but black
+    length_unit: str = "scene"  # ours: `Scene.scale`, independent of world units | world: as published
+    surroundings: str = "auto"  # indoor | outdoor | auto: by the cloud, see `surroundings_of`
     density_shift: float | None = None  # density = softplus(feature + shift)
     distance_scale: float | None = None  # optical depth = density x scale x length
-    near: float | None = None  # distance where rays begin
-    far: float | None = None  # ... and end
+    near: float | None = None  # distance of the first sample
+    far: float | None = None  # distance of the last sample
     first_radius: float | None = None  # of the radial nodes, and the shortest interval between nodes or samples
-    environment: bool | None = None  # whether a picture of the sphere lies behind everything; else it is black
-    environment_height: int = 1920  # its rows; it has twice as many columns
+    environment: bool | None = None  # environment map as background; else black
+    environment_height: int = 1920  # rows of the environment map; twice as many columns
     samples_at_once: int = 1 << 18  # ours: bounds the memory of a pass, in training and rendering
 
     def __post_init__(self) -> None:
@@ -73,7 +73,7 @@ class EgoNeRFOptions:
                 "they must be at least 4 and 1"
             )
         for surroundings in PUBLISHED if self.surroundings == "auto" else (self.surroundings,):
-            _refuse_impossible(self.constants(surroundings))
+            _check_constants(self.constants(surroundings))
         check(self, "in [0, 1)", lambda weight: 0 <= weight < 1, "min_weight")
         if self.samples_at_once < self.samples:
             raise ValueError(
@@ -81,7 +81,7 @@ class EgoNeRFOptions:
             )
 
     def constants(self, surroundings: str) -> Constants:
-        """The values that are used indoors or outdoors, those given before the published ones."""
+        """Return the constants for indoor or outdoor; given values replace published ones."""
         published, unit = PUBLISHED[surroundings]
         if self.length_unit == "scene":
             published = published.in_units_of(unit)
@@ -90,16 +90,16 @@ class EgoNeRFOptions:
 
     @property
     def samples(self) -> int:
-        """Samples of a ray that are shaded."""
+        """Shaded samples of a ray."""
         return self.coarse_samples + self.fine_samples
 
     @property
     def rays_at_once(self) -> int:
-        """Rays of a pass."""
+        """Rays in one pass."""
         return self.samples_at_once // self.samples
 
 
-def _refuse_impossible(constants: Constants) -> None:
+def _check_constants(constants: Constants) -> None:
     near, far, first_radius = constants.near, constants.far, constants.first_radius
     if not 0 < first_radius < far - near or not near > 0:
         raise ValueError(
@@ -107,3 +107,33 @@ def _refuse_impossible(constants: Constants) -> None:
             "far - near larger than first_radius"
         )
     check(constants, "> 0", lambda scale: scale > 0, "distance_scale")
+
+
+@dataclass(frozen=True)
+class EgoNeRFTraining:
+    """The training, as published for Ricoh360."""
+
+    rays: int = 4096  # of an iteration
+    grid_rate: float = 0.02  # learning rates of Adam at the start
+    network_rate: float = 1e-3  # bases and network
+    environment_rate: float = 5e-3  # of the environment map
+    environment_pretraining: int = 0  # first iterations that train it alone; outdoor OmniBlender: 10 000
+    pretraining_rate: float = 0.02  # of the environment map in pretraining; rates decay after pretraining
+    rate_decay: float = 0.1  # rates and weights of the total variation decay exponentially to this share
+    density_variation: float = 0.1  # weight of the total variation of the density planes; 0: none
+    appearance_variation: float = 0.01  # weight of the total variation of the appearance planes
+
+    def __post_init__(self) -> None:
+        check(self, "at least 1", lambda count: count >= 1, "rays")
+        check(self, "at least 0", lambda count: count >= 0, "environment_pretraining")
+        rates = ("grid_rate", "network_rate", "environment_rate", "pretraining_rate", "rate_decay")
+        check(self, "> 0", lambda rate: rate > 0, *rates)
+        check(self, ">= 0", lambda weight: weight >= 0, "density_variation", "appearance_variation")
+
+    def refuse_length(self, iterations: int) -> None:
+        """Raise ValueError if pretraining leaves no iteration for the grids."""
+        if self.environment_pretraining >= iterations:
+            raise ValueError(
+                f"environment_pretraining is {self.environment_pretraining} of {iterations} iterations, which leaves "
+                "none for the grids; train longer, or lower it"
+            )

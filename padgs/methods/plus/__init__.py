@@ -1,1 +1,1 @@
-"""padgs_plus, the method of this project: explicit Gaussians that know the sphere in every part."""
+"""padgs_plus, the method of this project: explicit Gaussians without charts, axes or world units."""

@@ -1,65 +1,113 @@
-"""How rough the surfaces are that a drawing shows: what few views leave open, flat surfaces answer best.
+"""Smoothness prior of padgs_plus: surfaces that the training views leave open become flat.
 
-The inverse distance of a plane is linear in the direction of view, 1 / r = n . d / h, so its second difference along
-any great circle is that of a cosine: some (pixel angle)^2 of itself, however near, steep or far the plane is. What
-bends more is an edge, and then the brightness mostly bends there too, or a surface that fits the training views alone.
+The inverse distance of a plane is linear in the direction of view, 1 / r = n . d / h, so its second difference along a
+great circle is that of a cosine: (pixel angle)^2 of itself, however near, steep or far the plane is. Larger second
+differences are edges, where brightness mostly bends too, or surfaces that fit the training views alone.
+
+On the CPU one native call computes value and derivative (csrc/cpu/roughness.cpp); `define_roughness` is the definition.
 """
 
 from __future__ import annotations
 
+import ctypes
+import functools
+from typing import Any
+
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from padgs.geometry.camera import Camera, Panorama
 from padgs.geometry.distortion import solid_angle_weight
-from padgs.methods.plus.cpu_roughness import fits, native_roughness
+from padgs.native import cpu
+from padgs.native.abi import RoughnessArguments, pointer
 from padgs.render import Rendering
 
-EDGES = 10.0  # per unit of the brightness's second difference, by which a place counts less: e^-1 at 0.1
-JUMP = 0.1  # relative second difference from which on there is an edge, which nothing pulls at
+EDGE_DECAY = 10.0  # weight exp(-EDGE_DECAY x second difference of the brightness): e^-1 at 0.1
+MAX_BEND = 0.1  # relative second difference beyond which there is an edge, without gradient
+MIN_SIDE = 3  # pixels that second differences take
 
 
 def roughness(rendering: Rendering, camera: Camera, *, near: float) -> Tensor:
-    """Mean over neighbours across and down of |second difference of 1 / r| / (1 / r), a scalar.
+    """Return the mean of |second difference of 1 / r| / (1 / r) across and down, a scalar.
 
-    Differentiable by `rendering.depth` alone. Pixels count by their solid angle, by the opacity along all three rays,
-    and less where the brightness bends. Where the image is no panorama all weigh alike, and left and right do not meet.
+    Differentiable by `rendering.depth` only. Pixels are weighted by solid angle, by the opacity along all three rays,
+    and less where the brightness bends. For cameras other than panoramas all pixels weigh the same and rows do not
+    wrap.
 
     Args:
         rendering: of [H, W] pixels, in any unit of length.
-        camera: that it was drawn for.
-        near: > 0, no distance is taken to be less, in the same unit.
+        camera: of the rendering.
+        near: > 0, lower limit of distances, in the same unit.
     """
-    depth, around = rendering.depth, isinstance(camera, Panorama)
+    depth, wraps = rendering.depth, isinstance(camera, Panorama)
     rows = depth.new_ones(len(depth))
-    if around:
+    if wraps:
         rows = solid_angle_weight(len(depth), dtype=depth.dtype, device=depth.device)
-    if fits(rendering):
-        return native_roughness(rendering, rows, around=around, near=near, edges=EDGES, jump=JUMP)
+    if fits_native(rendering):
+        inputs = (depth, rendering.image, rendering.transmittance, rows)
+        return _Roughness.apply(*inputs, wraps, near, EDGE_DECAY, MAX_BEND)
+    return define_roughness(rendering, rows, wraps=wraps, near=near)
+
+
+def define_roughness(rendering: Rendering, rows: Tensor, *, wraps: bool, near: float) -> Tensor:
+    """Compute `roughness` in torch; `rows` [H] are the weights of rows, `wraps` whether rows are closed."""
     grey, opacity = rendering.image.detach().mean(-1), 1 - rendering.transmittance.detach()
-    inverse = 1 / depth.clamp(min=near)
-    down = _bends(grey, opacity, inverse, 0)
-    if around:
+    inverse = 1 / rendering.depth.clamp(min=near)
+    down = _weighted_bends(grey, opacity, inverse, 0)
+    if wraps:
         grey, opacity, inverse = (torch.cat((v[:, -1:], v, v[:, :1]), dim=1) for v in (grey, opacity, inverse))
-    return _mean(down, rows[1:-1]) + _mean(_bends(grey, opacity, inverse, 1), rows)
+    return _row_mean(down, rows[1:-1]) + _row_mean(_weighted_bends(grey, opacity, inverse, 1), rows)
 
 
-def _bends(grey: Tensor, opacity: Tensor, inverse: Tensor, axis: int) -> Tensor:
-    """Of all pixels but the first and last along an axis: how much 1 / r bends there, times what it counts."""
+def _weighted_bends(grey: Tensor, opacity: Tensor, inverse: Tensor, axis: int) -> Tensor:
+    """Return weighted relative second differences of 1 / r along an axis, without the first and last pixel."""
     before, here, after = _neighbours(opacity, axis)
-    counts = before * here * after
+    weights = before * here * after
     before, here, after = _neighbours(grey, axis)
-    counts *= torch.exp(-EDGES * (before + after - 2 * here).abs())
+    weights *= torch.exp(-EDGE_DECAY * (before + after - 2 * here).abs())
     before, here, after = _neighbours(inverse, axis)
-    return counts * ((before + after) / here - 2).abs().clamp(max=JUMP)
+    return weights * ((before + after) / here - 2).abs().clamp(max=MAX_BEND)
 
 
 def _neighbours(values: Tensor, axis: int) -> tuple[Tensor, Tensor, Tensor]:
-    """All values but the first and last along an axis, in the middle of those before and after each."""
+    """Return the values before, at and after each inner position along an axis."""
     before, here, after = (values.narrow(axis, first, values.shape[axis] - 2) for first in range(3))
     return before, here, after
 
 
-def _mean(values: Tensor, rows: Tensor) -> Tensor:
-    """Of [H, W] values whose rows weigh so much [H]."""
+def _row_mean(values: Tensor, rows: Tensor) -> Tensor:
+    """Return the mean of values [H, W] with row weights [H]."""
     return (values.mean(1) * rows).sum() / rows.sum()
+
+
+def fits_native(rendering: Rendering) -> bool:
+    """Return whether the native call takes a rendering: float32 on the CPU, at least 3x3 pixels, library built."""
+    shape, parts = rendering.depth.shape, (rendering.depth, rendering.transmittance, rendering.image)
+    plain = all(part.device.type == "cpu" and part.dtype == torch.float32 for part in parts)
+    alike = rendering.transmittance.shape == shape and rendering.image.shape == (*shape, 3)
+    return plain and alike and min(shape) >= MIN_SIDE and cpu.available()
+
+
+class _Roughness(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, depth: Tensor, image: Tensor, transmittance: Tensor, rows: Tensor, wraps: bool, *scalars: float
+    ) -> Tensor:
+        height, width = depth.shape
+        inputs = [tensor.contiguous() for tensor in (image, transmittance, depth, rows)]
+        ctx.gradient = torch.empty_like(inputs[2]) if ctx.needs_input_grad[0] else None
+        tensors = map(pointer, (*inputs, _workspace(height, width), ctx.gradient))
+        arguments = RoughnessArguments(width, height, wraps, *scalars, *tensors)
+        return depth.new_tensor(cpu.library().padgs_roughness(ctypes.byref(arguments)))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_loss: Tensor):
+        return ctx.gradient * grad_loss, *[None] * 7
+
+
+@functools.lru_cache(maxsize=2)
+def _workspace(height: int, width: int) -> Tensor:
+    # Reused like the one of `padgs.training.loss`: only one thread at a time may train.
+    return torch.zeros(cpu.library().padgs_roughness_workspace(height, width), dtype=torch.float32)

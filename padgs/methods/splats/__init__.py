@@ -1,1 +1,1 @@
-"""Explicit Gaussians with spherical harmonics: the 3DGS family."""
+"""Explicit Gaussians: the family of 3D Gaussian splatting."""

@@ -1,159 +1,274 @@
-"""Explicit 3D Gaussians with spherical harmonics: the model of 3DGS and OmniGS, and the ablation's baseline."""
+"""Explicit Gaussians in training: parameters, learning rates and densification as one trainable model."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Sequence
+from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from padgs.gaussians import Gaussians
-from padgs.geometry import harmonics as spherical_harmonics
-from padgs.methods.splats import cpu_splats, gpu_splats
-from padgs.scene import Scene, View
-from padgs.training.initial_points import refuse_unusable, squared_spacing
-from padgs.training.optimizer import load_rows
+from padgs.methods.splats.densification import MIN_DENSIFY_EVERY, DensificationOptions, Densifier
+from padgs.methods.splats.importance import PruningStep, importance_scores, most_important
+from padgs.methods.splats.smoothing_filter import SmoothingFilter, cameras_of, finest_pixels, widened
+from padgs.methods.splats.splats import Splats
+from padgs.render import RenderConfig, Rendering, RenderOptions, render
+from padgs.render.contract import ALPHA_MIN
+from padgs.render.projection import widened_scales
+from padgs.scene import View
+from padgs.training.optimizer import keep_rows
+from padgs.training.schedule import Constant, LogLinear, ParameterGroup, scaled
+from padgs.training.model import TrainingRender, Parts, Size, State
 
-INITIAL_OPACITY = 0.1
-SMALLEST_SCALE = 1e-4  # initial scale of coinciding points, in scene units
-DARKEST = 1 / 1024  # initial colour; one of exactly 0 is cut off at 0 by rounding, where nothing pulls at it
-TINY = 1e-6  # scene units; keeps directions finite for a camera exactly on a Gaussian
+OFFSET_COLUMNS = {"image": 2, "space": 3, "space_absolute": 4}  # of `mean_offsets`, by positional gradient
+FILTER_VARIANCES = "filter/variances"  # key in a state
+DEGREE_EVERY = 1000  # published iterations between two SH degrees
 
 
-class Splats(nn.Module):
-    """N Gaussians, stored as they are learned: log-scales, opacity logits, SH coefficients.
+class SplatModel:
+    """Splats with the schedule of 3DGS for a run of `iterations`; a `padgs.training.model.Model`.
 
     Attributes:
-        means: [N, 3] world.
-        quats: [N, 4] wxyz, not normalised.
-        log_scales: [N, 3] of world units.
-        opacity_logits: [N].
-        sh_dc: [N, 3] colour coefficient of degree 0.
-        sh_rest: [N, (degree + 1)^2 - 1, 3] of the higher degrees.
-        active_degree: degree in use; the higher coefficients wait, and get no gradient.
-        unit: the scene's unit of length in world units.
+        splats: the parameters.
+        densifier: adds and removes Gaussians.
+        pruning: removes the least important Gaussians once densification has ended.
     """
 
     def __init__(
         self,
-        means: Tensor,
-        log_scales: Tensor,
-        colors: Tensor,
+        splats: Splats,
+        options: DensificationOptions,
+        config: RenderConfig,
         *,
-        degree: int = 3,
-        unit: float = 1.0,
-        opacity: float = INITIAL_OPACITY,
+        extent: float,
+        iterations: int,
+        views: Sequence[View] = (),
+        target: int | None = None,
+        seed: int = 0,
+        requested: int | str | None = None,
+        prune_psnr: float | None = None,
+        smoothing_filter: float = 0.0,
     ) -> None:
-        """Round Gaussians of one opacity: means [N, 3], log-scales [N, 3], RGB in [0, 1] [N, 3].
-
-        Raises:
-            ValueError: the degree is not 0, 1, 2 or 3.
-        """
-        super().__init__()
-        if not 0 <= degree <= spherical_harmonics.MAX_DEGREE:
-            raise ValueError(f"sh_degree is {degree}; it must be 0 to {spherical_harmonics.MAX_DEGREE}")
-        count = len(means)
-        self.degree, self.active_degree, self.unit = degree, 0, unit
-        self.means = nn.Parameter(means.clone())
-        self.quats = nn.Parameter(means.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1))
-        self.log_scales = nn.Parameter(log_scales.clone())
-        self.opacity_logits = nn.Parameter(means.new_full((count,), math.log(opacity / (1 - opacity))))
-        self.sh_dc = nn.Parameter(spherical_harmonics.dc_from_colors(colors.clamp(min=DARKEST)))
-        self.sh_rest = nn.Parameter(means.new_zeros(count, (degree + 1) ** 2 - 1, 3))
-
-    @classmethod
-    def from_scene(
-        cls,
-        scene: Scene,
-        *,
-        degree: int = 3,
-        max_gaussians: int | None = None,
-        opacity: float = INITIAL_OPACITY,
-        scale: float = 1.0,
-        generator: torch.Generator,
-    ) -> Splats:
-        """One Gaussian per point of the cloud; a random choice of points where there are more than `max_gaussians`.
+        """Wrap splats.
 
         Args:
-            scene: its cloud, and its unit.
-            degree: of the spherical harmonics.
-            max_gaussians: as many as there are at most; None: all.
-            opacity: of all.
-            scale: times `initial_scales`.
-            generator: of the random choice, on the CPU.
-
-        Raises:
-            ValueError: the point cloud is empty or not finite.
+            splats: the parameters.
+            options: of a published run, see `DensificationOptions.for_run`.
+            config: how the model is rendered.
+            extent: of the scene, world units.
+            iterations: of the run.
+            views: training views; empty for a model that is only rendered.
+            target: as in `Densifier`.
+            seed: of all random choices.
+            requested, prune_psnr: as in `PruningStep`.
+            smoothing_filter: variance of `SmoothingFilter`, square pixels; 0: none.
         """
-        points, colors = scene.points.float(), scene.point_colors.float() / 255
-        refuse_unusable(points, "Gaussians")
-        if max_gaussians is not None and len(points) > max_gaussians:
-            chosen = torch.randperm(len(points), generator=generator)[:max_gaussians].sort().values
-            points, colors = points[chosen], colors[chosen]
-        log_scales = torch.log(scale * initial_scales(points, scene.scale))[:, None].repeat(1, 3)
-        return cls(points, log_scales, colors, degree=degree, unit=scene.scale, opacity=opacity)
+        self.splats, self.iterations = splats, iterations
+        self._config, self._views, self._extent = config, views, extent
+        self.densifier = Densifier(
+            splats,
+            options.for_run(iterations),
+            extent=extent,
+            target=target,
+            rendered_opacities=self._rendered_opacities,
+            seed=seed,
+        )
+        self.pruning = PruningStep(self.densifier.options, iterations, requested=requested, prune_psnr=prune_psnr)
+        self._filter = SmoothingFilter(smoothing_filter, cameras_of(views)) if smoothing_filter > 0 else None
+        if self._filter is not None:
+            self._filter.update(splats.means)
 
-    def __len__(self) -> int:
-        return len(self.means)
+    def groups(self, means_rate_factor: float = 1.0) -> list[ParameterGroup]:
+        """Return the learning rates of 3DGS; that of the means decays over the run and scales with the extent."""
+        splats, factor = self.splats, means_rate_factor * self._extent
+        rates = {
+            "means": LogLinear(1.6e-4 * factor, 1.6e-6 * factor, self.iterations),
+            "quats": Constant(1e-3),
+            "log_scales": Constant(5e-3),
+            "opacity_logits": Constant(5e-2),
+            "sh_dc": Constant(2.5e-3),
+            "sh_rest": Constant(2.5e-3 / 20),
+        }
+        rows = splats.rows()
+        return [ParameterGroup(name, (rows[name],), rate, is_of_rows=True) for name, rate in rates.items()]
 
-    def rows(self) -> dict[str, nn.Parameter]:
-        """All parameters; each has one row per Gaussian."""
-        return dict(self.named_parameters())
+    def draw(self, view: View, mean_offsets: Tensor | None = None) -> TrainingRender:
+        """Render all Gaussians, differentiably.
+
+        `mean_offsets` are those of another render of the same Gaussians if a view is made of several renders: their
+        gradient is then the sum.
+        """
+        splats, kind = self.splats, self.densifier.options.positional_gradient
+        offsets = mean_offsets
+        if offsets is None:
+            offsets = splats.means.new_zeros(len(splats), OFFSET_COLUMNS[kind], requires_grad=True)
+        gaussians, absolute = splats.displaced(view, None if kind == "image" else offsets)
+        gaussians = self._training_gaussians(gaussians)
+        if kind == "image":
+            rendering = self._rendered(gaussians, view, mean_offsets=offsets)
+        else:
+            rendering = self._rendered(gaussians, view, absgrad=absolute)
+        return TrainingRender(rendering, offsets, gaussians, torch.arange(len(offsets), device=offsets.device))
+
+    def _rendered(self, gaussians: Gaussians, view: View, **offsets: Any) -> Rendering:
+        return render(gaussians, view, self.render_options(view), backend=self._config.backend, **offsets)
+
+    def _training_gaussians(self, gaussians: Gaussians) -> Gaussians:
+        """Return the Gaussians as the next training render has them."""
+        return gaussians if self._filter is None else self._filter(gaussians)
+
+    def observe(self, drawing: TrainingRender, iteration: int) -> None:
+        """Collect positional gradients."""
+        assert drawing.probe.grad is not None, "observe is called after draw and backward"
+        self.densifier.observe(drawing.probe.grad, drawing.rendering.visible, iteration)
+
+    def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
+        """Densify, prune by importance, and activate the next SH degree, each when it is due."""
+        events = self.densifier.adapt(iteration, optimizer, grows=self._has_enough_views)
+        if self.pruning.is_due(iteration):
+            events += self._prune(optimizer)
+        if self._filter is not None:
+            events += self._update_filter(self._filter, iteration, optimizer)
+        degree = min(self.splats.degree, self.degree_at(iteration + 1))
+        if degree > self.splats.active_degree:
+            self.splats.active_degree = degree
+            events += (f"spherical harmonics of degree {degree}",)
+        return events
+
+    def _has_enough_views(self) -> bool:
+        """Return whether the mean gradients of a round are over enough views.
+
+        If the schedule follows the clock, a round may come after few views. It is skipped: densification by noise makes
+        the model larger and its iterations fewer, which makes the next round noisier still.
+        """
+        if len(self.splats) == 0:  # the next render ends the run
+            return False
+        views = int(self.densifier.statistics["seen"].max())  # some Gaussian is seen by all
+        return 2 * views >= min(self.densifier.options.densify_every, MIN_DENSIFY_EVERY)
+
+    def _prune(self, optimizer: torch.optim.Adam) -> tuple[str, ...]:
+        """Keep the most important Gaussians, scored on about as many training views as a round has iterations."""
+        before, step = len(self.splats), math.ceil(len(self._views) / self.densifier.options.densify_every)
+        scores = importance_scores(self, self._views[::step])
+        kept = self.pruning.count(scores)
+        keep_rows(self.splats.rows(), optimizer, most_important(scores, kept))
+        self.densifier.reset_statistics()
+        self.pruning.done = True
+        return (f"pruned the least important of {before} Gaussians, kept {kept}",)
+
+    def _update_filter(
+        self, smoothing: SmoothingFilter, iteration: int, optimizer: torch.optim.Adam
+    ) -> tuple[str, ...]:
+        """Update the filter after rows changed and at least once a round; at the end prune what is invisible."""
+        splats, every = self.splats, self.densifier.options.densify_every
+        if len(smoothing.variances) == len(splats) and iteration % every and iteration < self.iterations:
+            return ()
+        smoothing.update(splats.means)
+        if iteration < self.iterations:
+            return ()
+        visible, before = self._rendered_opacities() >= ALPHA_MIN, len(splats)
+        keep_rows(splats.rows(), optimizer, visible)
+        self.densifier.reset_statistics()
+        smoothing.update(splats.means)
+        return (f"pruned {before - len(splats)} invisible Gaussians",)
+
+    def degree_at(self, iteration: int) -> int:
+        """Return the SH degree scheduled for an iteration, if the model has it."""
+        return iteration // scaled(DEGREE_EVERY, self.iterations)
+
+    def counts(self) -> dict[str, int]:
+        """Return the number of Gaussians."""
+        return {"gaussians": len(self.splats)}
+
+    def parts(self, view: View) -> Parts:
+        """Return all Gaussians; each is a row."""
+        slots = torch.arange(len(self.splats), device=self.splats.means.device)
+        return Parts(self._final_gaussians(view), slots, 1, self.render_options(view))
+
+    def keep(self, rows: Tensor) -> None:
+        """Keep these Gaussians only."""
+        keep_rows(self.splats.rows(), None, rows)
+        self.densifier.statistics = {name: values[rows] for name, values in self.densifier.statistics.items()}
+        if self._filter is not None:
+            self._filter.variances = self._filter.variances[rows]
 
     def truncate(self, degree: int) -> None:
-        """Leave out the harmonics above a degree; no optimizer may hold them."""
-        self.degree, self.active_degree = degree, min(degree, self.active_degree)
-        self.sh_rest.data, self.sh_rest.grad = self.sh_rest.data[:, : (degree + 1) ** 2 - 1].contiguous(), None
+        """Drop the harmonics above a degree; no optimizer may hold the parameters."""
+        self.splats.truncate(degree)
 
-    def load(self, tensors: Mapping[str, Tensor]) -> None:
-        """Take over what `state_dict` of another model gave; the number of Gaussians may differ.
+    @torch.no_grad()
+    def render(self, view: View) -> Rendering:
+        """Render a view without gradients."""
+        return self._rendered(self._final_gaussians(view), view)
+
+    def _final_gaussians(self, view: View) -> Gaussians:
+        """Return the Gaussians as a finished model renders them."""
+        gaussians = self.splats.gaussians(view)
+        return gaussians if self._filter is None else self._filter(gaussians)
+
+    def baked(self) -> Splats:
+        """Return splats with the smoothing filter applied, for programs that have no such filter."""
+        return self.splats if self._filter is None else widened(self.splats, self._filter.variances)
+
+    def size(self) -> Size:
+        """Return counts and bytes of the model."""
+        return Size.of(self.counts(), self.splats.parameters(), stored=self.splats.parameters())
+
+    def state(self) -> State:
+        """Return parameters, statistics and random state; not copies."""
+        tensors = {f"splats/{name}": tensor for name, tensor in self.splats.state_dict().items()}
+        tensors |= {f"statistics/{name}": tensor for name, tensor in self.densifier.statistics.items()}
+        tensors["random/pieces"] = self.densifier.generator.get_state()
+        if self._filter is not None:
+            tensors[FILTER_VARIANCES] = self._filter.variances
+        values = {
+            "active_degree": self.splats.active_degree,
+            "degree": self.splats.degree,
+            "scene_scale": self.splats.scene_scale,
+            "extent": self._extent,
+            "iterations": self.iterations,
+            "pruned": self.pruning.done,
+        }
+        return State(tensors, values)
+
+    def load_state(self, state: State) -> None:
+        """Restore the model that `state` was taken of.
 
         Raises:
-            ValueError: as `padgs.training.optimizer.load_rows` does.
+            ValueError: the state is of a model with other options.
         """
-        load_rows(self, tensors, self.rows())
+        self.load_model(state)
+        device = self.splats.means.device
+        self.densifier.statistics = {n: t.to(device, copy=True) for n, t in state.under("statistics/").items()}
+        self.densifier.generator.set_state(state.tensors["random/pieces"].cpu())
+        self.pruning.done = state.values["pruned"]
+        if self._filter is not None:
+            self._filter.variances = state.tensors[FILTER_VARIANCES].to(device, copy=True)
 
-    def gaussians(self, view: View) -> Gaussians:
-        """The Gaussians with the colours that this view sees."""
-        return self.probed(view)[0]
+    def load_model(self, state: State) -> None:
+        """Load the parameters only; densification starts anew.
 
-    def probed(self, view: View, probe: Tensor | None = None) -> tuple[Gaussians, Tensor | None]:
-        """The same, moved by a probe [N, 3] along the world's axes, in halves of the distance from the camera.
-
-        Of a probe [N, 4] the last values, in the same unit, are returned, too, [N]: see `padgs.methods.splats.probes`.
+        Raises:
+            ValueError: the state is of a model with other options.
         """
-        center, tiny = view.center.to(self.means), TINY * self.unit
-        for native in (cpu_splats, gpu_splats):
-            if native.fits(self.means, center):
-                learned = (self.means, self.log_scales, self.opacity_logits, self.sh_dc, self.sh_rest)
-                seen = native.native_splats(cpu_splats.Learned(*learned, probe), self.active_degree, center, tiny)
-                return Gaussians(seen.means, self.quats, seen.scales, seen.opacities, seen.colors), seen.pulls
-        means, pulls = self.means, None
-        if probe is not None:
-            steps = 0.5 * (means.detach() - center).norm(dim=-1, keepdim=True) * probe
-            means, pulls = means + steps[:, :3], steps[:, 3] if steps.shape[1] > 3 else None
-        opacities, colors = torch.sigmoid(self.opacity_logits), self._colors(means, center, tiny)
-        return Gaussians(means, self.quats, torch.exp(self.log_scales), opacities, colors), pulls
+        self.splats.load(state.under("splats/"))
+        self.splats.active_degree = state.values["active_degree"]
+        self.splats.scene_scale = state.values["scene_scale"]
+        self.densifier.reset_statistics()
+        if self._filter is not None:
+            self._filter.update(self.splats.means)
 
-    def _colors(self, means: Tensor, center: Tensor, tiny: float) -> Tensor:
-        """Max(0, 1/2 + SH), [N, 3], seen along camera -> Gaussian in the world frame."""
-        colors = 0.5 + spherical_harmonics.DC * self.sh_dc
-        if self.active_degree > 0:
-            rays = means - center
-            directions = rays / torch.sqrt((rays * rays).sum(-1, keepdim=True) + tiny**2)
-            values = spherical_harmonics.basis(directions, self.active_degree)[:, 1:]  # [N, K]
-            # No einsum, which on a GPU is a tiny matrix product for each Gaussian.
-            colors = colors + (values[..., None] * self.sh_rest[:, : values.shape[1]]).sum(1)
-        return colors.clamp(min=0)
+    @torch.no_grad()
+    def _rendered_opacities(self) -> Tensor:
+        """Return opacities [N] as rendered by the training camera with the finest pixel; 3D filters lower them."""
+        splats, variance = self.splats, 0.0 if self._filter is None else self._filter.square_pixels
+        if self._config.resolved_low_pass_kind == "solid":
+            variance += self._config.low_pass
+        squared = finest_pixels(splats.means, cameras_of(self._views)).square()
+        return torch.sigmoid(splats.opacity_logits) * widened_scales(splats.log_scales.exp(), variance * squared)[1]
 
-
-def initial_scales(points: Tensor, unit: float) -> Tensor:
-    """Root mean square distance [N] of each point [N, 3] to its three nearest others, at least `SMALLEST_SCALE` units.
-
-    A lone point gets a tenth of a unit.
-    """
-    squared = squared_spacing(points)
-    if squared is None:
-        return points.new_full((len(points),), 0.1 * unit)
-    return squared.sqrt().clamp(min=SMALLEST_SCALE * unit).to(points)
+    def render_options(self, view: View) -> RenderOptions:
+        """Return the renderer options for a view."""
+        return self._config.options(self.splats.scene_scale)

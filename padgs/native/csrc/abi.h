@@ -193,7 +193,7 @@ struct SplatArguments {
   float *grad_means, *grad_log_scales, *grad_opacity_logits, *grad_dc, *grad_rest, *grad_probe;
 };
 
-// What padgs.methods.plus.angular_size.mean_angular_size takes.
+// What padgs.methods.plus.model.mean_angular_size takes.
 struct AngularSizeArguments {
   int64_t count;
   float center[3], nearest;     // of the camera; what a distance is at least taken for; world units

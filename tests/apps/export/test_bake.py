@@ -7,7 +7,7 @@ from tiny_scene import tiny_scene, truth
 from padgs.apps.export.bake import axes_of, bake, contributions, distill, sample_cameras
 from padgs.gaussians import rotation_matrices
 from padgs.methods.anchors.method import PaDGSMethod
-from padgs.methods.splats.model import Splats
+from padgs.methods.splats.splats import Splats
 from padgs.render import RenderOptions, render
 from padgs.training.options import Budget
 
@@ -22,7 +22,7 @@ def trained() -> PaDGSMethod:
 
 def decibels(method: PaDGSMethod, splats: Splats) -> float:
     """Mean PSNR of the baked pictures of held-out and training views against the method's own."""
-    options = method.render_config.options(splats.unit)
+    options = method.render_config.options(splats.scene_scale)
     errors = [
         (render(splats.gaussians(view), view, options).image - method.render(view).image).square().mean()
         for view in (*tiny_scene().train, *tiny_scene().test)

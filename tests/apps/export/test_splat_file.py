@@ -11,15 +11,15 @@ from padgs.apps.export import splat_file
 from padgs.apps.export.splat_file import estimate_seconds, read_splats, write_splats
 from padgs.data.capture import Cloud, DataError
 from padgs.data.cloud import write_ply
-from padgs.methods.splats.model import Splats
+from padgs.methods.splats.splats import Splats
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_what_is_read_is_what_was_written_bit_by_bit(degree, tmp_path, generator):
     splats = random_splats(degree, generator)
     write_splats(tmp_path / "a.ply", splats, ["said of it"])
-    found = read_splats(tmp_path / "a.ply", unit=splats.unit)
-    assert (found.degree, found.active_degree, found.unit) == (degree, degree, splats.unit)
+    found = read_splats(tmp_path / "a.ply", unit=splats.scene_scale)
+    assert (found.degree, found.active_degree, found.scene_scale) == (degree, degree, splats.scene_scale)
     for name, row in splats.rows().items():
         assert torch.equal(found.rows()[name], row), name
     assert PlyData.read(str(tmp_path / "a.ply"))["vertex"].comments == ["said of it"]

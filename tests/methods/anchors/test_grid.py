@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from padgs.methods.anchors.grid import (
+from padgs.methods.anchors.anchors import (
     anchors_from_points,
     automatic_voxel_size,
     cell_keys,

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from padgs import load_scene
-from padgs.methods.anchors.growth import PUBLISHED_THRESHOLD, Growth, GrowthOptions, find_seeds
-from padgs.methods.anchors.model import PaDGS, PaDGSOptions
+from padgs.methods.anchors.anchors import PaDGS, PaDGSOptions
+from padgs.methods.anchors.growth import PUBLISHED_THRESHOLD, Growth, GrowthOptions, find_new_anchors
 from padgs.training.health import Failure
 
 VOXEL = 0.5
@@ -53,12 +53,12 @@ def test_a_real_cloud_leaves_room_for_growth_by_default(name, shared, generator)
     assert len(model) > 0.85 * len(scene.points)
     model.offsets.data.normal_(std=0.5, generator=generator)
     pulled = torch.full((len(model) * model.options.offsets,), 1.0)
-    seeds = find_seeds(model, pulled, GrowthOptions(), generator)
+    seeds = find_new_anchors(model, pulled, GrowthOptions(), generator)
     assert (seeds.sizes == GrowthOptions().coarsest).sum() > 0.05 * len(model)
 
 
 def seeds_of(model, gradients, options=PUBLISHED):
-    seeds = find_seeds(model, torch.tensor(gradients), options, torch.Generator())
+    seeds = find_new_anchors(model, torch.tensor(gradients), options, torch.Generator())
     return [tuple(cell) for cell in seeds.cells.tolist()], seeds
 
 
@@ -74,7 +74,7 @@ def test_candidates_are_kept_with_probability_one_half_then_three_quarters_then_
     model = model_at(cells, offsets=1)
     with torch.no_grad():
         model.offsets[:, 0, 1] = 20 * 16 * VOXEL
-    seeds = find_seeds(model, torch.ones(count), PUBLISHED, torch.Generator().manual_seed(0))
+    seeds = find_new_anchors(model, torch.ones(count), PUBLISHED, torch.Generator().manual_seed(0))
     # Level 1 and 2 may only add where no anchor, and no seed of a coarser level, is in their own cell.
     by_size = {size: int((seeds.sizes == size).sum()) for size in (16, 4, 1)}
     assert by_size[16] == pytest.approx(count / 2, rel=0.03)
@@ -113,7 +113,7 @@ def test_one_anchor_per_cell_with_the_largest_features_of_its_parents(lucky):
     cells, seeds = seeds_of(model, [0.0, 3e-4, 2.5e-4, 0.0])
     assert cells == [(160, 0, 0)]
     assert seeds.features.tolist() == [[-1.0, -1.0, 5.0]]
-    assert seeds.strength.item() == pytest.approx(3e-4)
+    assert seeds.gradients.item() == pytest.approx(3e-4)
 
 
 def ready(model, options, *, gradient, seen) -> Growth:

@@ -6,12 +6,13 @@ import pytest
 import torch
 
 from padgs.geometry.panorama import rays
+from padgs.methods.anchors.anchors import PaDGS
 from padgs.methods.anchors.method import PaDGSMethod, PaDGSMethodOptions
-from padgs.methods.anchors.model import PaDGS
-from padgs.methods.anchors.trainee import LearningRates
+from padgs.methods.anchors.model import LearningRates
 from padgs.render import RenderConfig
 from padgs.scene import Scene, View
-from padgs.training.options import Budget, TrainOptions
+from padgs.training.options import Budget
+from padgs.training.options import TrainOptions
 
 WIDTH, HEIGHT = 48, 24
 EAGER = PaDGSMethodOptions(  # growth early and often, so that a short run has it
@@ -108,7 +109,7 @@ def test_seeds_matter_and_repeat():
 def test_size_is_what_is_stored(long_run):
     method, records = long_run
     size, anchors = method.size(), records[-1].counts["anchors"]
-    networks = sum(p.numel() for p in method.model.model.decoder.parameters())
+    networks = sum(p.numel() for p in method.model.anchors.decoder.parameters())
     assert size.counts == {"anchors": anchors, "gaussians": 4 * anchors}
     assert size.parameters == anchors * (32 + 4 * 3 + 6) + networks
     assert size.bytes == 4 * (size.parameters + 3 * anchors)

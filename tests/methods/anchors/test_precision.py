@@ -1,4 +1,4 @@
-"""Products in a reduced type: within the bounds that its rounding has, and truly reduced."""
+"""Products in a reduced_dtype type: within the bounds that its rounding has, and truly reduced_dtype."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from padgs.methods.anchors.decoder import Decoder, SeenAnchors, decode, define_gaussians
-from padgs.methods.anchors.precision import OF_GRADIENTS, linear, reduced
+from padgs.methods.anchors.precision import GRADIENT_TYPE, linear, reduced_dtype
 
 each_reduced = pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16], ids=str)
 
@@ -40,7 +40,7 @@ def test_gradients_are_float32_and_err_by_the_rounding_of_bfloat16(dtype: torch.
     inputs, weight, bias = (tensor.requires_grad_() for tensor in layer(generator))
     upstream = size * torch.randn(500, 32, generator=generator)
     gradients = torch.autograd.grad(linear(inputs, weight, bias, dtype), (inputs, weight, bias), upstream)
-    u, exact = roundoff(OF_GRADIENTS), upstream.double()
+    u, exact = roundoff(GRADIENT_TYPE), upstream.double()
     for gradient, a, b in zip(gradients, (exact, exact.T), (weight.double(), inputs.double()), strict=False):
         error, magnitude = (gradient - a @ b).abs(), a.abs() @ b.abs()
         assert gradient.dtype == torch.float32 and (error <= 4 * u * magnitude).all()
@@ -88,4 +88,4 @@ def test_geometry_stays_float32(dtype: torch.dtype, generator: torch.Generator):
 
 def test_unknown_names_list_the_known():
     with pytest.raises(ValueError, match="unknown precision 'half'; known: float32, bfloat16, float16"):
-        reduced("half")
+        reduced_dtype("half")

@@ -15,7 +15,8 @@ VIEW = tiny_scene().train[3]
 
 
 def drawer(gaussians: Gaussians, projection: str = "ray", backend: str = "torch"):
-    def draw(view: View, probe: torch.Tensor | None = None) -> TrainingRender:
+    def draw(view: View, mean_offsets: torch.Tensor | None = None) -> TrainingRender:
+        probe = mean_offsets
         probe = gaussians.means.new_zeros(len(gaussians), 2, requires_grad=True) if probe is None else probe
         rendering = render(gaussians, view, RenderOptions(projection), mean_offsets=probe, backend=backend)
         return TrainingRender(rendering, probe, gaussians, torch.arange(len(gaussians)))

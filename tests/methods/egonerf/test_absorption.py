@@ -1,6 +1,6 @@
 import torch
 
-from padgs.methods.egonerf.ray_samples import visible_shares
+from padgs.methods.egonerf.rays import visible_shares
 
 DENSITY = 0.7
 

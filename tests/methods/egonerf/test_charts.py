@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from padgs.methods.egonerf.charts import YANG, YIN, ChartPosition, direction, locate, swapped
+from padgs.methods.egonerf.grids import YANG, YIN, ChartPosition, direction, locate, swapped
 
 YIN_SHARE = math.sqrt(2) * 1.5 * math.pi / (4 * math.pi)  # 2 sin(pi/4) x 3 pi/2 of the 4 pi
 

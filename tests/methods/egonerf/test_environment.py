@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from padgs.methods.egonerf.environment import EnvironmentMap
+from padgs.methods.egonerf.field import EnvironmentMap
 
 HEIGHT = 6
 

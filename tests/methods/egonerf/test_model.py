@@ -8,7 +8,7 @@ from tiny_scene import tiny_scene
 from torch.nn.functional import normalize, softplus
 
 from padgs.geometry.camera import Pinhole, RayTable
-from padgs.methods.egonerf.model import EgoNeRF
+from padgs.methods.egonerf.field import EgoNeRF
 from padgs.methods.egonerf.options import Constants, EgoNeRFOptions
 from padgs.runs.run import build_method
 from padgs.scene import Scene, View
@@ -201,7 +201,7 @@ def test_the_units_of_the_world_do_not_matter(scale):
     scene = tiny_scene()
     other = moved(scene, scale)
     plain, scaled = dense(scene=scene), dense(scene=other)
-    assert scaled.scale == pytest.approx(scale * plain.scale)
+    assert scaled.unit == pytest.approx(scale * plain.unit)
     a, b = plain.render(scene.test[0]), scaled.render(other.test[0])
     assert torch.allclose(a.image, b.image, atol=1e-4)
     assert torch.allclose(a.depth * scale, b.depth, rtol=1e-3)

@@ -3,17 +3,18 @@ import torch
 from torch.autograd import gradcheck
 from torch.nn.functional import normalize
 
-from padgs.methods.egonerf.charts import YANG, YIN
-from padgs.methods.egonerf.plane_lines import (
+from padgs.methods.egonerf.grids import (
     MODES,
+    YANG,
+    YIN,
     Factors,
     GridPosition,
     PlaneLines,
     density_feature,
+    exponential_nodes,
     grid_position,
     products,
 )
-from padgs.methods.egonerf.radii import exponential_nodes
 
 SHAPE = {"radius": 6, "polar": 4, "azimuth": 8}
 

@@ -3,7 +3,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from padgs.methods.egonerf.radii import exponential_nodes, node_fraction
+from padgs.methods.egonerf.grids import exponential_nodes, node_fraction
 
 
 @given(first=st.floats(1e-4, 0.5), factor=st.floats(1.5, 1e5), count=st.integers(3, 300))

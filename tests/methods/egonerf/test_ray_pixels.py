@@ -5,7 +5,7 @@ import torch
 from tiny_scene import tiny_scene
 
 from padgs.geometry.camera import Pinhole
-from padgs.methods.egonerf.ray_pixels import RayPixels
+from padgs.methods.egonerf.rays import RayPixels
 from padgs.scene import View
 
 

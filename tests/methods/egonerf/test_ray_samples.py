@@ -1,6 +1,6 @@
 import torch
 
-from padgs.methods.egonerf.ray_samples import interval_lengths, inverse_cdf, jittered, refined
+from padgs.methods.egonerf.rays import interval_lengths, inverse_cdf, jittered, refined
 
 
 def test_quantiles_of_an_exponential_density():

@@ -6,7 +6,7 @@ import torch
 from tiny_scene import tiny_scene
 from torch import Tensor, nn
 
-from padgs.methods.egonerf.ray_trainer import RayTrainer
+from padgs.methods.egonerf.model import RayTrainer
 from padgs.scene import Scene
 from padgs.training.health import Failure
 from padgs.training.model import State

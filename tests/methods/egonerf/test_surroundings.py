@@ -6,9 +6,8 @@ import torch
 from tiny_scene import tiny_scene
 
 from padgs.data.synthetic import SyntheticOptions, generate
-from padgs.methods.egonerf.model import EgoNeRF
+from padgs.methods.egonerf.field import EgoNeRF, cloud_reach, surroundings_of
 from padgs.methods.egonerf.options import EgoNeRFOptions
-from padgs.methods.egonerf.surroundings import of_scene, reach
 from padgs.scene import View
 
 TINY: dict[str, Any] = {"width": 32, "train_views": 4, "test_views": 1, "samples": 1, "points": 600}
@@ -18,8 +17,8 @@ TINY: dict[str, Any] = {"width": 32, "train_views": 4, "test_views": 1, "samples
 def test_rooms_and_the_open_are_told_apart_in_any_unit(tmp_path, monkeypatch, scene, kind):
     monkeypatch.setenv("PADGS_CACHE", str(tmp_path))
     found = [generate(SyntheticOptions(scene, **TINY, world_scale=scale)) for scale in (1.0, 100.0)]
-    assert [of_scene(one) for one in found] == [kind, kind]
-    assert reach(found[1]) == pytest.approx(reach(found[0]), rel=1e-3)
+    assert [surroundings_of(one) for one in found] == [kind, kind]
+    assert cloud_reach(found[1]) == pytest.approx(cloud_reach(found[0]), rel=1e-3)
 
 
 def test_a_few_points_behind_the_walls_make_no_outdoors():
@@ -29,13 +28,13 @@ def test_a_few_points_behind_the_walls_make_no_outdoors():
     for outliers, kind in ((30, "indoor"), (80, "outdoor")):
         points = shell.clone()
         points[:outliers] *= 50
-        assert of_scene(replace(scene, train=(still,), points=points)) == kind
+        assert surroundings_of(replace(scene, train=(still,), points=points)) == kind
 
 
 def test_what_is_given_comes_before_what_the_surroundings_say():
     small: dict[str, Any] = {"radial_nodes": 4, "polar_nodes": 4, "azimuth_nodes": 4, "environment_height": 4}
     chosen = EgoNeRF.from_scene(tiny_scene(), EgoNeRFOptions(**small))
-    assert chosen.kind == of_scene(tiny_scene())
+    assert chosen.kind == surroundings_of(tiny_scene())
     options = EgoNeRFOptions(**small, surroundings="indoor", far=7.0, environment=True)
     model = EgoNeRF.from_scene(tiny_scene(), options)
     assert model.kind == "indoor" and model.environment is not None

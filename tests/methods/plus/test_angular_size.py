@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from padgs.gaussians import Gaussians
-from padgs.methods.plus import angular_size
-from padgs.methods.plus.angular_size import mean_angular_size
+from padgs.methods.plus import model
+from padgs.methods.plus.model import mean_angular_size
 from padgs.native import cpu
 from padgs.scene import View
 
@@ -43,7 +43,7 @@ def test_the_native_value_and_gradient_are_those_of_the_definition(monkeypatch, 
     means, scales = torch.randn(count, 3, generator=generator), torch.rand(count, 3, generator=generator)
     found = []
     for native in (True, False):
-        monkeypatch.setattr(angular_size.cpu, "available", lambda native=native: native)
+        monkeypatch.setattr(model.cpu, "available", lambda native=native: native)
         leaf = scales.clone().requires_grad_()
         size = mean_angular_size(gaussians_at(means, leaf), view_from((0.1, 0.2, 0.3)), near=0.2)
         found.append((size.item(), *torch.autograd.grad(3 * size, leaf)))

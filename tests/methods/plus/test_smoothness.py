@@ -8,8 +8,7 @@ import torch
 
 from padgs.geometry.camera import Panorama, Pinhole, perspective
 from padgs.methods.plus import smoothness
-from padgs.methods.plus.cpu_roughness import fits
-from padgs.methods.plus.smoothness import JUMP, roughness
+from padgs.methods.plus.smoothness import MAX_BEND, fits_native, roughness
 from padgs.native import cpu
 from padgs.render import Rendering
 
@@ -65,7 +64,7 @@ def test_bends_of_colours_excuse_bends_of_surfaces():
 
 def test_a_jump_is_an_edge_that_nothing_pulls_at():
     depth = torch.ones(16, 32, dtype=torch.float64)
-    depth[:, 16:] = 1 + 4 * JUMP
+    depth[:, 16:] = 1 + 4 * MAX_BEND
     depth.requires_grad_()
     roughness(shown(depth), Panorama(32, 16), near=1e-6).backward()
     assert depth.grad is not None and not depth.grad.any()
@@ -109,8 +108,8 @@ def noisy(camera: Panorama | Pinhole) -> Rendering:
     [Panorama(33, 17), perspective(33, 17, 70.0), Panorama(32, 3), perspective(3, 3, 70.0), perspective(47, 21, 70.0)],
 )
 def test_native_matches_the_definition(camera, monkeypatch):
-    taken, native = [], smoothness.native_roughness
-    monkeypatch.setattr(smoothness, "native_roughness", lambda *a, **k: taken.append(1) or native(*a, **k))
+    taken, fits = [], smoothness.fits_native
+    monkeypatch.setattr(smoothness, "fits_native", lambda drawn: fits(drawn) and not taken.append(1))
     found, drawn = {}, noisy(camera)
     for dtype in (torch.float32, torch.float64):  # the native pass takes float32 only
         for near in (0.5, 1e-3):
@@ -139,7 +138,9 @@ def test_what_is_no_number_is_seen_in_the_loss(part, place):
 def test_what_the_native_pass_would_misread_goes_to_the_definition():
     camera = Panorama(16, 8)
     drawn = noisy(camera)
-    assert fits(drawn) and not fits(replace(drawn, image=drawn.image.double()))
-    assert not fits(replace(drawn, image=drawn.image[:4])) and not fits(replace(drawn, depth=drawn.depth[:2]))
+    assert fits_native(drawn) and not fits_native(replace(drawn, image=drawn.image.double()))
+    assert not fits_native(replace(drawn, image=drawn.image[:4])) and not fits_native(
+        replace(drawn, depth=drawn.depth[:2])
+    )
     strided = replace(drawn, depth=drawn.depth.T.contiguous().T)
     assert roughness(strided, camera, near=1e-3) == roughness(drawn, camera, near=1e-3)

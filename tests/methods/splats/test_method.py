@@ -15,11 +15,12 @@ def test_what_nobody_would_see_goes_once_when_growth_is_over(name):
     counts, events = [], []
     for record in method.fit(tiny_scene(), Budget(120, gaussians="auto")):
         counts.append(record.counts["gaussians"])
-        events += [(record.iteration, event) for event in record.events if "would miss most" in event]
+        events += [(record.iteration, event) for event in record.events if "least important" in event]
     ((iteration, event),) = events
     assert iteration == method.model.densifier.options.densify_until + 49
-    assert event.startswith(f"kept {counts[iteration - 1]} of {counts[iteration - 2]} Gaussians")
-    assert counts[iteration - 1] < counts[iteration - 2]
+    before, after = counts[iteration - 2], counts[iteration - 1]
+    assert event == f"pruned the least important of {before} Gaussians, kept {after}"
+    assert after < before
 
 
 def test_cameras_that_learn_along_say_nothing_of_what_would_be_seen():

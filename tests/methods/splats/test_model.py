@@ -1,129 +1,140 @@
-import math
+"""The published schedule of explicit Gaussians, number by number, and what it measures lengths with."""
+
 from dataclasses import replace
 
 import pytest
 import torch
+from composed import composed
 from tiny_scene import tiny_scene
 
-from padgs.geometry.harmonics import basis
-from padgs.methods.splats.model import Splats, initial_scales
-from padgs.scene import View
+from padgs.methods.splats.densification import DensificationOptions
+from padgs.methods.splats.method import SplatMethod
+from padgs.methods.splats.model import SplatModel
+from padgs.methods.splats.splats import Splats
+from padgs.render import RenderConfig
+from padgs.runs.session import build
+from padgs.scene import Scene
+from padgs.training.options import Budget
+from padgs.training.initial_points import ExtentOptions
+from padgs.training.schedule import PUBLISHED_ITERATIONS
 
-VIEW = View("v", torch.eye(4, dtype=torch.float64), 32, 16)
-
-
-def some_splats(count: int, generator: torch.Generator, dtype=torch.float32) -> Splats:
-    means = torch.randn(count, 3, generator=generator, dtype=dtype)
-    splats = Splats(means, means.new_full((count, 3), -1.0), torch.rand(count, 3, generator=generator).to(dtype))
-    splats.sh_rest.data.normal_(generator=generator)
-    return splats
-
-
-def test_starts_as_the_point_cloud():
-    scene = tiny_scene()
-    splats = Splats.from_scene(scene, generator=torch.Generator())
-    drawn = splats.gaussians(VIEW)
-    assert torch.equal(drawn.means, scene.points)
-    assert torch.allclose(drawn.colors, scene.point_colors / 255, atol=1e-6)
-    assert torch.allclose(drawn.opacities, torch.full((40,), 0.1))
-    assert torch.allclose(drawn.scales, initial_scales(scene.points, scene.scale)[:, None].expand(40, 3), rtol=1e-5)
-
-
-def test_initial_scale_is_the_root_mean_square_of_three_neighbours():
-    points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3], [50, 50, 50]])
-    assert initial_scales(points, unit=1.0)[0].item() == pytest.approx(math.sqrt((1 + 4 + 9) / 3))
+EXTENT = 7.0
+# group -> learning rates of 3DGS at the start and at the end; that of the means is for an extent of 1
+RATES = {
+    "means": (1.6e-4, 1.6e-6),
+    "quats": (1e-3, 1e-3),
+    "log_scales": (5e-3, 5e-3),
+    "opacity_logits": (5e-2, 5e-2),
+    "sh_dc": (2.5e-3, 2.5e-3),
+    "sh_rest": (1.25e-4, 1.25e-4),
+}
+LENGTHS = {"means": EXTENT}  # what a rate is multiplied by
 
 
-def test_coinciding_points_get_a_scale_relative_to_the_scene():
-    points = torch.zeros(5, 3)
-    assert torch.allclose(initial_scales(points, unit=20.0), torch.full((5,), 2e-3))
-    assert initial_scales(points[:1], unit=20.0).item() == pytest.approx(2.0)
+def trainable(iterations: int = PUBLISHED_ITERATIONS) -> SplatModel:
+    splats = Splats.from_scene(tiny_scene(), generator=torch.Generator())
+    return SplatModel(splats, DensificationOptions(), RenderConfig(), extent=EXTENT, iterations=iterations)
 
 
-def test_colour_is_the_series_in_the_direction_from_the_camera(generator):
-    splats = some_splats(5, generator, torch.float64)
-    splats.active_degree = 3
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, 3] = torch.tensor([0.3, -0.2, 0.5])
-    view = VIEW.at(pose)
-    directions = torch.nn.functional.normalize(splats.means - view.center, dim=-1)
-    coefficients = torch.cat((splats.sh_dc[:, None], splats.sh_rest), dim=1)
-    expected = (0.5 + (basis(directions, 3)[..., None] * coefficients).sum(1)).clamp(min=0)
-    assert torch.allclose(splats.gaussians(view).colors, expected, atol=1e-6)
-
-
-def test_inactive_degrees_neither_show_nor_learn(generator):
-    splats = some_splats(5, generator)
-    splats.active_degree = 1
-    splats.gaussians(VIEW).colors.sum().backward()
-    assert splats.sh_rest.grad is not None
-    assert splats.sh_rest.grad[:, :3].abs().sum() > 0 and splats.sh_rest.grad[:, 3:].abs().sum() == 0
-
-
-def test_camera_on_a_gaussian_stays_finite(generator):
-    splats = some_splats(3, generator)
-    splats.means.data[0] = 0
-    splats.active_degree = 3
-    splats.gaussians(VIEW).colors.sum().backward()
-    assert all(p.grad is None or torch.isfinite(p.grad).all() for p in splats.parameters())
-
-
-def test_derivatives_against_finite_differences(generator):
-    splats = some_splats(3, generator, torch.float64)
-    splats.sh_dc.data += 5  # away from the clamp at black
-    splats.active_degree = 3
-
-    def colors(means, rest):
-        tensors = {**splats.rows(), "means": means, "sh_rest": rest}
-        return torch.func.functional_call(ColorsOf(splats), {f"splats.{n}": t for n, t in tensors.items()})
-
-    assert torch.autograd.gradcheck(colors, (splats.means, splats.sh_rest))
-
-
-class ColorsOf(torch.nn.Module):
-    def __init__(self, splats: Splats) -> None:
-        super().__init__()
-        self.splats = splats
-
-    def forward(self) -> torch.Tensor:
-        return self.splats.gaussians(VIEW).colors
-
-
-def test_scene_in_other_units_is_the_same_scene():
-    scene = tiny_scene()
-    views = []
+def travelling(scene: Scene, times: float) -> Scene:
+    """All cameras so many times as far apart; the points stay."""
+    train = []
     for view in scene.train:
         pose = view.cam_from_world.clone()
-        pose[:3, 3] *= 128
-        views.append(replace(view, cam_from_world=pose))
-    large = replace(scene, points=scene.points * 128, train=tuple(views))
-    small_scales = Splats.from_scene(scene, generator=torch.Generator()).log_scales
-    large_scales = Splats.from_scene(large, generator=torch.Generator()).log_scales
-    assert torch.allclose(large_scales - small_scales, torch.full_like(small_scales, math.log(128)), atol=1e-5)
+        pose[:3, 3] *= times
+        train.append(replace(view, cam_from_world=pose))
+    return replace(scene, train=tuple(train))
 
 
-def test_large_clouds_are_thinned_at_random_but_repeatably():
+def in_one_place(scene: Scene, rounding: float) -> Scene:
+    """All cameras at the first one's place, up to `rounding` world units."""
+    train = []
+    for number, view in enumerate(scene.train):
+        pose = scene.train[0].cam_from_world.clone()
+        pose[0, 3] += rounding * number
+        train.append(replace(view, cam_from_world=pose))
+    return replace(scene, train=tuple(train))
+
+
+@pytest.mark.parametrize("iterations", [PUBLISHED_ITERATIONS, 600])
+def test_published_learning_rates(iterations):
+    model = trainable(iterations)
+    groups = {group.name: group for group in model.groups()}
+    assert groups.keys() == RATES.keys()
+    for name, (first, last) in RATES.items():
+        times, rate = LENGTHS.get(name, 1.0), groups[name].learning_rate
+        assert rate(0) == pytest.approx(times * first), name
+        assert rate(iterations // 2) == pytest.approx(times * (first * last) ** 0.5), name
+        assert rate(iterations) == pytest.approx(times * last), name
+    for name, parameter in model.splats.named_parameters():
+        (held,) = groups[name].parameters
+        assert held is parameter, name
+
+
+def test_adam_is_that_of_3dgs():
+    method = SplatMethod(render=RenderConfig(backend="torch"))
+    next(method.fit(tiny_scene(), Budget(10)))
+    for settings in method._trainer._optimizer.adam.param_groups:
+        assert (settings["betas"], settings["eps"], settings["weight_decay"]) == ((0.9, 0.999), 1e-15, 0)
+
+
+@pytest.mark.parametrize(("iterations", "every"), [(PUBLISHED_ITERATIONS, 1000), (3000, 100), (60, 2)])
+def test_a_degree_comes_into_use_every_thousand_published_iterations(iterations, every):
+    """Iteration -> degree that it is drawn with, where that is another one than before."""
+    model = trainable(iterations)
+    optimizer = torch.optim.Adam(model.splats.parameters())
+    rises, degree = {}, model.splats.active_degree
+    for iteration in range(1, 4 * every + 1):
+        if model.splats.active_degree > degree:
+            degree = rises[iteration] = model.splats.active_degree
+        model.adapt(iteration, optimizer)
+    assert rises == {every: 1, 2 * every: 2, 3 * every: 3}
+
+
+@pytest.mark.parametrize("apart", [2.0, 5.0])
+def test_lengths_are_measured_with_the_extent_of_cameras_that_move(apart):
+    scene = travelling(tiny_scene(), apart)
+    centers = torch.stack([view.center for view in scene.train])
+    extent = 1.1 * (centers - centers.mean(0)).norm(dim=-1).max().item()
+    assert 0.15 < extent / scene.scale < 0.9
+    assert scene.extent == ExtentOptions(0.1).extent_of(scene) == pytest.approx(extent)
+
+
+@pytest.mark.parametrize("apart", [0.0, 1e-8, 0.5])
+def test_lengths_are_measured_with_a_tenth_of_the_unit_where_cameras_hardly_move(apart):
+    scene = travelling(tiny_scene(), apart)
+    assert ExtentOptions(0.1).extent_of(scene) == pytest.approx(0.1 * scene.scale)
+
+
+@pytest.mark.parametrize("release", ["padgs_release", "omnigs_release", "odgs_release", "op43dgs_release"])
+def test_releases_measure_with_the_extent_of_their_cameras_however_little_they_move(release, monkeypatch, root):
+    """The rate of the means or offsets falls from a published share of it; in one place they could not learn."""
+    monkeypatch.setenv("PADGS_ROOT", str(root))
+    config, scene = composed(f"method={release}"), travelling(tiny_scene(), 0.1)
+    assert 0 < scene.extent < 0.05 * scene.scale
+    method = build(config)
+    method.fit(scene, Budget(1))
+    published = 0.01 if release == "padgs_release" else 1.6e-4
+    assert method.model.groups()[0].learning_rate(0) == pytest.approx(published * scene.extent, rel=1e-6)
+    with pytest.raises(ValueError, match=r"stand in one place, so their extent is 0 .* set method\.min_extent to a"):
+        build(config).fit(travelling(scene, 0.0), Budget(1))
+
+
+def test_the_least_that_counts_as_a_move():
+    """Around a millionth of the unit: below it is rounding, above it travel."""
     scene = tiny_scene()
-    thin = [Splats.from_scene(scene, max_gaussians=7, generator=torch.Generator().manual_seed(5)) for _ in range(2)]
-    assert len(thin[0]) == 7 and torch.equal(thin[0].means, thin[1].means)
+    for times, still in ((0.3, True), (3.0, False)):
+        moved = in_one_place(scene, times * 1e-6 * scene.scale / 2.2)  # the extent of steps 0 to 4 is 2.2 of them
+        assert moved.has_single_center == still
 
 
-def test_bad_clouds_are_refused():
-    scene = tiny_scene()
-    empty = replace(scene, points=torch.zeros(0, 3), point_colors=torch.zeros(0, 3, dtype=torch.uint8))
-    with pytest.raises(ValueError, match="point cloud is empty"):
-        Splats.from_scene(empty, generator=torch.Generator())
-    points = scene.points.clone()
-    points[3, 1] = math.nan
-    with pytest.raises(ValueError, match="point 3 of the cloud is"):
-        Splats.from_scene(replace(scene, points=points), generator=torch.Generator())
-
-
-def test_load_takes_another_count_but_not_another_degree(generator):
-    splats, other = some_splats(3, generator), some_splats(5, generator)
-    identity = id(splats.means)
-    splats.load(other.state_dict())
-    assert id(splats.means) == identity and torch.equal(splats.sh_rest, other.sh_rest) and len(splats) == 5
-    flat = Splats(other.means.detach(), other.log_scales.detach(), torch.zeros(5, 3), degree=1)
-    with pytest.raises(ValueError, match=r"sh_rest of the stored model has shape \[5, 15, 3\]; .* it is \[5, 3, 3\]"):
-        flat.load(other.state_dict())
+@pytest.mark.parametrize(
+    "scene", [travelling(tiny_scene(), 3.0), travelling(tiny_scene(), 0.0)], ids=["moving", "still"]
+)
+def test_a_method_trains_means_at_the_rate_of_its_scene(scene):
+    method = SplatMethod(render=RenderConfig(backend="torch"))
+    next(method.fit(scene, Budget(10)))
+    means = next(group for group in method.model.groups() if group.name == "means")
+    extent = ExtentOptions(0.1).extent_of(scene)
+    assert means.learning_rate(0) == pytest.approx(1.6e-4 * extent)
+    assert method.model.densifier.extent == extent

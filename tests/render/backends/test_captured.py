@@ -13,7 +13,7 @@ from render_cases import INPUTS, camera_of, mixture, random_pose, view_of
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from padgs.gaussians import Gaussians
-from padgs.methods.anchors.model import PaDGS, PaDGSOptions
+from padgs.methods.anchors.anchors import PaDGS, PaDGSOptions
 from padgs.native import cuda
 from padgs.render import Rendering, RenderOptions
 from padgs.render.backends import captured

@@ -10,17 +10,17 @@ import torch
 from torch import Tensor
 
 from padgs.gaussians import Gaussians
-from padgs.methods.anchors import gpu_decoder
+from padgs.methods.anchors import native_decoder
 from padgs.methods.anchors.decoder import (
     Decoder,
     DecoderWeights,
     SeenAnchors,
     decode_gaussians,
-    decode_within,
+    decode_with_capacity,
     define_gaussians,
 )
-from padgs.methods.anchors.gpu_decoder import decode_on_gpu
-from padgs.methods.anchors.precision import OF_GRADIENTS, PRECISIONS, reduced
+from padgs.methods.anchors.native_decoder import decode_on_gpu
+from padgs.methods.anchors.precision import GRADIENT_TYPE, PRECISIONS, reduced_dtype
 from padgs.native.loading import call_hook
 
 pytestmark = [*cuda_engine.marks()]
@@ -35,7 +35,7 @@ def on_gpu(
     if cuda_engine.ON_GPU:
         return decode_gaussians(weights, anchors, precision)
     flat = tuple(tensor for head in weights for tensor in head)
-    *values, slots, raw, _ = decode_on_gpu(flat, *anchors, dtype=reduced(precision))
+    *values, slots, raw, _ = decode_on_gpu(flat, *anchors, dtype=reduced_dtype(precision))
     return Gaussians(*values), slots, raw
 
 
@@ -83,7 +83,7 @@ def test_the_gpu_matches_the_definition(anchors: int, offsets: int, inputs: int,
 def test_products_in_parts_sum_up_to_the_whole(part: int, generator: torch.Generator, monkeypatch: pytest.MonkeyPatch):
     tensors, decoder = problem(300, 10, 37, 32, generator)
     whole = decoded(on_gpu, tensors, decoder)[3]
-    monkeypatch.setattr(gpu_decoder, "PART", part)
+    monkeypatch.setattr(native_decoder, "CHUNK", part)
     for name, gradient in decoded(on_gpu, tensors, decoder)[3].items():
         assert (gradient - whole[name]).abs().max() <= 2e-6 * whole[name].abs().max(), name
 
@@ -129,7 +129,7 @@ def test_reduced_precisions_match_the_definition_and_stay_near_float32(precision
         ours = decoded(on_gpu, tensors, decoder, precision)
     assert called == OF_PRODUCTS
     assert all(value.dtype == torch.float32 for value in (ours[2], *vars(ours[0]).values(), *ours[3].values()))
-    u, u_of_gradients = unit(reduced(precision)), unit(OF_GRADIENTS)
+    u, u_of_gradients = unit(reduced_dtype(precision)), unit(GRADIENT_TYPE)
     # Sums in another order may be rounded to the number beside.
     assert_near(ours, decoded(define_gaussians, tensors, decoder, precision), 8 * u, 8 * u_of_gradients)
     flips = (4 * u) ** 0.5  # of the norm: near enough to 0, a share of some u of the hidden units changes sides
@@ -152,7 +152,7 @@ def test_reduced_precisions_match_the_definition_in_any_size(
         ours = decoded(on_gpu, tensors, decoder, precision)
     assert called == OF_PRODUCTS and len(ours[1]) == anchors * (offsets - (offsets + 1) // 3)
     truth = decoded(define_gaussians, tensors, decoder, precision)
-    assert_near(ours, truth, 8 * unit(reduced(precision)), 8 * unit(OF_GRADIENTS))
+    assert_near(ours, truth, 8 * unit(reduced_dtype(precision)), 8 * unit(GRADIENT_TYPE))
     assert all(gradient.any() for gradient in ours[3].values()) or anchors == 1
 
 
@@ -166,7 +166,7 @@ def test_networks_that_do_not_fit_are_left_to_torch(precision, offsets, inputs, 
         ours = decoded(on_gpu, tensors, decoder, precision)
     assert called == []
     truth = decoded(define_gaussians, tensors, decoder, precision)
-    assert_near(ours, truth, 8 * unit(reduced(precision)), 8 * unit(OF_GRADIENTS))
+    assert_near(ours, truth, 8 * unit(reduced_dtype(precision)), 8 * unit(GRADIENT_TYPE))
 
 
 @pytest.mark.slow
@@ -175,7 +175,7 @@ def test_blocks_go_on_to_further_anchors(generator: torch.Generator):
     with torch.no_grad():
         decoder.opacity["b2"] += 4
     ours, truth = (decoded(function, tensors, decoder, "bfloat16") for function in (on_gpu, define_gaussians))
-    assert_near(ours, truth, 8 * unit(torch.bfloat16), 8 * unit(OF_GRADIENTS))
+    assert_near(ours, truth, 8 * unit(torch.bfloat16), 8 * unit(GRADIENT_TYPE))
 
 
 @REDUCED
@@ -218,7 +218,7 @@ def test_decoding_into_room_is_the_same_with_zeros_behind(precision: str, rows: 
     count = len(exact)
     assert 100 < count < 500
     room = {"all": 1000, "some more": count + 30, "too few": count - 30}[rows]
-    within, all_slots, same_raw, said = decode_within(decoder.weights(), SeenAnchors(**tensors), room, precision)
+    within, all_slots, same_raw, said = decode_with_capacity(decoder.weights(), SeenAnchors(**tensors), room, precision)
     assert said.tolist() == [count] and len(within) == len(all_slots) == min(room, 600) and torch.equal(raw, same_raw)
     for name, value in vars(exact).items():
         found = getattr(within, name)
@@ -235,7 +235,7 @@ def test_what_there_was_no_room_for_has_no_gradient(precision: str, generator: t
     upstream, found = torch.randn(count - 30, 3, generator=generator), []
     leaves = [tensors[name].requires_grad_() for name in ("features", "offsets", "log_scales")]
     for room in (count - 30, count):
-        gaussians = decode_within(decoder.weights(), SeenAnchors(**tensors), room, precision)[0]
+        gaussians = decode_with_capacity(decoder.weights(), SeenAnchors(**tensors), room, precision)[0]
         loss = sum((getattr(gaussians, of)[: count - 30] * upstream).sum() for of in ("means", "scales", "colors"))
         found.append(torch.autograd.grad(loss, [*leaves, *decoder.parameters()], allow_unused=True))
     for less, all_of_them in zip(*found, strict=True):
@@ -260,7 +260,7 @@ def test_rows_behind_the_selected_change_no_gradient(precision: str, generator: 
     tensors, decoder = problem(60, 10, 37, 32, generator)
 
     def within(weights: DecoderWeights, anchors: SeenAnchors, precision: str):
-        gaussians, slots, raw, count = decode_within(weights, anchors, 600, precision)
+        gaussians, slots, raw, count = decode_with_capacity(weights, anchors, 600, precision)
         return gaussians.first(int(count)), slots, raw
 
     exact, padded = (decoded(function, tensors, decoder, precision)[3] for function in (on_gpu, within))
@@ -269,8 +269,8 @@ def test_rows_behind_the_selected_change_no_gradient(precision: str, generator: 
 
 def test_decoding_into_room_elsewhere_is_refused(generator: torch.Generator):
     tensors, decoder = problem(3, 10, 37, 32, generator)
-    with pytest.raises(ValueError, match="only a GPU decodes without counting, and float32; got torch.float64 on "):
-        decode_within(decoder.weights(), SeenAnchors(*(tensor.double() for tensor in tensors.values())), 30)
+    with pytest.raises(ValueError, match="decoding with a capacity takes float32 on a GPU; got torch.float64 on "):
+        decode_with_capacity(decoder.weights(), SeenAnchors(*(tensor.double() for tensor in tensors.values())), 30)
 
 
 def test_nothing_selected_is_no_gaussians(generator: torch.Generator):

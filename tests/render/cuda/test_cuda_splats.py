@@ -7,8 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from padgs.methods.splats import cpu_splats, gpu_splats
-from padgs.methods.splats.model import Splats
+from padgs.methods.splats import native_splats
+from padgs.methods.splats import splats as splats_module
+from padgs.methods.splats.splats import Splats
 from padgs.scene import View
 
 pytestmark = [*cuda_engine.marks()]
@@ -32,16 +33,16 @@ def splats_of(count: int, stored: int, active: int, generator: torch.Generator) 
 
 def seen(splats: Splats, width: int, how: str, monkeypatch: pytest.MonkeyPatch) -> list[Tensor]:
     """Values and gradients, by kernels or by the definition."""
-    mean_offsets = 0.1 * torch.ones(len(splats), width, device=DEVICE).cumsum(-1).requires_grad_() if width else None
+    probe = 0.1 * torch.ones(len(splats), width, device=DEVICE).cumsum(-1).requires_grad_() if width else None
     with monkeypatch.context() as patch:
-        patch.setattr(cpu_splats, "fits", lambda *_: False)
-        patch.setattr(gpu_splats, "fits", lambda *_: how == "kernels")
-        gaussians, pulls = splats.probed(VIEW, mean_offsets)
+        call = native_splats.call_cuda if how == "kernels" else None
+        patch.setattr(splats_module, "native_call", lambda *_: call)
+        gaussians, pulls = splats.displaced(VIEW, probe)
     values = [gaussians.means, gaussians.scales, gaussians.opacities, gaussians.colors]
     values += [] if pulls is None else [pulls]
     generator = torch.Generator().manual_seed(0)
     upstream = [torch.randn(value.shape, generator=generator).to(DEVICE) for value in values]
-    leaves = [*splats.parameters(), *([] if mean_offsets is None else [mean_offsets])]
+    leaves = [*splats.parameters(), *([] if probe is None else [probe])]
     gradients = torch.autograd.grad(values, leaves, upstream, allow_unused=True)
     return [*values, *(torch.zeros((), device=DEVICE) if one is None else one for one in gradients)]
 
@@ -66,7 +67,8 @@ def test_what_is_no_number_stays_none(monkeypatch: pytest.MonkeyPatch, generator
 
 
 def test_there_are_kernels_for_float32_on_a_gpu_and_a_camera_that_does_not_learn(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setitem(gpu_splats.LIBRARIES, DEVICE, gpu_splats.cuda)
+    monkeypatch.setitem(native_splats.LIBRARIES, DEVICE, native_splats.cuda)
     means, center = torch.zeros(2, 3, device=DEVICE), torch.zeros(3, device=DEVICE)
-    assert gpu_splats.fits(means, center)
-    assert not gpu_splats.fits(means.double(), center) and not gpu_splats.fits(means, center.requires_grad_())
+    assert native_splats.native_call(means, center) is native_splats.call_cuda
+    assert native_splats.native_call(means.double(), center) is None
+    assert native_splats.native_call(means, center.requires_grad_()) is None

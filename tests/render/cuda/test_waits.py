@@ -18,12 +18,11 @@ from torch import Tensor
 
 from padgs.apps.bench.workload import Size, build, resident
 from padgs.methods.anchors.growth import GrowthOptions
+from padgs.methods.anchors.model import AnchorModel, LearningRates
 from padgs.methods.anchors.precision import PRECISIONS
-from padgs.methods.anchors.trainee import AnchorTrainee, LearningRates
-from padgs.methods.splats.clone_split import CloneSplitOptions
-from padgs.methods.splats.model import Splats
-from padgs.methods.splats.probes import SIGNALS
-from padgs.methods.splats.trainee import SplatTrainee
+from padgs.methods.splats.densification import POSITIONAL_GRADIENTS, DensificationOptions
+from padgs.methods.splats.model import SplatModel
+from padgs.methods.splats.splats import Splats
 from padgs.native import LIBRARIES, cuda
 from padgs.native.cuda import HostCopy
 from padgs.native.loading import Stage, call_hook
@@ -54,7 +53,7 @@ def trained(precision: str) -> tuple[Trainer, list[Counter[str]]]:
     with pretended_gpu() as waits:
         work.model.to(GPU)
         growth = GrowthOptions(statistics_from=0, grow_until=10**6, grow_from=10**6)
-        trainee = AnchorTrainee(
+        trainee = AnchorModel(
             work.model, RenderOptions(), "cuda", growth=growth, rates=LearningRates(), extent=1.0, iterations=1000
         )
         trainer = Trainer(trainee, resident(work.scene, GPU), Budget(1000))
@@ -93,7 +92,7 @@ def test_an_iteration_of_padgs_waits_for_nothing(precision: str, monkeypatch: py
     trainer, waited = trained(precision)
     assert waited[0] and waited[2:] == [Counter()] * (STEPS - 2), waited  # the first counts Gaussians and instances
     ahead = learned(trainer)
-    monkeypatch.setattr("padgs.methods.anchors.trainee.resolve_backend", lambda *_: "another")
+    monkeypatch.setattr("padgs.methods.anchors.model.resolve_backend", lambda *_: "another")
     exact, waited = trained(precision)
     assert all(waited), "with as many rows as there are Gaussians it waits"
     for name, tensor in learned(exact).items():
@@ -103,23 +102,23 @@ def test_an_iteration_of_padgs_waits_for_nothing(precision: str, monkeypatch: py
 
 def test_too_little_room_is_noticed_and_changes_nothing(monkeypatch: pytest.MonkeyPatch):
     enough = learned(trained("float32")[0])
-    monkeypatch.setattr("padgs.methods.anchors.trainee.HEADROOM", 0.5)
+    monkeypatch.setattr("padgs.methods.anchors.model.HEADROOM", 0.5)
     trainer, waited = trained("float32")
     assert any(waited[2:]), "it was decoded once more"
     for name, tensor in learned(trainer).items():
         assert torch.equal(enough[name], tensor), name
 
 
-@pytest.mark.parametrize("signal", SIGNALS)
-def test_an_iteration_of_explicit_gaussians_waits_for_nothing(signal: str):
+@pytest.mark.parametrize("kind", POSITIONAL_GRADIENTS)
+def test_an_iteration_of_explicit_gaussians_waits_for_nothing(kind: str):
     work = build(SIZE)
     with torch.no_grad():
         seen = work.model.decode(work.view).gaussians
     splats = Splats(seen.means, seen.scales.log(), seen.colors, degree=3)
     splats.active_degree = 3
-    options, config = CloneSplitOptions(signal=signal), RenderConfig("ray", backend="cuda")
+    options, config = DensificationOptions(positional_gradient=kind), RenderConfig("ray", backend="cuda")
     with pretended_gpu() as waits, call_hook(stage_of(called := [])):
-        trainee = SplatTrainee(splats.to(GPU), options, config, extent=1.0, iterations=30_000)
+        trainee = SplatModel(splats.to(GPU), options, config, extent=1.0, iterations=30_000)
         trainer = Trainer(trainee, resident(work.scene, GPU), Budget(30_000))
         waited = steps_of(trainer, waits)
     assert waited[0] and waited[2:] == [Counter()] * (STEPS - 2), waited  # the first counts instances

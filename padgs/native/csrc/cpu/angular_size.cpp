@@ -1,4 +1,4 @@
-// The mean angular size of Gaussians and its derivative by their scales. padgs.methods.plus.angular_size is the definition.
+// The mean angular size of Gaussians and its derivative by their scales. padgs.methods.plus.model is the definition.
 #include <algorithm>
 #include <vector>
 

@@ -1,6 +1,6 @@
 // Explicit Gaussians as a view sees them, from what is learned of them, and the derivatives by that: positions that a
 // probe moves, e^x of log-scales, sigmoids of opacity logits, colours max(0, 1/2 + spherical harmonics).
-// padgs.methods.splats.model.Splats is the definition.
+// padgs.methods.splats.splats.Splats is the definition.
 #include <algorithm>
 
 #include "../mathematics/harmonics.h"

@@ -12,7 +12,7 @@ namespace padgs {
 
 constexpr int kWarps = 4, kThreads = kWarps * kWarp;  // of a block
 constexpr int kRows = 16;                             // anchors of a warp
-// What there is room for; unused places hold zeros. padgs/methods/anchors/fused_decoder.py asks `padgs_cuda_networks_fit`.
+// What there is room for; unused places hold zeros. padgs/methods/anchors/native_decoder.py asks `padgs_cuda_networks_fit`.
 constexpr int kMostInputs = 48;  // with a 1, whose weight is the bias
 constexpr int kMostFeatures = 32, kMostHidden = 32, kMostOffsets = 10;
 constexpr int kHiddenTiles = kMostHidden / 8;

@@ -1,6 +1,6 @@
 // Explicit Gaussians as a view sees them, and the derivatives by what is learned of them, a thread each: positions that a
 // probe moves, e^x of log-scales, sigmoids of opacity logits, colours max(0, 1/2 + spherical harmonics). splats.cpp of the
-// CPU library does the same; padgs.methods.splats.model.Splats is the definition.
+// CPU library does the same; padgs.methods.splats.splats.Splats is the definition.
 #include "../mathematics/harmonics.h"
 #include "../mathematics/vector3.h"
 #include "arguments.h"

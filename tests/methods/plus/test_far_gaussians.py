@@ -7,8 +7,8 @@ import pytest
 import torch
 from tiny_scene import tiny_scene
 
-from padgs.methods.plus.sky import COVERED, FARTHEST, far_gaussians, fibonacci_sphere
-from padgs.methods.splats.model import Splats
+from padgs.methods.plus.depth_initialization import COVERED_SPACINGS, FAR_FACTOR, far_gaussians, fibonacci_sphere
+from padgs.methods.splats.splats import Splats
 from padgs.scene import Scene
 
 COUNT = 3000
@@ -60,9 +60,9 @@ def test_a_sparse_cloud_all_around_leaves_no_hole(points):
 @pytest.mark.parametrize("scale", [1.0, 1000.0])
 def test_the_open_half_gets_it(scale):
     made, rays = sky(under(hemisphere=True, scale=scale))
-    assert rays.norm(dim=-1) == pytest.approx([FARTHEST * 4 * scale] * len(rays), rel=0.02)
+    assert rays.norm(dim=-1) == pytest.approx([FAR_FACTOR * 4 * scale] * len(rays), rel=0.02)
     height = rays[:, 1] / rays.norm(dim=-1)
-    margin = COVERED * math.sqrt(4 * math.pi / COUNT)
+    margin = COVERED_SPACINGS * math.sqrt(4 * math.pi / COUNT)
     assert height.max() < -0.8 * margin and len(rays) == pytest.approx(COUNT * (1 - margin) / 2, rel=0.02)
     apart = torch.cdist(rays, rays).fill_diagonal_(math.inf).min(-1).values.median()
     assert made.log_scales.exp().median().item() == pytest.approx(apart.item() / 2, rel=0.3)  # they touch

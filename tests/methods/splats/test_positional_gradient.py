@@ -10,12 +10,11 @@ import torch
 
 from padgs.gaussians import rotation_matrices
 from padgs.geometry.panorama import direction
-from padgs.methods.splats.clone_split import CloneSplitOptions
+from padgs.methods.splats.densification import DensificationOptions
 from padgs.methods.splats.method import SplatMethod, SplatOptions
-from padgs.methods.splats.model import Splats
-from padgs.methods.splats.probes import render_probed
-from padgs.methods.splats.trainee import SplatTrainee
-from padgs.render import RenderConfig, RenderOptions, render
+from padgs.methods.splats.model import SplatModel
+from padgs.methods.splats.splats import Splats
+from padgs.render import RenderConfig, Rendering, RenderOptions, render
 from padgs.scene import View
 
 RAY = RenderOptions(projection="ray")
@@ -29,6 +28,14 @@ def colored_splats(count: int, generator: torch.Generator) -> Splats:
     splats.sh_rest.data.normal_(0, 0.1, generator=generator)
     splats.active_degree = 3
     return splats
+
+
+def drawn(splats: Splats, view: View, kind: str, **config) -> tuple[Rendering, torch.Tensor]:
+    """A training render by the torch backend, and its mean offsets, whose gradient is the positional gradient."""
+    render_config = RenderConfig(backend="torch", near=0.0, **config)
+    options = DensificationOptions(positional_gradient=kind)
+    drawing = SplatModel(splats, options, render_config, extent=1.0, iterations=100).draw(view)
+    return drawing.rendering, drawing.probe
 
 
 def view_at(generator: torch.Generator | None, width: int = 48) -> View:
@@ -48,7 +55,7 @@ def test_the_signal_in_space_is_half_the_distance_times_the_gradient_of_the_mean
     """
     splats, view = colored_splats(30, generator), view_at(generator)
     options, weight = RenderOptions(projection=projection), torch.rand(24, 48, 3, generator=generator).double()
-    rendering, _, probe = render_probed(splats, view, options, signal="space", backend="torch")
+    rendering, probe = drawn(splats, view, "space", projection=projection)
     (weight * rendering.image).sum().backward()
 
     gaussians = splats.gaussians(view)
@@ -78,7 +85,7 @@ def test_a_small_gaussian_is_pulled_alike_wherever_it_is(generator):
         splats.sh_dc.data[:] = 1.0
         splats.active_degree = 0
         view = view_at(None, width=256)
-        rendering, _, probe = render_probed(splats, view, RAY, signal="space", backend="torch")
+        rendering, probe = drawn(splats, view, "space", projection="ray")
         rays = view.camera.rays(dtype=torch.float64)
         aside = (splats.means.detach()[0].roll(1) / (2 * scale) * rays).sum(-1)  # odd about the ball's centre
         (rendering.image.sum(-1) * aside * (1 - rays[..., 1] ** 2).sqrt()).sum().backward()
@@ -102,8 +109,7 @@ def test_the_signal_in_the_image_has_one_unit_in_every_projection(projection, la
     target = torch.nn.functional.interpolate(blobs, (width // 2, width), mode="bicubic")[0].permute(1, 2, 0)
     signals = {}
     for name, kind in (("erp", "pixels"), (projection, "angular")):
-        options = RenderOptions(projection=name, low_pass_kind=kind)
-        rendering, _, probe = render_probed(splats, view_at(None, width), options, signal="image", backend="torch")
+        rendering, probe = drawn(splats, view_at(None, width), "image", projection=name, low_pass_kind=kind)
         ((rendering.image - target) ** 2).mean().backward()
         assert probe.grad is not None
         signals[name] = probe.grad.norm(dim=-1)
@@ -116,7 +122,7 @@ def test_the_absolute_signal_is_half_the_distance_times_the_pulls_of_all_pixels(
     gaussians, weight = splats.gaussians(view), torch.randn(24, 48, 3, generator=generator).double()
     probes = []
     for signal in ("space", "space_absolute"):
-        rendering, _, probe = render_probed(splats, view, RAY, signal=signal, backend="torch")
+        rendering, probe = drawn(splats, view, signal, projection="ray")
         (weight * rendering.image).sum().backward()
         probes.append(probe.grad)
     assert torch.equal(probes[0], probes[1][:, :3])
@@ -131,7 +137,9 @@ def test_the_absolute_signal_is_half_the_distance_times_the_pulls_of_all_pixels(
 @pytest.mark.parametrize(("signal", "axes"), [("image", 2), ("space", 3), ("space_absolute", 4)])
 def test_the_densifier_is_given_the_signal_of_its_options(signal, axes, generator):
     splats, render_config = colored_splats(10, generator), RenderConfig(backend="torch", projection="ray")
-    trainee = SplatTrainee(splats, CloneSplitOptions(signal=signal), render_config, extent=1.0, iterations=100)
+    trainee = SplatModel(
+        splats, DensificationOptions(positional_gradient=signal), render_config, extent=1.0, iterations=100
+    )
     drawing = trainee.draw(view_at(generator))
     drawing.rendering.image.sum().backward()
     assert drawing.probe.grad is not None and drawing.probe.grad.shape == (10, axes)
@@ -145,14 +153,11 @@ def test_the_densifier_is_given_the_signal_of_its_options(signal, axes, generato
 
 def test_the_absolute_signal_wants_the_projection_that_has_it():
     with pytest.raises(
-        ValueError, match=r"space_absolute is made for render\.projection=ray, not erp; set .*signal=space"
+        ValueError, match=r"space_absolute is made for render\.projection=ray, not erp; set .*positional_gradient=space"
     ):
-        SplatMethod(SplatOptions(signal="space_absolute"), RenderConfig())
+        SplatMethod(SplatOptions(positional_gradient="space_absolute"), RenderConfig())
 
 
-def test_unknown_signals_are_named(generator):
-    with pytest.raises(ValueError, match="unknown signal 'pixels'; known: image, space, space_absolute"):
-        CloneSplitOptions(signal="pixels")
-    view = view_at(generator)
-    with pytest.raises(ValueError, match="unknown signal 'pixels'; known: image, space, space_absolute"):
-        render_probed(colored_splats(1, generator), view, RAY, signal="pixels")
+def test_unknown_kinds_are_named():
+    with pytest.raises(ValueError, match="unknown positional_gradient 'pixels'; known: image, space, space_absolute"):
+        DensificationOptions(positional_gradient="pixels")

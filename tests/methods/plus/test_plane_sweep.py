@@ -7,9 +7,8 @@ import torch
 from torch import Tensor
 
 from padgs.geometry.camera import perspective
-from padgs.methods.plus import fill
-from padgs.methods.plus.sky import fibonacci_sphere
-from padgs.methods.plus.sweep import AT_ONCE, swept
+from padgs.methods.plus import depth_initialization
+from padgs.methods.plus.depth_initialization import CHUNK, fibonacci_sphere, plane_sweep
 from padgs.scene import Scene, View
 
 RADIUS, WIDTH = 4.0, 128
@@ -44,7 +43,7 @@ def found(views: tuple[View, ...], scale: float = 1.0, count: int = 300) -> tupl
     rays = rays[torch.randperm(len(rays), generator=torch.Generator().manual_seed(0))[:count]]
     true = 1 / (scale * ranges(rays, torch.zeros(3, dtype=torch.float64)))
     likely, around = 0.7 * true, torch.stack((0.5 * true, 0.7 * true, 1.6 * true), dim=1)
-    return swept(views[0], rays, likely, around, views), true, likely
+    return plane_sweep(views[0], rays, likely, around, views), true, likely
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 1e5])
@@ -67,7 +66,7 @@ def test_a_view_alone_and_one_that_is_no_panorama_stay_as_they_are():
     rays = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
     likely = torch.ones(1, dtype=torch.float64)
     straight = replace(views[0], lens=perspective(WIDTH, WIDTH // 2, 90.0))
-    assert torch.equal(swept(straight, rays, likely, likely[:, None], (straight, *views[1:])), likely)
+    assert torch.equal(plane_sweep(straight, rays, likely, likely[:, None], (straight, *views[1:])), likely)
 
 
 def test_one_that_something_hides_is_outvoted():
@@ -79,8 +78,8 @@ def test_one_that_something_hides_is_outvoted():
 
 def test_parts_are_put_together_in_order():
     views = ball()
-    whole, true, _ = found(views, count=AT_ONCE + 5)
-    assert len(whole) == len(true) == AT_ONCE + 5
+    whole, true, _ = found(views, count=CHUNK + 5)
+    assert len(whole) == len(true) == CHUNK + 5
     assert torch.equal(whole[:300], found(views)[0])
     assert ((whole[-5:] / true[-5:]).log2().abs() < 0.2).all()
 
@@ -93,7 +92,7 @@ def test_points_from_photographs_lie_where_these_agree_and_not_where_the_cloud_h
     errors = []
     for others in (True, False):
         if not others:
-            monkeypatch.setattr(fill, "swept", lambda view, rays, inverse_range, *_: inverse_range)
-        filled = fill.filled(scene, 1000, generator=torch.Generator().manual_seed(0))
+            monkeypatch.setattr(depth_initialization, "plane_sweep", lambda view, rays, inverse, *_: inverse)
+        filled = depth_initialization.fill_sparse_cloud(scene, 1000, generator=torch.Generator().manual_seed(0))
         errors.append((filled.points[60:].norm(dim=-1) / RADIUS).log2().abs().median().item())
     assert errors[0] < 0.5 * errors[1] and errors[1] > 0.15

@@ -6,17 +6,23 @@ import pytest
 import torch
 
 from padgs.geometry.camera import perspective
-from padgs.methods.splats.clone_split import CloneSplitOptions
-from padgs.methods.splats.model import Splats
-from padgs.methods.splats.trainee import SplatTrainee
+from padgs.methods.splats.densification import DensificationOptions
+from padgs.methods.splats.importance import (
+    MIN_KEPT_SHARE,
+    Importance,
+    count_for_psnr,
+    importance_scores,
+    most_important,
+)
+from padgs.methods.splats.model import SplatModel
+from padgs.methods.splats.splats import Splats
 from padgs.render import RenderConfig
 from padgs.scene import View
-from padgs.training.worth import LEAST, Worth, most_wanted, needed, worth
 
 
-def scored(*changes: float) -> Worth:
+def scored(*changes: float) -> Importance:
     change = torch.tensor(changes, dtype=torch.float64)
-    return Worth(-change, change, change, change, torch.ones(len(changes), dtype=torch.int64), len(changes))
+    return Importance(-change, change, change, change, torch.ones(len(changes), dtype=torch.int64), len(changes))
 
 
 @pytest.mark.parametrize(
@@ -24,12 +30,12 @@ def scored(*changes: float) -> Worth:
 )
 def test_as_many_go_as_change_the_views_by_no_less_than_asked(psnr, count):
     found = scored(1e-4, 1.0, 1e-2, 9e-5, 2e-9)
-    assert needed(found, psnr) == count
-    assert most_wanted(found, count).tolist() == sorted([1, 2, 0, 3, 4][:count])
+    assert count_for_psnr(found, psnr) == count
+    assert most_important(found, count).tolist() == sorted([1, 2, 0, 3, 4][:count])
 
 
 def test_a_tenth_stays_even_where_all_stand_in_for_each_other():
-    assert needed(scored(*[0.0] * 1000), 44.0) == LEAST * 1000
+    assert count_for_psnr(scored(*[0.0] * 1000), 44.0) == MIN_KEPT_SHARE * 1000
 
 
 def test_in_a_perspective_view_what_is_above_counts_as_much_as_what_is_beside():
@@ -39,5 +45,5 @@ def test_in_a_perspective_view_what_is_above_counts_as_much_as_what_is_beside():
     means = torch.tensor([[0.0, -0.8, 1.0], [0.8, 0.0, 1.0]])
     splats = Splats(means, torch.full((2, 3), math.log(0.1)), torch.ones(2, 3), degree=0)
     config = RenderConfig(projection="ray")
-    found = worth(SplatTrainee(splats, CloneSplitOptions(), config, extent=1.0, iterations=10), (view,))
+    found = importance_scores(SplatModel(splats, DensificationOptions(), config, extent=1.0, iterations=10), (view,))
     assert found.change[0].item() == pytest.approx(found.change[1].item(), rel=1e-3) and found.change[0] > 0

@@ -5,18 +5,17 @@ import torch
 from tiny_scene import tiny_scene
 
 from padgs.geometry.camera import perspective
-from padgs.methods.plus.method import PlusMethod
-from padgs.methods.plus.options import PlusOptions
-from padgs.methods.splats.nearest import RESOLVED, cameras_of, finest_pixels, no_finer
+from padgs.methods.plus.method import PlusMethod, PlusOptions
+from padgs.methods.splats.smoothing_filter import RESOLVED_PIXEL, cameras_of, finest_pixels, smoothed_for_view
 from padgs.render import render
-from padgs.render.projection import LowPass, low_pass_filtered
+from padgs.render.low_pass import LowPass, widened
 from padgs.scene import View
 from padgs.training.options import Budget
 
 
 @pytest.fixture(scope="module")
 def trained():
-    method = PlusMethod(PlusOptions(start_share=None))
+    method = PlusMethod(PlusOptions(initial_per_pixel=None))
     list(method.fit(tiny_scene(), Budget(20)))
     return method
 
@@ -38,12 +37,12 @@ def test_the_filter_of_a_view_on_top_makes_that_of_the_larger_pixel(trained):
     distances = (gaussians.means - view.center.float()).norm(dim=-1)
     own = distances / view.camera.focal
     pixels = own * torch.linspace(0.5, 3, len(own))
-    seen = low_pass_filtered(
-        no_finer(gaussians, view, pixels, variance),
+    seen = widened(
+        smoothed_for_view(gaussians, view, pixels, variance),
         gaussians.means - view.center.float(),
         LowPass(0.0, variance / view.camera.focal**2, compensate=True),
     )
-    wide = torch.sqrt(gaussians.scales**2 + variance * torch.maximum(own, RESOLVED * pixels)[:, None] ** 2)
+    wide = torch.sqrt(gaussians.scales**2 + variance * torch.maximum(own, RESOLVED_PIXEL * pixels)[:, None] ** 2)
     torch.testing.assert_close(seen.scales, wide)
     torch.testing.assert_close(seen.opacities, gaussians.opacities * (gaussians.scales / wide).prod(-1))
 
@@ -60,20 +59,20 @@ def test_training_views_are_drawn_as_they_were_trained_and_closer_ones_wider(tra
     difference = (trainee.render(near).image - plainly(near)).abs().max()
     assert difference > 0.01
     pixels = finest_pixels(trainee.splats.means, cameras_of(scene.train))
-    wider = no_finer(trainee.splats.gaussians(near), near, pixels, trained.render_config.low_pass)
+    wider = smoothed_for_view(trainee.splats.gaussians(near), near, pixels, trained.render_config.low_pass)
     drawn = render(wider, near, trainee.render_options(near)).image
     assert torch.equal(trainee.render(near).image, drawn)
 
 
 def test_a_loaded_model_knows_its_cameras_and_forgets_pixels_with_the_gaussians_that_it_loses(trained):
     view = close_up(tiny_scene().train[1])
-    loaded = PlusMethod(PlusOptions(start_share=None))
+    loaded = PlusMethod(PlusOptions(initial_per_pixel=None))
     loaded.load_state(trained.state())
     assert torch.equal(loaded.render(view).image, trained.render(view).image)
     kept = torch.arange(len(loaded.model.splats)) % 2 == 0
     loaded.model.keep(kept)
     pixels = finest_pixels(loaded.model.splats.means, cameras_of(tiny_scene().train))
-    wider = no_finer(loaded.model.splats.gaussians(view), view, pixels, loaded.render_config.low_pass)
+    wider = smoothed_for_view(loaded.model.splats.gaussians(view), view, pixels, loaded.render_config.low_pass)
     drawn = render(wider, view, loaded.model.render_options(view)).image
     assert torch.equal(loaded.render(view).image, drawn)
 

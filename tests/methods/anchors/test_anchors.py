@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from padgs.methods.anchors.model import Decoded, PaDGS, PaDGSOptions
+from padgs.methods.anchors.anchors import Decoded, PaDGS, PaDGSOptions
 from padgs.native import cpu
 from padgs.render import BACKENDS, RenderOptions, render
 from padgs.scene import Scene, View

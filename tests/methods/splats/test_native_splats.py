@@ -3,8 +3,9 @@
 import pytest
 import torch
 
-from padgs.methods.splats import cpu_splats
-from padgs.methods.splats.model import Splats
+from padgs.methods.splats import native_splats
+from padgs.methods.splats import splats as splats_module
+from padgs.methods.splats.splats import Splats
 from padgs.native import cpu
 from padgs.scene import View
 
@@ -38,9 +39,9 @@ def test_values_and_gradients_are_those_of_the_definition(monkeypatch, generator
             probe = 0.1 * torch.ones(count, width).cumsum(-1).requires_grad_() if width else None
             with monkeypatch.context() as patch:
                 if not native:
-                    patch.setattr(cpu_splats, "fits", lambda *_: False)
+                    patch.setattr(splats_module, "native_call", lambda *_: None)
                 splats.zero_grad()
-                seen, pulls = splats.probed(VIEW, probe)
+                seen, pulls = splats.displaced(VIEW, probe)
                 assert (pulls is None) == (width < 4)
                 values = [seen.means, seen.scales, seen.opacities, seen.colors, *([] if pulls is None else [pulls])]
                 leaves = [*splats.parameters(), *([] if probe is None else [probe])]
@@ -58,7 +59,7 @@ def test_colours_that_begin_at_an_end_of_their_range_learn_in_every_channel(monk
     for native in (True, False):
         with monkeypatch.context() as patch:
             if not native:
-                patch.setattr(cpu_splats, "fits", lambda *_: False)
+                patch.setattr(splats_module, "native_call", lambda *_: None)
             black.zero_grad()
             black.gaussians(VIEW).colors.sum().backward()
             assert black.sh_dc.grad is not None and (black.sh_dc.grad > 0.28).all()
@@ -69,17 +70,17 @@ def test_colours_that_begin_at_an_end_of_their_range_learn_in_every_channel(monk
     [
         ({"rest": torch.zeros(2, 3, 3)}, "sh_rest has 3 coefficients, but degree 2 in use takes 8 to 15"),
         ({"rest": torch.zeros(2, 24, 3)}, "sh_rest has 24 coefficients"),
-        ({"probe": torch.zeros(2, 5)}, "the probe is 5 wide; it must be 3 or 4"),
+        ({"mean_offsets": torch.zeros(2, 5)}, "mean_offsets has 5 columns; it must have 3 or 4"),
         ({"dc": torch.zeros(2, 3, dtype=torch.float64)}, "dc torch.float64 on cpu"),
     ],
 )
 def test_what_a_library_would_read_wrongly_is_refused(change, said):
     two = {"means": torch.zeros(2, 3), "log_scales": torch.zeros(2, 3), "opacity_logits": torch.zeros(2)}
-    learned = cpu_splats.Learned(
-        **two | {"dc": torch.zeros(2, 3), "rest": torch.zeros(2, 8, 3), "probe": None} | change
+    learned = native_splats.Parameters(
+        **two | {"dc": torch.zeros(2, 3), "rest": torch.zeros(2, 8, 3), "mean_offsets": None} | change
     )
     with pytest.raises(ValueError, match=said):
-        cpu_splats.native_splats(learned, 2, torch.zeros(3), 1e-6)
+        native_splats.native_splats(learned, 2, torch.zeros(3), 1e-6)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 80.0, -80.0, 200.0, -200.0, 0.0])

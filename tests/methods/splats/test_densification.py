@@ -2,12 +2,11 @@ import math
 
 import pytest
 import torch
-from tiny_scene import tiny_scene
 
 from padgs.gaussians import rotation_matrices
-from padgs.methods.splats.clone_split import SHRINK, CloneSplit, CloneSplitOptions
-from padgs.methods.splats.model import Splats
-from padgs.methods.splats.trainee import SplatTrainee
+from padgs.methods.splats.densification import SHRINK, DensificationOptions, Densifier
+from padgs.methods.splats.model import SplatModel
+from padgs.methods.splats.splats import Splats
 from padgs.render import RenderConfig
 from padgs.scene import View
 
@@ -15,7 +14,7 @@ LARGE, SMALL = 0.5, 0.005  # scales above and below percent_dense x extent = 0.0
 EVERY = 10
 
 
-def densifier(scales: list[float], **options) -> tuple[CloneSplit, torch.optim.Adam]:
+def densifier(scales: list[float], **options) -> tuple[Densifier, torch.optim.Adam]:
     """Gaussians of these scales, of opacity 1/2, numbered by their mean; extent 1."""
     means = torch.arange(len(scales), dtype=torch.float32)[:, None].repeat(1, 3)
     splats = Splats(means, torch.tensor(scales).log()[:, None].repeat(1, 3), torch.rand(len(scales), 3))
@@ -25,10 +24,10 @@ def densifier(scales: list[float], **options) -> tuple[CloneSplit, torch.optim.A
     optimizer.step()  # fills the moments, moves nothing
     optimizer.zero_grad()
     settings = {"densify_from": 0, "densify_every": EVERY, "reset_every": 10**6, "prune_by_extent_from": 0} | options
-    return CloneSplit(splats, CloneSplitOptions(**settings), extent=1.0), optimizer
+    return Densifier(splats, DensificationOptions(**settings), extent=1.0), optimizer
 
 
-def pull(densifier: CloneSplit, gradients: list[float], views: int = 1) -> None:
+def pull(densifier: Densifier, gradients: list[float], views: int = 1) -> None:
     for _ in range(views):
         gradient = torch.tensor(gradients)[:, None] * torch.tensor([0.6, 0.8])
         densifier.observe(gradient, torch.ones(len(gradients), dtype=torch.bool), iteration=1)
@@ -52,36 +51,6 @@ def test_large_gaussians_are_replaced_by_two_smaller_ones():
     assert torch.equal(grown.splats.means[0], torch.ones(3)), "the one that was split is gone"
     assert torch.allclose(grown.splats.log_scales[1:].exp(), torch.full((2, 3), LARGE / 1.6))
     assert not torch.equal(grown.splats.means[1], grown.splats.means[2])
-
-
-def test_a_margin_on_the_extent_clones_what_would_be_split():
-    for margin, expected in ((0.0, "cloned 0, split 1"), (100.0, "cloned 1, split 0")):
-        grown, optimizer = densifier([LARGE, LARGE], extent_margin=margin)
-        pull(grown, [1e-3, 0.0])
-        assert grown.adapt(EVERY, optimizer)[0].startswith(expected)
-
-
-def test_the_threshold_may_rise_towards_the_poles():
-    """At 60 degrees half way up: with 2e-4 at the horizon and 6e-4 at the poles a pull of 4e-4 is just enough there."""
-    for latitude, multiplies in ((0.0, True), (59.0, True), (61.0, False), (90.0, False)):
-        grown, optimizer = densifier([SMALL], polar_threshold=6e-4)
-        cos = torch.tensor([math.cos(math.radians(latitude))])
-        for _ in range(3):
-            grown.observe(torch.tensor([[4e-4, 0.0]]), torch.tensor([True]), 1, cos)
-        grown.observe(torch.tensor([[1.0, 0.0]]), torch.tensor([False]), 1, torch.tensor([1.0]))  # not seen: no vote
-        assert grown.adapt(EVERY, optimizer)[0].startswith(f"cloned {int(multiplies)}")
-
-
-def test_the_latitude_is_that_in_the_view():
-    scene = tiny_scene()
-    splats = Splats(torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[-1.0] * 3]), torch.ones(1, 3))
-    above = torch.eye(4)
-    above[:3, 3] = torch.tensor([0.0, 2.0, 0.0])  # the camera is 2 above the origin (y is down): it looks down by 45
-    trained = SplatTrainee(splats, CloneSplitOptions(polar_threshold=1e-3), RenderConfig(), extent=1.0, iterations=9)
-    drawing = trained.draw(scene.train[0].at(above))
-    drawing.rendering.image.sum().backward()
-    trained.observe(drawing, 1)
-    assert trained.densifier.statistics["polar"].item() == pytest.approx(1 - math.sqrt(0.5), rel=1e-5)
 
 
 def test_pruning_by_extent_may_begin_later():
@@ -155,16 +124,6 @@ def test_the_cap_holds_and_the_hardest_pulled_come_first(scale):
     assert len(grown.splats) == 7
 
 
-def test_the_cap_leaves_out_what_is_below_its_own_threshold():
-    """The one at the pole is pulled hardest, but not hard enough there; the cap has room for one of the other two."""
-    grown, optimizer = densifier([SMALL] * 3, polar_threshold=1e-2, max_gaussians=4)
-    for _ in range(3):
-        gradient = torch.tensor([[5e-3, 0.0], [1e-3, 0.0], [2e-3, 0.0]])
-        grown.observe(gradient, torch.ones(3, dtype=torch.bool), 1, torch.tensor([0.0, 1.0, 1.0]))
-    assert grown.adapt(EVERY, optimizer)[0].startswith("cloned 1")
-    assert torch.equal(grown.splats.means[3], grown.splats.means[2])
-
-
 def test_opacity_reset_makes_all_nearly_transparent():
     grown, optimizer = densifier([SMALL, SMALL], densify_from=10**6, reset_every=30)
     grown.splats.opacity_logits.data = torch.logit(torch.tensor([0.007, 0.9]))
@@ -175,19 +134,21 @@ def test_opacity_reset_makes_all_nearly_transparent():
     assert optimizer.state[grown.splats.means]["exp_avg_sq"].abs().sum() > 0
 
 
-@pytest.mark.parametrize("signal", ["space", "space_absolute"])
-def test_towards_a_target_those_that_are_pulled_hardest_multiply_in_equal_steps(signal):
+@pytest.mark.parametrize("kind", ["space", "space_absolute"])
+def test_towards_a_target_those_that_are_pulled_hardest_multiply_in_equal_steps(kind):
     count, target = 20, 50
-    grown, optimizer = densifier([SMALL] * count, densify_until=3 * EVERY + 1, signal=signal, gradient_threshold=1.0)
-    grown = CloneSplit(grown.splats, grown.options, extent=1.0, target=target)
+    grown, optimizer = densifier(
+        [SMALL] * count, densify_until=3 * EVERY + 1, positional_gradient=kind, gradient_threshold=1.0
+    )
+    grown = Densifier(grown.splats, grown.options, extent=1.0, target=target)
     found = []
     for turn in range(1, 4):
         now = len(grown.splats)
         pulls = torch.arange(now, dtype=torch.float32)[:, None].repeat(1, 4)
-        if signal == "space_absolute":
+        if kind == "space_absolute":
             pulls[:, 3] = -pulls[:, 3].flip(0)  # by these the first ones are pulled least, too, but none is 0
             pulls[:, 3] += now
-        grown.observe(pulls if signal == "space_absolute" else pulls[:, :3], torch.ones(now, dtype=torch.bool), 1)
+        grown.observe(pulls if kind == "space_absolute" else pulls[:, :3], torch.ones(now, dtype=torch.bool), 1)
         before = grown.splats.means.detach().clone()
         assert grown.adapt(turn * EVERY, optimizer)[0].startswith("cloned 10,")
         found.append(len(grown.splats))
@@ -212,7 +173,7 @@ def test_clones_may_be_samples_of_their_gaussian():
 
 def test_as_many_multiply_for_their_absolute_pull_as_pass_the_threshold():
     """GOF: above the quantile 1 - r, with r the share of those above the threshold."""
-    grown, optimizer = densifier([SMALL] * 6, signal="space_absolute", gradient_threshold=1e-4)
+    grown, optimizer = densifier([SMALL] * 6, positional_gradient="space_absolute", gradient_threshold=1e-4)
     pulls = torch.tensor([2e-4, 3e-4, 0.0, 5e-5, 0.0, 0.0])
     absolute = torch.tensor([1e-3, 0.0, 9e-3, 2e-3, 8e-3, 9.0])
     visible = torch.tensor([True, True, True, True, True, False])
@@ -241,6 +202,22 @@ def test_the_opacity_after_a_reset_is_an_option():
     assert torch.allclose(torch.sigmoid(grown.splats.opacity_logits), torch.tensor([0.05, 0.1]))
 
 
+def test_a_reset_to_1_only_clears_the_moments_of_adam():
+    grown, optimizer = densifier([SMALL], densify_from=10**6, reset_every=30, reset_opacity=1.0)
+    grown.splats.opacity_logits.data = torch.logit(torch.tensor([0.9]))
+    before = grown.splats.opacity_logits.detach().clone()
+    grown.adapt(30, optimizer)
+    assert torch.equal(grown.splats.opacity_logits, before)
+    assert optimizer.state[grown.splats.opacity_logits]["exp_avg_sq"].abs().sum() == 0
+
+
+@pytest.mark.parametrize("first, expected", [(500, 600), (0, 100)])
+def test_the_first_round_comes_after_densify_from(first, expected):
+    options = DensificationOptions(densify_from=first).for_run(30_000)
+    grown, optimizer = densifier([SMALL], densify_from=options.densify_from, densify_every=100)
+    assert [i for i in range(1, 700) if grown.adapt(i, optimizer)][0] == expected
+
+
 @pytest.mark.parametrize("kind", ["solid", "angular"])
 def test_a_reset_limits_the_opacity_that_the_nearest_camera_draws(kind, generator):
     """SPaGS: min(o c, 0.1) / c, with c^2 = prod s^2 / (s^2 + 0.2 (r / f)^2); without the 3D filter c is 1."""
@@ -253,9 +230,9 @@ def test_a_reset_limits_the_opacity_that_the_nearest_camera_draws(kind, generato
     views = [View("v", torch.eye(4), width, width // 2) for _ in centers]
     for view, center in zip(views, centers, strict=True):
         view.cam_from_world[:3, 3] = -center
-    options = CloneSplitOptions(densify_from=10**6, reset_every=3000, reset_opacity=0.1)
+    options = DensificationOptions(densify_from=10**6, reset_every=3000, reset_opacity=0.1)
     render = RenderConfig(projection="ray", low_pass=0.2, low_pass_kind=kind)
-    trained = SplatTrainee(splats, options, render, extent=1.0, iterations=30_000, views=views)
+    trained = SplatModel(splats, options, render, extent=1.0, iterations=30_000, views=views)
     trained.adapt(3000, torch.optim.Adam(splats.parameters()))
 
     nearest = torch.cdist(means, centers).amin(-1)[:, None]
@@ -267,28 +244,13 @@ def test_a_reset_limits_the_opacity_that_the_nearest_camera_draws(kind, generato
     assert (after < before - 1e-3).sum() > 5 and (kind == "angular" or (after > 0.2).sum() > 5)
 
 
-def test_released_reset_keeps_the_opacities_and_clears_their_moments():
-    grown, optimizer = densifier([SMALL], densify_from=10**6, reset_every=30, released_reset=True)
-    grown.splats.opacity_logits.data = torch.logit(torch.tensor([0.9]))
-    grown.adapt(30, optimizer)
-    assert torch.sigmoid(grown.splats.opacity_logits).item() == pytest.approx(0.9)
-    assert optimizer.state[grown.splats.opacity_logits]["exp_avg_sq"].abs().sum() == 0
-
-
-@pytest.mark.parametrize("released, first", [(False, 600), (True, 100)])
-def test_first_round(released, first):
-    grown, optimizer = densifier([SMALL], densify_from=500, densify_every=100, released_start=released)
-    rounds = [i for i in range(1, 700) if grown.adapt(i, optimizer)]
-    assert rounds[0] == first
-
-
 def test_nothing_happens_from_densify_until():
     grown, optimizer = densifier([SMALL], densify_until=40, reset_every=20)
     assert [i for i in range(1, 200) if grown.adapt(i, optimizer)] == [10, 20, 30]
 
 
 def test_windows_follow_the_run_length():
-    published = CloneSplitOptions()
+    published = DensificationOptions()
     assert published.for_run(30_000) == published
     short = published.for_run(3_000)
     assert (short.densify_from, short.densify_until) == (50, 1500)
@@ -299,11 +261,11 @@ def test_windows_follow_the_run_length():
 
 def test_options_without_a_meaning_are_refused():
     with pytest.raises(ValueError, match="densify_every is 0"):
-        CloneSplitOptions(densify_every=0)
+        DensificationOptions(densify_every=0)
     with pytest.raises(ValueError, match="reset_opacity is 0.0; it must be an opacity"):
-        CloneSplitOptions(reset_opacity=0.0)
+        DensificationOptions(reset_opacity=0.0)
     with pytest.raises(ValueError, match="opacity_decay is 1.5; it must be an opacity"):
-        CloneSplitOptions(opacity_decay=1.5)
+        DensificationOptions(opacity_decay=1.5)
     with pytest.raises(ValueError, match="max_gaussians is 0"):
-        CloneSplitOptions(max_gaussians=0)
+        DensificationOptions(max_gaussians=0)
     assert pytest.approx(1.6) == SHRINK

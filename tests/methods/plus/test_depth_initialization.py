@@ -8,11 +8,9 @@ import torch
 from tiny_scene import tiny_scene
 
 from padgs.methods.plus import method as method_module
-from padgs.methods.plus.fill import filled
-from padgs.methods.plus.method import PlusMethod
-from padgs.methods.plus.options import PlusOptions
-from padgs.methods.plus.sky import fibonacci_sphere
-from padgs.methods.plus.trainee import counted_pixels
+from padgs.methods.plus.depth_initialization import fibonacci_sphere, fill_sparse_cloud
+from padgs.methods.plus.method import PlusMethod, PlusOptions
+from padgs.methods.plus.model import solid_angle_pixels
 from padgs.scene import Scene
 from padgs.training.options import Budget
 
@@ -30,7 +28,7 @@ def dome(points: int, *, lowest: float = -1.0) -> Scene:
 
 
 def new_points(scene: Scene, count: int = COUNT) -> tuple[torch.Tensor, torch.Tensor]:
-    found = filled(scene, count, generator=torch.Generator().manual_seed(0))
+    found = fill_sparse_cloud(scene, count, generator=torch.Generator().manual_seed(0))
     assert torch.equal(found.points[: len(scene.points)], scene.points), "the cloud itself stays"
     return found.points[len(scene.points) :], found.point_colors[len(scene.points) :]
 
@@ -106,7 +104,7 @@ def test_it_turns_and_grows_with_the_world(scale):
 
 def test_what_has_enough_points_stays_as_it_is():
     scene = dome(300)
-    assert filled(scene, 300, generator=torch.Generator()) is scene
+    assert fill_sparse_cloud(scene, 300, generator=torch.Generator()) is scene
 
 
 def test_points_in_a_camera_say_nothing():
@@ -118,19 +116,22 @@ def test_points_in_a_camera_say_nothing():
 
 def test_padgs_plus_starts_from_what_it_asks_for():
     scene = dome(8)
-    asked = round(PlusOptions().fill_share * counted_pixels(scene.train[0]))
-    for share, count in ((PlusOptions().fill_share, asked), (0.0, 8)):
-        method = PlusMethod(PlusOptions(fill_share=share, sky_share=0.0), seed=0)
+    asked = round(PlusOptions().depth_init_per_pixel * solid_angle_pixels(scene.train[0]))
+    for share, count in ((PlusOptions().depth_init_per_pixel, asked), (0.0, 8)):
+        method = PlusMethod(PlusOptions(depth_init_per_pixel=share, sky_per_point=0.0), seed=0)
         started = len(method.build_model(scene, 10).splats)
         assert count <= started < count + len(scene.train)
 
 
 def test_no_more_is_sought_than_a_budget_has_room_for(monkeypatch):
     sought = []
-    monkeypatch.setattr(method_module, "filled", lambda scene, count, **_: sought.append(count) or scene)
+    monkeypatch.setattr(method_module, "fill_sparse_cloud", lambda scene, count, **_: sought.append(count) or scene)
     for budget in (None, 150):
-        list(PlusMethod(PlusOptions(sky_share=0.5)).fit(dome(300), Budget(16, gaussians=budget)))
-    assert sought == [round(PlusOptions().fill_share * counted_pixels(dome(8).train[0])), math.ceil(2 * 150 / 1.5)]
+        list(PlusMethod(PlusOptions(sky_per_point=0.5)).fit(dome(300), Budget(16, gaussians=budget)))
+    assert sought == [
+        round(PlusOptions().depth_init_per_pixel * solid_angle_pixels(dome(8).train[0])),
+        math.ceil(2 * 150 / 1.5),
+    ]
 
 
 def test_points_are_sought_once_for_a_run_and_not_where_it_goes_on(monkeypatch):
@@ -141,7 +142,7 @@ def test_points_are_sought_once_for_a_run_and_not_where_it_goes_on(monkeypatch):
         torch.rand(1, generator=generator)  # as a choice of pixels does
         return scene
 
-    monkeypatch.setattr(method_module, "filled", counted)
+    monkeypatch.setattr(method_module, "fill_sparse_cloud", counted)
     first = PlusMethod(seed=3)
     list(first.fit(scene, Budget(10_000, seconds=0.3)))  # rehearses
     assert len(sought) == 1

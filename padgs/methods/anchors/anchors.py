@@ -1,0 +1,286 @@
+"""PaD-GS: anchors on a grid, and the Gaussians that they become as seen from a camera (paper Eq. 13-15).
+
+An anchor sits on a vertex of a grid of spacing `voxel_size`, so three integers, its cell, identify it exactly. Anchors
+are compared by cells, never by floating-point positions.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from padgs.checks import check, check_known
+from padgs.gaussians import Gaussians
+from padgs.geometry.distortion import OMEGA_AXES, distortion, opacity_factor, polar_axis
+from padgs.methods.anchors.decoder import (
+    Decoder,
+    SeenAnchors,
+    decode_gaussians,
+    decode_with_capacity,
+    supports_capacity,
+)
+from padgs.methods.anchors.precision import PRECISIONS
+from padgs.native.cuda import HostCopy
+from padgs.scene import Scene, View
+from padgs.training.initial_points import refuse_unusable, squared_spacing
+from padgs.training.optimizer import load_rows
+
+OMEGA_INPUTS = ("sin2", "cos")
+DISTANCE_UNITS = ("scene", "world")
+TINY = 1e-6  # scene units; keeps directions finite for a camera exactly on an anchor
+
+
+@dataclass(frozen=True)
+class PaDGSOptions:
+    """The model. Defaults are the paper as written; conf/method/padgs_release.yaml is the released code."""
+
+    features: int = 32  # C, learned features per anchor
+    offsets: int = 10  # K, Gaussians per anchor
+    hidden: int = 32  # width of the hidden layer of each network
+    precision: str = "float32"  # of the networks' products: float32; bfloat16 or float16 for GPUs
+    tau: float = 0.9  # Eq. 15; 0 turns opacity modulation off
+    use_distance: bool = True  # distance camera - anchor as network input
+    use_distortion: bool = True  # distortion degree as network input (DAGD)
+    omega_axis: str = "camera_y"  # axis of the latitude: camera_y | world_z
+    omega_input: str = "sin2"  # network input: sin2 = Omega | cos = sqrt(1 - Omega)
+    max_modulated_omega: float = 1.0  # upper limit of Omega in Eq. 15
+    distance_unit: str = "scene"  # of the distance input: scene (`Scene.scale`) | world
+    voxel_size: float | str = "auto"  # world units, as the paper states it per data set; auto: by `voxel_pixels`
+    voxel_pixels: float = 0.1  # voxel_size=auto: pixels at the median depth; below 1 like the paper's voxels
+
+    def __post_init__(self) -> None:
+        check_known(self, omega_axis=OMEGA_AXES, omega_input=OMEGA_INPUTS)
+        check_known(self, distance_unit=DISTANCE_UNITS, precision=PRECISIONS)
+        check(self, "at least 1", lambda count: count >= 1, "features", "offsets", "hidden")
+        check(self, "in [0, 1], or opacities turn negative at the poles", lambda tau: 0 <= tau <= 1, "tau")
+        check(self, "> 0 and finite", lambda pixels: 0 < pixels < math.inf, "voxel_pixels")
+        if isinstance(self.voxel_size, str) and self.voxel_size != "auto":
+            raise ValueError(f"unknown voxel_size {self.voxel_size!r}; known: auto, or a length in world units")
+        rule = "a length > 0 in world units, or auto"
+        check(self, rule, lambda size: size == "auto" or 0 < size < math.inf, "voxel_size")
+
+    @property
+    def inputs(self) -> int:
+        """Number of network inputs: features, direction (3), distance, distortion; 37 in the paper."""
+        return self.features + 3 + self.use_distance + self.use_distortion
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """Gaussians decoded for one camera: N selected of A K."""
+
+    gaussians: Gaussians  # N, opacities modulated
+    slots: Tensor  # [N] int64 ascending, anchor K + k
+    raw_opacities: Tensor  # [A, K] in (-1, 1), before selection and modulation
+    selected: HostCopy | None = None  # N, if `gaussians` and `slots` have another number of rows, see `PaDGS.decode`
+
+    def count(self) -> int:
+        """Return N; waits for the GPU if necessary."""
+        return len(self.slots) if self.selected is None else self.selected.values()[0]
+
+
+class PaDGS(nn.Module):
+    """A anchors with K Gaussians each. Positions are a buffer: they are not learned.
+
+    Attributes:
+        positions: [A, 3] world.
+        features: [A, C].
+        offsets: [A, K, 3] in units of the anchor's scale.
+        log_scales: [A, 6]; the first three scale the offsets, the last three the Gaussians; world units.
+        decoder: three networks.
+        voxel_size: spacing of the grid that anchors live on, world units.
+        distance_scale: divisor of the distance input, world units.
+    """
+
+    positions: Tensor
+
+    def __init__(
+        self,
+        positions: Tensor,
+        log_scales: Tensor,
+        options: PaDGSOptions = PaDGSOptions(),
+        *,
+        voxel_size: float,
+        distance_scale: float = 1.0,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        """Build an untrained model: Gaussians at their anchors [A, 3], log-scales [A, 6], random networks."""
+        super().__init__()
+        count = len(positions)
+        self.options, self.voxel_size, self.distance_scale = options, voxel_size, distance_scale
+        self.register_buffer("positions", positions)
+        self.features = nn.Parameter(positions.new_zeros(count, options.features))
+        self.offsets = nn.Parameter(positions.new_zeros(count, options.offsets, 3))
+        self.log_scales = nn.Parameter(log_scales)
+        decoder = Decoder(options.inputs, options.offsets, options.hidden, generator=generator)
+        self.decoder = decoder.to(positions.device)
+
+    @classmethod
+    def from_scene(cls, scene: Scene, options: PaDGSOptions = PaDGSOptions(), *, seed: int = 0) -> PaDGS:
+        """Return the untrained model of a scene: its point cloud on a grid.
+
+        Raises:
+            ValueError: the point cloud is empty or not finite.
+        """
+        automatic = automatic_voxel_size(scene, options.voxel_pixels)
+        voxel_size = automatic if options.voxel_size == "auto" else float(options.voxel_size)
+        positions = anchors_from_points(scene.points, voxel_size)
+        return cls(
+            positions,
+            initial_log_scales(positions, voxel_size),
+            options,
+            voxel_size=voxel_size,
+            distance_scale=scene.scale if options.distance_unit == "scene" else 1.0,
+            generator=torch.Generator().manual_seed(seed),
+        )
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def rows(self) -> dict[str, nn.Parameter]:
+        """Return the parameters with one row per anchor."""
+        return {"offsets": self.offsets, "features": self.features, "log_scales": self.log_scales}
+
+    def load(self, tensors: Mapping[str, Tensor]) -> None:
+        """Copy the `state_dict` of another model, whose number of anchors may differ.
+
+        Raises:
+            ValueError: as `padgs.training.optimizer.load_rows`.
+        """
+        load_rows(self, tensors, ("positions", *self.rows()))
+        self.positions = tensors["positions"].to(self.positions).clone()
+
+    @torch.no_grad()
+    def centers(self) -> Tensor:
+        """Return the means [A K, 3] of all Gaussians, selected or not, world frame, without gradient (Eq. 14)."""
+        reach = torch.exp(self.log_scales[:, None, :3])
+        return (self.positions[:, None] + reach * self.offsets).view(-1, 3)
+
+    @torch.no_grad()
+    def seen_from(self, view: View) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the anchors as seen from a camera, without gradient.
+
+        Returns:
+            direction [A, 3] camera -> anchor, world frame; distance [A] in `distance_scale`; distortion degree Omega
+            [A].
+        """
+        ray = self.positions - view.center.to(self.positions)
+        distance = torch.sqrt((ray * ray).sum(-1) + (TINY * self.distance_scale) ** 2)
+        direction = ray / distance[:, None]
+        axis = polar_axis(self.options.omega_axis, view.cam_from_world.to(self.positions))
+        return direction, distance / self.distance_scale, distortion(direction, axis)
+
+    def decode(self, view: View, capacity: int | None = None) -> Decoded:
+        """Decode the Gaussians that a view sees (Eq. 13-15).
+
+        Args:
+            view: the camera.
+            capacity: on a GPU, return so many rows without waiting for N. Rows beyond N are zeros, which are culled; if
+                the capacity is below N, the last Gaussians are missing. None, or on other devices: N rows.
+        """
+        weights, anchors, precision = self.decoder.weights(), self.seen_anchors(view), self.options.precision
+        if capacity is None or not supports_capacity(anchors, precision):
+            return Decoded(*decode_gaussians(weights, anchors, precision))
+        gaussians, slots, raw_opacities, count = decode_with_capacity(weights, anchors, capacity, precision)
+        return Decoded(gaussians, slots, raw_opacities, HostCopy(count))
+
+    def show(self, view: View) -> Gaussians:
+        """Decode for `padgs.render.backends.captured`: A K Gaussians, of which the unselected ones are zeros.
+
+        Raises:
+            ValueError, OSError: as `padgs.methods.anchors.decoder.decode_with_capacity`.
+        """
+        everything = self.offsets[..., 0].numel()
+        return decode_with_capacity(
+            self.decoder.weights(), self.seen_anchors(view), everything, self.options.precision
+        )[0]
+
+    def seen_anchors(self, view: View) -> SeenAnchors:
+        """Return the inputs of the decoder for a view."""
+        options = self.options
+        direction, distance, omega = self.seen_from(view)
+        seen = [direction]
+        if options.use_distance:
+            seen.append(distance[:, None])
+        if options.use_distortion:
+            seen_omega = omega if options.omega_input == "sin2" else torch.sqrt((1 - omega).clamp(min=0))
+            seen.append(seen_omega[:, None])
+        attenuation = opacity_factor(omega, options.tau, options.max_modulated_omega)
+        seen = torch.cat(seen, dim=-1)
+        return SeenAnchors(self.features, seen, self.positions, self.offsets, self.log_scales, attenuation)
+
+
+def automatic_voxel_size(scene: Scene, pixels: float) -> float:
+    """Return the voxel size, world units, of so many pixels of the training panoramas (pi / H radians) at median depth.
+
+    Neither the units of the world nor the density of the cloud matter.
+    """
+    return pixels * math.pi / scene.train[0].height * scene.scale
+
+
+def cells_from_points(points: Tensor, size: float) -> Tensor:
+    """Return cells [N, 3] int64 of points [N, 3]: the nearest vertex of a grid of spacing `size`, halves to even."""
+    return torch.round(points.double() / size).long()
+
+
+def points_from_cells(cells: Tensor, size: float, dtype: torch.dtype = torch.float32) -> Tensor:
+    """Return vertices [N, 3] of a grid of spacing `size`; the inverse of `cells_from_points`."""
+    return (cells.double() * size).to(dtype)
+
+
+def cell_keys(cells: Tensor) -> Tensor:
+    """Return one int64 per row of cells [N, 3], [N]: equal exactly for equal rows, in lexicographic order.
+
+    A number with three digits, one per axis; or, if those exceed 64 bits (a far outlier in the cloud), the rank among
+    the distinct rows, which takes longer.
+    """
+    if len(cells) == 0:
+        return cells.new_zeros(0)
+    digits = cells - cells.min(0).values
+    if math.prod(side + 1 for side in digits.max(0).values.tolist()) >= 2**63:
+        return torch.unique(cells, dim=0, return_inverse=True)[1]
+    _, base_y, base_z = (digits.max(0).values + 1).unbind(-1)
+    return (digits[:, 0] * base_y + digits[:, 1]) * base_z + digits[:, 2]
+
+
+def unique_cells(cells: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the distinct rows [U, 3] of cells [N, 3] in lexicographic order, and the index of each input, [N]."""
+    keys, inverse = torch.unique(cell_keys(cells), return_inverse=True)
+    first = torch.full_like(keys, len(cells)).scatter_reduce(
+        0, inverse, torch.arange(len(cells), device=cells.device), "amin"
+    )
+    return cells[first], inverse
+
+
+def occupied(cells: Tensor, by: Tensor) -> Tensor:
+    """Return which cells [U, 3] occur among the cells `by` [N, 3], [U] bool; O((U + N) log(U + N))."""
+    keys = cell_keys(torch.cat((cells, by)))
+    return torch.isin(keys[: len(cells)], keys[len(cells) :])
+
+
+def anchors_from_points(points: Tensor, voxel_size: float) -> Tensor:
+    """Return anchor positions [A, 3] float32: the distinct grid vertices nearest to points [P, 3], world units.
+
+    Raises:
+        ValueError: no points, points that are not finite, or a voxel size that is not a positive length.
+    """
+    if not (voxel_size > 0 and math.isfinite(voxel_size)):
+        raise ValueError(f"voxel_size is {voxel_size}; it must be a length > 0 in world units, or auto")
+    refuse_unusable(points, "anchors")
+    cells, _ = unique_cells(cells_from_points(points, voxel_size))
+    return points_from_cells(cells, voxel_size)
+
+
+def initial_log_scales(positions: Tensor, voxel_size: float) -> Tensor:
+    """Return initial log-scales [A, 6] of anchors [A, 3]: the log RMS distance to the three nearest neighbours.
+
+    Anchors are at least a voxel apart, so no lower limit is needed; a single anchor gets the size of a voxel.
+    """
+    squared = squared_spacing(positions)
+    if squared is None:
+        return positions.new_full((len(positions), 6), math.log(voxel_size))
+    return (0.5 * torch.log(squared)).to(positions)[:, None].repeat(1, 6)

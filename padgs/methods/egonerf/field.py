@@ -1,0 +1,237 @@
+"""EgoNeRF's radiance field: density and appearance grids, shading, environment map, and volume rendering of rays."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from padgs.methods.egonerf.grids import (
+    CHARTS,
+    MODES,
+    YANG,
+    YIN,
+    Factors,
+    GridPosition,
+    PlaneLines,
+    density_feature,
+    exponential_nodes,
+    grid_position,
+    products,
+)
+from padgs.methods.egonerf.options import EgoNeRFOptions
+from padgs.methods.egonerf.rays import interval_lengths, jittered, refined, visible_shares
+from padgs.render import Rendering
+from padgs.scene import Scene, View
+
+CLOUD_SHARE = 0.95  # of the points; those behind may be outliers
+MAX_ROOM_REACH = 4.0  # scene units
+
+
+class RayColors(NamedTuple):
+    """Results of B rays."""
+
+    color: Tensor  # [B, 3]
+    transmittance: Tensor  # [B]
+    depth: Tensor  # [B] model units: mean distance weighted by contribution; 0 where nothing contributes
+
+
+class EgoNeRF(nn.Module):
+    """The radiance field. Internal positions are (world - centre) / unit.
+
+    Attributes:
+        centre: [3] float64, mean camera position in the world.
+        unit: world units per unit of the model.
+        travel: largest distance of a camera from the centre, model units; grids reach `far` beyond it.
+        kind: surroundings, indoor or outdoor.
+        constants: of the surroundings, or given.
+    """
+
+    centre: Tensor
+
+    def __init__(self, options: EgoNeRFOptions, centre: Tensor, unit: float, travel: float, kind: str) -> None:
+        """Build grids of noise from torch's global random state."""
+        super().__init__()
+        self.options, self.unit, self.travel, self.kind = options, unit, travel, kind
+        self.constants = constants = options.constants(kind)
+        self.register_buffer("centre", centre.double(), persistent=False)
+        shape = {"radius": options.radial_nodes, "polar": options.polar_nodes, "azimuth": options.azimuth_nodes}
+        self.density = PlaneLines(options.density_components, shape)
+        self.appearance = PlaneLines(options.appearance_components, shape)
+        self.shader = Shader(options)
+        self.environment = EnvironmentMap(options.environment_height) if constants.environment else None
+        # Half the diagonal of a cube around the reach of all rays, as published.
+        reach = math.sqrt(3) * (travel + constants.far)
+        first, samples = constants.first_radius, options.coarse_samples
+        self.register_buffer("nodes", exponential_nodes(first, reach, options.radial_nodes).float(), persistent=False)
+        distances = constants.near + exponential_nodes(first, constants.far - constants.near, samples)
+        self.register_buffer("distances", distances.float(), persistent=False)
+
+    @classmethod
+    def from_scene(cls, scene: Scene, options: EgoNeRFOptions, seed: int = 0) -> EgoNeRF:
+        """Return an untrained model around the mean training camera, on the device of the scene's points."""
+        unit = scene.scale if options.length_unit == "scene" else 1.0
+        centers = torch.stack([view.center for view in scene.train]).double().cpu()
+        centre = centers.mean(0)
+        travel = (centers - centre).norm(dim=-1).max().item() / unit
+        kind = surroundings_of(scene) if options.surroundings == "auto" else options.surroundings
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            model = cls(options, centre, unit, travel, kind)
+        return model.to(scene.points.device)
+
+    def trace(self, origins: Tensor, directions: Tensor, generator: torch.Generator | None = None) -> RayColors:
+        """Render rays, differentiably by the parameters.
+
+        Args:
+            origins: [B, 3] model units.
+            directions: [B, 3] unit.
+            generator: jitters the samples in training; None: no jitter.
+        """
+        distances = self._sample(origins, directions, generator)
+        at = self._at(origins, directions, distances)
+        depths = self._optical_depths(self.density.factors(), at, distances)
+        weights, residual = visible_shares(depths)
+        color = self._shade(at, directions, weights)
+        if self.environment is not None:
+            color = color + residual[:, None] * self.environment(directions)
+        contribution = weights.sum(-1)
+        depth = (weights * distances).sum(-1) / contribution.clamp(min=torch.finfo(weights.dtype).tiny)
+        return RayColors(color, residual, depth)
+
+    @torch.no_grad()
+    def render(self, view: View) -> Rendering:
+        """Render a view with any camera, in passes of bounded memory."""
+        camera, nodes = view.camera, self.get_buffer("nodes")
+        rotation = view.cam_from_world[:3, :3].to(nodes)
+        directions = camera.rays(dtype=nodes.dtype, device=nodes.device).reshape(-1, 3) @ rotation
+        origin = self.from_world(view.center)
+        passes = [self.trace(origin.expand_as(part), part) for part in directions.split(self.options.rays_at_once)]
+        color, transmittance, depth = (torch.cat(parts) for parts in zip(*passes, strict=True))
+        size = (view.height, view.width)
+        return Rendering(
+            color.view(*size, 3),
+            transmittance.view(size),
+            depth.view(size) * self.unit,
+            torch.zeros(0, dtype=torch.bool, device=nodes.device),  # no Gaussians
+            {"rays": len(directions), "samples": len(directions) * self.options.samples},
+        )
+
+    def from_world(self, points: Tensor) -> Tensor:
+        """Return positions [..., 3], model units, of points in the world, on the model's device."""
+        return ((points.to(self.centre) - self.centre) / self.unit).to(self.get_buffer("nodes"))
+
+    @torch.no_grad()
+    def _sample(self, origins: Tensor, directions: Tensor, generator: torch.Generator | None) -> Tensor:
+        """Return sample distances [B, coarse + fine], increasing."""
+        count, coarse = self.options.fine_samples, self.get_buffer("distances")
+        first = coarse.expand(len(origins), -1)
+        within = coarse.new_full((len(origins), count), 0.5)  # position in each quantile
+        if generator is not None:
+            first = jittered(first, torch.rand(first.shape, generator=generator).to(coarse))
+            within = torch.rand(within.shape, generator=generator).to(coarse)
+        at = self._at(origins, directions, first)
+        weights, _ = visible_shares(self._optical_depths(self.density.coarse(), at, first))
+        second = refined(first, weights, (torch.arange(count, device=coarse.device).to(coarse) + within) / count)
+        return torch.cat((first, second), dim=-1).sort(dim=-1).values
+
+    def _at(self, origins: Tensor, directions: Tensor, distances: Tensor) -> GridPosition:
+        points = origins[:, None] + distances[..., None] * directions[:, None]
+        return grid_position(points.reshape(-1, 3), self.get_buffer("nodes"))
+
+    def _optical_depths(self, factors: Factors, at: GridPosition, distances: Tensor) -> Tensor:
+        feature = density_feature(factors, at).view(distances.shape)
+        density = functional.softplus(feature + self.constants.density_shift)
+        return density * interval_lengths(distances) * self.constants.distance_scale
+
+    def _shade(self, at: GridPosition, directions: Tensor, weights: Tensor) -> Tensor:
+        """Return colours [B, 3], summed over samples."""
+        rays, samples = weights.shape
+        counts = (weights.detach().reshape(-1) >= self.options.min_weight).nonzero().squeeze(-1)
+        ray = counts // samples
+        at = at.where(counts)
+        color = self.shader(products(self.appearance.factors(), at), at.chart, directions[ray])
+        return color.new_zeros(rays, 3).index_add(0, ray, color * weights.reshape(-1)[counts, None])
+
+
+class Shader(nn.Module):
+    """Network from appearance features (a linear basis per chart) and direction to RGB in (0, 1)."""
+
+    def __init__(self, options: EgoNeRFOptions) -> None:
+        super().__init__()
+        self.options, features, hidden = options, options.features, options.hidden
+        inputs = len(MODES) * options.appearance_components
+        bound = 1 / math.sqrt(inputs)
+        self.basis = nn.Parameter(torch.empty(CHARTS, features, inputs).uniform_(-bound, bound))
+        width = features * (1 + 2 * options.feature_frequencies) + 3 * (1 + 2 * options.direction_frequencies)
+        last = nn.Linear(hidden, 3)
+        nn.init.zeros_(last.bias)
+        self.network = nn.Sequential(
+            nn.Linear(width, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), last, nn.Sigmoid()
+        )
+
+    def forward(self, products: Sequence[Tensor], chart: Tensor, directions: Tensor) -> Tensor:
+        """Return colours [N, 3].
+
+        Args:
+            products: [C, N] of each mode, see `grids.products`.
+            chart: [N] of the positions.
+            directions: [N, 3] unit, of the rays.
+        """
+        stacked = torch.cat(list(products))
+        features = torch.where(chart == YANG, self.basis[YANG] @ stacked, self.basis[YIN] @ stacked).T
+        seen = encoding(directions, self.options.direction_frequencies)
+        return self.network(torch.cat((encoding(features, self.options.feature_frequencies), seen), dim=-1))
+
+
+def encoding(values: Tensor, frequencies: int) -> Tensor:
+    """Return values [N, D] with sines and cosines of 1, 2, 4, ... times them, [N, D (1 + 2 frequencies)].
+
+    >>> encoding(torch.zeros(1, 1), 2).tolist()
+    [[0.0, 0.0, 0.0, 1.0, 1.0]]
+    """
+    factors = 2.0 ** torch.arange(frequencies, dtype=values.dtype, device=values.device)
+    angles = (values[..., None] * factors).flatten(-2)
+    return torch.cat((values, angles.sin(), angles.cos()), dim=-1)
+
+
+class EnvironmentMap(nn.Module):
+    """Colours by direction, bilinear, through a sigmoid; all texels cover the same solid angle.
+
+    Texel (i, j) of the H x 2H is centred at z = (2 i + 1) / H - 1 and azimuth = ((2 j + 1) / 2H - 1) pi; the
+    image is continuous across +-180 degrees.
+    """
+
+    def __init__(self, height: int) -> None:
+        """Build H rows, initially uniform in [0, 1) before the sigmoid."""
+        super().__init__()
+        self.emission = nn.Parameter(torch.rand(3, height, 2 * height))
+
+    def forward(self, directions: Tensor) -> Tensor:
+        """Return colours [N, 3] in (0, 1) of unit directions [N, 3]."""
+        x, y, z = directions.unbind(-1)
+        width = self.emission.shape[2]
+        padded = torch.cat((self.emission[..., -1:], self.emission, self.emission[..., :1]), dim=-1)
+        places = torch.stack((torch.atan2(y, x) / math.pi * (width / (width + 2)), z), dim=-1)[None, :, None]
+        values = functional.grid_sample(padded[None], places, align_corners=False, padding_mode="border")
+        return torch.sigmoid(values[0, :, :, 0].T)
+
+
+def surroundings_of(scene: Scene) -> str:
+    """Return indoor or outdoor, by the cloud: indoors nearly all points are about as far away as the median one.
+
+    Ours. 95 % of the points were within 1.4 to 2.4 scene units in nine rooms (built-in, scanned and reconstructed),
+    within 5.7 in a garden and 41 in the built-in outdoor scene. A random cloud looks like a room.
+    """
+    return "indoor" if cloud_reach(scene) <= MAX_ROOM_REACH else "outdoor"
+
+
+def cloud_reach(scene: Scene) -> float:
+    """Return the distance that `CLOUD_SHARE` of the points are within, scene units, median over training cameras."""
+    points = scene.points[:: max(1, len(scene.points) // 20_000)].double()
+    distances = [(points - view.center.to(points)).norm(dim=-1).quantile(CLOUD_SHARE) for view in scene.train]
+    return torch.stack(distances).median().item() / scene.scale

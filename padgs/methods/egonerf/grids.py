@@ -1,0 +1,197 @@
+"""EgoNeRF's grids: two charts of the sphere, exponential radial nodes, and planes times lines on them.
+
+Yin and yang are two charts without poles, 90 degrees of latitude by 270 degrees of longitude each. Yin holds the
+directions with polar angle acos(z / r) in [pi/4, 3 pi/4] and azimuth atan2(y, x) in [-3 pi/4, 3 pi/4]; yang holds all
+others, by the same angles after the swap (x, y, z) -> (-x, z, y), its own inverse.
+
+A function on both charts' (radius, polar, azimuth) boxes is a sum of planes times lines (VM decomposition of TensoRF).
+Every tensor has one slice per chart side by side along its first grid axis, so one bilinear look-up serves both charts.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+POLAR_SPAN = math.pi / 2  # of a chart, around the equator
+AZIMUTH_SPAN = 3 * math.pi / 2
+YIN, YANG = 0, 1
+CHARTS = 2
+# Each mode is a plane over two axes and a line over the third; the first axis of a plane carries the charts.
+MODES = ((("polar", "radius"), "azimuth"), (("azimuth", "radius"), "polar"), (("polar", "azimuth"), "radius"))
+THREADS = 4  # grid_sample is parallel over its batch only, so channels are split into so many batch entries
+
+
+class ChartPosition(NamedTuple):
+    """Charts and places of directions."""
+
+    chart: Tensor  # [...] int64, YIN or YANG
+    polar: Tensor  # [...] in [0, 1] from the chart's polar angle pi/4 to 3 pi/4
+    azimuth: Tensor  # [...] in [0, 1] from -3 pi/4 to 3 pi/4
+
+
+def locate(points: Tensor) -> ChartPosition:
+    """Return chart and place of points [..., 3], whatever their length; the centre has an arbitrary place.
+
+    >>> chart, polar, azimuth = locate(torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))
+    >>> chart.tolist(), polar.tolist(), azimuth.tolist()
+    ([0, 1], [0.5, 0.5], [0.5, 0.8333333730697632])
+    """
+    polar, azimuth = _angles(points)
+    inside = ((polar - math.pi / 2).abs() <= POLAR_SPAN / 2) & (azimuth.abs() <= AZIMUTH_SPAN / 2)
+    other_polar, other_azimuth = _angles(swapped(points))
+    polar = torch.where(inside, polar, other_polar)
+    azimuth = torch.where(inside, azimuth, other_azimuth)
+    return ChartPosition(
+        torch.where(inside, YIN, YANG),
+        ((polar - math.pi / 2) / POLAR_SPAN + 0.5).clamp(0, 1),
+        (azimuth / AZIMUTH_SPAN + 0.5).clamp(0, 1),
+    )
+
+
+def direction(position: ChartPosition) -> Tensor:
+    """Return unit directions [..., 3] of places; the inverse of `locate`."""
+    polar = (position.polar - 0.5) * POLAR_SPAN + math.pi / 2
+    azimuth = (position.azimuth - 0.5) * AZIMUTH_SPAN
+    sin_polar = torch.sin(polar)
+    unit = torch.stack((sin_polar * torch.cos(azimuth), sin_polar * torch.sin(azimuth), torch.cos(polar)), dim=-1)
+    return torch.where((position.chart == YIN)[..., None], unit, swapped(unit))
+
+
+def swapped(points: Tensor) -> Tensor:
+    """Return (-x, z, y) for points (x, y, z): from yin's axes to yang's and back."""
+    x, y, z = points.unbind(-1)
+    return torch.stack((-x, z, y), dim=-1)
+
+
+def _angles(points: Tensor) -> tuple[Tensor, Tensor]:
+    x, y, z = points.unbind(-1)
+    return torch.atan2(torch.sqrt(x * x + y * y), z), torch.atan2(y, x)
+
+
+def exponential_nodes(first: float, last: float, count: int) -> Tensor:
+    """Return distances 0, first, first q, first q^2, ... `last`, no interval shorter than `first`, [count] float64.
+
+    Intervals of the geometric series shorter than `first` become `first`, and all nodes behind them shift outwards (the
+    published interval threshold); so the nodes end at or behind `last`.
+
+    Raises:
+        ValueError: too few nodes, or lengths that do not grow.
+
+    >>> exponential_nodes(1.0, 4.0, 4).tolist()
+    [0.0, 1.0, 2.0, 4.0]
+    """
+    if count < 3:
+        raise ValueError(f"{count} radial nodes are too few; there must be at least 3")
+    if not 0 < first < last:
+        raise ValueError(f"the first radius is {first} and the last {last}; they must be 0 < first < last")
+    steps = torch.arange(count - 1, dtype=torch.float64)
+    nodes = first * (last / first) ** (steps / (count - 2))
+    intervals = torch.cat((nodes[:1], nodes.diff())).clamp(min=first)
+    return torch.cat((torch.zeros(1, dtype=torch.float64), intervals.cumsum(0)))
+
+
+def node_fraction(radius: Tensor, nodes: Tensor) -> Tensor:
+    """Return the position of radii [...] among increasing nodes [N], piecewise linear, 0 at the first, 1 at the last.
+
+    Args:
+        radius: any shape.
+        nodes: [N] of the same dtype.
+    """
+    last = len(nodes) - 1
+    upper = torch.searchsorted(nodes, radius.contiguous(), right=True).clamp(1, last)
+    below, above = nodes[upper - 1], nodes[upper]
+    return ((upper - 1 + (radius - below) / (above - below)) / last).clamp(0, 1)
+
+
+class GridPosition(NamedTuple):
+    """Positions in the grids: chart, and position along each axis in [0, 1]."""
+
+    chart: Tensor  # [N] int64
+    radius: Tensor  # [N]
+    polar: Tensor  # [N]
+    azimuth: Tensor  # [N]
+
+    def where(self, keep: Tensor) -> GridPosition:
+        """Return the positions that an index or mask selects."""
+        return GridPosition(*(values[keep] for values in self))
+
+
+class Factors(NamedTuple):
+    """Planes and lines of the three modes."""
+
+    planes: tuple[Tensor, ...]  # 3 x [C, 2, first axis, second axis]
+    lines: tuple[Tensor, ...]  # 3 x [C, 2, axis]
+
+
+class PlaneLines(nn.Module):
+    """Learnable factors with C components per mode, initialised from a normal distribution."""
+
+    def __init__(self, components: int, shape: dict[str, int], scale: float = 0.1) -> None:
+        """Build factors; `shape` is the number of nodes along radius, polar and azimuth in each chart."""
+        super().__init__()
+
+        def noise(*axes: str) -> nn.Parameter:
+            size = (components, CHARTS, *(shape[axis] for axis in axes))
+            return nn.Parameter(scale * torch.randn(size))
+
+        self.planes = nn.ParameterList([noise(*axes) for axes, _ in MODES])
+        self.lines = nn.ParameterList([noise(axis) for _, axis in MODES])
+
+    def factors(self) -> Factors:
+        """Return the factors at full resolution."""
+        return Factors(tuple(self.planes), tuple(self.lines))
+
+    def coarse(self) -> Factors:
+        """Return the factors at half the resolution, averaged over pairs of nodes."""
+        planes = tuple(functional.avg_pool2d(plane, 2) for plane in self.planes)
+        lines = tuple(functional.avg_pool1d(line, 2) for line in self.lines)
+        return Factors(planes, lines)
+
+    def variation(self) -> Tensor:
+        """Return twice the mean squared difference of neighbours, summed over axes, planes and charts; a scalar."""
+        total = self.planes[0].new_zeros(())
+        for plane in self.planes:
+            # The published sum runs over charts, each of which is a mean: a mean over both counts twice.
+            total = total + 2 * CHARTS * (plane.diff(dim=-1).square().mean() + plane.diff(dim=-2).square().mean())
+        return total
+
+
+def grid_position(points: Tensor, nodes: Tensor) -> GridPosition:
+    """Return positions of points [N, 3] relative to the centre, on grids with radial nodes at distances [R]."""
+    chart, polar, azimuth = locate(points)
+    return GridPosition(chart, node_fraction(points.norm(dim=-1), nodes), polar, azimuth)
+
+
+def products(factors: Factors, at: GridPosition) -> list[Tensor]:
+    """Return plane x line at N positions, [C, N] for each mode."""
+    found = []
+    for (axes, along), plane, line in zip(MODES, factors.planes, factors.lines, strict=True):
+        on_plane = _look_up(plane, at.chart, getattr(at, axes[0]), getattr(at, axes[1]))
+        found.append(on_plane * _look_up(line[..., None], at.chart, getattr(at, along), None))
+    return found
+
+
+def density_feature(factors: Factors, at: GridPosition) -> Tensor:
+    """Return the sum over modes of ReLU(sum over components of plane x line), [N]."""
+    return torch.stack([functional.relu(product.sum(0)) for product in products(factors, at)]).sum(0)
+
+
+def _look_up(image: Tensor, chart: Tensor, first: Tensor, second: Tensor | None) -> Tensor:
+    """Interpolate an image [C, 2, H, W] with nodes at its corners at N places, [C, N]; `first` runs along H."""
+    components, charts, height, width = image.shape
+    row = (chart * height + first * (height - 1)) * (2 / (charts * height - 1)) - 1
+    column = torch.zeros_like(row) if second is None else 2 * second - 1
+    places = torch.stack((column, row), dim=-1)[None, :, None]  # [1, N, 1, 2]
+    parts = math.gcd(components, THREADS)
+    values = functional.grid_sample(
+        image.reshape(parts, components // parts, charts * height, width),
+        places.expand(parts, -1, -1, -1),
+        align_corners=True,
+        padding_mode="border",
+    )
+    return values.reshape(components, -1)

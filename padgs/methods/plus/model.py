@@ -1,0 +1,197 @@
+"""padgs_plus in training: splats with schedules as shares of the run, priors, dropout and parameter averaging."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from padgs.gaussians import Gaussians
+from padgs.methods.plus.smoothness import roughness
+from padgs.methods.splats.model import SplatModel
+from padgs.methods.splats.smoothing_filter import cameras_of, finest_pixels, smoothed_for_view
+from padgs.methods.splats.splats import TINY, Splats
+from padgs.native import cpu
+from padgs.native.abi import AngularSizeArguments, pointer
+from padgs.render import RenderConfig
+from padgs.scene import View
+from padgs.training.schedule import ParameterGroup
+from padgs.training.model import TrainingRender, State
+
+if TYPE_CHECKING:
+    from padgs.methods.plus.method import PlusOptions
+
+DEGREE_SHARE = 0.1  # of the run, between two SH degrees
+AVERAGED_FROM = 0.9  # share of the run after which parameters are averaged and dropout ends
+GROWN_PER_KEPT = 2  # Gaussians before the pruning step per Gaussian after it, about
+AVERAGE = "average/"  # prefix of the running means in a state
+CAMERAS = "cameras"  # key of the training cameras in a state
+MIN_PIXELS = 2000.0  # panoramas below 80x40: many of them together show more than each
+
+
+def solid_angle_pixels(view: View) -> float:
+    """Return the number of independent pixels of a panorama: W H times the mean cosine of the latitude, 2 / pi.
+
+    At least `MIN_PIXELS`. Numbers of points and Gaussians are multiples of it.
+    """
+    return max(MIN_PIXELS, 2 * view.width * view.height / math.pi)
+
+
+class PlusModel(SplatModel):
+    """Splats with the schedule of padgs_plus for a run of `iterations`.
+
+    Attributes:
+        average: parameter name -> running mean over the last tenth of the run; empty before and after.
+    """
+
+    def __init__(
+        self, splats: Splats, options: PlusOptions, config: RenderConfig, *, limit: int | None = None, **kwargs: Any
+    ) -> None:
+        """Take arguments of `SplatModel`; `limit` is the maximal number of Gaussians."""
+        views = kwargs.get("views", ())
+        largest = max(map(solid_angle_pixels, views), default=MIN_PIXELS)
+        super().__init__(splats, replace(options.for_views(largest, len(views)), max_gaussians=limit), config, **kwargs)
+        self.options, self.average = options, dict[str, Tensor]()
+        self._step = 0  # last step of the schedule
+        self._pixels = sum(map(solid_angle_pixels, self._views))
+        self._cameras = cameras_of(self._views)
+        self._finest: tuple[Tensor, Tensor] | None = None  # means, and the finest training pixel at each
+
+    def groups(self, means_rate_factor: float = 1.0) -> list[ParameterGroup]:
+        """Return the learning rates of 3DGS with a factor on that of the means."""
+        return super().groups(means_rate_factor * self.options.means_rate_factor)
+
+    def degree_at(self, iteration: int) -> int:
+        """Return the scheduled SH degree: one more after each `DEGREE_SHARE` of the run."""
+        return int(iteration / (DEGREE_SHARE * self.iterations))
+
+    def draw(self, view: View, mean_offsets: Tensor | None = None) -> TrainingRender:
+        """Render all Gaussians, differentiably, with penalties on large Gaussians and rough surfaces."""
+        drawing, options, penalties = super().draw(view, mean_offsets), self.options, []
+        # `near` may be 0, and so is the depth of empty pixels.
+        near = max(self.render_options(view).near, TINY * self.splats.scene_scale)
+        if options.size_weight > 0:
+            penalties.append(options.size_weight * mean_angular_size(drawing.gaussians, view, near=near))
+        if options.smoothness_weight > 0:
+            penalties.append(options.smoothness_weight * roughness(drawing.rendering, view.camera, near=near))
+        return replace(drawing, penalty=sum(penalties)) if penalties else drawing
+
+    def _training_gaussians(self, gaussians: Gaussians) -> Gaussians:
+        factors, gaussians = self._dropout(), super()._training_gaussians(gaussians)
+        return gaussians if factors is None else replace(gaussians, opacities=factors * gaussians.opacities)
+
+    @torch.no_grad()
+    def _dropout(self) -> Tensor | None:
+        """Return factors [N] on opacities for the next render; None: no dropout.
+
+        Random dropout of opacities (DropGaussian, Park et al. 2025): 0 for dropped Gaussians, 1 / (1 - p) for kept ones
+        as far as opacities stay below 1. It exposes Gaussians that fit a single view only. There is none in the last
+        states, which become the model.
+        """
+        if self._pixels == 0 or self._step >= AVERAGED_FROM * self.iterations:
+            return None
+        fewer = GROWN_PER_KEPT if self.pruning.is_ahead(self._step) else 1
+        share = self.options.dropout_share(self._pixels, len(self.splats) / fewer)
+        if share == 0:
+            return None
+        opacities = torch.sigmoid(self.splats.opacity_logits)
+        seed = int(torch.randint(2**31, (), generator=self.densifier.generator))
+        kept = _hashed(seed, len(opacities), opacities.device) >= share * 2**32
+        return kept * (1 / opacities).clamp(max=1 / (1 - share))
+
+    def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
+        """Average parameters, densify, prune by importance, and activate the next SH degree, each when it is due."""
+        self._step, events = iteration, ()
+        if iteration > AVERAGED_FROM * self.iterations and self.options.averaged_share > 0:
+            events = self._update_average(iteration)
+        return events + super().adapt(iteration, optimizer)
+
+    def _update_average(self, iteration: int) -> tuple[str, ...]:
+        """Update the running means of the parameters; at the end of the run they replace the parameters."""
+        parameters = self.splats.rows()
+        weight = 1 / max(1.0, self.options.averaged_share * self.iterations)
+        for name, parameter in parameters.items():
+            self.average.setdefault(name, parameter.detach().clone()).lerp_(parameter, weight)
+        if iteration < self.iterations:
+            return ()
+        for name, parameter in parameters.items():
+            parameter.copy_(self.average[name])
+        self.average = {}
+        return ("replaced the parameters by their running means",)
+
+    @property
+    def has_smoothing_filter(self) -> bool:
+        """True if the training cameras are known and the low-pass acts in space, where it can be widened."""
+        return len(self._cameras) > 0 and self._config.resolved_low_pass_kind == "solid"
+
+    def _final_gaussians(self, view: View) -> Gaussians:
+        gaussians = super()._final_gaussians(view)
+        if not self.has_smoothing_filter:
+            return gaussians
+        if self._finest is None or not torch.equal(self._finest[0], gaussians.means):
+            means = gaussians.means.detach().clone()
+            self._finest = means, finest_pixels(means, self._cameras)
+        return smoothed_for_view(gaussians, view, self._finest[1], self._config.low_pass)
+
+    def state(self) -> State:
+        """Return the state of the splats, the schedule step, the training cameras and the running means."""
+        state = super().state()
+        averages = {AVERAGE + name: mean for name, mean in self.average.items()}
+        return State(state.tensors | averages | {CAMERAS: self._cameras}, state.values | {"step": self._step})
+
+    def load_state(self, state: State) -> None:
+        """Restore the model that `state` was taken of."""
+        super().load_state(state)
+        self._step, self._cameras, self._finest = state.values["step"], state.tensors[CAMERAS], None
+        device = self.splats.means.device
+        self.average = {name: mean.to(device, copy=True) for name, mean in state.under(AVERAGE).items()}
+
+
+def _hashed(seed: int, count: int, device: torch.device) -> Tensor:
+    """Return pseudo-random integers [count] below 2^32, the same on each device.
+
+    Integers from `seed` on, mixed by the finalizer of MurmurHash3: computed on the GPU, without waiting for the host.
+    """
+    mixed = torch.arange(seed, seed + count, device=device)
+    for factor, shift in ((0x9E3779B1, 16), (0x85EBCA6B, 13), (0xC2B2AE35, 16)):
+        mixed = mixed * factor & 0xFFFFFFFF
+        mixed = mixed ^ (mixed >> shift)
+    return mixed
+
+
+def mean_angular_size(gaussians: Gaussians, view: View, *, near: float) -> Tensor:
+    """Return the mean of scale / distance over Gaussians and axes, a scalar; differentiable by the scales only.
+
+    Large Gaussians cost (Gaussian, tile) pairs in every frame. On the CPU this is one native call
+    (csrc/cpu/angular_size.cpp).
+
+    Args:
+        gaussians: at least one.
+        view: whose camera distances are measured from.
+        near: > 0, lower limit of distances, world units.
+    """
+    means, center = gaussians.means.detach(), view.center.detach().to(gaussians.means)
+    if means.device.type == "cpu" and means.dtype == torch.float32 and cpu.available():
+        return _AngularSize.apply(gaussians.scales, means, center, near)
+    distances = (means - center).norm(dim=-1).clamp(min=near)
+    return (gaussians.scales / distances[:, None]).mean()
+
+
+class _AngularSize(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, scales: Tensor, means: Tensor, center: Tensor, near: float) -> Tensor:
+        scales, means = scales.contiguous(), means.contiguous()
+        ctx.gradient = torch.empty_like(scales) if ctx.needs_input_grad[0] else None
+        scalars = (len(means), (ctypes.c_float * 3)(*center.tolist()), near)
+        arguments = AngularSizeArguments(*scalars, *map(pointer, (means, scales, ctx.gradient)))
+        return scales.new_tensor(cpu.library().padgs_angular_size(ctypes.byref(arguments)))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_size: Tensor):
+        return ctx.gradient * grad_size, None, None, None
