@@ -8,7 +8,7 @@ from padgs.geometry.camera import perspective
 from padgs.methods.plus.method import PlusMethod, PlusOptions
 from padgs.methods.splats.smoothing_filter import RESOLVED_PIXEL, cameras_of, finest_pixels, smoothed_for_view
 from padgs.render import render
-from padgs.render.low_pass import LowPass, widened
+from padgs.render.projection import LowPass, low_pass_filtered
 from padgs.scene import View
 from padgs.training.options import Budget
 
@@ -37,7 +37,7 @@ def test_the_filter_of_a_view_on_top_makes_that_of_the_larger_pixel(trained):
     distances = (gaussians.means - view.center.float()).norm(dim=-1)
     own = distances / view.camera.focal
     pixels = own * torch.linspace(0.5, 3, len(own))
-    seen = widened(
+    seen = low_pass_filtered(
         smoothed_for_view(gaussians, view, pixels, variance),
         gaussians.means - view.center.float(),
         LowPass(0.0, variance / view.camera.focal**2, compensate=True),
