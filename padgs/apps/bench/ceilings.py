@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from padgs import clock
-from padgs.methods.anchors.model import PaDGSOptions
+from padgs.methods.anchors.anchors import PaDGSOptions
 from padgs.native import cpu
 from padgs.native.abi import pointer
 

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from padgs.methods.anchors.growth import GrowthOptions
 from padgs.methods.anchors.anchors import PaDGS
+from padgs.methods.anchors.growth import GrowthOptions
 from padgs.methods.anchors.model import AnchorModel, LearningRates
 from padgs.render import RenderOptions
 from padgs.scene import Scene, View

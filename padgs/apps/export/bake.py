@@ -18,8 +18,8 @@ from padgs.gaussians import Gaussians, rotation_matrices
 from padgs.geometry import harmonics
 from padgs.methods.anchors.anchors import PaDGS
 from padgs.methods.splats.densification import DensificationOptions
-from padgs.methods.splats.splats import Splats
 from padgs.methods.splats.model import SplatModel
+from padgs.methods.splats.splats import Splats
 from padgs.render import RenderConfig, Rendering, RenderOptions, render
 from padgs.scene import Scene, View
 from padgs.training.initial_points import ExtentOptions
@@ -93,7 +93,7 @@ def bake(model: PaDGS, views: Sequence[View], options: RenderOptions, backend: s
     coefficients = torch.linalg.solve(normal[keep] + shown[keep, None, None] * ridge, colour[keep])
     scales, quats = axes_of((covariance[keep] / seen[keep, None]).view(-1, 3, 3))
     opacities = (opacity[keep] / seen[keep]).clamp(1 / 255, MAX_OPACITY)
-    blank = Splats(zeros(0, 3), zeros(0, 3), zeros(0, 3), degree=DEGREE, unit=unit)
+    blank = Splats(zeros(0, 3), zeros(0, 3), zeros(0, 3), degree=DEGREE, scene_scale=unit)
     rest = zeros(len(keep), (DEGREE + 1) ** 2 - 1, 3)
     rest[:, : size - 1] = coefficients[:, 1:]
     blank.load(

@@ -18,9 +18,9 @@ from padgs.evaluation.protocols import PROTOCOLS
 from padgs.geometry import harmonics
 from padgs.methods.anchors.model import AnchorModel
 from padgs.methods.calibration.align import Similarity
-from padgs.methods.splats.splats import Splats
-from padgs.methods.splats.smoothing_filter import cameras_of, smoothed
 from padgs.methods.splats.model import SplatModel
+from padgs.methods.splats.smoothing_filter import cameras_of, smoothed
+from padgs.methods.splats.splats import Splats
 from padgs.render import Rendering, render
 from padgs.runs.load import LoadedRun
 from padgs.scene import View
@@ -53,7 +53,7 @@ def export_run(
         run: of any method with Gaussians.
         distillation_steps: iterations in which baked anchors are trained on renders of the run.
         upright: rotate the world so that the cameras' up is -y, as viewers expect.
-        smooth: include the 3D smoothing filter (`padgs.methods.splats.smoothing_filter`) in the scales, if the run has one;
+        smooth: include the 3D filter (`padgs.methods.splats.smoothing_filter`) in the scales, if there is one;
             viewers have no such filter, and show sharp Gaussians as needles.
         progress: called with the number of completed distillation steps.
 
@@ -152,7 +152,7 @@ def transform_splats(splats: Splats, new_from_old: Similarity) -> Splats:
     )
     sh = harmonics_rotation(rotation, splats.degree) @ torch.cat((splats.sh_dc[:, None], splats.sh_rest), dim=1)
     empty = splats.means[:0]
-    new = Splats(empty, empty, empty, degree=splats.degree, unit=splats.scene_scale * new_from_old.scale)
+    new = Splats(empty, empty, empty, degree=splats.degree, scene_scale=splats.scene_scale * new_from_old.scale)
     new.load(
         {
             "means": new_from_old(splats.means.to(new_from_old.rotation)).to(splats.means),

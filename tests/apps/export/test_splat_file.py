@@ -68,7 +68,7 @@ def test_without_the_converter_the_way_out_is_said(tmp_path, generator, monkeypa
 
 
 def test_what_takes_minutes_is_known_beforehand():
-    splats = Splats(torch.zeros(100_000, 3), torch.zeros(100_000, 3), torch.zeros(100_000, 3), degree=2, unit=1.0)
+    splats = Splats(*[torch.zeros(100_000, 3)] * 3, degree=2, scene_scale=1.0)
     assert estimate_seconds(Path("a.sog"), splats) == 0, "no harmonics in use"
     splats.active_degree = 2
     assert 400 < estimate_seconds(Path("a.sog"), splats) == estimate_seconds(Path("a.html"), splats) < 550  # took 476

@@ -45,7 +45,7 @@ def test_furniture_and_trees_make_no_room(name):
 @pytest.mark.parametrize(("condition", "level"), [("world_scale", 3), ("world_offset", 2), ("world_rotation", 3)])
 def test_the_world_may_be_anywhere(condition, level):
     scene = scene_of("room_chain", 3)
-    assert room_count(StressOptions(condition, level).scene(scene, 0)) == pytest.approx(room_count(scene), rel=0.1)
+    assert room_count(StressOptions(condition, level).apply(scene, 0)) == pytest.approx(room_count(scene), rel=0.1)
 
 
 def test_points_that_are_none_count_as_nothing():
