@@ -11,11 +11,10 @@ from padgs.methods.egonerf.model import EgoNeRFModel, RayTrainer
 from padgs.methods.egonerf.options import EgoNeRFOptions, EgoNeRFTraining
 from padgs.render import RenderConfig
 from padgs.scene import Scene
-from padgs.training.options import Budget
 from padgs.training.loop import Stage
 from padgs.training.method import Method
-from padgs.training.options import TrainOptions
 from padgs.training.model import State
+from padgs.training.options import Budget, TrainOptions
 
 BACKENDS = ("auto", "torch")
 
@@ -57,9 +56,11 @@ class EgoNeRFMethod(Method):
         raise ValueError("egonerf has no Gaussians that could be left out, as need does; take a method that has")
 
     def build_model(self, scene: Scene, iterations: int) -> EgoNeRFModel:
+        """See `Method.build_model`."""
         return EgoNeRFModel(EgoNeRF.from_scene(scene, self.options, self.seed), self.options, iterations)
 
     def restore(self, state: State) -> EgoNeRFModel:
+        """See `Method.restore`."""
         stored = state.of_model()
         centre = torch.tensor(stored.values["centre"], dtype=torch.float64)
         model = EgoNeRF(self.options, centre, *(stored.values[name] for name in ("unit", "travel", "kind")))
@@ -67,6 +68,7 @@ class EgoNeRFMethod(Method):
         return EgoNeRFModel(model, self.options, self.options.environment_pretraining + 1)
 
     def build_trainer(self, trainee: EgoNeRFModel, scene: Scene, budget: Budget, stage: Stage) -> RayTrainer:
+        """See `Method.build_trainer`."""
         return RayTrainer(trainee, scene, budget, self.train_options, self.seed, rays=self.options.rays, stage=stage)
 
     def _refuse_impossible(self) -> None:

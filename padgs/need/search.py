@@ -10,6 +10,7 @@ import torch
 
 from padgs.clock import Lap, timed
 from padgs.evaluation.evaluate import evaluate
+from padgs.methods.splats.importance import importance_scores, most_important
 from padgs.methods.splats.model import SplatModel
 from padgs.need import refine
 from padgs.need.calibration import RULES, calibration_split
@@ -24,7 +25,6 @@ from padgs.scene import View
 from padgs.training.loop import Trainer
 from padgs.training.model import Prunable, State
 from padgs.training.options import Budget
-from padgs.methods.splats.importance import most_important, importance_scores
 
 FOLDER = "need"  # in that of the run
 FRAMES = 10  # timed; the smallest time counts, since other programs only add to it

@@ -18,8 +18,8 @@ from torch import Tensor
 from padgs.apps.export.splat_file import CONVERTED, CONVERTER, read_splats, write_splats
 from padgs.methods.anchors.anchors import PaDGS
 from padgs.methods.anchors.model import AnchorModel
-from padgs.methods.splats.splats import Splats
 from padgs.methods.splats.model import SplatModel
+from padgs.methods.splats.splats import Splats
 from padgs.training.model import Prunable
 
 Model = Splats | PaDGS

@@ -12,8 +12,7 @@ from padgs.methods.egonerf.model import EgoNeRFModel
 from padgs.render import RenderConfig
 from padgs.runs.session import build
 from padgs.scene import Scene, View
-from padgs.training.options import Budget
-from padgs.training.options import TrainOptions
+from padgs.training.options import Budget, TrainOptions
 
 SMALL = EgoNeRFMethodOptions(
     radial_nodes=16,

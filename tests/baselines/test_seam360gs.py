@@ -11,8 +11,8 @@ from padgs.methods.calibration.dual_lens import DualLens
 from padgs.methods.splats.method import SplatMethod, SplatOptions
 from padgs.render import RenderConfig, RenderOptions, render
 from padgs.scene import Scene, View
-from padgs.training.options import Budget
 from padgs.training.model import TrainingRender
+from padgs.training.options import Budget
 
 TORCH = RenderConfig(projection="ray", backend="torch")
 

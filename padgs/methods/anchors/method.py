@@ -14,11 +14,11 @@ from padgs.methods.anchors.anchors import PaDGS, PaDGSOptions
 from padgs.methods.anchors.growth import GrowthOptions
 from padgs.methods.anchors.model import AnchorModel, LearningRates
 from padgs.scene import Scene
-from padgs.training.options import Budget
 from padgs.training.loop import Record, Stage
 from padgs.training.method import Method
-from padgs.training.schedule import PUBLISHED_ITERATIONS
 from padgs.training.model import State
+from padgs.training.options import Budget
+from padgs.training.schedule import PUBLISHED_ITERATIONS
 
 
 @dataclass(frozen=True)
@@ -65,11 +65,13 @@ class PaDGSMethod(Method):
             )
 
     def build_model(self, scene: Scene, iterations: int) -> AnchorModel:
+        """See `Method.build_model`."""
         extent = self.options.extent_of(scene)
         extent /= scene.scale if self.options.offset_rate_unit == "scene" else 1.0
         return self._model_of(PaDGS.from_scene(scene, self.options, seed=self.seed), extent, iterations)
 
     def restore(self, state: State) -> AnchorModel:
+        """See `Method.restore`."""
         stored = state.of_model()
         positions, log_scales = stored.tensors["positions"], stored.tensors["log_scales"]
         lengths = {name: stored.values[name] for name in ("voxel_size", "distance_scale")}

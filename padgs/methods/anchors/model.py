@@ -14,8 +14,8 @@ from padgs.methods.anchors.growth import Growth, GrowthOptions
 from padgs.render import Rendering, RenderOptions, render, resolve_backend
 from padgs.scene import View
 from padgs.training.initial_points import ExtentOptions
+from padgs.training.model import Parts, Size, State, TrainingRender
 from padgs.training.schedule import Constant, LogLinear, ParameterGroup
-from padgs.training.model import TrainingRender, Parts, Size, State
 
 OFFSET_RATE_UNITS = ("scene", "world")
 HEADROOM = 1.3  # capacity for the next view, in Gaussians of the last view

@@ -13,9 +13,9 @@ from padgs.methods.splats.method import SplatMethod
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.splats import Splats
 from padgs.scene import Scene, View
+from padgs.training.model import Parts, Size, State, TrainingRender
 from padgs.training.options import Budget
 from padgs.training.schedule import ParameterGroup
-from padgs.training.model import TrainingRender, Parts, Size, State
 
 PREFIX = "calibration/"  # of its tensors in a state
 
@@ -123,10 +123,12 @@ class CalibratedMethod(SplatMethod):
             )
 
     def build_model(self, scene: Scene, iterations: int) -> SplatModel:
+        """See `Method.build_model`."""
         self._calibration = self._as_given(scene)
         return super().build_model(scene, iterations)
 
     def restore(self, state: State) -> SplatModel:
+        """See `Method.restore`."""
         self._calibration = self._as_stored(state.of_model().values["calibration"])
         return super().restore(state)
 

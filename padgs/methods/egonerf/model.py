@@ -10,17 +10,16 @@ from typing import Any, ClassVar, cast
 import torch
 from torch import Tensor
 
+from padgs.clock import Lap
 from padgs.methods.egonerf.field import EgoNeRF
 from padgs.methods.egonerf.options import EgoNeRFTraining
 from padgs.methods.egonerf.rays import RayPixels
 from padgs.render import Rendering
 from padgs.scene import Scene, View
-from padgs.clock import Lap
-from padgs.training.options import Budget
 from padgs.training.loop import Stage, Trainer
-from padgs.training.options import TrainOptions
+from padgs.training.model import Model, Size, State
+from padgs.training.options import Budget, TrainOptions
 from padgs.training.schedule import LogLinear, ParameterGroup
-from padgs.training.model import Size, State, Model
 
 VARIATION_FACTOR = 1e-2  # published, on both weights of the total variation
 

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from padgs.geometry.camera import Camera
 from padgs.scene import View
-from padgs.training.targets import image_of, weight_of
 from padgs.training.model import State
+from padgs.training.targets import image_of, weight_of
 
 MIN_WEIGHT = 1e-5  # added to every weight, so that empty rays are still sampled everywhere
 

@@ -5,8 +5,8 @@ importance in a ninth, and kept small as seen from the cameras. No constant is i
 of the images, and latitude is no special case. Each part is an option that can be switched off
 (`+experiment=plus_ablation`).
 
-The number of Gaussians: `PlusMethod.build_model` sets the initial number and the limit, `padgs.methods.splats.densification`
-grows it by a threshold, and `padgs.methods.splats.importance` prunes it.
+The number of Gaussians: `PlusMethod.build_model` sets the initial number and the limit,
+`padgs.methods.splats.densification` adds Gaussians above a threshold, `padgs.methods.splats.importance` prunes them.
 """
 
 from __future__ import annotations
@@ -25,10 +25,9 @@ from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.splats import Splats
 from padgs.render import RenderConfig
 from padgs.scene import Scene
-from padgs.training.options import Budget
 from padgs.training.loop import Stage, Trainer
-from padgs.training.options import TrainOptions
 from padgs.training.model import Model
+from padgs.training.options import Budget, TrainOptions
 
 PIXEL_VARIANCE = 0.1  # square pixels; a pixel is the mean over a square, whose variance is 1/12
 ROUNDS = 8  # of densification
@@ -157,6 +156,7 @@ class PlusMethod(SplatMethod):
         return self.model.has_smoothing_filter
 
     def build_model(self, scene: Scene, iterations: int) -> SplatModel:
+        """See `Method.build_model`."""
         options, capacity = self.options, room_count(scene) * solid_angle_pixels(scene.train[0])
         start, limit = (_count(share, capacity) for share in (options.initial_per_pixel, options.limit_per_pixel))
         limit = lowest_limit(options.max_gaussians, limit if self._target is None else self._target)
@@ -192,6 +192,7 @@ class PlusMethod(SplatMethod):
         return self._filled[2], generator
 
     def build_trainer(self, trainee: Model, scene: Scene, budget: Budget, stage: Stage) -> Trainer:
+        """See `Method.build_trainer`."""
         share = self.options.coarse_share
         return Trainer(trainee, scene, budget, self.train_options, self.seed, coarse_share=share, stage=stage)
 

@@ -20,8 +20,8 @@ from padgs.native import cpu
 from padgs.native.abi import AngularSizeArguments, pointer
 from padgs.render import RenderConfig
 from padgs.scene import View
+from padgs.training.model import State, TrainingRender
 from padgs.training.schedule import ParameterGroup
-from padgs.training.model import TrainingRender, State
 
 if TYPE_CHECKING:
     from padgs.methods.plus.method import PlusOptions

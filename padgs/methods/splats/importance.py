@@ -16,8 +16,8 @@ from padgs.methods.splats.densification import DensificationOptions
 from padgs.render.contract import ALPHA_MIN
 from padgs.render.leave_one_out import leave_one_out
 from padgs.scene import View
-from padgs.training.targets import even_weight, image_of
 from padgs.training.model import Prunable
+from padgs.training.targets import even_weight, image_of
 
 MIN_KEPT_SHARE = 0.1  # of the rows stays in one pruning step, whatever the scores
 

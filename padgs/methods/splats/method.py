@@ -19,11 +19,10 @@ from padgs.methods.splats.densification import DensificationOptions
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.splats import Splats
 from padgs.scene import Scene, View
-from padgs.training.options import AUTO
 from padgs.training.initial_points import ExtentOptions
 from padgs.training.method import Method
-from padgs.training.options import TrainOptions
 from padgs.training.model import State
+from padgs.training.options import AUTO, TrainOptions
 
 PRUNE_PSNR = 44.0  # dB, with budget.gaussians=auto; see `padgs.methods.splats.importance.count_for_psnr`
 
@@ -65,6 +64,7 @@ class SplatMethod(Method):
             )
 
     def build_model(self, scene: Scene, iterations: int) -> SplatModel:
+        """See `Method.build_model`."""
         options = self.options
         generator = torch.Generator().manual_seed(self.seed)
         limit = lowest_limit(options.max_gaussians, self._target)
@@ -82,6 +82,7 @@ class SplatMethod(Method):
         return PRUNE_PSNR if self._gaussians == AUTO else None
 
     def restore(self, state: State) -> SplatModel:
+        """See `Method.restore`."""
         stored = state.of_model()
         values, empty = stored.values, stored.tensors["splats/means"][:0]
         splats = Splats(empty, empty, empty, degree=self.options.sh_degree, scene_scale=values["scene_scale"])

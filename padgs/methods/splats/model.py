@@ -18,9 +18,9 @@ from padgs.render import RenderConfig, Rendering, RenderOptions, render
 from padgs.render.contract import ALPHA_MIN
 from padgs.render.projection import widened_scales
 from padgs.scene import View
+from padgs.training.model import Parts, Size, State, TrainingRender
 from padgs.training.optimizer import keep_rows
 from padgs.training.schedule import Constant, LogLinear, ParameterGroup, scaled
-from padgs.training.model import TrainingRender, Parts, Size, State
 
 OFFSET_COLUMNS = {"image": 2, "space": 3, "space_absolute": 4}  # of `mean_offsets`, by positional gradient
 FILTER_VARIANCES = "filter/variances"  # key in a state

@@ -11,8 +11,7 @@ from padgs.methods.anchors.method import PaDGSMethod, PaDGSMethodOptions
 from padgs.methods.anchors.model import LearningRates
 from padgs.render import RenderConfig
 from padgs.scene import Scene, View
-from padgs.training.options import Budget
-from padgs.training.options import TrainOptions
+from padgs.training.options import Budget, TrainOptions
 
 WIDTH, HEIGHT = 48, 24
 EAGER = PaDGSMethodOptions(  # growth early and often, so that a short run has it

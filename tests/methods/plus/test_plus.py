@@ -25,9 +25,9 @@ from padgs.methods.plus.smoothness import roughness
 from padgs.methods.splats.importance import count_for_psnr, importance_scores
 from padgs.methods.splats.method import SplatMethod
 from padgs.scene import Scene
-from padgs.training.options import Budget
 from padgs.training.health import Failure
 from padgs.training.loop import Record
+from padgs.training.options import Budget
 
 OPTIONS = PlusOptions(gradient_threshold=1e-6, initial_per_pixel=None, limit_per_pixel=None, depth_init_per_pixel=0.0)
 

@@ -14,8 +14,8 @@ from padgs.methods.splats.splats import Splats
 from padgs.render import RenderConfig
 from padgs.runs.session import build
 from padgs.scene import Scene
-from padgs.training.options import Budget
 from padgs.training.initial_points import ExtentOptions
+from padgs.training.options import Budget
 from padgs.training.schedule import PUBLISHED_ITERATIONS
 
 EXTENT = 7.0
