@@ -10,7 +10,7 @@ from padgs.data.synthetic import SyntheticOptions, generate
 from padgs.methods.egonerf.field import EgoNeRF
 from padgs.methods.egonerf.model import EgoNeRFModel
 from padgs.render import RenderConfig
-from padgs.runs.session import build
+from padgs.runs.run import build_method
 from padgs.scene import Scene, View
 from padgs.training.options import Budget, TrainOptions
 
@@ -61,7 +61,7 @@ def test_the_room_is_learned(room):
 
 
 def test_the_small_setting_has_less_than_a_million_parameters():
-    scene, small = tiny_scene(), build(composed("method=egonerf_small"))
+    scene, small = tiny_scene(), build_method(composed("method=egonerf_small"))
     next(small.fit(scene, Budget(1)))
     assert small.size().parameters <= 1_000_000
     assert small.size().bytes == 4 * small.size().parameters

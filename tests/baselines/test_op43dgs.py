@@ -13,7 +13,7 @@ from tiny_scene import tiny_scene
 
 from padgs import results
 from padgs.baselines.op43dgs import OP43DGSMethod, OP43DGSOptions
-from padgs.runs import session
+from padgs.runs import run as pipeline
 from padgs.scene import Scene, View
 from padgs.training.options import Budget
 
@@ -73,9 +73,9 @@ def test_the_low_pass_of_the_release_is_the_same_angle_for_every_image(width):
 
 
 def run(setting: str, scene: Scene, folder, monkeypatch, *overrides: str) -> results.Result:
-    monkeypatch.setattr(session.data, "load", lambda path, format, options: scene)
+    monkeypatch.setattr(pipeline.data, "load", lambda path, format, options: scene)
     tiny = (f"run.folder={folder}", "train.iterations=4", "protocol=paper", "protocol.paper.lpips=none")
-    return session.Session(composed(f"method={setting}", *tiny, *overrides), Console(file=io.StringIO())).run()
+    return pipeline.run(composed(f"method={setting}", *tiny, *overrides), Console(file=io.StringIO()))
 
 
 @pytest.mark.slow

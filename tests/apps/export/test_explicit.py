@@ -135,7 +135,7 @@ def test_moved_gaussians_look_the_same_from_moved_cameras(generator):
     new = transform_splats(splats, similarity)
     after = render(new.gaussians(view.at(pose)), view.at(pose), RenderOptions())
     assert torch.allclose(after.image, before.image, atol=2e-3) and before.image.std() > 0.1
-    assert math.isclose(new.unit, 1.7 * splats.unit)
+    assert math.isclose(new.scene_scale, 1.7 * splats.scene_scale)
     back = transform_splats(new, similarity.inverse())
     for name in ("means", "log_scales", "sh_dc", "sh_rest"):
         assert torch.allclose(back.rows()[name], splats.rows()[name], atol=1e-4), name

@@ -12,7 +12,7 @@ from padgs.methods.splats.method import SplatMethod
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.splats import Splats
 from padgs.render import RenderConfig
-from padgs.runs.session import build
+from padgs.runs.run import build_method
 from padgs.scene import Scene
 from padgs.training.initial_points import ExtentOptions
 from padgs.training.options import Budget
@@ -112,12 +112,12 @@ def test_releases_measure_with_the_extent_of_their_cameras_however_little_they_m
     monkeypatch.setenv("PADGS_ROOT", str(root))
     config, scene = composed(f"method={release}"), travelling(tiny_scene(), 0.1)
     assert 0 < scene.extent < 0.05 * scene.scale
-    method = build(config)
+    method = build_method(config)
     method.fit(scene, Budget(1))
     published = 0.01 if release == "padgs_release" else 1.6e-4
     assert method.model.groups()[0].learning_rate(0) == pytest.approx(published * scene.extent, rel=1e-6)
     with pytest.raises(ValueError, match=r"stand in one place, so their extent is 0 .* set method\.min_extent to a"):
-        build(config).fit(travelling(scene, 0.0), Budget(1))
+        build_method(config).fit(travelling(scene, 0.0), Budget(1))
 
 
 def test_the_least_that_counts_as_a_move():
