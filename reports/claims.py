@@ -106,7 +106,7 @@ def load() -> list[Claim]:
     return [Claim(**entry) for entry in yaml.safe_load(Path(__file__).with_name("claims.yaml").read_text("utf-8"))]
 
 
-def test(claim: Claim, run_set: RunSet) -> Evidence:
+def evaluate(claim: Claim, run_set: RunSet) -> Evidence:
     """Test whether the mean advantage differs from zero, by a paired t-test on scenes, or on seeds of few scenes.
 
     A claim holds (does not hold) if the mean is significantly positive (negative) and so is every scene; it depends on
@@ -161,7 +161,7 @@ def findings(run_set: RunSet) -> Page:
         ReportError: results that must not stand together.
     """
     numbers, claims = published.load(), load()
-    tested = [(claim, test(claim, run_set)) for claim in claims]
+    tested = [(claim, evaluate(claim, run_set)) for claim in claims]
     parts = ["# Findings", _answer(tested), "## Evidence", _table(tested, numbers), "## Rules", RULES.strip()]
     return Page("findings.md", "\n\n".join(parts) + "\n")
 
