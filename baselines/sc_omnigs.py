@@ -18,8 +18,8 @@ from torch import Tensor
 from padgs.checks import check
 from padgs.geometry.panorama import sample_pixels
 from padgs.methods.calibration.align import Difference, Similarity, align
-from padgs.methods.calibration.camera_map import CameraMap
-from padgs.methods.calibration.splats import CalibratedMethod, Calibration
+from padgs.methods.calibration.lenses import CameraMap
+from padgs.methods.calibration.model import CalibratedMethod, Calibration
 from padgs.methods.splats.method import SplatOptions
 from padgs.render import Rendering
 from padgs.scene import Scene, View
@@ -152,7 +152,7 @@ class SCOmniGSMethod(CalibratedMethod):
                 "train.poses is learned, but sc_omnigs learns poses by itself; leave it at given, or take omnigs"
             )
 
-    def _as_given(self, scene: Scene) -> SelfCalibration:
+    def initial_calibration(self, scene: Scene) -> SelfCalibration:
         sizes = {(view.width, view.height) for view in scene.train}
         if len(sizes) > 1:
             raise ValueError(f"sc_omnigs calibrates one camera, but the training views have sizes {sorted(sizes)}")
@@ -164,7 +164,7 @@ class SCOmniGSMethod(CalibratedMethod):
         poses = PoseRefinement.of(scene.train, unit=scene.scale)
         return self._calibrating(poses, *sizes.pop())
 
-    def _as_stored(self, values: Mapping[str, Any]) -> SelfCalibration:
+    def restored_calibration(self, values: Mapping[str, Any]) -> SelfCalibration:
         names = values["views"]
         poses = PoseRefinement(names, torch.eye(4).repeat(len(names), 1, 1), unit=values["unit"])
         return self._calibrating(poses, values["width"], values["height"])

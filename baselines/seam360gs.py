@@ -16,8 +16,8 @@ import torch
 from padgs.checks import check, check_known
 from padgs.geometry.camera import RayTable
 from padgs.geometry.lens import AXES
-from padgs.methods.calibration.dual_lens import DualLens
-from padgs.methods.calibration.splats import CalibratedMethod
+from padgs.methods.calibration.lenses import DualLens
+from padgs.methods.calibration.model import CalibratedMethod
 from padgs.methods.splats.method import SplatOptions
 from padgs.render import RenderConfig
 from padgs.render.contract import check_camera
@@ -55,16 +55,16 @@ class Seam360GSMethod(CalibratedMethod):
         super()._refuse_impossible()
         check_camera(RayTable(torch.zeros(1, 1, 3), focal=1.0), self.render_config.options(scene_scale=1.0))
 
-    def _as_given(self, scene: Scene) -> DualLens:
-        return self._as_stored({"unit": scene.scale})
+    def initial_calibration(self, scene: Scene) -> DualLens:
+        return self.restored_calibration({"scene_scale": scene.scale})
 
-    def _as_stored(self, values: Mapping[str, Any]) -> DualLens:
+    def restored_calibration(self, values: Mapping[str, Any]) -> DualLens:
         options = self.options
         return DualLens(
             axis=options.lens_axis,
             order=options.lens_order,
             blend=options.lens_blend,
-            unit=values["unit"],
+            scene_scale=values["scene_scale"],
             gap_rate=options.gap_rate,
             coefficient_rate=options.coefficient_rate,
         )

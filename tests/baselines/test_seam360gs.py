@@ -7,7 +7,7 @@ from tiny_scene import tiny_scene, truth
 from padgs.baselines.seam360gs import Seam360GSMethod, Seam360GSOptions
 from padgs.data.synthetic import SyntheticOptions, SyntheticTruth, generate
 from padgs.evaluation.metrics import seam, ws_psnr
-from padgs.methods.calibration.dual_lens import DualLens
+from padgs.methods.calibration.lenses import DualLens
 from padgs.methods.splats.method import SplatMethod, SplatOptions
 from padgs.render import RenderConfig, RenderOptions, render
 from padgs.scene import Scene, View
@@ -43,7 +43,7 @@ def photographed(gap: float, bending: tuple[float, float]) -> Scene:
     """The tiny scene with its exact centres and colours as points, through two lenses."""
     scene, seen = tiny_scene(), truth()
     scene = replace(scene, points=seen.means, point_colors=(255 * seen.colors).round().to(torch.uint8))
-    lenses = DualLens(order=1, unit=scene.scale)
+    lenses = DualLens(order=1, scene_scale=scene.scale)
     with torch.no_grad():
         lenses.gap.fill_(gap)
         lenses.coefficients[:, 0] = torch.tensor(bending)

@@ -1,1 +1,1 @@
-"""Cameras that learn along: poses, a panoramic camera that is not ideal, two lenses."""
+"""Camera models that are learned with explicit Gaussians: SC-OmniGS and Seam360GS."""

@@ -1,7 +1,7 @@
-"""Two sets of poses of the same cameras, brought together by a similarity, and what then still differs.
+"""Alignment of two sets of poses of the same cameras by a similarity.
 
-The rotation comes from the orientations, not from the centres: on a nearly straight path the centres say nothing
-about the turn around it, and panoramas always see all around. Scale and translation are least squares on the centres.
+The rotation comes from the orientations, because centres on a nearly straight path do not determine the rotation about
+it. Scale and translation are least squares on the centres.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ class Similarity:
     translation: Tensor  # [3]
 
     def __call__(self, points: Tensor) -> Tensor:
-        """Points [..., 3] of the second world in the first."""
+        """Map points [..., 3] of the second world to the first."""
         return self.scale * points @ self.rotation.mT + self.translation
 
     def inverse(self) -> Similarity:
-        """second_from_first."""
+        """Return second_from_first."""
         return Similarity(1 / self.scale, self.rotation.mT, -self.translation @ self.rotation / self.scale)
 
 
 @dataclass(frozen=True)
 class Difference:
-    """What is left after the alignment, per camera."""
+    """Residuals of the alignment per camera."""
 
-    distance: Tensor  # [F] between the centres, in units of the first world
-    degrees: Tensor  # [F] between the orientations
+    distance: Tensor  # [F] between centres, units of the first world
+    degrees: Tensor  # [F] between orientations
 
 
 def align(first: Tensor, second: Tensor) -> tuple[Similarity, Difference]:
-    """Align poses of the same cameras in two worlds.
+    """Return the similarity first_from_second and its residuals.
 
     Args:
         first: cam_from_world [F, 4, 4] float64.

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from padgs.geometry.panorama import rays, sample_pixels, unproject
-from padgs.methods.calibration.camera_map import CameraMap
+from padgs.methods.calibration.lenses import CameraMap
 
 W, H = 64, 32
 

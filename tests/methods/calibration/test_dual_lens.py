@@ -6,7 +6,7 @@ from tiny_scene import tiny_scene, truth
 
 from padgs.gaussians import Gaussians
 from padgs.geometry.camera import Panorama, Pinhole, RayTable
-from padgs.methods.calibration.dual_lens import DualLens
+from padgs.methods.calibration.lenses import DualLens
 from padgs.render import RenderOptions, render
 from padgs.scene import View
 from padgs.training.model import TrainingRender
@@ -38,7 +38,7 @@ def test_lenses_in_one_place_that_bend_nothing_are_the_ideal_camera_to_the_bit(p
 
 
 def test_each_lens_stands_on_its_own_side():
-    lenses = DualLens(axis="z", unit=2.0)
+    lenses = DualLens(axis="z", scene_scale=2.0)
     with torch.no_grad():
         lenses.gap.fill_(0.1)
     front, back = lenses.lenses(VIEW)
@@ -61,7 +61,7 @@ def test_what_each_lens_shows_is_its_own_half():
 
 def test_gradients_are_those_of_differences():
     """Of gap and coefficients, through poses, ray tables, blending and the renderer."""
-    lenses = DualLens(axis="x", blend=20.0, unit=2.0).double()
+    lenses = DualLens(axis="x", blend=20.0, scene_scale=2.0).double()
     draw = drawer(truth().to(torch.float64))
     weight = torch.randn(*VIEW.image().shape, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
     with torch.no_grad():

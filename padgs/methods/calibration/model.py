@@ -1,4 +1,4 @@
-"""Explicit Gaussians whose cameras learn too: the splats of 3DGS and a `Calibration`, as a trainee."""
+"""Explicit Gaussians with a learned camera model."""
 
 from __future__ import annotations
 
@@ -17,119 +17,119 @@ from padgs.training.model import Parts, Size, State, TrainingRender
 from padgs.training.options import Budget
 from padgs.training.schedule import ParameterGroup
 
-PREFIX = "calibration/"  # of its tensors in a state
+PREFIX = "calibration/"  # of the camera model's tensors in a state
 
 
 class Calibration(nn.Module, ABC):
-    """A differentiable model of the cameras that draws views through itself."""
+    """A differentiable camera model through which training views are rendered."""
 
     @abstractmethod
     def groups(self, iterations: int) -> list[ParameterGroup]:
-        """Its parameters and their learning rates in a run of `iterations`."""
+        """Return the parameters and their learning rates in a run of `iterations`."""
 
     @abstractmethod
     def draw(self, draw: Callable[..., TrainingRender], view: View) -> TrainingRender:
-        """Draw a training view as its camera takes it; `draw(view, probe=None)` draws as an ideal camera does."""
+        """Render a training view through the camera; `draw(view, mean_offsets=None)` renders an ideal camera."""
 
     @abstractmethod
     def summary(self) -> str:
-        """What was found, for people."""
+        """Return the result as a sentence."""
 
     @abstractmethod
     def counts(self) -> dict[str, int]:
-        """What it consists of: poses, lenses, ..."""
+        """Return the numbers of poses, lenses, ..."""
 
     @abstractmethod
     def values(self) -> dict[str, Any]:
-        """What building it again takes besides the options, as JSON can hold it."""
+        """Return what restoring takes besides the options, as JSON values."""
 
 
 class CalibratedModel(SplatModel):
-    """Splats that are drawn through a calibration in training; `render` stays that of an ideal camera."""
+    """Splats that are trained through a calibration; `render` is that of an ideal camera."""
 
     def __init__(self, *args: Any, calibration: Calibration, **kwargs: Any) -> None:
-        """Arguments as for `SplatModel`, and the calibration that is optimised along with the splats."""
+        """Take arguments of `SplatModel` and the calibration that is learned with the splats."""
         super().__init__(*args, **kwargs)
         self.calibration = calibration
 
     def groups(self) -> list[ParameterGroup]:
-        """Those of the splats and of the cameras."""
+        """Return the learning rates of splats and cameras."""
         return super().groups() + self.calibration.groups(self.iterations)
 
     def parts(self, view: View) -> Parts:
-        """Refused: a photograph says little about what an ideal camera in its supposed place sees.
+        """Refuse: images of learned cameras cannot be compared with renders of the given ones.
 
         Raises:
             ValueError: always.
         """
         raise ValueError(
-            "its cameras learn along, so photographs cannot be compared with what stands at their poses; take a method "
-            "that does not calibrate"
+            "its cameras are learned, so images cannot be compared with renders at the given poses; take a method without "
+            "calibration"
         )
 
     def draw(self, view: View, mean_offsets: Tensor | None = None) -> TrainingRender:
-        """Render all Gaussians as the camera of the view takes them, differentiably."""
+        """Render all Gaussians through the camera model, differentiably."""
         return self.calibration.draw(super().draw, view)
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
-        """As the splats do; the last event of a whole run says what was found of the cameras."""
+        """Adapt the splats; the last event of a run is the summary of the calibration."""
         events = super().adapt(iteration, optimizer)
         return (*events, self.calibration.summary()) if iteration == self.iterations else events
 
     def size(self) -> Size:
-        """Counts and bytes of the model, calibration included."""
+        """Return counts and bytes of the model, calibration included."""
         size = super().size()
         parameters = list(self.calibration.parameters())
         own = Size.of(self.calibration.counts(), parameters, stored=parameters)
         return Size({**size.counts, **own.counts}, size.parameters + own.parameters, size.bytes + own.bytes)
 
     def state(self) -> State:
-        """That of the splats, and the calibration."""
+        """Return the state of splats and calibration."""
         state = super().state()
         tensors = {PREFIX + name: tensor for name, tensor in self.calibration.state_dict().items()}
         return State(state.tensors | tensors, state.values | {"calibration": self.calibration.values()})
 
     def load_model(self, state: State) -> None:
-        """Take the splats and the calibration alone."""
+        """Load the parameters of splats and calibration only."""
         super().load_model(state)
         self.calibration.load_state_dict(state.under(PREFIX))
 
 
 class CalibratedMethod(SplatMethod):
-    """A method whose cameras learn, too; a subclass says which calibration they have."""
+    """A method with a learned camera model; subclasses build it."""
 
     MODEL = CalibratedModel
-    _calibration: Calibration  # what the next trainee is made with
+    _calibration: Calibration  # of the next model
 
     @abstractmethod
-    def _as_given(self, scene: Scene) -> Calibration:
-        """The calibration that training starts with."""
+    def initial_calibration(self, scene: Scene) -> Calibration:
+        """Return the calibration that training starts with."""
 
     @abstractmethod
-    def _as_stored(self, values: Mapping[str, Any]) -> Calibration:
-        """A calibration of the shape that `Calibration.values` tells; its tensors are loaded afterwards."""
+    def restored_calibration(self, values: Mapping[str, Any]) -> Calibration:
+        """Return a calibration for `Calibration.values`; its tensors are loaded afterwards."""
 
     @property
     def _views_learn(self) -> bool:
         return True
 
     def refuse_budget(self, budget: Budget) -> None:
-        """Poses as given, which the choice scores Gaussians from, may be far from where the cameras end."""
+        """Refuse pruning by importance, which would be scored from the given poses."""
         super().refuse_budget(budget)
         if budget.gaussians == "auto":
             raise ValueError(
-                "budget.gaussians is auto, which scores Gaussians from the poses as given, but cameras learn along "
-                "here; set it to a number or null"
+                "budget.gaussians is auto, which scores Gaussians from the given poses, but cameras are learned here; "
+                "set it to a number or null"
             )
 
     def build_model(self, scene: Scene, iterations: int) -> SplatModel:
         """See `Method.build_model`."""
-        self._calibration = self._as_given(scene)
+        self._calibration = self.initial_calibration(scene)
         return super().build_model(scene, iterations)
 
     def restore(self, state: State) -> SplatModel:
         """See `Method.restore`."""
-        self._calibration = self._as_stored(state.of_model().values["calibration"])
+        self._calibration = self.restored_calibration(state.of_model().values["calibration"])
         return super().restore(state)
 
     def _model_of(self, splats: Splats, *args: Any, **more: Any) -> SplatModel:
