@@ -122,16 +122,15 @@ def trade_offs(run_set: RunSet) -> list[TradeOff]:
     return found
 
 
-def pareto(points: Sequence[tuple[float, float]], higher_is_better: bool) -> list[tuple[float, float]]:
-    """Return the points (cost, quality) that no other point beats in both, by rising cost.
+def pareto(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Return the points (cost, quality, more is better) that no other point beats in both, by rising cost.
 
-    >>> pareto([(1, 20.0), (2, 19.0), (3, 25.0)], higher_is_better=True)
+    >>> pareto([(1, 20.0), (2, 19.0), (3, 25.0)])
     [(1, 20.0), (3, 25.0)]
     """
-    sign = -1 if higher_is_better else 1
     front: list[tuple[float, float]] = []
-    for cost, quality in sorted(points, key=lambda point: (point[0], sign * point[1])):
-        if not front or sign * quality < sign * front[-1][1]:
+    for cost, quality in sorted(points, key=lambda point: (point[0], -point[1])):
+        if not front or quality > front[-1][1]:
             front.append((cost, quality))
     return front
 

@@ -110,7 +110,7 @@ class Panel:
         """Draw the Pareto front of all ranked points but releases, up to the end of the window."""
         rivals = [m for m in self.marks if m.role != "release" and m.point.preset not in self.trade_off.unranked]
         positions = {(mark.x, mark.y): mark.at for mark in rivals}
-        corners = [positions[point] for point in pareto([*positions], higher_is_better=True)]
+        corners = [positions[point] for point in pareto([*positions])]
         corners += [(max(self.x_axis.window[1], corners[-1][0]), corners[-1][1])] if corners else []
         steps = [corner for (_, y), (x, top) in pairwise(corners) for corner in ((x, y), (x, top))]
         self._line([*corners[:1], *steps], color=SOFT[0], linewidth=0.9, zorder=1.5)

@@ -55,8 +55,7 @@ def test_where_no_scene_is_finished_in_all_settings_there_is_no_chart_but_a_warn
 
 def test_no_point_of_the_front_is_beaten():
     points = [(1.0, 20.0), (1.0, 21.0), (2.0, 20.5), (3.0, 24.0), (4.0, 24.0)]
-    assert pareto(points, higher_is_better=True) == [(1.0, 21.0), (3.0, 24.0)]
-    assert pareto(points, higher_is_better=False) == [(1.0, 20.0)]
+    assert pareto(points) == [(1.0, 21.0), (3.0, 24.0)]
 
 
 def test_a_method_that_never_finishes_does_not_empty_the_chart():
