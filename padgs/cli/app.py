@@ -1,4 +1,4 @@
-"""The beginning and the end of `padgs`: imports nothing that takes time before it is ready to be stopped."""
+"""Entry point of `padgs`; imports slow modules only once it answers Ctrl-C."""
 
 from __future__ import annotations
 

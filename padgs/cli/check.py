@@ -1,4 +1,4 @@
-"""`padgs check`: is this folder ready for training?"""
+"""`padgs check`: check that a data set is ready for training."""
 
 from __future__ import annotations
 
@@ -8,25 +8,25 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from padgs.cli.refusing import refusing, show
+from padgs.cli.errors import exit_on, show
 
 if TYPE_CHECKING:
     from padgs.data.check import Report
 
 
-@refusing(ValueError, OSError)
+@exit_on(ValueError, OSError)
 def check(
     path: Annotated[str, typer.Argument(help="folder with panoramas and poses, or the file that describes them")],
     format: Annotated[str, typer.Option(help="auto, or the format's name")] = "auto",
     overlay: Annotated[
         str | None,
-        typer.Option(help="where the picture of the points on a panorama goes; if not said, beside the data; '': none"),
+        typer.Option(help="file for the points drawn on a panorama; default: beside the data; '': none"),
     ] = None,
     mask: Annotated[str, typer.Option(help="auto, none, rows:959/1024, or a file or folder")] = "auto",
     images: Annotated[str, typer.Option(help="image folder, if not the usual one")] = "",
     split: Annotated[str, typer.Option(help="auto, files, every or all")] = "auto",
 ) -> None:
-    """Look a data set through and list what is wrong with it. Exit code 1 if anything is."""
+    """Check a data set and list its problems. Exit code 1 if there are any."""
     from rich.console import Console
 
     from padgs.data.capture import DataOptions
@@ -37,14 +37,14 @@ def check(
             Path(path),
             format=format,
             options=DataOptions(mask=mask, images=images or None, split=split),
-            overlay=picture_place(Path(path)) if overlay is None else Path(overlay) if overlay else None,
+            overlay=overlay_path(Path(path)) if overlay is None else Path(overlay) if overlay else None,
             progress=lambda done, total: status.update(f"looking at image {done} of {total}"),
         )
     end_with(report)
 
 
-def picture_place(data: Path) -> Path:
-    """Where the picture of a data set goes if nobody says: into its folder, or here if that is read-only."""
+def overlay_path(data: Path) -> Path:
+    """Return the default file of the overlay: beside the data, or in the working folder if that is read-only."""
     from padgs.data.check import OVERLAY
 
     folder = data if data.is_dir() else data.parent

@@ -1,4 +1,4 @@
-"""The commands of `padgs`: everything beside running. One file per command, which imports what is slow when called."""
+"""The commands of `padgs`, one file each. A command imports slow modules when it is called."""
 
 from __future__ import annotations
 
@@ -22,16 +22,18 @@ from padgs.cli.view import view
 app = typer.Typer(no_args_is_help=True)
 
 
-def show_version(asked: bool) -> None:
-    """Print the version and stop, if that is asked."""
-    if asked:
+def show_version(requested: bool) -> None:
+    """Print the version and exit if requested."""
+    if requested:
         typer.echo(f"padgs {padgs.__version__}")
         raise typer.Exit
 
 
 @app.callback()
 def commands(
-    version: Annotated[bool, typer.Option("--version", callback=show_version, is_eager=True, help="and stop")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", callback=show_version, is_eager=True, help="print the version")
+    ] = False,
 ) -> None:
     """Panoramic Gaussian splatting, measured fairly."""
 

@@ -1,4 +1,4 @@
-"""`padgs convert`: from any known format to any other."""
+"""`padgs convert`: write a data set in another format."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.refusing import refusing, show
+from padgs.cli.errors import exit_on, show
 
 FORMATS = "colmap, nerfstudio (or transforms), openmvg, opensfm, roam360, ricoh360, omniblender, released"
 
 
-@refusing(ValueError, OSError)
+@exit_on(ValueError, OSError)
 def convert(
     source: Annotated[str, typer.Argument(help="folder with panoramas and poses, or the file that describes them")],
     destination: Annotated[str, typer.Argument(help="a folder that does not exist yet")],

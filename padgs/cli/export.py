@@ -6,20 +6,19 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.opening import DataPath, Run, naming_data, opened, writing
-from padgs.cli.refusing import refusing, show
+from padgs.cli.errors import DataPath, Run, exit_on, name_place, name_run, open_run, show
 
-LONG = 60.0  # seconds of writing, from which on it is said beforehand
+LONG = 60.0  # seconds of writing; announced beforehand if it takes longer
 
 
-@refusing(ValueError, OSError)
+@exit_on(ValueError, OSError)
 def export(
     run: Run,
     to: Annotated[str, typer.Option(help="file to write; .ply, .compressed.ply, .spz, .sog or .html")] = "",
     points: Annotated[bool, typer.Option("--points", help="only centres of opaque Gaussians, coloured")] = False,
     upright: Annotated[bool, typer.Option("--upright", help="turn -y up, as viewers expect; .html always is")] = False,
     smooth: Annotated[
-        bool, typer.Option("--smooth", help="as wide as photographs saw them, for viewers; .html always is")
+        bool, typer.Option("--smooth", help="at least a pixel wide, for viewers; .html always is")
     ] = False,
     distillation_steps: Annotated[
         int | None, typer.Option(help="iterations that refine the baked anchors of PaD-GS; default 300")
@@ -28,10 +27,10 @@ def export(
 ) -> None:
     """Write a run's Gaussians, by default into its folder as splats.ply (--points: points.ply).
 
-    Those of PaD-GS, which differ from view to view, are baked into ones that do not; what that costs is measured, said
-    and written into the file. Viewers that come nearer than the cameras were, or have smaller pixels, show sharp ones
-    as needles; --smooth writes none thinner than a pixel of the nearest photograph. All but .ply is made by
-    splat-transform (npm install -g @playcanvas/splat-transform).
+    The Gaussians of PaD-GS differ from view to view, so they are baked into explicit ones; the loss is measured,
+    printed and written into the file. Viewers that come nearer than the cameras, or have smaller pixels, show thin
+    Gaussians as needles; --smooth writes none thinner than a pixel of the nearest photograph. Formats other than .ply
+    are made by splat-transform (npm install -g @playcanvas/splat-transform).
     """
     from pathlib import Path
 
@@ -47,10 +46,10 @@ def export(
         raise ValueError(f"{path} is no plain .ply, which point clouds are written as")
     check_suffix(path)
     with Console().status("opening the run") as status:
-        trained = opened(run, data)
-        with writing(path):
+        trained = open_run(run, data)
+        with name_place(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-        with naming_data(run):
+        with name_run(run):
             found = export_run(
                 trained,
                 distillation_steps=steps,
@@ -61,7 +60,7 @@ def export(
         if not points and (seconds := estimate_seconds(path, found.splats)) > LONG:
             show(f"{path.name}: its harmonics take some {seconds / 60:.0f} minutes; a .spz or .ply takes seconds")
         status.update(f"writing {path}")
-        with writing(path):
+        with name_place(path):
             if points:
                 cloud = point_cloud(found.splats)
                 write_ply(path, cloud)

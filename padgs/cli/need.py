@@ -6,8 +6,7 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.opening import DataPath, naming_data
-from padgs.cli.refusing import refusing
+from padgs.cli.errors import DataPath, exit_on, name_run
 from padgs.results import NEED_LOSSES, NEED_STATED
 
 KNOWN = ", ".join(f"{loss:g}" for loss in NEED_LOSSES)
@@ -28,7 +27,7 @@ def need(
 
     console = Console(highlight=False, soft_wrap=True)
     try:
-        with refusing(OSError, RuntimeError, ValueError):
+        with exit_on(OSError, RuntimeError, ValueError):
             if epsilon not in NEED_LOSSES:
                 rule = "must be > 0" if not epsilon > 0 else "is none of those that are searched for"
                 raise ValueError(f"--epsilon is {epsilon:g}; it {rule}: {KNOWN}")
@@ -36,7 +35,7 @@ def need(
             if opened.result is None or not opened.result.ok:
                 state = "not finished" if opened.result is None else f"of status {opened.result.status}"
                 raise ValueError(f"{run} is {state}; a need is that of a run that ended well, so start it again first")
-            with naming_data(run):
+            with name_run(run):
                 search(opened, epsilon, console)
     except Interrupted as interrupted:  # outside of `refusing`, to which Exit is an error
         console.print(str(interrupted))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from padgs.cli.refusing import refusing, show
+from padgs.cli.errors import exit_on, show
 from padgs.runs.interrupt import INTERRUPTED
 
 if TYPE_CHECKING:
@@ -40,10 +40,10 @@ def prepare(
         int, typer.Option(help="processor threads; 0 = all, at most 8, as free memory allows; fewer take less memory")
     ] = 0,
 ) -> None:
-    """Find the poses of panoramas, then check the result. Interrupted, the same command goes on where it stopped."""
+    """Find the poses of panoramas, then check the result. After an interruption, the same command continues."""
     from pathlib import Path
 
-    from padgs.cli.check import end_with, picture_place
+    from padgs.cli.check import end_with, overlay_path
     from padgs.data.capture import DataError
     from padgs.data.check import check
     from padgs.data.prepare.pipeline import prepare as find_poses
@@ -51,12 +51,12 @@ def prepare(
 
     target = Path(destination)
     try:
-        with refusing(DataError, OSError), _bars() as tell:
+        with exit_on(DataError, OSError), _bars() as tell:
             options = PrepareOptions(accurate, pairs, mask, level, per_second, seed, threads)
             result = find_poses(Path(source), target, options, tell)
-            report = check(target, overlay=picture_place(target))
+            report = check(target, overlay=overlay_path(target))
     except KeyboardInterrupt as interrupt:
-        print("interrupted; the same command goes on where this stopped")
+        print("interrupted; the same command continues")
         raise typer.Exit(INTERRUPTED) from interrupt
     placed = len(result.registered)
     print(f"{placed} of {placed + len(result.unregistered)} panoramas placed, {result.points} points")
@@ -68,7 +68,7 @@ def prepare(
 
 @contextmanager
 def _bars() -> Iterator[Callable[[str, int, int], None]]:
-    """One bar per step, with the time that is left; plain lines now and then where there is no terminal."""
+    """Show a progress bar per step with the remaining time; without a terminal, print a line at each tenth."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     tasks: dict[str, tuple[TaskID, int]] = {}  # step -> bar, tenths that were told

@@ -6,11 +6,10 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.opening import DataPath, Run, naming_data, opened, writing
-from padgs.cli.refusing import refusing
+from padgs.cli.errors import DataPath, Run, exit_on, name_place, name_run, open_run
 
 
-@refusing(ValueError, OSError)
+@exit_on(ValueError, OSError)
 def render(
     run: Run,
     to: Annotated[str, typer.Option(help="an .mp4, or a folder for PNGs; default: video.mp4 in the run's folder")] = "",
@@ -18,14 +17,12 @@ def render(
         str, typer.Option(help="cameras, orbit, dolly, or a JSON: keyframes, nerfstudio's path")
     ] = "cameras",
     camera: Annotated[str, typer.Option(help="panorama or perspective")] = "panorama",
-    fov: Annotated[float | None, typer.Option(help="degrees across a perspective picture; 90 if not said")] = None,
-    width: Annotated[int, typer.Option(help="pixels; 0: the run's, for a perspective half as many")] = 0,
-    height: Annotated[
-        int | None, typer.Option(help="pixels of a perspective picture; 9/16 of the width if not said")
-    ] = None,
-    seconds: Annotated[float | None, typer.Option(help="length; 10 if not said, or what a camera path has")] = None,
+    fov: Annotated[float | None, typer.Option(help="horizontal degrees of a perspective image; default 90")] = None,
+    width: Annotated[int, typer.Option(help="pixels; 0: as the run, half of it in perspective")] = 0,
+    height: Annotated[int | None, typer.Option(help="pixels of a perspective image; default 9/16 of the width")] = None,
+    seconds: Annotated[float | None, typer.Option(help="length; default 10, or that of the camera path")] = None,
     fps: Annotated[float, typer.Option(help="frames per second")] = 30.0,
-    depth: Annotated[bool, typer.Option("--depth", help="also write depth, beside the colours")] = False,
+    depth: Annotated[bool, typer.Option("--depth", help="also write depth")] = False,
     data: DataPath = None,
 ) -> None:
     """Write a video (or PNGs) along a path, as panoramas, which players recognise, or in perspective."""
@@ -43,13 +40,13 @@ def render(
     if camera not in ("panorama", "perspective"):
         raise ValueError(f"unknown camera {camera!r}; known: panorama, perspective")
     if camera == "panorama" and (fov is not None or height is not None):
-        raise ValueError("--fov and --height are of perspective pictures: add --camera perspective")
+        raise ValueError("--fov and --height belong to perspective images: add --camera perspective")
     if not (fps > 0 and (seconds is None or seconds > 0)):
         wrong = f"--fps is {fps:g}" if seconds is None or seconds > 0 else f"--seconds is {seconds:g}"
         raise ValueError(f"{wrong}, which makes a video without frames; it must be > 0")
     with Console().status("opening the run") as status:
-        found = opened(run, data)
-        with naming_data(run):
+        found = open_run(run, data)
+        with name_run(run):
             scene = found.scene
         trained = scene.train[0]
         if camera == "panorama":
@@ -70,7 +67,7 @@ def render(
             for number, pose in enumerate(poses)
         ]
         output = Path(to) if to else found.folder / "video.mp4"
-        with writing(output):
+        with name_place(output):
             outputs = write_video(
                 output,
                 views,

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.refusing import refusing, show
+from padgs.cli.errors import exit_on, show
 from padgs.files import write_atomically
 from padgs.reports import REPORTS, store
 from padgs.reports.table import ReportError
@@ -19,7 +19,7 @@ from padgs.results import FILE_NAME, STOP_REQUESTED, ResultError
 ALL = "all"
 
 
-@refusing(ReportError, ResultError)
+@exit_on(ReportError, ResultError)
 def report(
     what: Annotated[str, typer.Argument(help=f"{', '.join(REPORTS)}, or {ALL}")],
     runs: Annotated[str, typer.Argument(help="folder of run folders, or a results.jsonl")] = "runs",

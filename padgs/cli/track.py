@@ -1,4 +1,4 @@
-"""`padgs track`: mirror finished runs into mlflow, whoever ran them."""
+"""`padgs track`: mirror finished runs into mlflow."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.refusing import refusing, show
+from padgs.cli.errors import exit_on, show
 
 
-@refusing(FileNotFoundError)
+@exit_on(FileNotFoundError)
 def track(
     runs: Annotated[str, typer.Argument(help="folder of run folders")] = "runs",
-    uri: Annotated[str, typer.Option(help="of a server or database; mlflow.db in RUNS if not given")] = "",
+    uri: Annotated[str, typer.Option(help="of a server or database; default: mlflow.db in RUNS")] = "",
 ) -> None:
-    """Mirror finished runs into mlflow: those of a cluster, or of a time when its server was away."""
+    """Mirror finished runs into mlflow, for example runs of a cluster."""
     from pathlib import Path
 
     from padgs import results

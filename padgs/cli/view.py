@@ -8,32 +8,31 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from padgs import results
-from padgs.cli.opening import DataPath, Run, naming_data, opened
-from padgs.cli.refusing import refusing
+from padgs.cli.errors import DataPath, Run, exit_on, name_run, open_run
 
 if TYPE_CHECKING:
     from padgs.runs.load import LoadedRun
 
 
-@refusing(ValueError, OSError)
+@exit_on(ValueError, OSError)
 def view(
     run: Run,
     beside: Annotated[str, typer.Option(help="another run of the same scene, to compare with")] = "",
-    port: Annotated[int | None, typer.Option(help="the first one to try; 8080 if not said")] = None,
+    port: Annotated[int | None, typer.Option(help="the first one to try; default 8080")] = None,
     host: Annotated[
         str | None,
-        typer.Option(help="0.0.0.0 shows it to the whole network, without a password; else this machine only"),
+        typer.Option(help="0.0.0.0 serves the whole network, without a password; default: this machine only"),
     ] = None,
     data: DataPath = None,
 ) -> None:
-    """Walk through a run in the browser, drawn here by the run's own renderer; one in training is followed."""
+    """Walk through a run in the browser, rendered by its own renderer; a run in training is followed."""
     from padgs.apps.viewer.process import has_screen, serve
     from padgs.apps.viewer.server import LOCAL, PORT
 
     folders = (run, beside) if beside else (run,)
     for folder in folders:
         if not (Path(folder) / results.CONFIG_NAME).is_file():
-            opened(folder, data)  # says what is wrong before a page stands
+            open_run(folder, data)  # raises before the page is served
 
     def of_one_scene() -> list[LoadedRun]:
         from padgs.apps.viewer.process import wait_for_checkpoint
@@ -41,8 +40,8 @@ def view(
         runs, names = [], []
         for folder in folders:
             wait_for_checkpoint(folder)
-            runs.append(found := opened(folder, data))
-            with naming_data(folder):
+            runs.append(found := open_run(folder, data))
+            with name_run(folder):
                 names.append(found.scene.name)
         if len({*names}) > 1:
             scenes = " and ".join(names)
