@@ -62,6 +62,7 @@ class Claim:
     within: tuple[str, ...] = ()
     published: Sequence[tuple[int, str, str]] = ()
     published_metric: str = ""
+    note: str = ""
 
     @property
     def sides(self) -> tuple[Side, Side]:
@@ -172,7 +173,8 @@ def _answer(tested: Sequence[tuple[Claim, Evidence]]) -> str:
     first += f"{paper.count(FAILS)} do not; the rest depend on the scene or are undecided."
     lines = []
     for verdict in (HOLDS, FAILS, MIXED, UNDECIDED, UNMEASURED):
-        texts = [f"- {claim.text} ({claim.source})." for claim, evidence in tested if evidence.verdict == verdict]
+        chosen = [claim for claim, evidence in tested if evidence.verdict == verdict]
+        texts = [" ".join(filter(None, (f"- {claim.text} ({claim.source}).", claim.note))) for claim in chosen]
         lines += [f"**{verdict.capitalize()}:**\n\n" + "\n".join(texts)] if texts else []
     return "\n\n".join([first, *lines])
 
