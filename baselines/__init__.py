@@ -18,27 +18,27 @@ METHODS = {
     "seam360gs": "padgs.baselines.seam360gs:Seam360GSMethod",
     "padgs_plus": "padgs.methods.plus.method:PlusMethod",
 }
-OURS = frozenset(METHODS)
+BUILT_IN = frozenset(METHODS)
 GROUP = "padgs.methods"  # of entry points
 
 
 def outside() -> dict[str, str]:
-    """The methods of other packages, name -> "package.module:class": entry points of the group padgs.methods."""
+    """Return the methods of other packages, name -> "package.module:class", from entry points of padgs.methods."""
     return {point.name: point.value for point in entry_points(group=GROUP)}
 
 
 def clash() -> str | None:
-    """What is wrong where another package calls a method as we call one of ours; None if none does."""
+    """Return an error message if another package uses the name of a built-in method, else None."""
     found = outside()
-    if taken := sorted(found.keys() & OURS):
-        return f"entry point {found[taken[0]]} is called {taken[0]}, as a method of padgs is; rename it"
+    if taken := sorted(found.keys() & BUILT_IN):
+        return f"entry point {found[taken[0]]} has the name {taken[0]} of a built-in method; rename it"
     return None
 
 
 def distribution(method: str) -> str:
-    """Name and version of the package that brings a method; empty for one of ours."""
-    points = () if method in OURS else entry_points(group=GROUP, name=method)
+    """Return name and version of the package that provides a method; empty for a built-in one."""
+    points = () if method in BUILT_IN else entry_points(group=GROUP, name=method)
     return " ".join(f"{point.dist.name} {point.dist.version}" for point in points if point.dist)
 
 
-METHODS |= {name: value for name, value in outside().items() if name not in OURS}
+METHODS |= {name: value for name, value in outside().items() if name not in BUILT_IN}

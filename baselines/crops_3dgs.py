@@ -1,7 +1,7 @@
-"""Ordinary 3DGS on perspective crops of the panoramas, all of one lens and so of one solid angle.
+"""3DGS (Kerbl et al. 2023) on overlapping perspective crops of the panoramas, all with one lens.
 
-Twelve crops look along the vertices of an icosahedron, the evenest twelve directions that there are; none looks along
-the panorama's axis. They overlap, so that no direction is seen at the border of crops alone.
+Twelve crops look along the vertices of an icosahedron, none along the vertical axis of the panorama. They overlap, so
+that every direction is inside some crop.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ GOLDEN = (1 + math.sqrt(5)) / 2
 ICOSAHEDRON = [
     vertex for a in (1.0, -1.0) for b in (GOLDEN, -GOLDEN) for vertex in ((0.0, a, b), (a, b, 0.0), (b, 0.0, a))
 ]
-# Twice the angle between a vertex and the middle of a face; crops that are any narrower leave holes there.
-NARROWEST = 2 * math.degrees(math.acos(math.sqrt((5 + 2 * math.sqrt(5)) / 15)))
+# Twice the angle between a vertex and the centre of a face: narrower crops do not cover the sphere.
+MIN_FIELD_OF_VIEW = 2 * math.degrees(math.acos(math.sqrt((5 + 2 * math.sqrt(5)) / 15)))
 
 
 @dataclass(frozen=True)
@@ -33,10 +33,10 @@ class Crops3DGSOptions(SplatOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not NARROWEST <= self.field_of_view < 180:
+        if not MIN_FIELD_OF_VIEW <= self.field_of_view < 180:
             raise ValueError(
-                f"field_of_view is {self.field_of_view}; below {NARROWEST:.2f} degrees the crops do not cover the "
-                "sphere, and it must be less than 180"
+                f"field_of_view is {self.field_of_view}; it must be less than 180, and at least {MIN_FIELD_OF_VIEW:.2f} "
+                "degrees for the crops to cover the sphere"
             )
 
 
@@ -46,9 +46,9 @@ class Crops3DGSMethod(Cubemap3DGSMethod):
     Options = Crops3DGSOptions
 
     def turns(self) -> Tensor:
-        """Rotations [12, 3, 3] from a panorama's camera frame to those of the crops."""
+        """Return rotations [12, 3, 3] from the camera frame of a panorama to those of the crops."""
         return looking_at(ICOSAHEDRON)
 
     def lens(self, panorama: Panorama) -> Pinhole:
-        """The camera of the crops."""
+        """Return the camera of the crops."""
         return square_lens(panorama, math.tan(math.radians(self.options.field_of_view / 2)), FINENESS)

@@ -1,8 +1,8 @@
-"""Ordinary 3DGS on the faces of a cube: what most people do with a 360 degree camera today.
+"""3DGS (Kerbl et al. 2023) on the faces of a cube, the common way to use a 360 degree camera.
 
-Each training panorama becomes six perspective views of 90 degrees, each a view of its own. Test panoramas stay whole:
-they are drawn face by face and put together (`padgs.render.cubemap`). An iteration trains on as many views as together
-show the whole sphere once, so that it sees what an iteration of a panoramic method sees.
+Each training panorama becomes six perspective views of 90 degrees. Test panoramas are rendered face by face
+(`padgs.render.cubemap`). An iteration trains on as many views as cover the sphere once, like an iteration of a
+panoramic method.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ from padgs.training.model import Model
 from padgs.training.options import Budget
 
 
-def of_cut_views(options: RenderOptions) -> RenderOptions:
-    """How views are drawn that are cut out of panoramas which are drawn with these options."""
+def cut_view_options(options: RenderOptions) -> RenderOptions:
+    """Return the renderer options for views cut from panoramas with these options."""
     return replace(options, cubemap=False, face_size=None).on_finer_pixels(FINENESS)
 
 
 class CutModel(SplatModel):
-    """Splats that train on views cut out of panoramas, and finer than those."""
+    """Splats that train on views cut from panoramas, with finer pixels."""
 
     def render_options(self, view: View) -> RenderOptions:
-        """A cut view is drawn as it is, with filters of the size of the panorama's pixels."""
+        """Return the renderer options for a view; filters of cut views keep the size of the panorama's pixels."""
         options = super().render_options(view)
         if isinstance(view.camera, Panorama):
             return options
-        return of_cut_views(options)
+        return cut_view_options(options)
 
 
 class Cubemap3DGSMethod(SplatMethod):
@@ -50,20 +50,20 @@ class Cubemap3DGSMethod(SplatMethod):
     MODEL = CutModel
     CUT_FINENESS = FINENESS
     RENDER = RenderConfig(projection="pinhole", cubemap=True)
-    _views_each = 1  # training views of an iteration; of the scene of `fit`
+    _views_per_step = 1  # training views of an iteration, for the scene of `fit`
 
     def fit(self, scene: Scene, budget: Budget, *, stage: Stage = nullcontext) -> Iterator[Record]:
-        """Train on what is cut out of the panoramas; an iteration is one panorama's worth of such views.
+        """Train on views cut from the panoramas; an iteration covers the sphere once.
 
         Raises:
             ValueError: a training view is no panorama.
         """
         cut = perspective_scene(scene, self.turns(), self.lens)
-        self._views_each = self._worth_a_panorama(scene, cut)
+        self._views_per_step = self._views_per_panorama(scene, cut)
         return super().fit(cut, budget, stage=stage)
 
     def _refuse_impossible(self) -> None:
-        """Also where pixels shall be weighted, or Gaussians chosen, by a latitude that cut views do not have."""
+        """Also refuse options that need panoramas as training views."""
         if self.render_config.projection == "pinhole" and not self.render_config.cubemap:
             raise ValueError(
                 "projection pinhole cannot draw the held-out panoramas at once; set render.cubemap=true, or "
@@ -81,24 +81,26 @@ class Cubemap3DGSMethod(SplatMethod):
                     f"its own; leave it at {GIVEN}, or take omnigs"
                 )
         super()._refuse_impossible()
-        check_camera(self.lens(Panorama(8, 4)), of_cut_views(self.render_config.options(scene_scale=1.0)))
+        check_camera(self.lens(Panorama(8, 4)), cut_view_options(self.render_config.options(scene_scale=1.0)))
 
     def turns(self) -> Tensor:
-        """Rotations [K, 3, 3] from a panorama's camera frame to those of the views."""
+        """Return rotations [K, 3, 3] from the camera frame of a panorama to those of the views."""
         return FACES
 
     def lens(self, panorama: Panorama) -> Pinhole:
-        """The camera of the views; together they see every direction once."""
+        """Return the camera of the views; together they cover every direction once."""
         return square_lens(panorama, 1.0, FINENESS)
 
-    def _worth_a_panorama(self, scene: Scene, cut: Scene) -> int:
-        """How many of the views that were cut show what there is to see once; each direction is in some of them."""
+    def _views_per_panorama(self, scene: Scene, cut: Scene) -> int:
+        """Return the number of cut views that cover the directions of a panorama once on average."""
         if not scene.train:
-            return 1  # `Method.fit` says what is wrong
+            return 1  # `Method.fit` refuses the scene
         lens = self.lens(Panorama(scene.train[0].width, scene.train[0].height))
         times_seen = len(self.turns()) * solid_angle(lens) / (4 * math.pi)
         return max(1, round(len(cut.train) / len(scene.train) / times_seen))
 
-    def build_trainer(self, trainee: Model, scene: Scene, budget: Budget, stage: Stage) -> Trainer:
+    def build_trainer(self, model: Model, scene: Scene, budget: Budget, stage: Stage) -> Trainer:
         """See `Method.build_trainer`."""
-        return Trainer(trainee, scene, budget, self.train_options, self.seed, views_each=self._views_each, stage=stage)
+        return Trainer(
+            trainee, scene, budget, self.train_options, self.seed, views_each=self._views_per_step, stage=stage
+        )

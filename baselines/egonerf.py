@@ -1,4 +1,4 @@
-"""EgoNeRF: a radiance field on spherical grids, rendered by sampling rays; the comparison that splats nothing."""
+"""EgoNeRF (Choi et al. 2023) as a method: a radiance field on spherical grids, rendered by sampling rays."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ BACKENDS = ("auto", "torch")
 
 @dataclass(frozen=True)
 class EgoNeRFMethodOptions(EgoNeRFOptions, EgoNeRFTraining):
-    """The `method` group of the configuration: the model and its training, all in one list."""
+    """The `method` group of the configuration: the model and its training."""
 
     def __post_init__(self) -> None:
         EgoNeRFOptions.__post_init__(self)
@@ -34,25 +34,25 @@ class EgoNeRFMethodOptions(EgoNeRFOptions, EgoNeRFTraining):
 
 
 class EgoNeRFMethod(Method):
-    """See `padgs.training.method.Method`; most options of renderer and loss mean nothing to it."""
+    """See `padgs.training.method.Method`; most options of renderer and loss do not apply."""
 
     Options = EgoNeRFMethodOptions
     TRAIN = TrainOptions(weight="uniform", learning_rates="published")
 
     def refuse_budget(self, budget: Budget) -> None:
-        """There are no Gaussians and no views, and a pretraining that must end."""
+        """Also refuse numbers of Gaussians, validation views, and runs shorter than the pretraining."""
         super().refuse_budget(budget)
         if budget.gaussians is not None:
             raise ValueError(f"budget.gaussians is {budget.gaussians}, but EgoNeRF has no Gaussians; leave it out")
         if budget.stop == "auto":
             raise ValueError(
-                "budget.stop is auto, which sets whole views apart, but rays are drawn from all views; set it to end"
+                "budget.stop is auto, which needs validation views, but rays are drawn from all views; set it to end"
             )
-        if budget.seconds is None:  # else the length is known when it is rehearsed
+        if budget.seconds is None:  # with seconds the length is measured
             self.options.refuse_length(budget.iterations)
 
     def refuse_search(self) -> None:
-        """There is nothing to leave out."""
+        """Refuse: there are no Gaussians."""
         raise ValueError("egonerf has no Gaussians that could be left out, as need does; take a method that has")
 
     def build_model(self, scene: Scene, iterations: int) -> EgoNeRFModel:
@@ -72,7 +72,7 @@ class EgoNeRFMethod(Method):
         return RayTrainer(trainee, scene, budget, self.train_options, self.seed, rays=self.options.rays, stage=stage)
 
     def _refuse_impossible(self) -> None:
-        """Also say so where an option is set that this method would have to ignore."""
+        """Also refuse options that do not apply to this method."""
         train = self.train_options
         loss = replace(self.TRAIN, weight=train.weight, check_every=train.check_every, monitor=train.monitor)
         if self.render_config.backend not in BACKENDS:
@@ -82,12 +82,12 @@ class EgoNeRFMethod(Method):
             )
         rays = RenderConfig(backend=self.render_config.backend)
         for group, given, possible, why in (
-            ("render", self.render_config, rays, "casts rays and draws no Gaussians"),
-            ("train", train, loss, "minimises the squared error of single rays, with neither Gaussians nor pictures"),
+            ("render", self.render_config, rays, "casts rays and renders no Gaussians"),
+            ("train", train, loss, "minimises the squared error of single rays, without Gaussians or images"),
         ):
             for field in fields(possible):
                 if getattr(given, field.name) != getattr(possible, field.name):
                     raise ValueError(
-                        f"egonerf {why}, so {group}.{field.name}={getattr(given, field.name)} means nothing to it; "
+                        f"egonerf {why}, so {group}.{field.name}={getattr(given, field.name)} does not apply; "
                         f"leave it at {getattr(possible, field.name)}"
                     )

@@ -1,7 +1,7 @@
-"""SC-OmniGS: OmniGS that calibrates itself; poses and the panoramic camera are optimised with the Gaussians.
+"""SC-OmniGS (arXiv 2502.04734): OmniGS with self-calibration of poses and of the panoramic camera.
 
-Made after the abstract and the project page; the paper (arXiv 2502.04734) was not read, and its code is not public.
-What these say and what is inferred here is told apart in docs/methods.md.
+Implemented after the abstract and the project page, without the paper and without code, which is not public.
+docs/methods.md lists what is stated there and what is inferred.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from padgs.training.targets import Target
 
 @dataclass(frozen=True)
 class SCOmniGSOptions(SplatOptions):
-    """Those of OmniGS, and of the calibration."""
+    """Options of OmniGS and of the calibration."""
 
     poses: PoseRates = PoseRates()
     focal_rate: float = 1e-5  # learning rate of the focal-type coefficient
-    distortion_rate: float = 1e-5  # ... of the angular distortion map, radians
-    roughness_weight: float = 1e-2  # in the loss, of the map's total variation per radian
-    anisotropy_weight: float = 1e-3  # in the loss, of `anisotropy`
-    anisotropy_ratio: float = 10.0  # longest to shortest axis that a Gaussian may have unpunished
+    distortion_rate: float = 1e-5  # learning rate of the angular distortion map, radians
+    roughness_weight: float = 1e-2  # loss weight of the map's total variation per radian
+    anisotropy_weight: float = 1e-3  # loss weight of `anisotropy`
+    anisotropy_ratio: float = 10.0  # longest to shortest axis without penalty
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -51,7 +51,7 @@ class SCOmniGSOptions(SplatOptions):
 
 
 class SelfCalibration(Calibration):
-    """Poses of all training views and the one camera that took them."""
+    """Poses of all training views and their common camera."""
 
     def __init__(self, poses: PoseRefinement, camera: CameraMap, options: SCOmniGSOptions, weight: str) -> None:
         """Start from the given poses and an ideal camera; `weight` is a name of `padgs.training.loss.ROW_WEIGHTS`."""
@@ -60,7 +60,7 @@ class SelfCalibration(Calibration):
         self._options, self._weight = options, weight
 
     def groups(self, iterations: int) -> list[ParameterGroup]:
-        """Parameters of poses and camera."""
+        """Return the learning rates of poses and camera."""
         options, camera = self._options, self.camera
         return [
             *self.poses.groups(options.poses, iterations),
@@ -69,30 +69,30 @@ class SelfCalibration(Calibration):
         ]
 
     def draw(self, draw: Callable[..., TrainingRender], view: View) -> TrainingRender:
-        """The ideal panorama at the refined pose; the photograph is resampled to it."""
+        """Render the ideal panorama at the refined pose; the image is resampled to it."""
         drawing, options = draw(self.poses.refined(view)), self._options
         penalty = options.roughness_weight * self.camera.roughness()
         penalty = penalty + options.anisotropy_weight * anisotropy(drawing.gaussians.scales, options.anisotropy_ratio)
-        return replace(drawing, penalty=penalty, photo=partial(self.photograph, view))
+        return replace(drawing, penalty=penalty, photo=partial(self.resampled, view))
 
     def summary(self) -> str:
-        """How far the poses have moved from the given ones, world units and degrees, once both are aligned."""
+        """Return the median distance of the poses from the given ones after alignment, as a sentence."""
         _, left = aligned(self.poses)
         return (
             f"poses moved by {left.distance.median():.3g} world units and {left.degrees.median():.3g} degrees (median)"
         )
 
     def values(self) -> dict[str, Any]:
-        """Names of the views, size of their images, unit of length."""
+        """Return names of the views, image size and scene scale."""
         size = {"width": self.camera.width, "height": self.camera.height}
         return {"views": self.poses.names, "unit": self.poses.unit, **size}
 
     def counts(self) -> dict[str, int]:
-        """The poses."""
+        """Return the number of poses."""
         return {"poses": len(self.poses.names)}
 
-    def photograph(self, view: View, target: Target) -> Target:
-        """A training image, and the mask of its view, as an ideal camera would have taken them."""
+    def resampled(self, view: View, target: Target) -> Target:
+        """Return a training image and its mask, resampled to an ideal camera."""
         pixels, mask = self.camera.source_pixels(), view.mask(device=target.image.device)
         if mask is None:
             return Target(sample_pixels(target.image, pixels), target.weight, moments=None)
@@ -108,18 +108,17 @@ class SelfCalibration(Calibration):
 class SCOmniGSMethod(CalibratedMethod):
     """See `padgs.training.method.Method`.
 
-    Held-out views: their poses are given in the world of the given training poses, the model lives in that of the
-    refined ones. The similarity that maps the former cameras onto the latter takes each view across; no pixel of a
-    held-out view is used. What is rendered is the photograph, distortion included.
+    The similarity between given and refined training poses maps held-out poses into the world of the model; no pixel of
+    a held-out view is used. `render` includes the distortion of the camera.
     """
 
     Options = SCOmniGSOptions
     TRAIN = TrainOptions(weight="solid_angle")
 
-    _photography: tuple[int, Similarity, Tensor] | None = None  # what rendering a given view takes, at an iteration
+    _render_cache: tuple[int, Similarity, Tensor] | None = None  # iteration, and what rendering takes then
 
     def render(self, view: View) -> Rendering:
-        """Render a view of the given world, as its camera photographs it, without gradients.
+        """Render a view of the given world through its camera, without gradients.
 
         Raises:
             ValueError: a view of another size than the training views.
@@ -132,27 +131,28 @@ class SCOmniGSMethod(CalibratedMethod):
                 f"{camera.width}x{camera.height}"
             )
         iteration = -1 if self._trainer is None else self._trainer.iteration
-        if self._photography is None or self._photography[0] != iteration:
-            self._photography = iteration, aligned(poses)[0], camera.ideal_pixels()
-        _, similarity, pixels = self._photography
-        ideal = trainee.render(replace(view, cam_from_world=carried(view.cam_from_world, similarity)))
+        if self._render_cache is None or self._render_cache[0] != iteration:
+            self._render_cache = iteration, aligned(poses)[0], camera.ideal_pixels()
+        _, similarity, pixels = self._render_cache
+        ideal = trainee.render(replace(view, cam_from_world=mapped_pose(view.cam_from_world, similarity)))
         layers = torch.cat((ideal.image, ideal.transmittance[..., None], ideal.depth[..., None]), dim=-1)
         image, transmittance, depth = sample_pixels(layers, pixels).split((3, 1, 1), dim=-1)
         return replace(ideal, image=image, transmittance=transmittance[..., 0], depth=depth[..., 0])
 
     def load_state(self, state: State) -> None:
-        """Become the method that `state` was taken of, ready to render and to go on."""
-        self._photography = None
+        """See `Method.load_state`."""
+        self._render_cache = None
         super().load_state(state)
 
     def _refuse_impossible(self) -> None:
         super()._refuse_impossible()
         if self.train_options.poses == "learned":
             raise ValueError(
-                "train.poses is learned, but sc_omnigs learns poses by itself; leave it at given, or take omnigs"
+                "train.poses is learned, but sc_omnigs refines poses itself; set train.poses=given, or take omnigs"
             )
 
     def initial_calibration(self, scene: Scene) -> SelfCalibration:
+        """See `CalibratedMethod.initial_calibration`."""
         sizes = {(view.width, view.height) for view in scene.train}
         if len(sizes) > 1:
             raise ValueError(f"sc_omnigs calibrates one camera, but the training views have sizes {sorted(sizes)}")
@@ -165,6 +165,7 @@ class SCOmniGSMethod(CalibratedMethod):
         return self._calibrating(poses, *sizes.pop())
 
     def restored_calibration(self, values: Mapping[str, Any]) -> SelfCalibration:
+        """See `CalibratedMethod.restored_calibration`."""
         names = values["views"]
         poses = PoseRefinement(names, torch.eye(4).repeat(len(names), 1, 1), unit=values["unit"])
         return self._calibrating(poses, values["width"], values["height"])
@@ -174,12 +175,12 @@ class SCOmniGSMethod(CalibratedMethod):
 
 
 def aligned(poses: PoseRefinement) -> tuple[Similarity, Difference]:
-    """The similarity refined_from_given, and what it leaves of the corrections (world units, degrees)."""
+    """Return the similarity refined_from_given and the residual corrections (world units, degrees)."""
     return align(poses.poses(), poses.given)
 
 
-def carried(cam_from_world: Tensor, similarity: Similarity) -> Tensor:
-    """A pose [4, 4] float64 in the world that the similarity leads to."""
+def mapped_pose(cam_from_world: Tensor, similarity: Similarity) -> Tensor:
+    """Map a pose [4, 4] by a similarity; float64."""
     cam_from_world = cam_from_world.to(similarity.rotation)
     rotation = cam_from_world[:3, :3] @ similarity.rotation.mT
     center = similarity(-cam_from_world[:3, :3].mT @ cam_from_world[:3, 3])
@@ -189,7 +190,7 @@ def carried(cam_from_world: Tensor, similarity: Similarity) -> Tensor:
 
 
 def anisotropy(scales: Tensor, ratio: float) -> Tensor:
-    """Mean over Gaussians of ln(longest / shortest axis) as far as it exceeds ln(ratio), for scales [N, 3]; a scalar.
+    """Return the mean excess of ln(longest / shortest axis) over ln(ratio), for scales [N, 3]; a scalar.
 
     >>> round(anisotropy(torch.tensor([[1.0, 1.0, 20.0], [1.0, 1.0, 1.0]]), 10.0).item(), 4)  # ln(2) / 2
     0.3466

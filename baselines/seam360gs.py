@@ -1,7 +1,7 @@
-"""Seam360GS: Gaussians seen through the two fisheye lenses that made the panorama, so that the seam is the camera's.
+"""Seam360GS (arXiv 2508.20080): Gaussians trained through the two fisheye lenses that made the panorama.
 
-Made after the abstract; the paper (arXiv 2508.20080) was not read, and its code is not public. What the abstract says
-and what is inferred here is told apart in docs/methods.md.
+Implemented after the abstract, without the paper and without code, which is not public. docs/methods.md lists what is
+stated there and what is inferred.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from padgs.scene import Scene
 
 @dataclass(frozen=True)
 class Seam360GSOptions(SplatOptions):
-    """Those of explicit Gaussians, and of the lenses; the values of the latter are inferred."""
+    """Options of explicit Gaussians and of the lenses; the values of the latter are inferred."""
 
     lens_axis: str = "z"  # x, y or z of the camera; the seam is the plane across it
-    lens_order: int = 2  # coefficients of each lens's radial map
-    lens_blend: float = 5.0  # degrees on both sides of the seam in which both lenses are seen
-    gap_rate: float = 1e-3  # learning rate of the gap at the start, scene units
-    coefficient_rate: float = 1e-3  # ... of the radial maps
+    lens_order: int = 2  # coefficients of the radial map per lens
+    lens_blend: float = 5.0  # degrees on both sides of the seam where both lenses are blended
+    gap_rate: float = 1e-3  # initial learning rate of the gap, scene units
+    coefficient_rate: float = 1e-3  # initial learning rate of the radial maps
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -45,7 +45,7 @@ class Seam360GSOptions(SplatOptions):
 class Seam360GSMethod(CalibratedMethod):
     """See `padgs.training.method.Method`. Trained through `DualLens`; `render` is the ideal camera, without a seam.
 
-    Lenses see along rays of their own, which the projection erp cannot draw.
+    Projection erp cannot render the rays of a lens.
     """
 
     Options = Seam360GSOptions
@@ -56,9 +56,11 @@ class Seam360GSMethod(CalibratedMethod):
         check_camera(RayTable(torch.zeros(1, 1, 3), focal=1.0), self.render_config.options(scene_scale=1.0))
 
     def initial_calibration(self, scene: Scene) -> DualLens:
+        """See `CalibratedMethod.initial_calibration`."""
         return self.restored_calibration({"scene_scale": scene.scale})
 
     def restored_calibration(self, values: Mapping[str, Any]) -> DualLens:
+        """See `CalibratedMethod.restored_calibration`."""
         options = self.options
         return DualLens(
             axis=options.lens_axis,

@@ -17,7 +17,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 from rich.console import Console
 
-from padgs.baselines import METHODS, OURS, distribution
+from padgs.baselines import METHODS, BUILT_IN, distribution
 from padgs.data.datasets import DATASETS
 from padgs.data.synthetic.options import SCENES
 from padgs.multirun.overrides import lenient, quoted, root
@@ -123,7 +123,7 @@ def register_choices() -> None:
         try:
             keys, nodes = method_fields(method), [*method_choices(method)]
         except Exception as error:  # of any kind: that package is not ours
-            if method in OURS:
+            if method in BUILT_IN:
                 raise
             del METHODS[method]
             why = f"{type(error).__name__}: {error}; repair {distribution(method)}, or uninstall it"

@@ -261,9 +261,9 @@ class Trainer:
             self._monitor.picture(drawing, target.image, iteration)
         with stage("backward"):
             loss.backward()
-            self._guard.clean(drawing.probe)
+            self._guard.clean(drawing.mean_offsets)
         if self._monitor is not None and optimizer.is_checked(iteration):
-            self._monitor.probe(drawing.probe.grad, iteration)
+            self._monitor.probe(drawing.mean_offsets.grad, iteration)
         with stage("observe"), torch.no_grad():
             model.observe(drawing, moment)
         return value, len(drawing.gaussians)  # and the graph is gone before rows of its leaves come and go

@@ -199,7 +199,7 @@ class Method(ABC):
 
     @property
     def has_smoothing_filter(self) -> bool:
-        """Whether the model is drawn no finer than its training views were by itself, whatever the filter of a view."""
+        """True if renders stay as smooth as those of the training views, whatever the pixels of a view."""
         return False
 
     def refuse_budget(self, budget: Budget) -> None:

@@ -1,7 +1,7 @@
 """What can be trained: a model with its densifier and its learning rates, as the loop sees them.
 
-Each family has one: `padgs.methods.anchors.model` (PaD-GS), `padgs.methods.splats.model` (3DGS). EgoNeRF casts rays instead
-of drawing views, so it has a trainer of its own (`padgs.methods.egonerf.model`).
+Each family has one: `padgs.methods.anchors.model` (PaD-GS), `padgs.methods.splats.model` (3DGS). EgoNeRF casts rays
+instead of drawing views, so it has a trainer of its own (`padgs.methods.egonerf.model`).
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class TrainingRender:
     """What a model drew of one view, with all that the densification statistics need after `backward`."""
 
     rendering: Rendering
-    probe: Tensor  # [N, 2], or as `padgs.methods.splats.model` says; its .grad is filled by backward
+    mean_offsets: Tensor  # [N, 2], [N, 3] or [N, 4] zeros; .grad is the positional gradient after backward
     gaussians: Gaussians  # the N that were drawn
     slots: Tensor  # [N] int64: the row of the model's statistics that each drawn Gaussian counts for
     _: KW_ONLY

@@ -113,12 +113,12 @@ def test_weights_of_rows_are_honoured():
         (
             {"projection": "ray"},
             {},
-            "draws no Gaussians, so render.projection=ray means nothing to it; leave it at erp",
+            "renders no Gaussians, so render.projection=ray does not apply; leave it at erp",
         ),
         ({"backend": "cpu"}, {}, "no backend 'cpu'; it casts rays in torch, known: auto, torch"),
-        ({}, {"lambda_l1": 0.5}, "squared error .* so train.lambda_l1=0.5 means nothing to it; leave it at 0.8"),
-        ({}, {"guard_gradients": True}, "neither Gaussians .* so train.guard_gradients=True means nothing to it"),
-        ({}, {"normalisation": "channel_sum"}, "train.normalisation=channel_sum means nothing"),
+        ({}, {"lambda_l1": 0.5}, "squared error .* so train.lambda_l1=0.5 does not apply; leave it at 0.8"),
+        ({}, {"guard_gradients": True}, "without Gaussians .* so train.guard_gradients=True does not apply"),
+        ({}, {"normalisation": "channel_sum"}, "train.normalisation=channel_sum does not apply"),
     ],
 )
 def test_options_of_splatting_are_refused_and_not_ignored(render, train, reason):

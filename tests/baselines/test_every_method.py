@@ -13,7 +13,7 @@ import torch
 from composed import composed
 from states import assert_same_but_time
 
-from padgs.baselines import METHODS, OURS
+from padgs.baselines import METHODS, BUILT_IN
 from padgs.data.synthetic import SCENES, SyntheticOptions, generate
 from padgs.runs import checkpoint
 from padgs.runs.config import RunConfig
@@ -80,7 +80,7 @@ def test_every_method_has_a_setting_of_its_name():
 def test_every_method_has_a_section_in_the_docs(root):
     lines = (root / "docs" / "methods.md").read_text().splitlines()
     headings = [line for line in lines if line.startswith("## ")]
-    assert [name for name in OURS if not any(f"`{name}`" in line for line in headings)] == []
+    assert [name for name in BUILT_IN if not any(f"`{name}`" in line for line in headings)] == []
 
 
 @pytest.mark.parametrize("setting", EVERY)

@@ -92,7 +92,7 @@ def test_means_of_the_release_are_half_a_pixel_off():
         block = half[v : v + 2, u : u + 2, number]
         torch.testing.assert_close(block, block[:1, :1].expand(2, 2), rtol=1e-3, atol=1e-4)  # centred between four
     drawing = model_of(gaussians, pixel_bias=0.5).draw(view)
-    assert torch.equal(drawing.rendering.image, half) and not drawing.probe.any()
+    assert torch.equal(drawing.rendering.image, half) and not drawing.mean_offsets.any()
     with pytest.raises(ValueError, match=r"pixel_bias is a deviation of render\.projection=erp, not ray"):
         ODGSMethod(ODGSOptions(pixel_bias=0.5), RenderConfig("ray"))
 

@@ -50,8 +50,8 @@ def test_it_keeps_the_promises_that_its_own_tests_state(installed, tmp_path):
 
 def test_a_name_of_ours_is_refused(installed, monkeypatch):
     assert clash() is None
-    monkeypatch.setattr(baselines, "OURS", baselines.OURS | {"my_method"})
-    assert clash() == "entry point my_method:MyMethod is called my_method, as a method of padgs is; rename it"
+    monkeypatch.setattr(baselines, "BUILT_IN", baselines.BUILT_IN | {"my_method"})
+    assert clash() == "entry point my_method:MyMethod has the name my_method of a built-in method; rename it"
 
 
 def test_a_method_that_cannot_be_imported_is_said_once_and_left_out(monkeypatch, capsys):

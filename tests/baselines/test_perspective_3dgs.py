@@ -11,7 +11,7 @@ from composed import composed
 from tiny_scene import tiny_scene
 
 from padgs.baselines import METHODS
-from padgs.baselines.crops_3dgs import NARROWEST, Crops3DGSMethod, Crops3DGSOptions
+from padgs.baselines.crops_3dgs import MIN_FIELD_OF_VIEW, Crops3DGSMethod, Crops3DGSOptions
 from padgs.baselines.cubemap_3dgs import Cubemap3DGSMethod
 from padgs.data.perspectives import solid_angle
 from padgs.geometry.camera import Panorama
@@ -56,7 +56,7 @@ def test_crops_cover_the_sphere_with_equal_solid_angles():
     assert (weight * seen).sum() / (weight * torch.ones_like(seen)).sum() == pytest.approx(
         12 * crop / (4 * math.pi), rel=0.01
     )
-    assert times_seen(Crops3DGSMethod(Crops3DGSOptions(field_of_view=NARROWEST))).min() == 1
+    assert times_seen(Crops3DGSMethod(Crops3DGSOptions(field_of_view=MIN_FIELD_OF_VIEW))).min() == 1
     with pytest.raises(ValueError, match="field_of_view is 70; below 74.75 degrees the crops do not cover the sphere"):
         Crops3DGSOptions(field_of_view=70)
 
@@ -74,7 +74,7 @@ def test_an_iteration_sees_as_much_as_one_of_a_panoramic_method(name, views):
 
     up = [replace(view, load_mask=lambda: (rays(64, 32)[..., 1] < 0).float()) for view in scene.train]
     method.fit(replace(scene, train=tuple(up)), Budget(1))
-    assert method._views_each == {"cubemap_3dgs": 5, "crops_3dgs": 7}[name]
+    assert method._views_per_step == {"cubemap_3dgs": 5, "crops_3dgs": 7}[name]
 
 
 @each_method

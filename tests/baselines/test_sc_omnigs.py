@@ -6,7 +6,7 @@ import torch
 from tiny_scene import HEIGHT, WIDTH, tiny_scene
 
 from padgs.baselines.omnigs import OmniGSMethod
-from padgs.baselines.sc_omnigs import SCOmniGSMethod, SCOmniGSOptions, aligned, carried
+from padgs.baselines.sc_omnigs import SCOmniGSMethod, SCOmniGSOptions, aligned, mapped_pose
 from padgs.data.synthetic import SyntheticOptions, SyntheticTruth, generate
 from padgs.evaluation.metrics import psnr
 from padgs.gaussians import rotation_matrices
@@ -51,17 +51,17 @@ def test_masks_are_undistorted_with_the_image(scene):
     with torch.no_grad():
         calibration.camera.focal.fill_(1)
         calibration.camera.offsets.zero_()
-    ideal = calibration.photograph(views[0], target)
+    ideal = calibration.resampled(views[0], target)
     assert torch.equal(ideal.image, target.image) and torch.equal(ideal.weight, target.weight)
     with torch.no_grad():
         calibration.camera.focal.copy_(torch.tensor([1.0, 1.5, 1.0]))  # rows move apart, away from the horizon
-    stretched = calibration.photograph(views[0], target)
+    stretched = calibration.resampled(views[0], target)
     assert (stretched.weight[10:] == 0).all(), "what shows row 10 and beyond"
     assert (stretched.weight[9] < 0.5 * target.weight[9]).all() and torch.equal(stretched.weight[:9], target.weight[:9])
     assert stretched.moments is None and stretched.image.requires_grad
     spoiled = replace(target, image=torch.where(mask[..., None] > 0, target.image, 1e3))
     seen = stretched.weight > 0
-    torch.testing.assert_close(calibration.photograph(views[0], spoiled).image[seen], stretched.image[seen])
+    torch.testing.assert_close(calibration.resampled(views[0], spoiled).image[seen], stretched.image[seen])
 
 
 def test_a_held_out_view_is_carried_with_the_cameras():
@@ -74,13 +74,13 @@ def test_a_held_out_view_is_carried_with_the_cameras():
     )
     similarity = Similarity(1.7, turn, torch.randn(3, generator=generator, dtype=torch.float64))
     given = torch.stack([view.cam_from_world for view in views])
-    moved = torch.stack([carried(pose, similarity) for pose in given])
+    moved = torch.stack([mapped_pose(pose, similarity) for pose in given])
     found, left = align(moved, given)
     assert found.scale == pytest.approx(1.7) and left.distance.max() < 1e-9
     point = torch.randn(3, generator=generator, dtype=torch.float64)
     for pose in given:
         before = pose[:3, :3] @ point + pose[:3, 3]
-        after = carried(pose, found)[:3, :3] @ found(point) + carried(pose, found)[:3, 3]
+        after = mapped_pose(pose, found)[:3, :3] @ found(point) + mapped_pose(pose, found)[:3, 3]
         torch.testing.assert_close(after, 1.7 * before)
 
 

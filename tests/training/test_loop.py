@@ -50,8 +50,8 @@ class Flat:
 
     def observe(self, drawing: TrainingRender, iteration: int) -> None:
         self.calls.append("observe")
-        assert drawing.probe.grad is not None
-        self.statistic = self.statistic + drawing.probe.grad.sum()
+        assert drawing.mean_offsets.grad is not None
+        self.statistic = self.statistic + drawing.mean_offsets.grad.sum()
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
         self.calls.append("adapt")
@@ -123,7 +123,7 @@ def test_an_iteration_may_draw_several_views_before_adam_steps_on_the_sum_of_the
 
 def plain(drawing: TrainingRender, color: Tensor) -> TrainingRender:
     """The same without noise."""
-    image = color + 0 * drawing.rendering.image.detach() + drawing.probe.sum()
+    image = color + 0 * drawing.rendering.image.detach() + drawing.mean_offsets.sum()
     return replace(drawing, rendering=replace(drawing.rendering, image=image))
 
 

@@ -116,23 +116,26 @@ class AnchorModel:
         """
         ahead = resolve_backend(self._backend, self.anchors.positions) == "cuda"
         decoded = self.anchors.decode(view, (self._capacity if ahead else 0) or None)
-        rendering, probe = self._rendered(decoded, view)
+        rendering, offsets = self._rendered(decoded, view)
         if decoded.count() > len(decoded.slots):
             decoded = self.anchors.decode(view)
-            rendering, probe = self._rendered(decoded, view)
+            rendering, offsets = self._rendered(decoded, view)
         count = decoded.count()
         self._capacity = max(int(HEADROOM * count) + 1, self._capacity * 15 // 16)
         drawn = replace(rendering, visible=rendering.visible[:count])
-        return AnchorRender(drawn, probe, decoded.gaussians.first(count), decoded.slots[:count], decoded.raw_opacities)
+        return AnchorRender(
+            drawn, offsets, decoded.gaussians.first(count), decoded.slots[:count], decoded.raw_opacities
+        )
 
     def _rendered(self, decoded: Decoded, view: View) -> tuple[Rendering, Tensor]:
-        probe = decoded.gaussians.means.new_zeros(len(decoded.slots), 2, requires_grad=True)
-        return render(decoded.gaussians, view, self._options, mean_offsets=probe, backend=self._backend), probe
+        offsets = decoded.gaussians.means.new_zeros(len(decoded.slots), 2, requires_grad=True)
+        return render(decoded.gaussians, view, self._options, mean_offsets=offsets, backend=self._backend), offsets
 
     def observe(self, drawing: TrainingRender, iteration: int) -> None:
         """Collect opacities and positional gradients."""
         assert isinstance(drawing, AnchorRender), type(drawing)
-        gradient = drawing.probe.grad if drawing.probe.grad is not None else torch.zeros_like(drawing.probe)
+        offsets = drawing.mean_offsets
+        gradient = torch.zeros_like(offsets) if offsets.grad is None else offsets.grad
         gradient = gradient[: len(drawing.slots)]
         self.growth.observe(drawing.raw_opacities, drawing.slots, gradient, drawing.rendering.visible, iteration)
 

@@ -63,8 +63,8 @@ class CalibratedModel(SplatModel):
             ValueError: always.
         """
         raise ValueError(
-            "its cameras are learned, so images cannot be compared with renders at the given poses; take a method without "
-            "calibration"
+            "its cameras are learned, so images cannot be compared with renders at the given poses; take a method "
+            "without calibration"
         )
 
     def draw(self, view: View, mean_offsets: Tensor | None = None) -> TrainingRender:

@@ -121,8 +121,8 @@ class SplatModel:
 
     def observe(self, drawing: TrainingRender, iteration: int) -> None:
         """Collect positional gradients."""
-        assert drawing.probe.grad is not None, "observe is called after draw and backward"
-        self.densifier.observe(drawing.probe.grad, drawing.rendering.visible, iteration)
+        assert drawing.mean_offsets.grad is not None, "observe is called after draw and backward"
+        self.densifier.observe(drawing.mean_offsets.grad, drawing.rendering.visible, iteration)
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
         """Densify, prune by importance, and activate the next SH degree, each when it is due."""

@@ -16,10 +16,11 @@ VIEW = tiny_scene().train[3]
 
 def drawer(gaussians: Gaussians, projection: str = "ray", backend: str = "torch"):
     def draw(view: View, mean_offsets: torch.Tensor | None = None) -> TrainingRender:
-        probe = mean_offsets
-        probe = gaussians.means.new_zeros(len(gaussians), 2, requires_grad=True) if probe is None else probe
-        rendering = render(gaussians, view, RenderOptions(projection), mean_offsets=probe, backend=backend)
-        return TrainingRender(rendering, probe, gaussians, torch.arange(len(gaussians)))
+        offsets = mean_offsets
+        if offsets is None:
+            offsets = gaussians.means.new_zeros(len(gaussians), 2, requires_grad=True)
+        rendering = render(gaussians, view, RenderOptions(projection), mean_offsets=offsets, backend=backend)
+        return TrainingRender(rendering, offsets, gaussians, torch.arange(len(gaussians)))
 
     return draw
 
@@ -83,11 +84,11 @@ def test_gradients_are_those_of_differences():
             assert gradient[k].item() == pytest.approx((sides[0] - sides[1]) / 2e-6, rel=1e-4, abs=1e-4)
 
 
-def test_both_lenses_pull_at_one_probe():
+def test_both_lenses_add_to_one_positional_gradient():
     lenses, draw = DualLens(), drawer(truth())
     drawing = lenses.draw(draw, VIEW)
     drawing.rendering.image.sum().backward()
-    assert drawing.probe.grad is not None and (drawing.probe.grad.norm(dim=-1) > 0).sum() > 4
+    assert drawing.mean_offsets.grad is not None and (drawing.mean_offsets.grad.norm(dim=-1) > 0).sum() > 4
 
 
 def test_only_panoramas_are_stitched():

@@ -254,7 +254,7 @@ def test_a_drawing_of_the_training_leaves_some_out_and_shows_more_of_the_others(
     assert (drawn == 0).float().mean().item() == pytest.approx(share, abs=0.01)
     assert torch.allclose(drawn.amax(0), (whole / (1 - share)).clamp(max=1)), "as much is seen on average"
     drawings[0].rendering.image.sum().backward()
-    pulls = drawings[0].probe.grad.abs().amax(-1)
+    pulls = drawings[0].mean_offsets.grad.abs().amax(-1)
     assert pulls[drawn[0] > 0].max() > 0 and not pulls[drawn[0] == 0].any()
 
 

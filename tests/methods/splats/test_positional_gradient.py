@@ -35,7 +35,7 @@ def drawn(splats: Splats, view: View, kind: str, **config) -> tuple[Rendering, t
     render_config = RenderConfig(backend="torch", near=0.0, **config)
     options = DensificationOptions(positional_gradient=kind)
     drawing = SplatModel(splats, options, render_config, extent=1.0, iterations=100).draw(view)
-    return drawing.rendering, drawing.probe
+    return drawing.rendering, drawing.mean_offsets
 
 
 def view_at(generator: torch.Generator | None, width: int = 48) -> View:
@@ -55,7 +55,7 @@ def test_the_signal_in_space_is_half_the_distance_times_the_gradient_of_the_mean
     """
     splats, view = colored_splats(30, generator), view_at(generator)
     options, weight = RenderOptions(projection=projection), torch.rand(24, 48, 3, generator=generator).double()
-    rendering, probe = drawn(splats, view, "space", projection=projection)
+    rendering, offsets = drawn(splats, view, "space", projection=projection)
     (weight * rendering.image).sum().backward()
 
     gaussians = splats.gaussians(view)
@@ -68,10 +68,10 @@ def test_the_signal_in_space_is_half_the_distance_times_the_gradient_of_the_mean
     assert (whole - footprint).norm() > 0.1 * whole.norm(), "colours matter here"
     in_camera = view.cam_from_world[:3, :3] @ splats.means.detach().T + view.cam_from_world[:3, 3:]
     expected = 0.5 * in_camera.norm(dim=0) * whole.norm(dim=-1)
-    assert probe.grad is not None
-    assert torch.equal(rendering.image, plain.image), "a probe of zeros moves nothing"
+    assert offsets.grad is not None
+    assert torch.equal(rendering.image, plain.image), "offsets of zeros move nothing"
     assert (expected > 0).sum() > 20
-    assert torch.allclose(probe.grad.norm(dim=-1), expected, rtol=1e-9, atol=1e-14)
+    assert torch.allclose(offsets.grad.norm(dim=-1), expected, rtol=1e-9, atol=1e-14)
 
 
 def test_a_small_gaussian_is_pulled_alike_wherever_it_is(generator):
@@ -85,11 +85,11 @@ def test_a_small_gaussian_is_pulled_alike_wherever_it_is(generator):
         splats.sh_dc.data[:] = 1.0
         splats.active_degree = 0
         view = view_at(None, width=256)
-        rendering, probe = drawn(splats, view, "space", projection="ray")
+        rendering, offsets = drawn(splats, view, "space", projection="ray")
         rays = view.camera.rays(dtype=torch.float64)
         aside = (splats.means.detach()[0].roll(1) / (2 * scale) * rays).sum(-1)  # odd about the ball's centre
         (rendering.image.sum(-1) * aside * (1 - rays[..., 1] ** 2).sqrt()).sum().backward()
-        signals.append(probe.grad.norm().item())
+        signals.append(offsets.grad.norm().item())
     assert signals[1] == pytest.approx(signals[0], rel=2e-3)
     assert signals[2] == pytest.approx(signals[0], rel=1e-6)
 
@@ -109,10 +109,10 @@ def test_the_signal_in_the_image_has_one_unit_in_every_projection(projection, la
     target = torch.nn.functional.interpolate(blobs, (width // 2, width), mode="bicubic")[0].permute(1, 2, 0)
     signals = {}
     for name, kind in (("erp", "pixels"), (projection, "angular")):
-        rendering, probe = drawn(splats, view_at(None, width), "image", projection=name, low_pass_kind=kind)
+        rendering, offsets = drawn(splats, view_at(None, width), "image", projection=name, low_pass_kind=kind)
         ((rendering.image - target) ** 2).mean().backward()
-        assert probe.grad is not None
-        signals[name] = probe.grad.norm(dim=-1)
+        assert offsets.grad is not None
+        signals[name] = offsets.grad.norm(dim=-1)
     assert (signals[projection] / signals["erp"]).median().item() == pytest.approx(1, abs=0.15)
 
 
@@ -120,18 +120,18 @@ def test_the_absolute_signal_is_half_the_distance_times_the_pulls_of_all_pixels(
     """Beside the signal in space, which is what it is without them."""
     splats, view = colored_splats(30, generator), view_at(generator)
     gaussians, weight = splats.gaussians(view), torch.randn(24, 48, 3, generator=generator).double()
-    probes = []
+    gradients = []
     for signal in ("space", "space_absolute"):
-        rendering, probe = drawn(splats, view, signal, projection="ray")
+        rendering, offsets = drawn(splats, view, signal, projection="ray")
         (weight * rendering.image).sum().backward()
-        probes.append(probe.grad)
-    assert torch.equal(probes[0], probes[1][:, :3])
+        gradients.append(offsets.grad)
+    assert torch.equal(gradients[0], gradients[1][:, :3])
 
     pulls = torch.zeros(30, dtype=torch.float64, requires_grad=True)
     (weight * render(gaussians, view, RAY, absgrad=pulls).image).sum().backward()
     distance = (gaussians.means.detach() @ view.cam_from_world[:3, :3].T + view.cam_from_world[:3, 3]).norm(dim=-1)
     assert pulls.grad is not None and (pulls.grad > 0).sum() > 20
-    assert torch.allclose(probes[1][:, 3], 0.5 * distance * pulls.grad, rtol=1e-9, atol=1e-14)
+    assert torch.allclose(gradients[1][:, 3], 0.5 * distance * pulls.grad, rtol=1e-9, atol=1e-14)
 
 
 @pytest.mark.parametrize(("signal", "axes"), [("image", 2), ("space", 3), ("space_absolute", 4)])
@@ -142,13 +142,13 @@ def test_the_densifier_is_given_the_signal_of_its_options(signal, axes, generato
     )
     drawing = trainee.draw(view_at(generator))
     drawing.rendering.image.sum().backward()
-    assert drawing.probe.grad is not None and drawing.probe.grad.shape == (10, axes)
+    assert drawing.mean_offsets.grad is not None and drawing.mean_offsets.grad.shape == (10, axes)
     trainee.observe(drawing, 1)
-    norms = torch.where(drawing.rendering.visible, drawing.probe.grad[:, :3].norm(dim=-1), 0.0)
+    norms = torch.where(drawing.rendering.visible, drawing.mean_offsets.grad[:, :3].norm(dim=-1), 0.0)
     assert torch.equal(trainee.densifier.statistics["gradient"], norms)
     assert norms.sum() > 0
     if axes == 4:
-        assert torch.equal(trainee.densifier.statistics["absolute"], drawing.probe.grad[:, 3])
+        assert torch.equal(trainee.densifier.statistics["absolute"], drawing.mean_offsets.grad[:, 3])
 
 
 def test_the_absolute_signal_wants_the_projection_that_has_it():
