@@ -1,36 +1,24 @@
-import csv
-import io
 from dataclasses import replace
 
 import pytest
 from made_up import compared, run_set, small, swept
 
-from padgs.reports.charts import sweep_chart
-from padgs.reports.charts.sweep_chart import sweeps
+from padgs.reports.charts.sweep_chart import chart, charts, sweeps
 from padgs.reports.table import ReportError
 
 
-def rows(sweep) -> list[dict[str, str]]:
-    return list(csv.DictReader(io.StringIO(sweep.numbers.to_csv(index=False))))
-
-
-def test_a_curve_for_each_scene_along_the_key_that_differs():
+def test_a_curve_per_scene_has_means_over_seeds_along_the_key_that_differs():
     (sweep,) = sweeps(run_set([*swept("tau"), *compared()], protocol="sphere"))
     assert (sweep.name, sweep.key) == ("tau@cpu", "method.tau")
     assert [curve.place.scene for curve in sweep.curves] == ["synthetic-outdoor", "synthetic-room"]
     assert [x for x, _ in sweep.curves[0].points] == [0.0, 0.5, 0.9, 1.0]
+    at = sweep.numbers.set_index(["scene", "x", "quantity"])
+    best = at.loc[("synthetic-room", 0.9, "WS-PSNR")]
+    assert (best["mean"], best["std"], best["n"]) == (pytest.approx(25 + 0.1 - 0.4), pytest.approx(0.1), 3)
+    assert at.loc[("synthetic-room", 1.0, "Gaussians"), "mean"] == 100_000
 
 
-def test_points_are_means_over_seeds_with_their_spread():
-    (sweep,) = sweeps(run_set(swept("tau"), protocol="sphere"))
-    at = {(r["scene"], r["x"], r["quantity"]): r for r in rows(sweep)}
-    best = at["synthetic-room", "0.9", "WS-PSNR"]
-    assert float(best["mean"]) == pytest.approx(25 + 0.1 - 0.4) and best["n"] == "3"
-    assert float(best["std"]) == pytest.approx(0.1)
-    assert float(at["synthetic-room", "1.0", "Gaussians"]["mean"]) == 100_000
-
-
-def test_two_keys_give_a_line_for_each_value_of_the_second():
+def test_two_keys_give_a_curve_for_each_value_of_the_second():
     grid = [
         small(25, 1 + offsets / 10 + features / 100, experiments=("grid",), config={"method": method})
         for offsets in (5, 10)
@@ -38,7 +26,7 @@ def test_two_keys_give_a_line_for_each_value_of_the_second():
         if (method := {"offsets": offsets, "features": features})
     ]
     (sweep,) = sweeps(run_set(grid))
-    assert sweep.key == "method.features" or sweep.key == "method.offsets"
+    assert sweep.key in ("method.features", "method.offsets")
     assert {len(curve.points) for curve in sweep.curves} in ({2}, {3})
     assert all(curve.fixed for curve in sweep.curves)
 
@@ -50,19 +38,15 @@ def test_settings_without_numeric_keys_have_names():
     ]
     (sweep,) = sweeps(run_set(projections))
     assert sweep.key == "" and [x for x, _ in sweep.curves[0].points] == ["projection erp", "projection tangent"]
-    assert "projection tangent" in sweep_chart.chart(sweep).svg
+    assert "projection tangent" in chart(sweep).svg
 
 
-def test_an_experiment_in_one_setting_is_no_sweep():
-    assert sweeps(run_set(compared())) == []
-
-
-def test_a_failed_point_says_so():
+def test_a_failed_point_shows_its_status():
     runs = [replace(r, status="nan", scores={}) if r.config["method"]["tau"] == 1.0 else r for r in swept("tau")]
     (sweep,) = sweeps(run_set(runs, metrics=("ssim",)))
-    failed = [r for r in rows(sweep) if r["x"] == "1.0"]
-    assert {(r["mean"], r["status"]) for r in failed} == {("", "nan")}
-    assert ">NAN<" in sweep_chart.chart(sweep).svg
+    failed = sweep.numbers.loc[sweep.numbers["x"] == 1.0]
+    assert failed["mean"].isna().all() and set(failed["status"]) == {"nan"}
+    assert ">NAN<" in chart(sweep).svg
 
 
 def test_metrics_are_chosen_by_name_and_unknown_ones_list_the_known():
@@ -72,10 +56,13 @@ def test_metrics_are_chosen_by_name_and_unknown_ones_list_the_known():
         sweeps(run_set(swept("tau"), metrics=("psrn",)))
 
 
-def test_the_experiment_chooses():
-    runs = [*swept("tau"), *swept("lambda_l1")]
+def test_an_experiment_is_chosen_and_those_of_charts_are_sweeps_only_if_requested():
+    runs = [*swept("tau", seeds=1), *swept("lambda_l1", seeds=1)]
     assert [sweep.name for sweep in sweeps(run_set(runs))] == ["lambda_l1@cpu", "tau@cpu"]
     assert [sweep.name for sweep in sweeps(run_set(runs, experiment="tau@cpu"))] == ["tau@cpu"]
+    lengths = [small(25.0, 1.0 + n, experiments=("pareto",), config={"train": {"iterations": n}}) for n in (1, 2)]
+    assert sweeps(run_set(lengths)) == sweeps(run_set(compared())) == []
+    assert [sweep.key for sweep in sweeps(run_set(lengths, experiment="pareto"))] == ["train.iterations"]
 
 
 def test_protocols_are_not_mixed_along_a_curve_nor_data_in_a_point():
@@ -88,16 +75,10 @@ def test_protocols_are_not_mixed_along_a_curve_nor_data_in_a_point():
 
 
 def test_a_chart_has_readable_text_and_tooltips_with_numbers():
-    (chart,) = sweep_chart.charts(run_set(swept("tau"), protocol="sphere"))
-    assert chart.name == "sweep_tau_cpu" and chart.png.startswith(b"\x89PNG")
-    assert ">method.tau<" in chart.svg and "WS-PSNR" in chart.svg
-    assert "<title>synthetic-room, PaD-GS\n0.9: 24.70 ± 0.10 (n=3)</title>" in chart.svg
-
-
-def test_experiments_of_charts_are_a_sweep_only_if_requested():
-    lengths = [small(25.0, 1.0 + n, experiments=("pareto",), config={"train": {"iterations": n}}) for n in (1, 2)]
-    assert sweeps(run_set(lengths)) == []
-    assert [sweep.key for sweep in sweeps(run_set(lengths, experiment="pareto"))] == ["train.iterations"]
+    (made,) = charts(run_set(swept("tau"), protocol="sphere"))
+    assert made.name == "sweep_tau_cpu" and made.png.startswith(b"\x89PNG")
+    assert ">method.tau<" in made.svg and "WS-PSNR" in made.svg
+    assert "<title>synthetic-room, PaD-GS\n0.9: 24.70 ± 0.10 (n=3)</title>" in made.svg
 
 
 def test_a_metric_without_values_has_no_panel():

@@ -1,5 +1,3 @@
-import csv
-import io
 from dataclasses import replace
 
 import pytest
@@ -8,47 +6,41 @@ from made_up import METHODS, compared, data_set, run_set, small
 from padgs.reports.charts.trade_off import pareto, trade_offs
 from padgs.reports.table import ReportError
 
-CHANGED = (("padgs", True), ("omnigs", False))  # method, whether on the scene bar
-
 
 def numbers(chart) -> dict[tuple[str, str], float]:
-    lines = csv.DictReader(io.StringIO(chart.numbers.to_csv(index=False)))
-    return {(line["setting"], line["quantity"]): float(line["mean"]) for line in lines}
+    return chart.numbers.set_index(["setting", "quantity"])["mean"].to_dict()
 
 
-def test_a_point_for_each_method_and_setting():
+def failed(runs, fails):
+    return [replace(run, status="oom", scores={}) if fails(run) else run for run in runs]
+
+
+def test_a_point_for_each_setting_that_finished():
     config = {"train": {"iterations": 3000}, "method": {"tau": 0.9}}
     longer = [small(28.0, 3.0, experiments=("pareto@cpu",), iterations=3000, config=config)]
-    room = next(chart for chart in trade_offs(run_set([*compared(), *longer])) if chart.name == "chart_synthetic-room")
-    found = numbers(room)
+    charts = {chart.name: chart for chart in trade_offs(run_set([*compared(), *longer]))}
+    found = numbers(charts["chart_synthetic-room"])
     assert found["ODGS, corrected", "WS-PSNR"] == pytest.approx(22 + 1.6 + 0.05 - 0.4)
     assert found["ODGS, corrected", "ms per frame"] == pytest.approx(40 * 1.1)
-    assert {title for title, _ in found if title.startswith("PaD-GS")} == {
-        "PaD-GS, iterations 1500",
-        "PaD-GS, iterations 3000",
-    }
+    ours = {title for title, _ in found if title.startswith("PaD-GS")}
+    assert ours == {"PaD-GS, iterations 1500", "PaD-GS, iterations 3000"}
+    assert {point.preset for point in charts["chart_synthetic-outdoor"].points} == set(METHODS) - {"op43dgs"}
 
 
-def test_a_failed_method_has_no_point():
-    outdoor = next(chart for chart in trade_offs(run_set(compared())) if "outdoor" in chart.name)
-    assert {point.preset for point in outdoor.points} == set(METHODS) - {"op43dgs"}
-
-
-def test_a_data_set_is_averaged_over_the_scenes_that_all_finished():
-    runs = [
-        replace(r, status="oom", scores={}) if (r.scene, r.method) == ("bar", "padgs") else r
-        for r in data_set("roam360")
-    ]
-    (chart,) = trade_offs(run_set(runs))
+def test_a_data_set_is_averaged_over_the_scenes_that_all_settings_finished():
+    (chart,) = trade_offs(run_set(failed(data_set("roam360"), lambda r: (r.scene, r.method) == ("bar", "padgs"))))
     assert "mean over its scenes base, cafe" in chart.title
     assert numbers(chart)["OmniGS, corrected", "PSNR"] == pytest.approx(20 + 5.5)  # scenes 1..10
+    (chart,) = trade_offs(run_set(failed(data_set("roam360"), lambda r: r.method == "padgs")))
+    assert "scenes bar, base" in chart.title and [point.preset for point in chart.points] == ["omnigs"]
 
 
 @pytest.mark.parametrize(
     "change", [{"status": "oom", "scores": {}}, {"config": {"train": {"iterations": 30_000}, "method": {"tau": 0.0}}}]
 )
-def test_where_no_scene_is_finished_in_all_settings_there_is_no_chart_but_a_warning(change):
-    runs = [replace(r, **change) if (r.method, r.scene == "bar") in CHANGED else r for r in data_set("roam360")]
+def test_without_a_scene_that_all_settings_finished_there_is_a_warning_and_no_chart(change):
+    changed = (("padgs", True), ("omnigs", False))  # method, whether on the scene bar
+    runs = [replace(r, **change) if (r.method, r.scene == "bar") in changed else r for r in data_set("roam360")]
     of = run_set(runs)
     assert trade_offs(of) == [] and "chart_roam360: no scene was finished in all settings" in "".join(of.warnings)
 
@@ -58,19 +50,10 @@ def test_no_point_of_the_front_is_beaten():
     assert pareto(points) == [(1.0, 21.0), (3.0, 24.0)]
 
 
-def test_a_method_that_never_finishes_does_not_empty_the_chart():
-    runs = [replace(r, status="oom", scores={}) if r.method == "padgs" else r for r in data_set("roam360")]
-    (chart,) = trade_offs(run_set(runs))
-    assert "scenes bar, base" in chart.title and [point.preset for point in chart.points] == ["omnigs"]
-
-
-def test_lengths_are_not_mixed_in_a_mean_over_scenes():
+def test_lengths_machines_and_settings_of_the_shown_protocol_are_not_mixed():
     runs = [replace(r, iterations=7000) if r.scene == "bar" else r for r in data_set("roam360")]
     with pytest.raises(ReportError, match="roam360, OmniGS, corrected: results differ in length"):
         trade_offs(run_set(runs))
-
-
-def test_settings_of_the_protocol_that_is_shown_and_machines_are_not_mixed():
     first, *others = compared()
     with pytest.raises(ReportError, match="differ in machine"):
         trade_offs(run_set([replace(first, machine={"gpu": "H200"}), *others]))
