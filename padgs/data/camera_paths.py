@@ -219,15 +219,15 @@ def read_path(
 def _keyframe(entry: dict[str, Any], up: Any) -> Tensor:
     if "cam_from_world" in entry:
         return _rigid(np.array(entry["cam_from_world"], dtype=np.float64).reshape(1, 4, 4))
-    place, target = (np.array([entry[name]], dtype=np.float64).reshape(1, 3) for name in ("position", "look_at"))
+    position, target = (np.array([entry[name]], dtype=np.float64).reshape(1, 3) for name in ("position", "look_at"))
     up = np.array(up, dtype=np.float64).reshape(3)
-    if not np.isfinite([*place, *target, up]).all():
-        raise ValueError(f"position, look_at or up is not finite: {place[0]}, {target[0]}, {up}")
-    if (place == target).all() or not up.any():
+    if not np.isfinite([*position, *target, up]).all():
+        raise ValueError(f"position, look_at or up is not finite: {position[0]}, {target[0]}, {up}")
+    if (position == target).all() or not up.any():
         raise ValueError(
-            f"position and look_at are both {place[0]}, or up is 0; give different positions and a non-zero up"
+            f"position and look_at are both {position[0]}, or up is 0; give different positions and a non-zero up"
         )
-    return look_along(place, target - place, up / np.linalg.norm(up))
+    return look_along(position, target - position, up / np.linalg.norm(up))
 
 
 def _nerfstudio(cameras: list[dict[str, Any]], transforms: Path, transforms_json: Path | None) -> Tensor:

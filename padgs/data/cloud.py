@@ -117,9 +117,9 @@ def random_cloud(cam_from_world: Tensor, count: int = RANDOM_POINTS) -> Cloud:
 
     Deterministic, and equivariant to the scale of the cameras.
     """
-    places = centers(cam_from_world)
-    middle = places.mean(0)
-    spread = (places - middle).norm(dim=1).max().clamp(min=1e-9)
+    positions = centers(cam_from_world)
+    middle = positions.mean(0)
+    spread = (positions - middle).norm(dim=1).max().clamp(min=1e-9)
     source = torch.Generator().manual_seed(0)
     direction = torch.nn.functional.normalize(torch.randn(count, 3, generator=source, dtype=torch.float64), dim=1)
     near, far = RANDOM_RADII

@@ -126,8 +126,8 @@ def _signed_axes() -> Iterator[tuple[str, Tensor]]:
 
 
 def _transposed(poses: Tensor) -> Tensor:
-    turned = poses[:, :3, :3].mT
-    return _with(poses, turned, -turned @ centers(poses)[..., None])
+    transposed = poses[:, :3, :3].mT
+    return _with(poses, transposed, -transposed @ centers(poses)[..., None])
 
 
 def _from_center(poses: Tensor) -> Tensor:

@@ -80,8 +80,8 @@ def boxes(data: bytes) -> list[tuple[bytes, bytes]]:
 
 @WITH_VIDEO
 def test_a_panoramic_video_plays_and_has_spherical_metadata(folder, tmp_path):
-    said = render(str(folder), "--to", str(tmp_path / "new" / "a.mp4"), "--seconds", "0.5", "--fps", "10", "--depth")
-    assert said.exit_code == 0 and "5 frames of 32x16" in said.output, said.output
+    result = render(str(folder), "--to", str(tmp_path / "new" / "a.mp4"), "--seconds", "0.5", "--fps", "10", "--depth")
+    assert result.exit_code == 0 and "5 frames of 32x16" in result.output, result.output
     for name in ("a.mp4", "a-depth.mp4"):
         frames = imageio.imread(tmp_path / "new" / name, plugin="pyav")
         assert frames.shape == (5, 16, 32, 3) and frames.std() > 5
@@ -130,8 +130,8 @@ def test_a_perspective_render_agrees_with_the_panorama(folder, tmp_path):
     ],
 )
 def test_invalid_options_are_refused(arguments, message, folder, tmp_path):
-    said = render(str(folder), *arguments, "--to", str(tmp_path / "frames"))
-    assert said.exit_code == 1 and message in " ".join((said.output + said.stderr).split())
+    result = render(str(folder), *arguments, "--to", str(tmp_path / "frames"))
+    assert result.exit_code == 1 and message in " ".join((result.output + result.stderr).split())
 
 
 def test_a_folder_with_images_is_refused(folder, tmp_path):
@@ -142,13 +142,13 @@ def test_a_folder_with_images_is_refused(folder, tmp_path):
 
 def test_errors_name_the_option_for_output_and_data(folder, tmp_path):
     (tmp_path / "file").touch()
-    said = render(str(folder), "--to", str(tmp_path / "file"), "--seconds", "0.1", "--fps", "20")
-    assert said.exit_code == 1 and f"cannot write {tmp_path}/file: " in said.stderr and "with --to" in said.stderr
-    said = render(str(folder), "--data", str(tmp_path / "gone"), "--to", str(tmp_path / "f"))
-    assert said.exit_code == 1 and f"it is the data of {folder}: if it has moved" in said.stderr
+    result = render(str(folder), "--to", str(tmp_path / "file"), "--seconds", "0.1", "--fps", "20")
+    assert result.exit_code == 1 and f"cannot write {tmp_path}/file: " in result.stderr and "with --to" in result.stderr
+    result = render(str(folder), "--data", str(tmp_path / "gone"), "--to", str(tmp_path / "f"))
+    assert result.exit_code == 1 and f"it is the data of {folder}: if it has moved" in result.stderr
 
 
 def test_other_video_formats_are_refused(folder, tmp_path):
-    said = render(str(folder), "--to", str(tmp_path / "x.avi"))
-    assert said.exit_code == 1 and "x.avi is not an .mp4" in " ".join(said.output.split())
+    result = render(str(folder), "--to", str(tmp_path / "x.avi"))
+    assert result.exit_code == 1 and "x.avi is not an .mp4" in " ".join(result.output.split())
     assert not list(tmp_path.iterdir())

@@ -150,19 +150,19 @@ APPLIED = {"applied_transform": [[1, 0, 0, 0.5], [0, 0, 1, -2], [0, -1, 0, 3]], 
 @pytest.mark.parametrize("applied", [{}, APPLIED])
 def test_nerfstudio_paths_are_converted_to_the_scene(applied, tmp_path):
     """Ours is that of transforms.json; what was applied to an earlier one is in nerfstudio's transform as well."""
-    turn, shift, scale = Rotation.from_rotvec([0.3, 0.2, -0.9]).as_matrix(), np.array([1.0, 2, 3]), 0.25
+    rotation, shift, scale = Rotation.from_rotvec([0.3, 0.2, -0.9]).as_matrix(), np.array([1.0, 2, 3]), 0.25
     ours = np.tile(np.eye(4), (3, 1, 1))  # world_from_cam, y down and z forward
     ours[:, :3, :3] = Rotation.from_rotvec([[0, 0.1 * n, 0.4] for n in range(3)]).as_matrix()
     ours[:, :3, 3] = [[n, 1, -n] for n in range(3)]
     theirs = ours.copy()
-    theirs[:, :3, :3] = turn @ ours[:, :3, :3] @ np.diag([1, -1, -1])
-    theirs[:, :3, 3] = scale * (ours[:, :3, 3] @ turn.T + shift)
+    theirs[:, :3, :3] = rotation @ ours[:, :3, :3] @ np.diag([1, -1, -1])
+    theirs[:, :3, 3] = scale * (ours[:, :3, 3] @ rotation.T + shift)
     cameras = [{"camera_to_world": pose.ravel().tolist(), "fov": 75, "aspect": 1} for pose in theirs]
     (tmp_path / "path.json").write_text(json.dumps({"camera_path": cameras, "fps": 24, "seconds": 2}))
     before = np.vstack((applied.get("applied_transform", np.eye(3, 4)), (0, 0, 0, 1)))
-    transform = np.column_stack((turn, shift)) @ before
-    told = {"transform": transform.tolist(), "scale": scale * applied.get("applied_scale", 1)}
-    (tmp_path / "dataparser_transforms.json").write_text(json.dumps(told))
+    transform = np.column_stack((rotation, shift)) @ before
+    normalized = {"transform": transform.tolist(), "scale": scale * applied.get("applied_scale", 1)}
+    (tmp_path / "dataparser_transforms.json").write_text(json.dumps(normalized))
     (tmp_path / "transforms.json").write_text(json.dumps(applied))
     found = read_path(tmp_path / "path.json", None, UP, tmp_path / "transforms.json")
     assert np.allclose(found.numpy(), np.linalg.inv(ours))

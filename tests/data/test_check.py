@@ -38,8 +38,8 @@ def test_valid_data_sets_pass(name: str, world: World, tmp_path: Path) -> None:
         assert report.exposure_spread is not None and report.exposure_spread < 0.05
     if name in ("colmap", "openmvg"):
         assert report.reprojection_95 is not None and report.reprojection_95 < 1e-9
-    with Image.open(tmp_path / "look.png") as picture:
-        assert picture.size == (64, 32)
+    with Image.open(tmp_path / "look.png") as image:
+        assert image.size == (64, 32)
 
 
 @pytest.mark.parametrize(

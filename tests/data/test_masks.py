@@ -1,4 +1,4 @@
-"""Masks weigh pixels, and never touch them."""
+"""Masks: files, rules, weights and errors."""
 
 import weakref
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Perspective views cut out of panoramas."""
+"""Perspective views resampled from panoramas."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ WIDTH, HEIGHT = 256, 128
 
 
 def pattern(directions: torch.Tensor) -> torch.Tensor:
-    """A smooth function of the direction, uint8."""
+    """Return a smooth function of the direction, uint8."""
     unit = torch.nn.functional.normalize(directions.double(), dim=-1)
     return (128 + 120 * torch.sin(3 * unit)).round().to(torch.uint8)
 
@@ -42,7 +42,7 @@ def test_cube_faces_reproduce_the_panorama(panorama: View):
 
 
 def test_cube_faces_preserve_detail(panorama: View, generator: torch.Generator):
-    """Noise of three pixels: 37 dB over the sphere. Bilinear cuts lose 2.5 dB of it, faces half as fine 5.6."""
+    """Reproduce noise of three pixels: 37 dB. Bilinear sampling loses 2.5 dB, half the resolution 5.6 dB."""
     noise = torch.rand(1, 3, HEIGHT, WIDTH, generator=generator)
     image = (255 * torch.nn.functional.avg_pool2d(noise, 3, 1, 1)[0].permute(1, 2, 0)).to(torch.uint8)
     square = (through_faces(replace(panorama, load_pixels=lambda: image)) - image / 255).square().mean(-1)
@@ -51,7 +51,7 @@ def test_cube_faces_preserve_detail(panorama: View, generator: torch.Generator):
 
 
 def through_faces(panorama: View) -> torch.Tensor:
-    """A panorama cut into faces as they are drawn, and put together again."""
+    """Resample a panorama to cube faces and back."""
     lens = face_camera(Panorama(WIDTH, HEIGHT))
     empty = torch.zeros(lens.height, lens.width)
     faces = [
@@ -71,15 +71,15 @@ def test_views_show_the_panorama_at_their_pose(panorama: View):
 
 
 def test_rendered_views_agree_with_resampled_panoramas(panorama: View, generator: torch.Generator):
-    """The renderer agrees with the resampling: a panorama of rays, cut, is what the faces of rays show."""
+    """Compare a resampled panorama with renders of the views, both of projection ray."""
     means = panorama.center.float() + 3 * torch.nn.functional.normalize(torch.randn(20, 3, generator=generator), dim=-1)
     quats, colors = torch.randn(20, 4, generator=generator), torch.rand(20, 3, generator=generator)
     scales = 0.3 + 0.3 * torch.rand(20, 3, generator=generator)
     gaussians = Gaussians(means, quats, scales, torch.full((20,), 0.8), colors)
     options, big = RenderOptions(projection="ray", low_pass=0.0), replace(panorama, width=512, height=256)
     whole = render(gaussians, big, options).image
-    for turn, view in zip(FACES, perspective_views(big, FACES, square_lens(big.camera, 1.0)), strict=True):
-        expected = sample(whole, view.camera.rays(dtype=torch.float64) @ turn)
+    for rotation, view in zip(FACES, perspective_views(big, FACES, square_lens(big.camera, 1.0)), strict=True):
+        expected = sample(whole, view.camera.rays(dtype=torch.float64) @ rotation)
         drawn = render(gaussians, view, options).image
         assert (drawn - expected).abs().mean() < 1e-3
 
@@ -92,24 +92,24 @@ def test_views_are_cached_in_the_store_of_the_panorama(tmp_path: Path, panorama:
         stored = replace(panorama, load_pixels=StoredImage(tmp_path / "p.png", WIDTH, HEIGHT, store))
         cut = perspective_views(stored, FACES, square_lens(panorama.camera, 1.0))
         pixels = [view.load_pixels() for view in cut]
-        assert cut[0].load_pixels != replace(cut[0].load_pixels), "which are told apart by identity"
+        assert cut[0].load_pixels != replace(cut[0].load_pixels), "loaders are compared by identity"
         for view, before, free in zip(
             cut, pixels, perspective_views(panorama, FACES, square_lens(panorama.camera, 1.0)), strict=True
         ):
             view.prefetch()
-            assert (view.load_pixels() is before) == kept, "kept, within the bytes that the panorama is kept in"
-            assert torch.equal(before, free.load_pixels()), "and the same pixels"
+            assert (view.load_pixels() is before) == kept, "cached within the limit of the store"
+            assert torch.equal(before, free.load_pixels()), "with the same pixels"
         assert store.bytes <= store.limit_bytes
 
 
 def test_masks_are_resampled_and_masked_colours_do_not_leak(panorama: View):
-    """What is masked is white; the views show the pattern or nothing."""
+    """Paint masked pixels white, and look for white in the views."""
     directions = rays(WIDTH, HEIGHT, dtype=torch.float64)
     mask = (directions[..., 1] < 0.3).float()
     pixels = torch.where(mask[..., None] > 0, pattern(directions), 255).to(torch.uint8)
     masked = replace(panorama, load_pixels=lambda: pixels, load_mask=lambda: mask)
-    for turn, view in zip(FACES, perspective_views(masked, FACES, square_lens(masked.camera, 1.0)), strict=True):
-        looks = view.camera.rays(dtype=torch.float64) @ turn
+    for rotation, view in zip(FACES, perspective_views(masked, FACES, square_lens(masked.camera, 1.0)), strict=True):
+        looks = view.camera.rays(dtype=torch.float64) @ rotation
         weight = view.mask()
         assert weight is not None
         height = looks[..., 1]

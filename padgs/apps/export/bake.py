@@ -69,16 +69,16 @@ def bake(model: PaDGS, views: Sequence[View], options: RenderOptions, backend: s
     """
     count = len(model) * model.options.offsets
     zeros = model.positions.new_zeros
-    shown, seen, opacity, covariance = zeros(count), zeros(count), zeros(count), zeros(count, 9)
+    contribution, visible, opacity, covariance = zeros(count), zeros(count), zeros(count), zeros(count, 9)
     size = (FITTED_DEGREE + 1) ** 2
     normal, colour = zeros(count, size, size), zeros(count, size, 3)
     for view in views:
         decoded = model.decode(view)
         drawn, slots = decoded.gaussians, decoded.slots
         pixels = contributions(drawn, view, options, backend)
-        shown.index_add_(0, slots, pixels)
+        contribution.index_add_(0, slots, pixels)
         within = pixels / drawn.opacities  # visible area of the footprint, in pixels
-        seen.index_add_(0, slots, within)
+        visible.index_add_(0, slots, within)
         opacity.index_add_(0, slots, pixels)
         axes = rotation_matrices(drawn.quats) * drawn.scales[:, None]
         covariance.index_add_(0, slots, within[:, None] * (axes @ axes.mT).flatten(1))
@@ -87,12 +87,12 @@ def bake(model: PaDGS, views: Sequence[View], options: RenderOptions, backend: s
         weighted = pixels[:, None] * values
         normal.index_add_(0, slots, weighted[:, :, None] * values[:, None])
         colour.index_add_(0, slots, weighted[:, :, None] * (drawn.colors - 0.5)[:, None])
-    keep = (shown > MIN_PIXELS).nonzero()[:, 0]
-    ridge = RIDGE * torch.eye(size).to(shown)
+    keep = (contribution > MIN_PIXELS).nonzero()[:, 0]
+    ridge = RIDGE * torch.eye(size).to(contribution)
     ridge[0, 0] = 0
-    coefficients = torch.linalg.solve(normal[keep] + shown[keep, None, None] * ridge, colour[keep])
-    scales, quats = axes_of((covariance[keep] / seen[keep, None]).view(-1, 3, 3))
-    opacities = (opacity[keep] / seen[keep]).clamp(1 / 255, MAX_OPACITY)
+    coefficients = torch.linalg.solve(normal[keep] + contribution[keep, None, None] * ridge, colour[keep])
+    scales, quats = axes_of((covariance[keep] / visible[keep, None]).view(-1, 3, 3))
+    opacities = (opacity[keep] / visible[keep]).clamp(1 / 255, MAX_OPACITY)
     blank = Splats(zeros(0, 3), zeros(0, 3), zeros(0, 3), degree=DEGREE, scene_scale=unit)
     rest = zeros(len(keep), (DEGREE + 1) ** 2 - 1, 3)
     rest[:, : size - 1] = coefficients[:, 1:]

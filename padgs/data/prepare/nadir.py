@@ -44,13 +44,13 @@ def write_nadir_mask(path: Path, below: float, *, overwrite: bool = False) -> Na
         )
     if not path.is_dir():
         raise DataError(f"{path} is not a folder; give a folder of panoramas, or of a data set")
-    images, place = image_folder(path, None), mask_folder(path)
+    images, target = image_folder(path, None), mask_folder(path)
     names = panoramas(images)
     if not names:
         raise DataError(f"{images} holds no images; give a folder of panoramas, or of a data set")
-    if not overwrite and (found := next((place / name for name in SCENE_MASKS if (place / name).exists()), None)):
+    if not overwrite and (found := next((target / name for name in SCENE_MASKS if (target / name).exists()), None)):
         raise DataError(f"{found} exists; check it, and use --overwrite to replace it")
-    _refuse_other_masks(place)
+    _refuse_other_masks(target)
     files = [inspect(images / name) for name in names]
     sizes = sorted({(file.width, file.height) for file in files})
     if len(sizes) > 1:
@@ -65,11 +65,11 @@ def write_nadir_mask(path: Path, below: float, *, overwrite: bool = False) -> Na
     preview = Image.fromarray(image.round().astype(np.uint8))
     preview.thumbnail((MAX_WIDTH, MAX_WIDTH // 2))
     try:
-        save_png(255 * use.expand(-1, width), place / SCENE_MASKS[0])
-        preview.save(place / PREVIEW)
+        save_png(255 * use.expand(-1, width), target / SCENE_MASKS[0])
+        preview.save(target / PREVIEW)
     except OSError as error:
-        raise DataError(f"cannot write into {place} ({error.strerror or error}); check its permissions") from error
-    return NadirMask(place / SCENE_MASKS[0], place / PREVIEW, len(files))
+        raise DataError(f"cannot write into {target} ({error.strerror or error}); check its permissions") from error
+    return NadirMask(target / SCENE_MASKS[0], target / PREVIEW, len(files))
 
 
 def _refuse_other_masks(folder: Path) -> None:

@@ -153,9 +153,9 @@ def find_source(path: Path, mask: str) -> Source:
     masks, digests, notes = find_masks(capture, mask, list(images.values()), sizes, ImageStore())
     if others:
         notes.append(f"left out: {others}{ways_out}")
-    place = mask_folder(path)
-    if unused := [name for name in _scene_masks(folder) if mask == "auto" and (folder / name).parent != place]:
-        notes.append(f"not used: {listed(unused)}; a mask of all panoramas must be in {place}")
+    expected = mask_folder(path)
+    if unused := [name for name in _scene_masks(folder) if mask == "auto" and (folder / name).parent != expected]:
+        notes.append(f"not used: {listed(unused)}; a mask of all panoramas must be in {expected}")
     digest = hashlib.sha256()
     for name, image in images.items():
         digest.update(f"{name}|{image.digest}|".encode())

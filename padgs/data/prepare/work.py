@@ -62,14 +62,14 @@ def refuse_full(folder: Path) -> None:
         )
 
 
-def link_or_copy(file: Path, place: Path) -> None:
+def link_or_copy(file: Path, target: Path) -> None:
     """Link a file, or copy it on file systems without links, such as exFAT."""
-    for link in (place.symlink_to, place.hardlink_to):
+    for link in (target.symlink_to, target.hardlink_to):
         try:
             return link(file.resolve())
         except OSError:
             continue
-    shutil.copyfile(file, place)
+    shutil.copyfile(file, target)
 
 
 @dataclass(frozen=True)

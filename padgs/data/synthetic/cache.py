@@ -55,12 +55,12 @@ def _source() -> bytes:
 
 def read(options: SyntheticOptions) -> Stored | None:
     """Read a cached scene; None if missing or damaged."""
-    place = folder() / key(options)
+    entry = folder() / key(options)
     try:
         # Opened here, because numpy does not close files that are not zip archives.
-        with open(place / "scene.npz", "rb") as file, np.load(file, allow_pickle=False) as table:
+        with open(entry / "scene.npz", "rb") as file, np.load(file, allow_pickle=False) as table:
             count = len(table["poses"])
-            images = [place / f"{index:03d}.png" for index in range(count)]
+            images = [entry / f"{index:03d}.png" for index in range(count)]
             if not all(path.is_file() for path in images):
                 return None
             return Stored(images, table["poses"], table["points"], table["colors"], str(table["fingerprint"]))
@@ -70,22 +70,22 @@ def read(options: SyntheticOptions) -> Stored | None:
 
 def write(options: SyntheticOptions, stored: Stored) -> str | None:
     """Cache a scene; returns the reason if that is impossible."""
-    place = folder() / key(options)
+    entry = folder() / key(options)
     draft = None
     try:
-        place.parent.mkdir(parents=True, exist_ok=True)
-        draft = Path(tempfile.mkdtemp(prefix=f".{place.name}-", dir=place.parent))
+        entry.parent.mkdir(parents=True, exist_ok=True)
+        draft = Path(tempfile.mkdtemp(prefix=f".{entry.name}-", dir=entry.parent))
         for index, image in enumerate(stored.images):
             assert isinstance(image, np.ndarray)
             Image.fromarray(image).save(draft / f"{index:03d}.png", compress_level=2)
         arrays = {name: getattr(stored, name) for name in ("poses", "points", "colors", "fingerprint")}
         np.savez_compressed(draft / "scene.npz", **arrays)
         draft.chmod(0o755)
-        if place.exists() and read(options) is None:
-            shutil.rmtree(place)  # damaged
-        draft.rename(place)
+        if entry.exists() and read(options) is None:
+            shutil.rmtree(entry)  # damaged
+        draft.rename(entry)
     except OSError as error:
-        if place.exists() and read(options) is not None:
+        if entry.exists() and read(options) is not None:
             return None  # another process was faster
         return f"generated scene not cached: {error}; set PADGS_CACHE to a folder that can be written"
     finally:

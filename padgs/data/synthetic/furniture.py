@@ -149,17 +149,17 @@ def scatter(
     Objects in the lower part stand on thin rods, the others float.
     """
     shapes: list[Shape] = []
-    places, sizes = np.empty((0, 3)), np.empty(0)
+    positions, sizes = np.empty((0, 3)), np.empty(0)
     for _ in range(count):
         size = rng.uniform(0.07, 0.16)
         for _attempt in range(200):
             where = rng.uniform(low, high)
-            apart = (np.linalg.norm(places - where, axis=1) > sizes + size).all()
+            apart = (np.linalg.norm(positions - where, axis=1) > sizes + size).all()
             if apart and np.linalg.norm(path - where, axis=1).min() > clearance + size:
                 break
         else:
             raise DataError(f"no free position for object {len(sizes) + 1} of {count}; lower data.generator.objects")
-        places, sizes = np.vstack((places, where)), np.append(sizes, size)
+        positions, sizes = np.vstack((positions, where)), np.append(sizes, size)
         shapes.append(loose_object(point(where), size, rng, reflectance))
         x, y, z = point(where)
         if z < high[2] * 0.6:  # supports of higher objects would block the cameras
@@ -176,9 +176,9 @@ def beside(count: int, path: Array, nearest: float, farthest: float, rng: np.ran
         if attempts > 200 * count:
             raise DataError(f"no free positions for {count} objects beside the path; lower data.generator.objects")
         size = rng.uniform(0.02, 0.07)
-        way = rng.normal(size=3) * (1, 1, 0.7)
+        direction = rng.normal(size=3) * (1, 1, 0.7)
         gap = rng.uniform(nearest, farthest)
-        where = path[rng.integers(len(path))] + way / np.linalg.norm(way) * (gap + size)
+        where = path[rng.integers(len(path))] + direction / np.linalg.norm(direction) * (gap + size)
         if np.linalg.norm(path - where, axis=1).min() >= nearest + size:
             shapes.append(loose_object(point(where), size, rng))
     return shapes

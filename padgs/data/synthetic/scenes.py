@@ -45,13 +45,13 @@ INK: tx.Color = (0.16, 0.13, 0.12)
 def _posters(count: int, width: float, size: float) -> list[tuple[float, float, float, float, Texture]]:
     """Return `count` posters of height `size` in a row along a wall of the given width."""
     looks = (
-        tx.picture((0.35, 0.6, 0.85), (0.12, 0.32, 0.22), (0.98, 0.75, 0.25), size),
+        tx.poster((0.35, 0.6, 0.85), (0.12, 0.32, 0.22), (0.98, 0.75, 0.25), size),
         tx.print_of(PAPER, INK, size / 16),
-        tx.picture((0.9, 0.55, 0.4), (0.25, 0.14, 0.3), (1.0, 0.9, 0.6), size),
+        tx.poster((0.9, 0.55, 0.4), (0.25, 0.14, 0.3), (1.0, 0.9, 0.6), size),
         tx.medallion((0.12, 0.18, 0.3), (0.85, 0.7, 0.4), (0.9, 0.9, 0.85), size / 2.2, 7),
     )
-    places = (np.arange(count) + 0.5) / count * width - width / 2
-    return [(float(u), 0.15, 0.72 * size, size, looks[k % len(looks)]) for k, u in enumerate(places)]
+    positions = (np.arange(count) + 0.5) / count * width - width / 2
+    return [(float(u), 0.15, 0.72 * size, size, looks[k % len(looks)]) for k, u in enumerate(positions)]
 
 
 def _room_materials(

@@ -219,7 +219,7 @@ def medallion(uv: Array, ground: Color, figure: Color, accent: Color, radius: fl
 
 
 @texture
-def picture(uv: Array, sky: Color, land: Color, sun: Color, size: float) -> Array:
+def poster(uv: Array, sky: Color, land: Color, sun: Color, size: float) -> Array:
     """Draw a poster: a landscape of layered hills with a sun, over a line of print."""
     caption = print_of((0.93, 0.91, 0.86), (0.15, 0.13, 0.12), size / 14)
     u, v = uv / size

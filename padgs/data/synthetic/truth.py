@@ -90,9 +90,9 @@ class SyntheticTruth:
         given = self.poses.copy()
         held_out = set(paths.held_out(self.options))
         for index in range(len(given)):
-            offset, turn, size = rng.standard_normal(3), rng.standard_normal(3), rng.standard_normal()
+            offset, axis, size = rng.standard_normal(3), rng.standard_normal(3), rng.standard_normal()
             if index not in held_out:
-                rotation = _rotation(turn / np.linalg.norm(turn) * angle * size) @ given[index, :3, :3]
+                rotation = _rotation(axis / np.linalg.norm(axis) * angle * size) @ given[index, :3, :3]
                 position = camera.center(given[index]) + shift * offset
                 given[index, :3, :3], given[index, :3, 3] = rotation, -rotation @ position
         return np.stack([self.to_world(pose) for pose in given])

@@ -95,9 +95,9 @@ def _direct(
     total = np.zeros(points.shape[1], np.float32)
     for lamp, power in light.lamps:
         position = np.asarray(lamp)
-        way = position - middle
-        along = np.clip((bounds[0] - middle) @ way / (way @ way), 0, 1)
-        gap = np.linalg.norm(bounds[0] - middle - along[:, None] * way, axis=1)
+        line = position - middle
+        along = np.clip((bounds[0] - middle) @ line / (line @ line), 0, 1)
+        gap = np.linalg.norm(bounds[0] - middle - along[:, None] * line, axis=1)
         between = np.flatnonzero(casts & (gap < bounds[1] + spread + light.size)).tolist()
         unshadowed = lambert(points, normal, position, power)
         if not between:
@@ -120,9 +120,9 @@ def _openness(points: Array, normal: Array, bounds: tuple[Array, Array], hit: Fi
     second = np.cross(up, first)
     steps = np.arange(_OPEN_SAMPLES)
     radius, angle = np.sqrt((steps + 0.5) / _OPEN_SAMPLES), 2.4 * steps  # a cosine-weighted spiral
-    ways = np.outer(first, radius * np.cos(angle)) + np.outer(second, radius * np.sin(angle))
-    ways += np.outer(up, np.sqrt(1 - radius**2))
-    start, rays = _all_pairs(points + np.float32(2e-3) * normal, ways.astype(np.float32))
+    directions = np.outer(first, radius * np.cos(angle)) + np.outer(second, radius * np.sin(angle))
+    directions += np.outer(up, np.sqrt(1 - radius**2))
+    start, rays = _all_pairs(points + np.float32(2e-3) * normal, directions.astype(np.float32))
     free = np.minimum(hit(start, rays, near) / _OCCLUSION_RADIUS, 1)
     return free.reshape(points.shape[1], -1).mean(1)
 
@@ -247,14 +247,14 @@ class World:
             if material.glows:
                 color[:, where] = albedo
                 continue
-            normal, place = surface.normal[:, where], points[:, where]
-            lit = albedo * self._irradiance(self.light_maps.get((index, face)), place, surface.uv[:, where], normal)
+            normal, position = surface.normal[:, where], points[:, where]
+            lit = albedo * self._irradiance(self.light_maps.get((index, face)), position, surface.uv[:, where], normal)
             if material.reflectance and reflect:
                 incoming = ray[:, where]
                 cosine = -(normal * incoming).sum(0)
                 share = material.reflectance + (1 - material.reflectance) * np.clip(1 - cosine, 0, 1) ** 5
                 bounced = incoming + 2 * cosine * normal
-                mirror = self.color(place + np.float32(1e-3) * normal, bounced, reflect=False)
+                mirror = self.color(position + np.float32(1e-3) * normal, bounced, reflect=False)
                 lit = lit + share * (mirror - lit)
             color[:, where] = lit
         return color

@@ -21,7 +21,7 @@ def trained() -> PaDGSMethod:
 
 
 def decibels(method: PaDGSMethod, splats: Splats) -> float:
-    """Mean PSNR of the baked pictures of held-out and training views against the method's own."""
+    """Return the mean PSNR of baked renders against the method's renders, over all views."""
     options = method.render_config.options(splats.scene_scale)
     errors = [
         (render(splats.gaussians(view), view, options).image - method.render(view).image).square().mean()
@@ -70,9 +70,9 @@ def test_axes_of_covariances(generator):
     scales = torch.rand(200, 3, generator=generator) + 0.01
     quats = torch.nn.functional.normalize(torch.randn(200, 4, generator=generator), dim=-1)
     axes = rotation_matrices(quats) * scales[:, None]
-    found, turned = axes_of(axes @ axes.mT)
+    found, rotated = axes_of(axes @ axes.mT)
     assert torch.allclose(found.sort(-1).values, scales.sort(-1).values, atol=1e-4)
-    again = rotation_matrices(turned) * found[:, None]
+    again = rotation_matrices(rotated) * found[:, None]
     assert torch.allclose(again @ again.mT, axes @ axes.mT, atol=1e-5)
     flat, _ = axes_of(torch.diag(torch.tensor([1.0, 0.0, 0.0]))[None])
     assert flat.min() > 0, "a scale of nothing has no logarithm"

@@ -37,8 +37,8 @@ def splat_run(tmp_path_factory):
 
 
 def test_an_exported_run_scores_like_the_run(splat_run):
-    said = export(str(splat_run))
-    assert said.exit_code == 0 and "Gaussians as trained" in said.output
+    result = export(str(splat_run))
+    assert result.exit_code == 0 and "Gaussians as trained" in result.output
     run = padgs.load_run(splat_run)
     splats = read_splats(splat_run / "splats.ply", unit=run.scene.scale)
     options = run.config.render.options(run.scene.scale)
@@ -52,14 +52,14 @@ def test_an_exported_run_scores_like_the_run(splat_run):
 
 
 def test_gaussians_are_exported_without_the_data_set(splat_run, tmp_path):
-    said = export(str(splat_run), "--data", str(tmp_path / "gone"), "--to", str(tmp_path / "a.ply"))
-    assert said.exit_code == 0 and "the data set is missing" in said.output
+    result = export(str(splat_run), "--data", str(tmp_path / "gone"), "--to", str(tmp_path / "a.ply"))
+    assert result.exit_code == 0 and "the data set is missing" in result.output
     assert len(read_splats(tmp_path / "a.ply")) == len(padgs.load_run(splat_run).method.model.splats)
 
 
 def test_smooth_includes_the_3d_smoothing_filter(splat_run, tmp_path):
-    said = export(str(splat_run), "--smooth", "--to", str(tmp_path / "smooth.ply"))
-    assert said.exit_code == 0 and "including the 3D smoothing filter" in " ".join(said.output.split())
+    result = export(str(splat_run), "--smooth", "--to", str(tmp_path / "smooth.ply"))
+    assert result.exit_code == 0 and "including the 3D smoothing filter" in " ".join(result.output.split())
     run = padgs.load_run(splat_run)
     view, options = run.scene.train[0], run.config.render.options(run.scene.scale)
     exact, smooth = (export_run(run, smooth=wanted).splats for wanted in (False, True))
@@ -99,10 +99,10 @@ def test_points_and_upright_worlds(splat_run, tmp_path):
 
 def test_anchors_are_baked_and_the_loss_is_reported(tmp_path_factory, tmp_path):
     folder = tiny_run(tmp_path_factory, "method=padgs_small", "train.iterations=60")
-    said = export(str(folder), "--to", str(tmp_path / "a.ply"), "--distillation-steps", "40")
-    assert said.exit_code == 0, said.output
+    result = export(str(folder), "--to", str(tmp_path / "a.ply"), "--distillation-steps", "40")
+    assert result.exit_code == 0, result.output
     (line,) = [line for line in PlyData.read(str(tmp_path / "a.ply"))["vertex"].comments if line.startswith("baked")]
-    assert line in said.output and "WS-PSNR of the test views" in line
+    assert line in result.output and "WS-PSNR of the test views" in line
     assert len(read_splats(tmp_path / "a.ply")) > 0
 
 
@@ -117,19 +117,19 @@ def test_methods_without_gaussians_are_refused(tmp_path_factory, tmp_path, splat
         ((str(splat_run), "--to", str(tmp_path / "file" / "a.ply")), "name another place with --to"),
         ((str(splat_run), "--upright", "--to", str(tmp_path / "a.ply"), "--data", "gone"), f"data of {splat_run}"),
     ):
-        said = export(*arguments)
-        assert said.exit_code == 1 and message in said.output + said.stderr
+        result = export(*arguments)
+        assert result.exit_code == 1 and message in result.output + result.stderr
     assert not (tmp_path / "RUNX").exists(), "a name that was misspelt"
 
 
 def test_moved_gaussians_look_the_same_from_moved_cameras(generator):
     splats = random_splats(3, generator)
     splats.log_scales.data -= 1.5
-    turn = torch.from_numpy(Rotation.from_rotvec([0.5, -1.2, 0.3]).as_matrix())
-    similarity = Similarity(1.7, turn, torch.tensor([0.3, -2.0, 5.0], dtype=torch.float64))
+    rotation = torch.from_numpy(Rotation.from_rotvec([0.5, -1.2, 0.3]).as_matrix())
+    similarity = Similarity(1.7, rotation, torch.tensor([0.3, -2.0, 5.0], dtype=torch.float64))
     view = tiny_scene().train[3]
     pose = view.cam_from_world.clone()
-    pose[:3, :3] = view.cam_from_world[:3, :3] @ turn.T
+    pose[:3, :3] = view.cam_from_world[:3, :3] @ rotation.T
     pose[:3, 3] = -pose[:3, :3] @ similarity(view.center)
     before = render(splats.gaussians(view), view, RenderOptions())
     new = transform_splats(splats, similarity)
@@ -142,15 +142,15 @@ def test_moved_gaussians_look_the_same_from_moved_cameras(generator):
 
 
 def test_turned_harmonics_are_the_function_turned(generator):
-    turn = torch.from_numpy(Rotation.random(random_state=3).as_matrix())
+    rotation = torch.from_numpy(Rotation.random(random_state=3).as_matrix())
     directions = torch.nn.functional.normalize(torch.randn(9, 3, generator=generator, dtype=torch.float64), dim=-1)
     coefficients = torch.randn(16, generator=generator, dtype=torch.float64)
     before = harmonics.basis(directions, 3) @ coefficients
-    after = harmonics.basis(directions @ turn.T, 3) @ harmonics_rotation(turn, 3) @ coefficients
+    after = harmonics.basis(directions @ rotation.T, 3) @ harmonics_rotation(rotation, 3) @ coefficients
     assert torch.allclose(after, before, atol=1e-9)
 
 
 def test_upright_turns_up_against_down():
     for up in ([0.0, 0.0, 1.0], [0.6, 0.0, -0.8], [0.0, 1.0, 0.0]):
-        turned = upright_rotation(torch.tensor(up, dtype=torch.float64))(torch.tensor(up, dtype=torch.float64))
-        assert torch.allclose(turned, torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64), atol=1e-9)
+        rotated = upright_rotation(torch.tensor(up, dtype=torch.float64))(torch.tensor(up, dtype=torch.float64))
+        assert torch.allclose(rotated, torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64), atol=1e-9)

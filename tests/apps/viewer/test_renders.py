@@ -22,9 +22,9 @@ def anchors(tmp_path_factory) -> RunRenderer:
 
 def test_panoramas_are_padded_renders_of_the_run(renderer):
     view = renderer.run.scene.train[1]
-    picture = renderer.render(ViewOptions("panorama"), view.cam_from_world, 32, 24)
-    assert picture.shape == (24, 32, 3) and picture[:4].max() == picture[20:].max() == 0
-    assert np.array_equal(picture[4:20], to_uint8(renderer.run.method.render(view).image))
+    image = renderer.render(ViewOptions("panorama"), view.cam_from_world, 32, 24)
+    assert image.shape == (24, 32, 3) and image[:4].max() == image[20:].max() == 0
+    assert np.array_equal(image[4:20], to_uint8(renderer.run.method.render(view).image))
     high = renderer.render(ViewOptions("panorama"), view.cam_from_world, 32, 8)
     assert high.shape == (8, 16, 3), "no wider than its height allows"
 

@@ -55,7 +55,7 @@ def test_network_pages_have_a_network_address():
 @pytest.mark.slow
 @in_chromium
 def test_a_browser_shows_all_controls(run, tmp_path):
-    """Controls are set from here, as the page would; what they do is seen on the page."""
+    """Set controls from Python, and observe the page."""
     with start_server(port=8420) as server, visiting(server.address) as visit, show_runs(server, [run, run]) as pages:
         until(lambda: pages)
         (page,) = pages.values()
@@ -94,13 +94,13 @@ def test_a_browser_shows_all_controls(run, tmp_path):
 
 def test_missing_viser_is_reported(run, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    said = CliRunner().invoke(app, ["view", str(run.folder)])
-    assert said.exit_code == 1 and install_command("view") in said.stderr
+    result = CliRunner().invoke(app, ["view", str(run.folder)])
+    assert result.exit_code == 1 and install_command("view") in result.stderr
 
 
 def test_other_folders_are_refused(run, tmp_path):
-    said = CliRunner().invoke(app, ["view", str(run.folder), "--beside", str(tmp_path)])
-    assert said.exit_code == 1 and "has no config.yaml" in said.stderr
+    result = CliRunner().invoke(app, ["view", str(run.folder), "--beside", str(tmp_path)])
+    assert result.exit_code == 1 and "has no config.yaml" in result.stderr
 
 
 def test_the_crop_box_contains_most_points(run):

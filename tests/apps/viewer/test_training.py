@@ -1,4 +1,4 @@
-"""Runs that are still in training: followed from checkpoint to checkpoint, and served beside their training."""
+"""Runs in training: followed from checkpoint to checkpoint, and served by a child process."""
 
 import json
 import re
@@ -37,7 +37,7 @@ WITH_VISER = pytest.mark.skipif(viser is None, reason="the extra `view` is not i
 
 @pytest.fixture
 def folder(tmp_path_factory, tmp_path) -> Path:
-    """Of a run that has not come to its end."""
+    """Return the folder of an unfinished run."""
     training = tmp_path / "training"
     shutil.copytree(tiny_run(tmp_path_factory), training)
     (training / results.FILE_NAME).unlink()
@@ -45,7 +45,7 @@ def folder(tmp_path_factory, tmp_path) -> Path:
 
 
 def train_on(folder: Path) -> None:
-    """Write the next checkpoint: everything a little nearer, ten iterations later."""
+    """Write a modified checkpoint, ten iterations later."""
     place = folder / "checkpoint"
     before, run = checkpoint.load(place), json.loads((place / checkpoint.MANIFEST).read_text())["run"]
     tensors = {name: 0.9 * tensor if name.endswith("means") else tensor for name, tensor in before.tensors.items()}
@@ -58,14 +58,14 @@ def test_training_is_followed_if_enabled(folder):
     renderer = RunRenderer(padgs.load_run(folder, device="cpu"))
     scene, pose = renderer.run.scene, renderer.run.scene.train[0].cam_from_world
 
-    def picture() -> np.ndarray:
+    def image() -> np.ndarray:
         return renderer.render(ViewOptions("panorama"), pose, 32, 16)
 
-    first = picture()
+    first = image()
     assert "after 30 iterations" in renderer.summary and not renderer.update()
     train_on(folder)
     assert renderer.update() and "after 40 iterations" in renderer.summary
-    assert not np.array_equal(picture(), first)
+    assert not np.array_equal(image(), first)
     assert renderer.run.scene is scene, "the scene is not loaded again"
     renderer.is_following = False
     train_on(folder)
@@ -74,7 +74,7 @@ def test_training_is_followed_if_enabled(folder):
     assert renderer.update() and "after 50 iterations" in renderer.summary
     (folder / "checkpoint" / checkpoint.MANIFEST).write_text("{")
     assert renderer.update() and "cannot follow" in renderer.summary and not renderer.update()
-    assert "after 50 iterations" in renderer.summary and picture().std() > 0, "what cannot be read changes no picture"
+    assert "after 50 iterations" in renderer.summary and image().std() > 0, "what cannot be read changes no picture"
     renderer.is_following = False
     assert renderer.update() and "cannot follow" not in renderer.summary
 
@@ -113,21 +113,21 @@ def test_only_local_pages_can_stop_training(folder, host):
             visit.wait("!document.body.innerText.includes('Stop training now?')")
         end = time.monotonic() + 20
         while not (folder / "stop").exists():
-            assert time.monotonic() < end, "training was not asked to end"
+            assert time.monotonic() < end, "no stop was requested"
             time.sleep(0.05)
 
 
 @dataclass
 class Renewed:
-    """A page that only notes that it shall draw again."""
+    """Page that records redraws."""
 
-    asked: threading.Event = field(default_factory=threading.Event)
+    redrawn: threading.Event = field(default_factory=threading.Event)
 
     def redraw(self) -> None:
-        self.asked.set()
+        self.redrawn.set()
 
     def close(self) -> None:
-        """Nothing to end."""
+        """Do nothing."""
 
 
 @WITH_VISER
@@ -136,9 +136,9 @@ def test_pages_redraw_after_a_checkpoint(folder, monkeypatch):
     page = Renewed()
     with start_server(port=8440) as server, show_runs(server, [padgs.load_run(folder, device="cpu")]) as there:
         there[-1] = page
-        assert not page.asked.wait(0.3)
+        assert not page.redrawn.wait(0.3)
         train_on(folder)
-        assert page.asked.wait(30)
+        assert page.redrawn.wait(30)
 
 
 def test_wait_for_the_first_checkpoint(folder, tmp_path, capsys):
@@ -175,12 +175,12 @@ def test_a_failed_run_without_checkpoint_ends_waiting(folder):
 @WITH_VISER
 def test_a_run_is_served_while_it_trains(folder, capfd):
     with serve_training(folder, None, "cpu"):
-        said, end = "", time.monotonic() + 60
-        while "http" not in said:
-            assert time.monotonic() < end, "no address was said"
-            said += capfd.readouterr().out
+        output, end = "", time.monotonic() + 60
+        while "http" not in output:
+            assert time.monotonic() < end, "no address was printed"
+            output += capfd.readouterr().out
             time.sleep(0.1)
-        address = next(word for word in said.split() if word.startswith("http"))
+        address = next(word for word in output.split() if word.startswith("http"))
         assert b"<html" in urlopen(address, timeout=20).read()[:500]
     with pytest.raises(OSError, match="refused"):
         urlopen(address, timeout=5)

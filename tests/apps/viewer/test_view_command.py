@@ -1,4 +1,4 @@
-"""What `padgs view` refuses before it serves anything, and where it opens the page by itself."""
+"""`padgs view`: refusals, and opening the browser."""
 
 import subprocess
 import sys
@@ -23,10 +23,10 @@ def no_handlers(monkeypatch):
 
 def test_runs_of_different_scenes_are_refused(tmp_path_factory):
     runs = [str(tiny_run(tmp_path_factory, f"data.generator.scene={scene}")) for scene in ("room", "white_room")]
-    said = CliRunner().invoke(app, ["view", runs[0], "--beside", runs[1]])
-    assert said.exit_code == 1 and "are of two scenes" in " ".join(said.output.split())
-    said = CliRunner().invoke(app, ["view", runs[0], "--data", "gone"])
-    assert said.exit_code == 1 and f"it is the data of {runs[0]}" in " ".join(said.output.split())
+    result = CliRunner().invoke(app, ["view", runs[0], "--beside", runs[1]])
+    assert result.exit_code == 1 and "are of two scenes" in " ".join(result.output.split())
+    result = CliRunner().invoke(app, ["view", runs[0], "--data", "gone"])
+    assert result.exit_code == 1 and f"it is the data of {runs[0]}" in " ".join(result.output.split())
 
 
 @pytest.mark.parametrize(("local", "browse", "opens"), [(True, True, 1), (True, False, 0), (False, True, 0)])

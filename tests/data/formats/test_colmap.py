@@ -1,4 +1,4 @@
-"""COLMAP models: hand-written ones in every layout, damaged ones, and the real ones beside the repository."""
+"""COLMAP models: written by hand, damaged, and real."""
 
 import shutil
 from pathlib import Path

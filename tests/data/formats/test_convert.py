@@ -1,4 +1,4 @@
-"""Write, read, compare: every format into every other, and nothing half-written."""
+"""Conversion of every format to every other, and of nothing partially."""
 
 import errno
 import re
@@ -22,7 +22,7 @@ from padgs.scene import Scene
 @pytest.mark.parametrize("to", WRITERS)
 @pytest.mark.parametrize("source", WRITERS)
 def test_round_trip(source: str, to: str, world: World, tmp_path: Path) -> None:
-    """Source by hand -> `to` by padgs -> read by padgs, against the truth."""
+    """Convert a data set written by hand, and compare both as loaded."""
     WRITERS[source](world, tmp_path / "in")
     if source == "omniblender":  # has none of its own
         write_cloud(world, tmp_path / "in" / "pcd.ply")

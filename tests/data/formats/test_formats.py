@@ -1,4 +1,4 @@
-"""Every format, from files written by hand: exact poses, points, colours, split, and images that agree with them."""
+"""Readers of all formats, on files written by hand: exact poses, points, colours, split and images."""
 
 import json
 from collections.abc import Callable
@@ -49,7 +49,7 @@ def test_scenes_are_read_exactly(name: str, world: World, tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("name", WRITERS)
 def test_pixels_agree_with_the_poses(name: str, world: World, tmp_path: Path) -> None:
-    """Points along the rays of padgs, from the poses as loaded, have the colours of the pixels."""
+    """Compare pixels with the analytic colours along rays of the loaded poses."""
     WRITERS[name](world, tmp_path / "scene")
     view = load(tmp_path / "scene").train[1]
     directions = rays(view.width, view.height, dtype=torch.float64) @ view.cam_from_world[:3, :3]

@@ -1,4 +1,4 @@
-"""Whatever stands in a JSON file in place of something else is read, or refused by a DataError that names its place."""
+"""Malformed JSON files are read, or refused by a DataError that names the position."""
 
 import json
 from collections.abc import Iterator
@@ -28,7 +28,7 @@ def small() -> World:
 
 
 def places(value: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """Where something stands; of lists, and of objects with many fields, the last only."""
+    """Yield all positions in a document; only the last of lists and of objects with many fields."""
     yield at
     keys = list(value) if isinstance(value, dict) else list(range(len(value))) if isinstance(value, list) else []
     for key in keys if isinstance(value, dict) and len(value) <= 12 else keys[-1:]:
@@ -86,7 +86,7 @@ def test_errors_name_the_position(name: str, at, value, message: str, small: Wor
 
 
 def test_openmvg_cannot_reach_other_folders(small: World, tmp_path: Path) -> None:
-    """What `root_path` says is of another machine; its last name may stand beside the file."""
+    """Check that only the last name of `root_path`, from another machine, is used."""
     WRITERS["openmvg"](small, tmp_path / "scene")
     (tmp_path / "scene" / "images").rename(tmp_path / "elsewhere")
     file = tmp_path / "scene" / "sfm_data.json"

@@ -1,4 +1,4 @@
-"""What a file may call a pose, and what not."""
+"""Poses as stated in files: conversion and refusal."""
 
 import math
 

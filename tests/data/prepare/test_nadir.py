@@ -1,4 +1,4 @@
-"""The mask over the tripod: where readers look for it, of the right angle, and never over another one."""
+"""Nadir masks: position, angle, and refusal of existing masks."""
 
 import json
 from pathlib import Path

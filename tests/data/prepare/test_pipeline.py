@@ -25,7 +25,7 @@ VIEWS = 6
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    """A walk of some metres through the synthetic room, and its panoramas in a folder with a space in its name."""
+    """Return a synthetic scene, and its panoramas in a folder with a space in its name."""
     folder = tmp_path_factory.mktemp("room é 1")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PADGS_CACHE", str(tmp_path_factory.mktemp("cache")))
@@ -38,14 +38,14 @@ def scene(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def prepared(scene, tmp_path_factory):
-    """The result of an uninterrupted call, and what was told on the way."""
-    out, told = tmp_path_factory.mktemp("out") / "done", []
-    result = prepare(scene[1], out, PrepareOptions(threads=1), lambda *step: told.append(step))
-    return result, out, told
+    """Return the result of an uninterrupted call, and its progress calls."""
+    out, calls = tmp_path_factory.mktemp("out") / "done", []
+    result = prepare(scene[1], out, PrepareOptions(threads=1), lambda *step: calls.append(step))
+    return result, out, calls
 
 
 def differences(folder, reference):
-    """(distance [F], degrees [F], path length) of a prepared folder against name -> pose."""
+    """Return distances [F], degrees [F] and path length of a prepared folder against exact poses by name."""
     frames = padgs.data.read(folder).frames
     found = torch.stack([frame.cam_from_world for frame in frames])
     exact = torch.stack([reference[frame.name] for frame in frames])
@@ -87,15 +87,15 @@ def test_the_result_is_level_complete_and_ready(prepared):
 
 
 def test_progress_counts_up_to_all(prepared):
-    _, _, told = prepared
-    last = {step: (done, total) for step, done, total in told}
+    _, _, calls = prepared
+    last = {step: (done, total) for step, done, total in calls}
     pairs = VIEWS * (VIEWS - 1) // 2
     assert last == {"features": (VIEWS,) * 2, "matches": (pairs,) * 2, "poses": (VIEWS,) * 2, "result": (1, 1)}
 
 
 @pytest.mark.slow
 def test_an_interrupted_call_resumes_with_the_same_result(scene, prepared, tmp_path):
-    """On one thread: with several, how busy the machine is may decide the last bits of poses."""
+    """Use one thread, because with several the last bits of poses depend on timing."""
     out = tmp_path / "done"
 
     def interrupt(step, done, total):
@@ -105,15 +105,15 @@ def test_an_interrupted_call_resumes_with_the_same_result(scene, prepared, tmp_p
     with pytest.raises(KeyboardInterrupt):
         prepare(scene[1], out, PrepareOptions(threads=1), interrupt)
     assert not out.exists()
-    told = []
-    prepare(scene[1], out, PrepareOptions(threads=1), lambda *step: told.append(step[0]))
-    assert "features" not in told
+    calls = []
+    prepare(scene[1], out, PrepareOptions(threads=1), lambda *step: calls.append(step[0]))
+    assert "features" not in calls
     for path in (prepared[1] / "sparse" / "0").iterdir():
         assert (out / "sparse" / "0" / path.name).read_bytes() == path.read_bytes(), path.name
 
 
 def test_other_input_starts_over(scene, tmp_path):
-    """A working folder belongs to its images and options; here it is of other images."""
+    """Check that a working folder is reused only for the same images and options."""
     out, work = tmp_path / "done", tmp_path / ".done.prepare"
 
     def interrupt(step, done, total):
@@ -134,7 +134,7 @@ def test_other_input_starts_over(scene, tmp_path):
 
 
 def test_masked_pixels_have_no_features_and_the_mask_is_copied(scene, tmp_path, monkeypatch):
-    """Of a video: its frames are gone in the end, so that only the file of the mask tells that it is another one."""
+    """Use a video, whose frames are deleted, so that the mask file must be part of the digest."""
     frames = scene[1].glob("pano*.png")
     monkeypatch.setattr(
         pipeline, "extract_frames", lambda video, folder, *_: [shutil.copy(frame, folder) for frame in frames]
@@ -172,7 +172,7 @@ def test_unrelated_images_are_reported(scene, tmp_path):
 
 
 def noise(folder, count=2):
-    """Panoramas of nothing, in a folder."""
+    """Write panoramas of noise to a folder."""
     folder.mkdir()
     for index in range(count):
         pixels = np.random.default_rng(index).integers(0, 256, (64, 128, 3), np.uint8)
@@ -181,16 +181,16 @@ def noise(folder, count=2):
 
 
 def test_unrelated_images_alone_are_refused(tmp_path, monkeypatch):
-    asked = []
-    monkeypatch.setattr(pipeline, "threads_for", lambda *size: asked.append(size) or 1)
+    calls = []
+    monkeypatch.setattr(pipeline, "threads_for", lambda *size: calls.append(size) or 1)
     with pytest.raises(DataError, match="no relative pose was found for any two of the 2 panoramas"):
         prepare(noise(tmp_path / "in"), tmp_path / "out")
     assert not (tmp_path / "out").exists()
-    assert asked == [(128, 64)]
+    assert calls == [(128, 64)]
 
 
 def test_a_result_inside_its_source_is_not_read_as_input(scene, tmp_path):
-    """Of panoramas in a format that pycolmap does not read."""
+    """Use panoramas in a format that pycolmap cannot read."""
     for index in range(3):
         Image.open(scene[1] / f"pano 00{index}.png").save(tmp_path / f"{index}.webp", lossless=True)
     result = prepare(tmp_path, tmp_path / "flat", PrepareOptions(threads=1))

@@ -1,4 +1,4 @@
-"""The perspective views of a panorama: geometry that can be predicted, pixels that can be computed."""
+"""Rigs of perspective views: rotations, ownership of directions, pixels and files."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def test_every_direction_belongs_to_one_view():
 
 
 def test_rig_views_resample_the_panorama():
-    """The panorama's colour is a smooth function of direction; so must be the view's, seam and poles included."""
+    """Compare with a smooth function of the direction, seam and poles included."""
 
     def color(directions):
         unit = directions / directions.norm(dim=-1, keepdim=True)
@@ -62,15 +62,15 @@ def test_files_and_masks_of_views(tmp_path):
     mask[:16] = 0  # only what is below the horizon
     Image.fromarray(image).save(tmp_path / "a.png")
     Image.fromarray(mask).save(tmp_path / "mask.png")
-    told = []
+    calls = []
     rig.render_views(
         {"a.png": tmp_path / "a.png"},
         {"a.png": tmp_path / "mask.png"},
         tmp_path / "views",
         tmp_path / "masks",
-        lambda *step: told.append(step),
+        lambda *step: calls.append(step),
     )
-    assert told == [(1, 1)]
+    assert calls == [(1, 1)]
     used = {}
     for index in range(12):
         name = rig.view_name(index, "a.png")

@@ -140,10 +140,10 @@ def test_the_sharpest_frame_of_each_interval_is_kept(tmp_path):
     pattern = np.kron(np.indices((16, 32)).sum(0) % 2, np.ones((4, 4)))[..., None] * np.ones(3)
     contrasts = [100 if index in (3, 16) else 20 for index in range(20)]  # two seconds; brightness tells frames apart
     frames = [(40 + 5 * index + contrast * pattern).clip(0, 255) for index, contrast in enumerate(contrasts)]
-    path, told = tmp_path / "a b.mp4", []
+    path, calls = tmp_path / "a b.mp4", []
     write(path, [pixels.astype(np.uint8) for pixels in frames])
-    assert extract_frames(path, tmp_path, 1.0, lambda *step: told.append(step)) == 2
-    assert told[-1][0] == 20
+    assert extract_frames(path, tmp_path, 1.0, lambda *step: calls.append(step)) == 2
+    assert calls[-1][0] == 20
     for name, index in (("frame_00001.jpg", 3), ("frame_00002.jpg", 16)):
         darkest = np.asarray(Image.open(tmp_path / name)).min()
         assert abs(int(darkest) - (40 + 5 * index)) < 12
@@ -151,10 +151,10 @@ def test_the_sharpest_frame_of_each_interval_is_kept(tmp_path):
 
 def test_other_aspect_ratios_are_refused_at_the_first_frame(tmp_path):
     write(tmp_path / "a.mp4", 3 * [np.zeros((72, 128, 3), np.uint8)])
-    told = []
+    calls = []
     with pytest.raises(DataError, match=r"a.mp4 is 128x72, which is not 2:1; an equirectangular panorama covers 360"):
-        extract_frames(tmp_path / "a.mp4", tmp_path, 2.0, lambda *step: told.append(step))
-    assert told == []
+        extract_frames(tmp_path / "a.mp4", tmp_path, 2.0, lambda *step: calls.append(step))
+    assert calls == []
 
 
 def test_not_a_video(tmp_path):

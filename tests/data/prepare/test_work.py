@@ -33,7 +33,6 @@ def test_free_memory_without_proc(monkeypatch):
 
 
 def test_files_are_copied_on_file_systems_without_links(tmp_path, monkeypatch):
-    """By what such disks answer: EPERM."""
     original = tmp_path / "original.png"
     original.write_bytes(b"a picture")
     link, hard, copy = (tmp_path / name for name in ("link", "hard", "copy"))

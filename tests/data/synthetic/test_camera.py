@@ -1,4 +1,4 @@
-"""Panoramas of a small world whose picture can be predicted, and of the room."""
+"""Ray casting of a small analytic world, and of the room."""
 
 import numpy as np
 import pytest
@@ -49,11 +49,11 @@ def test_rays_without_a_hit_see_the_sky():
 def test_rotating_by_whole_pixels_shifts_the_image(room, shift):
     """Longitude grows to the right, headings to the left: turning left by one pixel moves the image right by one."""
     pose, width = room.poses[2], 256
-    turn = 2 * np.pi * shift / width
-    c, s = np.cos(turn), np.sin(turn)
+    rotation = 2 * np.pi * shift / width
+    c, s = np.cos(rotation), np.sin(rotation)
     about_down = np.array(((c, 0, s, 0), (0, 1, 0, 0), (-s, 0, c, 0), (0, 0, 0, 1)))
-    straight, turned = (camera.draw(room.world, p, width, 4).astype(int) for p in (pose, about_down @ pose))
-    difference = np.abs(np.roll(straight, shift, axis=1) - turned).max(-1)
+    straight, rotated = (camera.draw(room.world, p, width, 4).astype(int) for p in (pose, about_down @ pose))
+    difference = np.abs(np.roll(straight, shift, axis=1) - rotated).max(-1)
     # Rounding moves a ray across the edge of a texture now and then.
     assert (difference > 1).mean() < 0.003
 

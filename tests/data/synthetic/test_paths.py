@@ -1,4 +1,4 @@
-"""Camera paths: equal steps, rigid upright poses, a split that is spread."""
+"""Synthetic camera paths: equal steps, rigid poses, evenly spread test views."""
 
 import numpy as np
 import pytest

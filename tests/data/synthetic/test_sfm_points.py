@@ -1,4 +1,4 @@
-"""The point cloud: on surfaces, seen twice, as noisy and as wrong as asked."""
+"""Synthetic point clouds: on surfaces seen twice, with noise and outliers."""
 
 import numpy as np
 import pytest
@@ -7,8 +7,8 @@ from padgs.data.synthetic import SyntheticOptions, SyntheticTruth, camera
 from padgs.data.synthetic.points import sample_points
 
 
-def cloud(**knobs):
-    options = SyntheticOptions(**({"width": 64, "train_views": 6, "test_views": 0, "points": 3000} | knobs))
+def cloud(**settings):
+    options = SyntheticOptions(**({"width": 64, "train_views": 6, "test_views": 0, "points": 3000} | settings))
     truth = SyntheticTruth(options)
     images = [camera.draw(truth.world, pose, 64, 4) for pose in truth.poses]
     return truth, images, *sample_points(truth.world, truth.poses, images, options, truth.random("points"))

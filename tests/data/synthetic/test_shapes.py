@@ -91,7 +91,7 @@ def test_bounding_spheres_contain_the_shape(name):
 
 
 def test_single_precision_is_preserved_and_accurate():
-    """A float64 that slips in doubles the time of drawing; a thin far rod is where float32 could fail."""
+    """Check dtypes, because float64 doubles the time, and accuracy on a thin distant rod."""
     thin = Rod((-5, 8, 1), (5, 8, 1), 0.006, SKIN)
     center = np.linspace(0.9, 1.1, 4001)
     rays = np.stack((0 * center, 0 * center + 8, center)) / np.hypot(8, center)
@@ -117,7 +117,7 @@ def test_point_at_inverts_the_texture_coordinates(face):
 
 
 def test_textures_are_not_mirrored():
-    """Seen from the middle of a room, or from outside a box, u grows to the right and v upwards."""
+    """Check that u increases to the right and v upwards, inside a room and outside a box."""
     room, box = Room((-1, -1, -1), (1, 1, 1), SKIN), Box((0, 0, 0), (1, 1, 1), SKIN)
     for forward in ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)):
         right = np.cross(forward, (0, 0, 1))
@@ -144,7 +144,7 @@ def test_unoccluded_light_maps_equal_the_lamp():
 
 
 def test_shadows_have_the_right_size_and_soft_edges():
-    """A 1 m plate at half the lamp's height throws a 2 m shadow."""
+    """Check that a 1 m plate at half the lamp's height casts a 2 m shadow."""
     plate = Box((0, 0, 1.0), (0.5, 0.5, 0.01), SKIN)
     ground = World((Ground(SKIN), plate), LIGHT).light_maps[0, 0]
     across = np.stack((np.linspace(0, 3, 61), np.zeros(61))).astype(np.float32)

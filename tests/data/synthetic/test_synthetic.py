@@ -1,4 +1,4 @@
-"""Whole scenes: deterministic, cached, each with the property that it is there for."""
+"""Built-in scenes: determinism, cache, and the property of each scene."""
 
 import os
 
@@ -94,7 +94,7 @@ def test_load_uses_the_data_options():
 
 
 @pytest.mark.parametrize(
-    ("knobs", "message"),
+    ("settings", "message"),
     [
         ({"width": 15}, "even number"),
         ({"samples": 5}, "square number"),
@@ -108,13 +108,13 @@ def test_load_uses_the_data_options():
         ({"objects": 2000}, "no free position"),
     ],
 )
-def test_invalid_options_are_refused(knobs, message):
+def test_invalid_options_are_refused(settings, message):
     with pytest.raises(DataError, match=message):
-        SyntheticTruth(SyntheticOptions(**knobs))
+        SyntheticTruth(SyntheticOptions(**settings))
 
 
-def depths(name, width=128, **knobs):
-    truth = SyntheticTruth(SyntheticOptions(scene=name, **knobs))
+def depths(name, width=128, **settings):
+    truth = SyntheticTruth(SyntheticOptions(scene=name, **settings))
     return truth, [camera.trace(truth.world, pose, width) for pose in truth.poses]
 
 
@@ -137,8 +137,8 @@ def test_mountains_are_at_the_given_distance(horizon):
 
 @pytest.mark.parametrize(("scene", "rooms"), [("two_rooms", 2), ("room_chain", 2), ("room_chain", 5)])
 def test_rooms_occlude_each_other(scene, rooms):
-    asked = {"rooms": rooms} if scene == "room_chain" else {}
-    truth, _ = depths(scene, 16, train_views=8 * rooms, test_views=0, **asked)
+    settings = {"rooms": rooms} if scene == "room_chain" else {}
+    truth, _ = depths(scene, 16, train_views=8 * rooms, test_views=0, **settings)
     rng = np.random.default_rng(0)
     middles = 5.0 * (np.arange(rooms) - (rooms - 1) / 2)
     cameras = np.stack([camera.center(pose) for pose in truth.poses])
@@ -205,7 +205,7 @@ def test_near_clutter_is_in_a_layer_of_25_cm_beside_the_path(layer):
 
 @pytest.mark.parametrize(("name", "changes"), [("glossy", True), ("room", False)])
 def test_only_glossy_surfaces_depend_on_the_view(name, changes):
-    """The same point of the floor from two cameras."""
+    """Compare points of the floor from two cameras."""
     truth = SyntheticTruth(SyntheticOptions(scene=name))
     rng = np.random.default_rng(3)
     points = np.stack((rng.uniform(-1.2, 1.2, 400), rng.uniform(-1.2, 1.2, 400), np.zeros(400)))

@@ -1,4 +1,4 @@
-"""Textures: in range, single precision, periodic where they say so, finer when asked."""
+"""Textures: range, precision, periodicity and frequency."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ TEXTURES = {
     "books": tx.books((A, B, C), C),
     "siemens_star": tx.siemens_star(A, B, 16, 1.0),
     "medallion": tx.medallion(A, B, C, 1.5, 8),
-    "picture": tx.picture(A, B, C, 0.8),
+    "poster": tx.poster(A, B, C, 0.8),
     "window": tx.window(A, B),
     "sectors": tx.sectors((A, B), 8, 0.5),
     "framed": tx.framed(tx.plain(A), [(0.2, 0.1, 0.6, 0.8, tx.plain(B))]),

@@ -23,12 +23,12 @@ def test_world_scale_and_rotation_change_no_pixel():
     plain = SyntheticOptions(**SMALL)
     moved = SyntheticOptions(**SMALL, world_scale=100.0, world_rotation=(20.0, -35.0, 50.0))
     scene, other = generate(plain), generate(moved)
-    truth, turned = SyntheticTruth(plain), SyntheticTruth(moved)
+    truth, rotated = SyntheticTruth(plain), SyntheticTruth(moved)
     pairs = zip((*scene.train, *scene.test), (*other.train, *other.test), strict=True)
     for view, far in pairs:
         assert torch.equal(view.image(), far.image())
         torch.testing.assert_close(far.center.norm(), 100 * view.center.norm())
-        torch.testing.assert_close(turned.depth(far), 100 * truth.depth(view), rtol=1e-9, atol=0)
+        torch.testing.assert_close(rotated.depth(far), 100 * truth.depth(view), rtol=1e-9, atol=0)
         rotation = far.cam_from_world[:3, :3]
         torch.testing.assert_close(rotation @ rotation.T, torch.eye(3, dtype=torch.float64))
     # Points in camera frames: 100 times as far in the same direction.
@@ -139,7 +139,7 @@ def test_lenses_affect_training_views_only():
         assert (a.image() - b.image()).abs().mean() > 0.005
 
 
-@pytest.mark.parametrize("knobs", [{"lens_gap": -0.1}, {"lens_blend": 90.0}, {"lens_k1": 0.5}])
-def test_invalid_lenses_are_refused(knobs):
-    with pytest.raises(DataError, match=next(iter(knobs))):
-        SyntheticOptions(**SMALL, **knobs)
+@pytest.mark.parametrize("settings", [{"lens_gap": -0.1}, {"lens_blend": 90.0}, {"lens_k1": 0.5}])
+def test_invalid_lenses_are_refused(settings):
+    with pytest.raises(DataError, match=next(iter(settings))):
+        SyntheticOptions(**SMALL, **settings)
