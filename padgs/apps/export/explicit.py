@@ -61,18 +61,18 @@ def export_run(
         ValueError: the run has no Gaussians.
         DataError: the data set is missing, and needed for more than Gaussians as trained.
     """
-    trainee = run.method.model
+    model = run.method.model
     config = run.config.render
     notes = [f"padgs {padgs.__version__}, run {run.folder.name}"]
-    if isinstance(trainee, SplatModel):
-        splats = trainee.baked()
+    if isinstance(model, SplatModel):
+        splats = model.baked()
         if isinstance(run.method, SCOmniGSMethod):  # trained in the world of its refined poses
             splats = transform_splats(splats, aligned(run.method.model.calibration.poses)[0].inverse())
         notes.append("Gaussians as trained")
         if smooth and config.low_pass > 0 and config.resolved_low_pass_kind == "solid":
             splats = smoothed(splats, cameras_of(run.scene.train), config.low_pass)
             notes[-1] = "Gaussians as trained, including the 3D smoothing filter"
-    elif isinstance(trainee, AnchorModel):
+    elif isinstance(model, AnchorModel):
         splats, loss = _bake_and_distill(run, distillation_steps, progress)
         notes.append(loss)
     else:
@@ -111,7 +111,7 @@ def _bake_and_distill(run: LoadedRun, steps: int, progress: Callable[[int], None
     scene, config, method = run.scene, run.config.render, run.method
     options = config.options(scene.scale)
     views = sample_cameras(scene.train)
-    splats = bake(method.model.model, views, options, config.backend, scene.scale)
+    splats = bake(method.model.anchors, views, options, config.backend, scene.scale)
     if steps:
         distill(splats, method.render, replace(scene, train=tuple(views)), config, steps, progress)
 

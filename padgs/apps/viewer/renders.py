@@ -141,10 +141,10 @@ class RunRenderer:
 
 def crop_model(method: Method, crop: Box) -> Method:
     """Remove all Gaussians or anchors outside a box, in place; the method can then only render."""
-    trainee = method.model
-    positions = trainee.anchors.positions if isinstance(trainee, AnchorModel) else trainee.splats.means
+    model = method.model
+    positions = model.anchors.positions if isinstance(model, AnchorModel) else model.splats.means
     low, high = (positions.new_tensor(corner) for corner in crop)
-    trainee.keep(((positions >= low) & (positions <= high)).all(-1))
+    model.keep(((positions >= low) & (positions <= high)).all(-1))
     return method
 
 

@@ -33,7 +33,7 @@ def decibels(method: PaDGSMethod, splats: Splats) -> float:
 def test_baked_anchors_resemble_the_method(trained):
     scene = tiny_scene()
     options = trained.render_config.options(scene.scale)
-    splats = bake(trained.model.model, sample_cameras(scene.train, 16), options, "auto", scene.scale)
+    splats = bake(trained.model.anchors, sample_cameras(scene.train, 16), options, "auto", scene.scale)
     assert decibels(trained, splats) > 35
     assert 0 < len(splats) < trained.size().counts["gaussians"], "what never shows is dropped"
 
@@ -41,7 +41,7 @@ def test_baked_anchors_resemble_the_method(trained):
 def test_distillation_reduces_the_error(trained):
     scene = tiny_scene()
     options = trained.render_config.options(scene.scale)
-    splats = bake(trained.model.model, scene.train, options, "auto", scene.scale)
+    splats = bake(trained.model.anchors, scene.train, options, "auto", scene.scale)
     splats.sh_dc.data += 0.5
     first, done = decibels(trained, splats), []
     distill(splats, trained.render, scene, trained.render_config, 60, done.append)
@@ -51,7 +51,7 @@ def test_distillation_reduces_the_error(trained):
 def test_distillation_works_with_one_camera_centre(trained):
     scene = tiny_scene()
     options = trained.render_config.options(scene.scale)
-    splats = bake(trained.model.model, scene.train, options, "auto", scene.scale)
+    splats = bake(trained.model.anchors, scene.train, options, "auto", scene.scale)
     before = splats.means.clone()
     alone = replace(scene, train=tuple(view.at(scene.train[0].cam_from_world) for view in scene.train))
     distill(splats, trained.render, alone, trained.render_config, 5)
