@@ -101,6 +101,5 @@ class Cubemap3DGSMethod(SplatMethod):
 
     def build_trainer(self, model: Model, scene: Scene, budget: Budget, stage: Stage) -> Trainer:
         """See `Method.build_trainer`."""
-        return Trainer(
-            trainee, scene, budget, self.train_options, self.seed, views_each=self._views_per_step, stage=stage
-        )
+        each = self._views_per_step
+        return Trainer(model, scene, budget, self.train_options, self.seed, views_each=each, stage=stage)

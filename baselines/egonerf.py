@@ -67,9 +67,9 @@ class EgoNeRFMethod(Method):
         model = model.to(next(iter(stored.tensors.values())).device)
         return EgoNeRFModel(model, self.options, self.options.environment_pretraining + 1)
 
-    def build_trainer(self, trainee: EgoNeRFModel, scene: Scene, budget: Budget, stage: Stage) -> RayTrainer:
+    def build_trainer(self, model: EgoNeRFModel, scene: Scene, budget: Budget, stage: Stage) -> RayTrainer:
         """See `Method.build_trainer`."""
-        return RayTrainer(trainee, scene, budget, self.train_options, self.seed, rays=self.options.rays, stage=stage)
+        return RayTrainer(model, scene, budget, self.train_options, self.seed, rays=self.options.rays, stage=stage)
 
     def _refuse_impossible(self) -> None:
         """Also refuse options that do not apply to this method."""

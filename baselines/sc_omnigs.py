@@ -123,7 +123,7 @@ class SCOmniGSMethod(CalibratedMethod):
         Raises:
             ValueError: a view of another size than the training views.
         """
-        trainee, calibration = self.model, self.model.calibration
+        model, calibration = self.model, self.model.calibration
         poses, camera = calibration.poses, calibration.camera
         if (view.width, view.height) != (camera.width, camera.height):
             raise ValueError(
@@ -134,7 +134,7 @@ class SCOmniGSMethod(CalibratedMethod):
         if self._render_cache is None or self._render_cache[0] != iteration:
             self._render_cache = iteration, aligned(poses)[0], camera.ideal_pixels()
         _, similarity, pixels = self._render_cache
-        ideal = trainee.render(replace(view, cam_from_world=mapped_pose(view.cam_from_world, similarity)))
+        ideal = model.render(replace(view, cam_from_world=mapped_pose(view.cam_from_world, similarity)))
         layers = torch.cat((ideal.image, ideal.transmittance[..., None], ideal.depth[..., None]), dim=-1)
         image, transmittance, depth = sample_pixels(layers, pixels).split((3, 1, 1), dim=-1)
         return replace(ideal, image=image, transmittance=transmittance[..., 0], depth=depth[..., 0])

@@ -33,7 +33,7 @@ class MyMethod(SplatMethod):
 
     def build_model(self, scene: Scene, iterations: int) -> SplatModel:
         """See `Method.build_model`."""
-        trainee = super().build_model(scene, iterations)
+        model = super().build_model(scene, iterations)
         with torch.no_grad():
-            trainee.splats.log_scales -= math.log(self.options.thinner)
-        return trainee
+            model.splats.log_scales -= math.log(self.options.thinner)
+        return model

@@ -57,7 +57,7 @@ def test_crops_cover_the_sphere_with_equal_solid_angles():
         12 * crop / (4 * math.pi), rel=0.01
     )
     assert times_seen(Crops3DGSMethod(Crops3DGSOptions(field_of_view=MIN_FIELD_OF_VIEW))).min() == 1
-    with pytest.raises(ValueError, match="field_of_view is 70; below 74.75 degrees the crops do not cover the sphere"):
+    with pytest.raises(ValueError, match="field_of_view is 70; it must be less than 180, and at least 74.75 degrees"):
         Crops3DGSOptions(field_of_view=70)
 
 

@@ -131,7 +131,7 @@ class RayTrainer(Trainer):
 
     def __init__(
         self,
-        trainee: EgoNeRFModel,
+        model: EgoNeRFModel,
         scene: Scene,
         budget: Budget,
         options: TrainOptions,
@@ -143,7 +143,7 @@ class RayTrainer(Trainer):
         """Load all pixels.
 
         Args:
-            trainee, scene, budget, stage: as for `Trainer`.
+            model, scene, budget, stage: as for `Trainer`.
             options: weight of pixels and interval of checks.
             seed: of rays and jitter.
             rays: per iteration.
@@ -152,8 +152,8 @@ class RayTrainer(Trainer):
             ValueError: the pixels of a view cannot be used.
         """
         # The model has only those members of `Model` that do not depend on views.
-        super().__init__(cast(Model, trainee), scene, budget, options, seed, stage=stage)
-        self._model, self._rays = trainee, rays
+        super().__init__(cast(Model, model), scene, budget, options, seed, stage=stage)
+        self._model, self._rays = model, rays
         lap = Lap()
         self._pixels = RayPixels(scene.train, options.weight, self._optimizer.device, seed)
         self._order = self._pixels

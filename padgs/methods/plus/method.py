@@ -191,10 +191,10 @@ class PlusMethod(SplatMethod):
         generator.set_state(self._filled[3])
         return self._filled[2], generator
 
-    def build_trainer(self, trainee: Model, scene: Scene, budget: Budget, stage: Stage) -> Trainer:
+    def build_trainer(self, model: Model, scene: Scene, budget: Budget, stage: Stage) -> Trainer:
         """See `Method.build_trainer`."""
         share = self.options.coarse_share
-        return Trainer(trainee, scene, budget, self.train_options, self.seed, coarse_share=share, stage=stage)
+        return Trainer(model, scene, budget, self.train_options, self.seed, coarse_share=share, stage=stage)
 
 
 def _count(share: float | None, pixels: float) -> int | None:
