@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 import padgs
 from padgs.apps.export.explicit import export_run, harmonics_rotation, transform_splats, upright_rotation
 from padgs.apps.export.splat_file import read_splats
-from padgs.baselines.sc_omnigs import aligned, carried
+from padgs.baselines.sc_omnigs import aligned, mapped_pose
 from padgs.cli.commands import app
 from padgs.data.cloud import read_ply
 from padgs.evaluation.evaluate import evaluate
@@ -80,9 +80,9 @@ def test_refined_poses_are_aligned_with_the_scene(tmp_path_factory):
         for correction in poses.parameters():
             correction += 0.02 * torch.randn(correction.shape, generator=torch.Generator().manual_seed(1))
     splats, view = export_run(run).splats, run.scene.test[0]
-    carried_view = view.at(carried(view.cam_from_world, aligned(poses)[0]))
+    mapped_view = view.at(mapped_pose(view.cam_from_world, aligned(poses)[0]))
     options = run.config.render.options(run.scene.scale)
-    own = run.method.model.render(carried_view).image
+    own = run.method.model.render(mapped_view).image
     assert torch.allclose(render(splats.gaussians(view), view, options).image, own, atol=0.02)
     assert (run.method.model.render(view).image - own).abs().max() > 0.05, "it is another world"
 
