@@ -1,4 +1,4 @@
-"""A set of 3D Gaussians, the only thing that a renderer knows of a model."""
+"""A set of 3D Gaussians: the interface between models and renderers."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from torch import Tensor
 class Gaussians:
     """N Gaussians in the world frame with covariance R diag(scales)^2 R^T (Eq. 2).
 
-    Quaternions are (w, x, y, z); they need not be normalised, the renderer does it. Scales are standard deviations
-    (not logarithms) in world units. Colours are RGB as stored in the images, not clamped.
+    Quaternions are (w, x, y, z); the renderer normalises them. Scales are standard deviations
+    (not logarithms) in world units. Colours are RGB in the color space of the images, not clamped.
     """
 
     means: Tensor  # [N, 3] world
@@ -23,20 +23,20 @@ class Gaussians:
     colors: Tensor  # [N, 3]
 
     def __len__(self) -> int:
-        """Number of Gaussians."""
+        """Return the number of Gaussians."""
         return self.means.shape[0]
 
     def first(self, count: int) -> Gaussians:
-        """The first so many, in the same memory."""
+        """Return the first `count` Gaussians, without a copy."""
         return replace(self, **{f.name: getattr(self, f.name)[:count] for f in fields(self)})
 
     def to(self, *args, **kwargs) -> Gaussians:
-        """The same Gaussians on another device or in another dtype (arguments of `Tensor.to`)."""
+        """Return the Gaussians on another device or in another dtype (arguments of `Tensor.to`)."""
         return replace(self, **{f.name: getattr(self, f.name).to(*args, **kwargs) for f in fields(self)})
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
-    """Rotation matrices [..., 3, 3] of quaternions (w, x, y, z) [..., 4], normalised first.
+    """Return rotation matrices [..., 3, 3] of quaternions (w, x, y, z) [..., 4], normalised first.
 
     >>> rotation_matrices(torch.tensor([2.0, 0.0, 0.0, 0.0]))
     tensor([[1., 0., 0.],

@@ -165,7 +165,7 @@ def _load(net: str, device: torch.device) -> LPIPS | str:
 
 
 def _distance(a: Tensor, b: Tensor, linear: Tensor) -> Tensor:
-    """Return the sum over channels of linear x (a / |a| - b / |b|)^2, [1, 1, h, w]; features are [1, C, h, w], linear [C]."""
+    """Return the sum over channels of linear [C] x (a / |a| - b / |b|)^2 for features [1, C, h, w], [1, 1, h, w]."""
     difference = _unit(a) - _unit(b)
     return functional.conv2d(difference * difference, linear.to(a.dtype)[None, :, None, None])
 

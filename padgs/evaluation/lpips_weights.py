@@ -146,7 +146,7 @@ class _ArrayUnpickler(pickle.Unpickler):
     """Unpickler of NumPy arrays and plain containers; anything else in a file raises an error."""
 
     def find_class(self, module: str, name: str) -> Any:
-        """Return one of the three names that a pickled array needs; the last one is taken from an array (NumPy moved it)."""
+        """Return one of the three names that a pickled array needs (NumPy moved the last one)."""
         allowed = {
             ("numpy", "dtype"): np.dtype,
             ("numpy", "ndarray"): np.ndarray,

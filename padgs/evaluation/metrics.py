@@ -139,7 +139,7 @@ def band_rows(height: int, band: str, *, device: torch.device | str = "cpu") -> 
 
 
 def weighted_mean(values: Tensor, weight: Tensor) -> Tensor:
-    """Return the mean of values [H, W, C] over channels and, weighted by [H, W], pixels; NaN if the weights sum to 0."""
+    """Return the mean of values [H, W, C] over channels and, by weight [H, W], pixels; NaN if weights sum to 0."""
     return (values.mean(-1) * weight).sum() / weight.sum()
 
 

@@ -1,1 +1,1 @@
-"""The geometry of panoramas: directions, angles, pixels, cameras, the distortion map, and functions on the sphere."""
+"""Geometry of panoramas: directions, angles, pixels, cameras, distortion map, functions on the sphere."""

@@ -1,7 +1,7 @@
-"""Cameras: which direction each pixel looks. Camera frame x right, y down, z forward; pixel centres at half integers.
+"""Cameras: the direction of each pixel. Camera frame x right, y down, z forward; pixel centres at half integers.
 
-A panorama is a formula, a pinhole is a formula, and everything else (fisheye, cylinder, calibrated lens) is a table of
-rays. Cameras are values: two of the same numbers are the same camera.
+Panorama and pinhole are formulas; any other camera (fisheye, cylinder, calibrated lens) is a table of rays. Panoramas
+and pinholes are equal if their numbers are.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ class Panorama:
     height: int
 
     def rays(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
-        """Unit directions [H, W, 3] through the pixel centres."""
+        """Return unit directions [H, W, 3] through the pixel centres."""
         return rays(self.width, self.height, dtype=dtype, device=device)
 
     @property
     def focal(self) -> float:
-        """Pixels per radian on the horizon, W / 2 pi."""
+        """Return the pixels per radian on the horizon, W / 2 pi."""
         return self.width / (2 * torch.pi)
 
 
 @dataclass(frozen=True)
 class Pinhole:
-    """An ordinary perspective camera: u = fx x / z + cx, v = fy y / z + cy."""
+    """A perspective camera: u = fx x / z + cx, v = fy y / z + cy."""
 
     width: int
     height: int
@@ -44,7 +44,7 @@ class Pinhole:
     cy: float
 
     def rays(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
-        """Unit directions [H, W, 3] through the pixel centres."""
+        """Return unit directions [H, W, 3] through the pixel centres."""
         x = (torch.arange(self.width, dtype=dtype, device=device) + 0.5 - self.cx) / self.fx
         y = (torch.arange(self.height, dtype=dtype, device=device) + 0.5 - self.cy) / self.fy
         grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
@@ -52,41 +52,44 @@ class Pinhole:
 
     @property
     def focal(self) -> float:
-        """Pixels per radian at the principal point, the geometric mean of both focal lengths."""
+        """Return the pixels per radian at the principal point, the geometric mean of both focal lengths."""
         return (self.fx * self.fy) ** 0.5
 
 
 def perspective(width: int, height: int, fov: float) -> Pinhole:
-    """A pinhole that shows `fov` degrees across the width, with square pixels and its axis in the middle.
+    """Return a pinhole with a horizontal field of view of `fov` degrees, square pixels and a central axis.
 
     Raises:
-        ValueError: a side without a pixel, or a field of view that is not between 0 and 180 degrees.
+        ValueError: the size or the field of view is out of range.
     """
     if width < 1 or height < 1 or not 0 < fov < 180:
-        raise ValueError(f"no perspective picture has {width}x{height} pixels across {fov:g} degrees (0 to 180)")
+        raise ValueError(
+            f"no perspective image has {width}x{height} pixels and a field of view of {fov:g} degrees; sizes must be at "
+            "least 1, and the field of view between 0 and 180"
+        )
     focal = width / 2 / math.tan(math.radians(fov) / 2)
     return Pinhole(width, height, focal, focal, width / 2, height / 2)
 
 
 @dataclass(frozen=True, eq=False)
 class RayTable:
-    """Any central camera: one unit direction per pixel. Gradients flow to the table where the projection allows it."""
+    """Any central camera: one unit direction per pixel. Gradients flow to the table if the projection allows it."""
 
     table: Tensor  # [H, W, 3] unit, camera frame
-    focal: float  # pixels per radian, which sets the size of low-pass filters given in pixels
+    focal: float  # pixels per radian, for low-pass filters given in pixels
 
     @property
     def width(self) -> int:
-        """Pixels in a row."""
+        """Return the number of columns."""
         return self.table.shape[1]
 
     @property
     def height(self) -> int:
-        """Pixels in a column."""
+        """Return the number of rows."""
         return self.table.shape[0]
 
     def rays(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
-        """The table [H, W, 3]."""
+        """Return the table [H, W, 3]."""
         return self.table.to(device=device, dtype=dtype)
 
 

@@ -1,8 +1,8 @@
-"""The distortion degree Omega, what it does to opacities, and the solid-angle weight M. Paper Eq. 8-12, 15 and 17.
+"""Distortion degree Omega, opacity modulation, and solid-angle weight M. Paper Eq. 8-12, 15 and 17.
 
 An ERP pixel at latitude t covers a solid angle proportional to cos(t): the image stretches the sphere by 1 / cos(t)
 (Eq. 11). The paper turns this into a distortion degree, Omega = 1 - cos^2(t) = sin^2(t) in [0, 1]: 0 on the horizon,
-1 at the poles. Latitude is that of the *camera* frame, unless another axis is asked for.
+1 at the poles. Latitude is measured in the *camera* frame unless another axis is given.
 """
 
 from __future__ import annotations
@@ -18,24 +18,27 @@ OMEGA_AXES = ("camera_y", "world_z")
 
 
 def polar_axis(name: str, cam_from_world: Tensor) -> Tensor:
-    """The axis [3], in the world frame, about which latitude is measured.
+    """Return the polar axis [3] of latitudes, in the world frame.
 
     Args:
-        name: camera_y, the panorama's own polar axis, as the paper defines it; world_z, as the released code does,
-            which agrees only where the world's z axis is vertical and the camera is level.
+        name: camera_y, the polar axis of the panorama, as in the paper; world_z, as in the released code, which
+            agrees only if the z axis of the world is vertical and the camera is level.
         cam_from_world: [4, 4].
+
+    Raises:
+        ValueError: unknown name.
     """
     if name == "camera_y":
         return cam_from_world[1, :3]
     if name == "world_z":
         axis = cam_from_world.new_zeros(3)
-        axis[2].fill_(1)  # nothing is sent to a GPU
+        axis[2].fill_(1)  # no transfer to a GPU
         return axis
     raise ValueError(f"unknown omega_axis {name!r}; known: {', '.join(OMEGA_AXES)}")
 
 
 def distortion(directions: Tensor, axis: Tensor) -> Tensor:
-    """Distortion degree sin^2(latitude) [...] of unit directions [..., 3] about a unit axis [3] (Eq. 12).
+    """Return the distortion degree sin^2(latitude) [...] of unit directions [..., 3] about a unit axis [3] (Eq. 12).
 
     >>> distortion(torch.tensor([[0.0, -1.0, 0.0], [0.6, 0.8, 0.0]]), torch.tensor([0.0, 1.0, 0.0]))
     tensor([1.0000, 0.6400])
@@ -47,20 +50,20 @@ def distortion(directions: Tensor, axis: Tensor) -> Tensor:
 def distortion_map(
     width: int, height: int, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
 ) -> Tensor:
-    """The distortion map: Omega [H, W] at the pixel centres of a panorama."""
+    """Return the distortion map, Omega [H, W] at the pixel centres of a panorama."""
     polar = polar_axis("camera_y", torch.eye(4, dtype=dtype, device=device))
     return distortion(rays(width, height, dtype=dtype, device=device), polar)
 
 
 def opacity_factor(omega: Tensor, tau: float, max_omega: float = 1.0) -> Tensor:
-    """What opacities are multiplied by at a distortion degree [N]: 1 - tau Omega (Eq. 15); 1 everywhere for tau 0.
+    """Return the factor of opacities at a distortion degree [N]: 1 - tau Omega (Eq. 15).
 
-    PaD-GS: tau 0.9 and no limit, of `PaDGSOptions`; decoded opacities are multiplied by it as they are drawn.
+    PaD-GS multiplies decoded opacities by it when rendering, with tau 0.9 (`PaDGSOptions`).
 
     Args:
         omega: [N] in [0, 1].
         tau: strength in [0, 1].
-        max_omega: Omega is limited to it; the released code uses 1 - 1e-4.
+        max_omega: upper limit of Omega; the released code uses 1 - 1e-4.
 
     >>> opacity_factor(torch.tensor([0.0, 1.0]), 0.9)
     tensor([1.0000, 0.1000])
@@ -71,7 +74,7 @@ def opacity_factor(omega: Tensor, tau: float, max_omega: float = 1.0) -> Tensor:
 def solid_angle_weight(
     height: int, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
 ) -> Tensor:
-    """The weight M = cos(latitude) of each image row, [H], at pixel centres (Eq. 17); positive everywhere.
+    """Return the weight M = cos(latitude) > 0 of each image row, [H], at pixel centres (Eq. 17).
 
     >>> solid_angle_weight(2)
     tensor([0.7071, 0.7071])
@@ -80,7 +83,7 @@ def solid_angle_weight(
 
 
 def end_row_weight(height: int, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
-    """The row weight [H] of the released code: cos(pi i / (H - 1) - pi / 2), which is 0 in the first and last row."""
+    """Return the row weight [H] of the released code: cos(pi i / (H - 1) - pi / 2), 0 in the first and last row."""
     rows = torch.arange(height, dtype=dtype, device=device)
     return torch.cos(math.pi * rows / (height - 1) - math.pi / 2)
 
@@ -88,7 +91,7 @@ def end_row_weight(height: int, *, dtype: torch.dtype = torch.float32, device: t
 def pixel_solid_angle(
     width: int, height: int, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
 ) -> Tensor:
-    """Exact solid angle in steradian of one pixel of each row, [H]; the whole image sums to 4 pi (Eq. 8-10).
+    """Return the exact solid angle in steradian of a pixel of each row, [H]; the image sums to 4 pi (Eq. 8-10).
 
     The integral of cos over a row is 2 sin(h / 2) cos(latitude) for row height h, so M is exactly proportional to it.
 

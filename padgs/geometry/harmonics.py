@@ -1,7 +1,7 @@
 """Real spherical harmonics up to degree 3, with the order and signs that 3D Gaussian files use.
 
-Per degree l the functions run over m = -l .. l; those of odd m carry a minus sign (Condon-Shortley). They are
-orthonormal on the unit sphere.
+Functions of degree l are ordered m = -l .. l; odd m have a minus sign (Condon-Shortley). They are orthonormal on the
+unit sphere.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ DC = math.sqrt(1 / (4 * math.pi))  # the constant function of degree 0
 
 
 def basis(directions: Tensor, degree: int) -> Tensor:
-    """Values [..., (degree + 1)^2] of all functions up to `degree` at unit directions [..., 3].
+    """Return the values [..., (degree + 1)^2] of all functions up to `degree` at unit directions [..., 3].
 
     Raises:
         ValueError: the degree is not 0, 1, 2 or 3.
@@ -25,7 +25,7 @@ def basis(directions: Tensor, degree: int) -> Tensor:
     [0.2821, -0.0, 0.4886, -0.0]
     """
     if not 0 <= degree <= MAX_DEGREE:
-        raise ValueError(f"degree is {degree}; spherical harmonics are known for degrees 0 to {MAX_DEGREE}")
+        raise ValueError(f"degree is {degree}; spherical harmonics must have degree 0 to {MAX_DEGREE}")
     x, y, z = directions.unbind(-1)
     xx, yy, zz = x * x, y * y, z * z
     values = [torch.full_like(x, DC)]
@@ -57,5 +57,5 @@ def basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def dc_from_colors(colors: Tensor) -> Tensor:
-    """Coefficient of degree 0 for RGB colours in [0, 1]; a zero coefficient is middle grey."""
+    """Return the coefficient of degree 0 for RGB colours in [0, 1]; a zero coefficient is middle grey."""
     return (colors - 0.5) / DC

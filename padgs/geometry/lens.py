@@ -1,7 +1,6 @@
-"""A fisheye lens that sees half a sphere: how it bends rays about its axis, and where it meets its twin.
+"""Dual-fisheye cameras: radial distortion of a half-sphere lens, and blending with the lens of the opposite axis.
 
-Directions are unit vectors in the camera frame (x right, y down, z forward), angles are radians. The lens of the other
-side is the same with the opposite axis.
+Directions are unit vectors in the camera frame (x right, y down, z forward), angles are radians.
 """
 
 from __future__ import annotations
@@ -15,10 +14,10 @@ AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}  # of 
 
 
 def axis_direction(name: str) -> Tensor:
-    """The axis [3] float64 of the first lens.
+    """Return the axis [3] float64 of the first lens.
 
     Raises:
-        ValueError: not one of `AXES`.
+        ValueError: the name is not in `AXES`.
     """
     if name not in AXES:
         raise ValueError(f"unknown lens axis {name!r}; known: {', '.join(AXES)}")
@@ -26,7 +25,7 @@ def axis_direction(name: str) -> Tensor:
 
 
 def radial_map(theta: Tensor, coefficients: Tensor) -> Tensor:
-    """theta' = theta (1 + k1 theta^2 + k2 theta^4 + ...): the angle from the axis that is seen where theta should be.
+    """Return theta' = theta (1 + k1 theta^2 + k2 theta^4 + ...), the observed angle from the axis for the angle theta.
 
     >>> round(radial_map(torch.tensor(0.5), torch.tensor([0.1])).item(), 6)
     0.5125
@@ -35,10 +34,10 @@ def radial_map(theta: Tensor, coefficients: Tensor) -> Tensor:
 
 
 def bend(directions: Tensor, axis: Tensor, coefficients: Tensor) -> Tensor:
-    """Directions [..., 3] turned away from the axis [3] by the radial map; as they are where all coefficients are 0.
+    """Turn directions [..., 3] away from the axis [3] by the radial map; the identity if all coefficients are 0.
 
-    d' = d cos(e) + t sin(e) with e = theta' - theta and t = (d cos(theta) - a) / sin(theta), the unit vector in which
-    theta grows. On the axis e / sin(theta) goes to 0.
+    d' = d cos(e) + t sin(e) with e = theta' - theta and t = (d cos(theta) - a) / sin(theta), the unit vector of growing
+    theta. On the axis e / sin(theta) goes to 0.
     """
     cosine = directions @ axis
     sine = torch.linalg.cross(directions, axis.expand_as(directions)).norm(dim=-1).clamp(min=1e-6)
@@ -48,10 +47,9 @@ def bend(directions: Tensor, axis: Tensor, coefficients: Tensor) -> Tensor:
 
 
 def hemisphere_weight(directions: Tensor, axis: Tensor, blend: float) -> Tensor:
-    """How much of each direction [..., 3] the lens along the axis [3] shows, in [0, 1]; its twin shows the rest.
+    """Return the weight in [0, 1] of the lens along the axis [3] for directions [..., 3]; the other lens has the rest.
 
-    A smooth step from 0 to 1 over the band of `blend` radians on both sides of the plane between the lenses; a hard one
-    for blend = 0.
+    A smooth step over the band of `blend` radians on both sides of the plane between the lenses; hard for blend = 0.
     """
     height = directions @ axis
     if blend == 0:
@@ -61,10 +59,10 @@ def hemisphere_weight(directions: Tensor, axis: Tensor, blend: float) -> Tensor:
 
 
 def check_blend(degrees: float) -> float:
-    """A half width of the band in radians.
+    """Return the half width of the blend band in radians.
 
     Raises:
-        ValueError: not in [0, 90) degrees.
+        ValueError: it is not in [0, 90) degrees.
     """
     if not 0 <= degrees < 90:
         raise ValueError(f"the blend band of the lenses is {degrees} degrees to each side; it must be in [0, 90)")

@@ -14,13 +14,13 @@ import math
 import torch
 from torch import Tensor
 
-CUBIC_REACH = 2  # pixels around a place that a bicubic sample leans on
+CUBIC_REACH = 2  # support of a bicubic sample in pixels
 
 
 def longitude_latitude(points: Tensor) -> tuple[Tensor, Tensor]:
-    """Longitude in (-pi, pi] and latitude in [-pi/2, pi/2] of camera-frame points (Eq. 6).
+    """Return longitude in (-pi, pi] and latitude in [-pi/2, pi/2] of camera-frame points (Eq. 6).
 
-    The latitude is atan2(y, rho), which keeps its digits near the poles where asin(y / r) loses them.
+    The latitude is atan2(y, rho), which is accurate near the poles, unlike asin(y / r).
 
     Args:
         points: [..., 3] camera frame, any length but zero.
@@ -37,7 +37,7 @@ def longitude_latitude(points: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def direction(longitude: Tensor, latitude: Tensor) -> Tensor:
-    """Unit direction [..., 3] in the camera frame at a longitude and latitude in radians (inverse of Eq. 6)."""
+    """Return the unit direction [..., 3] in the camera frame of a longitude and latitude in radians (inverse Eq. 6)."""
     cos_latitude = torch.cos(latitude)
     return torch.stack(
         (cos_latitude * torch.sin(longitude), torch.sin(latitude), cos_latitude * torch.cos(longitude)), dim=-1
@@ -45,18 +45,18 @@ def direction(longitude: Tensor, latitude: Tensor) -> Tensor:
 
 
 def pixel_from_angles(longitude: Tensor, latitude: Tensor, width: int, height: int) -> Tensor:
-    """Continuous pixel coordinates (u, v) [..., 2] of a longitude and latitude (Eq. 7)."""
+    """Return continuous pixel coordinates (u, v) [..., 2] of a longitude and latitude (Eq. 7)."""
     return torch.stack(((longitude / (2 * math.pi) + 0.5) * width, (latitude / math.pi + 0.5) * height), dim=-1)
 
 
 def angles_from_pixel(pixels: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """Longitude and latitude in radians of continuous pixel coordinates (u, v) [..., 2] (inverse of Eq. 7)."""
+    """Return longitude and latitude in radians of continuous pixel coordinates (u, v) [..., 2] (inverse of Eq. 7)."""
     u, v = pixels.unbind(-1)
     return (u / width - 0.5) * (2 * math.pi), (v / height - 0.5) * math.pi
 
 
 def project(points: Tensor, width: int, height: int) -> Tensor:
-    """Pixel (u, v) [..., 2] of camera-frame points [..., 3] (Eq. 6 and 7).
+    """Return the pixel (u, v) [..., 2] of camera-frame points [..., 3] (Eq. 6 and 7).
 
     >>> project(torch.tensor([0.0, 0.0, 2.0]), 8, 4)
     tensor([4., 2.])
@@ -65,12 +65,12 @@ def project(points: Tensor, width: int, height: int) -> Tensor:
 
 
 def unproject(pixels: Tensor, width: int, height: int) -> Tensor:
-    """Unit direction [..., 3] in the camera frame through continuous pixel coordinates (u, v) [..., 2]."""
+    """Return the unit direction [..., 3] in the camera frame through continuous pixel coordinates (u, v) [..., 2]."""
     return direction(*angles_from_pixel(pixels, width, height))
 
 
 def row_latitudes(height: int, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
-    """Latitude in radians at the centre of each image row, [H], from nearly -pi/2 (up) to nearly +pi/2 (down).
+    """Return the latitude in radians of each image row centre, [H], from nearly -pi/2 (up) to nearly +pi/2 (down).
 
     >>> row_latitudes(2) / math.pi
     tensor([-0.2500,  0.2500])
@@ -80,7 +80,7 @@ def row_latitudes(height: int, *, dtype: torch.dtype = torch.float32, device: to
 
 
 def rays(width: int, height: int, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
-    """Unit directions [H, W, 3] in the camera frame through all pixel centres."""
+    """Return unit directions [H, W, 3] in the camera frame through all pixel centres."""
     columns = torch.arange(width, dtype=dtype, device=device)
     longitude = ((columns + 0.5) / width - 0.5) * (2 * math.pi)
     latitude = row_latitudes(height, dtype=dtype, device=device)
@@ -88,7 +88,7 @@ def rays(width: int, height: int, *, dtype: torch.dtype = torch.float32, device:
 
 
 def projection_jacobian(points: Tensor, width: int, height: int, *, min_cos_latitude: float = 0.0) -> Tensor:
-    """Jacobian d(u, v) / d(x, y, z) of `project`, in pixels per unit length, [..., 2, 3].
+    """Return the Jacobian d(u, v) / d(x, y, z) of `project`, in pixels per unit length, [..., 2, 3].
 
     With r = |p|, rho^2 = x^2 + z^2, c = rho / r = cos(latitude):
     first row (W / 2 pi) east / (r c), second row (H / pi) down / r, where east = (z, 0, -x) / rho and
@@ -96,10 +96,10 @@ def projection_jacobian(points: Tensor, width: int, height: int, *, min_cos_lati
 
     Args:
         points: [..., 3] camera frame.
-        min_cos_latitude: lower limit of c in the first row; it is unbounded at the poles otherwise.
+        min_cos_latitude: lower limit of c in the first row, which is unbounded at the poles otherwise.
 
     Returns:
-        [..., 2, 3]. Exactly on the polar axis, where no direction is east, camera x is taken for east.
+        [..., 2, 3]. On the polar axis, where east is undefined, camera x is used as east.
     """
     x, y, z = points.unbind(-1)
     rho_squared = x * x + z * z
@@ -123,10 +123,10 @@ def projection_jacobian(points: Tensor, width: int, height: int, *, min_cos_lati
 
 
 def sample(image: Tensor, directions: Tensor) -> Tensor:
-    """Bilinear samples [..., C] of a panorama [H, W, C], across the seam and the poles, as `sample_pixels` takes them.
+    """Return bilinear samples [..., C] of a panorama [H, W, C] as in `sample_pixels`.
 
     Args:
-        image: any dtype, values as they are.
+        image: any dtype.
         directions: [..., 3] camera frame, any length but zero.
     """
     height, width = image.shape[:2]
@@ -134,13 +134,12 @@ def sample(image: Tensor, directions: Tensor) -> Tensor:
 
 
 def sample_sharply(image: Tensor, directions: Tensor) -> Tensor:
-    """Bicubic samples [..., C] of a panorama [H, W, C], across the seam and the poles; at pixel centres its own values.
+    """Return bicubic samples [..., C] of a panorama [H, W, C], continued across the seam and the poles.
 
-    The convolution of Keys (1981) with a = -1/2: exact for parabolas, where bilinear samples are for ramps, so that it
-    keeps what those blur. Beside sharp edges it overshoots the values of the image.
+    The convolution of Keys (1981) with a = -1/2, exact for parabolas and at pixel centres. It overshoots at edges.
 
     Args:
-        image: any dtype, values as they are.
+        image: any dtype.
         directions: [..., 3] camera frame, any length but zero.
     """
     height, width = image.shape[:2]
@@ -158,19 +157,19 @@ def sample_sharply(image: Tensor, directions: Tensor) -> Tensor:
 
 
 def _keys(t: Tensor) -> Tensor:
-    """Weights [..., 4] of the pixels -1, 0, 1 and 2 for places t in [0, 1) after pixel 0."""
+    """Return weights [..., 4] of the pixels -1, 0, 1 and 2 for positions t in [0, 1) after pixel 0."""
     return torch.stack(
         (((2 - t) * t - 1) * t, (3 * t - 5) * t * t + 2, ((4 - 3 * t) * t + 1) * t, (t - 1) * t * t), dim=-1
     ).div(2)
 
 
 def continued(image: Tensor, margin: int) -> Tensor:
-    """A panorama [H, W, ...] with so many pixels more on each side: what lies beyond its seam and its poles.
+    """Return a panorama [H, W, ...] continued by `margin` pixels on each side, across its seam and its poles.
 
-    Left and right it wraps. Beyond a pole it goes on down the opposite meridian: row -k is row k - 1 turned by W / 2.
+    Left and right it wraps. Beyond a pole it continues down the opposite meridian: row -k is row k - 1 rolled by W / 2.
 
     Raises:
-        ValueError: it has fewer rows than that, or an odd width, which has no opposite column.
+        ValueError: it has fewer rows than `margin`, or an odd width, which has no opposite column.
     """
     height, width = image.shape[:2]
     if height < margin or width % 2:
@@ -184,12 +183,12 @@ def continued(image: Tensor, margin: int) -> Tensor:
 
 
 def sample_pixels(image: Tensor, pixels: Tensor) -> Tensor:
-    """Bilinear samples [..., C] of a panorama [H, W, C] at pixel coordinates; at pixel centres its very values.
+    """Return bilinear samples [..., C] of a panorama [H, W, C] at pixel coordinates, across the seam and the poles.
 
-    Differentiable by both. Samples have the dtype of the image, float32 where it holds integers.
+    Differentiable by both. Samples have the dtype of the image, or float32 for integers.
 
     Args:
-        image: any dtype, values as they are.
+        image: any dtype.
         pixels: (u, v) [..., 2], continuous; u any number of turns around, v within the image.
     """
     height, width = image.shape[:2]
@@ -199,7 +198,7 @@ def sample_pixels(image: Tensor, pixels: Tensor) -> Tensor:
     across, down = (u - column)[..., None].to(image), (v - row)[..., None].to(image)
 
     def at(row: Tensor, column: Tensor) -> Tensor:
-        beyond = (row < 0) | (row >= height)  # a pole: the next row is the same one, half a turn further
+        beyond = (row < 0) | (row >= height)  # a pole: the next row is the same row, half a turn further
         column = torch.where(beyond, column + width // 2, column) % width
         return image[row.clamp(0, height - 1), column]
 

@@ -6,7 +6,7 @@ Backends are the entries of `BACKENDS`; each is a `padgs.render.contract.Backend
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cache
 from typing import Any
 
@@ -105,10 +105,6 @@ def make_request(
         background = means.new_zeros(3)
     request = Request(gaussians, cam_from_world, view.camera, options, background, mean_offsets, absgrad)
     check_inputs(request, check_values=check_values)
-    if options.pixel_bias:
-        bias = 2 * options.pixel_bias / means.new_tensor([view.camera.width, view.camera.height])
-        offsets = bias.expand(len(means), 2) if mean_offsets is None else mean_offsets + bias
-        request = replace(request, mean_offsets=offsets)
     return request
 
 

@@ -1,11 +1,11 @@
-"""The contract of every rasterizer backend: what goes in, what comes out, and what must hold.
+"""The contract of all rasterizer backends: input, output, and the definition of the image.
 
-The definition (all backends match it, values and gradients): each Gaussian that is not culled acts on a pixel through a
+All backends match the definition in values and gradients. Each Gaussian that is not culled acts on a pixel through a
 squared distance q >= 0 given by the projection; alpha = min(0.99, opacity * exp(-q / 2)); pairs with alpha < 1/255 are
 skipped. Gaussians are blended front to back by the radial distance of their mean (ties by index), and a pixel stops
 *before* the Gaussian that would bring its transmittance below 1e-4. Where alpha is limited to 0.99 its derivative is 0.
-Means nearer than 1e-15 or farther than 1e15 world units are culled too: float32 has no squares of them.
-That is blending "sorted"; "hybrid" shares all but the order and the stop, see `padgs.render.backends.torch`.
+Means nearer than 1e-15 or farther than 1e15 world units are culled too: float32 cannot represent their squares.
+This is blending "sorted"; "hybrid" differs in order and stop, see `padgs.render.backends.torch.hybrid_weights`.
 """
 
 from __future__ import annotations
@@ -25,71 +25,57 @@ ALPHA_MIN = 1 / 255
 ALPHA_MAX = 0.99
 TRANSMITTANCE_MIN = 1e-4
 NEAREST, FURTHEST = 1e-15, 1e15
-PUBLISHED_FOCAL = 512  # pixels per radian on the tangent planes of the released OP43DGS, whatever the image
-CORE_ALPHA_MIN = 0.05  # hybrid: fainter fragments go to the tail
+CORE_ALPHA_MIN = 0.05  # hybrid: fainter fragments belong to the tail
 CORE_SIZE, MAX_CORE_SIZE = 16, 256
 BLENDINGS = ("sorted", "hybrid")
 BOUNDS = ("exact", "square")
 NEAR_CULLS = ("mean", "ellipsoid")
-LOW_PASS_KINDS = {  # of each projection, its natural one first; `padgs.render.projection` says what they are
+LOW_PASS_KINDS = {  # of each projection, the default first; defined in `padgs.render.projection`
     "erp": ("pixels", "angular", "solid"),
     "pinhole": ("pixels", "angular", "solid"),
-    "tangent": ("angular", "solid", "fixed"),
+    "tangent": ("angular", "solid"),
     "ray": ("solid", "angular"),
 }
 
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """How Gaussians become an image. The defaults are ours; conf/render/released.yaml is the published rasterizer."""
+    """Options of the rasterizer. conf/render/released.yaml has those of the published rasterizer."""
 
-    projection: str = "erp"  # how Gaussians become footprints: a name of `padgs.render.projection.PROJECTIONS`
+    projection: str = "erp"  # a name of `padgs.render.projection.PROJECTIONS`
     near: float = 0.0  # world units; Gaussians whose mean is at most this far away are culled
-    near_cull: str = "mean"  # what must be farther than near: the mean, or (ray) all that is drawn of the Gaussian
+    near_cull: str = "mean"  # what must be farther than near: the mean, or ellipsoid (ray): the whole drawn Gaussian
     # variance of the low-pass filter in square pixels (cubemap: of its panorama; perspective image: at its centre)
     low_pass: float = 0.3
-    low_pass_kind: str = "auto"  # pixels, angular, solid or fixed; auto: the first one of the projection
-    pixel_bias: float = 0.0  # erp: pixels right and down of the truth that means are drawn; released ODGS: 0.5
-    wrap: bool = True  # erp: continue footprints across the +-180 degree seam; tangent and ray know of no seam
-    cubemap: bool = False  # draw a panorama through the six faces of a cube, each an ordinary perspective view
+    low_pass_kind: str = "auto"  # pixels, angular or solid; auto: the default of the projection
+    wrap: bool = True  # erp: continue footprints across the +-180 degree seam; tangent and ray have none
+    cubemap: bool = False  # render a panorama from the six faces of a cube, each a perspective view
     face_size: int | None = None  # cubemap: pixels across the 90 degrees of a face; None: twice as fine as the panorama
-    bounds: str = "exact"  # exact: every pixel with alpha >= 1/255; square: as published, see `published_bounds`
-    blending: str = "sorted"  # sorted: by distance of the means; hybrid: by distance on each ray, the rest unordered
-    core_size: int = CORE_SIZE  # hybrid: how many fragments of a pixel are kept in order
-    max_instances: int = 1 << 26  # (Gaussian, tile) pairs in memory at once; beyond it the image is drawn in strips
-    memory_cap: int | None = None  # square: bytes of the published lists of all pairs; more than that is a MemoryError
+    bounds: str = "exact"  # exact: every pixel with alpha >= 1/255; square: as published, see `square_boxes`
+    blending: str = "sorted"  # sorted: by distance of means; hybrid: nearest fragments of each ray sorted, others not
+    core_size: int = CORE_SIZE  # hybrid: number of sorted fragments of a pixel
+    max_instances: int = 1 << 26  # (Gaussian, tile) pairs in memory at once; more are rendered in strips
 
     def __post_init__(self) -> None:
         check_known(self, bounds=BOUNDS, near_cull=NEAR_CULLS, blending=BLENDINGS)
         check(self, "a distance >= 0 in world units", lambda near: 0 <= near < math.inf, "near")
         check(self, "a variance >= 0 in square pixels", lambda v: 0 <= v < math.inf, "low_pass")
-        check(self, "finite", math.isfinite, "pixel_bias")
         check(self, f"from 1 to {MAX_CORE_SIZE} fragments a pixel", lambda n: 1 <= n <= MAX_CORE_SIZE, "core_size")
         check(self, "at least 1", lambda most: most >= 1, "max_instances")
-        check(self, "at least 1 byte, or None", lambda cap: cap is None or cap >= 1, "memory_cap")
         if self.near_cull == "ellipsoid" and self.projection != "ray":
             raise ValueError(
-                f"near_cull=ellipsoid is made for projection 'ray', not {self.projection!r}; set near_cull=mean"
+                f"near_cull=ellipsoid requires projection 'ray', not {self.projection!r}; set near_cull=mean"
             )
         if self.core_size != CORE_SIZE and self.blending != "hybrid":
             raise ValueError(
-                f"core_size is {self.core_size}, but blending={self.blending} keeps no core; set blending=hybrid, "
-                f"or leave it at {CORE_SIZE}"
+                f"core_size is {self.core_size}, but blending={self.blending} has no core; set blending=hybrid "
+                f"or core_size={CORE_SIZE}"
             )
         if self.bounds == "square" and self.wrap:
-            raise ValueError("bounds=square are the published bounds, which end at the seam; set wrap=false with them")
+            raise ValueError("bounds=square end at the seam, as published; set wrap=false")
         if not self.wrap and self.bounds == "exact" and self.projection in ("tangent", "ray"):
-            raise ValueError(
-                f"projection {self.projection!r} knows of no seam that wrap=false could cut; set wrap=true"
-            )
-        if self.pixel_bias and self.projection != "erp":
-            raise ValueError(f"pixel_bias is a defect of projection 'erp', not of {self.projection!r}; set it to 0")
-        if self.memory_cap is not None and self.bounds != "square":
-            raise ValueError(
-                "memory_cap is for the published rasterizers (bounds=square), which need all instances at once; with "
-                "bounds=exact the image is drawn in strips of max_instances"
-            )
-        kinds = LOW_PASS_KINDS.get(self.projection, ())  # of an unknown projection nothing is known; see `PROJECTIONS`
+            raise ValueError(f"projection {self.projection!r} has no seam that wrap=false could cut; set wrap=true")
+        kinds = LOW_PASS_KINDS.get(self.projection, ())  # () for unknown projections, which `lookup` refuses
         if kinds and self.low_pass_kind not in ("auto", *kinds):
             raise ValueError(
                 f"projection {self.projection!r} has no low_pass_kind {self.low_pass_kind!r}; known: auto, "
@@ -97,56 +83,54 @@ class RenderOptions:
             )
         if self.cubemap and self.projection == "erp":
             raise ValueError(
-                "projection 'erp' draws whole panoramas; the faces of a cubemap take pinhole, tangent or ray"
+                "projection 'erp' cannot render the faces of a cubemap; set projection to pinhole, tangent or ray"
             )
         if self.face_size is not None and not self.cubemap:
             raise ValueError(
-                f"face_size is {self.face_size}, but only a cubemap has faces; set cubemap=true, or leave it"
+                f"face_size is {self.face_size}, but only a cubemap has faces; set cubemap=true or face_size=null"
             )
         if self.face_size is not None and not self.face_size >= 2:
             raise ValueError(f"face_size is {self.face_size}; a face must be at least 2 pixels wide, or None")
 
     def on_finer_pixels(self, times: float) -> RenderOptions:
-        """The same low-pass, as an angle, for a camera with so many times the pixels per radian."""
-        if self.resolved_low_pass_kind == "fixed":  # it knows no pixels
-            return self
+        """Return options with the same low-pass angle for a camera with `times` the pixels per radian."""
         return replace(self, low_pass=self.low_pass * times**2)
 
     @property
     def resolved_low_pass_kind(self) -> str:
-        """The kind that `auto` stands for; other kinds as they are."""
+        """Return the low-pass kind that `auto` selects; other kinds are returned unchanged."""
         return LOW_PASS_KINDS[self.projection][0] if self.low_pass_kind == "auto" else self.low_pass_kind
 
 
 @dataclass(frozen=True)
 class Request:
-    """What a backend is asked for."""
+    """The input of a backend."""
 
     gaussians: Gaussians  # N, in the world frame
     cam_from_world: Tensor  # [4, 4] in the dtype and on the device of the means
-    camera: Camera  # which direction each pixel looks
+    camera: Camera  # the direction of each pixel
     options: RenderOptions
     background: Tensor  # [3]
-    mean_offsets: Tensor | None = None  # [N, 2], and the next [N]: see `padgs.render.render`
-    absgrad: Tensor | None = None
+    mean_offsets: Tensor | None = None  # [N, 2]; see `padgs.render.render`
+    absgrad: Tensor | None = None  # [N]
 
 
 @dataclass(frozen=True)
 class Rendering:
-    """What a backend returns. Differentiable by image, transmittance and depth."""
+    """The output of a backend. Image, transmittance and depth are differentiable."""
 
     image: Tensor  # [H, W, 3]
-    transmittance: Tensor  # [H, W] in [0, 1], what is left for the background
-    depth: Tensor  # [H, W] world units: mean radial distance weighted by contribution; 0 where nothing contributes
+    transmittance: Tensor  # [H, W] in [0, 1], the weight of the background
+    depth: Tensor  # [H, W] world units: mean radial distance weighted by contribution; 0 if nothing contributes
     visible: Tensor  # [N] bool: not culled and inside the image
     counters: Mapping[str, int] = field(default_factory=dict)  # gaussians, visible, instances, evaluated pairs, ...
 
 
 @dataclass(frozen=True)
 class Removals:
-    """What removing each of N Gaussians alone does to one view, see `padgs.render.leave_one_out`."""
+    """Leave-one-out scores of N Gaussians in one view, see `padgs.render.leave_one_out`."""
 
-    error: Tensor  # [N] float64, change of the mean square error, weighted by pixels; < 0: better without it
+    error: Tensor  # [N] float64, change of the weighted mean square error; < 0: better without it
     change: Tensor  # [N] float64 >= 0, mean square change of the image by the same weights
     contribution: Tensor  # [N] float64 in [0, 1], mean of alpha T by the same weights
     peak: Tensor  # [N] in [0, 1], largest alpha T of any pixel
@@ -156,11 +140,11 @@ Backend = Callable[[Request], Rendering]  # every entry of `padgs.render.BACKEND
 
 
 def check_inputs(request: Request, *, check_values: bool) -> None:
-    """Check what native code relies on and name the culprit.
+    """Check the properties that native code relies on.
 
     Args:
-        request: of a user, who may have got anything wrong.
-        check_values: also look at every number (finite, positive scales, ...); costs a pass over the tensors.
+        request: unchecked input.
+        check_values: also check every value (finite, positive scales, ...); costs a pass over the tensors.
 
     Raises:
         ValueError: a shape, dtype, device or value breaks the contract.
@@ -181,7 +165,7 @@ def check_inputs(request: Request, *, check_values: bool) -> None:
     if request.absgrad is not None:
         shapes["absgrad"] = (request.absgrad, (count,))
         if options.projection != "ray":
-            raise ValueError(f"absgrad is made for projection 'ray', not {options.projection!r}; leave it out")
+            raise ValueError(f"absgrad requires projection 'ray', not {options.projection!r}; leave it out")
     dtype, device = gaussians.means.dtype, gaussians.means.device
     if dtype not in (torch.float32, torch.float64):
         raise ValueError(f"means has dtype {dtype}; renderers take torch.float32 or torch.float64")
@@ -199,10 +183,10 @@ def check_inputs(request: Request, *, check_values: bool) -> None:
 
 
 def check_camera(camera: Camera, options: RenderOptions) -> None:
-    """Refuse a camera that cannot be drawn with these options.
+    """Refuse a camera that these options cannot render.
 
     Raises:
-        ValueError: it has no pixels, or is none that the projection or its bounds are made for.
+        ValueError: it has no pixels, or the projection or the bounds do not support it.
     """
     if isinstance(camera, RayTable) and (camera.table.ndim != 3 or camera.table.shape[2] != 3):
         raise ValueError(f"the ray table has shape {tuple(camera.table.shape)}; it must be (height, width, 3)")
@@ -219,17 +203,17 @@ def check_camera(camera: Camera, options: RenderOptions) -> None:
                 f"a cubemap is resampled to a Panorama, not to a {type(camera).__name__}; set cubemap=false"
             )
     elif kind is not None and not isinstance(camera, kind):
-        way_out = "; cubemap=true draws panoramas with it" if kind is Pinhole and isinstance(camera, Panorama) else ""
+        way_out = "; or set cubemap=true" if kind is Pinhole and isinstance(camera, Panorama) else ""
         raise ValueError(
-            f"projection {options.projection!r} is made for a {kind.__name__} camera, not a {type(camera).__name__}; "
-            f"tangent and ray take any camera{way_out}"
+            f"projection {options.projection!r} requires a {kind.__name__} camera, not a {type(camera).__name__}; "
+            f"use tangent or ray, which take any camera{way_out}"
         )
     if options.bounds == "square" and options.projection == "ray":
         raise ValueError("projection 'ray' has no square bounds; use bounds=exact")
     whole = isinstance(camera, Panorama) and not options.cubemap
     if options.bounds == "square" and options.projection == "tangent" and not whole:
         raise ValueError(
-            "the square bounds of projection 'tangent' are those of a panorama; use bounds=exact with a "
+            "projection 'tangent' has square bounds for a Panorama only; use bounds=exact with a "
             f"{'cubemap' if options.cubemap else type(camera).__name__}"
         )
 
@@ -238,14 +222,16 @@ def _check_rays(camera: Camera) -> None:
     if isinstance(camera, RayTable):
         off = ((camera.table.detach() ** 2).sum(-1) - 1).abs().max().item()
         if not off < 1e-3:
-            raise ValueError(f"the ray table has a direction whose squared length is off 1 by {off:.3g}; normalise it")
+            raise ValueError(
+                f"the ray table has a direction whose squared length differs from 1 by {off:.3g}; normalise it"
+            )
 
 
 def _check_values(gaussians: Gaussians, cam_from_world: Tensor, tensors: Mapping[str, Tensor]) -> None:
     for name, tensor in tensors.items():
         bad = ~torch.isfinite(tensor)
         if bad.any():
-            raise ValueError(f"{name} holds {int(bad.sum())} non-finite values, first at {bad.nonzero()[0].tolist()}")
+            raise ValueError(f"{name} has {int(bad.sum())} non-finite values, first at {bad.nonzero()[0].tolist()}")
     rules = {
         "scales": (gaussians.scales > 0, "must be > 0"),
         "opacities": ((gaussians.opacities >= 0) & (gaussians.opacities <= 1), "must be in [0, 1]"),
@@ -259,6 +245,4 @@ def _check_values(gaussians: Gaussians, cam_from_world: Tensor, tensors: Mapping
     rotation = cam_from_world[:3, :3].detach()
     identity = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
     if not torch.allclose(rotation @ rotation.T, identity, atol=1e-3):
-        raise ValueError(
-            "cam_from_world has a 3x3 part that is not a rotation; poses must be rigid (no scale, no shear)"
-        )
+        raise ValueError("the 3x3 part of cam_from_world is not a rotation; poses must be rigid (no scale, no shear)")

@@ -56,7 +56,7 @@ def face_camera(panorama: Panorama, face_size: int | None = None) -> Pinhole:
 
 
 def rasterize_cubemap(rasterize: Backend, request: Request) -> Rendering:
-    """Render a panorama from perspective views of a backend; low-pass filters keep the size of the panorama's pixels."""
+    """Render a panorama from perspective views of a backend; low-pass filters have the size of its own pixels."""
     gaussians, cam_from_world, camera = request.gaussians, request.cam_from_world, request.camera
     assert isinstance(camera, Panorama), type(camera)  # guaranteed by `check_inputs`
     if request.mean_offsets is not None:  # in units of the panorama, so they move the means, once for all faces

@@ -69,8 +69,8 @@ def leave_one_out(
     request = make_request(gaussians, view, options)
     if target.shape != (view.camera.height, view.camera.width, 3):
         raise ValueError(
-            f"the target has shape {list(target.shape)}, but the view is {view.camera.width}x{view.camera.height}; it must be "
-            f"[{view.camera.height}, {view.camera.width}, 3]"
+            f"the target has shape {list(target.shape)}, but the view is {view.camera.width}x{view.camera.height}; "
+            f"it must be [{view.camera.height}, {view.camera.width}, 3]"
         )
     target = target.to(gaussians.means)
     weight = weight.to(target).expand(target.shape[:2])

@@ -21,9 +21,9 @@ from padgs.render.projection import (
     low_pass_of,
     plane_covariance,
 )
-from padgs.render.published_bounds import is_on_image, square_boxes
 
 MIN_COS_LATITUDE = 1e-4  # within 0.006 degrees of the axis an erp footprint is undefined: its width is 1 / cos
+TILE = 16  # pixels, of the published rasterizers
 SLOPE_LIMIT = 1.3  # pinhole: limit of slopes in the Jacobian, as a multiple of the half field of view
 
 
@@ -121,3 +121,26 @@ def _exact_boxes(centers: Tensor, covariance: Tensor, opacities: Tensor) -> Tens
     first = torch.ceil(centers - half - 0.5)
     end = torch.floor(centers + half - 0.5) + 1
     return torch.stack((first[:, 0], end[:, 0], first[:, 1], end[:, 1]), dim=-1)
+
+
+def square_boxes(centers: Tensor, middle: Tensor, determinant: Tensor) -> Tensor:
+    """Return the pixels [N, 4] of `bounds=square`, as published: 3 sigma of the longest axis, in whole tiles.
+
+    Args:
+        centers: [N, 2] (u, v) pixels.
+        middle, determinant: [N] half the trace, and the determinant, of the covariance in square pixels.
+
+    Returns:
+        first column, end column, first row, end row of each Gaussian.
+    """
+    longest = middle + torch.sqrt((middle * middle - determinant).clamp(min=0.1))
+    radius = torch.ceil(3 * torch.sqrt(longest))[:, None]
+    first = TILE * torch.floor((centers - 0.5 - radius) / TILE)
+    end = TILE * torch.floor((centers - 0.5 + radius + TILE - 1) / TILE)
+    return torch.stack((first[:, 0], end[:, 0], first[:, 1], end[:, 1]), dim=-1)
+
+
+def is_on_image(boxes: Tensor, width: int, height: int, *, wraps: bool = False) -> Tensor:
+    """Return which boxes [N, 4] contain a pixel of the image, [N] bool; `wraps`: columns repeat across the seam."""
+    rows = (boxes[:, 3] > 0) & (boxes[:, 2] < height) & (boxes[:, 3] > boxes[:, 2]) & (boxes[:, 1] > boxes[:, 0])
+    return rows if wraps else rows & (boxes[:, 1] > 0) & (boxes[:, 0] < width)

@@ -7,7 +7,7 @@ The low-pass filter widens a footprint, or the Gaussian, to about a pixel, so th
 pixels: a variance in the image plane, as in 3D Gaussian splatting; on a panorama a circle of the ERP image, which spans
 less and less of the sphere towards the poles. angular: the same angle in every direction. solid: the same, but in 3D
 and with the opacity lowered as the volume grows: the mass stays, and a thin Gaussian fades instead of swelling (3D
-filter of SPaGS). fixed: angular, of pixels at 512 per radian for every image (the released OP43DGS).
+filter of SPaGS).
 
 angular and solid add low_pass (r / f)^2 to the 3D covariance, at distance r and with f pixels per radian. Every
 projection sees that as a circle of low_pass / f^2, because none sees along the direction of the mean.
@@ -24,7 +24,7 @@ from torch import Tensor
 from padgs.gaussians import Gaussians, rotation_matrices
 from padgs.geometry.camera import Camera
 from padgs.registry import lookup
-from padgs.render.contract import FURTHEST, NEAREST, PUBLISHED_FOCAL, RenderOptions, Request
+from padgs.render.contract import FURTHEST, NEAREST, RenderOptions, Request
 
 PROJECTIONS = {
     "erp": "padgs.render.planar:project_erp",
@@ -114,8 +114,6 @@ def low_pass_of(options: RenderOptions, camera: Camera) -> LowPass:
     kind, variance = options.resolved_low_pass_kind, options.low_pass
     if kind == "pixels":
         return LowPass(variance, 0.0, False)
-    if kind == "fixed":
-        return LowPass(variance / PUBLISHED_FOCAL**2, 0.0, False)
     angle = variance / camera.focal**2
     if kind == "angular" and options.projection == "tangent":  # its covariance is already in square radians
         return LowPass(angle, 0.0, False)

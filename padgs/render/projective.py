@@ -13,7 +13,9 @@ import torch
 from torch import Tensor
 
 from padgs.geometry.camera import Camera, Panorama
+from padgs.geometry.panorama import longitude_latitude, pixel_from_angles, projection_jacobian
 from padgs.render.contract import ALPHA_MIN, Request
+from padgs.render.planar import is_on_image, square_boxes
 from padgs.render.projection import (
     Footprints,
     camera_frame,
@@ -22,7 +24,9 @@ from padgs.render.projection import (
     low_pass_of,
     plane_covariance,
 )
-from padgs.render.published_bounds import is_on_image, tangent_boxes
+
+PUBLISHED_FOCAL = 512  # pixels per radian on the tangent planes of the released OP43DGS, for every image size
+LEAST_COS_LATITUDE, LEAST_DIVISOR = 1e-4, 1e-20  # keep the directions of the poles finite
 
 
 @dataclass(frozen=True)
@@ -153,3 +157,27 @@ def _tangent_basis(normals: Tensor) -> Tensor:
 
 def _rays(camera: Camera, like: Tensor) -> Tensor:
     return camera.rays(dtype=like.dtype, device=like.device)
+
+
+def tangent_boxes(means: Tensor, spread: Tensor, determinant: Tensor, low_pass: float, camera: Panorama) -> Tensor:
+    """Return the pixels [N, 4] that the released OP43DGS renders; they grow with the distance of a mean, in any units.
+
+    It computes the radius from the trace of the footprint in the panorama, by a Jacobian whose lower row is divided by
+    sqrt(x^2 + z^2 r^2) instead of r^2 sqrt(x^2 + z^2), and the determinant of the footprint on a tangent plane of 512
+    pixels per radian.
+
+    Args:
+        means: [N, 3] camera frame, world units.
+        spread: [N, 3, 3] A with Sigma = A A^T.
+        determinant: [N] of the covariance on the tangent plane with its low-pass, in square radians.
+        low_pass: its variance, square radians.
+        camera: the panorama.
+    """
+    x, y, z = means.unbind(-1)
+    right = (x * x + y * y + z * z) * torch.sqrt(x * x + z * z)
+    written = torch.sqrt(x * x + z * z * (x * x + y * y + z * z)).clamp(min=LEAST_DIVISOR)
+    jacobian = projection_jacobian(means, camera.width, camera.height, min_cos_latitude=LEAST_COS_LATITUDE)
+    var_u, var_v = ((jacobian @ spread) ** 2).sum(-1).unbind(-1)
+    trace = var_u + (right / written) ** 2 * var_v + 2 * low_pass * PUBLISHED_FOCAL**2
+    centers = pixel_from_angles(*longitude_latitude(means), camera.width, camera.height)
+    return square_boxes(centers, 0.5 * trace, determinant * PUBLISHED_FOCAL**4)

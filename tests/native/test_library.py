@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from render_cases import gaussians_of, identity_pose, needs_native
 from padgs import render as package
 from padgs.gaussians import Gaussians
 from padgs.native import cpu, loading
+from padgs.native.abi import NativeCamera
 from padgs.render import render
 from padgs.scene import View
 
@@ -97,3 +99,13 @@ def test_auto_is_cpu_for_float32_and_torch_for_float64(gaussians: Gaussians):
     assert package.resolve_backend("auto", gaussians.means.double()) == "torch"
     assert package.resolve_backend("auto", gaussians.means.to("meta")) == "torch"
     assert package.resolve_backend("torch", gaussians.means) == "torch"
+
+
+@needs_native
+def test_a_library_of_another_version_is_refused(monkeypatch):
+    class Grown(ctypes.Structure):
+        _fields_ = [*NativeCamera._fields_, ("more", ctypes.c_int32)]
+
+    monkeypatch.setattr(cpu, "STRUCTURES", (Grown, *cpu.STRUCTURES[1:]))
+    with pytest.raises(OSError, match="libpadgs_cpu.* is of another version, with another Grown; build it again"):
+        cpu.library.__wrapped__()

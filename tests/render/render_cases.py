@@ -22,6 +22,7 @@ from padgs.render.projective import RayFootprints
 from padgs.scene import View
 
 INPUTS = ("means", "quats", "scales", "opacities", "colors")
+OUTPUTS = ("image", "transmittance", "depth")
 KINDS = ("ordinary", "polar", "pole", "seam", "near", "huge", "needle")
 ODD_SIZES = ((72, 36), (70, 44), (33, 17))
 RELEASED = RenderOptions(near=0.2, wrap=False, bounds="square")  # as conf/render/released.yaml, one world unit
@@ -180,7 +181,7 @@ def stable_pixels(
     width: int,
     height: int,
     *,
-    lens: str = "panorama",
+    lens: str | Camera = "panorama",
     pose: Tensor | None = None,
     options: RenderOptions = RenderOptions(),  # noqa: B008 - frozen dataclass
     margin: float = 1e-3,
@@ -192,7 +193,8 @@ def stable_pixels(
     ray meets a Gaussian within `margin` (relative) of the near radius.
     """
     pose = identity_pose() if pose is None else pose
-    footprints = projected(gaussians, pose.to(gaussians.means.dtype), camera_of(lens, width, height), options)
+    camera = camera_of(lens, width, height) if isinstance(lens, str) else lens
+    footprints = projected(gaussians, pose.to(gaussians.means.dtype), camera, options)
     everything = torch.arange(len(gaussians))[footprints.visible]
     pixels = torch.arange(height * width)
     rows, columns = pixels // width, pixels % width
@@ -228,3 +230,71 @@ def row_error(actual: Tensor, expected: Tensor) -> float:
 def blended(blending: str, core_size: int) -> dict:
     """Options of either blending, with a core of that size where there is one."""
     return {"blending": blending} | ({"core_size": core_size} if blending == "hybrid" else {})
+
+
+def differentiated(
+    gaussians: Gaussians,
+    camera: Camera,
+    options: RenderOptions,
+    weights: Tensor,
+    *,
+    backend: str,
+    dtype: torch.dtype,
+    pose: Tensor | None = None,
+) -> tuple[Rendering, dict[str, Tensor]]:
+    """Return a rendering and the gradients of the sum of its outputs times weights [H, W, 3 to 5] by every input.
+
+    The gradient of the pose is by a rotation and a shift, [2, 3]: three of the nine entries of a rotation are free.
+    """
+    inputs, pose = leaves(gaussians, dtype), (identity_pose() if pose is None else pose).to(dtype, copy=True)
+    background = torch.tensor([0.3, 0.6, 0.9], dtype=dtype, requires_grad=True)
+    extra = {"background": background, "mean_offsets": torch.zeros(len(gaussians), 2, dtype=dtype, requires_grad=True)}
+    variables = {**vars(inputs), **extra, "pose": pose.requires_grad_()}
+    if isinstance(camera, RayTable):
+        variables["rays"] = camera.table.to(dtype, copy=True).requires_grad_()
+        camera = RayTable(variables["rays"], camera.focal)
+    rendering = render(inputs, view_of(camera, pose), options, backend=backend, **extra)
+    outputs = torch.cat((rendering.image, rendering.transmittance[..., None], rendering.depth[..., None]), dim=-1)
+    (outputs[..., : weights.shape[-1]] * weights.to(dtype)).sum().backward()
+    gradients = {name: variable.grad for name, variable in variables.items()}
+    turn = gradients["pose"][:3, :3] @ pose.detach()[:3, :3].T
+    turn = turn - turn.T
+    gradients["pose"] = torch.stack((torch.stack((turn[2, 1], turn[0, 2], turn[1, 0])), gradients["pose"][:3, 3]))
+    return rendering, gradients
+
+
+def assert_matches_definition(
+    gaussians: Gaussians,
+    camera: Camera,
+    options: RenderOptions,
+    stable: Tensor,
+    generator: torch.Generator,
+    *,
+    backend: str,
+    dtype: torch.dtype = torch.float32,
+    pose: Tensor | None = None,
+    slack: float = 1,
+    depth_tolerance: float = 1e-5,
+) -> None:
+    """Compare values and gradients by every input with backend torch in float64 on stable pixels [H, W]."""
+    weights = torch.randn(*stable.shape, 5, generator=generator, dtype=torch.float64) * stable[..., None]
+    arguments = (gaussians, camera, options, weights)
+    expected, expected_gradients = differentiated(*arguments, pose=pose, backend="torch", dtype=torch.float64)
+    actual, gradients = differentiated(*arguments, pose=pose, backend=backend, dtype=dtype)
+    if options.projection in ("erp", "pinhole"):
+        assert torch.equal(actual.visible, expected.visible)
+    else:  # the definition has no bounds: visible Gaussians may lie outside the image
+        assert not (actual.visible & ~expected.visible).any()
+    for name, absolute, relative in (("image", 2e-5, 0), ("transmittance", 2e-5, 0), ("depth", 0, depth_tolerance)):
+        output, truth = (getattr(rendering, name)[stable].double() for rendering in (actual, expected))
+        torch.testing.assert_close(
+            output, truth, atol=slack * absolute, rtol=slack * relative, msg=lambda text, n=name: f"{n}: {text}"
+        )
+    pairs = [rendering.counters["contributing"] for rendering in (actual, expected)]
+    assert abs(pairs[0] - pairs[1]) <= 8 * int((~stable).sum())
+    for name, gradient in expected_gradients.items():
+        assert gradient.any(), f"{name} has no gradient to compare"
+        if name == "rays":  # a row is a pixel here, and faint pixels have few digits
+            assert (gradients[name] - gradient).abs().max() < slack * 2e-3 * gradient.norm(dim=-1).max()
+        else:
+            assert row_error(gradients[name], gradient) < slack * 2e-3, name

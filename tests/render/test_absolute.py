@@ -96,15 +96,6 @@ def test_is_per_length_and_changes_no_other_gradient(backend: str, dtype: torch.
     torch.testing.assert_close(gradients[1][1], gradients[0][1], rtol=1e-5, atol=1e-7)
 
 
-def test_refuses_other_projections_and_shapes(generator: torch.Generator):
-    gaussians, view = mixture(2, generator), View("v", identity_pose(), 16, 8)
-    mean_offsets = torch.zeros(len(gaussians), dtype=torch.float64)
-    with pytest.raises(ValueError, match="absgrad is made for projection 'ray', not 'erp'"):
-        render(gaussians, view, RenderOptions(), absgrad=mean_offsets)
-    with pytest.raises(ValueError, match=r"absgrad has shape \(1,\)"):
-        render(gaussians, view, RenderOptions(projection="ray"), absgrad=mean_offsets[:1])
-
-
 def test_faces_of_a_cube_pull_together(generator: torch.Generator):
     """Interpolated to a panorama from finer faces, pixels pull about as those of the panorama do."""
     gaussians, view = mixture(5, generator, ("ordinary", "seam")), View("v", identity_pose(), 64, 32)

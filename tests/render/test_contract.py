@@ -20,10 +20,11 @@ from render_cases import (
 
 from padgs.gaussians import Gaussians
 from padgs.geometry.camera import Panorama, Pinhole, RayTable
-from padgs.render import RenderOptions, render
+from padgs.render import RenderConfig, RenderOptions, render
 from padgs.scene import View
 
 VIEW = View("v", identity_pose(), 32, 16)
+SQUARE = {"wrap": False, "bounds": "square"}
 
 
 @pytest.fixture
@@ -32,7 +33,7 @@ def gaussians(generator: torch.Generator) -> Gaussians:
 
 
 @pytest.mark.parametrize("name", INPUTS)
-def test_a_wrong_shape_is_named(name: str, gaussians: Gaussians):
+def test_wrong_shapes_are_named(name: str, gaussians: Gaussians):
     for wrong in (getattr(gaussians, name)[:4], getattr(gaussians, name)[..., None], torch.zeros(())):
         if name == "means" and wrong.shape == (4, 3):
             message = r"quats has shape \(5, 4\); with 4 means it must be \(4, 4\)"
@@ -57,22 +58,21 @@ def test_unusable_dtypes_are_named(gaussians: Gaussians):
             render(gaussians.to(dtype), VIEW)
 
 
-def test_background_probe_and_pose_are_checked(gaussians: Gaussians):
+def test_background_offsets_and_pose_are_checked(gaussians: Gaussians):
     with pytest.raises(ValueError, match=r"background has shape \(4,\); .* must be \(3,\)"):
         render(gaussians, VIEW, background=torch.zeros(4))
     with pytest.raises(ValueError, match="background has dtype torch.float64 but means has torch.float32"):
         render(gaussians, VIEW, background=torch.zeros(3, dtype=torch.float64))
     with pytest.raises(ValueError, match=r"mean_offsets has shape \(5, 3\); with 5 means it must be \(5, 2\)"):
         render(gaussians, VIEW, mean_offsets=torch.zeros(5, 3))
+    for projection, count, message in (
+        ("erp", 5, "requires projection 'ray', not 'erp'"),
+        ("ray", 1, r"has shape \(1,\)"),
+    ):
+        with pytest.raises(ValueError, match=f"absgrad {message}"):
+            render(gaussians, VIEW, RenderOptions(projection), absgrad=torch.zeros(count))
     with pytest.raises(ValueError, match=r"cam_from_world has shape \(3, 4\)"):
         render(gaussians, VIEW.at(identity_pose()[:3]))
-
-
-@pytest.mark.parametrize(("width", "height"), [(0, 16), (32, 0), (-32, 16)])
-@each_engine
-def test_an_empty_image_is_refused(width: int, height: int, backend: str, dtype: torch.dtype, gaussians: Gaussians):
-    with pytest.raises(ValueError, match=f"image size is {width}x{height}; both sides must be at least 1 pixel"):
-        render(gaussians.to(dtype), View("v", identity_pose(), width, height), backend=backend)
 
 
 @pytest.mark.parametrize(
@@ -83,8 +83,8 @@ def test_an_empty_image_is_refused(width: int, height: int, backend: str, dtype:
         ("opacities", (4,), 1.5, r"opacities\[4\] is 1.5; opacities must be in \[0, 1\]"),
         ("opacities", (0,), -0.25, r"opacities\[0\] is -0.25; opacities must be in \[0, 1\]"),
         ("quats", (2,), 0.0, r"quats\[2\] is \[0.0, 0.0, 0.0, 0.0\]; quats must not be zero"),
-        ("means", (1, 2), float("nan"), r"means holds 1 non-finite values, first at \[1, 2\]"),
-        ("colors", (1, 0), float("inf"), r"colors holds 1 non-finite values, first at \[1, 0\]"),
+        ("means", (1, 2), float("nan"), r"means has 1 non-finite values, first at \[1, 2\]"),
+        ("colors", (1, 0), float("inf"), r"colors has 1 non-finite values, first at \[1, 0\]"),
     ],
 )
 @each_engine
@@ -93,96 +93,104 @@ def test_bad_values_are_named_when_checked(name, index, value, message, backend,
     getattr(broken, name).data[index] = value
     with pytest.raises(ValueError, match=message):
         render(broken, VIEW, backend=backend, check_values=True)
-    render(broken, VIEW, backend=backend)  # the switch is off: drawn as well as can be, without a crash
+    render(broken, VIEW, backend=backend)  # unchecked: no crash
 
 
-def test_bad_poses_backgrounds_and_probes_are_named_when_checked(gaussians: Gaussians):
+def test_bad_poses_backgrounds_and_offsets_are_named_when_checked(gaussians: Gaussians):
     stretched, lost = 2 * identity_pose(), identity_pose()
     lost[1, 3] = float("nan")
-    with pytest.raises(ValueError, match="cam_from_world has a 3x3 part that is not a rotation"):
+    with pytest.raises(ValueError, match="the 3x3 part of cam_from_world is not a rotation"):
         render(gaussians, VIEW.at(stretched), check_values=True)
-    with pytest.raises(ValueError, match=r"cam_from_world holds 1 non-finite values, first at \[1, 3\]"):
+    with pytest.raises(ValueError, match=r"cam_from_world has 1 non-finite values, first at \[1, 3\]"):
         render(gaussians, VIEW.at(lost), check_values=True)
-    with pytest.raises(ValueError, match="background holds 3 non-finite values"):
+    with pytest.raises(ValueError, match="background has 3 non-finite values"):
         render(gaussians, VIEW, background=torch.full((3,), float("nan")), check_values=True)
-    with pytest.raises(ValueError, match="mean_offsets holds 10 non-finite values"):
+    with pytest.raises(ValueError, match="mean_offsets has 10 non-finite values"):
         render(gaussians, VIEW, mean_offsets=torch.full((5, 2), float("inf")), check_values=True)
-
-
-def test_unknown_names_list_the_known_ones(gaussians: Gaussians):
-    with pytest.raises(ValueError, match="unknown backend 'gpu'; known: .*cpu.*torch"):
-        render(gaussians, VIEW, backend="gpu")
-    with pytest.raises(ValueError, match="unknown bounds 'tight'; known: exact, square"):
-        RenderOptions(bounds="tight")
-
-
-@each_engine
-def test_unknown_projections_list_the_known_ones(backend: str, dtype: torch.dtype, gaussians: Gaussians):
-    with pytest.raises(ValueError, match="'mercator'; known: .*erp"):
-        render(gaussians.to(dtype), VIEW, RenderOptions(projection="mercator"), backend=backend)
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"bounds": "square"}, "bounds=square are the published bounds.*; set wrap=false"),
+        ({"bounds": "tight"}, "unknown bounds 'tight'; known: exact, square"),
+        ({"bounds": "square"}, "bounds=square end at the seam, as published; set wrap=false"),
         ({"near": -1.0}, "near is -1.0; it must be a distance >= 0"),
         ({"near": float("nan")}, "near is nan; it must be a distance >= 0"),
+        ({"near_cull": "ellipsoid"}, "near_cull=ellipsoid requires projection 'ray', not 'erp'"),
+        ({"near_cull": "box"}, "unknown near_cull 'box'; known: mean, ellipsoid"),
         ({"low_pass": -0.1}, "low_pass is -0.1; it must be a variance >= 0"),
+        ({"projection": "ray", "low_pass_kind": "pixels"}, "'ray' has no .* 'pixels'; known: auto, solid, angular"),
+        ({"projection": "tangent", "low_pass_kind": "pixels"}, "'tangent' has no .*; known: auto, angular, solid"),
+        ({"low_pass_kind": "3d"}, "'erp' has no low_pass_kind '3d'; known: auto, pixels, angular, solid"),
         ({"max_instances": 0}, "max_instances is 0; it must be at least 1"),
-        ({"memory_cap": 1000}, "memory_cap is for the published rasterizers .bounds=square."),
-        ({"projection": "ray", "wrap": False}, "projection 'ray' knows of no seam that wrap=false could cut; set wrap"),
-        ({"projection": "tangent", "wrap": False}, "projection 'tangent' knows of no seam"),
+        ({"projection": "ray", "wrap": False}, "projection 'ray' has no seam that wrap=false could cut; set wrap=true"),
+        ({"projection": "tangent", "wrap": False}, "projection 'tangent' has no seam"),
+        ({"blending": "oit"}, "unknown blending 'oit'; known: sorted, hybrid"),
+        ({"core_size": 0}, "core_size is 0; it must be from 1 to 256"),
+        ({"core_size": 257}, "core_size is 257; it must be from 1 to 256"),
+        ({"core_size": 8}, "core_size is 8, but blending=sorted has no core; set blending=hybrid or core_size=16"),
+        ({"cubemap": True}, "projection 'erp' cannot render the faces of a cubemap; set projection to pinhole"),
         ({"projection": "ray", "face_size": 64}, "face_size is 64, but only a cubemap has faces; set cubemap=true"),
-        ({"core_size": 8}, "core_size is 8, but blending=sorted keeps no core; set blending=hybrid, or leave it at 16"),
-        ({"memory_cap": 0, "bounds": "square", "wrap": False}, "memory_cap is 0; it must be at least 1 byte"),
+        ({"projection": "ray", "cubemap": True, "face_size": 1}, "face_size is 1; a face must be at least 2 pixels"),
     ],
 )
-def test_options_that_no_backend_can_honour_are_refused(options: dict, message: str):
+def test_invalid_options_are_refused(options: dict, message: str):
     with pytest.raises(ValueError, match=message):
         RenderOptions(**options)
 
 
-@pytest.mark.parametrize("lens", ["pinhole", "fisheye"])
+def test_config_passes_options_on_and_scales_lengths():
+    config = RenderConfig(projection="ray", blending="hybrid", core_size=8, near=0.5, low_pass_kind="angular")
+    expected = {"projection": "ray", "blending": "hybrid", "core_size": 8, "low_pass_kind": "angular"}
+    assert config.options(2.0) == RenderOptions(near=1.0, **expected)
+    assert replace(config, near_unit="world").options(2.0) == RenderOptions(near=0.5, **expected)
+    cubemap = {"projection": "pinhole", "cubemap": True, "face_size": 64}
+    assert RenderConfig(near=0.0, **cubemap).options(1.0) == RenderOptions(**cubemap)
+
+
 @each_engine
-def test_erp_takes_panoramas_only(lens: str, backend: str, dtype: torch.dtype, gaussians: Gaussians):
-    kind = {"pinhole": "Pinhole", "fisheye": "RayTable"}[lens]
-    message = f"projection 'erp' is made for a Panorama camera, not a {kind}; tangent and ray take any camera"
+def test_unknown_names_list_the_known_ones(backend: str, dtype: torch.dtype, gaussians: Gaussians):
+    with pytest.raises(ValueError, match="'mercator'; known: .*erp"):
+        render(gaussians.to(dtype), VIEW, RenderOptions(projection="mercator"), backend=backend)
+    with pytest.raises(ValueError, match="unknown backend 'gpu'; known: .*cpu.*torch"):
+        render(gaussians, VIEW, backend="gpu")
+
+
+@pytest.mark.parametrize(
+    ("projection", "lens", "more", "message"),
+    [
+        ("erp", "pinhole", {}, "'erp' requires a Panorama camera, not a Pinhole; use tangent or ray, which take any"),
+        ("erp", "fisheye", {}, "'erp' requires a Panorama camera, not a RayTable"),
+        ("pinhole", "panorama", {}, "'pinhole' requires a Pinhole camera, not a Panorama; .*or set cubemap=true"),
+        ("pinhole", "fisheye", {}, "'pinhole' requires a Pinhole camera, not a RayTable"),
+        (
+            "ray",
+            "pinhole",
+            {"cubemap": True},
+            "resampled to a Panorama, not to a Pinhole; set cubemap=false",
+        ),
+        ("ray", "panorama", SQUARE, "projection 'ray' has no square bounds; use bounds=exact"),
+        ("tangent", "pinhole", SQUARE, "'tangent' has square bounds for a Panorama only; use .* with a Pinhole"),
+        ("tangent", "fisheye", SQUARE, "use bounds=exact with a RayTable"),
+        ("tangent", "panorama", {**SQUARE, "cubemap": True}, "use bounds=exact with a cubemap"),
+    ],
+)
+@each_engine
+def test_unsupported_cameras_are_refused(projection, lens, more, message, backend, dtype, gaussians: Gaussians):
+    view, options = view_of(camera_of(lens, 32, 16)), RenderOptions(projection, **more)
     with pytest.raises(ValueError, match=message):
-        render(gaussians.to(dtype), view_of(camera_of(lens, 32, 16)), backend=backend)
-
-
-@pytest.mark.parametrize("lens", ["panorama", "fisheye"])
-@each_engine
-def test_pinhole_takes_pinholes_only(lens: str, backend: str, dtype: torch.dtype, gaussians: Gaussians):
-    kind = {"panorama": "Panorama", "fisheye": "RayTable"}[lens]
-    with pytest.raises(ValueError, match=f"projection 'pinhole' is made for a Pinhole camera, not a {kind}"):
-        view = view_of(camera_of(lens, 32, 16))
-        render(gaussians.to(dtype), view, RenderOptions("pinhole"), backend=backend)
-
-
-@each_engine
-def test_square_bounds_are_those_that_were_published(backend: str, dtype: torch.dtype, gaussians: Gaussians):
-    square = {"wrap": False, "bounds": "square"}
-    with pytest.raises(ValueError, match="projection 'ray' has no square bounds; use bounds=exact"):
-        render(gaussians.to(dtype), VIEW, RenderOptions("ray", **square), backend=backend)
-    for lens, name in (("pinhole", "Pinhole"), ("fisheye", "RayTable")):
-        view = view_of(camera_of(lens, 32, 16))
-        with pytest.raises(ValueError, match=f"'tangent' are those of a panorama; use bounds=exact with a {name}"):
-            render(gaussians.to(dtype), view, RenderOptions("tangent", **square), backend=backend)
-    with pytest.raises(ValueError, match="use bounds=exact with a cubemap"):
-        render(gaussians.to(dtype), VIEW, RenderOptions("tangent", cubemap=True, **square), backend=backend)
+        render(gaussians.to(dtype), view, options, backend=backend)
 
 
 @pytest.mark.parametrize("projection", ["tangent", "ray"])
 @each_engine
-def test_rays_are_of_unit_length(projection: str, backend: str, dtype: torch.dtype, gaussians: Gaussians):
+def test_rays_must_have_unit_length(projection: str, backend: str, dtype: torch.dtype, gaussians: Gaussians):
     options, camera = RenderOptions(projection), camera_of("fisheye", 32, 16)
     for value, off in ((0.0, "1"), (2.0, "3"), (float("nan"), "nan"), (float("inf"), "inf")):
         table = camera.table.clone()
         table[3, 4] = table[3, 4] * value
         view = view_of(RayTable(table, camera.focal))
-        with pytest.raises(ValueError, match=f"direction whose squared length is off 1 by {off}; normalise it"):
+        with pytest.raises(ValueError, match=f"direction whose squared length differs from 1 by {off}; normalise it"):
             render(gaussians.to(dtype), view, options, backend=backend, check_values=True)
         image = render(gaussians.to(dtype), view, options, backend=backend).image
         expected = render(gaussians.to(dtype), view_of(camera), options, backend=backend).image
@@ -200,14 +208,15 @@ def test_a_ray_table_has_three_axes(shape: tuple[int, ...], backend: str, dtype:
 
 
 @pytest.mark.parametrize("lens", ["panorama", "pinhole", "fisheye"])
-@pytest.mark.parametrize(("width", "height"), [(0, 16), (32, 0)])
+@pytest.mark.parametrize(("width", "height"), [(0, 16), (32, 0), (-32, 16)])
 @each_engine
-def test_an_empty_camera_is_refused(width, height, lens: str, backend: str, dtype: torch.dtype, gaussians: Gaussians):
+def test_an_empty_image_is_refused(width, height, lens: str, backend: str, dtype: torch.dtype, gaussians: Gaussians):
     cameras = {
         "panorama": Panorama(width, height),
         "pinhole": Pinhole(width, height, 10, 10, 0, 0),
-        "fisheye": RayTable(torch.zeros(height, width, 3), 5.0),
+        "fisheye": RayTable(torch.zeros(height, max(width, 0), 3), 5.0),
     }
+    width = cameras[lens].width
     with pytest.raises(ValueError, match=f"image size is {width}x{height}; both sides must be at least 1 pixel"):
         render(gaussians.to(dtype), view_of(cameras[lens]), RenderOptions("ray"), backend=backend)
 
@@ -227,7 +236,7 @@ def test_focal_lengths_are_positive(focal: float, projection: str, backend: str,
 @pytest.mark.parametrize("table_dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("projection", ["tangent", "ray"])
 @each_engine
-def test_the_table_of_rays_may_be_of_any_dtype(projection, table_dtype, backend, dtype, gaussians: Gaussians):
+def test_ray_tables_may_have_any_dtype(projection, table_dtype, backend, dtype, gaussians: Gaussians):
     camera, weight = camera_of("fisheye", 33, 16), torch.rand(16, 33, 3, dtype=dtype)
     results = []
     for table in (camera.table.to(dtype), camera.table.to(table_dtype)):
@@ -247,16 +256,17 @@ def test_the_cpu_backend_refuses_float64(gaussians: Gaussians):
         render(gaussians.to(torch.float64), VIEW, backend="cpu")
 
 
+@pytest.mark.parametrize("blending", ["sorted", "hybrid"])
 @each_setup
 @each_engine
-def test_no_gaussians_are_the_background(projection: str, lens: str, backend: str, dtype: torch.dtype):
+def test_without_gaussians_the_image_is_the_background(projection, lens, blending, backend, dtype):
     nothing = Gaussians(
         *(torch.zeros(0, *shape, dtype=dtype, requires_grad=True) for shape in ((3,), (4,), (3,), (), (3,)))
     )
     background = torch.tensor([0.25, 0.5, 0.75], dtype=dtype, requires_grad=True)
     extra = {"background": background, "mean_offsets": torch.zeros(0, 2, dtype=dtype), "backend": backend}
     view = view_of(camera_of(lens, 32, 16))
-    rendering = render(nothing, view, RenderOptions(projection), check_values=True, **extra)
+    rendering = render(nothing, view, RenderOptions(projection, blending=blending), check_values=True, **extra)
     assert torch.equal(rendering.image, background.expand(16, 32, 3))
     assert torch.equal(rendering.transmittance, torch.ones(16, 32, dtype=dtype))
     assert torch.equal(rendering.depth, torch.zeros(16, 32, dtype=dtype))
@@ -267,7 +277,7 @@ def test_no_gaussians_are_the_background(projection: str, lens: str, backend: st
 
 @each_setup
 @each_engine
-def test_gaussians_that_are_not_contiguous_are_drawn_the_same(projection, lens, backend, dtype, gaussians: Gaussians):
+def test_tensors_need_not_be_contiguous(projection, lens, backend, dtype, gaussians: Gaussians):
     view, options = view_of(camera_of(lens, 32, 16)), RenderOptions(projection)
     reference = render(gaussians.to(dtype), view, options, backend=backend).image
     strided = {}

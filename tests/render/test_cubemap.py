@@ -9,6 +9,7 @@ import pytest
 import torch
 from render_cases import (
     INPUTS,
+    differentiated,
     draw,
     each_engine,
     gaussians_of,
@@ -23,7 +24,7 @@ from render_cases import (
 from padgs.gaussians import Gaussians
 from padgs.geometry.camera import Panorama, Pinhole
 from padgs.geometry.panorama import rays
-from padgs.render import RenderConfig, Rendering, RenderOptions, render
+from padgs.render import Rendering, RenderOptions, render
 from padgs.render.cubemap import FACES, FINENESS, _corners, face_camera, panorama_from_faces
 from padgs.scene import View
 
@@ -99,11 +100,6 @@ def test_a_gaussian_below_a_pixel_looks_the_same_through_faces_of_any_size(proje
     assert (coarse - fine).abs().max() < 0.06 * fine.max() + 1 / 255
 
 
-def test_a_low_pass_that_knows_no_pixels_is_the_same_on_finer_ones():
-    fixed = RenderOptions(projection="tangent", low_pass_kind="fixed")
-    assert fixed.on_finer_pixels(2) == fixed
-
-
 @pytest.mark.parametrize(("width", "height"), [(64, 32), (70, 44), (256, 128)])
 def test_directions_come_back_to_second_order(width: int, height: int):
     panorama = Panorama(width, height)
@@ -164,22 +160,11 @@ def test_depth_is_not_mixed_with_emptiness(backend: str, dtype: torch.dtype):
 def test_native_faces_match_the_definition(projection: str, generator):
     gaussians = gaussians_of("ordinary", 25, generator)
     pose = random_pose(generator, shift=0.1)
-    weight = torch.rand(36, 72, 5, generator=generator, dtype=torch.float64)
-    found = {}
-    for backend, dtype in (("torch", torch.float64), ("cpu", torch.float32)):
-        inputs, eye = leaves(gaussians, dtype), pose.to(dtype, copy=True).requires_grad_()
-        mean_offsets = torch.zeros(25, 2, dtype=dtype, requires_grad=True)
-        options = RenderOptions(projection=projection, cubemap=True, near=0.05)
-        rendering = render(inputs, View("v", eye, 72, 36), options, backend=backend, mean_offsets=mean_offsets)
-        outputs = torch.cat(
-            (rendering.image, rendering.transmittance[..., None], 0.1 * rendering.depth[..., None]), dim=-1
-        )
-        (outputs * weight).sum().backward()
-        gradients = {name: getattr(inputs, name).grad for name in INPUTS}
-        turn = eye.grad[:3, :3] @ eye.detach()[:3, :3].T  # by a small rotation: the part that is antisymmetric
-        gradients |= {"shift": eye.grad[:3, 3:], "turn": turn - turn.T, "mean_offsets": mean_offsets.grad}
-        found[backend] = rendering, gradients
-    (expected, expected_gradients), (actual, gradients) = found["torch"], found["cpu"]
+    weights = torch.rand(36, 72, 5, generator=generator, dtype=torch.float64)
+    weights[..., 4] *= 0.1
+    arguments = (gaussians, Panorama(72, 36), RenderOptions(projection=projection, cubemap=True, near=0.05), weights)
+    expected, expected_gradients = differentiated(*arguments, pose=pose, backend="torch", dtype=torch.float64)
+    actual, gradients = differentiated(*arguments, pose=pose, backend="cpu", dtype=torch.float32)
     assert ((actual.image - expected.image).abs().amax(-1) > 2e-5).double().mean() < 5e-3  # pairs at the cut may flip
     assert torch.equal(actual.visible, expected.visible)
     assert actual.counters["contributing"] == pytest.approx(expected.counters["contributing"], rel=1e-3)
@@ -271,24 +256,3 @@ def test_what_no_face_shows_is_not_visible():
     assert rendering.visible.tolist() == [False] and rendering.counters["visible"] == 0
     shown = render(broad("edge"), View("v", identity_pose(), 32, 16), RenderOptions(projection="ray", cubemap=True))
     assert shown.visible.tolist() == [True] and shown.counters["gaussians"] == 1
-
-
-def test_misuse_is_named():
-    with pytest.raises(
-        ValueError, match="'erp' draws whole panoramas; the faces of a cubemap take pinhole, tangent or"
-    ):
-        RenderOptions(projection="erp", cubemap=True)
-    with pytest.raises(ValueError, match="face_size is 1; a face must be at least 2 pixels wide, or None"):
-        RenderOptions(projection="ray", cubemap=True, face_size=1)
-    lens = Pinhole(8, 8, 4.0, 4.0, 4.0, 4.0)
-    with pytest.raises(ValueError, match="a cubemap is resampled to a Panorama, not to a Pinhole; set cubemap=false"):
-        render(
-            broad("edge"), View("v", identity_pose(), 8, 8, lens=lens), RenderOptions(projection="ray", cubemap=True)
-        )
-    with pytest.raises(ValueError, match="made for a Pinhole camera, not a Panorama; .*cubemap=true"):
-        render(broad("edge"), View("v", identity_pose(), 8, 4), RenderOptions(projection="pinhole"))
-
-
-def test_it_is_a_setting_of_a_run():
-    options = RenderConfig(projection="pinhole", cubemap=True, face_size=64).options(1.0)
-    assert (options.projection, options.cubemap, options.face_size) == ("pinhole", True, 64)

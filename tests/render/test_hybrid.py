@@ -7,7 +7,6 @@ import torch
 from hybrid_reference import one_pixel
 from torch import Tensor
 
-from padgs.render import RenderConfig, RenderOptions
 from padgs.render.backends.torch import hybrid_weights
 
 
@@ -107,14 +106,3 @@ def test_no_fragments_leave_everything():
     assert weights.shape == (3, 0) and torch.equal(left, torch.ones(3))
     weights, left = hybrid_weights(torch.zeros(3, 2), torch.ones(3, 2), 16)
     assert not weights.any() and torch.equal(left, torch.ones(3))
-
-
-def test_options_are_checked_and_passed_on():
-    with pytest.raises(ValueError, match="unknown blending 'oit'; known: sorted, hybrid"):
-        RenderOptions(blending="oit")
-    for size in (0, 257):
-        with pytest.raises(ValueError, match=f"core_size is {size}; it must be from 1 to 256"):
-            RenderOptions(core_size=size)
-    options = RenderConfig(projection="ray", blending="hybrid", core_size=8).options(2.0)
-    assert (options.blending, options.core_size) == ("hybrid", 8)
-    assert RenderConfig().options(1.0).blending == "sorted"

@@ -3,12 +3,7 @@
 from __future__ import annotations
 
 import math
-import os
-import subprocess
-import sys
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import render_cases
@@ -16,13 +11,13 @@ import torch
 from hybrid_reference import one_pixel
 from render_cases import (
     INPUTS,
+    assert_matches_definition,
+    differentiated,
     each_engine,
     engines,
     gaussians_of,
     identity_pose,
-    leaves,
     mixture,
-    needs_native,
     projected,
     random_pose,
     row_error,
@@ -32,7 +27,7 @@ from torch import Tensor
 from padgs.gaussians import Gaussians, rotation_matrices
 from padgs.geometry.camera import Camera, Panorama, Pinhole, RayTable
 from padgs.geometry.panorama import direction
-from padgs.render import Rendering, RenderOptions, render
+from padgs.render import RenderOptions, render
 from padgs.render.planar import PlanarFootprints
 from padgs.scene import View
 
@@ -115,49 +110,13 @@ def test_images_are_those_of_the_published_procedure(projection: str, size: int,
     assert abs(rendering.counters["contributing"] - contributing) <= int((alpha[~stable] > 0).sum())
 
 
-def run(
-    gaussians: Gaussians, camera: Camera, options: RenderOptions, pose: Tensor, weights: Tensor, backend: str, dtype
-) -> tuple[Rendering, dict[str, Tensor]]:
-    """A rendering, and the gradients by every input of its outputs [H, W, 5] times the weights."""
-    inputs = leaves(gaussians, dtype)
-    background = BACKGROUND.to(dtype, copy=True).requires_grad_()
-    mean_offsets = torch.zeros(len(gaussians), 2, dtype=dtype, requires_grad=True)
-    twist = torch.zeros(6, dtype=dtype, requires_grad=True)  # rigid motions: other matrices are no poses
-    turn = rotation_matrices(torch.cat((torch.ones_like(twist[:1]), 0.5 * twist[:3])))
-    moved = torch.cat((turn @ pose[:3, :3].to(dtype), pose[:3, 3:].to(dtype) + twist[3:, None]), dim=1)
-    found = {**vars(inputs), "background": background, "mean_offsets": mean_offsets, "twist": twist}
-    if isinstance(camera, RayTable):
-        found["table"] = camera.table.to(dtype, copy=True).requires_grad_()
-        camera = RayTable(found["table"], camera.focal)
-    view = View("v", torch.cat((moved, pose[3:].to(dtype))), camera.width, camera.height, lens=camera)
-    rendering = render(inputs, view, options, background=background, mean_offsets=mean_offsets, backend=backend)
-    outputs = torch.cat((rendering.image, rendering.transmittance[..., None], rendering.depth[..., None]), dim=-1)
-    (outputs * weights.to(dtype)).sum().backward()
-    return rendering, {name: leaf.grad for name, leaf in found.items()}
-
-
-def assert_native_is_the_definition(
+def assert_native_matches(
     gaussians: Gaussians, camera: Camera, options: RenderOptions, generator: torch.Generator, backend: str
 ) -> None:
-    pose = identity_pose()
-    *_, stable = fragments(gaussians, camera, options, pose)
+    *_, stable = fragments(gaussians, camera, options, identity_pose())
     stable = stable.view(camera.height, camera.width)
     assert stable.double().mean() > 0.6
-    weights = torch.randn(*stable.shape, 5, generator=generator, dtype=torch.float64) * stable[..., None]
-    arguments = (gaussians, camera, options, pose, weights)
-    expected, gradients = run(*arguments, "torch", torch.float64)
-    actual, found = run(*arguments, backend, torch.float32)
-    if isinstance(camera, Panorama) or options.projection == "pinhole":
-        assert torch.equal(actual.visible, expected.visible)
-    else:  # the definition knows no bounds: what it draws may lie outside the image
-        assert not (actual.visible & ~expected.visible).any()
-    torch.testing.assert_close(actual.image[stable].double(), expected.image[stable], atol=2e-5, rtol=0)
-    torch.testing.assert_close(actual.transmittance[stable].double(), expected.transmittance[stable], atol=2e-5, rtol=0)
-    torch.testing.assert_close(actual.depth[stable].double(), expected.depth[stable], atol=0, rtol=1e-4)
-    for name, gradient in gradients.items():
-        assert gradient.any(), f"{name} has no gradient to compare"
-        rows = gradient.reshape(-1, 3) if name == "table" else gradient[None] if name == "twist" else gradient
-        assert row_error(found[name].reshape(rows.shape), rows) < 2e-3, name
+    assert_matches_definition(gaussians, camera, options, stable, generator, backend=backend, depth_tolerance=1e-4)
 
 
 @each_native_engine
@@ -177,7 +136,7 @@ def test_native_values_and_gradients_are_those_of_the_definition(projection: str
         gaussians = replace(gaussians, scales=0.0625 * gaussians.scales, opacities=0.5 * gaussians.opacities)
     for width, height in ((70, 44), (33, 17)):
         camera = camera_of(projection, width, height)
-        assert_native_is_the_definition(gaussians, camera, options_of(projection, size), generator, backend)
+        assert_native_matches(gaussians, camera, options_of(projection, size), generator, backend)
 
 
 @each_native_engine
@@ -186,7 +145,7 @@ def test_native_gradients_of_a_table_of_rays(projection: str, backend: str, gene
     formula = Panorama(45, 23)
     camera = RayTable(formula.rays(dtype=torch.float64), formula.focal)
     gaussians = mixture(6, generator, ("ordinary", "polar", "seam"))
-    assert_native_is_the_definition(gaussians, camera, options_of(projection, 3), generator, backend)
+    assert_native_matches(gaussians, camera, options_of(projection, 3), generator, backend)
 
 
 @each_native_engine
@@ -195,14 +154,14 @@ def test_native_gradients_of_a_table_of_rays(projection: str, backend: str, gene
 def test_native_lenses_agree(projection: str, lens: str, backend: str, generator: torch.Generator):
     gaussians = gaussians_of("ordinary", 60, generator)
     camera = render_cases.camera_of(lens, 72, 36)
-    assert_native_is_the_definition(gaussians, camera, options_of(projection, 3), generator, backend)
+    assert_native_matches(gaussians, camera, options_of(projection, 3), generator, backend)
 
 
 @each_native_engine
 def test_native_tiles_wider_than_a_chunk_agree(backend: str, generator: torch.Generator):
     gaussians = mixture(8, generator, ("polar", "pole", "seam"))  # tiles near the poles of 330 columns are wide
     for projection in ("erp", "ray"):
-        assert_native_is_the_definition(gaussians, Panorama(330, 165), options_of(projection, 4), generator, backend)
+        assert_native_matches(gaussians, Panorama(330, 165), options_of(projection, 4), generator, backend)
 
 
 def overlapping(count: int, generator: torch.Generator) -> Gaussians:
@@ -296,102 +255,9 @@ def test_the_order_of_the_gaussians_does_not_matter(projection: str, backend: st
     weights = torch.randn(24, 48, 5, generator=generator, dtype=torch.float64) * stable.view(24, 48, 1)
     order = torch.randperm(len(gaussians), generator=generator)
     permuted = Gaussians(**{name: getattr(gaussians, name)[order] for name in INPUTS})
-    first, gradients = run(gaussians, camera, options, identity_pose(), weights, backend, dtype)
-    second, found = run(permuted, camera, options, identity_pose(), weights, backend, dtype)
+    first, gradients = differentiated(gaussians, camera, options, weights, backend=backend, dtype=dtype)
+    second, found = differentiated(permuted, camera, options, weights, backend=backend, dtype=dtype)
     assert first.counters == second.counters
     torch.testing.assert_close(second.image, first.image, rtol=0, atol=1e-6)
     for name in INPUTS:
         assert row_error(found[name], gradients[name][order]) < 1e-4, name
-
-
-@pytest.fixture
-def restored_threads() -> Iterator[None]:
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
-
-
-@needs_native
-@pytest.mark.parametrize("projection", ["erp", "ray"])
-def test_results_are_bit_equal_for_any_number_of_threads(projection: str, restored_threads: None):
-    generator = torch.Generator().manual_seed(99)
-    gaussians = mixture(800, generator, ("ordinary", "polar", "seam"))
-    weights = torch.randn(125, 250, 5, generator=generator, dtype=torch.float64)
-    results = []
-    for threads in (1, 2, 3):
-        torch.set_num_threads(threads)
-        arguments = (gaussians, Panorama(250, 125), options_of(projection, 8), identity_pose(), weights)
-        results.append(run(*arguments, "cpu", torch.float32))
-    (reference, gradients), *others = results
-    for rendering, found in others:
-        assert rendering.counters == reference.counters
-        for name in ("image", "transmittance", "depth"):
-            assert torch.equal(getattr(rendering, name), getattr(reference, name)), name
-        for name, gradient in gradients.items():
-            assert torch.equal(found[name], gradient), name
-
-
-@needs_native
-def test_strips_change_nothing(generator: torch.Generator):
-    gaussians, camera = mixture(200, generator, ("ordinary", "polar", "seam")), Panorama(128, 64)
-    weights = torch.randn(64, 128, 5, generator=generator, dtype=torch.float64)
-    whole, strips = (
-        run(
-            gaussians, camera, options_of("ray", 4, max_instances=limit), identity_pose(), weights, "cpu", torch.float32
-        )
-        for limit in (1 << 26, 100)
-    )
-    assert torch.equal(whole[0].image, strips[0].image) and whole[0].counters == strips[0].counters
-    for name, gradient in whole[1].items():
-        assert row_error(strips[1][name], gradient) < 1e-4, name
-
-
-DRAW = """
-import sys, torch
-from padgs.gaussians import Gaussians
-from padgs.render import RenderOptions, render
-from padgs.native import cpu
-from padgs.scene import View
-inputs = {k: v.requires_grad_() for k, v in torch.load(sys.argv[1]).items()}
-options = RenderOptions(projection="ray", blending="hybrid", core_size=3)
-r = render(Gaussians(**inputs), View("v", torch.eye(4), 72, 36), options, backend="cpu")
-(r.image.square().sum() + r.depth.sum()).backward()
-torch.save({"image": r.image.detach(), **{k: v.grad for k, v in inputs.items()}}, sys.argv[2])
-print(cpu.library().padgs_isa().decode(), end="")
-"""
-
-
-@needs_native
-@pytest.mark.slow  # a process each
-def test_every_instruction_set_draws_the_same(tmp_path: Path, generator: torch.Generator):
-    torch.save(vars(mixture(10, generator, ("ordinary", "seam")).to(torch.float32)), tmp_path / "in.pt")
-    root = str(Path(__file__).resolve().parents[2])
-    path = os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))
-    results = {}
-    for isa in ("baseline", "avx2", "avx512"):
-        arguments = [sys.executable, "-c", DRAW, str(tmp_path / "in.pt"), str(tmp_path / f"{isa}.pt")]
-        environment = {**os.environ, "PYTHONPATH": path, "PADGS_ISA": isa}
-        done = subprocess.run(arguments, env=environment, capture_output=True, text=True, timeout=120)
-        assert done.returncode == 0, done.stderr
-        results.setdefault(done.stdout, torch.load(tmp_path / f"{isa}.pt"))
-    if len(results) == 1:
-        pytest.skip("this machine has only the baseline instruction set")
-    reference = results.pop("baseline")
-    for isa, result in results.items():
-        assert (result["image"] - reference["image"]).abs().max() <= 1e-5, isa
-        for name in INPUTS:
-            assert row_error(result[name], reference[name]) < 1e-3, f"{name} with {isa}"
-
-
-@each_engine
-def test_nothing_to_draw_is_the_background(backend: str, dtype: torch.dtype):
-    empty = Gaussians(*(torch.zeros(0, width) for width in (3, 4, 3)), torch.zeros(0), torch.zeros(0, 3)).to(dtype)
-    behind = gaussians_of("ordinary", 3, torch.Generator().manual_seed(1)).to(dtype)
-    for gaussians in (empty, replace(behind, opacities=torch.zeros_like(behind.opacities))):
-        view = View("v", identity_pose(), 20, 10)
-        rendering = render(gaussians, view, options_of("ray", 16), background=BACKGROUND.to(dtype), backend=backend)
-        assert torch.equal(rendering.image, BACKGROUND.to(dtype).expand(10, 20, 3))
-        assert not rendering.depth.any() and rendering.counters["contributing"] == 0
-        inputs = leaves(gaussians, dtype)
-        render(inputs, view, options_of("ray", 16), backend=backend).image.square().sum().backward()
-        assert all(value.grad is not None and not value.grad.any() for value in vars(inputs).values())

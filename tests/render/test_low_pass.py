@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
-import ctypes
 import math
 from dataclasses import replace
 
 import pytest
 import torch
-from render_cases import INPUTS, identity_pose, leaves, mixture, needs_native, projected, random_pose, row_error
+from render_cases import (
+    differentiated,
+    identity_pose,
+    leaves,
+    mixture,
+    needs_native,
+    projected,
+    random_pose,
+    row_error,
+    stable_pixels,
+)
 
 from padgs.gaussians import Gaussians
 from padgs.geometry.camera import Camera, Panorama, Pinhole
 from padgs.geometry.panorama import direction
-from padgs.native import cpu
-from padgs.native.abi import NativeCamera
-from padgs.render import RenderConfig, RenderOptions, render
-from padgs.render.contract import ALPHA_MIN, LOW_PASS_KINDS, PUBLISHED_FOCAL
+from padgs.render import RenderOptions, render
+from padgs.render.contract import LOW_PASS_KINDS
 from padgs.render.planar import PlanarFootprints
 from padgs.render.projection import PROJECTIONS
 from padgs.scene import View
@@ -106,7 +113,7 @@ def test_a_large_gaussian_hardly_notices(projection: str, kind: str):
     plain = render(large, View("v", identity_pose(), 64, 32, lens=camera), options_of(projection, kind, near=0.1))
     none = replace(options_of(projection, kind, near=0.1), low_pass=0.0)
     sharp = render(large, View("v", identity_pose(), 64, 32, lens=camera), none)
-    wider = 1 + VARIANCE / (0.15 * (PUBLISHED_FOCAL if kind == "fixed" else camera.focal)) ** 2
+    wider = 1 + VARIANCE / (0.15 * camera.focal) ** 2
     faded = wider**-1.5 if kind == "solid" else 1.0
     assert plain.image.max() == pytest.approx(sharp.image.max().item() * faded, rel=0.01)
     assert plain.image.sum() == pytest.approx(sharp.image.sum().item() * wider * faded, rel=0.04)
@@ -138,34 +145,15 @@ def thin_mixture(generator: torch.Generator) -> Gaussians:
 def test_native_matches_the_definition(projection: str, kind: str, generator):
     gaussians, pose = thin_mixture(generator), random_pose(generator, shift=0.05)
     camera, options = camera_of(projection, 96), options_of(projection, kind, near=0.02)
-    footprints = projected(gaussians, pose, camera, options)
-    weight = torch.rand(48, 96, 3, generator=generator, dtype=torch.float64)
-    weight *= stable(footprints, camera)[..., None]
-    found = {}
-    for backend, dtype in (("torch", torch.float64), ("cpu", torch.float32)):
-        inputs, eye = leaves(gaussians, dtype), pose.to(dtype, copy=True).requires_grad_()
-        mean_offsets = torch.zeros(75, 2, dtype=dtype, requires_grad=True)
-        view = View("v", eye, camera.width, camera.height, lens=camera)
-        rendering = render(inputs, view, options, backend=backend, mean_offsets=mean_offsets, check_values=True)
-        (rendering.image * weight).sum().backward()
-        gradients = {name: getattr(inputs, name).grad for name in INPUTS}
-        gradients |= {"shift": eye.grad[:3, 3:], "mean_offsets": mean_offsets.grad}
-        found[backend] = rendering, gradients
-    (expected, expected_gradients), (actual, gradients) = found["torch"], found["cpu"]
+    weights = torch.rand(48, 96, 3, generator=generator, dtype=torch.float64)
+    weights *= stable_pixels(gaussians, 96, 48, lens=camera, pose=pose, options=options)[..., None]
+    arguments = (gaussians, camera, options, weights)
+    expected, expected_gradients = differentiated(*arguments, pose=pose, backend="torch", dtype=torch.float64)
+    actual, gradients = differentiated(*arguments, pose=pose, backend="cpu", dtype=torch.float32)
     assert expected.counters["visible"] >= 5
-    assert ((actual.image - expected.image).abs() * (weight > 0)).max() < 2e-5
+    assert ((actual.image - expected.image).abs() * (weights > 0)).max() < 2e-5
     for name, gradient in gradients.items():
         assert row_error(gradient, expected_gradients[name]) < 2e-3, name
-
-
-def stable(footprints, camera: Camera) -> torch.Tensor:
-    """Pixels [H, W] bool where no alpha is within 0.1 % of being cut or limited."""
-    drawn = footprints.visible.nonzero()[:, 0]
-    pixels = torch.arange(camera.height * camera.width)
-    q, _ = footprints.squared_distance(drawn, pixels // camera.width, pixels % camera.width)
-    alpha = footprints.opacities[drawn] * torch.exp(-0.5 * q)
-    near = ((alpha / ALPHA_MIN - 1).abs() < 1e-3) | ((alpha / 0.99 - 1).abs() < 1e-3)
-    return ~near.any(-1).view(camera.height, camera.width)
 
 
 @pytest.mark.parametrize("place", ["ordinary", "next to the pole", "across the seam"])
@@ -203,30 +191,3 @@ def test_gradients_are_the_slope(projection: str, kind: str, place: str, generat
                 name
             )
     assert (gradients[2].abs() > 1e-3).all(), "scales"
-
-
-@pytest.mark.parametrize(
-    ("projection", "kind", "known"),
-    [
-        ("ray", "pixels", "solid, angular"),
-        ("tangent", "pixels", "angular, solid"),
-        ("erp", "3d", "pixels, angular, solid"),
-    ],
-)
-def test_kinds_that_make_no_sense_are_named(projection: str, kind: str, known: str):
-    with pytest.raises(ValueError, match=f"'{projection}' has no low_pass_kind '{kind}'; known: auto, {known}"):
-        RenderOptions(projection=projection, low_pass_kind=kind)
-
-
-def test_it_is_a_setting_of_a_run():
-    assert RenderConfig(low_pass_kind="angular").options(1.0).resolved_low_pass_kind == "angular"
-
-
-@needs_native
-def test_a_library_of_another_version_is_refused(monkeypatch):
-    class Grown(ctypes.Structure):
-        _fields_ = [*NativeCamera._fields_, ("more", ctypes.c_int32)]
-
-    monkeypatch.setattr(cpu, "STRUCTURES", (Grown, *cpu.STRUCTURES[1:]))
-    with pytest.raises(OSError, match="libpadgs_cpu.* is of another version, with another Grown; build it again"):
-        cpu.library.__wrapped__()

@@ -87,10 +87,3 @@ def test_what_is_left_is_drawn_as_before(backend, dtype, generator):
         render(gaussians, VIEW, options(near_cull=kind), backend=backend) for kind in ("mean", "ellipsoid")
     )
     assert torch.equal(culled.visible, plain.visible) and torch.equal(culled.image, plain.image)
-
-
-def test_other_projections_refuse_it():
-    with pytest.raises(ValueError, match="near_cull=ellipsoid is made for projection 'ray', not 'erp'"):
-        RenderOptions(near_cull="ellipsoid")
-    with pytest.raises(ValueError, match="unknown near_cull 'box'; known: mean, ellipsoid"):
-        RenderOptions(near_cull="box")

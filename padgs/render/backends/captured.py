@@ -20,7 +20,6 @@ from padgs.render.backends import cuda as cuda_backend
 from padgs.render.backends.cuda import MAX_INSTANCES, DeviceProjected
 from padgs.render.backends.native import native_camera, native_rays
 from padgs.render.contract import Rendering, RenderOptions, Request, check_inputs
-from padgs.render.published_bounds import check_memory
 from padgs.scene import View
 
 HEADROOM = 1.5  # capacity as a multiple of the counted instances
@@ -65,18 +64,17 @@ class CapturedRender:
                 by reference: later writes to them are rendered. None may be replaced, as growth and `PaDGS.load` do: a
                 replay would read freed memory. Make a new `CapturedRender` instead.
             view: the camera, and the first pose.
-            options: as in `padgs.render.render`, without cubemap and pixel_bias.
+            options: as in `padgs.render.render`, without cubemap.
             background: [3] RGB, by reference; black if not given.
             capacity: number of instances; `HEADROOM` times those of the first pose if not given.
 
         Raises:
             ValueError: options or Gaussians that cannot be recorded, or more instances than `options.max_instances`,
                 which need strips.
-            MemoryError: more instances than `options.memory_cap` allows.
             OSError, RuntimeError, torch.cuda.OutOfMemoryError: as `cuda_backend.rasterize` does.
         """
-        if options.cubemap or options.pixel_bias:
-            raise ValueError("frames with cubemap or pixel_bias cannot be recorded; draw them with padgs.render.render")
+        if options.cubemap:
+            raise ValueError("frames with cubemap=true cannot be recorded; use padgs.render.render")
         self._most = min(options.max_instances, MAX_INSTANCES)
         if capacity is not None and not 1 <= capacity <= self._most:
             raise ValueError(f"capacity is {capacity}; it must be 1 to {self._most} instances (max_instances)")
@@ -95,11 +93,11 @@ class CapturedRender:
 
     @torch.no_grad()
     def __call__(self, cam_from_world: Tensor) -> Rendering:
-        """Render from a pose [4, 4]; waits for the end of the frame. The result is a copy that no later frame overwrites.
+        """Render from a pose [4, 4], and wait for the frame. The result is a copy that no later frame overwrites.
 
         Raises:
             ValueError: another shape.
-            ValueError, MemoryError, torch.cuda.OutOfMemoryError: the pose needs more capacity than is possible.
+            ValueError, torch.cuda.OutOfMemoryError: the pose needs more capacity than is possible.
         """
         pose = self._view.cam_from_world
         if cam_from_world.shape != pose.shape:
@@ -120,11 +118,10 @@ class CapturedRender:
         return Rendering(image, transmittance, depth, frame.visible.clone(), counters)
 
     def _capacity_for(self, instances: int) -> int:
-        check_memory(instances, self._options)
         if instances > self._most:
             raise ValueError(
                 f"this pose has {instances:,} (Gaussian, tile) instances; max_instances={self._most:,} draws them in "
-                "strips, which cannot be recorded. Raise max_instances, or draw it with padgs.render.render"
+                "strips, which cannot be recorded. Raise max_instances, or use padgs.render.render"
             )
         return min(self._most, int(HEADROOM * instances) + 1)
 

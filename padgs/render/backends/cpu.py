@@ -38,7 +38,6 @@ from padgs.render.backends.native import (
     strip_cuts,
 )
 from padgs.render.contract import Removals, Rendering, Request
-from padgs.render.published_bounds import check_memory
 
 
 def rasterize(request: Request) -> Rendering:
@@ -155,7 +154,6 @@ class _Image(NativeImage):
     def draw(self, inputs: Inputs, pose: Tensor, background: Tensor, *, differentiated: bool) -> tuple[Pixels, Tensor]:
         camera, options = self.camera, self.options
         self._projected = Projected(native_camera(pose, camera, options), inputs, options.max_instances)
-        check_memory(self._projected.instances, options)
         self.rays = native_rays(camera)
         size = (camera.height, camera.width)
         pixels = (torch.empty(*size, 3), torch.empty(size), torch.empty(size))

@@ -31,7 +31,6 @@ from padgs.render.backends.native import (
     strip_cuts,
 )
 from padgs.render.contract import Removals, Rendering, RenderOptions, Request
-from padgs.render.published_bounds import check_memory
 
 IDENTITY = torch.eye(4)
 MAX_INSTANCES = (1 << 31) - 1 - 512  # of one strip: positions in its lists, and a batch behind, are 32-bit integers
@@ -262,14 +261,12 @@ class _Image(NativeImage):
         outputs = Outputs.allocate(camera, options, device, differentiated=differentiated)
         native, key = native_camera(IDENTITY, camera, options), (device, camera.width, camera.height)
         limit = min(options.max_instances, MAX_INSTANCES)
-        capacity = _capacities.get(key, 0) if options.memory_cap is None else 0
+        capacity = _capacities.get(key, 0)
         if not 0 < capacity <= limit:
             capacity = 0
         while True:
             self._projected = DeviceProjected(native, pose, inputs, options.max_instances, capacity=capacity)
             counts = HostCopy(self._projected.counts) if capacity else None
-            if counts is None:
-                check_memory(self._projected.instances, options)
             pairs = blend(self._projected, self.rays, background, outputs)
             if counts is None or self._projected.fits(counts.values()):
                 break

@@ -24,7 +24,6 @@ from padgs.render.contract import (
     Request,
 )
 from padgs.render.projection import Footprints, project
-from padgs.render.published_bounds import check_memory, instances
 
 PAIRS_PER_BLOCK = 1 << 21  # (pixel, Gaussian) pairs held at once
 
@@ -35,8 +34,6 @@ def rasterize(request: Request) -> Rendering:
     footprints = project(request)
     order = torch.argsort(footprints.depths.detach(), stable=True)
     order = order[footprints.visible[order]]
-    if options.memory_cap is not None and footprints.boxes is not None:
-        check_memory(instances(footprints.boxes[order], camera.width, camera.height), options)
     parts = []
     places = blocks(camera, len(order), background.device)
     for rows, columns in places:

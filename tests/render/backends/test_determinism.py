@@ -10,14 +10,14 @@ from pathlib import Path
 
 import pytest
 import torch
-from render_cases import camera_of, leaves, mixture, needs_native, random_pose, view_of
+from render_cases import OUTPUTS, camera_of, differentiated, mixture, needs_native, random_pose
 from torch import Tensor
 
-from padgs.geometry.camera import Panorama, RayTable
+from padgs.geometry.camera import Panorama
 from padgs.methods.anchors.decoder import Decoder, SeenAnchors, decode_gaussians
 from padgs.methods.plus.smoothness import roughness
 from padgs.native import cpu
-from padgs.render import Rendering, RenderOptions, render
+from padgs.render import Rendering, RenderOptions
 from padgs.training.loss import photometric_loss
 
 pytestmark = needs_native
@@ -27,6 +27,8 @@ RENDERINGS = {
     "tangent": ("tangent", "panorama", {}),
     "ray": ("ray", "panorama", {"near": 0.05}),
     "pinhole": ("pinhole", "pinhole", {}),
+    "erp, hybrid": ("erp", "panorama", {"blending": "hybrid", "core_size": 8}),
+    "ray, hybrid": ("ray", "panorama", {"blending": "hybrid", "core_size": 3}),
     "ray in a pinhole": ("ray", "pinhole", {}),
     "tangent along a table": ("tangent", "fisheye", {}),
     "ray along a table": ("ray", "fisheye", {}),
@@ -38,22 +40,13 @@ def drawn(name: str, count: int = 250, size: tuple[int, int] = (250, 125)) -> di
     projection, lens, settings = RENDERINGS[name]
     generator = torch.Generator().manual_seed(99)
     gaussians = mixture(count, generator, ("ordinary", "polar", "seam", "needle"))
-    leaf = dict(vars(leaves(gaussians, torch.float32)))
-    inputs, camera = type(gaussians)(**leaf), camera_of(lens, *size)
-    leaf["pose"] = random_pose(generator, shift=0.1).float().requires_grad_()
-    leaf["background"] = torch.full((3,), 0.5, requires_grad=True)
-    leaf["mean_offsets"] = torch.zeros(len(gaussians), 2, requires_grad=True)
-    if isinstance(camera, RayTable):
-        leaf["rays"] = camera.table.float().requires_grad_()
-        camera = RayTable(leaf["rays"], camera.focal)
-    view, options = view_of(camera, leaf["pose"]), RenderOptions(projection, **settings)
-    extra = {"background": leaf["background"], "mean_offsets": leaf["mean_offsets"], "backend": "cpu"}
-    rendering = render(inputs, view, options, **extra)
-    outputs = {key: getattr(rendering, key) for key in ("image", "transmittance", "depth")}
-    loss = sum((value * torch.randn(value.shape, generator=generator)).sum() for value in outputs.values())
-    gradients = torch.autograd.grad(loss, list(leaf.values()))
+    camera, options = camera_of(lens, *size), RenderOptions(projection, **settings)
+    weights, pose = torch.randn(*size[::-1], 5, generator=generator), random_pose(generator, shift=0.1)
+    engine = {"pose": pose, "backend": "cpu", "dtype": torch.float32}
+    rendering, gradients = differentiated(gaussians, camera, options, weights, **engine)
+    outputs = {key: getattr(rendering, key).detach() for key in OUTPUTS}
     counters = torch.tensor([rendering.counters[key] for key in sorted(rendering.counters)])
-    return {**outputs, "counters": counters, **{f"by {key}": g for key, g in zip(leaf, gradients, strict=True)}}
+    return {**outputs, "counters": counters, **{f"by {key}": gradient for key, gradient in gradients.items()}}
 
 
 def decoded(anchors: int = 3000) -> dict[str, Tensor]:

@@ -83,7 +83,7 @@ def test_a_non_finite_gaussian_is_rejected_or_not_drawn(name: str, bad: float, p
     broken, options = leaves(gaussians, dtype), RenderOptions(projection)
     getattr(broken, name).data[1] = bad
     engine = {"backend": backend, "dtype": dtype, "lens": lens, "options": options}
-    with pytest.raises(ValueError, match=f"{name} holds .* non-finite"):
+    with pytest.raises(ValueError, match=f"{name} has .* non-finite"):
         draw(broken, 32, 16, **engine)
     pose = identity_pose().to(dtype).requires_grad_()
     rendering = render(broken, view_of(camera_of(lens, 32, 16), pose), options, backend=backend)
