@@ -15,8 +15,8 @@ namespace padgs {
 constexpr int kPatchWidth = 8, kPatchHeight = 2;  // pixels of a patch, which is one vector
 constexpr int kTile = 16;        // pixels: height of a tile, and its width times a power of two
 constexpr int kMaxLevel = 4;     // tiles are up to kTile 2^kMaxLevel pixels wide, near the poles
-constexpr int kMoments = 16;     // floats that backward blending leaves for each (Gaussian, tile) instance
-constexpr int kAbsoluteMoment = 14;
+constexpr int kGradientSums = 16;     // floats that backward blending leaves for each (Gaussian, tile) instance
+constexpr int kAbsgradSum = 14;
 constexpr int kRemoval = 4;      // floats for each instance: changes of error and image, sum and largest contribution
 constexpr float kAlphaMin = 1.0f / 255.0f;
 constexpr float kAlphaMax = 0.99f;
@@ -28,7 +28,7 @@ constexpr float kNearest = 1e-15f, kFurthest = 1e15f;  // distances of means tha
 enum Projection : int32_t { kErp = 0, kPinhole = 1, kTangent = 2, kRay = 3 };
 enum CameraModel : int32_t { kPanoramaModel = 0, kPinholeModel = 1, kTableModel = 2 };
 
-// What a camera and its options are to the kernels. Mirrored by `NativeCamera` in padgs/native/abi.py.
+// Camera and options as kernels take them. Mirrored by `NativeCamera` in padgs/native/abi.py.
 struct Camera {
   int32_t width, height;
   int32_t projection, model;
@@ -39,9 +39,9 @@ struct Camera {
   int32_t square;        // 1: published bounds, a square of 3 sigma of the longest axis rounded out to tiles
   float fx, fy, cx, cy;  // pinhole
   float widen;           // rad^2, times r^2 added to the 3D covariance
-  float off_panorama;    // of a table: radians that its rays are off a panorama's at most; < 0: they may look anywhere
+  float off_panorama;    // of a table: largest angle in radians to the rays of a panorama; < 0: arbitrary rays
   int32_t compensate;    // 1: widening lowers the opacity
-  int32_t cull_ellipsoids;  // 1: ray: all that is drawn of a Gaussian must be beyond near_radius, not the mean alone
+  int32_t cull_ellipsoids;  // 1: ray: the whole drawn Gaussian must be beyond near_radius, not only its mean
 };
 
 // One projected Gaussian as the blender reads it: a cache line.
@@ -71,7 +71,7 @@ struct TileGrid {
 // One (Gaussian, tile) pair, with the patches of the tile that the Gaussian can reach.
 struct Instance {
   int32_t gaussian;
-  uint32_t slot;                             // where its moments go
+  uint32_t slot;                             // where its gradient sums go
   uint8_t row, row_end, column, column_end;  // of patches, from the tile's corner; ends are exclusive
 };
 static_assert(sizeof(Instance) == 12, "padgs/render/backends/cpu.py allocates 3 integers per instance");
@@ -79,12 +79,12 @@ static_assert(sizeof(Instance) == 12, "padgs/render/backends/cpu.py allocates 3 
 struct Inputs {
   int64_t count;
   const float *means, *quats, *scales, *opacities, *colors;  // [N,3] [N,4] [N,3] [N] [N,3]
-  const float *probe;                                         // [N,2] or null
+  const float *mean_offsets;                                         // [N,2] or null
 };
 
 struct Gradients {
   float *means, *quats, *scales, *opacities, *colors;  // as in Inputs, written not added to
-  float *probe;                                        // [N,2] or null
+  float *mean_offsets;                                        // [N,2] or null
   double *pose;                                        // [12] or null
 };
 
@@ -98,7 +98,7 @@ struct Rays {
 struct BlendArguments {
   TileGrid grid;
   int32_t projection, wrap;
-  int32_t core_size;  // hybrid blending with so many fragments in order, or 0: sorted
+  int32_t core_size;  // hybrid blending with this many sorted fragments; 0: sorted blending
   Rays rays;
   const Footprint *footprints;           // [N]
   const int64_t *tile_start;             // [tiles + 1] over the drawn tiles
@@ -107,17 +107,17 @@ struct BlendArguments {
   float *image, *transmittance, *depth;  // [H,W,3] [H,W] [H,W]
   int32_t *last;                         // [H,W] 1 + position in the tile's list of the last contribution; sorted only
   int64_t *pair_counts;                  // [tiles, 2] evaluated and contributing pairs
-  // Hybrid, of what forward leaves to backward (kept_cores.h); null where no gradient is wanted.
-  int32_t *cores;       // padgs_core_words(...) words, of which only so many are touched as are needed
+  // Hybrid: state kept for the backward pass (kept_cores.h); null without gradients.
+  int32_t *cores;       // padgs_core_words(...) words, of which only the used ones are touched
   int64_t *core_start;  // [tiles + 1] where each tile's begin, and how many words are in use: 0 before forward
 };
 
 struct BlendGradientArguments {
   BlendArguments forward;
   const float *grad_image, *grad_transmittance, *grad_depth;  // [H,W,3] [H,W] or null, [H,W] or null
-  float *moments;                                             // [I, kMoments] by slot
+  float *gradient_sums;                                       // [I, kGradientSums] by slot
   float *grad_rays;                                           // [H, 3, padded W] or null
-  int32_t absolute;  // 1: also sum what each pixel alone pulls at the mean, into moment kAbsoluteMoment; `ray` only
+  int32_t absgrad;  // 1: also compute the absolute positional gradient, in sum kAbsgradSum; `ray` only
 };
 
 struct LeaveOneOutArguments {
@@ -149,7 +149,7 @@ struct DecodeArguments {
 struct DecodeGradientArguments {
   DecodeArguments forward;
   const float *means, *quats, *scales, *opacities, *colors;  // upstream, [N, ...]
-  int32_t features;                                          // the first so many inputs want a gradient
+  int32_t features;                                          // number of leading inputs with a gradient
   float *features_out, *offsets_out, *log_scales_out;        // [A, features] [A, K, 3] [A, 6]
   float *weights_out;  // all of opacity, color, covariance: w1, b1, w2, b2 each
 };
@@ -165,7 +165,7 @@ struct LossArguments {
   float *gradient;   // [H,W,3], dL/dimage, or null
 };
 
-// What padgs.methods.plus.smoothness.roughness takes.
+// Arguments of padgs.methods.plus.smoothness.roughness.
 struct RoughnessArguments {
   int32_t width, height;
   int32_t wrap;                               // 1: the ends of rows are neighbours
@@ -178,25 +178,25 @@ struct RoughnessArguments {
   float *gradient;                            // [H,W], by depth, or null
 };
 
-// Explicit Gaussians as a view sees them, from what is learned of them; with `grad_colors` the derivatives by that.
+// Parameters of explicit Gaussians to attributes for one view; with `grad_colors` the derivatives.
 struct SplatArguments {
   int64_t count;
   int32_t degree;       // of the spherical harmonics that are in use, 0 to 3
   int32_t stored;       // coefficients of a row of `rest`, which may be more
-  int32_t probe_width;  // 0: no probe; 3, or 4 with that of absolute pulls
-  float center[3], tiny;  // of the camera; what a distance is at least taken for; world units
+  int32_t offset_width;  // 0: no offsets; 3; or 4, the last one for the absolute positional gradient
+  float center[3], tiny;  // camera centre; lower limit of distances; world units
   const float *means, *log_scales, *opacity_logits, *dc;  // [N,3] [N,3] [N] [N,3]
   const float *rest;                                      // [N,stored,3]
-  const float *probe;                                     // [N,probe_width], in halves of the distance
-  float *moved, *scales, *opacities, *colors, *pulls;     // [N,3] [N,3] [N] [N,3] [N] or null
-  const float *grad_moved, *grad_scales, *grad_opacities, *grad_colors, *grad_pulls;  // as these, or null
-  float *grad_means, *grad_log_scales, *grad_opacity_logits, *grad_dc, *grad_rest, *grad_probe;
+  const float *offsets;                                     // [N,offset_width], in halves of the distance
+  float *moved, *scales, *opacities, *colors, *absgrad;     // [N,3] [N,3] [N] [N,3] [N] or null
+  const float *grad_moved, *grad_scales, *grad_opacities, *grad_colors, *grad_absgrad;  // as these, or null
+  float *grad_means, *grad_log_scales, *grad_opacity_logits, *grad_dc, *grad_rest, *grad_offsets;
 };
 
-// What padgs.methods.plus.model.mean_angular_size takes.
+// Arguments of padgs.methods.plus.model.mean_angular_size.
 struct AngularSizeArguments {
   int64_t count;
-  float center[3], nearest;     // of the camera; what a distance is at least taken for; world units
+  float center[3], nearest;     // camera centre; lower limit of distances; world units
   const float *means, *scales;  // [N,3]
   float *gradient;              // [N,3], by scales, or null
 };

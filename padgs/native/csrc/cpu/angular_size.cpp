@@ -23,7 +23,7 @@ float sixteen(const AngularSizeArguments &args, int64_t first, float each) {
     squared += away * away;
     sizes += scale[c];
   }
-  // What is no number is not less than any, and has to reach the loss; `maximum` loses it on some machines.
+  // NaN compares as not less, and must reach the loss; `maximum` drops it on some machines.
   const Vec distance = root(squared), nearest = splat(args.nearest);
   const Vec inverse = each / select(less(distance, nearest), nearest, distance);
   if (args.gradient) {

@@ -61,7 +61,7 @@ struct PatchBox {
 constexpr int kPatchRows = kTile / kPatchHeight;  // of a tile
 
 // An instance before it is known where in the list of its tile it comes. Its four bytes of patches are put together in a
-// register: who reads a word right after it was written byte by byte waits for all of them.
+// register: reading a word right after writing its bytes would wait for all of them.
 struct Listed {
   int32_t gaussian;
   uint32_t tile;
@@ -122,7 +122,7 @@ PADGS_API void padgs_count_instances(const PixelBox *boxes, int64_t count, const
 }
 
 // Fills the lists of the grid's drawn tiles.
-//   slot_start [N + 1]: where each Gaussian's moments begin; its instances are consecutive there
+//   slot_start [N + 1]: where each Gaussian's gradient sums begin; its instances are consecutive there
 //   tile_start [tiles + 1], instances [I]
 PADGS_API void padgs_bin(const PixelBox *boxes, int64_t count, const int32_t *order, int64_t visible,
                          const TileGrid *grid, int64_t *slot_start, int64_t *tile_start, Instance *instances) {
@@ -130,7 +130,7 @@ PADGS_API void padgs_bin(const PixelBox *boxes, int64_t count, const int32_t *or
   std::fill_n(slot_start, count + 1, int64_t(0));
   // Each thread takes a block of the Gaussians, in depth order, and has a histogram of its own. Counting sort is
   // stable, so that the lists do not depend on how many blocks there are. Which tiles a box touches is worked out once:
-  // how far its loops go, nobody can predict.
+  // the lengths of its loops are hard to predict.
   const int blocks = threads();
   const auto start = [&](int64_t block) { return visible * block / blocks; };
   std::vector<int64_t> next(blocks * tiles, 0);
@@ -184,10 +184,10 @@ PADGS_API void padgs_bin(const PixelBox *boxes, int64_t count, const int32_t *or
   }
 }
 
-// Adds the moments of each Gaussian's instances, in the order of its slots, to its totals [N, kMoments].
-PADGS_API void padgs_sum_moments(const float *moments, const int64_t *slot_start, int64_t count, float *totals) {
+// Adds the gradient sums of each Gaussian's instances, in the order of its slots, to its totals [N, kGradientSums].
+PADGS_API void padgs_sum_moments(const float *gradient_sums, const int64_t *slot_start, int64_t count, float *totals) {
 #pragma omp parallel for schedule(static)
   for (int64_t i = 0; i < count; ++i)
     for (int64_t slot = slot_start[i]; slot < slot_start[i + 1]; ++slot)
-      for (int k = 0; k < kMoments; ++k) totals[i * kMoments + k] += moments[slot * kMoments + k];
+      for (int k = 0; k < kGradientSums; ++k) totals[i * kGradientSums + k] += gradient_sums[slot * kGradientSums + k];
 }

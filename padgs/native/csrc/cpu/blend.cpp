@@ -2,7 +2,7 @@
 //
 // Forward takes a tile's instances in batches, front to back: it notes which patches each reaches, then finishes one
 // patch after the other, whose pixels stay in registers. Backward goes back to front, a few instances at a time: for
-// each it sums moments of M = dL/d(ln alpha) over the patches, which planar.h and projective.h turn into derivatives.
+// each it sums M = dL/d(ln alpha) times powers over the patches, which planar.h and projective.h turn into derivatives.
 #include <algorithm>
 #include <cmath>
 #include <vector>
@@ -145,8 +145,8 @@ struct Hit {
   int patch;
 };
 
-// kAbsolute: with `absolute`, see BlendGradientArguments.
-template <class Seen, bool kWithDepth, bool kWithRays, bool kAbsolute>
+// kAbsgrad: with `absgrad`, see BlendGradientArguments.
+template <class Seen, bool kWithDepth, bool kWithRays, bool kAbsgrad>
 void backward_tile(const BlendGradientArguments &args, const Tile &tile) {
   const BlendArguments &forward = args.forward;
   static thread_local std::vector<BackwardPatch> storage;
@@ -164,7 +164,7 @@ void backward_tile(const BlendGradientArguments &args, const Tile &tile) {
     furthest = std::max(furthest, load_patch(args, Patch(tile, p, forward.grid.width), states[p]));
 
   for (int64_t i = tile.first + furthest; i < tile.end; ++i)
-    std::fill_n(args.moments + int64_t(forward.instances[i].slot) * kMoments, kMoments, 0.0f);
+    std::fill_n(args.gradient_sums + int64_t(forward.instances[i].slot) * kGradientSums, kGradientSums, 0.0f);
   for (int64_t i = tile.first + furthest - 1; i >= tile.first;) {
     int count = 0, found = 0;
     for (; i >= tile.first && count < kEntrants && found < kHits; --i, ++count) {
@@ -188,8 +188,8 @@ void backward_tile(const BlendGradientArguments &args, const Tile &tile) {
     for (int e = 0; e < count; ++e) {
       const Footprint &g = forward.footprints[entrants[e].gaussian];
       const Seen seen(g, forward, tile);
-      typename Seen::Moments moments;
-      Vec red = zero(), green = zero(), blue = zero(), depth = zero(), absolute = zero();
+      typename Seen::GradientSums gradient_sums;
+      Vec red = zero(), green = zero(), blue = zero(), depth = zero(), absgrad = zero();
       for (const Hit<Seen> *end = hits + entrants[e].end; hit < end; ++hit) {
         BackwardPatch &state = states[hit->patch];
         const Vec alpha = minimum(hit->alpha, splat(kAlphaMax));
@@ -199,23 +199,23 @@ void backward_tile(const BlendGradientArguments &args, const Tile &tile) {
         Vec signal = state.grad_red * g.red + state.grad_green * g.green + state.grad_blue * g.blue;
         if (kWithDepth) signal += state.grad_depth * g.depth;
         signal = signal * weight;
-        // alpha dL/dalpha = T alpha (c . G) - (what is behind) alpha / (1 - alpha), and 0 where alpha is limited.
+        // alpha dL/dalpha = T alpha (c . G) - (contribution behind) alpha / (1 - alpha), and 0 where alpha is limited.
         const Vec m = keep(less(hit->alpha, splat(kAlphaMax)), signal - state.behind * (inverse * alpha));
         state.behind += signal;
         red += weight * state.grad_red;
         green += weight * state.grad_green;
         blue += weight * state.grad_blue;
         if (kWithDepth) depth += weight * state.grad_depth;
-        moments.add(hit->factors, m);
-        if constexpr (kAbsolute) absolute += seen.pull(hit->factors, m);
+        gradient_sums.add(hit->factors, m);
+        if constexpr (kAbsgrad) absgrad += seen.absgrad(hit->factors, m);
         if constexpr (kWithRays) seen.add_ray_gradient(hit->factors, hit->b_by_d, m, ray_gradients[hit->patch]);
       }
-      float *out = args.moments + int64_t(entrants[e].slot) * kMoments;
-      Vec sums[kMoments];
-      moments.finish(sums);
+      float *out = args.gradient_sums + int64_t(entrants[e].slot) * kGradientSums;
+      Vec sums[kGradientSums];
+      gradient_sums.finish(sums);
       sums[10] = red, sums[11] = green, sums[12] = blue, sums[13] = depth;
-      sums[kAbsoluteMoment] = absolute, sums[15] = zero();
-      for (int k = 0; k < kMoments; k += 8) sum8(sums + k, out + k);
+      sums[kAbsgradSum] = absgrad, sums[15] = zero();
+      for (int k = 0; k < kGradientSums; k += 8) sum8(sums + k, out + k);
     }
   }
   if constexpr (kWithRays) add_ray_gradients(args, tile, ray_gradients);
@@ -239,7 +239,7 @@ void blend_backward(const BlendGradientArguments &args) {
                       : backward_tile<PlanarFootprint, false, false, false>(args, tile);
     else if (args.grad_rays)
       backward_tile<ProjectiveFootprint, true, true, true>(args, tile);
-    else if (args.absolute)
+    else if (args.absgrad)
       backward_tile<ProjectiveFootprint, true, false, true>(args, tile);
     else
       args.grad_depth ? backward_tile<ProjectiveFootprint, true, false, false>(args, tile)

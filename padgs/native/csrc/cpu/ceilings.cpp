@@ -1,4 +1,4 @@
-// What this machine can do at most, for padgs bench to measure everything else by: arithmetic without memory, and
+// Peak rates of this machine, which padgs bench compares with: arithmetic without memory, and
 // memory without arithmetic, on all threads. Both return the work they did; the caller reads the clocks.
 #include "kernels.h"
 #include "simd.h"

@@ -96,7 +96,7 @@ void load_rows(const float *rows, int width, int64_t first, int64_t count, Vec *
 struct Group {
   const DecodeArguments &args;
   int64_t first = 0;
-  int lanes = 0;  // of them that exist
+  int lanes = 0;  // number of valid lanes
   std::vector<Vec> memory;
   Vec *inputs, *hidden, *outputs;  // [I], [hidden], [7 K]
 
@@ -268,7 +268,7 @@ class BlockBackward {
     sums.first.add(grad_hidden, inputs);
   }
 
-  // What one anchor's selected Gaussians pass on: to its offsets and scales at once, to the networks through `grads`.
+  // Gradients of the selected Gaussians of an anchor: to its offsets and scales, and to the networks through `grads`.
   void anchor(int64_t anchor, float *grads, const float *lane_reaches) {
     const DecodeArguments &in = forward_;
     const int k = in.offsets;

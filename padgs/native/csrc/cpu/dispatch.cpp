@@ -83,10 +83,10 @@ PADGS_API void padgs_project(const Camera *camera, const Inputs *in, Footprint *
   kernels().project.forward(*camera, *in, footprints, boxes);
 }
 
-// Gradients of every input from the moments [N, kMoments], already summed over the instances of each Gaussian.
-PADGS_API void padgs_project_backward(const Camera *camera, const Inputs *in, const float *moments,
+// Gradients of every input from the gradient sums [N, kGradientSums], already summed over the instances of each Gaussian.
+PADGS_API void padgs_project_backward(const Camera *camera, const Inputs *in, const float *gradient_sums,
                                       const Gradients *out) {
-  kernels().project.backward(*camera, *in, moments, *out);
+  kernels().project.backward(*camera, *in, gradient_sums, *out);
 }
 
 static const BlendKernels &blending(int32_t core_size) {

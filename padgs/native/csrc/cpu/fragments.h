@@ -1,9 +1,9 @@
 // The fragments of sixteen pixels for hybrid blending: the nearest few in order, and sums over all others.
 //
 // The core is a list of rows, each of one instance: those of its fragments that are in the core of their pixels, with
-// holes at the other pixels. A hole is a transparent fragment as far away as what is in front of it, so the distances
+// holes at the other pixels. A hole is a transparent fragment as far away as the one in front of it, so the distances
 // of every pixel ascend along the rows. As instances come nearly front to back, most rows are appended; fragments
-// that are nearer than what their pixel has already make rows further up.
+// that are nearer than others of their pixel make rows further up.
 #pragma once
 
 #include <algorithm>
@@ -22,7 +22,7 @@ struct Row {
   int32_t front;  // the row in front of this one
 };
 
-// Sums over the fragments outside the core; they do not depend on any order but that of rounding.
+// Sums over the fragments outside the core; independent of order up to rounding.
 struct Tail {
   Vec alpha = zero(), left = splat(1.0f);                           // sum of alpha, product of 1 - alpha
   Vec red = zero(), green = zero(), blue = zero(), depth = zero();  // sums of alpha times them
@@ -56,7 +56,7 @@ class Fragments {
     reserve(0);
     rows[0] = {splat(-1.0f), zero(), 0, 0};
   }
-  // Makes room for `more` instances: a row for each pixel of each at most, and one that is written without being asked.
+  // Makes room for `more` instances: a row for each pixel of each at most, and one that is always written.
   void reserve(int more) {
     const int offset = int(rows - row_storage_.get());
     grow(row_storage_, row_capacity_, offset + row_count, kLanes * more + 1);
@@ -69,7 +69,7 @@ class Fragments {
   // the others join the tail, and rows that have none left are dropped.
   template <class FootprintOf>
   void close(int core_size, FootprintOf footprint_of) {
-    if (in_order) return;  // and none is too many: of what comes in order, nothing enters a full core
+    if (in_order) return;  // and none is too many: sorted fragments do not enter a full core
     in_order = true;
     grow(spare_storage_, spare_capacity_, 0, row_count);
     const Vec size = splat(float(core_size));
@@ -119,7 +119,7 @@ PADGS_INLINE int insert(Row *rows, int count, int last, Mask moving, Vec distanc
     const int front = rows[behind].front;
     const Vec nearest = rows[front].distance;
     const Mask further = both(moving, less(distance, nearest)), here = without(moving, further);
-    // Written in any case, which is cheaper than to ask.
+    // Always written, which is cheaper than a branch.
     rows[count] = {select(here, distance, nearest), keep(here, alpha), entrant, front};
     const int added = any(here);
     rows[behind].front = front + (count - front) * added;

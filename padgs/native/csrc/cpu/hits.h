@@ -1,4 +1,4 @@
-// Backward blending looks at a few instances before it sums their moments: evaluating needs no jumps and waits for
+// Backward blending looks at a few instances before it sums their gradients: evaluating needs no jumps and waits for
 // nothing, and by then it is known which patches an instance draws in, which could not be predicted.
 #pragma once
 

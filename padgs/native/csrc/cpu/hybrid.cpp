@@ -1,7 +1,7 @@
 // Hybrid blending: each pixel keeps its K nearest fragments in order and blends the rest as one layer behind them. The
 // definition is padgs/render/backends/torch.py. The tile lists may be in any order; front to back is fast.
 //
-// Forward collects the fragments of each patch, and keeps who is in the core. Backward turns the core into layers, one
+// Forward collects the fragments of each patch, and keeps the core. Backward turns the core into layers, one
 // for each instance that is in it, in the order of the list, and then visits the list.
 #include <cmath>
 #include <vector>
@@ -114,7 +114,7 @@ std::vector<Fragments> &collect(const BlendArguments &args, const Tile &tile, co
   return storage;
 }
 
-// What a core fragment leaves of `left`; nothing once that is below the threshold.
+// Transmittance `left` behind a core fragment; 0 below the threshold.
 Vec left_behind(Vec left, Vec weight) {
   const Vec next = left - weight;
   return keep(at_least(next, splat(kTransmittanceMin)), next);
@@ -182,10 +182,10 @@ void forward_tile(const BlendArguments &args, const Tile &tile, int64_t index) {
   args.pair_counts[2 * index + 1] = contributing;
 }
 
-// Upstream gradients of a patch, and what the derivatives of its tail fragments need. With s the signal of a
+// Upstream gradients of a patch, and state for the derivatives of its tail fragments. With s the signal of a
 // fragment (upstream gradient of its colour and depth times these), a fragment of weight alpha u has
 //   dL/dalpha = u (s - mean) - behind / (1 - alpha),
-// in the core u = what is in front leaves, mean = 0, behind = weighted signals behind it, background included;
+// in the core u = transmittance in front, mean = 0, behind = weighted signals behind it, background included;
 // in the tail u = T (1 - Q) / Z, mean = mean signal of the tail, behind = T Q (signal of the background - mean).
 struct Upstream {
   Vec red, green, blue, depth, offset;
@@ -195,7 +195,7 @@ struct Upstream {
   Vec signal(T r, T g, T b, T d) const { return red * r + green * g + blue * b + depth * d + offset; }
 };
 
-// What the derivatives of an instance's core fragments need, in one patch.
+// State for the derivatives of the core fragments of an instance in one patch.
 struct Layer {
   Vec front, behind;  // u and `behind` as above; front < 0 where it is not in the core
   int32_t position;   // of the instance in the tile's list
@@ -271,8 +271,8 @@ struct Hit {
   int patch;
 };
 
-// kAbsolute: with `absolute`, see BlendGradientArguments.
-template <class Seen, bool kWithDepth, bool kWithRays, bool kAbsolute>
+// kAbsgrad: with `absgrad`, see BlendGradientArguments.
+template <class Seen, bool kWithDepth, bool kWithRays, bool kAbsgrad>
 void backward_tile(const BlendGradientArguments &args, const Tile &tile, int64_t index) {
   const BlendArguments &forward = args.forward;
   const Places<Seen> &places = places_of<Seen>(forward, tile);
@@ -330,8 +330,8 @@ void backward_tile(const BlendGradientArguments &args, const Tile &tile, int64_t
     const Hit<Seen> *hit = hits;
     for (int e = 0; e < count; ++e) {
       const Seen g(forward.footprints[entrants[e].gaussian], forward, tile);
-      typename Seen::Moments moments;
-      Vec red = zero(), green = zero(), blue = zero(), depth = zero(), absolute = zero();
+      typename Seen::GradientSums gradient_sums;
+      Vec red = zero(), green = zero(), blue = zero(), depth = zero(), absgrad = zero();
       for (const Hit<Seen> *end = hits + entrants[e].end; hit < end; ++hit) {
         const Upstream &up = upstream[hit->patch];
         const Vec alpha = minimum(hit->alpha, splat(kAlphaMax));
@@ -348,16 +348,16 @@ void backward_tile(const BlendGradientArguments &args, const Tile &tile, int64_t
         green += weight * up.green;
         blue += weight * up.blue;
         if (kWithDepth) depth += weight * up.depth;
-        moments.add(hit->factors, m);
-        if constexpr (kAbsolute) absolute += g.pull(hit->factors, m);
+        gradient_sums.add(hit->factors, m);
+        if constexpr (kAbsgrad) absgrad += g.absgrad(hit->factors, m);
         if constexpr (kWithRays) g.add_ray_gradient(hit->factors, hit->b_by_d, m, ray_gradients[hit->patch]);
       }
-      float *out = args.moments + int64_t(entrants[e].slot) * kMoments;
-      Vec sums[kMoments];
-      moments.finish(sums);
+      float *out = args.gradient_sums + int64_t(entrants[e].slot) * kGradientSums;
+      Vec sums[kGradientSums];
+      gradient_sums.finish(sums);
       sums[10] = red, sums[11] = green, sums[12] = blue, sums[13] = depth;
-      sums[kAbsoluteMoment] = absolute, sums[15] = zero();
-      for (int k = 0; k < kMoments; k += 8) sum8(sums + k, out + k);
+      sums[kAbsgradSum] = absgrad, sums[15] = zero();
+      for (int k = 0; k < kGradientSums; k += 8) sum8(sums + k, out + k);
     }
   }
   if constexpr (kWithRays) add_ray_gradients(args, tile, ray_gradients);
@@ -381,7 +381,7 @@ void hybrid_backward(const BlendGradientArguments &args) {
                       : backward_tile<PlanarFootprint, false, false, false>(args, tile, index);
     else if (args.grad_rays)
       backward_tile<ProjectiveFootprint, true, true, true>(args, tile, index);
-    else if (args.absolute)
+    else if (args.absgrad)
       backward_tile<ProjectiveFootprint, true, false, true>(args, tile, index);
     else
       args.grad_depth ? backward_tile<ProjectiveFootprint, true, false, false>(args, tile, index)

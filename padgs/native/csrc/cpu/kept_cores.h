@@ -1,4 +1,4 @@
-// What forward hybrid blending leaves to backward: who is in the core of each pixel, and the sums over its tail.
+// State that forward hybrid blending keeps for backward: the core of each pixel, and the sums over its tail.
 //
 // A record of 32-bit words for each patch of a tile, one after the other: tail sums, numbers of rows and entrants,
 // positions of the entrants in the tile's list, rows from front to back. Alphas are cheaper to evaluate than to keep.

@@ -7,7 +7,7 @@ namespace padgs {
 
 struct ProjectKernels {
   void (*forward)(const Camera &, const Inputs &, Footprint *, PixelBox *);
-  void (*backward)(const Camera &, const Inputs &, const float *moments, const Gradients &);
+  void (*backward)(const Camera &, const Inputs &, const float *gradient_sums, const Gradients &);
 };
 
 struct BlendKernels {

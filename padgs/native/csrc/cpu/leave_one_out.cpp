@@ -1,4 +1,4 @@
-// What the image would lose with each Gaussian alone (leave_one_out.h): the way back of blend.cpp without derivatives.
+// Leave-one-out scores (leave_one_out.h): the backward pass of blend.cpp without derivatives.
 #include <algorithm>
 #include <vector>
 

@@ -11,7 +11,7 @@ namespace PADGS_ISA {
 constexpr int kMargin = kLanes;  // floats on both sides of a row, for neighbours at that distance at most
 
 // A stack of maps over the image, rows padded to whole vectors with zero margins on the left and right. The memory is
-// the caller's, zero at first; who needs anything else in the margins writes it anew at each call.
+// the caller's, zero at first; other values in the margins are written again at each call.
 class Maps {
  public:
   Maps(float *&memory, int count, int height, int length) : height_(height), stride_(stride(length)), data_(memory) {

@@ -1,4 +1,4 @@
-// One footprint over the sixteen pixels of a patch: what blending evaluates, and the moments that it sums.
+// One footprint over the sixteen pixels of a patch: its evaluation and its gradient sums.
 //
 // Two kinds: planar footprints live in pixel coordinates, projective ones on the directions of the pixels.
 #pragma once
@@ -49,7 +49,7 @@ struct PlanarFootprint {
     if (!args.wrap) return;
     const float half = 0.5f * float(tile.columns), away = float(tile.x0) + half - u;
     u += std::floor(away / width + 0.5f) * width;
-    // The copies meet half a turn away. Only what reaches about so far, |du| = sqrt(k (b^2 + c^2)) / (a c), can tell.
+    // The copies meet half a turn away. Only those that reach so far, |du| = sqrt(k (b^2 + c^2)) / (a c), can tell.
     const float limit = 0.99f * (0.5f * width - half), reach = a * c * limit;
     if (limit <= 0 || (log2_opacity - kLog2AlphaMin) * (b * b + c * c) >= reach * reach) turns = 1 / width;
   }
@@ -66,7 +66,7 @@ struct PlanarFootprint {
 
   // Sums of M times 1, t, dv, t^2, t dv, dv^2, with t = a du + b dv and not du: where a footprint is long and oblique,
   // those of du nearly cancel in every derivative.
-  struct Moments {
+  struct GradientSums {
     Vec one = zero(), t = zero(), v = zero(), tt = zero(), tv = zero(), vv = zero();
     PADGS_ALWAYS_INLINE void add(const Factors &at, Vec m) {
       const Vec mt = m * at.t, mv = m * at.dv;
@@ -153,12 +153,12 @@ struct ProjectiveFootprint {
     grad.x += scale * e.x, grad.y += scale * e.y, grad.z += scale * e.z;
   }
   // |dL/dmean| of each pixel, the covariance held: |M h| with h = -sqrt(kappa) e (projective.h).
-  PADGS_ALWAYS_INLINE Vec pull(const Factors &at, Vec m) const {
+  PADGS_ALWAYS_INLINE Vec absgrad(const Factors &at, Vec m) const {
     const Place e = slope(at);
     return magnitude(m) * root((e.x * e.x + e.y * e.y + e.z * e.z) * f.shape[9]);
   }
 
-  struct Moments {
+  struct GradientSums {
     Vec m = zero(), c0 = zero(), c1 = zero(), c2 = zero();
     Vec c00 = zero(), c01 = zero(), c02 = zero(), c11 = zero(), c12 = zero(), c22 = zero();
     PADGS_ALWAYS_INLINE void add(const Factors &at, Vec weight) {

@@ -1,9 +1,9 @@
 // How rough the surfaces of a drawing are and the derivative by its distances, in one call.
 // padgs.methods.plus.smoothness.roughness is the definition.
 //
-// Three sweeps over the rows: what neighbours are compared by, how much 1 / r bends across and down, and from that the
-// derivatives. With v = (before + after) / here - 2 and w what a place counts, the term w |v| pulls at both neighbours
-// with p = w sign(v) / here and at the place itself with -p (v + 2); above the jump it is constant and pulls at nothing.
+// Three passes over the rows: weights of neighbours, second differences of 1 / r across and down, and the derivatives.
+// With v = (before + after) / here - 2 and the weight w of a place, the term w |v| has the derivative p = w sign(v) / here
+// by both neighbours and -p (v + 2) by the place itself; above the jump it is constant.
 #include <algorithm>
 #include <vector>
 
@@ -25,7 +25,7 @@ class Roughness {
       : args_(args),
         memory_(args.workspace),
         places_(memory_, 3, args.height, args.width),
-        pulls_(memory_, 2, args.height, args.width) {
+        derivatives_(memory_, 2, args.height, args.width) {
     double all = 0, inner = 0;
     for (int y = 0; y < args.height; ++y) {
       all += args.row_weight[y];
@@ -53,27 +53,27 @@ class Roughness {
     const float across = across_ * args_.row_weight[y], down = down_ * args_.row_weight[y];
     for (int x = 0; x < args_.width; x += kLanes) {
       const Mask inside = less(iota() + float(x), splat(float(args_.width)));
-      total += terms(neighbours(y, x, 0, 1), inside, across, pulls_.row(0, y) + x);
-      if (has_rows_around(y)) total += terms(neighbours(y, x, 1, 0), inside, down, pulls_.row(1, y) + x);
+      total += terms(neighbours(y, x, 0, 1), inside, across, derivatives_.row(0, y) + x);
+      if (has_rows_around(y)) total += terms(neighbours(y, x, 1, 0), inside, down, derivatives_.row(1, y) + x);
     }
-    continue_around(pulls_.row(0, y));
+    continue_around(derivatives_.row(0, y));
     return double(sum(total));
   }
 
   void write_gradient(int y) {
     const int64_t first = int64_t(y) * args_.width;
     for (int x = 0; x < args_.width; x += kLanes) {
-      const float *p = pulls_.row(0, y) + x, *inverse = places_.row(kInverse, y) + x;
+      const float *p = derivatives_.row(0, y) + x, *inverse = places_.row(kInverse, y) + x;
       const Vec here = load(inverse);
-      Vec pull = load(p - 1) + load(p + 1) - load(p) * (load(inverse - 1) + load(inverse + 1)) / here;
-      if (has_rows_around(y - 1)) pull += load(pulls_.row(1, y - 1) + x);
-      if (has_rows_around(y + 1)) pull += load(pulls_.row(1, y + 1) + x);
+      Vec derivative = load(p - 1) + load(p + 1) - load(p) * (load(inverse - 1) + load(inverse + 1)) / here;
+      if (has_rows_around(y - 1)) derivative += load(derivatives_.row(1, y - 1) + x);
+      if (has_rows_around(y + 1)) derivative += load(derivatives_.row(1, y + 1) + x);
       if (has_rows_around(y)) {
         const Vec before = load(places_.row(kInverse, y - 1) + x), after = load(places_.row(kInverse, y + 1) + x);
-        pull += -(load(pulls_.row(1, y) + x) * (before + after) / here);
+        derivative += -(load(derivatives_.row(1, y) + x) * (before + after) / here);
       }
       float lanes[kLanes];
-      store(lanes, -(here * here * pull));
+      store(lanes, -(here * here * derivative));
       for (int i = 0; i < std::min(kLanes, args_.width - x); ++i)
         args_.gradient[first + x + i] = args_.depth[first + x + i] < args_.nearest ? 0.0f : lanes[i];
     }
@@ -100,10 +100,10 @@ class Roughness {
     return found;
   }
 
-  // The terms of sixteen places; leaves what pulls at their neighbours. Places next to what is not there have a
+  // The terms of sixteen places; leaves the derivatives by their neighbours. Places at the border have a
   // neighbour without opacity and count nothing. Of two numbers `minimum` takes the second if one is no number, so what
   // may be none stands there: it has to reach the loss, which somebody looks at.
-  Vec terms(const Neighbours &places, Mask inside, float weight, float *pull) const {
+  Vec terms(const Neighbours &places, Mask inside, float weight, float *derivative) const {
     const auto outer = [&](int map) { return load(places.before[map]) + load(places.after[map]); };
     const Vec here = load(places.here[kInverse]);
     const Vec bright = magnitude_of(outer(kGrey) - 2.0f * load(places.here[kGrey]));
@@ -112,7 +112,7 @@ class Roughness {
     const Vec counts = weight * opacity * excuse, bent = outer(kInverse) / here - 2.0f;
     const Vec size = magnitude_of(bent), jump = splat(args_.jump);
     const Vec sign = select(less(bent, zero()), splat(-1.0f), select(less(zero(), bent), splat(1.0f), zero()));
-    store(pull, keep(without(inside, less(jump, size)), counts * sign / here));
+    store(derivative, keep(without(inside, less(jump, size)), counts * sign / here));
     return keep(inside, counts * minimum(jump, size));
   }
 
@@ -120,7 +120,7 @@ class Roughness {
 
   const RoughnessArguments &args_;
   float *memory_;
-  Maps places_, pulls_;
+  Maps places_, derivatives_;
   float across_, down_;
 };
 

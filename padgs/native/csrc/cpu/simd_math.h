@@ -60,7 +60,7 @@ PADGS_INLINE Vec logarithm2(Vec x) {
   return exponent + z * p;
 }
 
-// e^x to 3e-7 relative: 2^n e^r of the nearest n. What ordinary exponents do not reach is the C library's.
+// e^x to 3e-7 relative: 2^n e^r of the nearest n. Other exponents use the C library.
 PADGS_INLINE Vec exponential(Vec x) {
   constexpr float kMost = 69.0f, kLog2High = 0.693359375f, kLog2Low = -2.12194440e-4f;  // n * kLog2High is exact
   if (bits(less(magnitude(x), splat(kMost))) != (1u << kLanes) - 1) {  // NaN is not less either

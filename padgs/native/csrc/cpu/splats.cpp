@@ -1,5 +1,5 @@
-// Explicit Gaussians as a view sees them, from what is learned of them, and the derivatives by that: positions that a
-// probe moves, e^x of log-scales, sigmoids of opacity logits, colours max(0, 1/2 + spherical harmonics).
+// Parameters of explicit Gaussians to attributes for one view, and the derivatives: positions moved by offsets, e^x of
+// log-scales, sigmoids of opacity logits, colours max(0, 1/2 + spherical harmonics).
 // padgs.methods.splats.splats.Splats is the definition.
 #include <algorithm>
 
@@ -14,22 +14,22 @@ namespace {
 
 constexpr int kAxes = 3, kRgb = 3;
 
-// How sixteen Gaussians lie before the camera, and where a probe, of no values, three or four, moves them to.
+// Sixteen Gaussians relative to the camera, moved by offsets of no, three or four values.
 struct Placed {
   Vec half;             // of the distance, before they are moved
   Vec moved[kAxes];     // world
   Vec ray[kAxes];       // direction
-  Vec inverse;          // of what it was divided by
-  Vec pull = zero();    // the fourth value of the probe, world units
+  Vec inverse;          // inverse length of the ray
+  Vec absgrad = zero();    // the fourth value of the offsets, world units
 
   Placed(const SplatArguments &args, int64_t first) {
-    Vec probe[kAxes + 1] = {zero(), zero(), zero(), zero()};
+    Vec offsets[kAxes + 1] = {zero(), zero(), zero(), zero()};
     load_items<kAxes>(args.means, first, args.count, moved);
-    if (args.probe_width == kAxes) load_items<kAxes>(args.probe, first, args.count, probe);
-    if (args.probe_width > kAxes) load_items<kAxes + 1>(args.probe, first, args.count, probe);
+    if (args.offset_width == kAxes) load_items<kAxes>(args.offsets, first, args.count, offsets);
+    if (args.offset_width > kAxes) load_items<kAxes + 1>(args.offsets, first, args.count, offsets);
     half = 0.5f * root(squared_distance(args));
-    for (int c = 0; c < kAxes; ++c) moved[c] += half * probe[c];
-    pull = half * probe[kAxes];
+    for (int c = 0; c < kAxes; ++c) moved[c] += half * offsets[c];
+    absgrad = half * offsets[kAxes];
     inverse = 1.0f / root(squared_distance(args) + args.tiny * args.tiny);
     for (int c = 0; c < kAxes; ++c) ray[c] = ray[c] * inverse;
   }
@@ -66,7 +66,7 @@ struct Splats {
     store_items<1>(args.opacities, first, count, opacity);
     const Placed placed(args, first);
     store_items<kAxes>(args.moved, first, count, placed.moved);
-    if (args.pulls) store_items<1>(args.pulls, first, count, &placed.pull);
+    if (args.absgrad) store_items<1>(args.absgrad, first, count, &placed.absgrad);
     Lanes value;
     functions(placed, value);
     const int end = int(std::min<int64_t>(kLanes, count - first));
@@ -93,32 +93,32 @@ struct Splats {
     store_items<1>(args.grad_opacity_logits, first, count, grad_opacity);
 
     const Placed placed(args, first);
-    Lanes value, pulls;
+    Lanes value, weights;
     functions(placed, value);
     const int end = int(std::min<int64_t>(kLanes, count - first));
-    for (int i = 0; i < end; ++i) gradients_of_coefficients(args, first + i, i, value, pulls);
+    for (int i = 0; i < end; ++i) gradients_of_coefficients(args, first + i, i, value, weights);
     load_items<kAxes>(args.grad_moved, first, count, grad);
     if constexpr (kDegree > 0) {  // the colour depends on the direction
-      Vec pull[kHarmonics], along[kAxes];
-      for (int k = 0; k < kUsed; ++k) pull[k] = load(pulls[k]);
-      harmonics_gradient<kDegree>(placed.ray[0], placed.ray[1], placed.ray[2], pull, along[0], along[1], along[2]);
+      Vec function[kHarmonics], along[kAxes];
+      for (int k = 0; k < kUsed; ++k) function[k] = load(weights[k]);
+      harmonics_gradient<kDegree>(placed.ray[0], placed.ray[1], placed.ray[2], function, along[0], along[1], along[2]);
       Vec radial = zero();
       for (int c = 0; c < kAxes; ++c) radial += along[c] * placed.ray[c];
       for (int c = 0; c < kAxes; ++c) grad[c] += (along[c] - radial * placed.ray[c]) * placed.inverse;
     }
     store_items<kAxes>(args.grad_means, first, count, grad);
-    Vec probe[kAxes + 1] = {placed.half * grad[0], placed.half * grad[1], placed.half * grad[2], zero()};
-    if (args.probe_width == kAxes) store_items<kAxes>(args.grad_probe, first, count, probe);
-    if (args.probe_width > kAxes) {
-      Vec pull[1];
-      load_items<1>(args.grad_pulls, first, count, pull);
-      probe[kAxes] = placed.half * pull[0];
-      store_items<kAxes + 1>(args.grad_probe, first, count, probe);
+    Vec offsets[kAxes + 1] = {placed.half * grad[0], placed.half * grad[1], placed.half * grad[2], zero()};
+    if (args.offset_width == kAxes) store_items<kAxes>(args.grad_offsets, first, count, offsets);
+    if (args.offset_width > kAxes) {
+      Vec absgrad[1];
+      load_items<1>(args.grad_absgrad, first, count, absgrad);
+      offsets[kAxes] = placed.half * absgrad[0];
+      store_items<kAxes + 1>(args.grad_offsets, first, count, offsets);
     }
   }
 
-  // Of Gaussian n, lane i; `pulls` get what the loss changes by with each function.
-  static void gradients_of_coefficients(const SplatArguments &args, int64_t n, int i, const Lanes &value, Lanes &pulls) {
+  // Of Gaussian n, lane i; `weights` receives the derivative of the loss by each function.
+  static void gradients_of_coefficients(const SplatArguments &args, int64_t n, int i, const Lanes &value, Lanes &weights) {
     float grad[kRgb];
     for (int c = 0; c < kRgb; ++c) {
       grad[c] = args.colors[kRgb * n + c] > 0 ? args.grad_colors[kRgb * n + c] : 0.0f;
@@ -128,7 +128,7 @@ struct Splats {
     float *grad_rest = args.grad_rest + kRgb * args.stored * n;
     for (int k = 0; k < kUsed; ++k) {
       for (int c = 0; c < kRgb; ++c) grad_rest[kRgb * k + c] = value[k][i] * grad[c];
-      pulls[k][i] = rest[kRgb * k] * grad[0] + rest[kRgb * k + 1] * grad[1] + rest[kRgb * k + 2] * grad[2];
+      weights[k][i] = rest[kRgb * k] * grad[0] + rest[kRgb * k + 1] * grad[1] + rest[kRgb * k + 2] * grad[2];
     }
     std::fill(grad_rest + kRgb * kUsed, grad_rest + kRgb * args.stored, 0.0f);
   }

@@ -94,12 +94,12 @@ constexpr int kAhead = 16;
 PADGS_INLINE void prefetch(const BlendArguments &args, int64_t instance, int64_t end) {
   if (instance < end) __builtin_prefetch(args.footprints + args.instances[instance].gaussian);
 }
-// And for the slots of the moments, which the stores would wait for.
+// And for the slots of the gradient sums, which the stores would wait for.
 PADGS_INLINE void prefetch(const BlendGradientArguments &args, int64_t instance, int64_t first, int64_t end) {
   if (instance < first || instance >= end) return;
   const Instance &ahead = args.forward.instances[instance];
   __builtin_prefetch(args.forward.footprints + ahead.gaussian);
-  __builtin_prefetch(args.moments + int64_t(ahead.slot) * kMoments, 1);
+  __builtin_prefetch(args.gradient_sums + int64_t(ahead.slot) * kGradientSums, 1);
 }
 
 }  // namespace PADGS_ISA

@@ -23,7 +23,7 @@ struct ProjectGradientArguments {
   Camera camera;
   const float *pose;
   Inputs in;
-  const float *moments;  // [N, kMoments], sums over the instances of each Gaussian
+  const float *gradient_sums;  // [N, kGradientSums], sums over the instances of each Gaussian
   Gradients out;         // pose: [blocks, 12] partial sums, see padgs_cuda_pose_blocks, or null
 };
 
@@ -53,7 +53,7 @@ struct BinArguments {
 struct BlendInputs {
   TileTable table;
   int32_t projection, wrap;
-  int32_t core_size;  // hybrid blending with so many fragments in order, or 0: sorted
+  int32_t core_size;  // hybrid blending with this many sorted fragments; 0: sorted blending
   Rays rays;
   const Footprint *footprints;
   const int32_t *tile_start, *slots;  // the lists: slots of each tile, front to back
@@ -61,27 +61,27 @@ struct BlendInputs {
   const float *background;               // [3]
   float *image, *transmittance, *depth;  // [H,W,3] [H,W] [H,W]
   int32_t *last;                         // [H,W] 1 + position in the tile's list of the last contribution; sorted only
-  int32_t *core;  // [H,W,core_size] Gaussians in order, -1 behind the last; hybrid where a gradient is wanted, or null
+  int32_t *core;  // [H,W,core_size] sorted Gaussians, -1 behind the last; hybrid with gradients, or null
   Tail *tails;    // [H,W] as core
   int32_t *pair_counts;                  // [tiles, 2] evaluated and contributing pairs, or null
 };
 
 // Aligned, so that the GPU moves sixteen bytes at a time.
-struct alignas(16) Moments {
-  float of[kMoments];
+struct alignas(16) GradientSums {
+  float of[kGradientSums];
 };
 
 struct BlendGradientInputs {
   BlendInputs forward;
   const float *grad_image, *grad_transmittance, *grad_depth;  // [H,W,3] [H,W] or null, [H,W] or null
   CoreGradient *core_gradients;  // [H,W,core_size]; hybrid only
-  Moments *moments;        // [I] by slot
+  GradientSums *gradient_sums;        // [I] by slot
   float *grad_rays;        // [H, 3, padded W] or null
   const int32_t *order;    // [visible]
   const uint32_t *slot_start;
   int64_t visible;
-  float *totals;  // [N, kMoments], added to
-  int32_t absolute;  // as in BlendGradientArguments
+  float *totals;  // [N, kGradientSums], added to
+  int32_t absgrad;  // as in BlendGradientArguments
 };
 
 // After forward; sorted blending only. The instances are those of `forward`.

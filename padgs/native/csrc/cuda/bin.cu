@@ -54,7 +54,7 @@ __global__ void __launch_bounds__(kThreads) tile_start_kernel(BinArguments args,
 
 using namespace padgs;
 
-// Launches with a table of the host's sizes: the number of tiles comes from the caller, who has the table's rows.
+// The caller, which knows the rows of the table, passes the number of tiles.
 PADGS_API int padgs_cuda_bin(const Queue *queue, const BinArguments *args, int32_t tiles) {
   return on_device(*queue, [&] {
     // Without an instance too: the backward pass asks each Gaussian where its instances begin and end.

@@ -17,7 +17,7 @@ __global__ void __launch_bounds__(kTilePixels, kBlocks) blend_kernel(BlendInputs
   int last = 0, evaluated = 0, contributing = 0;
 
   for (int first = 0; first < length; first += batch.kSize) {
-    if (!__syncthreads_or(running)) break;  // and nobody reads the last batch any more
+    if (!__syncthreads_or(running)) break;  // and before the batch is overwritten
     const int count = least(length - first, batch.kSize);
     fill(batch, args, begin + first, count);
     __syncthreads();

@@ -1,4 +1,4 @@
-// What both directions of blending share: a tile is a block of 256 threads, a warp draws 8x4 pixels of it.
+// Shared by both passes of blending: a tile is a block of 256 threads, a warp renders 8x4 pixels of it.
 #pragma once
 
 #include "arguments.h"
@@ -37,7 +37,7 @@ __device__ unsigned reaching(const Batch<kRoom> &batch, int group, int count, co
   return __ballot_sync(kAllLanes, k < count && reaches_part(batch.reaches[k], place));
 }
 
-// Adds up what the threads of a block counted.
+// Sums the counts of the threads of a block.
 __device__ inline void write_pair_counts(const BlendInputs &args, int evaluated, int contributing) {
   if (!args.pair_counts) return;
   __shared__ int pairs[2];

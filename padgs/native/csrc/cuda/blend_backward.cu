@@ -1,6 +1,6 @@
 // Sorted blending, backward: a pixel undoes its blending from behind. And, for both ways of blending, the sum of a
-// Gaussian's moments over its instances.
-#include "moments.cuh"
+// Gaussian's gradient sums over its instances.
+#include "gradient_sums.cuh"
 
 namespace padgs {
 namespace {
@@ -32,27 +32,27 @@ struct SortedPixel {
     transmittance *= inverse;
     weight = alpha * transmittance;
     const float signal = weight * up.along(f);
-    // alpha dL/dalpha = T alpha (c . G) - (what is behind) alpha / (1 - alpha), and 0 where alpha is limited.
+    // alpha dL/dalpha = T alpha (c . G) - (contribution behind) alpha / (1 - alpha), and 0 where alpha is limited.
     const float m = full < kAlphaMax ? signal - behind * (inverse * alpha) : 0.0f;
     behind += signal;
     return m;
   }
 };
 
-// Sixteen threads add up the moments of a Gaussian's instances, always in the same order: every eighth slot by itself,
+// Sixteen threads add up the gradient sums of a Gaussian's instances, always in the same order: every eighth slot by itself,
 // so that eight of a Gaussian of thousands of tiles are on their way at once.
-__global__ void __launch_bounds__(kGaussiansPerBlock *kMoments) sum_kernel(BlendGradientInputs args) {
-  const int64_t i = global_thread() / kMoments;
-  const int k = int(threadIdx.x) % kMoments;
+__global__ void __launch_bounds__(kGaussiansPerBlock *kGradientSums) sum_kernel(BlendGradientInputs args) {
+  const int64_t i = global_thread() / kGradientSums;
+  const int k = int(threadIdx.x) % kGradientSums;
   if (i >= args.visible) return;
   float part[8] = {}, sum = 0;
   uint32_t slot = args.slot_start[i];
   const uint32_t end = args.slot_start[i + 1];
   for (; slot + 8 <= end; slot += 8)
-    for (int j = 0; j < 8; ++j) part[j] += args.moments[slot + j].of[k];
-  for (; slot < end; ++slot) sum += args.moments[slot].of[k];
+    for (int j = 0; j < 8; ++j) part[j] += args.gradient_sums[slot + j].of[k];
+  for (; slot < end; ++slot) sum += args.gradient_sums[slot].of[k];
   for (int j = 0; j < 8; ++j) sum += part[j];
-  args.totals[int64_t(args.order[i]) * kMoments + k] += sum;
+  args.totals[int64_t(args.order[i]) * kGradientSums + k] += sum;
 }
 
 }  // namespace
@@ -65,8 +65,8 @@ PADGS_API int padgs_cuda_blend_backward(const Queue *queue, const BlendGradientI
     if (args->forward.core_size)
       hybrid_backward(*queue, *args);
     else
-      launch_moments<SortedPixel, SortedPixel>(*queue, *args);
-    launch(sum_kernel, blocks_for(args->visible, kGaussiansPerBlock), kGaussiansPerBlock * kMoments, *queue, *args);
+      launch_gradient_sums<SortedPixel, SortedPixel>(*queue, *args);
+    launch(sum_kernel, blocks_for(args->visible, kGaussiansPerBlock), kGaussiansPerBlock * kGradientSums, *queue, *args);
     return 0;
   });
 }

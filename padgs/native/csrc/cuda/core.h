@@ -36,7 +36,7 @@ struct Core {
   }
 };
 
-// Sums over the fragments outside the core; they do not depend on any order but that of rounding.
+// Sums over the fragments outside the core; independent of order up to rounding.
 struct alignas(8) Tail {
   float alpha, left;               // sum of alpha, product of 1 - alpha
   float red, green, blue, depth;  // sums of alpha times them
@@ -54,16 +54,16 @@ struct alignas(8) Tail {
 };
 static_assert(sizeof(Tail) == 24, "padgs/render/backends/cuda.py allocates 6 floats per pixel");
 
-// What a core fragment leaves of `left`; nothing once that is below the threshold.
+// Transmittance `left` behind a core fragment; 0 below the threshold.
 PADGS_HD float left_behind(float left, float weight) {
   const float next = left - weight;
   return next >= kTransmittanceMin ? next : 0.0f;
 }
 
-// What the derivatives of a pixel's fragments need. With s the signal of a fragment (upstream gradient of its colour
+// State for the derivatives of the fragments of a pixel. With s the signal of a fragment (upstream gradient of its colour
 // and depth times these), a fragment of weight alpha u has
 //   dL/dalpha = u (s - mean) - behind / (1 - alpha),
-// in the core u = what is in front leaves, mean = 0, behind = weighted signals behind it, background included;
+// in the core u = transmittance in front, mean = 0, behind = weighted signals behind it, background included;
 // in the tail u = T (1 - Q) / Z, mean = mean signal of the tail, behind = T Q (signal of the background - mean).
 struct alignas(8) CoreGradient {
   float unit, behind;

@@ -1,5 +1,5 @@
-// From what the networks say of a Gaussian to its attributes (paper Eq. 13-15), and from the gradients of these back to
-// those of the networks' outputs: for kernels that take outputs from memory as for those that have just computed them.
+// From outputs of the networks to attributes of a Gaussian (paper Eq. 13-15), and from their gradients back to those of
+// the outputs: for kernels that read outputs from memory and for kernels that compute them.
 #pragma once
 
 #include "arguments.h"
@@ -13,7 +13,7 @@ constexpr int kOpacityValues = 1, kColorValues = 3, kShrinkage = 3, kCovarianceV
 
 __device__ inline float sigmoid(float x) { return quick_inverse(1.0f + expf(-x)); }
 
-// The row of a slot's Gaussian. Selected ones come first; others, zeros that nobody draws, fill the room behind them.
+// The row of a slot's Gaussian. Selected ones come first; others, zeros that are not drawn, fill the rest.
 struct Row {
   int64_t index;
   bool selected, written;
@@ -24,7 +24,7 @@ __device__ inline Row row_of(int64_t slot, bool selected, int64_t before, int64_
   return {index, selected, index < room};
 }
 
-// A Gaussian's attributes, from what the networks of colours and of covariances say.
+// Attributes of a Gaussian from the outputs of the colour and covariance networks.
 __device__ inline void place(const DecodeArguments &args, int64_t anchor, int64_t slot, const Row &row,
                              const float (&color)[kColorValues], const float (&covariance)[kCovarianceValues]) {
   const float *logs = args.log_scales + 6 * anchor;

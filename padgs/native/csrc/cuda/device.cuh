@@ -1,4 +1,4 @@
-// What the kernels need of CUDA, so that the same sources also compile for the host: with PADGS_EMULATED every block's
+// The part of CUDA that the kernels use, so that the same sources also compile for the host: with PADGS_EMULATED a block's
 // threads run in turns on one CPU thread (tests/render/cuda/emulation.h), which is how machines without a GPU test them.
 #pragma once
 
@@ -105,7 +105,7 @@ __device__ float dealt_sum(const float (&values)[kCount]) {
 }
 // Which of `count` <= 16 values a lane has the sum of; -1 where it has none, or another lane's.
 __device__ inline int dealt_index(int count, int lane) {
-  int index = 0, here = count, step = kWarp / 2;  // values of the lane's half, without what fills it up
+  int index = 0, here = count, step = kWarp / 2;  // values of the lane's half, without padding
   for (int size = count; size > 1; step /= 2) {
     const int half = (size + 1) / 2;
     const bool upper = lane & step;

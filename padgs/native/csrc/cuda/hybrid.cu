@@ -18,7 +18,7 @@ __global__ void __launch_bounds__(kTilePixels, kBlocks) hybrid_kernel(BlendInput
   int evaluated = 0, contributing = 0, in_tail = 0;
 
   for (int first = 0; first < length; first += batch.kSize) {
-    __syncthreads();  // nobody reads the last batch any more
+    __syncthreads();  // before the batch is overwritten
     const int count = least(length - first, batch.kSize);
     fill(batch, args, begin + first, count);
     __syncthreads();

@@ -1,7 +1,7 @@
 // Hybrid blending, backward. The derivative of a fragment needs its pixel's core and the sums over its tail, which the
 // forward pass kept, but no other fragment: first a pixel turns its core into what derivatives need, then it visits the
 // list of its tile.
-#include "moments.cuh"
+#include "gradient_sums.cuh"
 
 namespace padgs {
 namespace {
@@ -75,7 +75,7 @@ struct HybridPixel {
 }  // namespace
 
 void hybrid_backward(const Queue &queue, const BlendGradientInputs &args) {
-  launch_moments<HybridPixel<PlanarPixel>, HybridPixel<ProjectivePixel>>(queue, args);
+  launch_gradient_sums<HybridPixel<PlanarPixel>, HybridPixel<ProjectivePixel>>(queue, args);
 }
 
 }  // namespace padgs

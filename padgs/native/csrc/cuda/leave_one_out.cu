@@ -1,4 +1,4 @@
-// What the image would lose with each Gaussian alone (leave_one_out.h): the way back of blend_backward.cu without
+// Leave-one-out scores (leave_one_out.h): the backward pass of blend_backward.cu without
 // derivatives. As there, warps sum over their pixels, their sums are added in order, and a slot is written once.
 #include "../mathematics/leave_one_out.h"
 
@@ -66,7 +66,7 @@ __global__ void __launch_bounds__(kTilePixels, kBlocks) removal_kernel(RemovalIn
           total = k < kSums ? total + partial[w][bit][k] : larger(total, partial[w][bit][k]);
         args.removals[int64_t(forward.slots[begin + first + group + bit]) * kRemoval + k] = total;
       }
-      __syncthreads();  // nobody reads the numbers, or the batch, any more
+      __syncthreads();  // before the numbers and the batch are overwritten
     }
   }
 }

@@ -1,11 +1,11 @@
-// What the library says about itself.
+// Version and capabilities of the library.
 #include "arguments.h"
 #include "device.cuh"
 
 namespace padgs {
 namespace {
 
-__global__ void __launch_bounds__(kWarp) probe_kernel(int32_t *) {}
+__global__ void __launch_bounds__(kWarp) empty_kernel(int32_t *) {}
 
 }  // namespace
 }  // namespace padgs
@@ -64,7 +64,7 @@ PADGS_API void padgs_cuda_versions(int32_t *driver, int32_t *built_with) {
 // Whether the kernels can run on a device: 0, or an error such as that none was compiled for it.
 PADGS_API int padgs_cuda_check(const Queue *queue) {
   return on_device(*queue, [&] {
-    launch(probe_kernel, 1, kWarp, *queue, (int32_t *)nullptr);
+    launch(empty_kernel, 1, kWarp, *queue, (int32_t *)nullptr);
     return 0;
   });
 }

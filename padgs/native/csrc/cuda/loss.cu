@@ -1,5 +1,5 @@
 // The photometric loss (Eq. 16) and its derivative by the image: L1 and SSIM under a weight map. Two passes, each of
-// which blurs a block of pixels and what surrounds it in shared memory; loss.cpp of the CPU library says why two are
+// which blurs a block of pixels and its margin in shared memory; loss.cpp of the CPU library says why two are
 // enough.
 #include "arguments.h"
 #include "device.cuh"
@@ -8,7 +8,7 @@ namespace padgs {
 namespace {
 
 constexpr int kHalf = 5, kSide = 32, kHalo = kSide + 2 * kHalf;  // the window is 11 pixels long, sigma 1.5
-constexpr int kEach = 4;  // neighbouring pixels that a thread works on, for which it reads what surrounds them once
+constexpr int kEach = 4;  // neighbouring pixels of a thread, which share the reads of their margin
 constexpr int kThreads = kSide * kSide / kEach;
 // Odd, so that threads next to each other may read columns as well as rows: 32 addresses then lie in 32 banks.
 constexpr int kPitch = kHalo + 1, kRowPitch = kSide + 1;
@@ -93,7 +93,7 @@ __global__ void __launch_bounds__(kThreads) compare_kernel(DeviceLossArguments d
   const int64_t size = int64_t(args.width) * args.height * kChannels;
   float loss = 0;
   for (int channel = 0; channel < kChannels; ++channel) {
-    __syncthreads();  // nobody reads the last channel any more
+    __syncthreads();  // before the channel is overwritten
     for (int entry = int(threadIdx.x); entry < kEntries; entry += kThreads) {
       int64_t pixel;
       const bool inside = halo_pixel(args, p, entry, pixel);

@@ -1,5 +1,5 @@
 // Matrix products of a warp on tensor cores, which begin with compute capability 8.0: A [16, 16] times B [16, 8] in
-// bfloat16 or float16, summed in float32. Fragments, which is what a lane holds of a matrix, are those of PTX's
+// bfloat16 or float16, summed in float32. Fragments, the part of a matrix in a lane, are those of PTX's
 // mma.m16n8k16. With lane = 4 group + thread, their numbers are
 //   A  (row, column): 4 pairs of columns 2 thread and 2 thread + 1, of rows group and group + 8, then 8 columns further on
 //   B  (row, column): 2 pairs of rows 2 thread and 2 thread + 1 of column group, then 8 rows further on
@@ -48,7 +48,7 @@ __device__ inline float2 unpacked(uint32_t pair, Float16) {
   return __half22float2(reinterpret_cast<const __half2 &>(pair));
 }
 
-// Where the code is of an older capability, nobody calls what it has not; `padgs_cuda_networks_fit` sees to it.
+// Not called on older capabilities; `padgs_cuda_networks_fit` guarantees it.
 #if __CUDA_ARCH__ >= 800
 #define PADGS_MMA(type)                                                                                            \
   asm volatile("mma.sync.aligned.m16n8k16.row.col.f32." type "." type ".f32 {%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, " \
@@ -79,7 +79,7 @@ __device__ inline uint32_t transposed(uint32_t pair) {
 
 namespace padgs {
 
-// What is left of numbers in a type.
+// Numbers rounded to a type.
 template <class T>
 __device__ void round_to(Sums &sums) {
   for (int i = 0; i < 4; i += 2) {

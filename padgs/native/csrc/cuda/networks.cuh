@@ -12,12 +12,12 @@ namespace padgs {
 
 constexpr int kWarps = 4, kThreads = kWarps * kWarp;  // of a block
 constexpr int kRows = 16;                             // anchors of a warp
-// What there is room for; unused places hold zeros. padgs/methods/anchors/native_decoder.py asks `padgs_cuda_networks_fit`.
+// Capacities; unused places hold zeros. padgs/methods/anchors/native_decoder.py calls `padgs_cuda_networks_fit`.
 constexpr int kMostInputs = 48;  // with a 1, whose weight is the bias
 constexpr int kMostFeatures = 32, kMostHidden = 32, kMostOffsets = 10;
 constexpr int kHiddenTiles = kMostHidden / 8;
 
-// Outputs of a network in parts of so many.
+// Number of outputs in a part of a network.
 template <int kValues, int kSize>
 constexpr int kOutputParts = (kValues * kMostOffsets + kSize - 1) / kSize;
 
@@ -31,7 +31,7 @@ using FirstLayer = Factor<kMostInputs / 16, kHiddenTiles>;
 template <int kValues>
 using SecondLayer = Factor<kMostHidden / 16, kOutputParts<kValues, 8>>;
 
-// All threads of the block, before a barrier; `number(row, column)` is what goes there.
+// All threads of the block, before a barrier; `number(row, column)` is the value.
 template <class T, int kSteps, int kTiles, class Number>
 __device__ void fill(Factor<kSteps, kTiles> &factor, Number number) {
   for (int i = int(threadIdx.x); i < kSteps * kTiles * kWarp; i += kThreads) {
@@ -55,7 +55,7 @@ __device__ void fill_first_layer(FirstLayer &layer, const HeadWeights &head, con
   });
 }
 
-// The sixteen anchors of a warp, as far as there are so many.
+// The anchors of a warp, at most sixteen.
 struct Anchors {
   int64_t first;
   int count;
@@ -71,7 +71,7 @@ struct Anchors {
   }
 };
 
-// No more than so many blocks, for each prepares the weights and leaves a gradient of all of them. The number depends on
+// Limit of blocks, because each prepares the weights and writes a gradient of all of them. The number depends on
 // nothing else, so that each block adds up the same on every GPU; torch
 // adds the blocks, in an order that is the same on GPUs of one model.
 constexpr int64_t kMostBlocks = 512;

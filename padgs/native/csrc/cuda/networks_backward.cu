@@ -30,7 +30,7 @@ struct Network {
   }
 };
 
-// What a warp leaves: columns of its sixteen anchors, transposed.
+// Output of a warp: columns of its sixteen anchors, transposed.
 struct Left {
   FragmentA inputs[kInputParts][kWarp], hidden[kHiddenParts][kWarp], of_hidden[kHiddenParts][kWarp];
   FragmentA of_outputs[kOutputParts<kCovarianceValues, kSide>][kWarp];
@@ -65,7 +65,7 @@ struct WeightSums {
     }
   }
 
-  // w1, b1, w2, b2; returns what is behind them.
+  // w1, b1, w2, b2; returns the address behind them.
   __device__ float *write(float *w1, const DecodeArguments &in) const {
     const int outputs = kValues * in.offsets, group = lane_index() / 4, thread = lane_index() % 4;
     float *b1 = w1 + in.hidden * in.inputs, *w2 = b1 + in.hidden, *b2 = w2 + outputs * in.hidden;
@@ -114,7 +114,7 @@ __device__ void leave_output_gradients(const NetworkGradientArguments &network, 
   __syncwarp();
 }
 
-// What one network adds to the gradients of the features, and to those of its weights.
+// Adds the gradients of one network to those of the features and of its weights.
 template <class T, int kValues>
 __device__ void go_back(const NetworkGradientArguments &network, const Network<kValues> &weights, const Anchors &anchors,
                         const InputRows<T> &inputs, Sums (&of_features)[kMostFeatures / 8], WeightSums<kValues> &of_weights, Left (&left)[kWarps]) {

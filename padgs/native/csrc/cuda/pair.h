@@ -1,6 +1,6 @@
-// One footprint at one pixel, as blending evaluates it, and the moments that its derivative sums; pixels.h of the CPU
+// One footprint at one pixel, as blending evaluates it, and its gradient sums; pixels.h of the CPU
 // library has the same for sixteen pixels of a row. Where a product meets a sum it says which way: forward and backward
-// must agree to the last bit on what is drawn, and a compiler fuses one and not the other.
+// must agree to the last bit on drawn pairs, but a compiler may fuse one and not the other.
 #pragma once
 
 #include "../mathematics/footprint.h"
@@ -11,15 +11,15 @@ namespace padgs {
 constexpr float kLog2AlphaMin = -7.994353437f;  // log2(1 / 255)
 
 struct PlanarPair {
-  static constexpr int kMoments = 6;
+  static constexpr int kGradientSums = 6;
   float t, dv, log2_alpha;
   bool reached;
 
   __device__ float distance(const Footprint &f, bool) const { return f.depth; }
-  __device__ float pull(const Footprint &, float) const { return 0.0f; }  // is asked of `ray` only
+  __device__ float absgrad(const Footprint &, float) const { return 0.0f; }  // used for `ray` only
 
   // M times 1, t, dv, t^2, t dv, dv^2 with t = a du + b dv; see planar.h.
-  __device__ void moments(float m, float *out) const {
+  __device__ void gradient_sums(float m, float *out) const {
     const float mt = m * t, mv = m * dv;
     out[0] = m, out[1] = mt, out[2] = mv;
     out[3] = mt * t, out[4] = mt * dv, out[5] = mv * dv;
@@ -27,7 +27,7 @@ struct PlanarPair {
 };
 
 struct ProjectivePair {
-  static constexpr int kMoments = 10;
+  static constexpr int kGradientSums = 10;
   float q, cx, cy, log2_alpha;
   float b_by_d;
   bool reached;
@@ -44,13 +44,13 @@ struct ProjectivePair {
     return scaled(cx, {s[0], s[1], s[2]}) + scaled(cy, {s[3], s[4], s[5]}) - scaled(q, {s[6], s[7], s[8]});
   }
   // |dL/dmean| of one pixel, the covariance held: |M h| with h = -sqrt(kappa) e (projective.h).
-  __device__ float pull(const Footprint &f, float m) const {
+  __device__ float absgrad(const Footprint &f, float m) const {
     const Vec3<float> e = slope(f);
     return magnitude(m) * root(dot(e, e) * f.shape[9]);
   }
 
   // M times 1, c and c c^T with c = (q, c_x, c_y); see projective.h.
-  __device__ void moments(float m, float *out) const {
+  __device__ void gradient_sums(float m, float *out) const {
     const float w0 = m * q, w1 = m * cx, w2 = m * cy;
     out[0] = m, out[1] = w0, out[2] = w1, out[3] = w2;
     out[4] = w0 * q, out[5] = w0 * cx, out[6] = w0 * cy;

@@ -10,12 +10,12 @@ constexpr int kThreads = 128;
 constexpr int kHistogram = 1024;  // rows of tiles that a block counts in shared memory: images of up to 16384 rows
 
 __device__ PosedGaussian<float> load_posed(const Camera &camera, const float *pose, const Inputs &in, int64_t i,
-                                           Probe<float> &probe) {
+                                           MeanOffset<float> &offset) {
   const float *m = in.means + 3 * i, *q = in.quats + 4 * i, *s = in.scales + 3 * i;
   PosedGaussian<float> posed(pose, {m[0], m[1], m[2]}, {q[0], q[1], q[2], q[3]}, {s[0], s[1], s[2]}, in.opacities[i]);
-  probe = {0.0f, 0.0f};
-  if (in.probe) probe = {in.probe[2 * i], in.probe[2 * i + 1]};
-  if (in.probe && !planar(camera.projection)) posed.gaussian.mean = probed_mean(posed.gaussian.mean, probe);
+  offset = {0.0f, 0.0f};
+  if (in.mean_offsets) offset = {in.mean_offsets[2 * i], in.mean_offsets[2 * i + 1]};
+  if (in.mean_offsets && !planar(camera.projection)) posed.gaussian.mean = shifted_mean(posed.gaussian.mean, offset);
   return posed;
 }
 
@@ -34,9 +34,9 @@ __global__ void __launch_bounds__(kThreads) project_kernel(ProjectArguments args
   __syncthreads();
   const int64_t i = global_thread();
   if (i < args.in.count) {
-    Probe<float> probe;
-    const PosedGaussian<float> posed = load_posed(args.camera, args.pose, args.in, i, probe);
-    const Projected<float> p = projected(args.camera, posed.gaussian, probe);
+    MeanOffset<float> offset;
+    const PosedGaussian<float> posed = load_posed(args.camera, args.pose, args.in, i, offset);
+    const Projected<float> p = projected(args.camera, posed.gaussian, offset);
     const PixelBox box = p.drawn > 0 ? box_of(args.camera, p.shape, p.bounds) : no_pixels();
     const bool seen = box.row < box.row_end;
     Footprint f;
@@ -66,10 +66,10 @@ __global__ void __launch_bounds__(kThreads) project_backward_kernel(ProjectGradi
   const int64_t i = global_thread();
   float pose[12] = {};
   if (i < args.in.count) {
-    Probe<float> probe;
-    const PosedGaussian<float> posed = load_posed(args.camera, args.pose, args.in, i, probe);
-    float m[kMoments], active = 0;
-    for (int k = 0; k < kMoments; ++k) m[k] = args.moments[i * kMoments + k], active += magnitude(m[k]);
+    MeanOffset<float> offset;
+    const PosedGaussian<float> posed = load_posed(args.camera, args.pose, args.in, i, offset);
+    float m[kGradientSums], active = 0;
+    for (int k = 0; k < kGradientSums; ++k) m[k] = args.gradient_sums[i * kGradientSums + k], active += magnitude(m[k]);
     const float on = active > 0 ? 1.0f : 0.0f;
     const InputGradient<float> g = gradient_of(args.camera, posed, m, on);
     const Vec3<float> scale = g.camera.scale;
@@ -80,7 +80,7 @@ __global__ void __launch_bounds__(kThreads) project_backward_kernel(ProjectGradi
     scales[0] = scale.x, scales[1] = scale.y, scales[2] = scale.z;
     args.out.opacities[i] = g.opacity;
     colors[0] = m[10], colors[1] = m[11], colors[2] = m[12];
-    if (args.out.probe) args.out.probe[2 * i] = g.probe.u, args.out.probe[2 * i + 1] = g.probe.v;
+    if (args.out.mean_offsets) args.out.mean_offsets[2 * i] = g.offset.u, args.out.mean_offsets[2 * i + 1] = g.offset.v;
     if (args.out.pose) pose_gradient(posed, g.camera, on, pose);
   }
   if (!args.out.pose) return;

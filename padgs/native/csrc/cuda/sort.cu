@@ -80,7 +80,7 @@ int exclusive_sum(const Queue &queue, const SortArguments &scratch, const uint32
 
 using namespace padgs;
 
-// Bytes of scratch for sorting, or summing over, so many items; the negative of an error.
+// Bytes of scratch for sorting, or summing over, a number of items; or the negative of an error.
 PADGS_API int64_t padgs_cuda_scratch_bytes(const Queue *queue, int64_t count) {
   int64_t sort = 0, scan = 0;
   const int error = on_device(*queue, [&] {

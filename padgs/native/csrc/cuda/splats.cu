@@ -1,5 +1,5 @@
-// Explicit Gaussians as a view sees them, and the derivatives by what is learned of them, a thread each: positions that a
-// probe moves, e^x of log-scales, sigmoids of opacity logits, colours max(0, 1/2 + spherical harmonics). splats.cpp of the
+// Parameters of explicit Gaussians to attributes for one view, and the derivatives, a thread each: positions moved by
+// offsets, e^x of log-scales, sigmoids of opacity logits, colours max(0, 1/2 + spherical harmonics). splats.cpp of the
 // CPU library does the same; padgs.methods.splats.splats.Splats is the definition.
 #include "../mathematics/harmonics.h"
 #include "../mathematics/vector3.h"
@@ -25,7 +25,7 @@ struct Rows {
   }
 };
 
-// What a block works on.
+// State of a block.
 struct Part {
   int64_t first;
   int count, width;  // Gaussians, and numbers of a row of coefficients
@@ -39,22 +39,22 @@ struct Part {
 __device__ inline Vec3<float> vector_at(const float *values) { return {values[0], values[1], values[2]}; }
 __device__ inline void store(float *to, Vec3<float> v) { to[0] = v.x, to[1] = v.y, to[2] = v.z; }
 
-// How a Gaussian lies before the camera, and where a probe, of no values, three or four, moves it to.
+// A Gaussian relative to the camera, moved by offsets of no, three or four values.
 struct Placed {
   float half;  // of the distance, before it is moved
   Vec3<float> moved, ray;
-  float inverse;    // of what the ray was divided by
-  float pull = 0;  // the fourth value of the probe, world units
+  float inverse;    // inverse length of the ray
+  float absgrad = 0;  // the fourth value of the offsets, world units
 
   __device__ Placed(const DeviceSplatArguments &device, int64_t i) {
     const SplatArguments &args = device.splats;
     const Vec3<float> center = vector_at(device.center);
-    const float *probe = args.probe + args.probe_width * i;
+    const float *offsets = args.offsets + args.offset_width * i;
     moved = vector_at(args.means + 3 * i);
     ray = moved - center;
     half = 0.5f * root(dot(ray, ray));
-    if (args.probe_width) moved = moved + scaled(half, vector_at(probe));
-    if (args.probe_width > 3) pull = half * probe[3];
+    if (args.offset_width) moved = moved + scaled(half, vector_at(offsets));
+    if (args.offset_width > 3) absgrad = half * offsets[3];
     ray = moved - center;
     inverse = 1.0f / root(dot(ray, ray) + args.tiny * args.tiny);
     ray = scaled(inverse, ray);
@@ -84,7 +84,7 @@ __global__ void __launch_bounds__(kThreads) splats_kernel(DeviceSplatArguments d
   if (own >= part.count) return;
   const Placed placed(device, i);
   store(args.moved + 3 * i, placed.moved);
-  if (args.pulls) args.pulls[i] = placed.pull;
+  if (args.absgrad) args.absgrad[i] = placed.absgrad;
   args.opacities[i] = 1.0f / (1.0f + expf(-args.opacity_logits[i]));
   const Basis basis(placed);
   const float *rest = rows.numbers + part.width * own;
@@ -109,7 +109,7 @@ __global__ void __launch_bounds__(kThreads) splats_backward_kernel(DeviceSplatAr
     const int64_t i = part.first + own;
     const Placed placed(device, i);
     const Basis basis(placed);
-    float color[kRgb], pulls[kHarmonics];
+    float color[kRgb], by_function[kHarmonics];
     for (int c = 0; c < kRgb; ++c) {
       args.grad_log_scales[3 * i + c] = args.grad_scales[3 * i + c] * args.scales[3 * i + c];
       color[c] = args.colors[kRgb * i + c] > 0 ? args.grad_colors[kRgb * i + c] : 0.0f;
@@ -121,7 +121,7 @@ __global__ void __launch_bounds__(kThreads) splats_backward_kernel(DeviceSplatAr
     float *rest = rows.numbers + part.width * own;  // which gradients take the place of
     for (int k = 0; k < Basis::kUsed; ++k) {
       float *of_function = rest + kRgb * k;
-      pulls[k] = of_function[0] * color[0] + of_function[1] * color[1] + of_function[2] * color[2];
+      by_function[k] = of_function[0] * color[0] + of_function[1] * color[1] + of_function[2] * color[2];
       for (int c = 0; c < kRgb; ++c) of_function[c] = basis.values[k] * color[c];
     }
     for (int n = kRgb * Basis::kUsed; n < part.width; ++n) rest[n] = 0;
@@ -129,13 +129,13 @@ __global__ void __launch_bounds__(kThreads) splats_backward_kernel(DeviceSplatAr
     Vec3<float> grad = vector_at(args.grad_moved + 3 * i);
     if constexpr (kDegree > 0) {  // the colour depends on the direction
       Vec3<float> along;
-      harmonics_gradient<kDegree>(placed.ray.x, placed.ray.y, placed.ray.z, pulls, along.x, along.y, along.z);
+      harmonics_gradient<kDegree>(placed.ray.x, placed.ray.y, placed.ray.z, by_function, along.x, along.y, along.z);
       grad = grad + scaled(placed.inverse, along - scaled(dot(along, placed.ray), placed.ray));
     }
     store(args.grad_means + 3 * i, grad);
-    float *probe = args.grad_probe + args.probe_width * i;
-    if (args.probe_width) store(probe, scaled(placed.half, grad));
-    if (args.probe_width > 3) probe[3] = placed.half * args.grad_pulls[i];
+    float *offsets = args.grad_offsets + args.offset_width * i;
+    if (args.offset_width) store(offsets, scaled(placed.half, grad));
+    if (args.offset_width > 3) offsets[3] = placed.half * args.grad_absgrad[i];
   }
   __syncthreads();
   rows.write(args.grad_rest + part.width * part.first, part.width * part.count);

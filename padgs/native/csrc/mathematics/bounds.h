@@ -117,7 +117,7 @@ PADGS_HD bool behind(const Cone &k, Vec3<float> plane) {
 }
 
 // Whether a cone misses a pinhole image: it lies behind the camera, or beside one of the four sides of the image.
-// Most of what is neither before nor behind the camera does, and would else be given the whole image below.
+// Most Gaussians beside the camera do, and would otherwise get the whole image below.
 PADGS_HD bool misses_pinhole(const Cone &k, const Camera &camera) {
   const float right = float(camera.width) - camera.cx, bottom = float(camera.height) - camera.cy;
   return behind(k, {0, 0, 1}) || behind(k, {camera.fx, 0, camera.cx}) || behind(k, {-camera.fx, 0, right}) ||

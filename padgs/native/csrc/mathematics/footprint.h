@@ -1,5 +1,5 @@
 // One Gaussian on its way to the image and back, of any scalar type: into the camera frame, widened, projected to a
-// footprint and its bounds; and from the moments that blending leaves to the gradient of every input.
+// footprint and its bounds; and from the gradient sums that blending leaves to the gradient of every input.
 #pragma once
 
 #include "boxes.h"
@@ -11,7 +11,7 @@ namespace padgs {
 
 PADGS_HD bool planar(int32_t projection) { return projection == kErp || projection == kPinhole; }
 
-// A Gaussian in the camera frame, with what its world-frame gradients need.
+// A Gaussian in the camera frame, with the values that gradients in the world frame need.
 template <class T>
 struct PosedGaussian {
   CameraGaussian<T> gaussian;
@@ -33,9 +33,9 @@ struct PosedGaussian {
   }
 };
 
-// How far the probe moves the centre of a footprint; zeros without one.
+// Offset of the centre of a footprint; zeros without one.
 template <class T>
-struct Probe {
+struct MeanOffset {
   T u, v;
 };
 
@@ -71,9 +71,9 @@ PADGS_HD T is_drawn(const Projected<T> &p, int bounds, T opacity, T in_front) {
 
 template <class T, class Chart>
 PADGS_HD Projected<T> projected_planar(const Camera &camera, const Chart &chart, const CameraGaussian<T> &g,
-                                       Probe<T> probe) {
+                                       MeanOffset<T> offset) {
   const Covariance2D<T> s = project_covariance(g.spread(), chart.jacobian_u, chart.jacobian_v, camera.low_pass);
-  const T u = chart.u + probe.u * (0.5f * float(camera.width)), v = chart.v + probe.v * (0.5f * float(camera.height));
+  const T u = chart.u + offset.u * (0.5f * float(camera.width)), v = chart.v + offset.v * (0.5f * float(camera.height));
   const T log2_opacity = log2_of_opacity(g.opacity), zero = constant(0.0f, u);
   const PlanarShape<T> shape = planar_shape(s, log2_opacity);
   Projected<T> p{{u, v, shape.a, shape.b, shape.c, zero, zero, zero, zero, zero, zero}, log2_opacity, chart.depth, zero,
@@ -102,19 +102,19 @@ PADGS_HD Projected<T> projected_rays(const Camera &camera, const ProjectiveShape
   return p;
 }
 
-// The probe of a projective footprint moves the mean itself, by the same share of the image on a panorama.
+// The offset of a projective footprint moves the mean itself, by the same share of the image on a panorama.
 template <class T>
-PADGS_HD Vec3<T> probed_mean(Vec3<T> mean, Probe<T> probe) {
+PADGS_HD Vec3<T> shifted_mean(Vec3<T> mean, MeanOffset<T> offset) {
   const SphereFrame<T> f = sphere_frame(mean);
-  return mean + scaled(probe.u * kPi * f.r * f.cos_latitude, f.east) + scaled(probe.v * (0.5f * kPi) * f.r, f.down);
+  return mean + scaled(offset.u * kPi * f.r * f.cos_latitude, f.east) + scaled(offset.v * (0.5f * kPi) * f.r, f.down);
 }
 
-// Footprint and bounds of a Gaussian in the camera frame; its mean is moved already where a probe moves it.
+// Footprint and bounds of a Gaussian in the camera frame; its mean includes the offset.
 template <class T>
-PADGS_HD Projected<T> projected(const Camera &camera, const CameraGaussian<T> &posed, Probe<T> probe) {
+PADGS_HD Projected<T> projected(const Camera &camera, const CameraGaussian<T> &posed, MeanOffset<T> offset) {
   const CameraGaussian<T> g = Widened<T>(camera, posed).gaussian;
-  if (camera.projection == kErp) return projected_planar(camera, ErpChart<T>(camera, g.mean), g, probe);
-  if (camera.projection == kPinhole) return projected_planar(camera, PinholeChart<T>(camera, g.mean), g, probe);
+  if (camera.projection == kErp) return projected_planar(camera, ErpChart<T>(camera, g.mean), g, offset);
+  if (camera.projection == kPinhole) return projected_planar(camera, PinholeChart<T>(camera, g.mean), g, offset);
   const T exact = largest_q(g.opacity), k = larger(exact, constant(0.0f, exact)) * kSlack;
   if (camera.projection == kTangent) {
     const TangentModel<T> model(g, camera.low_pass);
@@ -158,14 +158,14 @@ PADGS_HD PixelBox box_of(const Camera &camera, const float *shape, const float *
   return misses_pinhole(cone, camera) ? no_pixels() : pixel_box(camera, pinhole_range(cone, camera));
 }
 
-// What flows back to the inputs of one Gaussian. `camera` is with respect to the Gaussian in the camera frame.
+// Gradients of the inputs of one Gaussian. `camera` is by the Gaussian in the camera frame.
 template <class T>
 struct InputGradient {
   CameraGaussianGradient<T> camera;
   Vec3<T> mean;
   Quaternion<T> quat;
   T opacity;
-  Probe<T> probe;
+  MeanOffset<T> offset;
 };
 
 template <class T, class Chart>
@@ -176,16 +176,16 @@ PADGS_HD void planar_backward(const Camera &camera, const Chart &chart, const Ca
   f.depth = m[13];
   out.camera = planar_vjp(g, chart, f);
   out.camera.log_opacity = m[0];
-  out.probe = {f.u * (0.5f * float(camera.width)), f.v * (0.5f * float(camera.height))};
+  out.offset = {f.u * (0.5f * float(camera.width)), f.v * (0.5f * float(camera.height))};
 }
 
 template <class T>
 PADGS_HD void projective_backward(const Camera &camera, const CameraGaussian<T> &g, const T *m, InputGradient<T> &out) {
-  const ProjectiveMoments<T> moments = projective_moments(m);
-  out.camera = camera.projection == kTangent ? TangentModel<T>(g, camera.low_pass).vjp(g, moments, m[13])
-                                             : RayModel<T>(g).vjp(g, moments, m[13]);
-  const SphereFrame<T> f = sphere_frame(g.mean);  // the probe moves along it, which changes no radius: no widening
-  out.probe = {dot(out.camera.mean, f.east) * f.r * f.cos_latitude * kPi,
+  const ProjectiveSums<T> gradient_sums = projective_sums(m);
+  out.camera = camera.projection == kTangent ? TangentModel<T>(g, camera.low_pass).vjp(g, gradient_sums, m[13])
+                                             : RayModel<T>(g).vjp(g, gradient_sums, m[13]);
+  const SphereFrame<T> f = sphere_frame(g.mean);  // the offset moves along it, which changes no radius: no widening
+  out.offset = {dot(out.camera.mean, f.east) * f.r * f.cos_latitude * kPi,
                dot(out.camera.mean, f.down) * f.r * (0.5f * kPi)};
 }
 
@@ -194,7 +194,7 @@ PADGS_HD T kept(T on, T value) { return where(below(constant(0.0f, on), on), val
 template <class T>
 PADGS_HD Vec3<T> kept(T on, Vec3<T> v) { return {kept(on, v.x), kept(on, v.y), kept(on, v.z)}; }
 
-// From the moments [kMoments] of a Gaussian; its mean is moved already where a probe moves it. Where `on` is 0 it drew
+// From the gradient sums [kGradientSums] of a Gaussian; its mean includes the offset. Where `on` is 0 it drew
 // nothing and may hold anything, infinities too: its gradients are replaced by 0, not multiplied.
 template <class T>
 PADGS_HD InputGradient<T> gradient_of(const Camera &camera, const PosedGaussian<T> &posed, const T *m, T on) {
@@ -219,7 +219,7 @@ PADGS_HD InputGradient<T> gradient_of(const Camera &camera, const PosedGaussian<
   const Quaternion<T> q = rotation_vjp(posed.unit, posed.norm, turned);
   out.quat = {kept(on, q.w), kept(on, q.x), kept(on, q.y), kept(on, q.z)};
   out.opacity = kept(on, c.log_opacity / g.opacity);
-  out.probe = {kept(on, out.probe.u), kept(on, out.probe.v)};
+  out.offset = {kept(on, out.offset.u), kept(on, out.offset.v)};
   return out;
 }
 

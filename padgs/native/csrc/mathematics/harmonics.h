@@ -1,5 +1,5 @@
-// Real spherical harmonics of degrees 1 to 3 at a direction, in the order of padgs/geometry/harmonics.py, and what a
-// weighted sum of them changes by with the direction.
+// Real spherical harmonics of degrees 1 to 3 at a direction, in the order of padgs/geometry/harmonics.py, and the
+// derivative of a weighted sum by the direction.
 #pragma once
 
 #include "scalar.h"

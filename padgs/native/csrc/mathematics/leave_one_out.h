@@ -1,4 +1,4 @@
-// What a pixel would lose with one of its Gaussians. Removed, it no longer shows c with weight w = alpha T, and what lies
+// Change of a pixel when one Gaussian is removed. It no longer shows c with weight w = alpha T, and what lies
 // behind it, blended to B T (1 - alpha), shines through unattenuated: dC = alpha / (1 - alpha) behind - w c, exactly.
 #pragma once
 

@@ -140,7 +140,7 @@ PADGS_HD PlanarShape<T> planar_shape(const Covariance2D<T> &s, T log2_opacity) {
   return shape;
 }
 
-// From the moments of M = dL/d(ln alpha) over the pixels to the footprint's gradient. With S^-1 = K^T K, K the factor
+// From the gradient sums of M = dL/d(ln alpha) over the pixels to the footprint's gradient. With S^-1 = K^T K, K the factor
 // [[a, b], [0, c]] of planar_shape over h = sqrt(log2(e) / 2), and y = K delta:
 //   dL/d(u, v) = K^T sum(M y),  dL/dS = K^T Y K / 2 with Y = sum(M y y^T),  dL/dP = K^T Y (K P),
 // in this order, because S^-1 itself holds no digits where the footprint is long and oblique.

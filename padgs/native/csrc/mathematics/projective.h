@@ -23,11 +23,11 @@ struct ProjectiveShape {
 
 // The ten sums, by name.
 template <class T>
-struct ProjectiveMoments {
+struct ProjectiveSums {
   T one, c0, c1, c2, c00, c01, c02, c11, c12, c22;
 };
 template <class T>
-PADGS_HD ProjectiveMoments<T> projective_moments(const T *m) {
+PADGS_HD ProjectiveSums<T> projective_sums(const T *m) {
   return {m[0], m[1], m[2], m[3], m[4], m[5], m[6], m[7], m[8], m[9]};
 }
 
@@ -63,9 +63,9 @@ struct TangentModel {
     return {scaled(h * c11, frame.east) + scaled(h * c21, frame.down), scaled(h * c22, frame.down), {zero, zero, zero}};
   }
 
-  // What the released OP43DGS takes the radius of its bounds from: half a trace and a determinant, in square pixels.
+  // Radius of the bounds of the released OP43DGS, from half a trace and a determinant in square pixels.
   // The trace is that of the footprint in the panorama, by a Jacobian whose lower row is divided by
-  // sqrt(x^2 + z^2 r^2) where r^2 sqrt(x^2 + z^2) belongs; the determinant is that of S at 512 pixels per radian.
+  // sqrt(x^2 + z^2 r^2) instead of r^2 sqrt(x^2 + z^2); the determinant is that of S at 512 pixels per radian.
   // Grows with the distance.
   PADGS_HD Vec3<T> published_extent(const Camera &camera, Vec3<T> mean) const {
     const ErpChart<T> chart(camera, mean);
@@ -81,7 +81,7 @@ struct TangentModel {
   // With y = C^-1 tau, g = S^-1 tau = C^-T y, Y = sum M y y^T:
   //   dL/dP = C^-T Y (C^-1 P), in this order, because S^-1 itself holds no digits where S is long and oblique,
   //   dL/dA = E^T dL/dP / r,  dL/dmu = [E^T (sum M (I + tau tau^T) g - dL/dP n) - tr(P^T dL/dP) n] / r
-  PADGS_HD CameraGaussianGradient<T> vjp(const CameraGaussian<T> &g, const ProjectiveMoments<T> &m,
+  PADGS_HD CameraGaussianGradient<T> vjp(const CameraGaussian<T> &g, const ProjectiveSums<T> &m,
                                          T grad_depth) const {
     const T i11 = 1.0f / c11, i22 = 1.0f / c22, i21 = -(c21 * i11 * i22);  // C^-1
     const Vec3<T> q1 = scaled(i11, e), q2 = scaled(i21, e) + scaled(i22, d);
@@ -146,7 +146,7 @@ struct RayModel {
 
   // The closest point of a ray to the mean, in whitened space, is off by e = [o_hat u1 u2] (c0 / rho, -c1, -c2); with
   // h = M^-T e:  dL/dmu = -sum M h,  dL/dSigma = sum M h h^T / 2.
-  PADGS_HD CameraGaussianGradient<T> vjp(const CameraGaussian<T> &g, const ProjectiveMoments<T> &m,
+  PADGS_HD CameraGaussianGradient<T> vjp(const CameraGaussian<T> &g, const ProjectiveSums<T> &m,
                                          T grad_depth) const {
     const T inverse_rho = 1.0f / rho;
     const Mat3<T> basis{scaled(inverse_rho, o_hat), scaled(constant(-1.0f, rho), u1), scaled(constant(-1.0f, rho), u2)};

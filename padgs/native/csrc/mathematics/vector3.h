@@ -79,7 +79,7 @@ struct CameraGaussian {
   }
 };
 
-// What flows back to it.
+// Its gradient.
 template <class T>
 struct CameraGaussianGradient {
   Vec3<T> mean;

@@ -1,7 +1,7 @@
 // Blending, backward: a block goes through the list of its tile from behind, a thread for each pixel, and leaves the
-// moments (sums over pixels that gradients are made of) of every instance in its slot.
+// gradient sums (sums over pixels from which gradients are computed) of every instance in its slot.
 //
-// A warp visits the instances that reach its 8x4 pixels, sums their moments over its lanes, and leaves them in shared
+// A warp visits the instances that reach its 8x4 pixels, sums their gradients over its lanes, and leaves them in shared
 // memory; the sums of the eight warps are then added in order. Nothing is kept from the forward pass but what each pixel
 // ended with, no float is added atomically, and a slot is written once: the results do not depend on scheduling.
 #pragma once
@@ -10,17 +10,17 @@
 
 namespace padgs {
 
-constexpr int kColorMoment = 10;  // colour and depth; before it the shape's
+constexpr int kColorSum = 10;  // colour and depth; before it the shape's
 constexpr int kGradientBatch = 128;
 
-// What one pixel's fragments have in common on the way back.
+// Common state of the fragments of a pixel in the backward pass.
 struct Upstream {
-  float red, green, blue, depth;  // dL/d of what the weights multiply
+  float red, green, blue, depth;  // dL/d of the values that weights multiply
 
   __device__ float along(float r, float g, float b, float z) const { return red * r + green * g + blue * b + depth * z; }
   __device__ float along(const Footprint &f) const { return along(f.red, f.green, f.blue, f.depth); }
 };
-// dL by a pixel's colour, and by what it leaves for the background.
+// dL by the colour and by the transmittance of a pixel.
 __device__ inline float load_upstream(const BlendGradientInputs &args, int64_t p, Upstream &upstream) {
   const float *grad = args.grad_image + 3 * p, *background = args.forward.background;
   upstream = {grad[0], grad[1], grad[2], 0.0f};
@@ -41,17 +41,17 @@ __device__ inline void write_ray_gradient(const BlendGradientInputs &args, const
 //   up                                          what the weights are multiplied with
 //   step_back(f, gaussian, log2_alpha, weight)  visits one; returns M = dL/d(ln alpha), and its weight
 template <class Pixel, class State, bool kWithRays>
-__global__ void __launch_bounds__(kTilePixels, kBlocks) moments_kernel(BlendGradientInputs args) {
-  constexpr bool kPlanar = Pixel::Pair::kMoments < kColorMoment;
-  constexpr int kShape = Pixel::Pair::kMoments, kSums = kShape + 4 + !kPlanar;  // colour, depth; pulls
+__global__ void __launch_bounds__(kTilePixels, kBlocks) gradient_sums_kernel(BlendGradientInputs args) {
+  constexpr bool kPlanar = Pixel::Pair::kGradientSums < kColorSum;
+  constexpr int kShape = Pixel::Pair::kGradientSums, kSums = kShape + 4 + !kPlanar;  // colour, depth; absgrad
   __shared__ Batch<kGradientBatch> batch;
   __shared__ float partial[kWarps][kWarp][kSums];
   __shared__ bool summed_by[kWarp][kWarps];  // which instances of the group each warp has sums of
   __shared__ int furthest_of_block;
   const BlendInputs &forward = args.forward;
   const int thread = int(threadIdx.x), warp = thread / kWarp, lane = lane_index(), own = dealt_index(kSums, lane);
-  const int moment = thread % kMoments;  // that the thread adds up; of some there are no sums
-  const int sum_of_moment = moment < kShape ? moment : moment < kColorMoment ? kSums : moment - kColorMoment + kShape;
+  const int number = thread % kGradientSums;  // of the sum that the thread adds up; some are unused
+  const int shared_sum = number < kShape ? number : number < kColorSum ? kSums : number - kColorSum + kShape;
   const PixelPlace place = pixel_place(forward.table, int(blockIdx.x), thread);
   const int begin = forward.tile_start[blockIdx.x], length = forward.tile_start[blockIdx.x + 1] - begin;
   const Pixel pixel = pixel_at<Pixel>(forward, place);
@@ -64,8 +64,8 @@ __global__ void __launch_bounds__(kTilePixels, kBlocks) moments_kernel(BlendGrad
   if (lane == 0) atomicMax(&furthest_of_block, furthest_of_warp);
   __syncthreads();
   const int furthest = furthest_of_block;
-  for (int64_t i = int64_t(furthest) * kMoments + thread; i < int64_t(length) * kMoments; i += kTilePixels)
-    args.moments[forward.slots[begin + i / kMoments]].of[i % kMoments] = 0;
+  for (int64_t i = int64_t(furthest) * kGradientSums + thread; i < int64_t(length) * kGradientSums; i += kTilePixels)
+    args.gradient_sums[forward.slots[begin + i / kGradientSums]].of[i % kGradientSums] = 0;
 
   for (int first = (furthest - 1) / batch.kSize * batch.kSize; first >= 0 && furthest > 0; first -= batch.kSize) {
     const int count = least(furthest - first, batch.kSize);
@@ -84,12 +84,12 @@ __global__ void __launch_bounds__(kTilePixels, kBlocks) moments_kernel(BlendGrad
         if (reached) {
           float weight;
           const float m = state.step_back(f, batch.reaches[k].gaussian, pair.log2_alpha, weight);
-          pair.moments(m, sums);
+          pair.gradient_sums(m, sums);
           sums[kShape] = weight * state.up.red;
           sums[kShape + 1] = weight * state.up.green;
           sums[kShape + 2] = weight * state.up.blue;
           sums[kShape + 3] = weight * state.up.depth;
-          if constexpr (!kPlanar) sums[kSums - 1] = args.absolute ? pair.pull(f, m) : 0.0f;
+          if constexpr (!kPlanar) sums[kSums - 1] = args.absgrad ? pair.absgrad(f, m) : 0.0f;
           if constexpr (kWithRays) grad_ray = grad_ray + pixel.ray_gradient(f, pair, m);
         }
         const float sum = dealt_sum(sums);
@@ -98,14 +98,14 @@ __global__ void __launch_bounds__(kTilePixels, kBlocks) moments_kernel(BlendGrad
       }
       summed_by[lane][warp] = summed >> lane & 1;
       __syncthreads();
-      for (int bit = thread / kMoments; bit < least(count - group, kWarp); bit += kTilePixels / kMoments) {
+      for (int bit = thread / kGradientSums; bit < least(count - group, kWarp); bit += kTilePixels / kGradientSums) {
         float total = 0;
-        if (sum_of_moment < kSums)
+        if (shared_sum < kSums)
           for (int w = 0; w < kWarps; ++w)
-            if (summed_by[bit][w]) total += partial[w][bit][sum_of_moment];
-        args.moments[forward.slots[begin + first + group + bit]].of[moment] = total;
+            if (summed_by[bit][w]) total += partial[w][bit][shared_sum];
+        args.gradient_sums[forward.slots[begin + first + group + bit]].of[number] = total;
       }
-      __syncthreads();  // nobody reads the sums, or the batch, any more
+      __syncthreads();  // before the sums and the batch are overwritten
     }
   }
   if constexpr (kWithRays)
@@ -113,11 +113,11 @@ __global__ void __launch_bounds__(kTilePixels, kBlocks) moments_kernel(BlendGrad
 }
 
 template <class PlanarState, class ProjectiveState>
-void launch_moments(const Queue &queue, const BlendGradientInputs &args) {
+void launch_gradient_sums(const Queue &queue, const BlendGradientInputs &args) {
   const bool flat = planar(args.forward.projection);
-  const auto kernel = flat             ? moments_kernel<PlanarPixel, PlanarState, false>
-                      : args.grad_rays ? moments_kernel<ProjectivePixel, ProjectiveState, true>
-                                       : moments_kernel<ProjectivePixel, ProjectiveState, false>;
+  const auto kernel = flat             ? gradient_sums_kernel<PlanarPixel, PlanarState, false>
+                      : args.grad_rays ? gradient_sums_kernel<ProjectivePixel, ProjectiveState, true>
+                                       : gradient_sums_kernel<ProjectivePixel, ProjectiveState, false>;
   launch(kernel, tiles_drawn(args.forward.table), kTilePixels, queue, args);
 }
 
