@@ -16,11 +16,10 @@ from padgs.data.datasets import DATASETS
 from padgs.data.perturb import CONDITIONS
 from padgs.data.synthetic.options import SyntheticOptions
 from padgs.evaluation.protocols import PROTOCOLS, ROAM_360_BOTTOM_CROP
+from padgs.methods.anchors.anchors import PaDGSOptions
 from padgs.methods.anchors.growth import PUBLISHED_THRESHOLD
 from padgs.methods.anchors.method import PaDGSMethodOptions
-from padgs.methods.anchors.anchors import PaDGSOptions
-from padgs.methods.plus.method import PlusMethod
-from padgs.methods.plus.method import PlusOptions
+from padgs.methods.plus.method import PlusMethod, PlusOptions
 from padgs.multirun.composition import composing, configuration, method_choices, variant_choices
 from padgs.multirun.overrides import expand, lenient, missing_plugin, quoted
 from padgs.registry import lookup
@@ -224,13 +223,13 @@ def test_the_release_of_padgs_differs_from_the_paper_where_its_code_does():
     [
         (
             ["render.bounds=square"],
-            "render: bounds=square are the published bounds, which end at the seam; set wrap=false",
+            "render: bounds=square end at the seam, as published; set wrap=false",
         ),
         (
             ["method=omnigs", "render.near_cull=ellipsoid"],
-            "near_cull=ellipsoid is made for projection 'ray', not 'erp'",
+            "near_cull=ellipsoid requires projection 'ray', not 'erp'",
         ),
-        (["method=spags_sorted", "render.core_size=8"], "core_size is 8, but blending=sorted keeps no core"),
+        (["method=spags_sorted", "render.core_size=8"], "core_size is 8, but blending=sorted has no core"),
         (["render.near_unit=metre"], "unknown near_unit 'metre'; known: scene, world"),
     ],
 )

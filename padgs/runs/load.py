@@ -166,15 +166,13 @@ class LoadedRun:
                 low_pass_kind="angular" if angular else settings.low_pass_kind,
                 cubemap=False,
                 face_size=None,
-                pixel_bias=0.0,
                 bounds="exact",
                 wrap=True,
-                memory_cap=None,
             )
         finer = max(1.0, camera.focal / trained.focal)
         if not isinstance(camera, Panorama):
             finer /= self.method.CUT_FINENESS
-        if not (settings.low_pass_kind == "fixed" or self.method.has_smoothing_filter):
+        if not self.method.has_smoothing_filter:
             settings = replace(settings, low_pass=settings.low_pass * finer**2)
         return self.method if settings == self.config.render else self.method.with_renderer(settings)
 

@@ -97,7 +97,7 @@ def test_learning_rates_of_the_lenses_fall_to_a_tenth(scene):
 
 
 def test_charts_cannot_draw_lenses():
-    with pytest.raises(ValueError, match="projection 'erp' is made for a Panorama camera, not a RayTable"):
+    with pytest.raises(ValueError, match="projection 'erp' requires a Panorama camera, not a RayTable"):
         Seam360GSMethod(render=RenderConfig(backend="torch"))
 
 

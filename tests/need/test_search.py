@@ -14,6 +14,7 @@ import padgs
 from padgs.checks import ConfigError
 from padgs.cli.commands import app
 from padgs.data.perturb import StressOptions
+from padgs.methods.splats.importance import importance_scores, most_important
 from padgs.multirun import job
 from padgs.multirun.composition import composing, configuration
 from padgs.need import tiers
@@ -27,7 +28,6 @@ from padgs.runs.interrupt import Interrupt, Interrupted
 from padgs.runs.run import Callback
 from padgs.training.loop import Trainer
 from padgs.training.model import State
-from padgs.methods.splats.importance import most_important, importance_scores
 
 METHODS = ("method=omnigs", "method=padgs")
 

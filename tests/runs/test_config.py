@@ -9,7 +9,7 @@ from padgs.multirun.composition import composing
 MEANINGLESS = {
     "render.near=inf": "render.near is inf; it must be finite",
     "render.low_pass=inf": "it must be finite",
-    "render.pixel_bias=nan": "render.pixel_bias is nan",
+    "render.low_pass=nan": "render.low_pass is nan",
     "train.max_seconds=-1": "max_seconds is -1.0; it must be > 0",
     "run.checkpoint_seconds=nan": "it must be finite",
     "run.checkpoint_seconds=-1": "checkpoint_seconds is -1.0; it must be >= 0",
@@ -22,14 +22,14 @@ MEANINGLESS = {
 }
 TOO_LATE = {
     "render.projection=erpp": "unknown projection 'erpp'; known: erp, pinhole, tangent, ray",
-    "method=padgs render.projection=pinhole": "cubemap=true draws panoramas with it",
+    "method=padgs render.projection=pinhole": "or set cubemap=true",
     "render.backend=gpu": "unknown backend 'gpu'; known: auto, torch, cpu, cuda",
-    "method=seam360gs render.projection=erp": "made for a Panorama camera, not a RayTable",
-    "method=crops_3dgs render.projection=erp render.cubemap=false": "made for a Panorama camera, not a Pinhole",
+    "method=seam360gs render.projection=erp": "requires a Panorama camera, not a RayTable",
+    "method=crops_3dgs render.projection=erp render.cubemap=false": "requires a Panorama camera, not a Pinhole",
     "method=cubemap_3dgs train.weight=solid_angle": "have no latitude; set uniform",
     "method=cubemap_3dgs train.poses=learned": "cut from one photograph would learn its own; leave it at given",
     "method=egonerf render.projection=ray": "egonerf casts rays",
-    "method=spags render=default": "signal=space_absolute is made for render.projection=ray",
+    "method=spags render=default": "positional_gradient=space_absolute is made for render.projection=ray",
     "render.projection=ray render.bounds=square render.wrap=false": "has no square bounds",
     "render.core_size=1000": "core_size is 1000; it must be from 1 to 256",
     "method=omnigs method.sh_degree=9": "sh_degree is 9; it must be 0 to 3",
