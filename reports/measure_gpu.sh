@@ -1,15 +1,15 @@
 #!/bin/sh
-# On a machine with an NVIDIA GPU: build, benchmark, test, and look for faults, in this order; what is known by then is
-# written after each step to reports/measured/<device>.json, and the last line says what has been verified and what not.
+# Build, benchmark, test and sanitize on a machine with an NVIDIA GPU. Each step updates reports/measured/<device>.json;
+# the last line of output names the verified and the missing steps.
 #
-#   reports/measure_gpu.sh [STEP...]     all of: build bench kernels tests memcheck synccheck racecheck initcheck
+#   reports/measure_gpu.sh [STEP...]     default: build bench kernels tests memcheck synccheck racecheck initcheck
 #
-# A step that is done is not done again, so the same command goes on where it was cut off; build/gpu/out/STEP.state says
-# how each ended, STEP.log what it printed. Delete build/gpu/out to start over.
+# Finished steps are skipped, so the same command resumes after an interruption. build/gpu/out/STEP.state has the status
+# of a step, STEP.log its output. Delete build/gpu/out to start over.
 #
-# Needs no network: nvcc, cmake, a C++ compiler, and a python3 (PYTHON names another) with torch, numpy, scipy, pytest,
-# hypothesis, typer and rich. What is missing of the pure-Python ones may lie in the folder wheels/ as wheels. FULL=0
-# leaves out a million Gaussians, LIMIT gives a step so many seconds (540, as machines are lent for ten minutes).
+# Needs nvcc, cmake, a C++ compiler, and python3 (or PYTHON) with torch, numpy, scipy, pytest, hypothesis, typer and rich,
+# but no network: missing pure-Python packages may be wheels in the folder wheels/. FULL=0 skips a million Gaussians.
+# LIMIT is the time limit of a step in seconds (default: 540).
 set -eu
 cd "$(dirname "$0")/.."
 self=$PWD/reports/$(basename "$0")
@@ -23,6 +23,7 @@ export PADGS_LIBRARY_DIR="$build/lib" PYTHONPATH="$PWD:$site" PYTHONUNBUFFERED=1
 
 build() {
   if [ -d wheels ]; then $python -m pip install -q --no-index --no-deps --upgrade --target "$site" wheels/*.whl; fi
+  if [ -d baselines ]; then ln -sfn ../baselines padgs/baselines && ln -sfn ../reports padgs/reports; fi # not installed
   cmake -S . -B "$build" -DCMAKE_BUILD_TYPE=Release -DPADGS_CUDA=ON
   cmake --build "$build" --parallel
   mkdir -p "$build/lib"
@@ -40,7 +41,7 @@ sanitizer() {
     tests/render/cuda/test_cuda_backend.py tests/render/cuda/test_cuda_decoder.py tests/render/cuda/test_cuda_loss.py \
     tests/render/cuda/test_cuda_splats.py
 }
-# Without torch's cache of memory, in which it sees one large block that has been written before.
+# Without torch's caching allocator, whose large blocks count as initialized.
 memcheck() { PYTORCH_NO_CUDA_MEMORY_CACHING=1 sanitizer memcheck; }
 synccheck() { sanitizer synccheck; }
 racecheck() { sanitizer racecheck; }
@@ -71,7 +72,7 @@ print(f"verified: {verified or 'nothing'}; not verified: {missing or 'nothing'}"
 END
 }
 
-# In a process of its own, which the limit ends: the script itself, told to do only this.
+# One step in a process of its own, for the time limit.
 if [ "${1:-}" = --only ]; then
   "$2"
   exit

@@ -23,18 +23,18 @@ ALL = "all"
 def report(
     what: Annotated[str, typer.Argument(help=f"{', '.join(REPORTS)}, or {ALL}")],
     runs: Annotated[str, typer.Argument(help="folder of run folders, or a results.jsonl")] = "runs",
-    out: Annotated[str, typer.Option(help="where the files go; reports in or beside RUNS if not given")] = "",
+    out: Annotated[str, typer.Option(help="folder of the files; default: reports in or beside RUNS")] = "",
     protocol: Annotated[str, typer.Option(help="which scores: paper or sphere")] = "paper",
     experiment: Annotated[str, typer.Option(help="only runs of this experiment or sweep, e.g. tau@cpu")] = "",
-    metric: Annotated[list[str] | None, typer.Option(help="of the curves of sweeps, e.g. ws_psnr; repeatable")] = None,
+    metric: Annotated[list[str] | None, typer.Option(help="metric of sweeps' curves, e.g. ws_psnr; repeatable")] = None,
     where: Annotated[list[str] | None, typer.Option(help="only runs with KEY=VALUE; repeatable")] = None,
-    mix: Annotated[bool, typer.Option(help="let other rules, sizes, run lengths and machines stand together")] = False,
+    mix: Annotated[bool, typer.Option(help="compare runs with different rules, sizes, lengths and machines")] = False,
     collect: Annotated[
         bool, typer.Option(help="add the runs to OUT/results.jsonl first, and report on all in it")
     ] = False,
     svg: Annotated[bool, typer.Option(help="write charts as SVG, too")] = False,
     strict: Annotated[
-        bool, typer.Option(help="exit code 1 if a result file cannot be used, or results must not stand together")
+        bool, typer.Option(help="exit code 1 if a result file is unusable or runs must not be compared")
     ] = False,
 ) -> None:
     """Make tables (Markdown, LaTeX, CSV), charts (PNG, CSV) and a page (HTML) from result files."""
@@ -46,14 +46,14 @@ def report(
     target = Path(out) if out else (source if source.is_dir() else source.parent) / "reports"
     from padgs.reports.frame import frame
     from padgs.reports.selection import Request, RunSet
-    from padgs.reports.writers import files  # pandas, which other commands need not wait for
+    from padgs.reports.writers import files  # imports pandas, so not at the top
 
     request = Request(protocol, mix, strict, tuple(metric or ()), experiment, dict(map(_pair, where or [])))
     found, broken = store.read(source)
     if collect:
         with _writing_to(target):
             target.mkdir(parents=True, exist_ok=True)
-            found = store.add(found, target / store.FILE_NAME)  # pictures are there of those in `source` only
+            found = store.add(found, target / store.FILE_NAME)  # only runs in `source` have pictures
     for error in broken:
         show(f"left out: {error}", sys.stderr)
     if not found:
@@ -62,7 +62,7 @@ def report(
         raise ReportError(f"no result that can be used is in {source}; {hint}")
     run_set = RunSet(frame(found), request, tuple(map(str, broken)))
     if early := [run.result.run for run in found if run.result.ended == STOP_REQUESTED]:
-        run_set.warnings.append(f"asked to stop before their end, and so in no table but `runs`: {', '.join(early)}")
+        run_set.warnings.append(f"stopped by request, and only in the table `runs`: {', '.join(early)}")
     refused = 0
     single = what != ALL
     for name in [what] if single else REPORTS:

@@ -46,7 +46,7 @@ def test_runs_that_were_asked_to_stop_are_named(runs):
     early = replace(result("", run="early_1"), variant="stopped after 9 iterations", ended=results.STOP_REQUESTED)
     results.write(early, runs / "early")
     done = report("table3", runs)
-    assert done.exit_code == 0 and "in no table but `runs`: early_1" in " ".join(done.stderr.split())
+    assert done.exit_code == 0 and "only in the table `runs`: early_1" in " ".join(done.stderr.split())
 
 
 def test_the_same_results_give_the_same_bytes(runs, tmp_path):
