@@ -1,8 +1,8 @@
-"""The table of docs/cuda.md: how far backend cuda is from the definition in float64, by projection and region.
+"""Print the table of docs/cuda.md: deviations of backend cuda from the definition in float64.
 
     python docs/cuda_parity.py
 
-Runs on the GPU where there is one, else the same kernels on the CPU (tests/render/cuda/emulation.h), and says which.
+Runs on a GPU if there is one, else the same kernels on the CPU (tests/render/cuda/emulation.h), and prints which.
 """
 
 from __future__ import annotations
@@ -14,12 +14,20 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests/render"))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests/render/cuda"))
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests/render/backends"))
 
 import cuda_engine
-from render_cases import SETUPS, blended, camera_of, gaussians_of, identity_pose, random_pose, row_error, stable_pixels
+from render_cases import (
+    SETUPS,
+    blended,
+    camera_of,
+    differentiated,
+    gaussians_of,
+    identity_pose,
+    random_pose,
+    row_error,
+    stable_pixels,
+)
 from test_hybrid_rendering import fragments
-from test_parity import random_weights, run
 
 from padgs.render import RenderOptions
 from padgs.render.contract import BLENDINGS
@@ -45,10 +53,10 @@ def main() -> None:
 
 
 def errors(projection: str, lens: str, region: str, blending: str) -> list[float]:
-    """Of the image, the depth (relative) and the gradients (rows of all inputs, relative): the largest and the mean."""
+    """Return the largest and the mean error of the image, the depth (relative) and the gradients (relative, by row)."""
     generator = torch.Generator().manual_seed(11)
     gaussians = gaussians_of(region, COUNT, generator)
-    if region == "near" and projection == "ray":  # which draws nothing from inside
+    if region == "near" and projection == "ray":  # cameras inside a Gaussian do not see it
         gaussians.scales.mul_(0.2)
     pose = random_pose(generator) if region == "ordinary" and lens != "panorama" else identity_pose()
     options = RenderOptions(projection, **blended(blending, 4))
@@ -56,9 +64,9 @@ def errors(projection: str, lens: str, region: str, blending: str) -> list[float
     if blending == "hybrid":
         *_, decided = fragments(gaussians, camera_of(lens, *SIZE), options, pose)
         stable &= decided.view_as(stable)
-    weights = random_weights(SIZE, stable, generator)
+    weights = torch.randn(*stable.shape, 5, generator=generator, dtype=torch.float64) * stable[..., None]
     runs = [
-        run(gaussians, SIZE, lens, options, weights, pose=pose, backend=backend, dtype=dtype)
+        differentiated(gaussians, camera_of(lens, *SIZE), options, weights, pose=pose, backend=backend, dtype=dtype)
         for backend, dtype in (("torch", torch.float64), ("cuda", torch.float32))
     ]
     (truth, exact), (drawn, found) = runs

@@ -1,9 +1,9 @@
-"""Registers, stack, shared memory and occupancy of every kernel of ours in compiled CUDA code, as a table in Markdown.
+"""Print registers, stack, shared memory and occupancy of every padgs kernel in compiled CUDA code, as Markdown.
 
     python docs/cuda_resources.py build/libpadgs_cuda.so [--cuobjdump PROGRAM]
 
-The code says it itself, through cuobjdump of CUDA's toolkit (or `pip install nvidia-cuda-cuobjdump`), without a GPU.
-Occupancy is the share of an SM's threads that may be there at once. A stack is either an array of the source or spills.
+Reads the code with cuobjdump of the CUDA toolkit (or `pip install nvidia-cuda-cuobjdump`); no GPU is needed. Occupancy
+is the share of the threads of an SM that can be resident. A stack is an array of the source or spilled registers.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
-RESERVED = 1 << 10  # bytes of shared memory of every block that are the system's; from 9.0 on cuobjdump counts them
+RESERVED = 1 << 10  # bytes of shared memory per block for the system; from 9.0 on cuobjdump includes them
 REGISTERS = 65536  # of an SM; a warp takes them in units of 256
 # Threads, blocks and bytes of shared memory of an SM, by compute capability: CUDA C++ Programming Guide, "Compute
 # Capabilities".
@@ -31,7 +31,7 @@ SMS = {
 
 @dataclass(frozen=True)
 class Kernel:
-    """What one kernel takes on one architecture; bytes, of stack for each thread, of shared memory for each block."""
+    """Resources of one kernel on one architecture: bytes of stack per thread, and of shared memory per block."""
 
     name: str
     architecture: int
@@ -42,7 +42,7 @@ class Kernel:
 
     @property
     def occupancy(self) -> float:
-        """Share of an SM's threads; 0 where not even one block fits."""
+        """Return the share of the threads of an SM; 0 if no block fits."""
         threads, blocks, shared = SMS[self.architecture]
         warps = -(-self.threads // 32)
         by_registers = REGISTERS // (warps * -(-self.registers * 32 // 256) * 256)
@@ -51,10 +51,10 @@ class Kernel:
 
 
 def kernels(usage: str, elf: str) -> list[Kernel]:
-    """From what `cuobjdump --dump-resource-usage` and `--dump-elf` print, architecture by architecture.
+    """Parse the output of `cuobjdump --dump-resource-usage` and `--dump-elf`.
 
     Raises:
-        ValueError: a kernel whose source does not say by `__launch_bounds__` how many threads a block has.
+        ValueError: a kernel has no `__launch_bounds__`.
     """
     in_its_section = r"\.nv\.info\.(\w+)\n(?:(?!\.nv\.info).)*?"
     threads = dict(re.findall(in_its_section + r"EIATTR_MAX_THREADS.*?Value:\s*0x(\w+)", elf, re.S))
@@ -63,14 +63,14 @@ def kernels(usage: str, elf: str) -> list[Kernel]:
     for architecture, part in re.findall(r"arch = sm_(\d+)(.*?)(?=arch = |\Z)", usage, re.S):
         for name, registers, stack, shared in re.findall(of_kernel, part):
             if name not in threads:
-                raise ValueError(f"{name} has no __launch_bounds__, so that nobody knows how large its blocks are")
+                raise ValueError(f"{name} has no __launch_bounds__, so the size of its blocks is unknown; add them")
             numbers = map(int, (architecture, registers, stack, shared))
             found.append(Kernel(readable(name), *numbers, threads=int(threads[name], 16)))
     return sorted(found, key=lambda kernel: (kernel.name, kernel.architecture))
 
 
 def readable(mangled: str) -> str:
-    """What of a kernel's name tells it from the others, without a demangler."""
+    """Return the distinctive part of the mangled name of a kernel."""
     (own,) = re.findall(r"\d([a-z_]+_kernel)", mangled)
     arguments = mangled.split(own)[1].split("EEv")[0]
     told = re.findall(r"(Planar|Projective)Pixel|(Sorted|Hybrid)Pixel|Lb([01])|Li(\d+)|(B?[Ff]loat16)", arguments)
@@ -79,7 +79,7 @@ def readable(mangled: str) -> str:
 
 
 def table(found: list[Kernel]) -> str:
-    """One row for each kernel and architecture."""
+    """Return a Markdown table with a row for each kernel and architecture."""
     rows = ["| kernel | sm | registers | stack, B | shared, B | threads | occupancy |", "| --- |" + " ---: |" * 6]
     for k in found:
         numbers = (k.architecture, k.registers, k.stack, k.shared, k.threads, f"{k.occupancy:.0%}")

@@ -1,13 +1,13 @@
-"""How far each projection's footprint is from the truth, by size and latitude.
+"""Compute the footprint error of each projection by size and latitude.
 
     python docs/footprint_error.py
 
-writes the table in docs/projections.md and draws docs/footprint_error.png; it takes a minute or two. Tests compare the
-table with what is computed here.
+writes the table in docs/projections.md and the figure docs/footprint_error.png in about two minutes. Tests compare the
+table with the numbers computed here.
 
 The truth is the ray response, the largest value of the Gaussian along each ray; projection `ray` computes it, the
 others approximate it. The error of a footprint is the integral over the sphere of |footprint - truth|, relative to the
-integral of the truth. All of it without low-pass and without the cut at 1/255: this is the projection alone.
+integral of the truth. Without low-pass and without the cut at 1/255: the error of the projection alone.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from padgs.render.projection import project
 
 SIGMAS = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)  # degrees
 LATITUDES = (0.0, 30.0, 45.0, 60.0, 70.0, 80.0, 85.0, 89.0)  # degrees
-PIXELS_PER_SIGMA = 4  # a sum over pixels is then an integral, to far more digits than are shown
+PIXELS_PER_SIGMA = 4  # a sum over pixels then equals the integral to more digits than are shown
 
 FOLDER = Path(__file__).resolve().parent
 PROJECTIONS = ("erp", "tangent", "cubemap")
-# The same quantity by another program, in percent.
+# The same quantity computed by another program, in percent.
 REFERENCE = {
     "erp": {
         0.5: {0: 0, 45: 0.4, 70: 1.0, 85: 3.9, 89: 19.2},
@@ -49,15 +49,14 @@ REFERENCE = {
 
 
 def footprint_error(projection: str, sigma: float, latitude: float) -> float:
-    """Error of the footprint of one round Gaussian against the ray response, as a share of its mass.
+    """Return the error of the footprint of one round Gaussian against the ray response, as a share of its mass.
 
     Args:
         projection: erp, tangent, ray, or cubemap for projection pinhole on the faces of a cube.
         sigma: standard deviation as seen from the camera, in degrees: scale / distance.
-        latitude: of its mean, in degrees, positive down. On a cube its meridian is a degree beside the middle of the
-            front face; up to 45 degrees the latitude is then the angle from the middle of a face, beyond it the
-            complement is. (Exactly on the middle the mean would lie in the planes of the faces around, which would not
-            draw it at all; a degree beside, they do.)
+        latitude: of its mean, in degrees, positive down. Its meridian is one degree beside the centre of the front
+            face of a cube, because at the centre the mean would lie in the planes of neighbouring faces, which would
+            not render it. The angle from the centre of a face is the latitude up to 45 degrees, then its complement.
     """
     gaussian = _round(sigma, latitude)
     height = max(180, round(180 * PIXELS_PER_SIGMA / sigma))
@@ -89,7 +88,7 @@ def _on_panorama(projection: str) -> Callable[[Gaussians, Panorama, Tensor], Ten
 
 
 def _on_faces(gaussian: Gaussians, panorama: Panorama, directions: Tensor) -> Tensor:
-    """Projection pinhole, evaluated exactly where the panorama's pixels look: no face is resampled."""
+    """Return footprints of projection pinhole along the rays of the panorama, without resampling of faces."""
     focal = panorama.focal
     lens = Pinhole(math.ceil(2 * focal), math.ceil(2 * focal), focal, focal, focal, focal)
     directions = directions.flatten(0, 1)
@@ -108,10 +107,10 @@ def _on_faces(gaussian: Gaussians, panorama: Panorama, directions: Tensor) -> Te
 def _values(
     gaussian: Gaussians, pose: Tensor, camera: Camera, projection: str, rows: Tensor, columns: Tensor
 ) -> Tensor:
-    """exp(-q / 2) at pixels [P], which may lie between the pixel centres in a plane."""
+    """Return exp(-q / 2) at pixels [P], which may lie between pixel centres in a plane."""
     options = RenderOptions(projection=projection, low_pass=0.0)
     footprints = project(Request(gaussian, pose, camera, options, background=pose.new_zeros(3)))
-    if isinstance(footprints, PlanarFootprints):  # boxes belong to the cut at 1/255, which is left out here
+    if isinstance(footprints, PlanarFootprints):  # boxes belong to the cut at 1/255, which is not applied here
         everywhere = footprints.boxes.new_tensor([[-math.inf, math.inf, -math.inf, math.inf]])
         footprints = replace(footprints, boxes=everywhere)
     if not footprints.visible[0]:
@@ -129,7 +128,7 @@ _FOOTPRINTS = {
 
 
 def markdown(errors: dict[str, list[list[float]]]) -> str:
-    """One table, in percent; in brackets the other program's numbers."""
+    """Return the errors as a table in percent, with the reference numbers in brackets."""
     lines = ["| projection | σ | " + " | ".join(f"{latitude:g}°" for latitude in LATITUDES) + " |"]
     lines.append("|---|---|" + "---|" * len(LATITUDES))
     for projection in PROJECTIONS:
@@ -144,7 +143,7 @@ def markdown(errors: dict[str, list[list[float]]]) -> str:
 
 
 def draw(errors: dict[str, list[list[float]]], path: Path) -> None:
-    """Error over latitude, one panel for each projection, one line for each size."""
+    """Plot the error over latitude, one panel for each projection, one line for each size."""
     import matplotlib
 
     matplotlib.use("agg")
@@ -164,7 +163,7 @@ def draw(errors: dict[str, list[list[float]]], path: Path) -> None:
 
 
 def main() -> None:
-    """Compute, write, draw."""
+    """Compute the errors, write the table, plot the figure."""
     errors = {
         projection: [[footprint_error(projection, sigma, latitude) for latitude in LATITUDES] for sigma in SIGMAS]
         for projection in PROJECTIONS

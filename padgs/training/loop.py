@@ -249,7 +249,7 @@ class Trainer:
                 target.weight,
                 options.lambda_l1,
                 normalisation=options.normalisation,
-                moments=target.moments,
+                statistics=target.statistics,
             )
             if drawing.penalty is not None:
                 loss = loss + drawing.penalty

@@ -51,7 +51,7 @@ def photometric_loss(
     lambda_l1: float = 0.8,
     *,
     normalisation: str = "mean",
-    moments: SSIMStatistics | None = None,
+    statistics: SSIMStatistics | None = None,
 ) -> Tensor:
     """Eq. 16, a scalar; differentiable by `image`, and by `target` where that asks for a gradient.
 
@@ -61,7 +61,7 @@ def photometric_loss(
         weight: [H, W], or [H, 1] where all pixels of a row weigh the same; >= 0, not 0 everywhere.
         lambda_l1: lambda of Eq. 16.
         normalisation: mean divides by 3 sum(W); channel_sum by sum(W), as the released code does (3 x the mean).
-        moments: `ssim_statistics(target)`, if already known; they stop the gradient by the target.
+        statistics: `ssim_statistics(target)`, if already known; they stop the gradient by the target.
 
     Raises:
         ValueError: unknown normalisation.
@@ -76,7 +76,7 @@ def photometric_loss(
             mirrored = fused_photometric_loss(target, image.detach(), weight, lambda_l1, total)
             loss = loss + (mirrored - mirrored.detach())
         return loss
-    return define_loss(image, target, weight, lambda_l1, total, moments)
+    return define_loss(image, target, weight, lambda_l1, total, statistics)
 
 
 def define_loss(
@@ -85,10 +85,10 @@ def define_loss(
     weight: Tensor,
     lambda_l1: float,
     total: Tensor,
-    moments: SSIMStatistics | None = None,
+    statistics: SSIMStatistics | None = None,
 ) -> Tensor:
     """`photometric_loss` in torch, for any dtype and device; `total` is what the weighted sum is divided by."""
-    per_channel = lambda_l1 * (image - target).abs() + (1 - lambda_l1) * (1 - ssim_map(image, target, moments))
+    per_channel = lambda_l1 * (image - target).abs() + (1 - lambda_l1) * (1 - ssim_map(image, target, statistics))
     return (weight[..., None] * per_channel).sum() / total
 
 
@@ -115,16 +115,16 @@ def pixel_weight(
     return rows * mask.to(rows)
 
 
-def ssim_map(image: Tensor, target: Tensor, moments: SSIMStatistics | None = None) -> Tensor:
+def ssim_map(image: Tensor, target: Tensor, statistics: SSIMStatistics | None = None) -> Tensor:
     """Structural similarity per pixel and channel, [H, W, C]; zeros outside the image, no wrap.
 
     Variances are E[x^2] - E[x]^2 under the window. Arguments as in `photometric_loss`.
     """
-    moments = ssim_statistics(target) if moments is None else moments
+    statistics = ssim_statistics(target) if statistics is None else statistics
     mean_image, mean_square, mean_product = window_mean(torch.stack((image, image * image, image * target)))
-    cross, squares = mean_image * moments.mean, mean_image * mean_image
+    cross, squares = mean_image * statistics.mean, mean_image * mean_image
     similarity = (2 * cross + C1) * (2 * (mean_product - cross) + C2)
-    return similarity / ((squares + moments.mean**2 + C1) * (mean_square - squares + moments.variance + C2))
+    return similarity / ((squares + statistics.mean**2 + C1) * (mean_square - squares + statistics.variance + C2))
 
 
 def ssim_statistics(target: Tensor) -> SSIMStatistics:

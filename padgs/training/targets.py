@@ -1,4 +1,4 @@
-"""What the loss compares renderings with: image, weight and SSIM moments of each training view."""
+"""What the loss compares renderings with: image, weight and SSIM statistics of each training view."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from padgs.geometry.camera import Panorama
 from padgs.scene import View
 from padgs.training.loss import SSIMStatistics, fits, pixel_weight, ssim_statistics
 
-CACHE_BYTES = 1 << 29  # weights and moments of views beyond this are computed again at every iteration
+CACHE_BYTES = 1 << 29  # weights and statistics of views beyond this are computed again at every iteration
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Target:
 
     image: Tensor  # [H, W, 3]
     weight: Tensor  # [H, W] or [H, 1]
-    moments: SSIMStatistics | None  # None where the loss does without
+    statistics: SSIMStatistics | None  # None where the loss does without
 
 
 class Targets(Sequence[Target]):
@@ -33,7 +33,7 @@ class Targets(Sequence[Target]):
         """Load nothing yet; `weight` is a name of `padgs.training.loss.ROW_WEIGHTS`."""
         self._views, self._weight, self._device = views, weight, device
         self._weights: dict[int, Tensor] = {}
-        self._moments: dict[int, SSIMStatistics] = {}
+        self._statistics: dict[int, SSIMStatistics] = {}
         self._bytes_left = CACHE_BYTES
 
     def __len__(self) -> int:
@@ -48,7 +48,7 @@ class Targets(Sequence[Target]):
         """
         image = image_of(self._views[index], self._device)
         weight = self._weights[index] if index in self._weights else self._weight_of(index)
-        return Target(image, weight, None if fits(image) else self._moments_of(index, image))
+        return Target(image, weight, None if fits(image) else self._statistics_of(index, image))
 
     def _weight_of(self, index: int) -> Tensor:
         weight = weight_of(self._views[index], self._weight, self._device)
@@ -56,13 +56,13 @@ class Targets(Sequence[Target]):
             self._weights[index] = weight
         return weight
 
-    def _moments_of(self, index: int, image: Tensor) -> SSIMStatistics:
-        if index in self._moments:
-            return self._moments[index]
-        moments = ssim_statistics(image)
+    def _statistics_of(self, index: int, image: Tensor) -> SSIMStatistics:
+        if index in self._statistics:
+            return self._statistics[index]
+        statistics = ssim_statistics(image)
         if self._keeps(2 * image.nbytes):
-            self._moments[index] = moments
-        return moments
+            self._statistics[index] = statistics
+        return statistics
 
     def _keeps(self, size: int) -> bool:
         """Whether so many bytes more may be kept; they count from now on."""

@@ -85,11 +85,11 @@ def test_derivative_against_finite_differences(generator):
     assert torch.autograd.gradcheck(lambda x: photometric_loss(x, target, weight), (image,))
 
 
-def test_known_moments_change_nothing(generator):
+def test_known_statistics_change_nothing(generator):
     image, target = torch.rand(2, 16, 32, 3, generator=generator)
     weight = pixel_weight("solid_angle", 16)
-    with_moments = photometric_loss(image, target, weight, moments=ssim_statistics(target))
-    assert torch.equal(with_moments, photometric_loss(image, target, weight))
+    with_statistics = photometric_loss(image, target, weight, statistics=ssim_statistics(target))
+    assert torch.equal(with_statistics, photometric_loss(image, target, weight))
 
 
 def test_masked_pixels_neither_count_nor_dilute(generator):

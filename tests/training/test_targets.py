@@ -14,33 +14,33 @@ def view(pixels: torch.Tensor, mask: torch.Tensor | None = None) -> View:
 
 @pytest.fixture(autouse=True)
 def without_fused_loss(monkeypatch):
-    """The native loss keeps no moments."""
+    """The native loss keeps no statistics."""
     monkeypatch.setattr(padgs.training.targets, "fits", lambda image: False)
 
 
 PIXELS = torch.arange(96, dtype=torch.uint8).reshape(4, 8, 3)
 
 
-def test_image_weight_and_moments():
+def test_image_weight_and_statistics():
     mask = torch.ones(4, 8)
     mask[3] = 0
     target = Targets([view(PIXELS, mask)], "uniform")[0]
     assert torch.equal(target.image, PIXELS / 255)
     assert torch.equal(target.weight, mask)
-    assert target.moments is not None
-    assert torch.equal(target.moments.mean, ssim_statistics(PIXELS / 255).mean)
+    assert target.statistics is not None
+    assert torch.equal(target.statistics.mean, ssim_statistics(PIXELS / 255).mean)
 
 
 def test_moments_are_kept_only_while_there_is_room(monkeypatch):
-    monkeypatch.setattr(padgs.training.targets, "CACHE_BYTES", 2 * 16 + 2 * 96 * 4)  # two weights, and moments
+    monkeypatch.setattr(padgs.training.targets, "CACHE_BYTES", 2 * 16 + 2 * 96 * 4)  # two weights, and statistics
     targets = Targets([view(PIXELS), view(255 - PIXELS)], "uniform")
-    assert targets[0].moments is targets[0].moments
-    assert targets[1].moments is not targets[1].moments
+    assert targets[0].statistics is targets[0].statistics
+    assert targets[1].statistics is not targets[1].statistics
 
 
-def test_the_fused_loss_needs_no_moments(monkeypatch):
+def test_the_fused_loss_needs_no_statistics(monkeypatch):
     monkeypatch.setattr(padgs.training.targets, "fits", lambda image: True)
-    assert Targets([view(PIXELS)], "uniform")[0].moments is None
+    assert Targets([view(PIXELS)], "uniform")[0].statistics is None
 
 
 def test_wrong_sizes_are_named():
