@@ -53,7 +53,7 @@ class EgoNeRFMethod(Method):
 
     def refuse_search(self) -> None:
         """Refuse: there are no Gaussians."""
-        raise ValueError("egonerf has no Gaussians that could be left out, as need does; take a method that has")
+        raise ValueError("egonerf has no Gaussians to prune, so it has no smallest model; take a method with Gaussians")
 
     def build_model(self, scene: Scene, iterations: int) -> EgoNeRFModel:
         """See `Method.build_model`."""

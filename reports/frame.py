@@ -193,7 +193,7 @@ FACTS: Mapping[str, Callable[[Result], Any]] = {
         name: attrgetter(name)
         for name in (
             *("run", "ok", "status", "method", "preset", "variant", "dataset", "scene", "seed", "iterations"),
-            *("code_version", "finished", "need"),
+            *("code_version", "finished", "smallest"),
         )
     },
     "experiments": lambda result: result.experiments or (AD_HOC,),

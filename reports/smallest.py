@@ -1,4 +1,4 @@
-"""Smallest models of a quality (`padgs need`): curves of quality over size, and the table `need`."""
+"""Smallest models (`padgs smallest`): curves of quality over size, and the table."""
 
 from __future__ import annotations
 
@@ -8,19 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from pandas import DataFrame
 
 from padgs.reports.conditions import OF_TIMES, footnotes, refuse_mixture
-from padgs.reports.frame import CONFIG, by_conditions
+from padgs.reports.frame import by_conditions
 from padgs.reports.selection import RunSet, settings
 from padgs.reports.statistics import mean_cell
 from padgs.reports.table import Block, Cell, Column, Row, Table
-from padgs.results import NEED_LOSSES, NEED_PICTURE, NEED_STATED
+from padgs.results import SMALLEST_LOSSES, SMALLEST_PICTURE, SMALLEST_STATED
 
-EPSILONS = tuple(f"{loss:g}" for loss in NEED_LOSSES)  # dB, as results name them
-STATED = f"{NEED_STATED:g}"
-DEGREE = f"{CONFIG}method.sh_degree"
+EPSILONS = tuple(f"{loss:g}" for loss in SMALLEST_LOSSES)  # dB, as results name them
+STATED = f"{SMALLEST_STATED:g}"
 
 
 @dataclass(frozen=True)
@@ -31,26 +29,15 @@ class Curve:
     method: str  # the same without the seed
     preset: str
     seed: int
-    steps: tuple[Mapping[str, Any], ...]  # of `Result.need`, controls left out
-    needs: Mapping[str, Mapping[str, Any]]  # epsilon -> the smallest step that loses at most so much
+    steps: tuple[Mapping[str, Any], ...]  # of `Result.smallest`, from large to small
+    smallest: Mapping[str, Mapping[str, Any]]  # epsilon -> the smallest step that loses at most so much
     knee: Mapping[str, Any] | None
-    found: Mapping[str, Any]  # all of `Result.need`
-    picture: Path | None = None  # as `padgs.results.NEED_PICTURE` says, if there is one
+    found: Mapping[str, Any]  # all of `Result.smallest`
+    picture: Path | None = None  # as `padgs.results.SMALLEST_PICTURE` says, if there is one
 
     def values(self, name: str) -> list[float]:
         """A number of all steps; NaN where one has none."""
         return [np.nan if step[name] is None else step[name] for step in self.steps]
-
-    @property
-    def degree(self) -> int | None:
-        """Of the harmonics that are enough for `STATED`; None where that was not searched, or there are none."""
-        steps = self.found.get("degrees", {}).get(STATED) or [{"degree": None, "objections": {STATED: ()}}]
-        return [step["degree"] for step in steps if not step["objections"][STATED]][-1]
-
-    @property
-    def file(self) -> Mapping[str, Any] | None:
-        """The smallest good file of the model that was kept, if that is the one for `STATED`."""
-        return next(file for file in self.found["files"] if file["kept"]) if _is_stated(self.found) else None
 
     @property
     def quality(self) -> list[float]:
@@ -58,31 +45,21 @@ class Curve:
         return [self.quality_of(step) for step in self.steps]
 
     def quality_of(self, step: Mapping[str, Any]) -> float:
-        """What the whole model shows of the test views, which decide nothing, less what was lost against the control.
+        """Return the WS-PSNR of the searched run's test views less what a step loses there against the control, dB.
 
-        Both were trained on with fewer views than the whole model. Of the calibration views where there are no others.
+        Without test views, that of the validation views.
         """
-        steps = self.found["steps"]
-        control = next(other for other in steps if other["kind"] != "prune" and other["depth"] == step["depth"])
-        if step["test_ws_psnr"] is None:
-            return steps[0]["ws_psnr"] - step["loss"]
-        return steps[0]["test_ws_psnr"] - (control["test_ws_psnr"] - step["test_ws_psnr"])
+        control, whole = self.found["steps"][0], self.found["test_ws_psnr"]
+        if whole is None:
+            return control["ws_psnr"] - step["loss"]
+        return whole - (control["test_ws_psnr"] - step["test_ws_psnr"])
 
 
 def searched(run_set: RunSet) -> DataFrame:
-    """The runs that `padgs need` made, one of each search, though it keeps one for each loss that it is asked for: that
-    for `STATED`, if there is one. Each has a setting of its own, that of the run that was searched.
-    """
+    """Return the runs with a search for their smallest model; each is a setting of its own."""
     runs = run_set.requested
-    runs = runs.loc[runs["need"].map(bool)]
-    degrees = [_trained_degree(run) for _, run in runs.iterrows()]
-    runs = runs.assign(
-        variant="",  # which says what was kept
-        setting=[name.partition("_need-")[0] for name in runs["run"]],  # the searched run
-        **{DEGREE: pd.Series(degrees, index=runs.index, dtype=object)},
-    )
-    stated_first = sorted(runs.index, key=lambda index: not _is_stated(runs.at[index, "need"]))
-    return runs.loc[stated_first].drop_duplicates("setting").sort_index()
+    runs = runs.loc[runs["smallest"].map(bool)]
+    return runs.assign(setting=runs["run"])
 
 
 def curves(runs: DataFrame) -> list[Curve]:
@@ -90,15 +67,17 @@ def curves(runs: DataFrame) -> list[Curve]:
     found = []
     for setting in settings(runs.sort_values("seed", kind="stable")):
         run, seeds = setting.runs.iloc[0], runs.loc[runs["preset"] == setting.preset, "seed"]
-        steps = run["need"]["steps"]
-        rows = sorted((s for s in steps if s["kind"] != "control"), key=lambda step: -step["blended"])
+        steps = run["smallest"]["steps"]
+        rows = sorted(steps, key=lambda step: -step["blended"])
         title = setting.title + (f", seed {run['seed']}" if seeds.nunique() > 1 else "")
-        needs = {epsilon: steps[number] for epsilon, number in run["need"]["needs"].items()}
-        knee = None if run["need"]["knee"] is None else steps[run["need"]["knee"]]
-        picture = None if run["pictures"] is None else run["pictures"].with_name(NEED_PICTURE)
+        smallest = {epsilon: steps[number] for epsilon, number in run["smallest"]["minimal"].items()}
+        knee = None if run["smallest"]["knee"] is None else steps[run["smallest"]["knee"]]
+        picture = None if run["pictures"] is None else run["pictures"].with_name(SMALLEST_PICTURE)
         there = picture if picture is not None and picture.is_file() else None
         names = {"title": title, "method": setting.title, "preset": setting.preset, "seed": int(run["seed"])}
-        found.append(Curve(**names, steps=tuple(rows), needs=needs, knee=knee, found=run["need"], picture=there))
+        found.append(
+            Curve(**names, steps=tuple(rows), smallest=smallest, knee=knee, found=run["smallest"], picture=there)
+        )
     return found
 
 
@@ -149,7 +128,7 @@ def table(run_set: RunSet) -> Table:
         blocks.append(Block(title, tuple(rows)))
         runs_of[title] = own
     notes = (*footnotes(runs_of, run_set.request.protocol), *NOTES) if blocks else ()
-    return Table("need", "How many Gaussians a scene needs", "Method", tuple(COLUMNS), tuple(blocks), notes)
+    return Table("smallest", "Smallest models", "Method", tuple(COLUMNS), tuple(blocks), notes)
 
 
 def _over_seeds(seeds: Sequence[Curve], first: Sequence[Curve], of: Callable[[Curve, Curve], float | None]) -> Cell:
@@ -157,19 +136,6 @@ def _over_seeds(seeds: Sequence[Curve], first: Sequence[Curve], of: Callable[[Cu
     beside = {one.seed: one for one in first}
     values = [of(one, beside.get(one.seed, first[0])) for one in seeds]
     return mean_cell([value for value in values if value is not None])
-
-
-def _is_stated(found: Mapping[str, Any]) -> bool:
-    """Whether the model that a search kept is that for `STATED`."""
-    return found.get("kept", {}).get("epsilon") == NEED_STATED
-
-
-def _trained_degree(run: Any) -> Any:
-    """Of the harmonics of the searched run; the configuration has that of the kept model, which may be less."""
-    found = run["need"]
-    if found.get("kept", {}).get("degree") is None:
-        return run.get(DEGREE)
-    return found["degrees"][f"{found['kept']['epsilon']:g}"][0]["degree"]
 
 
 def _points(sizes: Sequence[float], qualities: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
@@ -192,30 +158,24 @@ def _mean_difference(ours: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarra
 COLUMNS: dict[Column, Callable[[Curve, Curve], float | None]] = {
     Column("Gaussians blended", 0): lambda own, _: own.found["steps"][0]["blended"],
     **{
-        Column(f"needed for {epsilon} dB", 0, False): lambda own, _, e=epsilon: own.needs[e]["blended"]
+        Column(f"minimal count for {epsilon} dB", 0, False): lambda own, _, e=epsilon: own.smallest[e]["blended"]
         for epsilon in EPSILONS
     },
-    Column(f"share for {STATED} dB", 2): lambda own, _: own.needs[STATED]["rows"] / own.found["rows"],
+    Column(f"share for {STATED} dB", 2): lambda own, _: own.smallest[STATED]["rows"] / own.found["rows"],
     Column("knee", 0): lambda own, _: None if own.knee is None else own.knee["blended"],
-    Column(f"MB for {STATED} dB", 2, False): lambda own, _: own.needs[STATED]["bytes"] / 1e6,
-    Column(f"degree for {STATED} dB", 0, False): lambda own, _: own.degree,
-    Column(f"MB of its file, {STATED} dB", 2, False): lambda own, _: (
-        None if own.file is None else own.file["bytes"] / 1e6
-    ),
-    Column(f"least ms of a frame for {STATED} dB", 1, False): lambda own, _: own.needs[STATED]["frame_ms"],
-    Column(f"WS-PSNR for {STATED} dB", 2, True): lambda own, _: own.quality_of(own.needs[STATED]),
+    Column(f"MB for {STATED} dB", 2, False): lambda own, _: own.smallest[STATED]["bytes"] / 1e6,
+    Column(f"least ms of a frame for {STATED} dB", 1, False): lambda own, _: own.smallest[STATED]["frame_ms"],
+    Column(f"WS-PSNR for {STATED} dB", 2, True): lambda own, _: own.quality_of(own.smallest[STATED]),
     Column("WS-PSNR of all", 2, True): lambda own, _: own.quality_of(own.found["steps"][0]),
     Column("dB at equal N against the first", 2, signed=True): gain,
     Column("N at equal dB over the first's", 2): ratio,
     Column("CPU s of the search", 0): lambda own, _: own.found["cpu_seconds"],
 }
 NOTES = (
-    "Needed: the smallest model as good as one that was refined as often and lost nothing, on views taken from the "
-    "training: WS-PSNR by at most so many dB with 95 % confidence, each latitude band by twice and each view by five "
-    "times that, LPIPS by 0.005. WS-PSNR: of the test views, which decide nothing, less what was lost there against a "
-    "model refined as often. Not searched: offsets an anchor, features.",
-    "Degree and file: of the model for that need, with as few harmonics and as small a file as lose no more against it "
-    "with all of them and in full; the file was written, read back and measured.",
+    "Minimal count: Gaussians of the smallest model that is not inferior to a control, which was refined likewise and "
+    "keeps all Gaussians, on validation views: WS-PSNR falls by at most so many dB with 95 % confidence, in a latitude "
+    "band by twice and in a view by five times that, and LPIPS rises by at most 0.005. WS-PSNR: of the test views, "
+    "which decide nothing, less what was lost there against the control. Not searched: offsets per anchor, features.",
     "Knee: the largest model below which a halving costs more than 0.1 dB. Beside the first: means over what both "
     "curves share.",
 )

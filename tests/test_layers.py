@@ -17,7 +17,7 @@ INSTALLED_WITHIN = ("baselines", "reports")  # folders at the root that are inst
 # A file imports only from its own package and the packages above it in this list.
 LAYERS = (
     *("native", "geometry", "core", "results", "reports", "data", "render", "training", "evaluation"),
-    *("methods", "baselines", "runs", "apps", "need", "multirun", "cli"),
+    *("methods", "baselines", "runs", "apps", "multirun", "cli"),
 )
 MAX_PACKAGES, MAX_LEVELS, MAX_EDGES = 20, 10, 85
 # Stricter limits: package -> the only packages that it imports.

@@ -12,10 +12,10 @@ from padgs.cli.check import check
 from padgs.cli.convert import convert
 from padgs.cli.export import export
 from padgs.cli.mask import mask
-from padgs.cli.need import need
 from padgs.cli.prepare import prepare
 from padgs.cli.render import render
 from padgs.cli.report import report
+from padgs.cli.smallest import smallest
 from padgs.cli.track import track
 from padgs.cli.view import view
 
@@ -38,5 +38,5 @@ def commands(
     """Panoramic Gaussian splatting, measured fairly."""
 
 
-for command in (bench, check, convert, export, mask, need, prepare, render, report, track, view):
+for command in (bench, check, convert, export, mask, prepare, render, report, smallest, track, view):
     app.command()(command)

@@ -19,14 +19,14 @@ from rich.console import Console
 from padgs.apps.viewer.process import serve_training
 from padgs.multirun.board import CRASHED, ELSEWHERE, REFUSED, STOPPED, Board, BoardEntry
 from padgs.multirun.composition import typed_config
-from padgs.need.entry import search
-from padgs.results import NEED_STATED, Result
+from padgs.results import SMALLEST_STATED, Result
 from padgs.runs.checkpoint import CheckpointError
 from padgs.runs.config import RunConfig
 from padgs.runs.console import say
 from padgs.runs.interrupt import Interrupted
 from padgs.runs.load import load_run
 from padgs.runs.run import Callback, load_scene, run, start
+from padgs.runs.smallest import find_smallest
 from padgs.runs.store import RunBusy, RunFolderError, RunStore
 from padgs.runs.tracking.tracker import SECONDS_BETWEEN_LOOKS, Tracker
 from padgs.training.health import Failure, validation_split
@@ -86,15 +86,15 @@ def complete(config: RunConfig, console: Console, callback: Callback) -> Result:
     """Do the missing part of a run, and of the search for its smallest model if that is requested."""
     scene = load_scene(config, start(config))
     folder = RunStore.of(config, scene).path
-    if config.need == "on":
+    if config.smallest == "on":
         validation_split(scene.train)  # refuses too few views before hours of training
     page = serve_training(folder, config.data.path, config.run.device) if config.run.view else nullcontext()
     with page:
         result = run(config, console, callback, scene)
-    if config.need == "on" and result.ok:
+    if config.smallest == "on" and result.ok:
         finished = load_run(folder, data_path=config.data.path, device=config.run.device)
         finished.scene = scene  # whose panoramas are loaded
-        search(finished, NEED_STATED, console, callback.stop_requested)
+        find_smallest(finished, SMALLEST_STATED, console, callback.stop_requested)
     return result
 
 

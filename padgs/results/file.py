@@ -21,7 +21,7 @@ from padgs.results.result import Result, Scores
 
 LOG_NAME, CONFIG_NAME = "log.jsonl", "config.yaml"
 PICTURES = "renders"  # folder of truth | render | error of each test view, in one picture
-NEED_PICTURE = "need.png"  # truth | whole model | smallest for each of `NEED_PICTURED`, of a test view
+SMALLEST_PICTURE = "smallest.png"  # truth | whole model | smallest for each of `SMALLEST_PICTURED`, of a test view
 
 
 def log_lines(run_folder: Path, tail: int | None = None) -> Iterator[dict[str, Any]]:
@@ -66,7 +66,7 @@ def picture_name(view: str) -> str:
 
 
 SCHEMA = 2
-ADDED = {"peak_device_memory_bytes", "need", "ended"}  # since then: files without are read, with the default
+ADDED = {"peak_device_memory_bytes", "smallest", "ended"}  # since then: files without are read, with the default
 FILE_NAME = "result.json"
 CONFIG_GROUPS = {"budget", "data", "method", "protocol", "render", "run", "stress", "train"}  # sections of settings
 # What is no more than a name, even in a command line or a path; `@` parts an experiment from its scale.

@@ -23,9 +23,9 @@ STOP_REQUESTED = (
 )
 AD_HOC = "ad_hoc"  # among experiments: a command without any requested the run as well
 HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "lpips": False}  # of every metric with the word in it
-NEED_LOSSES = (0.05, 0.1, 0.25, 0.5, 1.0)  # dB, for each of which `padgs need` finds the smallest model
-NEED_STATED = 0.1  # of these, the one that is put into one number, and whose model is kept if no other is asked for
-NEED_PICTURED = (NEED_STATED, 1.0)
+SMALLEST_LOSSES = (0.05, 0.1, 0.25, 0.5, 1.0)  # dB, for each of which `padgs smallest` finds the smallest model
+SMALLEST_STATED = 0.1  # of these, the one that is put into one number, and whose model is kept if no other is asked for
+SMALLEST_PICTURED = (SMALLEST_STATED, 1.0)
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Result:
     peak_device_memory_bytes: int | None = None  # of torch's tensors on the GPU, while training; None on the CPU
     config: dict[str, Any] = field(default_factory=dict)  # the resolved configuration
     experiments: tuple[str, ...] = ()  # experiments and sweeps that it belongs to, sorted; see `joined`
-    need: dict[str, Any] = field(default_factory=dict)  # of a pruned model: what `padgs need` found, see `padgs.need`
+    smallest: dict[str, Any] = field(default_factory=dict)  # of the kept model: see `padgs.runs.smallest.Search.front`
 
     def __post_init__(self) -> None:
         """Reject a status that no table knows."""

@@ -26,7 +26,7 @@ from padgs.training.schedule import PUBLISHED_ITERATIONS
 
 DEFAULT_METHOD = "padgs_plus"  # as conf/config.yaml says
 RETRIES = ("none", "failed")
-NEEDS = ("off", "on")
+SWITCH = ("off", "on")
 IMAGES_ON = ("device", "cpu")
 WATCHED = 5.0  # seconds between checkpoints at most, where somebody watches
 CONTINUED = "continued"  # the word for runs with `init` in tables
@@ -137,10 +137,10 @@ class Settings:
     seed: int = 0  # of the order of views and of all that is random in training
     init: WarmStart | None = None  # folder of a finished run of the method and scene: training begins with its model
     retry: str = "none"  # which finished runs are done again: a name of RETRIES
-    need: str = "off"  # on: a run that ended well is searched for its smallest model, as padgs need does
+    smallest: str = "off"  # on: search for the smallest model after the run, as padgs smallest does
 
     def __post_init__(self) -> None:
-        check_known(self, retry=RETRIES, need=NEEDS)
+        check_known(self, retry=RETRIES, smallest=SWITCH)
         check(self, "in [0, 2^63)", lambda seed: 0 <= seed < 2**63, "seed")
 
 
@@ -212,7 +212,7 @@ def config_from_values(values: Mapping[str, Any], labels: Labels = Labels()) -> 
         rules = {key: _protocol(key, _group(protocols, key, "protocol.")) for key in protocols}
         config = RunConfig(**vars(settings), method=name, options=options, protocols=rules, labels=labels)
         made.refuse_budget(config.time)
-        if config.need == "on":
+        if config.smallest == "on":
             made.refuse_search()
     except ValueError as error:
         raise ConfigError(str(error)) from error

@@ -21,8 +21,9 @@ from padgs.scene import Scene, View
 from padgs.training.corrections import LEARNED
 from padgs.training.health import is_out_of_memory
 from padgs.training.loop import Record, Stage, Trainer
-from padgs.training.model import Model, Size, State
+from padgs.training.model import Model, Prunable, Size, State
 from padgs.training.options import Budget, TrainOptions
+from padgs.training.refining import Refined, held_out
 from padgs.training.schedule import PUBLISHED_ITERATIONS
 
 REHEARSED = 0.02  # share of a budget of seconds that measures the speed of a method
@@ -99,6 +100,8 @@ class Method(ABC):
         if not scene.train:
             raise ValueError(f"scene {scene.name!r} has no training view; correct its split")
         self.refuse_budget(budget)
+        if self.train_options.refine and self._warm_start_state is None and self._loaded_state is None:
+            raise ValueError("train.refine refines the model of a finished run; set init=RUN, or train.refine=false")
         self._gaussians = budget.gaussians
         spent = (0.0, 0.0)
         if budget.seconds is not None:
@@ -108,7 +111,13 @@ class Method(ABC):
                 length = self._loaded_state.values["schedule"]
             budget = replace(budget, iterations=length)
         self._model = self._initial_model(scene, budget.iterations)
-        self._trainer = self.build_trainer(self._model, scene, budget, stage)
+        if self.train_options.hold_out:
+            scene = replace(scene, train=held_out(scene.train)[0])
+        if self.train_options.refine:
+            refined = Refined(self._model, self.train_options.learning_rates, budget.iterations)
+            self._trainer = Trainer(refined, scene, budget, self.train_options, self.seed, stage=stage)
+        else:
+            self._trainer = self.build_trainer(self._model, scene, budget, stage)
         self._trainer.seconds += spent[0]
         self._trainer.cpu_seconds += spent[1]
         if self._warm_start_state is not None:
@@ -215,15 +224,15 @@ class Method(ABC):
             )
 
     def refuse_search(self) -> None:
-        """Refuse the search for the smallest model (`padgs.need`) on any scene; subclasses add checks.
+        """Refuse the search for the smallest model (`padgs.runs.smallest`) on any scene; subclasses add checks.
 
         Raises:
             ValueError: with these options there is nothing to search.
         """
         if self._views_learn:
             raise ValueError(
-                "need compares renders with photographs, but exposures or cameras are learned here; take a method that "
-                "does not calibrate, with train.exposures=given and train.poses=given"
+                "the search for the smallest model compares renders with photographs, but exposures or cameras are "
+                "learned here; take a method that does not calibrate, with train.exposures=given and train.poses=given"
             )
 
     def _refuse_impossible(self) -> None:
@@ -236,7 +245,7 @@ class Method(ABC):
         return LEARNED in (self.train_options.exposures, self.train_options.poses)
 
     def _initial_model(self, scene: Scene, iterations: int) -> Model:
-        """Return `build_model`, with the parameters of the warm start if there is one.
+        """Return `build_model`, with the parameters of the warm start if there is one, pruned to the budget.
 
         Raises:
             ValueError: as `build_model`, or the warm start does not fit the options or the budget.
@@ -252,12 +261,9 @@ class Method(ABC):
             raise ValueError(
                 f"the model of the warm start does not fit these options ({error}); use those that it was trained with"
             ) from error
-        count = next(iter(model.counts().values()))
-        if isinstance(self._gaussians, int) and count > self._gaussians:
-            raise ValueError(
-                f"budget.gaussians is {self._gaussians}, but the model of the warm start has {count} already; set it to "
-                f"at least {count}, or prune that model by padgs need"
-            )
+        if isinstance(self._gaussians, int) and self._gaussians < next(iter(model.counts().values())):
+            assert isinstance(model, Prunable), "other models refuse a budget of Gaussians"
+            model.prune(self._gaussians, scene.train)
         return model
 
     def _measure_speed(self, scene: Scene, budget: Budget) -> tuple[int, tuple[float, float]]:

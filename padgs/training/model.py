@@ -6,7 +6,7 @@ instead of drawing views, so it has a trainer of its own (`padgs.methods.egonerf
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import KW_ONLY, dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -129,6 +129,10 @@ class Prunable(Model, Protocol):
 
     def parts(self, view: View) -> Parts:
         """What a view sees; raises ValueError where views are drawn otherwise than a plain `render` does."""
+        ...
+
+    def prune(self, count: int, views: Sequence[View]) -> None:
+        """Keep the `count` rows that are most important to the views."""
         ...
 
     def keep(self, rows: Tensor) -> None:

@@ -83,6 +83,8 @@ class TrainOptions:
     guard_scales: bool = False  # keep scales within bounds; both: see `padgs.training.health`
     exposures: str = GIVEN  # learned: a gain and offset of each training view; test views have the mean one
     poses: str = GIVEN  # learned: a small correction of each training view; test views stay where they are
+    refine: bool = False  # with init: neither densify nor prune; learning rates are those of the schedule's last fifth
+    hold_out: bool = False  # train without the validation views, see `padgs.training.health`
 
     def __post_init__(self) -> None:
         check(self, "in [0, 1]", lambda share: 0 <= share <= 1, "lambda_l1")

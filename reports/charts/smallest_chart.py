@@ -14,14 +14,14 @@ from padgs.reports.frame import by_conditions
 from padgs.reports.selection import RunSet
 from padgs.reports.smallest import Curve, by_method, curves, searched
 from padgs.reports.store import split_picture
-from padgs.results import NEED_PICTURED, file_name
+from padgs.results import SMALLEST_PICTURED, file_name
 
 PANELS = (
     ("blended", "Gaussians blended", 1.0),
     ("bytes", "model, MB", 1e-6),
     ("frame_ms", "minimal ms per frame", 1.0),
 )
-LOSSES = tuple(f"{loss:g}" for loss in NEED_PICTURED)  # dB, marked in the chart by a ring and a square
+LOSSES = tuple(f"{loss:g}" for loss in SMALLEST_PICTURED)  # dB, marked in the chart by a ring and a square
 LOG_RATIO = 1.5  # largest over smallest size, from which an axis is logarithmic
 
 
@@ -71,7 +71,7 @@ def _renders(name: str, title: str, found: list[Curve], notes: tuple[str, ...]) 
     made, axes = figure(4, len(found), 3.6, 2.2)
     for row, curve in zip(axes, found, strict=True):
         assert curve.picture is not None, "chosen by it"
-        steps = [curve.found["steps"][0], *(curve.needs[loss] for loss in LOSSES)]
+        steps = [curve.found["steps"][0], *(curve.smallest[loss] for loss in LOSSES)]
         words = [curve.title, f"all: {steps[0]['blended']} Gaussians"]
         words += [f"{loss} dB: {step['blended']}" for loss, step in zip(LOSSES, steps[1:], strict=True)]
         for panel, part, text in zip(row, split_picture(curve.picture, 4), words, strict=True):
@@ -92,7 +92,7 @@ def _draw(panel: Any, curve: Curve, quantity: str, unit: float, color: str, *, f
         text += f"\n{y:.2f} dB; lost {step['loss']:.2f} dB of validation views"
         panel.plot([x], [y], MARKERS[0], color=color, markersize=4 if first else 2.5, gid=tip(text))
         for loss, around in zip(LOSSES, MARKERS, strict=False):
-            if curve.needs.get(loss) is step:
+            if curve.smallest.get(loss) is step:
                 panel.plot([x], [y], around, markersize=9, fillstyle="none", color=INK[0], markeredgewidth=1)
 
 
@@ -100,7 +100,7 @@ def _numbers(name: str, found: list[Curve]) -> DataFrame:
     quantities = ("rows", "blended", "bytes", "frame_ms", "loss", "ws_psnr", "test_ws_psnr", "lpips")
     rows = [
         {"chart": name, "curve": curve.title, "preset": curve.preset, **{q: step[q] for q in quantities}}
-        | {"smallest for": " ".join(loss for loss, at in curve.needs.items() if at is step)}
+        | {"smallest for": " ".join(loss for loss, at in curve.smallest.items() if at is step)}
         for curve in found
         for step in curve.steps
     ]

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from padgs.methods.anchors.anchors import PaDGS, PaDGSOptions
 from padgs.methods.anchors.growth import GrowthOptions
@@ -17,7 +17,7 @@ from padgs.scene import Scene
 from padgs.training.loop import Record, Stage
 from padgs.training.method import Method
 from padgs.training.model import State
-from padgs.training.options import Budget
+from padgs.training.options import AUTO, Budget
 from padgs.training.schedule import PUBLISHED_ITERATIONS
 
 
@@ -56,19 +56,23 @@ class PaDGSMethod(Method):
         super().load_state(state)
 
     def refuse_budget(self, budget: Budget) -> None:
-        """Refuse a number of Gaussians, which differs from view to view."""
+        """Refuse a budget without a number: `budget.gaussians` counts anchors here."""
         super().refuse_budget(budget)
-        if budget.gaussians is not None:
-            raise ValueError(
-                f"budget.gaussians is {budget.gaussians}, but anchors decode Gaussians anew for every view; limit "
-                "them by method.max_anchors and method.voxel_pixels, or prune a trained run by padgs need"
-            )
+        if budget.gaussians == AUTO:
+            raise ValueError("budget.gaussians is auto, which prunes Gaussians, but PaD-GS has anchors; set a number")
 
     def build_model(self, scene: Scene, iterations: int) -> AnchorModel:
         """See `Method.build_model`."""
         extent = self.options.extent_of(scene)
         extent /= scene.scale if self.options.offset_rate_unit == "scene" else 1.0
-        return self._model_of(PaDGS.from_scene(scene, self.options, seed=self.seed), extent, iterations)
+        anchors = PaDGS.from_scene(scene, self.options, seed=self.seed)
+        is_new = self._warm_start_state is None and self._loaded_state is None
+        if is_new and isinstance(self._gaussians, int) and self._gaussians < len(anchors):
+            raise ValueError(
+                f"budget.gaussians is {self._gaussians}, but training starts with {len(anchors)} anchors; increase it "
+                "or method.voxel_pixels"
+            )
+        return self._model_of(anchors, extent, iterations)
 
     def restore(self, state: State) -> AnchorModel:
         """See `Method.restore`."""
@@ -78,11 +82,14 @@ class PaDGSMethod(Method):
         return self._model_of(PaDGS(positions, log_scales, self.options, **lengths), math.nan, PUBLISHED_ITERATIONS)
 
     def _model_of(self, anchors: PaDGS, extent: float, iterations: int) -> AnchorModel:
+        growth = self.options.for_run(iterations) if self.options.scale_windows else self.options
+        if isinstance(self._gaussians, int):
+            growth = replace(growth, max_anchors=min(self._gaussians, growth.max_anchors or self._gaussians))
         return AnchorModel(
             anchors,
             self.render_config.options(self._scene_scale),
             self.render_config.backend,
-            growth=self.options.for_run(iterations) if self.options.scale_windows else self.options,
+            growth=growth,
             rates=self.options,
             extent=extent,
             iterations=iterations,

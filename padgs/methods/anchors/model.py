@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -11,6 +12,7 @@ from torch import Tensor
 from padgs.checks import check, check_known
 from padgs.methods.anchors.anchors import Decoded, PaDGS
 from padgs.methods.anchors.growth import Growth, GrowthOptions
+from padgs.methods.splats.importance import importance_scores, most_important
 from padgs.render import Rendering, RenderOptions, render, resolve_backend
 from padgs.scene import View
 from padgs.training.initial_points import ExtentOptions
@@ -151,6 +153,10 @@ class AnchorModel:
     def keep(self, rows: Tensor) -> None:
         """Keep these anchors only."""
         self.growth.keep(rows, None)
+
+    def prune(self, count: int, views: Sequence[View]) -> None:
+        """Keep the `count` anchors that are most important to the views."""
+        self.keep(most_important(importance_scores(self, views), count))
 
     @torch.no_grad()
     def render(self, view: View) -> Rendering:

@@ -194,9 +194,9 @@ class SplatModel:
         if self._filter is not None:
             self._filter.variances = self._filter.variances[rows]
 
-    def truncate(self, degree: int) -> None:
-        """Drop the harmonics above a degree; no optimizer may hold the parameters."""
-        self.splats.truncate(degree)
+    def prune(self, count: int, views: Sequence[View]) -> None:
+        """Keep the `count` Gaussians that are most important to the views."""
+        self.keep(most_important(importance_scores(self, views), count))
 
     @torch.no_grad()
     def render(self, view: View) -> Rendering:

@@ -101,11 +101,6 @@ class Splats(nn.Module):
         """Return all parameters by name; each has one row per Gaussian."""
         return dict(self.named_parameters())
 
-    def truncate(self, degree: int) -> None:
-        """Drop the harmonics above a degree; no optimizer may hold the parameters."""
-        self.degree, self.active_degree = degree, min(degree, self.active_degree)
-        self.sh_rest.data, self.sh_rest.grad = self.sh_rest.data[:, : (degree + 1) ** 2 - 1].contiguous(), None
-
     def load(self, tensors: Mapping[str, Tensor]) -> None:
         """Copy the `state_dict` of another model, whose number of Gaussians may differ.
 

@@ -1,0 +1,247 @@
+"""The search for the smallest model: which counts it tries, and a whole search on a tiny run."""
+
+import math
+import shutil
+from statistics import mean
+
+import numpy as np
+import pytest
+from PIL import Image
+from rich.console import Console
+from typer.testing import CliRunner
+
+import padgs
+from padgs.checks import ConfigError
+from padgs.cli.commands import app
+from padgs.multirun import job
+from padgs.multirun.composition import composing, configuration
+from padgs.results import SMALLEST_LOSSES, Scores
+from padgs.runs import smallest as search
+from padgs.runs.interrupt import Interrupted
+from padgs.runs.run import Callback, run
+from padgs.runs.smallest import Candidate, Search, find_smallest, knee, loss, lower_bound, next_count, objections
+from padgs.training.refining import held_out
+
+SETTINGS = (
+    *("train.iterations=60", "data.generator.width=48", "data.generator.train_views=8", "data.generator.test_views=2"),
+    *("data.generator.samples=1", "data.generator.points=300", "protocol=sphere", "protocol.sphere.lpips=none"),
+    *("run.device=cpu", "run.threads=1", "tracking=none"),
+)
+
+
+def scores(*views: float, lpips: float = 0.1, **bands: float) -> Scores:
+    """Scores of views with these WS-PSNRs, all bands alike except those that are given."""
+    each: dict[str, dict[str, float | None]] = {
+        str(number): {"ws_psnr": value, "ws_lpips_alex": lpips, "ws_lpips_vgg": lpips}
+        | {f"ws_psnr_{band}": value + bands.get(band, 0.0) for band in search.BANDS}
+        for number, value in enumerate(views)
+    }
+    return Scores({}, {"ws_psnr": mean(views), "ws_lpips_alex": lpips}, each)
+
+
+def candidate(rows: int, *views: float) -> Candidate:
+    return Candidate("", rows, rows, rows, 1.0, scores(*views), None, 0.0, 0.0)
+
+
+def searched(quality) -> list[Candidate]:
+    """Return all candidates of a search in which a model of N rows has `quality(N)` dB."""
+    found: list[Candidate] = []
+    count: int | None = 10_000
+    while count is not None:
+        found.append(candidate(count, *[quality(count)] * 3))
+        count = next_count(found, SMALLEST_LOSSES)
+        assert len(found) < 60, "the search ends"
+    return found
+
+
+def test_the_smallest_model_of_each_loss_is_found_within_a_fifth():
+    def lost(rows: int) -> float:
+        return 0.3 * max(0.0, math.log2(5000 / rows)) ** 1.5
+
+    found = searched(lambda rows: 33 - lost(rows))
+    assert [one.rows for one in found[:3]] == [10_000, 7000, 4900] and loss(found, found[2]) == pytest.approx(
+        lost(4900)
+    )
+    for epsilon in SMALLEST_LOSSES:
+        true = min(rows for rows in range(100, 10_001) if lost(rows) < epsilon)
+        assert true <= search.smallest(found, epsilon).rows <= 1.2 * true + 1, epsilon
+    assert (bend := knee(found)) is not None and 3500 < bend.rows < 7500
+
+
+def test_a_search_ends_at_few_rows_if_none_is_needed_and_keeps_all_if_all_are():
+    found = searched(lambda rows: 30.0)
+    assert 130 <= found[-1].rows < 190 and knee(found) is None
+    found = searched(lambda rows: 30.0 - 100 * (rows < 10_000))
+    assert all(search.smallest(found, epsilon).rows == 10_000 for epsilon in SMALLEST_LOSSES)
+
+
+@pytest.mark.parametrize(
+    ("changed", "reasons"),
+    [
+        (scores(30.0, 30.0, 30.0), ()),
+        (scores(29.95, 29.95, 29.95), ()),
+        (scores(29.85, 29.85, 29.85), ("WS-PSNR may fall",)),
+        (scores(30.2, 30.0, 29.8), ("WS-PSNR may fall",)),
+        (scores(30.0, 30.0, 30.0, pole=-0.3), ("pole falls by 0.30 dB",)),
+        (scores(30.0, 30.0, 30.0, lpips=0.106), ("LPIPS rises by 0.0060",)),
+        (scores(30.9, 30.9, 29.4), ("WS-PSNR may fall", "a view falls by 0.60 dB")),
+    ],
+)
+def test_each_rule_objects_by_name(changed, reasons):
+    found = objections(changed, scores(30.0, 30.0, 30.0), 0.1)
+    assert len(found) == len(reasons) and all(map(str.startswith, found, reasons)), found
+
+
+def test_the_bound_is_that_of_students_t():
+    # mean 0, s = 0.1, n = 3: t(0.95, 2) = 2.920; -2.920 * 0.1 / sqrt(3)
+    assert lower_bound([0.1, 0.0, -0.1]) == pytest.approx(-0.16859, abs=1e-5)
+
+
+def test_validation_views_are_spread_evenly_and_too_few_are_refused():
+    left, chosen = held_out(list(range(48)))  # type: ignore[arg-type]
+    assert chosen == (4, 12, 20, 28, 36, 44) and len(left) == 42
+    assert len(held_out(list(range(6)))[1]) == 3  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="5 training views leave no .* views.*it takes 6"):
+        held_out(list(range(5)))  # type: ignore[arg-type]
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch, tmp_path):
+    """Search few counts, without LPIPS."""
+    monkeypatch.setattr(search, "RULES", search.TEST_RULES)
+    monkeypatch.setattr(search, "MIN_ROWS", 130)
+    monkeypatch.setenv("PADGS_CACHE", str(tmp_path / "cache"))
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """Return the folder of a finished run of a method, trained once."""
+    folders = {}
+
+    def folder(*settings: str):
+        if settings not in folders:
+            runs = tmp_path_factory.mktemp("runs")
+            with composing():
+                config = configuration([*SETTINGS, *settings, f"run.folder={runs}"])
+            run(config, Console(quiet=True))
+            folders[settings] = next(path.parent for path in runs.glob("*/result.json"))
+        return folders[settings]
+
+    return folder
+
+
+@pytest.fixture
+def load(finished, tmp_path):
+    """Load a copy of a finished run of a method."""
+
+    def loaded(*settings: str):
+        folder = finished(*settings)
+        copy = tmp_path / folder.name
+        if not copy.exists():
+            shutil.copytree(folder, copy)
+        return padgs.load_run(copy, device="cpu")
+
+    return loaded
+
+
+@pytest.mark.parametrize("method", [pytest.param("omnigs", marks=pytest.mark.slow), "padgs"])
+def test_a_search_writes_what_it_found_and_keeps_the_smallest_model_as_a_run(load, method):
+    loaded = load(f"method={method}")
+    with (console := Console(width=200)).capture() as shown:
+        result = find_smallest(loaded, 1.0, console)
+    found = result.smallest
+    rows = [step["rows"] for step in found["steps"]]
+    assert found["row"] == ("anchors" if method == "padgs" else "gaussians") and rows[0] == found["rows"] == max(rows)
+    assert found["steps"][0]["loss"] == 0 and rows[1] == math.ceil(0.7 * rows[0])
+    assert load(f"method={method}").result == result and "smallest" in result.experiments
+    assert result.scores == loaded.result.scores and result.config == loaded.result.config
+    kept = padgs.load_run(loaded.folder.with_name(found["kept"]["run"]), device="cpu")
+    assert kept.method.model.counts()[found["row"]] == rows[found["minimal"]["1"]]
+    assert kept.result.ok and kept.result.variant.startswith("smallest 1 dB")
+    assert kept.score("sphere").metrics == pytest.approx(kept.scores["sphere"].metrics, nan_ok=True)
+    assert np.array(Image.open(loaded.folder / "smallest.png")).shape == (24, 4 * 48, 3)
+    assert "1 dB" in shown.get() and kept.folder.name in shown.get()
+    candidates = sorted((loaded.folder / "smallest").glob("*/result.json"))
+    written = [path.stat().st_mtime_ns for path in candidates]
+    again = find_smallest(load(f"method={method}"), 0.1, Console(quiet=True)).smallest
+    assert again["steps"] == found["steps"] and again["kept"]["epsilon"] == 0.1, "candidates are not trained again"
+    assert [path.stat().st_mtime_ns for path in candidates] == written
+
+
+def test_an_interrupted_search_resumes_to_the_same_candidates(load):
+    whole = Search(load("method=padgs"))
+    whole.complete()
+    shutil.rmtree(whole.run.folder / "smallest")
+    stops, looks = 0, 0
+
+    def stop_requested() -> bool:
+        nonlocal looks
+        looks += 1
+        return looks % 3 == 0
+
+    while True:
+        again = Search(load("method=padgs"), stop_requested=stop_requested)
+        try:
+            again.complete()
+            break
+        except Interrupted:
+            stops += 1
+    assert stops > 1
+    for one, other in zip(whole.candidates, again.candidates, strict=True):
+        assert (one.run, one.rows, one.scores) == (other.run, other.rows, other.scores)
+
+
+def test_a_warm_start_prunes_the_least_important_rows_to_its_budget_and_refinement_keeps_their_number(load, tmp_path):
+    folder = load("method=omnigs").folder
+    for more in ([], ["train.refine=true", "train.hold_out=true"]):
+        settings = [*SETTINGS, "method=omnigs", f"init={folder}", "budget.gaussians=100", *more]
+        with composing():
+            config = configuration([*settings, f"run.folder={tmp_path}/{len(more)}"])
+        result = run(config, Console(quiet=True))
+        assert result.ok and result.counts["start"] == 100 >= result.counts["gaussians"]
+        assert not more or result.counts["gaussians"] == 100
+    with composing():
+        config = configuration([*SETTINGS, "method=omnigs", "train.refine=true", f"run.folder={tmp_path}/none"])
+    assert "set init=RUN" in run(config, Console(quiet=True)).reason
+
+
+def refused(*arguments: object) -> str:
+    result = CliRunner().invoke(app, ["smallest", *map(str, arguments)])
+    assert result.exit_code == 1, result.output
+    return " ".join(result.stderr.split())
+
+
+def test_runs_that_cannot_be_searched_are_refused_with_a_way_out(load, tmp_path):
+    loaded = load("method=omnigs")
+    assert "has no config.yaml; give the folder of one run" in refused(tmp_path)
+    assert "--epsilon is 0.3; it must be one of 0.05, 0.1" in refused(loaded.folder, "--epsilon", "0.3")
+    moved = refused(loaded.folder, "--data", str(tmp_path / "gone"))
+    assert f"it is the data of {loaded.folder}: if it has moved" in moved
+    (loaded.folder / "result.json").rename(loaded.folder / "elsewhere")
+    assert "is not finished" in refused(loaded.folder)
+    shutil.rmtree(loaded.folder / "checkpoint")
+    assert "has no checkpoint" in refused(loaded.folder)
+
+
+@pytest.mark.parametrize(
+    ("settings", "reason"),
+    [
+        (("method=egonerf_small",), "egonerf has no Gaussians to prune"),
+        (("method=sc_omnigs",), "cameras"),
+        (("train.exposures=learned",), "exposures or cameras are learned here"),
+        (("smallest=yes",), "known: off, on"),
+    ],
+)
+def test_methods_without_gaussians_or_with_learned_cameras_are_refused_before_training(settings, reason):
+    with composing(), pytest.raises(ConfigError, match=reason):
+        configuration(["smallest=on", *settings])
+
+
+def test_a_run_with_smallest_on_is_the_same_run_and_is_searched_at_its_end(tmp_path, capsys):
+    settings = (*SETTINGS, "method=padgs", "smallest=on", f"run.folder={tmp_path}")
+    with composing():
+        config = configuration(settings)
+        assert config.values() == configuration([*settings, "smallest=off"]).values()
+    result = job.complete(config, Console(width=400), Callback())
+    kept = padgs.load_run(tmp_path / result.run, device="cpu").result.smallest["kept"]
+    assert kept["epsilon"] == 0.1 and kept["run"] in capsys.readouterr().out
