@@ -1,11 +1,24 @@
-"""The three networks: shapes, order of their outputs, and that skipping work changes nothing."""
+"""The decoder, its native pass, and reduced precision."""
+
+from __future__ import annotations
 
 import math
 
 import pytest
 import torch
+from torch import Tensor
 
-from padgs.methods.anchors.decoder import Decoder, Head, decode, take_rows
+from padgs.methods.anchors.decoder import (
+    Decoder,
+    Head,
+    SeenAnchors,
+    decode,
+    decode_gaussians,
+    define_gaussians,
+    take_rows,
+)
+from padgs.methods.anchors.precision import GRADIENT_TYPE, linear, reduced_dtype
+from padgs.native import cpu
 
 
 @pytest.fixture
@@ -113,3 +126,162 @@ def test_gradients_match_finite_differences(generator):
     )
     inputs = torch.randn(6, 4, generator=generator, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda *args: Head(*args[1:])(args[0]), (inputs, *head))
+
+
+pytestmark = pytest.mark.skipif(not cpu.available(), reason="the native library is not built")
+OUTPUTS = ("means", "quats", "scales", "opacities", "colors")
+
+
+def decoded(function, tensors, decoder, generator_seed=0):
+    """Outputs, slots, raw opacities, and gradients of a random weighting of the outputs."""
+    leaves = {
+        name: tensor.clone().requires_grad_(name in ("features", "offsets", "log_scales"))
+        for name, tensor in tensors.items()
+    }
+    decoder.zero_grad()
+    gaussians, slots, raw = function(decoder.weights(), SeenAnchors(**leaves))
+    generator = torch.Generator().manual_seed(generator_seed)
+    loss = sum(
+        (getattr(gaussians, name) * torch.randn(getattr(gaussians, name).shape, generator=generator)).sum()
+        for name in OUTPUTS
+    )
+    if len(slots):
+        loss.backward()
+    gradients = {name: leaf.grad for name, leaf in leaves.items() if leaf.requires_grad}
+    return gaussians, slots, raw, gradients | {name: p.grad for name, p in decoder.named_parameters()}
+
+
+def problem(anchors, offsets, inputs, hidden, opacity_bias=0.0):
+    generator = torch.Generator().manual_seed(anchors + offsets)
+    decoder = Decoder(inputs, offsets, hidden, generator=generator)
+    with torch.no_grad():
+        decoder.opacity["b2"] += opacity_bias
+    features = min(32, inputs - 3)
+    sizes = {"features": (features,), "seen": (inputs - features,), "positions": (3,), "offsets": (offsets, 3)}
+    tensors = {name: torch.randn(anchors, *size, generator=generator) for name, size in sizes.items()}
+    tensors["log_scales"] = torch.randn(anchors, 6, generator=generator) * 0.3 - 1
+    tensors["attenuation"] = torch.rand(anchors, generator=generator) * 0.9 + 0.1
+    return tensors, decoder
+
+
+@pytest.mark.parametrize("anchors", [1, 15, 17, 70, 1025])
+@pytest.mark.parametrize(("offsets", "inputs", "hidden"), [(10, 37, 32), (10, 35, 32), (1, 36, 16), (3, 37, 32)])
+def test_native_matches_the_definition(anchors, offsets, inputs, hidden):
+    tensors, decoder = problem(anchors, offsets, inputs, hidden)
+    ours, slots, raw, gradients = decoded(decode_gaussians, tensors, decoder)
+    truth, true_slots, true_raw, true_gradients = decoded(define_gaussians, tensors, decoder)
+    assert torch.equal(slots, true_slots)
+    assert torch.allclose(raw, true_raw, atol=2e-6)
+    for name in OUTPUTS:
+        assert torch.allclose(getattr(ours, name), getattr(truth, name), atol=5e-6, rtol=1e-5), name
+    for name, expected in true_gradients.items():
+        if expected is None:
+            continue
+        assert expected.abs().max() > 0 or anchors == 1, name
+        assert (gradients[name] - expected).abs().max() <= 2e-5 * expected.abs().max().clamp(min=1e-6), name
+
+
+@pytest.mark.parametrize(("bias", "share"), [(-50.0, 0), (50.0, 1)])
+def test_nothing_and_everything_selected(bias, share):
+    tensors, decoder = problem(33, 10, 37, 32, opacity_bias=bias)
+    gaussians, slots, _, _ = decoded(decode_gaussians, tensors, decoder)
+    assert len(slots) == len(gaussians) == share * 330
+
+
+def test_threads_change_no_bit():
+    tensors, decoder = problem(2500, 10, 37, 32)
+    before, results = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            gaussians, _, _, gradients = decoded(decode_gaussians, tensors, decoder)
+            results.append(
+                [getattr(gaussians, name).detach().clone() for name in OUTPUTS]
+                + [g.clone() for g in gradients.values()]
+            )
+    finally:
+        torch.set_num_threads(before)
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+each_reduced = pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16], ids=str)
+
+
+def roundoff(dtype: torch.dtype) -> float:
+    """Largest relative error of rounding to a type."""
+    return torch.finfo(dtype).eps / 2
+
+
+def layer(generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+    """Inputs [500, 37], weight [32, 37], bias [32]."""
+    inputs, weight = torch.randn(500, 37, generator=generator), torch.randn(32, 37, generator=generator)
+    return inputs, weight, torch.randn(32, generator=generator)
+
+
+@each_reduced
+def test_a_product_errs_by_the_rounding_of_its_operands_and_its_result(dtype: torch.dtype, generator):
+    inputs, weight, bias = (tensor.double() for tensor in layer(generator))
+    error = (linear(inputs.float(), weight.float(), bias.float(), dtype) - (inputs @ weight.T + bias)).abs()
+    magnitude = inputs.abs() @ weight.T.abs() + bias.abs()
+    assert (error <= 4 * roundoff(dtype) * magnitude).all()  # two operands and the result, and a bit for their products
+    assert error.max() > 0.1 * roundoff(dtype) * magnitude.max()  # not float32, which would be 2^13 times as exact
+    exact = (linear(inputs.float(), weight.float(), bias.float(), None) - (inputs @ weight.T + bias)).abs()
+    assert exact.max() < 1e-2 * error.max()
+
+
+@each_reduced
+@pytest.mark.parametrize("size", [1.0, 1e-9])  # of the upstream gradient; float16 ends at 6e-8
+def test_gradients_are_float32_and_err_by_the_rounding_of_bfloat16(dtype: torch.dtype, size: float, generator):
+    inputs, weight, bias = (tensor.requires_grad_() for tensor in layer(generator))
+    upstream = size * torch.randn(500, 32, generator=generator)
+    gradients = torch.autograd.grad(linear(inputs, weight, bias, dtype), (inputs, weight, bias), upstream)
+    u, exact = roundoff(GRADIENT_TYPE), upstream.double()
+    for gradient, a, b in zip(gradients, (exact, exact.T), (weight.double(), inputs.double()), strict=False):
+        error, magnitude = (gradient - a @ b).abs(), a.abs() @ b.abs()
+        assert gradient.dtype == torch.float32 and (error <= 4 * u * magnitude).all()
+        assert error.max() > 1e-3 * u * magnitude.max()
+    torch.testing.assert_close(gradients[2], exact.sum(0).float(), rtol=1e-5, atol=1e-5 * size)
+
+
+@each_reduced
+def test_networks_err_by_rounding_alone_and_select_the_same_but_at_the_threshold(dtype: torch.dtype, generator):
+    weights, inputs = Decoder(37, 10, generator=generator).weights(), torch.randn(400, 37, generator=generator)
+    u, bounds = roundoff(dtype), []
+    with torch.no_grad():
+        for head in weights:
+            w1, b1, w2, b2 = (tensor.double() for tensor in head)
+            x = inputs.double()
+            hidden = torch.relu(x @ w1.T + b1)
+            hidden_error = 4 * u * (x.abs() @ w1.T.abs() + b1.abs())
+            magnitude = (hidden + hidden_error) @ w2.T.abs() + b2.abs()
+            bounds.append(1.01 * hidden_error @ w2.T.abs() + 3 * u * magnitude)
+            assert ((head(inputs, dtype) - (hidden @ w2.T + b2)).abs() <= bounds[-1]).all()
+        said, truth = decode(weights, inputs, dtype), decode(weights, inputs)
+    sure = torch.atanh(truth.raw_opacities).abs() > bounds[0]
+    assert sure.float().mean() > 0.5 and torch.equal(said.raw_opacities[sure] > 0, truth.raw_opacities[sure] > 0)
+    assert not torch.equal(said.raw_opacities, truth.raw_opacities)
+
+
+@each_reduced
+def test_geometry_stays_float32(dtype: torch.dtype, generator: torch.Generator):
+    """Means come of no network: they are those of a float32 decode, bit by bit."""
+    decoder, k = Decoder(37, 10, generator=generator), 10
+    shapes = ((32,), (5,), (3,), (k, 3), (6,))
+    features, seen, positions, offsets, log_scales = (torch.randn(50, *s, generator=generator) for s in shapes)
+    attenuation = torch.rand(50, generator=generator)
+    anchors = SeenAnchors(features, seen, positions, offsets, log_scales, attenuation)
+    ours, slots, _ = define_gaussians(decoder.weights(), anchors, str(dtype).removeprefix("torch."))
+    truth, true_slots, _ = define_gaussians(decoder.weights(), anchors)
+    shared = slots[torch.isin(slots, true_slots)]
+    assert len(shared) > 0.9 * len(true_slots) > 0
+    places, true_places = torch.searchsorted(slots, shared), torch.searchsorted(true_slots, shared)
+    assert torch.equal(ours.means[places], truth.means[true_places])
+    for field in ("quats", "scales", "opacities", "colors"):
+        values = getattr(ours, field)
+        assert values.dtype == torch.float32 and not torch.equal(values[places], getattr(truth, field)[true_places])
+
+
+def test_unknown_names_list_the_known():
+    with pytest.raises(ValueError, match="unknown precision 'half'; known: float32, bfloat16, float16"):
+        reduced_dtype("half")

@@ -1,289 +1,129 @@
+"""Training on random rays."""
+
+import time
 from dataclasses import replace
-from time import process_time
 
 import pytest
 import torch
-from composed import composed
 from tiny_scene import tiny_scene
-from torch.nn.functional import normalize, softplus
+from torch import Tensor, nn
 
-from padgs.geometry.camera import Pinhole, RayTable
-from padgs.methods.egonerf.field import EgoNeRF
-from padgs.methods.egonerf.options import Constants, EgoNeRFOptions
-from padgs.runs.run import build_method
-from padgs.scene import Scene, View
-from padgs.training.options import Budget
-
-SMALL = EgoNeRFOptions(
-    radial_nodes=16,
-    polar_nodes=8,
-    azimuth_nodes=24,
-    density_components=4,
-    appearance_components=4,
-    features=6,
-    hidden=16,
-    coarse_samples=24,
-    fine_samples=24,
-    surroundings="outdoor",
-    distance_scale=125.0,
-    near=0.05,
-    far=8.0,
-    first_radius=0.05,
-    environment_height=8,
-)
+from padgs.methods.egonerf.model import RayTrainer
+from padgs.scene import Scene
+from padgs.training.health import Failure
+from padgs.training.model import State
+from padgs.training.options import Budget, TrainOptions
+from padgs.training.schedule import Constant, ParameterGroup
 
 
-def dense(options: EgoNeRFOptions = SMALL, scene: Scene | None = None) -> EgoNeRF:
-    """A model of which rays see something: its fields are strong instead of nearly empty."""
-    model = EgoNeRF.from_scene(scene or tiny_scene(), options, seed=3)
-    with torch.no_grad():
-        for factor in model.density.parameters():
-            factor.mul_(10)
-        model.shader.basis.mul_(30)
-    return model
+class Flat:
+    """The least that rays can be traced through: one colour, whatever the ray."""
+
+    def __init__(self, rays_at_once: int = 1000, penalty: float = 0.0) -> None:
+        self.color = nn.Parameter(torch.full((3,), 0.2))
+        self.rays_at_once, self.penalty = rays_at_once, penalty
+        self.passes: list[int] = []
+
+    def groups(self) -> list[ParameterGroup]:
+        return [ParameterGroup("color", (self.color,), Constant(1e-2))]
+
+    def colors(self, origins: Tensor, directions: Tensor, generator: torch.Generator, iteration: int) -> Tensor:
+        self.passes.append(len(origins))
+        return self.color.expand(len(origins), 3)
+
+    def regularisation(self, iteration: int) -> Tensor | None:
+        return self.penalty * self.color.sum() if self.penalty else None
+
+    def counts(self) -> dict[str, int]:
+        return {"colors": 1}
+
+    def summary(self) -> str:
+        return "flat"
+
+    def state(self) -> State:
+        return State({"color": self.color}, {})
+
+    def load_state(self, state: State) -> None:
+        self.color.data = state.tensors["color"].clone()
 
 
-def rays(count: int, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
-    origins = 0.2 * torch.randn(count, 3, generator=generator)
-    return origins, normalize(torch.randn(count, 3, generator=generator), dim=-1)
+def trainer(model: Flat, iterations: int = 400, weight: str = "uniform", scene: Scene | None = None) -> RayTrainer:
+    options = TrainOptions(weight=weight, learning_rates="published")
+    return RayTrainer(model, scene or tiny_scene(), Budget(iterations), options, seed=3, rays=200)
 
 
-def moved(scene: Scene, scale: float) -> Scene:
-    """The same scene in other units of length."""
-
-    def scaled(view: View) -> View:
-        pose = view.cam_from_world.clone()
-        pose[:3, 3] *= scale
-        return replace(view, cam_from_world=pose)
-
-    views = {part: tuple(scaled(view) for view in getattr(scene, part)) for part in ("train", "test")}
-    return replace(scene, points=scene.points * scale, **views)
+def test_the_mean_colour_is_learned():
+    model = Flat()
+    records = list(trainer(model).records())
+    mean = torch.stack([view.image() for view in tiny_scene().train]).mean((0, 1, 2))
+    assert torch.allclose(model.color.detach(), mean, atol=0.03)
+    assert records[-1].loss < records[0].loss and records[0].counts == {"colors": 1, "rays": 200}
 
 
-def test_the_defaults_have_the_published_number_of_parameters():
-    """Per chart (150 x 172 + 150 x 516 + 172 x 516 + 150 + 172 + 516) x 64 values of the grids."""
-    with torch.device("meta"):
-        model = EgoNeRF(EgoNeRFOptions(), torch.zeros(3, device="cpu"), 1.0, 1.0, "outdoor")
-    grids = sum(p.numel() for part in (model.density, model.appearance) for p in part.parameters())
-    assert grids == 2 * 64 * (150 * 172 + 150 * 516 + 172 * 516 + 150 + 172 + 516)
-    assert 12.2e6 < grids / 2 < 12.4e6
-    assert model.environment is not None and model.environment.emission.numel() == 3 * 1920 * 3840
-    assert 46e6 < sum(p.numel() for p in model.parameters()) < 47.5e6
+def test_reading_the_images_is_training_time():
+    views = tiny_scene().train
+
+    def slow():
+        time.sleep(0.05)
+        return (views[0].image() * 255).round().to(torch.uint8)
+
+    first = replace(views[0], load_pixels=slow)
+    run = trainer(Flat(), 10, scene=replace(tiny_scene(), train=(first, *views[1:])))
+    reading = run.seconds
+    assert reading >= 0.05 and next(run.records()).seconds > reading
 
 
-@pytest.mark.parametrize(
-    ("surroundings", "unit", "published"),
-    [("outdoor", 5.0, (-10.0, 25.0, 0.1, 300.0, 0.05, True)), ("indoor", 2.5, (-8.0, 25.0, 0.01, 15.0, 0.03, False))],
-)
-def test_the_defaults_are_the_published_model_of_a_scene_of_some_unit(generator, surroundings, unit, published):
-    """Lengths are published in units of the data; the optical depth of a length is the same, too."""
-    world = tiny_scene()
-    world = moved(world, unit / world.scale)
-    assert world.scale == pytest.approx(unit)
-    free = dict.fromkeys(Constants._fields)
-    ours, theirs = (
-        dense(replace(SMALL, **free, surroundings=surroundings, length_unit=unit_of_lengths), world)
-        for unit_of_lengths in ("scene", "world")
-    )
-    assert theirs.constants == published
-    origins, directions = rays(50, generator)  # positions inside are in the model's unit
-    seen = [ours.trace(origins, directions), theirs.trace(unit * origins, directions)]
-    assert 0.01 < seen[0].transmittance.mean() < 0.95
-    assert torch.allclose(seen[0].transmittance, seen[1].transmittance, rtol=1e-3, atol=1e-5)
-    assert torch.allclose(seen[0].color, seen[1].color, atol=1e-4)
+def test_the_loss_is_the_squared_error_that_counts():
+    model = Flat()
+    run = trainer(model, weight="solid_angle")
+    rays = trainer(model, weight="solid_angle")._pixels.draw(200)
+    error = ((0.2 - rays.color).square().mean(-1) * rays.weight).sum() / rays.weight.sum()
+    assert next(run.records()).loss == pytest.approx(error.item(), rel=1e-5)
 
 
-def test_a_field_of_constant_density_absorbs_as_the_formula_says(generator):
-    """All factors zero: density = softplus(shift) everywhere, from the first sample on."""
-    model = dense(replace(SMALL, density_shift=-3.0, environment=False))
-    with torch.no_grad():
-        for factor in model.density.parameters():
-            factor.zero_()
-    origins, directions = rays(20, generator)
-    seen = model.trace(origins, directions)
-    distances = model._sample(origins, directions, None)
-    length = distances[:, -1] - distances[:, 0] + (distances[:, -1] - distances[:, -2])
-    expected = torch.exp(-softplus(torch.tensor(-3.0)) * model.constants.distance_scale * length)
-    assert torch.allclose(seen.transmittance, expected, rtol=1e-3, atol=1e-12)
+def test_passes_of_bounded_size_add_up_to_the_same_step():
+    whole, parts = Flat(), Flat(rays_at_once=64)
+    losses = [[record.loss for record in trainer(model, 5).records()] for model in (whole, parts)]
+    assert parts.passes[:4] == [64, 64, 64, 8] and whole.passes[0] == 200
+    assert losses[0] == pytest.approx(losses[1], rel=1e-5)
+    assert torch.allclose(whole.color, parts.color, atol=1e-5)
 
 
-def test_nothing_but_the_environment_is_seen_through_nothing(generator):
-    model = dense(replace(SMALL, density_shift=-200.0))
-    with torch.no_grad():
-        for factor in model.density.parameters():
-            factor.zero_()
-    origins, directions = rays(20, generator)
-    seen = model.trace(origins, directions)
-    assert model.environment is not None
-    assert torch.allclose(seen.color, model.environment(directions), atol=1e-6)
-    assert torch.equal(seen.transmittance, torch.ones(20)) and (seen.depth == 0).all()
+def test_regularisation_is_learned_from_and_not_recorded():
+    plain, penalised = Flat(), Flat(penalty=-100.0)
+    first = [next(trainer(model).records()).loss for model in (plain, penalised)]
+    assert first[0] == first[1]
+    assert plain.color[0] < 0.2 < penalised.color[0]
 
 
-def test_without_an_environment_black_lies_behind(generator):
-    options = replace(SMALL, environment=False, density_shift=-200.0)
-    assert EgoNeRF.from_scene(tiny_scene(), options).environment is None
-    model = dense(options)
-    with torch.no_grad():
-        for factor in model.density.parameters():
-            factor.zero_()
-    assert model.trace(*rays(20, generator)).color.abs().max() < 1e-6
+@pytest.mark.parametrize("stop", [0, 1, 13, 20])
+def test_resuming_changes_nothing(stop):
+    whole = trainer(Flat(), 20)
+    losses = [record.loss for record in whole.records()]
+    first = trainer(Flat(), 20)
+    records = first.records()
+    before = [next(records).loss for _ in range(stop)]
+    state = first.state()
+    next(records, None)
+    second = trainer(Flat(), 20)
+    second.load_state(state)
+    assert before + [record.loss for record in second.records()] == losses
+    for name, tensor in whole.state().tensors.items():
+        assert name == "random/torch" or torch.equal(tensor, second.state().tensors[name]), name
 
 
-def test_samples_start_at_near_reach_far_and_increase(generator):
-    model = dense()
-    origins, directions = rays(50, generator)
-    distances = model._sample(origins, directions, generator)
-    assert distances.shape == (50, 48) and (distances.diff(dim=-1) >= 0).all()
-    still = model._sample(origins, directions, None)
-    assert (
-        torch.equal(still[:, 0], torch.full((50,), model.constants.near))
-        and (still[:, -1] >= model.constants.far - 1e-4).all()
-    )
+def test_a_state_of_other_data_is_refused():
+    state = trainer(Flat(), 5).state()
+    other = trainer(Flat(), 5, scene=replace(tiny_scene(), train=tiny_scene().train[:2]))
+    with pytest.raises(ValueError, match="a run on 2560 pixels, but the training views have 1024"):
+        other.load_state(state)
 
 
-def test_fine_samples_gather_at_a_shell(generator):
-    """Density in one radial node only: half the samples are drawn to it."""
-    model = dense()
-    with torch.no_grad():
-        for factor in model.density.parameters():
-            factor.zero_()
-        model.density.planes[2].fill_(3.0)  # polar x azimuth, whose line runs along the radius
-        model.density.lines[2][:, :, 8:10] = 3.0
-    nodes = model.get_buffer("nodes")
-    directions = normalize(torch.randn(50, 3, generator=generator), dim=-1)
-    distances = model._sample(torch.zeros(50, 3), directions, None)
-    near_shell = (distances > nodes[5]) & (distances < nodes[12])
-    assert near_shell.float().sum(-1).min() > 24
+def test_what_is_not_finite_is_named():
+    class Broken(Flat):
+        def colors(self, origins: Tensor, directions: Tensor, generator: torch.Generator, iteration: int) -> Tensor:
+            return super().colors(origins, directions, generator, iteration) / torch.zeros(())
 
-
-def test_any_camera_sees_what_lies_in_its_directions():
-    """A table of the panorama's own rays gives the panorama; a pinhole's middle is the panorama's."""
-    scene, model = tiny_scene(), dense()
-    view = scene.test[0]
-    panorama = model.render(view)
-    table = RayTable(view.camera.rays(), view.camera.focal)
-    assert torch.equal(model.render(replace(view, lens=table)).image, panorama.image)
-    forward = Pinhole(3, 3, 50.0, 50.0, 1.5, 1.5)
-    middle = model.render(replace(view, width=3, height=3, lens=forward)).image[1, 1]
-    origin = model.from_world(view.center)[None]
-    along = view.cam_from_world[2:3, :3].float()
-    assert torch.allclose(middle, model.trace(origin, along).color[0], atol=1e-5)
-
-
-def test_a_rendering_has_depth_in_world_units_and_residual_transmittance():
-    scene, model = tiny_scene(), dense()
-    view = scene.test[0]
-    rendering = model.render(view)
-    assert rendering.depth.shape == rendering.transmittance.shape == (view.height, view.width)
-    assert ((rendering.transmittance >= 0) & (rendering.transmittance <= 1)).all()
-    seen = rendering.transmittance < 0.5
-    assert seen.any() and (rendering.depth[seen] >= model.constants.near * model.unit * 0.99).all()
-    assert rendering.depth.max() <= model.get_buffer("distances")[-1] * model.unit * 1.01
-    assert len(rendering.visible) == 0 and rendering.counters["rays"] == view.width * view.height
-
-
-def test_memory_in_smaller_passes_changes_nothing():
-    scene = tiny_scene()
-    whole, parts = dense(), dense(replace(SMALL, samples_at_once=48 * 7))
-    view = scene.test[0]
-    assert torch.allclose(whole.render(view).image, parts.render(view).image, atol=1e-6)
-
-
-def test_faint_samples_may_go_unshaded():
-    scene, view = tiny_scene(), tiny_scene().test[0]
-    full, quick = dense(scene=scene), dense(replace(SMALL, min_weight=1e-3), scene)
-    difference = (full.render(view).image - quick.render(view).image).abs().max()
-    assert 0 < difference <= SMALL.samples * 1e-3
-
-
-@pytest.mark.parametrize("scale", [0.01, 100.0])
-def test_the_units_of_the_world_do_not_matter(scale):
-    scene = tiny_scene()
-    other = moved(scene, scale)
-    plain, scaled = dense(scene=scene), dense(scene=other)
-    assert scaled.unit == pytest.approx(scale * plain.unit)
-    a, b = plain.render(scene.test[0]), scaled.render(other.test[0])
-    assert torch.allclose(a.image, b.image, atol=1e-4)
-    assert torch.allclose(a.depth * scale, b.depth, rtol=1e-3)
-
-
-def test_in_world_units_lengths_are_taken_as_they_stand():
-    model = EgoNeRF.from_scene(moved(tiny_scene(), 100.0), replace(SMALL, length_unit="world"))
-    assert model.unit == 1.0 and model.travel > 20
-
-
-def test_the_centre_is_the_mean_of_the_training_cameras():
-    scene = tiny_scene()
-    model = EgoNeRF.from_scene(scene, SMALL)
-    centers = torch.stack([view.center for view in scene.train])
-    assert torch.allclose(model.centre, centers.mean(0))
-    assert model.travel * model.unit == pytest.approx((centers - centers.mean(0)).norm(dim=-1).max().item())
-
-
-def test_gradients_reach_every_parameter(generator):
-    model = dense()
-    model.trace(*rays(200, generator), generator).color.square().sum().backward()
-    for name, parameter in model.named_parameters():
-        assert parameter.grad is not None and parameter.grad.abs().sum() > 0, name
-
-
-def test_gradients_of_colours(generator):
-    """float64, through absorption, shading and environment; the samples themselves are not differentiated."""
-    model = dense().double()
-    origins, directions = rays(2, generator)
-    names = ["density.planes.2", "density.lines.2", "shader.basis", "shader.network.0.weight", "environment.emission"]
-    own = dict(model.named_parameters())
-    distances = model._sample(origins.double(), directions.double(), None)
-    model._sample = lambda *_: distances  # type: ignore[method-assign]
-
-    def color(*values: torch.Tensor) -> torch.Tensor:
-        parameters = {**own, **dict(zip(names, values, strict=True))}
-        return torch.func.functional_call(Traced(model), {f"model.{n}": p for n, p in parameters.items()}, args)
-
-    args = (origins.double(), directions.double())
-    assert torch.autograd.gradcheck(color, tuple(own[name] for name in names), fast_mode=True)
-
-
-class Traced(torch.nn.Module):
-    """`trace` as the forward of a module."""
-
-    def __init__(self, model: EgoNeRF) -> None:
-        super().__init__()
-        self.model = model
-
-    def forward(self, origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
-        return self.model.trace(origins, directions).color
-
-
-@pytest.mark.parametrize(
-    "changes, reason",
-    [
-        ({"polar_nodes": 9}, "polar_nodes is 9; it must be even"),
-        ({"length_unit": "km"}, "unknown length_unit 'km'; known: scene, world"),
-        ({"near": 0.0}, "near is 0.0"),
-        ({"far": 0.06}, "far - near larger than first_radius"),
-        ({"samples_at_once": 10}, "less than the 48 of a single ray"),
-        ({"hidden": 0}, "hidden is 0; it must be at least 1"),
-        ({"coarse_samples": 3}, "coarse_samples is 3 and fine_samples 24"),
-    ],
-)
-def test_options_that_make_no_model_are_named(changes, reason):
-    with pytest.raises(ValueError, match=reason):
-        replace(SMALL, **changes)
-
-
-@pytest.mark.slow
-def test_the_small_setting_keeps_its_promises_of_time(monkeypatch, root):
-    """500 steps of 1024 rays in 3 minutes and 256x128 in 20 s on 2 cores: twice that in processor time."""
-    monkeypatch.setenv("PADGS_ROOT", str(root))
-    scene, small = tiny_scene(), build_method(composed("method=egonerf_small"))
-    records = small.fit(scene, Budget(500))
-    for _ in range(5):
-        next(records)
-    start = process_time()
-    for _ in range(20):
-        next(records)
-    assert (process_time() - start) * 500 / 20 < 2 * 180  # measured: 135
-    start = process_time()
-    small.render(replace(scene.test[0], width=256, height=128))
-    assert process_time() - start < 2 * 20  # measured: 4.7
+    with pytest.raises(Failure, match=r"image\[0, 0\] is inf at iteration 1") as caught:
+        list(trainer(Broken(), 5).records())
+    assert caught.value.status == "nan"

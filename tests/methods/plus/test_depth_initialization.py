@@ -1,4 +1,4 @@
-"""Photographs give the points that the cloud has not: where, how far, how many, of which colour."""
+"""Initial Gaussians: points from training pixels, plane sweep, far Gaussians, and the number of rooms."""
 
 import math
 from dataclasses import replace
@@ -6,12 +6,27 @@ from dataclasses import replace
 import pytest
 import torch
 from tiny_scene import tiny_scene
+from torch import Tensor
 
+from padgs.data.perturb import StressOptions
+from padgs.data.synthetic import SyntheticOptions, generate
+from padgs.geometry.camera import perspective
+from padgs.methods.plus import depth_initialization
 from padgs.methods.plus import method as method_module
-from padgs.methods.plus.depth_initialization import fibonacci_sphere, fill_sparse_cloud
+from padgs.methods.plus.depth_initialization import (
+    CHUNK,
+    COVERED_SPACINGS,
+    FAR_FACTOR,
+    far_gaussians,
+    fibonacci_sphere,
+    fill_sparse_cloud,
+    plane_sweep,
+    room_count,
+)
 from padgs.methods.plus.method import PlusMethod, PlusOptions
 from padgs.methods.plus.model import solid_angle_pixels
-from padgs.scene import Scene
+from padgs.methods.splats.splats import Splats
+from padgs.scene import Scene, View
 from padgs.training.options import Budget
 
 RADIUS = 4.0
@@ -166,3 +181,203 @@ def test_a_rehearsal_changes_nothing_of_the_points_that_a_run_begins_with():
         method.build_model(scene, length).splats for method, length in ((one, 9), (one, 20), (PlusMethod(seed=3), 20))
     )
     assert torch.equal(first.means, second.means) and torch.equal(second.means, other.means)
+
+
+RADIUS, WIDTH = 4.0, 128
+CENTERS = ((0.0, 0.0, 0.0), (1.0, 0.2, 0.0), (-0.6, 0.0, 0.9), (0.3, -0.4, -1.0))
+
+
+def ball(scale: float = 1.0, *, contrast: float = 1.0) -> tuple[View, ...]:
+    """Cameras in a hollow ball about the origin, whose colours wave with the place."""
+    return tuple(_inside(torch.tensor(center, dtype=torch.float64), scale, contrast) for center in CENTERS)
+
+
+def _inside(center: Tensor, scale: float, contrast: float) -> View:
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, 3] = -scale * center
+    view = View("v", pose, WIDTH, WIDTH // 2)
+    rays = view.camera.rays(dtype=torch.float64)
+    places = center + ranges(rays, center)[..., None] * rays
+    waves = torch.stack([torch.sin(places @ torch.tensor(way).double()) for way in ((5, 3, 1), (-2, 5, 4), (3, -4, 5))])
+    pixels = (255 * (0.5 + 0.45 * contrast * waves.permute(1, 2, 0))).round().to(torch.uint8)
+    return replace(view, load_pixels=lambda: pixels)
+
+
+def ranges(rays: Tensor, center: Tensor) -> Tensor:
+    """Distances [...] along rays [..., 3] from within to the ball of `RADIUS`."""
+    along = rays @ center
+    return (along * along - center @ center + RADIUS**2).sqrt() - along
+
+
+def found(views: tuple[View, ...], scale: float = 1.0, count: int = 300) -> tuple[Tensor, Tensor, Tensor]:
+    """Inverse ranges found for pixels of the first view, the true ones, and what was said to be likely."""
+    rays = views[0].camera.rays(dtype=torch.float64)[8:-8].reshape(-1, 3)
+    rays = rays[torch.randperm(len(rays), generator=torch.Generator().manual_seed(0))[:count]]
+    true = 1 / (scale * ranges(rays, torch.zeros(3, dtype=torch.float64)))
+    likely, around = 0.7 * true, torch.stack((0.5 * true, 0.7 * true, 1.6 * true), dim=1)
+    return plane_sweep(views[0], rays, likely, around, views), true, likely
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1.0, 1e5])
+def test_ranges_are_those_at_which_all_views_agree(scale):
+    inverse, true, _ = found(ball(scale), scale)
+    off = (inverse / true).log2().abs()
+    assert off.median() < 0.08 and (off < 0.2).double().mean() > 0.95, "steps between those tried are 0.19 octaves"
+
+
+def test_what_looks_alike_everywhere_stays_as_likely():
+    inverse, _, likely = found(ball(contrast=0.0))
+    assert torch.equal(inverse, likely)
+
+
+def test_a_view_alone_and_one_that_is_no_panorama_stay_as_they_are():
+    views = ball()
+    for alone in (views[:1], (views[0], views[0])):
+        inverse, _, likely = found(alone)
+        assert torch.equal(inverse, likely)
+    rays = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
+    likely = torch.ones(1, dtype=torch.float64)
+    straight = replace(views[0], lens=perspective(WIDTH, WIDTH // 2, 90.0))
+    assert torch.equal(plane_sweep(straight, rays, likely, likely[:, None], (straight, *views[1:])), likely)
+
+
+def test_one_that_something_hides_is_outvoted():
+    views = ball()
+    hidden = replace(views[1], load_pixels=lambda: torch.zeros(WIDTH // 2, WIDTH, 3, dtype=torch.uint8))
+    inverse, true, _ = found((views[0], hidden, *views[2:]))
+    assert ((inverse / true).log2().abs() < 0.2).double().mean() > 0.9
+
+
+def test_parts_are_put_together_in_order():
+    views = ball()
+    whole, true, _ = found(views, count=CHUNK + 5)
+    assert len(whole) == len(true) == CHUNK + 5
+    assert torch.equal(whole[:300], found(views)[0])
+    assert ((whole[-5:] / true[-5:]).log2().abs() < 0.2).all()
+
+
+def test_points_from_photographs_lie_where_these_agree_and_not_where_the_cloud_has_them(monkeypatch):
+    directions = fibonacci_sphere(60)
+    off = torch.where(torch.arange(60) % 2 == 0, 0.65, 1.5)[:, None]  # of a rough cloud
+    points = (RADIUS * off * directions).float()
+    scene = Scene("ball", ball(), (), points, torch.zeros(60, 3, dtype=torch.uint8), "")
+    errors = []
+    for others in (True, False):
+        if not others:
+            monkeypatch.setattr(depth_initialization, "plane_sweep", lambda view, rays, inverse, *_: inverse)
+        filled = depth_initialization.fill_sparse_cloud(scene, 1000, generator=torch.Generator().manual_seed(0))
+        errors.append((filled.points[60:].norm(dim=-1) / RADIUS).log2().abs().median().item())
+    assert errors[0] < 0.5 * errors[1] and errors[1] > 0.15
+
+
+DIRECTIONS = 3000
+
+
+def under(hemisphere: bool, scale: float = 1.0) -> Scene:
+    """A dome of points at a distance of 4 around the cameras of the tiny scene; or the lower half of it (y is down)."""
+    scene = tiny_scene()
+    centre = torch.stack([view.center for view in scene.train]).median(0).values
+    directions = fibonacci_sphere(20_000)
+    if hemisphere:
+        directions = directions[directions[:, 1] > 0]
+    points = (centre + 4 * directions).float() * scale
+    poses = []
+    for view in scene.train:
+        pose = view.cam_from_world.clone()
+        pose[:3, 3] *= scale
+        poses.append(replace(view, cam_from_world=pose))
+    colors = torch.zeros(len(points), 3, dtype=torch.uint8)
+    return replace(scene, train=tuple(poses), points=points, point_colors=colors)
+
+
+def sky(scene: Scene) -> tuple[Splats, torch.Tensor]:
+    """The far Gaussians, and where they are as seen from the middle of the cameras."""
+    made = far_gaussians(scene, DIRECTIONS, degree=1, opacity=0.5)
+    centre = torch.stack([view.center for view in scene.train]).median(0).values
+    return made, made.means.detach().double() - centre
+
+
+def test_directions_are_unit_and_even():
+    directions = fibonacci_sphere(DIRECTIONS)
+    assert torch.allclose(directions.norm(dim=-1), torch.ones(DIRECTIONS, dtype=torch.float64))
+    assert directions.mean(0).abs().max() < 1e-3
+    moments = directions.T @ directions / DIRECTIONS
+    assert torch.allclose(moments, torch.eye(3, dtype=torch.float64) / 3, atol=1e-3)
+
+
+def test_where_points_are_all_around_there_is_no_sky():
+    assert len(sky(under(hemisphere=False))[0]) == 0
+
+
+@pytest.mark.parametrize("points", [100, 500])
+def test_a_sparse_cloud_all_around_leaves_no_hole(points):
+    scene = under(hemisphere=False)
+    few = torch.randperm(len(scene.points), generator=torch.Generator().manual_seed(0))[:points]
+    assert len(sky(replace(scene, points=scene.points[few]))[0]) < 0.02 * DIRECTIONS
+
+
+@pytest.mark.parametrize("scale", [1.0, 1000.0])
+def test_the_open_half_gets_it(scale):
+    made, rays = sky(under(hemisphere=True, scale=scale))
+    assert rays.norm(dim=-1) == pytest.approx([FAR_FACTOR * 4 * scale] * len(rays), rel=0.02)
+    height = rays[:, 1] / rays.norm(dim=-1)
+    margin = COVERED_SPACINGS * math.sqrt(4 * math.pi / DIRECTIONS)
+    assert height.max() < -0.8 * margin and len(rays) == pytest.approx(DIRECTIONS * (1 - margin) / 2, rel=0.02)
+    apart = torch.cdist(rays, rays).fill_diagonal_(math.inf).min(-1).values.median()
+    assert made.log_scales.exp().median().item() == pytest.approx(apart.item() / 2, rel=0.3)  # they touch
+
+
+@pytest.fixture(autouse=True)
+def cached(monkeypatch, cache):
+    monkeypatch.setenv("PADGS_CACHE", str(cache))
+
+
+def scene_of(name: str, count: int = 1):
+    views, points = 8 * count, 3000 * count
+    return generate(
+        SyntheticOptions(
+            scene=name,
+            rooms=count if name == "room_chain" else None,
+            width=16,
+            samples=1,
+            train_views=views,
+            test_views=1,
+            points=points,
+        )
+    )
+
+
+def test_more_rooms_are_more_and_one_is_one():
+    one, two, five = (room_count(scene_of("room_chain", count)) for count in (1, 2, 5))
+    assert one == 1.0 < two < five
+    assert 1.5 < five < 5
+
+
+@pytest.mark.parametrize("name", ["room", "outdoor", "near_clutter"])
+def test_furniture_and_trees_make_no_room(name):
+    assert room_count(scene_of(name)) == 1.0
+
+
+@pytest.mark.parametrize(("condition", "level"), [("world_scale", 3), ("world_offset", 2), ("world_rotation", 3)])
+def test_the_world_may_be_anywhere(condition, level):
+    scene = scene_of("room_chain", 3)
+    assert room_count(StressOptions(condition, level).apply(scene, 0)) == pytest.approx(room_count(scene), rel=0.1)
+
+
+def test_points_that_are_none_count_as_nothing():
+    scene = scene_of("room_chain", 2)
+    lost = replace(scene, points=torch.cat((scene.points, torch.full((9, 3), torch.nan))))
+    assert room_count(lost) == pytest.approx(room_count(scene), rel=0.01)
+    assert room_count(replace(scene, points=scene.points[:0])) == 1.0
+    here = scene.train[0].center.float().expand(3, 3)
+    assert room_count(replace(scene, points=here)) >= 1.0
+
+
+def test_a_row_of_rooms_may_have_more_gaussians_than_one():
+    """With as many points and views, the row begins with more of them."""
+    row = scene_of("room_chain", 5)
+    near = row.train[0].center
+    one = replace(row, points=near + 0.3 * torch.nn.functional.normalize(row.points - near, dim=-1))
+    method = PlusMethod(PlusOptions(sky_per_point=0.0, depth_init_per_pixel=0.0))
+    starts = [len(method.build_model(scene, 100).splats) for scene in (one, row)]
+    assert starts[1] == pytest.approx(room_count(row) * starts[0], rel=0.01)

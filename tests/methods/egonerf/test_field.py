@@ -1,0 +1,371 @@
+"""The radiance field of EgoNeRF, its environment map and its constants by surroundings."""
+
+import math
+from dataclasses import replace
+from time import process_time
+from typing import Any
+
+import pytest
+import torch
+from composed import composed
+from tiny_scene import tiny_scene
+from torch.nn.functional import normalize, softplus
+
+from padgs.data.synthetic import SyntheticOptions, generate
+from padgs.geometry.camera import Pinhole, RayTable
+from padgs.methods.egonerf.field import EgoNeRF, EnvironmentMap, cloud_reach, surroundings_of
+from padgs.methods.egonerf.options import Constants, EgoNeRFOptions
+from padgs.runs.run import build_method
+from padgs.scene import Scene, View
+from padgs.training.options import Budget
+
+SMALL = EgoNeRFOptions(
+    radial_nodes=16,
+    polar_nodes=8,
+    azimuth_nodes=24,
+    density_components=4,
+    appearance_components=4,
+    features=6,
+    hidden=16,
+    coarse_samples=24,
+    fine_samples=24,
+    surroundings="outdoor",
+    distance_scale=125.0,
+    near=0.05,
+    far=8.0,
+    first_radius=0.05,
+    environment_height=8,
+)
+
+
+def dense(options: EgoNeRFOptions = SMALL, scene: Scene | None = None) -> EgoNeRF:
+    """A model of which rays see something: its fields are strong instead of nearly empty."""
+    model = EgoNeRF.from_scene(scene or tiny_scene(), options, seed=3)
+    with torch.no_grad():
+        for factor in model.density.parameters():
+            factor.mul_(10)
+        model.shader.basis.mul_(30)
+    return model
+
+
+def rays(count: int, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
+    origins = 0.2 * torch.randn(count, 3, generator=generator)
+    return origins, normalize(torch.randn(count, 3, generator=generator), dim=-1)
+
+
+def moved(scene: Scene, scale: float) -> Scene:
+    """The same scene in other units of length."""
+
+    def scaled(view: View) -> View:
+        pose = view.cam_from_world.clone()
+        pose[:3, 3] *= scale
+        return replace(view, cam_from_world=pose)
+
+    views = {part: tuple(scaled(view) for view in getattr(scene, part)) for part in ("train", "test")}
+    return replace(scene, points=scene.points * scale, **views)
+
+
+def test_the_defaults_have_the_published_number_of_parameters():
+    """Per chart (150 x 172 + 150 x 516 + 172 x 516 + 150 + 172 + 516) x 64 values of the grids."""
+    with torch.device("meta"):
+        model = EgoNeRF(EgoNeRFOptions(), torch.zeros(3, device="cpu"), 1.0, 1.0, "outdoor")
+    grids = sum(p.numel() for part in (model.density, model.appearance) for p in part.parameters())
+    assert grids == 2 * 64 * (150 * 172 + 150 * 516 + 172 * 516 + 150 + 172 + 516)
+    assert 12.2e6 < grids / 2 < 12.4e6
+    assert model.environment is not None and model.environment.emission.numel() == 3 * 1920 * 3840
+    assert 46e6 < sum(p.numel() for p in model.parameters()) < 47.5e6
+
+
+@pytest.mark.parametrize(
+    ("surroundings", "unit", "published"),
+    [("outdoor", 5.0, (-10.0, 25.0, 0.1, 300.0, 0.05, True)), ("indoor", 2.5, (-8.0, 25.0, 0.01, 15.0, 0.03, False))],
+)
+def test_the_defaults_are_the_published_model_of_a_scene_of_some_unit(generator, surroundings, unit, published):
+    """Lengths are published in units of the data; the optical depth of a length is the same, too."""
+    world = tiny_scene()
+    world = moved(world, unit / world.scale)
+    assert world.scale == pytest.approx(unit)
+    free = dict.fromkeys(Constants._fields)
+    ours, theirs = (
+        dense(replace(SMALL, **free, surroundings=surroundings, length_unit=unit_of_lengths), world)
+        for unit_of_lengths in ("scene", "world")
+    )
+    assert theirs.constants == published
+    origins, directions = rays(50, generator)  # positions inside are in the model's unit
+    seen = [ours.trace(origins, directions), theirs.trace(unit * origins, directions)]
+    assert 0.01 < seen[0].transmittance.mean() < 0.95
+    assert torch.allclose(seen[0].transmittance, seen[1].transmittance, rtol=1e-3, atol=1e-5)
+    assert torch.allclose(seen[0].color, seen[1].color, atol=1e-4)
+
+
+def test_a_field_of_constant_density_absorbs_as_the_formula_says(generator):
+    """All factors zero: density = softplus(shift) everywhere, from the first sample on."""
+    model = dense(replace(SMALL, density_shift=-3.0, environment=False))
+    with torch.no_grad():
+        for factor in model.density.parameters():
+            factor.zero_()
+    origins, directions = rays(20, generator)
+    seen = model.trace(origins, directions)
+    distances = model._sample(origins, directions, None)
+    length = distances[:, -1] - distances[:, 0] + (distances[:, -1] - distances[:, -2])
+    expected = torch.exp(-softplus(torch.tensor(-3.0)) * model.constants.distance_scale * length)
+    assert torch.allclose(seen.transmittance, expected, rtol=1e-3, atol=1e-12)
+
+
+def test_nothing_but_the_environment_is_seen_through_nothing(generator):
+    model = dense(replace(SMALL, density_shift=-200.0))
+    with torch.no_grad():
+        for factor in model.density.parameters():
+            factor.zero_()
+    origins, directions = rays(20, generator)
+    seen = model.trace(origins, directions)
+    assert model.environment is not None
+    assert torch.allclose(seen.color, model.environment(directions), atol=1e-6)
+    assert torch.equal(seen.transmittance, torch.ones(20)) and (seen.depth == 0).all()
+
+
+def test_without_an_environment_black_lies_behind(generator):
+    options = replace(SMALL, environment=False, density_shift=-200.0)
+    assert EgoNeRF.from_scene(tiny_scene(), options).environment is None
+    model = dense(options)
+    with torch.no_grad():
+        for factor in model.density.parameters():
+            factor.zero_()
+    assert model.trace(*rays(20, generator)).color.abs().max() < 1e-6
+
+
+def test_samples_start_at_near_reach_far_and_increase(generator):
+    model = dense()
+    origins, directions = rays(50, generator)
+    distances = model._sample(origins, directions, generator)
+    assert distances.shape == (50, 48) and (distances.diff(dim=-1) >= 0).all()
+    still = model._sample(origins, directions, None)
+    assert (
+        torch.equal(still[:, 0], torch.full((50,), model.constants.near))
+        and (still[:, -1] >= model.constants.far - 1e-4).all()
+    )
+
+
+def test_fine_samples_gather_at_a_shell(generator):
+    """Density in one radial node only: half the samples are drawn to it."""
+    model = dense()
+    with torch.no_grad():
+        for factor in model.density.parameters():
+            factor.zero_()
+        model.density.planes[2].fill_(3.0)  # polar x azimuth, whose line runs along the radius
+        model.density.lines[2][:, :, 8:10] = 3.0
+    nodes = model.get_buffer("nodes")
+    directions = normalize(torch.randn(50, 3, generator=generator), dim=-1)
+    distances = model._sample(torch.zeros(50, 3), directions, None)
+    near_shell = (distances > nodes[5]) & (distances < nodes[12])
+    assert near_shell.float().sum(-1).min() > 24
+
+
+def test_any_camera_sees_what_lies_in_its_directions():
+    """A table of the panorama's own rays gives the panorama; a pinhole's middle is the panorama's."""
+    scene, model = tiny_scene(), dense()
+    view = scene.test[0]
+    panorama = model.render(view)
+    table = RayTable(view.camera.rays(), view.camera.focal)
+    assert torch.equal(model.render(replace(view, lens=table)).image, panorama.image)
+    forward = Pinhole(3, 3, 50.0, 50.0, 1.5, 1.5)
+    middle = model.render(replace(view, width=3, height=3, lens=forward)).image[1, 1]
+    origin = model.from_world(view.center)[None]
+    along = view.cam_from_world[2:3, :3].float()
+    assert torch.allclose(middle, model.trace(origin, along).color[0], atol=1e-5)
+
+
+def test_a_rendering_has_depth_in_world_units_and_residual_transmittance():
+    scene, model = tiny_scene(), dense()
+    view = scene.test[0]
+    rendering = model.render(view)
+    assert rendering.depth.shape == rendering.transmittance.shape == (view.height, view.width)
+    assert ((rendering.transmittance >= 0) & (rendering.transmittance <= 1)).all()
+    seen = rendering.transmittance < 0.5
+    assert seen.any() and (rendering.depth[seen] >= model.constants.near * model.unit * 0.99).all()
+    assert rendering.depth.max() <= model.get_buffer("distances")[-1] * model.unit * 1.01
+    assert len(rendering.visible) == 0 and rendering.counters["rays"] == view.width * view.height
+
+
+def test_memory_in_smaller_passes_changes_nothing():
+    scene = tiny_scene()
+    whole, parts = dense(), dense(replace(SMALL, samples_at_once=48 * 7))
+    view = scene.test[0]
+    assert torch.allclose(whole.render(view).image, parts.render(view).image, atol=1e-6)
+
+
+def test_faint_samples_may_go_unshaded():
+    scene, view = tiny_scene(), tiny_scene().test[0]
+    full, quick = dense(scene=scene), dense(replace(SMALL, min_weight=1e-3), scene)
+    difference = (full.render(view).image - quick.render(view).image).abs().max()
+    assert 0 < difference <= SMALL.samples * 1e-3
+
+
+@pytest.mark.parametrize("scale", [0.01, 100.0])
+def test_the_units_of_the_world_do_not_matter(scale):
+    scene = tiny_scene()
+    other = moved(scene, scale)
+    plain, scaled = dense(scene=scene), dense(scene=other)
+    assert scaled.unit == pytest.approx(scale * plain.unit)
+    a, b = plain.render(scene.test[0]), scaled.render(other.test[0])
+    assert torch.allclose(a.image, b.image, atol=1e-4)
+    assert torch.allclose(a.depth * scale, b.depth, rtol=1e-3)
+
+
+def test_in_world_units_lengths_are_taken_as_they_stand():
+    model = EgoNeRF.from_scene(moved(tiny_scene(), 100.0), replace(SMALL, length_unit="world"))
+    assert model.unit == 1.0 and model.travel > 20
+
+
+def test_the_centre_is_the_mean_of_the_training_cameras():
+    scene = tiny_scene()
+    model = EgoNeRF.from_scene(scene, SMALL)
+    centers = torch.stack([view.center for view in scene.train])
+    assert torch.allclose(model.centre, centers.mean(0))
+    assert model.travel * model.unit == pytest.approx((centers - centers.mean(0)).norm(dim=-1).max().item())
+
+
+def test_gradients_reach_every_parameter(generator):
+    model = dense()
+    model.trace(*rays(200, generator), generator).color.square().sum().backward()
+    for name, parameter in model.named_parameters():
+        assert parameter.grad is not None and parameter.grad.abs().sum() > 0, name
+
+
+def test_gradients_of_colours(generator):
+    """float64, through absorption, shading and environment; the samples themselves are not differentiated."""
+    model = dense().double()
+    origins, directions = rays(2, generator)
+    names = ["density.planes.2", "density.lines.2", "shader.basis", "shader.network.0.weight", "environment.emission"]
+    own = dict(model.named_parameters())
+    distances = model._sample(origins.double(), directions.double(), None)
+    model._sample = lambda *_: distances  # type: ignore[method-assign]
+
+    def color(*values: torch.Tensor) -> torch.Tensor:
+        parameters = {**own, **dict(zip(names, values, strict=True))}
+        return torch.func.functional_call(Traced(model), {f"model.{n}": p for n, p in parameters.items()}, args)
+
+    args = (origins.double(), directions.double())
+    assert torch.autograd.gradcheck(color, tuple(own[name] for name in names), fast_mode=True)
+
+
+class Traced(torch.nn.Module):
+    """`trace` as the forward of a module."""
+
+    def __init__(self, model: EgoNeRF) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(self, origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
+        return self.model.trace(origins, directions).color
+
+
+@pytest.mark.parametrize(
+    "changes, reason",
+    [
+        ({"polar_nodes": 9}, "polar_nodes is 9; it must be even"),
+        ({"length_unit": "km"}, "unknown length_unit 'km'; known: scene, world"),
+        ({"near": 0.0}, "near is 0.0"),
+        ({"far": 0.06}, "far - near larger than first_radius"),
+        ({"samples_at_once": 10}, "less than the 48 of a single ray"),
+        ({"hidden": 0}, "hidden is 0; it must be at least 1"),
+        ({"coarse_samples": 3}, "coarse_samples is 3 and fine_samples 24"),
+    ],
+)
+def test_options_that_make_no_model_are_named(changes, reason):
+    with pytest.raises(ValueError, match=reason):
+        replace(SMALL, **changes)
+
+
+@pytest.mark.slow
+def test_the_small_setting_keeps_its_promises_of_time(monkeypatch, root):
+    """500 steps of 1024 rays in 3 minutes and 256x128 in 20 s on 2 cores: twice that in processor time."""
+    monkeypatch.setenv("PADGS_ROOT", str(root))
+    scene, small = tiny_scene(), build_method(composed("method=egonerf_small"))
+    records = small.fit(scene, Budget(500))
+    for _ in range(5):
+        next(records)
+    start = process_time()
+    for _ in range(20):
+        next(records)
+    assert (process_time() - start) * 500 / 20 < 2 * 180  # measured: 135
+    start = process_time()
+    small.render(replace(scene.test[0], width=256, height=128))
+    assert process_time() - start < 2 * 20  # measured: 4.7
+
+
+HEIGHT = 6
+
+
+@pytest.fixture
+def environment() -> EnvironmentMap:
+    torch.manual_seed(1)
+    return EnvironmentMap(HEIGHT).double()
+
+
+def towards(z: torch.Tensor, azimuth: torch.Tensor) -> torch.Tensor:
+    across = torch.sqrt(1 - z * z)
+    return torch.stack((across * torch.cos(azimuth), across * torch.sin(azimuth), z), dim=-1)
+
+
+def test_a_direction_through_the_centre_of_a_texel_sees_it_alone(environment):
+    row, column = (part.flatten() for part in torch.meshgrid(torch.arange(6), torch.arange(12), indexing="ij"))
+    z = (2 * row.double() + 1) / HEIGHT - 1
+    seen = environment(towards(z, ((2 * column.double() + 1) / (2 * HEIGHT) - 1) * math.pi))
+    assert torch.allclose(seen, torch.sigmoid(environment.emission[:, row, column].T))
+
+
+def test_all_texels_count_for_the_same_solid_angle(environment, generator):
+    """Each texel's share in random directions, as the gradient of their sum tells it (before the sigmoid)."""
+    count = 200_000
+    directions = normalize(torch.randn(count, 3, dtype=torch.float64, generator=generator), dim=-1)
+    with torch.no_grad():
+        environment.emission.zero_()  # the sigmoid has slope 1/4 everywhere
+    environment(directions).sum().backward()
+    share = environment.emission.grad * 4 / count * (2 * HEIGHT**2)
+    assert share.sum().item() / (2 * HEIGHT**2 * 3) == pytest.approx(1)
+    assert (share - 1).abs().max() < 0.08  # 4 standard deviations of the sampling
+
+
+def test_nothing_jumps_at_180_degrees(environment):
+    z = torch.linspace(-0.99, 0.99, 50, dtype=torch.float64)
+    left, right = (environment(towards(z, torch.full_like(z, side * (math.pi - 1e-9)))) for side in (-1, 1))
+    assert torch.allclose(left, right, atol=1e-7)
+
+
+def test_poles_are_finite(environment):
+    seen = environment(torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]], dtype=torch.float64))
+    assert ((seen > 0) & (seen < 1)).all()
+
+
+TINY: dict[str, Any] = {"width": 32, "train_views": 4, "test_views": 1, "samples": 1, "points": 600}
+
+
+@pytest.mark.parametrize(("scene", "kind"), [("room", "indoor"), ("outdoor", "outdoor")])
+def test_rooms_and_the_open_are_told_apart_in_any_unit(tmp_path, monkeypatch, scene, kind):
+    monkeypatch.setenv("PADGS_CACHE", str(tmp_path))
+    found = [generate(SyntheticOptions(scene, **TINY, world_scale=scale)) for scale in (1.0, 100.0)]
+    assert [surroundings_of(one) for one in found] == [kind, kind]
+    assert cloud_reach(found[1]) == pytest.approx(cloud_reach(found[0]), rel=1e-3)
+
+
+def test_a_few_points_behind_the_walls_make_no_outdoors():
+    shell = torch.nn.functional.normalize(torch.randn(1000, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    scene = tiny_scene()
+    still: View = replace(scene.train[0], cam_from_world=torch.eye(4, dtype=torch.float64))
+    for outliers, kind in ((30, "indoor"), (80, "outdoor")):
+        points = shell.clone()
+        points[:outliers] *= 50
+        assert surroundings_of(replace(scene, train=(still,), points=points)) == kind
+
+
+def test_what_is_given_comes_before_what_the_surroundings_say():
+    small: dict[str, Any] = {"radial_nodes": 4, "polar_nodes": 4, "azimuth_nodes": 4, "environment_height": 4}
+    chosen = EgoNeRF.from_scene(tiny_scene(), EgoNeRFOptions(**small))
+    assert chosen.kind == surroundings_of(tiny_scene())
+    options = EgoNeRFOptions(**small, surroundings="indoor", far=7.0, environment=True)
+    model = EgoNeRF.from_scene(tiny_scene(), options)
+    assert model.kind == "indoor" and model.environment is not None
+    assert (model.constants.far, model.constants.density_shift) == (7.0, -8.0)
+    with pytest.raises(ValueError, match="unknown surroundings 'cellar'; known: auto, outdoor, indoor"):
+        EgoNeRFOptions(surroundings="cellar")

@@ -1,0 +1,213 @@
+"""Charts, radial nodes, and planes times lines of EgoNeRF."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch.autograd import gradcheck
+from torch.nn.functional import normalize
+
+from padgs.methods.egonerf.grids import (
+    MODES,
+    YANG,
+    YIN,
+    ChartPosition,
+    Factors,
+    GridPosition,
+    PlaneLines,
+    density_feature,
+    direction,
+    exponential_nodes,
+    grid_position,
+    locate,
+    node_fraction,
+    products,
+    swapped,
+)
+
+YIN_SHARE = math.sqrt(2) * 1.5 * math.pi / (4 * math.pi)  # 2 sin(pi/4) x 3 pi/2 of the 4 pi
+
+
+@pytest.fixture
+def directions(generator) -> torch.Tensor:
+    return normalize(torch.randn(100_000, 3, dtype=torch.float64, generator=generator), dim=-1)
+
+
+def in_yin(directions: torch.Tensor) -> torch.Tensor:
+    """The definition, by angles."""
+    x, y, z = directions.unbind(-1)
+    polar, azimuth = torch.acos(z), torch.atan2(y, x)
+    return (polar >= math.pi / 4) & (polar <= 3 * math.pi / 4) & (azimuth.abs() <= 3 * math.pi / 4)
+
+
+def test_every_direction_has_one_chart_and_the_charts_share_the_sphere_as_their_areas_do(directions):
+    chart = locate(directions).chart
+    assert torch.equal(chart == YIN, in_yin(directions))
+    assert ((chart == YIN) | (chart == YANG)).all()
+    share = (chart == YIN).double().mean().item()
+    assert share == pytest.approx(YIN_SHARE, abs=4 * math.sqrt(0.25 / len(directions)))
+
+
+def test_what_is_not_yin_fits_into_the_chart_of_yang(directions):
+    """So nothing has to be clamped: the two charts cover the sphere."""
+    assert in_yin(swapped(directions[~in_yin(directions)])).all()
+
+
+def test_places_and_directions_are_inverse(directions):
+    assert torch.allclose(direction(locate(directions)), directions, atol=1e-12)
+    assert torch.allclose(direction(locate(directions * 7.5)), directions, atol=1e-12), "length does not matter"
+
+
+def test_neither_chart_has_a_pole(directions):
+    """An equal step in a chart's azimuth is never shorter on the sphere than 1 / sqrt 2 of one at its equator."""
+    place = locate(directions)
+    step = 1e-6
+    moved = direction(ChartPosition(place.chart, place.polar, place.azimuth - step))
+    per_step = (moved - directions).norm(dim=-1) / (step * 1.5 * math.pi)
+    assert per_step.min() > 1 / math.sqrt(2) - 1e-6 and per_step.max() < 1 + 1e-6
+
+
+def test_the_axes_are_where_they_belong():
+    axes = torch.cat((torch.eye(3), -torch.eye(3))).double()
+    assert locate(axes).chart.tolist() == [YIN, YIN, YANG, YANG, YIN, YANG]
+
+
+def test_the_centre_itself_is_somewhere():
+    place = locate(torch.zeros(1, 3))
+    assert all(0 <= value <= 1 for value in (place.polar.item(), place.azimuth.item()))
+
+
+@given(first=st.floats(1e-4, 0.5), factor=st.floats(1.5, 1e5), count=st.integers(3, 300))
+def test_nodes_grow_with_no_interval_shorter_than_the_first(first, factor, count):
+    nodes = exponential_nodes(first, first * factor, count)
+    assert len(nodes) == count and nodes[0] == 0
+    assert nodes[1].item() == pytest.approx(first)
+    assert (nodes.diff() >= first * (1 - 1e-12)).all()
+    assert (nodes.diff().diff() >= -1e-9 * nodes[-1]).all(), "intervals never shrink"
+    assert nodes[-1] >= first * factor * (1 - 1e-9)
+
+
+def test_behind_the_threshold_the_series_is_geometric_and_only_shifted():
+    first, last, count = 0.05, 520.0, 150
+    ratio = (last / first) ** (1 / (count - 2))
+    geometric = torch.cat((torch.zeros(1), first * ratio ** torch.arange(count - 1.0))).double()
+    nodes = exponential_nodes(first, last, count)
+    far = geometric.diff() > first
+    assert 10 < int((~far).sum()) < 60
+    assert torch.allclose(nodes.diff()[far], geometric.diff()[far], rtol=1e-4)
+    assert torch.allclose(nodes.diff()[~far], torch.tensor(first, dtype=torch.float64))
+
+
+def test_places_are_exact_at_nodes_linear_between_and_continuous():
+    nodes = exponential_nodes(0.1, 50.0, 24)
+    steps = torch.arange(24, dtype=torch.float64) / 23
+    assert torch.allclose(node_fraction(nodes, nodes), steps, atol=1e-14)
+    between = 0.25 * nodes[:-1] + 0.75 * nodes[1:]
+    assert torch.allclose(node_fraction(between, nodes), steps[:-1] + 0.75 / 23, atol=1e-14)
+    assert torch.allclose(node_fraction(nodes[1:-1] * (1 - 1e-12), nodes), steps[1:-1], atol=1e-10)
+
+
+def test_places_are_monotone_and_end_at_the_last_node():
+    nodes = exponential_nodes(0.1, 50.0, 24)
+    radii = torch.linspace(0, 80, 10_001, dtype=torch.float64)
+    places = node_fraction(radii, nodes)
+    inside = radii < nodes[-1]
+    assert (places.diff()[inside[1:]] > 0).all()
+    assert (places[~inside] == 1).all()
+
+
+def test_lengths_that_do_not_grow_are_refused():
+    with pytest.raises(ValueError, match="the first radius is 2.0 and the last 1.0"):
+        exponential_nodes(2.0, 1.0, 10)
+    with pytest.raises(ValueError, match="2 radial nodes are too few"):
+        exponential_nodes(1.0, 2.0, 2)
+
+
+SHAPE = {"radius": 6, "polar": 4, "azimuth": 8}
+
+
+@pytest.fixture
+def grids() -> PlaneLines:
+    torch.manual_seed(5)
+    return PlaneLines(3, SHAPE, scale=1.0).double()
+
+
+def places(count: int, generator: torch.Generator) -> GridPosition:
+    chart = torch.randint(2, (count,), generator=generator)
+    radius, polar, azimuth = torch.rand(3, count, dtype=torch.float64, generator=generator)
+    return GridPosition(chart, radius, polar, azimuth)
+
+
+def interpolated(factor: torch.Tensor, at: GridPosition, axes: tuple[str, ...]) -> torch.Tensor:
+    """Multilinear interpolation of [C, 2, ...] one point at a time, by its definition."""
+    values = []
+    for index in range(len(at.chart)):
+        value = factor[:, at.chart[index]]
+        for axis in axes:
+            place = getattr(at, axis)[index] * (value.shape[1] - 1)
+            low = min(int(place), value.shape[1] - 2)
+            value = value[:, low] * (low + 1 - place) + value[:, low + 1] * (place - low)
+        values.append(value)
+    return torch.stack(values, dim=-1)
+
+
+def test_products_are_interpolated_planes_times_lines(grids, generator):
+    at, factors = places(50, generator), grids.factors()
+    found = products(factors, at)
+    for (axes, along), plane, line, product in zip(MODES, factors.planes, factors.lines, found, strict=True):
+        assert torch.allclose(product, interpolated(plane, at, axes) * interpolated(line, at, (along,)), atol=1e-12)
+
+
+def test_density_is_the_sum_over_modes_of_rectified_sums(grids, generator):
+    at = places(50, generator)
+    expected = sum(product.sum(0).clamp(min=0) for product in products(grids.factors(), at))
+    assert torch.allclose(density_feature(grids.factors(), at), expected)
+
+
+@pytest.mark.parametrize("chart", [YIN, YANG])
+def test_a_chart_reads_nothing_of_the_other(grids, generator, chart):
+    at = places(200, generator)
+    with torch.no_grad():
+        for factor in grids.parameters():
+            factor[:, 1 - chart] = 1e6
+    edge = at._replace(chart=torch.full_like(at.chart, chart), polar=at.polar.round(), azimuth=at.azimuth.round())
+    assert torch.stack(products(grids.factors(), edge)).abs().max() < 1e3
+
+
+def test_gradients_of_the_look_up(grids, generator):
+    at = places(12, generator)
+    parameters = tuple(grids.factors().planes) + tuple(grids.factors().lines)
+
+    def field(*tensors: torch.Tensor) -> torch.Tensor:
+        factors = Factors(tensors[:3], tensors[3:])
+        return torch.cat([density_feature(factors, at), *(product.flatten() for product in products(factors, at))])
+
+    assert gradcheck(field, parameters)
+
+
+def test_the_coarse_grid_is_half_as_fine_and_has_the_same_means(grids):
+    coarse = grids.coarse()
+    for fine, half in zip((*grids.planes, *grids.lines), (*coarse.planes, *coarse.lines), strict=True):
+        assert all(b * 2 == a for a, b in zip(fine.shape[2:], half.shape[2:], strict=True))
+        axes = tuple(range(2, fine.ndim))
+        assert torch.allclose(fine.mean(axes), half.mean(axes)), "each chart and component by itself"
+
+
+def test_variation_is_the_published_sum_over_charts(grids):
+    def of_chart(plane: torch.Tensor) -> torch.Tensor:
+        components, rows, columns = plane.shape
+        down = (plane[:, 1:] - plane[:, :-1]).square().sum() / (components * (rows - 1) * columns)
+        along = (plane[:, :, 1:] - plane[:, :, :-1]).square().sum() / (components * rows * (columns - 1))
+        return 2 * (down + along)
+
+    expected = sum(of_chart(plane[:, chart]) for plane in grids.planes for chart in (YIN, YANG))
+    assert torch.allclose(grids.variation(), expected)
+
+
+def test_points_are_found_by_distance_and_direction(generator):
+    nodes = exponential_nodes(0.1, 20.0, 6)
+    directions = normalize(torch.randn(100, 3, dtype=torch.float64, generator=generator), dim=-1)
+    at = grid_position(directions * nodes[3], nodes)
+    assert torch.allclose(at.radius, torch.full_like(at.radius, 3 / 5))

@@ -1,0 +1,154 @@
+"""Rays of training pixels, samples along rays, and weights of intervals."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from tiny_scene import tiny_scene
+
+from padgs.geometry.camera import Pinhole
+from padgs.methods.egonerf.rays import RayPixels, interval_lengths, inverse_cdf, jittered, refined, visible_shares
+from padgs.scene import View
+
+
+@pytest.fixture
+def views() -> tuple[View, ...]:
+    """Panoramas that look in several directions, and a perspective picture among them."""
+    first, second, third, *_ = tiny_scene().train
+    turn = torch.tensor([[0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)
+    pixels = torch.arange(6 * 8 * 3, dtype=torch.uint8).reshape(6, 8, 3)
+    lens = Pinhole(8, 6, 5.0, 5.0, 4.0, 3.0)
+    photo = View("photo", turn @ third.cam_from_world, 8, 6, lambda: pixels, lens=lens)
+    return first, replace(second, cam_from_world=turn @ second.cam_from_world), photo
+
+
+def masked(view: View, mask: torch.Tensor) -> View:
+    return replace(view, load_mask=lambda: mask)
+
+
+def test_every_pixel_is_the_ray_of_its_own_view(views):
+    pixels = RayPixels(views)
+    start = 0
+    for view in views:
+        count = view.width * view.height
+        rays = pixels.at(torch.arange(start, start + count))
+        assert torch.equal(rays.color, view.image().reshape(-1, 3))
+        assert torch.allclose(rays.origins, view.center.expand(count, 3))
+        seen = rays.directions.double() @ view.cam_from_world[:3, :3].T
+        assert torch.allclose(seen, view.camera.rays(dtype=torch.float64).reshape(-1, 3), atol=1e-6)
+        start += count
+    assert len(pixels) == start
+
+
+def test_pixels_are_drawn_uniformly_over_all_views(views):
+    rays = RayPixels(views).draw(50_000)
+    in_photo = (rays.origins == views[2].center).all(-1).double().mean().item()
+    assert in_photo == pytest.approx(48 / (48 + 2 * 512), abs=0.004)
+    up = (rays.directions[:, 1] < -0.9).double().mean().item()
+    assert up > 1.5 * 0.05, "over pixels, not over the sphere, of which that is a twentieth"
+    assert torch.equal(rays.weight, torch.ones(50_000))
+
+
+def test_masked_pixels_are_never_drawn_and_others_weigh_as_the_mask_says(views):
+    mask = torch.ones(16, 32)
+    mask[:8], mask[8] = 0, 0.25
+    pixels = RayPixels([masked(views[0], mask)])
+    assert len(pixels) == 8 * 32
+    rays = pixels.draw(5000)
+    assert (rays.directions[:, 1] > 0).all(), "the upper half is masked"
+    assert set(rays.weight.tolist()) == {0.25, 1.0}
+
+
+def test_rows_may_weigh_by_solid_angle(views):
+    rays = RayPixels([views[0]], "solid_angle").draw(1000)
+    assert torch.allclose(rays.weight, rays.directions[:, [0, 2]].norm(dim=-1), atol=1e-5)
+
+
+def test_views_without_use_are_named(views):
+    with pytest.raises(ValueError, match="view '00': the mask is 0 everywhere"):
+        RayPixels([masked(views[0], torch.zeros(16, 32))])
+    with pytest.raises(ValueError, match="image of view '00' is 32x16; the view is 64x32"):
+        RayPixels([replace(views[0], width=64, height=32)])
+
+
+def test_quantiles_of_an_exponential_density():
+    """Density exp(-x) on [0, 8], cut finely: the quantile of share u is -log(1 - u (1 - exp(-8)))."""
+    edges = torch.linspace(0, 8, 20_001, dtype=torch.float64)[None]
+    weights = torch.exp(-edges[:, :-1]) - torch.exp(-edges[:, 1:])
+    shares = torch.linspace(0.001, 0.999, 500, dtype=torch.float64)[None]
+    exact = -torch.log1p(-shares * (1 - torch.exp(torch.tensor(-8.0, dtype=torch.float64))))
+    assert torch.allclose(inverse_cdf(edges, weights, shares), exact, atol=2e-5)
+
+
+def test_quantiles_of_pieces_are_exact_and_at_the_ends_the_ends(generator):
+    edges = torch.tensor([[1.0, 2.0, 4.0, 5.0], [0.0, 1.0, 2.0, 3.0]], dtype=torch.float64)
+    weights = torch.tensor([[1.0, 2.0, 1.0], [1e-12, 1.0, 1e-12]], dtype=torch.float64)
+    shares = torch.tensor([0.0, 0.25, 0.5, 0.75, 1.0], dtype=torch.float64).expand(2, 5)
+    found = inverse_cdf(edges, weights, shares)
+    assert torch.allclose(found[0], torch.tensor([1.0, 2.0, 3.0, 4.0, 5.0], dtype=torch.float64))
+    assert torch.allclose(found[1, 1:4], torch.tensor([1.25, 1.5, 1.75], dtype=torch.float64))
+    random = torch.rand(2, 1000, dtype=torch.float64, generator=generator).sort(dim=-1).values
+    assert (inverse_cdf(edges, weights, random).diff(dim=-1) >= 0).all()
+
+
+def test_refined_samples_gather_where_the_weight_is():
+    distances = torch.arange(1.0, 11.0)[None]
+    weights = torch.zeros(1, 10)
+    weights[0, 4] = 1.0  # at distance 5
+    found = refined(distances, weights, torch.linspace(0.01, 0.99, 50)[None])
+    assert ((found >= 4.5) & (found <= 5.5)).all()
+
+
+def test_a_ray_through_nothing_is_sampled_everywhere():
+    distances = torch.arange(1.0, 11.0)[None]
+    found = refined(distances, torch.zeros(1, 10), torch.linspace(0, 1, 9)[None])
+    assert torch.allclose(found, torch.linspace(1.5, 9.5, 9)[None])
+
+
+def test_jitter_stays_within_the_interval(generator):
+    distances = torch.tensor([1.0, 2.0, 4.0, 8.0]).expand(100, 4)
+    moved = jittered(distances, torch.rand(100, 4, generator=generator))
+    assert ((moved >= distances) & (moved <= distances + interval_lengths(distances))).all()
+    assert (moved.diff(dim=-1) > 0).all()
+
+
+DENSITY = 0.7
+
+
+def test_shares_and_residual_are_one(generator):
+    depths = torch.rand(1000, 40, generator=generator) ** 8 * 20
+    weights, residual = visible_shares(depths)
+    assert (weights >= 0).all() and (residual >= 0).all()
+    assert torch.allclose(weights.sum(-1) + residual, torch.ones(1000), atol=2e-6)
+
+
+def test_a_medium_of_constant_density_is_exact_however_it_is_cut(generator):
+    """What comes from the first length s is 1 - exp(-density s)."""
+    lengths = torch.rand(30, dtype=torch.float64, generator=generator)
+    weights, residual = visible_shares(DENSITY * lengths)
+    assert torch.allclose(weights.cumsum(0), 1 - torch.exp(-DENSITY * lengths.cumsum(0)), atol=1e-14)
+    assert torch.allclose(residual, torch.exp(-DENSITY * lengths.sum()))
+
+
+def test_a_slab_is_seen_through_the_empty_space_before_it():
+    depths = torch.zeros(50, dtype=torch.float64)
+    depths[20:30] = DENSITY * 0.1
+    weights, residual = visible_shares(depths)
+    assert weights[:20].sum() == 0 and weights[30:].sum() == 0
+    assert torch.allclose(weights.sum(), 1 - torch.exp(torch.tensor(-DENSITY, dtype=torch.float64)))
+    assert torch.allclose(residual, torch.exp(torch.tensor(-DENSITY, dtype=torch.float64)))
+
+
+def test_opaque_and_empty_media():
+    weights, residual = visible_shares(torch.tensor([[0.0, 0.0, 0.0], [0.0, 1e4, 5.0]]))
+    assert weights.tolist() == [[0, 0, 0], [0, 1, 0]] and residual.tolist() == [1, 0]
+
+
+def test_faint_media_keep_their_digits():
+    weights, _ = visible_shares(torch.full((4,), 1e-9))
+    assert torch.allclose(weights, torch.full((4,), 1e-9), rtol=1e-6)
+
+
+def test_gradients(generator):
+    depths = torch.rand(3, 5, dtype=torch.float64, generator=generator, requires_grad=True)
+    assert torch.autograd.gradcheck(visible_shares, depths)
