@@ -1,4 +1,4 @@
-"""The builder of all tables in `padgs.reports.specs`."""
+"""Builder of the tables in `padgs.reports.specs`."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def table(run_set: RunSet, name: str) -> Table:
     """Return the table of a name in `SPECS`.
 
     Raises:
-        ReportError: results that must not stand together.
+        ReportError: runs must not be compared, or are mixed in a cell.
     """
     return (_Pivot if SPECS[name].pivot else _Builder)(run_set, name).build()
 
@@ -54,7 +54,7 @@ class _Builder:
         measures = self.spec.measures(self.request.protocol)
         self.measures = [measure for measure in measures if measure.name in known or measure.name not in IF_KNOWN]
         self.shown: dict[str, DataFrame] = {}  # title of a block -> its runs
-        self.aside: list[Mapping[str, Reason]] = []  # presets that are not ranked, of each block
+        self.unranked: list[Mapping[str, Reason]] = []  # presets that are not ranked, of each block
 
     def build(self) -> Table:
         blocks: dict[str, list[Block]] = {dataset: [] for dataset in self.spec.paper if self.spec.averages}
@@ -73,7 +73,7 @@ class _Builder:
         if self.paper:
             delta = "; Δ = ours - paper" if any(measure.difference for measure in self.measures) else ""
             notes.append(f"Columns 'paper': published numbers, from one RTX 3090 Ti{delta}.")
-        notes += [*unranked_notes(self.aside), *filter(None, [self.spec.difference]), *self.spec.notes]
+        notes += [*unranked_notes(self.unranked), *filter(None, [self.spec.difference]), *self.spec.notes]
         all_blocks = tuple(block for of in blocks.values() for block in of)
         return Table(self.name, self.spec.title, self.spec.corner, self._columns(), all_blocks, tuple(notes))
 
@@ -96,30 +96,27 @@ class _Builder:
         if not spec.blocks:
             for place, runs in {**dict.fromkeys(spec.always, self.runs.iloc[:0]), **by_place(self.runs)}.items():
                 yield place.title, place, runs
+            return
         for experiment in REPORTS[self.name].experiments if spec.by_experiment else ("",):
-            own = self.runs.loc[
-                [not experiment or experiment in map(experiment_of, of) for of in self.runs["experiments"]]
-            ]
-            for title, runs in by_conditions(own, *spec.blocks).items() if spec.blocks and len(own) else ():
+            names = self.runs["experiments"]
+            own = self.runs.loc[[not experiment or experiment in map(experiment_of, of) for of in names]]
+            for title, runs in by_conditions(own, *spec.blocks).items():
                 yield f"{experiment}: {title}" if experiment else title, runs["place"].iloc[0], runs
 
     def _blocks(self, title: str, place: Place, runs: DataFrame) -> Iterator[Block]:
         spec = self.spec
         if spec.equal_images is not None:
-            self.aside.append(unranked(runs, equal_images=spec.equal_images))
-        if spec.rows == "run":
-            yield Block(title, tuple(self._each_run(runs)))
-        elif spec.rows == "setting":
-            yield Block(title, self._ranked(runs, title))
-        for method, titles in (
-            spec.titles.items() or (("", self._titles(place, runs)),) if spec.rows not in ("run", "setting") else ()
-        ):
-            aside = self.aside[-1] if self.aside else ()
-            cells = cells_by_value(runs, spec.rows, titles, title, self.measures, aside)
+            self.unranked.append(unranked(runs, equal_images=spec.equal_images))
+        if spec.rows in ("run", "setting"):
+            yield Block(title, self._ranked(runs, title) if spec.by_rank else tuple(self._each_run(runs)))
+            return
+        for method, titles in (spec.titles or {"": self._titles(place, runs)}).items():
             if spec.difference and not runs[spec.rows].isin(titles).any():
                 continue
-            rows = self._rows(place, titles, cells)
-            yield Block(f"{methods.name(method)}, {title}" if spec.difference else title, rows)
+            not_ranked = self.unranked[-1] if self.unranked else ()
+            cells = cells_by_value(runs, spec.rows, titles, title, self.measures, not_ranked)
+            heading = f"{methods.name(method)}, {title}" if spec.difference else title
+            yield Block(heading, self._rows(place, titles, cells))
         if spec.effects:
             yield Block(f"Effects, {title}", tuple(self._effects(runs)), signed=True)
 
@@ -168,13 +165,13 @@ class _Builder:
         title, place = published.TITLES[dataset], Place(dataset, AVERAGE)
         runs = self.runs.loc[[(of.dataset, of.apart) == (dataset, "") for of in self.runs["place"]]]
         refuse_mixture(runs, self.request, title, [what for what in self.spec.conditions if what != "data"])
-        self.aside.append(unranked(runs))
+        self.unranked.append(unranked(runs))
         titles, cells = self._titles(place, runs), {}
         for preset, words in titles.items():
             alike = runs.loc[runs["preset"] == preset]
             refuse_differences(alike, f"{title}, {words}", "preset")
             ours = over_scenes(alike, scenes, self.measures)
-            cells[preset] = unrank(ours) if preset in self.aside[-1] else ours
+            cells[preset] = unrank(ours) if preset in self.unranked[-1] else ours
         return Block(f"{title}, average over its {len(scenes)} scenes", self._rows(place, titles, cells))
 
     def _ranked(self, runs: DataFrame, where: str) -> tuple[Row, ...]:
@@ -224,9 +221,9 @@ class _Pivot(_Builder):
             ", ".join([words, *(RATES[rates] for rates in key[:-1])]) for key, words in zip(keys, lengths, strict=True)
         ]
         if spec.pivot == ("iterations",):
-            says = ", ".join(f"× {law(n):.2f} after {n}" for (n,) in keys)
+            factors = ", ".join(f"× {law(n):.2f} after {n}" for (n,) in keys)
             notes.append(
-                f"The law, √({PUBLISHED_ITERATIONS} / iterations) and at most {LARGEST_FACTOR:g}, says {says} "
+                f"The law, √({PUBLISHED_ITERATIONS} / iterations) and at most {LARGEST_FACTOR:g}, gives {factors} "
                 "iterations. Its loss is the difference, seed by seed, of the factor nearest to it (by their ratio) "
                 "from the one with the best mean."
             )

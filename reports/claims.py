@@ -115,7 +115,7 @@ def evaluate(claim: Claim, run_set: RunSet) -> Evidence:
     The level is divided by the number of rivals (Bonferroni), because the best rival of many is partly lucky.
 
     Raises:
-        ReportError: results that must not stand together.
+        ReportError: runs must not be compared, or are mixed in a cell.
     """
     from scipy.stats import ttest_rel
 
@@ -159,7 +159,7 @@ def findings(run_set: RunSet) -> Page:
     """Return the page: verdicts in words, a table with the evidence, and the rules.
 
     Raises:
-        ReportError: results that must not stand together.
+        ReportError: runs must not be compared, or are mixed in a cell.
     """
     numbers, claims = published.load(), load()
     tested = [(claim, evaluate(claim, run_set)) for claim in claims]

@@ -13,7 +13,7 @@ from padgs.reports.methods import name, title
 from padgs.reports.selection import Mixture, Request
 from padgs.reports.table import UNRANKED
 
-# Columns of the frame; "protocol" stands for its rules.
+# Columns of the frame; "protocol" means its rules.
 OF_A_DATA_SET = ("protocol", "resolution", "length", "learning_rates")  # scenes may differ, rules may not
 CONDITIONS = (*OF_A_DATA_SET, "data")
 OF_TIMES = (*CONDITIONS, "machine")
@@ -33,10 +33,10 @@ CALIBRATES = {  # method -> keys of data.generator for the errors that it correc
     "sc_omnigs": ("pose_noise_translation", "pose_noise_rotation"),
     "seam360gs": ("lens_gap", "lens_k1"),
 }
-FEWER_IMAGES = "for it saw less than half as much of the training images as another method of its table"
+FEWER_IMAGES = "for it saw less than half as many training pixels as another method of its table"
 NOTHING_TO_CORRECT = (
-    "for it is made after an abstract, and nothing is known here of what it mends (noise of the training poses; two "
-    "lenses apart); +experiment=calibration compares it where it is"
+    "for it follows an abstract, and the errors that it corrects (noise of the training poses; two lenses apart) are "
+    "not known here; +experiment=calibration compares it where they are"
 )
 
 
@@ -57,8 +57,8 @@ def refuse_mixture(runs: DataFrame, request: Request, where: str, conditions: It
                 f"{value} in {run}" for value, run in zip(values, runs["run"][values.index], strict=True)
             )
             column = _column(what, request.protocol)
-            told = f"{where}: results differ in {what} ({examples})"
-            raise Mixture(told, "choose with --where, or say --mix if this is meant", runs, [column])
+            difference = f"{where}: results differ in {what} ({examples})"
+            raise Mixture(difference, "choose with --where, or compare them anyway with --mix", runs, [column])
 
 
 def footnotes(blocks: Mapping[str, DataFrame], *protocols: str) -> list[str]:

@@ -137,7 +137,7 @@ def stressed_methods(run_set: RunSet) -> dict[str, list[StressedMethod]]:
     """Return title of a scene -> methods run with and without stress, sorted by worst quartile, incomplete ones last.
 
     Raises:
-        ReportError: results that must not stand together.
+        ReportError: runs must not be compared, or are mixed in a cell.
     """
     runs, found = run_set.of_experiments("stress"), {}
     if not {CONDITION, QUALITY, ONE_COLOR} <= {*runs}:
@@ -165,7 +165,7 @@ def stability(run_set: RunSet) -> list[Table | Chart]:
     """Return a table with three blocks for each scene, and for each a heat map and a chart of robustness over time.
 
     Raises:
-        ReportError: results that must not stand together.
+        ReportError: runs must not be compared, or are mixed in a cell.
     """
     from padgs.reports.charts.robustness_chart import heat_map, speed_and_accuracy  # they import this module
 
@@ -201,7 +201,7 @@ def limits(run_set: RunSet) -> Table:
     """Return what methods lose under stress beside what is allowed, for scenes with the size and length of the limits.
 
     Raises:
-        ReportError: results that must not stand together.
+        ReportError: runs must not be compared, or are mixed in a cell.
     """
     found = {title: [one for one in those if _has_limits(one)] for title, those in stressed_methods(run_set).items()}
     found = {title: those for title, those in found.items() if those}

@@ -88,17 +88,17 @@ class RunSet:
         return self._made[name]
 
     def _separated(self, name: str, function: Callable[..., Any], *arguments: str) -> Any:
-        run_set, told = self, dict[str, None]()
+        run_set, mixtures = self, dict[str, None]()
         while True:
             try:
                 made = function(run_set, *arguments)
             except Mixture as mixture:
                 if self.request.strict:
                     raise
-                told[mixture.what] = None
+                mixtures[mixture.what] = None
                 run_set = replace(run_set, runs=separate(run_set.runs, mixture), _made={})
                 continue
-            self.warnings.extend(f"{name}: {what}, so they stand apart; --where chooses" for what in told)
+            self.warnings.extend(f"{name}: {what}; they are separated, and --where chooses" for what in mixtures)
             return made
 
     def chosen(self, name: str) -> DataFrame:

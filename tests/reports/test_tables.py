@@ -195,7 +195,7 @@ def test_calibrating_methods_are_ranked_where_there_is_something_to_calibrate(me
         table = methods(run_set([small(20, 1.0, **own), small(30, 0.5, method=method, **own)]))
         (mine,) = {row.title for row in table.blocks[0].rows} - {"PaD-GS"}
         best = bool(ranks(table)[mine])
-        assert ("+experiment=calibration compares it where it is" in "".join(table.notes)) == (not best)
+        assert ("+experiment=calibration compares it where they are" in "".join(table.notes)) == (not best)
         return best
 
     assert ranked(**{knob: 0.1}) and not ranked(**{knob: 0.0}) and not ranked()
