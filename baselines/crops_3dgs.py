@@ -35,8 +35,8 @@ class Crops3DGSOptions(SplatOptions):
         super().__post_init__()
         if not MIN_FIELD_OF_VIEW <= self.field_of_view < 180:
             raise ValueError(
-                f"field_of_view is {self.field_of_view}; it must be less than 180, and at least {MIN_FIELD_OF_VIEW:.2f} "
-                "degrees for the crops to cover the sphere"
+                f"field_of_view is {self.field_of_view}; it must be less than 180, and at least "
+                f"{MIN_FIELD_OF_VIEW:.2f} degrees for the crops to cover the sphere"
             )
 
 

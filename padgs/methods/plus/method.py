@@ -70,7 +70,6 @@ class PlusOptions(SplatOptions):
     size_weight: float = 0.05  # loss weight of the mean angular size: large Gaussians cost pairs in every frame
     smoothness_weight: float = 0.12  # loss weight of the roughness of surfaces, which few views leave open
     dropout: float = 0.1  # maximal share of Gaussians dropped from a training render, see `dropout_share`
-    averaged_share: float = 0.04  # time constant of the parameter average at the end, share of the run; 0: none
     sky_per_point: float = 0.5  # directions per initial point that get a far Gaussian if no point is there
 
     def __post_init__(self) -> None:
@@ -84,7 +83,6 @@ class PlusOptions(SplatOptions):
         check(self, off, lambda value: 0 <= value < math.inf, *weights, *thresholds)
         check(self, "a share of the run in [0, 1]", lambda share: 0 <= share <= 1, "coarse_share")
         check(self, "a share of the Gaussians in [0, 1)", lambda share: 0 <= share < 1, "dropout")
-        check(self, "a share of the run in [0, 0.1]", lambda share: 0 <= share <= 0.1, "averaged_share")
         limits = ("initial_per_pixel", "limit_per_pixel")
         check(self, "> 0, or none for no limit", lambda share: share is None or share > 0, *limits)
         for field in fields(DensificationOptions):

@@ -1,4 +1,4 @@
-"""padgs_plus in training: splats with schedules as shares of the run, priors, dropout and parameter averaging."""
+"""padgs_plus in training: splats with schedules as shares of the run, priors and dropout."""
 
 from __future__ import annotations
 
@@ -27,9 +27,8 @@ if TYPE_CHECKING:
     from padgs.methods.plus.method import PlusOptions
 
 DEGREE_SHARE = 0.1  # of the run, between two SH degrees
-AVERAGED_FROM = 0.9  # share of the run after which parameters are averaged and dropout ends
+DROPOUT_UNTIL = 0.9  # share of the run after which no Gaussians are dropped
 GROWN_PER_KEPT = 2  # Gaussians before the pruning step per Gaussian after it, about
-AVERAGE = "average/"  # prefix of the running means in a state
 CAMERAS = "cameras"  # key of the training cameras in a state
 MIN_PIXELS = 2000.0  # panoramas below 80x40: many of them together show more than each
 
@@ -43,11 +42,7 @@ def solid_angle_pixels(view: View) -> float:
 
 
 class PlusModel(SplatModel):
-    """Splats with the schedule of padgs_plus for a run of `iterations`.
-
-    Attributes:
-        average: parameter name -> running mean over the last tenth of the run; empty before and after.
-    """
+    """Splats with the schedule of padgs_plus for a run of `iterations`."""
 
     def __init__(
         self, splats: Splats, options: PlusOptions, config: RenderConfig, *, limit: int | None = None, **kwargs: Any
@@ -56,7 +51,7 @@ class PlusModel(SplatModel):
         views = kwargs.get("views", ())
         largest = max(map(solid_angle_pixels, views), default=MIN_PIXELS)
         super().__init__(splats, replace(options.for_views(largest, len(views)), max_gaussians=limit), config, **kwargs)
-        self.options, self.average = options, dict[str, Tensor]()
+        self.options = options
         self._step = 0  # last step of the schedule
         self._pixels = sum(map(solid_angle_pixels, self._views))
         self._cameras = cameras_of(self._views)
@@ -93,7 +88,7 @@ class PlusModel(SplatModel):
         as far as opacities stay below 1. It exposes Gaussians that fit a single view only. There is none in the last
         states, which become the model.
         """
-        if self._pixels == 0 or self._step >= AVERAGED_FROM * self.iterations:
+        if self._pixels == 0 or self._step >= DROPOUT_UNTIL * self.iterations:
             return None
         fewer = GROWN_PER_KEPT if self.pruning.is_ahead(self._step) else 1
         share = self.options.dropout_share(self._pixels, len(self.splats) / fewer)
@@ -105,24 +100,9 @@ class PlusModel(SplatModel):
         return kept * (1 / opacities).clamp(max=1 / (1 - share))
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
-        """Average parameters, densify, prune by importance, and activate the next SH degree, each when it is due."""
-        self._step, events = iteration, ()
-        if iteration > AVERAGED_FROM * self.iterations and self.options.averaged_share > 0:
-            events = self._update_average(iteration)
-        return events + super().adapt(iteration, optimizer)
-
-    def _update_average(self, iteration: int) -> tuple[str, ...]:
-        """Update the running means of the parameters; at the end of the run they replace the parameters."""
-        parameters = self.splats.rows()
-        weight = 1 / max(1.0, self.options.averaged_share * self.iterations)
-        for name, parameter in parameters.items():
-            self.average.setdefault(name, parameter.detach().clone()).lerp_(parameter, weight)
-        if iteration < self.iterations:
-            return ()
-        for name, parameter in parameters.items():
-            parameter.copy_(self.average[name])
-        self.average = {}
-        return ("replaced the parameters by their running means",)
+        """Densify, prune by importance, and activate the next SH degree, each when it is due."""
+        self._step = iteration
+        return super().adapt(iteration, optimizer)
 
     @property
     def has_smoothing_filter(self) -> bool:
@@ -139,17 +119,14 @@ class PlusModel(SplatModel):
         return smoothed_for_view(gaussians, view, self._finest[1], self._config.low_pass)
 
     def state(self) -> State:
-        """Return the state of the splats, the schedule step, the training cameras and the running means."""
+        """Return the state of the splats, the schedule step and the training cameras."""
         state = super().state()
-        averages = {AVERAGE + name: mean for name, mean in self.average.items()}
-        return State(state.tensors | averages | {CAMERAS: self._cameras}, state.values | {"step": self._step})
+        return State(state.tensors | {CAMERAS: self._cameras}, state.values | {"step": self._step})
 
     def load_state(self, state: State) -> None:
         """Restore the model that `state` was taken of."""
         super().load_state(state)
         self._step, self._cameras, self._finest = state.values["step"], state.tensors[CAMERAS], None
-        device = self.splats.means.device
-        self.average = {name: mean.to(device, copy=True) for name, mean in state.under(AVERAGE).items()}
 
 
 def _hashed(seed: int, count: int, device: torch.device) -> Tensor:
