@@ -32,7 +32,7 @@ def frame(runs: Iterable[Run]) -> DataFrame:
     runs = list(runs)
     results = [run.result for run in runs]
     facts = DataFrame({name: [of(result) for result in results] for name, of in FACTS.items()}, dtype=object)
-    facts["log"], facts["pictures"] = [run.log for run in runs], [run.pictures for run in runs]
+    facts["log"], facts["renders"] = [run.log for run in runs], [run.renders for run in runs]
     numbers = DataFrame({name: [of(result) for result in results] for name, of in NUMBERS.items()}, dtype=float)
     last = [run.log.get("polar_transmittance", ())[-1:] for run in runs]
     numbers["polar_transmittance"] = [value[0] if value else math.nan for value in last]
@@ -171,7 +171,7 @@ def _factor(result: Result) -> float | None:
 
 
 def _view_psnr(scores: Mapping[str, Scores]) -> dict[str, float]:
-    """Return file name of a picture -> PSNR (or else WS-PSNR) of the view, by the first protocol that has it."""
+    """Return file name of a render -> PSNR (or else WS-PSNR) of the view, by the first protocol that has it."""
     found: dict[str, float] = {}
     for view, numbers in (pair for one in scores.values() for pair in one.views.items()):
         if (psnr := numbers.get("psnr", numbers.get("ws_psnr"))) is not None:

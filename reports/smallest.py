@@ -33,7 +33,7 @@ class Curve:
     smallest: Mapping[str, Mapping[str, Any]]  # epsilon -> the smallest step that loses at most so much
     knee: Mapping[str, Any] | None
     found: Mapping[str, Any]  # all of `Result.smallest`
-    picture: Path | None = None  # as `padgs.results.SMALLEST_PICTURE` says, if there is one
+    image: Path | None = None  # as `padgs.results.SMALLEST_PICTURE` says, if there is one
 
     def values(self, name: str) -> list[float]:
         """A number of all steps; NaN where one has none."""
@@ -72,11 +72,11 @@ def curves(runs: DataFrame) -> list[Curve]:
         title = setting.title + (f", seed {run['seed']}" if seeds.nunique() > 1 else "")
         smallest = {epsilon: steps[number] for epsilon, number in run["smallest"]["minimal"].items()}
         knee = None if run["smallest"]["knee"] is None else steps[run["smallest"]["knee"]]
-        picture = None if run["pictures"] is None else run["pictures"].with_name(SMALLEST_PICTURE)
-        there = picture if picture is not None and picture.is_file() else None
+        image = None if run["renders"] is None else run["renders"].with_name(SMALLEST_PICTURE)
+        there = image if image is not None and image.is_file() else None
         names = {"title": title, "method": setting.title, "preset": setting.preset, "seed": int(run["seed"])}
         found.append(
-            Curve(**names, steps=tuple(rows), smallest=smallest, knee=knee, found=run["smallest"], picture=there)
+            Curve(**names, steps=tuple(rows), smallest=smallest, knee=knee, found=run["smallest"], image=there)
         )
     return found
 

@@ -28,12 +28,12 @@ NO_LOG: Mapping[str, Sequence[float]] = {name: () for name in LOGGED}
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run: result, log, and folder of pictures."""
+    """A finished run: result, log, and folder of renders."""
 
     result: Result
     log: Mapping[str, Sequence[float]] = field(default_factory=lambda: NO_LOG)  # name of `LOGGED` -> its values
     document: Mapping[str, Any] | None = None  # content of the result file
-    pictures: Path | None = None  # folder of ground truth | render | error of each test view; None in a store
+    renders: Path | None = None  # folder of ground truth | render | error of each test view; None in a store
 
 
 def read(source: Path) -> tuple[list[Run], list[ResultError]]:
@@ -75,21 +75,21 @@ def add(runs: Iterable[Run], store: Path) -> list[Run]:
     return merged
 
 
-def picture_names(folder: Path | None) -> list[str]:
-    """Return the sorted names of a run's pictures of test views; none in a store."""
+def render_names(folder: Path | None) -> list[str]:
+    """Return the sorted file names of a run's renders of test views; none in a store."""
     return [] if folder is None else sorted(path.name for path in folder.glob("*.png"))
 
 
-def split_picture(path: Path, count: int) -> list[Image.Image]:
-    """Return `count` parts of equal width that lie side by side in a picture.
+def split_image(path: Path, count: int) -> list[Image.Image]:
+    """Return `count` parts of equal width that lie side by side in an image file.
 
     Raises:
-        OSError: the picture is missing or truncated.
+        OSError: the file is missing or truncated.
     """
-    with Image.open(path) as picture:
-        picture.load()
-        width = picture.width // count
-        return [picture.crop((part * width, 0, (part + 1) * width, picture.height)) for part in range(count)]
+    with Image.open(path) as image:
+        image.load()
+        width = image.width // count
+        return [image.crop((part * width, 0, (part + 1) * width, image.height)) for part in range(count)]
 
 
 def _from_line(line: bytes, where: str) -> Run:

@@ -13,7 +13,7 @@ from padgs.reports.charts.drawing import Chart, figure, lay_out, show_image, sty
 from padgs.reports.conditions import footnotes, refuse_mixture
 from padgs.reports.frame import by_conditions
 from padgs.reports.selection import RunSet
-from padgs.reports.store import picture_names, split_picture
+from padgs.reports.store import render_names, split_image
 from padgs.results import file_name
 
 COLUMNS = 3
@@ -26,11 +26,11 @@ def charts(run_set: RunSet) -> list[Chart]:
         ReportError: the results of a sheet differ in protocol or data.
     """
     runs, found = run_set.chosen("gallery"), []
-    runs = runs.loc[runs["ok"] & (runs["variant"] == "") & (runs["pictures"].map(picture_names).map(len) > 0)]
+    runs = runs.loc[runs["ok"] & (runs["variant"] == "") & (runs["renders"].map(render_names).map(len) > 0)]
     for where, own in by_conditions(runs, "resolution", "length").items():
         refuse_mixture(own, run_set.request, where, ("protocol", "data"))
         own = own.sort_values("seed", kind="stable").drop_duplicates("preset")
-        shared = sorted(set.intersection(*(set(picture_names(folder)) for folder in own["pictures"])))
+        shared = sorted(set.intersection(*(set(render_names(folder)) for folder in own["renders"])))
         if shared and (images := _images(own, view := shared[len(shared) // 2])):
             name = file_name(f"gallery_{own['place'].iloc[0].stem}_{own['resolution'].iloc[0]}_{own['length'].iloc[0]}")
             title = f"{where}\ntest view {Path(view).stem}, with the PSNR of this view"
@@ -43,7 +43,7 @@ def _images(runs: DataFrame, view: str) -> list[tuple[str, Image.Image]]:
     truth, renders = None, []
     for run in runs.to_dict("records"):
         try:
-            truth, render, _ = split_picture(run["pictures"] / view, 3)
+            truth, render, _ = split_image(run["renders"] / view, 3)
         except OSError:
             continue  # an incomplete file of a killed run
         psnr, title = run["view_psnr"].get(view), methods.title(run["preset"])

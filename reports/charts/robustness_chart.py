@@ -94,7 +94,7 @@ def _worst_view(runs: DataFrame) -> str | None:
     """Return the address of the render with the lowest PSNR of all runs of a cell, if there is one."""
     shown = [
         (psnr, path)
-        for folder, psnrs in zip(runs["pictures"], runs["view_psnr"], strict=True)
+        for folder, psnrs in zip(runs["renders"], runs["view_psnr"], strict=True)
         for name, psnr in psnrs.items()
         if folder is not None and (path := folder / name).is_file()
     ]

@@ -13,7 +13,7 @@ from padgs.reports.conditions import OF_TIMES, footnotes, refuse_mixture
 from padgs.reports.frame import by_conditions
 from padgs.reports.selection import RunSet
 from padgs.reports.smallest import Curve, by_method, curves, searched
-from padgs.reports.store import split_picture
+from padgs.reports.store import split_image
 from padgs.results import SMALLEST_PICTURED, file_name
 
 PANELS = (
@@ -37,7 +37,7 @@ def charts(run_set: RunSet) -> list[Chart]:
         name = file_name(f"smallest_{own['place'].iloc[0].stem}_{own['resolution'].iloc[0]}_{own['length'].iloc[0]}")
         notes = tuple(footnotes({title: own}, run_set.request.protocol))
         found.append(_chart(name, title, curves(own), notes))
-        if rendered := [curve for curve in curves(own) if curve.picture is not None]:
+        if rendered := [curve for curve in curves(own) if curve.image is not None]:
             found.append(_renders(f"{name}_renders", title, rendered, notes))
     return found
 
@@ -70,11 +70,11 @@ def _renders(name: str, title: str, found: list[Curve], notes: tuple[str, ...]) 
     """Return a test view of each run: ground truth, the whole model, and the smallest models for two losses."""
     made, axes = figure(4, len(found), 3.6, 2.2)
     for row, curve in zip(axes, found, strict=True):
-        assert curve.picture is not None, "chosen by it"
+        assert curve.image is not None, "chosen by it"
         steps = [curve.found["steps"][0], *(curve.smallest[loss] for loss in LOSSES)]
         words = [curve.title, f"all: {steps[0]['blended']} Gaussians"]
         words += [f"{loss} dB: {step['blended']}" for loss, step in zip(LOSSES, steps[1:], strict=True)]
-        for panel, part, text in zip(row, split_picture(curve.picture, 4), words, strict=True):
+        for panel, part, text in zip(row, split_image(curve.image, 4), words, strict=True):
             show_image(panel, part, text)
             panel.set_axis_off()
     what = f"{title}\na test view: ground truth, whole model, and the smallest that lose {' and '.join(LOSSES)} dB"

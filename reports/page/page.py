@@ -22,7 +22,7 @@ from padgs.reports.charts.drawing import Chart
 from padgs.reports.frame import by_place
 from padgs.reports.selection import RunSet, Setting, settings
 from padgs.reports.statistics import BEST, emphasis
-from padgs.reports.store import picture_names, split_picture
+from padgs.reports.store import render_names, split_image
 from padgs.reports.table import Block, Cell, ReportError, Table
 
 HERE = Path(__file__).resolve().parent
@@ -90,13 +90,13 @@ def album(run_set: RunSet) -> Album:
     """Return a few views of each scene, of all settings of methods and rows of ablations; one seed is enough."""
     runs, parts = run_set.chosen("table1"), run_set.chosen("table3")
     own = pd.concat([runs, parts.loc[parts["variant"] != ""]]).drop_duplicates("run")
-    own = own.loc[own["pictures"].map(picture_names).map(len) > 0]
+    own = own.loc[own["renders"].map(render_names).map(len) > 0]
     groups = {place: sorted(settings(runs), key=_mean_psnr, reverse=True) for place, runs in by_place(own).items()}
     groups = dict(sorted(groups.items(), key=lambda group: bool(group[0].dataset)))  # the user's captures first
     count = min(MAX_VIEWS, max(1, MAX_FILES // max(1, sum(map(len, groups.values())))))
     made, opened = Album(), 0
     for place, shown in groups.items():
-        names = _spread(picture_names(shown[0].runs["pictures"].iloc[0]), count)
+        names = _spread(render_names(shown[0].runs["renders"].iloc[0]), count)
         opened += len(shown) * len(names)
         if opened > MAX_FILES:
             made.left_out.append(place.title)
@@ -115,12 +115,12 @@ def _mean_psnr(setting: Setting) -> float:
 def _view(made: Album, shown: Sequence[Setting], name: str) -> dict[str, Any]:
     view: dict[str, Any] = {"title": Path(name).stem, "truth": None, "methods": []}
     for setting in shown:
-        runs = setting.runs.loc[[(folder / name).is_file() for folder in setting.runs["pictures"]]]
+        runs = setting.runs.loc[[(folder / name).is_file() for folder in setting.runs["renders"]]]
         if runs.empty:
             continue
         run = runs.iloc[0]
         try:
-            truth, render, error = split_picture(run["pictures"] / name, 3)
+            truth, render, error = split_image(run["renders"] / name, 3)
         except OSError:
             continue  # an incomplete file of a killed run
         if view["truth"] is None:

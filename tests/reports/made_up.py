@@ -165,8 +165,8 @@ def swept(
     ]
 
 
-def write(results_: list[Result], folder: Path, pictures: bool = False) -> Path:
-    """Run folders as `padgs-run` leaves them: result.json, log.jsonl, and pictures if asked."""
+def write(results_: list[Result], folder: Path, renders: bool = False) -> Path:
+    """Run folders as `padgs-run` leaves them: result.json, log.jsonl, and renders if requested."""
     for one in results_:
         run = folder / one.run
         run.mkdir(parents=True)
@@ -177,12 +177,12 @@ def write(results_: list[Result], folder: Path, pictures: bool = False) -> Path:
             parts = range(1, 16)
             log = [{"iteration": 100 * i, "seconds": seconds * i / 15, "psnr": best - 8 / i} for i in parts]
             (run / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in log))
-        if pictures and one.ok:
-            picture(one, run)
+        if renders and one.ok:
+            write_renders(one, run)
     return folder
 
 
-def picture(one: Result, run: Path, width: int = 128) -> None:
+def write_renders(one: Result, run: Path, width: int = 128) -> None:
     """truth | render | error of two views: a gradient, a shifted one, and their difference."""
     (run / "renders").mkdir()
     longitude = np.linspace(0, 1, width)[None, :].repeat(width // 2, 0)

@@ -161,13 +161,13 @@ def test_the_name_of_a_condition_is_text_and_not_markup():
     assert "<b-x>" not in html and "&lt;b-x&gt; 1" in html
 
 
-def test_a_cell_opens_the_picture_of_its_worst_view(tmp_path):
+def test_a_cell_opens_its_worst_view(tmp_path):
     made = run("omnigs", 16.0, "pose_noise", 2)
     views = {name: {**made.scores["stability"].metrics, "ws_psnr": value} for name, value in (("a", 17.0), ("b", 15.0))}
     made = replace(made, scores={"stability": replace(made.scores["stability"], views=views)})
     for name in views:
         (tmp_path / picture_name(name)).touch()
-    _, chart, _ = stability(RunSet(frame([Run(run("omnigs", 22.0)), Run(made, pictures=tmp_path)])))
+    _, chart, _ = stability(RunSet(frame([Run(run("omnigs", 22.0)), Run(made, renders=tmp_path)])))
     assert (tmp_path / picture_name("b")).resolve().as_uri() in chart.svg
     assert (tmp_path / picture_name("a")).resolve().as_uri() not in chart.svg
     assert "opens its worst view" in chart.notes[1] and "file:" not in stability(run_set(runs()))[1].svg

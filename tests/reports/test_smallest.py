@@ -106,11 +106,11 @@ def test_charts_of_scenes_of_two_data_sets_have_names_of_their_own():
     assert names == ["smallest_room_512x256_1500-iterations", "smallest_room_omniblender_512x256_1500-iterations"]
 
 
-def test_a_test_view_is_shown_at_each_size_where_there_is_a_picture_of_it(tmp_path):
+def test_a_test_view_is_shown_at_each_size_where_there_is_an_image_of_it(tmp_path):
     found = run_set(runs())
     assert len(charts(found)) == 1
     Image.new("RGB", (4 * 32, 16), "red").save(tmp_path / "smallest.png")
-    found.runs["pictures"] = [tmp_path / "renders"] * len(found.runs)
-    _, pictures = charts(found)
-    assert pictures.name.endswith("_renders") and "all: 8000 Gaussians" in pictures.svg
-    assert "0.1 dB: 4000" in pictures.svg and "1 dB: 1000" in pictures.svg
+    found.runs["renders"] = [tmp_path / "renders"] * len(found.runs)
+    _, sheet = charts(found)
+    assert sheet.name.endswith("_renders") and "all: 8000 Gaussians" in sheet.svg
+    assert "0.1 dB: 4000" in sheet.svg and "1 dB: 1000" in sheet.svg

@@ -26,7 +26,7 @@ def many() -> list:
 
 @pytest.mark.slow
 def test_everything_from_a_thousand_results_within_40_s(tmp_path, root):
-    write(many(), tmp_path / "runs", pictures=True)
+    write(many(), tmp_path / "runs", renders=True)
     arguments = ["report", "all", tmp_path / "runs", "--out", tmp_path / "out"]
     before = _children()
     done = subprocess.run([sys.executable, "-m", "padgs.cli.app", *arguments], cwd=root, capture_output=True, text=True)

@@ -18,7 +18,7 @@ def report(*arguments, code: int = 0):
 
 @pytest.fixture
 def runs(tmp_path):
-    return write(compared(["synthetic-room"], seeds=1), tmp_path / "runs", pictures=True)
+    return write(compared(["synthetic-room"], seeds=1), tmp_path / "runs", renders=True)
 
 
 def content(runs: list[store.Run]) -> list:
@@ -28,11 +28,11 @@ def content(runs: list[store.Run]) -> list:
 def test_what_is_read_from_a_store_is_what_was_read_from_the_folder(runs, tmp_path):
     found, broken = store.read(runs)
     assert (
-        broken == [] and len(found[0].log["psnr"]) == 15 and found[0].pictures == runs / found[0].result.run / "renders"
+        broken == [] and len(found[0].log["psnr"]) == 15 and found[0].renders == runs / found[0].result.run / "renders"
     )
     store.add(found, tmp_path / "store.jsonl")
     again, broken = store.read(tmp_path / "store.jsonl")
-    assert broken == [] and content(again) == content(found) and {run.pictures for run in again} == {None}
+    assert broken == [] and content(again) == content(found) and {run.renders for run in again} == {None}
 
 
 def test_a_line_is_the_result_file_with_its_digest_and_the_log(runs, tmp_path):

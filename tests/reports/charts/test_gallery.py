@@ -23,7 +23,7 @@ def test_each_scene_has_a_sheet_with_each_method_once_by_falling_psnr(tmp_path):
             for name, of in one.scores.items()
         }
         runs.append(replace(one, scores=scores))
-    made = sheets(write(runs, tmp_path, pictures=True))
+    made = sheets(write(runs, tmp_path, renders=True))
     names = [f"gallery_synthetic-{scene}_512x256_1500-iterations" for scene in ("outdoor", "room")]
     assert [chart.name for chart in made] == names
     outdoors, indoors = (chart.svg for chart in made)
@@ -36,13 +36,13 @@ def test_each_scene_has_a_sheet_with_each_method_once_by_falling_psnr(tmp_path):
 
 def test_scenes_of_two_data_sets_have_different_names(tmp_path):
     runs = [small(25.0, scene="room", dataset=dataset, run=f"of-{dataset}") for dataset in ("", "omniblender")]
-    names = [chart.name for chart in sheets(write(runs, tmp_path, pictures=True))]
+    names = [chart.name for chart in sheets(write(runs, tmp_path, renders=True))]
     assert names == [f"gallery_{stem}_512x256_1500-iterations" for stem in ("room", "room_omniblender")]
 
 
 def test_runs_without_a_readable_render_are_left_out(tmp_path):
     first, second, *_ = compared(["synthetic-room"], seeds=1)
-    write([first, second], tmp_path, pictures=True)
+    write([first, second], tmp_path, renders=True)
     broken = tmp_path / first.run / "renders" / "view1.png"
     broken.write_bytes(broken.read_bytes()[:300])
     (sheet,) = sheets(tmp_path)

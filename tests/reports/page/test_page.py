@@ -16,7 +16,7 @@ from padgs.reports.selection import Request, RunSet
 def runs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("page") / "runs"
     results = [*compared(["synthetic-room"], seeds=1), *swept(scenes=["synthetic-room"], seeds=2)]
-    return frame(store.read(write(results, folder, pictures=True))[0])
+    return frame(store.read(write(results, folder, renders=True))[0])
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def test_a_refused_table_is_named_and_the_others_are_there():
 
 def test_the_users_captures_and_the_best_method_come_first(tmp_path):
     own = [replace(one, dataset="", scene="z-flat", run=f"own{one.run}") for one in compared(["synthetic-room"], 1)]
-    write([*compared(["synthetic-room"], 1), *own], tmp_path, pictures=True)
+    write([*compared(["synthetic-room"], 1), *own], tmp_path, renders=True)
     first, second = page.album(RunSet(frame(store.read(tmp_path)[0]))).scenes
     assert first["title"].startswith("z-flat") and second["title"].startswith("synthetic-room")
     psnr = [float(method["title"].split()[-2]) for method in first["views"][0]["methods"]]
@@ -78,8 +78,8 @@ def test_the_number_of_files_is_bounded(runs, monkeypatch):
 
 
 def test_an_incomplete_file_is_left_out(tmp_path):
-    runs = frame(store.read(write(compared(["synthetic-room"], seeds=1)[:2], tmp_path, pictures=True))[0])
-    broken = runs["pictures"][0] / "view0.png"
+    runs = frame(store.read(write(compared(["synthetic-room"], seeds=1)[:2], tmp_path, renders=True))[0])
+    broken = runs["renders"][0] / "view0.png"
     broken.write_bytes(broken.read_bytes()[:300])
     first, second = page.album(RunSet(runs)).scenes[0]["views"]
     assert (len(first["methods"]), len(second["methods"])) == (1, 2)
