@@ -13,7 +13,7 @@ import torch
 from composed import composed
 from states import assert_same_but_time
 
-from padgs.baselines import METHODS, BUILT_IN
+from padgs.baselines import BUILT_IN, METHODS
 from padgs.data.synthetic import SCENES, SyntheticOptions, generate
 from padgs.runs import checkpoint
 from padgs.runs.config import RunConfig

@@ -57,7 +57,7 @@ def test_the_published_schedule():
     assert not options.prune_by_extent and options.sh_degree == 3
 
 
-def trainee_of(scene: Scene, iterations: int = 100) -> SplatModel:
+def model_of(scene: Scene, iterations: int = 100) -> SplatModel:
     splats = Splats.from_scene(scene, generator=torch.Generator().manual_seed(0))
     options = SPaGSOptions()
     return SplatModel(
@@ -71,54 +71,54 @@ def trainee_of(scene: Scene, iterations: int = 100) -> SplatModel:
     )
 
 
-def test_the_filter_is_a_fifth_of_a_square_pixel_of_the_nearest_training_view_whoever_looks(scene):
+def test_the_smoothing_filter_is_a_fifth_of_a_square_pixel_of_the_nearest_training_view(scene):
     """Sigma' = Sigma + 0.2 (r / f)^2 I with f = W / 2 pi, o' = o sqrt(det Sigma / det Sigma'), without a derivative."""
-    trainee = trainee_of(scene)
-    splats, views = trainee.splats, (scene.train[0], scene.test[0])
+    model = model_of(scene)
+    splats, views = model.splats, (scene.train[0], scene.test[0])
     centers = torch.stack([view.center for view in scene.train]).float()
     nearest = torch.cdist(splats.means, centers).amin(-1)
     assert len({*torch.cdist(splats.means, centers).argmin(-1).tolist()}) > 1
     added = 0.2 * (nearest * 2 * math.pi / scene.train[0].width) ** 2
     for view in views:
-        drawn = trainee.draw(view).gaussians
+        drawn = model.draw(view).gaussians
         torch.testing.assert_close(drawn.scales**2 - splats.log_scales.exp() ** 2, added[:, None].expand(-1, 3))
         mass = torch.sigmoid(splats.opacity_logits) * splats.log_scales.exp().prod(-1)
         torch.testing.assert_close(drawn.opacities * drawn.scales.prod(-1), mass)
-        assert trainee.parts(view).options.low_pass == 0, "there is no filter of the view beside it"
+        assert model.parts(view).options.low_pass == 0, "there is no filter of the view beside it"
     drawn.scales.sum().backward()
     assert (splats.means.grad is None or not splats.means.grad.any()) and splats.log_scales.grad.abs().min() > 0
 
 
-def test_the_filter_follows_the_means_once_a_round_and_keeps_to_the_rows(scene):
-    trainee = trainee_of(scene, iterations=3000)
-    optimizer, view = torch.optim.Adam(trainee.splats.parameters()), scene.train[0]
+def test_the_smoothing_filter_is_updated_once_a_round(scene):
+    model = model_of(scene, iterations=3000)
+    optimizer, view = torch.optim.Adam(model.splats.parameters()), scene.train[0]
 
     def added() -> torch.Tensor:
-        return trainee.draw(view).gaussians.scales ** 2 - trainee.splats.log_scales.exp() ** 2
+        return model.draw(view).gaussians.scales ** 2 - model.splats.log_scales.exp() ** 2
 
     before = added()
-    trainee.splats.means.data *= 3
-    trainee.adapt(1, optimizer)
+    model.splats.means.data *= 3
+    model.adapt(1, optimizer)
     torch.testing.assert_close(added(), before, atol=1e-7, rtol=1e-3)
-    every = trainee.densifier.options.densify_every
-    trainee.adapt(every, optimizer)
+    every = model.densifier.options.densify_every
+    model.adapt(every, optimizer)
     after = added()
     assert not torch.allclose(after, before, rtol=0.1)
-    trainee.keep(torch.arange(5))
+    model.keep(torch.arange(5))
     torch.testing.assert_close(added(), after[:5])
 
 
-def test_what_is_too_faint_to_be_seen_is_no_part_of_the_model_and_was_in_no_image(scene):
-    trainee = trainee_of(scene, iterations=100)
-    trainee.splats.opacity_logits.data[::2] = torch.logit(torch.tensor(0.006))
-    trainee.splats.log_scales.data[::2] = math.log(1e-3)
-    image, count = trainee.render(scene.test[0]).image, len(trainee.splats)
-    events = trainee.adapt(100, torch.optim.Adam(trainee.splats.parameters()))
-    left_out = count - len(trainee.splats)
+def test_invisible_gaussians_are_pruned_at_the_end(scene):
+    model = model_of(scene, iterations=100)
+    model.splats.opacity_logits.data[::2] = torch.logit(torch.tensor(0.006))
+    model.splats.log_scales.data[::2] = math.log(1e-3)
+    image, count = model.render(scene.test[0]).image, len(model.splats)
+    events = model.adapt(100, torch.optim.Adam(model.splats.parameters()))
+    left_out = count - len(model.splats)
     assert 0 < left_out <= (count + 1) // 2 and any(
         f"pruned {left_out} invisible Gaussians" in event for event in events
     )
-    assert torch.equal(trainee.render(scene.test[0]).image, image)
+    assert torch.equal(model.render(scene.test[0]).image, image)
 
 
 def test_boxes_are_as_narrow_as_can_be_and_the_published_ones_are_not(generator):

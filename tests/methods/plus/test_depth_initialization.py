@@ -72,7 +72,7 @@ def test_points_fill_a_sphere_at_its_range():
     assert torch.allclose(moments, torch.eye(3, dtype=torch.float64) / 3, atol=0.03), "even by solid angle"
 
 
-def test_a_lone_point_says_how_far_everything_is():
+def test_a_single_point_sets_the_depth_of_all_pixels():
     scene = dome(300)
     points, _ = new_points(replace(scene, points=scene.points[:1], train=scene.train[:1]))
     ranges = (points.double() - scene.train[0].center).norm(dim=-1)
@@ -122,7 +122,7 @@ def test_what_has_enough_points_stays_as_it_is():
     assert fill_sparse_cloud(scene, 300, generator=torch.Generator()) is scene
 
 
-def test_points_in_a_camera_say_nothing():
+def test_points_at_a_camera_centre_are_ignored():
     scene = dome(300)
     inside = scene.train[0].center.float().expand(3, 3)
     alone = replace(scene, points=inside, train=scene.train[:1])
@@ -138,7 +138,7 @@ def test_padgs_plus_starts_from_what_it_asks_for():
         assert count <= started < count + len(scene.train)
 
 
-def test_no_more_is_sought_than_a_budget_has_room_for(monkeypatch):
+def test_a_budget_limits_the_number_of_filled_points(monkeypatch):
     sought = []
     monkeypatch.setattr(method_module, "fill_sparse_cloud", lambda scene, count, **_: sought.append(count) or scene)
     for budget in (None, 150):
@@ -149,7 +149,7 @@ def test_no_more_is_sought_than_a_budget_has_room_for(monkeypatch):
     ]
 
 
-def test_points_are_sought_once_for_a_run_and_not_where_it_goes_on(monkeypatch):
+def test_the_cloud_is_filled_once_per_run_and_not_when_resuming(monkeypatch):
     sought, scene = [], dome(40)
 
     def counted(scene, count, *, generator):
@@ -225,7 +225,7 @@ def test_ranges_are_those_at_which_all_views_agree(scale):
     assert off.median() < 0.08 and (off < 0.2).double().mean() > 0.95, "steps between those tried are 0.19 octaves"
 
 
-def test_what_looks_alike_everywhere_stays_as_likely():
+def test_without_texture_the_estimate_stays():
     inverse, _, likely = found(ball(contrast=0.0))
     assert torch.equal(inverse, likely)
 
@@ -241,14 +241,14 @@ def test_a_view_alone_and_one_that_is_no_panorama_stay_as_they_are():
     assert torch.equal(plane_sweep(straight, rays, likely, likely[:, None], (straight, *views[1:])), likely)
 
 
-def test_one_that_something_hides_is_outvoted():
+def test_an_occluded_view_is_outvoted():
     views = ball()
     hidden = replace(views[1], load_pixels=lambda: torch.zeros(WIDTH // 2, WIDTH, 3, dtype=torch.uint8))
     inverse, true, _ = found((views[0], hidden, *views[2:]))
     assert ((inverse / true).log2().abs() < 0.2).double().mean() > 0.9
 
 
-def test_parts_are_put_together_in_order():
+def test_chunks_are_concatenated_in_order():
     views = ball()
     whole, true, _ = found(views, count=CHUNK + 5)
     assert len(whole) == len(true) == CHUNK + 5
@@ -359,12 +359,12 @@ def test_furniture_and_trees_make_no_room(name):
 
 
 @pytest.mark.parametrize(("condition", "level"), [("world_scale", 3), ("world_offset", 2), ("world_rotation", 3)])
-def test_the_world_may_be_anywhere(condition, level):
+def test_the_room_count_is_invariant_to_the_world_frame(condition, level):
     scene = scene_of("room_chain", 3)
     assert room_count(StressOptions(condition, level).apply(scene, 0)) == pytest.approx(room_count(scene), rel=0.1)
 
 
-def test_points_that_are_none_count_as_nothing():
+def test_points_that_are_not_finite_are_ignored():
     scene = scene_of("room_chain", 2)
     lost = replace(scene, points=torch.cat((scene.points, torch.full((9, 3), torch.nan))))
     assert room_count(lost) == pytest.approx(room_count(scene), rel=0.01)

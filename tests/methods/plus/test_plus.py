@@ -43,7 +43,7 @@ def in_other_units(scene: Scene, scale: float) -> Scene:
 
 
 @pytest.mark.parametrize("iterations", [16, 60, 500, 7000, 30_000])
-def test_growth_has_as_many_rounds_in_a_run_of_any_length(iterations):
+def test_the_number_of_rounds_does_not_depend_on_the_length(iterations):
     options = PlusOptions().for_run(iterations)
     rounds = [i for i in range(1, iterations + 1) if i < options.densify_until and i % options.densify_every == 0]
     assert len(rounds) == ROUNDS and options.reset_every > iterations
@@ -52,24 +52,24 @@ def test_growth_has_as_many_rounds_in_a_run_of_any_length(iterations):
 
 @pytest.mark.parametrize("points", [40, 20])
 @pytest.mark.parametrize("units", [1.0, 100.0])
-def test_a_budget_of_gaussians_is_met_whatever_the_points_and_units(points, units):
+def test_a_budget_of_gaussians_is_met_for_any_points_and_units(points, units):
     scene = in_other_units(tiny_scene(), units)
     scene = replace(scene, points=scene.points[:points], point_colors=scene.point_colors[:points])
     records = list(PlusMethod(PlusOptions(initial_per_pixel=None)).fit(scene, Budget(64, gaussians=150)))
     assert 135 <= records[-1].counts["gaussians"] <= 150
 
 
-def test_the_threshold_of_growth_falls_with_the_length_of_a_run_and_then_stays():
+def test_the_threshold_falls_with_the_length_of_a_run_up_to_2000():
     found = [PlusOptions().for_run(iterations).gradient_threshold for iterations in (125, 500, 2000, 30_000)]
     assert found == pytest.approx([2e-4, 1e-4, 5e-5, 5e-5])
 
 
-def test_the_threshold_of_growth_falls_with_the_width_of_a_pixel_where_views_are_many_but_not_below_a_width_of_256():
+def test_the_threshold_falls_with_the_pixel_width_and_rises_for_few_views():
     def threshold(width):
         scene = tiny_scene()
         views = tuple(replace(view, width=width, height=width // 2) for view in scene.train)
-        trainee = PlusMethod(PlusOptions(depth_init_per_pixel=0.0)).build_model(replace(scene, train=views), 30_000)
-        return trainee.densifier.options.gradient_threshold
+        model = PlusMethod(PlusOptions(depth_init_per_pixel=0.0)).build_model(replace(scene, train=views), 30_000)
+        return model.densifier.options.gradient_threshold
 
     pixels = [2 * w * w / 2 / math.pi for w in (64, 256, 512, 1024)]
     found = [[PlusOptions().for_views(p, views).gradient_threshold for p in pixels] for views in (100, 28, 7, 1)]
@@ -82,7 +82,7 @@ def test_the_threshold_of_growth_falls_with_the_width_of_a_pixel_where_views_are
     assert [threshold(w) for w in (64, 1024)] == pytest.approx([5e-5, min(1, few / 4) * 5e-5])
 
 
-def test_what_is_kept_after_growth_is_what_the_views_would_miss():
+def test_the_most_important_gaussians_are_kept():
     trained, tiny = [], tiny_scene()
     for psnr in (None, 44.0):
         method = PlusMethod(replace(OPTIONS, prune_psnr=psnr, dropout=0.0))
@@ -90,7 +90,7 @@ def test_what_is_kept_after_growth_is_what_the_views_would_miss():
             before = record.counts["gaussians"]
         trained.append(method.model)
         assert method.render(tiny.test[0]).image.isfinite().all(), "at once"
-    whole, chosen = (trainee.splats.means for trainee in trained)
+    whole, chosen = (model.splats.means for model in trained)
     found = importance_scores(trained[0], tiny.train)
     assert len(whole) > before == len(chosen) == count_for_psnr(found, 44.0)
     kept = torch.isin(whole[:, 0], chosen[:, 0])
@@ -98,14 +98,14 @@ def test_what_is_kept_after_growth_is_what_the_views_would_miss():
 
 
 @pytest.mark.parametrize("iterations", [100, 6])
-def test_a_budget_of_gaussians_says_how_many_are_kept(iterations):
+def test_a_budget_of_gaussians_is_enforced_at_the_end(iterations):
     for record in PlusMethod(OPTIONS).fit(tiny_scene(), Budget(iterations, gaussians=150)):
         last = record.counts["gaussians"]
     assert last == 150
 
 
 @pytest.mark.parametrize(("gaussians", "chosen"), [(150, [31]), ("auto", [31]), (None, [])])
-def test_a_run_that_is_stopped_before_the_choice_makes_it_at_once_if_a_budget_asks_for_it(gaussians, chosen):
+def test_a_run_stopped_before_pruning_prunes_at_once_only_for_a_budget(gaussians, chosen):
     budget, whole, again = Budget(100, gaussians=gaussians), PlusMethod(OPTIONS), PlusMethod(OPTIONS)
     counts, events = [], []
     for record in whole.fit(tiny_scene(), budget):
@@ -120,7 +120,7 @@ def test_a_run_that_is_stopped_before_the_choice_makes_it_at_once_if_a_budget_as
     assert_same_but_time(again.state(), whole.state())
 
 
-def test_a_tight_budget_leaves_room_for_the_sky_and_for_growth():
+def test_a_tight_budget_leaves_capacity_for_sky_and_densification():
     tiny = tiny_scene()
     points = tiny.points[:1] + 0.1 * torch.randn(400, 3, generator=torch.Generator().manual_seed(0))
     scene = replace(tiny, points=points, point_colors=tiny.point_colors[:1].expand(400, 3))
@@ -161,12 +161,12 @@ def test_a_limit_of_seconds_does_not_end_the_rehearsal():
     )
 
 
-def test_options_of_the_schedule_of_3dgs_are_refused_and_not_ignored():
+def test_schedule_options_of_3dgs_are_refused():
     with pytest.raises(ValueError, match="reset_every is 100, but padgs_plus has densification rounds of its own"):
         PlusOptions(reset_every=100)
 
 
-def test_pixels_are_counted_by_what_they_see():
+def test_solid_angle_pixels():
     tiny = tiny_scene().train[0]
     view = replace(tiny, width=256, height=128)
     weight = solid_angle_weight(128).sum().item() * 256  # 1 at the horizon
@@ -183,7 +183,7 @@ def test_the_units_of_the_world_do_not_matter():
     assert losses[1] == pytest.approx(losses[0], rel=1e-3)
 
 
-def test_it_starts_with_a_share_of_the_pixels_and_stays_below_another():
+def test_initial_number_and_limit_are_multiples_of_the_pixels():
     options = replace(
         OPTIONS, initial_per_pixel=0.01, limit_per_pixel=0.03, sky_per_point=0.5, depth_init_per_pixel=0.0
     )
@@ -194,7 +194,7 @@ def test_it_starts_with_a_share_of_the_pixels_and_stays_below_another():
     assert max(counts) > counts[0]
 
 
-def test_the_penalty_is_the_mean_size_as_the_view_sees_it():
+def test_the_size_penalty_is_the_mean_angular_size():
     method, scene = PlusMethod(replace(OPTIONS, size_weight=0.7, smoothness_weight=0.0)), tiny_scene()
     next(method.fit(scene, Budget(10)))
     drawing = method.model.draw(scene.train[1])
@@ -205,13 +205,13 @@ def test_the_penalty_is_the_mean_size_as_the_view_sees_it():
     assert gradient is None or not gradient.any()  # it shall not push Gaussians away
 
 
-def test_where_gaussians_may_be_as_near_as_they_like_an_empty_direction_is_no_distance():
+def test_empty_pixels_have_a_finite_penalty_with_near_0():
     near = replace(PlusMethod.RENDER, near=0.0)
     records = list(PlusMethod(replace(OPTIONS, sky_per_point=0.0), near).fit(tiny_scene(), Budget(3)))
     assert len(records) == 3 and all(math.isfinite(record.loss) for record in records)
 
 
-def test_the_penalty_asks_for_smooth_surfaces_of_what_is_drawn():
+def test_the_smoothness_penalty_is_the_roughness_of_the_render():
     method, scene = PlusMethod(replace(OPTIONS, size_weight=0.0, smoothness_weight=0.3)), tiny_scene()
     next(method.fit(scene, Budget(10)))
     view = scene.train[1]
@@ -222,7 +222,7 @@ def test_the_penalty_asks_for_smooth_surfaces_of_what_is_drawn():
     assert method.model.splats.means.grad.any() and method.model.splats.log_scales.grad.any()
 
 
-def test_the_fewer_pixels_a_gaussian_has_the_more_of_them_a_drawing_leaves_out():
+def test_dropout_rises_as_pixels_per_gaussian_fall():
     options = PlusOptions(dropout=0.2)
     found = [
         options.dropout_share(pixels=1000.0 * AMPLE_PIXELS, gaussians=n) for n in (1, 1000, 1414.2136, 2000, 10**6)
@@ -244,7 +244,7 @@ def crowded_scene() -> Scene:
 
 
 @pytest.mark.parametrize(("done", "share"), [(1, 0.25), (17, 0.25), (18, 0.0), (20, 0.0)])
-def test_a_drawing_of_the_training_leaves_some_out_and_shows_more_of_the_others(done, share):
+def test_dropout_scales_the_kept_opacities(done, share):
     scene = crowded_scene()
     method, view = PlusMethod(replace(OPTIONS, dropout=0.25)), scene.train[0]
     list(islice(method.fit(scene, Budget(20)), done))
@@ -254,12 +254,12 @@ def test_a_drawing_of_the_training_leaves_some_out_and_shows_more_of_the_others(
     assert (drawn == 0).float().mean().item() == pytest.approx(share, abs=0.01)
     assert torch.allclose(drawn.amax(0), (whole / (1 - share)).clamp(max=1)), "as much is seen on average"
     drawings[0].rendering.image.sum().backward()
-    pulls = drawings[0].mean_offsets.grad.abs().amax(-1)
-    assert pulls[drawn[0] > 0].max() > 0 and not pulls[drawn[0] == 0].any()
+    gradients = drawings[0].mean_offsets.grad.abs().amax(-1)
+    assert gradients[drawn[0] > 0].max() > 0 and not gradients[drawn[0] == 0].any()
 
 
 @pytest.mark.parametrize("at", [13, 28])
-def test_what_is_left_out_is_the_same_after_an_interruption(at):
+def test_dropout_is_the_same_after_resuming(at):
     scene, whole, resumed = crowded_scene(), PlusMethod(OPTIONS), PlusMethod(OPTIONS)
     for record in whole.fit(scene, Budget(30)):
         if record.iteration == at:

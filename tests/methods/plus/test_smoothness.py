@@ -49,7 +49,7 @@ def test_a_plane_is_smooth_with_the_square_of_the_pixels(normal):
 
 
 @pytest.mark.parametrize("normal", [(0.6, 0.0, 0.0), (0.0, 0.6, 0.0), (0.3, -0.4, 0.3)])
-def test_what_is_smooth_on_the_sphere_is_so_at_the_poles_and_the_seam(normal):
+def test_poles_and_seam_are_no_edges(normal):
     coarse, fine = rough(wavy(64, normal)), rough(wavy(128, normal))
     assert fine == pytest.approx(coarse / 4, rel=0.1)
     noise = 1 + 0.02 * torch.randn(64, 128, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
@@ -61,7 +61,7 @@ def test_units_and_headings_change_nothing():
     assert rough(depth * 1e4) == pytest.approx(rough(depth)) and rough(depth.roll(13, 1)) == pytest.approx(rough(depth))
 
 
-def test_bends_of_colours_excuse_bends_of_surfaces():
+def test_edges_in_the_image_lower_the_weight():
     depth = torch.ones(16, 32, dtype=torch.float64)
     depth[:, 16:] = 1.05
     image = torch.zeros(16, 32, 3, dtype=torch.float64)
@@ -69,7 +69,7 @@ def test_bends_of_colours_excuse_bends_of_surfaces():
     assert 0 < rough(depth, image) < 1e-3 * rough(depth)
 
 
-def test_a_jump_is_an_edge_that_nothing_pulls_at():
+def test_large_jumps_have_no_gradient():
     depth = torch.ones(16, 32, dtype=torch.float64)
     depth[:, 16:] = 1 + 4 * MAX_BEND
     depth.requires_grad_()
@@ -77,7 +77,7 @@ def test_a_jump_is_an_edge_that_nothing_pulls_at():
     assert depth.grad is not None and not depth.grad.any()
 
 
-def test_what_is_transparent_does_not_count_and_a_narrow_picture_has_two_ends():
+def test_transparent_pixels_have_no_weight_and_perspective_rows_do_not_wrap():
     depth = torch.ones(16, 32, dtype=torch.float64)
     depth[:, :16] = 1.05  # the two jumps are in the middle, and where the ends meet
     clear = shown(depth)
@@ -134,7 +134,7 @@ def test_native_matches_the_definition(camera, monkeypatch):
 @needs_native
 @pytest.mark.parametrize("part", ["depth", "transmittance", "image"])
 @pytest.mark.parametrize("place", [(4, 5), (4, 1)])  # opaque, transparent
-def test_what_is_no_number_is_seen_in_the_loss(part, place):
+def test_nan_reaches_the_loss(part, place):
     camera = Panorama(33, 17)
     drawn = noisy(camera)
     getattr(drawn, part)[place] = math.nan
@@ -142,7 +142,7 @@ def test_what_is_no_number_is_seen_in_the_loss(part, place):
 
 
 @needs_native
-def test_what_the_native_pass_would_misread_goes_to_the_definition():
+def test_unsupported_tensors_use_the_definition():
     camera = Panorama(16, 8)
     drawn = noisy(camera)
     assert fits_native(drawn) and not fits_native(replace(drawn, image=drawn.image.double()))
@@ -167,7 +167,7 @@ def view_from(center: tuple[float, float, float]) -> View:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("unit", [1e-4, 1.0, 1e6])
-def test_it_is_scale_over_distance_but_none_is_less_than_near(dtype, unit):
+def test_angular_size_is_scale_over_distance_limited_by_near(dtype, unit):
     means = unit * torch.tensor([[1.0, 0.0, 4.0], [1.0, 2.0, 0.0], [1.0, 0.0, 0.001]], dtype=dtype)
     scales = unit * torch.tensor([[0.4, 0.2, 0.6], [0.1, 0.1, 0.1], [0.3, 0.3, 0.3]], dtype=dtype)
     found = mean_angular_size(gaussians_at(means, scales), view_from((unit, 0.0, 0.0)), near=0.5 * unit)
@@ -189,13 +189,13 @@ def test_the_native_value_and_gradient_are_those_of_the_definition(monkeypatch, 
 
 
 @pytest.mark.parametrize("place", ["means", "scales"])
-def test_what_is_no_number_reaches_the_loss(place, generator):
+def test_nan_reaches_the_angular_size(place, generator):
     values = {"means": torch.randn(20, 3, generator=generator), "scales": torch.rand(20, 3, generator=generator)}
     values[place][7, 1] = math.nan
     assert mean_angular_size(gaussians_at(**values), view_from((0.0, 0.0, 0.0)), near=0.1).isnan()
 
 
-def test_no_instruction_set_takes_what_is_no_number_for_near():
+def test_no_instruction_set_hides_nan():
     """Which of two numbers a maximum takes, if one is none, differs between them; this machine's own is above."""
     code = (
         "import torch; from test_smoothness import gaussians_at, view_from, mean_angular_size as size; "

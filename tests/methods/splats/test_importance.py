@@ -28,17 +28,17 @@ def scored(*changes: float) -> Importance:
 @pytest.mark.parametrize(
     ("psnr", "count"), [(90.0, 5), (60.0, 4), (40.0, 3), (37.0, 2), (20.5, 2), (19.5, 1), (-10.0, 1)]
 )
-def test_as_many_go_as_change_the_views_by_no_less_than_asked(psnr, count):
+def test_rows_are_removed_until_their_changes_add_up_to_the_psnr(psnr, count):
     found = scored(1e-4, 1.0, 1e-2, 9e-5, 2e-9)
     assert count_for_psnr(found, psnr) == count
     assert most_important(found, count).tolist() == sorted([1, 2, 0, 3, 4][:count])
 
 
-def test_a_tenth_stays_even_where_all_stand_in_for_each_other():
+def test_a_tenth_stays_even_if_all_rows_replace_each_other():
     assert count_for_psnr(scored(*[0.0] * 1000), 44.0) == MIN_KEPT_SHARE * 1000
 
 
-def test_in_a_perspective_view_what_is_above_counts_as_much_as_what_is_beside():
+def test_all_pixels_of_a_perspective_view_weigh_the_same():
     black = torch.zeros(32, 32, 3, dtype=torch.uint8)
     pose, lens = torch.eye(4, dtype=torch.float64), perspective(32, 32, 90.0)
     view = View("cut", pose, 32, 32, load_pixels=lambda: black, lens=lens)

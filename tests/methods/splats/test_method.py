@@ -10,7 +10,7 @@ from padgs.training.options import Budget
 
 
 @pytest.mark.parametrize("name", ["omnigs", "spags", "cubemap_3dgs"])
-def test_what_nobody_would_see_goes_once_when_growth_is_over(name):
+def test_budget_auto_prunes_once_after_densification(name):
     method = lookup(METHODS, name, "method")()
     counts, events = [], []
     for record in method.fit(tiny_scene(), Budget(120, gaussians="auto")):
@@ -23,12 +23,12 @@ def test_what_nobody_would_see_goes_once_when_growth_is_over(name):
     assert after < before
 
 
-def test_cameras_that_learn_along_say_nothing_of_what_would_be_seen():
+def test_budget_auto_is_refused_if_cameras_are_learned():
     with pytest.raises(ValueError, match="budget.gaussians is auto.*set it to a number or null"):
         lookup(METHODS, "sc_omnigs", "method")().refuse_budget(Budget(120, gaussians="auto"))
 
 
-def test_exposures_that_learn_along_do_not_matter_to_what_would_be_seen():
+def test_budget_auto_works_with_learned_exposures():
     method = make_method("omnigs", "train.exposures=learned")
     method.refuse_budget(Budget(120, gaussians="auto"))
     with pytest.raises(ValueError, match="budget.stop is auto"):

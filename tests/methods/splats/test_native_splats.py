@@ -52,7 +52,7 @@ def test_values_and_gradients_are_those_of_the_definition(monkeypatch, generator
             torch.testing.assert_close(native, defined.expand_as(native), atol=limit, rtol=1e-6)
 
 
-def test_colours_that_begin_at_an_end_of_their_range_learn_in_every_channel(monkeypatch, generator):
+def test_initially_black_colours_get_gradients(monkeypatch, generator):
     """Rounding must not cut off what begins at 0, for nothing would ever pull at it."""
     splats = splats_of(4, 2, generator)
     black = Splats(splats.means, splats.log_scales, torch.eye(4)[:, :3], degree=2)
@@ -74,7 +74,7 @@ def test_colours_that_begin_at_an_end_of_their_range_learn_in_every_channel(monk
         ({"dc": torch.zeros(2, 3, dtype=torch.float64)}, "dc torch.float64 on cpu"),
     ],
 )
-def test_what_a_library_would_read_wrongly_is_refused(change, said):
+def test_invalid_tensors_are_refused(change, said):
     two = {"means": torch.zeros(2, 3), "log_scales": torch.zeros(2, 3), "opacity_logits": torch.zeros(2)}
     learned = native_splats.Parameters(
         **two | {"dc": torch.zeros(2, 3), "rest": torch.zeros(2, 8, 3), "mean_offsets": None} | change
@@ -85,7 +85,7 @@ def test_what_a_library_would_read_wrongly_is_refused(change, said):
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 80.0, -80.0, 200.0, -200.0, 0.0])
 @pytest.mark.parametrize("count", [1, 16, 40])
-def test_extreme_parameters_become_what_they_do_in_the_definition(generator, value, count):
+def test_extreme_parameters_match_the_definition(generator, value, count):
     """So that what is no number is found out, and nothing else becomes one."""
     splats = splats_of(count, 0, generator)
     splats.log_scales.data[-1, 1] = value

@@ -1,4 +1,4 @@
-"""Densification signals against their formulas."""
+"""Positional gradients against their formulas."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def view_at(generator: torch.Generator | None, width: int = 48) -> View:
 
 
 @pytest.mark.parametrize("projection", ["erp", "tangent", "ray"])
-def test_the_signal_in_space_is_half_the_distance_times_the_gradient_of_the_mean(projection, generator):
+def test_space_is_half_the_distance_times_the_gradient_of_the_mean(projection, generator):
     """By autograd, in float64, with a pose that is turned and shifted: 0.5 |mean - centre| |dL/dmean|.
 
     The direction of the mean, which its colour depends on, counts.
@@ -74,9 +74,9 @@ def test_the_signal_in_space_is_half_the_distance_times_the_gradient_of_the_mean
     assert torch.allclose(offsets.grad.norm(dim=-1), expected, rtol=1e-9, atol=1e-14)
 
 
-def test_a_small_gaussian_is_pulled_alike_wherever_it_is(generator):
-    """r |dL/dmean| is per radian: neither turning the world nor multiplying its lengths changes the signal."""
-    signals = []
+def test_the_gradient_in_space_is_invariant_to_rotation_and_scale(generator):
+    """r |dL/dmean| is per radian: neither rotating nor scaling the world changes it."""
+    norms_by = []
     for scale, axis in ((1.0, 2), (1.0, 0), (3.0, 2)):
         splats = colored_splats(1, generator)
         splats.means.data = torch.zeros(1, 3).double()
@@ -89,15 +89,15 @@ def test_a_small_gaussian_is_pulled_alike_wherever_it_is(generator):
         rays = view.camera.rays(dtype=torch.float64)
         aside = (splats.means.detach()[0].roll(1) / (2 * scale) * rays).sum(-1)  # odd about the ball's centre
         (rendering.image.sum(-1) * aside * (1 - rays[..., 1] ** 2).sqrt()).sum().backward()
-        signals.append(offsets.grad.norm().item())
-    assert signals[1] == pytest.approx(signals[0], rel=2e-3)
-    assert signals[2] == pytest.approx(signals[0], rel=1e-6)
+        norms_by.append(offsets.grad.norm().item())
+    assert norms_by[1] == pytest.approx(norms_by[0], rel=2e-3)
+    assert norms_by[2] == pytest.approx(norms_by[0], rel=1e-6)
 
 
 @pytest.mark.parametrize("latitude", [15.0, 45.0, 70.0])
 @pytest.mark.parametrize("projection", ["tangent", "ray"])
-def test_the_signal_in_the_image_has_one_unit_in_every_projection(projection, latitude, generator):
-    """So one threshold of growth means the same: medians over many small Gaussians agree to some percent."""
+def test_the_gradient_in_the_image_has_the_same_unit_in_every_projection(projection, latitude, generator):
+    """One threshold fits all projections: medians over many small Gaussians agree to some percent."""
     count, width = 60, 256
     longitude = math.pi * (2 * torch.rand(count, generator=generator, dtype=torch.float64) - 1)
     means = 2 * direction(longitude, torch.full_like(longitude, math.radians(latitude)))
@@ -107,51 +107,51 @@ def test_the_signal_in_the_image_has_one_unit_in_every_projection(projection, la
     splats.quats.data, splats.opacity_logits.data = quats, torch.zeros_like(longitude)
     blobs = torch.rand(1, 3, 8, 16, generator=generator, dtype=torch.float64)
     target = torch.nn.functional.interpolate(blobs, (width // 2, width), mode="bicubic")[0].permute(1, 2, 0)
-    signals = {}
+    norms_by = {}
     for name, kind in (("erp", "pixels"), (projection, "angular")):
         rendering, offsets = drawn(splats, view_at(None, width), "image", projection=name, low_pass_kind=kind)
         ((rendering.image - target) ** 2).mean().backward()
         assert offsets.grad is not None
-        signals[name] = offsets.grad.norm(dim=-1)
-    assert (signals[projection] / signals["erp"]).median().item() == pytest.approx(1, abs=0.15)
+        norms_by[name] = offsets.grad.norm(dim=-1)
+    assert (norms_by[projection] / norms_by["erp"]).median().item() == pytest.approx(1, abs=0.15)
 
 
-def test_the_absolute_signal_is_half_the_distance_times_the_pulls_of_all_pixels(generator):
-    """Beside the signal in space, which is what it is without them."""
+def test_space_absolute_adds_half_the_distance_times_the_absolute_gradients_of_pixels(generator):
+    """The gradient in space itself does not change."""
     splats, view = colored_splats(30, generator), view_at(generator)
     gaussians, weight = splats.gaussians(view), torch.randn(24, 48, 3, generator=generator).double()
     gradients = []
-    for signal in ("space", "space_absolute"):
-        rendering, offsets = drawn(splats, view, signal, projection="ray")
+    for kind in ("space", "space_absolute"):
+        rendering, offsets = drawn(splats, view, kind, projection="ray")
         (weight * rendering.image).sum().backward()
         gradients.append(offsets.grad)
     assert torch.equal(gradients[0], gradients[1][:, :3])
 
-    pulls = torch.zeros(30, dtype=torch.float64, requires_grad=True)
-    (weight * render(gaussians, view, RAY, absgrad=pulls).image).sum().backward()
+    absolute = torch.zeros(30, dtype=torch.float64, requires_grad=True)
+    (weight * render(gaussians, view, RAY, absgrad=absolute).image).sum().backward()
     distance = (gaussians.means.detach() @ view.cam_from_world[:3, :3].T + view.cam_from_world[:3, 3]).norm(dim=-1)
-    assert pulls.grad is not None and (pulls.grad > 0).sum() > 20
-    assert torch.allclose(gradients[1][:, 3], 0.5 * distance * pulls.grad, rtol=1e-9, atol=1e-14)
+    assert absolute.grad is not None and (absolute.grad > 0).sum() > 20
+    assert torch.allclose(gradients[1][:, 3], 0.5 * distance * absolute.grad, rtol=1e-9, atol=1e-14)
 
 
-@pytest.mark.parametrize(("signal", "axes"), [("image", 2), ("space", 3), ("space_absolute", 4)])
-def test_the_densifier_is_given_the_signal_of_its_options(signal, axes, generator):
+@pytest.mark.parametrize(("kind", "axes"), [("image", 2), ("space", 3), ("space_absolute", 4)])
+def test_the_densifier_observes_the_gradient_of_its_options(kind, axes, generator):
     splats, render_config = colored_splats(10, generator), RenderConfig(backend="torch", projection="ray")
-    trainee = SplatModel(
-        splats, DensificationOptions(positional_gradient=signal), render_config, extent=1.0, iterations=100
+    model = SplatModel(
+        splats, DensificationOptions(positional_gradient=kind), render_config, extent=1.0, iterations=100
     )
-    drawing = trainee.draw(view_at(generator))
+    drawing = model.draw(view_at(generator))
     drawing.rendering.image.sum().backward()
     assert drawing.mean_offsets.grad is not None and drawing.mean_offsets.grad.shape == (10, axes)
-    trainee.observe(drawing, 1)
+    model.observe(drawing, 1)
     norms = torch.where(drawing.rendering.visible, drawing.mean_offsets.grad[:, :3].norm(dim=-1), 0.0)
-    assert torch.equal(trainee.densifier.statistics["gradient"], norms)
+    assert torch.equal(model.densifier.statistics["gradient"], norms)
     assert norms.sum() > 0
     if axes == 4:
-        assert torch.equal(trainee.densifier.statistics["absolute"], drawing.mean_offsets.grad[:, 3])
+        assert torch.equal(model.densifier.statistics["absolute"], drawing.mean_offsets.grad[:, 3])
 
 
-def test_the_absolute_signal_wants_the_projection_that_has_it():
+def test_space_absolute_needs_projection_ray():
     with pytest.raises(
         ValueError, match=r"space_absolute is made for render\.projection=ray, not erp; set .*positional_gradient=space"
     ):

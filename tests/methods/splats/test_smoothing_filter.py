@@ -1,4 +1,4 @@
-"""No picture is finer than the photographs."""
+"""The 3D smoothing filter: no render is finer than the training views."""
 
 import pytest
 import torch
@@ -24,14 +24,14 @@ def close_up(view: View) -> View:
     return View("close", view.cam_from_world, 96, 96, lens=perspective(96, 96, 90))
 
 
-def test_the_finest_pixel_is_that_of_the_nearest_camera_or_of_the_sharpest():
+def test_the_finest_pixel_depends_on_distance_and_focal_length():
     cameras = torch.tensor([[0.0, 0, 0, 10], [4.0, 0, 0, 10], [0.0, 0, 0, 20]], dtype=torch.float64)
     found = finest_pixels(torch.tensor([[1.0, 0, 0], [3.9, 0, 0], [0, 8.0, 0]]), cameras)
     assert found.tolist() == pytest.approx([1 / 20, 0.1 / 10, 8 / 20])
     assert not finest_pixels(torch.ones(2, 3), cameras[:0]).any()
 
 
-def test_the_filter_of_a_view_on_top_makes_that_of_the_larger_pixel(trained):
+def test_with_the_low_pass_of_the_view_the_larger_pixel_results(trained):
     view, variance = tiny_scene().train[0], 0.1
     gaussians = trained.model.splats.gaussians(view)
     distances = (gaussians.means - view.center.float()).norm(dim=-1)
@@ -47,24 +47,24 @@ def test_the_filter_of_a_view_on_top_makes_that_of_the_larger_pixel(trained):
     torch.testing.assert_close(seen.opacities, gaussians.opacities * (gaussians.scales / wide).prod(-1))
 
 
-def test_training_views_are_drawn_as_they_were_trained_and_closer_ones_wider(trained):
-    trainee, scene = trained.model, tiny_scene()
+def test_training_views_are_unchanged_and_closer_views_are_smoothed(trained):
+    model, scene = trained.model, tiny_scene()
 
     def plainly(view: View):
-        return render(trainee.splats.gaussians(view), view, trainee.render_options(view)).image
+        return render(model.splats.gaussians(view), view, model.render_options(view)).image
 
     for view in scene.train:
-        torch.testing.assert_close(trainee.render(view).image, plainly(view), atol=1e-5, rtol=0)
+        torch.testing.assert_close(model.render(view).image, plainly(view), atol=1e-5, rtol=0)
     near = close_up(scene.train[0])
-    difference = (trainee.render(near).image - plainly(near)).abs().max()
+    difference = (model.render(near).image - plainly(near)).abs().max()
     assert difference > 0.01
-    pixels = finest_pixels(trainee.splats.means, cameras_of(scene.train))
-    wider = smoothed_for_view(trainee.splats.gaussians(near), near, pixels, trained.render_config.low_pass)
-    drawn = render(wider, near, trainee.render_options(near)).image
-    assert torch.equal(trainee.render(near).image, drawn)
+    pixels = finest_pixels(model.splats.means, cameras_of(scene.train))
+    wider = smoothed_for_view(model.splats.gaussians(near), near, pixels, trained.render_config.low_pass)
+    drawn = render(wider, near, model.render_options(near)).image
+    assert torch.equal(model.render(near).image, drawn)
 
 
-def test_a_loaded_model_knows_its_cameras_and_forgets_pixels_with_the_gaussians_that_it_loses(trained):
+def test_the_filter_survives_loading_and_pruning(trained):
     view = close_up(tiny_scene().train[1])
     loaded = PlusMethod(PlusOptions(initial_per_pixel=None))
     loaded.load_state(trained.state())
@@ -77,10 +77,10 @@ def test_a_loaded_model_knows_its_cameras_and_forgets_pixels_with_the_gaussians_
     assert torch.equal(loaded.render(view).image, drawn)
 
 
-def test_a_model_in_another_order_is_drawn_the_same(trained):
-    view, trainee = close_up(tiny_scene().train[0]), trained.model
-    before, stored = trainee.render(view).image, trainee.splats.state_dict()
-    rows = {name: tensor.flip(0) if name in trainee.splats.rows() else tensor for name, tensor in stored.items()}
-    trainee.splats.load(rows)
-    torch.testing.assert_close(trainee.render(view).image, before, atol=1e-5, rtol=0)
-    trainee.splats.load(stored)
+def test_the_order_of_rows_does_not_matter(trained):
+    view, model = close_up(tiny_scene().train[0]), trained.model
+    before, stored = model.render(view).image, model.splats.state_dict()
+    rows = {name: tensor.flip(0) if name in model.splats.rows() else tensor for name, tensor in stored.items()}
+    model.splats.load(rows)
+    torch.testing.assert_close(model.render(view).image, before, atol=1e-5, rtol=0)
+    model.splats.load(stored)

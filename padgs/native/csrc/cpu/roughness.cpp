@@ -1,5 +1,5 @@
 // How rough the surfaces of a drawing are and the derivative by its distances, in one call.
-// padgs.methods.plus.smoothness.roughness is the definition.
+// padgs.methods.plus.smoothness.define_roughness is the definition.
 //
 // Three passes over the rows: weights of neighbours, second differences of 1 / r across and down, and the derivatives.
 // With v = (before + after) / here - 2 and the weight w of a place, the term w |v| has the derivative p = w sign(v) / here
