@@ -50,7 +50,7 @@ def test_axioms_of_rotations(first, second):
     torch.testing.assert_close(composed, matrix @ rotation_matrices(b), rtol=0, atol=1e-12)
 
 
-def test_rotations_come_in_any_batch_and_are_differentiable(generator):
+def test_rotations_are_batched_and_differentiable(generator):
     quats = torch.randn(2, 5, 4, generator=generator, dtype=torch.float64, requires_grad=True)
     batch = rotation_matrices(quats)
     assert batch.shape == (2, 5, 3, 3)
@@ -63,7 +63,7 @@ def some(count: int) -> Gaussians:
     return Gaussians(*(torch.rand(shape) for shape in shapes))
 
 
-def test_a_set_of_gaussians_has_a_size_and_converts_as_one():
+def test_size_and_conversion():
     gaussians = some(7)
     assert len(gaussians) == 7 and len(some(0)) == 0
     converted = gaussians.to(torch.float64)

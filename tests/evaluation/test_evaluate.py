@@ -45,7 +45,7 @@ def image(generator, pixels):
     return pixels / 255 + 0.2 * torch.randn(H, W, 3, generator=generator)
 
 
-def test_the_number_is_that_of_the_saved_files(tmp_path, image, pixels):
+def test_scores_are_those_of_saved_8_bit_images(tmp_path, image, pixels):
     evaluation = evaluate(lambda _: rendering(image), [view("a", pixels)], PAPER)
     Image.fromarray((image.clamp(0, 1) * 255).round().byte().numpy()).save(tmp_path / "render.png")
     stored = torch.from_numpy(np.array(Image.open(tmp_path / "render.png"))) / 255
@@ -71,7 +71,7 @@ def test_a_perfect_render(name, pixels):
     assert [*evaluation.metrics] == [*protocol.metrics, *lpips]
 
 
-def test_means_and_pictures_of_several_views(image, pixels):
+def test_means_and_images_of_several_views(image, pixels):
     views = [view("a", pixels), view("b", pixels.flip(0))]
     seen = []
     evaluation = evaluate(
@@ -91,7 +91,7 @@ def test_means_and_pictures_of_several_views(image, pixels):
 
 
 @pytest.mark.parametrize("protocol", [PAPER, SPHERE, protocol_from_options("paper", lpips="alex")])
-def test_what_a_mask_hides_changes_nothing_in_any_protocol(image, pixels, generator, protocol):
+def test_masked_pixels_change_no_protocol(image, pixels, generator, protocol):
     mask = torch.ones(H, W)
     mask[-6:] = 0
     ruined = torch.where(mask[..., None] > 0, image, torch.rand(H, W, 3, generator=generator))
@@ -115,7 +115,7 @@ def test_paper_cuts_the_bottom_off_and_sphere_hides_it(image, pixels):
     assert sphere["ws_psnr_nadir"] is None  # rows 29 to 31
 
 
-def test_a_band_that_no_pixel_counts_in_is_missing_and_does_not_spoil_the_mean(image, pixels):
+def test_metrics_without_weighted_pixels_are_missing(image, pixels):
     mask = torch.ones(H, W)
     mask[H // 2 :] = 0
     views = [view("a", pixels, mask), view("b", pixels)]
@@ -125,7 +125,7 @@ def test_a_band_that_no_pixel_counts_in_is_missing_and_does_not_spoil_the_mean(i
     assert mean_metrics([{"x": None}, {"x": None}]) == {"x": None}
 
 
-def test_missing_lpips_is_said_once_and_the_rest_stands(image, pixels, monkeypatch):
+def test_missing_lpips_is_noted_once(image, pixels, monkeypatch):
     def nothing_here(*_, **__):
         raise LpipsUnavailable("no weights for LPIPS vgg")
 

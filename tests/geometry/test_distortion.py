@@ -44,7 +44,7 @@ def test_known_points(point, expected):
 
 
 @pytest.mark.parametrize(("width", "height"), SIZES)
-def test_the_map_is_sine_squared_of_the_latitude_of_each_row(width, height):
+def test_distortion_map_is_sine_squared_of_latitude(width, height):
     expected = torch.sin(row_latitudes(height, dtype=torch.float64)) ** 2
     ours = distortion_map(width, height, dtype=torch.float64)
     assert ours.shape == (height, width)
@@ -52,7 +52,7 @@ def test_the_map_is_sine_squared_of_the_latitude_of_each_row(width, height):
 
 
 @given(st.tuples(coordinates, coordinates, coordinates), st.floats(1e-3, 1e3))
-def test_it_is_sine_squared_of_the_latitude_at_any_distance(point, scale):
+def test_distortion_does_not_depend_on_distance(point, scale):
     point = torch.tensor(point, dtype=torch.float64)
     assume(point.norm() > 1e-3)
     assert 0 <= omega(point).item() <= 1 + 1e-15
@@ -61,7 +61,7 @@ def test_it_is_sine_squared_of_the_latitude_at_any_distance(point, scale):
     torch.testing.assert_close(omega(point * scale), omega(point), rtol=0, atol=1e-13)
 
 
-def test_it_is_smooth_on_the_polar_axis():
+def test_distortion_is_smooth_on_the_polar_axis():
     points = torch.tensor([[0.0, 1.0, 0.0], [0.0, -3.0, 0.0], [1e-9, 1.0, 0.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
     points.requires_grad_()
     omega(points).sum().backward()
@@ -69,7 +69,7 @@ def test_it_is_smooth_on_the_polar_axis():
     assert torch.autograd.gradcheck(omega, points)
 
 
-def test_the_axis_is_the_cameras_or_as_released_the_worlds(generator):
+def test_polar_axes(generator):
     points = torch.randn(50, 3, generator=generator, dtype=torch.float64)
     rotation = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64)).Q
     pose = torch.eye(4, dtype=torch.float64)
@@ -81,14 +81,14 @@ def test_the_axis_is_the_cameras_or_as_released_the_worlds(generator):
         polar_axis("y", pose)
 
 
-def test_opacities_fall_towards_the_poles():
+def test_opacity_factor():
     degrees = torch.tensor([0.0, 0.5, 1.0])
     assert torch.allclose(opacity_factor(degrees, 0.9), torch.tensor([1.0, 0.55, 0.1]))
     assert torch.equal(opacity_factor(degrees, 0.0), torch.ones(3))
     assert torch.allclose(opacity_factor(degrees, 1.0, 1 - 1e-4), torch.tensor([1.0, 0.5, 1e-4]), atol=1e-7)
 
 
-def test_distortion_and_weight_are_two_sides_of_the_latitude():
+def test_distortion_plus_squared_weight_is_one():
     # Eq. 11 and 12: Omega = 1 - cos^2, M = cos.
     weight = solid_angle_weight(48, dtype=torch.float64)
     torch.testing.assert_close(distortion_map(4, 48, dtype=torch.float64)[:, 0], 1 - weight**2)
@@ -128,7 +128,7 @@ def test_no_row_has_weight_zero(height, dtype):
     torch.testing.assert_close(weight, weight.flip(0), rtol=1e-3, atol=1e-6)
 
 
-def test_the_released_weight_gives_up_the_end_rows():
+def test_released_weight_is_zero_in_the_end_rows():
     weight = end_row_weight(9, dtype=torch.float64)
     assert weight[[0, -1]].tolist() == pytest.approx([0, 0], abs=1e-15)
     assert weight[4].item() == pytest.approx(1)

@@ -44,7 +44,7 @@ def test_every_function_is_its_polynomial_up_to_parity():
     assert torch.allclose(backward, forward * parity, atol=1e-12)
 
 
-def test_constant_term_gives_back_the_colour():
+def test_constant_term_reproduces_the_color():
     colors = torch.tensor([[0.0, 0.5, 1.0]])
     assert torch.allclose(0.5 + basis(torch.tensor([0.0, 1.0, 0.0]), 0) * dc_from_colors(colors), colors)
 

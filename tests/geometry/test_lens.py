@@ -15,7 +15,7 @@ def angle_from(axis: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("name", AXES)
-def test_bending_changes_the_angle_from_the_axis_by_the_radial_map_and_nothing_else(name):
+def test_bend_applies_the_radial_map(name):
     axis, directions = axis_direction(name), rays(64, 32, dtype=torch.float64)
     bent = bend(directions, axis, K)
     torch.testing.assert_close(bent.norm(dim=-1), torch.ones(32, 64, dtype=torch.float64))
@@ -25,17 +25,17 @@ def test_bending_changes_the_angle_from_the_axis_by_the_radial_map_and_nothing_e
     assert (bent * aside).sum(-1).abs().max() < 1e-12, "in the plane of axis and direction"
 
 
-def test_without_coefficients_no_bit_changes():
+def test_without_coefficients_bend_is_exact():
     directions = rays(48, 24)
     assert torch.equal(bend(directions, axis_direction("z").float(), torch.zeros(2)), directions)
 
 
-def test_on_the_axis_nothing_bends():
+def test_bend_on_the_axis():
     axis = axis_direction("z")
     assert torch.equal(bend(axis[None], axis, K), axis[None])
 
 
-def test_the_radial_map_can_be_undone():
+def test_radial_map_is_invertible():
     theta = torch.linspace(0, 1.7, 500, dtype=torch.float64)
     bent = radial_map(theta, K)
     assert (bent.diff() > 0).all()
@@ -54,14 +54,14 @@ def test_the_radial_map_can_be_undone():
 
 
 @pytest.mark.parametrize("blend", [0.0, 0.1, 0.8])
-def test_the_two_lenses_share_each_direction(blend):
+def test_weights_of_two_lenses_sum_to_one(blend):
     axis, directions = axis_direction("x"), rays(64, 32, dtype=torch.float64)
     front, back = hemisphere_weight(directions, axis, blend), hemisphere_weight(directions, -axis, blend)
     torch.testing.assert_close(front + back, torch.ones_like(front))
     assert (front[directions[..., 0] > math.sin(blend)] == 1).all() and (front[..., 32:] >= 0.5).all()
 
 
-def test_the_gradient_by_the_coefficients_is_that_of_differences():
+def test_gradient_by_coefficients():
     directions = rays(12, 6, dtype=torch.float64)
     coefficients = K.clone().requires_grad_()
     assert torch.autograd.gradcheck(lambda k: bend(directions, axis_direction("z"), k), coefficients)

@@ -115,7 +115,7 @@ def test_project_undoes_unproject(u, v):
 
 
 @given(st.floats(-math.pi, math.pi, exclude_min=True), st.floats(-math.pi / 2, math.pi / 2))
-def test_angles_survive_the_way_to_pixels_and_back(longitude, latitude):
+def test_angles_round_trip(longitude, latitude):
     angles = angles_from_pixel(pixel_from_angles(double(longitude), double(latitude), W, H), W, H)
     assert [angle.item() for angle in angles] == pytest.approx([longitude, latitude], abs=1e-14)
     assert direction(double(longitude), double(latitude)).norm().item() == pytest.approx(1, abs=1e-15)
@@ -139,7 +139,7 @@ def test_the_seam_is_where_the_columns_end():
     assert left[0].item() == pytest.approx(0, abs=1e-6) and right[0].item() == pytest.approx(W, abs=1e-6)
 
 
-def test_latitude_keeps_its_digits_near_the_poles():
+def test_latitude_is_accurate_near_the_poles():
     colatitude = torch.logspace(-6, -2, 50, dtype=torch.float64)
     exact = torch.stack((torch.sin(colatitude), torch.cos(colatitude), torch.zeros(50).double()), dim=-1)
     error = math.pi / 2 - longitude_latitude(exact.float())[1].double() - colatitude
@@ -196,7 +196,7 @@ def test_jacobian_on_the_axis_is_the_limit_from_ahead(pole, dtype):
     assert ours[0, 0].item() == pytest.approx(W / (2 * math.pi) / (2 * 1e-4), rel=1e-5)
 
 
-def test_the_lower_limit_changes_only_what_is_below_it():
+def test_jacobian_limit_changes_only_smaller_values():
     point = double(0.3, 1.0, 0.2)
     cosine = (torch.hypot(point[0], point[2]) / point.norm()).item()
     free = projection_jacobian(point, W, H)

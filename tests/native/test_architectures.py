@@ -1,4 +1,4 @@
-"""What libpadgs_cuda is compiled for, decided by CMake from what nvcc and nvidia-smi say; both are pretended here."""
+"""Architectures of libpadgs_cuda, chosen by CMake from the output of nvcc and nvidia-smi; both are faked here."""
 
 from __future__ import annotations
 
@@ -35,9 +35,7 @@ def program(folder: Path, name: str, *lines: str) -> str:
         ("90;35", [], "35;90", "nvcc does not know compute capability 35; it knows 75, 80, 89, 90, 120"),
     ],
 )
-def test_architectures_are_those_of_the_machine_or_the_list_that_is_asked_for(
-    asked, gpus, architectures, problem, tmp_path: Path
-):
+def test_architectures(asked, gpus, architectures, problem, tmp_path: Path):
     nvcc = program(tmp_path, "nvcc", "compute_75", "compute_80", "compute_89", "compute_90", "compute_120")
     program(tmp_path, "nvidia-smi", *gpus)
     found, told = chosen(nvcc, asked, tmp_path)
@@ -45,7 +43,7 @@ def test_architectures_are_those_of_the_machine_or_the_list_that_is_asked_for(
 
 
 @pytest.mark.parametrize(("release", "problem"), [("11.5", "is of CUDA 11.5"), ("11.8", ""), ("13.0", "")])
-def test_a_compiler_that_cannot_transpose_matrices_is_a_problem(release, problem, tmp_path: Path):
+def test_a_compiler_without_matrix_transpose_is_refused(release, problem, tmp_path: Path):
     found, told = chosen(program(tmp_path, "nvcc", "compute_80", f"release {release}, V{release}.1"), "80", tmp_path)
     assert found == "80" and problem in told and bool(problem) == bool(told)
 

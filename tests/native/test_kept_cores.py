@@ -1,4 +1,4 @@
-"""What forward hybrid blending keeps of the cores for its backward pass."""
+"""Cores that hybrid blending keeps for its backward pass."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from padgs.scene import View
 
 
 @each_native_engine
-def test_going_back_twice_gives_the_same(backend: str, generator: torch.Generator):
+def test_repeated_backward_is_equal(backend: str, generator: torch.Generator):
     inputs = leaves(gaussians_of("ordinary", 12, generator), torch.float32)
     rendering = render(inputs, View("v", identity_pose(), 40, 20), options_of("ray", 3), backend=backend)
     loss = rendering.image.square().sum() + rendering.depth.sum()
@@ -36,7 +36,7 @@ def kept(monkeypatch: pytest.MonkeyPatch) -> list:
 
 @needs_native
 @pytest.mark.parametrize("size", [1, 3, 16, 256])
-def test_what_is_kept_for_backward_fits_where_it_goes(size: int, kept: list, generator: torch.Generator):
+def test_kept_cores_fit_their_buffer(size: int, kept: list, generator: torch.Generator):
     """Solid dots of about a pixel: in the core of each pixel are other Gaussians than in those beside it."""
     count, view = 20_000, View("v", identity_pose(), 60, 30)
     gaussians = gaussians_of("ordinary", count, generator)
@@ -52,7 +52,7 @@ def test_what_is_kept_for_backward_fits_where_it_goes(size: int, kept: list, gen
 
 
 @needs_native
-def test_nothing_is_kept_where_no_gradient_is_wanted(kept: list, generator: torch.Generator):
+def test_cores_are_kept_only_with_gradients(kept: list, generator: torch.Generator):
     gaussians, view = gaussians_of("ordinary", 12, generator).to(torch.float32), View("v", identity_pose(), 40, 20)
     render(gaussians, view, options_of("ray", 3), backend="cpu")
     with torch.no_grad():

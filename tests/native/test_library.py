@@ -1,4 +1,4 @@
-"""The native library: chosen at run time, loaded when first asked for, missed once and politely."""
+"""Selection, loading and absence of the native library."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ print("padgs.native" in sys.modules, "padgs_cpu" in open("/proc/self/maps").read
 
 @pytest.fixture
 def missing_library(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
-    """As on a machine where nothing was compiled."""
+    """A machine without compiled libraries."""
     caches = (cpu.library, cpu.available, package._warn_missing_library)
     monkeypatch.setenv("PADGS_LIBRARY_DIR", str(tmp_path))
     monkeypatch.setattr(loading, "_package_folders", lambda: [str(tmp_path / "padgs" / "render")])
@@ -65,7 +65,7 @@ def gaussians(generator: torch.Generator) -> Gaussians:
     return gaussians_of("ordinary", 5, generator).to(torch.float32)
 
 
-def test_without_the_library_auto_means_torch_and_says_so_once(missing_library: None, gaussians: Gaussians):
+def test_missing_library_warns_once_and_uses_torch(missing_library: None, gaussians: Gaussians):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         images = [render(gaussians, VIEW).image for _ in range(3)]
@@ -76,16 +76,14 @@ def test_without_the_library_auto_means_torch_and_says_so_once(missing_library: 
     assert torch.equal(images[0], render(gaussians, VIEW, backend="torch").image)
 
 
-def test_without_the_library_nothing_is_said_where_it_could_not_be_used(missing_library: None, gaussians: Gaussians):
+def test_missing_library_warns_only_if_it_would_be_used(missing_library: None, gaussians: Gaussians):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         render(gaussians.to(torch.float64), VIEW)
         render(gaussians, VIEW, backend="torch")
 
 
-def test_without_the_library_asking_for_it_says_the_way_out(
-    missing_library: None, gaussians: Gaussians, tmp_path: Path
-):
+def test_missing_library_error(missing_library: None, gaussians: Gaussians, tmp_path: Path):
     with pytest.raises(
         OSError, match="padgs_cpu.* not found in .*C\\+\\+ compiler.* or render with backend=torch"
     ) as error:

@@ -1,4 +1,4 @@
-"""Footprints straight from the definition, written once more: no bounds, no cut, nothing of the renderer.
+"""Footprints from the definition, written independently of the renderer, without bounds and cut.
 
 Everything is float64 and happens in the camera frame: the pose is the identity. Low-pass filters are those that each
 projection was published with.

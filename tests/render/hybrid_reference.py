@@ -1,4 +1,4 @@
-"""Hybrid blending of one pixel as it was published: fragments arrive one by one, evicted ones join the tail."""
+"""Hybrid blending of one pixel as published: fragments arrive one by one, evicted ones join the tail."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gaussians that are hard to draw, cameras, poses, and the engines (backend, dtype) that tests of drawing run on."""
+"""Difficult Gaussians, cameras, poses, engines (backend, dtype), and comparisons for tests of rendering."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One picture, whatever describes the camera: a formula, a table of rays, or another pose."""
+"""Equivalent descriptions of a camera: formula, ray table, or another pose."""
 
 from __future__ import annotations
 
@@ -167,7 +167,7 @@ def test_the_gradient_of_the_rays_is_that_of_the_pose(projection: str, backend: 
     assert along.abs().max() <= 1e-4 * by_table.norm(dim=-1).max()
 
 
-def test_a_table_is_brought_to_a_device_once_and_again_where_it_changes():
+def test_ray_tables_are_cached_until_they_change():
     table = Panorama(20, 10).rays()
     camera = RayTable(table, 20 / 6)
     first = native_rays(camera).table

@@ -1,4 +1,4 @@
-"""Bad input gets an error that names the tensor, the rule and the way out; no input crashes."""
+"""Invalid input raises an error that names the tensor, the rule and the way out; no input crashes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A panorama through six faces: geometry of the cube, interpolation, seams, gradients."""
+"""Cubemaps: geometry, interpolation, seams, gradients."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def seen_by_faces(panorama: Panorama, lens: Pinhole) -> list[Rendering]:
     return [Rendering(local @ turn, empty, empty + 3.0, torch.ones(1, dtype=torch.bool)) for turn in FACES]
 
 
-def test_faces_are_turns_and_look_along_all_axes():
+def test_faces_are_rotations_along_all_axes():
     torch.testing.assert_close(FACES @ FACES.mT, torch.eye(3, dtype=torch.float64).expand(6, 3, 3))
     assert torch.equal(torch.linalg.det(FACES), torch.ones(6, dtype=torch.float64))
     assert {tuple(axis) for axis in FACES[:, 2].tolist()} == {
@@ -77,7 +77,7 @@ def test_every_pixel_is_interpolated_inside_one_face(width: int, height: int, fa
     assert (column[:, 1] - column[:, 0] == 1).all() and (row[:, 2] - row[:, 0] == 1).all()
 
 
-def test_a_face_is_twice_as_fine_as_the_panorama_unless_its_size_is_given():
+def test_face_size():
     assert FINENESS == 2
     assert face_camera(Panorama(1024, 512)).focal == pytest.approx(2 * 1024 / (2 * math.pi))
     assert face_camera(Panorama(100, 100)).focal == pytest.approx(2 * 100 / math.pi)
@@ -88,7 +88,7 @@ def test_a_face_is_twice_as_fine_as_the_panorama_unless_its_size_is_given():
     ("projection", "kind"), [("pinhole", "pixels"), ("pinhole", "solid"), ("tangent", "angular"), ("ray", "solid")]
 )
 @each_engine
-def test_a_gaussian_below_a_pixel_looks_the_same_through_faces_of_any_size(projection, kind, backend, dtype):
+def test_low_pass_does_not_depend_on_face_size(projection, kind, backend, dtype):
     """The low-pass is of the panorama's pixels: finer faces do not sharpen what it widens."""
     options = RenderOptions(projection=projection, cubemap=True, low_pass_kind=kind, low_pass=4.0)
     gaussian = replace(broad("middle of a face", 3.0), means=torch.tensor([[0.02, 0.01, 2.0]]).double())
@@ -101,7 +101,7 @@ def test_a_gaussian_below_a_pixel_looks_the_same_through_faces_of_any_size(proje
 
 
 @pytest.mark.parametrize(("width", "height"), [(64, 32), (70, 44), (256, 128)])
-def test_directions_come_back_to_second_order(width: int, height: int):
+def test_directions_are_interpolated_to_second_order(width: int, height: int):
     panorama = Panorama(width, height)
     lens = face_camera(panorama)
     result = panorama_from_faces(seen_by_faces(panorama, lens), panorama, lens)
@@ -114,7 +114,7 @@ def test_directions_come_back_to_second_order(width: int, height: int):
 
 @pytest.mark.parametrize("projection", PROJECTIONS)
 @each_engine
-def test_a_sphere_of_one_colour_stays_so(projection: str, backend: str, dtype: torch.dtype, generator):
+def test_constant_colors_stay_constant(projection: str, backend: str, dtype: torch.dtype, generator):
     gaussians = gaussians_of("ordinary", 30, generator)
     color = torch.tensor([0.25, 0.5, 0.75], dtype=torch.float64)
     gaussians = replace(gaussians, colors=color.expand(30, 3))
@@ -126,7 +126,7 @@ def test_a_sphere_of_one_colour_stays_so(projection: str, backend: str, dtype: t
 
 @pytest.mark.parametrize("place", PLACES)
 @each_engine
-def test_rays_see_the_same_through_faces(place: str, backend: str, dtype: torch.dtype):
+def test_ray_projection_has_no_seams(place: str, backend: str, dtype: torch.dtype):
     """No seam: at edges and corners of the cube the error is that of interpolation, as in the middle of a face."""
     options, sigma = RenderOptions(projection="ray", low_pass=0.0), 8.0
     for width in (128, 256):
@@ -143,7 +143,7 @@ def test_rays_see_the_same_through_faces(place: str, backend: str, dtype: torch.
 
 
 @each_engine
-def test_depth_is_not_mixed_with_emptiness(backend: str, dtype: torch.dtype):
+def test_depth_does_not_mix_with_empty_pixels(backend: str, dtype: torch.dtype):
     for place in PLACES:
         options = RenderOptions(projection="ray", cubemap=True)
         rendering = draw(broad(place), 64, 32, backend=backend, dtype=dtype, options=options)
@@ -174,7 +174,7 @@ def test_native_faces_match_the_definition(projection: str, generator):
 
 @pytest.mark.parametrize("projection", ["tangent", "ray"])
 @needs_native
-def test_native_faces_lose_nothing_and_draw_little_in_vain(projection: str, generator):
+def test_native_faces_are_complete_and_efficient(projection: str, generator):
     """What neither lies before a face nor behind it is the hard part: about every Gaussian does so for some face."""
     gaussians = mixture(12, generator)
     lens = Pinhole(70, 44, 28.0, 33.0, 11.5, 30.25)  # wide, and its axis far from its middle
@@ -198,7 +198,7 @@ def test_native_faces_lose_nothing_and_draw_little_in_vain(projection: str, gene
 
 
 @pytest.mark.parametrize("projection", PROJECTIONS)
-def test_gradients_are_the_slope(projection: str, generator):
+def test_gradients_match_differences(projection: str, generator):
     """Every input and the pose, float64, against central differences; nothing here is near a cut."""
     count = 4
     radius = torch.tensor([[2.5], [3.0], [3.5], [4.0]], dtype=torch.float64)  # apart: the order stays
@@ -233,8 +233,8 @@ def test_gradients_are_the_slope(projection: str, generator):
 
 
 @each_engine
-def test_the_probe_means_the_same_as_on_the_panorama(backend: str, dtype: torch.dtype):
-    """The densification signal does not depend on how a panorama is drawn."""
+def test_mean_offsets_match_the_panorama(backend: str, dtype: torch.dtype):
+    """The positional gradient does not depend on how a panorama is rendered."""
     weight = torch.rand(64, 128, 3, generator=torch.Generator().manual_seed(5)).to(dtype)
     weight = torch.nn.functional.avg_pool2d(weight.movedim(-1, 0), 9, 1, 4).movedim(0, -1)  # smooth, for interpolation
     for place in ("middle of a face", "edge", "corner"):
@@ -250,7 +250,7 @@ def test_the_probe_means_the_same_as_on_the_panorama(backend: str, dtype: torch.
         assert (signals[0] - signals[1]).norm() < 0.03 * signals[0].norm(), place
 
 
-def test_what_no_face_shows_is_not_visible():
+def test_visibility():
     gaussians = replace(broad("edge"), opacities=torch.tensor([1e-3]).double())
     rendering = render(gaussians, View("v", identity_pose(), 32, 16), RenderOptions(projection="ray", cubemap=True))
     assert rendering.visible.tolist() == [False] and rendering.counters["visible"] == 0

@@ -12,12 +12,12 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "projections.md"
 
 
 @pytest.mark.parametrize("latitude", [0.0, 60.0, -89.0])
-def test_ray_is_the_truth(latitude: float):
+def test_ray_has_no_error(latitude: float):
     for sigma in (2.0, 10.0):
         assert footprint_error("ray", sigma, latitude) < 1e-9
 
 
-def test_the_tangent_plane_does_not_care_for_latitude():
+def test_tangent_error_does_not_depend_on_latitude():
     errors = [footprint_error("tangent", 5.0, latitude) for latitude in (0.0, 45.0, 89.0, -70.0)]
     assert errors == pytest.approx([errors[0]] * 4, rel=5e-3)
     # q = tan^2 instead of sin^2: the relative loss is of order sigma^2.
@@ -25,12 +25,12 @@ def test_the_tangent_plane_does_not_care_for_latitude():
     assert ratio == pytest.approx(4, rel=0.1)
 
 
-def test_the_chart_errs_alike_on_both_sides_of_the_horizon():
+def test_erp_error_is_symmetric():
     for latitude in (30.0, 85.0):
         assert footprint_error("erp", 4.0, latitude) == pytest.approx(footprint_error("erp", 4.0, -latitude), rel=1e-9)
 
 
-def test_all_faces_of_a_cube_are_alike():
+def test_cubemap_error_is_the_same_on_all_faces():
     """From the middle of the front face to its edge is from the edge of the lower face to its middle."""
     for latitude in (10.0, 30.0):
         above, below = (footprint_error("cubemap", 2.0, angle) for angle in (latitude, 90 - latitude))

@@ -1,4 +1,4 @@
-"""Hybrid blending of fragments: the K nearest of a pixel in order, all others as one layer behind them."""
+"""Weights of hybrid blending."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def random_fragments(pixels: int, count: int, generator: torch.Generator) -> tup
 
 
 @pytest.mark.parametrize("size", [1, 2, 5, 16, 256])
-def test_weights_are_those_of_the_published_procedure(size: int, generator: torch.Generator):
+def test_weights_match_the_published_procedure(size: int, generator: torch.Generator):
     alpha, distance = random_fragments(50, 40, generator)
     distance[:20] = (4 * distance[:20]).round()  # many ties: the first in the list is in front
     weights, left = hybrid_weights(alpha, distance, size)
@@ -45,7 +45,7 @@ def test_nothing_lies_behind_a_core_that_ends_early():
     assert left.item() == 0
 
 
-def test_the_tail_lies_behind_the_core_wherever_it_is():
+def test_the_tail_lies_behind_the_core():
     near_fog = hybrid_weights(torch.tensor([[0.04, 0.5]]), torch.tensor([[1.0, 2.0]]), 16)
     far_fog = hybrid_weights(torch.tensor([[0.04, 0.5]]), torch.tensor([[3.0, 2.0]]), 16)
     for weights, left in (near_fog, far_fog):
@@ -54,7 +54,7 @@ def test_the_tail_lies_behind_the_core_wherever_it_is():
 
 
 @pytest.mark.parametrize("size", [1, 4, 64])
-def test_derivatives_are_the_closed_ones(size: int, generator: torch.Generator):
+def test_derivatives_match_closed_forms(size: int, generator: torch.Generator):
     """Section 3.7 of the reference, with a background: dI/dalpha of core and tail fragments."""
     alpha, distance = random_fragments(30, 20, generator)
     alpha = (0.5 * alpha).where(alpha > 0.1, alpha).requires_grad_()  # so that no core ends early
@@ -101,7 +101,7 @@ def test_weights_do_not_depend_on_the_order_of_the_list(generator: torch.Generat
     torch.testing.assert_close(permuted_left, left, rtol=1e-12, atol=0)
 
 
-def test_no_fragments_leave_everything():
+def test_without_fragments_transmittance_is_one():
     weights, left = hybrid_weights(torch.zeros(3, 0), torch.zeros(3, 0), 16)
     assert weights.shape == (3, 0) and torch.equal(left, torch.ones(3))
     weights, left = hybrid_weights(torch.zeros(3, 2), torch.ones(3, 2), 16)

@@ -1,4 +1,4 @@
-"""Hybrid blending by every backend and projection: values, derivatives, order, threads, strips, instruction sets."""
+"""Hybrid blending in every backend and projection: values, derivatives, order."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def fragments(gaussians: Gaussians, camera: Camera, options: RenderOptions, pose
 @pytest.mark.parametrize("size", [1, 4, 16])
 @each_projection
 @each_engine
-def test_images_are_those_of_the_published_procedure(projection: str, size: int, backend: str, dtype: torch.dtype):
+def test_images_match_the_published_procedure(projection: str, size: int, backend: str, dtype: torch.dtype):
     generator = torch.Generator().manual_seed(100 * PROJECTIONS.index(projection) + size)
     camera, options, pose = camera_of(projection, 33, 17), options_of(projection, size), random_pose(generator, 0.2)
     gaussians = mixture(6, generator)
@@ -128,7 +128,7 @@ def assert_native_matches(
         *[("pinhole", kind) for kind in ("ordinary", "broad")],
     ],
 )
-def test_native_values_and_gradients_are_those_of_the_definition(projection: str, kind: str, size: int, backend: str):
+def test_native_matches_the_definition(projection: str, kind: str, size: int, backend: str):
     generator = torch.Generator().manual_seed(7 + size)
     gaussians = gaussians_of("huge" if kind == "broad" else kind, 25, generator)
     gaussians.opacities[0] = 1.0  # reaches the maximum alpha, where the derivative is 0
@@ -235,7 +235,7 @@ def test_each_ray_has_its_own_order(backend: str, dtype: torch.dtype):
 @pytest.mark.parametrize("size", [1, 2])
 @each_projection
 @each_engine
-def test_of_equally_far_gaussians_the_first_is_in_front(projection: str, size: int, backend: str, dtype: torch.dtype):
+def test_ties_are_won_by_the_first(projection: str, size: int, backend: str, dtype: torch.dtype):
     one = {"means": [0.1, 0.0, 2.0], "quats": [1.0, 0.2, 0.0, 0.1], "scales": [0.3, 0.2, 0.1]}
     twins = {name: torch.tensor([value, value]) for name, value in one.items()}
     gaussians = Gaussians(**twins, opacities=torch.tensor([0.5, 0.5]), colors=torch.eye(3)[:2]).to(dtype)
@@ -248,7 +248,7 @@ def test_of_equally_far_gaussians_the_first_is_in_front(projection: str, size: i
 
 @each_projection
 @each_engine
-def test_the_order_of_the_gaussians_does_not_matter(projection: str, backend: str, dtype: torch.dtype):
+def test_input_order_does_not_matter(projection: str, backend: str, dtype: torch.dtype):
     generator = torch.Generator().manual_seed(12)
     gaussians, camera, options = mixture(8, generator), camera_of(projection, 48, 24), options_of(projection, 3)
     *_, stable = fragments(gaussians, camera, options, identity_pose())

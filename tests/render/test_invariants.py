@@ -1,4 +1,4 @@
-"""What must hold for any renderer: no place, direction, unit of length or order of the input is special."""
+"""Invariances of every renderer: position, direction, unit of length, order of the input."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_the_unit_of_length_does_not_matter(kind: str, projection: str, lens: st
 
 @each_setup
 @each_engine
-def test_moving_world_and_camera_together_changes_nothing(projection, lens, backend, dtype):
+def test_rigid_motion_changes_nothing(projection, lens, backend, dtype):
     generator = torch.Generator().manual_seed(7)
     gaussians, options = mixture(4, generator), RenderOptions(projection)
     stable = stable_pixels(gaussians, 48, 24, lens=lens, options=options)
@@ -110,7 +110,7 @@ def product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 
 @each_setup
 @each_engine
-def test_the_order_of_the_input_does_not_matter(projection, lens, backend, dtype):
+def test_input_order_does_not_matter(projection, lens, backend, dtype):
     generator = torch.Generator().manual_seed(10)
     gaussians = mixture(8, generator)
     assert gaussians.means.float().norm(dim=-1).unique().numel() == len(gaussians), "the case has ties"
@@ -124,7 +124,7 @@ def test_the_order_of_the_input_does_not_matter(projection, lens, backend, dtype
 
 @each_setup
 @each_engine
-def test_equal_depths_are_drawn_in_the_order_of_the_input(projection, lens, backend, dtype):
+def test_ties_keep_the_input_order(projection, lens, backend, dtype):
     def ball(color: tuple[float, float, float]) -> Gaussians:
         row = ((0.1, 0, 2), (1.0, 0, 0, 0), (0.5, 0.5, 0.5), 0.95, color)
         return Gaussians(*(torch.tensor([value], dtype=torch.float64) for value in row))

@@ -1,4 +1,4 @@
-"""What a Gaussian's removal is said to do, against what it does."""
+"""Leave-one-out scores against actual removals."""
 
 import cuda_engine
 import pytest
@@ -38,7 +38,7 @@ def without(gaussians: Gaussians, removed: Tensor) -> Gaussians:
     return chosen(gaussians, kept)
 
 
-def test_two_gaussians_behind_each_other_by_hand():
+def test_two_gaussians_by_hand():
     view = view_of(camera_of("panorama", 16, 8))
     ray = rays(16, 8, dtype=torch.float64)[3, 5]
     gaussians = Gaussians(
@@ -61,7 +61,7 @@ def test_two_gaussians_behind_each_other_by_hand():
 
 @each_setup
 @pytest.mark.parametrize("backend", ["torch", pytest.param("cpu", marks=needs_native)])
-def test_every_single_removal_does_what_was_said(projection, lens, backend):
+def test_scores_match_actual_removals(projection, lens, backend):
     generator = torch.Generator().manual_seed(3)
     dtype = torch.float64 if backend == "torch" else torch.float32
     gaussians = mixture(6, generator, ("ordinary", "huge", "needle")).to(dtype)
@@ -80,7 +80,7 @@ def test_every_single_removal_does_what_was_said(projection, lens, backend):
 
 
 @needs_native
-def test_targets_are_taken_in_any_type_and_in_the_size_of_the_view_only():
+def test_targets_have_any_dtype_but_the_size_of_the_view():
     generator = torch.Generator().manual_seed(2)
     gaussians, view = mixture(3, generator).to(torch.float32), view_of(camera_of("panorama", 16, 8))
     target, weight = torch.rand(8, 16, 3, generator=generator), torch.ones(8, 16)
@@ -113,7 +113,7 @@ def test_native_agrees_with_the_definition(projection, lens, backend):
 
 
 @needs_native
-def test_ranks_of_single_removals_and_of_groups_are_those_of_true_ones():
+def test_rank_correlation_with_actual_removals():
     generator = torch.Generator().manual_seed(0)
     true = gaussians_of("ordinary", COUNT, generator).to(torch.float32)
     view, options = view_of(camera_of("panorama", 64, 32)), RenderOptions(projection="ray")
@@ -135,7 +135,7 @@ def test_ranks_of_single_removals_and_of_groups_are_those_of_true_ones():
         assert correlation(groups) > 0.9, share
 
 
-def test_masked_pixels_and_other_blendings_are_scored_too():
+def test_masks_and_other_blendings():
     generator = torch.Generator().manual_seed(2)
     gaussians, view = gaussians_of("ordinary", 30, generator), view_of(camera_of("panorama", 24, 12), identity_pose())
     target = torch.rand(12, 24, 3, generator=generator, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""The kinds of low-pass in every projection: what they widen, how they fade, and their gradients."""
+"""Low-pass kinds in every projection: width, opacity and gradients."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def small(latitude: float, scale: float, radius: float = 2.0) -> Gaussians:
     return Gaussians(mean, quats, scales, opacities, torch.tensor([[1.0, 0.5, 0.25]]).double())
 
 
-def test_every_projection_has_its_kinds_and_the_published_one_is_the_default():
+def test_kinds_of_every_projection():
     assert set(LOW_PASS_KINDS) == set(PROJECTIONS)
     natural = {projection: RenderOptions(projection=projection).resolved_low_pass_kind for projection in PROJECTIONS}
     assert natural == {"erp": "pixels", "pinhole": "pixels", "tangent": "angular", "ray": "solid"}
@@ -60,7 +60,7 @@ def test_every_projection_has_its_kinds_and_the_published_one_is_the_default():
 
 
 @pytest.mark.parametrize("latitude", [0.0, 0.9, -1.4])
-def test_a_point_on_the_chart_becomes_a_circle_of_pixels_or_of_angle(latitude: float):
+def test_a_point_becomes_a_circle_of_pixels_or_angle(latitude: float):
     camera, point = camera_of("erp"), small(latitude, 1e-9)
     widths = {}
     for kind in ("pixels", "angular"):
@@ -108,7 +108,7 @@ def test_solid_is_angular_with_the_opacity_of_the_larger_volume(projection: str,
 
 
 @each_combination
-def test_a_large_gaussian_hardly_notices(projection: str, kind: str):
+def test_large_gaussians_change_little(projection: str, kind: str):
     camera, large = camera_of(projection), small(0.1, 0.15)  # 1.5 pixels of filter on a standard deviation of 6
     plain = render(large, View("v", identity_pose(), 64, 32, lens=camera), options_of(projection, kind, near=0.1))
     none = replace(options_of(projection, kind, near=0.1), low_pass=0.0)
@@ -158,7 +158,7 @@ def test_native_matches_the_definition(projection: str, kind: str, generator):
 
 @pytest.mark.parametrize("place", ["ordinary", "next to the pole", "across the seam"])
 @each_combination
-def test_gradients_are_the_slope(projection: str, kind: str, place: str, generator):
+def test_gradients_match_differences(projection: str, kind: str, place: str, generator):
     """Of what the filter touches, one input at a time, against central differences in float64."""
     camera = camera_of(projection, 40)
     turn = {"ordinary": (0.2, 0.1), "next to the pole": (0.4, math.radians(89.9)), "across the seam": (math.pi, -0.3)}

@@ -1,4 +1,4 @@
-"""near_cull=ellipsoid: nothing is drawn of a Gaussian that reaches the near sphere, and nothing else changes."""
+"""near_cull=ellipsoid culls Gaussians that reach the near plane, and changes nothing else."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def balls(relative_size: float, spread: float, generator: torch.Generator, count
 
 
 @each_engine
-def test_a_round_gaussian_is_culled_where_its_nearest_point_is(backend, dtype):
+def test_round_gaussians_are_culled_by_their_nearest_point(backend, dtype):
     """R - sqrt(2 ln 255) sigma against near, just before and behind."""
     sigma = 0.3
     edge = NEAR + sigma * math.sqrt(2 * math.log(255))
@@ -50,7 +50,7 @@ def test_a_round_gaussian_is_culled_where_its_nearest_point_is(backend, dtype):
 
 
 @each_engine
-def test_of_what_is_drawn_nothing_lies_before_the_near_plane(backend, dtype, generator):
+def test_rendered_ellipsoids_are_beyond_the_near_plane(backend, dtype, generator):
     """Points sampled on the surface q = k: all beyond n.x = near for what is drawn, not all for what is culled."""
     gaussians = balls(0.15, 0.7, generator, count=300)
     opacities = 0.05 + 0.9 * torch.rand(300, generator=generator, dtype=torch.float64)
@@ -72,7 +72,7 @@ def test_of_what_is_drawn_nothing_lies_before_the_near_plane(backend, dtype, gen
 
 
 @pytest.mark.parametrize(("relative_size", "published"), [(0.02, 1.9), (0.1, 18), (0.3, 75), (0.5, 95)])
-def test_shares_that_are_culled_agree_with_those_that_another_program_found(relative_size, published, generator):
+def test_culled_shares_match_reference_numbers(relative_size, published, generator):
     """Axes log-normal with deviation 0.7 and opacity 1: our reading of how that program sampled."""
     gaussians = balls(relative_size, 0.7, generator, count=20_000)
     kept = projected(gaussians, identity_pose(), VIEW.camera, options(near_cull="ellipsoid")).visible
@@ -81,7 +81,7 @@ def test_shares_that_are_culled_agree_with_those_that_another_program_found(rela
 
 
 @each_engine
-def test_what_is_left_is_drawn_as_before(backend, dtype, generator):
+def test_remaining_gaussians_are_unchanged(backend, dtype, generator):
     gaussians = gaussians_of("ordinary", 30, generator).to(dtype)
     plain, culled = (
         render(gaussians, VIEW, options(near_cull=kind), backend=backend) for kind in ("mean", "ellipsoid")

@@ -82,7 +82,7 @@ def assert_same(actual: Rendering, expected: Rendering) -> None:
     ],
     ids=lambda value: f"{value.projection}-{value.blending}" if isinstance(value, RenderOptions) else value,
 )
-def test_every_bit_is_that_of_an_ordinary_frame(options, lens, generator: torch.Generator, recorded: list[int]):
+def test_captured_frames_equal_ordinary_frames(options, lens, generator: torch.Generator, recorded: list[int]):
     gaussians, view = scene_of(generator), view_of(camera_of(lens, 72, 36), random_pose(generator, shift=0.1))
     draw = CapturedRender(lambda _: gaussians, view, options, capacity=20_000)
     frames = []
@@ -99,7 +99,7 @@ def test_every_bit_is_that_of_an_ordinary_frame(options, lens, generator: torch.
 
 @pytest.mark.usefixtures("dirty_memory")
 @pytest.mark.parametrize("missing", [1, 10, "nearly all", 0])
-def test_too_little_room_is_noticed_and_made(missing: int | str, generator: torch.Generator, recorded: list[int]):
+def test_too_small_capacity_is_increased(missing: int | str, generator: torch.Generator, recorded: list[int]):
     gaussians, view = scene_of(generator), view_of(camera_of("panorama", 72, 36))
     expected = ordinary(gaussians, view, RenderOptions())
     instances = expected.counters["instances"]
@@ -112,7 +112,7 @@ def test_too_little_room_is_noticed_and_made(missing: int | str, generator: torc
     assert len(recorded) < 3
 
 
-def test_poses_and_backgrounds_may_lie_in_memory_in_any_order(generator: torch.Generator):
+def test_poses_and_backgrounds_need_not_be_contiguous(generator: torch.Generator):
     gaussians, view = scene_of(generator), view_of(camera_of("panorama", 40, 20), random_pose(generator, shift=1))
     transposed, background = view.at(view.cam_from_world.T.contiguous().T), torch.ones(1, device=DEVICE).expand(3)
     draw = CapturedRender(lambda _: gaussians, transposed, background=background)
@@ -120,13 +120,13 @@ def test_poses_and_backgrounds_may_lie_in_memory_in_any_order(generator: torch.G
     assert_same(draw(transposed.cam_from_world), expected(view.cam_from_world))
 
 
-def test_the_room_is_for_the_first_pose_and_half_as_much_again(generator: torch.Generator):
+def test_default_capacity(generator: torch.Generator):
     gaussians, view = scene_of(generator), view_of(camera_of("panorama", 72, 36))
     draw = CapturedRender(lambda _: gaussians, view)
     assert draw.capacity == int(1.5 * ordinary(gaussians, view, RenderOptions()).counters["instances"]) + 1
 
 
-def test_what_a_view_shows_is_recorded_too_and_tensors_are_taken_by_reference(generator: torch.Generator):
+def test_show_is_recorded_and_tensors_are_references(generator: torch.Generator):
     gaussians, view = scene_of(generator), view_of(camera_of("panorama", 40, 20), random_pose(generator))
 
     def shown(view: View) -> Gaussians:  # as colours that depend on where the camera is
@@ -202,7 +202,7 @@ def test_a_recording_reads_nothing_back(options, generator: torch.Generator, mon
         torch.ones(1).sum().item()
 
 
-def test_a_frame_is_recorded_on_its_own_stream_and_other_threads_may_go_on(monkeypatch: pytest.MonkeyPatch):
+def test_recording_uses_its_own_stream_and_thread_local_mode(monkeypatch: pytest.MonkeyPatch):
     """Torch's own stream for recordings is of one device, and its usual mode ends them if any thread allocates."""
     how, inside = [], []
 
@@ -219,14 +219,14 @@ def test_a_frame_is_recorded_on_its_own_stream_and_other_threads_may_go_on(monke
     assert inside == [0, 1] and how == [{"stream": streams[0], "capture_error_mode": "thread_local"}]
 
 
-def test_nothing_to_draw_is_the_background(generator: torch.Generator):
+def test_empty_frames(generator: torch.Generator):
     nothing = Gaussians(**{name: getattr(scene_of(generator), name)[:0] for name in INPUTS})
     view = view_of(camera_of("panorama", 40, 20))
     drawn = CapturedRender(lambda _: nothing, view)(view.cam_from_world)
     assert not drawn.image.any() and (drawn.transmittance == 1).all() and drawn.counters["instances"] == 0
 
 
-def test_more_than_a_strip_is_refused_when_counted_and_when_drawn(generator: torch.Generator):
+def test_frames_that_need_strips_are_refused(generator: torch.Generator):
     gaussians, view = scene_of(generator), view_of(camera_of("panorama", 72, 36))
     message = r"has \d+ \(Gaussian, tile\) instances; max_instances=30 draws them in strips, .* Raise max_instances"
     with pytest.raises(ValueError, match=message):
@@ -237,7 +237,7 @@ def test_more_than_a_strip_is_refused_when_counted_and_when_drawn(generator: tor
             draw(view.cam_from_world)
 
 
-def test_what_cannot_be_recorded_is_refused(generator: torch.Generator):
+def test_unsupported_recordings_are_refused(generator: torch.Generator):
     gaussians, view = scene_of(generator), view_of(camera_of("panorama", 72, 36))
     with pytest.raises(ValueError, match="cubemap=true cannot be recorded; use padgs"):
         CapturedRender(lambda _: gaussians, view, RenderOptions("tangent", cubemap=True))
@@ -251,7 +251,7 @@ def test_what_cannot_be_recorded_is_refused(generator: torch.Generator):
 
 
 @pytest.mark.usefixtures("dirty_memory")
-def test_more_instances_than_32_bits_count_leave_the_first_ones_in_place():
+def test_instance_counts_beyond_32_bits():
     """Slots of Gaussians far back must not begin again at 0, where they would be written over the first."""
     side, count, capacity = 8192, 16_400, 100
     view = DeviceProjected.__new__(DeviceProjected)

@@ -55,7 +55,7 @@ EXTREME = {
 @pytest.mark.parametrize("name", EXTREME)
 @each_setup
 @each_engine
-def test_extreme_gaussians_stay_finite_beside_ordinary_ones(name: str, projection, lens, backend, dtype):
+def test_extreme_gaussians_stay_finite(name: str, projection, lens, backend, dtype):
     both = joined(EXTREME[name], gaussians_of("ordinary", 3, torch.Generator().manual_seed(1)))
     inputs, pose = leaves(both, dtype), identity_pose().to(dtype).requires_grad_()
     view = view_of(camera_of(lens, 32, 16), pose)
@@ -78,7 +78,7 @@ def test_extreme_gaussians_stay_finite_beside_ordinary_ones(name: str, projectio
 @pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities"])
 @each_setup
 @each_engine
-def test_a_non_finite_gaussian_is_rejected_or_not_drawn(name: str, bad: float, projection, lens, backend, dtype):
+def test_non_finite_gaussians_are_refused_or_not_rendered(name: str, bad: float, projection, lens, backend, dtype):
     gaussians = gaussians_of("ordinary", 4, torch.Generator().manual_seed(2))
     broken, options = leaves(gaussians, dtype), RenderOptions(projection)
     getattr(broken, name).data[1] = bad
@@ -99,7 +99,7 @@ def test_a_non_finite_gaussian_is_rejected_or_not_drawn(name: str, bad: float, p
 @pytest.mark.slow
 @pytest.mark.parametrize(("projection", "lens"), [setup for setup in SETUPS if setup[0] in ("erp", "pinhole")])
 @pytest.mark.parametrize(("backend", "dtype"), ENGINES_IN_FLOAT32)
-def test_long_oblique_needles_are_drawn_in_float32_as_in_float64(projection, lens, backend, dtype):
+def test_long_oblique_needles_in_float32(projection, lens, backend, dtype):
     """Hundreds of pixels long, thinner than one: du^2, du dv and dv^2 are large there, and their sum is not."""
     generator = torch.Generator().manual_seed(3)
     half = torch.deg2rad(torch.tensor([[45.0], [-30.0], [20.0]], dtype=torch.float64)) / 2

@@ -217,7 +217,7 @@ def test_every_input_receives_a_gradient(projection: str, lens: str, backend: st
 
 @pytest.mark.parametrize("projection", sorted({projection for projection, lens in SETUPS if lens == "panorama"}))
 @needs_native
-def test_only_what_is_asked_for_is_differentiated(projection: str):
+def test_gradients_of_subsets_of_inputs(projection: str):
     """Each subset of inputs gets the gradients that it gets beside all others."""
     generator = torch.Generator().manual_seed(14)
     gaussians = gaussians_of("ordinary", 12, generator)

@@ -1,4 +1,4 @@
-"""All backends draw the same and differentiate the same as the definition in float64."""
+"""Values and gradients of all backends against the definition in float64."""
 
 from __future__ import annotations
 

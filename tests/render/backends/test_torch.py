@@ -1,4 +1,4 @@
-"""The definition itself: exact on paper, differentiable in float64, the same in chunks of any size."""
+"""The definition: results by hand, gradients in float64, independence of the block size."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_blending_by_hand():
     assert rendering.depth[8, 16].item() == pytest.approx(depth, abs=1e-5)
 
 
-def test_a_ray_stops_before_the_gaussian_that_would_make_it_opaque():
+def test_a_pixel_stops_before_it_is_opaque():
     colors = [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]]
     rendering = draw(row_of_gaussians([1.0, 2.0, 3.0], [0.98, 0.98, 0.9], colors), 32, 16, **ENGINE)
     left = 0.02 * 0.02  # 4e-4; the third would leave 4e-5 < 1e-4
@@ -58,7 +58,7 @@ def test_alpha_is_limited_and_has_no_derivative_there():
     assert gradient.item() == 0
 
 
-def test_pixel_centres_are_half_way():
+def test_pixel_centers():
     """A Gaussian on the corner of four pixels lights them equally; one on a pixel centre lights that most."""
     for columns, rows, expected in ((0.0, 0.0, 4), (0.5, 0.5, 1)):
         angles = torch.tensor([columns * 2 * math.pi / 32, rows * math.pi / 16], dtype=torch.float64)
@@ -82,7 +82,7 @@ def test_pixel_centres_are_half_way():
 
 
 @pytest.mark.parametrize("pairs", [1, 300, 1 << 12])
-def test_chunks_change_nothing(pairs: int, generator: torch.Generator, monkeypatch: pytest.MonkeyPatch):
+def test_blocks_change_nothing(pairs: int, generator: torch.Generator, monkeypatch: pytest.MonkeyPatch):
     gaussians = mixture(5, generator)
     view = View("v", identity_pose(), 20, 11)
     weights = [torch.randn(11, 20, generator=generator, dtype=torch.float64) for _ in OUTPUTS]
@@ -105,7 +105,7 @@ def test_chunks_change_nothing(pairs: int, generator: torch.Generator, monkeypat
     assert chunked.counters == whole.counters
 
 
-def test_memory_is_bounded_by_the_chunk(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch):
+def test_memory_is_bounded_by_the_block(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch):
     """What autograd keeps for the backward pass does not grow with the number of chunks."""
     gaussians = leaves(gaussians_of("ordinary", 40, generator), torch.float64)
     kept = {}
@@ -156,8 +156,8 @@ def test_depth_follows_the_mean_and_transmittance_the_opacity():
     assert by_opacity.item() == pytest.approx(-1, abs=1e-4)
 
 
-def test_the_probe_moves_a_footprint_like_the_mean():
-    """Its unit is half an image: the gradient in pixels is the gradient by the mean_offsets over W / 2 and H / 2."""
+def test_mean_offsets_move_footprints():
+    """The unit is half an image: the gradient in pixels is the gradient by mean_offsets over W / 2 and H / 2."""
     gaussians = gaussians_of("ordinary", 1, torch.Generator().manual_seed(4))
     view = View("v", identity_pose(), 64, 32)
     mean_offsets = torch.zeros(1, 2, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""What the native library decides before it draws: pixel boxes and tile lists, as tensors."""
+"""Pixel boxes and tile lists of the native library as tensors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bounds lose nothing: each (pixel, Gaussian) pair with alpha >= 1/255 is drawn. By brute force from the definition."""
+"""Bounds lose nothing: each (pixel, Gaussian) pair with alpha >= 1/255 is rendered; by brute force."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def test_the_outermost_pixel_of_a_footprint_is_drawn(side: str, width: int, proj
 
 
 @each_engine
-def test_published_bounds_lose_what_they_lose(backend: str, dtype: torch.dtype):
+def test_published_bounds_lose_contributions(backend: str, dtype: torch.dtype):
     """A square of three standard deviations cuts alphas up to 0.011 o, and a footprint ends at the seam."""
     scale = 0.25
     broad = Gaussians(

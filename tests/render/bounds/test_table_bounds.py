@@ -1,4 +1,4 @@
-"""A table of rays that is nearly a panorama has a panorama's bounds, a little wider, and loses nothing by it."""
+"""Bounds of ray tables that are nearly panoramas."""
 
 import pytest
 import torch
@@ -39,7 +39,7 @@ def test_bounds_around_a_bent_panorama_lose_nothing(k1, axis, projection):
 
 
 @needs_native
-def test_bounds_spare_most_of_the_work():
+def test_bounds_of_a_bent_panorama_are_tight():
     generator = torch.Generator().manual_seed(42)
     gaussians = mixture(40, generator).to(torch.float32)
     plain = render(gaussians, view_of(Panorama(256, 128)), OPTIONS, backend="cpu").counters

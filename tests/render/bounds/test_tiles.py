@@ -39,7 +39,7 @@ SIZES = st.sampled_from([*ODD_SIZES, (200, 90), (256, 128), (1, 1), (90, 200)])
 @needs_native
 @few
 @given(kind=st.sampled_from(KINDS), seed=st.integers(0, 2**31), size=SIZES, wrap=st.booleans())
-def test_tiles_hold_every_pixel_and_each_tile_once(kind, seed, size, wrap, projection: str, lens: str):
+def test_tiles_contain_every_pixel_once(kind, seed, size, wrap, projection: str, lens: str):
     gaussians = gaussians_of(kind, 12, torch.Generator().manual_seed(seed))
     camera, options = camera_of(lens, *size), RenderOptions(projection, wrap=wrap or projection != "erp")
     tiles = NativeTiles(gaussians, camera, options, identity_pose())
@@ -73,7 +73,7 @@ def test_tiles_cover_the_same_angle_in_every_row(width: int, height: int):
 
 
 @needs_native
-def test_tiles_are_few():
+def test_exact_bounds_need_fewer_tiles():
     """Bounds follow the opacity and both axes, and tiles widen toward the poles: far fewer instances than published."""
     gaussians = mixture(200, torch.Generator().manual_seed(5), ("ordinary", "polar"))
     published = NativeTiles(gaussians, Panorama(512, 256), RELEASED, identity_pose()).count
@@ -83,7 +83,7 @@ def test_tiles_are_few():
 
 
 @needs_native
-def test_the_tiles_of_a_small_gaussian_are_as_many_at_every_latitude():
+def test_tile_count_of_a_small_gaussian_by_latitude():
     """Near the poles it spans many columns; wide tiles keep the count below twice that of the horizon."""
     counts = []
     for latitude in (0, 45, 70, 80, 85):
@@ -131,7 +131,7 @@ def test_strips_render_and_differentiate_the_same(projection: str, lens: str, mo
 
 
 @needs_native
-def test_no_strip_holds_more_instances_than_allowed():
+def test_strips_respect_max_instances():
     gaussians = mixture(100, torch.Generator().manual_seed(13), ("ordinary", "polar"))
     for limit in (1, 100, 400, 1000):
         lists = projected(gaussians, Panorama(256, 128), RenderOptions("ray", max_instances=limit), identity_pose())

@@ -55,7 +55,7 @@ def crowd(count: int, generator: torch.Generator) -> Gaussians:
 
 @pytest.mark.parametrize("blending", ["sorted", "hybrid"])
 @pytest.mark.parametrize("projection", ["erp", "tangent", "ray"])
-def test_long_lists_are_drawn_like_short_ones(projection: str, blending: str, generator: torch.Generator):
+def test_long_lists(projection: str, blending: str, generator: torch.Generator):
     gaussians = crowd(1200, generator)
     options = RenderOptions(projection, low_pass_kind="angular", **blended(blending, 4))
     expected, expected_gradients = drawn(gaussians, (72, 36), options, backend="cpu")
@@ -70,7 +70,7 @@ def test_long_lists_are_drawn_like_short_ones(projection: str, blending: str, ge
             assert (gradients[name] - gradient).norm() < 5e-3 * gradient.norm(), name
 
 
-def test_removals_are_scored_in_many_batches_whichever_thread_runs_first(generator, monkeypatch):
+def test_leave_one_out_of_long_lists_is_deterministic(generator, monkeypatch):
     gaussians, options = crowd(1200, generator), RenderOptions("ray", low_pass=0.1)
     gaussians = Gaussians(**{name: tensor.float() for name, tensor in vars(gaussians).items()})
     view, target, weight = view_of(camera_of("panorama", 72, 36)), torch.rand(36, 72, 3), torch.rand(36, 72)
@@ -106,7 +106,7 @@ def test_cores_of_any_size(projection: str, generator: torch.Generator):
 
 
 @pytest.mark.parametrize("blending", ["sorted", "hybrid"])
-def test_strips_are_parts_of_the_same_image(blending: str, generator: torch.Generator):
+def test_strips_change_nothing(blending: str, generator: torch.Generator):
     gaussians, options = crowd(200, generator), RenderOptions(**blended(blending, 3))
     whole, whole_gradients = drawn(gaussians, (131, 77), options)
     parts, parts_gradients = drawn(gaussians, (131, 77), replace(options, max_instances=300))
@@ -142,7 +142,7 @@ def assert_same_bits(actual, expected, outputs: tuple[str, ...]) -> None:
 @pytest.mark.parametrize(
     ("projection", "lens"), [("erp", "panorama"), ("ray", "panorama"), ("tangent", "fisheye"), ("pinhole", "pinhole")]
 )
-def test_what_is_drawn_does_not_depend_on_what_a_compiler_fuses(projection, lens, generator, monkeypatch):
+def test_fused_multiply_add_changes_no_decision(projection, lens, generator, monkeypatch):
     """Forward by one build and backward by another agree on every pair to the last bit, or gradients would differ."""
     gaussians, options = crowd(400, generator), RenderOptions(projection)
     call = cuda.call
@@ -170,7 +170,7 @@ def no_image_before(monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.parametrize("blending", ["sorted", "hybrid"])
-def test_room_of_the_last_image_changes_nothing_and_too_little_is_noticed(
+def test_capacity_of_the_last_image_changes_nothing(
     blending: str, generator: torch.Generator, monkeypatch: pytest.MonkeyPatch
 ):
     gaussians, options, rooms = crowd(200, generator), RenderOptions("ray", **blended(blending, 3)), []
@@ -207,7 +207,7 @@ def test_results_repeat_bit_by_bit(blending: str, generator: torch.Generator):
 
 @pytest.mark.parametrize("blending", ["sorted", "hybrid"])
 @pytest.mark.parametrize("lens", ["panorama", "pinhole"])
-def test_counters_are_those_of_the_cpu(lens: str, blending: str, generator: torch.Generator):
+def test_counters_equal_those_of_the_cpu(lens: str, blending: str, generator: torch.Generator):
     gaussians, options = gaussians_of("ordinary", 40, generator), RenderOptions("ray", **blended(blending, 2))
     expected, actual = (drawn(gaussians, (72, 36), options, backend=name, lens=lens)[0] for name in ("cpu", "cuda"))
     assert set(actual.counters) == set(expected.counters) and len(actual.counters) == 5
@@ -219,7 +219,7 @@ def test_counters_are_those_of_the_cpu(lens: str, blending: str, generator: torc
         actual.counters["pixels"]
 
 
-def test_cores_are_kept_only_to_be_differentiated(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch):
+def test_cores_are_kept_only_with_gradients(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch):
     kept = []
     call = cuda.call
 
@@ -241,7 +241,7 @@ def test_cores_are_kept_only_to_be_differentiated(generator: torch.Generator, mo
 
 
 @pytest.mark.parametrize("blending", ["sorted", "hybrid"])
-def test_going_back_twice_gives_the_same(blending: str, generator: torch.Generator):
+def test_repeated_backward_is_equal(blending: str, generator: torch.Generator):
     inputs = leaves(gaussians_of("ordinary", 12, generator), torch.float32)
     rendering = render(inputs, view_of(camera_of("panorama", 40, 20)), RenderOptions(blending=blending), backend="cuda")
     loss = rendering.image.square().sum() + rendering.depth.sum()
@@ -249,7 +249,7 @@ def test_going_back_twice_gives_the_same(blending: str, generator: torch.Generat
     assert all(torch.equal(*pair) and pair[0].any() for pair in zip(first, second, strict=True))
 
 
-def test_other_dtypes_and_places_are_refused(monkeypatch: pytest.MonkeyPatch):
+def test_other_dtypes_and_devices_are_refused(monkeypatch: pytest.MonkeyPatch):
     with pytest.raises(ValueError, match="backend cuda takes float32 tensors on a GPU, got torch.float64 on "):
         cuda_backend.check(torch.zeros(1, 3, dtype=torch.float64))
     monkeypatch.setattr(cuda, "device_type", lambda: "cuda")
@@ -265,7 +265,7 @@ def test_more_instances_than_a_list_can_hold_are_refused(generator, monkeypatch:
         drawn(crowd(200, generator), (72, 36), RenderOptions())
 
 
-def test_errors_of_cuda_keep_their_names():
+def test_cuda_errors():
     cuda.raise_for(0, "padgs_cuda_sort")
     with pytest.raises(RuntimeError, match="padgs_cuda_sort: CUDA error 700, ") as error:
         cuda.raise_for(700, "padgs_cuda_sort")
@@ -275,7 +275,7 @@ def test_errors_of_cuda_keep_their_names():
     assert is_out_of_memory(error.value)
 
 
-def test_a_gpu_that_nothing_was_compiled_for_is_named(monkeypatch: pytest.MonkeyPatch):
+def test_unsupported_gpus_are_named(monkeypatch: pytest.MonkeyPatch):
     fake = SimpleNamespace(padgs_cuda_check=lambda _: 209, padgs_cuda_architectures=lambda: b"80 90")
     monkeypatch.setattr(cuda, "library", lambda: fake)
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda _: (7, 5))
@@ -289,7 +289,7 @@ def test_a_gpu_that_nothing_was_compiled_for_is_named(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize(("driver", "built_with"), [(0, 13000), (13000, 13020), (13020, 13000), (0, 0)])
-def test_a_driver_of_the_same_major_version_or_none_at_all_is_taken(driver: int, built_with: int):
+def test_drivers_of_the_same_major_version_are_accepted(driver: int, built_with: int):
     cuda.refuse_old_driver(versions_of(driver, built_with))
 
 
@@ -305,7 +305,7 @@ def looked_for_anew(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("looked_for_anew")
-def test_a_driver_that_is_too_old_means_torch_and_says_so(monkeypatch: pytest.MonkeyPatch):
+def test_old_drivers_warn_and_use_torch(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(cuda, "find_library", lambda *_: None)
     monkeypatch.setattr(cuda, "declare", lambda *_: versions_of(12080, 13000))
     means = SimpleNamespace(device=torch.device("cuda"), dtype=torch.float32)
@@ -339,7 +339,7 @@ def test_the_default_dtype_of_torch_changes_nothing(lens: str, blending: str, ge
 
 
 @pytest.mark.usefixtures("looked_for_anew")
-def test_without_the_library_auto_means_torch_and_says_so(tmp_path, monkeypatch: pytest.MonkeyPatch):
+def test_missing_library_warns_and_uses_torch(tmp_path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("PADGS_LIBRARY_DIR", str(tmp_path))
     monkeypatch.setattr(loading, "_package_folders", lambda: [str(tmp_path)])
     means = SimpleNamespace(device=torch.device("cuda"), dtype=torch.float32)
@@ -354,7 +354,7 @@ def test_without_the_library_auto_means_torch_and_says_so(tmp_path, monkeypatch:
     assert package.resolve_backend("auto", SimpleNamespace(device=torch.device("cuda"), dtype=torch.float64)) == "torch"
 
 
-def test_nothing_is_drawn_outside_the_gradients_that_are_asked_for(generator: torch.Generator):
+def test_no_writes_beyond_requested_gradients(generator: torch.Generator):
     """Without a pose or a table that wants one, the same gradients."""
     gaussians = gaussians_of("ordinary", 12, generator)
     everything = drawn(gaussians, (40, 20), RenderOptions("ray"))[1]

@@ -158,7 +158,7 @@ def test_reduced_precisions_match_the_definition_in_any_size(
 
 @REDUCED
 @pytest.mark.parametrize(("offsets", "inputs", "hidden"), [(11, 37, 32), (10, 48, 32), (10, 37, 33)])
-def test_networks_that_do_not_fit_are_left_to_torch(precision, offsets, inputs, hidden, generator: torch.Generator):
+def test_large_networks_use_torch(precision, offsets, inputs, hidden, generator: torch.Generator):
     tensors, decoder = problem(20, offsets, inputs, hidden, generator)
     with torch.no_grad():
         decoder.opacity["b2"] += 4
@@ -212,7 +212,7 @@ def test_float16_overflows_where_the_definition_does(large: str, hidden: int, ge
 
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("rows", ["all", "some more", "too few"])
-def test_decoding_into_room_is_the_same_with_zeros_behind(precision: str, rows: str, generator: torch.Generator):
+def test_decoding_with_capacity_pads_with_zeros(precision: str, rows: str, generator: torch.Generator):
     tensors, decoder = problem(60, 10, 37, 32, generator)
     exact, slots, raw = on_gpu(decoder.weights(), SeenAnchors(**tensors), precision)
     count = len(exact)
@@ -229,7 +229,7 @@ def test_decoding_into_room_is_the_same_with_zeros_behind(precision: str, rows: 
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
-def test_what_there_was_no_room_for_has_no_gradient(precision: str, generator: torch.Generator):
+def test_gaussians_beyond_capacity_have_no_gradient(precision: str, generator: torch.Generator):
     tensors, decoder = problem(60, 10, 37, 32, generator)
     count = len(on_gpu(decoder.weights(), SeenAnchors(**tensors), precision)[0])
     upstream, found = torch.randn(count - 30, 3, generator=generator), []
@@ -249,7 +249,7 @@ def test_what_there_was_no_room_for_has_no_gradient(precision: str, generator: t
         (lambda tensors: tensors | {"offsets": tensors["offsets"].double()}, "must be float32"),
     ],
 )
-def test_fused_kernels_refuse_what_they_would_read_wrongly(change, said, generator: torch.Generator):
+def test_fused_kernels_refuse_unsupported_inputs(change, said, generator: torch.Generator):
     tensors, decoder = problem(10, 10, 37, 32, generator)
     with pytest.raises(ValueError, match=said):
         on_gpu(decoder.weights(), SeenAnchors(**change(tensors)), "bfloat16")
@@ -267,13 +267,13 @@ def test_rows_behind_the_selected_change_no_gradient(precision: str, generator: 
     assert all(torch.equal(padded[name], gradient) for name, gradient in exact.items())
 
 
-def test_decoding_into_room_elsewhere_is_refused(generator: torch.Generator):
+def test_decoding_with_capacity_requires_the_gpu_library(generator: torch.Generator):
     tensors, decoder = problem(3, 10, 37, 32, generator)
     with pytest.raises(ValueError, match="decoding with a capacity takes float32 on a GPU; got torch.float64 on "):
         decode_with_capacity(decoder.weights(), SeenAnchors(*(tensor.double() for tensor in tensors.values())), 30)
 
 
-def test_nothing_selected_is_no_gaussians(generator: torch.Generator):
+def test_nothing_selected(generator: torch.Generator):
     decoder = Decoder(36, 10, generator=generator).to(DEVICE)
     with torch.no_grad():
         decoder.opacity["b2"] -= 50

@@ -1,4 +1,4 @@
-"""The table of what kernels take, from what cuobjdump prints."""
+"""The table of kernel resources, from output of cuobjdump."""
 
 from __future__ import annotations
 

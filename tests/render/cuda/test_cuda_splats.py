@@ -1,4 +1,4 @@
-"""Explicit Gaussians as a view sees them, by the GPU against their definition: values and gradients; or emulated."""
+"""Attributes of explicit Gaussians on the GPU, or emulated, against their definition: values and gradients."""
 
 from __future__ import annotations
 
@@ -59,14 +59,14 @@ def test_values_and_gradients_are_those_of_the_definition(monkeypatch, generator
             torch.testing.assert_close(ours, truth.expand_as(ours), atol=limit, rtol=2e-6)
 
 
-def test_what_is_no_number_stays_none(monkeypatch: pytest.MonkeyPatch, generator: torch.Generator):
+def test_nan_stays_nan(monkeypatch: pytest.MonkeyPatch, generator: torch.Generator):
     splats = splats_of(5, 3, 3, generator)
     splats.sh_rest.data[2, 4, 1] = float("nan")
     colors = seen(splats, 0, "kernels", monkeypatch)[3]
     assert colors.isnan().nonzero().tolist() == [[2, 1]]
 
 
-def test_there_are_kernels_for_float32_on_a_gpu_and_a_camera_that_does_not_learn(monkeypatch: pytest.MonkeyPatch):
+def test_supported_inputs(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(native_splats.LIBRARIES, DEVICE, native_splats.cuda)
     means, center = torch.zeros(2, 3, device=DEVICE), torch.zeros(3, device=DEVICE)
     assert native_splats.native_call(means, center) is native_splats.call_cuda

@@ -78,7 +78,7 @@ def test_each_tile_lists_the_gaussians_whose_boxes_touch_it_front_to_back(size, 
     assert seen == view.instances > 100
 
 
-def test_slots_of_a_gaussian_are_consecutive_and_everybody_has_one(generator: torch.Generator):
+def test_slots_of_a_gaussian_are_consecutive(generator: torch.Generator):
     view = projected((131, 77), RenderOptions(), "panorama", mixture(12, generator), identity_pose())
     (strip,) = view.strips()
     counts = torch.bincount(strip.reaches[:, 0].long(), minlength=len(view.order))
@@ -89,7 +89,7 @@ def test_slots_of_a_gaussian_are_consecutive_and_everybody_has_one(generator: to
     assert torch.equal(strip.reaches[:, 0].long(), owners)
 
 
-def test_where_nothing_is_listed_no_gaussian_has_a_slot(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch):
+def test_no_slots_without_instances(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch):
     """One row of tiles is more than a strip holds, and there is nothing below it."""
     gaussians = gaussians_of("ordinary", 20, generator)
     above = torch.tensor([0.0, -2.0, 0.3], dtype=torch.float64) + 0.1 * gaussians.means
@@ -122,7 +122,7 @@ EDGES = st.tuples(st.integers(0, 15), st.integers(1, 16)).filter(lambda edge: ed
 
 @settings(max_examples=20)
 @given(st.lists(st.tuples(EDGES, EDGES), min_size=1, max_size=8))
-def test_every_pixel_has_one_thread_whose_warp_visits_what_reaches_it(reaches):
+def test_every_pixel_has_one_thread(reaches):
     width, height, threads = 5 * TILE - 3, 40, 2 * 5 * 256
     table = cuda.TileTable(width, height, 1, 3)
     packed = [top | bottom << 8 | left << 16 | right << 24 for (top, bottom), (left, right) in reaches]

@@ -1,4 +1,4 @@
-"""The emulated GPU finds faults that are planted, each of a kind that hardware would not forgive."""
+"""The emulated GPU detects planted faults."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ def planted(fault: str, *flags: str) -> torch.Tensor:
     return out
 
 
-def test_shared_memory_that_nobody_wrote_to_is_no_number():
+def test_uninitialised_shared_memory_is_nan():
     assert planted("unwritten").isnan().all()
 
 
-def test_a_race_that_neither_order_of_turns_brings_out_shows_in_some_schedule(monkeypatch: pytest.MonkeyPatch):
+def test_some_schedule_exposes_a_race(monkeypatch: pytest.MonkeyPatch):
     outcomes = [planted("race").tolist()]
     for seed in range(3):
         monkeypatch.setenv("PADGS_EMULATION_SEED", str(seed))
@@ -47,7 +47,7 @@ def test_a_race_that_neither_order_of_turns_brings_out_shows_in_some_schedule(mo
     assert planted("race").tolist() == outcomes[1]  # a schedule can be had again
 
 
-def test_in_some_schedule_a_warp_stays_behind_until_others_wait_for_it(monkeypatch: pytest.MonkeyPatch):
+def test_some_schedule_delays_a_warp(monkeypatch: pytest.MonkeyPatch):
     assert planted("ahead").all()
     outcomes = []
     for seed in range(8):
@@ -63,7 +63,7 @@ def test_in_some_schedule_a_warp_stays_behind_until_others_wait_for_it(monkeypat
         ("two votes", "lanes of a warp wait for different things"),
     ],
 )
-def test_waits_at_different_places_end_the_process(fault: str, word: str):
+def test_divergent_barriers_end_the_process(fault: str, word: str):
     command = [sys.executable, "-c", ALONE, library()._name, str(FAULTS.index(fault))]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode < 0 and word in done.stderr

@@ -38,7 +38,7 @@ def test_a_product_is_that_of_the_rounded_matrices(dtype: torch.dtype, generator
     torch.testing.assert_close(sums, expected.float(), atol=1e-6, rtol=1e-6)
 
 
-def test_transposing_exchanges_what_is_summed_over(generator: torch.Generator):
+def test_transposed_products(generator: torch.Generator):
     a, b = torch.randn(2, 16, 16, generator=generator).to(DEVICE)
     out, rounded = torch.empty(16, 16, device=DEVICE), [matrix.bfloat16().double() for matrix in (a, b)]
     library().check_transposed_product(*addresses(a, b, out))

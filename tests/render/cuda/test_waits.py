@@ -1,4 +1,4 @@
-"""How often the host waits while a method trains with the kernels: those of the emulation, on a GPU that is not there.
+"""Number of waits of the host during training, with emulated kernels on a pretended GPU.
 
 Numbers that are read beside the drawing (`HostCopy`) are no wait: the device goes on with what it has.
 """
@@ -88,7 +88,7 @@ def learned(trainer: Trainer) -> dict[str, Tensor]:
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
-def test_an_iteration_of_padgs_waits_for_nothing(precision: str, monkeypatch: pytest.MonkeyPatch):
+def test_padgs_iterations_do_not_wait(precision: str, monkeypatch: pytest.MonkeyPatch):
     trainer, waited = trained(precision)
     assert waited[0] and waited[2:] == [Counter()] * (STEPS - 2), waited  # the first counts Gaussians and instances
     ahead = learned(trainer)
@@ -100,7 +100,7 @@ def test_an_iteration_of_padgs_waits_for_nothing(precision: str, monkeypatch: py
     assert ahead["model/growth/seen"].any() and ahead["model/growth/gradient"].any()
 
 
-def test_too_little_room_is_noticed_and_changes_nothing(monkeypatch: pytest.MonkeyPatch):
+def test_too_small_capacity_changes_nothing(monkeypatch: pytest.MonkeyPatch):
     enough = learned(trained("float32")[0])
     monkeypatch.setattr("padgs.methods.anchors.model.HEADROOM", 0.5)
     trainer, waited = trained("float32")
@@ -110,7 +110,7 @@ def test_too_little_room_is_noticed_and_changes_nothing(monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize("kind", POSITIONAL_GRADIENTS)
-def test_an_iteration_of_explicit_gaussians_waits_for_nothing(kind: str):
+def test_splat_iterations_do_not_wait(kind: str):
     work = build(SIZE)
     with torch.no_grad():
         seen = work.model.decode(work.view).gaussians

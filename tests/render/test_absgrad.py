@@ -1,4 +1,4 @@
-"""The absolute pull of pixels against its definition, and by every backend."""
+"""The absolute positional gradient against its definition, in every backend."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ BLENDINGS = ("sorted", "hybrid")
 each_blending = pytest.mark.parametrize("blending", BLENDINGS)
 
 
-def pulls(gaussians: Gaussians, view: View, options: RenderOptions, weights: Tensor, backend: str) -> Tensor:
-    """The gradient [N] of an absolute mean_offsets for the outputs [H, W, 3 to 5] times the weights."""
+def absgrads(gaussians: Gaussians, view: View, options: RenderOptions, weights: Tensor, backend: str) -> Tensor:
+    """Return the absgrad [N] for the outputs [H, W, 3 to 5] times the weights."""
     dtype = gaussians.means.dtype
-    mean_offsets = torch.zeros(len(gaussians), dtype=dtype, requires_grad=True)
-    rendering = render(gaussians, view, options, absgrad=mean_offsets, backend=backend)
+    absgrad = torch.zeros(len(gaussians), dtype=dtype, requires_grad=True)
+    rendering = render(gaussians, view, options, absgrad=absgrad, backend=backend)
     outputs = torch.cat((rendering.image, rendering.transmittance[..., None], rendering.depth[..., None]), dim=-1)
     (outputs[..., : weights.shape[-1]] * weights.to(dtype)).sum().backward()
-    assert mean_offsets.grad is not None
-    return mean_offsets.grad
+    assert absgrad.grad is not None
+    return absgrad.grad
 
 
 @each_blending
-def test_is_the_sum_of_what_each_pixel_alone_does(blending: str, generator: torch.Generator):
+def test_absgrad_is_the_sum_of_norms_of_single_pixels(blending: str, generator: torch.Generator):
     """By one backward pass for each pixel, in float64; low_pass=0, as the filter's width would follow the means."""
     gaussians = mixture(3, generator, ("ordinary", "polar", "seam", "near"))
     view = View("v", identity_pose().double(), 24, 12)
@@ -43,7 +43,7 @@ def test_is_the_sum_of_what_each_pixel_alone_does(blending: str, generator: torc
     each = [torch.autograd.grad(loss, means, retain_graph=True)[0] for loss in losses]
     expected = torch.stack(each).norm(dim=-1).sum(0)
     assert (expected > 0).sum() > len(gaussians) // 2
-    torch.testing.assert_close(pulls(gaussians, view, options, weights, "torch"), expected, rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(absgrads(gaussians, view, options, weights, "torch"), expected, rtol=1e-9, atol=1e-12)
     assert (torch.stack(each).sum(0).norm(dim=-1) < 0.7 * expected)[expected > 0].any(), "nothing cancels here"
 
 
@@ -58,50 +58,52 @@ def test_backends_agree(kind: str, channels: int, blending: str, backend: str, d
         gaussians = replace(gaussians, scales=0.0625 * gaussians.scales, opacities=0.5 * gaussians.opacities)
     view, options = View("v", identity_pose(), 70, 44), RenderOptions(projection="ray", **blended(blending, 4))
     weights = torch.randn(44, 70, channels, generator=generator, dtype=torch.float64)
-    expected = pulls(gaussians, view, options, weights, "torch")
-    found = pulls(gaussians.to(dtype), view, options, weights, backend)
+    expected = absgrads(gaussians, view, options, weights, "torch")
+    found = absgrads(gaussians.to(dtype), view, options, weights, backend)
     assert expected.any()
     assert row_error(found[:, None], expected[:, None]) < 2e-3
 
 
 @each_engine
-def test_together_with_a_table_of_rays_that_is_learned(backend: str, dtype: torch.dtype, generator: torch.Generator):
+def test_absgrad_with_learned_rays(backend: str, dtype: torch.dtype, generator: torch.Generator):
     formula = Panorama(40, 20)
     gaussians, options = mixture(5, generator, ("ordinary", "seam")).to(dtype), RenderOptions(projection="ray")
     weights = torch.randn(20, 40, 3, generator=generator, dtype=torch.float64)
     table = formula.rays(dtype=dtype).clone()
     fixed = View("v", identity_pose(), 40, 20, lens=RayTable(table, formula.focal))
     learned = View("v", identity_pose(), 40, 20, lens=RayTable(table.clone().requires_grad_(), formula.focal))
-    expected = pulls(gaussians, fixed, options, weights, backend)
+    expected = absgrads(gaussians, fixed, options, weights, backend)
     assert expected.any()
-    torch.testing.assert_close(pulls(gaussians, learned, options, weights, backend), expected, rtol=1e-5, atol=1e-7)
+    torch.testing.assert_close(absgrads(gaussians, learned, options, weights, backend), expected, rtol=1e-5, atol=1e-7)
 
 
 @each_engine
-def test_is_per_length_and_changes_no_other_gradient(backend: str, dtype: torch.dtype, generator: torch.Generator):
-    """Twice the world, half the pull; and the mean_offsets leaves images and the gradients of all else as they are."""
+def test_absgrad_is_per_length_and_changes_no_other_gradient(
+    backend: str, dtype: torch.dtype, generator: torch.Generator
+):
+    """Doubling the world halves absgrad, and absgrad changes no image and no other gradient."""
     gaussians, view = mixture(5, generator).to(dtype), View("v", identity_pose(), 40, 20)
     options, weights = RenderOptions(projection="ray"), torch.rand(20, 40, 3, generator=generator).double()
     twice = replace(gaussians, means=2 * gaussians.means, scales=2 * gaussians.scales)
-    once = pulls(gaussians, view, options, weights, backend)
-    torch.testing.assert_close(pulls(twice, view, options, weights, backend), 0.5 * once, rtol=1e-4, atol=1e-6)
+    once = absgrads(gaussians, view, options, weights, backend)
+    torch.testing.assert_close(absgrads(twice, view, options, weights, backend), 0.5 * once, rtol=1e-4, atol=1e-6)
 
     gradients = []
-    for mean_offsets in (None, torch.zeros(len(gaussians), dtype=dtype, requires_grad=True)):
+    for absgrad in (None, torch.zeros(len(gaussians), dtype=dtype, requires_grad=True)):
         means = gaussians.means.clone().requires_grad_()
-        drawn = render(replace(gaussians, means=means), view, options, absgrad=mean_offsets, backend=backend)
+        drawn = render(replace(gaussians, means=means), view, options, absgrad=absgrad, backend=backend)
         (drawn.image * weights.to(dtype)).sum().backward()
         gradients.append((drawn.image, means.grad))
     assert torch.equal(gradients[0][0], gradients[1][0])
     torch.testing.assert_close(gradients[1][1], gradients[0][1], rtol=1e-5, atol=1e-7)
 
 
-def test_faces_of_a_cube_pull_together(generator: torch.Generator):
-    """Interpolated to a panorama from finer faces, pixels pull about as those of the panorama do."""
+def test_absgrad_of_a_cubemap(generator: torch.Generator):
+    """Pixels interpolated from finer faces give about the absgrad of the panorama."""
     gaussians, view = mixture(5, generator, ("ordinary", "seam")), View("v", identity_pose(), 64, 32)
     options = RenderOptions(projection="ray", low_pass=0.0)  # a pixel of the faces is smaller
     weights = torch.ones(32, 64, 3, dtype=torch.float64)
-    whole = pulls(gaussians, view, options, weights, "torch")
-    faces = pulls(gaussians, view, replace(options, cubemap=True, face_size=64), weights, "torch")
+    whole = absgrads(gaussians, view, options, weights, "torch")
+    faces = absgrads(gaussians, view, replace(options, cubemap=True, face_size=64), weights, "torch")
     seen = whole > 0.1 * whole.max()
     assert (faces[seen] / whole[seen] - 1).abs().median() < 0.2
