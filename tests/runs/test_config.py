@@ -45,7 +45,7 @@ OF_ANOTHER_TYPE = {
     "protocol.paper.lpips=3": "protocol.paper.lpips is 3; it must be a text",
     "data.generator=3": "data.generator is 3; it must be a group of keys",
     "data.generator.width=abc": "data.generator.width is 'abc'; it must be a whole number",
-    "data.generator.width=9": "width 9 is not an even number",
+    "data.generator.width=9": "data.generator.width is 9; it must be an even number",
     "data.generator.x=1": "unknown key data.generator.x; known: data.generator.scene",
 }
 

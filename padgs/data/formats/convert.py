@@ -20,7 +20,7 @@ from padgs.data.images import save_png
 from padgs.data.masks import write_masks
 from padgs.scene import Scene
 
-IMAGE_FOLDERS = {"ricoh360": "imgs"}  # "images" otherwise
+IMAGE_FOLDERS = {"ricoh360": "imgs"}  # default: images
 PNG_ONLY = ("ricoh360",)  # EgoNeRF appends .png to the names in its lists
 
 

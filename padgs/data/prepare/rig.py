@@ -47,11 +47,6 @@ def owned(index: int, rays: Tensor) -> Tensor:
     return (rays @ cam_from_pano()[:, 2].mT).argmax(-1) == index
 
 
-def resample(image: Tensor, rays: Tensor) -> Tensor:
-    """Sample a panorama [H, W, C] uint8 bilinearly in directions [..., 3]; returns [..., C] uint8."""
-    return sample(image, rays).round().to(torch.uint8)
-
-
 def render_views(
     images: dict[str, Path],
     masks: dict[str, Path],
@@ -77,8 +72,8 @@ def render_views(
             pano_rays = rays @ rotation  # R^T d: from the view's frame to the panorama's
             use = owned(index, pano_rays)
             if mask is not None:
-                use &= resample(mask, pano_rays)[..., 0] >= 128
-            _save(resample(image, pano_rays).numpy(), folder / view_name(index, name))
+                use &= sample(mask, pano_rays)[..., 0].round() >= 128
+            _save(sample(image, pano_rays).round().byte().numpy(), folder / view_name(index, name))
             _save((use.numpy() * np.uint8(255)), mask_folder / f"{view_name(index, name)}.png")
         progress(done + 1, len(images))
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from padgs.data.capture import DataError
 
@@ -13,6 +15,22 @@ SCENES = (
 )
 PATHS = ("roaming", "cross", "line")
 HEADINGS = ("path", "fixed", "random")
+
+_RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
+    ("width", lambda x: x >= 8 and x % 2 == 0, "an even number >= 8, as a panorama is 2:1 (set data.width)"),
+    ("samples", lambda x: x >= 1 and math.isqrt(x) ** 2 == x, "a square number: 1, 4, 9, 16, 25, ..."),
+    ("train_views", lambda x: x >= 2, "at least 2"),
+    ("test_views", lambda x: x >= 0, "at least 0"),
+    ("points spokes", lambda x: x >= 1, "at least 1"),
+    ("point_noise pose_noise_translation pose_noise_rotation", lambda x: 0 <= x < math.inf, "a finite number >= 0"),
+    ("exposure_range tilt lens_gap", lambda x: 0 <= x < math.inf, "a finite number >= 0"),
+    ("texture_frequency world_scale", lambda x: 0 < x < math.inf, "a finite number > 0"),
+    ("lens_blend", lambda x: 0 <= x < 90, "an angle in [0, 90) degrees"),
+    ("lens_k1", lambda x: -0.1 <= x <= 0.1, "in [-0.1, 0.1]"),  # theta' must increase with theta up to 90 degrees
+    ("outliers", lambda x: 0 <= x < 1, "a share in [0, 1)"),
+    ("path_radius nearest horizon", lambda x: x is None or 0 < x < math.inf, "a finite length > 0 in metres, or null"),
+    ("objects", lambda x: x is None or x >= 0, "at least 0, or null for the default"),
+)
 
 
 @dataclass(frozen=True)
@@ -57,38 +75,10 @@ class SyntheticOptions:
             if getattr(self, field) not in known:
                 names = ", ".join(sorted(name for name in known if name is not None))
                 raise DataError(f"unknown synthetic {field} {getattr(self, field)!r}; known: {names}")
-        if self.width < 8 or self.width % 2:
-            raise DataError(f"width {self.width} is not an even number >= 8; a panorama is 2:1 (data.width)")
-        if math.isqrt(max(self.samples, 0)) ** 2 != self.samples or self.samples < 1:
-            raise DataError(f"samples {self.samples} is not a square number; use 1, 4, 9, 16, 25, ...")
-        for field, least in (("train_views", 2), ("test_views", 0), ("points", 1), ("spokes", 1)):
-            if getattr(self, field) < least:
-                raise DataError(f"{field} {getattr(self, field)} is less than {least}")
-        for field in (
-            "point_noise",
-            "pose_noise_translation",
-            "pose_noise_rotation",
-            "exposure_range",
-            "tilt",
-            "lens_gap",
-        ):
-            if not 0 <= getattr(self, field) < math.inf:
-                raise DataError(f"{field} {getattr(self, field)} is not a finite number >= 0")
-        if not 0 <= self.lens_blend < 90:
-            raise DataError(f"lens_blend {self.lens_blend} is not an angle in [0, 90) degrees")
-        if not -0.1 <= self.lens_k1 <= 0.1:  # theta' must increase with theta up to 90 degrees
-            raise DataError(f"lens_k1 {self.lens_k1} is not in [-0.1, 0.1]")
-        if not 0 <= self.outliers < 1:
-            raise DataError(f"outliers {self.outliers} is not a share in [0, 1)")
-        for field in ("texture_frequency", "world_scale"):
-            if not 0 < getattr(self, field) < math.inf:
-                raise DataError(f"{field} {getattr(self, field)} is not a finite number > 0")
-        for field in ("path_radius", "nearest", "horizon"):
-            length = getattr(self, field)
-            if length is not None and not 0 < length < math.inf:
-                raise DataError(f"{field} {length} is not a finite length > 0 in metres; use null for the default")
-        if self.objects is not None and self.objects < 0:
-            raise DataError(f"objects {self.objects} is negative; use null for the default")
+        for names, is_valid, rule in _RULES:
+            for name in names.split():
+                if not is_valid(value := getattr(self, name)):
+                    raise DataError(f"data.generator.{name} is {value}; it must be {rule}")
         if self.rooms is not None and (self.scene != "room_chain" or self.rooms < 1):
             raise DataError(
                 f"rooms is {self.rooms} of scene {self.scene}; only room_chain has this option, which must be 1 or "
