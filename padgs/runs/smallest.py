@@ -199,14 +199,14 @@ class Search:
         lap, folder = Lap(), self.run.folder / FOLDER
         result = self._trained(self._config(count, str(folder), hold_out=True), stop_requested)
         if not result.smallest:
-            run = self._load(folder / result.run)
-            tested = result.scores[RULES.name].metrics[QUALITY] if result.scores else None
-            measured = self._measured(run) | {"test_ws_psnr": tested}
+            loaded = self._load(folder / result.run)
+            measured = self._measured(loaded)
+            measured["test_ws_psnr"] = result.scores[RULES.name].metrics[QUALITY] if result.scores else None
             measured["seconds"], measured["cpu_seconds"] = lap.seconds()
-            with run.files:
-                result = run.files.finish(replace(result, smallest=measured))
-        values = result.smallest
-        return Candidate(**values | {"scores": Scores(**values["scores"])})
+            with loaded.files:
+                result = loaded.files.finish(replace(result, smallest=measured))
+        values: dict[str, Any] = {**result.smallest, "scores": Scores(**result.smallest["scores"])}
+        return Candidate(**values)
 
     def _measured(self, run: LoadedRun) -> dict[str, Any]:
         views, scene, device = islice(cycle(self.validation), FRAMES), self.run.scene, self.run.scene.points.device

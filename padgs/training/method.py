@@ -114,7 +114,7 @@ class Method(ABC):
         if self.train_options.hold_out:
             scene = replace(scene, train=held_out(scene.train)[0])
         if self.train_options.refine:
-            refined = Refined(self._model, self.train_options.learning_rates, budget.iterations)
+            refined: Any = Refined(self._model, self.train_options.learning_rates, budget.iterations)
             self._trainer = Trainer(refined, scene, budget, self.train_options, self.seed, stage=stage)
         else:
             self._trainer = self.build_trainer(self._model, scene, budget, stage)

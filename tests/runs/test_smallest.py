@@ -29,7 +29,7 @@ SETTINGS = (
 )
 
 
-def scores(*views: float, lpips: float = 0.1, **bands: float) -> Scores:
+def scores(*views: float, lpips: float | None = 0.1, **bands: float) -> Scores:
     """Scores of views with these WS-PSNRs, all bands alike except those that are given."""
     each: dict[str, dict[str, float | None]] = {
         str(number): {"ws_psnr": value, "ws_lpips_alex": lpips, "ws_lpips_vgg": lpips}
@@ -157,7 +157,7 @@ def test_a_search_writes_what_it_found_and_keeps_the_smallest_model_as_a_run(loa
     assert result.scores == loaded.result.scores and result.config == loaded.result.config
     kept = padgs.load_run(loaded.folder.with_name(found["kept"]["run"]), device="cpu")
     assert kept.method.model.counts()[found["row"]] == rows[found["minimal"]["1"]]
-    assert kept.result.ok and kept.result.variant.startswith("smallest 1 dB")
+    assert kept.result is not None and kept.result.ok and kept.result.variant.startswith("smallest 1 dB")
     assert kept.score("sphere").metrics == pytest.approx(kept.scores["sphere"].metrics, nan_ok=True)
     assert np.array(Image.open(loaded.folder / "smallest.png")).shape == (24, 4 * 48, 3)
     assert "1 dB" in shown.get() and kept.folder.name in shown.get()
@@ -243,5 +243,7 @@ def test_a_run_with_smallest_on_is_the_same_run_and_is_searched_at_its_end(tmp_p
         config = configuration(settings)
         assert config.values() == configuration([*settings, "smallest=off"]).values()
     result = job.complete(config, Console(width=400), Callback())
-    kept = padgs.load_run(tmp_path / result.run, device="cpu").result.smallest["kept"]
+    searched_run = padgs.load_run(tmp_path / result.run, device="cpu").result
+    assert searched_run is not None
+    kept = searched_run.smallest["kept"]
     assert kept["epsilon"] == 0.1 and kept["run"] in capsys.readouterr().out
