@@ -1,8 +1,7 @@
-"""A tiny world with exact poses, and a hand-written file layout of every format that padgs reads.
+"""A tiny world with exact poses, written in every format that padgs reads.
 
-Nothing here uses padgs: images are ray-cast and files are written from the formats' own documentation, so that an
-error of a reader cannot hide behind the same error here. The world is a coloured box without symmetries; cameras
-stand inside it, tilted, so that every wrong axis shows.
+Nothing here uses padgs: images are ray-cast, and files follow the formats' own documentation, so that errors of readers
+are not repeated. The world is a coloured box without symmetries; cameras inside are tilted, which reveals wrong axes.
 """
 
 from __future__ import annotations
@@ -15,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 HALF = np.array([2.0, 1.2, 1.6])  # of the box, world units
 OPENGL = np.diag([1.0, -1.0, -1.0])
@@ -22,11 +22,11 @@ OPENGL = np.diag([1.0, -1.0, -1.0])
 
 @dataclass(frozen=True)
 class World:
-    """The truth."""
+    """Ground truth of the tiny world."""
 
     names: tuple[str, ...]  # without extension
     images: tuple[NDArray[np.uint8], ...]  # [H, W, 3]
-    rotations: NDArray[np.float64]  # [F, 3, 3] cam from world; x right, y down, z forward
+    rotations: NDArray[np.float64]  # [F, 3, 3] cam_from_world; x right, y down, z forward
     centers: NDArray[np.float64]  # [F, 3] world
     points: NDArray[np.float64]  # [P, 3] on the box
     colors: NDArray[np.uint8]  # [P, 3]
@@ -45,7 +45,7 @@ class World:
         return self.images[0].shape[1], self.images[0].shape[0]
 
     def world_from_cam(self, i: int, axes: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
-        """[4, 4] pose of frame i for a camera whose axes are `axes` times ours."""
+        """Return the pose [4, 4] of frame i for a camera whose axes are `axes` times those of OpenCV."""
         pose = np.eye(4)
         pose[:3, :3] = self.rotations[i].T @ (np.eye(3) if axes is None else axes)
         pose[:3, 3] = self.centers[i]
@@ -54,18 +54,13 @@ class World:
 
 def make_world(count: int = 6, width: int = 64, points: int = 400, seed: int = 7) -> World:
     source = np.random.default_rng(seed)
-    rotations = np.stack([_rotation(source.normal(size=4)) for _ in range(count)])
+    rotations = Rotation.from_quat([np.roll(source.normal(size=4), -1) for _ in range(count)]).as_matrix()
     centers = source.uniform(-0.5, 0.5, (count, 3)) * HALF
     images = tuple(_panorama(rotations[i], centers[i], width) for i in range(count))
     cloud = source.normal(size=(points, 3))
     cloud = _exit(np.zeros(3), cloud / np.linalg.norm(cloud, axis=1, keepdims=True))
     names = tuple(f"pano_{i:02d}" for i in range(count))
-    return World(names, images, rotations, centers, cloud, _paint(cloud), (names[1], names[4]))
-
-
-def paint(points: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """The colour of the box at points on it."""
-    return _paint(points)
+    return World(names, images, rotations, centers, cloud, paint(cloud), (names[1], names[4]))
 
 
 def write_images(world: World, folder: Path, extension: str = "png") -> None:
@@ -81,7 +76,7 @@ def write_lists(world: World, folder: Path, extension: str = "") -> None:
 
 
 def write_cloud(world: World, path: Path) -> None:
-    """ASCII PLY, as many exporters write it."""
+    """Write an ASCII PLY."""
     header = ["ply", "format ascii 1.0", f"element vertex {len(world.points)}"]
     header += [f"property double {axis}" for axis in "xyz"]
     header += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
@@ -99,7 +94,7 @@ def write_colmap_text(world: World, folder: Path, camera: str = "EQUIRECTANGULAR
 
 
 def write_colmap_binary(world: World, folder: Path, rigs: bool = True) -> None:
-    """With `rigs` as COLMAP 4 writes it, without as COLMAP 3 did. Every point has a track over all frames."""
+    """Write a model of COLMAP 4 (`rigs`) or 3. Every point has a track over all frames."""
     write_images(world, folder / "images")
     write_lists(world, folder, ".png")
     model = folder / "sparse" / "0"
@@ -139,12 +134,7 @@ def write_transforms(world: World, folder: Path) -> None:
     ]
     meta = {
         "camera_model": "EQUIRECTANGULAR",
-        "w": width,
-        "h": height,
-        "fl_x": height,
-        "fl_y": height,
-        "cx": width / 2,
-        "cy": height / 2,
+        **{"w": width, "h": height, "fl_x": height, "fl_y": height, "cx": width / 2, "cy": height / 2},
         "ply_file_path": "sparse_pc.ply",
         "frames": frames,
         "train_filenames": [f"images/{name}.png" for name in world.train],
@@ -159,7 +149,7 @@ def write_openmvg(world: World, folder: Path) -> None:
     write_lists(world, folder)
     views, extrinsics = _openmvg(world)
     width, height = world.size
-    intrinsic = {"value0": {"width": width, "height": height}}
+    intrinsic = {"ptr_wrapper": {"id": 2147483800, "data": {"value0": {"width": width, "height": height}}}}
     structure = []
     for k, point in enumerate(world.points):
         seen = [_project(point[None], world.rotations[i], world.centers[i], width)[0] for i in range(2)]
@@ -170,14 +160,7 @@ def write_openmvg(world: World, folder: Path) -> None:
         "root_path": "/home/somebody/else/images",
         "views": views,
         "intrinsics": [
-            {
-                "key": 0,
-                "value": {
-                    "polymorphic_id": 2147483649,
-                    "polymorphic_name": "spherical",
-                    "ptr_wrapper": {"id": 2147483800, "data": intrinsic},
-                },
-            }
+            {"key": 0, "value": {"polymorphic_id": 2147483649, "polymorphic_name": "spherical", **intrinsic}}
         ],
         "extrinsics": extrinsics,
         "structure": structure,
@@ -192,7 +175,7 @@ def write_opensfm(world: World, folder: Path) -> None:
     width, height = world.size
     shots = {
         f"{name}.png": {
-            "rotation": rotation_vector(world.rotations[i]).tolist(),
+            "rotation": Rotation.from_matrix(world.rotations[i]).as_rotvec().tolist(),
             "translation": world.translations[i].tolist(),
             "camera": "v2 camera spherical",
             "orientation": 1,
@@ -215,10 +198,7 @@ def write_roam360(world: World, folder: Path) -> None:
     write_cloud(world, folder / "scene.ply")
     poses = {
         side: [
-            {
-                "rgb_file": f"{name}.jpg",
-                "transform_matrix": world.world_from_cam(world.names.index(name)).tolist(),
-            }
+            {"rgb_file": f"{name}.jpg", "transform_matrix": world.world_from_cam(world.names.index(name)).tolist()}
             for name in names
         ]
         for side, names in (("train", world.train), ("test", world.test))
@@ -227,7 +207,7 @@ def write_roam360(world: World, folder: Path) -> None:
 
 
 def write_ricoh360(world: World, folder: Path) -> None:
-    """The camera line is what OpenMVG's export says, not a COLMAP camera; images.txt names the files as .jpg."""
+    """Write the camera line of OpenMVG's export, which COLMAP does not know; images.txt names the files as .jpg."""
     write_images(world, folder / "imgs")
     Image.fromarray(np.full(world.images[0].shape[:2], 255, np.uint8)).save(folder / "imgs" / "mask.png")
     write_lists(world, folder)
@@ -268,45 +248,19 @@ WRITERS = {
 
 
 def quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(w, x, y, z), w >= 0, from the eigenvector of the 4 x 4 matrix that holds it: no special cases."""
-    m = rotation
-    k = np.array(
-        [
-            [m[0, 0] - m[1, 1] - m[2, 2], 0, 0, 0],
-            [m[1, 0] + m[0, 1], m[1, 1] - m[0, 0] - m[2, 2], 0, 0],
-            [m[2, 0] + m[0, 2], m[2, 1] + m[1, 2], m[2, 2] - m[0, 0] - m[1, 1], 0],
-            [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1], m[0, 0] + m[1, 1] + m[2, 2]],
-        ]
-    )
-    x, y, z, w = np.linalg.eigh(k, UPLO="L")[1][:, -1]
-    return np.array([w, x, y, z]) * (1 if w >= 0 else -1)
-
-
-def rotation_vector(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    w, *axis = quaternion(rotation)
-    axis = np.array(axis)
-    return axis / np.linalg.norm(axis) * 2 * np.arctan2(np.linalg.norm(axis), w)
-
-
-def _rotation(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    w, x, y, z = q / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    """Return (w, x, y, z), w >= 0."""
+    return np.roll(Rotation.from_matrix(rotation).as_quat(canonical=True), 1)
 
 
 def _exit(center: NDArray[np.float64], direction: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Where rays from inside the box leave it."""
+    """Return the points where rays from inside leave the box."""
     with np.errstate(divide="ignore"):
         distance = ((np.sign(direction) * HALF - center) / direction).min(-1, keepdims=True)
     return center + distance * direction
 
 
-def _paint(points: NDArray[np.float64]) -> NDArray[np.uint8]:
+def paint(points: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Return the colours of the box at points on it."""
     phase = np.array([[0.0, 1.0, 2.0]])
     waves = np.sin(points @ np.array([[1.3, -0.4, 0.9], [0.5, 1.7, -1.1], [-0.8, 0.6, 1.5]]) + phase)
     return np.rint(127.5 + 110 * waves).astype(np.uint8)
@@ -320,7 +274,7 @@ def _panorama(rotation: NDArray[np.float64], center: NDArray[np.float64], width:
         [np.cos(latitude) * np.sin(longitude), np.sin(latitude) + 0 * longitude, np.cos(latitude) * np.cos(longitude)],
         -1,
     )
-    return _paint(_exit(center, rays @ rotation))
+    return paint(_exit(center, rays @ rotation))
 
 
 def _project(
