@@ -15,7 +15,7 @@ from padgs.methods.splats.splats import Splats
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_what_is_read_is_what_was_written_bit_by_bit(degree, tmp_path, generator):
+def test_writing_and_reading_is_lossless(degree, tmp_path, generator):
     splats = random_splats(degree, generator)
     write_splats(tmp_path / "a.ply", splats, ["said of it"])
     found = read_splats(tmp_path / "a.ply", unit=splats.scene_scale)
@@ -25,7 +25,7 @@ def test_what_is_read_is_what_was_written_bit_by_bit(degree, tmp_path, generator
     assert PlyData.read(str(tmp_path / "a.ply"))["vertex"].comments == ["said of it"]
 
 
-def test_the_columns_are_those_of_3dgs(tmp_path, generator):
+def test_columns_of_3dgs(tmp_path, generator):
     splats = random_splats(2, generator)
     write_splats(tmp_path / "a.ply", splats)
     vertex = PlyData.read(str(tmp_path / "a.ply"))["vertex"]
@@ -37,7 +37,7 @@ def test_the_columns_are_those_of_3dgs(tmp_path, generator):
     assert read_splats(tmp_path / "a.ply").degree == 1, "harmonics that wait are not written"
 
 
-def test_the_header_is_what_the_viewer_of_3dgs_counts_on(tmp_path, generator):
+def test_the_header_suits_the_viewer_of_3dgs(tmp_path, generator):
     """It takes the number of Gaussians from the third line, and rows by position; PLY is ASCII."""
     splats = random_splats(0, generator)
     write_splats(tmp_path / "a.ply", splats, ["run flat é"])
@@ -61,13 +61,13 @@ def test_invalid_files_are_refused(tmp_path, generator):
         read_splats(tmp_path / "a.ply")
 
 
-def test_without_the_converter_the_way_out_is_said(tmp_path, generator, monkeypatch):
+def test_a_missing_converter_is_reported(tmp_path, generator, monkeypatch):
     monkeypatch.setattr(splat_file.shutil, "which", lambda name: None)
     with pytest.raises(ValueError, match="npm install -g @playcanvas/splat-transform; or write a .ply"):
         write_splats(tmp_path / "a.spz", random_splats(0, generator))
 
 
-def test_what_takes_minutes_is_known_beforehand():
+def test_conversion_times_are_estimated():
     splats = Splats(*[torch.zeros(100_000, 3)] * 3, degree=2, scene_scale=1.0)
     assert estimate_seconds(Path("a.sog"), splats) == 0, "no harmonics in use"
     splats.active_degree = 2
