@@ -194,18 +194,6 @@ class Method(ABC):
         other.load_state(self.state())
         return other
 
-    def resumed(self, scene: Scene, iterations: int) -> Any:
-        """Return the loaded model as `build_model` makes it for a schedule of `iterations`, ready for more training.
-
-        Raises:
-            RuntimeError: nothing was loaded.
-            ValueError: the method cannot train on this scene.
-        """
-        stored = self.state().of_model()
-        model = self.build_model(scene, iterations)
-        model.load_state(stored)
-        return model
-
     @property
     def has_smoothing_filter(self) -> bool:
         """True if renders stay as smooth as those of the training views, whatever the pixels of a view."""

@@ -22,7 +22,7 @@ from padgs.scene import View
 
 def scored(*changes: float) -> Importance:
     change = torch.tensor(changes, dtype=torch.float64)
-    return Importance(-change, change, change, change, torch.ones(len(changes), dtype=torch.int64), len(changes))
+    return Importance(change, len(changes))
 
 
 @pytest.mark.parametrize(
