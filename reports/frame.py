@@ -18,7 +18,7 @@ from pandas import DataFrame
 
 from padgs.reports.published import Place
 from padgs.reports.store import Run
-from padgs.results import AD_HOC, DECIDE_NOTHING, Result, Scores, picture_name
+from padgs.results import AD_HOC, DECIDE_NOTHING, SMALLEST_STATED, Result, Scores, picture_name
 
 CONFIG = "config."  # prefix of a dotted key
 WITHOUT_EFFECT = ("seed", *DECIDE_NOTHING)  # keys that make no other setting; a section stands for all its keys
@@ -170,6 +170,11 @@ def _factor(result: Result) -> float | None:
     return 1.0 if choice == "published" else law(result.iterations) if choice == "run" else float(choice)
 
 
+def _minimal_count(found: Mapping[str, Any]) -> float | None:
+    """Return the Gaussians of the smallest model for a loss of `SMALLEST_STATED` dB, if it was searched."""
+    return found["steps"][found["minimal"][f"{SMALLEST_STATED:g}"]]["blended"] if "steps" in found else None
+
+
 def _view_psnr(scores: Mapping[str, Scores]) -> dict[str, float]:
     """Return file name of a render -> PSNR (or else WS-PSNR) of the view, by the first protocol that has it."""
     found: dict[str, float] = {}
@@ -219,6 +224,7 @@ NUMBERS: Mapping[str, Callable[[Result], float | None]] = {
     "anchors": lambda result: result.counts.get("anchors"),
     "start": lambda result: result.counts.get("start"),  # Gaussians or anchors before training
     "gaussians": lambda result: result.counts.get("gaussians"),
+    "minimal_count": lambda result: _minimal_count(result.smallest),
     "megabytes": lambda result: result.model_bytes / 1e6 or None,
     "peak_gigabytes": lambda result: result.peak_memory_bytes / 1e9 or None,  # of the process, while training
     "peak_gpu_gigabytes": lambda result: (result.peak_device_memory_bytes or math.nan) / 1e9,  # of the tensors there

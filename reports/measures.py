@@ -42,6 +42,7 @@ COSTS = {
         Measure("anchors", Column("anchors", 0)),
         Measure("start", Column("started from", 0)),
         Measure("gaussians", Column("Gaussians", 0)),
+        Measure("minimal_count", Column("minimal count", 0, False)),
         Measure("megabytes", Column("model MB", 1, False)),
         Measure("polar_transmittance", Column("transmittance above 85°", 3, False)),
         Measure("peak_gigabytes", Column("peak GB", 2, False)),

@@ -1,4 +1,4 @@
-"""Smallest models (`padgs smallest`): curves of quality over size, and the table."""
+"""Smallest models of a quality (`padgs smallest`): curves of quality over size, and the table `smallest`."""
 
 from __future__ import annotations
 
@@ -17,88 +17,95 @@ from padgs.reports.statistics import mean_cell
 from padgs.reports.table import Block, Cell, Column, Row, Table
 from padgs.results import SMALLEST_LOSSES, SMALLEST_PICTURE, SMALLEST_STATED
 
-EPSILONS = tuple(f"{loss:g}" for loss in SMALLEST_LOSSES)  # dB, as results name them
-STATED = f"{SMALLEST_STATED:g}"
+STATED = f"{SMALLEST_STATED:g}"  # dB, as results name losses
+NOTES = (
+    "Minimal count: Gaussians of the smallest model that is not inferior to a control, which was refined likewise and "
+    "keeps all Gaussians, on validation views: WS-PSNR falls by at most so many dB with 95 % confidence, in a latitude "
+    "band by twice and in a view by five times that, and LPIPS rises by at most 0.005. WS-PSNR: of the test views, "
+    "which decide nothing, less what was lost there against the control. Not searched: offsets per anchor, features.",
+    "Knee: the largest model below which a halving costs more than 0.1 dB. Beside the first: means over what both "
+    "curves share.",
+)
 
 
 @dataclass(frozen=True)
 class Curve:
-    """The sizes of one run's model, from large to small."""
+    """The candidates of a search on one run, from large to small."""
 
-    title: str  # of the method, with what sets it apart from others, and the seed where there are several
+    title: str  # of the method, with its setting, and the seed if there are several
     method: str  # the same without the seed
     preset: str
     seed: int
-    steps: tuple[Mapping[str, Any], ...]  # of `Result.smallest`, from large to small
-    smallest: Mapping[str, Mapping[str, Any]]  # epsilon -> the smallest step that loses at most so much
-    knee: Mapping[str, Any] | None
-    found: Mapping[str, Any]  # all of `Result.smallest`
-    image: Path | None = None  # as `padgs.results.SMALLEST_PICTURE` says, if there is one
+    found: Mapping[str, Any]  # `Result.smallest`
+    image: Path | None = None  # see `padgs.results.SMALLEST_PICTURE`
 
-    def values(self, name: str) -> list[float]:
-        """A number of all steps; NaN where one has none."""
-        return [np.nan if step[name] is None else step[name] for step in self.steps]
+    @property
+    def steps(self) -> list[Mapping[str, Any]]:
+        """Candidates, the largest first."""
+        return sorted(self.found["steps"], key=lambda step: -step["blended"])
+
+    @property
+    def smallest(self) -> dict[str, Mapping[str, Any]]:
+        """Allowed loss, as text -> smallest model."""
+        return {epsilon: self.found["steps"][number] for epsilon, number in self.found["minimal"].items()}
 
     @property
     def quality(self) -> list[float]:
-        """WS-PSNR, dB, of all steps; see `quality_of`."""
-        return [self.quality_of(step) for step in self.steps]
+        """Quality of the candidates, see `quality_of`."""
+        return list(map(self.quality_of, self.steps))
+
+    def values(self, name: str) -> list[float]:
+        """Return a number of all candidates; NaN where missing."""
+        return [np.nan if step[name] is None else step[name] for step in self.steps]
 
     def quality_of(self, step: Mapping[str, Any]) -> float:
-        """Return the WS-PSNR of the searched run's test views less what a step loses there against the control, dB.
+        """Return WS-PSNR (dB) of the searched run less the loss of a candidate against the control, on test views.
 
-        Without test views, that of the validation views.
+        Without test views on validation views. The control was refined likewise, and kept all Gaussians.
         """
-        control, whole = self.found["steps"][0], self.found["test_ws_psnr"]
-        if whole is None:
+        control = self.found["steps"][0]
+        if step["test_ws_psnr"] is None:
             return control["ws_psnr"] - step["loss"]
-        return whole - (control["test_ws_psnr"] - step["test_ws_psnr"])
+        return self.found["test_ws_psnr"] - (control["test_ws_psnr"] - step["test_ws_psnr"])
 
 
 def searched(run_set: RunSet) -> DataFrame:
-    """Return the runs with a search for their smallest model; each is a setting of its own."""
+    """Return the runs on which `padgs smallest` was run."""
     runs = run_set.requested
-    runs = runs.loc[runs["smallest"].map(bool)]
-    return runs.assign(setting=runs["run"])
+    return runs.loc[["steps" in found for found in runs["smallest"]]]
 
 
 def curves(runs: DataFrame) -> list[Curve]:
-    """A curve for each search on one scene, in the order of methods, of what sets their runs apart, and of seeds."""
+    """Return a curve for each run of one scene, in the order of methods, settings and seeds."""
     found = []
     for setting in settings(runs.sort_values("seed", kind="stable")):
-        run, seeds = setting.runs.iloc[0], runs.loc[runs["preset"] == setting.preset, "seed"]
-        steps = run["smallest"]["steps"]
-        rows = sorted(steps, key=lambda step: -step["blended"])
-        title = setting.title + (f", seed {run['seed']}" if seeds.nunique() > 1 else "")
-        smallest = {epsilon: steps[number] for epsilon, number in run["smallest"]["minimal"].items()}
-        knee = None if run["smallest"]["knee"] is None else steps[run["smallest"]["knee"]]
-        image = None if run["renders"] is None else run["renders"].with_name(SMALLEST_PICTURE)
-        there = image if image is not None and image.is_file() else None
-        names = {"title": title, "method": setting.title, "preset": setting.preset, "seed": int(run["seed"])}
-        found.append(
-            Curve(**names, steps=tuple(rows), smallest=smallest, knee=knee, found=run["smallest"], image=there)
-        )
+        several = runs.loc[runs["preset"] == setting.preset, "seed"].nunique() > 1
+        for _, run in setting.runs.iterrows():
+            title = setting.title + (f", seed {run['seed']}" if several else "")
+            image = None if run["renders"] is None else run["renders"].with_name(SMALLEST_PICTURE)
+            image = image if image is not None and image.is_file() else None
+            found.append(Curve(title, setting.title, setting.preset, int(run["seed"]), run["smallest"], image))
     return found
 
 
 def by_method(found: Sequence[Curve]) -> dict[str, list[Curve]]:
-    """The curves of each method, one a seed."""
+    """Return the curves of each method, one a seed."""
     methods = dict.fromkeys(one.method for one in found)
     return {method: [one for one in found if one.method == method] for method in methods}
 
 
 def gain(ours: Curve, other: Curve) -> float | None:
-    """Mean of our quality minus the other's at equal numbers of Gaussians, dB; None where no number is shared.
+    """Return the mean difference of quality at equal numbers of Gaussians, dB; None where the curves share none.
 
-    Both are taken over log2 N, straight between the steps, where both have some (Bjontegaard's way without his cubic).
+    Both are interpolated linearly over log2 N (the difference of Bjontegaard, without his cubic).
     """
     return _mean_difference(*(_points(curve.values("blended"), curve.quality) for curve in (ours, other)))
 
 
 def ratio(ours: Curve, other: Curve) -> float | None:
-    """Geometric mean of our number of Gaussians over the other's at equal quality; None where no quality is shared.
+    """Return the geometric mean ratio of numbers of Gaussians at equal quality; None where the curves share none.
 
-    Where more Gaussians are no better, the fewer are taken.
+    Where more Gaussians are no better, the smaller number counts.
     """
     points = []
     for curve in (ours, other):
@@ -110,59 +117,18 @@ def ratio(ours: Curve, other: Curve) -> float | None:
     return None if difference is None else 2.0**difference
 
 
-def table(run_set: RunSet) -> Table:
-    """Return a block for each scene, resolution and length, and a row for each method whose runs were searched.
-
-    Raises:
-        ReportError: results that must not stand together.
-    """
-    blocks, runs_of = [], {}
-    for title, own in by_conditions(searched(run_set), "resolution", "length").items():
-        refuse_mixture(own, run_set.request, title, OF_TIMES)
-        found = by_method(curves(own))
-        first = next(iter(found.values()))
-        rows = (
-            Row(method, tuple(_over_seeds(seeds, first, of) for of in COLUMNS.values()))
-            for method, seeds in found.items()
-        )
-        blocks.append(Block(title, tuple(rows)))
-        runs_of[title] = own
-    notes = (*footnotes(runs_of, run_set.request.protocol), *NOTES) if blocks else ()
-    return Table("smallest", "Smallest models", "Method", tuple(COLUMNS), tuple(blocks), notes)
-
-
-def _over_seeds(seeds: Sequence[Curve], first: Sequence[Curve], of: Callable[[Curve, Curve], float | None]) -> Cell:
-    """A number of the runs of a method, each beside that of the first method with its seed, if there is one."""
-    beside = {one.seed: one for one in first}
-    values = [of(one, beside.get(one.seed, first[0])) for one in seeds]
-    return mean_cell([value for value in values if value is not None])
-
-
-def _points(sizes: Sequence[float], qualities: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-    """From small to large: log2 of the sizes, and the qualities."""
-    order = np.argsort(sizes, kind="stable")
-    return np.log2(np.asarray(sizes, dtype=float))[order], np.asarray(qualities, dtype=float)[order]
-
-
-def _mean_difference(ours: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray]) -> float | None:
-    """Mean of ours minus the other over the range of x that both (x ascending, y) have; exact for straight pieces."""
-    low, high = max(ours[0][0], other[0][0]), min(ours[0][-1], other[0][-1])
-    if not low < high:
-        return None
-    inner = [x for curve in (ours, other) for x in curve[0] if low < x < high]
-    at = np.unique([low, *inner, high])
-    difference = np.interp(at, *ours) - np.interp(at, *other)
-    return float(np.sum((difference[1:] + difference[:-1]) / 2 * np.diff(at)) / (high - low))
+def _knee(own: Curve, _: Curve) -> float | None:
+    return None if own.found["knee"] is None else own.found["steps"][own.found["knee"]]["blended"]
 
 
 COLUMNS: dict[Column, Callable[[Curve, Curve], float | None]] = {
     Column("Gaussians blended", 0): lambda own, _: own.found["steps"][0]["blended"],
     **{
-        Column(f"minimal count for {epsilon} dB", 0, False): lambda own, _, e=epsilon: own.smallest[e]["blended"]
-        for epsilon in EPSILONS
+        Column(f"minimal count for {loss:g} dB", 0, False): lambda own, _, e=f"{loss:g}": own.smallest[e]["blended"]
+        for loss in SMALLEST_LOSSES
     },
     Column(f"share for {STATED} dB", 2): lambda own, _: own.smallest[STATED]["rows"] / own.found["rows"],
-    Column("knee", 0): lambda own, _: None if own.knee is None else own.knee["blended"],
+    Column("knee", 0): _knee,
     Column(f"MB for {STATED} dB", 2, False): lambda own, _: own.smallest[STATED]["bytes"] / 1e6,
     Column(f"least ms of a frame for {STATED} dB", 1, False): lambda own, _: own.smallest[STATED]["frame_ms"],
     Column(f"WS-PSNR for {STATED} dB", 2, True): lambda own, _: own.quality_of(own.smallest[STATED]),
@@ -171,11 +137,47 @@ COLUMNS: dict[Column, Callable[[Curve, Curve], float | None]] = {
     Column("N at equal dB over the first's", 2): ratio,
     Column("CPU s of the search", 0): lambda own, _: own.found["cpu_seconds"],
 }
-NOTES = (
-    "Minimal count: Gaussians of the smallest model that is not inferior to a control, which was refined likewise and "
-    "keeps all Gaussians, on validation views: WS-PSNR falls by at most so many dB with 95 % confidence, in a latitude "
-    "band by twice and in a view by five times that, and LPIPS rises by at most 0.005. WS-PSNR: of the test views, "
-    "which decide nothing, less what was lost there against the control. Not searched: offsets per anchor, features.",
-    "Knee: the largest model below which a halving costs more than 0.1 dB. Beside the first: means over what both "
-    "curves share.",
-)
+
+
+def table(run_set: RunSet) -> Table:
+    """Return a block for each scene, resolution and length, and a row for each method whose runs were searched.
+
+    Raises:
+        ReportError: runs must not be compared, or are mixed in a cell.
+    """
+    blocks, shown = [], {}
+    for title, own in by_conditions(searched(run_set), "resolution", "length").items():
+        refuse_mixture(own, run_set.request, title, OF_TIMES)
+        found = by_method(curves(own))
+        first = {one.seed: one for one in next(iter(found.values()))}
+        rows = (Row(of, tuple(_over_seeds(seeds, first, n) for n in COLUMNS.values())) for of, seeds in found.items())
+        blocks.append(Block(title, tuple(rows)))
+        shown[title] = own
+    notes = (*footnotes(shown, run_set.request.protocol), *NOTES) if blocks else ()
+    return Table("smallest", "Smallest models", "Method", tuple(COLUMNS), tuple(blocks), notes)
+
+
+def _over_seeds(
+    curves: Sequence[Curve], first: Mapping[int, Curve], number: Callable[[Curve, Curve], float | None]
+) -> Cell:
+    """Return the mean over seeds, each beside the first method's curve of its seed, or else its first curve."""
+    values = [number(one, first.get(one.seed, next(iter(first.values())))) for one in curves]
+    return mean_cell([value for value in values if value is not None])
+
+
+def _points(sizes: Sequence[float], qualities: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+    """Return log2 of the sizes in ascending order, and the qualities."""
+    order = np.argsort(sizes, kind="stable")
+    return np.log2(np.asarray(sizes, dtype=float))[order], np.asarray(qualities, dtype=float)[order]
+
+
+def _mean_difference(ours: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray]) -> float | None:
+    """Return the mean of ours minus the other over their common range of x (ascending); exact for straight pieces."""
+    low, high = max(ours[0][0], other[0][0]), min(ours[0][-1], other[0][-1])
+    if not low < high:
+        return None
+    inner = [x for curve in (ours, other) for x in curve[0] if low < x < high]
+    at = np.unique([low, *inner, high])
+    from scipy.integrate import trapezoid
+
+    return float(trapezoid(np.interp(at, *ours) - np.interp(at, *other), at) / (high - low))
