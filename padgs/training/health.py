@@ -360,7 +360,7 @@ def validation_split(views: Sequence[View]) -> tuple[int, ...]:
     count = max(FEWEST, len(views) // APART)
     if len(views) < count + FEWEST:
         raise ValueError(
-            f"{len(views)} training views leave no calibration views: {FEWEST} are measured on and as many trained on; "
+            f"{len(views)} training views leave no validation views: {FEWEST} are measured on and as many trained on; "
             f"it takes {2 * FEWEST}"
         )
     return tuple(int((number + 0.5) * len(views) / count) for number in range(count))

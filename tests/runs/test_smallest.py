@@ -101,7 +101,7 @@ def test_validation_views_are_spread_evenly_and_too_few_are_refused():
     left, chosen = held_out(list(range(48)))  # type: ignore[arg-type]
     assert chosen == (4, 12, 20, 28, 36, 44) and len(left) == 42
     assert len(held_out(list(range(6)))[1]) == 3  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="5 training views leave no .* views.*it takes 6"):
+    with pytest.raises(ValueError, match="5 training views leave no validation views.*it takes 6"):
         held_out(list(range(5)))  # type: ignore[arg-type]
 
 
@@ -247,3 +247,22 @@ def test_a_run_with_smallest_on_is_the_same_run_and_is_searched_at_its_end(tmp_p
     assert searched_run is not None
     kept = searched_run.smallest["kept"]
     assert kept["epsilon"] == 0.1 and kept["run"] in capsys.readouterr().out
+
+
+def test_a_budget_of_pad_gs_counts_anchors(finished, tmp_path):
+    whole = padgs.load_run(finished("method=padgs"), device="cpu").result
+    assert whole is not None
+    for budget, status in ((whole.counts["start"] + 1, "ok"), (10, "rejected")):
+        with composing():
+            config = configuration(
+                [
+                    *SETTINGS,
+                    "method=padgs",
+                    f"budget.gaussians={budget}",
+                    f"run.folder={tmp_path}",
+                    "train.iterations=150",
+                ]
+            )
+        result = run(config, Console(quiet=True))
+        assert result.status == status and (status == "ok" or "training starts with" in result.reason)
+        assert result.counts.get("anchors", 0) <= budget

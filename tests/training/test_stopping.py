@@ -145,7 +145,7 @@ def test_quality_is_the_mean_ws_psnr():
 
 
 def test_too_few_views_to_set_any_apart_are_refused():
-    with pytest.raises(ValueError, match="5 training views leave no calibration views.*it takes 6"):
+    with pytest.raises(ValueError, match="5 training views leave no validation views.*it takes 6"):
         Trainer(Counted(tiny_scene()), tiny_scene(), Budget(10, stop="auto"))
     with pytest.raises(ValueError, match="unknown stop 'never'; known: end, auto"):
         Budget(10, stop="never")
