@@ -22,6 +22,8 @@ from padgs.data.store import area_resize
 from padgs.geometry.panorama import project
 from padgs.scene import Scene, View, move_origin
 
+OVERLAY = "check.png"  # default name, beside the data
+MAX_WIDTH = 2048  # of the overlay
 SMALL = 256  # width at which colours are compared
 MAX_REPROJECTION = 1 / 500  # of the width, for the median error: 4 pixels of 2048
 MIN_GAIN = 0.1  # in correlation, from which another pose convention is suggested
@@ -244,10 +246,6 @@ def _small(views: Sequence[View]) -> Tensor:
         assert view.load_pixels is not None
         images.append(torch.from_numpy(area_resize(view.load_pixels().cpu().numpy(), width, width // 2)))
     return torch.stack(images)
-
-
-OVERLAY = "check.png"  # default name, beside the data
-MAX_WIDTH = 2048  # of the overlay
 
 
 def draw_overlay(view: View, points: Tensor, path: Path, most: int = 20_000) -> None:
