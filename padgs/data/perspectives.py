@@ -17,7 +17,7 @@ from torch.nn.functional import max_pool2d
 
 from padgs.data.store import ImageStore, StoredImage
 from padgs.geometry.camera import Panorama, Pinhole
-from padgs.geometry.panorama import CUBIC_REACH, continued, sample, sample_sharply
+from padgs.geometry.panorama import CUBIC_REACH, pad_panorama, sample, sample_bicubic
 from padgs.scene import Scene, View
 
 
@@ -50,11 +50,11 @@ class _Pixels(_Resampled):
         """Interpolate without the cache."""
         image = self.load()
         rays, mask = self.rays(image), self.panorama.mask(device=image.device)
-        colors = sample_sharply(image, rays)
+        colors = sample_bicubic(image, rays)
         if mask is not None:
             mask = mask[..., None]
             weighted = sample(torch.cat((image * mask, mask), dim=-1), rays)
-            masked = continued((mask < 1).float(), CUBIC_REACH).movedim(-1, 0)
+            masked = pad_panorama((mask < 1).float(), CUBIC_REACH).movedim(-1, 0)
             near_masked = max_pool2d(masked, 2 * CUBIC_REACH + 1, stride=1).movedim(0, -1)
             linear = weighted[..., :3] / weighted[..., 3:].clamp(min=1e-6)
             colors = torch.where(sample(near_masked, rays) > 0, linear, colors)

@@ -154,7 +154,9 @@ def blurred(image: Tensor, sigma: float) -> Tensor:
     height, width = image.shape[:2]
     spectrum = torch.fft.rfft(image, dim=1)
     orders = torch.arange(spectrum.shape[1], device=image.device)
-    beyond = (1 - 2 * (orders % 2)).to(image.dtype)[:, None]  # half a turn, as in `padgs.geometry.panorama.continued`
+    beyond = (1 - 2 * (orders % 2)).to(image.dtype)[
+        :, None
+    ]  # half a turn, as in `padgs.geometry.panorama.pad_panorama`
     spectrum = torch.cat((beyond * spectrum[:1], spectrum, beyond * spectrum[-1:]))
     latitudes = row_latitudes(height, dtype=image.dtype, device=image.device)
     ahead = direction(torch.zeros_like(latitudes), latitudes)

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from padgs.evaluation import BANDS
 from padgs.geometry.distortion import solid_angle_weight
-from padgs.geometry.panorama import continued, row_latitudes
+from padgs.geometry.panorama import pad_panorama, row_latitudes
 from padgs.training.loss import ssim_map
 
 Metric = Callable[[Tensor, Tensor, Tensor | None], Tensor]
@@ -82,8 +82,8 @@ def ws_ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor
     It does not depend on the position of the seam.
     """
     r = WINDOW_RADIUS
-    padded = ssim_map(continued(image, r), continued(target, r))
-    whole = None if mask is None else _whole_windows(continued(mask, r))
+    padded = ssim_map(pad_panorama(image, r), pad_panorama(target, r))
+    whole = None if mask is None else _whole_windows(pad_panorama(mask, r))
     return weighted_mean(padded[r:-r, r:-r], sphere_weight(image, whole))
 
 

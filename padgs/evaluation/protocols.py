@@ -48,8 +48,8 @@ class Protocol:
     def rows(self, height: int) -> int:
         """Return how many rows of an image are evaluated; a row that the crop touches is not.
 
-        >>> PAPER_360ROAM.rows(1024), PAPER_360ROAM.rows(512)
-        (959, 479)
+        >>> replace(PROTOCOLS["paper"], bottom_crop=ROAM_360_BOTTOM_CROP).rows(1024)
+        959
         """
         return max(1, math.floor(height * (1 - self.bottom_crop) + 1e-9))
 
@@ -65,7 +65,7 @@ PROTOCOLS = {
         lpips_inputs="11",
         solid_angle=True,
     ),
-    # Signs of failed training; `padgs.evaluation.scoring` adds diagnostics, and scores of training views and of one colour.
+    # Signs of failed training; `padgs.evaluation.scoring` adds diagnostics and further scores.
     "stability": Protocol(
         "stability",
         ("ws_psnr", "ws_psnr_equator", "ws_psnr_pole", "seam"),
@@ -75,7 +75,6 @@ PROTOCOLS = {
     ),
 }
 ROAM_360_BOTTOM_CROP = 65 / 1024  # 360Roam shows the robot there; the released evaluation cuts rows >= 959 of 1024
-PAPER_360ROAM = replace(PROTOCOLS["paper"], bottom_crop=ROAM_360_BOTTOM_CROP)
 
 
 def protocol_from_options(name: str, /, **options: Any) -> Protocol:

@@ -64,8 +64,8 @@ def perspective(width: int, height: int, fov: float) -> Pinhole:
     """
     if width < 1 or height < 1 or not 0 < fov < 180:
         raise ValueError(
-            f"no perspective image has {width}x{height} pixels and a field of view of {fov:g} degrees; sizes must be at "
-            "least 1, and the field of view between 0 and 180"
+            f"an image of {width}x{height} pixels and {fov:g} degrees is impossible; sizes must be at least 1, and the "
+            "field of view between 0 and 180 degrees"
         )
     focal = width / 2 / math.tan(math.radians(fov) / 2)
     return Pinhole(width, height, focal, focal, width / 2, height / 2)

@@ -133,7 +133,7 @@ def sample(image: Tensor, directions: Tensor) -> Tensor:
     return sample_pixels(image, project(directions, width, height))
 
 
-def sample_sharply(image: Tensor, directions: Tensor) -> Tensor:
+def sample_bicubic(image: Tensor, directions: Tensor) -> Tensor:
     """Return bicubic samples [..., C] of a panorama [H, W, C], continued across the seam and the poles.
 
     The convolution of Keys (1981) with a = -1/2, exact for parabolas and at pixel centres. It overshoots at edges.
@@ -143,10 +143,10 @@ def sample_sharply(image: Tensor, directions: Tensor) -> Tensor:
         directions: [..., 3] camera frame, any length but zero.
     """
     height, width = image.shape[:2]
-    around = continued(image if image.is_floating_point() else image.float(), CUBIC_REACH)
+    around = pad_panorama(image if image.is_floating_point() else image.float(), CUBIC_REACH)
     u, v = (project(directions, width, height) - 0.5).unbind(-1)
     column, row = u.floor(), v.floor()
-    across, down = _keys(u - column).to(around), _keys(v - row).to(around)
+    across, down = _bicubic_weights(u - column).to(around), _bicubic_weights(v - row).to(around)
     columns = (column.long() + CUBIC_REACH - 1)[..., None] + torch.arange(4, device=image.device)
     rows = row.long() + CUBIC_REACH - 1
     samples = torch.zeros(*directions.shape[:-1], image.shape[2], dtype=around.dtype, device=image.device)
@@ -156,14 +156,14 @@ def sample_sharply(image: Tensor, directions: Tensor) -> Tensor:
     return samples
 
 
-def _keys(t: Tensor) -> Tensor:
+def _bicubic_weights(t: Tensor) -> Tensor:
     """Return weights [..., 4] of the pixels -1, 0, 1 and 2 for positions t in [0, 1) after pixel 0."""
     return torch.stack(
         (((2 - t) * t - 1) * t, (3 * t - 5) * t * t + 2, ((4 - 3 * t) * t + 1) * t, (t - 1) * t * t), dim=-1
     ).div(2)
 
 
-def continued(image: Tensor, margin: int) -> Tensor:
+def pad_panorama(image: Tensor, margin: int) -> Tensor:
     """Return a panorama [H, W, ...] continued by `margin` pixels on each side, across its seam and its poles.
 
     Left and right it wraps. Beyond a pole it continues down the opposite meridian: row -k is row k - 1 rolled by W / 2.

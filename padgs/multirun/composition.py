@@ -17,7 +17,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 from rich.console import Console
 
-from padgs.baselines import METHODS, BUILT_IN, distribution
+from padgs.baselines import BUILT_IN, METHODS, distribution
 from padgs.data.datasets import DATASETS
 from padgs.data.synthetic.options import SCENES
 from padgs.multirun.overrides import lenient, quoted, root

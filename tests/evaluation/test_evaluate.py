@@ -9,7 +9,7 @@ from padgs.evaluation import evaluate as module
 from padgs.evaluation.evaluate import evaluate, mean_metrics, quantized, score
 from padgs.evaluation.lpips_weights import LpipsUnavailable
 from padgs.evaluation.metrics import METRICS, psnr, ssim, ws_psnr
-from padgs.evaluation.protocols import PAPER_360ROAM, PROTOCOLS, protocol_from_options
+from padgs.evaluation.protocols import PROTOCOLS, protocol_from_options
 from padgs.render import Rendering
 from padgs.scene import View
 from padgs.training.health import Failure
@@ -104,9 +104,10 @@ def test_masked_pixels_change_no_protocol(image, pixels, generator, protocol):
 
 def test_paper_cuts_the_bottom_off_and_sphere_hides_it(image, pixels):
     truth, stored = pixels / 255, quantized(image)
-    rows = PAPER_360ROAM.rows(H)
+    protocol = protocol_from_options("paper", lpips="none", bottom_crop=65 / 1024)
+    rows = protocol.rows(H)
     assert rows == 29  # 32 x 959 / 1024 = 29.97
-    paper = score(stored, truth, None, protocol_from_options("paper", lpips="none", bottom_crop=65 / 1024))
+    paper = score(stored, truth, None, protocol)
     assert paper["ssim"] == ssim(stored[:rows], truth[:rows]).item()
     mask = (torch.arange(H) < rows)[:, None].float().expand(H, W)
     sphere = score(stored, truth, None, protocol_from_options("sphere", lpips="none", bottom_crop=65 / 1024))

@@ -21,7 +21,7 @@ from padgs.evaluation.metrics import (
     ws_ssim,
 )
 from padgs.geometry.distortion import solid_angle_weight
-from padgs.geometry.panorama import continued
+from padgs.geometry.panorama import pad_panorama
 from padgs.results import higher_is_better
 
 H, W = 32, 64
@@ -94,7 +94,7 @@ def test_ssim_windows_agree_with_scikit_image(pair):
     options = dict(
         gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1.0, channel_axis=2, full=True
     )
-    image, target = (continued(tensor, 5).numpy() for tensor in pair)
+    image, target = (pad_panorama(tensor, 5).numpy() for tensor in pair)
     theirs = torch.from_numpy(structural_similarity(image, target, **options)[1])[5:-5, 5:-5].mean(-1)
     weight = solid_angle_weight(H, dtype=torch.float64)[:, None]
     assert ws_ssim(*pair).item() == pytest.approx(((theirs * weight).sum() / (weight.sum() * W)).item(), abs=1e-9)

@@ -2,8 +2,10 @@ from dataclasses import FrozenInstanceError, asdict
 
 import pytest
 
-from padgs.evaluation.protocols import LPIPS_CHOICES, PAPER_360ROAM, PROTOCOLS, Protocol, protocol_from_options
+from padgs.evaluation.protocols import LPIPS_CHOICES, PROTOCOLS, Protocol, protocol_from_options
 from padgs.results import higher_is_better
+
+PAPER_360ROAM = protocol_from_options("paper", bottom_crop=65 / 1024)
 
 
 def test_paper_is_the_released_evaluation():

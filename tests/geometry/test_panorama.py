@@ -9,17 +9,17 @@ from torch.autograd.functional import jacobian
 
 from padgs.geometry.panorama import (
     angles_from_pixel,
-    continued,
     direction,
     longitude_latitude,
+    pad_panorama,
     pixel_from_angles,
     project,
     projection_jacobian,
     rays,
     row_latitudes,
     sample,
+    sample_bicubic,
     sample_pixels,
-    sample_sharply,
     unproject,
 )
 
@@ -236,13 +236,13 @@ def test_sharp_samples_keep_the_pixels_and_err_less_between_them(generator):
         return torch.sin(4 * directions) + directions.roll(1, -1)
 
     image = smooth(rays(64, 32, dtype=torch.float64))
-    assert torch.allclose(sample_sharply(image, rays(64, 32, dtype=torch.float64)), image, atol=1e-9)
+    assert torch.allclose(sample_bicubic(image, rays(64, 32, dtype=torch.float64)), image, atol=1e-9)
     anywhere = torch.nn.functional.normalize(torch.randn(500, 3, generator=generator, dtype=torch.float64), dim=-1)
     pole = torch.tensor([[0.02, 1.0, 0.03], [-0.04, -1.0, 0.01], [0.001, 0.2, -1.0], [-0.001, 0.2, -1.0]]).double()
     for directions in (anywhere, torch.nn.functional.normalize(pole, dim=-1)):
-        error, blurred = ((of(image, directions) - smooth(directions)).abs().max() for of in (sample_sharply, sample))
+        error, blurred = ((of(image, directions) - smooth(directions)).abs().max() for of in (sample_bicubic, sample))
         assert error < 0.5 * blurred
-    assert sample_sharply((image * 50 + 100).byte(), anywhere.view(10, 50, 3)).shape == (10, 50, 3)
+    assert sample_bicubic((image * 50 + 100).byte(), anywhere.view(10, 50, 3)).shape == (10, 50, 3)
 
 
 def test_samples_are_continuous_across_the_seam(generator):
@@ -263,7 +263,7 @@ def test_a_row_beyond_a_pole_is_the_same_row_half_a_turn_further(generator):
 
 def test_continuation_past_a_pole_is_the_opposite_meridian():
     columns = torch.arange(8).expand(4, 8) + 10 * torch.arange(4)[:, None]  # pixel = 10 row + column
-    padded = continued(columns, 2)
+    padded = pad_panorama(columns, 2)
     assert padded.shape == (8, 12)
     assert padded[1, 2:-2].tolist() == [4, 5, 6, 7, 0, 1, 2, 3]  # row -1 = row 0, turned by half
     assert padded[0, 2:-2].tolist() == [14, 15, 16, 17, 10, 11, 12, 13]  # row -2 = row 1
@@ -274,4 +274,4 @@ def test_continuation_past_a_pole_is_the_opposite_meridian():
 @pytest.mark.parametrize("shape", [(4, 9), (1, 8)])
 def test_a_panorama_that_cannot_be_continued_is_an_error(shape):
     with pytest.raises(ValueError, match=f"{shape[1]}x{shape[0]}.*must be even"):
-        continued(torch.zeros(*shape, 3), 2)
+        pad_panorama(torch.zeros(*shape, 3), 2)

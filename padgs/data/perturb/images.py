@@ -16,7 +16,7 @@ from PIL import Image
 from torch import Tensor
 
 from padgs.data.perturb.geometry import change_training_views, change_views, rotate_camera
-from padgs.geometry.panorama import continued, project, rays, sample, sample_sharply
+from padgs.geometry.panorama import pad_panorama, project, rays, sample, sample_bicubic
 from padgs.scene import Scene, View
 
 SECTORS = 8  # colors of the person under the camera
@@ -69,7 +69,7 @@ def pitch(scene: Scene, degrees: float, random: np.random.Generator) -> Scene:
         old_rays = rays(view.width, view.height) @ rotation.float()  # in the old camera frame, of each new pixel
 
         def colors(pixels: Tensor) -> Tensor:
-            return _to_bytes(sample_sharply(pixels, old_rays.to(pixels.device)))
+            return _to_bytes(sample_bicubic(pixels, old_rays.to(pixels.device)))
 
         def weights(mask: Tensor) -> Tensor:
             return sample(mask[..., None], old_rays.to(mask.device))[..., 0]
@@ -89,7 +89,7 @@ def textureless(scene: Scene, share: float, random: np.random.Generator) -> Scen
     def fade(pixels: Tensor) -> Tensor:
         radius = max(1, pixels.shape[1] // BLUR // 2)
         fine = pixels.float()
-        coarse = _pool(continued(fine, radius), 2 * radius + 1, stride=1)
+        coarse = _pool(pad_panorama(fine, radius), 2 * radius + 1, stride=1)
         return _to_bytes(fine.lerp(coarse, share))
 
     return change_views(scene, lambda view: change_pixels(_panorama(view), fade))

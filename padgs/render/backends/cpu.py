@@ -7,7 +7,6 @@ own slot for the gradient sums of the backward pass, and the slots of a Gaussian
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -30,6 +29,7 @@ from padgs.render.backends.native import (
     TILE,
     NativeImage,
     Pixels,
+    Strips,
     Upstream,
     native_camera,
     native_rays,
@@ -97,7 +97,7 @@ class Strip:
         )
 
 
-class Projected:
+class Projected(Strips[Strip]):
     """All Gaussians projected to one view, in depth order, with the number of instances in each row of tiles.
 
     The number of (Gaussian, tile) instances is known before anything of that size is allocated. If it exceeds the
@@ -120,18 +120,7 @@ class Projected:
         self.per_row = torch.empty(rows, dtype=torch.int64)
         library.padgs_count_instances(pointer(self.boxes), count, pointer(self.level), rows, pointer(self.per_row))
         self.instances = int(self.per_row.sum())
-        self._cuts = strip_cuts(self.per_row.tolist(), max_instances)
-        self._only: Strip | None = None
-
-    def strips(self) -> Iterator[Strip]:
-        """Yield the strips from top to bottom; a single one is kept for the backward pass, several are not."""
-        if len(self._cuts) == 2:
-            if self._only is None:
-                self._only = Strip(self, *self._cuts)
-            yield self._only
-            return
-        for first, end in zip(self._cuts, self._cuts[1:], strict=False):
-            yield Strip(self, first, end)
+        super().__init__(Strip, strip_cuts(self.per_row.tolist(), max_instances))
 
 
 @dataclass

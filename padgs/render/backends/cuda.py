@@ -23,6 +23,7 @@ from padgs.render.backends.native import (
     NativeImage,
     NativeRays,
     Pixels,
+    Strips,
     Upstream,
     native_camera,
     native_rays,
@@ -132,7 +133,7 @@ class Sorter:
         return SortArguments(pointer(self.scratch), len(self.scratch), self.count, *map(pointer, buffers), bits)
 
 
-class DeviceProjected:
+class DeviceProjected(Strips[DeviceStrip]):
     """All Gaussians projected to one view, in depth order, with the number of instances in each row of tiles.
 
     The host reads one thing back: the number of instances in each row of tiles, before memory for them is allocated.
@@ -160,7 +161,6 @@ class DeviceProjected:
         self.boxes = INTEGERS(count, 5, device=device)
         self.order = INTEGERS(count, device=device)
         self.per_row: list[int] = []
-        self._only: DeviceStrip | None = None
         sort = Sorter(self.queue, count, device)
         self.counts = torch.zeros(rows + 1, dtype=torch.int64, device=device)
         outputs = (self.footprints, self.boxes, sort.keys, sort.values)
@@ -171,10 +171,11 @@ class DeviceProjected:
         cuda.call("padgs_cuda_project", self.queue, arguments)
         cuda.call("padgs_cuda_sort", self.queue, sort.arguments(self.order, bits=32))
         self.capacity, self.visible = capacity, count
-        self._cuts = [0, rows]
+        cuts = [0, rows]
         if not capacity:
             *self.per_row, self.visible = self.counts.tolist()
-            self._cuts = strip_cuts(self.per_row, min(max_instances, MAX_INSTANCES))
+            cuts = strip_cuts(self.per_row, min(max_instances, MAX_INSTANCES))
+        super().__init__(DeviceStrip, cuts)
 
     def fits(self, counts: list[int]) -> bool:
         """Return whether the capacity was enough for all instances; `counts` are the values of `self.counts`."""
@@ -189,16 +190,6 @@ class DeviceProjected:
     def table(self, first_row: int, end_row: int) -> TileTable:
         """Return some rows of tiles for the library."""
         return TileTable(self.camera.width, self.camera.height, first_row, end_row)
-
-    def strips(self) -> Iterator[DeviceStrip]:
-        """Yield the strips from top to bottom; a single one is kept for the backward pass, several are not."""
-        if len(self._cuts) == 2:
-            if self._only is None:
-                self._only = DeviceStrip(self, *self._cuts)
-            yield self._only
-            return
-        for first, end in zip(self._cuts, self._cuts[1:], strict=False):
-            yield DeviceStrip(self, first, end)
 
 
 class Counters(Mapping[str, int]):

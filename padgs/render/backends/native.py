@@ -9,8 +9,8 @@ from __future__ import annotations
 import ctypes
 import functools
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, MutableMapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Mapping, MutableMapping
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -30,6 +30,7 @@ SLACK = 1e-5  # radians; rounding must never cost a contribution
 CHUNK = 16  # pixels; rows of ray tables are padded to whole chunks
 PROJECTIONS = ("erp", "pinhole", "tangent", "ray")  # numbered as in csrc/abi.h
 MODELS = (Panorama, Pinhole, RayTable)
+StripType = TypeVar("StripType")
 Pixels = tuple[Tensor, Tensor, Tensor]  # image [H, W, 3], transmittance [H, W], depth [H, W]
 
 
@@ -167,6 +168,24 @@ class _Rasterize(torch.autograd.Function):
         if grad_rays is not None:
             leaves = leaves._replace(table=grad_rays[:, :, : image.shape[1]].permute(0, 2, 1))
         return None, None, *leaves
+
+
+class Strips(Generic[StripType]):
+    """Strips of tile rows of an image; a single strip is kept for the backward pass, several are made again."""
+
+    def __init__(self, make: Callable[[Any, int, int], StripType], cuts: list[int]) -> None:
+        self._make, self._cuts = make, cuts
+        self._only: StripType | None = None
+
+    def strips(self) -> Iterator[StripType]:
+        """Yield the strips from top to bottom."""
+        if len(self._cuts) == 2:
+            if self._only is None:
+                self._only = self._make(self, *self._cuts)
+            yield self._only
+            return
+        for first, end in zip(self._cuts, self._cuts[1:], strict=False):
+            yield self._make(self, first, end)
 
 
 def strip_cuts(per_row: list[int], max_instances: int) -> list[int]:

@@ -52,7 +52,7 @@ def layout_library() -> ctypes.CDLL:
 
 @functools.cache
 def fused_library() -> ctypes.CDLL:
-    """As `emulated_library`, with products fused into sums wherever the compiler may, as nvcc does."""
+    """Return the library as `emulated_library` does, with products fused into sums as nvcc does."""
     return compiled("padgs_cuda_fused", [SOURCES / "blend.cu", SOURCES / "hybrid.cu"], *FUSED)
 
 
