@@ -1,4 +1,4 @@
-"""A method outside of padgs: explicit Gaussians that start thinner, as an example to change."""
+"""Example of a method in another package: explicit Gaussians that start thinner."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from padgs.scene import Scene
 
 @dataclass(frozen=True)
 class MyOptions(SplatOptions):
-    """The keys of `method=my_method`: those of all explicit Gaussians, and one more."""
+    """The `method` group for `method=my_method`: options of explicit Gaussians and one more."""
 
-    thinner: float = 2.0  # factor by which Gaussians are thinner at the start than their neighbours are apart
+    thinner: float = 2.0  # divisor of the initial scales
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -26,7 +26,7 @@ class MyOptions(SplatOptions):
 
 
 class MyMethod(SplatMethod):
-    """See `padgs.training.method.Method` for what a method may say, and `padgs.methods.splats.method` for this kind."""
+    """See `padgs.training.method.Method` and `padgs.methods.splats.method.SplatMethod`."""
 
     Options = MyOptions
     RENDER = RenderConfig(projection="ray")
