@@ -53,9 +53,7 @@ class PlusOptions(SplatOptions):
     sh_degree: int = 2  # one more each tenth of the run; degree 3 gains nothing and costs a fifth of the time
     positional_gradient: str = "space_absolute"
     gradient_threshold: float = 5e-5  # of SPaGS; adapted by `for_run` and `for_views`
-    threshold_pixel_exponent: float = (
-        1.0  # threshold ~ pixel width ^ exponent, below the pixels of 256x128; 0: constant
-    )
+    threshold_pixel_exponent: float = 1.0  # threshold ~ pixel width ^ exponent, for views above 256x128; 0: constant
     threshold_full_views: int = 28  # fewer views lower the threshold less, by sqrt(views / this); 0: never less
     sample_clones: bool = True
     min_opacity: float = 0.05  # fainter Gaussians are pruned after each round
