@@ -124,9 +124,9 @@ def test_a_perspective_render_agrees_with_the_panorama(folder, tmp_path):
         (("--camera", "fisheye"), "unknown camera 'fisheye'; known: panorama, perspective"),
         (("--fps", "0"), "--fps is 0, which makes a video without frames; it must be > 0"),
         (("--seconds", "0"), "--seconds is 0, which makes a video"),
-        (("--height", "9"), "are of perspective pictures: add --camera perspective"),
+        (("--height", "9"), "belong to perspective images: add --camera perspective"),
         (("--path", "spiral"), "the path spiral does not exist; known: cameras, orbit, dolly"),
-        (("--camera", "perspective", "--fov", "180"), "across 180 degrees"),
+        (("--camera", "perspective", "--fov", "180"), "and 180 degrees is impossible"),
     ],
 )
 def test_invalid_options_are_refused(arguments, message, folder, tmp_path):
