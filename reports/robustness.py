@@ -31,8 +31,7 @@ PROTOCOL = "stability"
 QUALITY, ONE_COLOR = f"{PROTOCOL}/ws_psnr", f"{PROTOCOL}/ws_psnr_one_color"
 EQUATOR, POLE = f"{PROTOCOL}/ws_psnr_equator", f"{PROTOCOL}/ws_psnr_pole"
 SHARED = ("resolution", "learning_rates", "data", "machine")
-# Shown but not scored: some methods have no such option, or the condition makes the scene easier.
-NOT_SCORED = {"precision", "capacity", "textureless"}
+NOT_SCORED = {"textureless"}  # shown but not scored, because the scene becomes easier
 HALF = 0.5  # a condition breaks a method below this robustness
 LIMITS = yaml.safe_load(files("padgs").joinpath("data/perturb/conditions.yaml").read_text("utf-8"))
 LIMITS_ARE_FOR = ("256x128", 1500)  # resolution, and iterations without stress

@@ -104,11 +104,11 @@ def test_an_incomplete_method_has_no_score_and_stands_last():
 
 def test_some_conditions_are_shown_but_not_scored():
     both = [*runs(), *MISSING]
-    shown = [run("padgs", 12.0, "precision", 1), replace(run("padgs", 12.0, "capacity", 1), status="rejected")]
+    shown = [run("padgs", 12.0, "textureless", 1), run("padgs", 12.0, "textureless", 2, status="rejected")]
     with_it, without = (cells(stability(run_set(of))[0], "synthetic-room") for of in ([*both, *shown], both))
     assert with_it == without
     kept = cells(stability(run_set([*both, *shown]))[0], "Robustness")
-    assert kept["precision 1"]["PaD-GS"] == "0.00" and kept["capacity 1"]["PaD-GS"] == "0.00 [REJECTED]"
+    assert kept["textureless 1"]["PaD-GS"] == "0.00" and kept["textureless 2"]["PaD-GS"] == "0.00 [REJECTED]"
 
 
 def test_a_stopped_run_is_neither_a_seed_nor_a_reference():
