@@ -30,14 +30,14 @@ GPU = torch.device("pretended", 0)
 
 @contextmanager
 def pretended_gpu():
-    """Within it there is a device `GPU`; yields the Counter of what made the host wait for it."""
+    """Provide a device `GPU`; yield the Counter of operations that made the host wait for it."""
     waits: Counter[str] = Counter()
     with _Operations(waits), _Functions(waits):
         yield waits
 
 
 class OnGPU(Tensor):
-    """A CPU tensor that says it is on the GPU."""
+    """A CPU tensor that claims to be on the GPU."""
 
     held: Tensor
 
@@ -51,16 +51,16 @@ class OnGPU(Tensor):
         return self
 
     def __repr__(self, **_: Any) -> str:
-        """What is held."""
+        """Return the tensor."""
         return f"OnGPU({self.held!r})"
 
     def data_ptr(self) -> int:
-        """For kernels that are emulated."""
+        """Return the address, for emulated kernels."""
         return self.held.data_ptr()
 
     @classmethod
     def __torch_dispatch__(cls, function, types, args=(), kwargs=None):
-        """Where no mode is active: outside of `pretended_gpu`, which would otherwise have been asked first."""
+        """Refuse operations outside of `pretended_gpu`, whose mode otherwise handles them."""
         with _Operations(Counter()):
             return function(*args, **(kwargs or {}))
 
@@ -104,7 +104,7 @@ class _Operations(TorchDispatchMode):
 
 
 class _Functions(TorchFunctionMode):
-    """What torch does before any operation is dispatched: tensors from Python's numbers, and numbers from tensors."""
+    """Handle calls that torch does not dispatch: tensors from Python numbers, and numbers from tensors."""
 
     def __init__(self, waits: Counter[str]) -> None:
         super().__init__()
@@ -131,7 +131,7 @@ class _Functions(TorchFunctionMode):
 
 
 def indices_of(args: tuple) -> list[Tensor]:
-    """The second argument of an operation of `INDEXING`."""
+    """Return the second argument of an operation of `INDEXING`."""
     return [index for index in args[1] if isinstance(index, Tensor)]
 
 

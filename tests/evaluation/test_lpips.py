@@ -12,7 +12,7 @@ from padgs.evaluation.lpips_weights import NETS, LpipsUnavailable, Weights, from
 
 @pytest.fixture(scope="session")
 def weights():
-    """Skip where no LPIPS weights are installed."""
+    """Skip the test if no LPIPS weights are installed."""
     try:
         return {net: network(net) for net in NETS}
     except LpipsUnavailable as reason:

@@ -87,7 +87,7 @@ def test_an_unusable_package_is_skipped(monkeypatch, error):
 
 
 class FakeAlexLpips(torch.nn.Module):
-    """The attributes of lpips.LPIPS that are read, with numbers of our own."""
+    """A fake of lpips.LPIPS with other numbers."""
 
     def __init__(self, net: str, verbose: bool) -> None:
         super().__init__()

@@ -22,7 +22,7 @@ coordinates = st.floats(-10, 10, allow_subnormal=False)
 
 
 def omega(point) -> torch.Tensor:
-    """Of a point in the camera frame."""
+    """Return the distortion degree of a point in the camera frame."""
     point = torch.as_tensor(point, dtype=torch.float64)
     return distortion(normalize(point, dim=-1), polar_axis("camera_y", torch.eye(4, dtype=torch.float64)))
 

@@ -230,7 +230,7 @@ def test_samples_at_pixel_coordinates_are_exact_wrap_and_have_gradients(generato
 
 
 def test_sharp_samples_keep_the_pixels_and_err_less_between_them(generator):
-    """Of a smooth function of the direction, also at the poles and the seam: of third order, bilinear of second."""
+    """Errors for a smooth function of the direction, poles and seam included: third order, second order if bilinear."""
 
     def smooth(directions):
         return torch.sin(4 * directions) + directions.roll(1, -1)
@@ -254,7 +254,7 @@ def test_samples_are_continuous_across_the_seam(generator):
 
 
 def test_a_row_beyond_a_pole_is_the_same_row_half_a_turn_further(generator):
-    """Between the first row's centres and the pole: halfway there, a quarter of what is across."""
+    """Halfway from the centres of the first row to the pole, the value across the pole has weight 1/4."""
     image = torch.rand(16, 32, 1, generator=generator)
     at = unproject(torch.tensor([[5.5, 0.25], [7.5, 15.75]], dtype=torch.float64), 32, 16)
     expected = torch.stack((0.75 * image[0, 5] + 0.25 * image[0, 21], 0.75 * image[15, 7] + 0.25 * image[15, 23]))

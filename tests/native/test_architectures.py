@@ -15,7 +15,7 @@ pytestmark = pytest.mark.skipif(shutil.which("cmake") is None, reason="no cmake"
 
 
 def program(folder: Path, name: str, *lines: str) -> str:
-    """A program that prints these lines."""
+    """Write a program that prints these lines."""
     path = folder / name
     path.write_text("#!/bin/sh\n" + "".join(f"echo {line}\n" for line in lines))
     path.chmod(0o755)
@@ -49,7 +49,7 @@ def test_a_compiler_without_matrix_transpose_is_refused(release, problem, tmp_pa
 
 
 def chosen(nvcc: str, asked: str, tmp_path: Path) -> list[str]:
-    """Architectures, and what is wrong."""
+    """Return the architectures and the problem, if any."""
     script = tmp_path / "ask.cmake"
     script.write_text(
         f'include("{SCRIPT}")\nchoose_architectures({nvcc} "{asked}")\n'

@@ -26,7 +26,7 @@ def test_repeated_backward_is_equal(backend: str, generator: torch.Generator):
 
 @pytest.fixture
 def kept(monkeypatch: pytest.MonkeyPatch) -> list:
-    """What forward passes of the CPU keep for backward."""
+    """Collect the cores that forward passes on the CPU keep."""
     found, allocate = [], cpu_backend._Cores.allocate
     monkeypatch.setattr(
         cpu_backend._Cores, "allocate", lambda *arguments: found.append(allocate(*arguments)) or found[-1]
@@ -37,7 +37,7 @@ def kept(monkeypatch: pytest.MonkeyPatch) -> list:
 @needs_native
 @pytest.mark.parametrize("size", [1, 3, 16, 256])
 def test_kept_cores_fit_their_buffer(size: int, kept: list, generator: torch.Generator):
-    """Solid dots of about a pixel: in the core of each pixel are other Gaussians than in those beside it."""
+    """Opaque dots of about a pixel: neighbouring pixels have different cores."""
     count, view = 20_000, View("v", identity_pose(), 60, 30)
     gaussians = gaussians_of("ordinary", count, generator)
     dots = replace(gaussians, scales=torch.full((count, 3), 0.1), opacities=torch.full((count,), 0.9))

@@ -20,7 +20,7 @@ QUICK = {
 
 @pytest.hookimpl(tryfirst=True)  # before marks are looked at
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the others slow."""
+    """Mark all other tests of the emulated GPU slow."""
     for item in items:
         engine = getattr(item, "callspec", None)
         if engine is None or engine.params.get("backend") != "cuda" or cuda_engine.ON_GPU:

@@ -20,7 +20,7 @@ MARGIN = 1e-3  # relative; closer than this to flipping, rounding may decide
 
 
 def alphas(gaussians: Gaussians, camera: Camera, options: RenderOptions, pixels: Tensor | None = None) -> Tensor:
-    """Alpha [N, P] of every Gaussian at every pixel, before the cut and the maximum; 0 where it does not act.
+    """Return alpha [N, P] of every Gaussian at every pixel, before the cut and the maximum; 0 where it does not act.
 
     Args:
         gaussians: float64.
@@ -36,12 +36,12 @@ def alphas(gaussians: Gaussians, camera: Camera, options: RenderOptions, pixels:
 
 
 def near_a_decision(alpha: Tensor) -> Tensor:
-    """Where [...] rounding may decide whether a pair counts."""
+    """Return where [...] rounding may decide whether a pair contributes."""
     return ((alpha / ALPHA_MIN - 1).abs() < MARGIN) | ((alpha / 0.99 - 1).abs() < MARGIN)
 
 
 def blended(gaussians: Gaussians, alpha: Tensor) -> Tensor:
-    """The image [P, 3] over black of all alphas [N, P], one Gaussian after the other."""
+    """Return the image [P, 3] over black of alphas [N, P], one Gaussian after the other."""
     image = torch.zeros(alpha.shape[1], 3, dtype=alpha.dtype)
     left = torch.ones_like(alpha[0])
     alive = torch.ones_like(left, dtype=torch.bool)

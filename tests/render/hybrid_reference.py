@@ -6,7 +6,7 @@ import math
 
 
 def one_pixel(alphas: list[float], distances: list[float], size: int) -> tuple[list[float], float]:
-    """Weights and transmittance of fragments in order of arrival, with a core of `size`; alpha 0 is no fragment."""
+    """Return weights and transmittance of fragments in order of arrival for a core of `size`; alpha 0: no fragment."""
     core: list[int] = []
     tail: list[int] = []
     for i, alpha in enumerate(alphas):

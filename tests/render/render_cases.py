@@ -39,7 +39,7 @@ SETUPS = (  # every projection with every camera that it takes
 
 
 def engines() -> list:
-    """Every backend in every dtype that it takes, as pytest parameters `backend, dtype`."""
+    """Return all backends with all their dtypes as pytest parameters `backend, dtype`."""
     found = []
     for backend in BACKENDS:
         for dtype in (torch.float64, torch.float32) if backend == "torch" else (torch.float32,):
@@ -57,12 +57,12 @@ each_panorama = pytest.mark.parametrize("projection", ("erp", "tangent", "ray"))
 
 
 def projected(gaussians: Gaussians, cam_from_world: Tensor, camera: Camera, options: RenderOptions) -> Footprints:
-    """What the torch backend draws."""
+    """Return the footprints of the torch backend."""
     return project(Request(gaussians, cam_from_world, camera, options, background=gaussians.means.new_zeros(3)))
 
 
 def camera_of(lens: str, width: int, height: int) -> Camera:
-    """A panorama, a pinhole with nothing symmetric about it, or a table: a fisheye of 240 degrees across its width."""
+    """Return a panorama, an asymmetric pinhole, or a ray table: a fisheye of 240 degrees across its width."""
     if lens == "panorama":
         return Panorama(width, height)
     pinhole = Pinhole(width, height, 0.5 * width, 0.45 * width, 0.46 * width, 0.55 * height)
@@ -79,7 +79,7 @@ def camera_of(lens: str, width: int, height: int) -> Camera:
 
 
 def gaussians_of(kind: str, count: int, generator: torch.Generator) -> Gaussians:
-    """Random Gaussians around a camera at the origin, float64 but exactly representable in float32.
+    """Return random Gaussians around a camera at the origin, float64 but exactly representable in float32.
 
     ordinary: anywhere; polar: 0.2 to 15 degrees from a pole; pole: broad, covering it; seam: across longitude 180;
     near: centimetres away where the others are metres; huge: one to five times as broad as far away; needle: 100 times
@@ -120,17 +120,17 @@ def gaussians_of(kind: str, count: int, generator: torch.Generator) -> Gaussians
 
 
 def joined(*parts: Gaussians) -> Gaussians:
-    """All Gaussians of several sets in one."""
+    """Concatenate sets of Gaussians."""
     return Gaussians(**{name: torch.cat([getattr(part, name) for part in parts]) for name in INPUTS})
 
 
 def chosen(gaussians: Gaussians, which: Tensor | slice) -> Gaussians:
-    """Some of the Gaussians."""
+    """Return a subset of the Gaussians."""
     return Gaussians(**{name: getattr(gaussians, name)[which] for name in INPUTS})
 
 
 def mixture(count_of_each: int, generator: torch.Generator, kinds: tuple[str, ...] = KINDS) -> Gaussians:
-    """Some of every kind in one set."""
+    """Return some Gaussians of every kind."""
     return joined(*(gaussians_of(kind, count_of_each, generator) for kind in kinds))
 
 
@@ -139,7 +139,7 @@ def identity_pose() -> Tensor:
 
 
 def random_pose(generator: torch.Generator, shift: float = 0.0) -> Tensor:
-    """A rigid pose [4, 4] float64, representable in float32."""
+    """Return a rigid pose [4, 4] float64, representable in float32."""
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, :3] = rotation_matrices(torch.randn(4, generator=generator, dtype=torch.float64))
     pose[:3, 3] = shift * torch.randn(3, generator=generator, dtype=torch.float64)
@@ -147,7 +147,7 @@ def random_pose(generator: torch.Generator, shift: float = 0.0) -> Tensor:
 
 
 def view_of(camera: Camera, pose: Tensor | None = None) -> View:
-    """A view without an image."""
+    """Return a view without an image."""
     return View("test", identity_pose() if pose is None else pose, camera.width, camera.height, lens=camera)
 
 
@@ -163,14 +163,14 @@ def draw(
     options: RenderOptions = RenderOptions(),  # noqa: B008 - frozen dataclass
     **more,
 ) -> Rendering:
-    """Render in one engine; the pose may carry a gradient."""
+    """Render with one engine; the pose may require a gradient."""
     more = {name: value.to(dtype) if isinstance(value, Tensor) else value for name, value in more.items()}
     view = view_of(camera_of(lens, width, height), pose)
     return render(gaussians.to(dtype), view, options=options, backend=backend, check_values=True, **more)
 
 
 def leaves(gaussians: Gaussians, dtype: torch.dtype) -> Gaussians:
-    """A copy whose tensors collect gradients."""
+    """Return a copy whose tensors require gradients."""
     return Gaussians(
         **{name: getattr(gaussians, name).detach().to(dtype, copy=True).requires_grad_() for name in INPUTS}
     )
@@ -186,7 +186,7 @@ def stable_pixels(
     options: RenderOptions = RenderOptions(),  # noqa: B008 - frozen dataclass
     margin: float = 1e-3,
 ) -> Tensor:
-    """Pixels [H, W] bool where no yes/no decision is near: the image is smooth there and rounding flips nothing.
+    """Return pixels [H, W] bool that are far from any decision: the image is smooth there and rounding flips nothing.
 
     A decision is near where an alpha is within `margin` (relative) of 1/255 or 0.99; for a chart footprint broader than
     half a turn, where the pixel is within `margin` pixels of the longitude opposite to the mean; for `ray`, where the
@@ -216,7 +216,7 @@ def stable_pixels(
 
 
 def row_error(actual: Tensor, expected: Tensor) -> float:
-    """Largest error of a gradient, row by row: max |g - e| / (|e| + 1e-3 E), E the largest row."""
+    """Return the largest error of a gradient by rows: max |g - e| / (|e| + 1e-3 E), E the largest row."""
     actual, expected = actual.double(), expected.double()
     if actual.ndim == 1:
         actual, expected = actual[:, None], expected[:, None]
@@ -228,7 +228,7 @@ def row_error(actual: Tensor, expected: Tensor) -> float:
 
 
 def blended(blending: str, core_size: int) -> dict:
-    """Options of either blending, with a core of that size where there is one."""
+    """Return options of a blending, with the core size if it has a core."""
     return {"blending": blending} | ({"core_size": core_size} if blending == "hybrid" else {})
 
 

@@ -17,11 +17,10 @@ from render_cases import (
     stable_pixels,
     view_of,
 )
-from torch import Tensor
 
 from padgs.gaussians import Gaussians
 from padgs.geometry.camera import Camera, Panorama, Pinhole, RayTable
-from padgs.geometry.panorama import project as pixel_of
+from padgs.geometry.panorama import sample
 from padgs.render import RenderOptions, render
 from padgs.render.backends.native import native_rays
 
@@ -31,7 +30,7 @@ each_free = pytest.mark.parametrize("projection", ("tangent", "ray"))  # free of
 def picture(
     gaussians: Gaussians, camera: Camera, projection: str, *, backend, dtype, pose=None, weight=None, **options
 ):
-    """The image, and the gradients of its sum times `weight` [H, W, 3] by every input."""
+    """Return the image, and the gradients of its sum times `weight` [H, W, 3] by every input."""
     inputs, view = leaves(gaussians, dtype), view_of(camera, pose)
     rendering = render(inputs, view, RenderOptions(projection, **options), backend=backend, check_values=True)
     if weight is None:
@@ -63,7 +62,7 @@ def test_a_formula_is_its_table_of_rays(size, lens: str, projection: str, backen
 @each_free
 @each_engine
 def test_turning_the_camera_turns_its_rays(projection: str, backend: str, dtype: torch.dtype):
-    """A panorama from a turned camera is what the unturned camera sees along the turned rays, poles and all."""
+    """The panorama of a rotated camera equals the image of the original camera along the rotated rays."""
     generator = torch.Generator().manual_seed(32)
     gaussians = mixture(4, generator)
     for _ in range(30):
@@ -78,21 +77,6 @@ def test_turning_the_camera_turns_its_rays(projection: str, backend: str, dtype:
         assert (turned - expected)[stable].abs().max() <= limit
 
 
-def resampled(image: Tensor, directions: Tensor) -> Tensor:
-    """A panorama [H, W, 3] at the directions [..., 3], bilinear and across the seam; rows end at the poles."""
-    height, width, _ = image.shape
-    u, v = (pixel_of(directions, width, height) - 0.5).unbind(-1)
-    column, row = torch.floor(u).long(), torch.floor(v).long()
-    across, down = (u - column)[..., None], (v - row)[..., None]
-
-    def at(row: Tensor, column: Tensor) -> Tensor:
-        return image[row.clamp(0, height - 1), column % width]
-
-    above = (1 - across) * at(row, column) + across * at(row, column + 1)
-    below = (1 - across) * at(row + 1, column) + across * at(row + 1, column + 1)
-    return (1 - down) * above + down * below
-
-
 @each_free
 @each_engine
 def test_a_turned_panorama_is_the_old_one_resampled(projection: str, backend: str, dtype: torch.dtype):
@@ -104,14 +88,14 @@ def test_a_turned_panorama_is_the_old_one_resampled(projection: str, backend: st
     for _ in range(3):
         pose = random_pose(generator)
         turned = picture(broad, panorama, projection, backend=backend, dtype=dtype, pose=pose)
-        expected = resampled(old, panorama.rays(dtype=dtype) @ pose[:3, :3].to(dtype))
+        expected = sample(old, panorama.rays(dtype=dtype) @ pose[:3, :3].to(dtype))
         # The cut at 1/255 is an edge, which interpolation blurs.
         assert -10 * torch.log10(((turned - expected) ** 2).mean()) >= 50
 
 
 @each_engine
 def test_on_the_axis_the_perspective_jacobian_is_the_tangent_plane(backend: str, dtype: torch.dtype):
-    """Where the mean is straight ahead, pinhole and tangent are one model; elsewhere they differ."""
+    """pinhole and tangent agree for means on the optical axis, and differ elsewhere."""
     generator = torch.Generator().manual_seed(34)
     camera = Pinhole(64, 48, 60.0, 60.0, 30.0, 22.0)
     for off_axis in (False, True):
@@ -147,7 +131,7 @@ def test_the_smaller_a_gaussian_the_less_ray_and_tangent_differ(backend: str, dt
 @each_free
 @each_engine
 def test_the_gradient_of_the_rays_is_that_of_the_pose(projection: str, backend: str, dtype: torch.dtype):
-    """To turn all rays by a small angle is to turn the camera; both derivatives must say the same."""
+    """Rotating all rays by a small angle is rotating the camera; both derivatives must agree."""
     generator = torch.Generator().manual_seed(36)
     gaussians = joined(gaussians_of("ordinary", 15, generator), gaussians_of("needle", 5, generator))
     table = camera_of("fisheye", 60, 40).table.to(dtype).requires_grad_()

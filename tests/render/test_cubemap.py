@@ -41,7 +41,7 @@ PLACES = {  # where a Gaussian can lie on a cube
 
 
 def broad(place: str, sigma: float = 8.0) -> Gaussians:
-    """One isotropic Gaussian, sigma in degrees, two units away."""
+    """Return an isotropic Gaussian, sigma in degrees, two units away."""
     mean = 2 * torch.nn.functional.normalize(torch.tensor([PLACES[place]], dtype=torch.float64), dim=-1)
     scales = torch.full((1, 3), 2 * math.radians(sigma), dtype=torch.float64)
     quats, opacities = torch.tensor([[1.0, 0, 0, 0]]).double(), torch.tensor([0.9]).double()
@@ -49,7 +49,7 @@ def broad(place: str, sigma: float = 8.0) -> Gaussians:
 
 
 def seen_by_faces(panorama: Panorama, lens: Pinhole) -> list[Rendering]:
-    """Renderings of a world in which every direction has its own coordinates for a colour."""
+    """Return renderings of a world whose colours are the directions."""
     local = lens.rays(dtype=torch.float64)
     empty = local.new_zeros(local.shape[:2])
     return [Rendering(local @ turn, empty, empty + 3.0, torch.ones(1, dtype=torch.bool)) for turn in FACES]
@@ -89,7 +89,7 @@ def test_face_size():
 )
 @each_engine
 def test_low_pass_does_not_depend_on_face_size(projection, kind, backend, dtype):
-    """The low-pass is of the panorama's pixels: finer faces do not sharpen what it widens."""
+    """The low-pass has the size of pixels of the panorama; finer faces do not change it."""
     options = RenderOptions(projection=projection, cubemap=True, low_pass_kind=kind, low_pass=4.0)
     gaussian = replace(broad("middle of a face", 3.0), means=torch.tensor([[0.02, 0.01, 2.0]]).double())
     coarse, fine = (
@@ -127,7 +127,7 @@ def test_constant_colors_stay_constant(projection: str, backend: str, dtype: tor
 @pytest.mark.parametrize("place", PLACES)
 @each_engine
 def test_ray_projection_has_no_seams(place: str, backend: str, dtype: torch.dtype):
-    """No seam: at edges and corners of the cube the error is that of interpolation, as in the middle of a face."""
+    """At edges and corners of the cube the error is that of interpolation, as at the centre of a face."""
     options, sigma = RenderOptions(projection="ray", low_pass=0.0), 8.0
     for width in (128, 256):
         whole = draw(broad(place, sigma), width, width // 2, backend=backend, dtype=dtype, options=options)
@@ -175,7 +175,7 @@ def test_native_faces_match_the_definition(projection: str, generator):
 @pytest.mark.parametrize("projection", ["tangent", "ray"])
 @needs_native
 def test_native_faces_are_complete_and_efficient(projection: str, generator):
-    """What neither lies before a face nor behind it is the hard part: about every Gaussian does so for some face."""
+    """Gaussians beside a face are the hard case; almost every Gaussian is beside some face."""
     gaussians = mixture(12, generator)
     lens = Pinhole(70, 44, 28.0, 33.0, 11.5, 30.25)  # wide, and its axis far from its middle
     options = RenderOptions(projection=projection, near=0.001)
@@ -199,7 +199,7 @@ def test_native_faces_are_complete_and_efficient(projection: str, generator):
 
 @pytest.mark.parametrize("projection", PROJECTIONS)
 def test_gradients_match_differences(projection: str, generator):
-    """Every input and the pose, float64, against central differences; nothing here is near a cut."""
+    """Gradients by all inputs and the pose against central differences in float64, away from cuts."""
     count = 4
     radius = torch.tensor([[2.5], [3.0], [3.5], [4.0]], dtype=torch.float64)  # apart: the order stays
     gaussians = Gaussians(

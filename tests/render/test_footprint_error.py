@@ -31,7 +31,7 @@ def test_erp_error_is_symmetric():
 
 
 def test_cubemap_error_is_the_same_on_all_faces():
-    """From the middle of the front face to its edge is from the edge of the lower face to its middle."""
+    """The front face from centre to edge mirrors the lower face from edge to centre."""
     for latitude in (10.0, 30.0):
         above, below = (footprint_error("cubemap", 2.0, angle) for angle in (latitude, 90 - latitude))
         assert above == pytest.approx(below, rel=0.03)
@@ -39,7 +39,7 @@ def test_cubemap_error_is_the_same_on_all_faces():
 
 @pytest.mark.parametrize("projection", ["erp", "tangent"])
 def test_known_numbers(projection: str):
-    """Of another program."""
+    """Numbers of another program."""
     for sigma, percents in REFERENCE[projection].items():
         for latitude, percent in percents.items():
             if 2 <= sigma <= 10:  # below, the same code is slow; above, the programs differ, as the table shows

@@ -14,7 +14,7 @@ from padgs.render import RenderOptions
 
 
 def footprint(sigma: float, latitude: float, *, projection: str, backend: str, dtype: torch.dtype, opacity=0.9):
-    """L1 error and mass of one isotropic footprint against the exact ray response, both relative to the true mass.
+    """Return L1 error and mass of one isotropic footprint against the exact ray response, both relative to that mass.
 
     Area-weighted over the sphere; angles in degrees. Also the alpha [H, W] itself.
     """

@@ -26,7 +26,7 @@ VALUE_TOLERANCE, DEPTH_TOLERANCE, GRADIENT_TOLERANCE = 2e-5, 1e-4, 2e-3
 
 
 def options_of(meta: dict) -> RenderOptions:
-    """The options under which a case was made; a meta key that is not listed here or below is an error."""
+    """Return the options of a case; unknown meta keys raise an error."""
     option_of = {
         "projection": "projection",
         "near": "near",
@@ -72,7 +72,7 @@ def test_golden_case(case: str, backend: str, dtype: torch.dtype):
 @pytest.mark.parametrize("case", [case for case in CASES if case.startswith(("tangent", "ray"))])
 @needs_native
 def test_golden_case_through_a_table_of_rays(case: str):
-    """The same camera without its formula."""
+    """Replace the formula of the camera by its rays."""
     data, meta = load(case)
     panorama = camera_of(meta)
     check_case(data, meta, RayTable(panorama.rays(), panorama.focal), "cpu", torch.float32)

@@ -11,7 +11,7 @@ from padgs.render.backends.torch import hybrid_weights
 
 
 def random_fragments(pixels: int, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """alpha and distance [P, K]: a third not drawn, a third faint."""
+    """Return alpha and distance [P, K]: a third not drawn, a third faint."""
     alpha = torch.rand(pixels, count, generator=generator, dtype=torch.float64)
     kind = torch.randint(3, alpha.shape, generator=generator)
     alpha = torch.where(kind == 0, 0.0, torch.where(kind == 1, 1 / 255 + 0.04 * alpha, 0.06 + 0.6 * alpha))

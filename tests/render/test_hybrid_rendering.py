@@ -51,7 +51,7 @@ def options_of(projection: str, size: int, **more) -> RenderOptions:
 
 
 def fragments(gaussians: Gaussians, camera: Camera, options: RenderOptions, pose: Tensor) -> tuple[Tensor, ...]:
-    """alpha, distance [P, N], radial depths [N] of every pair, and which pixels [P] are far from any decision."""
+    """Return alpha and distance [P, N], radial depths [N], and which pixels [P] are far from any decision."""
     footprints = projected(gaussians, pose, camera, options)
     everything, pixels = torch.arange(len(gaussians)), torch.arange(camera.height * camera.width)
     rows, columns = pixels // camera.width, pixels % camera.width
@@ -165,7 +165,7 @@ def test_native_tiles_wider_than_a_chunk_agree(backend: str, generator: torch.Ge
 
 
 def overlapping(count: int, generator: torch.Generator) -> Gaussians:
-    """Broad and flat Gaussians ahead at about the same distance; the camera is outside all of them."""
+    """Return broad, flat Gaussians ahead at similar distances; the camera is outside of all."""
 
     def uniform(low: float, high: float, *shape: int) -> Tensor:
         return low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64)

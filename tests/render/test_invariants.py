@@ -26,7 +26,7 @@ from padgs.render import RenderOptions
 
 
 def yaw(angle: float) -> torch.Tensor:
-    """A turn [3, 3] of directions to larger longitudes, about the camera's y axis."""
+    """Return the rotation [3, 3] about the y axis of the camera to larger longitudes."""
     cos, sin = math.cos(angle), math.sin(angle)
     return torch.tensor([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]], dtype=torch.float64)
 
@@ -91,7 +91,7 @@ def test_rigid_motion_changes_nothing(projection, lens, backend, dtype):
 
 
 def quaternion_of(rotation: torch.Tensor) -> torch.Tensor:
-    """Unit quaternion (w, x, y, z) of a rotation [3, 3]: the eigenvector that it leaves alone, with its half angle."""
+    """Return the unit quaternion (w, x, y, z) of a rotation [3, 3]."""
     k = torch.tensor(
         [[rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]]
     )
@@ -102,7 +102,7 @@ def quaternion_of(rotation: torch.Tensor) -> torch.Tensor:
 
 
 def product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Quaternion product a b, a [4], b [N, 4]."""
+    """Return the quaternion products a b of a [4] and b [N, 4]."""
     scalar = a[0] * b[:, :1] - (a[1:] * b[:, 1:]).sum(-1, keepdim=True)
     vector = a[0] * b[:, 1:] + b[:, :1] * a[1:] + torch.linalg.cross(a[1:].expand(len(b), 3), b[:, 1:])
     return torch.cat((scalar, vector), dim=-1)

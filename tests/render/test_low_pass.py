@@ -45,7 +45,7 @@ def options_of(projection: str, kind: str, **more) -> RenderOptions:
 
 
 def small(latitude: float, scale: float, radius: float = 2.0) -> Gaussians:
-    """One round Gaussian at a latitude in radians; `scale` is relative to its distance."""
+    """Return a round Gaussian at a latitude in radians; `scale` is relative to its distance."""
     mean = radius * direction(torch.tensor([0.05]).double(), torch.tensor([latitude]).double())
     quats, opacities = torch.tensor([[1.0, 0, 0, 0]]).double(), torch.tensor([0.9]).double()
     scales = torch.full((1, 3), radius * scale, dtype=torch.float64)
@@ -133,7 +133,7 @@ def test_the_unit_of_length_does_not_matter(projection: str, kind: str):
 
 
 def thin_mixture(generator: torch.Generator) -> Gaussians:
-    """Gaussians about as large as the filter, and thin, where it matters most."""
+    """Return thin Gaussians about as large as the filter, which it affects most."""
     gaussians = mixture(25, generator, ("ordinary", "polar", "seam"))
     shrink = 0.1 + 0.6 * torch.rand(75, 3, generator=generator, dtype=torch.float64)
     opacities = 0.5 + 0.5 * gaussians.opacities
@@ -159,7 +159,7 @@ def test_native_matches_the_definition(projection: str, kind: str, generator):
 @pytest.mark.parametrize("place", ["ordinary", "next to the pole", "across the seam"])
 @each_combination
 def test_gradients_match_differences(projection: str, kind: str, place: str, generator):
-    """Of what the filter touches, one input at a time, against central differences in float64."""
+    """Gradients of each affected input against central differences in float64."""
     camera = camera_of(projection, 40)
     turn = {"ordinary": (0.2, 0.1), "next to the pole": (0.4, math.radians(89.9)), "across the seam": (math.pi, -0.3)}
     longitude, latitude = (0.2, 0.1) if projection == "pinhole" else turn[place]

@@ -24,7 +24,7 @@ def options(**more) -> RenderOptions:
 
 
 def balls(relative_size: float, spread: float, generator: torch.Generator, count: int = 4000) -> Gaussians:
-    """Opaque Gaussians anywhere around the camera, distances log-uniform in [0.1, 10], axes log-normal."""
+    """Return opaque Gaussians around the camera, distances log-uniform in [0.1, 10], axes log-normal."""
 
     def uniform(low: float, high: float) -> torch.Tensor:
         return low + (high - low) * torch.rand(count, generator=generator, dtype=torch.float64)
@@ -39,7 +39,7 @@ def balls(relative_size: float, spread: float, generator: torch.Generator, count
 
 @each_engine
 def test_round_gaussians_are_culled_by_their_nearest_point(backend, dtype):
-    """R - sqrt(2 ln 255) sigma against near, just before and behind."""
+    """Compare R - sqrt(2 ln 255) sigma with near, just below and above."""
     sigma = 0.3
     edge = NEAR + sigma * math.sqrt(2 * math.log(255))
     means = torch.tensor([[0, 0, edge - 1e-4], [edge + 1e-4, 0, 0], [0, edge - 1e-4, 0]], dtype=dtype)
@@ -51,7 +51,7 @@ def test_round_gaussians_are_culled_by_their_nearest_point(backend, dtype):
 
 @each_engine
 def test_rendered_ellipsoids_are_beyond_the_near_plane(backend, dtype, generator):
-    """Points sampled on the surface q = k: all beyond n.x = near for what is drawn, not all for what is culled."""
+    """Points on the surface q = k lie beyond n.x = near for all visible Gaussians, but not for culled ones."""
     gaussians = balls(0.15, 0.7, generator, count=300)
     opacities = 0.05 + 0.9 * torch.rand(300, generator=generator, dtype=torch.float64)
     gaussians = replace(gaussians, opacities=opacities).to(dtype)
@@ -73,7 +73,7 @@ def test_rendered_ellipsoids_are_beyond_the_near_plane(backend, dtype, generator
 
 @pytest.mark.parametrize(("relative_size", "published"), [(0.02, 1.9), (0.1, 18), (0.3, 75), (0.5, 95)])
 def test_culled_shares_match_reference_numbers(relative_size, published, generator):
-    """Axes log-normal with deviation 0.7 and opacity 1: our reading of how that program sampled."""
+    """Axes log-normal with deviation 0.7 and opacity 1, as we assume for the other program."""
     gaussians = balls(relative_size, 0.7, generator, count=20_000)
     kept = projected(gaussians, identity_pose(), VIEW.camera, options(near_cull="ellipsoid")).visible
     culled = 100 * (~kept).double().mean().item()

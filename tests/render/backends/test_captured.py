@@ -31,7 +31,7 @@ DEVICE = torch.device("cuda" if cuda_engine.ON_GPU else "cpu")
 
 @pytest.fixture(autouse=True)
 def recorded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """How often a frame was recorded; without a GPU, a recording is played back by doing its work again."""
+    """Count recordings; without a GPU, a replay runs the recorded function again."""
     times, original = [], captured.captured
 
     def counted(record, device):
@@ -44,7 +44,7 @@ def recorded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 @pytest.fixture
 def dirty_memory(monkeypatch: pytest.MonkeyPatch):
-    """Memory that nobody wrote to holds the largest numbers, so that whoever reads it is found out."""
+    """Fill uninitialised memory with the largest numbers, so that reading it is detected."""
     monkeypatch.setenv("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # else products on a GPU warn, which is an error here
     torch.use_deterministic_algorithms(True, warn_only=True)
     try:
@@ -169,7 +169,7 @@ def test_anchors_are_decoded_within_the_recording(omega_axis: str, generator: to
 
 
 class NothingIsRead(TorchDispatchMode):
-    """Refuses operations for which the host waits; so does a real recording."""
+    """Refuse operations that make the host wait, as a real recording does."""
 
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):
         name = function._schema.name.split("::")[1]
@@ -203,7 +203,7 @@ def test_a_recording_reads_nothing_back(options, generator: torch.Generator, mon
 
 
 def test_recording_uses_its_own_stream_and_thread_local_mode(monkeypatch: pytest.MonkeyPatch):
-    """Torch's own stream for recordings is of one device, and its usual mode ends them if any thread allocates."""
+    """The default stream belongs to one device, and the default mode ends recordings when any thread allocates."""
     how, inside = [], []
 
     def graph(graph, **options):
@@ -252,7 +252,7 @@ def test_unsupported_recordings_are_refused(generator: torch.Generator):
 
 @pytest.mark.usefixtures("dirty_memory")
 def test_instance_counts_beyond_32_bits():
-    """Slots of Gaussians far back must not begin again at 0, where they would be written over the first."""
+    """Slots must not wrap around to 0, where they would overwrite the first ones."""
     side, count, capacity = 8192, 16_400, 100
     view = DeviceProjected.__new__(DeviceProjected)
     view.camera = native_camera(cuda_backend.IDENTITY, camera_of("pinhole", side, side), RenderOptions("pinhole"))

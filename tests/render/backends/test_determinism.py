@@ -36,7 +36,7 @@ RENDERINGS = {
 
 
 def drawn(name: str, count: int = 250, size: tuple[int, int] = (250, 125)) -> dict[str, Tensor]:
-    """Outputs and gradients of one rendering, by name."""
+    """Return outputs and gradients of one rendering, by name."""
     projection, lens, settings = RENDERINGS[name]
     generator = torch.Generator().manual_seed(99)
     gaussians = mixture(count, generator, ("ordinary", "polar", "seam", "needle"))
@@ -50,7 +50,7 @@ def drawn(name: str, count: int = 250, size: tuple[int, int] = (250, 125)) -> di
 
 
 def decoded(anchors: int = 3000) -> dict[str, Tensor]:
-    """Gaussians of a decoder and the gradients of everything that it learns, by name."""
+    """Return Gaussians of a decoder and the gradients of its parameters, by name."""
     generator = torch.Generator().manual_seed(98)
 
     def randn(*shape: int) -> Tensor:
@@ -69,7 +69,7 @@ def decoded(anchors: int = 3000) -> dict[str, Tensor]:
 
 
 def compared(size: tuple[int, int] = (203, 101)) -> dict[str, Tensor]:
-    """The photometric loss of two images and its gradient."""
+    """Return the photometric loss of two images and its gradient."""
     generator = torch.Generator().manual_seed(97)
     image, target = torch.rand(2, *size, 3, generator=generator)
     image.requires_grad_()
@@ -78,7 +78,7 @@ def compared(size: tuple[int, int] = (203, 101)) -> dict[str, Tensor]:
 
 
 def roughened(size: tuple[int, int] = (101, 203)) -> dict[str, Tensor]:
-    """The roughness of a drawing and its gradient."""
+    """Return the roughness of a rendering and its gradient."""
     generator = torch.Generator().manual_seed(96)
     image, transmittance = torch.rand(*size, 3, generator=generator), torch.rand(size, generator=generator)
     depth = (1 + 0.1 * torch.rand(size, generator=generator)).requires_grad_()
@@ -111,7 +111,7 @@ def test_results_are_bit_equal_for_any_number_of_threads(name: str, restored_thr
 
 
 def small_results() -> dict[str, dict[str, Tensor]]:
-    """So few pairs that in none of them rounding decides about the cut."""
+    """Return results with few pairs, none of them near the cut."""
     results = {name: drawn(name, 6, (72, 36)) for name in RENDERINGS}
     return {**results, **{name: made() for name, made in NAMELESS.items()}}
 
@@ -125,7 +125,7 @@ print(cpu.library().padgs_isa().decode(), end="")
 
 
 def on_instruction_set(isa: str, file: Path) -> tuple[str, dict[str, dict[str, Tensor]]]:
-    """All results with PADGS_ISA set, and the instruction set that was really used."""
+    """Return the instruction set that was used with PADGS_ISA set, and all results."""
     folder = Path(__file__).parent
     places = (folder.parents[2], folder.parent, folder.parent / "cuda", folder, os.environ.get("PYTHONPATH"))
     search_path = os.pathsep.join(str(place) for place in places if place)

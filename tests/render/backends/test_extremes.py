@@ -100,7 +100,7 @@ def test_non_finite_gaussians_are_refused_or_not_rendered(name: str, bad: float,
 @pytest.mark.parametrize(("projection", "lens"), [setup for setup in SETUPS if setup[0] in ("erp", "pinhole")])
 @pytest.mark.parametrize(("backend", "dtype"), ENGINES_IN_FLOAT32)
 def test_long_oblique_needles_in_float32(projection, lens, backend, dtype):
-    """Hundreds of pixels long, thinner than one: du^2, du dv and dv^2 are large there, and their sum is not."""
+    """Hundreds of pixels long and thinner than one: du^2, du dv and dv^2 are large, but their sum is small."""
     generator = torch.Generator().manual_seed(3)
     half = torch.deg2rad(torch.tensor([[45.0], [-30.0], [20.0]], dtype=torch.float64)) / 2
     gaussians = Gaussians(

@@ -67,14 +67,14 @@ def scene_at(place: str, projection: str, lens: str, generator: torch.Generator)
 
 
 def tangent_pose(base: Tensor, twist: Tensor) -> Tensor:
-    """The pose [4, 4] turned and shifted by a twist [6]; a rigid motion for every twist."""
+    """Return the pose [4, 4] rotated and shifted by a twist [6]; rigid for every twist."""
     half = torch.cat((torch.ones_like(twist[:1]), 0.5 * twist[:3]))
     top = torch.cat((rotation_matrices(half) @ base[:3, :3], base[:3, 3:] + twist[3:, None]), dim=1)
     return torch.cat((top, base[3:]))
 
 
 def steps_of(gaussians: Gaussians, projection: str) -> dict[str, Tensor]:
-    """What moves each input by about one footprint: the unit in which steps are taken, one per entry."""
+    """Return the change of each input that moves a footprint by about its size: the unit of steps."""
     radius = gaussians.means.norm(dim=-1, keepdim=True)
     cos_latitude = gaussians.means[:, [0, 2]].norm(dim=-1, keepdim=True) / radius
     reach = gaussians.scales.amax(-1, keepdim=True)
@@ -95,7 +95,7 @@ def steps_of(gaussians: Gaussians, projection: str) -> dict[str, Tensor]:
 
 
 class Scene:
-    """Six Gaussians, weights of everything drawn, and the loss that they make together."""
+    """Six Gaussians, weights of all outputs, and the weighted loss."""
 
     def __init__(self, place: str, projection: str, lens: str, generator: torch.Generator, dtype: torch.dtype) -> None:
         self.camera, self.options = camera_of(lens, WIDTH, HEIGHT), RenderOptions(projection)
@@ -127,7 +127,7 @@ class Scene:
 
 
 def slopes(scene: Scene, step: float, backend: str, generator: torch.Generator) -> dict[str, list]:
-    """(difference, prediction) of the loss along random directions: one for each row of each input."""
+    """Return (difference, prediction) of the loss along random directions, one for each row of each input."""
     variables = {name: value.clone().requires_grad_() for name, value in scene.inputs.items()}
     gradients = torch.autograd.grad(scene.loss(variables, backend), list(variables.values()))
     units, found = steps_of(scene.gaussians, scene.options.projection), {}
@@ -218,7 +218,7 @@ def test_every_input_receives_a_gradient(projection: str, lens: str, backend: st
 @pytest.mark.parametrize("projection", sorted({projection for projection, lens in SETUPS if lens == "panorama"}))
 @needs_native
 def test_gradients_of_subsets_of_inputs(projection: str):
-    """Each subset of inputs gets the gradients that it gets beside all others."""
+    """Gradients of a subset of inputs equal those computed together with all others."""
     generator = torch.Generator().manual_seed(14)
     gaussians = gaussians_of("ordinary", 12, generator)
     weight = torch.randn(HEIGHT, WIDTH, 3, generator=generator)

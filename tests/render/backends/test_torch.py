@@ -106,7 +106,7 @@ def test_blocks_change_nothing(pairs: int, generator: torch.Generator, monkeypat
 
 
 def test_memory_is_bounded_by_the_block(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch):
-    """What autograd keeps for the backward pass does not grow with the number of chunks."""
+    """Memory for the backward pass does not grow with the number of blocks."""
     gaussians = leaves(gaussians_of("ordinary", 40, generator), torch.float64)
     kept = {}
     for pairs in (1 << 30, 40 * 64):
@@ -121,7 +121,7 @@ def test_memory_is_bounded_by_the_block(generator: torch.Generator, monkeypatch:
 @pytest.mark.parametrize("output", OUTPUTS)
 @pytest.mark.parametrize(("projection", "wrap"), [("erp", True), ("erp", False), ("tangent", True), ("ray", True)])
 def test_gradcheck(output: str, projection: str, wrap: bool):
-    """Every entry of the Jacobian of every output, against differences, in float64."""
+    """Jacobians of all outputs against differences in float64."""
     gaussians = gaussians_of("seam", 3, torch.Generator().manual_seed(21))
     inputs = leaves(gaussians, torch.float64)
     pose = identity_pose()

@@ -29,7 +29,7 @@ PATCH_WIDTH, PATCH_HEIGHT = 8, 2  # pixels, as in csrc/abi.h
 
 
 class NativeTiles:
-    """The tile lists of one view, drawn in one strip."""
+    """The tile lists of one view, in one strip."""
 
     def __init__(self, gaussians: Gaussians, camera: Camera, options: RenderOptions, pose: Tensor) -> None:
         self.projected = projected(gaussians, camera, options, pose)
@@ -47,7 +47,7 @@ class NativeTiles:
         self.first_column = column_of_tile * TILE << self.level[self.row_of_tile]  # [tiles] pixels
 
     def times_listed(self, gaussian: int, camera: Camera) -> Tensor:
-        """How many instances of a Gaussian hold each pixel, [H W]."""
+        """Return how many instances of a Gaussian contain each pixel, [H W]."""
         times = torch.zeros(camera.height, camera.width, dtype=torch.int64)
         for i in (self.gaussian == gaussian).nonzero()[:, 0].tolist():
             x, y = int(self.first_column[self.tile[i]]), int(self.row_of_tile[self.tile[i]]) * TILE

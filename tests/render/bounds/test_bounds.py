@@ -42,7 +42,7 @@ more = settings(max_examples=20, deadline=None, derandomize=True, database=None)
 
 
 def unsure(gaussians: Gaussians, camera: Camera, options: RenderOptions, alpha: Tensor) -> Tensor:
-    """Pairs [N, P] where rounding may decide: near the cut or the maximum, opposite the mean, or near `near`."""
+    """Return pairs [N, P] that rounding may decide: near the cut or the maximum, opposite the mean, or near `near`."""
     pairs = near_a_decision(alpha)
     if options.projection == "erp" and options.wrap:
         center = (torch.atan2(gaussians.means[:, 0], gaussians.means[:, 2]) / (2 * math.pi) + 0.5) * camera.width

@@ -22,7 +22,7 @@ PUBLISHED = (11, 34, 362, 1432, 3772)
 
 
 def shell(distance: float, count: int = 2000, sigma: float = 0.1) -> Gaussians:
-    """Gaussians all around, of many sizes and shapes, which look the same from every distance; sigma in degrees."""
+    """Return Gaussians in all directions, of many shapes, with the same angular sizes at every distance; degrees."""
     generator = torch.Generator().manual_seed(0)
     normals = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
     size = torch.exp(

@@ -74,7 +74,7 @@ def test_tiles_cover_the_same_angle_in_every_row(width: int, height: int):
 
 @needs_native
 def test_exact_bounds_need_fewer_tiles():
-    """Bounds follow the opacity and both axes, and tiles widen toward the poles: far fewer instances than published."""
+    """Bounds depend on opacity and both axes, and tiles widen towards the poles."""
     gaussians = mixture(200, torch.Generator().manual_seed(5), ("ordinary", "polar"))
     published = NativeTiles(gaussians, Panorama(512, 256), RELEASED, identity_pose()).count
     for projection in ("erp", "tangent", "ray"):
@@ -84,7 +84,7 @@ def test_exact_bounds_need_fewer_tiles():
 
 @needs_native
 def test_tile_count_of_a_small_gaussian_by_latitude():
-    """Near the poles it spans many columns; wide tiles keep the count below twice that of the horizon."""
+    """It spans many columns near the poles; wide tiles keep the count below twice that of the horizon."""
     counts = []
     for latitude in (0, 45, 70, 80, 85):
         generator = torch.Generator().manual_seed(3)

@@ -39,14 +39,14 @@ real_library = cuda.library
 
 @functools.cache
 def emulated_library() -> ctypes.CDLL:
-    """The kernels compiled for the host; seconds, once in a process."""
+    """Return the kernels compiled for the host; takes seconds, once in a process."""
     loaded = compiled("padgs_cuda", sorted(SOURCES.glob("*.cu")))
     return loading.declare(loaded, cuda.SIGNATURES, "padgs_cuda_structure_bytes", cuda.STRUCTURES)
 
 
 @functools.cache
 def layout_library() -> ctypes.CDLL:
-    """Functions of layout_check.cpp."""
+    """Return the library of layout_check.cpp."""
     return compiled("layout", [HERE / "layout_check.cpp"])
 
 
@@ -57,7 +57,7 @@ def fused_library() -> ctypes.CDLL:
 
 
 def compiled(name: str, sources: list[Path], *more: str) -> ctypes.CDLL:
-    """A shared library of C++ sources, CUDA ones included, for as long as this process lives; `more` flags."""
+    """Compile C++ or CUDA sources to a shared library for the lifetime of this process."""
     flags = ["-std=c++17", "-O2", "-fPIC", "-shared", "-Wall", "-Wextra", "-Werror", "-DPADGS_EMULATED"]
     flags += ["-Wno-unknown-pragmas"]  # nvcc's
     flags += ["-fno-gnu-unique"]  # or the emulations of two libraries would be one
@@ -66,7 +66,7 @@ def compiled(name: str, sources: list[Path], *more: str) -> ctypes.CDLL:
 
 
 def compiled_for_gpu(name: str, source: Path) -> ctypes.CDLL:
-    """The same of one source, by nvcc for the GPU of this machine."""
+    """Compile one source by nvcc for the GPU of this machine."""
     flags = ["-std=c++17", "-shared", "-Xcompiler", "-fPIC", "--expt-relaxed-constexpr", "-arch=native"]
     return _loaded(name, [str(NVCC), *flags, f"-I{SOURCES}", "-x", "cu", str(source)])
 
@@ -91,14 +91,14 @@ def on_gpu(request: Request) -> Request:
 
 
 def rasterize_on_gpu(request: Request) -> Rendering:
-    """`cuda_backend.rasterize` for tensors on the CPU; gradients find their way back."""
+    """Call `cuda_backend.rasterize` for tensors on the CPU, differentiably."""
     drawn = cuda_backend.rasterize(on_gpu(request))
     tensors = {name: getattr(drawn, name).cpu() for name in ("image", "transmittance", "depth", "visible")}
     return replace(drawn, **tensors)
 
 
 def leave_one_out_on_gpu(request: Request, target: torch.Tensor, weight: torch.Tensor) -> Removals:
-    """`cuda_backend.leave_one_out` for tensors on the CPU."""
+    """Call `cuda_backend.leave_one_out` for tensors on the CPU."""
     found = cuda_backend.leave_one_out(on_gpu(request), target.cuda(), weight.cuda())
     return Removals(*(tensor.cpu() for tensor in vars(found).values()))
 
@@ -114,5 +114,5 @@ needs_engine = pytest.mark.skipif(not ON_GPU and COMPILER is None, reason="no GP
 
 
 def marks() -> list:
-    """What an engine of backend cuda is marked with."""
+    """Return the pytest marks of tests of backend cuda."""
     return [pytest.mark.cuda] if ON_GPU else [needs_engine]

@@ -37,7 +37,7 @@ def drawn(
     weights: torch.dtype | None = None,
     outputs: tuple[str, ...] = ("image", "transmittance", "depth"),
 ) -> tuple[Rendering, dict[str, Tensor]]:
-    """A rendering in a random pose, and gradients of a random weighting of outputs of it."""
+    """Return a rendering in a random pose, and gradients of randomly weighted outputs."""
     generator = torch.Generator().manual_seed(5)
     inputs = leaves(gaussians, torch.float32)
     pose = random_pose(generator, shift=0.1).float().requires_grad_()
@@ -48,7 +48,7 @@ def drawn(
 
 
 def crowd(count: int, generator: torch.Generator) -> Gaussians:
-    """So many faint Gaussians that lists are longer than the batches and buckets that kernels take them in."""
+    """Return faint Gaussians whose lists are longer than the batches and buckets of kernels."""
     gaussians = mixture(count // 4, generator, ("ordinary", "polar", "pole", "seam"))
     return Gaussians(**{**vars(gaussians), "opacities": 0.1 * gaussians.opacities})
 
@@ -89,7 +89,7 @@ def test_leave_one_out_of_long_lists_is_deterministic(generator, monkeypatch):
 
 @pytest.mark.parametrize("projection", ["erp", "ray"])
 def test_cores_of_any_size(projection: str, generator: torch.Generator):
-    """On both sides of the sizes that kernels are compiled for; some pixels have more fragments than any."""
+    """Core sizes around those that kernels are compiled for; some pixels have more fragments."""
     gaussians = gaussians_of("ordinary", 300, generator)
     ahead = gaussians.means.abs() * torch.tensor([0.1, 0.1, 1.0]) + torch.tensor([0.0, 0.0, 2.0])
     broad = {"scales": 0.4 + gaussians.scales, "opacities": torch.full((300,), 0.08, dtype=torch.float64)}
@@ -143,7 +143,7 @@ def assert_same_bits(actual, expected, outputs: tuple[str, ...]) -> None:
     ("projection", "lens"), [("erp", "panorama"), ("ray", "panorama"), ("tangent", "fisheye"), ("pinhole", "pinhole")]
 )
 def test_fused_multiply_add_changes_no_decision(projection, lens, generator, monkeypatch):
-    """Forward by one build and backward by another agree on every pair to the last bit, or gradients would differ."""
+    """Forward and backward passes of different builds must agree on every pair to the last bit."""
     gaussians, options = crowd(400, generator), RenderOptions(projection)
     call = cuda.call
 
@@ -165,7 +165,7 @@ def test_fused_multiply_add_changes_no_decision(projection, lens, generator, mon
 
 @pytest.fixture(autouse=True)
 def no_image_before(monkeypatch: pytest.MonkeyPatch):
-    """Every test begins without a last image, of whose size capacity for the next is taken."""
+    """Forget the capacities of images of earlier tests."""
     monkeypatch.setattr(cuda_backend, "_capacities", {})
 
 
@@ -295,7 +295,7 @@ def test_drivers_of_the_same_major_version_are_accepted(driver: int, built_with:
 
 @pytest.fixture
 def looked_for_anew(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """The real library is looked for by the test, and again by whoever comes after it."""
+    """Clear the caches of the library before and after the test."""
     found = cuda.available
     monkeypatch.setattr(cuda, "library", cuda_engine.real_library.__wrapped__)
     found.cache_clear()
@@ -355,7 +355,7 @@ def test_missing_library_warns_and_uses_torch(tmp_path, monkeypatch: pytest.Monk
 
 
 def test_no_writes_beyond_requested_gradients(generator: torch.Generator):
-    """Without a pose or a table that wants one, the same gradients."""
+    """Gradients are the same without those of pose and table."""
     gaussians = gaussians_of("ordinary", 12, generator)
     everything = drawn(gaussians, (40, 20), RenderOptions("ray"))[1]
     inputs = Gaussians(**{name: getattr(gaussians, name).float() for name in INPUTS})

@@ -31,7 +31,7 @@ LEARNED = ("features", "offsets", "log_scales")
 def on_gpu(
     weights: DecoderWeights, anchors: SeenAnchors, precision: str = "float32"
 ) -> tuple[Gaussians, Tensor, Tensor]:
-    """What `decode_gaussians` does with tensors of a GPU."""
+    """Decode as `decode_gaussians` does for tensors of a GPU."""
     if cuda_engine.ON_GPU:
         return decode_gaussians(weights, anchors, precision)
     flat = tuple(tensor for head in weights for tensor in head)
@@ -94,7 +94,7 @@ OF_PRODUCTS = ["opacity", "attributes", "backward"]  # kernels of csrc/cuda/netw
 
 @contextmanager
 def products_of_ours():
-    """Yields the list of the kernels with products of networks that are called."""
+    """Yield the list of called kernels with products of networks."""
     called: list[str] = []
 
     @contextmanager
@@ -108,7 +108,7 @@ def products_of_ours():
 
 
 def assert_near(ours, truth, limit: float, of_gradients: float) -> None:
-    """What two calls of `decoded` gave; limits are shares of norms."""
+    """Compare two results of `decoded`; limits are shares of norms."""
     assert torch.equal(ours[1], truth[1]) and (ours[2] - truth[2]).abs().max() < limit
     for name, value in vars(truth[0]).items():
         assert (getattr(ours[0], name) - value).norm() <= limit * value.norm(), name

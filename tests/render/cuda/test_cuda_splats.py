@@ -20,7 +20,7 @@ VIEW = View("v", POSE.to(DEVICE), 32, 16)
 
 
 def splats_of(count: int, stored: int, active: int, generator: torch.Generator) -> Splats:
-    """Of all sizes and opacities, the first in the camera; some colours are cut at 0."""
+    """Return splats of all sizes and opacities, the first at the camera; some colours are clamped at 0."""
     means = torch.randn(count, 3, generator=generator)
     means[0] = -POSE[:3, 3]
     log_scales = 3 * torch.randn(count, 3, generator=generator) - 4
@@ -32,7 +32,7 @@ def splats_of(count: int, stored: int, active: int, generator: torch.Generator) 
 
 
 def seen(splats: Splats, width: int, how: str, monkeypatch: pytest.MonkeyPatch) -> list[Tensor]:
-    """Values and gradients, by kernels or by the definition."""
+    """Return values and gradients, by kernels or by the definition."""
     probe = 0.1 * torch.ones(len(splats), width, device=DEVICE).cumsum(-1).requires_grad_() if width else None
     with monkeypatch.context() as patch:
         call = native_splats.call_cuda if how == "kernels" else None

@@ -27,7 +27,7 @@ def library(*flags: str) -> ctypes.CDLL:
 
 
 def planted(fault: str, *flags: str) -> torch.Tensor:
-    """What a faulty kernel of 64 threads leaves [64]."""
+    """Return the output [64] of a faulty kernel of 64 threads."""
     out = torch.zeros(64)
     library(*flags).plant(FAULTS.index(fault), Pointer(out.data_ptr()))
     return out

@@ -47,7 +47,7 @@ def kernels_are_there(monkeypatch: pytest.MonkeyPatch):
 
 
 def trained(precision: str) -> tuple[Trainer, list[Counter[str]]]:
-    """After some iterations with statistics in each and no growth; what made the host wait, iteration by iteration."""
+    """Return what made the host wait in each of several iterations without densification."""
     work = build(SIZE)
     work.model.options = replace(work.model.options, precision=precision)
     with pretended_gpu() as waits:
@@ -61,7 +61,7 @@ def trained(precision: str) -> tuple[Trainer, list[Counter[str]]]:
 
 
 def steps_of(trainer: Trainer, waits: Counter[str]) -> list[Counter[str]]:
-    """Train; what made the host wait, iteration by iteration."""
+    """Train; return what made the host wait in each iteration."""
     waited = []
     waits.clear()
     for _ in islice(trainer.records(), STEPS):
@@ -71,7 +71,7 @@ def steps_of(trainer: Trainer, waits: Counter[str]) -> list[Counter[str]]:
 
 
 def stage_of(called: list[str]) -> Stage:
-    """Notes the names of the library's functions that are called."""
+    """Record the names of called functions of the library."""
 
     @contextmanager
     def stage(name: str):
@@ -82,7 +82,7 @@ def stage_of(called: list[str]) -> Stage:
 
 
 def learned(trainer: Trainer) -> dict[str, Tensor]:
-    """All that the iterations have changed, statistics of growth included."""
+    """Return all trained state, densification statistics included."""
     with pretended_gpu():
         return {name: tensor.cpu() for name, tensor in trainer.state().tensors.items()}
 
