@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -101,6 +101,16 @@ class Evidence:
     pairs: DataFrame  # columns scene, seed, rival, advantage
     interval: tuple[float, float] | None = None  # of the mean advantage, see `CONFIDENCE`; None for a single unit
 
+    @property
+    def by_scene(self) -> Any:
+        """Mean advantage on each scene, as a series."""
+        return self.pairs.groupby("scene")["advantage"].mean()
+
+    @property
+    def units(self) -> Any:
+        """Advantages that are tested: of scenes, or of seeds if there are few scenes."""
+        return self.by_scene if len(self.by_scene) >= LEAST_SCENES else self.pairs["advantage"]
+
 
 def load() -> list[Claim]:
     """Return the claims."""
@@ -122,17 +132,16 @@ def evaluate(claim: Claim, run_set: RunSet) -> Evidence:
     found = list(_pairs(claim, run_set))
     if not found:
         return Evidence(UNMEASURED, DataFrame())
-    pairs = concat([own for own, _ in found], ignore_index=True)
-    by_scene = pairs.groupby("scene")["advantage"].mean()
-    units = by_scene if len(by_scene) >= LEAST_SCENES else pairs["advantage"]
+    evidence = Evidence(UNDECIDED, concat([own for own, _ in found], ignore_index=True))
+    units, by_scene = evidence.units, evidence.by_scene
     if len(units) < 2:
-        return Evidence(UNDECIDED, pairs)
+        return evidence
     level = (1 - CONFIDENCE) / max(rivals for _, rivals in found)
     interval = ttest_rel(units, [0.0] * len(units)).confidence_interval(1 - level)
     low, high = float(interval.low), float(interval.high)
-    if not ((by_scene > 0).all() or (by_scene < 0).all()):
-        return Evidence(MIXED, pairs, (low, high))
-    return Evidence(HOLDS if low > 0 else FAILS if high < 0 else UNDECIDED, pairs, (low, high))
+    agree = (by_scene > 0).all() or (by_scene < 0).all()
+    verdict = MIXED if not agree else HOLDS if low > 0 else FAILS if high < 0 else UNDECIDED
+    return replace(evidence, verdict=verdict, interval=(low, high))
 
 
 def in_the_paper(claim: Claim, numbers: Mapping[Key, Published]) -> dict[str, float]:
@@ -187,9 +196,8 @@ def _table(tested: Sequence[tuple[Claim, Evidence]], numbers: Mapping[Key, Publi
     for claim, evidence in tested:
         cells = [claim.text, claim.source, claim.measure.column.title, *[MISSING] * 4]
         if len(evidence.pairs):
-            by_scene = evidence.pairs.groupby("scene")["advantage"].mean()
-            mean = by_scene.mean() if len(by_scene) >= LEAST_SCENES else evidence.pairs["advantage"].mean()
-            cells[3] = claim.show(mean)
+            by_scene = evidence.by_scene
+            cells[3] = claim.show(evidence.units.mean())
             cells[4] = " to ".join(map(claim.show, evidence.interval)) if evidence.interval else MISSING
             cells[5] = f"{(by_scene > 0).sum()} of {len(by_scene)} scenes"
             cells[6] = "; ".join(evidence.pairs["rival"].unique())

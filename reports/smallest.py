@@ -80,7 +80,7 @@ def curves(runs: DataFrame) -> list[Curve]:
     found = []
     for setting in settings(runs.sort_values("seed", kind="stable")):
         several = runs.loc[runs["preset"] == setting.preset, "seed"].nunique() > 1
-        for _, run in setting.runs.iterrows():
+        for run in setting.runs.to_dict("records"):
             title = setting.title + (f", seed {run['seed']}" if several else "")
             image = None if run["renders"] is None else run["renders"].with_name(SMALLEST_PICTURE)
             image = image if image is not None and image.is_file() else None

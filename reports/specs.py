@@ -5,7 +5,6 @@ A new table is an entry of `SPECS` and one of `REPORTS`.
 
 from __future__ import annotations
 
-import numbers
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib.resources import files
@@ -19,6 +18,7 @@ from padgs.reports.conditions import CONDITIONS, OF_PARTS, OF_TIMES
 from padgs.reports.frame import CONFIG
 from padgs.reports.measures import Measure, costs, metric, metrics
 from padgs.reports.published import Place
+from padgs.reports.selection import is_number
 from padgs.reports.statistics import NOTE
 
 Measures = tuple[Measure, ...]
@@ -117,12 +117,9 @@ def _with_costs(protocol: str) -> Measures:
 
 def _with_budget(runs: DataFrame) -> DataFrame:
     """Keep runs with a number of Gaussians, not auto or null, the fewest first."""
-    runs = (
-        runs.loc[runs[BUDGET].map(lambda count: isinstance(count, numbers.Real) and count > 0)] if len(runs) else runs
-    )
     if runs.empty:
         return runs
-    runs = runs.sort_values(BUDGET, kind="stable")
+    runs = runs.loc[runs[BUDGET].map(lambda count: is_number(count) and count > 0)].sort_values(BUDGET, kind="stable")
     return runs.assign(budget=[f"at most {count:,} Gaussians".replace(",", " ") for count in runs[BUDGET]])
 
 
