@@ -85,7 +85,7 @@ class SelfCalibration(Calibration):
     def values(self) -> dict[str, Any]:
         """Return names of the views, image size and scene scale."""
         size = {"width": self.camera.width, "height": self.camera.height}
-        return {"views": self.poses.names, "unit": self.poses.unit, **size}
+        return {"views": self.poses.names, "unit": self.poses.scale, **size}
 
     def counts(self) -> dict[str, int]:
         """Return the number of poses."""
@@ -161,13 +161,13 @@ class SCOmniGSMethod(CalibratedMethod):
                 f"the {len(scene.train)} training cameras of scene {scene.name!r} stand in one place, which has no "
                 "scale to carry held-out views by; sc_omnigs needs two places, omnigs does without"
             )
-        poses = PoseRefinement.of(scene.train, unit=scene.scale)
+        poses = PoseRefinement.of(scene.train, scale=scene.scale)
         return self._calibrating(poses, *sizes.pop())
 
     def restored_calibration(self, values: Mapping[str, Any]) -> SelfCalibration:
         """See `CalibratedMethod.restored_calibration`."""
         names = values["views"]
-        poses = PoseRefinement(names, torch.eye(4).repeat(len(names), 1, 1), unit=values["unit"])
+        poses = PoseRefinement(names, torch.eye(4).repeat(len(names), 1, 1), scale=values["unit"])
         return self._calibrating(poses, values["width"], values["height"])
 
     def _calibrating(self, poses: PoseRefinement, width: int, height: int) -> SelfCalibration:

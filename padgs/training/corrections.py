@@ -1,7 +1,9 @@
-"""Poses that learn: a small rigid correction for each training view, optimised with the model.
+"""Corrections that training learns for its views: poses and exposures. Held-out views and stored models have none.
 
-The correction is a quaternion and a translation in the camera's own frame, so it turns the camera about its own centre,
-wherever the origin of the world lies: x' = R(q) (R x + t) + unit * s.
+A pose correction is a quaternion and a translation in the camera's own frame, so it turns the camera about its own
+center wherever the world's origin lies: x' = R(q) (R x + t) + scale * s. Exposures are gains and offsets per channel
+(as in URF, Rematas et al. 2022, but diagonal). They are relative: log-gains and offsets have a mean of 0 over all
+views, so held-out views have the mean exposure.
 """
 
 from __future__ import annotations
@@ -19,12 +21,12 @@ from padgs.training.schedule import Constant, LogLinear, ParameterGroup
 
 @dataclass(frozen=True)
 class PoseRates:
-    """Learning rates of the poses, log-linear from the first to the last iteration. As published (SC-OmniGS)."""
+    """Learning rates of poses, log-linear over the run; defaults as published (SC-OmniGS)."""
 
-    rotation: float = 1e-2  # of unit quaternions
-    rotation_end: float = 1.6e-4  # ... and of the last iteration
-    translation: float = 1e-2  # scene units
-    translation_end: float = 6e-3  # ... and of the last iteration
+    rotation: float = 1e-2  # of unit quaternions, at the first iteration
+    rotation_end: float = 1.6e-4  # at the last iteration
+    translation: float = 1e-2  # scene scales, at the first iteration
+    translation_end: float = 6e-3  # at the last iteration
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -32,47 +34,47 @@ class PoseRates:
                 raise ValueError(f"poses.{field.name} is {getattr(self, field.name)}; a learning rate must be > 0")
 
 
-SMALL = PoseRates(rotation=1e-3, rotation_end=1e-5, translation=2e-3, translation_end=2e-5)  # harmless to exact poses
+SMALL = PoseRates(rotation=1e-3, rotation_end=1e-5, translation=2e-3, translation_end=2e-5)  # do no harm to exact poses
 
 
 class PoseRefinement(nn.Module):
     """Corrections of the poses of named views.
 
-    Each view has parameters of its own, so that the optimizer's moments of a view rest while other views are drawn.
+    Each view has its own parameters, so that Adam leaves a view's moments alone while other views are rendered.
 
     Attributes:
-        names: of the V views.
+        names: names of the V views.
         given: [V, 4, 4] float64 cam_from_world before the correction.
         quaternions: V times [4] (w, x, y, z), not normalised.
-        shifts: V times [3] camera frame, scene units.
-        unit: the scene's unit of length in world units.
+        shifts: V times [3], camera frame, scene scales.
+        scale: scene scale in world units.
     """
 
     given: Tensor
 
-    def __init__(self, names: Sequence[str], given: Tensor, *, unit: float = 1.0) -> None:
-        """No correction yet; `given` is [V, 4, 4] cam_from_world.
+    def __init__(self, names: Sequence[str], given: Tensor, *, scale: float = 1.0) -> None:
+        """Begin without corrections; `given` is [V, 4, 4] cam_from_world.
 
         Raises:
-            ValueError: two views of one name.
+            ValueError: two views have the same name.
         """
         super().__init__()
         twice = sorted({name for name in names if list(names).count(name) > 1})
         if twice:
             raise ValueError(f"several training views are called {twice[0]!r}; poses are kept by name, rename them")
-        self.names, self.unit = list(names), unit
+        self.names, self.scale = list(names), scale
         self.register_buffer("given", given.double())
         identity = torch.tensor([1.0, 0.0, 0.0, 0.0])
         self.quaternions = nn.ParameterList([identity.clone() for _ in names])
         self.shifts = nn.ParameterList([torch.zeros(3) for _ in names])
 
     @classmethod
-    def of(cls, views: Sequence[View], *, unit: float) -> PoseRefinement:
-        """For these views."""
-        return cls([view.name for view in views], torch.stack([view.cam_from_world for view in views]), unit=unit)
+    def of(cls, views: Sequence[View], *, scale: float) -> PoseRefinement:
+        """Return the refinement of these views."""
+        return cls([view.name for view in views], torch.stack([view.cam_from_world for view in views]), scale=scale)
 
     def groups(self, rates: PoseRates, iterations: int) -> list[ParameterGroup]:
-        """Learning rates for a run of `iterations`."""
+        """Return the parameters with their learning rates in a run of `iterations`."""
         turning = LogLinear(rates.rotation, rates.rotation_end, iterations)
         moving = LogLinear(rates.translation, rates.translation_end, iterations)
         return [
@@ -81,32 +83,32 @@ class PoseRefinement(nn.Module):
         ]
 
     def refined(self, view: View) -> View:
-        """The view at its corrected pose; differentiable.
+        """Return the view at its corrected pose; differentiable.
 
         Raises:
-            ValueError: no view of this name is being refined.
+            ValueError: the view has no pose correction.
         """
         if view.name not in self.names:
             raise ValueError(f"view {view.name!r} has no pose to refine; known: {', '.join(self.names)}")
         return replace(view, cam_from_world=self._pose(self.names.index(view.name)))
 
     @torch.no_grad()
-    def centre(self) -> None:
-        """Take out what all corrections have in common: to first order, a similarity of the whole world.
+    def center(self) -> None:
+        """Remove what all corrections have in common: to first order, a similarity of the whole world.
 
-        Then the world stays the given one, and held-out views stand in it where they are said to.
+        This keeps held-out views at their given places.
         """
         rotations = self.given[:, :3, :3]
         beside = -(rotations.mT @ self.given[:, :3, 3:])[..., 0]
-        beside = beside - beside.mean(0)  # the centres, from their middle
+        beside = beside - beside.mean(0)  # camera centers, from their mean
         quaternions, shifts = (torch.stack(list(own)).double() for own in (self.quaternions, self.shifts))
         real, imaginary = quaternions.split((1, 3), dim=-1)
-        turn = -2 * _each(rotations.mT, imaginary / real).mean(0)  # of the world, radians
-        moves = -self.unit * _each(rotations.mT, shifts) - torch.linalg.cross(turn.expand_as(beside), beside)
+        turn = -2 * _each(rotations.mT, imaginary / real).mean(0)  # rotation of the world, radians
+        moves = -self.scale * _each(rotations.mT, shifts) - torch.linalg.cross(turn.expand_as(beside), beside)
         moves = moves - moves.mean(0)
         growth = (moves * beside).sum() / beside.square().sum().clamp(min=torch.finfo(beside.dtype).tiny)
         imaginary = imaginary + 0.5 * real * _each(rotations, turn)
-        shifts = -_each(rotations, moves - growth * beside) / self.unit
+        shifts = -_each(rotations, moves - growth * beside) / self.scale
         for mine, new in zip(self.quaternions, torch.cat((real, imaginary), dim=-1), strict=True):
             mine.copy_(new)
         for mine, new in zip(self.shifts, shifts, strict=True):
@@ -114,53 +116,51 @@ class PoseRefinement(nn.Module):
 
     @torch.no_grad()
     def poses(self) -> Tensor:
-        """All corrected poses, cam_from_world [V, 4, 4] float64."""
+        """Return all corrected poses, cam_from_world [V, 4, 4] float64."""
         return torch.stack([self._pose(index) for index in range(len(self.names))])
 
     def _pose(self, index: int) -> Tensor:
         turn, given = rotation_matrices(self.quaternions[index].double()), self.given[index]
         upper = turn @ given[:3]
-        shift = self.unit * self.shifts[index].double()
+        shift = self.scale * self.shifts[index].double()
         return torch.cat((torch.cat((upper[:, :3], upper[:, 3:] + shift[:, None]), dim=1), given[3:]))
 
 
 def _each(rotations: Tensor, vectors: Tensor) -> Tensor:
-    """Rotations [V, 3, 3] times vectors [V, 3] or [3]."""
+    """Return rotations [V, 3, 3] times vectors [V, 3] or [3]."""
     return (rotations @ vectors[..., None])[..., 0]
 
 
-RATE = 3e-3  # of log-gains; at the end still so much, for what is frozen early is wrong
+RATE = 3e-3  # of log-gains; it does not decay, because exposures that freeze early are wrong
 OFFSET_RATE = RATE / 5  # of offsets, in colours from 0 to 1
 
 
 class Exposures(nn.Module):
-    """Of V views, by their numbers; see `padgs.training.corrections.Corrections`.
-
-    Each view has parameters of its own, so that the optimizer's moments of a view rest while other views are drawn.
+    """Gain and offset of each colour channel of V views.
 
     Attributes:
-        log_gains, offsets: V times [3], of the colour channels.
+        log_gains, offsets: V times [3], a parameter per view as for poses.
     """
 
     def __init__(self, views: int) -> None:
-        """No correction yet."""
+        """Begin without corrections."""
         super().__init__()
         self.log_gains, self.offsets = (nn.ParameterList([torch.zeros(3) for _ in range(views)]) for _ in range(2))
 
     def groups(self) -> list[ParameterGroup]:
-        """Learning rates, at the pace of the run as those of the model that they follow."""
+        """Return the parameters with their learning rates, which follow the pace of the run like those of the model."""
         return [
             ParameterGroup("exposure_log_gains", tuple(self.log_gains), Constant(RATE)),
             ParameterGroup("exposure_offsets", tuple(self.offsets), Constant(OFFSET_RATE)),
         ]
 
     def exposed(self, image: Tensor, index: int) -> Tensor:
-        """An image [H, W, 3] as view `index` would show it; differentiable."""
+        """Return an image [H, W, 3] under the exposure of view `index`; differentiable."""
         return image * self.log_gains[index].exp() + self.offsets[index]
 
     @torch.no_grad()
-    def centre(self) -> None:
-        """Take the mean out again; called after each step."""
+    def center(self) -> None:
+        """Remove the mean over all views."""
         for of_views in (self.log_gains, self.offsets):
             mean = torch.stack(list(of_views)).mean(0)
             for own in of_views:
@@ -172,33 +172,33 @@ CHOICES = (GIVEN, LEARNED)  # of exposures, and of poses
 
 
 class Corrections(nn.Module):
-    """Corrections of the training views of a scene; without parameters where nothing is corrected."""
+    """Corrections of the training views of a scene; no parameters if nothing is corrected."""
 
     def __init__(self, scene: Scene, *, exposures: bool, poses: bool) -> None:
-        """No correction yet.
+        """Begin without corrections.
 
         Raises:
-            ValueError: poses shall learn, but two views have one name.
+            ValueError: poses are learned, but two views have the same name.
         """
         super().__init__()
         self.exposures = Exposures(len(scene.train)) if exposures else None
-        self.poses = PoseRefinement.of(scene.train, unit=scene.scale) if poses else None
+        self.poses = PoseRefinement.of(scene.train, scale=scene.scale) if poses else None
 
     def groups(self, iterations: int) -> list[ParameterGroup]:
-        """All parameters, with their learning rates in a run of `iterations`."""
+        """Return all parameters with their learning rates in a run of `iterations`."""
         exposures = [] if self.exposures is None else self.exposures.groups()
         return exposures + ([] if self.poses is None else self.poses.groups(SMALL, iterations))
 
     def posed(self, view: View) -> View:
-        """A training view where it is taken to have been; differentiable."""
+        """Return a training view at its corrected pose; differentiable."""
         return view if self.poses is None else self.poses.refined(view)
 
     def exposed(self, image: Tensor, index: int) -> Tensor:
-        """What was drawn of training view `index`, [H, W, 3], as its photograph was exposed; differentiable."""
+        """Return the render [H, W, 3] of training view `index` under its exposure; differentiable."""
         return image if self.exposures is None else self.exposures.exposed(image, index)
 
-    def centre(self) -> None:
-        """Have all corrections together change nothing; called after each step of the optimizer."""
+    def center(self) -> None:
+        """Remove what the corrections of all views have in common; called after each optimizer step."""
         for part in (self.exposures, self.poses):
             if part is not None:
-                part.centre()
+                part.center()

@@ -61,7 +61,7 @@ def photometric_loss(
         weight: [H, W], or [H, 1] where all pixels of a row weigh the same; >= 0, not 0 everywhere.
         lambda_l1: lambda of Eq. 16.
         normalisation: mean divides by 3 sum(W); channel_sum by sum(W), as the released code does (3 x the mean).
-        statistics: `ssim_statistics(target)`, if already known; they stop the gradient by the target.
+        statistics: `ssim_statistics(target)` if already known; they stop the gradient with respect to the target.
 
     Raises:
         ValueError: unknown normalisation.
@@ -120,7 +120,8 @@ def ssim_map(image: Tensor, target: Tensor, statistics: SSIMStatistics | None = 
 
     Variances are E[x^2] - E[x]^2 under the window. Arguments as in `photometric_loss`.
     """
-    statistics = ssim_statistics(target) if statistics is None else statistics
+    if statistics is None:
+        statistics = ssim_statistics(target)
     mean_image, mean_square, mean_product = window_mean(torch.stack((image, image * image, image * target)))
     cross, squares = mean_image * statistics.mean, mean_image * mean_image
     similarity = (2 * cross + C1) * (2 * (mean_product - cross) + C2)

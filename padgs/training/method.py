@@ -20,8 +20,8 @@ from padgs.render.contract import check_camera
 from padgs.scene import Scene, View
 from padgs.training.corrections import LEARNED
 from padgs.training.health import is_out_of_memory
-from padgs.training.loop import Record, Stage, Trainer
-from padgs.training.model import Model, Prunable, Size, State
+from padgs.training.loop import VIEWS, Stage, Trainer
+from padgs.training.model import Model, Prunable, Record, Size, State
 from padgs.training.options import Budget, TrainOptions
 from padgs.training.refining import Refined, held_out
 from padgs.training.schedule import PUBLISHED_ITERATIONS
@@ -121,7 +121,8 @@ class Method(ABC):
         self._trainer.seconds += spent[0]
         self._trainer.cpu_seconds += spent[1]
         if self._warm_start_state is not None:
-            self._trainer.take_corrections(self._warm_start_state)
+            corrections = self._warm_start_state.under(VIEWS)
+            self._trainer.corrections.load_state_dict(corrections, strict=False)
         if self._loaded_state is not None:
             self._trainer.load_state(self._loaded_state)
             self._loaded_state = None
@@ -208,7 +209,7 @@ class Method(ABC):
         if budget.stop == "auto" and self._views_learn:
             raise ValueError(
                 "budget.stop is auto, which measures validation views, but exposures or cameras are learned here, and "
-                "validation views have none; set budget.stop=end"
+                "validation views have none; set it to end"
             )
 
     def refuse_search(self) -> None:

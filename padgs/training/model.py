@@ -1,13 +1,9 @@
-"""What can be trained: a model with its densifier and its learning rates, as the loop sees them.
-
-Each family has one: `padgs.methods.anchors.model` (PaD-GS), `padgs.methods.splats.model` (3DGS). EgoNeRF casts rays
-instead of drawing views, so it has a trainer of its own (`padgs.methods.egonerf.model`).
-"""
+"""The model protocol: what the training loop needs of a trainable model, and the data that pass between them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -24,23 +20,23 @@ MODEL = "model/"  # prefix of the model's own tensors in the state of a trainer
 
 @dataclass(frozen=True)
 class State:
-    """Everything that continuing bit-identically needs: tensors, and values that JSON can hold."""
+    """All that resuming bit-identically needs: tensors, and values that JSON can hold."""
 
     tensors: dict[str, Tensor]
     values: dict[str, Any]
 
     def under(self, prefix: str) -> dict[str, Tensor]:
-        """The tensors whose names begin so, without that beginning."""
+        """Return the tensors whose names begin with a prefix, without that prefix."""
         return {name.removeprefix(prefix): t for name, t in self.tensors.items() if name.startswith(prefix)}
 
     def of_model(self) -> State:
-        """The model's own part of what `Trainer.state` returned."""
+        """Return the model's part of a `Trainer.state`."""
         return State(self.under(MODEL), self.values["model"])
 
 
 @dataclass(frozen=True)
 class Size:
-    """What a trained model costs to keep."""
+    """Size of a trained model."""
 
     counts: dict[str, int]  # anchors, gaussians (potential), ...
     parameters: int  # learnable scalars
@@ -48,32 +44,45 @@ class Size:
 
     @staticmethod
     def of(counts: dict[str, int], parameters: Iterable[Tensor], stored: Iterable[Tensor]) -> Size:
-        """The size of a model of which these tensors are learned, and those stored."""
+        """Return the size of a model with these learned and these stored tensors."""
         return Size(counts, sum(tensor.numel() for tensor in parameters), sum(tensor.nbytes for tensor in stored))
 
 
 @dataclass(frozen=True)
 class TrainingRender:
-    """What a model drew of one view, with all that the densification statistics need after `backward`."""
+    """A differentiable render of one view, with all that densification statistics need after `backward`."""
 
     rendering: Rendering
     mean_offsets: Tensor  # [N, 2], [N, 3] or [N, 4] zeros; .grad is the positional gradient after backward
     gaussians: Gaussians  # the N that were drawn
-    slots: Tensor  # [N] int64: the row of the model's statistics that each drawn Gaussian counts for
+    slots: Tensor  # [N] int64: row of the model's statistics for each drawn Gaussian
     _: KW_ONLY
-    penalty: Tensor | None = None  # a scalar to be added to the loss
-    photo: Callable[[Target], Target] | None = None  # brings the training image to where it was drawn; differentiable
+    penalty: Tensor | None = None  # scalar, added to the loss
+    photo: Callable[[Target], Target] | None = None  # warps the target to the pose of the render; differentiable
+
+
+@dataclass(frozen=True)
+class Record:
+    """One training iteration, after the optimizer step."""
+
+    iteration: int  # 1 for the first
+    progress: float  # share of the schedule, 1 for the last step
+    loss: float | Tensor  # a scalar on the GPU if it has not been read: `float` then waits for the iteration
+    seconds: float  # training time so far, without evaluation and files
+    cpu_seconds: float  # the same, summed over all threads of the process
+    counts: dict[str, int] = field(default_factory=dict)  # anchors, drawn Gaussians, ...
+    events: tuple[str, ...] = ()  # such as "grew 120 anchors"
 
 
 class Model(Protocol):
-    """A model in training.
+    """A model in training: parameters, learning rates and densification.
 
-    `load_state` must make it what `state` was taken of, sizes included, and may replace the data of parameters but not
-    the parameters returned by `groups`.
+    `load_state` restores everything that `state` holds, sizes included; it may replace the data of the parameters that
+    `groups` returned, but not the parameters themselves.
     """
 
     def groups(self) -> list[ParameterGroup]:
-        """All learnable parameters, each in exactly one group, with their learning rates in this run."""
+        """Return all learnable parameters, each in exactly one group, with their learning rates."""
         ...
 
     def draw(self, view: View) -> TrainingRender:
@@ -85,7 +94,7 @@ class Model(Protocol):
         ...
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
-        """Grow and prune where it is time to; called after the optimizer step. Returns events for the record."""
+        """Densify and prune if that is due; called after the optimizer step. Return events for the record."""
         ...
 
     def render(self, view: View) -> Rendering:
@@ -93,42 +102,42 @@ class Model(Protocol):
         ...
 
     def counts(self) -> dict[str, int]:
-        """What the model consists of now: anchors, gaussians, ..."""
+        """Return the present counts: anchors, gaussians, ..."""
         ...
 
     def size(self) -> Size:
-        """What keeping the model costs."""
+        """Return the size of the model."""
         ...
 
     def state(self) -> State:
-        """Parameters, statistics and random state, without the optimizer; not copies."""
+        """Return parameters, statistics and random state, without the optimizer; not copies."""
         ...
 
     def load_state(self, state: State) -> None:
-        """Become the model that `state` was taken of."""
+        """Restore the model from `state`."""
         ...
 
     def load_model(self, state: State) -> None:
-        """Take the parameters alone, with nothing noted of their training: for another run that begins with them."""
+        """Load the parameters alone, for a warm start."""
         ...
 
 
 @dataclass(frozen=True)
 class Parts:
-    """What a view sees of a model that can lose rows, and which Gaussian belongs to which."""
+    """Gaussians of a prunable model in one view, and the row that each belongs to."""
 
     gaussians: Gaussians  # the N that are drawn
-    slots: Tensor  # [N] int64, no two alike; the same Gaussian has the same one in all views
-    each: int  # Gaussians that a row can show at most: row i has slots from i `each` on
-    options: RenderOptions  # how they are drawn
+    slots: Tensor  # [N] int64, unique; the same Gaussian has the same slot in all views
+    each: int  # largest number of Gaussians of a row; row i has the slots from i * each on
+    options: RenderOptions
 
 
 @runtime_checkable
 class Prunable(Model, Protocol):
-    """A model of Gaussians whose rows, single Gaussians or anchors, can be taken away."""
+    """A model whose rows (Gaussians or anchors) can be pruned."""
 
     def parts(self, view: View) -> Parts:
-        """What a view sees; raises ValueError where views are drawn otherwise than a plain `render` does."""
+        """Return the Gaussians in a view; raises ValueError if views are not drawn by a plain `render`."""
         ...
 
     def prune(self, count: int, views: Sequence[View]) -> None:
@@ -136,5 +145,5 @@ class Prunable(Model, Protocol):
         ...
 
     def keep(self, rows: Tensor) -> None:
-        """Keep these rows only, [N] bool, or row numbers in ascending order; of all that has rows, but no optimizer."""
+        """Keep only some rows, [N] bool or ascending row numbers, of all that has rows except an optimizer."""
         ...

@@ -1,8 +1,7 @@
-"""Removing, adding and loading rows of per-anchor or per-Gaussian parameters while an Adam optimizer holds them.
+"""Adam with a learning rate per parameter group, and edits of parameter rows that keep its moments consistent.
 
-The `nn.Parameter` objects keep their identity, so the optimizer, its groups and the model go on referring to them;
-their `.data` and Adam moments are replaced, and their gradients are dropped. No graph that was built on the old rows
-may be alive when the next one is built.
+Parameters (`nn.Parameter`) keep their identity; their `.data` and Adam moments are replaced and gradients dropped. No
+graph over the old rows may be alive when the next one is built.
 """
 
 from __future__ import annotations
@@ -50,7 +49,7 @@ def append_rows(parameters: Mapping[str, nn.Parameter], optimizer: torch.optim.A
         new: the same names -> [M, ...], all with the same M.
 
     Raises:
-        ValueError: a name is missing or unknown, or a shape does not fit; nothing has been changed then.
+        ValueError: a name is missing or unknown, or a shape does not fit; nothing is changed.
     """
     _row_count(parameters)
     if new.keys() != parameters.keys():
@@ -72,7 +71,7 @@ def append_rows(parameters: Mapping[str, nn.Parameter], optimizer: torch.optim.A
 
 
 def forget_moments(parameter: nn.Parameter, optimizer: torch.optim.Adam) -> None:
-    """Set the Adam moments of a parameter to 0, if it has any yet."""
+    """Set the Adam moments of a parameter to 0, if it has any."""
     moments = optimizer.state.get(parameter, {})
     for name in MOMENTS:
         if name in moments:
@@ -80,10 +79,10 @@ def forget_moments(parameter: nn.Parameter, optimizer: torch.optim.Adam) -> None
 
 
 def load_rows(model: nn.Module, tensors: Mapping[str, Tensor], growing: Collection[str]) -> None:
-    """Set all parameters to what `state_dict` of another model gave, whose `growing` tensors may have other row counts.
+    """Load the `state_dict` of another model, whose `growing` tensors may have another number of rows.
 
     Raises:
-        ValueError: a tensor is missing, or has another shape than the options of this model make it.
+        ValueError: a tensor is missing, or has another shape than in this model.
     """
     count = len(tensors[first]) if (first := next(iter(growing))) in tensors else 0
     for name, own in model.state_dict().items():
@@ -103,63 +102,64 @@ def _row_count(parameters: Mapping[str, nn.Parameter]) -> int:
     return next(iter(counts.values()))
 
 
-ADAM = "adam/"  # of its tensors in a state
+ADAM = "adam/"  # prefix of its tensors in a state
 
 
 class Optimizer:
-    """Steps the parameters of some groups.
+    """Adam with a learning rate per parameter group, and checks for values that are not finite.
 
     Attributes:
-        adam: what densification changes rows of.
-        pace: of the learning rates.
-        silent: groups that should have learned when all was last checked, and whose gradients were exactly 0.
+        adam: the torch optimizer, whose rows densification edits.
+        pace: of the learning rates in the last step; None before the first, and for published rates.
+        silent: names of groups whose gradients were exactly 0 at the last check, although they should have learned.
     """
 
-    def __init__(self, groups: Sequence[ParameterGroup], pace: Pace, check_every: int, **adam: Any) -> None:
-        """No step is taken yet.
+    def __init__(self, groups: Sequence[ParameterGroup], check_every: int, **adam: Any) -> None:
+        """Prepare.
 
         Args:
-            groups: what is optimised.
-            pace: of their learning rates.
-            check_every: iterations between checks of all gradients and parameters for values that are not finite.
+            groups: the parameters.
+            check_every: iterations between checks of all gradients and parameters.
             adam: betas and eps.
         """
-        self._groups, self.pace, self._check_every = groups, pace, check_every
+        self._groups, self._check_every = groups, check_every
+        self.pace: Pace | None = None
         parameters = [{"params": list(group.parameters), "name": group.name} for group in groups]
         self.silent: tuple[str, ...] = ()
         self.adam = torch.optim.Adam(parameters, fused=True, **adam)  # fused: 2 to 3 times faster on CPUs
 
     @property
     def device(self) -> torch.device:
-        """Where the parameters are."""
+        """Device of the parameters."""
         return self._groups[0].parameters[0].device
 
     def parameters(self) -> dict[str, nn.Parameter]:
-        """All parameters by a name for messages and checkpoints."""
+        """Return all parameters by their names in messages and checkpoints."""
         return {
             group.name if len(group.parameters) == 1 else f"{group.name}[{number}]": parameter
             for group in self._groups
             for number, parameter in enumerate(group.parameters)
         }
 
-    def step(self, iteration: int) -> None:
-        """Step Adam at the rates of an iteration, and drop the gradients.
+    def step(self, step: int, pace: Pace | None = None) -> None:
+        """Step Adam at the learning rates of a schedule step, and drop the gradients.
 
-        The graph must be gone by now if rows of its leaves come and go afterwards.
+        No graph may be alive if densification edits rows afterwards.
         """
+        self.pace = pace
         for group, settings in zip(self._groups, self.adam.param_groups, strict=True):
-            settings["lr"] = group.learning_rate(iteration) * (self.pace(iteration) if group.paced else 1.0)
+            settings["lr"] = group.learning_rate(step) * (pace(step) if pace and group.paced else 1.0)
         self.adam.step()
         self.adam.zero_grad(set_to_none=True)
 
     def is_checked(self, iteration: int) -> bool:
-        """Whether it is time to look at everything."""
+        """Return whether all values are checked at an iteration."""
         return iteration % self._check_every == 0
 
-    def check(self, iteration: int, moment: int) -> None:
-        """Look at all parameters and gradients where it is time to; called after `backward`.
+    def check(self, iteration: int, step: int) -> None:
+        """Check all parameters and gradients if that is due; called after `backward`.
 
-        `moment` is the iteration of the schedule, which says who learns then.
+        The schedule step decides which groups should learn.
 
         Raises:
             Failure: nan.
@@ -168,10 +168,10 @@ class Optimizer:
             parameters = self.parameters()
             gradients = {f"gradient of {name}": parameter.grad for name, parameter in parameters.items()}
             self.refuse_non_finite({**parameters, **gradients}, iteration)
-            self.silent = tuple(group.name for group in self._groups if _is_silent(group, moment))
+            self.silent = tuple(group.name for group in self._groups if _is_silent(group, step))
 
     def refuse_non_finite(self, tensors: Mapping[str, Tensor | None], iteration: int) -> None:
-        """Stop where one of the tensors is not finite.
+        """Refuse tensors that are not finite.
 
         Raises:
             Failure: nan; the reason names the first such tensor and entry.
@@ -184,7 +184,7 @@ class Optimizer:
             )
 
     def tensors(self) -> dict[str, Tensor]:
-        """The moments of Adam, by name; not copies."""
+        """Return the moments of Adam by name; not copies."""
         return {
             f"{ADAM}{name}/{key}": value
             for name, parameter in self.parameters().items()
@@ -192,7 +192,7 @@ class Optimizer:
         }
 
     def load(self, state: State) -> None:
-        """Take the moments out of a whole state; parameters without any start anew."""
+        """Load the moments from a whole state; parameters without moments begin without."""
         self.adam.state.clear()
         for name, parameter in self.parameters().items():
             moments = state.under(f"{ADAM}{name}/")
@@ -201,7 +201,7 @@ class Optimizer:
 
 
 def _is_silent(group: ParameterGroup, iteration: int) -> bool:
-    """Whether nothing pulls at any of its parameters, although there are some and their learning rate is not 0."""
+    """Return whether all gradients of a group are 0 although its learning rate is not."""
     learned = [parameter for parameter in group.parameters if parameter.numel()]
     if not learned or group.learning_rate(iteration) == 0:
         return False

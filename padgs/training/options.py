@@ -1,4 +1,4 @@
-"""How a method is trained, beside its own options and the length of the run."""
+"""Budget and options of a training."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from padgs.training.corrections import CHOICES, GIVEN
 from padgs.training.loss import NORMALISATIONS, ROW_WEIGHTS
 from padgs.training.schedule import LEARNING_RATES
 
-AUTO = "auto"  # as many Gaussians, or iterations, as needed
+AUTO = "auto"  # number of Gaussians or iterations as needed
 STOPS = ("end", AUTO)
-CLOCKS = ("wall", "cpu")  # cpu: of all threads of the process, which other programs change less
+CLOCKS = ("wall", "cpu")  # cpu: summed over all threads; other programs change it less
 
 
 @dataclass(frozen=True)
 class Budget:
-    """How long a method may train, evaluation and files never counted, and how large its model may become.
+    """Length of the training, without evaluation and files, and size of the model.
 
-    In a budget of `seconds` the schedule follows the clock: a step after half of the time is a step at half of the
-    schedule, so growth, decay and the last iteration come when they should, whatever a step costs.
+    With a budget of `seconds` the schedule follows the clock: after half of the time the schedule is at half of its
+    steps, so densification, decay and the last step come when they should, however long an iteration takes.
     """
 
-    iterations: int  # of the schedule, and of the run where there are no seconds
-    max_seconds: float | None = None  # on the wall clock, after which the run ends as it is
+    iterations: int  # of the schedule, and of the run unless `seconds` are given
+    max_seconds: float | None = None  # wall time after which the run ends as it is
     seconds: float | None = None
-    clock: str = "wall"  # that `seconds` are counted on: a name of CLOCKS
-    gaussians: int | str | None = None  # None: as many as thresholds give; auto: without the least missed
-    stop: str = "end"  # of the schedule | auto: as soon as nothing is gained, see `padgs.training.health`
+    clock: str = "wall"  # clock of `seconds`: a name of CLOCKS
+    gaussians: int | str | None = None  # None: as densification gives; auto: also prune the least important
+    stop: str = "end"  # of the schedule | auto: early stopping, see `padgs.training.health`
 
     def __post_init__(self) -> None:
         check(self, "at least 1", lambda count: count >= 1, "iterations")
@@ -38,7 +38,7 @@ class Budget:
         check_known(self, clock=CLOCKS, stop=STOPS)
 
     def __str__(self) -> str:
-        """How people say it.
+        """Return the length in words.
 
         >>> str(Budget(100)), str(Budget(1, seconds=60.0)), str(Budget(1, seconds=2.5, clock="cpu"))
         ('100 iterations', '60 s', '2.5 s of CPU time')
@@ -47,24 +47,25 @@ class Budget:
             return f"{self.iterations} iterations"
         return f"{self.seconds:g} s{' of CPU time' if self.clock == 'cpu' else ''}"
 
-    def moment(self, last: int, spent: float, step: float, skipped: int = 0) -> int:
-        """The iteration of the schedule that the next step stands for; `iterations` for the last one.
+    def next_step(self, last: int, spent: float, step_seconds: float, skipped: int = 0) -> int:
+        """Return the schedule step of the next iteration; `iterations` for the last one.
 
         Args:
-            last: that of the step before, 0 for none.
+            last: step of the iteration before, 0 for none.
             spent: seconds of training so far.
-            step: seconds that the next step will take, as far as anybody knows.
-            skipped: iterations of the schedule that no time was spent on.
+            step_seconds: expected duration of the next iteration.
+            skipped: steps that took no time because they were skipped.
 
-        >>> Budget(100).moment(6, spent=50.0, step=1.0), Budget(100, seconds=10.0).moment(6, spent=4.0, step=1.0)
+        >>> timed = Budget(100, seconds=10.0)
+        >>> Budget(100).next_step(6, spent=50.0, step_seconds=1.0), timed.next_step(6, spent=4.0, step_seconds=1.0)
         (7, 50)
         """
         if self.seconds is None:
             return last + 1
         spent += skipped / self.iterations * self.seconds
-        if spent + 1.5 * step >= self.seconds:  # one more would end more than half a step too late
+        if spent + 1.5 * step_seconds >= self.seconds:  # one more would end more than half a step too late
             return self.iterations
-        return min(max(last, round(self.iterations * (spent + step) / self.seconds), 1), self.iterations - 1)
+        return min(max(last, round(self.iterations * (spent + step_seconds) / self.seconds), 1), self.iterations - 1)
 
 
 @dataclass(frozen=True)
@@ -74,15 +75,15 @@ class TrainOptions:
     lambda_l1: float = 0.8  # lambda of Eq. 16
     weight: str = "solid_angle"  # M of Eq. 17, see `padgs.training.loss.ROW_WEIGHTS`
     normalisation: str = "mean"  # channel_sum: 3 x the mean, as the released code does
-    # published: made for 30 000 iterations | run: made for the length of this run, see `padgs.training.schedule.Pace` |
-    # a factor on the published ones, at the beginning.
+    # published: for 30 000 iterations | run: for the length of this run, see `padgs.training.schedule.Pace` |
+    # a factor on the published ones.
     learning_rates: str | float = "run"
     check_every: int = 50  # iterations between checks of all gradients and parameters; the loss is checked at each
-    monitor: bool = True  # end a run that diverges, explodes, collapses or falls silent: see `padgs.training.health`
-    guard_gradients: bool = False  # gradients of Gaussians and anchors that are not finite count as none, and are told
-    guard_scales: bool = False  # keep scales within bounds; both: see `padgs.training.health`
-    exposures: str = GIVEN  # learned: a gain and offset of each training view; test views have the mean one
-    poses: str = GIVEN  # learned: a small correction of each training view; test views stay where they are
+    monitor: bool = True  # end a failing run, see `padgs.training.health.Monitor`
+    guard_gradients: bool = False  # set non-finite gradients of single rows to 0; see `padgs.training.guard`
+    guard_scales: bool = False  # keep scales within bounds; see `padgs.training.guard`
+    exposures: str = GIVEN  # learned: gain and offset of each training view; test views have the mean one
+    poses: str = GIVEN  # learned: a small correction of each training view; test views keep their poses
     refine: bool = False  # with init: neither densify nor prune; learning rates are those of the schedule's last fifth
     hold_out: bool = False  # train without the validation views, see `padgs.training.health`
 

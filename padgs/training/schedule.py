@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from torch import nn
 
-PUBLISHED_ITERATIONS = 30_000  # the run length that all published schedules are written for
+PUBLISHED_ITERATIONS = 30_000  # length of all published schedules
 LEARNING_RATES = ("published", "run")
-FASTEST = 8.0  # no rate is larger than so many published ones; at 9 times, pilots of 500 iterations lost
-SLOWING_FROM = 0.6  # share of the run after which faster rates come back to the published ones
+FASTEST = 8.0  # largest factor on published rates; 9 lost quality in runs of 500 iterations
+SLOWING_FROM = 0.6  # share of the run after which faster rates fall back to the published ones
 
 
 @dataclass(frozen=True)
@@ -21,8 +21,8 @@ class ParameterGroup:
     name: str
     parameters: tuple[nn.Parameter, ...]
     learning_rate: Callable[[int], float]  # iteration (1 for the first step) -> published learning rate
-    paced: bool = True  # whether it follows `Pace`; cameras that learn do not
-    is_of_rows: bool = False  # whether each row belongs to one Gaussian or anchor, and all such groups have as many
+    paced: bool = True  # whether it follows `Pace`; learned cameras do not
+    is_of_rows: bool = False  # whether each row belongs to one Gaussian or anchor
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Constant:
     value: float
 
     def __call__(self, iteration: int) -> float:
-        """Learning rate at an iteration."""
+        """Return the learning rate at an iteration."""
         return self.value
 
 
@@ -55,19 +55,19 @@ class LogLinear:
             raise ValueError(f"{self} has no log-linear decay; both rates must be > 0 and steps >= 1")
 
     def __call__(self, iteration: int) -> float:
-        """Learning rate at an iteration."""
+        """Return the learning rate at an iteration."""
         t = min(max(iteration / self.steps, 0.0), 1.0)
         return math.exp((1 - t) * math.log(self.start) + t * math.log(self.end))
 
 
 @dataclass(frozen=True)
 class Pace:
-    """By how much learning rates exceed the published ones: by `factor`, which fades away at the end of the run.
+    """Ratio of learning rates to the published ones: `factor`, which falls to 1 at the end of the run.
 
-    Adam moves a parameter by about its learning rate in a step, so in a run with fewer steps than the published one
-    nothing comes as far. Where steps are random, distances grow with the square root of their number; so the factor
-    that fits a run is the square root of what it is shorter, bounded by `FASTEST`. From `SLOWING_FROM` on it falls
-    log-linearly to 1, so that models settle as they do at published rates. At the published length it is 1.
+    Adam moves a parameter by about its learning rate in a step, so parameters move less in a run with fewer steps.
+    Random steps cover distances that grow with the square root of their number; the factor that fits a run is the
+    square root of published over actual length, at most `FASTEST`. From `SLOWING_FROM` on it falls log-linearly to 1,
+    so that models settle as they do at published rates. At the published length it is 1.
 
     >>> Pace.of("run", 30_000).factor, Pace.of("run", 7500).factor, Pace.of("run", 60).factor
     (1.0, 2.0, 8.0)
@@ -81,24 +81,29 @@ class Pace:
 
     @classmethod
     def of(cls, choice: str | float, iterations: int) -> Pace:
-        """That of a run of so many iterations: `published`, `run` for the factor that fits it, or a factor."""
+        """Return the pace of a run of `iterations`: `published`, `run` for the factor that fits, or a factor."""
         if choice == "published":
             return cls(1.0, iterations)
         if choice == "run":
             return cls(min(max(math.sqrt(PUBLISHED_ITERATIONS / iterations), 1.0), FASTEST), iterations)
         return cls(float(choice), iterations)
 
+    @classmethod
+    def of_run(cls, choice: str | float, schedule: int, iterations: int) -> Pace:
+        """Return the pace over a schedule that is done in `iterations`, fewer than its steps if it follows a clock."""
+        return replace(cls.of(choice, iterations), iterations=schedule)
+
     def __call__(self, iteration: int) -> float:
-        """The factor at an iteration."""
+        """Return the factor at an iteration."""
         t = iteration / self.iterations
         return self.factor ** min((1 - t) / (1 - SLOWING_FROM), 1.0)
 
 
 def scaled(published: int, total: int) -> int:
-    """A published iteration number, moved to a run of `total` iterations; at least 1.
+    """Return a published iteration number, scaled to a run of `total` iterations; at least 1.
 
-    All windows and intervals that say *when* something happens follow the run length like this, so that a short run
-    goes through the same phases as the published 30 000 iterations.
+    Windows and intervals of densification scale like this, so that a short run goes through the same phases as the
+    published 30 000 iterations.
 
     >>> scaled(1500, 30_000), scaled(1500, 3_000), scaled(15_000, 30_000)
     (1500, 150, 15000)

@@ -1,4 +1,4 @@
-"""What the loss compares renderings with: image, weight and SSIM statistics of each training view."""
+"""Targets of the loss: image, weight and SSIM statistics of each training view, at full or reduced size."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from padgs.scene import View
 from padgs.training.loss import SSIMStatistics, fits, pixel_weight, ssim_statistics
 
 CACHE_BYTES = 1 << 29  # weights and statistics of views beyond this are computed again at every iteration
+MIN_WIDTH = 512  # pixels; smaller panoramas gain nothing from a smaller start
 
 
 @dataclass(frozen=True)
@@ -23,11 +24,11 @@ class Target:
 
     image: Tensor  # [H, W, 3]
     weight: Tensor  # [H, W] or [H, 1]
-    statistics: SSIMStatistics | None  # None where the loss does without
+    statistics: SSIMStatistics | None  # None if the loss computes its own
 
 
 class Targets(Sequence[Target]):
-    """The targets of some views, by number. Keeps what fits into a fixed amount of memory."""
+    """The targets of views, by index; weights and statistics are cached within `CACHE_BYTES`."""
 
     def __init__(self, views: Sequence[View], weight: str, device: torch.device | str = "cpu") -> None:
         """Load nothing yet; `weight` is a name of `padgs.training.loss.ROW_WEIGHTS`."""
@@ -41,53 +42,51 @@ class Targets(Sequence[Target]):
         return len(self._views)
 
     def __getitem__(self, index: int) -> Target:
-        """The target of view `index`.
+        """Return the target of view `index`.
 
         Raises:
-            ValueError: the view has no pixels, or they have another size than the view, or the mask leaves none.
+            ValueError: image or mask have another size than the view, or there is no image, or the mask is 0.
         """
         image = image_of(self._views[index], self._device)
-        weight = self._weights[index] if index in self._weights else self._weight_of(index)
+        weight = self._weights.get(index)
+        if weight is None:
+            weight = weight_of(self._views[index], self._weight, self._device)
+            if self._is_cached(weight.nbytes):
+                self._weights[index] = weight
         return Target(image, weight, None if fits(image) else self._statistics_of(index, image))
-
-    def _weight_of(self, index: int) -> Tensor:
-        weight = weight_of(self._views[index], self._weight, self._device)
-        if self._keeps(weight.nbytes):
-            self._weights[index] = weight
-        return weight
 
     def _statistics_of(self, index: int, image: Tensor) -> SSIMStatistics:
         if index in self._statistics:
             return self._statistics[index]
         statistics = ssim_statistics(image)
-        if self._keeps(2 * image.nbytes):
+        if self._is_cached(2 * image.nbytes):
             self._statistics[index] = statistics
         return statistics
 
-    def _keeps(self, size: int) -> bool:
-        """Whether so many bytes more may be kept; they count from now on."""
-        kept = size <= self._bytes_left
-        self._bytes_left -= size if kept else 0
-        return kept
+    def _is_cached(self, size: int) -> bool:
+        """Return whether `size` more bytes may be cached, and reserve them."""
+        cached = size <= self._bytes_left
+        self._bytes_left -= size if cached else 0
+        return cached
 
 
 def image_of(view: View, device: torch.device | str = "cpu") -> Tensor:
-    """Image [H, W, 3] in [0, 1] of a view.
+    """Return the image [H, W, 3] of a view, in [0, 1].
 
     Raises:
-        ValueError: the view has no pixels, or they have another size than the view.
+        ValueError: the view has no image, or one of another size.
     """
-    return _fitting(view, "image", view.image(device=device))
+    return _checked_size(view, "image", view.image(device=device))
 
 
 def weight_of(view: View, weight: str, device: torch.device | str = "cpu") -> Tensor:
-    """Weight of the pixels of a view, [H, W], or [H, 1] without a mask; `weight` is a name of `ROW_WEIGHTS`.
+    """Return the weight of the pixels of a view, [H, W], or [H, 1] without a mask; `weight` is in `ROW_WEIGHTS`.
 
     Raises:
-        ValueError: the mask has another size than the view, or leaves no pixel.
+        ValueError: the mask has another size than the view, or is 0 everywhere.
     """
     mask = view.mask(device=device)
-    mask = None if mask is None else _fitting(view, "mask", mask)
+    mask = None if mask is None else _checked_size(view, "mask", mask)
     try:
         return pixel_weight(weight, view.height, mask, device=device)
     except ValueError as error:
@@ -95,47 +94,44 @@ def weight_of(view: View, weight: str, device: torch.device | str = "cpu") -> Te
 
 
 def even_weight(view: View, device: torch.device) -> Tensor:
-    """Weight [H, W] or [H, 1] of pixels: all directions of a panorama count alike, and all pixels of other views."""
+    """Return the weight [H, W] or [H, 1] by solid angle for panoramas, and uniform for other views."""
     return weight_of(view, "solid_angle" if isinstance(view.camera, Panorama) else "uniform", device)
 
 
-def _fitting(view: View, what: str, pixels: Tensor) -> Tensor:
+def _checked_size(view: View, what: str, pixels: Tensor) -> Tensor:
     height, width = pixels.shape[:2]
     if (height, width) != (view.height, view.width):
         raise ValueError(f"{what} of view {view.name!r} is {width}x{height}; the view is {view.width}x{view.height}")
     return pixels
 
 
-LEAST_WIDTH = 512  # pixels; smaller panoramas gain nothing by beginning smaller still
+class CoarseToFine:
+    """Views and their targets, smaller at the beginning of a run.
 
-
-class Sizes:
-    """Views and their targets, by how much of a run is done.
-
-    They have their own size from `coarse_share` of the run on; half of it before, a quarter of it in the first half of
-    that time, and so on, as long as all are panoramas of `LEAST_WIDTH` or more.
+    From `coarse_share` of the run on, views have their own size; before that half of it, a quarter in the first half of
+    that time, and so on, as long as all views are panoramas of `MIN_WIDTH` or more.
     """
 
     def __init__(self, views: Sequence[View], weight: str, device: torch.device, coarse_share: float) -> None:
         """Load nothing yet; `weight` is a name of `padgs.training.loss.ROW_WEIGHTS`."""
         self._coarse_share, self._levels = coarse_share, [(views, Targets(views, weight, device))]
-        while views and all(view.lens is None and view.width >= 2 * LEAST_WIDTH for view in views):
+        while views and all(view.lens is None and view.width >= 2 * MIN_WIDTH for view in views):
             views = [halved(view) for view in views]
             self._levels.append((views, Targets(views, weight, device)))
 
     def halvings(self, progress: float) -> int:
-        """How often views are halved in a step after which so much of the run is done, in (0, 1]."""
+        """Return how often views are halved in a step that ends at a share of the run in (0, 1]."""
         if progress >= self._coarse_share:
             return 0
         return min(math.ceil(math.log2(self._coarse_share / progress)), len(self._levels) - 1)
 
     def at(self, progress: float) -> tuple[Sequence[View], Targets]:
-        """What such a step draws."""
+        """Return views and targets of such a step."""
         return self._levels[self.halvings(progress)]
 
 
 def halved(view: View) -> View:
-    """The same panorama at half the width and height, each pixel the mean of those that it covers."""
+    """Return a panorama at half the width and height, each pixel the mean of those that it covers."""
     width, height = view.width // 2, view.height // 2
 
     def reduced(load: Callable[[], Tensor]) -> Tensor:

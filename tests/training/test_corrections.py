@@ -66,7 +66,7 @@ class Truth:
 def corrected(scene: Scene, train: TrainOptions, iterations: int = 250) -> Corrections:
     run = Trainer(Truth(), scene, Budget(iterations), train, seed=0)
     list(run.records())
-    return run._corrections
+    return run.corrections
 
 
 def test_exposures_that_differ_are_found_but_for_their_mean():

@@ -10,7 +10,8 @@ from tiny_scene import tiny_scene
 from torch import nn
 
 from padgs.runs.run import build_method
-from padgs.training.health import ANISOTROPY, SMALLEST, Failure, Guard
+from padgs.training.guard import MAX_ANISOTROPY, MIN_SCALE, Guard
+from padgs.training.health import Failure
 from padgs.training.options import Budget
 from padgs.training.schedule import Constant, ParameterGroup
 
@@ -34,7 +35,7 @@ class Poison:
 
 
 GUARDED = ("train.monitor=false", "train.guard_gradients=true")
-TOLD = "left out {} rows whose gradients were not finite"
+TOLD = "cleaned {} rows whose gradients were not finite"
 
 
 def begun(preset: str, name: str, rows: slice, *settings: str, steps: int = 6):
@@ -104,6 +105,6 @@ def test_scales_stay_within_the_bounds_of_the_beginning(others):
     guard.load(state)
     guard.bound()
     assert torch.allclose(scales[0, others:].exp(), torch.tensor(farthest, dtype=torch.float32))
-    assert torch.allclose(scales[1, others:].exp() / scene.scale, torch.tensor(SMALLEST))
-    assert scales[2, others:].exp().tolist() == pytest.approx([0.1, 0.1, 0.1 / ANISOTROPY], rel=1e-5)
+    assert torch.allclose(scales[1, others:].exp() / scene.scale, torch.tensor(MIN_SCALE))
+    assert scales[2, others:].exp().tolist() == pytest.approx([0.1, 0.1, 0.1 / MAX_ANISOTROPY], rel=1e-5)
     assert (scales[:2, :others].abs() == 50).all()

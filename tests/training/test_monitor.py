@@ -17,7 +17,7 @@ ITERATIONS = 1000
 
 
 def monitor() -> Monitor:
-    return Monitor(ITERATIONS, parts=1000, pixels=2000)
+    return Monitor(ITERATIONS, count=1000, pixels=2000)
 
 
 def ends(see, expected: str) -> tuple[Failure, int]:
@@ -56,10 +56,11 @@ def test_a_loss_that_rises_and_stays_has_diverged():
 def test_losses_of_views_of_another_size_are_not_compared():
     watch = monitor()
     for iteration in range(1, 401):
-        watch.size(1 if iteration < 200 else 0, iteration)
+        watch.begin(iteration, 1 if iteration < 200 else 0, iteration)
         watch.loss(0.1 if iteration < 200 else 0.3, iteration)
     with pytest.raises(Failure, match="the best, 0.3 "):
         for iteration in range(401, ITERATIONS):
+            watch.begin(iteration, 0, iteration)
             watch.loss(0.6, iteration)
 
 
@@ -115,10 +116,10 @@ def test_pictures_of_nothing_have_collapsed():
     photograph = torch.rand(4, 8, 3, generator=torch.Generator().manual_seed(1))
     for made, said in (
         (drawing(photograph, transmittance=0.99), "the mean opacity is 0.01"),
-        (drawing(torch.full((4, 8, 3), 0.4)), "of the variance of the photograph"),
+        (drawing(torch.full((4, 8, 3), 0.4)), "of the variance of the image"),
     ):
         watch = monitor()
-        failure, _ = ends(lambda i, made=made, watch=watch: watch.picture(made, photograph, 50 * i), "collapsed")
+        failure, _ = ends(lambda i, made=made, watch=watch: watch.render(made, photograph, 50 * i), "collapsed")
         assert said in str(failure) and "at iteration 150, and since 50" in str(failure)
 
 
@@ -126,13 +127,13 @@ def test_single_large_gaussians_are_healthy_and_many_have_exploded():
     photograph = torch.rand(4, 8, 3, generator=torch.Generator().manual_seed(1))
     for large, healthy in ((2, True), (3, False)):
         watch = monitor()
-        watch.picture(drawing(photograph), photograph, 0)
+        watch.render(drawing(photograph), photograph, 0)
         made = drawing(photograph, large=large, scale=1e3)
         if healthy:
             for i in range(1, 20):
-                watch.picture(made, photograph, 50 * i)
+                watch.render(made, photograph, 50 * i)
         else:
-            failure, _ = ends(lambda i, made=made, watch=watch: watch.picture(made, photograph, 50 * i), "exploded")
+            failure, _ = ends(lambda i, made=made, watch=watch: watch.render(made, photograph, 50 * i), "exploded")
             assert "scales[0] is 1e+03 world units at iteration 150; since 50 more than 1% of all" in str(failure)
 
 
@@ -148,16 +149,16 @@ def test_parameters_without_a_gradient_are_silent_after_a_quarter_of_the_run():
 @pytest.mark.parametrize("gradient", [None, torch.zeros(9, 3)])
 def test_growth_that_nothing_pulls_at_is_silent(gradient):
     watch = monitor()
-    failure, when = ends(lambda i: watch.probe(gradient if i > 300 else torch.eye(3), i), "silent")
+    failure, when = ends(lambda i: watch.positional_gradient(gradient if i > 300 else torch.eye(3), i), "silent")
     assert when == 301 + ITERATIONS // 4 and "since 301, so nothing can grow" in str(failure)
 
 
 def test_where_the_schedule_follows_the_clock_a_sign_lasts_for_a_share_of_it():
     watch = monitor()
     for iteration in range(1, 2000):  # 2000 steps are a tenth of the schedule
-        watch.moment = iteration // 20
+        watch.begin(iteration // 20, 0, iteration)
         watch.counts({"gaussians": 9}, iteration)
-    watch.moment = 101
+    watch.begin(101, 0, 2001)
     with pytest.raises(Failure, match="few since 1"):
         watch.counts({"gaussians": 9}, 2001)
 
@@ -166,7 +167,7 @@ def test_what_it_remembers_is_json_and_goes_on():
     first, second = monitor(), monitor()
     for iteration in range(1, 150):
         first.loss(0.1 if iteration < 100 else 0.4, iteration)
-    second.state = json.loads(json.dumps(first.state))
+    second.load(json.loads(json.dumps(first.state)))
     assert (
         ends(lambda i: first.loss(0.4, 149 + i), "diverged")[1]
         == ends(lambda i: second.loss(0.4, 149 + i), "diverged")[1]
@@ -174,8 +175,8 @@ def test_what_it_remembers_is_json_and_goes_on():
 
 
 def test_a_resumed_run_is_compared_with_the_model_that_it_began_with():
-    began, resumed = Monitor(ITERATIONS, parts=5000, pixels=100), Monitor(ITERATIONS, parts=10, pixels=100)
-    resumed.state = json.loads(json.dumps(began.state))
+    began, resumed = Monitor(ITERATIONS, count=5000, pixels=100), Monitor(ITERATIONS, count=10, pixels=100)
+    resumed.load(json.loads(json.dumps(began.state)))
     resumed.counts({"gaussians": 50_000}, 1)
     with pytest.raises(Failure, match="50001 gaussians at iteration 2, more than 10 times the 5000"):
         resumed.counts({"gaussians": 50_001}, 2)

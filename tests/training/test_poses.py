@@ -13,7 +13,7 @@ VIEWS = tiny_scene().train
 
 
 def refinement() -> PoseRefinement:
-    return PoseRefinement.of(VIEWS, unit=2.0)
+    return PoseRefinement.of(VIEWS, scale=2.0)
 
 
 def test_without_a_correction_no_bit_of_a_pose_changes():
@@ -48,7 +48,7 @@ def test_the_origin_of_the_world_does_not_matter():
     far = torch.eye(4, dtype=torch.float64)
     far[:3, 3] = torch.tensor([1000.0, -500.0, 300.0])
     away = [replace(view, cam_from_world=view.cam_from_world @ far) for view in VIEWS]
-    here, there = refinement(), PoseRefinement.of(away, unit=2.0)
+    here, there = refinement(), PoseRefinement.of(away, scale=2.0)
     for poses in (here, there):
         with torch.no_grad():
             poses.quaternions[2].add_(torch.tensor([0.0, 0.1, -0.05, 0.02]))
@@ -95,12 +95,12 @@ def test_what_all_corrections_share_is_taken_out():
             quaternion[1:] = -0.5 * rotation @ turn
             shift.copy_(-rotation @ moved / 2.0)
     assert align(poses.poses(), poses.given)[1].distance.max() < 1e-4, "it is one"
-    poses.centre()
+    poses.center()
     torch.testing.assert_close(poses.poses(), poses.given, atol=1e-8, rtol=0)
     with torch.no_grad():
         poses.shifts[1].add_(0.1)
         poses.quaternions[2][1:] += 0.01
-    poses.centre()
+    poses.center()
     world, left = align(poses.poses(), poses.given)
     assert abs(world.scale - 1) < 1e-3 and (world.rotation - torch.eye(3)).norm() < 1e-3 and left.distance.max() > 0.1
 
@@ -109,4 +109,4 @@ def test_names_decide():
     with pytest.raises(ValueError, match="view 'x' has no pose to refine; known: 00, 01"):
         refinement().refined(replace(VIEWS[0], name="x"))
     with pytest.raises(ValueError, match="several training views are called '00'"):
-        PoseRefinement.of([VIEWS[0], VIEWS[0]], unit=1.0)
+        PoseRefinement.of([VIEWS[0], VIEWS[0]], scale=1.0)

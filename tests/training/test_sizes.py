@@ -13,7 +13,7 @@ from padgs.scene import View
 from padgs.training import targets as training_targets
 from padgs.training.health import FIRST
 from padgs.training.options import Budget
-from padgs.training.targets import Sizes, halved
+from padgs.training.targets import CoarseToFine, halved
 
 OPTIONS = PlusOptions()
 
@@ -25,8 +25,8 @@ def made(width: int, height: int) -> View:
     return View("a", torch.eye(4, dtype=torch.float64), width, height, lambda: pixels, lambda: mask)
 
 
-def sized(coarse_share: float, *views: View) -> Sizes:
-    return Sizes(views, "uniform", torch.device("cpu"), coarse_share)
+def sized(coarse_share: float, *views: View) -> CoarseToFine:
+    return CoarseToFine(views, "uniform", torch.device("cpu"), coarse_share)
 
 
 def test_a_pixel_is_the_mean_of_the_four_that_it_covers():
@@ -54,7 +54,7 @@ def test_sizes_that_are_odd_leave_no_direction_out():
 
 
 def test_views_double_until_a_share_of_the_run(monkeypatch):
-    monkeypatch.setattr(training_targets, "LEAST_WIDTH", 8)
+    monkeypatch.setattr(training_targets, "MIN_WIDTH", 8)
     found = sized(0.4, made(32, 16), made(32, 16))
     widths = [found.at(progress)[0][1].width for progress in (0.01, 0.19, 0.2, 0.21, 0.39, 0.4, 1)]
     assert widths == [8, 8, 16, 16, 16, 32, 32]
@@ -73,7 +73,7 @@ def test_small_panoramas_and_perspective_views_keep_their_size():
 
 
 def test_padgs_plus_begins_with_small_views_and_resumes_bit_identically(monkeypatch):
-    monkeypatch.setattr(training_targets, "LEAST_WIDTH", WIDTH // 2)
+    monkeypatch.setattr(training_targets, "MIN_WIDTH", WIDTH // 2)
     method = PlusMethod(OPTIONS)
     whole = method.fit(tiny_scene(), Budget(20))
     drawn = []
@@ -93,7 +93,7 @@ def test_padgs_plus_begins_with_small_views_and_resumes_bit_identically(monkeypa
 
 
 def test_a_run_that_is_stopped_while_views_are_small_ends_on_large_ones_and_has_not_diverged(monkeypatch):
-    monkeypatch.setattr(training_targets, "LEAST_WIDTH", WIDTH // 2)
+    monkeypatch.setattr(training_targets, "MIN_WIDTH", WIDTH // 2)
     method, ended = PlusMethod(OPTIONS), 0
     for record in method.fit(tiny_scene(), Budget(100)):
         if record.iteration == 10:

@@ -13,28 +13,28 @@ from padgs.methods.splats.splats import Splats
 from padgs.registry import lookup
 from padgs.render import RenderConfig, Rendering
 from padgs.scene import View
-from padgs.training.health import FADE, Plateau, quality, validation_split
+from padgs.training.health import FADE, EarlyStopping, quality, validation_split
 from padgs.training.loop import Trainer
 from padgs.training.options import Budget
-from padgs.training.view_order import ViewOrder
+from padgs.training.view_order import TrainingViews
 
 ITERATIONS = 100
 
 
 class Counted(SplatModel):
-    """Notes the views that are drawn, and which moments of the schedule come."""
+    """Notes the views that are drawn, and which schedule steps come."""
 
     def __init__(self, scene) -> None:
         splats = Splats.from_scene(scene, degree=0, generator=torch.Generator().manual_seed(0))
         super().__init__(splats, DensificationOptions(), RenderConfig(), extent=1.0, iterations=ITERATIONS)
-        self.drawn, self.moments = [], []
+        self.drawn, self.steps = [], []
 
     def draw(self, view: View, probe: Tensor | None = None):
         self.drawn.append(view.name)
         return super().draw(view, probe)
 
     def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
-        self.moments.append(iteration)
+        self.steps.append(iteration)
         return super().adapt(iteration, optimizer)
 
 
@@ -53,43 +53,44 @@ def trainer(scene, stop: str = "auto") -> Trainer:
     return Trainer(Counted(scene), scene, Budget(ITERATIONS, stop=stop), seed=1)
 
 
+def stopping() -> EarlyStopping:
+    return EarlyStopping(views_of(6), Budget(ITERATIONS, stop="auto"))
+
+
 def test_a_plateau_is_where_the_average_gains_nothing_and_not_before():
-    rising, flat = Plateau(100), Plateau(100)
-    assert not any(rising.reached(20 + 0.1 * moment, 1, moment) for moment in range(1, 101))
-    values = [20 + min(moment, 40) for moment in range(1, 101)]
-    first = next(moment for moment, value in enumerate(values, 1) if flat.reached(value, 1, moment))
-    assert 45 < first < 75
-    assert not flat.is_due(first) and flat.is_due(first + 1)
-    for parts in (range(1, 101), range(100, 0, -1), [100] * 97 + [50] * 3):  # growing, thinning out, just chosen
-        changing = Plateau(100)
-        found = [
-            changing.reached(20.0 + 0.1 * moment * (moment < 97), count, moment) for moment, count in enumerate(parts)
-        ]
-        assert not any(found)
+    rising, flat = stopping(), stopping()
+    assert not any(rising._is_settled(20 + 0.1 * step, 1, step) for step in range(1, 101))
+    values = [20 + min(step, 40) for step in range(1, 101)]
+    first = next(step for step, value in enumerate(values, 1) if flat._is_settled(value, 1, step))
+    assert 45 < first < 75 and flat.state["next"] == first + 1
+    for counts in (range(1, 101), range(100, 0, -1), [100] * 97 + [50] * 3):  # growth, pruning, pruned just now
+        changing = stopping()
+        values = enumerate(counts)
+        assert not any(changing._is_settled(20.0 + 0.1 * step * (step < 97), count, step) for step, count in values)
 
 
-def test_views_set_apart_come_back_when_rates_fade(scene, monkeypatch):
-    monkeypatch.setattr(Plateau, "reached", lambda self, value, parts, moment: moment > 49)
+def test_validation_views_are_trained_on_during_the_fade(scene, monkeypatch):
+    monkeypatch.setattr(EarlyStopping, "_is_settled", lambda self, psnr, count, step: step > 49)
     run = trainer(scene)
     apart = {scene.train[number].name for number in validation_split(scene.train)}
     records = list(run.records())
-    trainee = run._trainee
+    model = run._model
     stopped = next(number for number, record in enumerate(records) if any("stopping" in e for e in record.events))
     assert stopped == 49
-    assert apart.isdisjoint(trainee.drawn[: stopped + 1]) and apart < set(trainee.drawn[stopped + 1 :])
-    assert trainee.moments == [*range(1, 51), *range(round((1 - FADE) * ITERATIONS) + 1, ITERATIONS + 1)]
+    assert apart.isdisjoint(model.drawn[: stopped + 1]) and apart < set(model.drawn[stopped + 1 :])
+    assert model.steps == [*range(1, 51), *range(round((1 - FADE) * ITERATIONS) + 1, ITERATIONS + 1)]
     assert records[-1].progress == 1 and len(records) == 65 and run.skipped == 35 and "0.02 dB" in run.ended
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_they_come_back_within_the_epoch_that_runs(scene, seed):
     apart = validation_split(scene.train)
-    order = ViewOrder(scene, seed, apart)
-    drawn = [order.next()]
-    order.take_all()
-    drawn += [order.next() for _ in range(2)]
-    order.take_all()
-    drawn += [order.next() for _ in range(3)]
+    order = TrainingViews(scene, seed=seed, held_out=apart)
+    drawn = [order.next_index()]
+    order.include_held_out()
+    drawn += [order.next_index() for _ in range(2)]
+    order.include_held_out()
+    drawn += [order.next_index() for _ in range(3)]
     assert drawn[0] not in apart and sorted(drawn) == list(range(6))
 
 
@@ -116,7 +117,7 @@ def test_rates_never_rise_when_a_run_is_stopped(scene):
 
 @pytest.mark.parametrize("at", [30, 50, 60])
 def test_a_stopped_run_resumes_to_the_same(scene, monkeypatch, at):
-    monkeypatch.setattr(Plateau, "reached", lambda self, value, parts, moment: moment > 49)
+    monkeypatch.setattr(EarlyStopping, "_is_settled", lambda self, psnr, count, step: step > 49)
     whole = trainer(scene)
     expected = [record.loss for record in whole.records()]
     first = trainer(scene)
@@ -130,8 +131,8 @@ def test_a_stopped_run_resumes_to_the_same(scene, monkeypatch, at):
 
 def test_in_a_budget_of_seconds_the_fade_takes_its_share_of_them():
     budget = Budget(100, seconds=10.0)
-    assert budget.moment(85, spent=3.0, step=0.1, skipped=55) == 86
-    assert budget.moment(99, spent=4.45, step=0.1, skipped=55) == 100
+    assert budget.next_step(85, spent=3.0, step_seconds=0.1, skipped=55) == 86
+    assert budget.next_step(99, spent=4.45, step_seconds=0.1, skipped=55) == 100
 
 
 def test_quality_is_the_mean_ws_psnr():
@@ -144,7 +145,7 @@ def test_quality_is_the_mean_ws_psnr():
     assert found == pytest.approx(sum(ws_psnr(images[v.name], v.image()).item() for v in views) / 2, abs=1e-4)
 
 
-def test_too_few_views_to_set_any_apart_are_refused():
+def test_too_few_views_for_a_validation_split_are_refused():
     with pytest.raises(ValueError, match="5 training views leave no validation views.*it takes 6"):
         Trainer(Counted(tiny_scene()), tiny_scene(), Budget(10, stop="auto"))
     with pytest.raises(ValueError, match="unknown stop 'never'; known: end, auto"):
@@ -152,6 +153,6 @@ def test_too_few_views_to_set_any_apart_are_refused():
 
 
 @pytest.mark.parametrize("name", ["egonerf", "sc_omnigs"])
-def test_methods_that_views_set_apart_say_nothing_of_refuse_to_stop_by_themselves(name, scene):
+def test_methods_without_validation_views_refuse_early_stopping(name, scene):
     with pytest.raises(ValueError, match="budget.stop is auto.*set it to end"):
         lookup(METHODS, name, "method")().fit(scene, Budget(10, stop="auto"))

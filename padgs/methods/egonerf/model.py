@@ -159,7 +159,7 @@ class RayTrainer(Trainer):
         self._order = self._pixels
         self.seconds, self.cpu_seconds = lap.seconds()  # reading images counts as training
 
-    def _step(self, iteration: int, moment: int) -> tuple[float | Tensor, dict[str, int], tuple[str, ...]]:
+    def _gradients(self, iteration: int, step: int) -> tuple[float | Tensor, dict[str, int], tuple[str, ...]]:
         model, optimizer, generator = self._model, self._optimizer, self._pixels.generator
         with self._stage("target"):
             rays = self._pixels.draw(self._rays)
@@ -167,7 +167,7 @@ class RayTrainer(Trainer):
         total = 3 * rays.weight.sum()
         for part in torch.arange(self._rays, device=total.device).split(model.rays_at_once):
             with self._stage("draw"):
-                image = model.colors(rays.origins[part], rays.directions[part], generator, moment)
+                image = model.colors(rays.origins[part], rays.directions[part], generator, step)
             error = (image - rays.color[part]).square() * rays.weight[part, None]
             loss = error.sum() / total
             value += loss.detach()
@@ -177,11 +177,14 @@ class RayTrainer(Trainer):
             with self._stage("backward"):
                 loss.backward()
         with self._stage("backward"):
-            extra = model.regularisation(moment)
+            extra = model.regularisation(step)
             if extra is not None:
                 extra.backward()
-        optimizer.check(iteration, moment)
-        with self._stage("optimizer"):
-            optimizer.step(moment)
         events = (model.summary(),) if iteration == 1 else ()
-        return self._read(value, iteration), {**model.counts(), "rays": self._rays}, events
+        return self._read(value, iteration), {"rays": self._rays}, events
+
+    def _update(self, iteration: int, step: int) -> tuple[str, ...]:
+        self._optimizer.check(iteration, step)
+        with self._stage("optimizer"):
+            self._optimizer.step(step)
+        return ()
