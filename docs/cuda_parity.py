@@ -15,8 +15,8 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests/render"))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests/render/cuda"))
 
-import cuda_engine
-from render_cases import (
+from support import cuda_engine
+from support.render_cases import (
     SETUPS,
     blended,
     camera_of,

@@ -6,9 +6,9 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
-from composed import composed, expanded, first_and_last_job, jobs
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
+from support.composed import composed, expanded, first_and_last_job, jobs
 
 from padgs.baselines import METHODS
 from padgs.checks import ConfigError

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from pretended_gpu import GPU, pretended_gpu
+from support.pretended_gpu import GPU, pretended_gpu
 from torch import Tensor
 
 WAITS: dict[str, Callable[[Tensor, Tensor], object]] = {

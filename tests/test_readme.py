@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from composed import first_and_last_job
+from support.composed import first_and_last_job
 from typer.main import get_command
 
 from padgs.cli.commands import app

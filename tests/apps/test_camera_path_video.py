@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from tiny_run import tiny_run
+from support.tiny_run import tiny_run
 from typer.testing import CliRunner
 
 from padgs.apps.camera_path_video import write_video

@@ -2,8 +2,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from composed import composed
-from tiny_scene import tiny_scene
+from support.composed import composed
+from support.tiny_scene import tiny_scene
 
 from padgs.baselines.egonerf import EgoNeRFMethod, EgoNeRFMethodOptions
 from padgs.data.synthetic import SyntheticOptions, generate

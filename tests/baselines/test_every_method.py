@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from composed import composed
-from states import assert_same_but_time
+from support.composed import composed
+from support.states import assert_same_but_time
 
 from padgs.baselines import BUILT_IN, METHODS
 from padgs.data.synthetic import SCENES, SyntheticOptions, generate

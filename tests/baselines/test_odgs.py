@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from composed import composed
+from support.composed import composed
 from torch import Tensor
 
 from padgs.baselines.odgs import ODGSMethod, ODGSModel, ODGSOptions

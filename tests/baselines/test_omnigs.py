@@ -2,9 +2,9 @@ from dataclasses import replace
 
 import pytest
 import torch
-from composed import composed
-from states import assert_same_but_time
-from tiny_scene import tiny_scene
+from support.composed import composed
+from support.states import assert_same_but_time
+from support.tiny_scene import tiny_scene
 
 from padgs.baselines.omnigs import OmniGSMethod
 from padgs.methods.splats.method import SplatOptions

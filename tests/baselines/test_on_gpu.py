@@ -6,8 +6,8 @@ and that the host waits for nothing but the renderer's and the decoder's counts.
 
 import pytest
 import torch
-from composed import composed
-from pretended_gpu import GPU, pretended_gpu
+from support.composed import composed
+from support.pretended_gpu import GPU, pretended_gpu
 
 from padgs.data.synthetic import SyntheticOptions, generate
 from padgs.evaluation import scoring

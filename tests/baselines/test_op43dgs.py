@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import pytest
 import torch
-from composed import composed
 from rich.console import Console
-from tiny_scene import tiny_scene
+from support.composed import composed
+from support.tiny_scene import tiny_scene
 
 from padgs import results
 from padgs.baselines.op43dgs import OP43DGSMethod, OP43DGSOptions

@@ -6,7 +6,7 @@ import sys
 from configparser import ConfigParser
 
 import pytest
-from tiny_scene import tiny_scene
+from support.tiny_scene import tiny_scene
 
 import padgs
 from padgs import baselines

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from composed import composed
-from tiny_scene import tiny_scene
+from support.composed import composed
+from support.tiny_scene import tiny_scene
 
 from padgs.baselines import METHODS
 from padgs.baselines.crops_3dgs import MIN_FIELD_OF_VIEW, Crops3DGSMethod, Crops3DGSOptions

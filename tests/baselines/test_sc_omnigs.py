@@ -3,7 +3,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tiny_scene import HEIGHT, WIDTH, tiny_scene
+from support.tiny_scene import HEIGHT, WIDTH, tiny_scene
 
 from padgs.baselines.omnigs import OmniGSMethod
 from padgs.baselines.sc_omnigs import SCOmniGSMethod, SCOmniGSOptions, aligned, mapped_pose

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tiny_scene import tiny_scene, truth
+from support.tiny_scene import tiny_scene, truth
 
 from padgs.baselines.seam360gs import Seam360GSMethod, Seam360GSOptions
 from padgs.data.synthetic import SyntheticOptions, SyntheticTruth, generate

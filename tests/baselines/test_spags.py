@@ -6,8 +6,8 @@ import math
 
 import pytest
 import torch
-from composed import composed
-from tiny_scene import tiny_scene
+from support.composed import composed
+from support.tiny_scene import tiny_scene
 
 from padgs.baselines import METHODS
 from padgs.baselines.spags import SPaGSMethod, SPaGSOptions

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tiny_scene import tiny_scene
+from support.tiny_scene import tiny_scene
 
 from padgs.baselines import METHODS
 from padgs.methods.splats.method import SplatMethod

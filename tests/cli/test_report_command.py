@@ -3,7 +3,7 @@ import sys
 from dataclasses import replace
 
 import pytest
-from made_up import compared, result, small, swept, write
+from support.made_up import compared, result, small, swept, write
 from typer.testing import CliRunner
 
 from padgs import results

@@ -1,7 +1,7 @@
 """The tiny world, once for all tests of data sources."""
 
 import pytest
-from fixtures import World, make_world
+from support.fixtures import World, make_world
 
 
 @pytest.fixture(scope="session")

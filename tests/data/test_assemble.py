@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fixtures import World, write_colmap_text
 from PIL import Image
+from support.fixtures import World, write_colmap_text
 
 from padgs.data import DATASETS, LOADERS, DataError, DataOptions, load
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from tiny_scene import tiny_scene
+from support.tiny_scene import tiny_scene
 
 from padgs.data.camera_paths import (
     PATHS,

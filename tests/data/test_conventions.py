@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fixtures import World, write_colmap_text
+from support.fixtures import World, write_colmap_text
 from torch import Tensor
 
 from padgs.cli.check import lines

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fixtures import World, write_colmap_text
 from PIL import Image
+from support.fixtures import World, write_colmap_text
 
 from padgs.data import DataError
 from padgs.data.check import check

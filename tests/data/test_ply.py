@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from fixtures import World, write_cloud
+from support.fixtures import World, write_cloud
 
 from padgs.data.capture import Cloud, DataError
 from padgs.data.cloud import read_ply, write_ply

@@ -3,7 +3,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tiny_scene import tiny_scene, truth
+from support.tiny_scene import tiny_scene, truth
 
 from padgs.evaluation.diagnostics import (
     blurred,

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from render_cases import gaussians_of, identity_pose, leaves, needs_native
+from support.render_cases import gaussians_of, identity_pose, leaves, needs_native
 from test_hybrid_rendering import each_native_engine, options_of
 
 from padgs.gaussians import Gaussians

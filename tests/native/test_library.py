@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from render_cases import gaussians_of, identity_pose, needs_native
+from support.render_cases import gaussians_of, identity_pose, needs_native
 
 from padgs import render as package
 from padgs.gaussians import Gaussians

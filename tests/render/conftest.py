@@ -1,7 +1,7 @@
 """Selection of the tests of the emulated GPU that run by default."""
 
-import cuda_engine
 import pytest
+from support import cuda_engine
 
 # The definition, the golden cases and bad input; the rest of what every engine is asked takes minutes at this pace.
 QUICK = {

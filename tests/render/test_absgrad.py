@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from render_cases import blended, each_engine, gaussians_of, identity_pose, mixture, row_error
+from support.render_cases import blended, each_engine, gaussians_of, identity_pose, mixture, row_error
 from torch import Tensor
 
 from padgs.gaussians import Gaussians

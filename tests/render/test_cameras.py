@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from render_cases import (
+from support.render_cases import (
     INPUTS,
     camera_of,
     each_engine,

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from render_cases import (
+from support.render_cases import (
     INPUTS,
     differentiated,
     draw,

@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from render_cases import draw, each_engine, each_panorama
+from support.render_cases import draw, each_engine, each_panorama
 
 from padgs.gaussians import Gaussians
 from padgs.geometry.panorama import direction, rays, row_latitudes

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from render_cases import INPUTS, engines, needs_native, view_of
+from support.render_cases import INPUTS, engines, needs_native, view_of
 
 from padgs.gaussians import Gaussians
 from padgs.geometry.camera import Camera, Panorama, Pinhole, RayTable

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from hybrid_reference import one_pixel
+from support.hybrid_reference import one_pixel
 from torch import Tensor
 
 from padgs.render.backends.torch import hybrid_weights

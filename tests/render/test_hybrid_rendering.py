@@ -6,10 +6,10 @@ import math
 from dataclasses import replace
 
 import pytest
-import render_cases
 import torch
-from hybrid_reference import one_pixel
-from render_cases import (
+from support import render_cases
+from support.hybrid_reference import one_pixel
+from support.render_cases import (
     INPUTS,
     assert_matches_definition,
     differentiated,

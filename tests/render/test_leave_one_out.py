@@ -1,9 +1,10 @@
 """Leave-one-out scores against actual removals."""
 
-import cuda_engine
 import pytest
 import torch
-from render_cases import (
+from scipy.stats import spearmanr
+from support import cuda_engine
+from support.render_cases import (
     camera_of,
     chosen,
     each_setup,
@@ -14,7 +15,6 @@ from render_cases import (
     random_pose,
     view_of,
 )
-from scipy.stats import spearmanr
 from torch import Tensor
 
 from padgs.gaussians import Gaussians

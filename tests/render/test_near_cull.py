@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from render_cases import each_engine, gaussians_of, identity_pose, projected
+from support.render_cases import each_engine, gaussians_of, identity_pose, projected
 
 from padgs.gaussians import Gaussians, rotation_matrices
 from padgs.geometry.camera import Panorama

@@ -5,8 +5,8 @@ import hypothesis
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from made_up import of_experiment, run_set
 from scipy.stats import ttest_rel
+from support.made_up import of_experiment, run_set
 
 from padgs.reports import published
 from padgs.reports.claims import (

@@ -4,7 +4,7 @@ from dataclasses import replace
 import pandas as pd
 import pytest
 import torch
-from made_up import failed, result, small
+from support.made_up import failed, result, small
 
 from padgs.reports.frame import by_place, frame, images_seen
 from padgs.reports.published import Place

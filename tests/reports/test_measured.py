@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from made_up import assert_apart
+from support.made_up import assert_apart
 
 from padgs.reports import REPORTS, store
 from padgs.reports.charts import trade_off, trade_off_chart

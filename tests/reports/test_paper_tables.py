@@ -5,7 +5,7 @@ import io
 from dataclasses import replace
 
 import pytest
-from made_up import RULES, builder, data_set, failed, result, run_set
+from support.made_up import RULES, builder, data_set, failed, result, run_set
 
 from padgs.reports.table import MISSING, ReportError, Table
 from padgs.reports.writers import csv_text, markdown

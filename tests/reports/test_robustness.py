@@ -1,7 +1,7 @@
 from dataclasses import replace
 
 import pytest
-from made_up import failed, of_experiment, run_set
+from support.made_up import failed, of_experiment, run_set
 
 from padgs.data.perturb import CONDITIONS
 from padgs.reports.charts.robustness_chart import STATUS_LETTERS

@@ -1,6 +1,6 @@
 import pytest
-from made_up import run_set, small
 from pandas import DataFrame
+from support.made_up import run_set, small
 
 from padgs.reports.selection import Mixture, one_setting, separate
 

@@ -3,8 +3,8 @@
 from dataclasses import replace
 
 import pytest
-from made_up import run_set, small
 from PIL import Image
+from support.made_up import run_set, small
 
 from padgs.reports.charts.smallest_chart import charts
 from padgs.reports.smallest import curves, gain, ratio, searched, table

@@ -4,7 +4,7 @@ import sys
 from dataclasses import replace
 
 import pytest
-from made_up import METHODS, compared, data_set, swept, write
+from support.made_up import METHODS, compared, data_set, swept, write
 
 RESULTS = 1000
 SECONDS = 40.0  # of CPU time, 34 on an EPYC with AVX2; what others do on the machine does not count

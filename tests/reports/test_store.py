@@ -1,7 +1,7 @@
 import json
 
 import pytest
-from made_up import compared, small, write
+from support.made_up import compared, small, write
 from typer.testing import CliRunner
 
 from padgs import results

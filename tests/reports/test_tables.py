@@ -4,8 +4,8 @@ import math
 from dataclasses import replace
 
 import pytest
-from made_up import RULES, builder, compared, failed, of_experiment, result, run_set, small
 from omegaconf import OmegaConf
+from support.made_up import RULES, builder, compared, failed, of_experiment, result, run_set, small
 
 from padgs.reports.frame import law
 from padgs.reports.methods import title

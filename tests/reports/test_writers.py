@@ -3,7 +3,7 @@ import shutil
 import subprocess
 
 import pytest
-from made_up import builder, data_set, failed, result, run_set
+from support.made_up import builder, data_set, failed, result, run_set
 
 from padgs.reports.writers import _line, latex
 

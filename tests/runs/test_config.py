@@ -1,7 +1,7 @@
 """What no run could do anything sensible with is found when its configuration is composed."""
 
 import pytest
-from composed import configuration
+from support.composed import configuration
 
 from padgs.checks import ConfigError
 from padgs.multirun.composition import composing

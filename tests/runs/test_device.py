@@ -2,9 +2,9 @@ import io
 
 import pytest
 import torch
-from composed import composed
 from rich.console import Console
-from tiny_scene import tiny_scene
+from support.composed import composed
+from support.tiny_scene import tiny_scene
 
 from padgs.checks import ConfigError
 from padgs.native import cuda

@@ -1,6 +1,6 @@
 import pytest
-from composed import composed
 from omegaconf import OmegaConf
+from support.composed import composed
 
 from padgs import results
 from padgs.runs.store import RunStore, config_hash, run_id

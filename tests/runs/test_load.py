@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
-from tiny_run import tiny_run
+from support.tiny_run import tiny_run
 
 import padgs
 from padgs.data.capture import DataError

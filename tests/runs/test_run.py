@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from composed import composed
 from PIL import Image
 from rich.console import Console
-from tiny_scene import HEIGHT, WIDTH, tiny_scene
+from support.composed import composed
+from support.tiny_scene import HEIGHT, WIDTH, tiny_scene
 
 from padgs import results
 from padgs.data.capture import DataError

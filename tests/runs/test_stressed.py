@@ -6,10 +6,10 @@ from functools import partial
 
 import pytest
 import torch
-from composed import composed
-from made_up import result
 from rich.console import Console
-from tiny_scene import tiny_scene
+from support.composed import composed
+from support.made_up import result
+from support.tiny_scene import tiny_scene
 
 from padgs.evaluation.protocols import Protocol
 from padgs.evaluation.scoring import constant_color_quality

@@ -3,10 +3,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from composed import composed
-from made_up import result
 from rich.console import Console
-from tiny_scene import tiny_scene
+from support.composed import composed
+from support.made_up import result
+from support.tiny_scene import tiny_scene
 
 from padgs.runs.console import introduce, say, show_result
 

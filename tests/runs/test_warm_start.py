@@ -6,9 +6,9 @@ from dataclasses import replace
 import pytest
 import torch
 from rich.console import Console
-from states import assert_same_but_time
-from tiny_run import SETTINGS, tiny_run
-from tiny_scene import tiny_scene
+from support.states import assert_same_but_time
+from support.tiny_run import SETTINGS, tiny_run
+from support.tiny_scene import tiny_scene
 
 import padgs
 from padgs import results

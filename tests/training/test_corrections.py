@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import pytest
 import torch
-from composed import composed
-from states import assert_same_but_time
-from tiny_scene import tiny_scene, truth
+from support.composed import composed
+from support.states import assert_same_but_time
+from support.tiny_scene import tiny_scene, truth
 from torch import nn
 
 from padgs.baselines.omnigs import OmniGSMethod

@@ -4,9 +4,9 @@ import math
 
 import pytest
 import torch
-from composed import composed
-from states import assert_same_but_time
-from tiny_scene import tiny_scene
+from support.composed import composed
+from support.states import assert_same_but_time
+from support.tiny_scene import tiny_scene
 from torch import nn
 
 from padgs.runs.run import build_method

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from states import assert_same_but_time
-from tiny_scene import tiny_scene
+from support.states import assert_same_but_time
+from support.tiny_scene import tiny_scene
 from torch import Tensor, nn
 
 from padgs import clock

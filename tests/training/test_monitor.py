@@ -2,7 +2,7 @@ import json
 
 import pytest
 import torch
-from tiny_scene import tiny_scene
+from support.tiny_scene import tiny_scene
 
 from padgs.gaussians import Gaussians
 from padgs.methods.splats.method import SplatMethod

@@ -3,7 +3,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tiny_scene import tiny_scene, truth
+from support.tiny_scene import tiny_scene, truth
 
 from padgs.methods.calibration.align import align
 from padgs.render import RenderOptions, render

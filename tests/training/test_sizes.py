@@ -3,8 +3,8 @@ from itertools import islice
 
 import pytest
 import torch
-from states import assert_same_but_time
-from tiny_scene import HEIGHT, WIDTH, tiny_scene, truth
+from support.states import assert_same_but_time
+from support.tiny_scene import HEIGHT, WIDTH, tiny_scene, truth
 
 from padgs.geometry.camera import Pinhole
 from padgs.methods.plus.method import PlusMethod, PlusOptions

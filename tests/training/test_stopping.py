@@ -2,8 +2,8 @@
 
 import pytest
 import torch
-from states import assert_same_but_time
-from tiny_scene import HEIGHT, WIDTH, tiny_scene
+from support.states import assert_same_but_time
+from support.tiny_scene import HEIGHT, WIDTH, tiny_scene
 from torch import Tensor
 
 from padgs.baselines import METHODS

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from pretended_gpu import GPU, pretended_gpu
+from support.pretended_gpu import GPU, pretended_gpu
 from typer.testing import CliRunner
 
 from padgs.apps.bench import report

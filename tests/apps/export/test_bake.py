@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tiny_scene import tiny_scene, truth
+from support.tiny_scene import tiny_scene, truth
 
 from padgs.apps.export.bake import axes_of, bake, contributions, distill, sample_cameras
 from padgs.gaussians import rotation_matrices

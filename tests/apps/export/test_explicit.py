@@ -6,10 +6,10 @@ from dataclasses import replace
 import pytest
 import torch
 from plyfile import PlyData
-from random_splats import random_splats
 from scipy.spatial.transform import Rotation
-from tiny_run import tiny_run
-from tiny_scene import tiny_scene
+from support.random_splats import random_splats
+from support.tiny_run import tiny_run
+from support.tiny_scene import tiny_scene
 from typer.testing import CliRunner
 
 import padgs

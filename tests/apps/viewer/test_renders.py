@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tiny_run import tiny_run
+from support.tiny_run import tiny_run
 
 import padgs
 from padgs.apps.viewer.renders import RunRenderer, ViewOptions, side_by_side

@@ -5,8 +5,8 @@ import time
 from urllib.request import urlopen
 
 import pytest
-from chromium import in_chromium, visiting
-from tiny_run import tiny_run
+from support.chromium import in_chromium, visiting
+from support.tiny_run import tiny_run
 from typer.testing import CliRunner
 
 import padgs

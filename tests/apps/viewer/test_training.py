@@ -12,8 +12,8 @@ from urllib.request import urlopen
 
 import numpy as np
 import pytest
-from chromium import in_chromium, visiting
-from tiny_run import tiny_run
+from support.chromium import in_chromium, visiting
+from support.tiny_run import tiny_run
 
 import padgs
 from padgs import results

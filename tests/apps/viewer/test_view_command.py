@@ -7,7 +7,7 @@ from types import SimpleNamespace
 from unittest.mock import MagicMock
 
 import pytest
-from tiny_run import tiny_run
+from support.tiny_run import tiny_run
 from typer.testing import CliRunner
 
 from padgs.apps.viewer import pages, process

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from fixtures import World, write_colmap_binary, write_colmap_text
+from support.fixtures import World, write_colmap_binary, write_colmap_text
 
 from padgs.data import DataError, load, read
 from padgs.geometry.panorama import project

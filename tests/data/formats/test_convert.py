@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fixtures import WRITERS, World, write_cloud
 from PIL import Image
+from support.fixtures import WRITERS, World, write_cloud
 
 from padgs.cli.convert import FORMATS
 from padgs.data import DataError, DataOptions, load, read

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from fixtures import WRITERS, World, paint, write_colmap_binary, write_colmap_text, write_transforms
+from support.fixtures import WRITERS, World, paint, write_colmap_binary, write_colmap_text, write_transforms
 
 from padgs.data import DataError, load, read
 from padgs.data.formats.transforms import transforms_file

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fixtures import WRITERS, World, make_world, write_colmap_text
+from support.fixtures import WRITERS, World, make_world, write_colmap_text
 
 from padgs.data import DataError, load, read
 

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from composed import composed
-from tiny_scene import tiny_scene
+from support.composed import composed
+from support.tiny_scene import tiny_scene
 
 from padgs.data.perturb import StressOptions
 from padgs.evaluation.diagnostics import yaw_error

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from composed import composed
+from support.composed import composed
 
 from padgs.evaluation.scoring import score
 from padgs.runs.run import build_method, load_scene

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fixtures import World, write_colmap_text, write_images, write_transforms
 from PIL import Image
+from support.fixtures import World, write_colmap_text, write_images, write_transforms
 from typer import Typer
 from typer.testing import CliRunner
 

@@ -105,7 +105,7 @@ def backend_cases():
 def test_golden_image_and_gradients(golden, backend, dtype):
     if backend == "cpu" and not cpu.available():
         pytest.skip("the native CPU library is not built")
-    if backend == "cuda" and "cuda_engine" not in sys.modules:
+    if backend == "cuda" and "support.cuda_engine" not in sys.modules:
         pytest.skip("tests/render, which arranges for backend cuda, is not part of this run")
     meta = golden["meta"]
     model, view = golden_model(golden, dtype), golden_view(golden)

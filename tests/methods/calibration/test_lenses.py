@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tiny_scene import tiny_scene, truth
+from support.tiny_scene import tiny_scene, truth
 
 from padgs.gaussians import Gaussians
 from padgs.geometry.camera import Panorama, Pinhole, RayTable

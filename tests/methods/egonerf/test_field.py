@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 import torch
-from composed import composed
-from tiny_scene import tiny_scene
+from support.composed import composed
+from support.tiny_scene import tiny_scene
 from torch.nn.functional import normalize, softplus
 
 from padgs.data.synthetic import SyntheticOptions, generate

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tiny_scene import tiny_scene
+from support.tiny_scene import tiny_scene
 from torch import Tensor, nn
 
 from padgs.methods.egonerf.model import RayTrainer

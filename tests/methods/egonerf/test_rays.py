@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tiny_scene import tiny_scene
+from support.tiny_scene import tiny_scene
 
 from padgs.geometry.camera import Pinhole
 from padgs.methods.egonerf.rays import RayPixels, interval_lengths, inverse_cdf, jittered, refined, visible_shares

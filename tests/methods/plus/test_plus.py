@@ -7,8 +7,8 @@ from itertools import count, islice
 
 import pytest
 import torch
-from states import assert_same_but_time
-from tiny_scene import tiny_scene
+from support.states import assert_same_but_time
+from support.tiny_scene import tiny_scene
 
 from padgs import clock
 from padgs.geometry.distortion import solid_angle_weight

@@ -1,7 +1,7 @@
 """Budgets of Gaussians, for all methods that have some."""
 
 import pytest
-from tiny_scene import tiny_scene
+from support.tiny_scene import tiny_scene
 
 from padgs.baselines import METHODS
 from padgs.multirun.composition import make_method

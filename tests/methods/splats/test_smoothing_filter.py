@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from tiny_scene import tiny_scene
+from support.tiny_scene import tiny_scene
 
 from padgs.geometry.camera import perspective
 from padgs.methods.plus.method import PlusMethod, PlusOptions

@@ -3,7 +3,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tiny_scene import tiny_scene
+from support.tiny_scene import tiny_scene
 
 from padgs.geometry.harmonics import basis
 from padgs.methods.splats.splats import Splats, initial_scales

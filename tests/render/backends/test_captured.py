@@ -6,10 +6,10 @@ import contextlib
 from dataclasses import replace
 from types import SimpleNamespace
 
-import cuda_engine
 import pytest
 import torch
-from render_cases import INPUTS, camera_of, mixture, random_pose, view_of
+from support import cuda_engine
+from support.render_cases import INPUTS, camera_of, mixture, random_pose, view_of
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from padgs.gaussians import Gaussians

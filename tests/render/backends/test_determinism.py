@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from render_cases import OUTPUTS, camera_of, differentiated, mixture, needs_native, random_pose
+from support.render_cases import OUTPUTS, camera_of, differentiated, mixture, needs_native, random_pose
 from torch import Tensor
 
 from padgs.geometry.camera import Panorama

@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from render_cases import (
+from support.render_cases import (
     INPUTS,
     SETUPS,
     camera_of,

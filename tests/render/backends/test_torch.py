@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from render_cases import draw, gaussians_of, identity_pose, leaves, mixture
+from support.render_cases import draw, gaussians_of, identity_pose, leaves, mixture
 
 from padgs.gaussians import Gaussians
 from padgs.render import RenderOptions, render

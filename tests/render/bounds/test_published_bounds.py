@@ -6,8 +6,8 @@ import math
 
 import pytest
 import torch
-from native_tiles import NativeTiles
-from render_cases import identity_pose, needs_native, projected
+from support.native_tiles import NativeTiles
+from support.render_cases import identity_pose, needs_native, projected
 
 from padgs.gaussians import Gaussians
 from padgs.geometry.camera import Panorama

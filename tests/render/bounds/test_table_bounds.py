@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from render_cases import mixture, needs_native, random_pose, view_of
+from support.render_cases import mixture, needs_native, random_pose, view_of
 
 from padgs.geometry.camera import Panorama, RayTable
 from padgs.geometry.lens import axis_direction, bend

@@ -6,11 +6,11 @@ import math
 
 import pytest
 import torch
-from definition import MARGIN, alphas
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from native_tiles import NativeTiles, projected
-from render_cases import (
+from support.definition import MARGIN, alphas
+from support.native_tiles import NativeTiles, projected
+from support.render_cases import (
     KINDS,
     ODD_SIZES,
     OUTPUTS,

@@ -9,10 +9,20 @@ from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
 
-import cuda_engine
 import pytest
 import torch
-from render_cases import INPUTS, blended, camera_of, gaussians_of, leaves, mixture, random_pose, row_error, view_of
+from support import cuda_engine
+from support.render_cases import (
+    INPUTS,
+    blended,
+    camera_of,
+    gaussians_of,
+    leaves,
+    mixture,
+    random_pose,
+    row_error,
+    view_of,
+)
 from torch import Tensor
 
 from padgs import render as package

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from contextlib import contextmanager
 
-import cuda_engine
 import pytest
 import torch
+from support import cuda_engine
 from torch import Tensor
 
 from padgs.gaussians import Gaussians

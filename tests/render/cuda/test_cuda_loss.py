@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import cuda_engine
 import pytest
 import torch
+from support import cuda_engine
 
 from padgs.training import loss as training_loss
 from padgs.training.loss import fused_photometric_loss, photometric_loss, pixel_weight

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import cuda_engine
 import pytest
 import torch
+from support import cuda_engine
 from torch import Tensor
 
 from padgs.methods.splats import native_splats

@@ -6,12 +6,12 @@ import ctypes
 import itertools
 from dataclasses import replace
 
-import cuda_engine
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from render_cases import INPUTS, camera_of, gaussians_of, identity_pose, mixture, random_pose
+from support import cuda_engine
+from support.render_cases import INPUTS, camera_of, gaussians_of, identity_pose, mixture, random_pose
 from torch import Tensor
 
 from padgs.gaussians import Gaussians

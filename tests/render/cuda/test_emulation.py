@@ -7,9 +7,9 @@ import functools
 import subprocess
 import sys
 
-import cuda_engine
 import pytest
 import torch
+from support import cuda_engine
 
 from padgs.native.abi import Pointer
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import ctypes
 import functools
 
-import cuda_engine
 import pytest
 import torch
+from support import cuda_engine
 from torch import Tensor
 
 from padgs.native.abi import pointer

@@ -10,10 +10,10 @@ from contextlib import contextmanager
 from dataclasses import replace
 from itertools import islice
 
-import cuda_engine
 import pytest
 import torch
-from pretended_gpu import GPU, pretended_gpu
+from support import cuda_engine
+from support.pretended_gpu import GPU, pretended_gpu
 from torch import Tensor
 
 from padgs.apps.bench.workload import Size, build, resident

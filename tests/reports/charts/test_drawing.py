@@ -1,7 +1,7 @@
 import re
 
 import pytest
-from made_up import compared, run_set, small, swept
+from support.made_up import compared, run_set, small, swept
 
 from padgs import baselines
 from padgs.reports.charts import drawing, sweep_chart, trade_off_chart

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from made_up import compared, small, write
+from support.made_up import compared, small, write
 
 from padgs.reports import store
 from padgs.reports.charts import gallery

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from made_up import assert_apart
+from support.made_up import assert_apart
 
 from padgs.reports.charts.drawing import figure, lay_out
 from padgs.reports.charts.labels import BESIDE, Label, write_labels

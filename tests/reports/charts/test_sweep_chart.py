@@ -1,7 +1,7 @@
 from dataclasses import replace
 
 import pytest
-from made_up import compared, run_set, small, swept
+from support.made_up import compared, run_set, small, swept
 
 from padgs.reports.charts.sweep_chart import chart, charts, sweeps
 from padgs.reports.table import ReportError

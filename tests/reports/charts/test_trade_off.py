@@ -1,7 +1,7 @@
 from dataclasses import replace
 
 import pytest
-from made_up import METHODS, compared, data_set, run_set, small
+from support.made_up import METHODS, compared, data_set, run_set, small
 
 from padgs.reports.charts.trade_off import pareto, trade_offs
 from padgs.reports.table import ReportError

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_up import assert_apart, compared, run_set, small, write
+from support.made_up import assert_apart, compared, run_set, small, write
 
 from padgs.reports import store
 from padgs.reports.charts import time_chart

@@ -3,8 +3,8 @@ import time
 from dataclasses import replace
 
 import pytest
-from chromium import in_chromium, visiting
-from made_up import compared, data_set, failed, run_set, small, swept, write
+from support.chromium import in_chromium, visiting
+from support.made_up import compared, data_set, failed, run_set, small, swept, write
 
 from padgs.reports import store
 from padgs.reports.frame import frame

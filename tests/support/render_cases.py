@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-import cuda_engine
 import pytest
 import torch
 from torch import Tensor
@@ -20,6 +19,7 @@ from padgs.render.planar import PlanarFootprints
 from padgs.render.projection import Footprints, project
 from padgs.render.projective import RayFootprints
 from padgs.scene import View
+from support import cuda_engine
 
 INPUTS = ("means", "quats", "scales", "opacities", "colors")
 OUTPUTS = ("image", "transmittance", "depth")

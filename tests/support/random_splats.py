@@ -1,9 +1,9 @@
 """Gaussians with all of their numbers at random."""
 
 import torch
-from tiny_scene import tiny_scene
 
 from padgs.methods.splats.splats import Splats
+from support.tiny_scene import tiny_scene
 
 
 def random_splats(degree: int, generator: torch.Generator) -> Splats:

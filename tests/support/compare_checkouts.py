@@ -1,6 +1,6 @@
 """Whether two checkouts train to the same numbers: one short run of each method, compared bit by bit.
 
-    python tests/compare_checkouts.py OLD NEW FOLDER
+    python tests/support/compare_checkouts.py OLD NEW FOLDER
 
 OLD and NEW are checkouts whose `.venv` is set up (`make test` does that), FOLDER takes the runs of both; finished ones
 are not repeated. Compared are the tensors and values of the checkpoint, the scores and the name of the run; then NEW

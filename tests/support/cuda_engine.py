@@ -27,7 +27,7 @@ from padgs.render.contract import Removals, Request
 from padgs.render.leave_one_out import BACKENDS as SCORERS
 
 os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # deterministic; older torch reads it but once
-HERE = Path(__file__).parent
+HERE = Path(__file__).parents[1] / "render" / "cuda"
 SOURCES = Path(cuda.__file__).parent / "csrc" / "cuda"
 NVCC = shutil.which("nvcc")
 COMPILER = shutil.which("c++") or shutil.which("g++")

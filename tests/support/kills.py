@@ -1,6 +1,6 @@
 """Kill `padgs-run` and `padgs report` at random moments, again and again; every end must be the same, bit by bit.
 
-    python tests/kills.py 100 --seed 7
+    python tests/support/kills.py 100 --seed 7
 
 One process imports everything once and forks a child for each attempt, so a kill costs no more than what it cuts off.
 """
@@ -22,13 +22,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from processes import SMALLEST
 
 from padgs import results
 from padgs.cli.commands import app
 from padgs.multirun import job, run, sweep  # noqa: F401 - before the first fork
 from padgs.runs import checkpoint
 from padgs.runs import run as pipeline  # noqa: F401
+from support.processes import SMALLEST
 
 TINY = [*SMALLEST, "train.iterations=60", "run.checkpoint_every=5", "run.probe_every=20", "tracking=none"]
 TIMES = re.compile(r'"(cpu_)?seconds": [0-9.]+')

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from render_cases import INPUTS
 from torch import Tensor
 
 from padgs.gaussians import Gaussians
@@ -12,6 +11,7 @@ from padgs.native.abi import Inputs, pointer
 from padgs.render import RenderOptions
 from padgs.render.backends.cpu import TILE, Projected
 from padgs.render.backends.native import native_camera
+from support.render_cases import INPUTS
 
 
 def projected(gaussians: Gaussians, camera: Camera, options: RenderOptions, pose: Tensor) -> Projected:
