@@ -58,7 +58,7 @@ def read(source: Path) -> tuple[list[Run], list[ResultError]]:
 
 
 def add(runs: Iterable[Run], store: Path) -> list[Run]:
-    """Add runs to a store, atomic_path those of the same name; return all runs in it.
+    """Add runs to a store, replacing those of the same name; return all runs in it.
 
     Raises:
         ResultError: a line of the store is damaged, and would be lost.

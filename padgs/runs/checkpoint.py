@@ -1,7 +1,7 @@
 """A `State` as a folder: tensors in safetensors, values in JSON; nothing in it is ever executed.
 
 `state.json` names the file of tensors with its size and SHA-256, says which run it is of, and ends with a SHA-256 of
-itself. The tensors are written first, under a new name, and atomic_path `state.json` is the one step that makes the new
+itself. The tensors are written first, under a new name, and replacing `state.json` is the one step that makes the new
 checkpoint count. So at every moment, whatever is killed or full, the folder holds one complete checkpoint: the old one
 or the new one.
 """
@@ -48,7 +48,7 @@ def digest(folder: Path) -> str:
 
 
 def save(state: State, folder: Path, run: Mapping[str, str] | None = None) -> None:
-    """Write a checkpoint, atomic_path the one in the folder, which stays whole until the new one is.
+    """Write a checkpoint, replacing the one in the folder, which stays whole until the new one is.
 
     Args:
         state: of a method.
