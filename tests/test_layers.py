@@ -19,7 +19,7 @@ LAYERS = (
     *("native", "geometry", "core", "results", "reports", "data", "render", "training", "evaluation"),
     *("methods", "baselines", "runs", "apps", "multirun", "cli"),
 )
-MAX_PACKAGES, MAX_LEVELS, MAX_EDGES = 20, 10, 85
+MAX_PACKAGES, MAX_LEVELS, MAX_EDGES = 20, 9, 85
 # Stricter limits: package -> the only packages that it imports.
 ONLY = {"data": {"core", "geometry"}, "results": {"core"}, "reports": {"core", "results"}}
 # Foreign packages -> the only places that import them.
@@ -36,7 +36,7 @@ STANDARD_LIBRARY_ONLY = ("padgs.registry", "padgs.files", "padgs.results")
 CATCH_ALL_NAMES = {"utils", "util", "helpers", "helper", "common", "misc", "base", "tools", "stuff"}
 # A docstring begins with a verb or a noun.
 NO_FIRST_WORDS = set("Of That Those What Whom Whose Where How As Whether Which Who".split())  # noqa: SIM905
-MAX_TO_REWRITE = 166
+MAX_TO_REWRITE = 30
 
 
 def module_name(path: Path) -> str:
@@ -140,7 +140,7 @@ def test_the_packages_form_few_levels_with_few_edges():
     levels: dict[str, int] = {}
     for package in TopologicalSorter(graph).static_order():  # raises CycleError
         levels[package] = 1 + max((levels[other] for other in graph[package]), default=0)
-    assert set(graph) <= set(LAYERS) and len(graph) <= MAX_PACKAGES
+    assert set(graph) == set(LAYERS) and len(graph) <= MAX_PACKAGES
     assert max(levels.values()) <= MAX_LEVELS, levels
     assert sum(map(len, graph.values())) <= MAX_EDGES, {package: sorted(others) for package, others in graph.items()}
 
