@@ -83,7 +83,7 @@ class TrainOptions:
     guard_gradients: bool = False  # set non-finite gradients of single rows to 0; see `padgs.training.guard`
     guard_scales: bool = False  # keep scales within bounds; see `padgs.training.guard`
     exposures: str = GIVEN  # learned: gain and offset of each training view; test views have the mean one
-    poses: str = GIVEN  # learned: a small correction of each training view; test views keep their poses
+    poses: str = GIVEN  # learned: a small correction of each training view; test views keep theirs
     refine: bool = False  # with init: neither densify nor prune; learning rates are those of the schedule's last fifth
     hold_out: bool = False  # train without the validation views, see `padgs.training.health`
 
