@@ -46,7 +46,7 @@ class EgoNeRFMethod(Method):
             raise ValueError(f"budget.gaussians is {budget.gaussians}, but EgoNeRF has no Gaussians; leave it out")
         if budget.stop == "auto":
             raise ValueError(
-                "budget.stop is auto, which needs validation views, but rays come from all views; set budget.stop=end"
+                "budget.stop is auto, which needs validation views, but rays come from all views; set it to end"
             )
         if budget.seconds is None:  # with seconds the length is measured
             self.options.refuse_length(budget.iterations)

@@ -154,5 +154,5 @@ def test_too_few_views_for_a_validation_split_are_refused():
 
 @pytest.mark.parametrize("name", ["egonerf", "sc_omnigs"])
 def test_methods_without_validation_views_refuse_early_stopping(name, scene):
-    with pytest.raises(ValueError, match="budget.stop is auto.*set budget.stop=end"):
+    with pytest.raises(ValueError, match="budget.stop is auto.*set it to end"):
         lookup(METHODS, name, "method")().fit(scene, Budget(10, stop="auto"))
