@@ -82,12 +82,12 @@ def test_a_loss_that_comes_back_has_not(of):
 
 
 def test_a_short_run_that_ends_while_its_loss_is_high_has_diverged():
-    watch = Monitor(60, parts=1000, pixels=2000)
+    watch = Monitor(60, count=1000, pixels=2000)
     for iteration in range(1, 60):
         watch.loss(0.2 if iteration < 20 else 0.6, iteration)
     with pytest.raises(Failure, match="the loss at iteration 60 is .* since iteration 2"):
         watch.loss(0.6, 60)
-    calm = Monitor(60, parts=1000, pixels=2000)
+    calm = Monitor(60, count=1000, pixels=2000)
     for iteration in range(1, 61):
         calm.loss(0.2 if iteration != 58 else 0.9, iteration)
 
