@@ -19,7 +19,7 @@ def test_every_key_stands_there_with_the_default_of_the_method_and_its_meaning(r
     assert "train.iterations=1500" in said["train.iterations"] and "omnigs_release" in "".join(lines)
     assert "method.tau=0.9" in said["method.tau"] and "Eq. 15; 0 turns opacity modulation off" in said["method.tau"]
     assert "pixels; the height is half of it" in said["data.generator.width"] and max(map(len, lines)) <= 100
-    assert "published: made for 30 000" in said["train.learning_rates"], "the comment above it"
+    assert "published: for 30 000" in said["train.learning_rates"], "the comment above it"
     assert "render.projection=ray" in manual(["--help"]), "padgs+ is drawn by rays"
     assert "budget=auto, given" in "\n".join(lines)
     assert all(name in said["+scene"] for name in ("noisy_poses", "omniblender_LOU")), "of files and of data sets"
