@@ -15,13 +15,13 @@ namespace padgs {
 constexpr int kPatchWidth = 8, kPatchHeight = 2;  // pixels of a patch, which is one vector
 constexpr int kTile = 16;        // pixels: height of a tile, and its width times a power of two
 constexpr int kMaxLevel = 4;     // tiles are up to kTile 2^kMaxLevel pixels wide, near the poles
-constexpr int kGradientSums = 16;     // floats that backward blending leaves for each (Gaussian, tile) instance
-constexpr int kAbsgradSum = 14;
+constexpr int kGradientSums = 16;  // floats that backward blending writes for each (Gaussian, tile) instance
+constexpr int kAbsgradSum = 14;  // index of the absolute positional gradient
 constexpr int kRemoval = 4;      // floats for each instance: changes of error and image, sum and largest contribution
 constexpr float kAlphaMin = 1.0f / 255.0f;
 constexpr float kAlphaMax = 0.99f;
 constexpr float kTransmittanceMin = 1e-4f;
-constexpr float kCoreAlphaMin = 0.05f;  // hybrid: fainter fragments go to the tail
+constexpr float kCoreAlphaMin = 0.05f;  // hybrid: fainter fragments belong to the tail
 constexpr int kMaxCoreSize = 256;       // hybrid
 constexpr float kNearest = 1e-15f, kFurthest = 1e15f;  // distances of means that are drawn; see padgs/render/contract.py
 

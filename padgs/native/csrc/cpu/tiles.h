@@ -61,7 +61,7 @@ struct Patch {
 };
 
 // Calls visit(p) for each patch of a tile that an instance can reach, row by row. In one loop: where those of rows end,
-// nobody can predict.
+// hard to predict.
 template <typename Visit>
 PADGS_INLINE void for_each_patch(const Tile &tile, const Instance &instance, Visit visit) {
   const int columns = instance.column_end - instance.column, to_next_row = tile.patch_columns - columns + 1;

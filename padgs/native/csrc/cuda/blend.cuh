@@ -19,8 +19,8 @@ struct Batch {
   Reach reaches[kRoom];
 };
 
-// Reads `count` instances from the place `from` of all lists on. The whole block takes part, nobody may read the batch
-// before any more, and nobody may read it yet.
+// Reads `count` instances, starting at position `from` of all lists. The whole block takes part; barriers are needed
+// before, so that no thread reads the old batch, and after, before any thread reads this one.
 template <int kRoom>
 __device__ void fill(Batch<kRoom> &batch, const BlendInputs &args, int from, int count) {
   const int k = int(threadIdx.x);
