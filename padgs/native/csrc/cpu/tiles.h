@@ -60,7 +60,7 @@ struct Patch {
   }
 };
 
-// Calls visit(p) for each patch of a tile that an instance can reach, row by row. In one loop: where those of rows end,
+// Calls visit(p) for each patch of a tile that an instance can reach, row by row. In one loop, because the ends of rows are
 // hard to predict.
 template <typename Visit>
 PADGS_INLINE void for_each_patch(const Tile &tile, const Instance &instance, Visit visit) {
