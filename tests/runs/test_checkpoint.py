@@ -131,15 +131,6 @@ def test_a_checkpoint_of_another_run_is_refused(tmp_path):
             checkpoint.load(tmp_path, run={**run, what: "c"})
 
 
-def test_a_checkpoint_of_the_first_format_which_named_no_run_is_refused(tmp_path):
-    checkpoint.save(example(), tmp_path, {"configuration": "a"})
-    manifest = json.loads((tmp_path / "state.json").read_text())
-    old = {key: manifest[key] for key in ("tensors", "bytes", "sha256", "values")}
-    (tmp_path / "state.json").write_text(json.dumps({"format": 1, **old}))
-    with pytest.raises(CheckpointError, match="has format 1, this program reads 2; delete the checkpoint folder"):
-        checkpoint.load(tmp_path)
-
-
 def test_missing_tensors_are_named(tmp_path):
     checkpoint.save(example(), tmp_path)
     file = tensors_file(tmp_path)

@@ -1,18 +1,15 @@
-import io
 
 import pytest
 import torch
-from rich.console import Console
 from support.composed import composed
 from support.tiny_scene import tiny_scene
 
-from padgs.checks import ConfigError
 from padgs.native import cuda
 from padgs.render import RenderConfig
 from padgs.runs import run as pipeline
 from padgs.runs.config import RunOptions
 from padgs.runs.device import choose_device
-from padgs.runs.run import run
+from padgs.runs.run import load_scene
 
 GPU = torch.device("cuda", 0)
 
@@ -46,7 +43,7 @@ def test_the_backend_of_a_gpu_is_refused_on_the_cpu_and_where_it_is_not_built(mo
         == choose_device("cuda", RenderConfig(backend="cuda"))
         == GPU
     )
-    with pytest.raises(ValueError, match="render.backend=cuda draws on a GPU only, .*set run.device=auto"):
+    with pytest.raises(ValueError, match="render.backend=cuda renders on a GPU only, .*set run.device=auto"):
         choose_device("cpu", RenderConfig(backend="cuda"))
 
     def missing():
@@ -88,7 +85,6 @@ def test_an_unknown_place_is_refused():
 
 def test_panoramas_are_kept_where_the_run_trains_or_in_main_memory(monkeypatch, root):
     monkeypatch.setenv("PADGS_ROOT", str(root))
-    monkeypatch.setattr(pipeline, "choose_device", lambda name, render: torch.device("meta"))
     places = []
 
     def load(path, format, options):
@@ -97,11 +93,5 @@ def test_panoramas_are_kept_where_the_run_trains_or_in_main_memory(monkeypatch, 
 
     monkeypatch.setattr(pipeline.data, "load", load)
     for setting in ("run.images_on=device", "run.images_on=cpu"):
-        run(composed(setting), Console(file=io.StringIO()))
+        load_scene(composed(setting), torch.device("meta"))
     assert places == ["meta", "cpu"]
-
-
-def test_the_second_key_for_the_device_names_the_first(monkeypatch, root):
-    monkeypatch.setenv("PADGS_ROOT", str(root))
-    with pytest.raises(ConfigError, match="data.device is no key any more: run.device .*run.images_on=cpu"):
-        composed("data.device=cpu")

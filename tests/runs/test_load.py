@@ -93,8 +93,8 @@ def test_a_run_that_is_not_finished_opens_too_and_an_old_key_is_passed_over(fold
     [
         ("config.yaml", "seed: 0\nrender", "seed: 0\nrender", None),
         ("config.yaml", "iterations: 30", "iterations: 31", "is of a run with another configuration"),
-        ("config.yaml", "data:\n", "date:\n", "is no configuration that padgs-run wrote"),
-        ("config.yaml", "data:\n", "data: [\n", "is no configuration that padgs-run wrote"),
+        ("config.yaml", "data:\n", "date:\n", "is not a configuration of padgs-run"),
+        ("config.yaml", "data:\n", "data: [\n", "is not a configuration of padgs-run"),
         ("checkpoint/state.json", '"iteration": 30', '"iteration": 29', "was changed after it was written"),
     ],
 )
@@ -114,7 +114,7 @@ def test_data_that_have_changed_since_are_told_to_who_looks_and_refused_to_who_c
     run.refuse_other_data()
     run = padgs.load_run(folder, device="cpu")
     run.result = replace(run.result, fingerprint="other")
-    with pytest.warns(UserWarning, match="was trained on other data than the generator holds now"):
+    with pytest.warns(UserWarning, match="was trained on other data than the generator holds"):
         assert run.scene.train
     with pytest.raises(DataError, match="say with --data where those are"):
         run.refuse_other_data()
