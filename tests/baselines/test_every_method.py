@@ -42,11 +42,6 @@ SETTINGS = sorted({*METHODS, *(path.stem for path in (CONF / "method").glob("*.y
 EVERY = [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in SETTINGS]
 
 
-@pytest.fixture(autouse=True)
-def padgs_root(monkeypatch, root):
-    monkeypatch.setenv("PADGS_ROOT", str(root))
-
-
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory) -> Iterator[Callable[[str], Scene]]:
     """The synthetic scenes by their names, tiny."""

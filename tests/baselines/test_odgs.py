@@ -47,19 +47,14 @@ def test_the_tangent_plane_leads_to_the_jacobian_of_the_panorama(generator):
     assert difference[means.norm(dim=-1) > 1].max() < 1e-9
 
 
-@pytest.fixture
-def padgs_root(monkeypatch, root):
-    monkeypatch.setenv("PADGS_ROOT", str(root))
-
-
-def test_the_method_is_omnigs_with_half_the_threshold(padgs_root):
+def test_the_method_is_omnigs_with_half_the_threshold():
     odgs, omnigs = composed("method=odgs"), composed("method=omnigs")
     assert odgs.options == replace(ODGSOptions(**vars(omnigs.options)), gradient_threshold=1e-4)
     assert (odgs.render, odgs.train) == (omnigs.render, omnigs.train)
     assert omnigs.options.gradient_threshold == 2e-4
 
 
-def test_the_release_differs_by_its_deviations_only(padgs_root):
+def test_the_release_differs_by_its_deviations_only():
     odgs, release = composed("method=odgs"), composed("method=odgs_release")
     deviations = {"sh_degree": 0, "extent_margin": 100.0, "pixel_bias": 0.5, "prune_by_extent": True}
     assert release.options == replace(odgs.options, **deviations, min_extent=0.0, max_gaussians=None)

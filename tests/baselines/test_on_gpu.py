@@ -51,11 +51,6 @@ METHODS = {
 }
 
 
-@pytest.fixture(autouse=True)
-def padgs_root(monkeypatch, root):
-    monkeypatch.setenv("PADGS_ROOT", str(root))
-
-
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory) -> Scene:
     with pytest.MonkeyPatch.context() as patch:

@@ -9,7 +9,7 @@ import pytest
 import torch
 from rich.console import Console
 from support.composed import composed
-from support.tiny_scene import tiny_scene
+from support.tiny_scene import in_other_units, squared_error, tiny_scene
 
 from padgs import results
 from padgs.baselines.op43dgs import OP43DGSMethod, OP43DGSOptions
@@ -18,37 +18,22 @@ from padgs.scene import Scene, View
 from padgs.training.options import Budget
 
 
-@pytest.fixture(autouse=True)
-def padgs_root(monkeypatch, root):
-    monkeypatch.setenv("PADGS_ROOT", str(root))
-
-
 def test_a_held_out_view_is_learned():
     scene, method = tiny_scene(), OP43DGSMethod()
     records = method.fit(scene, Budget(60))
     first = next(records)
-
-    def error() -> float:
-        return (method.render(scene.test[0]).image.clamp(0, 1) - scene.test[0].image()).square().mean().item()
-
-    start = error()
+    start = squared_error(method, scene.test[0])
     *_, last = records
     assert last.loss < 0.65 * first.loss  # measured: 0.52
-    assert error() < 0.6 * start  # measured: 0.46
+    assert squared_error(method, scene.test[0]) < 0.6 * start  # measured: 0.46
 
 
 def scene_of(distance: float) -> Scene:
     """Points and cameras that look the same from every distance, on panoramas of many tiles."""
-    near = tiny_scene()
-    grey = torch.full((128, 256, 3), 128, dtype=torch.uint8)
-
-    def enlarged(view: View) -> View:
-        pose = view.cam_from_world.clone()
-        pose[:3, 3] *= distance
-        return View(view.name, pose, 256, 128, load_pixels=lambda: grey)
-
-    train, test = (tuple(map(enlarged, views)) for views in (near.train, near.test))
-    return Scene(f"{distance:g}", train, test, distance * near.points, near.point_colors, fingerprint=f"{distance:g}")
+    far = in_other_units(tiny_scene(), distance)
+    size = {"width": 256, "height": 128, "load_pixels": lambda: torch.full((128, 256, 3), 128, dtype=torch.uint8)}
+    train, test = (tuple(replace(view, **size) for view in views) for views in (far.train, far.test))
+    return replace(far, name=f"{distance:g}", train=train, test=test, fingerprint=f"{distance:g}")
 
 
 def test_the_release_differs_by_its_deviations_only():

@@ -34,8 +34,7 @@ def times_seen(method: Cubemap3DGSMethod) -> torch.Tensor:
 
 
 @each_method
-def test_registered_and_configured_as_the_class_says(name, monkeypatch, root):
-    monkeypatch.setenv("PADGS_ROOT", str(root))
+def test_registered_and_configured_as_the_class_says(name):
     config, method = composed(f"method={name}"), METHOD[name]
     assert lookup(METHODS, name, "method") is method
     assert (config.method, config.options, config.render) == (name, method.Options(), method.RENDER)
@@ -81,7 +80,7 @@ def test_an_iteration_sees_as_much_as_one_of_a_panoramic_method(name, views):
 def test_cut_views_are_twice_as_fine_with_filters_of_the_panoramas_size(name):
     method, scene = METHOD[name](), tiny_scene()
     method.fit(scene, Budget(1))
-    (cut, *_), panorama = method._trainer._scene.train, scene.test[0]
+    (cut, *_), panorama = method._trainer._views._scene.train, scene.test[0]
     assert cut.camera.focal == pytest.approx(2 * panorama.camera.focal, rel=0.03)
     low_pass = [method.model.render_options(view).low_pass for view in (cut, panorama)]
     assert low_pass == [pytest.approx(4 * 0.3), 0.3]

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import pytest
 import torch
-from support.tiny_scene import tiny_scene
+from support.tiny_scene import in_other_units, tiny_scene
 
 from padgs.baselines import METHODS
 from padgs.methods.splats.method import SplatMethod
 from padgs.registry import lookup
-from padgs.scene import Scene, View
+from padgs.scene import Scene
 from padgs.training.options import Budget
 
 LARGER = 64.0  # a power of two: lengths are multiplied exactly, and what differs is the rounding of logarithms
@@ -18,16 +18,6 @@ STEPS = 20
 EXPLICIT = [
     name for name in METHODS if issubclass(lookup(METHODS, name, "method"), SplatMethod) and name != "padgs_plus"
 ]
-
-
-def scaled(scene: Scene, scale: float) -> Scene:
-    def view_of(view: View) -> View:
-        pose = view.cam_from_world.clone()
-        pose[:3, 3] *= scale
-        return replace(view, cam_from_world=pose)
-
-    train, test = (tuple(map(view_of, views)) for views in (scene.train, scene.test))
-    return replace(scene, train=train, test=test, points=scale * scene.points)
 
 
 def trained(name: str, scene: Scene) -> tuple[torch.Tensor, torch.Tensor, list[float]]:
@@ -43,7 +33,7 @@ def trained(name: str, scene: Scene) -> tuple[torch.Tensor, torch.Tensor, list[f
 def test_a_world_64_times_as_large_is_learned_the_same(name):
     scene = tiny_scene()
     (moves, image, losses), (far, larger_image, larger_losses) = (
-        trained(name, scaled(scene, factor)) for factor in (1.0, LARGER)
+        trained(name, in_other_units(scene, factor)) for factor in (1.0, LARGER)
     )
     assert moves.norm(dim=-1).mean() > 1e-5 * scene.scale, "measured: 5e-5"
     assert (far / LARGER - moves).norm() < 0.05 * moves.norm()  # measured: 1e-4

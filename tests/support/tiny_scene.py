@@ -1,6 +1,9 @@
 """A scene small enough to train on in a second: eight coloured Gaussians seen by six cameras."""
 
+from dataclasses import replace
+
 import torch
+from torch import Tensor
 
 from padgs.gaussians import Gaussians
 from padgs.render import RenderOptions, render
@@ -18,6 +21,26 @@ def truth() -> Gaussians:
         opacities=torch.full((8,), 0.9),
         colors=0.1 + 0.8 * (corners > 0).float(),
     )
+
+
+def in_other_units(scene: Scene, scale: float, rotation: Tensor | None = None) -> Scene:
+    """Return the same scene in another world: x' = scale * rotation x."""
+
+    def moved(view: View) -> View:
+        pose = view.cam_from_world.clone()
+        if rotation is not None:
+            pose[:3, :3] = pose[:3, :3] @ rotation.T
+        pose[:3, 3] *= scale
+        return replace(view, cam_from_world=pose)
+
+    points = scene.points if rotation is None else (scene.points.double() @ rotation.T).float()
+    train, test = (tuple(map(moved, views)) for views in (scene.train, scene.test))
+    return replace(scene, points=scale * points, train=train, test=test)
+
+
+def squared_error(method, view: View) -> float:
+    """Return the mean squared error of a method's render of a view."""
+    return (method.render(view).image.clamp(0, 1) - view.image()).square().mean().item()
 
 
 def tiny_scene() -> Scene:

@@ -81,27 +81,17 @@ def assert_decoded(decoded: Decoded, golden, prefix: str, tolerance: float = 1e-
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_golden_decode(golden, dtype):
-    model, view = golden_model(golden, dtype), golden_view(golden)
-    assert_decoded(model.decode(view), golden, "expected_")
-    assert (model.seen_from(view)[2] - golden["expected_omega"]).abs().max() <= 1e-5
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_golden_decode_released(golden, dtype):
-    model, view = golden_model(golden, dtype, **RELEASED), golden_view(golden)
-    assert_decoded(model.decode(view), golden, "expected_released_")
+@pytest.mark.parametrize(("options", "prefix"), [({}, "expected_"), (RELEASED, "expected_released_")])
+def test_golden_decode(golden, dtype, options, prefix):
+    model, view = golden_model(golden, dtype, **options), golden_view(golden)
+    assert_decoded(model.decode(view), golden, prefix)
     omega = model.seen_from(view)[2].clamp(max=model.options.max_modulated_omega)
-    assert (omega - golden["expected_released_omega"]).abs().max() <= 1e-5
+    assert (omega - golden[f"{prefix}omega"]).abs().max() <= 1e-5
 
 
-def backend_cases():
-    for backend in BACKENDS:
-        for dtype in DTYPES if backend == "torch" else (torch.float32,):
-            yield pytest.param(backend, dtype, id=f"{backend}-{dtype}")
-
-
-@pytest.mark.parametrize(("backend", "dtype"), list(backend_cases()))
+@pytest.mark.parametrize(
+    ("backend", "dtype"), [("torch", torch.float64), *((backend, torch.float32) for backend in BACKENDS)]
+)
 def test_golden_image_and_gradients(golden, backend, dtype):
     if backend == "cpu" and not cpu.available():
         pytest.skip("the native CPU library is not built")
@@ -304,11 +294,7 @@ def test_points_go_to_the_nearest_vertex_once():
     points = torch.tensor([[0.24, 0.0, 0.0], [0.26, 0.0, 0.0], [-0.26, 0.6, 0.0], [0.2, 0.1, -0.1]])
     expected = torch.tensor([[-0.5, 0.5, 0.0], [0.0, 0.0, 0.0], [0.5, 0.0, 0.0]])
     assert torch.equal(anchors_from_points(points, 0.5), expected)
-
-
-def test_halves_go_to_even():
-    halves = torch.tensor([[0.5, 1.5, -0.5]])
-    assert cells_from_points(halves, 1.0).tolist() == [[0, 2, 0]]
+    assert cells_from_points(torch.tensor([[0.5, 1.5, -0.5]]), 1.0).tolist() == [[0, 2, 0]], "halves go to even"
 
 
 @pytest.mark.parametrize("size", [0.001, 0.037, 5.0])
@@ -318,24 +304,20 @@ def test_cells_survive_the_way_through_float32_positions(size, generator):
 
 
 @pytest.mark.parametrize("spread", [3, 2**40])  # narrow: digits of one number; wide: more than 64 bits
-def test_unique_cells_are_those_of_python(spread, generator):
+def test_unique_and_occupied_cells_match_python_sets(spread, generator):
     cells = torch.randint(-spread, spread, (300, 3), generator=generator)
     cells = torch.cat((cells, cells[::3], torch.tensor([[-spread] * 3, [spread] * 3])))
     unique, inverse = unique_cells(cells)
     assert [tuple(row) for row in unique.tolist()] == sorted({tuple(row) for row in cells.tolist()})
     assert torch.equal(unique[inverse], cells)
     assert len(cell_keys(cells).unique()) == len(unique)
-
-
-@pytest.mark.parametrize("spread", [3, 2**40])
-def test_occupied_are_those_of_python(spread, generator):
     by = torch.randint(-spread, spread, (200, 3), generator=generator)
     cells = torch.cat((torch.randint(-spread, spread, (200, 3), generator=generator), by[::7]))
     there = {tuple(row) for row in by.tolist()}
     assert occupied(cells, by).tolist() == [tuple(row) in there for row in cells.tolist()]
 
 
-def test_no_cells_are_no_problem():
+def test_empty_sets_of_cells():
     nothing = torch.zeros(0, 3, dtype=torch.int64)
     assert [len(part) for part in unique_cells(nothing)] == [0, 0]
     assert occupied(nothing, torch.ones(2, 3, dtype=torch.int64)).shape == (0,)
@@ -347,10 +329,7 @@ def test_initial_scale_is_the_root_mean_square_of_three_distances():
     log_scales = initial_log_scales(positions, 1.0)
     assert log_scales.shape == (5, 6) and log_scales.dtype == torch.float32
     assert torch.allclose(log_scales[0], torch.tensor(0.5 * math.log((1 + 4 + 9) / 3)))
-
-
-def test_initial_scale_of_few_anchors():
-    assert initial_log_scales(torch.zeros(1, 3), 0.25).eq(math.log(0.25)).all()
+    assert initial_log_scales(torch.zeros(1, 3), 0.25).eq(math.log(0.25)).all(), "an anchor alone has the voxel size"
     two = initial_log_scales(torch.tensor([[0.0, 0, 0], [0, 4.0, 0]]), 1.0)
     assert torch.allclose(two, torch.tensor(math.log(4.0)))
 

@@ -6,18 +6,18 @@ import math
 
 import pytest
 import torch
+from support.decoder_cases import EVERY_SIZE, assert_matches_definition, decoded, problem
 from torch import Tensor
 
 from padgs.methods.anchors.decoder import (
     Decoder,
     Head,
-    SeenAnchors,
     decode,
     decode_gaussians,
     define_gaussians,
     take_rows,
 )
-from padgs.methods.anchors.precision import GRADIENT_TYPE, linear, reduced_dtype
+from padgs.methods.anchors.precision import GRADIENT_TYPE, linear
 from padgs.native import cpu
 
 
@@ -46,11 +46,8 @@ def test_published_shapes(decoder):
 
 
 def test_initial_weights_are_those_of_torch_linear(decoder):
-    for weights, fan_in in (
-        (decoder.opacity["w1"], 37),
-        (decoder.covariance["b1"], 37),
-        (decoder.covariance["w2"], 32),
-    ):
+    covariance = decoder.covariance
+    for weights, fan_in in ((decoder.opacity["w1"], 37), (covariance["b1"], 37), (covariance["w2"], 32)):
         bound = 1 / math.sqrt(fan_in)
         assert 0.8 * bound < weights.abs().max() <= bound
         assert weights.var().item() == pytest.approx(bound**2 / 3, rel=0.5)
@@ -59,24 +56,24 @@ def test_initial_weights_are_those_of_torch_linear(decoder):
 def test_outputs_belong_to_gaussian_k_of_their_anchor(decoder, inputs):
     """Every selected Gaussian against the networks evaluated plainly, one anchor at a time."""
     weights = decoder.weights()
-    said = decode(weights, inputs)
+    found = decode(weights, inputs)
     row = 0
     for anchor, x in enumerate(inputs):
         opacity, color, covariance = (
             head.w2 @ torch.relu(head.w1 @ x + head.b1) + head.b2
             for head in (weights.opacity, weights.color, weights.covariance)
         )
-        assert torch.allclose(said.raw_opacities[anchor], torch.tanh(opacity))
+        assert torch.allclose(found.raw_opacities[anchor], torch.tanh(opacity))
         for k in range(10):
             if opacity[k] <= 0:
                 continue
-            assert said.slots[row] == anchor * 10 + k
-            assert torch.allclose(said.opacities[row], torch.tanh(opacity[k]))
-            assert torch.allclose(said.colors[row], torch.sigmoid(color[3 * k : 3 * k + 3]))
-            assert torch.allclose(said.shrinkage[row], torch.sigmoid(covariance[7 * k : 7 * k + 3]))
-            assert torch.allclose(said.quats[row], covariance[7 * k + 3 : 7 * k + 7])
+            assert found.slots[row] == anchor * 10 + k
+            assert torch.allclose(found.opacities[row], torch.tanh(opacity[k]))
+            assert torch.allclose(found.colors[row], torch.sigmoid(color[3 * k : 3 * k + 3]))
+            assert torch.allclose(found.shrinkage[row], torch.sigmoid(covariance[7 * k : 7 * k + 3]))
+            assert torch.allclose(found.quats[row], covariance[7 * k + 3 : 7 * k + 7])
             row += 1
-    assert row == len(said.slots) > 0
+    assert row == len(found.slots) > 0
 
 
 def test_leaving_out_dead_anchors_changes_no_value_and_no_gradient(decoder, inputs):
@@ -91,24 +88,17 @@ def test_leaving_out_dead_anchors_changes_no_value_and_no_gradient(decoder, inpu
     for rows in (inputs, inputs[1::2]):
         decoder.zero_grad()
         rows = rows.clone().requires_grad_()
-        said = decode(decoder.weights(), rows)
-        (said.opacities.sum() + said.colors.square().sum() + said.shrinkage.sum() + said.quats.sin().sum()).backward()
-        outcomes.append((said, rows.grad, [weight.grad.clone() for weight in decoder.parameters()]))
+        found = decode(decoder.weights(), rows)
+        (
+            found.opacities.sum() + found.colors.square().sum() + found.shrinkage.sum() + found.quats.sin().sum()
+        ).backward()
+        outcomes.append((found, rows.grad, [weight.grad.clone() for weight in decoder.parameters()]))
     (whole, whole_grad, whole_weights), (part, part_grad, part_weights) = outcomes
     assert (whole.raw_opacities[::2] < 0).all() and len(part.slots) > 0
     for name in ("opacities", "colors", "shrinkage", "quats"):
         assert torch.allclose(getattr(whole, name), getattr(part, name))
     assert torch.allclose(whole_grad[1::2], part_grad) and (whole_grad[::2] == 0).all()
     assert all(torch.allclose(a, b) for a, b in zip(whole_weights, part_weights, strict=True))
-
-
-def test_nothing_selected(decoder, inputs):
-    with torch.no_grad():
-        decoder.opacity["b2"].fill_(-100.0)
-    said = decode(decoder.weights(), inputs)
-    assert [len(part) for part in said] == [40, 0, 0, 0, 0, 0] and said.quats.shape == (0, 4)
-    (said.opacities.sum() + said.colors.sum() + said.quats.sum()).backward()
-    assert all(torch.isfinite(weight.grad).all() for weight in decoder.parameters() if weight.grad is not None)
 
 
 def test_take_rows_is_indexing(generator):
@@ -118,87 +108,37 @@ def test_take_rows_is_indexing(generator):
 
 
 def test_gradients_match_finite_differences(generator):
-    head = Head(
-        *(
-            torch.randn(s, generator=generator, dtype=torch.float64).requires_grad_()
-            for s in ((5, 4), (5,), (3, 5), (3,))
-        )
-    )
-    inputs = torch.randn(6, 4, generator=generator, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda *args: Head(*args[1:])(args[0]), (inputs, *head))
+    sizes = ((6, 4), (5, 4), (5,), (3, 5), (3,))
+    inputs, *head = (torch.randn(s, generator=generator, dtype=torch.float64, requires_grad=True) for s in sizes)
+    assert torch.autograd.gradcheck(lambda x, *weights: Head(*weights)(x), (inputs, *head))
 
 
 pytestmark = pytest.mark.skipif(not cpu.available(), reason="the native library is not built")
-OUTPUTS = ("means", "quats", "scales", "opacities", "colors")
-
-
-def decoded(function, tensors, decoder, generator_seed=0):
-    """Outputs, slots, raw opacities, and gradients of a random weighting of the outputs."""
-    leaves = {
-        name: tensor.clone().requires_grad_(name in ("features", "offsets", "log_scales"))
-        for name, tensor in tensors.items()
-    }
-    decoder.zero_grad()
-    gaussians, slots, raw = function(decoder.weights(), SeenAnchors(**leaves))
-    generator = torch.Generator().manual_seed(generator_seed)
-    loss = sum(
-        (getattr(gaussians, name) * torch.randn(getattr(gaussians, name).shape, generator=generator)).sum()
-        for name in OUTPUTS
-    )
-    if len(slots):
-        loss.backward()
-    gradients = {name: leaf.grad for name, leaf in leaves.items() if leaf.requires_grad}
-    return gaussians, slots, raw, gradients | {name: p.grad for name, p in decoder.named_parameters()}
-
-
-def problem(anchors, offsets, inputs, hidden, opacity_bias=0.0):
-    generator = torch.Generator().manual_seed(anchors + offsets)
-    decoder = Decoder(inputs, offsets, hidden, generator=generator)
-    with torch.no_grad():
-        decoder.opacity["b2"] += opacity_bias
-    features = min(32, inputs - 3)
-    sizes = {"features": (features,), "seen": (inputs - features,), "positions": (3,), "offsets": (offsets, 3)}
-    tensors = {name: torch.randn(anchors, *size, generator=generator) for name, size in sizes.items()}
-    tensors["log_scales"] = torch.randn(anchors, 6, generator=generator) * 0.3 - 1
-    tensors["attenuation"] = torch.rand(anchors, generator=generator) * 0.9 + 0.1
-    return tensors, decoder
 
 
 @pytest.mark.parametrize("anchors", [1, 15, 17, 70, 1025])
-@pytest.mark.parametrize(("offsets", "inputs", "hidden"), [(10, 37, 32), (10, 35, 32), (1, 36, 16), (3, 37, 32)])
-def test_native_matches_the_definition(anchors, offsets, inputs, hidden):
-    tensors, decoder = problem(anchors, offsets, inputs, hidden)
-    ours, slots, raw, gradients = decoded(decode_gaussians, tensors, decoder)
-    truth, true_slots, true_raw, true_gradients = decoded(define_gaussians, tensors, decoder)
-    assert torch.equal(slots, true_slots)
-    assert torch.allclose(raw, true_raw, atol=2e-6)
-    for name in OUTPUTS:
-        assert torch.allclose(getattr(ours, name), getattr(truth, name), atol=5e-6, rtol=1e-5), name
-    for name, expected in true_gradients.items():
-        if expected is None:
-            continue
-        assert expected.abs().max() > 0 or anchors == 1, name
-        assert (gradients[name] - expected).abs().max() <= 2e-5 * expected.abs().max().clamp(min=1e-6), name
+@pytest.mark.parametrize(("offsets", "inputs", "hidden"), EVERY_SIZE)
+def test_native_matches_the_definition(anchors, offsets, inputs, hidden, generator):
+    assert_matches_definition(decode_gaussians, *problem(anchors, offsets, inputs, hidden, generator))
 
 
+@pytest.mark.parametrize("function", [decode_gaussians, define_gaussians])
 @pytest.mark.parametrize(("bias", "share"), [(-50.0, 0), (50.0, 1)])
-def test_nothing_and_everything_selected(bias, share):
-    tensors, decoder = problem(33, 10, 37, 32, opacity_bias=bias)
-    gaussians, slots, _, _ = decoded(decode_gaussians, tensors, decoder)
+def test_nothing_and_everything_selected(bias, share, function, generator):
+    tensors, decoder = problem(33, 10, 37, 32, generator, bias=bias)
+    gaussians, slots, _, gradients = decoded(function, tensors, decoder)
     assert len(slots) == len(gaussians) == share * 330
+    assert all(torch.isfinite(gradient).all() for gradient in gradients.values())
 
 
-def test_threads_change_no_bit():
-    tensors, decoder = problem(2500, 10, 37, 32)
+def test_threads_change_no_bit(generator):
+    tensors, decoder = problem(2500, 10, 37, 32, generator)
     before, results = torch.get_num_threads(), []
     try:
         for threads in (1, 2, 3):
             torch.set_num_threads(threads)
             gaussians, _, _, gradients = decoded(decode_gaussians, tensors, decoder)
-            results.append(
-                [getattr(gaussians, name).detach().clone() for name in OUTPUTS]
-                + [g.clone() for g in gradients.values()]
-            )
+            results.append([*vars(gaussians).values(), *gradients.values()])
     finally:
         torch.set_num_threads(before)
     for other in results[1:]:
@@ -257,22 +197,18 @@ def test_networks_err_by_rounding_alone_and_select_the_same_but_at_the_threshold
             magnitude = (hidden + hidden_error) @ w2.T.abs() + b2.abs()
             bounds.append(1.01 * hidden_error @ w2.T.abs() + 3 * u * magnitude)
             assert ((head(inputs, dtype) - (hidden @ w2.T + b2)).abs() <= bounds[-1]).all()
-        said, truth = decode(weights, inputs, dtype), decode(weights, inputs)
+        found, truth = decode(weights, inputs, dtype), decode(weights, inputs)
     sure = torch.atanh(truth.raw_opacities).abs() > bounds[0]
-    assert sure.float().mean() > 0.5 and torch.equal(said.raw_opacities[sure] > 0, truth.raw_opacities[sure] > 0)
-    assert not torch.equal(said.raw_opacities, truth.raw_opacities)
+    assert sure.float().mean() > 0.5 and torch.equal(found.raw_opacities[sure] > 0, truth.raw_opacities[sure] > 0)
+    assert not torch.equal(found.raw_opacities, truth.raw_opacities)
 
 
 @each_reduced
 def test_geometry_stays_float32(dtype: torch.dtype, generator: torch.Generator):
     """Means come of no network: they are those of a float32 decode, bit by bit."""
-    decoder, k = Decoder(37, 10, generator=generator), 10
-    shapes = ((32,), (5,), (3,), (k, 3), (6,))
-    features, seen, positions, offsets, log_scales = (torch.randn(50, *s, generator=generator) for s in shapes)
-    attenuation = torch.rand(50, generator=generator)
-    anchors = SeenAnchors(features, seen, positions, offsets, log_scales, attenuation)
-    ours, slots, _ = define_gaussians(decoder.weights(), anchors, str(dtype).removeprefix("torch."))
-    truth, true_slots, _ = define_gaussians(decoder.weights(), anchors)
+    tensors, decoder = problem(50, 10, 37, 32, generator)
+    ours, slots, *_ = decoded(define_gaussians, tensors, decoder, str(dtype).removeprefix("torch."))
+    truth, true_slots, *_ = decoded(define_gaussians, tensors, decoder)
     shared = slots[torch.isin(slots, true_slots)]
     assert len(shared) > 0.9 * len(true_slots) > 0
     places, true_places = torch.searchsorted(slots, shared), torch.searchsorted(true_slots, shared)
@@ -280,8 +216,3 @@ def test_geometry_stays_float32(dtype: torch.dtype, generator: torch.Generator):
     for field in ("quats", "scales", "opacities", "colors"):
         values = getattr(ours, field)
         assert values.dtype == torch.float32 and not torch.equal(values[places], getattr(truth, field)[true_places])
-
-
-def test_unknown_names_list_the_known():
-    with pytest.raises(ValueError, match="unknown precision 'half'; known: float32, bfloat16, float16"):
-        reduced_dtype("half")

@@ -91,14 +91,10 @@ def test_thresholds_double_and_cells_shrink_from_level_to_level(lucky, gradient,
     assert seeds.sizes.tolist() == [16, 4, 1][:levels]
 
 
-def test_without_a_seed_at_the_coarsest_level_finer_ones_are_not_tried(lucky):
-    model = model_at([[0, 0, 0]])
-    move(model, 1, [1.5, 0.0, 0.0])  # voxel 3: free at 1 and at 4, but 16-cell 0 holds the anchor
-    assert seeds_of(model, [0.0, 1.0])[0] == []
-
-
-def test_after_a_coarse_seed_finer_levels_are_tried_even_past_an_empty_one(lucky):
+def test_finer_levels_are_tried_only_after_a_seed_at_the_coarsest(lucky):
     model = model_at([[0, 0, 0], [64, 0, 0]])
+    move(model, 1, [0.5 * 3, 0.0, 0.0])  # voxel 3: free at 1 and at 4, but 16-cell 0 holds the anchor
+    assert seeds_of(model, [0.0, 1.0, 0.0, 0.0])[0] == []
     move(model, 1, [0.5 * 1, 0.0, 0.0])  # voxel 1: free only at the finest level
     move(model, 2, [0.5 * 160, 0.0, 0.0])  # free at the coarsest
     assert seeds_of(model, [0.0, 1.0, 1.0, 0.0])[0] == [(160, 0, 0), (1, 0, 0)]
@@ -247,10 +243,14 @@ def test_the_limit_keeps_the_strongest_and_says_so(lucky):
     assert len(model) == 7
 
 
-def test_options_name_what_is_wrong():
-    with pytest.raises(ValueError, match="coarsest is 10 voxels; it must be a multiple"):
-        GrowthOptions(coarsest=10)
-    with pytest.raises(ValueError, match="grow_every is 0"):
-        GrowthOptions(grow_every=0)
-    with pytest.raises(ValueError, match="max_anchors is 0"):
-        GrowthOptions(max_anchors=0)
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"coarsest": 10}, "coarsest is 10 voxels; it must be a multiple"),
+        ({"grow_every": 0}, "grow_every is 0"),
+        ({"max_anchors": 0}, "max_anchors is 0"),
+    ],
+)
+def test_invalid_options_are_refused(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        GrowthOptions(**wrong)

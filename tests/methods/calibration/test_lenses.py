@@ -61,45 +61,42 @@ def test_a_turn_in_the_map_is_none():
     assert (camera.directions() - d).abs().max() < 1e-4  # the mean over pixels is that over the sphere up to 1/H^2
 
 
-def test_gradients_are_those_of_differences(generator):
-    camera = distorted()
-    photograph = torch.rand(H, W, 3, generator=generator, dtype=torch.float64)
-    weight = torch.randn(H, W, 3, generator=generator, dtype=torch.float64)
-
-    def loss() -> torch.Tensor:
-        return (sample_pixels(photograph, camera.source_pixels()) * weight).sum() + camera.roughness()
-
+def assert_gradients_match_differences(loss, entries, step: float, tolerance: float) -> None:
+    """Compare gradients of `loss()` at entries (parameter, index) with central differences."""
     loss().backward()
-    entries = [(camera.focal, (k,)) for k in range(3)]
-    entries += [(camera.offsets, place) for place in [(0, 3, 1), (15, 0, 0), (16, 63, 2), (31, 40, 1), (8, 30, 0)]]
     for parameter, place in entries:
         sides = []
-        for step in (1e-7, -1e-7):
+        for moved in (step, -step):
             with torch.no_grad():
-                parameter[place] += step
+                parameter[place] += moved
                 sides.append(loss().item())
-                parameter[place] -= step
-        assert parameter.grad[place].item() == pytest.approx((sides[0] - sides[1]) / 2e-7, rel=1e-5, abs=1e-5)
+                parameter[place] -= moved
+        expected = (sides[0] - sides[1]) / (2 * step)
+        assert parameter.grad[place].item() == pytest.approx(expected, rel=tolerance, abs=tolerance)
+
+
+def test_gradients_of_the_map(generator):
+    camera = distorted()
+    image, weight = torch.randn(2, H, W, 3, generator=generator, dtype=torch.float64)
+    places = [(0, 3, 1), (15, 0, 0), (16, 63, 2), (31, 40, 1), (8, 30, 0)]
+    entries = [(camera.focal, k) for k in range(3)] + [(camera.offsets, place) for place in places]
+
+    def loss() -> torch.Tensor:
+        return (sample_pixels(image, camera.source_pixels()) * weight).sum() + camera.roughness()
+
+    assert_gradients_match_differences(loss, entries, 1e-7, 1e-5)
 
 
 def test_roughness_of_a_linear_field_is_its_slope():
     """D = a d.y along one axis, a times the sine of the latitude: its slope is a times the cosine, pi/4 on average."""
-    rough = []
-    for scale in (1.0, 2.0):
+    rough, latitude_sine = [], rays(256, 128, dtype=torch.float64)[..., 1]
+    for scale in (1.0, 2.0, -1.0):  # -1: upside down
         camera = CameraMap(256, 128, dtype=torch.float64)
         with torch.no_grad():
-            camera.offsets[..., 0] = scale * rays(256, 128, dtype=torch.float64)[..., 1]
+            camera.offsets[..., 0] = scale * latitude_sine
         rough.append(camera.roughness().item())
-    assert rough[0] == pytest.approx(torch.pi / 4, rel=1e-3) and rough[1] == pytest.approx(2 * rough[0])
-
-
-def test_roughness_is_the_same_upside_down(generator: torch.Generator):
-    camera = CameraMap(64, 32, dtype=torch.float64)
-    with torch.no_grad():
-        camera.offsets.copy_(torch.randn(camera.offsets.shape, generator=generator, dtype=torch.float64))
-        upright = camera.roughness().item()
-        camera.offsets.copy_(camera.offsets.flip(0))
-    assert camera.roughness().item() == pytest.approx(upright, rel=1e-12)
+    assert rough == pytest.approx([torch.pi / 4, torch.pi / 2, torch.pi / 4], rel=1e-3)
+    assert rough[2] == pytest.approx(rough[0], rel=1e-12)
 
 
 VIEW = tiny_scene().train[3]
@@ -151,28 +148,18 @@ def test_what_each_lens_shows_is_its_own_half():
     assert (front - back).abs().max() > 0.1
 
 
-def test_gradients_of_the_lenses_are_those_of_differences():
-    """Of gap and coefficients, through poses, ray tables, blending and the renderer."""
+def test_gradients_of_the_lenses():
+    """Check gap and coefficients, through poses, ray tables, blending and the renderer."""
     lenses = DualLens(axis="x", blend=20.0, scene_scale=2.0).double()
     draw = drawer(truth().to(torch.float64))
     weight = torch.randn(*VIEW.image().shape, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
     with torch.no_grad():
         lenses.gap.fill_(0.05)
         lenses.coefficients.copy_(torch.tensor([[0.01, -0.002], [-0.02, 0.003]]))
-
-    def loss() -> torch.Tensor:
-        return (lenses.draw(draw, VIEW).rendering.image * weight).sum()
-
-    loss().backward()
-    for parameter in (lenses.gap, lenses.coefficients):
-        values, gradient = parameter.data.view(-1), parameter.grad.view(-1)
-        for k in range(len(values)):
-            sides = []
-            for step in (1e-6, -1e-6):
-                values[k] += step
-                sides.append(loss().item())
-                values[k] -= step
-            assert gradient[k].item() == pytest.approx((sides[0] - sides[1]) / 2e-6, rel=1e-4, abs=1e-4)
+    entries = [(lenses.gap, ()), *((lenses.coefficients, (lens, k)) for lens in (0, 1) for k in (0, 1))]
+    assert_gradients_match_differences(
+        lambda: (lenses.draw(draw, VIEW).rendering.image * weight).sum(), entries, 1e-6, 1e-4
+    )
 
 
 def test_both_lenses_add_to_one_positional_gradient():

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 from support.composed import composed
-from support.tiny_scene import tiny_scene
+from support.tiny_scene import in_other_units, tiny_scene
 from torch.nn.functional import normalize, softplus
 
 from padgs.data.synthetic import SyntheticOptions, generate
@@ -48,21 +48,18 @@ def dense(options: EgoNeRFOptions = SMALL, scene: Scene | None = None) -> EgoNeR
     return model
 
 
+def without_density(options: EgoNeRFOptions) -> EgoNeRF:
+    """A model whose density is softplus(shift) everywhere."""
+    model = dense(options)
+    with torch.no_grad():
+        for factor in model.density.parameters():
+            factor.zero_()
+    return model
+
+
 def rays(count: int, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
     origins = 0.2 * torch.randn(count, 3, generator=generator)
     return origins, normalize(torch.randn(count, 3, generator=generator), dim=-1)
-
-
-def moved(scene: Scene, scale: float) -> Scene:
-    """The same scene in other units of length."""
-
-    def scaled(view: View) -> View:
-        pose = view.cam_from_world.clone()
-        pose[:3, 3] *= scale
-        return replace(view, cam_from_world=pose)
-
-    views = {part: tuple(scaled(view) for view in getattr(scene, part)) for part in ("train", "test")}
-    return replace(scene, points=scene.points * scale, **views)
 
 
 def test_the_defaults_have_the_published_number_of_parameters():
@@ -83,7 +80,7 @@ def test_the_defaults_have_the_published_number_of_parameters():
 def test_the_defaults_are_the_published_model_of_a_scene_of_some_unit(generator, surroundings, unit, published):
     """Lengths are published in units of the data; the optical depth of a length is the same, too."""
     world = tiny_scene()
-    world = moved(world, unit / world.scale)
+    world = in_other_units(world, unit / world.scale)
     assert world.scale == pytest.approx(unit)
     free = dict.fromkeys(Constants._fields)
     ours, theirs = (
@@ -98,12 +95,8 @@ def test_the_defaults_are_the_published_model_of_a_scene_of_some_unit(generator,
     assert torch.allclose(seen[0].color, seen[1].color, atol=1e-4)
 
 
-def test_a_field_of_constant_density_absorbs_as_the_formula_says(generator):
-    """All factors zero: density = softplus(shift) everywhere, from the first sample on."""
-    model = dense(replace(SMALL, density_shift=-3.0, environment=False))
-    with torch.no_grad():
-        for factor in model.density.parameters():
-            factor.zero_()
+def test_constant_density_absorbs_exponentially(generator):
+    model = without_density(replace(SMALL, density_shift=-3.0, environment=False))
     origins, directions = rays(20, generator)
     seen = model.trace(origins, directions)
     distances = model._sample(origins, directions, None)
@@ -112,26 +105,15 @@ def test_a_field_of_constant_density_absorbs_as_the_formula_says(generator):
     assert torch.allclose(seen.transmittance, expected, rtol=1e-3, atol=1e-12)
 
 
-def test_nothing_but_the_environment_is_seen_through_nothing(generator):
-    model = dense(replace(SMALL, density_shift=-200.0))
-    with torch.no_grad():
-        for factor in model.density.parameters():
-            factor.zero_()
+@pytest.mark.parametrize("environment", [True, False])
+def test_empty_space_shows_the_environment_or_black(generator, environment):
+    model = without_density(replace(SMALL, density_shift=-200.0, environment=environment))
     origins, directions = rays(20, generator)
     seen = model.trace(origins, directions)
-    assert model.environment is not None
-    assert torch.allclose(seen.color, model.environment(directions), atol=1e-6)
+    behind = model.environment(directions) if environment else torch.zeros(20, 3)
+    assert (model.environment is not None) == environment
+    assert torch.allclose(seen.color, behind, atol=1e-6)
     assert torch.equal(seen.transmittance, torch.ones(20)) and (seen.depth == 0).all()
-
-
-def test_without_an_environment_black_lies_behind(generator):
-    options = replace(SMALL, environment=False, density_shift=-200.0)
-    assert EgoNeRF.from_scene(tiny_scene(), options).environment is None
-    model = dense(options)
-    with torch.no_grad():
-        for factor in model.density.parameters():
-            factor.zero_()
-    assert model.trace(*rays(20, generator)).color.abs().max() < 1e-6
 
 
 def test_samples_start_at_near_reach_far_and_increase(generator):
@@ -140,18 +122,14 @@ def test_samples_start_at_near_reach_far_and_increase(generator):
     distances = model._sample(origins, directions, generator)
     assert distances.shape == (50, 48) and (distances.diff(dim=-1) >= 0).all()
     still = model._sample(origins, directions, None)
-    assert (
-        torch.equal(still[:, 0], torch.full((50,), model.constants.near))
-        and (still[:, -1] >= model.constants.far - 1e-4).all()
-    )
+    assert torch.equal(still[:, 0], torch.full((50,), model.constants.near))
+    assert (still[:, -1] >= model.constants.far - 1e-4).all()
 
 
 def test_fine_samples_gather_at_a_shell(generator):
     """Density in one radial node only: half the samples are drawn to it."""
-    model = dense()
+    model = without_density(SMALL)
     with torch.no_grad():
-        for factor in model.density.parameters():
-            factor.zero_()
         model.density.planes[2].fill_(3.0)  # polar x azimuth, whose line runs along the radius
         model.density.lines[2][:, :, 8:10] = 3.0
     nodes = model.get_buffer("nodes")
@@ -204,7 +182,7 @@ def test_faint_samples_may_go_unshaded():
 @pytest.mark.parametrize("scale", [0.01, 100.0])
 def test_the_units_of_the_world_do_not_matter(scale):
     scene = tiny_scene()
-    other = moved(scene, scale)
+    other = in_other_units(scene, scale)
     plain, scaled = dense(scene=scene), dense(scene=other)
     assert scaled.unit == pytest.approx(scale * plain.unit)
     a, b = plain.render(scene.test[0]), scaled.render(other.test[0])
@@ -213,7 +191,7 @@ def test_the_units_of_the_world_do_not_matter(scale):
 
 
 def test_in_world_units_lengths_are_taken_as_they_stand():
-    model = EgoNeRF.from_scene(moved(tiny_scene(), 100.0), replace(SMALL, length_unit="world"))
+    model = EgoNeRF.from_scene(in_other_units(tiny_scene(), 100.0), replace(SMALL, length_unit="world"))
     assert model.unit == 1.0 and model.travel > 20
 
 
@@ -241,23 +219,13 @@ def test_gradients_of_colours(generator):
     distances = model._sample(origins.double(), directions.double(), None)
     model._sample = lambda *_: distances  # type: ignore[method-assign]
 
+    model.forward = lambda *args: model.trace(*args).color  # type: ignore[method-assign]
+
     def color(*values: torch.Tensor) -> torch.Tensor:
         parameters = {**own, **dict(zip(names, values, strict=True))}
-        return torch.func.functional_call(Traced(model), {f"model.{n}": p for n, p in parameters.items()}, args)
+        return torch.func.functional_call(model, parameters, (origins.double(), directions.double()))
 
-    args = (origins.double(), directions.double())
     assert torch.autograd.gradcheck(color, tuple(own[name] for name in names), fast_mode=True)
-
-
-class Traced(torch.nn.Module):
-    """`trace` as the forward of a module."""
-
-    def __init__(self, model: EgoNeRF) -> None:
-        super().__init__()
-        self.model = model
-
-    def forward(self, origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
-        return self.model.trace(origins, directions).color
 
 
 @pytest.mark.parametrize(
@@ -327,13 +295,10 @@ def test_all_texels_count_for_the_same_solid_angle(environment, generator):
     assert (share - 1).abs().max() < 0.08  # 4 standard deviations of the sampling
 
 
-def test_nothing_jumps_at_180_degrees(environment):
+def test_the_environment_is_continuous_at_180_degrees_and_finite_at_the_poles(environment):
     z = torch.linspace(-0.99, 0.99, 50, dtype=torch.float64)
     left, right = (environment(towards(z, torch.full_like(z, side * (math.pi - 1e-9)))) for side in (-1, 1))
     assert torch.allclose(left, right, atol=1e-7)
-
-
-def test_poles_are_finite(environment):
     seen = environment(torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]], dtype=torch.float64))
     assert ((seen > 0) & (seen < 1)).all()
 
@@ -350,7 +315,7 @@ def test_rooms_and_the_open_are_told_apart_in_any_unit(tmp_path, monkeypatch, sc
 
 
 def test_a_few_points_behind_the_walls_make_no_outdoors():
-    shell = torch.nn.functional.normalize(torch.randn(1000, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    shell = normalize(torch.randn(1000, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
     scene = tiny_scene()
     still: View = replace(scene.train[0], cam_from_world=torch.eye(4, dtype=torch.float64))
     for outliers, kind in ((30, "indoor"), (80, "outdoor")):

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from support.tiny_scene import tiny_scene
+from support.tiny_scene import in_other_units, tiny_scene
 from torch import Tensor
 
 from padgs.data.perturb import StressOptions
@@ -46,17 +46,6 @@ def new_points(scene: Scene, count: int = COUNT) -> tuple[torch.Tensor, torch.Te
     found = fill_sparse_cloud(scene, count, generator=torch.Generator().manual_seed(0))
     assert torch.equal(found.points[: len(scene.points)], scene.points), "the cloud itself stays"
     return found.points[len(scene.points) :], found.point_colors[len(scene.points) :]
-
-
-def moved(scene: Scene, rotation: torch.Tensor, scale: float) -> Scene:
-    """The same scene in another world: x' = scale * rotation x."""
-    views = []
-    for view in scene.train:
-        pose = view.cam_from_world.clone()
-        pose[:3, :3] = pose[:3, :3] @ rotation.T
-        pose[:3, 3] *= scale
-        views.append(replace(view, cam_from_world=pose))
-    return replace(scene, train=tuple(views), points=scale * (scene.points.double() @ rotation.T).float())
 
 
 def test_points_fill_a_sphere_at_its_range():
@@ -112,7 +101,7 @@ def test_it_turns_and_grows_with_the_world(scale):
     rotation = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3)))[0]
     rotation = rotation * rotation.det()
     points, colors = new_points(dome(300))
-    others, their_colors = new_points(moved(dome(300), rotation, scale))
+    others, their_colors = new_points(in_other_units(dome(300), scale, rotation))
     assert torch.equal(colors, their_colors)
     assert torch.allclose(others.double() / scale, points.double() @ rotation.T, atol=1e-4)
 
@@ -278,14 +267,8 @@ def under(hemisphere: bool, scale: float = 1.0) -> Scene:
     directions = fibonacci_sphere(20_000)
     if hemisphere:
         directions = directions[directions[:, 1] > 0]
-    points = (centre + 4 * directions).float() * scale
-    poses = []
-    for view in scene.train:
-        pose = view.cam_from_world.clone()
-        pose[:3, 3] *= scale
-        poses.append(replace(view, cam_from_world=pose))
-    colors = torch.zeros(len(points), 3, dtype=torch.uint8)
-    return replace(scene, train=tuple(poses), points=points, point_colors=colors)
+    colors = torch.zeros(len(directions), 3, dtype=torch.uint8)
+    return in_other_units(replace(scene, points=(centre + 4 * directions).float(), point_colors=colors), scale)
 
 
 def sky(scene: Scene) -> tuple[Splats, torch.Tensor]:

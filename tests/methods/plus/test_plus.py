@@ -8,7 +8,7 @@ from itertools import count, islice
 import pytest
 import torch
 from support.states import assert_same_but_time
-from support.tiny_scene import tiny_scene
+from support.tiny_scene import in_other_units, tiny_scene
 
 from padgs import clock
 from padgs.geometry.distortion import solid_angle_weight
@@ -30,16 +30,6 @@ from padgs.training.loop import Record
 from padgs.training.options import Budget
 
 OPTIONS = PlusOptions(gradient_threshold=1e-6, initial_per_pixel=None, limit_per_pixel=None, depth_init_per_pixel=0.0)
-
-
-def in_other_units(scene: Scene, scale: float) -> Scene:
-    def moved(view):
-        pose = view.cam_from_world.clone()
-        pose[:3, 3] *= scale
-        return replace(view, cam_from_world=pose)
-
-    views = {"train": tuple(map(moved, scene.train)), "test": tuple(map(moved, scene.test))}
-    return replace(scene, points=scene.points * scale, **views)
 
 
 @pytest.mark.parametrize("iterations", [16, 60, 500, 7000, 30_000])
@@ -194,32 +184,27 @@ def test_initial_number_and_limit_are_multiples_of_the_pixels():
     assert max(counts) > counts[0]
 
 
-def test_the_size_penalty_is_the_mean_angular_size():
-    method, scene = PlusMethod(replace(OPTIONS, size_weight=0.7, smoothness_weight=0.0)), tiny_scene()
-    next(method.fit(scene, Budget(10)))
-    drawing = method.model.draw(scene.train[1])
-    splats, centre = method.model.splats, scene.train[1].center
-    angles = torch.exp(splats.log_scales) / (splats.means - centre).norm(dim=-1, keepdim=True)
-    assert drawing.penalty.item() == pytest.approx(0.7 * angles.mean().item())
-    (gradient,) = torch.autograd.grad(drawing.penalty, splats.means, allow_unused=True)
-    assert gradient is None or not gradient.any()  # it shall not push Gaussians away
+def test_penalties_are_the_mean_angular_size_and_the_roughness_of_the_render():
+    view = tiny_scene().train[1]
+    for size_weight, smoothness_weight in ((0.7, 0.0), (0.0, 0.3)):
+        weights = {"size_weight": size_weight, "smoothness_weight": smoothness_weight}
+        method = PlusMethod(replace(OPTIONS, **weights))
+        next(method.fit(tiny_scene(), Budget(10)))
+        splats, drawing = method.model.splats, method.model.draw(view)
+        angles = torch.exp(splats.log_scales) / (splats.means - view.center).norm(dim=-1, keepdim=True)
+        rough = roughness(drawing.rendering, view.camera, near=method.model.render_options(view).near).item()
+        expected = size_weight * angles.mean().item() + smoothness_weight * rough
+        assert drawing.penalty.item() == pytest.approx(expected) and rough > 0
+        drawing.penalty.backward()
+        moves = splats.means.grad is not None and bool(splats.means.grad.any())
+        assert moves == (smoothness_weight > 0), "the size penalty must not push Gaussians away"
+        assert splats.log_scales.grad.any()
 
 
 def test_empty_pixels_have_a_finite_penalty_with_near_0():
     near = replace(PlusMethod.RENDER, near=0.0)
     records = list(PlusMethod(replace(OPTIONS, sky_per_point=0.0), near).fit(tiny_scene(), Budget(3)))
     assert len(records) == 3 and all(math.isfinite(record.loss) for record in records)
-
-
-def test_the_smoothness_penalty_is_the_roughness_of_the_render():
-    method, scene = PlusMethod(replace(OPTIONS, size_weight=0.0, smoothness_weight=0.3)), tiny_scene()
-    next(method.fit(scene, Budget(10)))
-    view = scene.train[1]
-    drawing = method.model.draw(view)
-    rough = roughness(drawing.rendering, view.camera, near=method.model.render_options(view).near)
-    assert drawing.penalty.item() == pytest.approx(0.3 * rough.item()) and rough > 0
-    drawing.penalty.backward()
-    assert method.model.splats.means.grad.any() and method.model.splats.log_scales.grad.any()
 
 
 def test_dropout_rises_as_pixels_per_gaussian_fall():

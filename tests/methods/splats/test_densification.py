@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from padgs.gaussians import rotation_matrices
-from padgs.methods.splats.densification import SHRINK, DensificationOptions, Densifier
+from padgs.methods.splats.densification import DensificationOptions, Densifier
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.splats import Splats
 from padgs.render import RenderConfig
@@ -53,27 +53,34 @@ def test_large_gaussians_are_replaced_by_two_smaller_ones():
     assert not torch.equal(grown.splats.means[1], grown.splats.means[2])
 
 
-def test_pruning_by_extent_may_begin_later():
+def test_large_gaussians_are_pruned_only_on_request_and_perhaps_later():
+    grown, optimizer = densifier([LARGE, SMALL])
+    grown.adapt(EVERY, optimizer)
+    assert len(grown.splats) == 2
     grown, optimizer = densifier([LARGE, SMALL], prune_by_extent=True, prune_by_extent_from=EVERY)
     assert grown.adapt(EVERY, optimizer) == ("cloned 0, split 0, pruned 0 Gaussians",)
     assert grown.adapt(2 * EVERY, optimizer) == ("cloned 0, split 0, pruned 1 Gaussians",)
 
 
-def test_pieces_are_samples_of_the_gaussian_they_replace():
+@pytest.mark.parametrize("clones", [False, True])
+def test_pieces_and_sampled_clones_follow_the_distribution_of_their_gaussian(clones):
+    """Means N(mean, Sigma); clones keep everything else (GOF)."""
     count = 4000
-    grown, optimizer = densifier([LARGE] * count, max_gaussians=None)
-    scales = torch.tensor([0.5, 0.2, 0.05])
+    largest = 5e-3 if clones else 0.5
+    scales, quat = largest * torch.tensor([1.0, 0.4, 0.2]), torch.tensor([0.8, 0.3, -0.4, 0.2])
+    grown, optimizer = densifier([largest] * count, max_gaussians=None, sample_clones=clones)
     splats = grown.splats
     splats.means.data.zero_()
-    splats.log_scales.data = scales.log().repeat(count, 1)
-    quat = torch.tensor([0.8, 0.3, -0.4, 0.2])
-    splats.quats.data = quat.repeat(count, 1)
+    splats.log_scales.data, splats.quats.data = scales.log().repeat(count, 1), quat.repeat(count, 1)
     pull(grown, [1.0] * count)
-    grown.adapt(EVERY, optimizer)
-    spread = rotation_matrices(quat) @ torch.diag(scales)
-    covariance = splats.means.T @ splats.means / len(splats)
+    cloned, split = (count, 0) if clones else (0, count)
+    assert grown.adapt(EVERY, optimizer) == (f"cloned {cloned}, split {split}, pruned 0 Gaussians",)
     assert len(splats) == 2 * count
-    assert torch.allclose(covariance, spread @ spread.T, atol=0.05 * scales[0].item() ** 2)
+    steps = splats.means[count:] if clones else splats.means
+    spread = rotation_matrices(quat) @ torch.diag(scales)
+    assert torch.allclose(steps.T @ steps / len(steps), spread @ spread.T, atol=0.1 * largest**2)
+    if clones:
+        assert not splats.means[:count].any() and torch.equal(splats.log_scales[count:], splats.log_scales[:count])
 
 
 def test_threshold_is_on_the_mean_over_views_that_saw_it():
@@ -102,13 +109,6 @@ def test_faint_gaussians_are_pruned():
     assert grown.splats.means[:, 0].tolist() == [1.0, 2.0]
 
 
-@pytest.mark.parametrize("prune, left", [(False, 2), (True, 1)])
-def test_large_gaussians_are_pruned_only_on_request(prune, left):
-    grown, optimizer = densifier([LARGE, SMALL], prune_by_extent=prune)
-    grown.adapt(EVERY, optimizer)
-    assert len(grown.splats) == left
-
-
 @pytest.mark.parametrize("scale", [SMALL, LARGE])
 def test_the_cap_holds_and_the_hardest_pulled_come_first(scale):
     grown, optimizer = densifier([scale] * 5, max_gaussians=7)
@@ -124,12 +124,16 @@ def test_the_cap_holds_and_the_hardest_pulled_come_first(scale):
     assert len(grown.splats) == 7
 
 
-def test_opacity_reset_makes_all_nearly_transparent():
-    grown, optimizer = densifier([SMALL, SMALL], densify_from=10**6, reset_every=30)
-    grown.splats.opacity_logits.data = torch.logit(torch.tensor([0.007, 0.9]))
+@pytest.mark.parametrize(
+    ("limit", "before", "after"),
+    [(0.01, [0.007, 0.9], [0.007, 0.01]), (0.1, [0.05, 0.9], [0.05, 0.1]), (1.0, [0.05, 0.9], [0.05, 0.9])],
+)
+def test_a_reset_limits_opacities_and_clears_their_adam_moments(limit, before, after):
+    grown, optimizer = densifier([SMALL, SMALL], densify_from=10**6, reset_every=30, reset_opacity=limit)
+    grown.splats.opacity_logits.data = torch.logit(torch.tensor(before))
     assert grown.adapt(29, optimizer) == ()
     assert grown.adapt(30, optimizer) == ("reset opacities",)
-    assert torch.allclose(torch.sigmoid(grown.splats.opacity_logits), torch.tensor([0.007, 0.01]))
+    assert torch.allclose(torch.sigmoid(grown.splats.opacity_logits), torch.tensor(after))
     assert optimizer.state[grown.splats.opacity_logits]["exp_avg_sq"].abs().sum() == 0
     assert optimizer.state[grown.splats.means]["exp_avg_sq"].abs().sum() > 0
 
@@ -156,21 +160,6 @@ def test_towards_a_target_those_that_are_pulled_hardest_multiply_in_equal_steps(
     assert found == [30, 40, 50]
 
 
-def test_clones_may_be_samples_of_their_gaussian():
-    """Means N(mean, Sigma), everything else as it was (GOF's way to clone)."""
-    count = 4000
-    grown, optimizer = densifier([SMALL] * count, max_gaussians=None, sample_clones=True)
-    splats, scales = grown.splats, torch.tensor([5e-3, 2e-3, 1e-3])
-    quat = torch.tensor([0.8, 0.3, -0.4, 0.2])
-    splats.log_scales.data, splats.quats.data = scales.log().repeat(count, 1), quat.repeat(count, 1)
-    pull(grown, [1.0] * count)
-    assert grown.adapt(EVERY, optimizer) == (f"cloned {count}, split 0, pruned 0 Gaussians",)
-    steps = splats.means[count:] - splats.means[:count]
-    spread = rotation_matrices(quat) @ torch.diag(scales)
-    assert torch.allclose(steps.T @ steps / count, spread @ spread.T, atol=0.1 * scales[0].item() ** 2)
-    assert torch.equal(splats.log_scales[count:], splats.log_scales[:count])
-
-
 def test_as_many_multiply_for_their_absolute_pull_as_pass_the_threshold():
     """GOF: above the quantile 1 - r, with r the share of those above the threshold."""
     grown, optimizer = densifier([SMALL] * 6, positional_gradient="space_absolute", gradient_threshold=1e-4)
@@ -193,22 +182,6 @@ def test_opacities_decay_in_every_round_once_the_faintest_are_gone():
     assert torch.allclose(torch.sigmoid(grown.splats.opacity_logits), opacities[1:3] - 0.001, rtol=1e-4)
     moments = {name: optimizer.state[parameter]["exp_avg_sq"] for name, parameter in grown.splats.rows().items()}
     assert [name for name, moment in moments.items() if not moment.any()] == ["opacity_logits"]
-
-
-def test_the_opacity_after_a_reset_is_an_option():
-    grown, optimizer = densifier([SMALL, SMALL], densify_from=10**6, reset_every=30, reset_opacity=0.1)
-    grown.splats.opacity_logits.data = torch.logit(torch.tensor([0.05, 0.9]))
-    grown.adapt(30, optimizer)
-    assert torch.allclose(torch.sigmoid(grown.splats.opacity_logits), torch.tensor([0.05, 0.1]))
-
-
-def test_a_reset_to_1_only_clears_the_moments_of_adam():
-    grown, optimizer = densifier([SMALL], densify_from=10**6, reset_every=30, reset_opacity=1.0)
-    grown.splats.opacity_logits.data = torch.logit(torch.tensor([0.9]))
-    before = grown.splats.opacity_logits.detach().clone()
-    grown.adapt(30, optimizer)
-    assert torch.equal(grown.splats.opacity_logits, before)
-    assert optimizer.state[grown.splats.opacity_logits]["exp_avg_sq"].abs().sum() == 0
 
 
 @pytest.mark.parametrize("first, expected", [(500, 600), (0, 100)])
@@ -260,12 +233,12 @@ def test_windows_follow_the_run_length():
 
 
 def test_options_without_a_meaning_are_refused():
-    with pytest.raises(ValueError, match="densify_every is 0"):
-        DensificationOptions(densify_every=0)
-    with pytest.raises(ValueError, match="reset_opacity is 0.0; it must be an opacity"):
-        DensificationOptions(reset_opacity=0.0)
-    with pytest.raises(ValueError, match="opacity_decay is 1.5; it must be an opacity"):
-        DensificationOptions(opacity_decay=1.5)
-    with pytest.raises(ValueError, match="max_gaussians is 0"):
-        DensificationOptions(max_gaussians=0)
-    assert pytest.approx(1.6) == SHRINK
+    for name, value, rule in (
+        ("densify_every", 0, ""),
+        ("reset_opacity", 0.0, "; it must be an opacity"),
+        ("opacity_decay", 1.5, "; it must be an opacity"),
+        ("max_gaussians", 0, ""),
+        ("positional_gradient", "pixels", "; known: image, space, space_absolute"),
+    ):
+        with pytest.raises(ValueError, match=f"{name} (is )?'?{value}'?{rule}"):
+            DensificationOptions(**{name: value})

@@ -156,8 +156,3 @@ def test_space_absolute_needs_projection_ray():
         ValueError, match=r"space_absolute is made for render\.projection=ray, not erp; set .*positional_gradient=space"
     ):
         SplatMethod(SplatOptions(positional_gradient="space_absolute"), RenderConfig())
-
-
-def test_unknown_kinds_are_named():
-    with pytest.raises(ValueError, match="unknown positional_gradient 'pixels'; known: image, space, space_absolute"):
-        DensificationOptions(positional_gradient="pixels")

@@ -3,7 +3,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from support.tiny_scene import tiny_scene
+from support.tiny_scene import in_other_units, tiny_scene
 
 from padgs.geometry.harmonics import basis
 from padgs.methods.splats.splats import Splats, initial_scales
@@ -91,14 +91,9 @@ class ColorsOf(torch.nn.Module):
 
 def test_scene_in_other_units_is_the_same_scene():
     scene = tiny_scene()
-    views = []
-    for view in scene.train:
-        pose = view.cam_from_world.clone()
-        pose[:3, 3] *= 128
-        views.append(replace(view, cam_from_world=pose))
-    large = replace(scene, points=scene.points * 128, train=tuple(views))
-    small_scales = Splats.from_scene(scene, generator=torch.Generator()).log_scales
-    large_scales = Splats.from_scene(large, generator=torch.Generator()).log_scales
+    small_scales, large_scales = (
+        Splats.from_scene(each, generator=torch.Generator()).log_scales for each in (scene, in_other_units(scene, 128))
+    )
     assert torch.allclose(large_scales - small_scales, torch.full_like(small_scales, math.log(128)), atol=1e-5)
 
 
