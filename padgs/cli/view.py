@@ -21,7 +21,7 @@ def view(
     port: Annotated[int | None, typer.Option(help="the first one to try; default 8080")] = None,
     host: Annotated[
         str | None,
-        typer.Option(help="0.0.0.0 serves the whole network, without a password; default: this machine only"),
+        typer.Option(help="0.0.0.0 serves all who have the printed address; default: this machine only"),
     ] = None,
     data: DataPath = None,
 ) -> None:

@@ -24,6 +24,8 @@ IDLE_SECONDS = 0.2  # without a change, after which the full resolution is rende
 FRAME_SECONDS = 0.06  # target while something changes; the resolution adapts
 MIN_RESOLUTION = 0.125  # factor on width and height
 WIDTHS = ("512", "768", "1024", "1536", "2048")
+FOVS = range(20, 141)  # degrees
+MAX_NUMBER = 1e15  # of a camera or crop, whose square is a finite float32
 BOTH = "side by side"
 
 
@@ -74,9 +76,11 @@ class Page:
         folders = [renderer.run.folder.name for renderer in renderers]
         names = folders if len(folders) == 1 else [f"{number}: {name}" for number, name in enumerate(folders, 1)]
         self._by_name = dict(zip(names, self._renderers, strict=True))
-        self._run = gui.add_dropdown("run", names if len(names) == 1 else (*names, BOTH))
-        self._fov = gui.add_slider("degrees across", min=20, max=140, step=1, initial_value=75)
+        runs = tuple(names) if len(names) == 1 else (*names, BOTH)
+        self._run = gui.add_dropdown("run", runs)
+        self._fov = gui.add_slider("degrees across", min=FOVS[0], max=FOVS[-1], step=1, initial_value=75)
         self._width = gui.add_dropdown("pixels across", WIDTHS, initial_value="1024")
+        self._offers = {"camera": CAMERAS, "layer": LAYERS, "run": runs, "fov": FOVS, "width": WIDTHS}
         self._target = gui.add_dropdown("go to", ("", *self._views))
         self._frusta_shown = gui.add_checkbox("cameras", initial_value=False)
         if any(renderer.run.result is None for renderer in renderers):
@@ -98,7 +102,9 @@ class Page:
             control.on_update(self.redraw)
         for control in (self._crop, self._low, self._high):
             control.on_update(self.redraw)
-        self._target.on_update(lambda _: self.go_to(self._views[self._target.value]) if self._target.value else None)
+        self._target.on_update(
+            lambda _: self.go_to(self._views[self._target.value]) if self._target.value in self._views else None
+        )
         client.camera.on_update(self.redraw)
         client.camera.near, client.camera.far = 1e-3 * scene.scale, 1e3 * scene.scale
 
@@ -125,10 +131,20 @@ class Page:
             self._client.camera.wxyz = wxyz_of(world_from_cam)
 
     def state(self) -> PageState:
-        """Return the state of controls and camera."""
+        """Return the state of controls and camera.
+
+        Raises:
+            ValueError: a value that the page does not offer; any message may come from a browser.
+        """
+        for name, offer in self._offers.items():
+            if (value := getattr(self, f"_{name}").value) not in offer:
+                raise ValueError(f"{name} = {str(value)[:40]!r} is not one of the page's choices; choose one of them")
         crop: Box | None = (self._low.value, self._high.value) if self._crop.value else None
         options = ViewOptions(self._camera.value, self._layer.value, float(self._fov.value), crop)
         camera = self._client.camera
+        numbers = np.concatenate((camera.wxyz, camera.position, *(crop or ())))
+        if not np.all(np.abs(numbers) < MAX_NUMBER) or not np.linalg.norm(camera.wxyz) > 1 / MAX_NUMBER:  # also NaN
+            raise ValueError(f"camera and crop need a rotation and numbers below {MAX_NUMBER:g}; reload the page")
         world_from_cam = matrix_of(camera.wxyz)
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = world_from_cam.T, -world_from_cam.T @ camera.position

@@ -5,6 +5,7 @@ Imports no torch, so that browsers can load the page while torch and the runs ar
 
 from __future__ import annotations
 
+import secrets
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
@@ -12,6 +13,7 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
+from padgs.apps.viewer.access import guard
 from padgs.checks import install_command
 
 LOCAL, PORT = "127.0.0.1", 8080
@@ -22,7 +24,7 @@ ALL_INTERFACES = "0.0.0.0"
 class Server:
     """A running server; `padgs.apps.viewer.pages.show_runs` adds the runs."""
 
-    address: str  # URL
+    address: str  # URL with the token that lets browsers in
     viser: Any  # the `viser.ViserServer`
     is_local: bool  # whether it serves only this machine
 
@@ -39,14 +41,18 @@ def start_server(*, host: str = LOCAL, port: int = PORT) -> Iterator[Server]:
         ValueError: the extra `view` is not installed.
         OSError: the address cannot be used.
     """
-    viser = viser_module()
-    with redirect_stdout(None):  # viser prints addresses even if not verbose
+    viser, token, local = viser_module(), secrets.token_urlsafe(24), host in (LOCAL, "localhost")
+    with redirect_stdout(None), guard(token, is_local=local) as guarded:  # viser prints addresses even if not verbose
         server = viser.ViserServer(host=host, port=port, label="padgs", verbose=False)
+    if not guarded:
+        server.stop()
+        raise ValueError(f"access to viser {viser.__version__} cannot be restricted; pip install viser==1.1.1")
     server.gui.configure_theme(dark_mode=True, show_share_button=False)  # sharing uses an external server
-    local = host in (LOCAL, "localhost")
+    for message in (viser._messages.ShareUrlRequest, viser._messages.ShareUrlDisconnect):
+        server._websock_server.unregister_handler(message)
     name = "localhost" if local else network_address() if host == ALL_INTERFACES else host
     try:
-        yield Server(f"http://{name}:{server.get_port()}", server, local)
+        yield Server(f"http://{name}:{server.get_port()}/?token={token}", server, local)
     finally:
         with redirect_stdout(None):
             server.stop()
