@@ -20,12 +20,12 @@ from padgs.methods.anchors.anchors import PaDGSOptions
 from padgs.methods.anchors.growth import PUBLISHED_THRESHOLD
 from padgs.methods.anchors.method import PaDGSMethodOptions
 from padgs.methods.plus.method import PlusMethod, PlusOptions
-from padgs.multirun.composition import composing, configuration, method_choices, variant_choices
+from padgs.multirun.composition import composing, configuration, variant_choices
 from padgs.multirun.overrides import expand, lenient, missing_plugin, quoted
 from padgs.registry import lookup
 from padgs.render import RenderConfig
 from padgs.reports.conditions import CALIBRATES
-from padgs.runs.config import RunOptions, TrainConfig
+from padgs.runs.config import RunOptions, TrainConfig, method_choices
 from padgs.runs.tracking.tracker import TrackingOptions
 from padgs.training.options import TrainOptions
 

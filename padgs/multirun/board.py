@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import TextIO
 
 from padgs import results
-from padgs.files import write_atomically
 from padgs.runs.console import duration
 from padgs.runs.run import Callback
 
@@ -58,7 +57,9 @@ class Board:
         """Write the state of a job; a full disk must not end the job, so nothing is raised."""
         with suppress(OSError):
             self.folder.mkdir(parents=True, exist_ok=True)
-            write_atomically(self._path(job), json.dumps(asdict(state)).encode())
+            draft = self._path(job).with_suffix(".draft")  # never read half-written
+            draft.write_text(json.dumps(asdict(state)))
+            draft.replace(self._path(job))
 
     def read(self, job: int) -> JobState:
         """Return the state of a job; waiting, if it has written none."""

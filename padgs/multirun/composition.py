@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -18,17 +18,20 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from rich.console import Console
 
 from padgs.baselines import BUILT_IN, METHODS, distribution
-from padgs.data.datasets import DATASETS
-from padgs.data.synthetic.options import SCENES
+from padgs.multirun.finished import FOLDER
 from padgs.multirun.overrides import lenient, quoted, root
-from padgs.registry import lookup
-from padgs.render import RenderConfig
-from padgs.runs.config import DEFAULT_METHOD, RunConfig, config_from_values, default_fields, method_fields
+from padgs.runs.config import (
+    DEFAULT_METHOD,
+    RunConfig,
+    config_from_values,
+    default_fields,
+    method_choices,
+    method_fields,
+    scene_choices,
+)
 from padgs.runs.console import say
-from padgs.runs.run import build_method
+from padgs.runs.run import Method, build_method
 from padgs.runs.store import labels
-from padgs.training.method import Method
-from padgs.training.options import TrainOptions
 
 
 @contextmanager
@@ -56,24 +59,19 @@ def single_run(arguments: Sequence[str]) -> tuple[DictConfig, Mapping[str, objec
     return config, choices
 
 
-def multirun(arguments: Sequence[str], *extra: str) -> DictConfig | None:
+def multirun(arguments: Sequence[str]) -> DictConfig | None:
     """Compose a command line without what it sweeps; None if it is no multirun.
 
-    Args:
-        arguments: of the command line.
-        extra: overrides to add, in Hydra's grammar.
-
     Raises:
-        HydraException: as above.
+        HydraException: an unknown choice, or a violation of Hydra's grammar.
     """
     hydra = GlobalHydra.instance().hydra
     assert hydra is not None, "call within `composing`"
     forced = {"-m", "--multirun"} & {*arguments}
     settings = [text for text in lenient(quoted(arguments)) if text not in forced]
-    mode = ["hydra.mode=MULTIRUN"] if forced else []
-    config = hydra.compose_config(
-        "config", [*settings, *extra, *mode], RunMode.MULTIRUN, from_shell=False, with_log_configuration=False
-    )
+    settings += ["hydra.mode=MULTIRUN"] if forced else []
+    settings.append(f"hydra.sweep.dir=${{run.folder}}/{FOLDER}/{datetime.now():%Y%m%d-%H%M%S}-{os.getpid()}")
+    config = hydra.compose_config("config", settings, RunMode.MULTIRUN, from_shell=False, with_log_configuration=False)
     return config if config.hydra.mode == RunMode.MULTIRUN else None
 
 
@@ -121,7 +119,9 @@ def register_choices() -> None:
     store.store(name="fields", node=default_fields())
     for method in [*METHODS]:
         try:
-            keys, nodes = method_fields(method), [*method_choices(method)]
+            keys = method_fields(method)
+            has_file = (root() / "conf" / "method" / f"{method}.yaml").exists()
+            nodes = [] if has_file else [*method_choices(method)]
         except Exception as error:  # of any kind: that package is not ours
             if method in BUILT_IN:
                 raise
@@ -135,43 +135,6 @@ def register_choices() -> None:
     for group, rows in {"scene": scene_choices(), **variant_choices(), **set_choices()}.items():
         for name, node in rows.items():
             store.store(group=group, name=name, node=node, package="_global_")
-
-
-def method_choices(name: str) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield group and node of `method=NAME`, and of its own render and train settings, if it has any.
-
-    These are choices as well, so that render=... and train=... on a command line replace them. A method with a file in
-    conf/method has none.
-
-    >>> list(method_choices("op43dgs"))[0]
-    ('render', {'render': {'projection': 'tangent'}})
-    """
-    if (root() / "conf" / "method" / f"{name}.yaml").exists():
-        return
-    kind = lookup(METHODS, name, "method")
-    defaults: list[Any] = [f"/fields/method/{name}@method"]
-    for group, own, usual in (("render", kind.RENDER, RenderConfig()), ("train", kind.TRAIN, TrainOptions())):
-        changes = {key: value for key, value in asdict(own).items() if value != getattr(usual, key)}
-        if changes:
-            yield group, {group: changes}
-            defaults.append({f"override /{group}": name})
-    yield "method", {"defaults": defaults}
-
-
-def scene_choices() -> dict[str, dict[str, Any]]:
-    """Return name -> node of `+scene=`; named DATASET_SCENE, so that a sweep can take `+scene=glob(roam360_*)`.
-
-    >>> scene_choices()["ricoh360_cat_tower"]
-    {'defaults': [{'override /data': 'ricoh360'}], 'data': {'path': 'data/ricoh360/cat_tower'}}
-    >>> scene_choices()["synthetic_outdoor"]
-    {'defaults': [{'override /data': 'synthetic'}], 'data': {'generator': {'scene': 'outdoor'}}}
-    """
-    values = {f"synthetic_{scene}": ("synthetic", {"generator": {"scene": scene}}) for scene in SCENES} | {
-        f"{name}_{scene}": (name, {"path": f"data/{known.title.casefold()}/{scene}"})
-        for name, known in DATASETS.items()
-        for scene in known.scenes
-    }
-    return {name: {"defaults": [{"override /data": data}], "data": keys} for name, (data, keys) in values.items()}
 
 
 def variant_choices() -> dict[str, dict[str, dict[str, Any]]]:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import os
+import sys
 import time
 import traceback
-from collections.abc import Mapping
-from contextlib import ExitStack, nullcontext
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 
 from hydra.conf import HydraConf
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
@@ -20,19 +22,16 @@ from padgs.apps.viewer.process import serve_training
 from padgs.multirun.board import CRASHED, ELSEWHERE, REFUSED, STOPPED, Board, BoardEntry
 from padgs.multirun.composition import typed_config
 from padgs.results import SMALLEST_STATED, Result
-from padgs.runs.checkpoint import CheckpointError
 from padgs.runs.config import RunConfig
 from padgs.runs.console import say
 from padgs.runs.interrupt import Interrupted
 from padgs.runs.load import load_run
-from padgs.runs.run import Callback, load_scene, run, start
+from padgs.runs.run import REPORTED, Callback, Scene, load_scene, run, start
 from padgs.runs.smallest import find_smallest
-from padgs.runs.store import RunBusy, RunFolderError, RunStore
+from padgs.runs.store import RunBusy, RunStore
 from padgs.runs.tracking.tracker import SECONDS_BETWEEN_LOOKS, Tracker
-from padgs.training.health import Failure, validation_split
 
-# Errors whose message suffices without a traceback. Failures of training are results; this is one of a later search.
-EXPECTED = (ValueError, OSError, OmegaConfBaseException, Failure, CheckpointError, RunFolderError, RunBusy)
+EXPECTED = (*REPORTED, OmegaConfBaseException)  # errors whose message suffices without a traceback
 
 
 def only_job(composed: DictConfig, choices: Mapping[str, object]) -> str:
@@ -41,7 +40,10 @@ def only_job(composed: DictConfig, choices: Mapping[str, object]) -> str:
         config, console = typed_config(composed, choices), Console()
         dimly = partial(say, console, style="dim")
         tracker = Tracker(config.tracking, Path(config.run.folder), " ".join(config.labels.experiments), dimly)
-        result = complete(config, console, TrackedRun(tracker))
+        callback = TrackedRun(tracker)
+        with served_scene(config) as scene:
+            result = run(config, console, callback, scene)
+        search_smallest(config, scene, result, console, callback)
         tracker.update(Path(config.run.folder) / result.run)
         return result.status
     except EXPECTED as error:
@@ -68,7 +70,9 @@ def job_of_many(composed: DictConfig) -> str:
                 raise Interrupted("not started")
             config = typed_config(composed, hydra.runtime.choices)
             entry.data = None if config.data.path is None else str(Path(config.data.path).absolute())
-            result = complete(config, console, entry)
+            with served_scene(config) as scene:
+                result = run(config, console, entry, scene)
+            search_smallest(config, scene, result, console, entry)
             return entry.end(result.status, result.reason)
         except KeyboardInterrupt as error:
             entry.end(STOPPED, str(error))
@@ -82,25 +86,37 @@ def job_of_many(composed: DictConfig) -> str:
             return entry.end(CRASHED, f"{type(error).__name__}: {error}")
 
 
-def complete(config: RunConfig, console: Console, callback: Callback) -> Result:
-    """Do the missing part of a run, and of the search for its smallest model if that is requested."""
+@contextmanager
+def served_scene(config: RunConfig) -> Iterator[Scene]:
+    """Load the scene of a run, and show the run in the browser while the context lasts if that is requested."""
     scene = load_scene(config, start(config))
     folder = RunStore.of(config, scene).path
-    if config.smallest == "on":
-        validation_split(scene.train)  # refuses too few views before hours of training
-    page = serve_training(folder, config.data.path, config.run.device) if config.run.view else nullcontext()
-    with page:
-        result = run(config, console, callback, scene)
+    with serve_training(folder, config.data.path, config.run.device) if config.run.view else nullcontext():
+        yield scene
+
+
+def search_smallest(config: RunConfig, scene: Scene, result: Result, console: Console, callback: Callback) -> None:
+    """Search for the smallest model as good as that of a run which ended well, if that is requested."""
     if config.smallest == "on" and result.ok:
+        folder = Path(config.run.folder) / result.run
         finished = load_run(folder, data_path=config.data.path, device=config.run.device)
         finished.scene = scene  # whose panoramas are loaded
         find_smallest(finished, SMALLEST_STATED, console, callback.stop_requested)
-    return result
 
 
 def complain(message: str) -> None:
     """Print an error on the error stream."""
     say(Console(stderr=True), f"error: {message}", "red")
+
+
+@contextmanager
+def exit_on_hydra_errors() -> Iterator[None]:
+    """Exit with code 1 and the message of an error of Hydra, such as an unknown choice, without a traceback."""
+    try:
+        yield
+    except HydraException as error:
+        complain("\n".join(map(str, filter(None, (error, error.__cause__)))))
+        sys.exit(1)
 
 
 def in_own_process(hydra: DictConfig | HydraConf) -> bool:

@@ -6,15 +6,14 @@ import inspect
 import re
 import shutil
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import fields, is_dataclass
 from typing import Any
 
 from padgs.baselines import METHODS
-from padgs.data.synthetic.options import SyntheticOptions
-from padgs.multirun.composition import composing, configuration, scene_choices
+from padgs.multirun.composition import composing, configuration
 from padgs.multirun.overrides import root
-from padgs.runs.config import Settings
+from padgs.runs.config import DataConfig, Settings, scene_choices
 
 USAGE = """\
 padgs-run [KEY=VALUE ...]     one run, scored; by default padgs+ on a built-in room
@@ -65,7 +64,7 @@ def keys(options: Any, where: str = "") -> Iterator[tuple[str, Any, str]]:
         value = getattr(options, field.name)
         if is_dataclass(value):
             yield from keys(value, f"{where}{field.name}.")
-        elif field.name == "generator" and isinstance(value, Mapping):
-            yield from keys(SyntheticOptions(), f"{where}{field.name}.")
+        elif field.name == "generator" and isinstance(options, DataConfig):
+            yield from keys(options.synthetic, f"{where}{field.name}.")
         elif field.init:
             yield f"{where}{field.name}", value, meanings.get(field.name, "")

@@ -15,8 +15,17 @@ def main() -> None:
     """Entry point of `padgs-run`; exit code 0, 1 if any run failed, 130 if stopped by Ctrl-C."""
     arguments = sys.argv[1:]
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # schedulers send it; it is no crash
-    try:
-        sys.exit(_run(arguments))
+    try:  # slow modules are imported within, so that Ctrl-C is answered from the beginning
+        _answer(arguments)
+        from padgs.multirun.board import OK
+        from padgs.multirun.composition import composing, multirun, single_run
+        from padgs.multirun.job import exit_on_hydra_errors, only_job
+        from padgs.multirun.sweep import sweep
+
+        with exit_on_hydra_errors(), composing() as loader:
+            config = multirun(arguments)
+            ends = {*sweep(config, loader)} if config else {only_job(*single_run(arguments))}
+        sys.exit(0 if ends <= {OK} else 1)
     except KeyboardInterrupt as stopped:
         from padgs.runs.console import printable
 
@@ -25,46 +34,29 @@ def main() -> None:
         sys.exit(INTERRUPTED)
 
 
-def _run(arguments: Sequence[str]) -> int:
-    """Return the exit code. Slow modules are imported here, so that Ctrl-C is answered from the beginning."""
+def _answer(arguments: Sequence[str]) -> None:
+    """Exit after options that run nothing, and after settings that cannot be run."""
     import padgs
 
     if "--version" in arguments:
         print(f"padgs {padgs.__version__}")
-        return 0
-    from datetime import datetime
-
-    from hydra.errors import HydraException
-
+        sys.exit()
     from padgs.baselines import clash
-    from padgs.multirun import job
-    from padgs.multirun.board import OK
-    from padgs.multirun.composition import composing, multirun, single_run
-    from padgs.multirun.finished import FOLDER
+    from padgs.multirun.job import complain, exit_on_hydra_errors
     from padgs.multirun.manual import manual
     from padgs.multirun.overrides import missing_plugin, problem
-    from padgs.multirun.sweep import sweep
 
-    try:
-        if {"--help", "-h"} & {*arguments}:
+    if {"--help", "-h"} & {*arguments}:
+        with exit_on_hydra_errors():
             print(manual(arguments))
-            return 0
-        if error := problem(arguments) or missing_plugin(arguments) or clash():
-            job.complain(error)
-            return 1
-        if any(argument.startswith("-") and argument not in ("-m", "--multirun") for argument in arguments):
+        sys.exit()
+    if error := problem(arguments) or missing_plugin(arguments) or clash():
+        complain(error)
+        sys.exit(1)
+    if any(argument.startswith("-") and argument not in ("-m", "--multirun") for argument in arguments):
+        with exit_on_hydra_errors():
             _let_hydra_answer(arguments)
-            return 0
-        with composing() as loader:
-            start = f"{datetime.now():%Y%m%d-%H%M%S}-{os.getpid()}"
-            if config := multirun(arguments, f"hydra.sweep.dir=${{run.folder}}/{FOLDER}/{start}"):
-                ends = {*sweep(config, loader)}
-            else:
-                ends = {job.only_job(*single_run(arguments))}
-    except HydraException as error:
-        job.complain("\n".join(map(str, filter(None, (error, error.__cause__)))))
-        return 1
-    return 0 if ends <= {OK} else 1
+        sys.exit()
 
 
 def _let_hydra_answer(arguments: Sequence[str]) -> None:

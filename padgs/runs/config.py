@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
@@ -13,7 +13,7 @@ from padgs.data import LOADERS
 from padgs.data.capture import DataOptions, DataSettings
 from padgs.data.datasets import DATASETS
 from padgs.data.perturb import StressOptions
-from padgs.data.synthetic.options import SyntheticOptions
+from padgs.data.synthetic.options import SCENES, SyntheticOptions
 from padgs.evaluation.protocols import PROTOCOLS, Protocol, protocol_from_options
 from padgs.registry import lookup
 from padgs.render import RenderConfig
@@ -45,8 +45,17 @@ class DataConfig(DataSettings):
         check_known(self, format=("auto", *LOADERS))
         if self.dataset is not None:
             check_known(self, dataset=DATASETS)
+        _ = self.synthetic
+
+    @property
+    def synthetic(self) -> SyntheticOptions:
+        """Options of a generated scene.
+
+        Raises:
+            ConfigError: an unknown key, or a value of the wrong type.
+        """
         width = {} if self.width is None else {"width": self.width}
-        typed(SyntheticOptions, {**self.generator, **width}, "data.generator")
+        return typed(SyntheticOptions, {**self.generator, **width}, "data.generator")
 
     def options(self, device: str) -> DataOptions:
         """What the loader is told, with the device that keeps decoded images."""
@@ -244,3 +253,37 @@ def default_fields() -> dict[str, Any]:
 def method_fields(name: str) -> dict[str, Any]:
     """The keys of `method` with their defaults for one method."""
     return {"name": name, **asdict(lookup(METHODS, name, "method").Options())}
+
+
+def method_choices(name: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield group and node for Hydra of `method=NAME`, and of its own render and train settings, if it has any.
+
+    These are choices as well, so that render=... and train=... on a command line replace them.
+
+    >>> list(method_choices("op43dgs"))[0]
+    ('render', {'render': {'projection': 'tangent'}})
+    """
+    kind = lookup(METHODS, name, "method")
+    defaults: list[Any] = [f"/fields/method/{name}@method"]
+    for group, own, usual in (("render", kind.RENDER, RenderConfig()), ("train", kind.TRAIN, TrainOptions())):
+        changes = {key: value for key, value in asdict(own).items() if value != getattr(usual, key)}
+        if changes:
+            yield group, {group: changes}
+            defaults.append({f"override /{group}": name})
+    yield "method", {"defaults": defaults}
+
+
+def scene_choices() -> dict[str, dict[str, Any]]:
+    """Return name -> node of `+scene=`; named DATASET_SCENE, so that a sweep can take `+scene=glob(roam360_*)`.
+
+    >>> scene_choices()["ricoh360_cat_tower"]
+    {'defaults': [{'override /data': 'ricoh360'}], 'data': {'path': 'data/ricoh360/cat_tower'}}
+    >>> scene_choices()["synthetic_outdoor"]
+    {'defaults': [{'override /data': 'synthetic'}], 'data': {'generator': {'scene': 'outdoor'}}}
+    """
+    values = {f"synthetic_{scene}": ("synthetic", {"generator": {"scene": scene}}) for scene in SCENES} | {
+        f"{name}_{scene}": (name, {"path": f"data/{known.title.casefold()}/{scene}"})
+        for name, known in DATASETS.items()
+        for scene in known.scenes
+    }
+    return {name: {"defaults": [{"override /data": data}], "data": keys} for name, (data, keys) in values.items()}

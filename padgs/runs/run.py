@@ -23,19 +23,22 @@ from padgs.evaluation.protocols import Protocol
 from padgs.evaluation.scoring import constant_color_quality, frame_times, probe, score
 from padgs.registry import lookup
 from padgs.results import STATUSES, STOP_REQUESTED, Result
+from padgs.runs.checkpoint import CheckpointError
 from padgs.runs.config import RunConfig
 from padgs.runs.console import LiveLine, introduce, say, show_result
 from padgs.runs.device import choose_device
 from padgs.runs.interrupt import STOP_SIGNALS, Interrupt, Interrupted
-from padgs.runs.store import Progress, RunFolderError, RunStore, config_hash
+from padgs.runs.store import Progress, RunBusy, RunFolderError, RunStore, config_hash
 from padgs.scene import Scene
-from padgs.training.health import Failure, is_out_of_memory, memory_reason
+from padgs.training.health import Failure, is_out_of_memory, memory_reason, validation_split
 from padgs.training.loop import Record
 from padgs.training.method import Method
 
 MAX_DEPTH_ERROR = 0.5  # AbsRel; more is degenerate
 MIN_THICKNESS = 0.01  # of all surfaces along their thinnest axis, relative to the true one; less is degenerate
 MIN_ITERATIONS = 50  # a shorter run is not judged by its quality
+# Errors whose message suffices without a traceback. Failures of training are results; Failure is one of a later search.
+REPORTED = (ValueError, OSError, Failure, CheckpointError, RunFolderError, RunBusy)
 RETRIED = STATUSES.keys() - {"ok", "timeout"}  # statuses that retry=failed starts again
 
 
@@ -110,11 +113,14 @@ def load_scene(config: RunConfig, device: torch.device) -> Scene:
 
     Raises:
         DataError: the input cannot be used.
-        ValueError: the stress condition cannot be applied to it.
+        ValueError: the stress condition cannot be applied to it, or it has too few views for `smallest=on`.
     """
     images_on = str(device) if config.run.images_on == "device" else config.run.images_on
     scene = data.load(config.data.path, config.data.format, config.data.options(images_on))
-    return config.stress.apply(scene, config.seed).recentered().to(device)
+    scene = config.stress.apply(scene, config.seed).recentered().to(device)
+    if config.smallest == "on":
+        validation_split(scene.train)  # refuses too few views before hours of training
+    return scene
 
 
 def build_method(config: RunConfig) -> Method:

@@ -22,11 +22,11 @@ ROOT = Path(__file__).resolve().parents[2]
 TINY = [*SMALLEST, "train.iterations=300", "run.checkpoint_every=10", "run.probe_every=50", "tracking=none"]
 ANNOUNCED = """
 from padgs.multirun import run
-begin = run._run
+begin = run._answer
 def announce(arguments):  # inside of what answers Ctrl-C: a signal sent on this word is never too early
     print("begun", flush=True)
-    return begin(arguments)
-run._run = announce
+    begin(arguments)
+run._answer = announce
 run.main()
 """
 

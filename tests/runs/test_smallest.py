@@ -242,7 +242,9 @@ def test_a_run_with_smallest_on_is_the_same_run_and_is_searched_at_its_end(tmp_p
     with composing():
         config = configuration(settings)
         assert config.values() == configuration([*settings, "smallest=off"]).values()
-    result = job.complete(config, Console(width=400), Callback())
+    with job.served_scene(config) as scene:
+        result = run(config, Console(width=400), scene=scene)
+    job.search_smallest(config, scene, result, Console(width=400), Callback())
     searched_run = padgs.load_run(tmp_path / result.run, device="cpu").result
     assert searched_run is not None
     kept = searched_run.smallest["kept"]
