@@ -20,7 +20,7 @@ from padgs.scene import View
 
 @dataclass(frozen=True)
 class ODGSOptions(SplatOptions):
-    """As published; the last two options are deviations of the released code (conf/method/odgs_release.yaml)."""
+    """Options as published; the last two are deviations of the released code (conf/method/odgs_release.yaml)."""
 
     gradient_threshold: float = 1e-4
     pixel_bias: float = 0.0  # pixels that means are rendered too far right and down; released: 0.5

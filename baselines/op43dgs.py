@@ -22,7 +22,7 @@ INSTANCE_BYTES = 24  # per (Gaussian, tile) pair: a key of 8 bytes and a value o
 
 @dataclass(frozen=True)
 class OP43DGSOptions(SplatOptions):
-    """As published; the options here are deviations of the released code."""
+    """Options as published; those defined here are deviations of the released code."""
 
     fixed_low_pass: bool = False  # render.low_pass is in pixels of `RELEASED_FOCAL`
     memory_cap: int | None = None  # bytes for all (Gaussian, tile) pairs of an image; None: unlimited

@@ -1,4 +1,4 @@
-"""Checks of options. What is refused is named with its value and the rule, or with the names that are known."""
+"""Checks of options; messages name the option, its value, and the rule or the known names."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ T = TypeVar("T")
 
 
 class ConfigError(ValueError):
-    """A configuration that cannot be used; the message names the key, the value and what is known."""
+    """A configuration that cannot be used; the message names the key, its value and the known values."""
 
 
 def typed(kind: type[T], values: Mapping[str, Any], where: str = "") -> T:
-    """An instance of the dataclass `kind` with some of its fields set, nested dataclasses included.
+    """Return an instance of the dataclass `kind` with some of its fields set, nested dataclasses included.
 
     Args:
         kind: a dataclass; its checks in `__post_init__` run.
@@ -95,7 +95,7 @@ def _value(kind: Any, value: Any, where: str) -> Any:
         return value
     if kind is str and isinstance(value, str):
         if any(0xD800 <= ord(character) < 0xE000 for character in value):
-            raise ConfigError(f"{where} is {value!r}, which is not Unicode; rename what it names")
+            raise ConfigError(f"{where} is {value!r}, which is not Unicode; rename the file or value")
         return value
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         if not -sys.float_info.max <= value <= sys.float_info.max:
@@ -113,7 +113,7 @@ def _first_fit(kinds: tuple[Any, ...], value: Any, where: str) -> Any:
             return _value(kind, value, where)
         except ConfigError:
             if is_dataclass(kind) and isinstance(value, Mapping):
-                raise  # what is wrong inside says more than that nothing fits
+                raise  # the error inside the group says more
     raise ConfigError(f"{where} is {value!r}; it must be {' or '.join(_name(kind) for kind in kinds)}")
 
 

@@ -1,7 +1,7 @@
 """Time, memory and the machine they were measured on, as plain dicts that go into results as they are.
 
-Both clocks are read: wall time is what the user waits, CPU time what the work costs; on a machine that others use too
-they come apart, and then the smallest of several repeats says most.
+Wall time is how long the user waits, CPU time is what the work costs. On a shared machine they differ, and then the
+smallest of several repeats is the most reliable.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ class Lap:
 
 
 def synchronise(device: Device = "cpu") -> None:
-    """Wait until the device has done all it was given; without it a GPU is timed at being asked, not at working."""
+    """Wait until the device has finished its queue; otherwise only the launch of GPU work is timed."""
     if torch.device(device).type == "cuda":
         torch.cuda.synchronize(device)
 
 
 def timed(work: Callable[[], T], device: Device = "cpu") -> tuple[T, float]:
-    """The value of `work()` and the wall time in seconds that it took, on the device too."""
+    """Return the value of `work()` and its wall time in seconds, including the work queued on the device."""
     synchronise(device)
     lap = Lap()
     value = work()
@@ -54,7 +54,7 @@ def timed(work: Callable[[], T], device: Device = "cpu") -> tuple[T, float]:
 
 @contextmanager
 def threads(count: int) -> Iterator[None]:
-    """Within it torch works with so many threads."""
+    """Limit torch to `count` threads inside the context."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
@@ -66,7 +66,7 @@ def threads(count: int) -> Iterator[None]:
 def measure(
     work: Callable[[], object], *, repeats: int = 10, warm_up: int = 2, device: Device = "cpu"
 ) -> dict[str, Any]:
-    """Time `work()` several times after some that do not count.
+    """Time `work()` several times, after some untimed calls.
 
     Returns:
         {"repeats": n, "wall": {"median", "p95", "min"}, "cpu": {the same}} in seconds; CPU time is summed over threads.
@@ -87,7 +87,7 @@ def measure(
 
 
 def summary(seconds: list[float]) -> dict[str, float]:
-    """Median, 95th percentile (the smallest value that 95 % do not exceed) and minimum.
+    """Return median, 95th percentile (the smallest value that 95 % do not exceed) and minimum.
 
     >>> summary([3.0, 1.0, 2.0])
     {'median': 2.0, 'p95': 3.0, 'min': 1.0}
@@ -98,7 +98,7 @@ def summary(seconds: list[float]) -> dict[str, float]:
 
 
 def reset_peak_memory(device: Device = "cpu") -> None:
-    """Forget the peak so far, so that several runs in one process are told apart (host: Linux only)."""
+    """Reset the peak, so that each run of a process has its own (host: Linux only)."""
     if torch.device(device).type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
     with suppress(OSError):  # not Linux, or not allowed: the peak is that of the whole process
@@ -106,7 +106,7 @@ def reset_peak_memory(device: Device = "cpu") -> None:
 
 
 def peak_memory(device: Device = "cpu") -> dict[str, Any]:
-    """Bytes at the peak, since `reset_peak_memory` or the start: of the process, and of tensors on a GPU, or None."""
+    """Return peak bytes since `reset_peak_memory` or the start: of the process, and of tensors on a GPU (or None)."""
     on_device = torch.cuda.max_memory_allocated(device) if torch.device(device).type == "cuda" else None
     # VmHWM and not ru_maxrss where there is one: ru_maxrss survives exec, so a process that a large one started
     # reports its parent's peak.
@@ -116,7 +116,7 @@ def peak_memory(device: Device = "cpu") -> dict[str, Any]:
 
 
 def machine(device: Device = "cpu") -> dict[str, Any]:
-    """What a measurement needs to be read later: hardware, versions, code, date."""
+    """Return hardware, versions, code and date, which a measurement is read with."""
     gpu = torch.device(device) if torch.device(device).type == "cuda" else None
     return {
         "cpu": _linux("/proc/cpuinfo", "model name") or platform.processor() or platform.machine(),
@@ -135,7 +135,7 @@ def machine(device: Device = "cpu") -> dict[str, Any]:
 
 
 def commit(folder: Path | None = None) -> str | None:
-    """Commit of the checkout that this code is run from, with "+" if files differ from it; None outside a checkout."""
+    """Return the commit of the checkout of this code, with "+" if files differ from it; None outside a checkout."""
     folder = Path(__file__).resolve().parent.parent if folder is None else folder
     if not (folder / ".git").exists():
         return None  # without this check, an installed package would report whatever repository lies around it
@@ -153,7 +153,7 @@ def _git(folder: Path, *arguments: str) -> str | None:
 
 
 def _linux(file: str, key: str) -> str:
-    """The first value that a file of the kernel has under a key; empty elsewhere."""
+    """Return the first value of a key in a file of the Linux kernel; empty elsewhere."""
     try:
         lines = Path(file).read_text().splitlines()
     except OSError:

@@ -1,4 +1,4 @@
-"""Files that take their place once they are complete: where writing is cut off, the earlier one stays as it was."""
+"""Atomic writes: a file is replaced only by a complete one."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from pathlib import Path
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """A hidden place beside `path`, of the same ending, to write to: it becomes `path` at the end, or nothing is left.
+    """Yield a hidden path beside `path` to write to; it replaces `path` at the end, or is removed after an error.
 
     Raises:
-        OSError: it was not written, or cannot take the place.
+        OSError: it was not written, or cannot replace `path`.
     """
     draft = path.with_name(f".{os.getpid()}-{path.name}")
     try:

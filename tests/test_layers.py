@@ -36,7 +36,7 @@ STANDARD_LIBRARY_ONLY = ("padgs.registry", "padgs.files", "padgs.results")
 CATCH_ALL_NAMES = {"utils", "util", "helpers", "helper", "common", "misc", "base", "tools", "stuff"}
 # A docstring begins with a verb or a noun.
 NO_FIRST_WORDS = set("Of That Those What Whom Whose Where How As Whether Which Who".split())  # noqa: SIM905
-MAX_TO_REWRITE = 30
+MAX_TO_REWRITE = 0
 
 
 def module_name(path: Path) -> str:

@@ -88,17 +88,6 @@ def test_missing_and_unknown_keys_are_listed(result, tmp_path):
         results.read(path)
 
 
-def test_a_file_from_before_the_memory_of_a_gpu_was_measured_is_read(result, tmp_path):
-    on_gpu = replace(result, peak_device_memory_bytes=3 * 10**9)
-    path = results.write(on_gpu, tmp_path)
-    assert results.read(path) == on_gpu
-    document = json.loads(path.read_text())
-    del document["peak_device_memory_bytes"], document["sha256"]
-    document["sha256"] = file._digest({key: value for key, value in document.items() if key != "schema"})
-    path.write_text(json.dumps(document))
-    assert results.read(path) == result
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -107,17 +96,17 @@ def test_a_file_from_before_the_memory_of_a_gpu_was_measured_is_read(result, tmp
         ({"dataset": "/etc"}, "'/etc' is no name"),
         ({"experiments": ("tau@cpu", "../../x")}, "'../../x' is no name"),
         ({"experiments": (1,)}, "they must be names"),
-        ({"seed": "0"}, "seed is '0', which is no int"),
-        ({"config": []}, "config is .., which is no dict"),
+        ({"seed": "0"}, "seed is '0'; it must be int"),
+        ({"config": []}, "config is ..; it must be dict"),
         ({"iterations": True}, "iterations is True"),
         ({"timing": 3}, "timing|items"),
         ({"timing": {"train_seconds": 10**400}}, "int too large"),
         ({"counts": {"gaussians": "many"}}, "counts.gaussians is 'many'"),
-        ({"config": {"train": []}}, r"config.train is \[\], which is no group"),
+        ({"config": {"train": []}}, r"config.train is \[\]; it must be a group"),
         ({"config": {"budget": {"seconds": "long"}}}, "could not convert"),
         (
             {"config": {"budget": {"clock": "cpu; rm -rf ."}}},
-            "config.budget.clock is 'cpu; rm -rf .', which is no name",
+            "config.budget.clock is 'cpu; rm -rf .'; it must be a name",
         ),
         ({"config": {"budget": {"clock": ["cpu"]}}}, "config.budget.clock is .'cpu'."),
         ({"config": {"protocol": {"sphere": "sphere"}}}, "rules of a protocol are 'sphere'"),
@@ -177,5 +166,5 @@ def test_the_tail_of_a_log_has_its_last_whole_lines(tmp_path):
 
 
 def test_keys_that_decide_nothing_are_left_out_wherever_they_are():
-    config = {"data": {"device": "cpu", "path": "/x", "width": 8, "generator": {"path": 1}}, "protocol": {}, "seed": 1}
+    config = {"data": {"path": "/x", "width": 8, "generator": {"path": 1}}, "protocol": {}, "seed": 1}
     assert results.decisive(config) == {"data": {"width": 8, "generator": {"path": 1}}, "seed": 1}

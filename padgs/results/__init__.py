@@ -1,4 +1,4 @@
-"""What is known of a run without torch: its result and the file of it, what lies beside that, and what decided it.
+"""Results of runs and their files, without torch.
 
 Standard library only, so that reports need nothing else.
 """

@@ -1,6 +1,6 @@
-"""The file of a result, `result.json`. It is written last and whole: where it exists, the run is done.
+"""The file of a result, `result.json`, and the names of the files beside it.
 
-A run that failed has a result too, with its status instead of scores; it appears in the tables as such.
+It is written last and atomically: if it exists, the run is finished. A failed run has one too, with a status.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from padgs.files import write_atomically
 from padgs.results.result import Result, Scores
 
 LOG_NAME, CONFIG_NAME = "log.jsonl", "config.yaml"
-PICTURES = "renders"  # folder of truth | render | error of each test view, in one picture
-SMALLEST_PICTURE = "smallest.png"  # truth | whole model | smallest for each of `SMALLEST_PICTURED`, of a test view
+PICTURES = "renders"  # folder of images: ground truth | render | error of each test view
+SMALLEST_PICTURE = "smallest.png"  # ground truth | full model | smallest model for each loss of `SMALLEST_PICTURED`
 
 
 def log_lines(run_folder: Path, tail: int | None = None) -> Iterator[dict[str, Any]]:
-    """The whole lines of a run's log, each with its `iteration`; a line that is being written, or was cut, is left out.
+    """Yield the complete lines of a run's log, each with its `iteration`; incomplete lines are skipped.
 
     Args:
-        run_folder: of one run; a log that is missing has no lines.
-        tail: read so many bytes at the end of the log only.
+        run_folder: folder of one run; a missing log has no lines.
+        tail: number of bytes to read at the end of the log; None reads all.
     """
     try:
         with (run_folder / LOG_NAME).open("rb") as file:
@@ -48,7 +48,7 @@ def log_lines(run_folder: Path, tail: int | None = None) -> Iterator[dict[str, A
 
 
 def file_name(text: str) -> str:
-    """A text as the name of a file, which leads nowhere else.
+    """Return a text as a file name without separators.
 
     >>> file_name("left/R001 a"), file_name("chart_../../etc")
     ('left-R001-a', 'chart_..-..-etc')
@@ -57,7 +57,7 @@ def file_name(text: str) -> str:
 
 
 def picture_name(view: str) -> str:
-    """The name of the file with the picture of a test view, among the `renders` of a run.
+    """Return the file name of the image of a test view, in `renders` of a run.
 
     >>> picture_name("left/R001 a")
     'left-R001-a.png'
@@ -66,22 +66,21 @@ def picture_name(view: str) -> str:
 
 
 SCHEMA = 2
-ADDED = {"peak_device_memory_bytes", "smallest", "ended"}  # since then: files without are read, with the default
 FILE_NAME = "result.json"
 CONFIG_GROUPS = {"budget", "data", "method", "protocol", "render", "run", "stress", "train"}  # sections of settings
-# What is no more than a name, even in a command line or a path; `@` parts an experiment from its scale.
+# Names that are safe in a path and a command line; `@` separates an experiment from its scale.
 PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*(@[A-Za-z0-9._-]+)?")
 
 
 class ResultError(ValueError):
-    """A result file cannot be used; the message names the file, what is wrong with it, and the way out."""
+    """A result file cannot be used; the message names the file, the error and the way out."""
 
 
 def write(result: Result, folder: Path) -> Path:
-    """Write `result.json` into the run folder, whole or not at all; returns its path.
+    """Write `result.json` atomically into the run folder; return its path.
 
     Raises:
-        OSError: the disk is full, the folder is read-only, ...; no file is left behind, an older one stays.
+        OSError: the disk is full, the folder is read-only, ...; an older file stays.
     """
     path = folder / FILE_NAME
     write_atomically(path, (json.dumps(encoded(result), indent=1, allow_nan=False) + "\n").encode())
@@ -98,7 +97,7 @@ def read(path: Path) -> Result:
 
 
 def file_content(path: Path) -> bytes:
-    """What the file holds.
+    """Return the bytes of a file.
 
     Raises:
         ResultError: it cannot be read.
@@ -110,16 +109,16 @@ def file_content(path: Path) -> bytes:
 
 
 def encoded(result: Result) -> dict[str, Any]:
-    """What a file holds of a result: its fields, after the version of the schema and a digest of all."""
+    """Return a result as the document of its file: schema version, digest, and all fields."""
     content = _encode(asdict(result))
     return {"schema": SCHEMA, "sha256": _digest(content), **content}
 
 
 def parsed(content: bytes, where: str) -> dict[str, Any]:
-    """What `encoded` made, from its JSON; `where` names it in errors.
+    """Parse the JSON of a document; `where` names it in errors.
 
     Raises:
-        ResultError: it is truncated, or something else.
+        ResultError: it is truncated or no result.
     """
     try:
         document = json.loads(content)
@@ -131,18 +130,18 @@ def parsed(content: bytes, where: str) -> dict[str, Any]:
 
 
 def decoded(document: Mapping[str, Any], where: str) -> Result:
-    """The result that `encoded` made a document of; `where` names it in errors.
+    """Return the result of a document that `encoded` made; `where` names it in errors.
 
     Raises:
-        ResultError: it is of another version, or was edited; or, as a digest is no signature and the file may be from
-            elsewhere, it has values of other types, or texts for names that would mean something in a path or command.
+        ResultError: it is of another version, was edited, has values of other types, or has names that are unsafe in a
+            path or command (a digest is no signature, and files may come from elsewhere).
     """
     document = dict(document)
     if document.pop("schema") != SCHEMA:
         raise ResultError(f"{where} was written by another version (schema is not {SCHEMA}); run again with this one")
     digest = document.pop("sha256", None)
     known = {field.name for field in fields(Result)}
-    missing, unknown = known - document.keys() - ADDED, document.keys() - known
+    missing, unknown = known - document.keys(), document.keys() - known
     if missing or unknown:
         raise ResultError(f"{where}: missing {sorted(missing)}, unknown {sorted(unknown)}; delete it and run again")
     if digest != _digest(document):
@@ -160,9 +159,9 @@ def decoded(document: Mapping[str, Any], where: str) -> Result:
 
 
 def read_all(folder: Path) -> tuple[dict[Path, Result], list[ResultError]]:
-    """Run folder -> result, of all in a folder of run folders, in the order of their names; and what could not be read.
+    """Return run folder -> result for all run folders in a folder, sorted by name, and the errors of unreadable ones.
 
-    A folder may have another name than its run, if somebody renamed it.
+    A folder that was renamed has another name than its run.
     """
     results: dict[Path, Result] = {}
     errors: list[ResultError] = []
@@ -180,19 +179,19 @@ def _refuse_other_types(result: Result) -> None:
         kinds = tuple(get_origin(kind) or kind for kind in hints)
         value = getattr(result, name)
         if not isinstance(value, kinds) or isinstance(value, bool):
-            raise TypeError(f"{name} is {value!r}, which is no {' or '.join(kind.__name__ for kind in kinds)}")
+            raise TypeError(f"{name} is {value!r}; it must be {' or '.join(kind.__name__ for kind in kinds)}")
     if not all(isinstance(name, str) for name in result.experiments):
         raise TypeError(f"experiments are {result.experiments!r}; they must be names")
     for name, count in result.counts.items():
         if not (isinstance(count, int) and 0 <= count < 2**63):
-            raise TypeError(f"counts.{name} is {count!r}, which is no number of anything")
+            raise TypeError(f"counts.{name} is {count!r}; it must be a count")
     for name in CONFIG_GROUPS & result.config.keys():
         if not isinstance(result.config[name], dict):
-            raise TypeError(f"config.{name} is {result.config[name]!r}, which is no group of settings")
+            raise TypeError(f"config.{name} is {result.config[name]!r}; it must be a group of settings")
     budget = result.config.get("budget", {})
     float(budget.get("seconds") or 0)
     if not PLAIN.fullmatch(str(clock := budget.get("clock", "wall"))):  # findings print it in a command
-        raise ValueError(f"config.budget.clock is {clock!r}, which is no name")
+        raise ValueError(f"config.budget.clock is {clock!r}; it must be a name")
     rules = [*result.config.get("protocol", {}).values(), *(scores.protocol for scores in result.scores.values())]
     if odd := [rule for rule in rules if not isinstance(rule, dict)]:
         raise TypeError(f"the rules of a protocol are {odd[0]!r}; they must be a table")
@@ -203,7 +202,7 @@ def _digest(content: dict[str, Any]) -> str:
 
 
 def _encode(value: Any) -> Any:
-    """JSON has no infinity (the PSNR of a perfect image); such numbers are written as strings."""
+    """Return a value for JSON; infinities, such as the PSNR of a perfect image, become strings."""
     if isinstance(value, dict):
         return {str(key): _encode(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

@@ -1,4 +1,4 @@
-"""What a run has to say for itself: what was trained, how it ended, and its marks."""
+"""The result of a run: its configuration, status, metrics and cost."""
 
 from __future__ import annotations
 
@@ -11,31 +11,29 @@ STATUSES = {
     "oom": "an allocation failed, or memory would have passed the declared limit",
     "nan": "a loss, gradient or parameter was not finite",
     "diverged": "the loss rose far above its best and stayed there, or test views are worse than one mean colour",
-    "collapsed": "next to nothing was left to draw",
+    "collapsed": "almost nothing was left to render",
     "exploded": "Gaussians grew far beyond the scene, or in number beyond all pixels",
-    "degenerate": "pictures may be fine, but the depth behind them is wrong",
-    "silent": "nothing pulled at some of the parameters",
+    "degenerate": "images may be fine, but the depth is wrong",
+    "silent": "the gradients of some parameters were always 0",
     "timeout": "the time limit came before the last iteration",
     "rejected": "the input was refused with a clear error",
 }
-STOP_REQUESTED = (
-    "asked to stop and score"  # why a run ended, where no setting says so: it is no seed of one that ran on
-)
-AD_HOC = "ad_hoc"  # among experiments: a command without any requested the run as well
-HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "lpips": False}  # of every metric with the word in it
-SMALLEST_LOSSES = (0.05, 0.1, 0.25, 0.5, 1.0)  # dB, for each of which `padgs smallest` finds the smallest model
-SMALLEST_STATED = 0.1  # of these, the one that is put into one number, and whose model is kept if no other is asked for
+STOP_REQUESTED = "asked to stop and score"  # `ended` of a run stopped by the user, which is no repeat of a full run
+AD_HOC = "ad_hoc"  # in `experiments`: the run was also requested without an experiment
+HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "lpips": False}  # word in the name of a metric
+SMALLEST_LOSSES = (0.05, 0.1, 0.25, 0.5, 1.0)  # dB; `padgs smallest` finds the smallest model for each
+SMALLEST_STATED = 0.1  # dB; the loss of the headline number, and of the model that is kept by default
 SMALLEST_PICTURED = (SMALLEST_STATED, 1.0)
 
 
 @dataclass(frozen=True)
 class Scores:
-    """The marks of one run under one protocol. Numbers of different protocols cannot be compared."""
+    """Metrics of one run under one protocol; metrics of different protocols cannot be compared."""
 
     protocol: dict[str, Any]  # all its rules
     metrics: dict[str, float | None]  # metric -> mean over the test views; None = missing
     views: dict[str, dict[str, float | None]]  # view -> metric -> value
-    notes: tuple[str, ...] = ()  # what is missing and why
+    notes: tuple[str, ...] = ()  # missing metrics, with the reason
 
 
 @dataclass(frozen=True)
@@ -45,55 +43,55 @@ class Result:
     run: str  # run id = name of the run folder
     status: str  # key of STATUSES
     method: str  # name in `baselines.METHODS`
-    preset: str  # what `method=` was when the run was started: a method, or a file in conf/method
+    preset: str  # value of `method=`: a method, or a file in conf/method
     variant: str  # row of an ablation; empty for none
-    dataset: str  # synthetic, a name of padgs.data.DATASETS, or empty for a capture of one's own
+    dataset: str  # synthetic, a name of padgs.data.DATASETS, or empty for own captures
     scene: str
     width: int  # of the test views, pixels
     height: int
-    iterations: int  # asked for; those that were done, where seconds were asked for
+    iterations: int  # requested; with a budget of seconds, those that were done
     iterations_done: int
     seed: int
     code_version: str
-    machine: dict[str, Any]  # as `padgs.clock.machine` describes it
+    machine: dict[str, Any]  # see `padgs.clock.machine`
     config_hash: str
     fingerprint: str  # of the data
     finished: str  # UTC, ISO 8601
     reason: str = ""  # why a run failed
-    ended: str = ""  # why a run that ended well left out a part of its schedule, see `padgs.training.health`
-    scores: dict[str, Scores] = field(default_factory=dict)  # protocol -> marks
+    ended: str = ""  # why the run skipped part of its schedule, see `padgs.training.health`
+    scores: dict[str, Scores] = field(default_factory=dict)  # protocol -> scores
     timing: dict[str, float] = field(default_factory=dict)  # train_seconds, render_ms_median, render_ms_p95, ...
     counts: dict[str, int] = field(default_factory=dict)  # anchors, gaussians, ...
     model_bytes: int = 0
     peak_memory_bytes: int = 0  # of the process, while training
     peak_device_memory_bytes: int | None = None  # of torch's tensors on the GPU, while training; None on the CPU
     config: dict[str, Any] = field(default_factory=dict)  # the resolved configuration
-    experiments: tuple[str, ...] = ()  # experiments and sweeps that it belongs to, sorted; see `joined`
-    smallest: dict[str, Any] = field(default_factory=dict)  # of the kept model: see `padgs.runs.smallest.Search.front`
+    experiments: tuple[str, ...] = ()  # experiments and sweeps of the run, sorted; see `joined`
+    smallest: dict[str, Any] = field(default_factory=dict)  # see `padgs.runs.smallest.Search.front`
 
     def __post_init__(self) -> None:
-        """Reject a status that no table knows."""
+        """Reject a status that is not in STATUSES."""
         if self.status not in STATUSES:
             raise ValueError(f"unknown status {self.status!r}; known: {', '.join(STATUSES)}")
 
     @property
     def ok(self) -> bool:
-        """Whether the scores count."""
+        """True if the scores count."""
         return self.status == "ok"
 
 
 def joined(first: Iterable[str], second: Iterable[str]) -> tuple[str, ...]:
-    """The experiments of a run that two commands asked for; none of a run that was asked for by itself alone.
+    """Return the experiments of a run requested by two commands; empty if neither names an experiment.
 
     >>> joined(("tau",), ("table1",)), joined((), ("tau",)), joined((), ())
-    (('table1', 'tau'), ("ad_hoc", "tau"), ())
+    (('table1', 'tau'), ('ad_hoc', 'tau'), ())
     """
     names = {*(tuple(first) or (AD_HOC,)), *(tuple(second) or (AD_HOC,))}
     return () if names == {AD_HOC} else tuple(sorted(names))
 
 
 def higher_is_better(metric: str) -> bool | None:
-    """Which end of a metric is the better one, by the word of `HIGHER_IS_BETTER` in its name; None for others.
+    """Return whether higher values of a metric are better; None if neither end is.
 
     >>> higher_is_better("ws_psnr_pole"), higher_is_better("lpips_vgg_01"), higher_is_better("seam")  # best at 1
     (True, False, None)
@@ -101,15 +99,14 @@ def higher_is_better(metric: str) -> bool | None:
     return next((HIGHER_IS_BETTER[word] for word in metric.split("_") if word in HIGHER_IS_BETTER), None)
 
 
-# Keys that no trained number depends on but by rounding: of the machine, and the others. What was
-# read is said by the fingerprint of the data; scoring comes after training; a monitor changes no number, but may end a
-# run. `data.device` is in files of old runs only.
+# Configuration keys that results do not depend on except by rounding: those of the machine, and others. The fingerprint
+# stands for the data, scoring comes after training, and the monitor may end a run but changes no number.
 OF_THE_MACHINE = ("run", "render.max_instances", "data.cache_bytes", "data.prefetch_threads")
 DECIDE_NOTHING = (*OF_THE_MACHINE, "data.path", "init.run", "protocol", "train.monitor")
 
 
 def decisive(config: Mapping[str, Any], where: str = "") -> dict[str, Any]:
-    """A configuration without the keys that decide nothing.
+    """Return a configuration without the keys of DECIDE_NOTHING.
 
     >>> decisive({"seed": 0, "run": {"threads": 2}, "data": {"path": "/x", "width": 64}})
     {'seed': 0, 'data': {'width': 64}}

@@ -1,9 +1,8 @@
-"""A `State` as a folder: tensors in safetensors, values in JSON; nothing in it is ever executed.
+"""Checkpoints: a `State` as a folder with tensors in safetensors and values in JSON; no code is ever executed.
 
-`state.json` names the file of tensors with its size and SHA-256, says which run it is of, and ends with a SHA-256 of
-itself. The tensors are written first, under a new name, and replacing `state.json` is the one step that makes the new
-checkpoint count. So at every moment, whatever is killed or full, the folder holds one complete checkpoint: the old one
-or the new one.
+`state.json` holds the name, size and SHA-256 of the file of tensors, the identity of the run, and a SHA-256 of itself.
+The tensors are written first, under a new name; replacing `state.json` then switches to the new checkpoint. If the
+process is killed or the disk is full, the folder still holds one complete checkpoint.
 """
 
 from __future__ import annotations
@@ -34,12 +33,12 @@ class CheckpointError(RuntimeError):
 
 
 def exists(folder: Path) -> bool:
-    """Whether the folder holds a checkpoint, sound or not."""
+    """Return whether the folder holds a checkpoint, even a damaged one."""
     return (folder / MANIFEST).exists()
 
 
 def digest(folder: Path) -> str:
-    """SHA-256 of the tensors of a checkpoint.
+    """Return the SHA-256 of the tensors of a checkpoint.
 
     Raises:
         CheckpointError: it cannot be read.
@@ -48,12 +47,12 @@ def digest(folder: Path) -> str:
 
 
 def save(state: State, folder: Path, run: Mapping[str, str] | None = None) -> None:
-    """Write a checkpoint, replacing the one in the folder, which stays whole until the new one is.
+    """Write a checkpoint; the previous one in the folder stays complete until it is replaced.
 
     Args:
         state: of a method.
         folder: of the checkpoint.
-        run: which one it is of, as `padgs.runs.store.identity` says.
+        run: identity of the run, see `padgs.runs.store.identity`.
 
     Raises:
         CheckpointError: the disk is full, the folder is read-only, ...; the previous checkpoint is untouched.
@@ -71,8 +70,8 @@ def save(state: State, folder: Path, run: Mapping[str, str] | None = None) -> No
         write_atomically(folder / MANIFEST, text)
     except OSError as error:
         raise CheckpointError(
-            f"cannot write checkpoint {folder}: {error.strerror or error}; the previous one, if any, is still whole. "
-            "Make room or mend the permissions, then start the run again to resume"
+            f"cannot write checkpoint {folder}: {error.strerror or error}; the previous one, if any, is complete. "
+            "Make room or correct the permissions, then start the run again to resume"
         ) from error
     for stale in folder.glob("tensors-*"):
         if stale.name != name:
@@ -80,12 +79,12 @@ def save(state: State, folder: Path, run: Mapping[str, str] | None = None) -> No
 
 
 def load(folder: Path, device: torch.device | str = "cpu", run: Mapping[str, str] | None = None) -> State:
-    """Read a checkpoint that `save` wrote, whole or not at all, all tensors on one device.
+    """Read a checkpoint that `save` wrote, with all tensors on one device.
 
     Args:
         folder: of the checkpoint.
         device: of the tensors.
-        run: what it has to say of its run, if it says anything.
+        run: the identity that the checkpoint must have; None or missing keys are not compared.
 
     Raises:
         CheckpointError: a file is missing, truncated, changed, of another format, or of another run.
@@ -104,17 +103,17 @@ def load(folder: Path, device: torch.device | str = "cpu", run: Mapping[str, str
     if hashlib.sha256(content).hexdigest() != manifest["sha256"]:
         raise CheckpointError(f"{path} was changed after it was written (SHA-256 differs); {WAY_OUT}")
     with understood(folder):
-        # Clones own aligned memory. Views into the file's bytes would not, and products may round differently then.
+        # Copies own aligned memory; products of views into the file's bytes may round differently.
         loaded = safetensors.torch.load(content)
         return State({name: tensor.to(device, copy=True) for name, tensor in loaded.items()}, manifest["values"])
 
 
 @contextmanager
 def understood(folder: Path) -> Iterator[None]:
-    """For work with what a checkpoint holds: whatever goes wrong says that it is none of this method.
+    """Raise a CheckpointError for errors that a state of another method causes.
 
     Raises:
-        CheckpointError: something went wrong, and not for lack of memory.
+        CheckpointError: the work failed, and not for lack of memory.
     """
     try:
         yield

@@ -28,17 +28,17 @@ DEFAULT_METHOD = "padgs_plus"  # as conf/config.yaml says
 RETRIES = ("none", "failed")
 SWITCH = ("off", "on")
 IMAGES_ON = ("device", "cpu")
-WATCHED = 5.0  # seconds between checkpoints at most, where somebody watches
-CONTINUED = "continued"  # the word for runs with `init` in tables
+WATCHED = 5.0  # longest time in seconds between checkpoints of a run shown in the browser
+CONTINUED = "continued"  # label of runs with `init` in tables
 
 
 @dataclass(frozen=True)
 class DataConfig(DataSettings):
-    """The `data` group: where a scene comes from."""
+    """The `data` group: the source of the scene."""
 
     format: str = "synthetic"  # a name of padgs.data.LOADERS
-    path: str | None = None  # folder of the scene; null for a scene that is generated
-    voxel_size: float | str = "auto"  # of the anchors of methods that have them, where the paper states it
+    path: str | None = None  # folder of the scene; null for a generated scene
+    voxel_size: float | str = "auto"  # of anchors, as the paper states it for a dataset
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -58,16 +58,16 @@ class DataConfig(DataSettings):
         return typed(SyntheticOptions, {**self.generator, **width}, "data.generator")
 
     def options(self, device: str) -> DataOptions:
-        """What the loader is told, with the device that keeps decoded images."""
+        """Return the options of the loader; decoded images are kept on `device`."""
         return DataOptions(**{field.name: getattr(self, field.name) for field in fields(DataSettings)}, device=device)
 
 
 @dataclass(frozen=True)
 class TrainConfig(TrainOptions):
-    """The `train` group: how a method is trained, and for how long."""
+    """The `train` group: options and length of the training."""
 
-    iterations: int = PUBLISHED_ITERATIONS  # of training, one view each; schedules fit themselves to it
-    max_seconds: float | None = None  # of training; where they end it, the run has status timeout
+    iterations: int = PUBLISHED_ITERATIONS  # training iterations of one view each; schedules scale with them
+    max_seconds: float | None = None  # training time after which the run ends with status timeout
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -76,19 +76,18 @@ class TrainConfig(TrainOptions):
 
 @dataclass(frozen=True)
 class BudgetOptions:
-    """The `budget` group: what a run may spend instead of what `train.iterations` and thresholds of growth say."""
+    """The `budget` group: limits that replace `train.iterations` and the size that densification reaches."""
 
-    seconds: float | None = None  # of training: schedules follow the clock, and the run ends on time
-    clock: str = "wall"  # wall | cpu: cpu counts what the process itself takes, whatever else the machine does
-
-    gaussians: int | str | None = None  # that the model has in the end; auto: the least missed go after growth
-    stop: str = "end"  # of the schedule | auto: as soon as views that are set apart gain nothing any more
+    seconds: float | None = None  # training time; schedules follow the clock
+    clock: str = "wall"  # wall | cpu: CPU time of the process, independent of other load
+    gaussians: int | str | None = None  # final number; auto: prune the least important ones after densification
+    stop: str = "end"  # end of the schedule | auto: when validation views stop improving
 
     def __post_init__(self) -> None:
         Budget(1, **asdict(self))
 
     def asked(self) -> dict[str, Any]:
-        """What is asked for, by key."""
+        """Return the options that differ from the defaults, by key."""
         time = {} if self.seconds is None else {"seconds": self.seconds, "clock": self.clock}
         rest = {"gaussians": self.gaussians, "stop": self.stop}
         usual = asdict(BudgetOptions())
@@ -97,19 +96,19 @@ class BudgetOptions:
 
 @dataclass(frozen=True)
 class RunOptions:
-    """The `run` group: what a machine or a person decides and only rounding depends on; not part of the run id."""
+    """The `run` group: options that results depend on at most by rounding; not part of the run id."""
 
-    folder: str = "runs"  # of the run folders
-    device: str = "auto"  # auto | cpu | cuda; auto: a GPU where there is one that can draw what is asked for
-    images_on: str = "device"  # device | cpu: where decoded panoramas are kept, as uint8 within data.cache_bytes
+    folder: str = "runs"  # parent of the run folders
+    device: str = "auto"  # auto | cpu | cuda; auto: a GPU if it can render this configuration
+    images_on: str = "device"  # device | cpu: memory for decoded panoramas, uint8 within data.cache_bytes
     jobs: int = 1  # runs at the same time on one machine: conf/launcher
     threads: int | None = None  # of one run; null = cores / jobs
     log_every: int = 10  # iterations between lines of log.jsonl
     probe_every: int = 100  # iterations between renders of one test view, the held-out PSNR of the live line
     checkpoint_every: int | None = None  # iterations between checkpoints; null = only by time
-    checkpoint_seconds: float = 60.0  # between checkpoints, if not sooner by iterations
+    checkpoint_seconds: float = 60.0  # longest time between checkpoints
     view: bool = False  # show the run in the browser while it trains, a checkpoint every few seconds
-    pictures: bool = True  # save truth | render | error of each test view
+    pictures: bool = True  # save ground truth | render | error of each test view
 
     def __post_init__(self) -> None:
         check_known(self, device=DEVICES, images_on=IMAGES_ON)
@@ -119,12 +118,12 @@ class RunOptions:
 
     @property
     def seconds_between_checkpoints(self) -> float:
-        """As `checkpoint_seconds`, unless somebody watches."""
+        """Longest time between checkpoints, shorter if the run is shown in the browser."""
         return min(self.checkpoint_seconds, WATCHED) if self.view else self.checkpoint_seconds
 
     @property
     def threads_per_job(self) -> int | None:
-        """Threads of one run, such that all runs together use the cores of this process; None: as torch likes."""
+        """Threads of one run, so that all jobs together use the cores of this process; None: torch's default."""
         if self.threads is not None or self.jobs == 1:
             return self.threads
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -133,7 +132,7 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class Settings:
-    """What can be set whatever the method."""
+    """Settings of a run that do not depend on the method."""
 
     data: DataConfig = DataConfig()
     render: RenderConfig = RenderConfig()
@@ -143,9 +142,9 @@ class Settings:
     stress: StressOptions = StressOptions()
     tracking: TrackingOptions = TrackingOptions()
     variant: str = ""  # name of this setting within an experiment, such as a row of the ablation
-    seed: int = 0  # of the order of views and of all that is random in training
-    init: WarmStart | None = None  # folder of a finished run of the method and scene: training begins with its model
-    retry: str = "none"  # which finished runs are done again: a name of RETRIES
+    seed: int = 0  # of all randomness in training, such as the order of views
+    init: WarmStart | None = None  # a finished run of the same method and scene whose model training begins with
+    retry: str = "none"  # finished runs to start again: a name of RETRIES
     smallest: str = "off"  # on: search for the smallest model after the run, as padgs smallest does
 
     def __post_init__(self) -> None:
@@ -164,24 +163,23 @@ class RunConfig(Settings):
 
     @property
     def preset(self) -> str:
-        """The name of the method's settings: its own, or that of a file in conf/method."""
+        """Name of the method, or of a file in conf/method."""
         return self.labels.preset or self.method
 
     @property
     def time(self) -> Budget:
-        """How long the method may train."""
+        """Budget of the training."""
         return Budget(self.train.iterations, self.train.max_seconds, **asdict(self.budget))
 
     @property
     def row(self) -> str:
-        """What sets the run apart within an experiment: its variant, what it is stressed by, and begins with."""
+        """Label of the run within an experiment: variant, stress condition, and warm start."""
         return ", ".join(filter(None, (self.variant, self.stress.title, CONTINUED if self.init else "")))
 
     def values(self) -> dict[str, Any]:
-        """The configuration of a run as plain values in the shape of the YAML files, defaults included.
+        """Return the configuration as plain values in the shape of the YAML files, defaults included.
 
-        Stress, a budget, what is learned of views and what the run begins with are there only if there are any: ids of
-        runs without are what they were before.
+        Stress, budget and warm start are left out if they are not used, so that they do not change the run id.
         """
         stress = {"stress": asdict(self.stress)} if self.stress.title else {}
         return {
@@ -200,7 +198,7 @@ class RunConfig(Settings):
 
 
 def config_from_values(values: Mapping[str, Any], labels: Labels = Labels()) -> RunConfig:  # noqa: B008 - frozen
-    """The typed configuration of what Hydra composed.
+    """Return the typed configuration of values that Hydra composed.
 
     Raises:
         ConfigError: an unknown key or name (the known ones are listed), or a value of the wrong type.
@@ -209,7 +207,7 @@ def config_from_values(values: Mapping[str, Any], labels: Labels = Labels()) -> 
     if unknown := [key for key in values if key not in known]:
         raise ConfigError(f"unknown key {unknown[0]}; known: {', '.join(known)}")
     name = str(_group(values, "method").get("name", DEFAULT_METHOD))
-    if isinstance(values.get("init"), str):  # on command lines; in files of runs it is what `WarmStart.of` made of that
+    if isinstance(values.get("init"), str):  # on the command line; config.yaml of runs has the fields of a WarmStart
         values = {**values, "init": asdict(WarmStart.of(values["init"], name))}
     settings = typed(Settings, {key: value for key, value in values.items() if key not in ("method", "protocol")})
     method = {key: value for key, value in _group(values, "method").items() if key != "name"}
@@ -217,7 +215,7 @@ def config_from_values(values: Mapping[str, Any], labels: Labels = Labels()) -> 
     try:
         kind = lookup(METHODS, name, "method")
         options = typed(kind.Options, method, "method")
-        made = kind(options, settings.render, settings.train, settings.seed)  # refuses what goes together in no scene
+        made = kind(options, settings.render, settings.train, settings.seed)  # refuses options that exclude each other
         rules = {key: _protocol(key, _group(protocols, key, "protocol.")) for key in protocols}
         config = RunConfig(**vars(settings), method=name, options=options, protocols=rules, labels=labels)
         made.refuse_budget(config.time)
@@ -231,7 +229,7 @@ def config_from_values(values: Mapping[str, Any], labels: Labels = Labels()) -> 
 
 
 def _group(values: Mapping[str, Any], key: str, where: str = "") -> Mapping[str, Any]:
-    """The keys of a group; none where there is no such group."""
+    """Return the keys of a group; empty if there is no such group."""
     group = values.get(key, {})
     if not isinstance(group, Mapping):
         raise ConfigError(f"{where}{key} is {group!r}; it must be a group of keys")
@@ -239,19 +237,19 @@ def _group(values: Mapping[str, Any], key: str, where: str = "") -> Mapping[str,
 
 
 def _protocol(name: str, rules: Mapping[str, Any]) -> Protocol:
-    """A protocol of which some rules are given, with values of their types."""
+    """Return a protocol of which some rules are given, with values of their types."""
     given = {key: value for key, value in rules.items() if key != "name"}
     usual = protocol_from_options(name)
     return typed(Protocol, {**vars(usual), **given}, f"protocol.{name}")
 
 
 def default_fields() -> dict[str, Any]:
-    """All keys of the configuration with their defaults, except those that depend on a name: of method or protocol."""
+    """Return all keys of the configuration with their defaults, except those of method and protocol."""
     return asdict(Settings())
 
 
 def method_fields(name: str) -> dict[str, Any]:
-    """The keys of `method` with their defaults for one method."""
+    """Return the keys of `method` with their defaults for one method."""
     return {"name": name, **asdict(lookup(METHODS, name, "method").Options())}
 
 

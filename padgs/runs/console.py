@@ -1,23 +1,18 @@
-"""Text on a terminal: whatever names and messages hold is shown, and neither obeyed by it nor taken for markup."""
+"""Output of runs on a terminal. Control characters and markup in names and messages are printed, not obeyed."""
 
 from __future__ import annotations
 
 import time
 from collections import deque
-from typing import TYPE_CHECKING, TypeVar
-
-from rich.console import Console, RenderableType
-from rich.live import Live
-from rich.text import Text
-
-if TYPE_CHECKING:
-    from padgs.training.loop import Record
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from rich.box import SIMPLE_HEAD
+from rich.console import Console, RenderableType
+from rich.live import Live
 from rich.table import Table
+from rich.text import Text
 
 from padgs.evaluation import BANDS
 from padgs.results import Result
@@ -25,15 +20,16 @@ from padgs.results import Result
 if TYPE_CHECKING:
     from padgs.runs.config import RunConfig
     from padgs.scene import Scene
+    from padgs.training.loop import Record
 
 
 def say(console: Console, text: object, style: str = "") -> None:
-    """Print lines as they are, of any length."""
+    """Print lines without wrapping."""
     console.print(Text(printable(str(text)), style), soft_wrap=True)
 
 
 def printable(text: str) -> str:
-    r"""The text with escapes for what a terminal would obey, and for what no encoding has.
+    r"""Return a text with escapes for control characters and for code points without encoding.
 
     >>> printable("caf\u00e9 \x1b[2J \udce9")
     'café \\x1b[2J \\udce9'
@@ -43,17 +39,17 @@ def printable(text: str) -> str:
 
 
 REDRAWS_PER_SECOND = 5
-SECONDS_BETWEEN_LINES = 10.0  # where there is no terminal
-RECENT = 64  # records that the speed is taken from
+SECONDS_BETWEEN_LINES = 10.0  # without a terminal
+RECENT = 64  # records that the speed is measured over
 
 D = TypeVar("D", bound="Display")
 
 
 class Display:
-    """A place on the console for what changes; the last picture stays."""
+    """A part of the console that is redrawn; its last content stays."""
 
     def __init__(self, console: Console, *, redraw: float, line: float) -> None:
-        """Show something new after `redraw` seconds in a terminal, after `line` seconds elsewhere."""
+        """Redraw every `redraw` seconds in a terminal; print every `line` seconds elsewhere."""
         self._console = console
         self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
         self._interval = line if self._live is None else redraw
@@ -71,11 +67,11 @@ class Display:
 
     @property
     def is_due(self) -> bool:
-        """Whether what is shown is old."""
+        """True if it is time to redraw."""
         return time.monotonic() - self._shown >= self._interval
 
     def show(self, line: str, picture: RenderableType | None = None) -> None:
-        """Show a line, or in a terminal what says more."""
+        """Show a line, or a picture if there is one and the console is a terminal."""
         self._shown = time.monotonic()
         if self._live is not None:
             self._live.update(picture or Text(line, no_wrap=True, overflow="ellipsis"), refresh=True)
@@ -84,7 +80,7 @@ class Display:
 
 
 class LiveLine(Display):
-    """Of one run: iteration and share of the run, loss, held-out PSNR, counts, speed and the time that is left."""
+    """Progress of one run: iteration, share of the run, loss, held-out PSNR, counts, speed and remaining time."""
 
     def __init__(self, console: Console) -> None:
         super().__init__(console, redraw=1 / REDRAWS_PER_SECOND, line=SECONDS_BETWEEN_LINES)
@@ -92,7 +88,7 @@ class LiveLine(Display):
         self._psnr: float | None = None
 
     def update(self, record: Record, psnr: float | None) -> None:
-        """Take in a record and, where it was measured, the PSNR of the held-out view."""
+        """Show a record and the last measured PSNR of the held-out view."""
         self._times.append((record.iteration, record.progress, time.monotonic()))
         self._psnr = self._psnr if psnr is None else psnr
         if self.is_due or len(self._times) == 1 or record.progress == 1:
@@ -111,7 +107,7 @@ class LiveLine(Display):
 
 
 def compact(count: int) -> str:
-    """A count in few characters.
+    """Return a count in at most five characters.
 
     >>> [compact(n) for n in (987, 12_345, 123_456, 2_345_678)]
     ['987', '12.3k', '123k', '2.35M']
@@ -122,7 +118,7 @@ def compact(count: int) -> str:
 
 
 def duration(seconds: float) -> str:
-    """A duration as people write it.
+    """Return a duration as [hours:]minutes:seconds.
 
     >>> [duration(s) for s in (7, 72, 3723)]
     ['0:07', '1:12', '1:02:03']
@@ -133,16 +129,16 @@ def duration(seconds: float) -> str:
 
 
 MISSING = "–"
-MEANINGS = {  # word of a metric -> what it says, with an arrow towards the better end
+MEANINGS = {  # word in the name of a metric -> meaning, with an arrow towards better values
     "psnr": "↑ dB",
-    "ssim": "↑ likeness of structure",
+    "ssim": "↑ structural similarity",
     "lpips": "↓ perceptual distance",
     "seam": "error at ±180° over elsewhere, best 1",
 }
 
 
 def introduce(config: RunConfig, scene: Scene, folder: Path, console: Console) -> None:
-    """Print what is trained on what, the notes of the loader, and where the files will be."""
+    """Print method, scene, notes of the loader, and the run folder."""
     view = scene.train[0]
     what = f"{config.preset}{f' ({config.row})' if config.row else ''} on {scene.name}"
     views = f"{len(scene.train)} training and {len(scene.test)} test views of {view.width}x{view.height}"
@@ -153,7 +149,7 @@ def introduce(config: RunConfig, scene: Scene, folder: Path, console: Console) -
 
 
 def show_result(result: Result, folder: Path, console: Console) -> None:
-    """Print the marks of a run, what it cost, and where its files are."""
+    """Print metrics, cost and folder of a run."""
     if not result.ok:
         reason = printable(result.reason) or "stopped early"
         console.print(Text.assemble((result.status, "bold red"), f": {reason}"), soft_wrap=True)
@@ -177,7 +173,7 @@ def show_result(result: Result, folder: Path, console: Console) -> None:
 
 
 def marks(result: Result) -> Table:
-    """One row per metric, one column per protocol, and what the metric says."""
+    """Return a table of metrics: a row per metric, a column per protocol, and the meaning."""
     table = Table("metric", box=SIMPLE_HEAD)
     for protocol in result.scores:
         table.add_column(protocol, justify="right")
@@ -189,7 +185,7 @@ def marks(result: Result) -> Table:
 
 
 def meaning(metric: str) -> str:
-    """What a metric says, in a line, with an arrow towards its better end.
+    """Return the meaning of a metric in a line, with an arrow towards better values.
 
     >>> meaning("ws_psnr_pole"), meaning("lpips_vgg_01")
     ('↑ dB, 75 to 90° up and down', '↓ perceptual distance')
@@ -202,7 +198,7 @@ def meaning(metric: str) -> str:
 
 
 def number(metric: str, value: float | None) -> str:
-    """A mark as tables show it: decibels with two decimals, all else with three.
+    """Format the value of a metric: decibels with two decimals, others with three.
 
     >>> number("ws_psnr", 24.256), number("ssim", 0.5), number("lpips_vgg", None)
     ('24.26', '0.500', '–')

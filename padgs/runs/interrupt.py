@@ -20,7 +20,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 class Interrupt:
-    """Context in which signals only set `requested`; its owner reads that when it is safe to stop."""
+    """Context in which signals only set `requested`, so that the owner stops when it is safe."""
 
     def __init__(self, also: Callable[[], bool] = lambda: False, signals: tuple[signal.Signals, ...] = SIGNALS) -> None:
         """Watch `signals`; `also` is another way to request."""
@@ -29,7 +29,7 @@ class Interrupt:
 
     @property
     def requested(self) -> bool:
-        """Whether to stop."""
+        """True if the owner should stop."""
         return self._signalled or self._also()
 
     def __enter__(self) -> Interrupt:

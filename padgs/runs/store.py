@@ -118,7 +118,7 @@ class RunStore:
 
     @property
     def is_busy(self) -> bool:
-        """Whether another process holds the lock."""
+        """True if another process holds the lock."""
         try:
             self._lock.acquire(timeout=0)
         except OSError:  # a `Timeout`, or a folder that cannot be locked from here
@@ -128,7 +128,7 @@ class RunStore:
 
     @property
     def has_checkpoint(self) -> bool:
-        """Whether there is a checkpoint, sound or not."""
+        """True if there is a checkpoint, even a damaged one."""
         return checkpoint.exists(self.checkpoint)
 
     def prepare(self, values: Mapping[str, Any]) -> None:

@@ -38,7 +38,7 @@ ROW_WEIGHTS = {
 
 @dataclass(frozen=True)
 class SSIMStatistics:
-    """What the SSIM window sees of the target alone; computed once per view instead of once per iteration."""
+    """SSIM statistics of a target; computed once per view instead of once per iteration."""
 
     mean: Tensor  # [H, W, C]
     variance: Tensor  # [H, W, C]
@@ -53,7 +53,7 @@ def photometric_loss(
     normalisation: str = "mean",
     statistics: SSIMStatistics | None = None,
 ) -> Tensor:
-    """Eq. 16, a scalar; differentiable by `image`, and by `target` where that asks for a gradient.
+    """Return Eq. 16, a scalar; differentiable by `image`, and by `target` if it requires a gradient.
 
     Args:
         image: [H, W, 3], not clamped.
@@ -72,7 +72,7 @@ def photometric_loss(
     total = weight.sum() * (height * width // weight.numel() * (channels if normalisation == "mean" else 1))
     if fits(image):
         loss = fused_photometric_loss(image, target.detach(), weight, lambda_l1, total)
-        if target.requires_grad:  # Eq. 16 is symmetric, so that is the derivative by the image with both exchanged
+        if target.requires_grad:  # Eq. 16 is symmetric: exchange both to differentiate by the target
             mirrored = fused_photometric_loss(target, image.detach(), weight, lambda_l1, total)
             loss = loss + (mirrored - mirrored.detach())
         return loss
@@ -87,7 +87,7 @@ def define_loss(
     total: Tensor,
     statistics: SSIMStatistics | None = None,
 ) -> Tensor:
-    """`photometric_loss` in torch, for any dtype and device; `total` is what the weighted sum is divided by."""
+    """Return `photometric_loss` in torch, for any dtype and device; the weighted sum is divided by `total`."""
     per_channel = lambda_l1 * (image - target).abs() + (1 - lambda_l1) * (1 - ssim_map(image, target, statistics))
     return (weight[..., None] * per_channel).sum() / total
 
@@ -100,7 +100,7 @@ def pixel_weight(
     dtype: torch.dtype = torch.float32,
     device: torch.device | str = "cpu",
 ) -> Tensor:
-    """The weight W of Eq. 16: row weight `name` times the mask, [H, W], or [H, 1] without a mask [H, W].
+    """Return the weight W of Eq. 16: row weight `name` times the mask, [H, W], or [H, 1] without a mask [H, W].
 
     Raises:
         ValueError: unknown name, or a mask that leaves no pixel.
@@ -111,12 +111,14 @@ def pixel_weight(
     if mask is None:
         return rows
     if not (mask > 0).any():
-        raise ValueError("the mask is 0 everywhere, so no pixel is left to learn from; mend the mask or drop the view")
+        raise ValueError(
+            "the mask is 0 everywhere, so no pixel is left; correct the mask or remove the view"
+        )
     return rows * mask.to(rows)
 
 
 def ssim_map(image: Tensor, target: Tensor, statistics: SSIMStatistics | None = None) -> Tensor:
-    """Structural similarity per pixel and channel, [H, W, C]; zeros outside the image, no wrap.
+    """Return the structural similarity per pixel and channel, [H, W, C]; zeros outside the image, no wrap.
 
     Variances are E[x^2] - E[x]^2 under the window. Arguments as in `photometric_loss`.
     """
@@ -129,18 +131,18 @@ def ssim_map(image: Tensor, target: Tensor, statistics: SSIMStatistics | None = 
 
 
 def ssim_statistics(target: Tensor) -> SSIMStatistics:
-    """Mean and variance of a target [H, W, C] under the SSIM window."""
+    """Return mean and variance of a target [H, W, C] under the SSIM window."""
     mean, mean_square = window_mean(torch.stack((target, target * target)))
     return SSIMStatistics(mean, mean_square - mean * mean)
 
 
 def window_mean(images: Tensor) -> Tensor:
-    """Mean of each pixel's neighbourhood under the Gaussian window, [B, H, W, C]; zeros outside."""
+    """Return the mean of each pixel's neighbourhood under the Gaussian window, [B, H, W, C]; zeros outside."""
     return _WindowMean.apply(images)
 
 
 class _WindowMean(torch.autograd.Function):
-    """The window is symmetric and so is its zero padding: the derivative of the blur is the blur itself."""
+    """Blur with the SSIM window; as window and zero padding are symmetric, the blur is its own derivative."""
 
     @staticmethod
     def forward(ctx, images: Tensor) -> Tensor:
@@ -165,7 +167,7 @@ def _blur(images: Tensor, dim: int) -> Tensor:
 
 
 def fits(image: Tensor) -> bool:
-    """Whether a native loss takes this image: float32, three channels, and the library of its device is there."""
+    """Return whether a native loss takes an image: float32, three channels, and a library for its device."""
     library = LIBRARIES.get(image.device.type)
     if library is None or image.dtype != torch.float32 or image.shape[-1] != 3:
         return False
@@ -173,18 +175,18 @@ def fits(image: Tensor) -> bool:
 
 
 def fused_photometric_loss(image: Tensor, target: Tensor, weight: Tensor, lambda_l1: float, total: Tensor) -> Tensor:
-    """Eq. 16 over float32 tensors on one device, a scalar; differentiable by `image`.
+    """Return Eq. 16 over float32 tensors on one device, a scalar; differentiable by `image`.
 
     Args:
         image, target: [H, W, 3].
         weight: [H, W] or [H, 1].
         lambda_l1: lambda of Eq. 16.
-        total: what the weighted sum over pixels and channels is divided by, a scalar.
+        total: divisor of the weighted sum over pixels and channels, a scalar.
 
     Raises:
         ValueError: a target of another shape or type than the image, or tensors on several devices.
     """
-    if (target.shape, target.dtype) != (image.shape, image.dtype):  # memory is all that the library sees of them
+    if (target.shape, target.dtype) != (image.shape, image.dtype):  # the library gets bare pointers
         raise ValueError(
             f"the target is {target.dtype} of {list(target.shape)}, the image {image.dtype} of {list(image.shape)}; "
             "give both alike"
@@ -220,13 +222,13 @@ def _on_cpu(arguments: LossArguments, image: Tensor, total: Tensor) -> Tensor:
 
 @functools.lru_cache(maxsize=2)
 def _workspace(height: int, width: int) -> Tensor:
-    # Kept between iterations: fresh memory costs more in page faults than the loss does in arithmetic. Python threads
-    # would share it: one at a time may train.
+    # Kept between iterations, because page faults of fresh memory cost more than the loss itself. Python threads share
+    # it, so only one may train at a time.
     return torch.zeros(cpu.library().padgs_loss_workspace(height, width), dtype=torch.float32)
 
 
 def _on_gpu(arguments: LossArguments, image: Tensor, total: Tensor) -> Tensor:
-    """The host waits for nothing: what to divide by stays on the device, and so does the loss."""
+    """Evaluate without waiting for the GPU: divisor and loss stay on the device."""
     height, width, _ = image.shape
     total = total.to(torch.float32)
     partials = None if arguments.gradient is None else image.new_empty(3, height, width, 3)

@@ -230,7 +230,7 @@ class Method(ABC):
 
     @property
     def _views_learn(self) -> bool:
-        """Whether exposures or poses of single views are learned, which held-out views then lack."""
+        """True if exposures or poses of single views are learned; held-out views have none then."""
         return LEARNED in (self.train_options.exposures, self.train_options.poses)
 
     def _initial_model(self, scene: Scene, iterations: int) -> Model:

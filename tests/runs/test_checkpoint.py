@@ -148,7 +148,7 @@ def test_full_disk_leaves_the_previous_checkpoint_whole(tmp_path):
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
     try:
-        with pytest.raises(CheckpointError, match="previous one, if any, is still whole"):
+        with pytest.raises(CheckpointError, match="previous one, if any, is complete"):
             checkpoint.save(large, tmp_path)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)

@@ -1,4 +1,4 @@
-"""What stands in mlflow about a run folder: settings, progress in batches, marks, pictures and tables."""
+"""Contents of a run folder in mlflow: settings, progress in batches, marks, pictures and tables."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class Mirror:
             self._client.log_batch(identity, params=batch)
 
     def _log_progress(self, identity: str, run: Path) -> None:
-        """What log.jsonl says and mlflow does not know; a run that went back to a checkpoint says nothing twice."""
+        """Send lines of log.jsonl that mlflow does not have; iterations repeated after a resume are sent once."""
         from mlflow.entities import Metric, RunTag
 
         known = int(self._client.get_run(identity).data.tags.get(LOGGED, 0))

@@ -48,7 +48,7 @@ class TrackingOptions:
 
     @property
     def asked(self) -> bool:
-        """Whether somebody counts on it."""
+        """True if tracking was requested explicitly, so that a missing mlflow is reported."""
         return self.kind == "mlflow" or (self.kind == "auto" and self.uri is not None)
 
 
@@ -78,7 +78,7 @@ class Tracker:
 
     @property
     def uri(self) -> str:
-        """Where runs are mirrored to, whatever the working folder."""
+        """Return the address that runs are mirrored to, independent of the working folder."""
         return self._options.uri or f"sqlite:///{self._runs / 'mlflow.db'}"
 
     def update(self, run: Path) -> None:
