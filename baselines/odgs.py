@@ -14,6 +14,7 @@ from padgs.checks import check
 from padgs.gaussians import Gaussians
 from padgs.methods.splats.method import SplatMethod, SplatOptions
 from padgs.methods.splats.model import SplatModel
+from padgs.methods.splats.splats import Splats
 from padgs.render import Rendering
 from padgs.scene import View
 
@@ -35,16 +36,17 @@ class ODGSOptions(SplatOptions):
 class ODGSModel(SplatModel):
     """Splats with the deviations of the released code."""
 
-    def __init__(self, *args: Any, pixel_bias: float, extent_margin: float, **kwargs: Any) -> None:
-        """Take arguments of `SplatModel` and the two options of `ODGSOptions`."""
-        super().__init__(*args, **kwargs)
-        self.densifier.extent += extent_margin
-        self._pixel_bias = pixel_bias
+    options: ODGSOptions
+
+    def __init__(self, splats: Splats, options: ODGSOptions, *args: Any, **kwargs: Any) -> None:
+        """Take arguments of `SplatModel`."""
+        super().__init__(splats, options, *args, **kwargs)
+        self.densifier.extent += options.extent_margin
 
     def _rendered(self, gaussians: Gaussians, view: View, **offsets: Any) -> Rendering:
-        if self._pixel_bias:
+        if self.options.pixel_bias:
             means, given = gaussians.means, offsets.get("mean_offsets")
-            bias = 2 * self._pixel_bias / means.new_tensor([view.camera.width, view.camera.height])
+            bias = 2 * self.options.pixel_bias / means.new_tensor([view.camera.width, view.camera.height])
             offsets["mean_offsets"] = bias.expand(len(means), 2) if given is None else given + bias
         return super()._rendered(gaussians, view, **offsets)
 
@@ -54,10 +56,6 @@ class ODGSMethod(SplatMethod):
 
     Options = ODGSOptions
     MODEL = ODGSModel
-
-    def _model_of(self, *args: Any, **more: Any) -> SplatModel:
-        options = self.options
-        return super()._model_of(*args, pixel_bias=options.pixel_bias, extent_margin=options.extent_margin, **more)
 
     def _refuse_impossible(self) -> None:
         super()._refuse_impossible()

@@ -35,26 +35,23 @@ class OP43DGSOptions(SplatOptions):
 class OP43DGSModel(SplatModel):
     """Splats with the deviations of the released code."""
 
-    def __init__(self, *args: Any, fixed_low_pass: bool, memory_cap: int | None, **kwargs: Any) -> None:
-        """Take arguments of `SplatModel` and the options of `OP43DGSOptions`."""
-        super().__init__(*args, **kwargs)
-        self._fixed_low_pass, self._memory_cap = fixed_low_pass, memory_cap
+    options: OP43DGSOptions
 
     def render_options(self, view: View) -> RenderOptions:
         """Return the renderer options for a view."""
         options = super().render_options(view)
-        if not self._fixed_low_pass:
+        if not self.options.fixed_low_pass:
             return options
         return replace(options, low_pass=options.low_pass * (view.camera.focal / RELEASED_FOCAL) ** 2)
 
     def _rendered(self, gaussians: Gaussians, view: View, **offsets: Any) -> Rendering:
-        rendering = super()._rendered(gaussians, view, **offsets)
-        instances = rendering.counters.get("instances", 0) if self._memory_cap is not None else 0
+        rendering, cap = super()._rendered(gaussians, view, **offsets), self.options.memory_cap
+        instances = 0 if cap is None else rendering.counters.get("instances", 0)
         needed = instances * INSTANCE_BYTES
-        if self._memory_cap is not None and needed > self._memory_cap:
+        if cap is not None and needed > cap:
             raise MemoryError(
                 f"{instances:,} (Gaussian, tile) instances of {INSTANCE_BYTES} bytes are {needed:,} bytes at once; "
-                f"memory_cap is {self._memory_cap:,}"
+                f"memory_cap is {cap:,}"
             )
         return rendering
 
@@ -70,7 +67,3 @@ class OP43DGSMethod(SplatMethod):
     def has_smoothing_filter(self) -> bool:
         """True if the low-pass is the same angle for every camera."""
         return self.options.fixed_low_pass
-
-    def _model_of(self, *args: Any, **more: Any) -> SplatModel:
-        options = self.options
-        return super()._model_of(*args, fixed_low_pass=options.fixed_low_pass, memory_cap=options.memory_cap, **more)

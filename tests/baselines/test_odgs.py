@@ -65,8 +65,7 @@ def test_the_release_differs_by_its_deviations_only():
 def model_of(gaussians: Gaussians, **deviations: float) -> ODGSModel:
     splats = Splats(gaussians.means, gaussians.scales.log(), gaussians.colors, degree=0)
     splats.opacity_logits.data = torch.logit(gaussians.opacities)
-    deviations = {"pixel_bias": 0.0, "extent_margin": 0.0} | deviations
-    return ODGSModel(splats, ODGSOptions(), RenderConfig(near=0.0), extent=1.0, iterations=30_000, **deviations)
+    return ODGSModel(splats, ODGSOptions(**deviations), RenderConfig(near=0.0), extent=1.0, iterations=30_000)
 
 
 def test_means_of_the_release_are_half_a_pixel_off():

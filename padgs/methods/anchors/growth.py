@@ -192,13 +192,8 @@ class Growth:
         return (f"pruned {count} anchors",) if count else ()
 
     def _empty(self, count: int) -> dict[str, Tensor]:
-        zeros, offsets = self.model.positions.new_zeros, self.model.options.offsets
-        return {
-            "opacity": zeros(count),
-            "decoded": zeros(count),
-            "gradient": zeros(count, offsets),
-            "seen": zeros(count, offsets),
-        }
+        zeros, each = self.model.positions.new_zeros, (count, self.model.options.offsets)
+        return {"opacity": zeros(count), "decoded": zeros(count), "gradient": zeros(each), "seen": zeros(each)}
 
 
 def find_new_anchors(

@@ -90,16 +90,10 @@ class AnchorModel:
         iterations: int,
         seed: int = 0,
     ) -> None:
-        """Wrap anchors.
+        """Wrap anchors for a run of `iterations`.
 
-        Args:
-            anchors: the parameters.
-            options, backend: how the model is rendered.
-            growth: of the run, see `GrowthOptions.for_run`.
-            rates: learning rates.
-            extent: of the cameras, in `rates.offset_rate_unit`.
-            iterations: of the run.
-            seed: of the random choices of growth.
+        `growth` has windows of this run (`GrowthOptions.for_run`); `extent` of the cameras is in
+        `rates.offset_rate_unit`; `seed` is of the random choices of growth.
         """
         self.anchors, self.growth = anchors, Growth(anchors, growth, seed=seed)
         self._options, self._backend = options, backend

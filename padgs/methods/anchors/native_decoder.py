@@ -117,9 +117,11 @@ def decode_on_gpu(
     Returns:
         As `decode_on_cpu`, and the number of selected Gaussians, [1] int64.
     """
-    features, offsets = tensors[0], tensors[3]
-    if dtype is not None and fits_tensor_cores(weights, features, offsets):
-        return decode_on_tensor_cores(weights, *tensors, dtype=dtype, capacity=capacity)
+    if dtype is not None:
+        features, offsets, (hidden, inputs) = tensors[0], tensors[3], weights[0].shape
+        sizes = features.shape[1], inputs, hidden, offsets.shape[1]
+        if cuda.library().padgs_cuda_networks_fit(ctypes.byref(cuda.queue(features.device)), *sizes):
+            return _DecodeOnTensorCores.apply(REDUCED_TYPES[dtype], capacity, *tensors, *weights)
     return _DecodeOnGPU.apply(dtype, capacity, *tensors, *weights)
 
 
@@ -197,27 +199,6 @@ def summed_products(left: Tensor, right: Tensor) -> Tensor:
     whole = parts * CHUNK
     first, second = (rows[:whole].view(parts, CHUNK, rows.shape[1]) for rows in (left, right))
     return torch.bmm(first.transpose(1, 2), second).sum(0) + left[whole:].T @ right[whole:]
-
-
-def fits_tensor_cores(weights: Sequence[Tensor], features: Tensor, offsets: Tensor) -> bool:
-    """Return whether the kernels take networks of this size and this GPU has the tensor cores for them.
-
-    Args:
-        weights: the twelve tensors of the networks.
-        features: [A, C].
-        offsets: [A, K, 3].
-    """
-    hidden, inputs = weights[0].shape
-    queue = cuda.queue(features.device)
-    sizes = features.shape[1], inputs, hidden, offsets.shape[1]
-    return bool(cuda.library().padgs_cuda_networks_fit(ctypes.byref(queue), *sizes))
-
-
-def decode_on_tensor_cores(
-    weights: tuple[Tensor, ...], *tensors: Tensor, dtype: torch.dtype, capacity: int | None
-) -> tuple[Tensor, ...]:
-    """Decode as `decode_on_gpu` if `fits_tensor_cores`; `dtype` is one of `REDUCED_TYPES`."""
-    return _DecodeOnTensorCores.apply(REDUCED_TYPES[dtype], capacity, *tensors, *weights)
 
 
 class _DecodeOnTensorCores(torch.autograd.Function):

@@ -140,13 +140,7 @@ class RayTrainer(Trainer):
         rays: int,
         stage: Stage = nullcontext,
     ) -> None:
-        """Load all pixels.
-
-        Args:
-            model, scene, budget, stage: as for `Trainer`.
-            options: weight of pixels and interval of checks.
-            seed: of rays and jitter.
-            rays: per iteration.
+        """Load all pixels; `rays` is the number per iteration, other arguments are as for `Trainer`.
 
         Raises:
             ValueError: the pixels of a view cannot be used.

@@ -32,6 +32,7 @@ class SplatModel:
 
     Attributes:
         splats: the parameters.
+        options: of a published run.
         densifier: adds and removes Gaussians.
         pruning: removes the least important Gaussians once densification has ended.
     """
@@ -65,7 +66,7 @@ class SplatModel:
             requested, prune_psnr: as in `PruningStep`.
             smoothing_filter: variance of `SmoothingFilter`, square pixels; 0: none.
         """
-        self.splats, self.iterations = splats, iterations
+        self.splats, self.options, self.iterations = splats, options, iterations
         self._config, self._views, self._extent = config, views, extent
         self.densifier = Densifier(
             splats,

@@ -33,40 +33,9 @@ from padgs.render.backends.native import (
     Upstream,
     native_camera,
     native_rays,
-    rasterize_as,
-    score_as,
     strip_cuts,
 )
-from padgs.render.contract import Removals, Rendering, Request
-
-
-def rasterize(request: Request) -> Rendering:
-    """Render on the CPU.
-
-    Raises:
-        ValueError: the library does not take these tensors or this projection.
-        OSError: the library was not built.
-    """
-    _check(request.gaussians.means)
-    return rasterize_as(_Image(request), request)
-
-
-def leave_one_out(request: Request, target: Tensor, weight: Tensor) -> Removals:
-    """Return leave-one-out scores, computed on the CPU; sorted blending only.
-
-    Raises:
-        ValueError, OSError: as `rasterize` does.
-    """
-    _check(request.gaussians.means)
-    return score_as(_Image(request), request, target, weight)
-
-
-def _check(means: Tensor) -> None:
-    if means.dtype != torch.float32 or means.device.type != "cpu":
-        raise ValueError(
-            f"backend cpu takes float32 tensors on the CPU, got {means.dtype} on {means.device}; convert them, or use "
-            "backend=torch"
-        )
+from padgs.render.contract import Removals
 
 
 class Strip:
@@ -140,6 +109,14 @@ class _Cores:
 
 
 class _Image(NativeImage):
+    @staticmethod
+    def check(means: Tensor) -> None:
+        if means.dtype != torch.float32 or means.device.type != "cpu":
+            raise ValueError(
+                f"backend cpu takes float32 tensors on the CPU, got {means.dtype} on {means.device}; convert them, or "
+                "use backend=torch"
+            )
+
     def draw(self, inputs: Inputs, pose: Tensor, background: Tensor, *, differentiated: bool) -> tuple[Pixels, Tensor]:
         camera, options = self.camera, self.options
         self._projected = Projected(native_camera(pose, camera, options), inputs, options.max_instances)
@@ -217,3 +194,6 @@ class _Image(NativeImage):
         core_size = options.core_size if options.blending == "hybrid" else 0
         scalars = (projected.camera.projection, projected.camera.wrap, core_size)
         return BlendArguments(strip.grid, *scalars, self.rays.native(), *map(pointer, (*lists, *outputs)))
+
+
+rasterize, leave_one_out = _Image.rasterize, _Image.leave_one_out

@@ -27,11 +27,9 @@ from padgs.render.backends.native import (
     Upstream,
     native_camera,
     native_rays,
-    rasterize_as,
-    score_as,
     strip_cuts,
 )
-from padgs.render.contract import Removals, Rendering, RenderOptions, Request
+from padgs.render.contract import Removals, RenderOptions
 
 IDENTITY = torch.eye(4)
 MAX_INSTANCES = (1 << 31) - 1 - 512  # of one strip: positions in its lists, and a batch behind, are 32-bit integers
@@ -41,24 +39,11 @@ FLOATS = functools.partial(torch.empty, dtype=torch.float32)
 INTEGERS = functools.partial(torch.empty, dtype=torch.int32)
 
 
-def rasterize(request: Request) -> Rendering:
-    """Render on the GPU that holds the tensors.
-
-    Raises:
-        ValueError: the library does not take these tensors or options.
-        OSError: the library was not built.
-        RuntimeError: the library was not compiled for this GPU.
-        torch.cuda.OutOfMemoryError: the GPU has too little memory; `options.max_instances` makes the strips smaller.
-    """
-    check(request.gaussians.means)
-    return rasterize_as(_Image(request), request)
-
-
 def check(means: Tensor) -> None:
     """Refuse tensors that the library cannot render.
 
     Raises:
-        ValueError, OSError: as `rasterize` does.
+        ValueError: tensors that are not float32 on a GPU.
     """
     if means.dtype != torch.float32 or means.device.type != cuda.device_type():
         missing = "" if torch.cuda.is_available() else " (torch finds no GPU with a driver here)"
@@ -66,16 +51,6 @@ def check(means: Tensor) -> None:
             f"backend cuda takes float32 tensors on a GPU, got {means.dtype} on {means.device}{missing}; convert them, "
             "or use backend=auto"
         )
-
-
-def leave_one_out(request: Request, target: Tensor, weight: Tensor) -> Removals:
-    """Return leave-one-out scores, computed on the GPU that holds the tensors; sorted blending only.
-
-    Raises:
-        ValueError, OSError, RuntimeError: as `rasterize` does.
-    """
-    check(request.gaussians.means)
-    return score_as(_Image(request), request, target, weight)
 
 
 class DeviceStrip:
@@ -246,6 +221,8 @@ class Outputs:
 
 
 class _Image(NativeImage):
+    check = staticmethod(check)
+
     def draw(self, inputs: Inputs, pose: Tensor, background: Tensor, *, differentiated: bool) -> tuple[Pixels, Tensor]:
         camera, options, device = self.camera, self.options, pose.device
         self.rays = native_rays(camera, device)
@@ -345,3 +322,6 @@ def _blend_inputs(
         rays.native(),
         *map(pointer, (*lists, *written, pair_counts)),
     )
+
+
+rasterize, leave_one_out = _Image.rasterize, _Image.leave_one_out

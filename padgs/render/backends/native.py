@@ -68,7 +68,45 @@ class NativeImage(ABC):
     rays: NativeRays
 
     def __init__(self, request: Request) -> None:
+        self.check(request.gaussians.means)
         self.camera, self.options = request.camera, request.options
+
+    @classmethod
+    def rasterize(cls, request: Request) -> Rendering:
+        """Render the request, differentiably.
+
+        Raises:
+            ValueError: the library does not take these tensors or options.
+            OSError: the library was not built.
+            RuntimeError: the library was not compiled for this GPU.
+            torch.cuda.OutOfMemoryError: too little GPU memory; `options.max_instances` makes the strips smaller.
+        """
+        leaves = Leaves(
+            **vars(request.gaussians),
+            mean_offsets=request.mean_offsets,
+            absgrad=request.absgrad,
+            cam_from_world=request.cam_from_world,
+            background=request.background,
+            table=request.camera.table if isinstance(request.camera, RayTable) else None,
+        )
+        image, grad_enabled = cls(request), torch.is_grad_enabled()  # always false inside `apply`
+        color, transmittance, depth, visible = _Rasterize.apply(image, grad_enabled, *leaves)
+        return Rendering(color, transmittance, depth, visible, image.counters)
+
+    @classmethod
+    def leave_one_out(cls, request: Request, target: Tensor, weight: Tensor) -> Removals:
+        """Return leave-one-out scores of sorted blending, without gradients; raises as `rasterize` does."""
+        image, attributes = cls(request), [tensor.contiguous() for tensor in vars(request.gaussians).values()]
+        mean_offsets = None if request.mean_offsets is None else request.mean_offsets.contiguous()
+        pose, background = request.cam_from_world.contiguous(), request.background.contiguous()
+        inputs = Inputs(len(request.gaussians), *map(pointer, (*attributes, mean_offsets)))
+        pixels, _ = image.draw(inputs, pose, background, differentiated=False)
+        return image.removals(pixels, background, target, weight)
+
+    @staticmethod
+    @abstractmethod
+    def check(means: Tensor) -> None:
+        """Raise ValueError for tensors that the library cannot render."""
 
     @abstractmethod
     def draw(self, inputs: Inputs, pose: Tensor, background: Tensor, *, differentiated: bool) -> tuple[Pixels, Tensor]:
@@ -102,31 +140,6 @@ class Leaves(NamedTuple):
     cam_from_world: Any = None
     background: Any = None
     table: Any = None  # of the camera's rays
-
-
-def rasterize_as(image: NativeImage, request: Request) -> Rendering:
-    """Render the request with a native image, differentiably."""
-    leaves = Leaves(
-        **vars(request.gaussians),
-        mean_offsets=request.mean_offsets,
-        absgrad=request.absgrad,
-        cam_from_world=request.cam_from_world,
-        background=request.background,
-        table=request.camera.table if isinstance(request.camera, RayTable) else None,
-    )
-    grad_enabled = torch.is_grad_enabled()  # always false inside `apply`
-    color, transmittance, depth, visible = _Rasterize.apply(image, grad_enabled, *leaves)
-    return Rendering(color, transmittance, depth, visible, image.counters)
-
-
-def score_as(image: NativeImage, request: Request, target: Tensor, weight: Tensor) -> Removals:
-    """Render the request with a native image, and return its leave-one-out scores; no gradients."""
-    attributes = [tensor.contiguous() for tensor in vars(request.gaussians).values()]
-    mean_offsets = None if request.mean_offsets is None else request.mean_offsets.contiguous()
-    pose, background = request.cam_from_world.contiguous(), request.background.contiguous()
-    inputs = Inputs(len(request.gaussians), *map(pointer, (*attributes, mean_offsets)))
-    pixels, _ = image.draw(inputs, pose, background, differentiated=False)
-    return image.removals(pixels, background, target, weight)
 
 
 class _Rasterize(torch.autograd.Function):
