@@ -57,13 +57,13 @@ def test_the_small_setting_has_less_than_a_million_parameters():
     assert small.size().bytes == 4 * small.size().parameters
 
 
-def test_the_units_of_the_world_do_not_matter_to_training():
+def test_training_is_invariant_to_world_units():
     scenes = (tiny_scene(), in_other_units(tiny_scene(), 100.0))
     losses = [[record.loss for record in method().fit(scene, Budget(10))] for scene in scenes]
     assert losses[0] == pytest.approx(losses[1], rel=1e-3)
 
 
-def test_masked_pixels_teach_nothing():
+def test_masked_pixels_do_not_affect_training():
     """What lies under the mask may be anything: the training is the same."""
     scene = tiny_scene()
     mask = torch.ones(16, 32)
@@ -82,7 +82,7 @@ def test_masked_pixels_teach_nothing():
     assert torch.equal(*images)
 
 
-def test_weights_of_rows_are_honoured():
+def test_row_weights_change_the_loss():
     losses = [
         next(method(replace(EgoNeRFMethod.TRAIN, weight=weight)).fit(tiny_scene(), Budget(1))).loss
         for weight in ("uniform", "solid_angle")
@@ -100,14 +100,14 @@ def test_weights_of_rows_are_honoured():
         ({}, {"normalisation": "channel_sum"}, "train.normalisation=channel_sum does not apply"),
     ],
 )
-def test_options_of_splatting_are_refused_and_not_ignored(render, train, reason):
+def test_options_of_splatting_are_refused(render, train, reason):
     train_options = replace(EgoNeRFMethod.TRAIN, **train)
     with pytest.raises(ValueError, match=reason):
         next(EgoNeRFMethod(SMALL, RenderConfig(**render), train_options).fit(tiny_scene(), Budget(1)))
 
 
 @pytest.mark.parametrize("name, value", [("rays", 0), ("grid_rate", 0.0), ("density_variation", -1.0)])
-def test_training_options_without_a_meaning_are_named(name, value):
+def test_invalid_training_options_are_refused(name, value):
     with pytest.raises(ValueError, match=f"{name} is {value}"):
         method(**{name: value})
 
@@ -155,7 +155,7 @@ def test_rates_decay_to_a_tenth_after_the_environment_learned_alone(alone):
     assert [environment / 5e-3 for _, environment in rates[alone:]] == pytest.approx(expected)
 
 
-def test_alone_the_environment_becomes_the_mean_panorama(room):
+def test_pretrained_environment_is_the_mean_panorama(room):
     trained = method(environment_pretraining=200, environment_height=8)
     records = trained.fit(room, Budget(201))
     losses = [next(records).loss for _ in range(200)]
@@ -195,7 +195,7 @@ def test_published_weights_of_the_variation_fall_like_the_rates():
         assert trainable.regularisation(iteration).item() == pytest.approx(expected, rel=1e-5)
 
 
-def test_the_setting_trains_as_published():
+def test_published_training_options():
     options = composed("method=egonerf").options
     assert (options.rays, options.grid_rate, options.network_rate, options.environment_rate) == (4096, 0.02, 1e-3, 5e-3)
     assert (options.rate_decay, options.density_variation, options.appearance_variation) == (0.1, 0.1, 0.01)

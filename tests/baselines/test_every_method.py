@@ -79,14 +79,14 @@ def test_every_method_has_a_section_in_the_docs(root):
 
 
 @pytest.mark.parametrize("setting", EVERY)
-def test_twenty_steps_on_a_scene_leave_a_method_that_renders(setting, scenes):
+def test_methods_train_and_render(setting, scenes):
     survives(setting, scenes("room"))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("setting", SETTINGS)
-def test_every_synthetic_scene_is_survived(setting, scene, scenes):
+def test_methods_train_on_every_synthetic_scene(setting, scene, scenes):
     survives(setting, scenes(scene))
 
 
@@ -105,7 +105,7 @@ def survives(setting: str, scene: Scene) -> None:
 
 
 @pytest.mark.parametrize("setting", EVERY)
-def test_before_a_scene_is_known_every_method_says_so_and_an_empty_one_is_refused_at_once(setting, scenes):
+def test_untrained_methods_and_empty_scenes_are_refused(setting, scenes):
     method, scene = method_of(setting), scenes("room")
     for ask in (method.state, method.size, lambda: method.render(scene.test[0])):
         with pytest.raises(RuntimeError, match="call fit or load_state first"):
@@ -115,7 +115,7 @@ def test_before_a_scene_is_known_every_method_says_so_and_an_empty_one_is_refuse
 
 
 @pytest.mark.parametrize("setting", EVERY)
-def test_killed_and_resumed_every_method_ends_bit_identically(setting, scenes, tmp_path):
+def test_resuming_is_bit_identical(setting, scenes, tmp_path):
     scene, steps, stop = scenes("room"), 12, 7
     whole, _ = trained(setting, scene, steps)
     first = method_of(setting)

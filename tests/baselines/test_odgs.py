@@ -36,7 +36,7 @@ def tangent_plane_jacobian(means: Tensor, width: int, height: int) -> Tensor:
     return scale[..., None] * (pinhole @ pitch @ yaw)
 
 
-def test_the_tangent_plane_leads_to_the_jacobian_of_the_panorama(generator):
+def test_tangent_plane_jacobian_equals_the_panorama_jacobian(generator):
     means = torch.randn(5000, 3, generator=generator, dtype=torch.float64)
     means = means * torch.logspace(-2, 2, 5000, dtype=torch.float64)[:, None]
     latitude = longitude_latitude(means)[1]
@@ -68,7 +68,7 @@ def model_of(gaussians: Gaussians, **deviations: float) -> ODGSModel:
     return ODGSModel(splats, ODGSOptions(**deviations), RenderConfig(near=0.0), extent=1.0, iterations=30_000)
 
 
-def test_means_of_the_release_are_half_a_pixel_off():
+def test_pixel_bias_shifts_the_render():
     width, height = 64, 32
     pixels = torch.tensor([[10.5, 16.5], [40.5, 20.5], [50.5, 12.5]])
     angles = (pixels / torch.tensor([width, height]) - 0.5) * torch.tensor([2 * math.pi, math.pi])
@@ -91,7 +91,7 @@ def test_means_of_the_release_are_half_a_pixel_off():
         ODGSMethod(ODGSOptions(pixel_bias=0.5), RenderConfig("ray"))
 
 
-def test_a_margin_on_the_extent_clones_what_would_be_split():
+def test_extent_margin_clones_instead_of_splitting():
     for margin, expected in ((0.0, "cloned 0, split 1"), (100.0, "cloned 1, split 0")):
         model = model_of(
             Gaussians(*(torch.ones(1, n) for n in (3, 4, 3)), torch.full((1,), 0.5), torch.ones(1, 3)),

@@ -89,7 +89,7 @@ def test_size_counts_59_numbers_per_gaussian(finished):
     assert size.counts == {"gaussians": 60} and size.parameters == 60 * 59 and size.bytes == 60 * 236
 
 
-def test_a_poisoned_gaussian_stops_the_run_by_name(scene):
+def test_non_finite_parameters_stop_the_run(scene):
     """Renderers leave such a Gaussian out, so the loss stays finite; the next check of all parameters finds it."""
     trained = method()
     records = trained.fit(scene, Budget(60))
@@ -125,6 +125,6 @@ def test_the_release_differs_by_its_deviations_only():
     assert described.train == released.train and released.train.weight == "uniform"
 
 
-def test_other_options_than_the_state_are_refused(finished):
+def test_state_of_other_options_is_refused(finished):
     with pytest.raises(ValueError, match=r"sh_rest of the stored model has shape \[60, 15, 3\]"):
         method(sh_degree=1).load_state(finished)

@@ -38,7 +38,7 @@ def installed(root, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_it_keeps_the_promises_that_its_own_tests_state(installed, tmp_path):
+def test_tests_of_the_example_method_pass(installed, tmp_path):
     assert "my_method" in METHODS
     scene = padgs.load_scene(generator=installed.ROOM)
     promises = [test for name, test in inspect.getmembers(installed) if name.startswith("test_")]
@@ -48,13 +48,13 @@ def test_it_keeps_the_promises_that_its_own_tests_state(installed, tmp_path):
     assert len(promises) == 4
 
 
-def test_a_name_of_ours_is_refused(installed, monkeypatch):
+def test_names_of_built_in_methods_are_refused(installed, monkeypatch):
     assert clash() is None
     monkeypatch.setattr(baselines, "BUILT_IN", baselines.BUILT_IN | {"my_method"})
     assert clash() == "entry point my_method:MyMethod has the name my_method of a built-in method; rename it"
 
 
-def test_a_method_that_cannot_be_imported_is_said_once_and_left_out(monkeypatch, capsys):
+def test_methods_that_fail_to_import_are_skipped_with_one_warning(monkeypatch, capsys):
     monkeypatch.setitem(METHODS, "broken", "no_such_module:Method")
     for _ in range(2):
         register_choices()

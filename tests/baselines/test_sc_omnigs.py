@@ -30,7 +30,7 @@ def calibration_of(method: SCOmniGSMethod):
     return method.model.calibration
 
 
-def test_the_first_step_is_that_of_omnigs_to_the_bit(scene):
+def test_first_step_is_bit_equal_to_omnigs(scene):
     """Poses as given and an ideal camera are no calibration: the same drawing, photograph, loss."""
     losses = []
     for method in (
@@ -64,7 +64,7 @@ def test_masks_are_undistorted_with_the_image(scene):
     torch.testing.assert_close(calibration.resampled(views[0], spoiled).image[seen], stretched.image[seen])
 
 
-def test_a_held_out_view_is_carried_with_the_cameras():
+def test_test_poses_follow_the_refined_cameras():
     """Poses moved by a similarity: a view of the given world lands where the moved cameras say, exactly."""
     generator = torch.Generator().manual_seed(7)
     views = tiny_scene().train
@@ -84,7 +84,7 @@ def test_a_held_out_view_is_carried_with_the_cameras():
         torch.testing.assert_close(after, 1.7 * before)
 
 
-def test_a_scene_that_cannot_be_calibrated_is_refused(scene):
+def test_unsuitable_scenes_are_refused(scene):
     turned = []  # about one centre, which the poses then have up to rounding only
     for angle, view in enumerate(scene.train):
         pose = torch.eye(4, dtype=torch.float64)
@@ -103,7 +103,7 @@ def test_a_scene_that_cannot_be_calibrated_is_refused(scene):
         method.render(other)
 
 
-def test_options_without_a_meaning_are_refused():
+def test_invalid_options_are_refused():
     with pytest.raises(ValueError, match=r"anisotropy_ratio is 0\.5"):
         SCOmniGSOptions(anisotropy_ratio=0.5)
     with pytest.raises(ValueError, match=r"distortion_rate is -1\.0"):
@@ -112,7 +112,7 @@ def test_options_without_a_meaning_are_refused():
         PoseRates(rotation=0.0)
 
 
-def test_published_learning_rates_of_the_poses_and_ours_of_the_camera(scene):
+def test_learning_rates_of_poses_and_camera(scene):
     method, steps = SCOmniGSMethod(render=TORCH), 400
     next(method.fit(scene, Budget(steps)))
     poses, camera = calibration_of(method).poses, calibration_of(method).camera
@@ -143,13 +143,13 @@ def test_size_counts_poses_and_camera(scene):
     assert method.size().counts == {"gaussians": 40, "poses": 5}
 
 
-def test_the_last_record_says_how_far_the_poses_moved(scene):
+def test_last_record_reports_the_pose_correction(scene):
     *_, last = SCOmniGSMethod(render=TORCH).fit(scene, Budget(5))
     assert "poses moved by" in last.events[-1]
 
 
 @pytest.mark.slow
-def test_injected_pose_noise_is_found(tmp_path, monkeypatch):
+def test_injected_pose_noise_is_corrected(tmp_path, monkeypatch):
     """0.5 % of the median depth and 0.2 degrees: 400 steps leave an eighth and half of it, and win over OmniGS."""
     monkeypatch.setenv("PADGS_CACHE", str(tmp_path))
     options = SyntheticOptions(

@@ -26,7 +26,7 @@ def lenses_of(method: Seam360GSMethod):
     return method.model.calibration
 
 
-def test_an_ideal_camera_starts_as_one(scene):
+def test_initial_loss_is_that_of_an_ideal_camera(scene):
     """Before the first step the lenses change nothing: the loss is that of the same Gaussians in one centre."""
     first = next(Seam360GSMethod(render=TORCH).fit(scene, Budget(100))).loss
     plain = next(SplatMethod(SplatOptions(), TORCH).fit(scene, Budget(100))).loss
@@ -34,7 +34,7 @@ def test_an_ideal_camera_starts_as_one(scene):
 
 
 @pytest.mark.parametrize("axis", ["xy", "", "w"])
-def test_an_axis_that_there_is_not_is_refused_at_once(axis):
+def test_unknown_axes_are_refused(axis):
     with pytest.raises(ValueError, match=f"unknown lens_axis '{axis}'; known: x, y, z"):
         Seam360GSOptions(lens_axis=axis)
 
@@ -61,7 +61,7 @@ def photographed(gap: float, bending: tuple[float, float]) -> Scene:
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_lenses_are_found_and_the_test_camera_is_ideal(sign):
+def test_lenses_are_recovered_and_test_cameras_are_ideal(sign):
     """With Gaussians that are right from the start and learn next to nothing, all that is wrong is the camera."""
     gap, bending = sign * 0.06, (sign * 0.02, sign * -0.03)
     scene = photographed(gap, bending)
@@ -96,12 +96,12 @@ def test_learning_rates_of_the_lenses_fall_to_a_tenth(scene):
         assert held is parameter, name
 
 
-def test_charts_cannot_draw_lenses():
+def test_projection_erp_is_refused():
     with pytest.raises(ValueError, match="projection 'erp' requires a Panorama camera, not a RayTable"):
         Seam360GSMethod(render=RenderConfig(backend="torch"))
 
 
-def test_a_rate_of_nothing_is_refused():
+def test_invalid_rates_are_refused():
     with pytest.raises(ValueError, match=r"gap_rate is 0\.0; it must be a learning rate > 0"):
         Seam360GSOptions(gap_rate=0.0)
 
@@ -114,7 +114,7 @@ def test_size_counts_the_lenses(scene):
 
 
 @pytest.mark.slow
-def test_a_simulated_gap_is_found_and_the_seam_goes(tmp_path, monkeypatch):
+def test_simulated_gap_is_recovered_and_the_seam_error_falls(tmp_path, monkeypatch):
     """Lenses 6 % of the median depth apart, all cameras facing one way: their seams add up in the same places.
 
     The same Gaussians without lenses are trained on the same images, and on images without a gap: the latter is what

@@ -121,7 +121,7 @@ def test_invisible_gaussians_are_pruned_at_the_end(scene):
     assert torch.equal(model.render(scene.test[0]).image, image)
 
 
-def test_boxes_are_as_narrow_as_can_be_and_the_published_ones_are_not(generator):
+def test_boxes_are_tight_and_published_boxes_are_not(generator):
     """Widths in longitude over the true ones: 1 for ours, 1.20 (median) and 1.56 (95 %) as published."""
     count = 400
     radius = 1 + 3 * torch.rand(count, generator=generator, dtype=torch.float64)

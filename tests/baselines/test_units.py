@@ -30,7 +30,7 @@ def trained(name: str, scene: Scene) -> tuple[torch.Tensor, torch.Tensor, list[f
 
 
 @pytest.mark.parametrize("name", EXPLICIT)
-def test_a_world_64_times_as_large_is_learned_the_same(name):
+def test_training_is_invariant_to_world_units(name):
     scene = tiny_scene()
     (moves, image, losses), (far, larger_image, larger_losses) = (
         trained(name, in_other_units(scene, factor)) for factor in (1.0, LARGER)

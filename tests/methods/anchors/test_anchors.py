@@ -157,7 +157,7 @@ def view_from(center, rotation=None) -> View:
     return View("here", pose, 64, 32)
 
 
-def test_inputs_are_as_published_and_as_in_the_ablation_ladder():
+def test_number_of_network_inputs():
     assert PaDGSOptions().inputs == 37
     assert PaDGSOptions(use_distortion=False).inputs == 36
     assert PaDGSOptions(use_distortion=False, use_distance=False).inputs == 35
@@ -185,7 +185,7 @@ def test_direction_points_from_camera_to_anchor_in_the_world_frame():
     assert distance.item() == pytest.approx(5.0) and omega.item() == pytest.approx(0.64)
 
 
-def test_modulation_dims_by_the_anchors_latitude_in_the_camera():
+def test_opacity_modulation_follows_the_latitude_in_the_camera():
     bright, dim = (one_anchor([0.0, -2.0, 0.0], PaDGSOptions(tau=tau, use_distortion=False)) for tau in (0.0, 0.9))
     view = view_from([0.0, 0.0, 0.0])
     full, modulated = bright.decode(view).gaussians.opacities, dim.decode(view).gaussians.opacities
@@ -196,7 +196,7 @@ def test_modulation_dims_by_the_anchors_latitude_in_the_camera():
 
 @pytest.mark.parametrize("overrides", [{}, RELEASED])
 @pytest.mark.parametrize("position", [[0, 2, 0], [0, -2, 0], [0, 0, 2], [0, 0, -2], [0, 0, 0], [1e-9, 0, 0]])
-def test_finite_on_the_poles_and_on_the_camera(overrides, position):
+def test_gradients_are_finite_at_the_poles_and_at_the_camera(overrides, position):
     model = one_anchor([float(x) for x in position], PaDGSOptions(**overrides))
     decoded = model.decode(view_from([0.0, 0.0, 0.0]))
     assert len(decoded.slots) > 0
@@ -206,13 +206,13 @@ def test_finite_on_the_poles_and_on_the_camera(overrides, position):
         assert torch.isfinite(parameter).all() and torch.isfinite(parameter.grad).all(), name
 
 
-def test_positions_are_no_parameter_and_views_carry_no_gradient():
+def test_positions_and_views_have_no_gradient():
     model = one_anchor([1.0, 1.0, 1.0])
     assert "positions" not in dict(model.named_parameters()) and "positions" in dict(model.named_buffers())
     assert not any(value.requires_grad for value in model.seen_from(view_from([0.0, 0.0, 0.0])))
 
 
-def test_multiplying_the_world_by_100_changes_nothing():
+def test_decoding_is_invariant_to_world_units():
     small, large = (perturbed(PaDGS.from_scene(box_scene(scale=scale))) for scale in (1.0, 100.0))
     assert large.voxel_size == pytest.approx(100 * small.voxel_size)
     assert torch.allclose(large.positions, 100 * small.positions, rtol=1e-6)
@@ -225,13 +225,13 @@ def test_multiplying_the_world_by_100_changes_nothing():
     assert torch.allclose(first.opacities, second.opacities, atol=1e-5)
 
 
-def test_same_seed_same_networks_and_another_seed_others():
+def test_seeds_determine_the_networks():
     first, same, other = (PaDGS.from_scene(box_scene(), seed=seed).decoder.opacity["w1"] for seed in (1, 1, 2))
     assert torch.equal(first, same) and not torch.equal(first, other)
 
 
 @pytest.mark.parametrize("precision", ["bfloat16", "float16"])
-def test_a_reduced_precision_is_that_of_the_networks_and_all_learns_in_float32(precision):
+def test_reduced_precision_rounds_networks_only_and_keeps_float32_gradients(precision):
     exact, rounded = (
         perturbed(PaDGS.from_scene(box_scene(count=40), PaDGSOptions(precision=name)))
         for name in ("float32", precision)
@@ -285,12 +285,12 @@ class _Decode(torch.nn.Module):
         ({"offsets": 0}, "offsets is 0"),
     ],
 )
-def test_options_name_what_is_wrong(options, message):
+def test_invalid_options_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         PaDGSOptions(**options)
 
 
-def test_points_go_to_the_nearest_vertex_once():
+def test_anchors_are_the_distinct_nearest_vertices():
     points = torch.tensor([[0.24, 0.0, 0.0], [0.26, 0.0, 0.0], [-0.26, 0.6, 0.0], [0.2, 0.1, -0.1]])
     expected = torch.tensor([[-0.5, 0.5, 0.0], [0.0, 0.0, 0.0], [0.5, 0.0, 0.0]])
     assert torch.equal(anchors_from_points(points, 0.5), expected)
@@ -298,7 +298,7 @@ def test_points_go_to_the_nearest_vertex_once():
 
 
 @pytest.mark.parametrize("size", [0.001, 0.037, 5.0])
-def test_cells_survive_the_way_through_float32_positions(size, generator):
+def test_cells_survive_conversion_to_float32_positions(size, generator):
     cells = torch.randint(-(2**20), 2**20, (2000, 3), generator=generator)
     assert torch.equal(cells_from_points(points_from_cells(cells, size), size), cells)
 
@@ -335,14 +335,14 @@ def test_initial_scale_is_the_root_mean_square_of_three_distances():
 
 
 @pytest.mark.parametrize("scale", [0.01, 1.0, 100.0])
-def test_automatic_voxel_is_an_angle_at_the_training_resolution(scale):
+def test_automatic_voxel_size(scale):
     points = scale * torch.tensor([[0.0, 0.0, 5.0], [0.0, 5.0, 0.0], [-5.0, 0.0, 0.0]])
     view = View("v", torch.eye(4, dtype=torch.float64), 400, 200)
     scene = Scene("s", (view,), (), points, torch.zeros(3, 3, dtype=torch.uint8), "0")
     assert automatic_voxel_size(scene, 0.25) == pytest.approx(0.25 * math.pi / 200 * 5.0 * scale)
 
 
-def test_bad_clouds_and_sizes_are_named():
+def test_invalid_clouds_and_voxel_sizes_are_refused():
     with pytest.raises(ValueError, match="point cloud is empty"):
         anchors_from_points(torch.zeros(0, 3), 0.1)
     with pytest.raises(ValueError, match="point 1 of the cloud is"):

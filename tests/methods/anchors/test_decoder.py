@@ -53,7 +53,7 @@ def test_initial_weights_are_those_of_torch_linear(decoder):
         assert weights.var().item() == pytest.approx(bound**2 / 3, rel=0.5)
 
 
-def test_outputs_belong_to_gaussian_k_of_their_anchor(decoder, inputs):
+def test_outputs_match_networks_evaluated_one_anchor_at_a_time(decoder, inputs):
     """Every selected Gaussian against the networks evaluated plainly, one anchor at a time."""
     weights = decoder.weights()
     found = decode(weights, inputs)
@@ -76,7 +76,7 @@ def test_outputs_belong_to_gaussian_k_of_their_anchor(decoder, inputs):
     assert row == len(found.slots) > 0
 
 
-def test_leaving_out_dead_anchors_changes_no_value_and_no_gradient(decoder, inputs):
+def test_filtering_dead_anchors_changes_no_value_or_gradient(decoder, inputs):
     """Half the anchors are made dead; decoding the living ones alone must give the same."""
     with torch.no_grad():
         decoder.opacity["w1"][0] = 0
@@ -101,7 +101,7 @@ def test_leaving_out_dead_anchors_changes_no_value_and_no_gradient(decoder, inpu
     assert all(torch.allclose(a, b) for a, b in zip(whole_weights, part_weights, strict=True))
 
 
-def test_take_rows_is_indexing(generator):
+def test_take_rows_equals_indexing(generator):
     table = torch.randn(7, 3, generator=generator)
     rows = torch.tensor([6, 0, 0, 3])
     assert torch.equal(take_rows(table, rows), table[rows])
@@ -131,7 +131,7 @@ def test_nothing_and_everything_selected(bias, share, function, generator):
     assert all(torch.isfinite(gradient).all() for gradient in gradients.values())
 
 
-def test_threads_change_no_bit(generator):
+def test_results_are_bit_equal_for_any_number_of_threads(generator):
     tensors, decoder = problem(2500, 10, 37, 32, generator)
     before, results = torch.get_num_threads(), []
     try:
@@ -160,7 +160,7 @@ def layer(generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
 
 
 @each_reduced
-def test_a_product_errs_by_the_rounding_of_its_operands_and_its_result(dtype: torch.dtype, generator):
+def test_error_of_a_reduced_product_is_bounded_by_rounding(dtype: torch.dtype, generator):
     inputs, weight, bias = (tensor.double() for tensor in layer(generator))
     error = (linear(inputs.float(), weight.float(), bias.float(), dtype) - (inputs @ weight.T + bias)).abs()
     magnitude = inputs.abs() @ weight.T.abs() + bias.abs()
@@ -172,7 +172,7 @@ def test_a_product_errs_by_the_rounding_of_its_operands_and_its_result(dtype: to
 
 @each_reduced
 @pytest.mark.parametrize("size", [1.0, 1e-9])  # of the upstream gradient; float16 ends at 6e-8
-def test_gradients_are_float32_and_err_by_the_rounding_of_bfloat16(dtype: torch.dtype, size: float, generator):
+def test_error_of_reduced_gradients_is_bounded_by_rounding_to_bfloat16(dtype: torch.dtype, size: float, generator):
     inputs, weight, bias = (tensor.requires_grad_() for tensor in layer(generator))
     upstream = size * torch.randn(500, 32, generator=generator)
     gradients = torch.autograd.grad(linear(inputs, weight, bias, dtype), (inputs, weight, bias), upstream)
@@ -185,7 +185,7 @@ def test_gradients_are_float32_and_err_by_the_rounding_of_bfloat16(dtype: torch.
 
 
 @each_reduced
-def test_networks_err_by_rounding_alone_and_select_the_same_but_at_the_threshold(dtype: torch.dtype, generator):
+def test_error_of_reduced_networks_is_bounded_by_rounding(dtype: torch.dtype, generator):
     weights, inputs = Decoder(37, 10, generator=generator).weights(), torch.randn(400, 37, generator=generator)
     u, bounds = roundoff(dtype), []
     with torch.no_grad():
@@ -204,7 +204,7 @@ def test_networks_err_by_rounding_alone_and_select_the_same_but_at_the_threshold
 
 
 @each_reduced
-def test_geometry_stays_float32(dtype: torch.dtype, generator: torch.Generator):
+def test_means_are_float32_in_reduced_precision(dtype: torch.dtype, generator: torch.Generator):
     """Means come of no network: they are those of a float32 decode, bit by bit."""
     tensors, decoder = problem(50, 10, 37, 32, generator)
     ours, slots, *_ = decoded(define_gaussians, tensors, decoder, str(dtype).removeprefix("torch."))

@@ -44,7 +44,7 @@ def adam(model) -> torch.optim.Adam:
 
 
 @pytest.mark.parametrize("name", ["room", "flat"])
-def test_a_real_cloud_leaves_room_for_growth_by_default(name, shared, generator):
+def test_default_voxels_of_a_captured_cloud_leave_free_cells(name, shared, generator):
     """The voxels are so small that nearly every point is an anchor, and that around them even the coarsest cells are
     free: where none is, finer ones are not tried, and nothing ever grows.
     """
@@ -68,7 +68,7 @@ def test_published_levels():
     assert GrowthOptions().threshold(0) == pytest.approx(2e-4 / 3)
 
 
-def test_candidates_are_kept_with_probability_one_half_then_three_quarters_then_seven_eighths():
+def test_sampling_probability_of_each_level():
     count = 40_000
     cells = [[64 * i, 0, 0] for i in range(count)]  # far apart: every anchor may seed its own cell at every level
     model = model_at(cells, offsets=1)
@@ -83,7 +83,7 @@ def test_candidates_are_kept_with_probability_one_half_then_three_quarters_then_
 
 
 @pytest.mark.parametrize(("gradient", "levels"), [(1.9e-4, 0), (2.1e-4, 1), (4.1e-4, 2), (8.1e-4, 3)])
-def test_thresholds_double_and_cells_shrink_from_level_to_level(lucky, gradient, levels):
+def test_thresholds_and_cells_of_each_level(lucky, gradient, levels):
     model = model_at([[0, 0, 0]])
     move(model, 1, [18.5, 0.5, 0.5])  # voxel (37, 1, 1): another vertex on each grid
     cells, seeds = seeds_of(model, [0.0, gradient])
@@ -100,7 +100,7 @@ def test_finer_levels_are_tried_only_after_a_seed_at_the_coarsest(lucky):
     assert seeds_of(model, [0.0, 1.0, 1.0, 0.0])[0] == [(160, 0, 0), (1, 0, 0)]
 
 
-def test_one_anchor_per_cell_with_the_largest_features_of_its_parents(lucky):
+def test_new_anchors_take_the_largest_features_of_their_cell(lucky):
     model = model_at([[0, 0, 0], [64, 0, 0]])
     for slot in (1, 2):
         move(model, slot, [0.5 * 160, 0.0, 0.0])
@@ -121,7 +121,7 @@ def ready(model, options, *, gradient, seen) -> Growth:
 
 
 @pytest.mark.parametrize(("seen", "grown"), [(40, 0), (41, 1)])
-def test_a_gaussian_must_have_been_seen_in_more_than_40_of_100_iterations(lucky, seen, grown):
+def test_gaussians_seen_in_few_iterations_are_not_eligible(lucky, seen, grown):
     model = model_at([[0, 0, 0]])
     move(model, 1, [0.5 * 160, 0.0, 0.0])
     growth = ready(model, PUBLISHED, gradient=2.5e-4, seen=seen)
@@ -149,7 +149,7 @@ def test_new_anchors_start_as_published(lucky):
         assert len(values) == 2 and (values[1] == 0).all()
 
 
-def test_window_opens_after_its_first_and_closes_before_its_last_iteration(monkeypatch):
+def test_ends_of_the_growth_window_are_exclusive(monkeypatch):
     growth = Growth(model_at([[0, 0, 0]]), PUBLISHED)
     optimizer = adam(growth.model)
     monkeypatch.setattr(growth, "_grow", lambda optimizer: ("grew",))
@@ -175,7 +175,7 @@ def test_statistics_are_collected_in_their_window(iteration, collected):
         assert torch.equal(growth.statistics[name], collected * torch.tensor(values)), name
 
 
-def test_short_runs_go_through_the_same_phases():
+def test_windows_scale_with_the_run():
     assert PUBLISHED.for_run(30_000) == PUBLISHED
     short = PUBLISHED.for_run(3_000)
     assert (short.statistics_from, short.grow_from, short.grow_until, short.grow_every) == (50, 150, 1500, 50)
@@ -188,7 +188,7 @@ def test_short_runs_go_through_the_same_phases():
     ("decoded", "opacity", "pruned"),
     [(80, 0.0, False), (81, 0.0, True), (81, 0.80, True), (81, 0.82, False), (500, 4.9, True), (500, 5.1, False)],
 )
-def test_anchors_are_pruned_below_a_mean_opacity_of_one_percent(decoded, opacity, pruned):
+def test_anchors_below_the_mean_opacity_limit_are_pruned(decoded, opacity, pruned):
     model = model_at([[0, 0, 0], [9, 0, 0], [30, 0, 0]])
     with torch.no_grad():
         model.features.copy_(torch.arange(9.0).view(3, 3))
@@ -207,7 +207,7 @@ def test_anchors_are_pruned_below_a_mean_opacity_of_one_percent(decoded, opacity
     assert torch.equal(growth.statistics["decoded"], expected)
 
 
-def test_pruning_everything_is_a_collapse():
+def test_pruning_all_anchors_fails_as_collapsed():
     model = model_at([[0, 0, 0]])
     growth = Growth(model, PUBLISHED)
     growth.statistics["decoded"].fill_(500)
@@ -217,7 +217,7 @@ def test_pruning_everything_is_a_collapse():
 
 
 @pytest.mark.parametrize(("cap", "expected"), [(None, 2.0), (0.05, 0.05)])
-def test_only_the_released_code_caps_the_size_of_gaussians(cap, expected):
+def test_log_scale_cap_is_off_by_default(cap, expected):
     model = model_at([[0, 0, 0]])
     with torch.no_grad():
         model.log_scales.fill_(2.0)
@@ -226,7 +226,7 @@ def test_only_the_released_code_caps_the_size_of_gaussians(cap, expected):
     assert GrowthOptions().log_scale_cap is None
 
 
-def test_the_limit_keeps_the_strongest_and_says_so(lucky):
+def test_max_anchors_keeps_the_largest_gradients_and_reports_it(lucky):
     cells = [[64 * i, 0, 0] for i in range(5)]
     model = model_at(cells, offsets=1)
     with torch.no_grad():

@@ -50,7 +50,7 @@ def long_run():
     return trained(60)
 
 
-def test_learns_a_view_it_has_not_seen(long_run):
+def test_test_view_is_learned(long_run):
     method, records = long_run
     untrained, _ = trained(1)
     assert [record.iteration for record in records] == list(range(1, 61))
@@ -59,7 +59,7 @@ def test_learns_a_view_it_has_not_seen(long_run):
     assert records[-1].loss < 0.6 * records[0].loss
 
 
-def test_grows_in_its_window_only(long_run):
+def test_growth_happens_in_its_window_only(long_run):
     _, records = long_run
     assert {r.iteration for r in records if any("grew" in e for e in r.events)} <= set(range(12, 40, 4))
     assert records[-1].counts["anchors"] > records[0].counts["anchors"]
@@ -84,7 +84,7 @@ def test_resumed_run_is_bit_identical(long_run):
     assert_same_but_time(resumed.state(), whole.state())
 
 
-def test_multiplying_the_world_by_100_changes_nothing():
+def test_training_is_invariant_to_world_units():
     options = replace(EAGER, voxel_size="auto", voxel_pixels=3.0, coarsest=4, refinement=2, offset_rate_unit="scene")
     (small, before), (large, after) = trained(14, options=options), trained(14, scale=100.0, options=options)
     assert [r.counts for r in before] == [r.counts for r in after]
@@ -95,12 +95,12 @@ def test_multiplying_the_world_by_100_changes_nothing():
     assert torch.allclose(100 * small.render(view).depth, large.render(far).depth, rtol=0.05)
 
 
-def test_seeds_matter_and_repeat():
+def test_seeds_determine_the_losses():
     losses = [[r.loss for r in trained(3, seed=seed)[1]] for seed in (1, 1, 2)]
     assert losses[0] == losses[1] != losses[2]
 
 
-def test_size_is_what_is_stored(long_run):
+def test_size_counts_parameters_and_bytes(long_run):
     method, records = long_run
     size, anchors = method.size(), records[-1].counts["anchors"]
     networks = sum(p.numel() for p in method.model.anchors.decoder.parameters())
@@ -109,7 +109,7 @@ def test_size_is_what_is_stored(long_run):
     assert size.bytes == 4 * (size.parameters + 3 * anchors)
 
 
-def test_a_state_of_other_options_is_refused(long_run):
+def test_state_of_other_options_is_refused(long_run):
     other = PaDGSMethod(replace(EAGER, features=16), TORCH, TrainOptions())
     with pytest.raises(ValueError, match="features of the stored model has shape"):
         other.load_state(long_run[0].state())

@@ -39,7 +39,7 @@ def test_a_known_similarity_is_found(generator):
     assert left.degrees.max() < 1e-6
 
 
-def test_a_straight_path_does_not_leave_the_turn_around_it_open():
+def test_rotation_about_a_straight_path_is_determined():
     poses = torch.eye(4, dtype=torch.float64).repeat(5, 1, 1)
     poses[:, 2, 3] = -torch.arange(5)
     rotation = rotation_from_vector(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), "test")  # about the path
@@ -64,7 +64,7 @@ def test_one_wrong_camera_is_measured():
     assert left.degrees.median().item() == pytest.approx(0.01, rel=0.05)
 
 
-def test_what_cannot_be_aligned_is_refused(generator):
+def test_degenerate_poses_are_refused(generator):
     poses = random_poses(3, generator)
     with pytest.raises(ValueError, match="same two or more"):
         align(poses, poses[:2])

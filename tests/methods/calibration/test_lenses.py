@@ -33,14 +33,14 @@ def distorted(size: float = 0.03) -> CameraMap:
     return camera
 
 
-def test_an_ideal_camera_changes_no_bit(generator):
+def test_ideal_camera_is_the_identity(generator):
     camera, image = CameraMap(W, H), torch.rand(H, W, 3, generator=generator)
     assert torch.equal(sample_pixels(image, camera.source_pixels()), image)
     assert torch.equal(sample_pixels(image, camera.ideal_pixels()), image)
     assert camera.roughness() == 0
 
 
-def test_there_and_back(generator):
+def test_ideal_pixels_invert_source_pixels(generator):
     """The inverse map, sampled at where the map leads, leads back: to a small share of a pixel away from the poles."""
     camera = distorted()
     there, back = camera.source_pixels(), camera.ideal_pixels()
@@ -51,7 +51,7 @@ def test_there_and_back(generator):
     assert off.max() < 0.03 and off.mean() < 0.006
 
 
-def test_a_turn_in_the_map_is_none():
+def test_rotations_are_removed_from_the_map():
     """A rotation of all cameras in their own frames is left to the poses."""
     camera = CameraMap(W, H, dtype=torch.float64)
     d = rays(W, H, dtype=torch.float64)
@@ -115,7 +115,7 @@ def drawer(gaussians: Gaussians, projection: str = "ray", backend: str = "torch"
 
 @pytest.mark.parametrize("projection", ["ray", "tangent"])
 @pytest.mark.parametrize("backend", ["torch", "auto"])
-def test_lenses_in_one_place_that_bend_nothing_are_the_ideal_camera_to_the_bit(projection, backend):
+def test_initial_lenses_are_bit_equal_to_the_ideal_camera(projection, backend):
     draw = drawer(truth(), projection, backend)
     table = replace(VIEW, lens=RayTable(VIEW.camera.rays(dtype=torch.float64).float(), VIEW.camera.focal))
     for axis in "xyz":
@@ -126,7 +126,7 @@ def test_lenses_in_one_place_that_bend_nothing_are_the_ideal_camera_to_the_bit(p
         assert torch.equal(stitched.image, plain.image) and torch.equal(stitched.depth, plain.depth)
 
 
-def test_each_lens_stands_on_its_own_side():
+def test_positions_of_the_lenses():
     lenses = DualLens(axis="z", scene_scale=2.0)
     with torch.no_grad():
         lenses.gap.fill_(0.1)
@@ -136,7 +136,7 @@ def test_each_lens_stands_on_its_own_side():
     torch.testing.assert_close(back.center, VIEW.center - 0.1 * ahead)
 
 
-def test_what_each_lens_shows_is_its_own_half():
+def test_each_lens_renders_its_own_half():
     lenses, draw = DualLens(axis="z", blend=5.0), drawer(truth())
     with torch.no_grad():
         lenses.gap.fill_(0.3)
@@ -184,6 +184,6 @@ def test_only_panoramas_are_stitched():
         ({"axis": "forward"}, "unknown lens axis 'forward'"),
     ],
 )
-def test_meaningless_options_are_refused(options, message):
+def test_invalid_options_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         DualLens(**options)

@@ -62,7 +62,7 @@ def rays(count: int, generator: torch.Generator) -> tuple[torch.Tensor, torch.Te
     return origins, normalize(torch.randn(count, 3, generator=generator), dim=-1)
 
 
-def test_the_defaults_have_the_published_number_of_parameters():
+def test_published_number_of_parameters():
     """Per chart (150 x 172 + 150 x 516 + 172 x 516 + 150 + 172 + 516) x 64 values of the grids."""
     with torch.device("meta"):
         model = EgoNeRF(EgoNeRFOptions(), torch.zeros(3, device="cpu"), 1.0, 1.0, "outdoor")
@@ -77,7 +77,7 @@ def test_the_defaults_have_the_published_number_of_parameters():
     ("surroundings", "unit", "published"),
     [("outdoor", 5.0, (-10.0, 25.0, 0.1, 300.0, 0.05, True)), ("indoor", 2.5, (-8.0, 25.0, 0.01, 15.0, 0.03, False))],
 )
-def test_the_defaults_are_the_published_model_of_a_scene_of_some_unit(generator, surroundings, unit, published):
+def test_scene_units_match_published_constants(generator, surroundings, unit, published):
     """Lengths are published in units of the data; the optical depth of a length is the same, too."""
     world = tiny_scene()
     world = in_other_units(world, unit / world.scale)
@@ -126,7 +126,7 @@ def test_samples_start_at_near_reach_far_and_increase(generator):
     assert (still[:, -1] >= model.constants.far - 1e-4).all()
 
 
-def test_fine_samples_gather_at_a_shell(generator):
+def test_fine_samples_concentrate_at_a_shell(generator):
     """Density in one radial node only: half the samples are drawn to it."""
     model = without_density(SMALL)
     with torch.no_grad():
@@ -139,7 +139,7 @@ def test_fine_samples_gather_at_a_shell(generator):
     assert near_shell.float().sum(-1).min() > 24
 
 
-def test_any_camera_sees_what_lies_in_its_directions():
+def test_cameras_agree_along_equal_rays():
     """A table of the panorama's own rays gives the panorama; a pinhole's middle is the panorama's."""
     scene, model = tiny_scene(), dense()
     view = scene.test[0]
@@ -153,7 +153,7 @@ def test_any_camera_sees_what_lies_in_its_directions():
     assert torch.allclose(middle, model.trace(origin, along).color[0], atol=1e-5)
 
 
-def test_a_rendering_has_depth_in_world_units_and_residual_transmittance():
+def test_depth_and_transmittance_of_a_rendering():
     scene, model = tiny_scene(), dense()
     view = scene.test[0]
     rendering = model.render(view)
@@ -165,14 +165,14 @@ def test_a_rendering_has_depth_in_world_units_and_residual_transmittance():
     assert len(rendering.visible) == 0 and rendering.counters["rays"] == view.width * view.height
 
 
-def test_memory_in_smaller_passes_changes_nothing():
+def test_passes_do_not_change_the_image():
     scene = tiny_scene()
     whole, parts = dense(), dense(replace(SMALL, samples_at_once=48 * 7))
     view = scene.test[0]
     assert torch.allclose(whole.render(view).image, parts.render(view).image, atol=1e-6)
 
 
-def test_faint_samples_may_go_unshaded():
+def test_min_weight_bounds_the_error():
     scene, view = tiny_scene(), tiny_scene().test[0]
     full, quick = dense(scene=scene), dense(replace(SMALL, min_weight=1e-3), scene)
     difference = (full.render(view).image - quick.render(view).image).abs().max()
@@ -180,7 +180,7 @@ def test_faint_samples_may_go_unshaded():
 
 
 @pytest.mark.parametrize("scale", [0.01, 100.0])
-def test_the_units_of_the_world_do_not_matter(scale):
+def test_rendering_is_invariant_to_world_units(scale):
     scene = tiny_scene()
     other = in_other_units(scene, scale)
     plain, scaled = dense(scene=scene), dense(scene=other)
@@ -190,7 +190,7 @@ def test_the_units_of_the_world_do_not_matter(scale):
     assert torch.allclose(a.depth * scale, b.depth, rtol=1e-3)
 
 
-def test_in_world_units_lengths_are_taken_as_they_stand():
+def test_length_unit_world_takes_lengths_as_given():
     model = EgoNeRF.from_scene(in_other_units(tiny_scene(), 100.0), replace(SMALL, length_unit="world"))
     assert model.unit == 1.0 and model.travel > 20
 
@@ -240,13 +240,13 @@ def test_gradients_of_colours(generator):
         ({"coarse_samples": 3}, "coarse_samples is 3 and fine_samples 24"),
     ],
 )
-def test_options_that_make_no_model_are_named(changes, reason):
+def test_invalid_options_are_refused(changes, reason):
     with pytest.raises(ValueError, match=reason):
         replace(SMALL, **changes)
 
 
 @pytest.mark.slow
-def test_the_small_setting_keeps_its_promises_of_time(monkeypatch, root):
+def test_time_of_the_small_preset(monkeypatch, root):
     """500 steps of 1024 rays in 3 minutes and 256x128 in 20 s on 2 cores: twice that in processor time."""
     monkeypatch.setenv("PADGS_ROOT", str(root))
     scene, small = tiny_scene(), build_method(composed("method=egonerf_small"))
@@ -276,14 +276,14 @@ def towards(z: torch.Tensor, azimuth: torch.Tensor) -> torch.Tensor:
     return torch.stack((across * torch.cos(azimuth), across * torch.sin(azimuth), z), dim=-1)
 
 
-def test_a_direction_through_the_centre_of_a_texel_sees_it_alone(environment):
+def test_texel_centres_show_one_texel(environment):
     row, column = (part.flatten() for part in torch.meshgrid(torch.arange(6), torch.arange(12), indexing="ij"))
     z = (2 * row.double() + 1) / HEIGHT - 1
     seen = environment(towards(z, ((2 * column.double() + 1) / (2 * HEIGHT) - 1) * math.pi))
     assert torch.allclose(seen, torch.sigmoid(environment.emission[:, row, column].T))
 
 
-def test_all_texels_count_for_the_same_solid_angle(environment, generator):
+def test_texels_have_equal_solid_angles(environment, generator):
     """Each texel's share in random directions, as the gradient of their sum tells it (before the sigmoid)."""
     count = 200_000
     directions = normalize(torch.randn(count, 3, dtype=torch.float64, generator=generator), dim=-1)
@@ -307,14 +307,14 @@ TINY: dict[str, Any] = {"width": 32, "train_views": 4, "test_views": 1, "samples
 
 
 @pytest.mark.parametrize(("scene", "kind"), [("room", "indoor"), ("outdoor", "outdoor")])
-def test_rooms_and_the_open_are_told_apart_in_any_unit(tmp_path, monkeypatch, scene, kind):
+def test_indoor_and_outdoor_scenes_are_distinguished_in_any_unit(tmp_path, monkeypatch, scene, kind):
     monkeypatch.setenv("PADGS_CACHE", str(tmp_path))
     found = [generate(SyntheticOptions(scene, **TINY, world_scale=scale)) for scale in (1.0, 100.0)]
     assert [surroundings_of(one) for one in found] == [kind, kind]
     assert cloud_reach(found[1]) == pytest.approx(cloud_reach(found[0]), rel=1e-3)
 
 
-def test_a_few_points_behind_the_walls_make_no_outdoors():
+def test_outliers_do_not_change_the_surroundings():
     shell = normalize(torch.randn(1000, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
     scene = tiny_scene()
     still: View = replace(scene.train[0], cam_from_world=torch.eye(4, dtype=torch.float64))
@@ -324,7 +324,7 @@ def test_a_few_points_behind_the_walls_make_no_outdoors():
         assert surroundings_of(replace(scene, train=(still,), points=points)) == kind
 
 
-def test_what_is_given_comes_before_what_the_surroundings_say():
+def test_given_constants_override_those_of_the_surroundings():
     small: dict[str, Any] = {"radial_nodes": 4, "polar_nodes": 4, "azimuth_nodes": 4, "environment_height": 4}
     chosen = EgoNeRF.from_scene(tiny_scene(), EgoNeRFOptions(**small))
     assert chosen.kind == surroundings_of(tiny_scene())

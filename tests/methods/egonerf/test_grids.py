@@ -42,7 +42,7 @@ def in_yin(directions: torch.Tensor) -> torch.Tensor:
     return (polar >= math.pi / 4) & (polar <= 3 * math.pi / 4) & (azimuth.abs() <= 3 * math.pi / 4)
 
 
-def test_every_direction_has_one_chart_and_the_charts_share_the_sphere_as_their_areas_do(directions):
+def test_charts_partition_the_sphere_by_their_areas(directions):
     chart = locate(directions).chart
     assert torch.equal(chart == YIN, in_yin(directions))
     assert ((chart == YIN) | (chart == YANG)).all()
@@ -51,12 +51,12 @@ def test_every_direction_has_one_chart_and_the_charts_share_the_sphere_as_their_
     assert in_yin(swapped(directions[~in_yin(directions)])).all(), "nothing has to be clamped"
 
 
-def test_places_and_directions_are_inverse(directions):
+def test_direction_inverts_locate(directions):
     assert torch.allclose(direction(locate(directions)), directions, atol=1e-12)
     assert torch.allclose(direction(locate(directions * 7.5)), directions, atol=1e-12), "length does not matter"
 
 
-def test_neither_chart_has_a_pole(directions):
+def test_charts_have_bounded_distortion(directions):
     """An equal step in a chart's azimuth is never shorter on the sphere than 1 / sqrt 2 of one at its equator."""
     place = locate(directions)
     step = 1e-6
@@ -65,7 +65,7 @@ def test_neither_chart_has_a_pole(directions):
     assert per_step.min() > 1 / math.sqrt(2) - 1e-6 and per_step.max() < 1 + 1e-6
 
 
-def test_the_axes_are_where_they_belong():
+def test_charts_of_the_axes_and_the_centre():
     axes = torch.cat((torch.eye(3), -torch.eye(3))).double()
     assert locate(axes).chart.tolist() == [YIN, YIN, YANG, YANG, YIN, YANG]
     center = locate(torch.zeros(1, 3))
@@ -73,7 +73,7 @@ def test_the_axes_are_where_they_belong():
 
 
 @given(first=st.floats(1e-4, 0.5), factor=st.floats(1.5, 1e5), count=st.integers(3, 300))
-def test_nodes_grow_with_no_interval_shorter_than_the_first(first, factor, count):
+def test_node_intervals_grow_from_the_first(first, factor, count):
     nodes = exponential_nodes(first, first * factor, count)
     assert len(nodes) == count and nodes[0] == 0
     assert nodes[1].item() == pytest.approx(first)
@@ -82,7 +82,7 @@ def test_nodes_grow_with_no_interval_shorter_than_the_first(first, factor, count
     assert nodes[-1] >= first * factor * (1 - 1e-9)
 
 
-def test_behind_the_threshold_the_series_is_geometric_and_only_shifted():
+def test_far_nodes_are_a_shifted_geometric_series():
     first, last, count = 0.05, 520.0, 150
     ratio = (last / first) ** (1 / (count - 2))
     geometric = torch.cat((torch.zeros(1), first * ratio ** torch.arange(count - 1.0))).double()
@@ -93,7 +93,7 @@ def test_behind_the_threshold_the_series_is_geometric_and_only_shifted():
     assert torch.allclose(nodes.diff()[~far], torch.tensor(first, dtype=torch.float64))
 
 
-def test_places_are_exact_at_nodes_linear_between_and_continuous():
+def test_node_fraction_is_piecewise_linear():
     nodes = exponential_nodes(0.1, 50.0, 24)
     steps = torch.arange(24, dtype=torch.float64) / 23
     assert torch.allclose(node_fraction(nodes, nodes), steps, atol=1e-14)
@@ -104,7 +104,7 @@ def test_places_are_exact_at_nodes_linear_between_and_continuous():
     assert at.radius.item() == pytest.approx(3 / 23, abs=1e-6)
 
 
-def test_places_are_monotone_and_end_at_the_last_node():
+def test_node_fraction_is_monotone_and_clamped():
     nodes = exponential_nodes(0.1, 50.0, 24)
     radii = torch.linspace(0, 80, 10_001, dtype=torch.float64)
     places = node_fraction(radii, nodes)
@@ -113,7 +113,7 @@ def test_places_are_monotone_and_end_at_the_last_node():
     assert (places[~inside] == 1).all()
 
 
-def test_lengths_that_do_not_grow_are_refused():
+def test_invalid_radii_are_refused():
     with pytest.raises(ValueError, match="the first radius is 2.0 and the last 1.0"):
         exponential_nodes(2.0, 1.0, 10)
     with pytest.raises(ValueError, match="2 radial nodes are too few"):
@@ -162,7 +162,7 @@ def test_density_is_the_sum_over_modes_of_rectified_sums(grids, generator):
 
 
 @pytest.mark.parametrize("chart", [YIN, YANG])
-def test_a_chart_reads_nothing_of_the_other(grids, generator, chart):
+def test_charts_are_independent(grids, generator, chart):
     at = places(200, generator)
     with torch.no_grad():
         for factor in grids.parameters():
@@ -182,7 +182,7 @@ def test_gradients_of_the_look_up(grids, generator):
     assert gradcheck(field, parameters)
 
 
-def test_the_coarse_grid_is_half_as_fine_and_has_the_same_means(grids):
+def test_coarse_grids_are_pooled(grids):
     coarse = grids.coarse()
     for fine, half in zip((*grids.planes, *grids.lines), (*coarse.planes, *coarse.lines), strict=True):
         assert all(b * 2 == a for a, b in zip(fine.shape[2:], half.shape[2:], strict=True))
@@ -190,7 +190,7 @@ def test_the_coarse_grid_is_half_as_fine_and_has_the_same_means(grids):
         assert torch.allclose(fine.mean(axes), half.mean(axes)), "each chart and component by itself"
 
 
-def test_variation_is_the_published_sum_over_charts(grids):
+def test_total_variation_matches_the_published_formula(grids):
     def of_chart(plane: torch.Tensor) -> torch.Tensor:
         components, rows, columns = plane.shape
         down = (plane[:, 1:] - plane[:, :-1]).square().sum() / (components * (rows - 1) * columns)

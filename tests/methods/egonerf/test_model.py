@@ -73,7 +73,7 @@ def test_reading_the_images_is_training_time():
     assert reading >= 0.05 and next(run.records()).seconds > reading
 
 
-def test_the_loss_is_the_squared_error_that_counts():
+def test_loss_is_the_weighted_squared_error():
     model = Flat()
     run = trainer(model, weight="solid_angle")
     rays = trainer(model, weight="solid_angle")._pixels.draw(200)
@@ -81,7 +81,7 @@ def test_the_loss_is_the_squared_error_that_counts():
     assert next(run.records()).loss == pytest.approx(error.item(), rel=1e-5)
 
 
-def test_passes_of_bounded_size_add_up_to_the_same_step():
+def test_passes_sum_to_the_same_step():
     whole, parts = Flat(), Flat(rays_at_once=64)
     losses = [[record.loss for record in trainer(model, 5).records()] for model in (whole, parts)]
     assert parts.passes[:4] == [64, 64, 64, 8] and whole.passes[0] == 200
@@ -89,7 +89,7 @@ def test_passes_of_bounded_size_add_up_to_the_same_step():
     assert torch.allclose(whole.color, parts.color, atol=1e-5)
 
 
-def test_regularisation_is_learned_from_and_not_recorded():
+def test_regularisation_is_trained_but_not_recorded():
     plain, penalised = Flat(), Flat(penalty=-100.0)
     first = [next(trainer(model).records()).loss for model in (plain, penalised)]
     assert first[0] == first[1]
@@ -112,14 +112,14 @@ def test_resuming_changes_nothing(stop):
         assert name == "random/torch" or torch.equal(tensor, second.state().tensors[name]), name
 
 
-def test_a_state_of_other_data_is_refused():
+def test_state_of_other_data_is_refused():
     state = trainer(Flat(), 5).state()
     other = trainer(Flat(), 5, scene=replace(tiny_scene(), train=tiny_scene().train[:2]))
     with pytest.raises(ValueError, match="a run on 2560 pixels, but the training views have 1024"):
         other.load_state(state)
 
 
-def test_what_is_not_finite_is_named():
+def test_non_finite_colours_are_reported():
     class Broken(Flat):
         def colors(self, origins: Tensor, directions: Tensor, generator: torch.Generator, iteration: int) -> Tensor:
             return super().colors(origins, directions, generator, iteration) / torch.zeros(())

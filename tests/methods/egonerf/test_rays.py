@@ -22,7 +22,7 @@ def views() -> tuple[View, ...]:
     return first, replace(second, cam_from_world=turn @ second.cam_from_world), photo
 
 
-def test_every_pixel_is_the_ray_of_its_own_view(views):
+def test_rays_match_their_pixels(views):
     pixels = RayPixels(views)
     start = 0
     for view in views:
@@ -45,7 +45,7 @@ def test_pixels_are_drawn_uniformly_over_all_views(views):
     assert torch.equal(rays.weight, torch.ones(50_000))
 
 
-def test_masked_pixels_are_never_drawn_and_others_weigh_as_the_mask_says(views):
+def test_masks_select_and_weight_pixels(views):
     mask = torch.ones(16, 32)
     mask[:8], mask[8] = 0, 0.25
     pixels = RayPixels([replace(views[0], load_mask=lambda: mask)])
@@ -55,12 +55,12 @@ def test_masked_pixels_are_never_drawn_and_others_weigh_as_the_mask_says(views):
     assert set(rays.weight.tolist()) == {0.25, 1.0}
 
 
-def test_rows_may_weigh_by_solid_angle(views):
+def test_solid_angle_weights(views):
     rays = RayPixels([views[0]], "solid_angle").draw(1000)
     assert torch.allclose(rays.weight, rays.directions[:, [0, 2]].norm(dim=-1), atol=1e-5)
 
 
-def test_views_without_use_are_named(views):
+def test_unusable_views_are_refused(views):
     with pytest.raises(ValueError, match="view '00': the mask is 0 everywhere"):
         RayPixels([replace(views[0], load_mask=lambda: torch.zeros(16, 32))])
     with pytest.raises(ValueError, match="image of view '00' is 32x16; the view is 64x32"):
@@ -76,7 +76,7 @@ def test_quantiles_of_an_exponential_density():
     assert torch.allclose(inverse_cdf(edges, weights, shares), exact, atol=2e-5)
 
 
-def test_quantiles_of_pieces_are_exact_and_at_the_ends_the_ends(generator):
+def test_quantiles_of_piecewise_constant_densities(generator):
     edges = torch.tensor([[1.0, 2.0, 4.0, 5.0], [0.0, 1.0, 2.0, 3.0]], dtype=torch.float64)
     weights = torch.tensor([[1.0, 2.0, 1.0], [1e-12, 1.0, 1e-12]], dtype=torch.float64)
     shares = torch.tensor([0.0, 0.25, 0.5, 0.75, 1.0], dtype=torch.float64).expand(2, 5)
@@ -87,7 +87,7 @@ def test_quantiles_of_pieces_are_exact_and_at_the_ends_the_ends(generator):
     assert (inverse_cdf(edges, weights, random).diff(dim=-1) >= 0).all()
 
 
-def test_refined_samples_gather_where_the_weight_is():
+def test_refined_samples_follow_the_weights():
     distances = torch.arange(1.0, 11.0)[None]
     weights = torch.zeros(1, 10)
     empty = refined(distances, weights, torch.linspace(0, 1, 9)[None])
@@ -107,14 +107,14 @@ def test_jitter_stays_within_the_interval(generator):
 DENSITY = 0.7
 
 
-def test_shares_and_residual_are_one(generator):
+def test_weights_and_residual_sum_to_one(generator):
     depths = torch.rand(1000, 40, generator=generator) ** 8 * 20
     weights, residual = visible_shares(depths)
     assert (weights >= 0).all() and (residual >= 0).all()
     assert torch.allclose(weights.sum(-1) + residual, torch.ones(1000), atol=2e-6)
 
 
-def test_a_medium_of_constant_density_is_exact_however_it_is_cut(generator):
+def test_constant_density_is_exact_for_any_intervals(generator):
     """What comes from the first length s is 1 - exp(-density s)."""
     lengths = torch.rand(30, dtype=torch.float64, generator=generator)
     lengths = torch.cat((torch.zeros(5), lengths, torch.zeros(5)))  # empty space before and behind

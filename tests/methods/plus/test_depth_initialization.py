@@ -79,7 +79,7 @@ def test_colours_are_those_of_the_pixels():
     assert torch.equal(colors, view.load_pixels().reshape(-1, 3)[seen])
 
 
-def test_the_sky_stays_empty():
+def test_pixels_far_from_all_points_are_dropped():
     points, _ = new_points(dome(600, lowest=0.0))
     directions = torch.nn.functional.normalize(points.double() - tiny_scene().train[0].center, dim=-1)
     assert len(points) > 500 and directions[:, 1].min() > -2 * math.sqrt(4 * math.pi / 300)
@@ -97,7 +97,7 @@ def test_masks_hide_pixels():
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e4])
-def test_it_turns_and_grows_with_the_world(scale):
+def test_points_are_equivariant_to_rotation_and_scale(scale):
     rotation = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3)))[0]
     rotation = rotation * rotation.det()
     points, colors = new_points(dome(300))
@@ -106,7 +106,7 @@ def test_it_turns_and_grows_with_the_world(scale):
     assert torch.allclose(others.double() / scale, points.double() @ rotation.T, atol=1e-4)
 
 
-def test_what_has_enough_points_stays_as_it_is():
+def test_dense_clouds_are_unchanged():
     scene = dome(300)
     assert fill_sparse_cloud(scene, 300, generator=torch.Generator()) is scene
 
@@ -118,7 +118,7 @@ def test_points_at_a_camera_centre_are_ignored():
     assert len(new_points(alone)[0]) == 0
 
 
-def test_padgs_plus_starts_from_what_it_asks_for():
+def test_initial_number_of_gaussians():
     scene = dome(8)
     asked = round(PlusOptions().depth_init_per_pixel * solid_angle_pixels(scene.train[0]))
     for share, count in ((PlusOptions().depth_init_per_pixel, asked), (0.0, 8)):
@@ -162,7 +162,7 @@ def test_the_cloud_is_filled_once_per_run_and_not_when_resuming(monkeypatch):
     assert len(sought) == 3
 
 
-def test_a_rehearsal_changes_nothing_of_the_points_that_a_run_begins_with():
+def test_speed_measurement_does_not_change_the_initial_points():
     scene, one = dome(40), PlusMethod(seed=3)
     first, second, other = (
         method.build_model(scene, length).splats for method, length in ((one, 9), (one, 20), (PlusMethod(seed=3), 20))
@@ -206,18 +206,18 @@ def found(views: tuple[View, ...], scale: float = 1.0, count: int = 300) -> tupl
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 1e5])
-def test_ranges_are_those_at_which_all_views_agree(scale):
+def test_plane_sweep_finds_the_depth(scale):
     inverse, true, _ = found(ball(scale), scale)
     off = (inverse / true).log2().abs()
     assert off.median() < 0.08 and (off < 0.2).double().mean() > 0.95, "steps between those tried are 0.19 octaves"
 
 
-def test_without_texture_the_estimate_stays():
+def test_plane_sweep_without_texture_keeps_the_estimate():
     inverse, _, likely = found(ball(contrast=0.0))
     assert torch.equal(inverse, likely)
 
 
-def test_a_view_alone_and_one_that_is_no_panorama_stay_as_they_are():
+def test_plane_sweep_needs_several_panoramas():
     views = ball()
     for alone in (views[:1], (views[0], views[0])):
         inverse, _, likely = found(alone)
@@ -243,7 +243,7 @@ def test_chunks_are_concatenated_in_order():
     assert ((whole[-5:] / true[-5:]).log2().abs() < 0.2).all()
 
 
-def test_points_from_photographs_lie_where_these_agree_and_not_where_the_cloud_has_them(monkeypatch):
+def test_plane_sweep_improves_the_depth_of_a_rough_cloud(monkeypatch):
     directions = fibonacci_sphere(60)
     off = torch.where(torch.arange(60) % 2 == 0, 0.65, 1.5)[:, None]  # of a rough cloud
     points = (RADIUS * off * directions).float()
@@ -286,19 +286,19 @@ def test_directions_are_unit_and_even():
     assert torch.allclose(moments, torch.eye(3, dtype=torch.float64) / 3, atol=1e-3)
 
 
-def test_where_points_are_all_around_there_is_no_sky():
+def test_closed_clouds_get_no_far_gaussians():
     assert len(sky(under(hemisphere=False))[0]) == 0
 
 
 @pytest.mark.parametrize("points", [100, 500])
-def test_a_sparse_cloud_all_around_leaves_no_hole(points):
+def test_sparse_closed_clouds_get_few_far_gaussians(points):
     scene = under(hemisphere=False)
     few = torch.randperm(len(scene.points), generator=torch.Generator().manual_seed(0))[:points]
     assert len(sky(replace(scene, points=scene.points[few]))[0]) < 0.02 * DIRECTIONS
 
 
 @pytest.mark.parametrize("scale", [1.0, 1000.0])
-def test_the_open_half_gets_it(scale):
+def test_far_gaussians_fill_the_open_half(scale):
     made, rays = sky(under(hemisphere=True, scale=scale))
     assert rays.norm(dim=-1) == pytest.approx([FAR_FACTOR * 4 * scale] * len(rays), rel=0.02)
     height = rays[:, 1] / rays.norm(dim=-1)
@@ -328,14 +328,14 @@ def scene_of(name: str, count: int = 1):
     )
 
 
-def test_more_rooms_are_more_and_one_is_one():
+def test_room_count_grows_with_the_rooms():
     one, two, five = (room_count(scene_of("room_chain", count)) for count in (1, 2, 5))
     assert one == 1.0 < two < five
     assert 1.5 < five < 5
 
 
 @pytest.mark.parametrize("name", ["room", "outdoor", "near_clutter"])
-def test_furniture_and_trees_make_no_room(name):
+def test_room_count_of_single_rooms_is_one(name):
     assert room_count(scene_of(name)) == 1.0
 
 

@@ -164,7 +164,7 @@ def test_solid_angle_pixels():
     assert solid_angle_pixels(tiny) == MIN_PIXELS
 
 
-def test_the_units_of_the_world_do_not_matter():
+def test_training_is_invariant_to_world_units():
     losses = []
     for scale in (1.0, 100.0):
         records = list(PlusMethod(OPTIONS).fit(in_other_units(tiny_scene(), scale), Budget(32)))
@@ -216,7 +216,7 @@ def test_dropout_rises_as_pixels_per_gaussian_fall():
     assert PlusOptions(dropout=0.0).dropout_share(1.0, 1000) == 0
 
 
-def test_a_round_that_prunes_all_ends_the_run_as_collapsed():
+def test_pruning_all_gaussians_fails_as_collapsed():
     with pytest.raises(Failure, match="no Gaussian is left to draw"):
         list(PlusMethod(replace(OPTIONS, min_opacity=0.999)).fit(tiny_scene(), Budget(60)))
 
@@ -253,7 +253,7 @@ def test_dropout_is_the_same_after_resuming(at):
     assert_same_but_time(resumed.state(), whole.state())
 
 
-def test_degrees_come_each_tenth_and_means_are_faster_than_those_of_3dgs():
+def test_sh_degrees_and_learning_rate_of_means():
     method, scene = (
         PlusMethod(replace(OPTIONS, means_rate_factor=3.0, initial_opacity=0.3, initial_scale=0.5)),
         tiny_scene(),

@@ -38,7 +38,7 @@ def wavy(width: int, normal: tuple[float, float, float]) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.2, -0.1, 0.5), (0.3, 0.0, 0.8)])
-def test_a_plane_is_smooth_with_the_square_of_the_pixels(normal):
+def test_roughness_of_a_plane_is_quadratic_in_the_pixel_size(normal):
     found = []
     for size in (32, 64):
         camera = perspective(size, size, 80.0)
@@ -48,14 +48,14 @@ def test_a_plane_is_smooth_with_the_square_of_the_pixels(normal):
 
 
 @pytest.mark.parametrize("normal", [(0.6, 0.0, 0.0), (0.0, 0.6, 0.0), (0.3, -0.4, 0.3)])
-def test_poles_and_seam_are_no_edges(normal):
+def test_roughness_at_poles_and_seam_vanishes_with_resolution(normal):
     coarse, fine = rough(wavy(64, normal)), rough(wavy(128, normal))
     assert fine == pytest.approx(coarse / 4, rel=0.1)
     noise = 1 + 0.02 * torch.randn(64, 128, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     assert rough(wavy(128, normal) * noise) > 20 * fine
 
 
-def test_units_and_headings_change_nothing():
+def test_roughness_is_invariant_to_units_and_heading():
     depth = wavy(64, (0.2, 0.1, 0.3)) * (1 + 0.05 * torch.rand(32, 64, dtype=torch.float64))
     assert rough(depth * 1e4) == pytest.approx(rough(depth)) and rough(depth.roll(13, 1)) == pytest.approx(rough(depth))
 
@@ -173,7 +173,7 @@ def test_angular_size_is_scale_over_distance_limited_by_near(dtype, unit):
 
 @needs_native
 @pytest.mark.parametrize("count", [1, 16, 1000, 3000])
-def test_the_native_value_and_gradient_are_those_of_the_definition(monkeypatch, generator, count):
+def test_native_angular_size_matches_the_definition(monkeypatch, generator, count):
     means, scales = torch.randn(count, 3, generator=generator), torch.rand(count, 3, generator=generator)
     for values in (means, scales):
         broken = values.clone()

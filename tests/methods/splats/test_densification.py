@@ -110,7 +110,7 @@ def test_faint_gaussians_are_pruned():
 
 
 @pytest.mark.parametrize("scale", [SMALL, LARGE])
-def test_the_cap_holds_and_the_hardest_pulled_come_first(scale):
+def test_max_gaussians_keeps_the_largest_gradients(scale):
     grown, optimizer = densifier([scale] * 5, max_gaussians=7)
     pull(grown, [1e-3, 5e-3, 2e-3, 4e-3, 3e-3])
     assert grown.adapt(EVERY, optimizer)[1:] == ("max_gaussians 7 left out 3 of 5 candidates",)
@@ -139,7 +139,7 @@ def test_a_reset_limits_opacities_and_clears_their_adam_moments(limit, before, a
 
 
 @pytest.mark.parametrize("kind", ["space", "space_absolute"])
-def test_towards_a_target_those_that_are_pulled_hardest_multiply_in_equal_steps(kind):
+def test_target_is_reached_in_equal_steps_by_the_largest_gradients(kind):
     count, target = 20, 50
     grown, optimizer = densifier(
         [SMALL] * count, densify_until=3 * EVERY + 1, positional_gradient=kind, gradient_threshold=1.0
@@ -160,7 +160,7 @@ def test_towards_a_target_those_that_are_pulled_hardest_multiply_in_equal_steps(
     assert found == [30, 40, 50]
 
 
-def test_as_many_multiply_for_their_absolute_pull_as_pass_the_threshold():
+def test_absolute_gradients_select_as_many_as_the_threshold():
     """GOF: above the quantile 1 - r, with r the share of those above the threshold."""
     grown, optimizer = densifier([SMALL] * 6, positional_gradient="space_absolute", gradient_threshold=1e-4)
     pulls = torch.tensor([2e-4, 3e-4, 0.0, 5e-5, 0.0, 0.0])
@@ -232,7 +232,7 @@ def test_windows_follow_the_run_length():
     assert (long.densify_until, long.densify_every, long.reset_every) == (30_000, 200, 6000)
 
 
-def test_options_without_a_meaning_are_refused():
+def test_invalid_options_are_refused():
     for name, value, rule in (
         ("densify_every", 0, ""),
         ("reset_opacity", 0.0, "; it must be an opacity"),
