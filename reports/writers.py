@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
+from pathlib import Path
 
 from pandas import DataFrame
 
+from padgs.files import write_atomically
 from padgs.reports.charts.drawing import Chart
 from padgs.reports.statistics import BEST, emphasis
 from padgs.reports.table import Table
@@ -52,6 +54,17 @@ def files(made: Table | Page | Chart | Sequence[Table | Chart] | str, svg: bool 
     else:
         for part in made:
             yield from files(part, svg)
+
+
+def write_files(texts: Mapping[str, bytes], folder: Path) -> None:
+    """Write the files of a report, name -> content, each atomically.
+
+    Raises:
+        OSError: a file cannot be written; the old one stays.
+    """
+    for file, content in texts.items():
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(folder / file, content)
 
 
 def rows_of(table: Table) -> list[tuple[str, list[tuple[str, str | None]]]]:

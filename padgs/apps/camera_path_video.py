@@ -16,19 +16,68 @@ from tempfile import TemporaryDirectory
 from uuid import UUID
 
 import numpy as np
+import torch
 from PIL import Image
 from torch import Tensor
 
 from padgs.checks import install_command
+from padgs.data.camera_paths import PATHS, gravity, read_path
+from padgs.data.formats.transforms import transforms_file
 from padgs.evaluation.images import depth_image, to_uint8
 from padgs.files import atomic_path
+from padgs.geometry.camera import Camera, Panorama, perspective
 from padgs.render import Rendering
-from padgs.scene import View
+from padgs.runs.load import LoadedRun
+from padgs.scene import View, move_origin
 
 WriteFrame = Callable[[np.ndarray], None]  # of [H, W, 3] uint8, or [H, W] uint16
 DEPTH_STEPS = 1000  # of 16-bit depth, per scene scale
 # Stated explicitly: by default, players take large videos to be BT.709, and small ones to be BT.601.
 COLOURS = {"colorspace": "bt709", "color_primaries": "bt709", "color_trc": "bt709", "color_range": "tv"}
+
+
+def views_along(
+    run: LoadedRun,
+    path: str,
+    seconds: float | None,
+    fps: float,
+    width: int = 0,
+    perspective_shape: tuple[int | None, float] | None = None,
+) -> list[View]:
+    """Return the views of a camera path through the scene of a run.
+
+    Args:
+        run: with its scene.
+        path: a name of PATHS, or a JSON file of keyframes or of nerfstudio.
+        seconds: length of the video; None: 10, or the length stored in the file.
+        fps: frames per second.
+        width: pixels; 0: width of the training views, half of it in perspective.
+        perspective_shape: height in pixels (None: 9/16 of the width), and horizontal field of view in degrees; None
+            renders panoramas.
+
+    Raises:
+        ValueError: the file is no camera path.
+        OSError: the file cannot be read.
+    """
+    scene, trained = run.scene, run.scene.train[0]
+    if perspective_shape is None:
+        lens: Camera = Panorama(width or trained.width, (width or trained.width) // 2)
+    else:
+        height, fov = perspective_shape
+        width = width or trained.width // 2
+        lens = perspective(width, height or 2 * round(width * 9 / 32), fov)
+    frames = None if seconds is None else max(2, round(seconds * fps))
+    if path in PATHS:
+        poses = PATHS[path](scene, frames or max(2, round(10 * fps)))
+    else:
+        up = gravity(torch.stack([view.cam_from_world for view in scene.train])).up
+        data_set = run.config.data
+        poses = read_path(Path(path), frames, up, transforms_file(data_set.path, data_set.format))
+        poses = move_origin(poses, scene.origin)
+    return [
+        View(f"frame {number}", pose.to(trained.cam_from_world), lens.width, lens.height, lens=lens)
+        for number, pose in enumerate(poses)
+    ]
 
 
 def write_video(

@@ -20,7 +20,6 @@ def bench(
     device: Annotated[str, typer.Option(help="cpu, or cuda")] = "cpu",
 ) -> None:
     """Measure training and rendering, stage by stage, against the ceilings of this machine."""
-    import json
     from dataclasses import replace
     from pathlib import Path
 
@@ -28,7 +27,6 @@ def bench(
 
     from padgs.apps.bench.report import QUICK, BenchOptions, measure_all
     from padgs.apps.bench.tables import lines
-    from padgs.files import write_atomically
 
     usual = QUICK if quick else BenchOptions(repeats=10 if device == "cpu" else 50)
     sizes = (*usual.sizes, "large") if full else usual.sizes
@@ -36,14 +34,8 @@ def bench(
         usual, sizes=sizes, device=device, threads=threads or None, repeats=repeats or usual.repeats, seed=seed
     )
     file, console = Path(out) / "bench.json", Console(highlight=False)
-    file.parent.mkdir(parents=True, exist_ok=True)  # before minutes of measuring, not after
-
-    def keep(report: dict) -> None:
-        write_atomically(file, json.dumps(report, indent=1, allow_nan=False).encode())
-
     with console.status("measuring") as status:
-        report = measure_all(options, lambda what: status.update(f"measuring {what}"), keep)
-    keep(report)
+        report = measure_all(options, lambda what: status.update(f"measuring {what}"), file)
     for line in lines(report):
         console.print(line)
     print(f"written: {file}")

@@ -28,14 +28,9 @@ def render(
     """Write a video (or PNGs) along a path, as panoramas, which players recognise, or in perspective."""
     from pathlib import Path
 
-    import torch
     from rich.console import Console
 
-    from padgs.apps.camera_path_video import write_video
-    from padgs.data.camera_paths import PATHS, gravity, read_path
-    from padgs.data.formats.transforms import transforms_file
-    from padgs.geometry.camera import Panorama, perspective
-    from padgs.scene import View, move_origin
+    from padgs.apps.camera_path_video import views_along, write_video
 
     if camera not in ("panorama", "perspective"):
         raise ValueError(f"unknown camera {camera!r}; known: panorama, perspective")
@@ -48,24 +43,9 @@ def render(
         found = open_run(run, data)
         with name_run(run):
             scene = found.scene
-        trained = scene.train[0]
-        if camera == "panorama":
-            lens = Panorama(width or trained.width, (width or trained.width) // 2)
-        else:
-            width = width or trained.width // 2
-            lens = perspective(width, height or 2 * round(width * 9 / 32), 90.0 if fov is None else fov)
-        frames = None if seconds is None else max(2, round(seconds * fps))
-        if path in PATHS:
-            poses = PATHS[path](scene, frames or max(2, round(10 * fps)))
-        else:
-            up = gravity(torch.stack([view.cam_from_world for view in scene.train])).up
-            data_set = found.config.data
-            poses = read_path(Path(path), frames, up, transforms_file(data_set.path, data_set.format))
-            poses = move_origin(poses, scene.origin)
-        views = [
-            View(f"frame {number}", pose.to(trained.cam_from_world), lens.width, lens.height, lens=lens)
-            for number, pose in enumerate(poses)
-        ]
+        shape = None if camera == "panorama" else (height, 90.0 if fov is None else fov)
+        views = views_along(found, path, seconds, fps, width, shape)
+        lens = views[0].camera
         output = Path(to) if to else found.folder / "video.mp4"
         with name_place(output):
             outputs = write_video(

@@ -11,7 +11,6 @@ from typing import Annotated
 import typer
 
 from padgs.cli.errors import exit_on, show
-from padgs.files import write_atomically
 from padgs.reports import REPORTS, store
 from padgs.reports.table import ReportError
 from padgs.results import FILE_NAME, STOP_REQUESTED, ResultError
@@ -46,7 +45,7 @@ def report(
     target = Path(out) if out else (source if source.is_dir() else source.parent) / "reports"
     from padgs.reports.frame import frame
     from padgs.reports.selection import Request, RunSet
-    from padgs.reports.writers import files  # imports pandas, so not at the top
+    from padgs.reports.writers import files, write_files  # imports pandas, so not at the top
 
     request = Request(protocol, mix, strict, tuple(metric or ()), experiment, dict(map(_pair, where or [])))
     found, broken = store.read(source)
@@ -75,9 +74,7 @@ def report(
         if what == name and not texts:
             raise ReportError(f"nothing to show for {name}; no run or experiment in {source} is of that kind")
         with _writing_to(target):
-            for file, content in texts.items():
-                (target / file).parent.mkdir(parents=True, exist_ok=True)
-                write_atomically(target / file, content)
+            write_files(texts, target)
         if what == name and f"{name}.md" in texts:
             show(texts[f"{name}.md"].decode())
     print(f"{len(found)} results, {len(broken)} left out; see {target}", file=sys.stderr)

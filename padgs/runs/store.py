@@ -72,7 +72,7 @@ class RunStore:
             run: `identity` that its checkpoint must have; None reads checkpoints of any run.
         """
         self.path, self._run = path, run
-        self.checkpoint = path / "checkpoint"
+        self.checkpoint, self.config = path / "checkpoint", path / results.CONFIG_NAME
         self.renders = path / results.PICTURES
         self.stop = path / "stop"
         self._log = path / results.LOG_NAME
@@ -131,6 +131,11 @@ class RunStore:
         """True if there is a checkpoint, even a damaged one."""
         return checkpoint.exists(self.checkpoint)
 
+    @property
+    def has_result(self) -> bool:
+        """True if the run has ended with a result."""
+        return (self.path / results.FILE_NAME).exists()
+
     def prepare(self, values: Mapping[str, Any]) -> None:
         """Make the folder and write config.yaml.
 
@@ -140,7 +145,7 @@ class RunStore:
         with self._writing():
             self.renders.mkdir(parents=True, exist_ok=True)
             content = OmegaConf.to_yaml(OmegaConf.create(dict(values))).encode()
-            write_atomically(self.path / results.CONFIG_NAME, content)
+            write_atomically(self.config, content)
 
     def result(self) -> Result | None:
         """Return the result if the run is finished.
@@ -148,8 +153,7 @@ class RunStore:
         Raises:
             ResultError: the file cannot be used.
         """
-        path = self.path / results.FILE_NAME
-        return results.read(path) if path.exists() else None
+        return results.read(self.path / results.FILE_NAME) if self.has_result else None
 
     def finish(self, result: Result) -> Result:
         """Write result.json, which finishes the run; return the result as later readers see it."""

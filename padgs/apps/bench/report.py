@@ -22,8 +22,10 @@ tiles       tiles per Gaussian by latitude, on the CPU: see `padgs.apps.bench.ti
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -33,6 +35,7 @@ from padgs.apps.bench.ceilings import add_floors, measure_ceilings
 from padgs.apps.bench.stages import WARM_UP, cpu_stages, device_stages
 from padgs.apps.bench.tile_counts import tiles_by_latitude
 from padgs.apps.bench.workload import OPTIONS, SIZES, Size, Workload, build, median_sigma
+from padgs.files import write_atomically
 from padgs.native import cpu, cuda
 from padgs.render import Rendering, render
 
@@ -68,22 +71,24 @@ QUICK = BenchOptions(sizes=("quick",), repeats=3, ceiling_seconds=0.05)
 def measure_all(
     options: BenchOptions,
     progress: Callable[[str], None] = lambda _: None,
-    keep: Callable[[dict[str, Any]], None] = lambda _: None,
+    file: Path | None = None,
 ) -> dict[str, Any]:
     """Measure and return the report described above.
 
     Args:
         options: sizes, device and repeats.
         progress: called with what is being measured.
-        keep: called with the unfinished report after each size, so that a time limit loses little.
+        file: for the report as JSON; also written after each size, so that a time limit loses little.
 
     Raises:
-        OSError: the native library of the CPU is missing.
+        OSError: the native library of the CPU is missing, or the file cannot be written.
         ValueError: the device is a GPU, and torch finds none.
     """
     device = torch.device(options.device)
     if device.type == "cuda" and not torch.cuda.is_available():
         raise ValueError("--device cuda, but torch finds no GPU with a driver here; see docs/cuda.md")
+    if file is not None:
+        file.parent.mkdir(parents=True, exist_ok=True)  # before minutes of measuring, not after
     with clock.threads(options.threads or clock.machine()["cores"]):
         progress("the ceilings of this machine")
         ceilings = measure_ceilings(device, options.ceiling_seconds)
@@ -96,7 +101,7 @@ def measure_all(
         for name in options.sizes:
             progress(f"size {name}")
             report["sizes"][name] = measure_size(SIZES[name], options, device)
-            keep(report)
+            _write(report, file)
         if device.type == "cpu":
             progress("tiles by latitude")
             report["tiles"] = tiles_by_latitude(count=50_000 if options.repeats > QUICK.repeats else 20_000)
@@ -105,7 +110,14 @@ def measure_all(
         add_floors(size, ceilings)
     worst = max([ceilings.crowding, *map(_disagreement, report["sizes"].values())])
     noise = {"noise": {"worst": worst, "limit": NOISE_LIMIT}, "noisy": worst > NOISE_LIMIT}
-    return noise | report | {"ceilings": dataclasses.asdict(ceilings)}
+    report = noise | report | {"ceilings": dataclasses.asdict(ceilings)}
+    _write(report, file)
+    return report
+
+
+def _write(report: dict[str, Any], file: Path | None) -> None:
+    if file is not None:
+        write_atomically(file, json.dumps(report, indent=1, allow_nan=False).encode())
 
 
 def measure_size(size: Size, options: BenchOptions, device: torch.device) -> dict[str, Any]:

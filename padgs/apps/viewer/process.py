@@ -99,17 +99,15 @@ def wait_for_checkpoint(folder: str | Path) -> None:
     Raises:
         ValueError: the run was started, but no process trains it.
     """
-    from padgs import results
-    from padgs.runs import checkpoint
     from padgs.runs.store import RunStore
 
     files, printed, is_child = RunStore(Path(folder)), False, parent_process() is not None
 
     def is_decided() -> bool:
-        return checkpoint.exists(files.checkpoint) or (files.path / results.FILE_NAME).exists()
+        return files.has_checkpoint or files.has_result
 
     while not is_decided() and parent_is_alive():
-        if not is_child and not (files.path / results.CONFIG_NAME).is_file():
+        if not is_child and not files.config.is_file():
             return
         # A parent that trains may not hold the lock yet; a run may have ended since the first test.
         if not is_child and not files.is_busy and not is_decided():

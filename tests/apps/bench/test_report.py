@@ -56,12 +56,15 @@ def test_noise_is_stated_first(bench):
 
 
 @needs_library
-def test_a_gpu_has_the_same_report_with_kernels_and_what_is_measured_is_kept(monkeypatch):
+def test_a_gpu_has_the_same_report_with_kernels_and_each_size_is_written(monkeypatch, tmp_path):
     monkeypatch.setattr(report, "cpu_stages", lambda *_: {"blend_kernel": {"seconds": 0.5, "calls": 2.0}})
     monkeypatch.setitem(SIZES, "quick", Size(32, 16, 50))
-    kept = []
-    made = report.measure_all(replace(QUICK, repeats=1), keep=lambda made: kept.append(json.dumps(made)))
-    assert [set(json.loads(one)["sizes"]) for one in kept] == [{"quick"}]
+    written, file = [], tmp_path / "new" / "bench.json"
+    tiles = report.tiles_by_latitude  # measured after the sizes
+    monkeypatch.setattr(report, "tiles_by_latitude", lambda **kw: written.append(file.read_text()) or tiles(**kw))
+    made = report.measure_all(replace(QUICK, repeats=1), file=file)
+    assert [set(json.loads(text)["sizes"]) for text in written] == [{"quick"}]
+    assert json.loads(file.read_text()) == json.loads(json.dumps(made))
     text = [line for line in lines(made | {"machine": made["machine"] | {"gpu": "Some GPU"}}) if isinstance(line, str)]
     assert "Some GPU" in text[1] and "ceilings of the GPU" in text[1]
 
