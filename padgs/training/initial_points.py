@@ -46,9 +46,7 @@ def squared_spacing(points: Tensor) -> Tensor | None:
 class ExtentOptions:
     """Options of methods whose learning rates and densification scale with the extent of the cameras."""
 
-    min_extent: float = (
-        0.1  # lower bound in scene scales, for cameras that hardly move; 0: as published
-    )
+    min_extent: float = 0.1  # lower bound in scene scales, for cameras that hardly move; 0: as published
 
     def __post_init__(self) -> None:
         check(self, "a length >= 0 in scene scales", lambda least: 0 <= least < math.inf, "min_extent")

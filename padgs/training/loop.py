@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, ClassVar
 
@@ -15,7 +15,6 @@ from padgs.scene import Scene
 from padgs.training.corrections import LEARNED, Corrections
 from padgs.training.guard import Guard
 from padgs.training.health import EarlyStopping, Failure, Monitor, out_of_memory_as_failure
-from padgs.training.loss import photometric_loss
 from padgs.training.model import MODEL, Model, Record, State
 from padgs.training.optimizer import Optimizer
 from padgs.training.options import Budget, TrainOptions
@@ -105,12 +104,15 @@ class Trainer:
                 loss, sizes, events = self._gradients(iteration, step)
                 events += self._update(iteration, step)
             counts = self._model.counts()
-            silent = self._optimizer.silent if self._optimizer.is_checked(iteration) else None
-            self._monitor.end(loss, counts, silent, iteration)
+            self._monitor.end(loss, counts, self._optimizer.silent, iteration)
             if step == budget.iterations:
                 self._optimizer.refuse_non_finite(self._optimizer.parameters(), iteration)
             self.iteration, self.step, before = iteration, step, self.spent
-            events += self._stop_early()
+            if step >= self._early_stopping.fade:
+                self._views.include_held_out()
+            elif reason := self._early_stopping.reason(self._model, step):
+                self.request_stop(reason)
+                events += (f"stopping: {reason}",)
             wall, cpu = lap.seconds()
             self.seconds, self.cpu_seconds = self.seconds + wall, self.cpu_seconds + cpu
             self.step_seconds = self.spent - before
@@ -149,16 +151,9 @@ class Trainer:
                 raise Failure("collapsed", f"no Gaussian is left to draw at iteration {iteration}")
             with stage("loss"):
                 target = target if rendered.photo is None else rendered.photo(target)
-                loss = photometric_loss(
-                    *(image, target.image, target.weight, options.lambda_l1),
-                    normalisation=options.normalisation,
-                    statistics=target.statistics,
-                )
+                loss = target.loss(image, options.lambda_l1, options.normalisation)
                 loss = loss if rendered.penalty is None else loss + rendered.penalty
-                value = self._read(loss, iteration)
-            if isinstance(value, float) and not math.isfinite(value):
-                inputs = {**vars(rendered.gaussians), "image": image, "loss": loss}
-                optimizer.refuse_non_finite({**optimizer.parameters(), **inputs}, iteration)
+                losses.append(self._read(loss, {**vars(rendered.gaussians), "image": image}, iteration))
             if checked:
                 self._monitor.render(rendered, target.image, iteration)
             with stage("backward"):
@@ -168,7 +163,6 @@ class Trainer:
                 self._monitor.positional_gradient(rendered.mean_offsets.grad, iteration)
             with stage("observe"), torch.no_grad():
                 model.observe(rendered, step)
-            losses.append(value)
             drawn.append(len(rendered.gaussians))
         return sum(losses) / len(losses), {"drawn": max(drawn)}, ()
 
@@ -189,20 +183,17 @@ class Trainer:
             events = tuple(event for one in passed for event in self._model.adapt(one, optimizer.adam))
         return events + (self._guard.report(iteration) if optimizer.is_checked(iteration) or step == length else ())
 
-    def _stop_early(self) -> tuple[str, ...]:
-        """Stop if validation views gain nothing; train on them from the fade on."""
-        if self.step >= self._early_stopping.fade:
-            self._views.include_held_out()
-        elif reason := self._early_stopping.reason(self._model, self.step):
-            self.request_stop(reason)
-            return (f"stopping: {reason}",)
-        return ()
+    def _read(self, loss: Tensor, inputs: Mapping[str, Tensor | None], iteration: int) -> float | Tensor:
+        """Return the loss as a number; on a GPU only every few iterations, because the host has to wait for it.
 
-    def _read(self, loss: Tensor, iteration: int) -> float | Tensor:
-        """Return the loss as a number; on a GPU only now and then, as the host has to wait for it."""
-        if loss.device.type == "cpu" or iteration % READ_EVERY == 0 or self._optimizer.is_checked(iteration):
-            return loss.item()
-        return loss.detach()
+        Raises:
+            Failure: nan, naming a parameter or one of `inputs`.
+        """
+        if loss.device.type != "cpu" and iteration % READ_EVERY and not self._optimizer.is_checked(iteration):
+            return loss.detach()
+        if not math.isfinite(value := loss.item()):
+            self._optimizer.refuse_non_finite({**self._optimizer.parameters(), **inputs, "loss": loss}, iteration)
+        return value
 
     def state(self) -> State:
         """Copy model, optimizer, statistics, random state and data order; to be taken between two records."""

@@ -111,9 +111,7 @@ def pixel_weight(
     if mask is None:
         return rows
     if not (mask > 0).any():
-        raise ValueError(
-            "the mask is 0 everywhere, so no pixel is left; correct the mask or remove the view"
-        )
+        raise ValueError("the mask is 0 everywhere, so no pixel is left; correct the mask or remove the view")
     return rows * mask.to(rows)
 
 

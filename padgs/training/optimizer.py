@@ -111,7 +111,7 @@ class Optimizer:
     Attributes:
         adam: the torch optimizer, whose rows densification edits.
         pace: of the learning rates in the last step; None before the first, and for published rates.
-        silent: names of groups whose gradients were exactly 0 at the last check, although they should have learned.
+        silent: names of groups whose gradients are exactly 0 although they should learn; None if they were not checked.
     """
 
     def __init__(self, groups: Sequence[ParameterGroup], check_every: int, **adam: Any) -> None:
@@ -125,7 +125,7 @@ class Optimizer:
         self._groups, self._check_every = groups, check_every
         self.pace: Pace | None = None
         parameters = [{"params": list(group.parameters), "name": group.name} for group in groups]
-        self.silent: tuple[str, ...] = ()
+        self.silent: tuple[str, ...] | None = None
         self.adam = torch.optim.Adam(parameters, fused=True, **adam)  # fused: 2 to 3 times faster on CPUs
 
     @property
@@ -164,6 +164,7 @@ class Optimizer:
         Raises:
             Failure: nan.
         """
+        self.silent = None
         if self.is_checked(iteration):
             parameters = self.parameters()
             gradients = {f"gradient of {name}": parameter.grad for name, parameter in parameters.items()}

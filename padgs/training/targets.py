@@ -12,7 +12,7 @@ from torch.nn.functional import interpolate
 
 from padgs.geometry.camera import Panorama
 from padgs.scene import View
-from padgs.training.loss import SSIMStatistics, fits, pixel_weight, ssim_statistics
+from padgs.training.loss import SSIMStatistics, fits, photometric_loss, pixel_weight, ssim_statistics
 
 CACHE_BYTES = 1 << 29  # weights and statistics of views beyond this are computed again at every iteration
 MIN_WIDTH = 512  # pixels; smaller panoramas gain nothing from a smaller start
@@ -20,11 +20,17 @@ MIN_WIDTH = 512  # pixels; smaller panoramas gain nothing from a smaller start
 
 @dataclass(frozen=True)
 class Target:
-    """One view, ready for `padgs.training.loss.photometric_loss`."""
+    """Image, weight and SSIM statistics of one view."""
 
     image: Tensor  # [H, W, 3]
     weight: Tensor  # [H, W] or [H, 1]
     statistics: SSIMStatistics | None  # None if the loss computes its own
+
+    def loss(self, image: Tensor, lambda_l1: float, normalisation: str) -> Tensor:
+        """Return the photometric loss of an image [H, W, 3], a scalar."""
+        return photometric_loss(
+            image, self.image, self.weight, lambda_l1, normalisation=normalisation, statistics=self.statistics
+        )
 
 
 class Targets(Sequence[Target]):

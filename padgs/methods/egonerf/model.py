@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from contextlib import nullcontext
 from typing import Any, ClassVar, cast
@@ -154,10 +153,10 @@ class RayTrainer(Trainer):
         self.seconds, self.cpu_seconds = lap.seconds()  # reading images counts as training
 
     def _gradients(self, iteration: int, step: int) -> tuple[float | Tensor, dict[str, int], tuple[str, ...]]:
-        model, optimizer, generator = self._model, self._optimizer, self._pixels.generator
+        model, generator = self._model, self._pixels.generator
         with self._stage("target"):
             rays = self._pixels.draw(self._rays)
-        value = rays.weight.new_zeros((), dtype=torch.float64)
+        value, read = rays.weight.new_zeros((), dtype=torch.float64), 0.0
         total = 3 * rays.weight.sum()
         for part in torch.arange(self._rays, device=total.device).split(model.rays_at_once):
             with self._stage("draw"):
@@ -165,9 +164,7 @@ class RayTrainer(Trainer):
             error = (image - rays.color[part]).square() * rays.weight[part, None]
             loss = error.sum() / total
             value += loss.detach()
-            read = self._read(value, iteration)
-            if isinstance(read, float) and not math.isfinite(read):
-                optimizer.refuse_non_finite({**optimizer.parameters(), "image": image, "loss": loss}, iteration)
+            read = self._read(value, {"image": image}, iteration)
             with self._stage("backward"):
                 loss.backward()
         with self._stage("backward"):
@@ -175,7 +172,7 @@ class RayTrainer(Trainer):
             if extra is not None:
                 extra.backward()
         events = (model.summary(),) if iteration == 1 else ()
-        return self._read(value, iteration), {"rays": self._rays}, events
+        return read, {"rays": self._rays}, events
 
     def _update(self, iteration: int, step: int) -> tuple[str, ...]:
         self._optimizer.check(iteration, step)
