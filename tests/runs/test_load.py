@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from omegaconf import OmegaConf
 from support.tiny_run import tiny_run
 
 import padgs
@@ -14,8 +13,7 @@ from padgs.data.capture import DataError
 from padgs.geometry.camera import Panorama, perspective
 from padgs.geometry.panorama import sample
 from padgs.results import read
-from padgs.runs import checkpoint
-from padgs.runs.store import RunFolderError, config_hash
+from padgs.runs.store import RunFolderError
 
 
 @pytest.fixture(scope="module")
@@ -75,14 +73,9 @@ def test_what_draws_panoramas_only_draws_other_cameras_by_pinhole(folder):
     assert drawn.render(replace(view, width=16, height=8, lens=lens)).image.isfinite().all()
 
 
-def test_a_run_that_is_not_finished_opens_too_and_an_old_key_is_passed_over(folder, tmp_path):
+def test_an_unfinished_run_is_loaded(folder, tmp_path):
     copy = shutil.copytree(folder, tmp_path / "run")
     (copy / "result.json").unlink()
-    settings = copy / "config.yaml"
-    old = settings.read_text().replace("data:\n", "data:\n  device: cpu\n", 1)
-    settings.write_text(old.replace("method:\n", "method:\n  some_old_key: 0.5\n", 1))
-    of = {"configuration": config_hash(OmegaConf.to_container(OmegaConf.load(settings)))}
-    checkpoint.save(checkpoint.load(copy / "checkpoint"), copy / "checkpoint", of)
     run = padgs.load_run(copy)
     assert run.result is None and run.scores == {}
     assert run.method.size().counts["gaussians"] > 0
@@ -109,14 +102,14 @@ def test_a_run_that_was_edited_is_refused(folder, tmp_path, file, old, new, erro
         padgs.load_run(copy)
 
 
-def test_data_that_have_changed_since_are_told_to_who_looks_and_refused_to_who_compares(folder):
+def test_changed_data_warn_when_shown_and_are_refused_when_compared(folder):
     run = padgs.load_run(folder, device="cpu")
     run.refuse_other_data()
     run = padgs.load_run(folder, device="cpu")
     run.result = replace(run.result, fingerprint="other")
     with pytest.warns(UserWarning, match="was trained on other data than the generator holds"):
         assert run.scene.train
-    with pytest.raises(DataError, match="say with --data where those are"):
+    with pytest.raises(DataError, match="pass the right folder with --data"):
         run.refuse_other_data()
 
 

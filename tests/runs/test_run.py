@@ -253,7 +253,7 @@ def test_a_failed_run_has_a_result_with_its_status(config, monkeypatch, error, s
     monkeypatch.setattr(PaDGSMethod, "fit", fail)
     result, said = run(config)
     assert (result.status, result.scores) == (status, {}) and result.reason in said and status in said
-    reasons = {RuntimeError: "9.0 GB more were asked for than there are"}
+    reasons = {RuntimeError: "9.0 GB more were requested than there are"}
     assert reasons.get(type(error), str(error)) in result.reason and "Allocator" not in result.reason
     again, said = run(config)
     assert again == result and "retry=failed" in said

@@ -123,8 +123,8 @@ def test_going_on_changes_nothing():
     ("settings", "said"),
     [
         (("train.exposures=some",), "unknown exposures 'some'; known: given, learned"),
-        (("method=egonerf", "train.exposures=learned"), "so train.exposures=learned means nothing to it"),
-        (("method=sc_omnigs", "train.poses=learned"), "learns poses by itself"),
+        (("method=egonerf", "train.exposures=learned"), "so train.exposures=learned does not apply"),
+        (("method=sc_omnigs", "train.poses=learned"), "refines poses itself"),
         (
             ("method=egonerf", "method.environment_pretraining=7", "train.iterations=7"),
             "environment_pretraining is 7 of 7 iterations",
