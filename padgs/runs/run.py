@@ -81,21 +81,70 @@ def run(
     callback.started(store.path)
     introduce(config, scene, store.path, console)
     result = store.result()
-    if result is None or _is_incomplete(config, result):
-        with store:
-            result = store.result()  # another process may have finished it in the meantime
-            if result is not None and _is_retried(config, result):
-                store.forget(result)
-                result = None
-            if result is None:
-                result = train(config, scene, store, console, callback)
-            else:
-                result = _complete(config, scene, store, result, console)
-    else:
+    if result is not None and not _is_incomplete(config, result):
         advice = "; it failed, retry=failed starts it again" if result.status in RETRIED else ""
         say(console, f"finished before, nothing to do{advice}")
+        show_result(result, store.path, console)
+        return result
+    with store:
+        result = _completed(config, scene, store, console)
+        if result is None:
+            method, progress = _prepared(config, scene, store, console)
+            saved_at, saved = time.monotonic(), progress
+            with _Outcome(initial_result(config, scene, store.path.name), scene) as outcome:
+                with (
+                    Interrupt(callback.stop_requested) as interrupt,
+                    Interrupt(store.stop.exists, STOP_SIGNALS) as stop,
+                    LiveLine(console) as line,
+                ):
+                    for record in method.fit(scene, config.time):
+                        progress = Progress(record.iteration, record.seconds, record.cpu_seconds, record.progress)
+                        line.update(record, _log(config, scene, store, record, method))
+                        interrupted = interrupt.requested
+                        ending = stop.requested and not method.ended and method.request_stop(STOP_REQUESTED)
+                        if interrupted or ending or _is_checkpoint_due(config, record, saved_at):
+                            store.save(method, progress)
+                            callback.saved(store.path)
+                            saved_at, saved = time.monotonic(), progress
+                        if interrupted and record.progress < 1:
+                            raise Interrupted(f"stopped after iteration {record.iteration}, the checkpoint is written")
+                    if saved != progress:
+                        store.save(method, progress)
+                outcome.result = replace(outcome.result, **_trained(method, scene, progress))
+                if scene.test:
+                    outcome.result = _scored(config, scene, store, outcome.result, method)
+            result = store.finish(_final(config, outcome.result, progress))
     show_result(result, store.path, console)
     return result
+
+
+class _Outcome:
+    """Context of a training, in which failures become the status of `result`.
+
+    Other errors pass: an interrupt, and an image that cannot be read, which may be readable when the run is resumed.
+    """
+
+    def __init__(self, result: Result, scene: Scene) -> None:
+        self.result, self._scene = result, scene
+
+    def __enter__(self) -> _Outcome:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: object) -> bool:
+        if isinstance(error, KeyboardInterrupt) and not isinstance(error, Interrupted):
+            raise Interrupted("stopped at once, the last checkpoint stands") from error
+        if isinstance(error, DataError) or not isinstance(error, Exception):
+            return False
+        if isinstance(error, Failure):
+            status, reason = error.status, str(error)
+        elif isinstance(error, ValueError):
+            status, reason = "rejected", str(error)
+        elif is_out_of_memory(error):
+            status, reason = "oom", f"out of memory: {memory_reason(error)}"
+        else:
+            return False
+        self.result = replace(self.result, status=status, reason=reason, **_peak_memory(self._scene))
+        return True
 
 
 def start(config: RunConfig) -> torch.device:
@@ -128,14 +177,10 @@ def build_method(config: RunConfig) -> Method:
     return lookup(METHODS, config.method, "method")(config.options, config.render, config.train, seed=config.seed)
 
 
-def train(config: RunConfig, scene: Scene, store: RunStore, console: Console, callback: Callback) -> Result:
-    """Train to the end of the budget, resuming from a checkpoint if there is one; score, and write the result.
-
-    The last checkpoint holds the trained method. Failures of the training are results with their status.
+def _prepared(config: RunConfig, scene: Scene, store: RunStore, console: Console) -> tuple[Method, Progress]:
+    """Return the method of a run with its warm start or checkpoint, and its progress; write config.yaml.
 
     Raises:
-        Interrupted: stopped from outside; the checkpoint was written.
-        DataError: an image cannot be read any more; the last checkpoint stands.
         CheckpointError, RunFolderError: files cannot be read or written.
         ConfigError: the run of the warm start does not fit this scene.
     """
@@ -148,50 +193,27 @@ def train(config: RunConfig, scene: Scene, store: RunStore, console: Console, ca
     progress = store.resume(method, scene.points.device)
     if progress.iteration:
         say(console, f"resuming after iteration {progress.iteration}")
-    result = initial_result(config, scene, store.path.name)
-    saved_at, saved = time.monotonic(), progress
-    try:
-        with (
-            Interrupt(callback.stop_requested) as interrupt,
-            Interrupt(store.stop.exists, STOP_SIGNALS) as stop,
-            LiveLine(console) as line,
-        ):
-            for record in method.fit(scene, config.time):
-                progress = Progress(record.iteration, record.seconds, record.cpu_seconds, record.progress)
-                line.update(record, _log(config, scene, store, record, method))
-                interrupted = interrupt.requested
-                ending = stop.requested and not method.ended and method.request_stop(STOP_REQUESTED)
-                if interrupted or ending or _is_checkpoint_due(config, record, saved_at):
-                    store.save(method, progress)
-                    callback.saved(store.path)
-                    saved_at, saved = time.monotonic(), progress
-                if interrupted and record.progress < 1:
-                    raise Interrupted(f"stopped after iteration {record.iteration}, the checkpoint is written")
-            if saved != progress:
-                store.save(method, progress)
-        result = replace(result, **_trained(method, scene, progress))
-        if scene.test:
-            save_image = store.save_image if config.run.pictures else None
-            timing = result.timing | frame_times(method.render, scene)
-            result = replace(result, timing=timing, scores=score(method.render, scene, config.protocols, save_image))
-            result = judge(result, scene, progress.iteration)
-    except (Interrupted, DataError):  # an image that cannot be read may be there again: the run has not failed
-        raise
-    except KeyboardInterrupt as error:
-        raise Interrupted("stopped at once, the last checkpoint stands") from error
-    except (Failure, ValueError, MemoryError, RuntimeError) as error:
-        status, reason = _status(error)
-        result = replace(result, status=status, reason=reason, **_peak_memory(scene))
+    return method, progress
+
+
+def _scored(config: RunConfig, scene: Scene, store: RunStore, result: Result, method: Method) -> Result:
+    """Return the result of a trained method with its frame times and scores."""
+    save_image = store.save_image if config.run.pictures else None
+    timing = result.timing | frame_times(method.render, scene)
+    scores = score(method.render, scene, config.protocols, save_image)
+    return judge(replace(result, timing=timing, scores=scores), scene, result.iterations_done)
+
+
+def _final(config: RunConfig, result: Result, progress: Progress) -> Result:
+    """Return the result with the number of iterations and the time."""
+    done = progress.iteration
     if result.ended == STOP_REQUESTED:
-        title = (config.row, f"stopped after {progress.iteration} iterations")
-        result = replace(result, variant=", ".join(filter(None, title)))
-    return store.finish(
-        replace(
-            result,
-            iterations=progress.iteration if config.budget.seconds is not None else result.iterations,
-            iterations_done=progress.iteration,
-            finished=datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        )
+        result = replace(result, variant=", ".join(filter(None, (config.row, f"stopped after {done} iterations"))))
+    return replace(
+        result,
+        iterations=done if config.budget.seconds is not None else result.iterations,
+        iterations_done=done,
+        finished=datetime.now(timezone.utc).isoformat(timespec="seconds"),
     )
 
 
@@ -253,6 +275,7 @@ def _trained(method: Method, scene: Scene, progress: Progress) -> dict[str, Any]
     initial = {"start": method.start} if "gaussians" in size.counts else {}
     return {
         "status": "ok" if progress.share == 1 else "timeout",
+        "iterations_done": progress.iteration,
         "counts": {**size.counts, "parameters": size.parameters, **initial},
         "model_bytes": size.bytes,
         "ended": method.ended,
@@ -264,17 +287,6 @@ def _trained(method: Method, scene: Scene, progress: Progress) -> dict[str, Any]
 def _peak_memory(scene: Scene) -> dict[str, int | None]:
     peak = clock.peak_memory(scene.points.device)
     return {"peak_memory_bytes": peak["host"], "peak_device_memory_bytes": peak["device"]}
-
-
-def _status(error: Exception) -> tuple[str, str]:
-    """Return status and reason of a run that an error ended; errors that no status stands for are raised again."""
-    if isinstance(error, Failure):
-        return error.status, str(error)
-    if isinstance(error, ValueError):
-        return "rejected", str(error)
-    if is_out_of_memory(error):
-        return "oom", f"out of memory: {memory_reason(error)}"
-    raise error
 
 
 def judge(result: Result, scene: Scene, iterations: int) -> Result:
@@ -329,8 +341,13 @@ def _unscored(config: RunConfig, result: Result) -> dict[str, Protocol]:
     return {name: rules for name, rules in config.protocols.items() if result.ok and not is_scored(name, rules)}
 
 
-def _complete(config: RunConfig, scene: Scene, store: RunStore, result: Result, console: Console) -> Result:
-    """Add missing scores and experiments to a finished run."""
+def _completed(config: RunConfig, scene: Scene, store: RunStore, console: Console) -> Result | None:
+    """Return the result of a finished run with all scores and experiments; None if the run is to be trained."""
+    result = store.result()  # another process may have finished it in the meantime
+    if result is None or _is_retried(config, result):
+        if result is not None:
+            store.forget(result)
+        return None
     complete = replace(result, experiments=_experiments(config, result) or result.experiments)
     if unscored := _unscored(config, result):
         say(console, "finished before; only the new protocol is missing")

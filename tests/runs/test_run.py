@@ -300,7 +300,7 @@ def test_two_frames_lie_between_a_job_and_its_method(config, monkeypatch):
 
     monkeypatch.setattr(PaDGSMethod, "fit", fit)
     run(config)
-    assert frames == ["train", "run"]
+    assert frames == ["run"]
 
 
 def test_a_run_that_another_process_works_on_is_left_alone(config):
