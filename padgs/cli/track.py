@@ -25,11 +25,11 @@ def track(
     found, broken = results.read_all(Path(runs))
     for error in broken:
         show(f"left out: {error}")
-    asked, trackers = TrackingOptions("mlflow", uri or None), dict[str, Tracker]()
+    options, trackers = TrackingOptions("mlflow", uri or None), dict[str, Tracker]()
     for folder, result in found.items():
         experiment = " ".join(name for name in result.experiments if name != results.AD_HOC)
         if experiment not in trackers:
-            trackers[experiment] = Tracker(asked, Path(runs), experiment, show)
+            trackers[experiment] = Tracker(options, Path(runs), experiment, show)
         trackers[experiment].update(folder)
         if not trackers[experiment].on:
             raise typer.Exit(1)

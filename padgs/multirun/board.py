@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import time
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -28,7 +28,6 @@ ELSEWHERE = "elsewhere"  # another process works on this run
 STOPPED = "stopped"  # on request, after it wrote its checkpoint
 UNFINISHED = (RUNNING, WAITING, ELSEWHERE, STOPPED)  # neither done nor failed
 SECONDS_BETWEEN_LOOKS = 1.0  # at `stop`
-TAIL = 1000  # bytes at the end of a log that hold its last line
 
 
 @dataclass(frozen=True)
@@ -114,20 +113,17 @@ class BoardEntry(Callback):
         return status
 
 
-def status_line(
-    before: Counter[str], states: Collection[JobState], seconds: float, progress: Mapping[int, float] | None = None
-) -> str:
+def status_line(before: Counter[str], states: Collection[JobState], seconds: float) -> str:
     """Sum up a multirun in one line.
 
     Args:
         before: status -> number of runs that were finished when it started.
         states: of the jobs.
         seconds: since the start.
-        progress: job -> share of its training in [0, 1], of running jobs.
 
     >>> states = [JobState("ok"), JobState("nan"), JobState("running"), JobState()]
-    >>> status_line(Counter(ok=2), states, 60.0, {2: 0.5})
-    '3 of 6 done (2 before), 1 failed (nan), 1 running, 1 waiting, ETA 0:36'
+    >>> status_line(Counter(ok=2), states, 60.0)
+    '3 of 6 done (2 before), 1 failed (nan), 1 running, 1 waiting, ETA 1:00'
     """
     counts = before + Counter(state.status for state in states)
     total, done, earlier = counts.total(), counts.pop(OK, 0), before[OK]
@@ -137,13 +133,8 @@ def status_line(
         statuses = [name if number == 1 else f"{number} {name}" for name, number in counts.most_common()]
         parts.append(f"{counts.total()} failed ({', '.join(statuses)})")
     parts += [f"{number} {name}" for name, number in unfinished.items() if number]
-    left, trained = unfinished[RUNNING] + unfinished[WAITING], sum((progress or {}).values())
-    ran = sum(state.status in results.STATUSES for state in states) + trained
-    if left and ran:  # all runs counted alike
-        parts.append(f"ETA {duration(seconds * (left - trained) / ran)}")
+    left = unfinished[RUNNING] + unfinished[WAITING]
+    ran = sum(state.status in results.STATUSES for state in states)
+    if left and ran:  # all runs count alike
+        parts.append(f"ETA {duration(seconds * left / ran)}")
     return ", ".join(parts)
-
-
-def share_done(run: Path) -> float:
-    """Return the share of its training that a run has completed, by the last line of its log; 0 without a log."""
-    return max((line.get("progress", 0.0) for line in results.log_lines(run, TAIL)), default=0.0)

@@ -28,17 +28,7 @@ from rich.console import Console
 
 from padgs import results
 from padgs.checks import typed
-from padgs.multirun.board import (
-    CRASHED,
-    ELSEWHERE,
-    KILLED,
-    REFUSED,
-    RUNNING,
-    Board,
-    JobState,
-    share_done,
-    status_line,
-)
+from padgs.multirun.board import CRASHED, ELSEWHERE, KILLED, REFUSED, RUNNING, Board, JobState, status_line
 from padgs.multirun.finished import FinishedJobs
 from padgs.multirun.job import complain, in_own_process, job_of_many
 from padgs.multirun.overrides import expand
@@ -172,10 +162,7 @@ class Multirun:
     def line(self) -> str:
         """Read the board and sum it up."""
         self._follow(index for index, state in self.states.items() if not state.ended and self._numbers[index] >= 0)
-        states = self.states.items()
-        running = {index: state.run for index, state in states if state.status == RUNNING and state.run}
-        progress = {index: share_done(self.runs / run) for index, run in running.items()}
-        return status_line(self.before, [*self.states.values()], time.monotonic() - self._began, progress)
+        return status_line(self.before, [*self.states.values()], time.monotonic() - self._began)
 
     def close(self) -> Counter[str]:
         """Print how the jobs ended; delete the board unless it explains a crash or jobs still need it."""

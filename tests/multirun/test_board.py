@@ -6,12 +6,12 @@ import pytest
 from rich.console import Console
 
 from padgs.multirun import sweep
-from padgs.multirun.board import Board, JobState, share_done, status_line
+from padgs.multirun.board import Board, JobState, status_line
 from padgs.multirun.sweep import Display, repeated
 
 
-def line(*statuses: str, before: dict[str, int] | None = None, progress: dict[int, float] | None = None) -> str:
-    return status_line(Counter(before or {}), [JobState(status) for status in statuses], 100.0, progress)
+def line(*statuses: str, before: dict[str, int] | None = None) -> str:
+    return status_line(Counter(before or {}), [JobState(status) for status in statuses], 100.0)
 
 
 def test_counts_add_up():
@@ -21,24 +21,16 @@ def test_counts_add_up():
 
 
 @pytest.mark.parametrize(
-    ("statuses", "progress", "eta"),
+    ("statuses", "eta"),
     [
-        (("waiting", "running"), {}, None),
-        (("ok", "waiting", "waiting"), {}, "3:20"),
-        (("ok", "running", "running"), {1: 0.5, 2: 0.5}, "0:50"),
-        (("ok", "nan"), {}, None),
+        (("waiting", "running"), None),
+        (("ok", "waiting", "running"), "3:20"),
+        (("ok", "nan"), None),
     ],
 )
-def test_the_remaining_time_follows_from_the_speed_since_the_start(statuses, progress, eta):
-    text = line(*statuses, progress=progress)
+def test_the_remaining_time_follows_from_the_speed_since_the_start(statuses, eta):
+    text = line(*statuses)
     assert text.endswith(f", ETA {eta}") if eta else "ETA" not in text
-
-
-def test_progress_is_that_of_the_last_whole_line_of_the_log(tmp_path):
-    assert share_done(tmp_path) == 0
-    lines = (f'{{"iteration": {n}, "progress": {n / 200}}}\n' for n in range(1, 200))
-    (tmp_path / "log.jsonl").write_text("".join(lines))
-    assert share_done(tmp_path) == 199 / 200
 
 
 @pytest.mark.parametrize("terminal", [False, True])

@@ -26,23 +26,16 @@ class Mirror:
     """Writes run folders into one experiment."""
 
     def __init__(self, client: Any, experiment: str, multirun: str = "") -> None:
-        """Find or make the run that stands for a multirun.
-
-        Args:
-            client: an MlflowClient.
-            experiment: id of an experiment.
-            multirun: name of the run under which the others stand; empty = none.
-        """
+        """Find or create the parent run of a multirun (no parent if `multirun` is empty) in the experiment of an id."""
         self._client, self._experiment = client, experiment
         self._parent = (self._find(MULTIRUN, multirun) or self._create(MULTIRUN, multirun)) if multirun else ""
 
     def update(self, run: Path) -> None:
-        """Bring mlflow up to date about a run, finished or in progress."""
+        """Log what is new in a run folder, finished or in progress."""
         result = results.read(run / results.FILE_NAME) if (run / results.FILE_NAME).exists() else None
         identity = self._find(RUN, run.name)
-        if identity and self._failed(identity) and (result is None or result.ok):
-            identity = None  # it was started again: nothing that the failed attempt said belongs to this one
-        if identity is None:
+        has_failed = identity and self._client.get_run(identity).info.status == "FAILED"
+        if not identity or (has_failed and (result is None or result.ok)):  # restarted: keep the failed attempt apart
             identity = self._create(RUN, run.name, {PARENT: self._parent} if self._parent else {})
             self._log_settings(identity, run)
         self._log_progress(identity, run)
@@ -52,23 +45,19 @@ class Mirror:
             self._client.update_run(identity, status="RUNNING")
 
     def finish(self, found: Sequence[Result], jobs: int) -> None:
-        """End the run that stands for a multirun of so many jobs, with a table of all its results."""
+        """End the parent run of a multirun, with a table of all its results."""
         if self._parent:
             self._log_table(self._parent, found)
             ended = "KILLED" if len(found) < jobs else "FINISHED" if all(result.ok for result in found) else "FAILED"
             self._client.set_terminated(self._parent, ended)
 
     def _find(self, tag: str, value: str) -> str | None:
-        """The latest run of mlflow with a tag."""
+        """Return the id of the latest mlflow run with a tag."""
         found = self._client.search_runs([self._experiment], f"tags.`{tag}` = '{value}'", max_results=1)
         return found[0].info.run_id if found else None
 
-    def _failed(self, identity: str) -> bool:
-        return self._client.get_run(identity).info.status == "FAILED"
-
     def _create(self, tag: str, name: str, more: Mapping[str, str] | None = None) -> str:
-        tags = {tag: name, **(more or {})}
-        return self._client.create_run(self._experiment, run_name=name, tags=tags).info.run_id
+        return self._client.create_run(self._experiment, run_name=name, tags={tag: name, **(more or {})}).info.run_id
 
     def _log_settings(self, identity: str, run: Path) -> None:
         from mlflow.entities import Param
@@ -92,8 +81,7 @@ class Mirror:
                 metrics += [Metric(f"train/{key}", float(value), now, last) for key, value in numbers.items()]
         for batch in batches(metrics, MOST_METRICS):
             self._client.log_batch(identity, metrics=batch)
-        if last > known:
-            self._client.log_batch(identity, tags=[RunTag(LOGGED, str(last))])
+        self._client.log_batch(identity, tags=[RunTag(LOGGED, str(last))])
 
     def _log_result(self, identity: str, run: Path, result: Result) -> None:
         from mlflow.entities import Metric, RunTag
@@ -116,7 +104,7 @@ class Mirror:
 
 
 def final_numbers(result: Result) -> dict[str, float]:
-    """Marks under each protocol, times and sizes; what is missing is left out."""
+    """Return metrics under each protocol, times and sizes, without missing values."""
     numbers = {
         f"{name}/{metric}": value
         for name, scores in result.scores.items()
@@ -131,6 +119,6 @@ def final_numbers(result: Result) -> dict[str, float]:
 
 
 def batches(items: Sequence[Any], size: int) -> Iterator[Sequence[Any]]:
-    """Consecutive parts of at most `size` items."""
+    """Yield consecutive parts of at most `size` items."""
     for start in range(0, len(items), size):
         yield items[start : start + size]

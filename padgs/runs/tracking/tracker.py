@@ -1,7 +1,7 @@
-"""Runs mirrored into mlflow. It reads run folders and writes elsewhere, so whatever happens to it, no run is lost.
+"""Mirror run folders into mlflow. Errors of mlflow never end a run: run folders are only read.
 
-Only one process of a multirun does this, the one that the user started. mlflow takes seconds to import and to make its
-database, so that is done when there is first something to say, which is after training has begun.
+Only the process that the user started mirrors the runs of a multirun. mlflow takes seconds to import and to create its
+database, so it is imported when the first run is mirrored, after training has begun.
 """
 
 from __future__ import annotations
@@ -22,14 +22,12 @@ if TYPE_CHECKING:
     from padgs.runs.tracking.mlflow_mirror import Mirror
 
 KINDS = ("auto", "mlflow", "none")
-DEFAULT_EXPERIMENT = "padgs"  # of mlflow, for runs of no experiment of ours
-SERVERS = ("http", "databricks")  # how their URIs begin
-SECONDS_BETWEEN_LOOKS = 30.0  # at a run in progress
-PATIENCE = 60.0  # seconds for another process that makes the database
-# A server that does not answer must not hold up anything for minutes, as it does by default.
-# And nobody wants to know about the tables of a new database.
+DEFAULT_EXPERIMENT = "padgs"  # of mlflow, for runs without an experiment
+SERVERS = ("http", "databricks")  # beginnings of their URIs
+SECONDS_BETWEEN_LOOKS = 30.0  # between updates of a run in progress
+PATIENCE = 60.0  # seconds to wait for another process that creates the database
 SETTINGS = {
-    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1",
+    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1",  # by default, a server that does not answer holds a run up for minutes
     "MLFLOW_HTTP_REQUEST_TIMEOUT": "10",
     "MLFLOW_LOGGING_LEVEL": "WARNING",
 }
@@ -37,9 +35,9 @@ SETTINGS = {
 
 @dataclass(frozen=True)
 class TrackingOptions:
-    """The `tracking` group of the configuration; no part of a run."""
+    """The `tracking` group of the configuration; it does not affect the run id."""
 
-    kind: str = "auto"  # auto | mlflow | none; auto: mlflow where it is installed, and not a word where it is not
+    kind: str = "auto"  # auto | mlflow | none; auto: mlflow if it is installed
     uri: str | None = None  # of a server or database; None = mlflow.db in run.folder
     telemetry: bool = False  # whether mlflow may report its use to its makers
 
@@ -47,25 +45,25 @@ class TrackingOptions:
         check_known(self, kind=KINDS)
 
     @property
-    def asked(self) -> bool:
+    def is_requested(self) -> bool:
         """True if tracking was requested explicitly, so that a missing mlflow is reported."""
         return self.kind == "mlflow" or (self.kind == "auto" and self.uri is not None)
 
 
 class Tracker:
-    """Keeps mlflow up to date about the runs of one experiment, or says once why it does not, to who asked for it."""
+    """Mirrors the runs of one experiment into mlflow, or says once why it does not."""
 
     def __init__(
         self, options: TrackingOptions, runs: Path, experiment: str, say: Callable[[str], None], multirun: str = ""
     ) -> None:
-        """Nothing is imported or connected yet.
+        """Import and connect nothing yet.
 
         Args:
-            options: where to.
+            options: the server or database.
             runs: the folder of run folders.
             experiment: of mlflow; empty = DEFAULT_EXPERIMENT.
             say: shows a line to the user; called at most once.
-            multirun: name of the run of mlflow under which the runs stand; empty = none.
+            multirun: name of the parent run in mlflow; empty = none.
         """
         self._options, self._runs, self.name = options, runs.absolute(), experiment or DEFAULT_EXPERIMENT
         self._say, self._multirun = say, multirun
@@ -73,7 +71,7 @@ class Tracker:
         self.on = options.kind != "none"
         if self.on and importlib.util.find_spec("mlflow") is None:
             self.on = False
-            if options.asked:
+            if options.is_requested:
                 say(f"runs are not mirrored into mlflow: {install_command('mlflow')}, or set tracking=none")
 
     @property
@@ -82,11 +80,11 @@ class Tracker:
         return self._options.uri or f"sqlite:///{self._runs / 'mlflow.db'}"
 
     def update(self, run: Path) -> None:
-        """Bring mlflow up to date about a run folder, finished or in progress."""
+        """Log what is new in a run folder, finished or in progress."""
         self._attempt(lambda mirror: mirror.update(run))
 
     def finish(self, found: Sequence[Result], jobs: int) -> None:
-        """End the run that stands for a multirun of so many jobs, with a table of all its results."""
+        """End the parent run of a multirun of so many jobs, with a table of all its results."""
         self._attempt(lambda mirror: mirror.finish(found, jobs))
 
     def _attempt(self, work: Callable[[Mirror], None]) -> None:
@@ -96,13 +94,10 @@ class Tracker:
             if self._mirror is None:
                 self._mirror = self._connected()
             work(self._mirror)
-        except Exception as error:  # of any kind: mlflow, its database and its server are not ours
+        except Exception as error:  # of any kind: mlflow, its database and its server are foreign
+            self.on = False
             reason = f"{type(error).__name__}: {str(error).strip().partition(chr(10))[0][:200]}"
-            self._give_up(f"no longer mirrored into mlflow at {self.uri} ({reason}); `padgs track` does it later")
-
-    def _give_up(self, why: str) -> None:
-        self.on = False
-        self._say(why)
+            self._say(f"no longer mirrored into mlflow at {self.uri} ({reason}); `padgs track` does it later")
 
     def _connected(self) -> Mirror:
         for name, value in SETTINGS.items():
@@ -113,10 +108,10 @@ class Tracker:
 
         from padgs.runs.tracking.mlflow_mirror import Mirror
 
-        with FileLock(self._runs / ".mlflow.lock", timeout=PATIENCE):  # two processes that make one database destroy it
+        with FileLock(self._runs / ".mlflow.lock", timeout=PATIENCE):  # two processes creating one database destroy it
             client = MlflowClient(self.uri)
             known = client.get_experiment_by_name(self.name)
-            # A server has a place for artifacts; beside a database they would land wherever one happens to stand.
+            # Beside a database, artifacts would be written into the working folder.
             place = None if self.uri.startswith(SERVERS) else (self._runs / "mlflow-artifacts").as_uri()
             identity = known.experiment_id if known else client.create_experiment(self.name, place)
             return Mirror(client, identity, self._multirun)
