@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from padgs import results
-from padgs.results import Result, ResultError, Scores, file
+from padgs.results import Result, ResultError, Scores
 
 
 @pytest.fixture

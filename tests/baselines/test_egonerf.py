@@ -3,6 +3,7 @@ from dataclasses import replace
 import pytest
 import torch
 from support.composed import composed
+from support.rates import assert_log_linear
 from support.tiny_scene import in_other_units, squared_error, tiny_scene
 
 from padgs.baselines.egonerf import EgoNeRFMethod, EgoNeRFMethodOptions
@@ -126,12 +127,8 @@ def test_published_learning_rates():
     groups = {group.name: group for group in EgoNeRFModel(model, SMALL, 100_000).groups()}
     starts = {"density": 0.02, "appearance": 0.02, "shader": 1e-3, "environment": 5e-3}
     assert groups.keys() == starts.keys()
-    for name, start in starts.items():
-        rate = groups[name].learning_rate
-        assert rate(0) == pytest.approx(start), name
-        assert rate(50_000) == pytest.approx(start * 0.1**0.5), name
-        assert rate(100_000) == pytest.approx(0.1 * start), name
-        assert set(groups[name].parameters) == set(getattr(model, name).parameters()), name
+    ends = {name: (start, 0.1 * start, [*getattr(model, name).parameters()]) for name, start in starts.items()}
+    assert_log_linear(groups.values(), ends, 100_000)
 
 
 @pytest.mark.parametrize("alone", [0, 3])

@@ -3,6 +3,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from support.rates import assert_log_linear
 from support.tiny_scene import HEIGHT, WIDTH, tiny_scene
 
 from padgs.baselines.omnigs import OmniGSMethod
@@ -124,12 +125,7 @@ def test_learning_rates_of_poses_and_camera(scene):
         "camera_offsets": (1e-5, 1e-5, [camera.offsets]),
     }
     assert groups.keys() > ends.keys()
-    for name, (first, last, parameters) in ends.items():
-        rate = groups[name].learning_rate
-        assert rate(0) == pytest.approx(first), name
-        assert rate(steps // 2) == pytest.approx((first * last) ** 0.5), name
-        assert rate(steps) == pytest.approx(last), name
-        assert [id(p) for p in groups[name].parameters] == [id(p) for p in parameters], name
+    assert_log_linear(groups.values(), ends, steps)
     held = [id(p) for group in groups.values() for p in group.parameters]
     everything = [*calibration_of(method).parameters(), *method.model.splats.parameters()]
     assert sorted(held) == sorted(id(p) for p in everything)

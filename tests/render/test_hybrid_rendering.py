@@ -14,7 +14,7 @@ from support.render_cases import (
     assert_matches_definition,
     differentiated,
     each_engine,
-    engines,
+    each_native_engine,
     gaussians_of,
     identity_pose,
     mixture,
@@ -34,10 +34,6 @@ from padgs.scene import View
 PROJECTIONS = ("erp", "pinhole", "tangent", "ray")
 BACKGROUND = torch.tensor([0.3, 0.6, 0.9], dtype=torch.float64)
 each_projection = pytest.mark.parametrize("projection", PROJECTIONS)
-each_native_engine = pytest.mark.parametrize(
-    "backend",
-    [pytest.param(e.values[0], marks=e.marks, id=e.values[0]) for e in engines() if e.values[0] != "torch"],
-)
 
 
 def camera_of(projection: str, width: int, height: int) -> Camera:
@@ -141,27 +137,17 @@ def test_native_matches_the_definition(projection: str, kind: str, size: int, ba
 
 @each_native_engine
 @pytest.mark.parametrize("projection", ["tangent", "ray"])
-def test_native_gradients_of_a_table_of_rays(projection: str, backend: str, generator: torch.Generator):
-    formula = Panorama(45, 23)
-    camera = RayTable(formula.rays(dtype=torch.float64), formula.focal)
-    gaussians = mixture(6, generator, ("ordinary", "polar", "seam"))
+@pytest.mark.parametrize("case", ["table", "pinhole", "fisheye", "wide tiles"])
+def test_native_matches_the_definition_for_other_cameras(projection: str, case: str, backend: str, generator):
+    if case == "table":
+        formula = Panorama(45, 23)
+        camera = RayTable(formula.rays(dtype=torch.float64), formula.focal)
+        gaussians = mixture(6, generator, ("ordinary", "polar", "seam"))
+    elif case == "wide tiles":  # tiles near the poles of 330 columns are wider than a chunk
+        camera, gaussians = Panorama(330, 165), mixture(8, generator, ("polar", "pole", "seam"))
+    else:
+        camera, gaussians = render_cases.camera_of(case, 72, 36), gaussians_of("ordinary", 60, generator)
     assert_native_matches(gaussians, camera, options_of(projection, 3), generator, backend)
-
-
-@each_native_engine
-@pytest.mark.parametrize("lens", ["pinhole", "fisheye"])
-@pytest.mark.parametrize("projection", ["tangent", "ray"])
-def test_native_lenses_agree(projection: str, lens: str, backend: str, generator: torch.Generator):
-    gaussians = gaussians_of("ordinary", 60, generator)
-    camera = render_cases.camera_of(lens, 72, 36)
-    assert_native_matches(gaussians, camera, options_of(projection, 3), generator, backend)
-
-
-@each_native_engine
-def test_native_tiles_wider_than_a_chunk_agree(backend: str, generator: torch.Generator):
-    gaussians = mixture(8, generator, ("polar", "pole", "seam"))  # tiles near the poles of 330 columns are wide
-    for projection in ("erp", "ray"):
-        assert_native_matches(gaussians, Panorama(330, 165), options_of(projection, 4), generator, backend)
 
 
 def overlapping(count: int, generator: torch.Generator) -> Gaussians:

@@ -51,6 +51,10 @@ def engines() -> list:
 
 
 each_engine = pytest.mark.parametrize(("backend", "dtype"), engines())
+each_native_engine = pytest.mark.parametrize(
+    "backend",
+    [pytest.param(e.values[0], marks=e.marks, id=e.values[0]) for e in engines() if e.values[0] != "torch"],
+)
 needs_native = pytest.mark.skipif(not cpu.available(), reason="the native library is not built")
 each_setup = pytest.mark.parametrize(("projection", "lens"), SETUPS, ids=["-".join(setup) for setup in SETUPS])
 each_panorama = pytest.mark.parametrize("projection", ("erp", "tangent", "ray"))

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from support.composed import composed
+from support.rates import assert_log_linear
 from support.tiny_scene import tiny_scene
 
 from padgs.methods.splats.densification import DensificationOptions
@@ -61,14 +62,11 @@ def test_published_learning_rates(iterations):
     model = trainable(iterations)
     groups = {group.name: group for group in model.groups()}
     assert groups.keys() == RATES.keys()
+    rows, ends = model.splats.rows(), {}
     for name, (first, last) in RATES.items():
-        times, rate = LENGTHS.get(name, 1.0), groups[name].learning_rate
-        assert rate(0) == pytest.approx(times * first), name
-        assert rate(iterations // 2) == pytest.approx(times * (first * last) ** 0.5), name
-        assert rate(iterations) == pytest.approx(times * last), name
-    for name, parameter in model.splats.named_parameters():
-        (held,) = groups[name].parameters
-        assert held is parameter, name
+        times = LENGTHS.get(name, 1.0)
+        ends[name] = (times * first, times * last, [rows[name]])
+    assert_log_linear(groups.values(), ends, iterations)
 
 
 def test_adam_is_that_of_3dgs():

@@ -11,12 +11,12 @@ from support.render_cases import (
     SETUPS,
     camera_of,
     each_engine,
+    each_native_engine,
     each_setup,
     engines,
     gaussians_of,
     identity_pose,
     leaves,
-    needs_native,
     random_pose,
     stable_pixels,
     view_of,
@@ -216,8 +216,8 @@ def test_every_input_receives_a_gradient(projection: str, lens: str, backend: st
 
 
 @pytest.mark.parametrize("projection", sorted({projection for projection, lens in SETUPS if lens == "panorama"}))
-@needs_native
-def test_gradients_of_subsets_of_inputs(projection: str):
+@each_native_engine
+def test_gradients_of_subsets_of_inputs(projection: str, backend: str):
     """Gradients of a subset of inputs equal those computed together with all others."""
     generator = torch.Generator().manual_seed(14)
     gaussians = gaussians_of("ordinary", 12, generator)
@@ -227,7 +227,7 @@ def test_gradients_of_subsets_of_inputs(projection: str):
         values = {name: getattr(gaussians, name).float().requires_grad_(name in names) for name in INPUTS}
         pose = identity_pose().float().requires_grad_("pose" in names)
         view = view_of(camera_of("panorama", WIDTH, HEIGHT), pose)
-        image = render(Gaussians(**values), view, RenderOptions(projection), backend="cpu").image
+        image = render(Gaussians(**values), view, RenderOptions(projection), backend=backend).image
         wanted = {**values, "pose": pose}
         return dict(zip(names, torch.autograd.grad((image * weight).sum(), [wanted[n] for n in names]), strict=True))
 

@@ -179,31 +179,37 @@ def no_image_before(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(cuda_backend, "_capacities", {})
 
 
+def recorded(monkeypatch: pytest.MonkeyPatch, function: str, read) -> list:
+    """Record `read(arguments)` of each call of a function of the library."""
+    found, call = [], cuda.call
+
+    def spy(name: str, where, *arguments) -> None:
+        if name == function:
+            found.append(read(arguments[0]))
+        call(name, where, *arguments)
+
+    monkeypatch.setattr(cuda, "call", spy)
+    return found
+
+
 @pytest.mark.parametrize("blending", ["sorted", "hybrid"])
 def test_capacity_of_the_last_image_changes_nothing(
     blending: str, generator: torch.Generator, monkeypatch: pytest.MonkeyPatch
 ):
-    gaussians, options, rooms = crowd(200, generator), RenderOptions("ray", **blended(blending, 3)), []
-    call = cuda.call
-
-    def spy(name: str, where, *arguments) -> None:
-        if name == "padgs_cuda_bin":
-            rooms.append(arguments[0].sort.count)
-        call(name, where, *arguments)
-
-    monkeypatch.setattr(cuda, "call", spy)
+    gaussians, options = crowd(200, generator), RenderOptions("ray", **blended(blending, 3))
+    capacities = recorded(monkeypatch, "padgs_cuda_bin", lambda arguments: arguments.sort.count)
     usual = drawn(gaussians, (72, 36), options)
     count = usual[0].counters["instances"]
     outputs = ("image", "transmittance", "depth", "visible")
     assert_same_bits(drawn(gaussians, (72, 36), options), usual, outputs)
-    assert rooms == [count, int(1.3 * count) + 1]
+    assert capacities == [count, int(1.3 * count) + 1]
     for (_, *size), capacity in list(cuda_backend._capacities.items()):
         assert size == [72, 36] and capacity == int(1.3 * count) + 1
     cuda_backend._capacities = dict.fromkeys(cuda_backend._capacities, count - 1)
     assert_same_bits(drawn(gaussians, (72, 36), options), usual, outputs)
-    assert rooms[2:] == [count - 1, count]  # drawn again
+    assert capacities[2:] == [count - 1, count]  # drawn again
     assert_same_bits(drawn(gaussians, (72, 36), replace(options, max_instances=count)), usual, outputs)
-    assert rooms[4:] == [count]  # the capacity would be for more than may be
+    assert capacities[4:] == [count]  # the capacity would be for more than may be
     assert {*cuda_backend._capacities.values()} == {count}  # the next has as much as may be
 
 
@@ -230,15 +236,7 @@ def test_counters_equal_those_of_the_cpu(lens: str, blending: str, generator: to
 
 
 def test_cores_are_kept_only_with_gradients(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch):
-    kept = []
-    call = cuda.call
-
-    def spy(name: str, where, *arguments) -> None:
-        if name == "padgs_cuda_blend":
-            kept.append(arguments[0].core is not None and arguments[0].tails is not None)
-        call(name, where, *arguments)
-
-    monkeypatch.setattr(cuda, "call", spy)
+    kept = recorded(monkeypatch, "padgs_cuda_blend", lambda a: a.core is not None and a.tails is not None)
     inputs = leaves(gaussians_of("ordinary", 5, generator), torch.float32)
     view, options = view_of(camera_of("panorama", 32, 16)), RenderOptions(blending="hybrid")
     images = [render(inputs, view, options, backend="cuda").image]
@@ -362,17 +360,3 @@ def test_missing_library_warns_and_uses_torch(tmp_path, monkeypatch: pytest.Monk
     monkeypatch.setattr(cuda, "works_on", lambda device: True)
     assert package.resolve_backend("auto", means) == "cuda"
     assert package.resolve_backend("auto", SimpleNamespace(device=torch.device("cuda"), dtype=torch.float64)) == "torch"
-
-
-def test_no_writes_beyond_requested_gradients(generator: torch.Generator):
-    """Gradients are the same without those of pose and table."""
-    gaussians = gaussians_of("ordinary", 12, generator)
-    everything = drawn(gaussians, (40, 20), RenderOptions("ray"))[1]
-    inputs = Gaussians(**{name: getattr(gaussians, name).float() for name in INPUTS})
-    inputs.means.requires_grad_()
-    again = torch.Generator().manual_seed(5)
-    pose = random_pose(again, shift=0.1).float()
-    rendering = render(inputs, view_of(camera_of("panorama", 40, 20), pose), RenderOptions("ray"), backend="cuda")
-    outputs = (rendering.image, rendering.transmittance, rendering.depth)
-    sum((out * torch.randn(out.shape, generator=again)).sum() for out in outputs).backward()
-    assert torch.equal(inputs.means.grad, everything["means"])

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from padgs.apps.bench.workload import Size, build, resident
 from padgs.methods.anchors.growth import GrowthOptions
-from padgs.methods.anchors.model import AnchorModel, LearningRates
+from padgs.methods.anchors.model import AnchorModel
 from padgs.methods.anchors.precision import PRECISIONS
 from padgs.methods.splats.densification import POSITIONAL_GRADIENTS, DensificationOptions
 from padgs.methods.splats.model import SplatModel
@@ -51,12 +51,10 @@ def trained(precision: str) -> tuple[Trainer, list[Counter[str]]]:
     work = build(SIZE)
     work.model.options = replace(work.model.options, precision=precision)
     with pretended_gpu() as waits:
-        work.model.to(GPU)
         growth = GrowthOptions(statistics_from=0, grow_until=10**6, grow_from=10**6)
-        trainee = AnchorModel(
-            work.model, RenderOptions(), "cuda", growth=growth, rates=LearningRates(), extent=1.0, iterations=1000
-        )
-        trainer = Trainer(trainee, resident(work.scene, GPU), Budget(1000))
+        anchors = work.model.to(GPU)
+        model = AnchorModel(anchors, RenderOptions(), "cuda", growth=growth, extent=1.0, iterations=1000)
+        trainer = Trainer(model, resident(work.scene, GPU), Budget(1000))
         return trainer, steps_of(trainer, waits)
 
 
@@ -118,8 +116,8 @@ def test_splat_iterations_do_not_wait(kind: str):
     splats.active_degree = 3
     options, config = DensificationOptions(positional_gradient=kind), RenderConfig("ray", backend="cuda")
     with pretended_gpu() as waits, call_hook(stage_of(called := [])):
-        trainee = SplatModel(splats.to(GPU), options, config, extent=1.0, iterations=30_000)
-        trainer = Trainer(trainee, resident(work.scene, GPU), Budget(30_000))
+        model = SplatModel(splats.to(GPU), options, config, extent=1.0, iterations=30_000)
+        trainer = Trainer(model, resident(work.scene, GPU), Budget(30_000))
         waited = steps_of(trainer, waits)
     assert waited[0] and waited[2:] == [Counter()] * (STEPS - 2), waited  # the first counts instances
-    assert called.count("padgs_cuda_splats") == 2 * STEPS and trainee.densifier.statistics["gradient"].held.any()
+    assert called.count("padgs_cuda_splats") == 2 * STEPS and model.densifier.statistics["gradient"].held.any()
