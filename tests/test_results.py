@@ -159,12 +159,6 @@ def test_lines_of_a_log_that_are_being_written_are_left_for_later(tmp_path):
     assert list(results.log_lines(tmp_path)) == [{"iteration": 1}]
 
 
-def test_the_tail_of_a_log_has_its_last_whole_lines(tmp_path):
-    (tmp_path / "log.jsonl").write_text("".join(f'{{"iteration": {n}}}\n' for n in (10, 11, 12)))
-    assert [line["iteration"] for line in results.log_lines(tmp_path, tail=40)] == [11, 12]
-    assert [line["iteration"] for line in results.log_lines(tmp_path, tail=4000)] == [10, 11, 12]
-
-
 def test_keys_that_decide_nothing_are_left_out_wherever_they_are():
     config = {"data": {"path": "/x", "width": 8, "generator": {"path": 1}}, "protocol": {}, "seed": 1}
     assert results.decisive(config) == {"data": {"width": 8, "generator": {"path": 1}}, "seed": 1}

@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, fields
@@ -24,18 +23,10 @@ PICTURES = "renders"  # folder of images: ground truth | render | error of each 
 SMALLEST_PICTURE = "smallest.png"  # ground truth | full model | smallest model for each loss of `SMALLEST_PICTURED`
 
 
-def log_lines(run_folder: Path, tail: int | None = None) -> Iterator[dict[str, Any]]:
-    """Yield the complete lines of a run's log, each with its `iteration`; incomplete lines are skipped.
-
-    Args:
-        run_folder: folder of one run; a missing log has no lines.
-        tail: number of bytes to read at the end of the log; None reads all.
-    """
+def log_lines(run_folder: Path) -> Iterator[dict[str, Any]]:
+    """Yield the complete lines of a run's log, each with its `iteration`; a missing log has no lines."""
     try:
-        with (run_folder / LOG_NAME).open("rb") as file:
-            if tail is not None:
-                file.seek(max(0, file.seek(0, os.SEEK_END) - tail))
-            lines = file.read().splitlines()
+        lines = (run_folder / LOG_NAME).read_bytes().splitlines()
     except OSError:
         return
     for line in lines:

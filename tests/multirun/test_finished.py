@@ -23,19 +23,19 @@ def test_a_finished_job_is_known_at_the_next_start(runs):
     assert FinishedJobs(runs).status(["method=padgs", "++seed=2"]) is None
 
 
-def test_what_decides_nothing_about_results_is_ignored(runs):
+def test_settings_without_effect_on_results_are_ignored(runs):
     for extra in ("++run.threads=2", "launcher=local", "tracking=none", "++retry=failed", "hydra.verbose=true"):
         assert FinishedJobs(runs).status([extra, *reversed(JOB)]) == "ok"
 
 
 @pytest.mark.parametrize("setting", ["init=runs/other", "++data.images=/a", "data.mask=/a.png", "data.points=/a.ply"])
-def test_a_job_that_reads_other_files_than_those_of_its_data_is_looked_at(runs, setting):
+def test_a_job_that_reads_other_files_than_those_of_its_data_is_looked_up(runs, setting):
     job = [setting, *JOB]
     FinishedJobs(runs).add(job, "room_padgs_1", "ok", None)
     assert FinishedJobs(runs).status(job) is None, "they may have changed, or another run been trained anew"
 
 
-def test_a_result_that_is_gone_or_was_written_anew_is_looked_at(runs):
+def test_a_result_that_is_gone_or_was_written_anew_is_looked_up(runs):
     path = runs / "room_padgs_1" / "result.json"
     content = path.read_text()
     path.unlink()
@@ -44,13 +44,13 @@ def test_a_result_that_is_gone_or_was_written_anew_is_looked_at(runs):
     assert FinishedJobs(runs).status(JOB) is None
 
 
-def test_a_job_whose_result_was_gone_when_it_was_noted_is_looked_at(runs):
+def test_a_job_whose_result_was_gone_when_it_was_noted_is_looked_up(runs):
     FinishedJobs(runs).add(JOB, "nowhere", "ok", None)
     assert FinishedJobs(runs).status(JOB) is None
 
 
 @pytest.mark.parametrize("name", ["", "transforms.json"])
-def test_data_that_changed_are_looked_at(runs, tmp_path, name):
+def test_data_that_changed_are_looked_up(runs, tmp_path, name):
     data, images = tmp_path / "data", tmp_path / "images"
     for folder in (data, images):
         folder.mkdir()
@@ -67,7 +67,7 @@ def test_data_that_changed_are_looked_at(runs, tmp_path, name):
     assert FinishedJobs(runs).status(JOB) is None
 
 
-def test_other_sources_are_looked_at(runs, monkeypatch):
+def test_other_sources_are_looked_up(runs, monkeypatch):
     monkeypatch.setattr(finished, "_sources", lambda: ("other",))
     assert FinishedJobs(runs).status(JOB) is None
 

@@ -7,7 +7,7 @@ from padgs.multirun.job import TrackedRun
 from padgs.training.health import Failure
 
 
-def test_a_run_in_progress_is_not_looked_at_all_the_time(tmp_path, monkeypatch):
+def test_a_run_in_progress_is_mirrored_at_intervals(tmp_path, monkeypatch):
     looks = []
     watch = TrackedRun(type("Fake", (), {"update": lambda self, run: looks.append(run)})())
     watch.saved(tmp_path)

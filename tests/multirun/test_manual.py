@@ -12,21 +12,21 @@ from padgs.registry import lookup
 from padgs.runs.config import Settings
 
 
-def test_every_key_stands_there_with_the_default_of_the_method_and_its_meaning(root, monkeypatch):
+def test_help_lists_every_key_with_its_default_and_meaning(root, monkeypatch):
     monkeypatch.setenv("PADGS_ROOT", str(root))
     lines = manual(["--help", "method=padgs"], 100).splitlines()
-    said = {line.split("=")[0].strip(): line for line in lines if line.startswith("  ") and "=" in line}
-    assert "train.iterations=1500" in said["train.iterations"] and "omnigs_release" in "".join(lines)
-    assert "method.tau=0.9" in said["method.tau"] and "Eq. 15; 0 turns opacity modulation off" in said["method.tau"]
-    assert "pixels; the height is half of it" in said["data.generator.width"] and max(map(len, lines)) <= 100
-    assert "published: for 30 000" in said["train.learning_rates"], "the comment above it"
-    assert "render.projection=ray" in manual(["--help"]), "padgs+ is drawn by rays"
+    shown = {line.split("=")[0].strip(): line for line in lines if line.startswith("  ") and "=" in line}
+    assert "train.iterations=1500" in shown["train.iterations"] and "omnigs_release" in "".join(lines)
+    assert "method.tau=0.9" in shown["method.tau"] and "Eq. 15; 0 turns opacity modulation off" in shown["method.tau"]
+    assert "pixels; the height is half of it" in shown["data.generator.width"] and max(map(len, lines)) <= 100
+    assert "published: for 30 000" in shown["train.learning_rates"], "the comment above it"
+    assert "render.projection=ray" in manual(["--help"]), "padgs+ renders by rays"
     assert "budget=auto, given" in "\n".join(lines)
-    assert all(name in said["+scene"] for name in ("noisy_poses", "omniblender_LOU")), "of files and of data sets"
+    assert all(name in shown["+scene"] for name in ("noisy_poses", "omniblender_LOU")), "of files and of data sets"
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_no_key_is_without_a_meaning(name):
+def test_every_key_has_a_meaning(name):
     groups = (Settings, lookup(METHODS, name, "method").Options)
     shown = {key: meaning for kind in groups for key, _, meaning in keys(kind())}
     assert [key for key, meaning in shown.items() if not meaning] == []

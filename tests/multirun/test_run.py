@@ -43,7 +43,7 @@ def test_ctrl_c_is_answered_while_the_program_starts(delay):
 
 
 def newest(folder: Path) -> bytes:
-    """What the checkpoint of the only run in a folder says."""
+    """Return the state file of the checkpoint of the only run in a folder."""
     return next((path.read_bytes() for path in folder.glob("*/checkpoint/state.json")), b"")
 
 
@@ -55,7 +55,7 @@ def wait_for_new_checkpoint(folder: Path, before: bytes, process: subprocess.Pop
 
 
 def same_end(one: Path, other: Path) -> None:
-    """Marks and checkpoint of the only run in each folder are equal, bit by bit."""
+    """Assert that metrics, checkpoint and log of the only run in each folder are equal, bit by bit."""
     (mine,), (theirs,) = results.read_all(one)[0].values(), results.read_all(other)[0].values()
     assert mine.status == "ok"
     assert (mine.run, mine.scores, mine.counts) == (theirs.run, theirs.scores, theirs.counts)
@@ -73,7 +73,7 @@ def test_killed_and_interrupted_runs_end_bit_identically(start, tmp_path, method
     arguments = [*TINY, f"method={method}"]
     code, _, error = finish(start(*arguments, "run.folder=undisturbed"))
     assert code == 0, error
-    source = random.Random(time.time_ns())  # a random moment, as asked: any must do
+    source = random.Random(time.time_ns())  # a random moment: any must do
     for number in (signal.SIGKILL, signal.SIGINT, signal.SIGTERM):
         before = newest(tmp_path / "disturbed")
         process = start(*arguments, "run.folder=disturbed")
@@ -140,7 +140,7 @@ def test_a_folder_that_cannot_be_written_is_a_clear_error(start, tmp_path, argum
         ),
     ],
 )
-def test_what_is_unknown_is_named_with_what_is_known(start, argument, message):
+def test_unknown_names_are_reported_with_the_known_ones(start, argument, message):
     code, _, error = finish(start(argument))
     assert code == 1 and message in error and "Traceback" not in error
 

@@ -1,4 +1,4 @@
-"""What a multirun makes of its jobs, with launchers that only write on the board."""
+"""A multirun with launchers that only write states on the board."""
 
 import io
 import os
@@ -39,7 +39,7 @@ class Start:
         self.board, self.launched = Board(self.folder), []
 
     def launch(self, jobs, initial_job_idx):
-        """What Hydra's launchers do; subclasses say how jobs end."""
+        """Stand in for a launcher of Hydra; subclasses choose how jobs end."""
         self.launched += [job[0] for job in jobs]
         for number, job in enumerate(jobs, initial_job_idx):
             self.end(number, job[0])
@@ -70,7 +70,7 @@ def test_a_second_start_launches_nothing(tmp_path, target):
     assert not again.folder.exists()
 
 
-def test_only_what_is_missing_is_launched(tmp_path):
+def test_only_missing_jobs_are_launched(tmp_path):
     Start(tmp_path, 1, ELSEWHERE, jobs=JOBS[:2]).counts()
     more = Start(tmp_path, 2, ELSEWHERE)
     assert more.counts() == {"ok": 3} and more.launched == ["++seed=2"]
@@ -83,7 +83,7 @@ class InArrays(Start):
         super().launch(jobs, initial_job_idx)
 
 
-def test_a_launcher_gets_as_many_jobs_at_a_time_as_it_takes(tmp_path):
+def test_jobs_are_launched_in_batches(tmp_path):
     assert InArrays(tmp_path, 1, ELSEWHERE).counts(2) == {"ok": 3}
 
 
@@ -92,7 +92,7 @@ class OneFails(Start):
         self.finish(number, job, "nan" if job == "++seed=1" else "ok")
 
 
-def test_failed_runs_are_kept_and_retried_only_if_asked(tmp_path, capsys):
+def test_failed_runs_are_retried_only_on_request(tmp_path, capsys):
     first = OneFails(tmp_path, 1, ELSEWHERE)
     assert first.counts() == {"ok": 2, "nan": 1} and "retry=failed" in first.out.getvalue()
     kept = Start(tmp_path, 2, ELSEWHERE)
@@ -106,7 +106,7 @@ class OneRunsOutOfTime(Start):
         self.finish(number, job, "timeout" if job == "++seed=1" else "ok")
 
 
-def test_a_run_out_of_time_is_not_retried_because_its_time_is_part_of_what_it_is(tmp_path):
+def test_a_run_out_of_time_is_not_retried(tmp_path):
     first = OneRunsOutOfTime(tmp_path, 1, ELSEWHERE)
     assert first.counts() == {"ok": 2, "timeout": 1} and "retry=failed" not in first.out.getvalue()
     again = Start(tmp_path, 2, ELSEWHERE, retry="failed")
@@ -138,7 +138,7 @@ class NeverStarts(Start):
         raise RuntimeError("there is no such partition")
 
 
-def test_a_launcher_that_starts_nothing_is_not_asked_for_ever(tmp_path, capsys):
+def test_a_launcher_that_starts_nothing_is_retried_once(tmp_path, capsys):
     start = NeverStarts(tmp_path, 1, ELSEWHERE)
     assert start.counts() == {"killed": 3} and len(start.launched) == 6
     assert capsys.readouterr().err.count("there is no such partition") == 1
@@ -149,7 +149,7 @@ class Refuses(Start):
         self.board.write(number, JobState("refused", reason="the data set is not there"))
 
 
-def test_what_is_wrong_with_all_jobs_is_said_once(tmp_path, capsys):
+def test_an_error_of_all_jobs_is_printed_once(tmp_path, capsys):
     for target in (IN_PROCESS, ELSEWHERE):
         start = Refuses(tmp_path, 1, target)
         assert start.counts() == {"refused": 3} and start.out.getvalue().count("\n") == 1
@@ -164,7 +164,7 @@ class AtWorkElsewhere(Start):
             self.finish(number, job, "ok")
 
 
-def test_what_another_process_does_is_no_failure_and_not_done(tmp_path, capsys):
+def test_a_job_of_another_process_counts_as_neither_failed_nor_done(tmp_path, capsys):
     start = AtWorkElsewhere(tmp_path, 1, ELSEWHERE)
     assert start.counts() == {"ok": 2, "elsewhere": 1}
     assert "2 of 3 done, 1 elsewhere" in start.out.getvalue()
@@ -202,7 +202,7 @@ class InterruptsTwice(Start):
         raise KeyboardInterrupt
 
 
-def test_a_second_ctrl_c_leaves_jobs_what_they_need(tmp_path):
+def test_a_second_ctrl_c_keeps_the_board(tmp_path):
     start = InterruptsTwice(tmp_path, 1, ELSEWHERE)
     with pytest.raises(KeyboardInterrupt):
         start.counts()
