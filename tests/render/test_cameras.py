@@ -42,7 +42,7 @@ def picture(
 @pytest.mark.parametrize("lens", ["panorama", "pinhole"])
 @each_free
 @each_engine
-def test_a_formula_is_its_table_of_rays(size, lens: str, projection: str, backend: str, dtype: torch.dtype):
+def test_panorama_equals_its_ray_table(size, lens: str, projection: str, backend: str, dtype: torch.dtype):
     generator = torch.Generator().manual_seed(31)
     gaussians, options = mixture(5, generator), RenderOptions(projection, near=0.02)
     formula = camera_of(lens, *size)
@@ -111,7 +111,7 @@ def test_on_the_axis_the_perspective_jacobian_is_the_tangent_plane(backend: str,
 
 
 @each_engine
-def test_the_smaller_a_gaussian_the_less_ray_and_tangent_differ(backend: str, dtype: torch.dtype):
+def test_tangent_is_the_limit_of_ray_for_small_gaussians(backend: str, dtype: torch.dtype):
     """tangent is the limit of ray; halving the angle halves the difference."""
     differences = []
     for size in (0.08, 0.04, 0.02):

@@ -221,7 +221,7 @@ def test_each_ray_has_its_own_order(backend: str, dtype: torch.dtype):
 @pytest.mark.parametrize("size", [1, 2])
 @each_projection
 @each_engine
-def test_ties_are_won_by_the_first(projection: str, size: int, backend: str, dtype: torch.dtype):
+def test_ties_keep_the_input_order(projection: str, size: int, backend: str, dtype: torch.dtype):
     one = {"means": [0.1, 0.0, 2.0], "quats": [1.0, 0.2, 0.0, 0.1], "scales": [0.3, 0.2, 0.1]}
     twins = {name: torch.tensor([value, value]) for name, value in one.items()}
     gaussians = Gaussians(**twins, opacities=torch.tensor([0.5, 0.5]), colors=torch.eye(3)[:2]).to(dtype)

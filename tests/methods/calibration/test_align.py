@@ -19,12 +19,9 @@ def random_poses(count, generator):
 
 def moved(poses, scale, rotation, translation):
     """The same cameras in a world where x_new = scale * rotation @ x + translation."""
-    out = []
-    for pose in poses:
-        turn = pose[:3, :3] @ rotation.mT
-        center = scale * rotation @ centers(pose[None])[0] + translation
-        out.append(rigid(turn, -turn @ center))
-    return torch.stack(out)
+    turns = poses[:, :3, :3] @ rotation.mT
+    places = scale * centers(poses) @ rotation.mT + translation
+    return torch.stack([rigid(turn, -turn @ place) for turn, place in zip(turns, places, strict=True)])
 
 
 def test_a_known_similarity_is_found(generator):

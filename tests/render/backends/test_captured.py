@@ -104,6 +104,7 @@ def test_too_small_capacity_is_increased(missing: int | str, generator: torch.Ge
     expected = ordinary(gaussians, view, RenderOptions())
     instances = expected.counters["instances"]
     capacity = 1 if isinstance(missing, str) else instances - missing
+    assert CapturedRender(lambda _: gaussians, view).capacity == int(1.5 * instances) + 1
     draw = CapturedRender(lambda _: gaussians, view, capacity=capacity)
     assert_same(draw(view.cam_from_world), expected)
     assert len(recorded) == (1 if capacity == instances else 2)
@@ -118,12 +119,6 @@ def test_poses_and_backgrounds_need_not_be_contiguous(generator: torch.Generator
     draw = CapturedRender(lambda _: gaussians, transposed, background=background)
     expected = CapturedRender(lambda _: gaussians, view, background=torch.ones(3, device=DEVICE))
     assert_same(draw(transposed.cam_from_world), expected(view.cam_from_world))
-
-
-def test_default_capacity(generator: torch.Generator):
-    gaussians, view = scene_of(generator), view_of(camera_of("panorama", 72, 36))
-    draw = CapturedRender(lambda _: gaussians, view)
-    assert draw.capacity == int(1.5 * ordinary(gaussians, view, RenderOptions()).counters["instances"]) + 1
 
 
 def test_show_is_recorded_and_tensors_are_references(generator: torch.Generator):
@@ -180,7 +175,7 @@ class NothingIsRead(TorchDispatchMode):
 @pytest.mark.parametrize(
     "options", [RenderOptions(), RenderOptions("ray", blending="hybrid")], ids=lambda o: o.blending
 )
-def test_a_recording_reads_nothing_back(options, generator: torch.Generator, monkeypatch: pytest.MonkeyPatch):
+def test_recordings_do_not_wait_for_the_device(options, generator: torch.Generator, monkeypatch: pytest.MonkeyPatch):
     view = view_of(camera_of("fisheye" if options.projection == "ray" else "panorama", 40, 20))
     model = PaDGS(
         torch.randn(30, 3, generator=generator),

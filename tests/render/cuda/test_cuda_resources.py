@@ -64,7 +64,7 @@ def test_every_kernel_of_every_architecture_is_a_row():
     ],
     ids=lambda value: value.name if isinstance(value, Kernel) else None,
 )
-def test_occupancy_is_limited_by_what_runs_out_first(kernel: Kernel, occupancy: float):
+def test_occupancy_is_limited_by_the_scarcest_resource(kernel: Kernel, occupancy: float):
     assert kernel.occupancy == occupancy
 
 

@@ -102,7 +102,7 @@ def test_no_slots_without_instances(generator: torch.Generator, monkeypatch: pyt
 
 @pytest.mark.parametrize(("device", "current"), [(1, 0), (0, 0), (0, 2)])
 @pytest.mark.parametrize(("of_work", "of_launch", "error"), [(0, 0, 0), (2, 0, 2), (0, 700, 700), (2, 700, 2)])
-def test_work_on_a_device_leaves_the_thread_its_own_and_no_error(device, current, of_work, of_launch, error):
+def test_device_guard_restores_device_and_clears_errors(device, current, of_work, of_launch, error):
     found = torch.empty(3, dtype=torch.int32)
     check = cuda_engine.layout_library().check_on_device
     assert check(device, current, of_work, of_launch, Pointer(found.data_ptr())) == error
@@ -145,7 +145,7 @@ def test_every_pixel_has_one_thread(reaches):
 
 
 @pytest.mark.parametrize("count", range(1, 17))
-def test_every_sum_is_dealt_to_one_lane(count: int):
+def test_each_sum_belongs_to_one_lane(count: int):
     index = (ctypes.c_int32 * 32)()
     cuda_engine.layout_library().check_dealt_index(count, index)
     assert sorted(one for one in index if one >= 0) == list(range(count))

@@ -31,7 +31,7 @@ def addresses(*tensors: Tensor) -> list[ctypes.c_void_p]:
 
 
 @pytest.mark.parametrize("dtype", TYPES)
-def test_a_product_is_that_of_the_rounded_matrices(dtype: torch.dtype, generator: torch.Generator):
+def test_products_match_rounded_matrices(dtype: torch.dtype, generator: torch.Generator):
     a, b, sums = (torch.randn(*size, generator=generator).to(DEVICE) for size in ((16, 16), (16, 8), (16, 8)))
     expected = sums.double() + a.to(dtype).double() @ b.to(dtype).double()
     library().check_product(TYPES.index(dtype), *addresses(a, b, sums))
