@@ -15,8 +15,7 @@ from padgs.reports.frame import LARGEST_FACTOR, PUBLISHED_ITERATIONS, by_conditi
 from padgs.reports.measures import Measure
 from padgs.reports.published import AVERAGE, Place, Published
 from padgs.reports.selection import RunSet, experiment_of, one_setting, refuse_differences, settings
-from padgs.reports.specs import SPECS
-from padgs.reports.statistics import (
+from padgs.reports.significance import (
     better_rows,
     cells_by_value,
     mean_cell,
@@ -26,6 +25,7 @@ from padgs.reports.statistics import (
     places,
     unrank,
 )
+from padgs.reports.specs import SPECS
 from padgs.reports.table import Block, Cell, Column, Row, Table
 
 PAPER_COLUMNS = ("paper", "Δ")  # titles of the columns that published numbers add

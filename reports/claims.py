@@ -17,7 +17,7 @@ from padgs.reports.frame import CONFIG, grouped
 from padgs.reports.measures import COSTS, Measure, metric
 from padgs.reports.published import DATASETS, Key, Place, Published
 from padgs.reports.selection import RunSet, one_setting, settings
-from padgs.reports.statistics import CONFIDENCE
+from padgs.reports.significance import CONFIDENCE
 from padgs.reports.table import MISSING
 from padgs.reports.writers import Page
 from padgs.results import higher_is_better

@@ -22,7 +22,7 @@ from padgs.reports.charts.drawing import Chart
 from padgs.reports.conditions import footnotes, refuse_mixture
 from padgs.reports.frame import CONFIG, by_conditions, grouped
 from padgs.reports.selection import RunSet, one_setting, refuse_differences
-from padgs.reports.statistics import mean_cell
+from padgs.reports.significance import mean_cell
 from padgs.reports.table import Block, Cell, Column, Row, Table
 from padgs.results import file_name
 

@@ -13,7 +13,7 @@ from pandas import DataFrame
 from padgs.reports.conditions import OF_TIMES, footnotes, refuse_mixture
 from padgs.reports.frame import by_conditions
 from padgs.reports.selection import RunSet, settings
-from padgs.reports.statistics import mean_cell
+from padgs.reports.significance import mean_cell
 from padgs.reports.table import Block, Cell, Column, Row, Table
 from padgs.results import SMALLEST_LOSSES, SMALLEST_PICTURE, SMALLEST_STATED
 

@@ -19,7 +19,7 @@ from padgs.reports.frame import CONFIG
 from padgs.reports.measures import Measure, costs, metric, metrics
 from padgs.reports.published import Place
 from padgs.reports.selection import is_number
-from padgs.reports.statistics import NOTE
+from padgs.reports.significance import NOTE
 
 Measures = tuple[Measure, ...]
 

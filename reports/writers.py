@@ -11,7 +11,7 @@ from pandas import DataFrame
 
 from padgs.files import write_atomically
 from padgs.reports.charts.drawing import Chart
-from padgs.reports.statistics import BEST, emphasis
+from padgs.reports.significance import BEST, emphasis
 from padgs.reports.table import Table
 from padgs.results import file_name
 

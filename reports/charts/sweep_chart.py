@@ -16,7 +16,7 @@ from padgs.reports.frame import by_place, grouped
 from padgs.reports.measures import Measure, costs, metrics, quantity
 from padgs.reports.published import Place
 from padgs.reports.selection import Request, RunSet, Setting, is_number, of_a_table, settings, sort_key
-from padgs.reports.statistics import over_seeds
+from padgs.reports.significance import over_seeds
 from padgs.reports.table import Cell
 from padgs.results import AD_HOC
 

@@ -16,7 +16,7 @@ from padgs.reports.frame import by_place
 from padgs.reports.measures import Measure, costs, metric
 from padgs.reports.published import Place
 from padgs.reports.selection import Request, RunSet, settings
-from padgs.reports.statistics import over_scenes
+from padgs.reports.significance import over_scenes
 from padgs.reports.table import Cell
 
 COSTS = costs("frame_ms", "train_seconds", "cpu_seconds", "gaussians", "megabytes")

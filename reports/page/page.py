@@ -21,7 +21,7 @@ from padgs.reports.build import PAPER_COLUMNS
 from padgs.reports.charts.drawing import Chart
 from padgs.reports.frame import by_place
 from padgs.reports.selection import RunSet, Setting, settings
-from padgs.reports.statistics import BEST, emphasis
+from padgs.reports.significance import BEST, emphasis
 from padgs.reports.store import render_names, split_image
 from padgs.reports.table import Block, Cell, ReportError, Table
 

@@ -9,8 +9,8 @@ from support.made_up import RULES, builder, compared, failed, of_experiment, res
 
 from padgs.reports.frame import law
 from padgs.reports.methods import title
+from padgs.reports.significance import BEST, SECOND, emphasis
 from padgs.reports.specs import DEVIATIONS, EFFECTS, PARTS, RUNGS, WITHOUT
-from padgs.reports.statistics import BEST, SECOND, emphasis
 from padgs.reports.table import ReportError, Table
 from padgs.reports.writers import csv_rows, latex, markdown
 from padgs.results import Scores

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from scipy.special import stdtrit
 from scipy.stats import ttest_ind_from_stats
 
-from padgs.reports.statistics import BEST, CONFIDENCE, SECOND, better_rows, emphasis, places, pooled_variance
+from padgs.reports.significance import BEST, CONFIDENCE, SECOND, better_rows, emphasis, places, pooled_variance
 from padgs.reports.table import Block, Cell, Column, Row, format_number
 
 PSNR, LPIPS, COUNT = Column("PSNR", 2, True), Column("LPIPS", 3, False), Column("Gaussians", 0)
