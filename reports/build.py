@@ -17,7 +17,6 @@ from padgs.reports.published import AVERAGE, Place, Published
 from padgs.reports.selection import RunSet, experiment_of, one_setting, refuse_differences, settings
 from padgs.reports.significance import (
     better_rows,
-    cells_by_value,
     mean_cell,
     numbers_of,
     over_scenes,
@@ -114,7 +113,12 @@ class _Builder:
             if spec.difference and not runs[spec.rows].isin(titles).any():
                 continue
             not_ranked = self.unranked[-1] if self.unranked else ()
-            cells = cells_by_value(runs, spec.rows, titles, title, self.measures, not_ranked)
+            apart_in = spec.rows if spec.rows == "preset" else "place"  # rows of a variant have titles of their own
+            cells = {}
+            for value, words in titles.items():
+                own = one_setting(runs.loc[runs[spec.rows] == value], f"{title}, {words}", apart_in)
+                ours = over_seeds(own, self.measures)
+                cells[value] = unrank(ours) if value in not_ranked else ours
             heading = f"{methods.name(method)}, {title}" if spec.difference else title
             yield Block(heading, self._rows(place, titles, cells))
         if spec.effects:

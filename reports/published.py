@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+FILE = Path(__file__).resolve().parent.parent / "baselines" / "published.csv"  # in a checkout and when installed
 PROTOCOL = "paper"  # the only protocol under which ours may stand beside published numbers
 DATASETS = {"roam360": "360roam", "ricoh360": "ricoh360"}  # our names -> names in the file
 TITLES = {"roam360": "360Roam", "ricoh360": "Ricoh360"}
@@ -90,13 +91,13 @@ class Place:
         return (order.index(self.dataset) if self.published else len(order), self.dataset, self.scene, self.apart)
 
 
-def load(path: Path | None = None) -> Mapping[Key, Published]:
+def load() -> Mapping[Key, Published]:
     """Return all published numbers.
 
     Raises:
         FileNotFoundError: the file is missing from the package.
     """
-    with (path or default_path()).open(newline="") as file:
+    with FILE.open(newline="") as file:
         return {
             Key(
                 int(row["table"]), row["dataset"], SCENES.get(row["scene"], row["scene"]), row["method"], row["metric"]
@@ -115,8 +116,3 @@ def scenes(numbers: Mapping[Key, Published], dataset: str) -> list[str]:
     """Return the folder names of a data set's scenes, in the paper's order; `dataset` as the paper calls it."""
     found = dict.fromkeys(key.scene for key in numbers if key.dataset == dataset and key.table < 3)
     return [scene for scene in found if scene != AVERAGE]
-
-
-def default_path() -> Path:
-    """Return the path of the file, in a checkout and in an installed package."""
-    return Path(__file__).resolve().parent.parent / "baselines" / "published.csv"

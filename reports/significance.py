@@ -11,7 +11,6 @@ import numpy as np
 from pandas import DataFrame
 
 from padgs.reports.measures import Measure
-from padgs.reports.selection import one_setting
 from padgs.reports.table import Block, Cell, Column, format_number
 
 BEST, SECOND = "best", "second"
@@ -21,28 +20,6 @@ NOTE = (
     f"{CONFIDENCE:.0%}; a single run is taken to scatter as the seeds of the other rows; where these are no more than "
     "one pair, single runs tie with their equals only)."
 )
-
-
-def cells_by_value(
-    runs: DataFrame,
-    column: str,
-    titles: Mapping[str, str],
-    where: str,
-    measures: Sequence[Measure],
-    unranked: Collection[str] = (),
-) -> dict[str, list[Cell]]:
-    """Return value of a column -> a cell for each measure, in the order of `titles`; `unranked` values are only shown.
-
-    Raises:
-        Mixture: runs of one value differ in more than the seed.
-    """
-    apart_in = column if column == "preset" else "place"  # rows of a variant have titles of their own
-    groups = {
-        value: one_setting(runs.loc[runs[column] == value], f"{where}, {title}", apart_in)
-        for value, title in titles.items()
-    }
-    cells = {value: over_seeds(runs, measures) for value, runs in groups.items()}
-    return {value: unrank(row) if value in unranked else row for value, row in cells.items()}
 
 
 def unrank(cells: Sequence[Cell]) -> list[Cell]:

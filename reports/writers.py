@@ -124,12 +124,7 @@ def latex(table: Table) -> str:
 
 
 def csv_text(table: Table) -> str:
-    """Return CSV with a line for each cell and all digits."""
-    return csv_rows(table).to_csv(index=False, lineterminator="\n")
-
-
-def csv_rows(table: Table) -> DataFrame:
-    """Return a row for each cell; `value` is empty where there is no number, and `status` says why."""
+    """Return CSV with a line for each cell and all digits; without a number `value` is empty and `status` says why."""
     rows = []
     for block in table.blocks:
         columns = block.columns(table.columns)
@@ -139,7 +134,7 @@ def csv_rows(table: Table) -> DataFrame:
                 place = {"table": table.name, "block": block.title, "row": row.title}
                 place |= {"group": column.group, "column": column.title}
                 rows.append({**place, **cell.numbers, "rank": rank.get(number, "")})
-    return DataFrame(rows, dtype=object)
+    return DataFrame(rows, dtype=object).to_csv(index=False, lineterminator="\n")
 
 
 def escaped(words: str) -> str:

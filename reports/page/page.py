@@ -21,9 +21,9 @@ from padgs.reports.build import PAPER_COLUMNS
 from padgs.reports.charts.drawing import Chart
 from padgs.reports.frame import by_place
 from padgs.reports.selection import RunSet, Setting, settings
-from padgs.reports.significance import BEST, emphasis
 from padgs.reports.store import render_names, split_image
-from padgs.reports.table import Block, Cell, ReportError, Table
+from padgs.reports.table import Cell, ReportError, Row, Table
+from padgs.reports.writers import rows_of
 
 HERE = Path(__file__).resolve().parent
 SCRIPTS = ("pannellum.js", "tablesort.min.js", "tablesort.number.min.js", "img-comparison-slider.js")
@@ -172,21 +172,14 @@ def _block(table: Table) -> dict[str, Any]:
         "title": block.title,
         "groups": groups if any(size > 1 for _, size in groups) else [],
         "headings": [column.heading for column in table.columns],
-        "rows": _rows(table, block),
+        "rows": [_row(row, *shown) for row, shown in zip(block.rows, rows_of(table), strict=True)],
     }
 
 
-def _rows(table: Table, block: Block) -> list[dict[str, Any]]:
-    ranks = [emphasis(block, index, table.columns) for index in range(len(table.columns))]
-    rows = []
-    for number, row in enumerate(block.rows):
-        title, *texts = row.texts(table.columns)
-        cells = []
-        for text, cell, rank in zip(texts, row.cells, ranks, strict=True):
-            style = "" if number not in rank else "best" if rank[number] == BEST else "second"
-            cells.append({"text": text, "sort": LOWEST if cell.value is None else f"{cell.value:.9f}", "style": style})
-        rows.append({"title": title, "cells": cells})
-    return rows
+def _row(row: Row, title: str, cells: Sequence[tuple[str, str | None]]) -> dict[str, Any]:
+    keys = (LOWEST if cell.value is None else f"{cell.value:.9f}" for cell in row.cells)
+    shown = [{"text": text, "sort": key, "style": rank or ""} for key, (text, rank) in zip(keys, cells, strict=True)]
+    return {"title": title, "cells": shown}
 
 
 def _charts(parts: Sequence[Any]) -> list[dict[str, Any]]:

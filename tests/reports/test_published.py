@@ -40,7 +40,7 @@ def test_averages_are_those_of_the_scenes():
 
 
 def test_it_is_the_file_that_came_with_the_paper(shared):
-    with (shared / "paper" / "published.csv").open() as theirs, published.default_path().open() as ours:
+    with (shared / "paper" / "published.csv").open() as theirs, published.FILE.open() as ours:
         assert list(csv.reader(ours)) == list(csv.reader(theirs))
 
 

@@ -17,29 +17,33 @@ def ranks(column: Column, *cells: Cell) -> dict[int, str]:
     return emphasis(block, 0, (column,))
 
 
-def test_each_metric_has_its_own_direction():
-    cells = Cell(1.0), Cell(3.0), Cell(2.0)
-    assert ranks(PSNR, *cells) == {1: BEST, 2: SECOND}
-    assert ranks(LPIPS, *cells) == {0: BEST, 2: SECOND}
-    assert ranks(COUNT, *cells) == {}
+FIRST, NEAR, FAR = Cell(25.0, 0.1, 3), Cell(25.1, 0.1, 3), Cell(24.0, 0.1, 3)
 
 
-def test_nothing_stands_out_alone_and_failures_do_not_compete():
-    assert ranks(PSNR, Cell(1.0), Cell(status="oom")) == {}
-
-
-def test_what_prints_the_same_shares_a_place():
-    assert ranks(PSNR, Cell(1.001), Cell(1.0), Cell(0.5)) == {0: BEST, 1: BEST, 2: SECOND}
+@pytest.mark.parametrize(
+    ("column", "cells", "expected"),
+    [
+        (PSNR, (Cell(1.0), Cell(3.0), Cell(2.0)), {1: BEST, 2: SECOND}),
+        (LPIPS, (Cell(1.0), Cell(3.0), Cell(2.0)), {0: BEST, 2: SECOND}),
+        (COUNT, (Cell(1.0), Cell(3.0), Cell(2.0)), {}),
+        (PSNR, (Cell(1.0), Cell(status="oom")), {}),
+        (PSNR, (Cell(1.001), Cell(1.0), Cell(0.5)), {0: BEST, 1: BEST, 2: SECOND}),  # print alike
+        (PSNR, (Cell(1.001), Cell(1.0)), {}),
+        (PSNR, (FIRST, NEAR, FAR), {0: BEST, 1: BEST, 2: SECOND}),
+        (PSNR, (FAR, FIRST, NEAR, Cell(20.0)), {1: BEST, 2: BEST, 0: SECOND}),
+        (PSNR, (FIRST, NEAR), {}),
+        (PSNR, (Cell(float("inf")), Cell(1.0)), {0: BEST, 1: SECOND}),
+        (PSNR, (Cell(float("-inf")), Cell(1.0)), {1: BEST, 0: SECOND}),
+    ],
+)
+def test_best_and_second(column, cells, expected):
+    assert ranks(column, *cells) == expected
 
 
 def test_means_are_tested_as_they_are_and_not_as_they_print():
     for far, expected in ((0.99, set()), (1.01, {1})):
         cells = {0: Cell(25.0, 0.4, 4), 1: Cell(25.0 + far * stdtrit(6, 0.975) * 0.4 / 2**0.5, 0.4, 4)}
         assert better_rows(cells, Column("", 0, True))[0] == expected
-
-
-def test_nothing_stands_out_among_equals():
-    assert ranks(PSNR, Cell(1.001), Cell(1.0)) == {}
 
 
 @given(
@@ -63,13 +67,6 @@ def test_rows_share_a_place_exactly_as_long_as_no_test_separates_them(numbers, c
         assert (i in better[j] or j in better[i]) == (differ and test.pvalue < 1 - CONFIDENCE)
 
 
-def test_a_tie_for_the_first_place_is_shared_and_a_tie_of_all_is_none():
-    first, near, far = Cell(25.0, 0.1, 3), Cell(25.1, 0.1, 3), Cell(24.0, 0.1, 3)
-    assert ranks(PSNR, first, near, far) == {0: BEST, 1: BEST, 2: SECOND}
-    assert ranks(PSNR, far, first, near, Cell(20.0)) == {1: BEST, 2: BEST, 0: SECOND}
-    assert ranks(PSNR, first, near) == {}
-
-
 def test_single_runs_scatter_as_the_seeds_of_the_other_rows():
     pooled = Cell(20.0, 0.1, 3), Cell(21.0, 0.3, 2)
     variance, freedom = pooled_variance(pooled)
@@ -87,8 +84,3 @@ def test_what_is_not_ranked_neither_stands_out_nor_stands_in_the_way():
     aside = Cell(9.0, ranked=False)
     assert ranks(PSNR, Cell(1.0), aside, Cell(2.0)) == {2: BEST, 0: SECOND}
     assert Row("A", (Cell(1.0), aside)).texts((PSNR, PSNR)) == ["A †", "1.00", "9.00"]
-
-
-@pytest.mark.parametrize("value", [float("inf"), float("-inf")])
-def test_infinities_are_ranked(value):
-    assert ranks(PSNR, Cell(value), Cell(1.0))[0 if value > 0 else 1] == BEST

@@ -1,8 +1,10 @@
 """Tables of `specs` without published numbers."""
 
+import io
 import math
 from dataclasses import replace
 
+import pandas as pd
 import pytest
 from omegaconf import OmegaConf
 from support.made_up import RULES, builder, compared, failed, of_experiment, result, run_set, small
@@ -12,7 +14,7 @@ from padgs.reports.methods import title
 from padgs.reports.significance import BEST, SECOND, emphasis
 from padgs.reports.specs import DEVIATIONS, EFFECTS, PARTS, RUNGS, WITHOUT
 from padgs.reports.table import ReportError, Table
-from padgs.reports.writers import csv_rows, latex, markdown
+from padgs.reports.writers import csv_text, latex, markdown
 from padgs.results import Scores
 from padgs.training.schedule import Pace
 
@@ -376,7 +378,7 @@ def test_effects_have_their_sign_and_none_is_the_best():
     shown = markdown(table).split("### Effects")[1].split("\n- ")[0]
     assert "+2.15" in shown and "**" not in shown and "↑" not in shown and "<ins>" not in shown
     assert r"$\tau$ = 0.9 instead of 0" in latex(table)
-    numbers = csv_rows(table)
+    numbers = pd.read_csv(io.StringIO(csv_text(table)), keep_default_na=False)
     assert set(numbers.loc[numbers["row"].isin(EFFECTS), "rank"]) == {""} != set(numbers["rank"])
 
 
