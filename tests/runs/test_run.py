@@ -291,7 +291,7 @@ def test_a_failed_run_is_retried_only_if_asked(config, monkeypatch, status, star
     assert run(replace(config, retry="failed"))[0] == retried
 
 
-def test_two_frames_lie_between_a_job_and_its_method(config, monkeypatch):
+def test_one_frame_lies_between_a_job_and_its_method(config, monkeypatch):
     frames = []
 
     def fit(self, scene, budget):
