@@ -173,7 +173,7 @@ class Trainer:
         length = self._budget.iterations
         # Skipped steps count as done, so that learning rates do not rise when a run is stopped.
         iterations = round(length * iteration / (step - self.skipped))
-        pace = Pace.of_run(self._options.learning_rates, length, iterations)
+        pace = Pace.of(self._options.learning_rates, iterations, length)
         with self._stage("optimizer"):
             optimizer.step(step, pace)
             self._guard.bound()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from torch import nn
 
@@ -80,18 +80,14 @@ class Pace:
     iterations: int
 
     @classmethod
-    def of(cls, choice: str | float, iterations: int) -> Pace:
-        """Return the pace of a run of `iterations`: `published`, `run` for the factor that fits, or a factor."""
-        if choice == "published":
-            return cls(1.0, iterations)
-        if choice == "run":
-            return cls(min(max(math.sqrt(PUBLISHED_ITERATIONS / iterations), 1.0), FASTEST), iterations)
-        return cls(float(choice), iterations)
+    def of(cls, choice: str | float, iterations: int, schedule: int | None = None) -> Pace:
+        """Return the pace of a run of `iterations`: `published`, `run` for the factor that fits, or a factor.
 
-    @classmethod
-    def of_run(cls, choice: str | float, schedule: int, iterations: int) -> Pace:
-        """Return the pace over a schedule that is done in `iterations`, fewer than its steps if it follows a clock."""
-        return replace(cls.of(choice, iterations), iterations=schedule)
+        A `schedule` that follows a clock has more steps than the run has iterations; None: as many.
+        """
+        if choice == "run":
+            choice = min(max(math.sqrt(PUBLISHED_ITERATIONS / iterations), 1.0), FASTEST)
+        return cls(1.0 if choice == "published" else float(choice), schedule or iterations)
 
     def __call__(self, iteration: int) -> float:
         """Return the factor at an iteration."""
