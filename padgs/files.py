@@ -1,4 +1,4 @@
-"""Atomic writes: a file is replaced only by a complete one."""
+"""Atomic writes, where only a complete file replaces another, and the one function that opens images."""
 
 from __future__ import annotations
 
@@ -6,6 +6,13 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import IO, TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+# Other decoders of Pillow run programs on what a file holds, such as Ghostscript, whatever the name of the file.
+IMAGE_FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP")
 
 
 @contextmanager
@@ -41,3 +48,15 @@ def write_atomically(path: Path, content: bytes) -> None:
         os.fsync(folder)  # the rename itself must survive a power cut
     finally:
         os.close(folder)
+
+
+def open_image(file: Path | IO[bytes]) -> Image:
+    """Open an image of `IMAGE_FORMATS`, which `with` closes; pixels are decoded when they are needed.
+
+    Raises:
+        OSError: it cannot be read, or has another format (PIL.UnidentifiedImageError).
+        PIL.Image.DecompressionBombError: it has more pixels than Pillow reads.
+    """
+    from PIL import Image
+
+    return Image.open(file, formats=IMAGE_FORMATS)

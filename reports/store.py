@@ -17,7 +17,7 @@ from typing import Any
 from PIL import Image
 
 from padgs import results
-from padgs.files import write_atomically
+from padgs.files import open_image, write_atomically
 from padgs.results import Result, ResultError
 
 FILE_NAME = "results.jsonl"
@@ -86,7 +86,7 @@ def split_image(path: Path, count: int) -> list[Image.Image]:
     Raises:
         OSError: the file is missing or truncated.
     """
-    with Image.open(path) as image:
+    with open_image(path) as image:
         image.load()
         width = image.width // count
         return [image.crop((part * width, 0, (part + 1) * width, image.height)) for part in range(count)]

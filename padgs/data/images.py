@@ -18,6 +18,7 @@ from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from padgs.data.capture import DataError
+from padgs.files import IMAGE_FORMATS, open_image
 
 EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 _ORIENTATION = 0x0112  # EXIF tag; 1 = stored upright
@@ -45,12 +46,18 @@ def inspect(path: Path, *, mask: bool = False) -> ImageFile:
     """
     data = read_bytes(path)
     try:
-        with Image.open(BytesIO(data)) as image:
+        with open_image(BytesIO(data)) as image:
             width, height, mode, has_alpha = image.width, image.height, image.mode, "A" in image.getbands()
             orientation = 1 if image.format == "PNG" and "exif" not in image.info else image.getexif().get(_ORIENTATION)
             deep = _is_deep(image, data)
-    except (UnidentifiedImageError, OSError, SyntaxError, Image.DecompressionBombError) as error:
-        raise DataError(f"{path} is not an image that Pillow can read ({error}); replace or remove it") from error
+    except Image.DecompressionBombError as error:
+        raise DataError(
+            f"{path} has more than {2 * (Image.MAX_IMAGE_PIXELS or 0) / 1e6:.0f} million pixels, the most that are "
+            "read; reduce it (`mogrify -resize 50%`)"
+        ) from error
+    except (UnidentifiedImageError, OSError, SyntaxError) as error:
+        formats = ", ".join(IMAGE_FORMATS)
+        raise DataError(f"{path} is not an image in {formats} ({error}); convert, replace or remove it") from error
     if orientation not in (None, 0, 1):
         raise DataError(
             f"{path} carries EXIF orientation {orientation}: its pixels are stored rotated, and it is unknown which "
@@ -98,7 +105,7 @@ def save_png(pixels: Tensor, path: Path) -> None:
 
 def _decode(data: bytes, path: Path, mode: str) -> NDArray[np.uint8]:
     try:
-        with Image.open(BytesIO(data)) as image:
+        with open_image(BytesIO(data)) as image:
             image.load()
             transparent = "A" in image.getbands() and np.asarray(image.getchannel("A")).min() < 255
             pixels = np.array(_eight_bit(image).convert(mode))
@@ -162,7 +169,7 @@ def _misses_pixels(image: Image.Image, data: bytes, pixels: NDArray[np.uint8]) -
     if image.format != "JPEG" or not ("progressive" in image.info or (pixels[-1] == GREY).all()):
         return False
     end = data.rfind(b"\xff\xd9")
-    with Image.open(BytesIO(data[:end] + FILLING + data[end:])) as longer:
+    with open_image(BytesIO(data[:end] + FILLING + data[end:])) as longer:
         return not np.array_equal(np.array(longer.convert("RGB" if pixels.shape[-1] == 3 else "L")), pixels)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 from support.fixtures import World, write_colmap_text
 
 from padgs.data import DataError
@@ -15,6 +15,7 @@ from padgs.data.check import check
 from padgs.data.images import decode, inspect, is_dual_fisheye
 from padgs.data.prepare.sources import find_source
 from padgs.geometry.panorama import sample
+from padgs.reports.store import split_image
 
 PIXELS = np.random.default_rng(3).integers(0, 256, (64, 128, 3), dtype=np.uint8)
 
@@ -146,7 +147,7 @@ def test_unreadable_files_are_refused(tmp_path: Path) -> None:
     text, empty, forbidden = tmp_path / "a.jpg", tmp_path / "b.jpg", tmp_path / "c.jpg"
     text.write_text("<html>404</html>")
     empty.touch()
-    with pytest.raises(DataError, match=r"a.jpg is not an image that Pillow can read"):
+    with pytest.raises(DataError, match=r"a.jpg is not an image in JPEG, PNG"):
         inspect(text)
     with pytest.raises(DataError, match=r"b.jpg is empty \(0 bytes\)"):
         inspect(empty)
@@ -202,3 +203,40 @@ def test_prepare_and_check_refuse_dual_fisheye_images(world: World, tmp_path: Pa
     write_colmap_text(world, tmp_path / "posed")
     (tmp_path / "pano_02.jpg").rename(tmp_path / "posed/images/pano_02.png")
     assert any("pano_02.png shows two circles" in problem for problem in check(tmp_path / "posed").problems)
+
+
+EPS = b"""%!PS-Adobe-3.0 EPSF-3.0
+%%BoundingBox: 0 0 128 64
+%%EndComments
+(ran.txt) (w) file closefile
+%%EOF
+"""
+
+
+@pytest.mark.parametrize("kind", ["EPS", "GIF", "DDS", "ICO", "PCX", "TGA", "PPM"])
+def test_other_formats_are_refused_whatever_the_extension_says(kind, world, tmp_path, monkeypatch):
+    """The decoder of EPS runs Ghostscript, which runs the program in the file."""
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "a.jpg"
+    if kind == "EPS":
+        path.write_bytes(EPS)
+    else:
+        Image.fromarray(PIXELS).save(path, kind)
+    Image.init()  # all decoders of Pillow are known from here on
+    for look in (inspect, lambda path: inspect(path, mask=True), decode):
+        with pytest.raises(DataError, match="a.jpg"):
+            look(path)
+    with pytest.raises(UnidentifiedImageError):
+        split_image(path, 3)
+    assert not Path("ran.txt").exists()
+    write_colmap_text(world, tmp_path / "world")
+    first = sorted((tmp_path / "world" / "images").iterdir())[0]
+    first.write_bytes(path.read_bytes())
+    assert any(f"{first.name} is not an image in JPEG, PNG" in text for text in check(tmp_path / "world").problems)
+
+
+def test_images_beyond_the_limit_are_refused_with_the_limit(tmp_path, monkeypatch):
+    path = _save(tmp_path / "a.png", Image.fromarray(PIXELS))
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 64 * 64 - 100)
+    with pytest.raises(DataError, match=r"a.png has more than 0 million pixels, .* reduce it"):
+        inspect(path)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from support.processes import SMALLEST, finish
+from support.tiny_run import SMALLEST, finish
 
 from padgs import results
 from padgs.multirun.overrides import lenient

@@ -9,7 +9,7 @@ from unittest.mock import Mock
 
 import pytest
 from omegaconf import OmegaConf
-from support.processes import SMALLEST, finish
+from support.tiny_run import SMALLEST, finish
 
 from padgs import results
 from padgs.multirun.sweep import sweep

@@ -28,7 +28,7 @@ from padgs.cli.commands import app
 from padgs.multirun import job, run, sweep  # noqa: F401 - before the first fork
 from padgs.runs import checkpoint
 from padgs.runs import run as pipeline  # noqa: F401
-from support.processes import SMALLEST
+from support.tiny_run import SMALLEST
 
 TINY = [*SMALLEST, "train.iterations=60", "run.checkpoint_every=5", "run.probe_every=20", "tracking=none"]
 TIMES = re.compile(r'"(cpu_)?seconds": [0-9.]+')

@@ -7,6 +7,7 @@ from torch import Tensor
 from padgs.methods.splats import splats as splats_module
 from padgs.methods.splats.splats import Splats
 from padgs.scene import View
+from support.tiny_scene import tiny_scene
 
 
 def splats_of(count: int, stored: int, center: Tensor, generator: torch.Generator) -> Splats:
@@ -50,3 +51,12 @@ def assert_matches_definition(
         for ours, truth in zip(found, expected, strict=True):
             limit = 2 * tolerance * max(1.0, float(truth.detach().abs().max()))
             torch.testing.assert_close(ours, truth.expand_as(ours), atol=limit, rtol=tolerance)
+
+
+def random_splats(degree: int, generator: torch.Generator) -> Splats:
+    """Return splats of the tiny scene with random numbers in all rows."""
+    splats = Splats.from_scene(tiny_scene(), degree=degree, generator=generator)
+    for row in splats.rows().values():
+        row.data = torch.randn(row.shape, generator=generator)
+    splats.active_degree = degree
+    return splats

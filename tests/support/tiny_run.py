@@ -1,5 +1,6 @@
 """A finished run, small enough to be made in a second or two: 3 training and 2 test views of 32x16 of the room."""
 
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -31,3 +32,21 @@ def tiny_run(factory: pytest.TempPathFactory, *settings: str) -> Path:
             config = configuration(["method=omnigs", *SETTINGS, *settings, f"run.folder={runs}"])
         run(config, Console(quiet=True))
     return next(path.parent for path in runs.glob("*/result.json"))
+
+
+SMALLEST = [  # for `padgs-run` as a process
+    "protocol=paper",
+    "protocol.paper.lpips=none",
+    "data.generator.width=64",
+    "data.generator.train_views=4",
+    "data.generator.test_views=1",
+    "data.generator.samples=1",
+    "data.generator.points=400",
+    "run.threads=1",
+]
+
+
+def finish(process: subprocess.Popen) -> tuple[int, str, str]:
+    """Wait for a process; return its exit code, output and errors."""
+    out, error = process.communicate(timeout=400)
+    return process.returncode, out, error

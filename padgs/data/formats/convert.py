@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 import torch
-from PIL import Image
 
 import padgs.data
 from padgs.data.assemble import assemble, view_name
@@ -18,6 +17,7 @@ from padgs.data.cloud import initial_cloud
 from padgs.data.formats.writers import WRITERS, Content
 from padgs.data.images import save_png
 from padgs.data.masks import write_masks
+from padgs.files import open_image
 from padgs.scene import Scene
 
 IMAGE_FOLDERS = {"ricoh360": "imgs"}  # default: images
@@ -92,7 +92,7 @@ def _write_images(
     for done, i in enumerate(kept):
         frame = capture.frames[i]
         view = views[view_name(frame.name)]
-        with Image.open(frame.image) as image:
+        with open_image(frame.image) as image:
             reduced = image.width != view.width
         encode = reduced or (to in PNG_ONLY and frame.image.suffix.lower() != ".png")
         name = str(PurePosixPath(frame.name).with_suffix(".png")) if encode else frame.name

@@ -16,6 +16,7 @@ from PIL import Image
 from torch import Tensor
 
 from padgs.data.perturb.geometry import change_training_views, change_views, rotate_camera
+from padgs.files import open_image
 from padgs.geometry.panorama import pad_panorama, project, rays, sample, sample_bicubic
 from padgs.scene import Scene, View
 
@@ -129,7 +130,7 @@ def jpeg(scene: Scene, quality: int, random: np.random.Generator) -> Scene:
     def compress(pixels: Tensor) -> Tensor:
         file = io.BytesIO()
         Image.fromarray(pixels.cpu().numpy()).save(file, "JPEG", quality=quality)
-        return torch.from_numpy(np.array(Image.open(file))).to(pixels.device)
+        return torch.from_numpy(np.array(open_image(file))).to(pixels.device)
 
     return change_training_views(scene, lambda view: change_pixels(view, compress))
 

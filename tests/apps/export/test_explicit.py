@@ -7,7 +7,7 @@ import pytest
 import torch
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
-from support.random_splats import random_splats
+from support.splat_cases import random_splats
 from support.tiny_run import tiny_run
 from support.tiny_scene import tiny_scene
 from typer.testing import CliRunner

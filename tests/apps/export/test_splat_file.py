@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 from plyfile import PlyData
-from support.random_splats import random_splats
+from support.splat_cases import random_splats
 
 from padgs.apps.export import splat_file
 from padgs.apps.export.splat_file import estimate_seconds, read_splats, write_splats
