@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from support.hybrid_reference import one_pixel
+from support.definition import one_pixel
 from torch import Tensor
 
 from padgs.render.backends.torch import hybrid_weights

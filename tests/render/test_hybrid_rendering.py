@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 from support import render_cases
-from support.hybrid_reference import one_pixel
+from support.definition import one_pixel
 from support.render_cases import (
     INPUTS,
     assert_matches_definition,
