@@ -126,9 +126,7 @@ print(cpu.library().padgs_isa().decode(), end="")
 
 def on_instruction_set(isa: str, file: Path) -> tuple[str, dict[str, dict[str, Tensor]]]:
     """Return the instruction set that was used with PADGS_ISA set, and all results."""
-    folder = Path(__file__).parent
-    places = (folder.parents[2], folder.parent, folder.parent / "cuda", folder, os.environ.get("PYTHONPATH"))
-    search_path = os.pathsep.join(str(place) for place in places if place)
+    search_path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
     done = subprocess.run(
         [sys.executable, "-c", IN_ANOTHER_PROCESS, str(file)],
         env={**os.environ, "PYTHONPATH": search_path, "PADGS_ISA": isa},
