@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from importlib.resources import files
 from pathlib import Path
 
 import yaml
@@ -57,8 +56,7 @@ class Spec:
 
 def _variants(table: str, chosen: Callable[[str], bool] = lambda name: True) -> dict[str, str]:
     """Return variant -> title of a table in conf/variants."""
-    package = Path(str(files("padgs")))
-    folder = (package if (package / "conf").is_dir() else package.parent) / "conf" / "variants"
+    folder = Path(__file__).resolve().parent.parent / "conf" / "variants"  # beside reports, installed or not
     rows = yaml.safe_load((folder / f"{table}.yaml").read_text("utf-8"))
     return {name: row["title"] for name, row in rows.items() if chosen(name)}
 

@@ -55,7 +55,7 @@ def inspect(path: Path, *, mask: bool = False) -> ImageFile:
             f"{path} has more than {2 * (Image.MAX_IMAGE_PIXELS or 0) / 1e6:.0f} million pixels, the most that are "
             "read; reduce it (`mogrify -resize 50%`)"
         ) from error
-    except (UnidentifiedImageError, OSError, SyntaxError) as error:
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
         formats = ", ".join(IMAGE_FORMATS)
         raise DataError(f"{path} is not an image in {formats} ({error}); convert, replace or remove it") from error
     if orientation not in (None, 0, 1):
