@@ -115,7 +115,7 @@ def test_weights_and_residual_sum_to_one(generator):
 
 
 def test_constant_density_is_exact_for_any_intervals(generator):
-    """What comes from the first length s is 1 - exp(-density s)."""
+    """The share of light from the first length s is 1 - exp(-density s)."""
     lengths = torch.rand(30, dtype=torch.float64, generator=generator)
     lengths = torch.cat((torch.zeros(5), lengths, torch.zeros(5)))  # empty space before and behind
     weights, residual = visible_shares(DENSITY * lengths)

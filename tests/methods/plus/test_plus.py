@@ -222,7 +222,7 @@ def test_pruning_all_gaussians_fails_as_collapsed():
 
 
 def crowded_scene() -> Scene:
-    """Of 10 000 pixels, as padgs_plus counts them, and 4000 points."""
+    """A scene of 10 000 pixels, as padgs_plus counts them, and 4000 points."""
     tiny = tiny_scene()
     points = tiny.points.repeat(100, 1) + 0.1 * torch.randn(4000, 3, generator=torch.Generator().manual_seed(0))
     return replace(tiny, points=points, point_colors=tiny.point_colors.repeat(100, 1))

@@ -1,4 +1,4 @@
-"""How many rows are needed, of hand-made scores, and what pixels count in a score."""
+"""Number of rows that hand-made importance scores require, and the pixels that count in a score."""
 
 import math
 
