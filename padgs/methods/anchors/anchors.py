@@ -188,17 +188,6 @@ class PaDGS(nn.Module):
         gaussians, slots, raw_opacities, count = decode_with_capacity(weights, anchors, capacity, precision)
         return Decoded(gaussians, slots, raw_opacities, HostCopy(count))
 
-    def show(self, view: View) -> Gaussians:
-        """Decode for `padgs.render.backends.captured`: A K Gaussians, of which the unselected ones are zeros.
-
-        Raises:
-            ValueError, OSError: as `padgs.methods.anchors.decoder.decode_with_capacity`.
-        """
-        everything = self.offsets[..., 0].numel()
-        return decode_with_capacity(
-            self.decoder.weights(), self.seen_anchors(view), everything, self.options.precision
-        )[0]
-
     def seen_anchors(self, view: View) -> SeenAnchors:
         """Return the inputs of the decoder for a view."""
         options = self.options

@@ -9,19 +9,16 @@ import ctypes
 import functools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from padgs.geometry.camera import Camera
 from padgs.native import cuda
 from padgs.native.abi import GRADIENT_SUMS, REMOVAL, Gradients, Inputs, NativeCamera, pointer
 from padgs.native.cuda import HostCopy, Queue, SortArguments, TileTable
 from padgs.render.backends.native import (
     TILE,
     NativeImage,
-    NativeRays,
     Pixels,
     Strips,
     Upstream,
@@ -188,36 +185,23 @@ class Counters(Mapping[str, int]):
         return 5
 
 
-@dataclass
-class Outputs:
-    """The outputs of blending, which the backward pass needs too."""
+@dataclass(frozen=True)
+class _Kept:
+    """The outputs of blending, besides the pixels, that the backward pass needs."""
 
-    image: Tensor  # [H, W, 3]
-    transmittance: Tensor  # [H, W]
-    depth: Tensor  # [H, W]
-    last: Tensor | None  # [H, W] int32, sorted blending: position of the last contribution
     core_size: int  # of hybrid blending, or 0
-    core: Tensor | None  # [H, W, core_size] int32, hybrid blending with gradients: see csrc/cuda/core.h
-    tails: Tensor | None  # [H, W, 6], as core
+    last: Tensor | None = None  # [H, W] int32, sorted blending: position of the last contribution
+    core: Tensor | None = None  # [H, W, core_size] int32, hybrid blending with gradients: see csrc/cuda/core.h
+    tails: Tensor | None = None  # [H, W, 6], as core
 
     @staticmethod
-    def allocate(
-        camera: Camera, options: RenderOptions, device: torch.device, *, differentiated: bool = False
-    ) -> Outputs:
-        """Allocate the outputs of one image."""
-        size, hybrid = (camera.height, camera.width), options.blending == "hybrid"
-        core_size = options.core_size if hybrid else 0
-        kept = hybrid and differentiated
-        transmittance, depth = FLOATS(2, *size, device=device)
-        return Outputs(
-            FLOATS(*size, 3, device=device),
-            transmittance,
-            depth,
-            None if hybrid else INTEGERS(size, device=device),
-            core_size,
-            INTEGERS((*size, core_size), device=device) if kept else None,
-            FLOATS(*size, 6, device=device) if kept else None,
-        )
+    def allocate(options: RenderOptions, size: tuple[int, int], device: torch.device, *, differentiated: bool) -> _Kept:
+        if options.blending != "hybrid":
+            return _Kept(0, INTEGERS(size, device=device))
+        if not differentiated:
+            return _Kept(options.core_size)
+        core = INTEGERS((*size, options.core_size), device=device)
+        return _Kept(options.core_size, None, core, FLOATS(*size, 6, device=device))
 
 
 class _Image(NativeImage):
@@ -226,7 +210,10 @@ class _Image(NativeImage):
     def draw(self, inputs: Inputs, pose: Tensor, background: Tensor, *, differentiated: bool) -> tuple[Pixels, Tensor]:
         camera, options, device = self.camera, self.options, pose.device
         self.rays = native_rays(camera, device)
-        outputs = Outputs.allocate(camera, options, device, differentiated=differentiated)
+        size = (camera.height, camera.width)
+        transmittance, depth = FLOATS(2, *size, device=device)
+        pixels = (FLOATS(*size, 3, device=device), transmittance, depth)
+        self._kept = _Kept.allocate(options, size, device, differentiated=differentiated)
         native, key = native_camera(IDENTITY, camera, options), (device, camera.width, camera.height)
         limit = min(options.max_instances, MAX_INSTANCES)
         capacity = _capacities.get(key, 0)
@@ -235,28 +222,25 @@ class _Image(NativeImage):
         while True:
             self._projected = DeviceProjected(native, pose, inputs, options.max_instances, capacity=capacity)
             counts = HostCopy(self._projected.counts) if capacity else None
-            pairs = blend(self._projected, self.rays, background, outputs)
+            pairs = self._blend(background, pixels)
             if counts is None or self._projected.fits(counts.values()):
                 break
             capacity = 0
         instances = self._projected.instances
         wanted = max(int(HEADROOM * instances) + 1, capacity * 15 // 16)
         _capacities[key] = min(wanted, limit) if instances <= limit else 0  # 0: strips need the exact number
-        self._kept = (outputs.last, outputs.core_size, outputs.core, outputs.tails)
-        known = {"visible": self._projected.visible, "instances": self._projected.instances}
-        self.counters = Counters(pairs, gaussians=inputs.count, **known)
+        self.counters = Counters(pairs, gaussians=inputs.count, visible=self._projected.visible, instances=instances)
         visible = self._projected.boxes[:, 3] < self._projected.boxes[:, 4]
-        return (outputs.image, outputs.transmittance, outputs.depth), visible
+        return pixels, visible
 
     def gradient_sums(self, pixels: Pixels, background: Tensor, upstream: Upstream) -> Tensor:
-        projected, outputs = self._projected, Outputs(*pixels, *self._kept)
-        device, size, hybrid = background.device, outputs.depth.shape, outputs.core_size > 0
+        projected, device, core_size = self._projected, background.device, self._kept.core_size
         totals = torch.zeros(len(projected.order), GRADIENT_SUMS, dtype=torch.float32, device=device)
-        core_gradients = FLOATS(*size, outputs.core_size, 2, device=device) if hybrid else None
+        core_gradients = FLOATS(*pixels[2].shape, core_size, 2, device=device) if core_size else None
         for strip in projected.strips():
             sums = FLOATS(strip.instances, GRADIENT_SUMS, device=device)
             arguments = cuda.BlendGradientInputs(
-                _blend_inputs(projected, strip, self.rays, background, outputs, None),
+                self._blend_inputs(strip, background, pixels, None),
                 *map(pointer, (upstream.image, upstream.transmittance, upstream.depth)),
                 *map(pointer, (core_gradients, sums, upstream.rays, projected.order, strip.slot_start)),
                 projected.visible,
@@ -267,13 +251,13 @@ class _Image(NativeImage):
         return totals
 
     def removals(self, pixels: Pixels, background: Tensor, target: Tensor, weight: Tensor) -> Removals:
-        projected, outputs, device = self._projected, Outputs(*pixels, *self._kept), background.device
+        projected, device = self._projected, background.device
         sums = torch.zeros(len(projected.order), REMOVAL - 1, dtype=torch.float64, device=device)
         peak = torch.zeros(len(projected.order), device=device)
         drawn = projected.order[: projected.visible].long()
         for strip in projected.strips():
             found = torch.zeros(strip.instances, REMOVAL, device=device)  # slots that no instance fills are read, too
-            forward = _blend_inputs(projected, strip, self.rays, background, outputs, None)
+            forward = self._blend_inputs(strip, background, pixels, None)
             arguments = cuda.RemovalInputs(forward, *map(pointer, (target, weight, found)))
             cuda.call("padgs_cuda_leave_one_out", projected.queue, arguments)
             starts = strip.slot_start[: projected.visible + 1].long()
@@ -295,33 +279,25 @@ class _Image(NativeImage):
         cuda.call("padgs_cuda_project_backward", projected.queue, arguments)
         return None if pose_gradient is None else pose_gradient.sum(0)
 
+    def _blend(self, background: Tensor, pixels: Pixels) -> Tensor:
+        """Fill the pixels; return how many pairs were evaluated, and how many contributed, [2] int64."""
+        pairs = torch.zeros(2, dtype=torch.int64, device=background.device)
+        for strip in self._projected.strips():
+            pair_counts = INTEGERS(strip.tiles, 2, device=background.device)
+            arguments = self._blend_inputs(strip, background, pixels, pair_counts)
+            cuda.call("padgs_cuda_blend", self._projected.queue, arguments)
+            pairs += pair_counts.sum(0)
+        return pairs
 
-def blend(projected: DeviceProjected, rays: NativeRays, background: Tensor, outputs: Outputs) -> Tensor:
-    """Fill the outputs; return how many pairs were evaluated, and how many contributed, [2] int64."""
-    pairs = torch.zeros(2, dtype=torch.int64, device=background.device)
-    for strip in projected.strips():
-        pair_counts = INTEGERS(strip.tiles, 2, device=background.device)
-        arguments = _blend_inputs(projected, strip, rays, background, outputs, pair_counts)
-        cuda.call("padgs_cuda_blend", projected.queue, arguments)
-        pairs += pair_counts.sum(0)
-    return pairs
-
-
-def _blend_inputs(
-    projected: DeviceProjected, strip: DeviceStrip, rays: Any, background: Tensor, outputs: Outputs, pair_counts
-) -> cuda.BlendInputs:
-    """Return the arguments of both blending passes; the tensors must outlive the call."""
-    camera = projected.camera
-    lists = (projected.footprints, strip.tile_start, strip.slots, strip.reaches, background)
-    written = (outputs.image, outputs.transmittance, outputs.depth, outputs.last, outputs.core, outputs.tails)
-    return cuda.BlendInputs(
-        strip.table,
-        camera.projection,
-        camera.wrap,
-        outputs.core_size,
-        rays.native(),
-        *map(pointer, (*lists, *written, pair_counts)),
-    )
+    def _blend_inputs(
+        self, strip: DeviceStrip, background: Tensor, pixels: Pixels, pair_counts: Tensor | None
+    ) -> cuda.BlendInputs:
+        """Return the arguments of both blending passes; the tensors must outlive the call."""
+        projected, kept = self._projected, self._kept
+        lists = (projected.footprints, strip.tile_start, strip.slots, strip.reaches, background)
+        outputs = (*pixels, kept.last, kept.core, kept.tails, pair_counts)
+        scalars = (projected.camera.projection, projected.camera.wrap, kept.core_size)
+        return cuda.BlendInputs(strip.table, *scalars, self.rays.native(), *map(pointer, (*lists, *outputs)))
 
 
 rasterize, leave_one_out = _Image.rasterize, _Image.leave_one_out

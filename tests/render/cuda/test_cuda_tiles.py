@@ -19,7 +19,7 @@ from padgs.native import cuda
 from padgs.native.abi import Inputs, Pointer, fields, pointer
 from padgs.render import RenderOptions
 from padgs.render.backends.cpu import TILE
-from padgs.render.backends.cuda import DeviceProjected
+from padgs.render.backends.cuda import DeviceProjected, DeviceStrip
 from padgs.render.backends.native import native_camera
 
 pytestmark = [
@@ -98,6 +98,22 @@ def test_no_slots_without_instances(generator: torch.Generator, monkeypatch: pyt
     first, rest = projected((131, 77), RenderOptions(max_instances=5), "panorama", gaussians, identity_pose()).strips()
     assert first.instances > 5 and rest.instances == 0
     assert not rest.slot_start.any(), "else the backward pass adds up what lies anywhere"
+
+
+def test_instance_counts_beyond_32_bits():
+    """Slots must not wrap around to 0, where they would overwrite the first ones."""
+    side, count, capacity = 8192, 16_400, 100
+    view = DeviceProjected.__new__(DeviceProjected)
+    view.camera = native_camera(identity_pose(), camera_of("pinhole", side, side), RenderOptions("pinhole"))
+    view.queue, view.capacity, view.visible = cuda.queue(CPU), capacity, count
+    view.boxes = torch.tensor([0, side, 0, 0, side], dtype=torch.int32).repeat(count, 1)
+    view.order = torch.arange(count, dtype=torch.int32)
+    strip = DeviceStrip(view, 0, side // 16)
+    assert count * strip.tiles > 2**32
+    wanted = (strip.tiles * torch.arange(count + 1)).clamp(max=2**31 - 1)
+    assert torch.equal(strip.slot_start.long(), wanted)
+    assert (strip.reaches[:, 0] == 0).all()
+    assert torch.equal(strip.tile_start.long(), torch.arange(strip.tiles + 1).clamp(max=capacity))
 
 
 @pytest.mark.parametrize(("device", "current"), [(1, 0), (0, 0), (0, 2)])
