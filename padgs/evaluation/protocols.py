@@ -13,8 +13,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from padgs.checks import check, check_known
-from padgs.evaluation.lpips import INPUTS
-from padgs.evaluation.lpips_weights import NETS
+from padgs.evaluation.lpips import INPUTS, NETS
 from padgs.evaluation.metrics import BANDS, METRICS
 
 LPIPS_CHOICES = (*NETS, "none")

@@ -40,7 +40,7 @@ from padgs.runs.load import LoadedRun, load_run
 from padgs.runs.run import Callback, run, start
 from padgs.runs.store import Labels
 from padgs.runs.warm_start import WarmStart
-from padgs.training.refining import held_out
+from padgs.training.health import held_out
 from padgs.training.schedule import Pace
 
 EXPERIMENT = FOLDER = "smallest"

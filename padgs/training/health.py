@@ -1,4 +1,4 @@
-"""Health of a training: failures, the monitor that ends failing runs, and early stopping."""
+"""Health of a training: failures, the monitor that ends failing runs, a guard against bad rows, and early stopping."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ import torch
 from torch import Tensor
 
 from padgs.render import Rendering
-from padgs.scene import View
+from padgs.scene import Scene, View
 from padgs.training.model import Model, TrainingRender
 from padgs.training.options import Budget
+from padgs.training.schedule import ParameterGroup
 from padgs.training.targets import even_weight, image_of
 
 OUT_OF_MEMORY_MESSAGES = ("can't allocate memory", "not enough memory", "out of memory", "bad_alloc")
@@ -35,6 +36,11 @@ LARGE_SHARE = 0.01  # of the Gaussians; single large ones of PaD-GS do no harm
 ADVICE = "train.monitor=false lets such a run continue"
 GRADIENT = "gradient of "
 
+MAX_BAD = 1e-4  # share of rows that may be bad in a render; one always may
+SCALES = "log_scales"  # name of the parameter group whose last three columns are log-scales of axes
+MIN_SCALE = 1e-6  # scene scales
+MAX_ANISOTROPY = 1e3  # longest axis over the shortest
+
 VALIDATION_SHARE, MIN_VALIDATION = 8, 3  # one of so many training views is held out, and at least so many are
 FADE = 0.15  # share of the schedule, at its end, that a stopped run still goes through
 GAIN = 0.02  # dB; a smaller gain ...
@@ -50,20 +56,6 @@ class Failure(RuntimeError):
     def __init__(self, status: str, reason: str) -> None:
         super().__init__(reason)
         self.status = status
-
-
-def first_non_finite(tensors: Mapping[str, Tensor | None]) -> str | None:
-    """Return name and first entry of the first tensor with a NaN or an infinity; None if all are finite.
-
-    >>> first_non_finite({"a": torch.zeros(2), "b": torch.tensor([[0.0, float("nan")]]), "c": None})
-    'b[0, 1] is nan'
-    """
-    for name, tensor in tensors.items():
-        if tensor is None or torch.isfinite(tensor).all():
-            continue
-        index = (~torch.isfinite(tensor)).nonzero()[0].tolist()
-        return f"{name}{index if index else ''} is {tensor[tuple(index)].item()}"
-    return None
 
 
 def is_out_of_memory(error: BaseException) -> bool:
@@ -98,8 +90,23 @@ def out_of_memory_as_failure(iteration: int) -> Iterator[None]:
         raise Failure("oom", f"out of memory at iteration {iteration}: {memory_reason(error)}") from error
 
 
-class Monitor:
-    """Ends a run that fails without a NaN: diverged, exploded, collapsed or silent.
+class _Remembering:
+    """Part of a trainer that remembers `_state`, values that JSON can hold."""
+
+    _state: dict[str, Any]
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """A copy of all that it remembers."""
+        return copy.deepcopy(self._state)
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Resume where `state` was taken."""
+        self._state = copy.deepcopy(dict(state))
+
+
+class Monitor(_Remembering):
+    """Ends a run that fails without a NaN, by a Failure: diverged, exploded, collapsed or silent.
 
     It reads the loss at every iteration (on a GPU when it has been read), and all else when gradients and parameters
     are checked. A sign must last before it ends a run: healthy runs show each sign for a while, as after a reset of
@@ -107,30 +114,17 @@ class Monitor:
     """
 
     def __init__(self, iterations: int, count: int, pixels: int, *, active: bool = True) -> None:
-        """Begin a run.
+        """Begin a run with `count` Gaussians, anchors or other parts, and training views of `pixels`.
 
-        Args:
-            iterations: schedule length.
-            count: initial number of Gaussians, anchors or other parts; the largest count of the model.
-            pixels: of all training views.
-            active: otherwise no run is ended.
+        No run is ended unless the monitor is `active`.
         """
         self._iterations, self._pixels, self._active = iterations, pixels, active
         self._smoothed = max(SMOOTHED, SMOOTHED_SHARE * iterations)
         self._step: int | None = None  # schedule step of the iteration; None if both are the same
-        self._state: dict[str, Any] = {
+        self._state = {
             **{"start": count, "sum": 0.0, "weight": 0.0, "seen": 0, "best": None, "largest": None},
             **{"since": {}, "highest": 0.0, "first": FIRST, "halvings": None},
         }
-
-    @property
-    def state(self) -> dict[str, Any]:
-        """A copy of all that it remembers, as JSON can hold it."""
-        return copy.deepcopy(self._state)
-
-    def load(self, state: Mapping[str, Any]) -> None:
-        """Resume where `state` was taken."""
-        self._state = copy.deepcopy(dict(state))
 
     def forget(self) -> None:
         """Restart all signs after the schedule has jumped, because their durations are meaningless then."""
@@ -144,32 +138,8 @@ class Monitor:
             state["since"].pop("diverged", None)
         state["halvings"] = halvings
 
-    def end(
-        self, loss: float | Tensor, counts: Mapping[str, int], silent: Sequence[str] | None, iteration: int
-    ) -> None:
-        """Check an iteration.
-
-        Args:
-            loss: a tensor if it has not been read from the GPU; it is left out then.
-            counts: of the model.
-            silent: names of parameter groups whose gradients are all 0; None if they were not checked.
-            iteration: 1 for the first.
-
-        Raises:
-            Failure: diverged, exploded, collapsed or silent.
-        """
-        if isinstance(loss, float):
-            self.loss(loss, iteration)
-        self.counts(counts, iteration)
-        if silent is not None:
-            self.gradients(silent, iteration)
-
     def loss(self, value: float, iteration: int) -> None:
-        """Check the loss of an iteration.
-
-        Raises:
-            Failure: diverged.
-        """
+        """Check the loss of an iteration."""
         state = self._state
         new = -math.expm1((state["seen"] - iteration) / self._smoothed)
         state["sum"] += (value - state["sum"]) * new
@@ -194,11 +164,7 @@ class Monitor:
             )
 
     def counts(self, counts: Mapping[str, int], iteration: int) -> None:
-        """Check the size of the model.
-
-        Raises:
-            Failure: exploded or collapsed.
-        """
+        """Check the size of the model."""
         name, most = max(counts.items(), key=lambda item: item[1])
         start = self._state["start"]
         healthy = max(start, self._pixels)
@@ -212,11 +178,7 @@ class Monitor:
             self._fail("collapsed", f"{most} of {start} {name} are left at iteration {iteration}, few since {since}")
 
     def render(self, rendered: TrainingRender, image: Tensor, iteration: int) -> None:
-        """Check a render against its image [H, W, 3].
-
-        Raises:
-            Failure: collapsed or exploded.
-        """
+        """Check a render against its image [H, W, 3]."""
         at = f"at iteration {iteration}, and since"
         alpha = 1 - rendered.rendering.transmittance.detach().mean().item()
         if since := self._lasting("faint", alpha < FAINTEST, iteration):
@@ -239,29 +201,20 @@ class Monitor:
                 f"{limit / LARGER:.3g}",
             )
 
-    def gradients(self, silent: Sequence[str], iteration: int) -> None:
-        """Check the parameter groups whose gradients are all exactly 0, by name.
-
-        Raises:
-            Failure: silent.
-        """
+    def gradients(self, silent: Sequence[str] | None, iteration: int) -> None:
+        """Check the parameter groups whose gradients are all exactly 0, by name; None if they are not known."""
+        if silent is None:
+            return
         known = {sign.removeprefix(GRADIENT) for sign in self._state["since"] if sign.startswith(GRADIENT)}
         for name in sorted({*silent, *known}):
             if since := self._lasting(GRADIENT + name, name in silent, iteration, SILENT):
                 self._fail("silent", f"the {GRADIENT}{name} is exactly 0 at iteration {iteration}, and since {since}")
 
     def positional_gradient(self, gradient: Tensor | None, iteration: int) -> None:
-        """Check the positional gradient that densification uses.
-
-        Raises:
-            Failure: silent.
-        """
+        """Check the positional gradient that densification uses."""
         if since := self._lasting("probe", gradient is None or not gradient.any(), iteration, SILENT):
-            self._fail(
-                "silent",
-                f"the positional gradient is exactly 0 at iteration {iteration}, and since {since}, so nothing can "
-                "grow",
-            )
+            zero = f"the positional gradient is exactly 0 at iteration {iteration}, and since {since}"
+            self._fail("silent", f"{zero}, so nothing can grow")
 
     def _fail(self, status: str, reason: str) -> None:
         if self._active:
@@ -280,6 +233,89 @@ class Monitor:
         return first if iteration - first >= least and step - began >= share * self._iterations else None
 
 
+class Guard:
+    """Guards a model against single rows (Gaussians, anchors) that spoil a run; off by default, as none is published.
+
+    Adam writes a NaN gradient of one row into its parameters, and the next render carries it everywhere. All gradients
+    of such a row are set to 0; Adam goes on with what it knows of the row. Networks and cameras have no guard: a NaN
+    there concerns the whole model. For anchors, scales are those that their networks shrink, so the scales of their
+    Gaussians are bounded from above only. Only `report` waits for a GPU.
+    """
+
+    def __init__(self, groups: Sequence[ParameterGroup], scene: Scene, *, gradients: bool, scales: bool) -> None:
+        """Prepare to clean `gradients` of bad rows, or to keep `scales` within bounds.
+
+        The largest scale is the distance of the farthest point from the first camera, the scene scale, or the largest
+        initial scale (such as of Gaussians for the sky), whichever is more.
+        """
+        self._gradients = gradients
+        self._rows = [parameter for group in groups if group.is_of_rows for parameter in group.parameters]
+        self._scales = [p for group in groups if scales and group.name == SCALES for p in group.parameters]
+        device = groups[0].parameters[0].device
+        # Since the last report: the sum of bad rows over renders, and the most in one render minus those allowed.
+        self._bad = torch.zeros((), dtype=torch.int64, device=device)
+        self._excess = torch.full((), -1.0, device=device)
+        self._bounds = [0.0, 0.0]
+        if self._scales:
+            farthest = (scene.points.double() - scene.train[0].center).norm(dim=-1).max().item()
+            initial = max(parameter[..., -3:].max().item() for parameter in self._scales)
+            largest = max(math.log(max(farthest, scene.scale)), initial)
+            self._bounds = [math.log(MIN_SCALE * scene.scale), largest]
+
+    @torch.no_grad()
+    def clean(self, mean_offsets: Tensor) -> None:
+        """Set all gradients of bad rows to 0 after `backward`, and non-finite entries of the positional gradient."""
+        gradients = [row.grad for row in self._rows if row.grad is not None] if self._gradients else []
+        if not gradients:
+            return
+        if mean_offsets.grad is not None:
+            mean_offsets.grad.nan_to_num_(nan=0.0, posinf=0.0, neginf=0.0)
+        bad = torch.stack([~gradient.unsqueeze(-1).flatten(1).isfinite().all(1) for gradient in gradients]).any(0)
+        for gradient in gradients:
+            gradient.masked_fill_(bad.view(-1, *[1] * (gradient.dim() - 1)), 0.0)
+        count = bad.sum()
+        self._bad += count
+        self._excess = torch.maximum(self._excess, count - max(1.0, MAX_BAD * len(bad)))
+
+    @torch.no_grad()
+    def bound(self) -> None:
+        """Clamp scales to their bounds after a step."""
+        for parameter in self._scales:
+            axes = parameter[..., -3:]
+            axes.clamp_(*self._bounds)
+            axes.copy_(torch.maximum(axes, axes.amax(-1, keepdim=True) - math.log(MAX_ANISOTROPY)))
+
+    def report(self, iteration: int) -> tuple[str, ...]:
+        """Return the number of bad rows since the last report, as an event.
+
+        Raises:
+            Failure: nan; one render had too many bad rows.
+        """
+        if not self._gradients:
+            return ()
+        excess, bad = self._excess.item(), int(self._bad.item())
+        self._excess.fill_(-1.0)
+        self._bad.zero_()
+        if excess > 0:
+            raise Failure(
+                "nan",
+                f"{bad} rows had gradients that are not finite up to iteration {iteration}, too many at once; "
+                f"train.guard_gradients cleans at most {MAX_BAD:.2%} of the rows of a render, or one",
+            )
+        return (f"cleaned {bad} rows whose gradients were not finite",) if bad else ()
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """All that it remembers, as JSON can hold it."""
+        return {"bad": int(self._bad.item()), "excess": self._excess.item(), "bounds": [*self._bounds]}
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Resume where `state` was taken, with the bounds of that run."""
+        self._bad.fill_(state["bad"])
+        self._excess.fill_(state["excess"])
+        self._bounds = [*state["bounds"]]
+
+
 def validation_split(views: Sequence[View]) -> tuple[int, ...]:
     """Return the indices of evenly spread training views that are measured and not trained on.
 
@@ -295,6 +331,12 @@ def validation_split(views: Sequence[View]) -> tuple[int, ...]:
     return tuple(int((number + 0.5) * len(views) / count) for number in range(count))
 
 
+def held_out(views: Sequence[View]) -> tuple[tuple[View, ...], tuple[View, ...]]:
+    """Return the views to train on, and the validation views; raises ValueError as `validation_split`."""
+    chosen = validation_split(views)
+    return tuple(v for n, v in enumerate(views) if n not in chosen), tuple(views[n] for n in chosen)
+
+
 @torch.no_grad()
 def quality(render: Callable[[View], Rendering], views: Sequence[View]) -> float:
     """Return the mean WS-PSNR of views, dB, at most 100; plain PSNR for perspective views."""
@@ -307,7 +349,7 @@ def quality(render: Callable[[View], Rendering], views: Sequence[View]) -> float
     return total / len(views)
 
 
-class EarlyStopping:
+class EarlyStopping(_Remembering):
     """Ends a run when validation views gain nothing; they are trained on during the final fade.
 
     A stopped run jumps to the last `FADE` of its schedule, in which learning rates fall, and ends like any other.
@@ -328,16 +370,7 @@ class EarlyStopping:
         self.fade = min(round((1 - FADE) * iterations), iterations - 1)  # at least one step ends a run
         self._views = [views[index] for index in self.held_out]
         self._every = max(1, round(EVERY * iterations))
-        self._state: dict[str, Any] = {"next": self._every, "averages": [], "counts": []}
-
-    @property
-    def state(self) -> dict[str, Any]:
-        """All that it remembers, as JSON can hold it."""
-        return copy.deepcopy(self._state)
-
-    def load(self, state: Mapping[str, Any]) -> None:
-        """Resume where `state` was taken."""
-        self._state = copy.deepcopy(dict(state))
+        self._state = {"next": self._every, "averages": [], "counts": []}
 
     def reason(self, model: Model, step: int) -> str:
         """Measure the validation views if that is due at a schedule step; return why to stop, or an empty string."""

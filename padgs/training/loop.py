@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, ClassVar
 
@@ -13,15 +12,13 @@ from torch import Tensor
 from padgs.clock import Lap
 from padgs.scene import Scene
 from padgs.training.corrections import LEARNED, Corrections
-from padgs.training.guard import Guard
-from padgs.training.health import EarlyStopping, Failure, Monitor, out_of_memory_as_failure
+from padgs.training.health import EarlyStopping, Failure, Guard, Monitor, out_of_memory_as_failure
 from padgs.training.model import MODEL, Model, Record, State
 from padgs.training.optimizer import Optimizer
 from padgs.training.options import Budget, TrainOptions
 from padgs.training.schedule import Pace
-from padgs.training.view_order import Order, TrainingViews
+from padgs.training.targets import TrainingViews
 
-READ_EVERY = 10  # iterations between reads of the loss from a GPU
 VIEWS = "views/"  # prefix of view corrections in the state of a trainer
 Stage = Callable[[str], AbstractContextManager[object]]  # entered with the name of each part of an iteration
 
@@ -82,7 +79,7 @@ class Trainer:
         self._early_stopping = EarlyStopping(scene.train, budget)
         held_out, device = self._early_stopping.held_out, self._optimizer.device
         self._views = TrainingViews(scene, options.weight, device, coarse_share, seed, held_out)
-        self._order: Order = self._views
+        self._order: Any = self._views  # its state decides which data the next iterations see
         pixels = sum(view.width * view.height for view in scene.train)
         self._monitor = Monitor(budget.iterations, max(model.counts().values()), pixels, active=options.monitor)
 
@@ -101,10 +98,13 @@ class Trainer:
             step = budget.next_step(self.step, self.spent, self.step_seconds, self.skipped)
             self._monitor.begin(step, self._views.halvings(step / self.schedule), iteration)
             with out_of_memory_as_failure(iteration):
-                loss, sizes, events = self._gradients(iteration, step)
-                events += self._update(iteration, step)
+                loss, sizes = self._gradients(iteration, step)
+                events = self._update(iteration, step)
             counts = self._model.counts()
-            self._monitor.end(loss, counts, self._optimizer.silent, iteration)
+            if isinstance(loss, float):
+                self._monitor.loss(loss, iteration)
+            self._monitor.counts(counts, iteration)
+            self._monitor.gradients(self._optimizer.silent, iteration)
             if step == budget.iterations:
                 self._optimizer.refuse_non_finite(self._optimizer.parameters(), iteration)
             self.iteration, self.step, before = iteration, step, self.spent
@@ -136,8 +136,8 @@ class Trainer:
         """Seconds of training so far, on the clock of the budget."""
         return self.seconds if self._budget.clock == "wall" else self.cpu_seconds
 
-    def _gradients(self, iteration: int, step: int) -> tuple[float | Tensor, dict[str, int], tuple[str, ...]]:
-        """Render the next views and go back to the gradients; return mean loss, further counts, and events."""
+    def _gradients(self, iteration: int, step: int) -> tuple[float | Tensor, dict[str, int]]:
+        """Render the next views and go back to the gradients; return mean loss and further counts."""
         model, optimizer, stage, options = self._model, self._optimizer, self._stage, self._options
         checked, losses, drawn = optimizer.is_checked(iteration), [], []
         for _ in range(self._views_each):
@@ -153,7 +153,7 @@ class Trainer:
                 target = target if rendered.photo is None else rendered.photo(target)
                 loss = target.loss(image, options.lambda_l1, options.normalisation)
                 loss = loss if rendered.penalty is None else loss + rendered.penalty
-                losses.append(self._read(loss, {**vars(rendered.gaussians), "image": image}, iteration))
+                losses.append(optimizer.read(loss, {**vars(rendered.gaussians), "image": image}, iteration))
             if checked:
                 self._monitor.render(rendered, target.image, iteration)
             with stage("backward"):
@@ -164,7 +164,7 @@ class Trainer:
             with stage("observe"), torch.no_grad():
                 model.observe(rendered, step)
             drawn.append(len(rendered.gaussians))
-        return sum(losses) / len(losses), {"drawn": max(drawn)}, ()
+        return sum(losses) / len(losses), {"drawn": max(drawn)}
 
     def _update(self, iteration: int, step: int) -> tuple[str, ...]:
         """Step the optimizer and densify; return events. No graph of `_gradients` may be alive."""
@@ -182,18 +182,6 @@ class Trainer:
             passed = range(self.step + 1, step + 1)  # each schedule step densifies once
             events = tuple(event for one in passed for event in self._model.adapt(one, optimizer.adam))
         return events + (self._guard.report(iteration) if optimizer.is_checked(iteration) or step == length else ())
-
-    def _read(self, loss: Tensor, inputs: Mapping[str, Tensor | None], iteration: int) -> float | Tensor:
-        """Return the loss as a number; on a GPU only every few iterations, because the host has to wait for it.
-
-        Raises:
-            Failure: nan, naming a parameter or one of `inputs`.
-        """
-        if loss.device.type != "cpu" and iteration % READ_EVERY and not self._optimizer.is_checked(iteration):
-            return loss.detach()
-        if not math.isfinite(value := loss.item()):
-            self._optimizer.refuse_non_finite({**self._optimizer.parameters(), **inputs, "loss": loss}, iteration)
-        return value
 
     def state(self) -> State:
         """Copy model, optimizer, statistics, random state and data order; to be taken between two records."""

@@ -19,11 +19,10 @@ from padgs.render import RenderConfig, Rendering
 from padgs.render.contract import check_camera
 from padgs.scene import Scene, View
 from padgs.training.corrections import LEARNED
-from padgs.training.health import is_out_of_memory
+from padgs.training.health import held_out, is_out_of_memory
 from padgs.training.loop import VIEWS, Stage, Trainer
-from padgs.training.model import Model, Prunable, Record, Size, State
+from padgs.training.model import Model, Prunable, Record, Refined, Size, State
 from padgs.training.options import Budget, TrainOptions
-from padgs.training.refining import Refined, held_out
 from padgs.training.schedule import PUBLISHED_ITERATIONS
 
 REHEARSED = 0.02  # share of a budget of seconds that measures the speed of a method

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import KW_ONLY, dataclass, field
-from typing import Any, Protocol, runtime_checkable
+from dataclasses import KW_ONLY, dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -12,9 +12,12 @@ from torch import Tensor
 from padgs.gaussians import Gaussians
 from padgs.render import Rendering, RenderOptions
 from padgs.scene import View
-from padgs.training.schedule import ParameterGroup
-from padgs.training.targets import Target
+from padgs.training.schedule import Pace, ParameterGroup
 
+if TYPE_CHECKING:
+    from padgs.training.targets import Target
+
+REPLAYED = 0.2  # share of a schedule, at its end, whose learning rates a refinement goes through
 MODEL = "model/"  # prefix of the model's own tensors in the state of a trainer
 
 
@@ -147,3 +150,33 @@ class Prunable(Model, Protocol):
     def keep(self, rows: Tensor) -> None:
         """Keep only some rows, [N] bool or ascending row numbers, of all that has rows except an optimizer."""
         ...
+
+
+class Refined:
+    """A model that does not densify or prune; its learning rates are those of the last fifth of a schedule."""
+
+    def __init__(self, model: Model, learning_rates: str | float, iterations: int) -> None:
+        """Wrap a model that was built for a schedule of `iterations`; `learning_rates` as in `TrainOptions`."""
+        self._model, self._iterations = model, iterations
+        self._pace = Pace.of(learning_rates, iterations)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._model, name)
+
+    def groups(self) -> list[ParameterGroup]:
+        """Return the parameter groups of the model with the learning rates of a refinement."""
+        return [replace(g, learning_rate=self._rate(g), paced=False) for g in self._model.groups()]
+
+    def _rate(self, group: ParameterGroup) -> Callable[[int], float]:
+        def rate(step: int) -> float:
+            iteration: Any = self._iterations - REPLAYED * (self._iterations - step)  # schedules take floats, too
+            return group.learning_rate(iteration) * (self._pace(iteration) if group.paced else 1.0)
+
+        return rate
+
+    def observe(self, drawing: TrainingRender, iteration: int) -> None:
+        """Do nothing: without densification no statistics are needed."""
+
+    def adapt(self, iteration: int, optimizer: torch.optim.Adam) -> tuple[str, ...]:
+        """Do nothing."""
+        return ()

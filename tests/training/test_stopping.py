@@ -16,7 +16,7 @@ from padgs.scene import View
 from padgs.training.health import FADE, EarlyStopping, quality, validation_split
 from padgs.training.loop import Trainer
 from padgs.training.options import Budget
-from padgs.training.view_order import TrainingViews
+from padgs.training.targets import TrainingViews
 
 ITERATIONS = 100
 

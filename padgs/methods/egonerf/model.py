@@ -152,7 +152,7 @@ class RayTrainer(Trainer):
         self._order = self._pixels
         self.seconds, self.cpu_seconds = lap.seconds()  # reading images counts as training
 
-    def _gradients(self, iteration: int, step: int) -> tuple[float | Tensor, dict[str, int], tuple[str, ...]]:
+    def _gradients(self, iteration: int, step: int) -> tuple[float | Tensor, dict[str, int]]:
         model, generator = self._model, self._pixels.generator
         with self._stage("target"):
             rays = self._pixels.draw(self._rays)
@@ -164,18 +164,17 @@ class RayTrainer(Trainer):
             error = (image - rays.color[part]).square() * rays.weight[part, None]
             loss = error.sum() / total
             value += loss.detach()
-            read = self._read(value, {"image": image}, iteration)
+            read = self._optimizer.read(value, {"image": image}, iteration)
             with self._stage("backward"):
                 loss.backward()
         with self._stage("backward"):
             extra = model.regularisation(step)
             if extra is not None:
                 extra.backward()
-        events = (model.summary(),) if iteration == 1 else ()
-        return read, {"rays": self._rays}, events
+        return read, {"rays": self._rays}
 
     def _update(self, iteration: int, step: int) -> tuple[str, ...]:
         self._optimizer.check(iteration, step)
         with self._stage("optimizer"):
             self._optimizer.step(step)
-        return ()
+        return (self._model.summary(),) if iteration == 1 else ()
