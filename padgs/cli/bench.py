@@ -6,10 +6,7 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.errors import exit_on
 
-
-@exit_on(OSError, RuntimeError, ValueError)
 def bench(
     out: Annotated[str, typer.Option(help="folder for bench.json")] = "runs/bench",
     quick: Annotated[bool, typer.Option(help="a few seconds on a tiny workload, to see that it works")] = False,

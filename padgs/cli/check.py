@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from padgs.cli.errors import exit_on, show
+from padgs.cli.errors import show
 
 if TYPE_CHECKING:
     from padgs.data.check import Report
 
 
-@exit_on(ValueError, OSError)
 def check(
     path: Annotated[str, typer.Argument(help="folder with panoramas and poses, or the file that describes them")],
     format: Annotated[str, typer.Option(help="auto, or the format's name")] = "auto",

@@ -10,6 +10,7 @@ import padgs
 from padgs.cli.bench import bench
 from padgs.cli.check import check
 from padgs.cli.convert import convert
+from padgs.cli.errors import without_traceback
 from padgs.cli.export import export
 from padgs.cli.mask import mask
 from padgs.cli.prepare import prepare
@@ -39,4 +40,4 @@ def commands(
 
 
 for command in (bench, check, convert, export, mask, prepare, render, report, smallest, track, view):
-    app.command()(command)
+    app.command()(without_traceback(command))

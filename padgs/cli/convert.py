@@ -6,12 +6,11 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.errors import exit_on, show
+from padgs.cli.errors import show
 
 FORMATS = "colmap, nerfstudio (or transforms), openmvg, opensfm, roam360, ricoh360, omniblender, released"
 
 
-@exit_on(ValueError, OSError)
 def convert(
     source: Annotated[str, typer.Argument(help="folder with panoramas and poses, or the file that describes them")],
     destination: Annotated[str, typer.Argument(help="a folder that does not exist yet")],

@@ -1,19 +1,18 @@
-"""Output of commands: messages instead of tracebacks, with the name of the run, the data set or the place concerned."""
+"""Parts of all commands: errors as one line, text for the terminal, arguments that name a run."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TextIO
+from typing import Annotated, Any, TextIO
 
 import typer
 
 from padgs.runs.console import printable
-
-if TYPE_CHECKING:
-    from padgs.runs.load import LoadedRun
+from padgs.runs.interrupt import INTERRUPTED
 
 Run = Annotated[str, typer.Argument(help="folder of a run, finished or not, as padgs-run names it at its end")]
 DataPath = Annotated[str | None, typer.Option("--data", help="new place of its data set, if it has moved")]
@@ -24,41 +23,34 @@ def show(text: str, stream: TextIO | None = None) -> None:
     print(printable(text), file=stream)
 
 
-@contextmanager
-def exit_on(*kinds: type[Exception]) -> Iterator[None]:
-    """End the command with exit code 1 and the message of an exception of these kinds, without a traceback."""
-    try:
-        yield
-    except kinds as error:
-        show(f"error: {error}", sys.stderr)
-        raise typer.Exit(1) from error
+def without_traceback(command: Callable[..., None]) -> Callable[..., None]:
+    """Wrap a command: an error ends it with a line and exit code 1, Ctrl-C with a line and exit code 130."""
+
+    @wraps(command)
+    def wrapped(**options: Any) -> None:
+        try:
+            command(**options)
+            sys.stdout.flush()
+        except KeyboardInterrupt as stopped:
+            show(str(stopped) or "stopped", sys.stderr)
+            raise typer.Exit(INTERRUPTED) from stopped
+        except (typer.Exit, BrokenPipeError):  # typer ends in silence where the reader of the output has ended
+            raise
+        except (ValueError, OSError, RuntimeError, MemoryError) as error:
+            show(f"error: {error or 'out of memory'}{_hint(error, **options)}", sys.stderr)
+            raise typer.Exit(1) from error
+
+    return wrapped
 
 
-def open_run(run: str, data: str | None) -> LoadedRun:
-    """Load the run of a folder.
-
-    Raises:
-        ValueError, OSError: it cannot be loaded.
-    """
-    from padgs.runs.checkpoint import CheckpointError
-    from padgs.runs.load import load_run
-    from padgs.runs.store import RunFolderError
-
-    try:
-        return load_run(run, data_path=data)
-    except (RunFolderError, CheckpointError) as error:
-        raise ValueError(str(error)) from error
-
-
-@contextmanager
-def name_run(run: str) -> Iterator[None]:
-    """Add the run to the message of data that cannot be used, and the option for data that has moved."""
+def _hint(error: Exception, *, run: str = "", beside: str = "", data: str | None = None, **_: object) -> str:
+    """Return the way out of data of a run that cannot be used."""
     from padgs.data.capture import DataError
 
-    try:
-        yield
-    except DataError as error:
-        raise ValueError(f"{error}; it is the data of {run}: if it has moved, name its place with --data") from error
+    if not run or not isinstance(error, DataError):
+        return ""
+    runs = " or ".join(filter(None, (run, beside)))
+    return f"; it is the data of {runs}: if it has moved, name its place with --data"
 
 
 @contextmanager

@@ -6,12 +6,11 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.errors import DataPath, Run, exit_on, name_place, name_run, open_run, show
+from padgs.cli.errors import DataPath, Run, name_place, show
 
 LONG = 60.0  # seconds of writing; announced beforehand if it takes longer
 
 
-@exit_on(ValueError, OSError)
 def export(
     run: Run,
     to: Annotated[str, typer.Option(help="file to write; .ply, .compressed.ply, .spz, .sog or .html")] = "",
@@ -39,6 +38,7 @@ def export(
     from padgs.apps.export.explicit import DISTILLATION_STEPS, export_run, point_cloud
     from padgs.apps.export.splat_file import check_suffix, estimate_seconds, write_splats
     from padgs.data.cloud import write_ply
+    from padgs.runs.load import load_run
 
     steps = DISTILLATION_STEPS if distillation_steps is None else distillation_steps
     path = Path(to) if to else Path(run) / ("points.ply" if points else "splats.ply")
@@ -46,17 +46,16 @@ def export(
         raise ValueError(f"{path} is no plain .ply, which point clouds are written as")
     check_suffix(path)
     with Console().status("opening the run") as status:
-        trained = open_run(run, data)
+        trained = load_run(run, data_path=data)
         with name_place(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-        with name_run(run):
-            found = export_run(
-                trained,
-                distillation_steps=steps,
-                upright=upright or path.suffix == ".html",
-                smooth=smooth or path.suffix == ".html",
-                progress=lambda done: status.update(f"distillation step {done} of {steps}"),
-            )
+        found = export_run(
+            trained,
+            distillation_steps=steps,
+            upright=upright or path.suffix == ".html",
+            smooth=smooth or path.suffix == ".html",
+            progress=lambda done: status.update(f"distillation step {done} of {steps}"),
+        )
         if not points and (seconds := estimate_seconds(path, found.splats)) > LONG:
             show(f"{path.name}: its harmonics take some {seconds / 60:.0f} minutes; a .spz or .ply takes seconds")
         status.update(f"writing {path}")

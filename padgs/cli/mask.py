@@ -7,10 +7,9 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.errors import exit_on, show
+from padgs.cli.errors import show
 
 
-@exit_on(ValueError, OSError)
 def mask(
     folder: Annotated[str, typer.Argument(help="folder of panoramas, or of a data set")],
     below: Annotated[float, typer.Option(help="hide everything more degrees below the horizon; try 60")],

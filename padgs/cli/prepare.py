@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from padgs.cli.errors import exit_on, show
-from padgs.runs.interrupt import INTERRUPTED
+from padgs.cli.errors import show
+from padgs.runs.interrupt import Interrupted
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
@@ -44,20 +44,18 @@ def prepare(
     from pathlib import Path
 
     from padgs.cli.check import end_with, overlay_path
-    from padgs.data.capture import DataError
     from padgs.data.check import check
     from padgs.data.prepare.pipeline import prepare as find_poses
     from padgs.data.prepare.work import PrepareOptions
 
     target = Path(destination)
     try:
-        with exit_on(DataError, OSError), _bars() as tell:
+        with _bars() as tell:
             options = PrepareOptions(accurate, pairs, mask, level, per_second, seed, threads)
             result = find_poses(Path(source), target, options, tell)
             report = check(target, overlay=overlay_path(target))
     except KeyboardInterrupt as interrupt:
-        print("interrupted; the same command continues")
-        raise typer.Exit(INTERRUPTED) from interrupt
+        raise Interrupted("interrupted; the same command continues") from interrupt
     placed = len(result.registered)
     print(f"{placed} of {placed + len(result.unregistered)} panoramas placed, {result.points} points")
     spent = ", ".join(f"{WORDS[step]} {seconds:.0f} s" for step, seconds in result.seconds.items() if seconds >= 1)

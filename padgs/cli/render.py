@@ -6,10 +6,9 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.errors import DataPath, Run, exit_on, name_place, name_run, open_run
+from padgs.cli.errors import DataPath, Run, name_place
 
 
-@exit_on(ValueError, OSError)
 def render(
     run: Run,
     to: Annotated[str, typer.Option(help="an .mp4, or a folder for PNGs; default: video.mp4 in the run's folder")] = "",
@@ -31,6 +30,7 @@ def render(
     from rich.console import Console
 
     from padgs.apps.camera_path_video import views_along, write_video
+    from padgs.runs.load import load_run
 
     if camera not in ("panorama", "perspective"):
         raise ValueError(f"unknown camera {camera!r}; known: panorama, perspective")
@@ -40,9 +40,7 @@ def render(
         wrong = f"--fps is {fps:g}" if seconds is None or seconds > 0 else f"--seconds is {seconds:g}"
         raise ValueError(f"{wrong}, which makes a video without frames; it must be > 0")
     with Console().status("opening the run") as status:
-        found = open_run(run, data)
-        with name_run(run):
-            scene = found.scene
+        found = load_run(run, data_path=data)
         shape = None if camera == "panorama" else (height, 90.0 if fov is None else fov)
         views = views_along(found, path, seconds, fps, width, shape)
         lens = views[0].camera
@@ -53,7 +51,7 @@ def render(
                 views,
                 found.through(lens).render,
                 fps=fps,
-                scene_scale=scene.scale,
+                scene_scale=found.scene.scale,
                 depth=depth,
                 spherical=camera == "panorama",
                 progress=lambda done: status.update(f"frame {done} of {len(views)}"),

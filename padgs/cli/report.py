@@ -10,15 +10,14 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.errors import exit_on, show
+from padgs.cli.errors import show
 from padgs.reports import REPORTS, store
 from padgs.reports.table import ReportError
-from padgs.results import FILE_NAME, STOP_REQUESTED, ResultError
+from padgs.results import FILE_NAME, STOP_REQUESTED
 
 ALL = "all"
 
 
-@exit_on(ReportError, ResultError)
 def report(
     what: Annotated[str, typer.Argument(help=f"{', '.join(REPORTS)}, or {ALL}")],
     runs: Annotated[str, typer.Argument(help="folder of run folders, or a results.jsonl")] = "runs",

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.errors import DataPath, exit_on, name_run
+from padgs.cli.errors import DataPath
 from padgs.results import SMALLEST_LOSSES, SMALLEST_STATED
 
 KNOWN = ", ".join(f"{loss:g}" for loss in SMALLEST_LOSSES)
@@ -21,21 +21,13 @@ def smallest(
     """Search for the smallest model as good as that of a finished run, for several losses; keep one as a run."""
     from rich.console import Console
 
-    from padgs.runs.interrupt import INTERRUPTED, Interrupted
     from padgs.runs.load import load_run
     from padgs.runs.smallest import find_smallest
 
-    console = Console(highlight=False, soft_wrap=True)
-    try:
-        with exit_on(OSError, RuntimeError, ValueError):
-            if epsilon not in SMALLEST_LOSSES:
-                raise ValueError(f"--epsilon is {epsilon:g}; it must be one of {KNOWN}")
-            opened = load_run(run, data_path=data, device=device)
-            if opened.result is None or not opened.result.ok:
-                state = "not finished" if opened.result is None else f"of status {opened.result.status}"
-                raise ValueError(f"{run} is {state}; only a run that ended well is searched, so start it again first")
-            with name_run(run):
-                find_smallest(opened, epsilon, console)
-    except Interrupted as interrupted:  # outside of `exit_on`, to which Exit is an error
-        console.print(str(interrupted))
-        raise typer.Exit(INTERRUPTED) from interrupted
+    if epsilon not in SMALLEST_LOSSES:
+        raise ValueError(f"--epsilon is {epsilon:g}; it must be one of {KNOWN}")
+    opened = load_run(run, data_path=data, device=device)
+    if opened.result is None or not opened.result.ok:
+        state = "not finished" if opened.result is None else f"of status {opened.result.status}"
+        raise ValueError(f"{run} is {state}; only a run that ended well is searched, so start it again first")
+    find_smallest(opened, epsilon, Console(highlight=False, soft_wrap=True))

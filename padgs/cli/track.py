@@ -6,10 +6,9 @@ from typing import Annotated
 
 import typer
 
-from padgs.cli.errors import exit_on, show
+from padgs.cli.errors import show
 
 
-@exit_on(FileNotFoundError)
 def track(
     runs: Annotated[str, typer.Argument(help="folder of run folders")] = "runs",
     uri: Annotated[str, typer.Option(help="of a server or database; default: mlflow.db in RUNS")] = "",

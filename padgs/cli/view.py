@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from padgs import results
-from padgs.cli.errors import DataPath, Run, exit_on, name_run, open_run
+from padgs.cli.errors import DataPath, Run
 
 if TYPE_CHECKING:
     from padgs.runs.load import LoadedRun
 
 
-@exit_on(ValueError, OSError)
 def view(
     run: Run,
     beside: Annotated[str, typer.Option(help="another run of the same scene, to compare with")] = "",
@@ -30,25 +29,21 @@ def view(
     from padgs.apps.viewer.server import LOCAL, PORT
 
     folders = (run, beside) if beside else (run,)
-    for folder in folders:
-        if not (Path(folder) / results.CONFIG_NAME).is_file():
-            open_run(folder, data)  # raises before the page is served
 
     def of_one_scene() -> list[LoadedRun]:
         from padgs.apps.viewer.process import wait_for_checkpoint
+        from padgs.runs.load import load_run
 
         runs, names = [], []
         for folder in folders:
             wait_for_checkpoint(folder)
-            runs.append(found := open_run(folder, data))
-            with name_run(folder):
-                names.append(found.scene.name)
+            runs.append(found := load_run(folder, data_path=data))
+            names.append(found.scene.name)
         if len({*names}) > 1:
             scenes = " and ".join(names)
             raise ValueError(f"{run} and {beside} are of two scenes, {scenes}; name two runs of one scene")
         return runs
 
-    try:
-        serve(of_one_scene, host=host or LOCAL, port=port or PORT, browse=has_screen())
-    except KeyboardInterrupt:
-        print()
+    if not all((Path(folder) / results.CONFIG_NAME).is_file() for folder in folders):
+        of_one_scene()  # raises before the page is served
+    serve(of_one_scene, host=host or LOCAL, port=port or PORT, browse=has_screen())
