@@ -30,10 +30,7 @@ class NadirMask(NamedTuple):
 def write_nadir_mask(path: Path, below: float, *, overwrite: bool = False) -> NadirMask:
     """Write mask.png, which hides everything more than `below` degrees under the horizon, and a preview.
 
-    Args:
-        path: folder of panoramas, or of a data set; readers find the mask there.
-        below: degrees.
-        overwrite: replace an existing mask.
+    Readers find the mask in `path`, a folder of panoramas or of a data set.
 
     Raises:
         DataError: invalid angle, no panoramas or several sizes, or other masks exist.

@@ -54,14 +54,10 @@ def render_views(
     mask_folder: Path,
     progress: Callable[[int, int], None],
 ) -> None:
-    """Write the twelve views of every panorama, and their masks, as <view>/<name>.png.
+    """Write the twelve views of every panorama, all of one size, as <view>/<name>.png.
 
-    Args:
-        images: name -> panorama; all of one size.
-        masks: name -> mask [H, W], 255 = use; panoramas without one are used entirely.
-        folder: of the written views.
-        mask_folder: of their masks, named as COLMAP requires: <view>/<name>.png.png.
-        progress: called with (panoramas done, total).
+    Their masks are written too, named as COLMAP requires: <view>/<name>.png.png. Panoramas without a mask are used
+    entirely.
     """
     rotations = cam_from_pano()
     for done, (name, path) in enumerate(sorted(images.items())):
@@ -111,13 +107,7 @@ def rig_config() -> Any:
 
 
 def panoramas(model: Any, images: dict[str, Path], width: int) -> tuple[tuple[Frame, ...], Cloud, Tracks]:
-    """Convert a reconstruction of rig views to frames, points and observations of their panoramas.
-
-    Args:
-        model: pycolmap.Reconstruction of the rig.
-        images: name -> panorama.
-        width: of the panoramas, in pixels.
-    """
+    """Convert a pycolmap.Reconstruction of rig views to frames, points and observations of their panoramas."""
     rotations = cam_from_pano()
     cloud, row_of = cloud_of(model)
     poses: dict[str, Tensor] = {}

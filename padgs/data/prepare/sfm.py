@@ -15,7 +15,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-from padgs.data.capture import DataError, natural_key
+from padgs.data.capture import natural_key
 from padgs.data.formats.colmap import pycolmap_module
 
 PAIRS = ("auto", "exhaustive", "sequential")
@@ -33,8 +33,6 @@ def image_pairs(names: Sequence[str], kind: str = "auto") -> list[tuple[str, str
     >>> image_pairs(["a", "b", "c"])
     [('a', 'b'), ('a', 'c'), ('b', 'c')]
     """
-    if kind not in PAIRS:
-        raise DataError(f"unknown kind of pairs {kind!r}; known: {', '.join(PAIRS)}")
     names = sorted(names, key=natural_key)
     if kind == "exhaustive" or (kind == "auto" and len(names) <= EXHAUSTIVE_UP_TO):
         return list(combinations(names, 2))
@@ -70,15 +68,9 @@ class Group:
 def extract_features(
     database: Path, folder: Path, groups: Sequence[Group], masks: Path | None, threads: int, progress: Progress
 ) -> None:
-    """Extract features of all images that are not in the database.
+    """Extract features of all images that are not in the database, which is created if missing.
 
-    Args:
-        database: created if missing.
-        folder: of the images.
-        groups: the images.
-        masks: a folder with <image name>.png for every image, 0 = ignore; or None.
-        threads: processor threads.
-        progress: called with (images done, total).
+    `masks` is a folder with <image name>.png for every image, 0 = ignore.
     """
     pycolmap = pycolmap_module()
     cameras = _register(database, groups)
@@ -139,23 +131,16 @@ def _register(database: Path, groups: Sequence[Group]) -> list[int]:
 
 def make_rig(database: Path, config: Any) -> None:
     """Group the images of the database into rigs."""
-    pycolmap = pycolmap_module()
-    with pycolmap.Database.open(database) as entries:
-        pycolmap.apply_rig_config([config], entries)
+    with pycolmap_module().Database.open(database) as entries:
+        pycolmap_module().apply_rig_config([config], entries)
 
 
 def match(
     database: Path, pairs: Sequence[Sequence[tuple[str, str]]], rig: bool, threads: int, seed: int, progress: Progress
 ) -> None:
-    """Match and verify pairs of images that have no matches in the database.
+    """Match and verify groups of pairs of images that have no matches in the database.
 
-    Args:
-        database: with features.
-        pairs: groups of pairs; for a rig, all pairs of views of two panoramas.
-        rig: verify the views of two panoramas jointly.
-        threads: processor threads.
-        seed: of the verification's random samples.
-        progress: called with (groups done, total).
+    For a rig, a group is all pairs of views of two panoramas, which are verified jointly.
     """
     pycolmap = pycolmap_module()
     matching = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=threads)
@@ -180,16 +165,9 @@ def match(
 def reconstruct(
     database: Path, folder: Path, parts: Path, threads: int, seed: int, images_per_pose: int, progress: Progress
 ) -> int:
-    """Compute poses and points, in parts that cannot be connected.
+    """Compute poses and points, and write a model for each part that cannot be connected to others.
 
-    Args:
-        database: with matches.
-        folder: of the images, for the colours of the points.
-        parts: folder for the model of each part.
-        threads: processor threads.
-        seed: of all random choices.
-        images_per_pose: views in a rig, else 1.
-        progress: called with (panoramas placed, total).
+    `images_per_pose` is the number of views in a rig, else 1.
 
     Returns:
         Number of parts; 0 if no two images could be placed.

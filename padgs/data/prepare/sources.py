@@ -32,13 +32,9 @@ def is_video(path: Path) -> bool:
 def extract_frames(
     video: Path, folder: Path, per_second: float, progress: Callable[[int, int], None] = lambda done, total: None
 ) -> int:
-    """Write the sharpest frame of every 1 / per_second seconds to `folder` as frame_00001.jpg, ...
+    """Write the sharpest frame of every 1 / per_second seconds of a stitched video as frame_00001.jpg, ...
 
-    Args:
-        video: a stitched (equirectangular) video.
-        folder: exists; files in it are overwritten.
-        per_second: frames kept per second of video.
-        progress: called with (frames decoded, estimated total).
+    `progress` is called with (frames decoded, estimated total).
 
     Returns:
         Number of frames written.
@@ -119,12 +115,9 @@ class Source:
 
 
 def find_source(path: Path, mask: str) -> Source:
-    """Read and check a folder of panoramas.
+    """Read and check a folder of panoramas, or one that holds them in images/.
 
-    Args:
-        path: the folder, or one that holds them in images/.
-        mask: as `data.mask`: auto | none | rows:959/1024 | a file, or a folder of files. auto searches for mask.png and
-            masks/ beside the images and beside an images/ folder.
+    `mask` is as `data.mask`: auto searches for mask.png and masks/ beside the images and beside an images/ folder.
 
     Raises:
         DataError: no folder, an unstitched file, fewer than two panoramas, an unusable image, names that differ only in

@@ -64,12 +64,10 @@ def refuse_full(folder: Path) -> None:
 
 def link_or_copy(file: Path, target: Path) -> None:
     """Link a file, or copy it on file systems without links, such as exFAT."""
-    for link in (target.symlink_to, target.hardlink_to):
-        try:
-            return link(file.resolve())
-        except OSError:
-            continue
-    shutil.copyfile(file, target)
+    try:
+        target.symlink_to(file.resolve())
+    except OSError:
+        shutil.copyfile(file, target)
 
 
 @dataclass(frozen=True)
@@ -154,16 +152,10 @@ def _file_digest(path: Path) -> str:
 
 
 class WorkFolder:
-    """Working folder in which each step runs once, with the marker file `STEP.done`.
-
-    Attributes:
-        path: of the folder.
-        seconds: step -> duration in this process.
-    """
+    """Working folder, which need not exist, in which each step runs once, with the marker file `STEP.done`."""
 
     def __init__(self, path: Path) -> None:
-        """Use a folder, which need not exist."""
-        self.path, self.seconds = path, dict[str, float]()
+        self.path, self.seconds = path, dict[str, float]()  # seconds: duration of each step in this process
 
     def open(self, kind: str, digest: str, keep: tuple[str, ...] = ()) -> None:
         """Resume if the folder has the same digest of this kind of input; else delete all but `keep`."""

@@ -2,7 +2,7 @@
 
 `generate(SyntheticOptions()) -> Scene` renders (or reads from the cache) panoramas, poses and a noisy point cloud;
 `SyntheticTruth` gives exact depth, object ids and poses, and renders new views. World frame: z up, x and y horizontal,
-one unit per metre unless `world_scale` and `world_rotation` change that.
+one unit per metre unless `world_scale` changes that.
 """
 
 from __future__ import annotations
@@ -28,11 +28,7 @@ __all__ = ["SCENES", "SyntheticOptions", "SyntheticTruth", "generate", "load"]
 
 
 def load(path: str | Path, options: DataOptions) -> Scene:
-    """Load a synthetic scene by name; the entry of LOADERS.
-
-    Args:
-        path: one of SCENES; empty = the scene in `options.generator`.
-        options: `options.generator` holds fields of SyntheticOptions; `options.width` overrides the image width.
+    """Load the synthetic scene `path`, or the one in `options.generator` if it is empty; the entry of LOADERS.
 
     Raises:
         DataError: unknown scene or field, or an invalid value.
@@ -46,8 +42,6 @@ def load(path: str | Path, options: DataOptions) -> Scene:
     for name in settings:
         if name not in known:
             raise DataError(f"unknown data.generator.{name}; known: {', '.join(sorted(known))}")
-    if "world_rotation" in settings:  # a list in configuration files
-        settings["world_rotation"] = tuple(settings["world_rotation"])
     store = ImageStore(options.cache_bytes, options.prefetch_threads, options.device)
     return generate(SyntheticOptions(**settings), store)
 
@@ -55,11 +49,7 @@ def load(path: str | Path, options: DataOptions) -> Scene:
 def generate(options: SyntheticOptions, store: ImageStore | None = None) -> Scene:
     """Generate a scene, or read it from the disk cache.
 
-    Takes 15-20 s of processor time for 30 views at 512 x 256, on all processors.
-
-    Args:
-        options: of the scene.
-        store: caches decoded images; a new one if None.
+    Takes 15-20 s of processor time for 30 views at 512 x 256, on all processors. `store` caches decoded images.
     """
     stored, notes = cache.read(options), []
     if stored is None:
@@ -105,20 +95,18 @@ def _truth(options: SyntheticOptions) -> SyntheticTruth:
 def _make(options: SyntheticOptions) -> cache.Stored:
     truth = SyntheticTruth(options)
     held_out = set(paths.held_out(options))
-    exposure = truth.random("exposure").uniform(-1, 1, len(truth.poses)) * options.exposure_range
     images = []
     for index, pose in enumerate(truth.poses):
-        gain = 1.0 if index in held_out else float(2 ** exposure[index])
         if index in held_out or not (options.lens_gap or options.lens_k1):
-            images.append(camera.draw(truth.world, pose, options.width, options.samples, options.seed, gain))
+            images.append(camera.draw(truth.world, pose, options.width, options.samples, options.seed))
         else:
             gap = options.lens_gap * truth.median_depth
-            images.append(draw_stitched(truth.world, pose, gap, options, gain))
+            images.append(draw_stitched(truth.world, pose, gap, options))
     train = [index for index in range(len(images)) if index not in held_out]
     points, colors = sample_points(
         truth.world, truth.poses[train], [images[index] for index in train], options, truth.random("points")
     )
-    points, poses = truth.points_to_world(points), truth.given_poses
+    points, poses = options.world_scale * points, truth.given_poses
     digest = hashlib.sha256(repr(sorted(held_out)).encode())
     for array in (*images, poses, points, colors):
         digest.update(np.ascontiguousarray(array).tobytes())

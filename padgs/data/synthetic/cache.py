@@ -1,7 +1,8 @@
 """Disk cache of generated scenes, keyed by a hash of their options and of the generator's source code.
 
-The folder is $PADGS_CACHE, or ~/.cache/padgs. A scene is a folder of PNGs and `scene.npz`, written to a temporary
-folder and then renamed, so that readers never see incomplete scenes. Without write access there is no cache.
+The folder is $PADGS_CACHE, or ~/.cache/padgs. A scene is a folder of PNGs, `scene.npz` and the digest of both. It is
+written to a temporary folder and then renamed, so that readers never see incomplete scenes. A scene that does not fit
+its digest is generated again. Without write access there is no cache.
 """
 
 from __future__ import annotations
@@ -11,11 +12,9 @@ import json
 import os
 import shutil
 import tempfile
-import zlib
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 from PIL import Image
@@ -53,18 +52,23 @@ def _source() -> bytes:
     return b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
 
 
+def _digest(entry: Path) -> str:
+    digest = hashlib.sha256()
+    for file in sorted(entry.glob("*.*")):
+        digest.update(f"{file.name}|".encode() + file.read_bytes())
+    return digest.hexdigest()
+
+
 def read(options: SyntheticOptions) -> Stored | None:
-    """Read a cached scene; None if missing or damaged."""
+    """Read a cached scene; None if it is missing or was changed."""
     entry = folder() / key(options)
     try:
-        # Opened here, because numpy does not close files that are not zip archives.
-        with open(entry / "scene.npz", "rb") as file, np.load(file, allow_pickle=False) as table:
-            count = len(table["poses"])
-            images = [entry / f"{index:03d}.png" for index in range(count)]
-            if not all(path.is_file() for path in images):
-                return None
-            return Stored(images, table["poses"], table["points"], table["colors"], str(table["fingerprint"]))
-    except (OSError, KeyError, ValueError, EOFError, BadZipFile, zlib.error):
+        if (entry / "sha256").read_text() != _digest(entry):
+            return None
+        with np.load(entry / "scene.npz", allow_pickle=False) as table:
+            images, fingerprint = sorted(entry.glob("*.png")), str(table["fingerprint"])
+            return Stored(images, table["poses"], table["points"], table["colors"], fingerprint)
+    except (OSError, ValueError):
         return None
 
 
@@ -77,15 +81,16 @@ def write(options: SyntheticOptions, stored: Stored) -> str | None:
         draft = Path(tempfile.mkdtemp(prefix=f".{entry.name}-", dir=entry.parent))
         for index, image in enumerate(stored.images):
             assert isinstance(image, np.ndarray)
-            Image.fromarray(image).save(draft / f"{index:03d}.png", compress_level=2)
+            Image.fromarray(image).save(draft / f"{index:06d}.png", compress_level=2)
         arrays = {name: getattr(stored, name) for name in ("poses", "points", "colors", "fingerprint")}
         np.savez_compressed(draft / "scene.npz", **arrays)
+        (draft / "sha256").write_text(_digest(draft))
         draft.chmod(0o755)
         if entry.exists() and read(options) is None:
-            shutil.rmtree(entry)  # damaged
+            shutil.rmtree(entry)  # changed or damaged
         draft.rename(entry)
     except OSError as error:
-        if entry.exists() and read(options) is not None:
+        if read(options) is not None:
             return None  # another process was faster
         return f"generated scene not cached: {error}; set PADGS_CACHE to a folder that can be written"
     finally:

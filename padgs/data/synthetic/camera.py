@@ -37,7 +37,6 @@ def draw(
     width: int,
     samples: int,
     seed: int = 0,
-    gain: float = 1.0,
     lens: Callable[[Array], Array] | None = None,
 ) -> Array:
     """Render the panorama [H, W, 3] uint8 of a camera at `cam_from_world` [4, 4], with `samples` rays per pixel.
@@ -59,7 +58,7 @@ def draw(
         rays = directions(v.ravel().astype(np.float32), u.ravel().astype(np.float32), width, height)
         color = world.color(origin, world_from_cam @ (rays if lens is None else lens(rays)))
         mean = color.reshape(3, len(rows), len(columns), samples).mean(-1)
-        image[np.ix_(rows, columns)] = np.clip(mean * (255 * gain) + 0.5, 0, 255).astype(np.uint8).transpose(1, 2, 0)
+        image[np.ix_(rows, columns)] = np.clip(mean * 255 + 0.5, 0, 255).astype(np.uint8).transpose(1, 2, 0)
 
     with ThreadPoolExecutor(workers()) as pool:  # numpy releases the interpreter lock
         list(pool.map(fill, blocks))
@@ -92,7 +91,7 @@ def _jitter(height: int, samples: int, seed: int) -> Array:
     return (cell + np.random.default_rng((seed, 0x5EED)).random((height, samples, 2))) / side
 
 
-def draw_stitched(world: World, cam_from_world: Array, gap: float, options: SyntheticOptions, gain: float) -> Array:
+def draw_stitched(world: World, cam_from_world: Array, gap: float, options: SyntheticOptions) -> Array:
     """Render the panorama [H, W, 3] uint8 of two fisheye lenses `gap` metres apart, centred between them.
 
     Rays of each lens are exact; stitching ignores the gap and the radial distortion, so that the image has parallax and
@@ -108,7 +107,7 @@ def draw_stitched(world: World, cam_from_world: Array, gap: float, options: Synt
             bent = bend(torch.from_numpy(directions).double().T, axis, coefficients)
             return bent.T.to(torch.float32).numpy()
 
-        images.append(draw(world, pose, options.width, options.samples, options.seed, gain, distorted))
+        images.append(draw(world, pose, options.width, options.samples, options.seed, distorted))
     directions = rays(options.width, options.height, dtype=torch.float64)
     weight = hemisphere_weight(directions, axis, math.radians(options.lens_blend)).numpy()[..., None]
     return np.round(weight * images[0] + (1 - weight) * images[1]).astype(np.uint8)

@@ -22,8 +22,11 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     ("train_views", lambda x: x >= 2, "at least 2"),
     ("test_views", lambda x: x >= 0, "at least 0"),
     ("points spokes", lambda x: x >= 1, "at least 1"),
-    ("point_noise pose_noise_translation pose_noise_rotation", lambda x: 0 <= x < math.inf, "a finite number >= 0"),
-    ("exposure_range tilt lens_gap", lambda x: 0 <= x < math.inf, "a finite number >= 0"),
+    (
+        "point_noise pose_noise_translation pose_noise_rotation tilt lens_gap",
+        lambda x: 0 <= x < math.inf,
+        "a finite number >= 0",
+    ),
     ("texture_frequency world_scale", lambda x: 0 < x < math.inf, "a finite number > 0"),
     ("lens_blend", lambda x: 0 <= x < 90, "an angle in [0, 90) degrees"),
     ("lens_k1", lambda x: -0.1 <= x <= 0.1, "in [-0.1, 0.1]"),  # theta' must increase with theta up to 90 degrees
@@ -37,8 +40,8 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
 class SyntheticOptions:
     """Options of a synthetic scene. The defaults are the scene of a run without arguments.
 
-    Worlds are built and rendered in metres; `world_scale` and `world_rotation` are then applied to poses, points and
-    depth, so that images do not depend on them. Pose noise, exposure and the two lenses affect training views only.
+    Worlds are built and rendered in metres; `world_scale` is then applied to poses, points and depth, so that images do
+    not depend on it. Pose noise and the two lenses affect training views only.
     """
 
     scene: str = "room"  # a name of `padgs.data.synthetic.SCENES`
@@ -48,7 +51,6 @@ class SyntheticOptions:
     path: str | None = None  # roaming | cross | line; None = default of the scene
     path_radius: float | None = None  # metres from the middle of the path to its ends; None = default of the scene
     heading: str = "path"  # path = look along the path; fixed = along world x; random = random per view
-    yaw: float = 0.0  # degrees, added to all headings
     tilt: float = 0.0  # degrees, standard deviation of roll and of pitch per view
     samples: int = 16  # rays per pixel, a square number; stratified and jittered
     seed: int = 0  # of path, points and noise
@@ -63,12 +65,10 @@ class SyntheticOptions:
     outliers: float = 0.01  # share of random points that lie on no surface
     pose_noise_translation: float = 0.0  # standard deviation per axis, relative to the scene's median depth
     pose_noise_rotation: float = 0.0  # degrees, standard deviation of the angle
-    exposure_range: float = 0.0  # training views are scaled by 2^e, e uniform in [-exposure_range, exposure_range]
     lens_gap: float = 0.0  # distance of the two lenses of training views, relative to the median depth
     lens_k1: float = 0.0  # of both lenses: theta' = theta (1 + k1 theta^2), see padgs/geometry/lens.py
     lens_blend: float = 5.0  # degrees on both sides of the plane between the lenses in which both are blended
     world_scale: float = 1.0  # world units per metre
-    world_rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)  # degrees about world x, then y, then z
 
     def __post_init__(self) -> None:
         for field, known in (("scene", SCENES), ("path", (None, *PATHS)), ("heading", HEADINGS)):

@@ -95,7 +95,6 @@ def poses(options: SyntheticOptions, path: Array, rng: np.random.Generator) -> A
     if options.heading != "path":
         headings = np.zeros(count) if options.heading == "fixed" else rng.uniform(-math.pi, math.pi, count)
     roll, pitch = np.radians(options.tilt) * rng.standard_normal((2, count))
-    headings = headings + math.radians(options.yaw)
     return np.stack([cam_from_world(*args) for args in zip(positions, headings, roll, pitch, strict=True)])
 
 

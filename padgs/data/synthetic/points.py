@@ -17,14 +17,8 @@ def sample_points(
     """Sample points [P, 3] float64 in metres and their colours [P, 3] uint8.
 
     Pixels are drawn with a probability proportional to solid angle times local contrast, because features are found at
-    texture; their exact surface points are kept if a second, random view sees them too.
-
-    Args:
-        world: the scene.
-        poses: [n, 4, 4] exact poses of the training views, metres.
-        images: their n panoramas [H, W, 3] uint8.
-        options: number of points, noise, outliers.
-        rng: random numbers.
+    texture; their exact surface points are kept if a second, random view sees them too. `poses` [n, 4, 4] and `images`,
+    n times [H, W, 3] uint8, are those of the training views.
     """
     outliers = round(options.outliers * options.points)
     wanted = options.points - outliers
@@ -33,17 +27,14 @@ def sample_points(
     for _round in range(20):
         batch = max(256, int(1.5 * (wanted - found) / len(poses)) + 1)
         for k in rng.permutation(len(poses)):
-            points, color = _seen_twice(world, poses, images, chance, int(k), batch, options.point_noise, rng)
+            points, color = _seen_twice(world, poses, int(k), images[k], chance[k], batch, options.point_noise, rng)
             kept.append(points)
             colors.append(color)
             found += len(points)
         if found >= wanted:
             break
     if not found:
-        raise DataError(
-            "no surface point is seen by two cameras, because the scene has no texture, or only sky; "
-            "choose another scene or path"
-        )
+        raise DataError("no surface point is seen by two cameras; choose another scene or path")
     points, color = np.concatenate(kept), np.concatenate(colors)
     choice = rng.permutation(found)[:wanted]
     points, color = points[choice], color[choice]
@@ -67,15 +58,15 @@ def _contrast(image: Array) -> Array:
 def _seen_twice(
     world: World,
     poses: Array,
-    images: list[Array],
-    chance: list[Array],
     view: int,
+    image: Array,
+    chance: Array,
     count: int,
     noise: float,
     rng: np.random.Generator,
 ) -> tuple[Array, Array]:
-    height, width = images[view].shape[:2]
-    pixel = np.searchsorted(np.cumsum(chance[view]), rng.random(count)).clip(max=height * width - 1)
+    height, width = image.shape[:2]
+    pixel = np.searchsorted(np.cumsum(chance), rng.random(count)).clip(max=height * width - 1)
     rows, columns = np.divmod(pixel, width)
     rays = poses[view, :3, :3].T @ directions(rows + 0.5, columns + 0.5, width, height)
     start = center(poses[view])[:, None]
@@ -91,4 +82,4 @@ def _seen_twice(
     visible = reached > far * (1 - 1e-4) - 1e-3
     points, distance, pixel = points[:, visible], distance[visible], pixel[visible]
     noisy = points + noise * distance * rng.standard_normal(points.shape)
-    return noisy.T, images[view].reshape(-1, 3)[pixel]
+    return noisy.T, image.reshape(-1, 3)[pixel]

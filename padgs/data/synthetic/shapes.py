@@ -1,7 +1,12 @@
 """Solids of synthetic scenes, with closed-form ray intersections.
 
 Arrays are component-first, [3, n], because numpy is fastest on contiguous components. World axes: x, y horizontal,
-z up, metres. `hit` uses the precision of the directions (float32 for colour, float64 for exact depth).
+z up, metres.
+
+Every shape has `materials` (one per face, or one for all), `bounds` (centre and radius of a bounding sphere; None if it
+surrounds the camera), and two functions. `hit` returns distances [n] along unit directions [3, n] from origins
+[3, 1 or n] to the first hit, inf for none, in the precision of the directions (float32 for colour, float64 for exact
+depth). `surface` returns normals, texture coordinates and faces of points [3, n] on the shape.
 """
 
 from __future__ import annotations
@@ -9,7 +14,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 
@@ -34,28 +38,6 @@ class Surface:
     normal: Array  # [3, n] towards the visible side
     uv: Array  # [2, n] metres from the centre of the face
     face: Array  # [n] int, index into the shape's materials
-
-
-class Shape(Protocol):
-    """Solid, or the inside of one."""
-
-    @property
-    def materials(self) -> tuple[Material, ...]:
-        """Return one material per face, or one for all."""
-        ...
-
-    @property
-    def bounds(self) -> tuple[Point, float] | None:
-        """Return a bounding sphere (centre, radius); None if the shape surrounds the camera."""
-        ...
-
-    def hit(self, origin: Array, direction: Array) -> Array:
-        """Return distances [n] along unit directions [3, n] from origins [3, 1 or n] to the first hit; inf = none."""
-        ...
-
-    def surface(self, points: Array) -> Surface:
-        """Return normals, texture coordinates and faces of points [3, n] on the shape."""
-        ...
 
 
 def _column(point: Point | Array, like: Array) -> Array:
@@ -303,4 +285,5 @@ class Ring:
         return Surface(normal, np.stack((angle * self.radius, points[2])), np.zeros(points.shape[1], np.int64))
 
 
+Shape = Room | Box | Sphere | Rod | Ground | Ring
 Flat = Room | Ground  # shapes with light maps

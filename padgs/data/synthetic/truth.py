@@ -17,17 +17,11 @@ from padgs.data.synthetic.textures import Array
 from padgs.data.synthetic.world import World
 from padgs.scene import View
 
-_STREAMS = ("path", "poses", "furniture", "points", "pose noise", "exposure")
+_STREAMS = ("path", "poses", "furniture", "points", "pose noise")
 
 
 class SyntheticTruth:
-    """World of a synthetic scene. Lengths in and out are world units.
-
-    >>> truth = SyntheticTruth(SyntheticOptions(width=16, train_views=2, test_views=0))
-    >>> view = View("anywhere", truth.exact_pose("000"), 16, 8)
-    >>> truth.depth(view).shape
-    torch.Size([8, 16])
-    """
+    """World of a synthetic scene. Lengths in and out are world units."""
 
     def __init__(self, options: SyntheticOptions) -> None:
         blueprint = BLUEPRINTS[options.scene]
@@ -56,16 +50,14 @@ class SyntheticTruth:
         """Return the exact cam_from_world [4, 4] float64 of a view, in world units."""
         if name not in self.names:
             raise DataError(f"unknown view {name!r}; known: {self.names[0]} to {self.names[-1]}")
-        return torch.from_numpy(self.to_world(self.poses[self.names.index(name)]))
+        pose = self.poses[self.names.index(name)].copy()
+        pose[:3, 3] *= self.options.world_scale
+        return torch.from_numpy(pose)
 
     def depth(self, view: View) -> Tensor:
         """Return distances [H, W] float64 to the surface at pixel centres, in world units; inf = sky."""
         distance, _ = camera.trace(self.world, self._pose(view), view.width)
         return torch.from_numpy(distance * self.options.world_scale)
-
-    def object_id(self, view: View) -> Tensor:
-        """Return the shape indices [H, W] int16 at pixel centres; -1 = sky."""
-        return torch.from_numpy(camera.trace(self.world, self._pose(view), view.width)[1])
 
     def image(self, view: View) -> Tensor:
         """Render the panorama [H, W, 3] uint8 of a view at any pose, without exposure changes."""
@@ -95,35 +87,18 @@ class SyntheticTruth:
                 rotation = _rotation(axis / np.linalg.norm(axis) * angle * size) @ given[index, :3, :3]
                 position = camera.center(given[index]) + shift * offset
                 given[index, :3, :3], given[index, :3, 3] = rotation, -rotation @ position
-        return np.stack([self.to_world(pose) for pose in given])
-
-    def to_world(self, pose: Array) -> Array:
-        """Convert a pose in metres to the scaled and rotated world."""
-        moved = pose.copy()
-        moved[:3, :3] = pose[:3, :3] @ self._world_rotation.T
-        moved[:3, 3] *= self.options.world_scale
-        return moved
-
-    def points_to_world(self, points: Array) -> Array:
-        """Convert points [P, 3] in metres to the scaled and rotated world."""
-        return self.options.world_scale * points @ self._world_rotation.T
-
-    @cached_property
-    def _world_rotation(self) -> Array:
-        x, y, z = np.radians(self.options.world_rotation)
-        return _rotation(np.array((0, 0, z))) @ _rotation(np.array((0, y, 0))) @ _rotation(np.array((x, 0, 0)))
+        given[:, :3, 3] *= self.options.world_scale
+        return given
 
     def _pose(self, view: View) -> Array:
         """Return a view's pose in metres, without noise if it is a view of the scene."""
-        pose = view.cam_from_world.detach().cpu().double().numpy()
+        pose = view.cam_from_world.detach().cpu().double().numpy().copy()
         if view.name in self.names:
             index = self.names.index(view.name)
             if np.array_equal(pose, self.given_poses[index]):
                 return self.poses[index]
-        back = pose.copy()
-        back[:3, :3] = pose[:3, :3] @ self._world_rotation
-        back[:3, 3] /= self.options.world_scale
-        return back
+        pose[:3, 3] /= self.options.world_scale
+        return pose
 
 
 def _rotation(vector: Array) -> Array:

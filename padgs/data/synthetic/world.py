@@ -16,9 +16,6 @@ import numpy as np
 from padgs.data.synthetic.shapes import Flat, Point, Shape
 from padgs.data.synthetic.textures import Array, Color, bilinear
 
-# (origins [3, n], directions [3, n], candidates) -> distance [n] of the first hit
-FirstHit = Callable[[Array, Array, Sequence[int]], Array]
-
 _OCCLUSION_RADIUS = 0.9  # metres
 _LAMP_SAMPLES, _OPEN_SAMPLES = 8, 12
 _TILE = 16  # texels; rays of a tile share a list of candidate shapes
@@ -61,17 +58,8 @@ class LightMap:
         return bilinear(self.direct, x, y), bilinear(self.openness, x, y)
 
 
-def bake(flat: Flat, face: int, light: Light, bounds: tuple[Array, Array], casts: Array, hit: FirstHit) -> LightMap:
-    """Compute the light map of a face.
-
-    Args:
-        flat: the shape.
-        face: index of the face.
-        light: the lamps.
-        bounds: centres [k, 3] and radii [k] of all shapes.
-        casts: [k] bool, whether a shape casts shadows.
-        hit: nearest hit of rays among some shapes.
-    """
+def bake(world: World, flat: Flat, face: int) -> LightMap:
+    """Compute the light map of a face."""
     width, height = flat.size(face)
     columns, rows = (int(np.ceil(extent / flat.texel / 2)) * 2 + 1 for extent in (width, height))  # odd: not periodic
     direct, openness = np.zeros((rows, columns), np.float32), np.zeros((rows, columns), np.float32)
@@ -83,22 +71,22 @@ def bake(flat: Flat, face: int, light: Light, bounds: tuple[Array, Array], casts
             points = flat.point_at(face, uv)
             normal = flat.surface(points).normal
             shape = direct[tile].shape
-            direct[tile] = _direct(points, normal, light, bounds, casts, hit).reshape(shape)
-            openness[tile] = _openness(points, normal, bounds, hit).reshape(shape)
+            direct[tile] = _direct(world, points, normal).reshape(shape)
+            openness[tile] = _openness(world, points, normal).reshape(shape)
     return LightMap(_smooth(direct), _smooth(openness), (width, height))
 
 
-def _direct(
-    points: Array, normal: Array, light: Light, bounds: tuple[Array, Array], casts: Array, hit: FirstHit
-) -> Array:
+def _direct(world: World, points: Array, normal: Array) -> Array:
     middle, spread = _ball(points)
+    light, (centers, radii) = world.light, world.bounds
+    casts = np.array([not isinstance(s, Flat) and not s.materials[0].glows for s in world.shapes])
     total = np.zeros(points.shape[1], np.float32)
     for lamp, power in light.lamps:
         position = np.asarray(lamp)
         line = position - middle
-        along = np.clip((bounds[0] - middle) @ line / (line @ line), 0, 1)
-        gap = np.linalg.norm(bounds[0] - middle - along[:, None] * line, axis=1)
-        between = np.flatnonzero(casts & (gap < bounds[1] + spread + light.size)).tolist()
+        along = np.clip((centers - middle) @ line / (line @ line), 0, 1)
+        gap = np.linalg.norm(centers - middle - along[:, None] * line, axis=1)
+        between = np.flatnonzero(casts & (gap < radii + spread + light.size)).tolist()
         unshadowed = lambert(points, normal, position, power)
         if not between:
             total += unshadowed
@@ -107,14 +95,15 @@ def _direct(
         start, toward = _all_pairs(points + np.float32(2e-3) * normal, targets)
         toward = toward - start
         far = np.sqrt((toward * toward).sum(0))
-        lit = hit(start, toward / far, between) >= far
+        lit = world.nearest(start, toward / far, between)[0] >= far
         total += unshadowed * lit.reshape(points.shape[1], -1).mean(1)
     return total
 
 
-def _openness(points: Array, normal: Array, bounds: tuple[Array, Array], hit: FirstHit) -> Array:
+def _openness(world: World, points: Array, normal: Array) -> Array:
     middle, spread = _ball(points)
-    near = np.flatnonzero(np.linalg.norm(bounds[0] - middle, axis=1) < bounds[1] + spread + _OCCLUSION_RADIUS).tolist()
+    centers, radii = world.bounds
+    near = np.flatnonzero(np.linalg.norm(centers - middle, axis=1) < radii + spread + _OCCLUSION_RADIUS).tolist()
     up = normal[:, 0]
     first = np.roll(np.abs(np.round(up)), 1)
     second = np.cross(up, first)
@@ -123,7 +112,7 @@ def _openness(points: Array, normal: Array, bounds: tuple[Array, Array], hit: Fi
     directions = np.outer(first, radius * np.cos(angle)) + np.outer(second, radius * np.sin(angle))
     directions += np.outer(up, np.sqrt(1 - radius**2))
     start, rays = _all_pairs(points + np.float32(2e-3) * normal, directions.astype(np.float32))
-    free = np.minimum(hit(start, rays, near) / _OCCLUSION_RADIUS, 1)
+    free = np.minimum(world.nearest(start, rays, near)[0] / _OCCLUSION_RADIUS, 1)
     return free.reshape(points.shape[1], -1).mean(1)
 
 
@@ -167,20 +156,15 @@ class World:
     light_maps: dict[tuple[int, int], LightMap] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        casts = np.array([not isinstance(s, Flat) and not s.materials[0].glows for s in self.shapes])
         for index, shape in enumerate(self.shapes):
             if isinstance(shape, Flat):
                 for face in range(shape.faces):
-                    light_map = bake(shape, face, self.light, self._bounds, casts, lambda *a: self.nearest(*a)[0])
-                    self.light_maps[index, face] = light_map
+                    self.light_maps[index, face] = bake(self, shape, face)
 
     def nearest(self, origin: Array, direction: Array, candidates: Sequence[int] | None = None) -> tuple[Array, Array]:
         """Return distance [n] (inf if nothing is hit) and object id [n] (then SKY) of the first hit.
 
-        Args:
-            origin: [3, 1] or [3, n] metres.
-            direction: [3, n] unit, float32 or float64.
-            candidates: indices of shapes to test; all if None.
+        Rays are as in `Shape.hit`; `candidates` are the indices of shapes to test, all if None.
         """
         distance = np.full(direction.shape[1], np.inf, direction.dtype)
         object_id = np.full(direction.shape[1], SKY, np.int16)
@@ -196,11 +180,7 @@ class World:
     ) -> Array:
         """Return colours [3, n] float32 along rays [3, n] float32; fastest for narrow bundles.
 
-        Args:
-            origin: [3, 1] or [3, n] metres.
-            direction: [3, n] unit.
-            candidates: indices of shapes to test; None selects those that the bundle can hit.
-            reflect: whether mirror-like surfaces show reflections.
+        `candidates` are the indices of shapes to test, those that the bundle can hit if None.
         """
         if candidates is None:
             candidates = self._within(origin, direction)
@@ -224,14 +204,14 @@ class World:
             return list(range(len(self.shapes)))
         axis = axis / length
         half_angle = np.arccos(np.clip((axis @ direction).min(), -1, 1)) + 1e-3
-        centers, radii = self._bounds
+        centers, radii = self.bounds
         toward, radii = centers - middle, radii + spread
         far = np.sqrt((toward * toward).sum(1)) + 1e-9
         angle = np.arccos(np.clip(toward @ axis / far, -1, 1)) - np.arcsin(np.minimum(radii / far, 1))
         return np.flatnonzero((angle <= half_angle) | (far <= radii)).tolist()
 
     @cached_property
-    def _bounds(self) -> tuple[Array, Array]:
+    def bounds(self) -> tuple[Array, Array]:
         """Return centres [k, 3] and radii [k] of all bounding spheres; infinite if a shape surrounds the camera."""
         bounds = [shape.bounds or ((0.0, 0.0, 0.0), np.inf) for shape in self.shapes]
         return np.array([center for center, _ in bounds]), np.array([radius for _, radius in bounds])

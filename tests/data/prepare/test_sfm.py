@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from padgs.data import DataError
 from padgs.data.prepare.pipeline import rotation_between
 from padgs.data.prepare.sfm import EXHAUSTIVE_UP_TO, image_pairs
 
@@ -33,11 +32,6 @@ def test_order_of_names_does_not_matter():
 def test_names_are_sorted_naturally():
     pairs = image_pairs([f"pano{number}.jpg" for number in range(1, 121)], "sequential")
     assert ("pano9.jpg", "pano10.jpg") in pairs and ("pano10.jpg", "pano100.jpg") not in pairs
-
-
-def test_unknown_kind():
-    with pytest.raises(DataError, match="unknown kind of pairs 'all'; known: auto, exhaustive, sequential"):
-        image_pairs(NAMES, "all")
 
 
 def test_rotation_between_is_the_smallest_rotation_to_z():

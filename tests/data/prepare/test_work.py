@@ -35,18 +35,15 @@ def test_free_memory_without_proc(monkeypatch):
 def test_files_are_copied_on_file_systems_without_links(tmp_path, monkeypatch):
     original = tmp_path / "original.png"
     original.write_bytes(b"a picture")
-    link, hard, copy = (tmp_path / name for name in ("link", "hard", "copy"))
+    link, copy = tmp_path / "link", tmp_path / "copy"
 
     def refuse(*args, **kwargs):
         raise PermissionError(errno.EPERM, "Operation not permitted")
 
     work.link_or_copy(original, link)
     monkeypatch.setattr(Path, "symlink_to", refuse)
-    work.link_or_copy(link, hard)
-    monkeypatch.setattr(Path, "hardlink_to", refuse)
     work.link_or_copy(link, copy)
-    assert link.is_symlink() and not hard.is_symlink() and not copy.is_symlink()
-    assert hard.samefile(original) and not copy.samefile(original)
+    assert link.is_symlink() and not copy.is_symlink() and not copy.samefile(original)
     assert copy.read_bytes() == b"a picture"
 
 

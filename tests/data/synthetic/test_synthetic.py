@@ -46,7 +46,7 @@ def test_cache_gives_identical_scenes(tmp_path):
     options = SyntheticOptions(**TINY)
     first = generate(options)
     files = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()}
-    assert len(files) == 7  # six images and a table, nothing left over
+    assert len(files) == 8  # six images, a table and a digest
     same(first, generate(options))
     assert {path: path.stat().st_mtime_ns for path in files} == files
     os.environ["PADGS_CACHE"] = str(tmp_path / "elsewhere")  # restored by the fixture
@@ -59,7 +59,7 @@ def test_a_damaged_cache_is_regenerated(tmp_path):
     table = next(tmp_path.rglob("scene.npz"))
     table.write_bytes(table.read_bytes()[:100])
     same(first, generate(options))
-    next(tmp_path.rglob("003.png")).unlink()
+    next(tmp_path.rglob("000003.png")).unlink()
     same(first, generate(options))
     assert cache.read(options) is not None
 
@@ -104,6 +104,9 @@ def test_load_uses_the_data_options():
         ({"point_noise": float("nan")}, "finite"),
         ({"path_radius": 0.0}, "path_radius is 0.0; it must be a finite length"),
         ({"horizon": float("inf")}, "horizon is inf; it must be a finite length"),
+        ({"lens_gap": -0.1}, "lens_gap"),
+        ({"lens_blend": 90.0}, "lens_blend"),
+        ({"lens_k1": 0.5}, "lens_k1"),
         ({"path": "zigzag"}, "known: cross, line, roaming"),
         ({"objects": 2000}, "no free position"),
     ],
