@@ -7,27 +7,14 @@ import functools
 
 import torch
 
-from padgs.native.abi import (
-    AngularSizeArguments,
-    BlendGradientArguments,
-    DecodeGradientArguments,
-    Gradients,
-    Inputs,
-    Int32,
-    Int64,
-    LeaveOneOutArguments,
-    LossArguments,
-    NativeCamera,
-    Pointer,
-    RoughnessArguments,
-    SplatArguments,
-)
+from padgs.native import abi
+from padgs.native.abi import Int32, Int64, Pointer
 from padgs.native.loading import Library, declare, find_library
 
 STRUCTURES = (
-    *(NativeCamera, Inputs, Gradients, BlendGradientArguments),
-    *(DecodeGradientArguments, LossArguments, SplatArguments, LeaveOneOutArguments, RoughnessArguments),
-    AngularSizeArguments,
+    *(abi.NativeCamera, abi.Inputs, abi.Gradients, abi.BlendGradientArguments, abi.DecodeGradientArguments),
+    *(abi.LossArguments, abi.SplatArguments, abi.LeaveOneOutArguments, abi.RoughnessArguments),
+    abi.AngularSizeArguments,
 )
 SIGNATURES = {
     "padgs_isa": ([], ctypes.c_char_p),

@@ -13,20 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from padgs.native.abi import (
-    DecodeArguments,
-    DecodeGradientArguments,
-    Gradients,
-    Inputs,
-    Int32,
-    Int64,
-    LossArguments,
-    NativeCamera,
-    Pointer,
-    RayPointers,
-    SplatArguments,
-    fields,
-)
+from padgs.native import abi
+from padgs.native.abi import Int32, Int64, Pointer, fields
 from padgs.native.loading import Library, declare, find_library
 
 OUT_OF_MEMORY = 2  # cudaErrorMemoryAllocation
@@ -43,9 +31,9 @@ class TileTable(ctypes.Structure):
 
 class ProjectArguments(ctypes.Structure):
     _fields_ = [
-        ("camera", NativeCamera),
+        ("camera", abi.NativeCamera),
         ("pose", Pointer),
-        ("inputs", Inputs),
+        ("inputs", abi.Inputs),
         *fields(Pointer, "footprints", "boxes", "depth_keys", "indices"),
         ("table", TileTable),
         ("counts", Pointer),
@@ -54,11 +42,11 @@ class ProjectArguments(ctypes.Structure):
 
 class ProjectGradientArguments(ctypes.Structure):
     _fields_ = [
-        ("camera", NativeCamera),
+        ("camera", abi.NativeCamera),
         ("pose", Pointer),
-        ("inputs", Inputs),
+        ("inputs", abi.Inputs),
         ("moments", Pointer),
-        ("out", Gradients),
+        ("out", abi.Gradients),
     ]
 
 
@@ -86,7 +74,7 @@ class BlendInputs(ctypes.Structure):
     _fields_ = [
         ("table", TileTable),
         *fields(Int32, "projection", "wrap", "core_size"),
-        ("rays", RayPointers),
+        ("rays", abi.RayPointers),
         *fields(Pointer, "footprints", "tile_start", "slots", "reaches", "background"),
         *fields(Pointer, "image", "transmittance", "depth", "last", "core", "tails", "pair_counts"),
     ]
@@ -108,20 +96,20 @@ class RemovalInputs(ctypes.Structure):
 
 
 class DeviceLossArguments(ctypes.Structure):
-    _fields_ = [("loss", LossArguments), *fields(Pointer, "total", "block_sums")]
+    _fields_ = [("loss", abi.LossArguments), *fields(Pointer, "total", "block_sums")]
 
 
 class DeviceSplatArguments(ctypes.Structure):
-    _fields_ = [("splats", SplatArguments), ("center", Pointer)]
+    _fields_ = [("splats", abi.SplatArguments), ("center", Pointer)]
 
 
 class DeviceDecodeArguments(ctypes.Structure):
-    _fields_ = [("decode", DecodeArguments), ("room", Int64), *fields(Pointer, "color_logits", "covariance_logits")]
+    _fields_ = [("decode", abi.DecodeArguments), ("room", Int64), *fields(Pointer, "color_logits", "covariance_logits")]
 
 
 class DeviceDecodeGradientArguments(ctypes.Structure):
     _fields_ = [
-        *(("gradient", DecodeGradientArguments), ("room", Int64)),
+        *(("gradient", abi.DecodeGradientArguments), ("room", Int64)),
         *fields(Pointer, "opacity_out", "color_out", "covariance_out"),
     ]
 
@@ -135,25 +123,13 @@ class NetworkArguments(ctypes.Structure):
 
 
 class NetworkGradientArguments(ctypes.Structure):
-    _fields_ = [("gradient", DecodeGradientArguments), ("inputs", NetworkInputs), ("room", Int64)]
+    _fields_ = [("gradient", abi.DecodeGradientArguments), ("inputs", NetworkInputs), ("room", Int64)]
 
 
 STRUCTURES = (
-    Queue,
-    ProjectArguments,
-    ProjectGradientArguments,
-    SortArguments,
-    BinArguments,
-    BlendInputs,
-    BlendGradientInputs,
-    RemovalInputs,
-    DeviceLossArguments,
-    DeviceSplatArguments,
-    DeviceDecodeArguments,
-    DeviceDecodeGradientArguments,
-    NetworkInputs,
-    NetworkArguments,
-    NetworkGradientArguments,
+    *(Queue, ProjectArguments, ProjectGradientArguments, SortArguments, BinArguments, BlendInputs),
+    *(BlendGradientInputs, RemovalInputs, DeviceLossArguments, DeviceSplatArguments, DeviceDecodeArguments),
+    *(DeviceDecodeGradientArguments, NetworkInputs, NetworkArguments, NetworkGradientArguments),
 )
 SIGNATURES: dict[str, tuple[list, Any]] = {
     "padgs_cuda_structure_bytes": ([Int32], Int64),

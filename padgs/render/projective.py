@@ -15,14 +15,15 @@ from torch import Tensor
 from padgs.geometry.camera import Camera, Panorama
 from padgs.geometry.panorama import longitude_latitude, pixel_from_angles, projection_jacobian
 from padgs.render.contract import ALPHA_MIN, Request
-from padgs.render.planar import is_on_image, square_boxes
 from padgs.render.projection import (
     Footprints,
     camera_frame,
+    is_on_image,
     is_sound,
     low_pass_filtered,
     low_pass_of,
     plane_covariance,
+    square_boxes,
 )
 
 PUBLISHED_FOCAL = 512  # pixels per radian on the tangent planes of the released OP43DGS, for every image size

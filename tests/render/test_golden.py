@@ -17,8 +17,7 @@ from support.render_cases import INPUTS, engines, needs_native, view_of
 from padgs.gaussians import Gaussians
 from padgs.geometry.camera import Camera, Panorama, Pinhole, RayTable
 from padgs.render import RenderOptions, render
-from padgs.render.planar import SLOPE_LIMIT
-from padgs.render.projection import PROJECTIONS
+from padgs.render.projection import PROJECTIONS, SLOPE_LIMIT
 
 FOLDER = Path(__file__).resolve().parents[2].parent / "shared" / "golden"
 CASES = sorted(path.stem for projection in PROJECTIONS for path in FOLDER.glob(f"{projection}_*.npz"))

@@ -28,7 +28,7 @@ from padgs.gaussians import Gaussians, rotation_matrices
 from padgs.geometry.camera import Camera, Panorama, Pinhole, RayTable
 from padgs.geometry.panorama import direction
 from padgs.render import RenderOptions, render
-from padgs.render.planar import PlanarFootprints
+from padgs.render.projection import PlanarFootprints
 from padgs.scene import View
 
 PROJECTIONS = ("erp", "pinhole", "tangent", "ray")

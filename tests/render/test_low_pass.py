@@ -24,8 +24,7 @@ from padgs.geometry.camera import Camera, Panorama, Pinhole
 from padgs.geometry.panorama import direction
 from padgs.render import RenderOptions, render
 from padgs.render.contract import LOW_PASS_KINDS
-from padgs.render.planar import PlanarFootprints
-from padgs.render.projection import PROJECTIONS
+from padgs.render.projection import PROJECTIONS, PlanarFootprints
 from padgs.scene import View
 
 COMBINATIONS = [(projection, kind) for projection, kinds in LOW_PASS_KINDS.items() for kind in kinds]

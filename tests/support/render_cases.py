@@ -15,8 +15,7 @@ from padgs.geometry.panorama import direction
 from padgs.native import cpu
 from padgs.render import BACKENDS, Rendering, RenderOptions, render
 from padgs.render.contract import ALPHA_MIN, Request
-from padgs.render.planar import PlanarFootprints
-from padgs.render.projection import Footprints, project
+from padgs.render.projection import Footprints, PlanarFootprints, project
 from padgs.render.projective import RayFootprints
 from padgs.scene import View
 from support import cuda_engine

@@ -12,19 +12,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from padgs.native import cpu
-from padgs.native.abi import (
-    GRADIENT_SUMS,
-    REMOVAL,
-    BlendArguments,
-    BlendGradientArguments,
-    Gradients,
-    Inputs,
-    LeaveOneOutArguments,
-    NativeCamera,
-    TileGrid,
-    pointer,
-)
+from padgs.native import abi, cpu
+from padgs.native.abi import Inputs, pointer
 from padgs.render.backends.native import (
     TILE,
     NativeImage,
@@ -48,7 +37,7 @@ class Strip:
         self._row_start = torch.cat((torch.zeros(1, dtype=torch.int64), per_row.cumsum(0)))
         self._level = projected.level
         self.tiles = int(self._row_start[-1])
-        self.grid = TileGrid(
+        self.grid = abi.TileGrid(
             camera.width, camera.height, first_row, end_row, pointer(self._level), pointer(self._row_start)
         )
         self.slot_start = torch.empty(count + 1, dtype=torch.int64)
@@ -73,7 +62,7 @@ class Projected(Strips[Strip]):
     limit, the image is rendered in strips of tile rows.
     """
 
-    def __init__(self, camera: NativeCamera, inputs: Inputs, max_instances: int) -> None:
+    def __init__(self, camera: abi.NativeCamera, inputs: Inputs, max_instances: int) -> None:
         library, count = cpu.library(), inputs.count
         rows = -(-camera.height // TILE)
         self.camera = camera
@@ -100,11 +89,11 @@ class _Cores:
     start: Tensor  # [tiles + 1] int64
 
     @staticmethod
-    def allocate(strip: Strip, arguments: BlendArguments) -> _Cores:
+    def allocate(strip: Strip, arguments: abi.BlendArguments) -> _Cores:
         words = cpu.library().padgs_core_words(ctypes.byref(arguments))
         return _Cores(torch.empty(words, dtype=torch.int32), torch.zeros(strip.tiles + 1, dtype=torch.int64))
 
-    def join(self, arguments: BlendArguments) -> None:
+    def join(self, arguments: abi.BlendArguments) -> None:
         arguments.cores, arguments.core_start = pointer(self.words), pointer(self.start)
 
 
@@ -146,25 +135,25 @@ class _Image(NativeImage):
 
     def gradient_sums(self, pixels: Pixels, background: Tensor, upstream: Upstream) -> Tensor:
         count = len(self._projected.boxes)
-        totals = torch.zeros(count, GRADIENT_SUMS)
+        totals = torch.zeros(count, abi.GRADIENT_SUMS)
         for number, strip in enumerate(self._projected.strips()):
             forward = self._blend_arguments(strip, background, pixels, None)
             if self._cores:
                 self._cores[number].join(forward)
-            sums = torch.empty(len(strip.instances), GRADIENT_SUMS)
+            sums = torch.empty(len(strip.instances), abi.GRADIENT_SUMS)
             grads = (upstream.image, upstream.transmittance, upstream.depth, sums, upstream.rays)
-            arguments = BlendGradientArguments(forward, *map(pointer, grads), upstream.absgrad)
+            arguments = abi.BlendGradientArguments(forward, *map(pointer, grads), upstream.absgrad)
             cpu.library().padgs_blend_backward(ctypes.byref(arguments))
             cpu.library().padgs_sum_moments(pointer(sums), pointer(strip.slot_start), count, pointer(totals))
         return totals
 
     def removals(self, pixels: Pixels, background: Tensor, target: Tensor, weight: Tensor) -> Removals:
         count = len(self._projected.boxes)
-        sums, peak = torch.zeros(count, REMOVAL - 1, dtype=torch.float64), torch.zeros(count)
+        sums, peak = torch.zeros(count, abi.REMOVAL - 1, dtype=torch.float64), torch.zeros(count)
         for strip in self._projected.strips():
             forward = self._blend_arguments(strip, background, pixels, None)
-            found = torch.empty(len(strip.instances), REMOVAL)
-            arguments = LeaveOneOutArguments(forward, *map(pointer, (target, weight, found)))
+            found = torch.empty(len(strip.instances), abi.REMOVAL)
+            arguments = abi.LeaveOneOutArguments(forward, *map(pointer, (target, weight, found)))
             cpu.library().padgs_leave_one_out(ctypes.byref(arguments))
             owner = torch.repeat_interleave(torch.arange(count), strip.slot_start.diff())
             sums.index_add_(0, owner, found[:, :-1].double())
@@ -180,20 +169,20 @@ class _Image(NativeImage):
             ctypes.byref(self._projected.camera),
             ctypes.byref(inputs),
             pointer(sums),
-            ctypes.byref(Gradients(*map(pointer, (*gradients, pose_gradient)))),
+            ctypes.byref(abi.Gradients(*map(pointer, (*gradients, pose_gradient)))),
         )
         return pose_gradient
 
     def _blend_arguments(
         self, strip: Strip, background: Tensor, pixels: Pixels, pair_counts: Tensor | None
-    ) -> BlendArguments:
+    ) -> abi.BlendArguments:
         """Return the arguments of both blending passes; the tensors must outlive the call."""
         projected, options = self._projected, self.options
         lists = (projected.footprints, strip.tile_start, strip.instances, background)
         outputs = (*pixels, self._last, pair_counts)
         core_size = options.core_size if options.blending == "hybrid" else 0
         scalars = (projected.camera.projection, projected.camera.wrap, core_size)
-        return BlendArguments(strip.grid, *scalars, self.rays.native(), *map(pointer, (*lists, *outputs)))
+        return abi.BlendArguments(strip.grid, *scalars, self.rays.native(), *map(pointer, (*lists, *outputs)))
 
 
 rasterize, leave_one_out = _Image.rasterize, _Image.leave_one_out

@@ -12,7 +12,7 @@ from support.render_cases import identity_pose, needs_native, projected
 from padgs.gaussians import Gaussians
 from padgs.geometry.camera import Panorama
 from padgs.render import RenderOptions
-from padgs.render.planar import TILE
+from padgs.render.projection import TILE
 
 OMNIGS = RenderOptions("erp", near=0.2, wrap=False, bounds="square")
 EXACT = RenderOptions("tangent", near=0.2)
