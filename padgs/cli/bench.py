@@ -22,8 +22,7 @@ def bench(
 
     from rich.console import Console
 
-    from padgs.apps.bench.report import QUICK, BenchOptions, measure_all
-    from padgs.apps.bench.tables import lines
+    from padgs.apps.bench.report import QUICK, BenchOptions, lines, measure_all
 
     usual = QUICK if quick else BenchOptions(repeats=10 if device == "cpu" else 50)
     sizes = (*usual.sizes, "large") if full else usual.sizes

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from padgs.gaussians import Gaussians
+from padgs.geometry.camera import Panorama
 from padgs.native.abi import Inputs, pointer
 from padgs.render import RenderOptions
 from padgs.render.backends.cpu import Projected
 from padgs.render.backends.native import native_camera
-from padgs.scene import View
 
 BANDS = ((0, 30), (30, 60), (60, 75), (75, 85), (85, 90))  # degrees of absolute latitude
 SIGMA = 4.0  # pixels at the equator
@@ -24,12 +24,12 @@ BOUNDS = {
 }
 
 
-def tiles_by_latitude(width: int = 2048, height: int = 1024, count: int = 50_000, seed: int = 0) -> dict[str, Any]:
+def tiles_by_latitude(width: int = 2048, height: int = 1024, count: int = 50_000) -> dict[str, Any]:
     """Return mean and maximum of tiles per Gaussian, of all and by band of latitude.
 
     The Gaussians are isotropic with `SIGMA` and `OPACITY`, in directions uniform on the sphere.
     """
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
     latitude = torch.rad2deg(directions[:, 1].clamp(-1, 1).asin()).abs()
     report: dict[str, Any] = {"sigma": SIGMA, "opacity": OPACITY, "width": width, "height": height, "count": count}
@@ -54,10 +54,9 @@ def spheres(directions: Tensor, sigma: float, width: int) -> Gaussians:
 
 def tiles_per_gaussian(gaussians: Gaussians, width: int, height: int, options: RenderOptions) -> Tensor:
     """Return the tile instances [N] of each Gaussian in a panorama at the origin."""
-    camera = View("origin", torch.eye(4, dtype=torch.float64), width, height).camera
     tensors = [tensor.contiguous() for tensor in vars(gaussians).values()]
     inputs = Inputs(len(gaussians), *map(pointer, tensors), None)
-    projected = Projected(native_camera(torch.eye(4), camera, options), inputs, max_instances=1 << 40)
+    projected = Projected(native_camera(torch.eye(4), Panorama(width, height), options), inputs, max_instances=1 << 40)
     (strip,) = projected.strips()
     return strip.slot_start.diff()
 
