@@ -26,7 +26,7 @@ from padgs.registry import lookup
 from padgs.render import RenderConfig
 from padgs.reports.conditions import CALIBRATES
 from padgs.runs.config import RunOptions, TrainConfig, method_choices
-from padgs.runs.tracking.tracker import TrackingOptions
+from padgs.runs.tracking import TrackingOptions
 from padgs.training.options import TrainOptions
 
 CONF = Path(__file__).resolve().parent.parent / "conf"

@@ -17,7 +17,7 @@ def track(
     from pathlib import Path
 
     from padgs import results
-    from padgs.runs.tracking.tracker import Tracker, TrackingOptions
+    from padgs.runs.tracking import Tracker, TrackingOptions
 
     if not Path(runs).is_dir():
         raise FileNotFoundError(f"there is no folder {runs}; give the folder of the runs")

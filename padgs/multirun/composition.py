@@ -14,7 +14,7 @@ from hydra.core.config_loader import ConfigLoader
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from padgs.baselines import BUILT_IN, METHODS, distribution
@@ -43,22 +43,6 @@ def composing() -> Iterator[ConfigLoader]:
         yield GlobalHydra.instance().config_loader()
 
 
-def single_run(arguments: Sequence[str]) -> tuple[DictConfig, Mapping[str, object]]:
-    """Compose a command line that is no multirun.
-
-    Returns:
-        The configuration without the keys of Hydra; group -> choice.
-
-    Raises:
-        HydraException: an unknown choice, or a violation of Hydra's grammar.
-    """
-    config = compose("config", lenient(quoted(arguments)), return_hydra_config=True)
-    choices = config.hydra.runtime.choices
-    with open_dict(config):
-        del config["hydra"]
-    return config, choices
-
-
 def multirun(arguments: Sequence[str]) -> DictConfig | None:
     """Compose a command line without what it sweeps; None if it is no multirun.
 
@@ -82,7 +66,23 @@ def configuration(settings: Sequence[str]) -> RunConfig:
         ConfigError: an unknown key or name, or a value of the wrong type.
         HydraException: an unknown choice, or a violation of Hydra's grammar.
     """
-    return typed_config(*single_run(settings))
+    composed = compose("config", lenient(quoted(settings)), return_hydra_config=True)
+    return typed_config(composed, composed.hydra.runtime.choices)
+
+
+def composed_text(settings: Sequence[str], key: str) -> str:
+    """Return what Hydra composes under a key as YAML; "job" is all but Hydra's own keys.
+
+    Raises:
+        ValueError: there is no such key.
+        HydraException: an unknown choice, or a violation of Hydra's grammar.
+    """
+    composed = multirun(settings) or compose("config", lenient(quoted(settings)), return_hydra_config=True)
+    if key == "job":
+        return OmegaConf.to_yaml(OmegaConf.masked_copy(composed, [str(name) for name in composed if name != "hydra"]))
+    if not OmegaConf.is_config(part := OmegaConf.select(composed, key)):
+        raise ValueError(f"{key} is no group of the configuration; give job for all, or e.g. method or hydra.launcher")
+    return OmegaConf.to_yaml(part)
 
 
 def typed_config(composed: DictConfig, choices: Mapping[str, object]) -> RunConfig:
@@ -91,7 +91,11 @@ def typed_config(composed: DictConfig, choices: Mapping[str, object]) -> RunConf
     Raises:
         ConfigError: an unknown key or name, or a value of the wrong type.
     """
-    values: Any = OmegaConf.to_container(composed, resolve=True)
+    values: Any = {
+        key: OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
+        for key, value in composed.items()
+        if key != "hydra"
+    }
     return config_from_values(values, labels(choices))
 
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
@@ -29,28 +28,9 @@ from padgs.runs.load import load_run
 from padgs.runs.run import REPORTED, Callback, Scene, load_scene, run, start
 from padgs.runs.smallest import find_smallest
 from padgs.runs.store import RunBusy, RunStore
-from padgs.runs.tracking.tracker import SECONDS_BETWEEN_LOOKS, Tracker
+from padgs.runs.tracking import SECONDS_BETWEEN_LOOKS, Tracker
 
 EXPECTED = (*REPORTED, OmegaConfBaseException)  # errors whose message suffices without a traceback
-
-
-def only_job(composed: DictConfig, choices: Mapping[str, object]) -> str:
-    """Do the only run of a process and return its status, one of `padgs.results.STATUSES` or refused."""
-    try:
-        config, console = typed_config(composed, choices), Console()
-        dimly = partial(say, console, style="dim")
-        tracker = Tracker(config.tracking, Path(config.run.folder), " ".join(config.labels.experiments), dimly)
-        callback = TrackedRun(tracker)
-        with served_scene(config) as scene:
-            result = run(config, console, callback, scene)
-        search_smallest(config, scene, result, console, callback)
-        tracker.update(Path(config.run.folder) / result.run)
-        return result.status
-    except EXPECTED as error:
-        if os.environ.get("HYDRA_FULL_ERROR"):
-            raise
-        complain(str(error))
-        return REFUSED
 
 
 def job_of_many(composed: DictConfig) -> str:
@@ -110,12 +90,15 @@ def complain(message: str) -> None:
 
 
 @contextmanager
-def exit_on_hydra_errors() -> Iterator[None]:
-    """Exit with code 1 and the message of an error of Hydra, such as an unknown choice, without a traceback."""
+def exit_on_errors() -> Iterator[None]:
+    """Exit with code 1 and the message of an expected error, without a traceback."""
     try:
         yield
     except HydraException as error:
         complain("\n".join(map(str, filter(None, (error, error.__cause__)))))
+        sys.exit(1)
+    except EXPECTED as error:
+        complain(str(error))
         sys.exit(1)
 
 
@@ -127,11 +110,17 @@ def in_own_process(hydra: DictConfig | HydraConf) -> bool:
 class TrackedRun(Callback):
     """Callback that mirrors the only run of a process from time to time."""
 
-    def __init__(self, tracker: Tracker) -> None:
-        self._tracker, self._looked = tracker, time.monotonic()
+    def __init__(self, config: RunConfig, console: Console) -> None:
+        self._runs, experiment = Path(config.run.folder), " ".join(config.labels.experiments)
+        self._tracker = Tracker(config.tracking, self._runs, experiment, partial(say, console, style="dim"))
+        self._looked = time.monotonic()
 
     def saved(self, folder: Path) -> None:
         """Mirror the run, whose log is up to date."""
         if time.monotonic() - self._looked >= SECONDS_BETWEEN_LOOKS:
             self._tracker.update(folder)
             self._looked = time.monotonic()
+
+    def ended(self, result: Result) -> None:
+        """Mirror the run, which has ended with a result."""
+        self._tracker.update(self._runs / result.run)

@@ -20,7 +20,7 @@ padgs-run [KEY=VALUE ...]     one run, scored; by default padgs+ on a built-in r
 padgs-run -m KEY=A,B ...      one run for each value; lists multiply
 padgs-run --cfg job           print the configuration, run nothing
 padgs-run --help method=NAME  print this text, with the keys of that method
-padgs-run --version           print the version; --hydra-help lists further options
+padgs-run --version           print the version
 """
 GROUPS = ("method", "+experiment", "+sweep", "+scene", "data", "protocol", "render", "budget", "+scale")
 GROUPS += ("launcher", "tracking")

@@ -17,6 +17,9 @@ from hydra.core.override_parser.types import Quote, QuotedString
 
 from padgs.checks import install_command
 
+SHOW = "--cfg"
+OPTIONS = ("-m", "--multirun", SHOW, "--help", "-h", "--version")
+HELP = "see padgs-run --help"
 PLUGINS = {  # choice of conf/launcher -> module of its plugin, extra of pyproject.toml
     "local": ("hydra_plugins.hydra_joblib_launcher", "launchers"),
     "slurm": ("hydra_plugins.hydra_submitit_launcher", "launchers"),
@@ -37,16 +40,6 @@ def root() -> Path:
     """
     package = Path(__file__).resolve().parent.parent
     return package if (package / "conf").is_dir() else package.parent
-
-
-def options_first(arguments: Sequence[str]) -> list[str]:
-    """Move options and their values before settings: Hydra's parser refuses settings on both sides of an option.
-
-    >>> options_first(["method=padgs", "-m", "seed=0,1", "--cfg", "job"])
-    ['-m', '--cfg', 'job', 'method=padgs', 'seed=0,1']
-    """
-    is_setting = [not text.startswith("-") and ("=" in text or text.startswith("~")) for text in arguments]
-    return [text for wanted in (False, True) for text, it in zip(arguments, is_setting, strict=True) if it == wanted]
 
 
 def lenient(arguments: Sequence[str]) -> list[str]:
@@ -127,25 +120,28 @@ def problem(arguments: Sequence[str]) -> str | None:
     'run.jobs=4 requires a launcher that runs several jobs at a time, e.g. launcher=local'
     """
     settings: dict[str, str] = {}
-    before = ""
-    for argument in arguments:
+    if SHOW in arguments[-1:]:
+        return f"{SHOW} needs the part of the configuration to print, e.g. {SHOW} job"
+    for before, argument in zip(["", *arguments], arguments, strict=False):
         key, equals, value = argument.partition("=")
-        if not (equals or argument.startswith(("-", "~")) or before.startswith("-")):  # which may have a value
-            return f"{argument} is no setting: these are KEY=VALUE, e.g. data.path={argument}; see padgs-run --help"
-        before = argument
-        if not equals or key.startswith("-"):
+        if argument.startswith("-") and argument not in OPTIONS:
+            return f"unknown option {argument}; known: {', '.join(OPTIONS)}"
+        if argument in OPTIONS or before == SHOW:
             continue
         key = key.lstrip("+~")
+        if not key or not (equals or argument.startswith("~")):
+            return f"{argument} is no setting: these are KEY=VALUE, e.g. data.path={value or argument}; {HELP}"
+        if not equals:
+            continue
         if key in settings:
             return f"{key} is set twice, by {settings[key]} and {argument}; keep one of them"
         if key in ("experiment", "sweep") and ("," in value or "(" in value):
             return f"{argument}: one {key} at a time, because each names what it sweeps"
         if key in _groups() and re.fullmatch(r"null|~|true|false|[-+.\d]*", value, re.IGNORECASE):
-            return f"{argument}: {key} is a group of settings, chosen by name; see padgs-run --help"
+            return f"{argument}: {key} is a group of settings, chosen by name; {HELP}"
         settings[key] = argument
     launcher = settings.get("launcher", "=none").partition("=")[2]
-    only_shown = any(argument.startswith("-") for argument in arguments)  # by an option such as --cfg
-    if launcher != "none" and not is_multirun(arguments) and not only_shown:
+    if launcher != "none" and not is_multirun(arguments) and SHOW not in arguments:
         command = f"padgs-run -m {shlex.join(arguments)}"
         return f"launcher={launcher} launches the jobs of a multirun; for this run: {command}"
     jobs = settings.get("run.jobs", "=1").partition("=")[2]

@@ -16,15 +16,29 @@ def main() -> None:
     arguments = sys.argv[1:]
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # schedulers send it; it is no crash
     try:  # slow modules are imported within, so that Ctrl-C is answered from the beginning
-        _answer(arguments)
-        from padgs.multirun.board import OK
-        from padgs.multirun.composition import composing, multirun, single_run
-        from padgs.multirun.job import exit_on_hydra_errors, only_job
-        from padgs.multirun.sweep import sweep
+        from padgs.multirun.job import exit_on_errors
 
-        with exit_on_hydra_errors(), composing() as loader:
-            config = multirun(arguments)
-            ends = {*sweep(config, loader)} if config else {only_job(*single_run(arguments))}
+        with exit_on_errors():
+            _answer(arguments)
+            from rich.console import Console
+
+            from padgs.multirun.board import OK
+            from padgs.multirun.composition import composing, configuration, multirun
+            from padgs.multirun.job import TrackedRun, search_smallest, served_scene
+            from padgs.multirun.sweep import sweep
+            from padgs.runs.run import run
+
+            with composing() as loader:
+                if composed := multirun(arguments):
+                    ends = {*sweep(composed, loader)}
+                else:
+                    config, console = configuration(arguments), Console()
+                    callback = TrackedRun(config, console)
+                    with served_scene(config) as scene:
+                        result = run(config, console, callback, scene)
+                    search_smallest(config, scene, result, console, callback)
+                    callback.ended(result)
+                    ends = {result.status}
         sys.exit(0 if ends <= {OK} else 1)
     except KeyboardInterrupt as stopped:
         from padgs.runs.console import printable
@@ -35,45 +49,48 @@ def main() -> None:
 
 
 def _answer(arguments: Sequence[str]) -> None:
-    """Exit after options that run nothing, and after settings that cannot be run."""
+    """Exit after options that run nothing.
+
+    Raises:
+        ValueError: settings that cannot be run.
+    """
     import padgs
 
     if "--version" in arguments:
         print(f"padgs {padgs.__version__}")
         sys.exit()
     from padgs.baselines import clash
-    from padgs.multirun.job import complain, exit_on_hydra_errors
+    from padgs.multirun.composition import composed_text, composing
     from padgs.multirun.manual import manual
-    from padgs.multirun.overrides import missing_plugin, problem
+    from padgs.multirun.overrides import SHOW, missing_plugin, problem
 
     if {"--help", "-h"} & {*arguments}:
-        with exit_on_hydra_errors():
-            print(manual(arguments))
+        print(manual(arguments))
         sys.exit()
+    if {"-sc", "--shell_completion"} & {*arguments}:
+        _complete()
     if error := problem(arguments) or missing_plugin(arguments) or clash():
-        complain(error)
-        sys.exit(1)
-    if any(argument.startswith("-") and argument not in ("-m", "--multirun") for argument in arguments):
-        with exit_on_hydra_errors():
-            _let_hydra_answer(arguments)
+        raise ValueError(error)
+    if SHOW in arguments:
+        settings = [*arguments]
+        key = settings.pop(settings.index(SHOW) + 1)
+        settings.remove(SHOW)
+        with composing():
+            print(composed_text(settings, key), end="")
         sys.exit()
 
 
-def _let_hydra_answer(arguments: Sequence[str]) -> None:
-    """Answer options of Hydra such as --cfg job, which run nothing."""
+def _complete() -> None:
+    """Let Hydra complete a command line, and exit."""
     import hydra
 
     from padgs.multirun.composition import register_choices
-    from padgs.multirun.overrides import lenient, options_first, quoted, root
-
-    def refuse(_: object) -> None:
-        raise SystemExit("this option of Hydra is not supported by padgs-run; see padgs-run --help")
+    from padgs.multirun.overrides import root
 
     os.environ.setdefault("PADGS_ROOT", str(root()))
     register_choices()
-    if not {"-sc", "--shell_completion"} & {*arguments}:
-        sys.argv[1:] = options_first(lenient(quoted(arguments)))
-    hydra.main(version_base="1.3", config_path=str(root() / "conf"), config_name="config")(refuse)()
+    hydra.main(version_base="1.3", config_path=str(root() / "conf"), config_name="config")(lambda _: None)()
+    sys.exit()
 
 
 if __name__ == "__main__":

@@ -38,7 +38,7 @@ from padgs.runs.console import Display, say
 from padgs.runs.interrupt import Interrupt, Interrupted
 from padgs.runs.run import RETRIED
 from padgs.runs.store import RunStore, cannot_write, labels
-from padgs.runs.tracking.tracker import SECONDS_BETWEEN_LOOKS, Tracker, TrackingOptions
+from padgs.runs.tracking import SECONDS_BETWEEN_LOOKS, Tracker, TrackingOptions
 
 ATTEMPTS = 2  # of a job whose process died: another job may have caused it
 SECONDS_BETWEEN_TICKS = 1.0
@@ -171,8 +171,9 @@ class Multirun:
                 self._end(index, replace(state, status=result.status))
         self._say(self.line())
         self._track()
-        counts, found = self.counts(), [result for state in self.states.values() if (result := self._result(state))]
-        self._tracker.finish(found, len(self.states))
+        counts = self.counts()
+        ended = [state.status for state in self.states.values() if state.status in results.STATUSES]
+        self._tracker.finish(ended, len(self.states))
         if RETRIED & {*counts}:
             self._say("failed runs are kept as they are; retry=failed starts them again")
         alive = any(self._numbers[index] >= 0 and not state.ended for index, state in self.states.items())

@@ -19,7 +19,7 @@ from padgs.registry import lookup
 from padgs.render import RenderConfig
 from padgs.runs.device import DEVICES
 from padgs.runs.store import Labels
-from padgs.runs.tracking.tracker import TrackingOptions
+from padgs.runs.tracking import TrackingOptions
 from padgs.runs.warm_start import WarmStart
 from padgs.training.options import Budget, TrainOptions
 from padgs.training.schedule import PUBLISHED_ITERATIONS

@@ -1,28 +1,32 @@
+from pathlib import Path
+from types import SimpleNamespace
+
 import pytest
-from omegaconf import OmegaConf
+from hydra.errors import HydraException
+from rich.console import Console
+from support.composed import composed
 
 from padgs.multirun import job
-from padgs.multirun.board import REFUSED
-from padgs.multirun.job import TrackedRun
+from padgs.multirun.job import TrackedRun, exit_on_errors
 from padgs.training.health import Failure
 
 
 def test_a_run_in_progress_is_mirrored_at_intervals(tmp_path, monkeypatch):
     looks = []
-    watch = TrackedRun(type("Fake", (), {"update": lambda self, run: looks.append(run)})())
+    monkeypatch.setattr(job, "Tracker", lambda *_: SimpleNamespace(update=looks.append))
+    watch = TrackedRun(composed(), Console())
     watch.saved(tmp_path)
     assert looks == []
     monkeypatch.setattr(job, "SECONDS_BETWEEN_LOOKS", 0.0)
     watch.saved(tmp_path)
-    assert looks == [tmp_path]
+    watch.ended(SimpleNamespace(run="room"))
+    assert looks == [tmp_path, Path("runs/room")]
 
 
-@pytest.mark.parametrize("error", [Failure("oom", "no memory for a search"), ValueError("no such data")])
-def test_expected_errors_are_reported_without_a_traceback(monkeypatch, capsys, error):
-    def fail(*_):
+@pytest.mark.parametrize(
+    "error", [Failure("oom", "no memory for a search"), ValueError("no such data"), HydraException("no such choice")]
+)
+def test_expected_errors_are_reported_without_a_traceback(capsys, error):
+    with pytest.raises(SystemExit, match="1"), exit_on_errors():
         raise error
-
-    monkeypatch.setattr(job, "typed_config", fail)
-    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
-    assert job.only_job(OmegaConf.create(), {}) == REFUSED
     assert capsys.readouterr().err == f"error: {error}\n"

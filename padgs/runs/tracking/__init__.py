@@ -1,1 +1,0 @@
-"""Runs mirrored into mlflow."""
