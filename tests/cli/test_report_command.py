@@ -23,7 +23,7 @@ def report(*arguments):
     return CliRunner().invoke(app, ["report", *map(str, arguments)])
 
 
-def test_it_writes_markdown_and_latex_and_shows_the_first(runs, tmp_path):
+def test_a_report_is_written_and_printed(runs, tmp_path):
     done = report("table3", runs, "--out", tmp_path / "out")
     assert done.exit_code == 0
     written = {path.name: path.read_text() for path in (tmp_path / "out").iterdir()}
@@ -62,7 +62,7 @@ def test_a_broken_file_is_named_and_left_out_and_strict_fails(runs):
     assert report("table3", runs, "--strict").exit_code == 1
 
 
-def test_no_name_in_a_result_leads_out_of_the_folder(tmp_path):
+def test_names_in_results_cannot_leave_the_folder(tmp_path):
     runs, out = tmp_path / "runs", tmp_path / "a" / "b" / "out"
     changes = {"scene": "../../x", "dataset": ""}, {"experiments": ("../../../x",)}, {"run": "../x"}
     for seed, change in enumerate(changes):
@@ -74,7 +74,7 @@ def test_no_name_in_a_result_leads_out_of_the_folder(tmp_path):
     assert {path for path in tmp_path.rglob("*") if path.is_file() and "runs" not in path.parts} == {*out.glob("*")}
 
 
-def test_a_terminal_obeys_nothing_in_a_name(tmp_path):
+def test_control_characters_in_names_are_escaped(tmp_path):
     (tmp_path / "run").mkdir()
     results.write(result("\x1b]0;title\x07<b>", scene="\x1b[2J", dataset="", run="x"), tmp_path / "run")
     done = report("runs", tmp_path)
@@ -93,12 +93,12 @@ def test_a_terminal_obeys_nothing_in_a_name(tmp_path):
         (["html", "--experiment", "x"], "unknown experiment 'x'; known: ad_hoc"),
     ],
 )
-def test_what_is_wrong_is_said(runs, arguments, message):
+def test_invalid_arguments_are_refused(runs, arguments, message):
     done = report(arguments[0], runs, *arguments[1:])
     assert done.exit_code == 1 and message in done.output
 
 
-def test_a_folder_that_is_not_there(tmp_path):
+def test_a_missing_folder_is_refused(tmp_path):
     done = report("table3", tmp_path / "none")
     assert done.exit_code == 1 and "there is no folder" in done.output
 
@@ -113,7 +113,7 @@ def test_help_is_quick(root):
     assert subprocess.run([sys.executable, "-c", code], cwd=root).returncode == 0
 
 
-def test_everything_at_once(tmp_path):
+def test_all_writes_every_report(tmp_path):
     runs = write([*compared(["synthetic-room"], seeds=1), *swept(scenes=["synthetic-room"])], tmp_path / "runs")
     done = report("all", runs, "--out", tmp_path / "out")
     assert done.exit_code == 0, done.output
@@ -126,7 +126,7 @@ def test_everything_at_once(tmp_path):
     assert (tmp_path / "svg" / "sweep_tau_cpu.svg").is_file()
 
 
-def test_what_is_refused_does_not_keep_the_rest_back(tmp_path):
+def test_a_refused_report_does_not_stop_the_others(tmp_path):
     first, *others = compared(["synthetic-room"], seeds=1)
     write([replace(first, machine={"gpu": "H200"}), *others], tmp_path / "runs")
     done = report("all", tmp_path / "runs", "--out", tmp_path / "out", "--strict")
@@ -134,7 +134,7 @@ def test_what_is_refused_does_not_keep_the_rest_back(tmp_path):
     assert (tmp_path / "out" / "table1.md").exists() and not (tmp_path / "out" / "table4.md").exists()
 
 
-def test_trials_of_all_kinds_stand_in_blocks_and_rows_of_their_own(tmp_path):
+def test_trials_of_different_kinds_have_their_own_blocks_and_rows(tmp_path):
     first, *others = compared(["synthetic-room"], seeds=1)
     longer = small(24.0, method="omnigs", iterations=7, experiments=("all_methods@cpu",))
     tau = replace(others[-1], run="tau", config={**others[-1].config, "method": {"tau": 0.5}})

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -167,19 +168,12 @@ def distill(
         steps: iterations.
         progress: called with the number of completed iterations.
     """
-    targets = tuple(replace(view, load_pixels=_Target(render_teacher, view), load_mask=None) for view in scene.train)
+
+    def target(view: View) -> View:
+        pixels = cache(lambda: (quantized(render_teacher(view).image) * 255).to(torch.uint8))
+        return replace(view, load_pixels=pixels, load_mask=None)
+
+    targets = tuple(map(target, scene.train))
     student = FixedCountSplats(splats, config, ExtentOptions().extent_of(scene), steps)
     for record in Trainer(student, replace(scene, train=targets), Budget(steps), DISTILLATION).records():
         progress(record.iteration)
-
-
-class _Target:
-    """Lazily rendered pixels of a view, [H, W, 3] uint8."""
-
-    def __init__(self, render: Callable[[View], Rendering], view: View) -> None:
-        self._render, self._view, self._pixels = render, view, None
-
-    def __call__(self) -> Tensor:
-        if self._pixels is None:
-            self._pixels = (quantized(self._render(self._view).image) * 255).to(torch.uint8)
-        return self._pixels

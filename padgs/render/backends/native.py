@@ -222,7 +222,9 @@ def native_camera(cam_from_world: Tensor, camera: Camera, options: RenderOptions
         raise ValueError(
             f"the native libraries do not know projection {options.projection!r}; known: {', '.join(PROJECTIONS)}"
         )
-    low_pass, off_panorama = low_pass_of(options, camera), _off_panorama(camera)
+    low_pass, off_panorama = low_pass_of(options, camera), -1.0
+    if isinstance(camera, RayTable):
+        off_panorama = _of_table(_off_panorama, camera.table, camera.table.device)
     lens = (camera.fx, camera.fy, camera.cx, camera.cy) if isinstance(camera, Pinhole) else (0.0, 0.0, 0.0, 0.0)
     return NativeCamera(
         camera.width,
@@ -242,24 +244,25 @@ def native_camera(cam_from_world: Tensor, camera: Camera, options: RenderOptions
     )
 
 
-def _off_panorama(camera: Camera) -> float:
+_kept: MutableMapping[Tensor, dict[Callable, tuple[Any, Any]]] = WeakTensorKeyDictionary()
+
+
+def _of_table(make: Callable[[Tensor, torch.device], Any], table: Tensor, device: torch.device) -> Any:
+    """Return `make(table, device)`, computed again only after the table changed or for another device."""
+    values, state = _kept.setdefault(table, {}), (table._version, device)
+    if make not in values or values[make][0] != state:
+        values[make] = state, make(table.detach(), device)
+    return values[make][1]
+
+
+def _off_panorama(table: Tensor, device: torch.device) -> float:
     """Return the largest angle in radians between the rays of a table and a panorama, or -1 if it is large.
 
     A table that is nearly a panorama has the bounds of a panorama; any other has none.
     """
-    if not isinstance(camera, RayTable):
-        return -1.0
-    known = _off_panoramas.get(camera.table)
-    if known is None or known[0] != camera.table._version:
-        table = camera.table.detach().float()
-        chord = (table - _panorama_rays(camera.width, camera.height, table.device)).norm(dim=-1)
-        angle = 2 * torch.asin((chord.max() / 2).clamp(max=1)).item() + SLACK  # waits for a GPU, once for a table
-        known = _off_panoramas[camera.table] = camera.table._version, angle if angle < MAX_DEVIATION else -1.0
-    return known[1]
-
-
-# table -> its version, and the angle
-_off_panoramas: MutableMapping[Tensor, tuple[int, float]] = WeakTensorKeyDictionary()
+    chord = (table.float() - _panorama_rays(table.shape[1], table.shape[0], device)).norm(dim=-1)
+    angle = 2 * torch.asin((chord.max() / 2).clamp(max=1)).item() + SLACK  # waits for a GPU, once for a table
+    return angle if angle < MAX_DEVIATION else -1.0
 
 
 @functools.lru_cache(maxsize=4)
@@ -269,23 +272,15 @@ def _panorama_rays(width: int, height: int, device: torch.device) -> Tensor:
 
 def native_rays(camera: Camera, device: torch.device = CPU) -> NativeRays:
     """Return the directions of the pixels; computed once for a camera and device, and again after a table changed."""
-    if not isinstance(camera, RayTable):
-        return _formula_rays(camera, device)
-    state, known = (camera.table._version, device), _padded_tables.get(camera.table)
-    if known is None or known[0] != state:
-        padded = _padded_table(camera.table.detach().to(device, torch.float32))
-        known = _padded_tables[camera.table] = state, padded
-    return NativeRays(table=known[1])
-
-
-# table -> its version and device, and the padded table
-_padded_tables: MutableMapping[Tensor, tuple[tuple[int, torch.device], Tensor]] = WeakTensorKeyDictionary()
+    if isinstance(camera, RayTable):
+        return NativeRays(table=_of_table(_padded_table, camera.table, device))
+    return _formula_rays(camera, device)
 
 
 @functools.lru_cache(maxsize=16)
 def _formula_rays(camera: Panorama | Pinhole, device: torch.device) -> NativeRays:
     if isinstance(camera, Pinhole):
-        return NativeRays(table=_padded_table(camera.rays()).to(device, torch.float32))
+        return NativeRays(table=_padded_table(camera.rays(), CPU).to(device))
     padded = -(-camera.width // CHUNK) * CHUNK
     longitude = ((torch.arange(padded, dtype=torch.float64) + 0.5) / camera.width - 0.5) * (2 * torch.pi)
     latitude = row_latitudes(camera.height, dtype=torch.float64)
@@ -293,6 +288,7 @@ def _formula_rays(camera: Panorama | Pinhole, device: torch.device) -> NativeRay
     return NativeRays(*(values.to(device, torch.float32) for values in angles))
 
 
-def _padded_table(rays: Tensor) -> Tensor:
+def _padded_table(rays: Tensor, device: torch.device) -> Tensor:
     padding = -rays.shape[1] % CHUNK  # copies of the last column are valid directions
-    return torch.nn.functional.pad(rays.permute(0, 2, 1), (0, padding), mode="replicate").contiguous()
+    columns = rays.to(device, torch.float32).permute(0, 2, 1)
+    return torch.nn.functional.pad(columns, (0, padding), mode="replicate").contiguous()

@@ -98,7 +98,7 @@ def test_leave_one_out_of_long_lists_is_deterministic(generator, monkeypatch):
 
 
 @pytest.mark.parametrize("projection", ["erp", "ray"])
-def test_cores_of_any_size(projection: str, generator: torch.Generator):
+def test_core_sizes(projection: str, generator: torch.Generator):
     """Core sizes around those that kernels are compiled for; some pixels have more fragments."""
     gaussians = gaussians_of("ordinary", 300, generator)
     ahead = gaussians.means.abs() * torch.tensor([0.1, 0.1, 1.0]) + torch.tensor([0.0, 0.0, 2.0])
