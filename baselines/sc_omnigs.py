@@ -95,14 +95,14 @@ class SelfCalibration(Calibration):
         """Return a training image and its mask, resampled to an ideal camera."""
         pixels, mask = self.camera.source_pixels(), view.mask(device=target.image.device)
         if mask is None:
-            return Target(sample_pixels(target.image, pixels), target.weight, statistics=None)
+            return Target(sample_pixels(target.image, pixels), target.weight)
         mask = mask[..., None]
         layers = sample_pixels(torch.cat((target.image, target.image * mask, mask), dim=-1), pixels)
         plain, kept, share = layers.split((3, 3, 1), dim=-1)
         # Weighted by the mask, so that ignored pixels do not bleed into their neighbours.
         image = torch.where(share > 0, kept / share.clamp(min=1e-6), plain)
         weight = pixel_weight(self._weight, view.height, share[..., 0].detach(), device=mask.device)
-        return Target(image, weight, statistics=None)
+        return Target(image, weight)
 
 
 class SCOmniGSMethod(CalibratedMethod):

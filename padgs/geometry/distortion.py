@@ -86,18 +86,3 @@ def end_row_weight(height: int, *, dtype: torch.dtype = torch.float32, device: t
     """Return the row weight [H] of the released code: cos(pi i / (H - 1) - pi / 2), 0 in the first and last row."""
     rows = torch.arange(height, dtype=dtype, device=device)
     return torch.cos(math.pi * rows / (height - 1) - math.pi / 2)
-
-
-def pixel_solid_angle(
-    width: int, height: int, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
-) -> Tensor:
-    """Return the exact solid angle in steradian of a pixel of each row, [H]; the image sums to 4 pi (Eq. 8-10).
-
-    The integral of cos over a row is 2 sin(h / 2) cos(latitude) for row height h, so M is exactly proportional to it.
-
-    >>> round((pixel_solid_angle(8, 4).sum() * 8 / math.pi).item(), 5)
-    4.0
-    """
-    row_height = math.pi / height
-    longitude_step = 2 * math.pi / width
-    return longitude_step * 2 * math.sin(row_height / 2) * solid_angle_weight(height, dtype=dtype, device=device)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import ctypes
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -25,23 +24,11 @@ C1, C2 = 0.01**2, 0.03**2
 NORMALISATIONS = ("mean", "channel_sum")
 
 
-def _uniform_weight(height: int, *, dtype: torch.dtype, device: torch.device | str) -> Tensor:
-    return torch.ones(height, dtype=dtype, device=device)
-
-
 ROW_WEIGHTS = {
     "solid_angle": solid_angle_weight,  # M = cos(latitude) of the row's centre
-    "uniform": _uniform_weight,  # M = 1
+    "uniform": torch.ones,  # M = 1
     "end_rows": end_row_weight,  # the released code's M, 0 in the first and last row
 }
-
-
-@dataclass(frozen=True)
-class SSIMStatistics:
-    """SSIM statistics of a target; computed once per view instead of once per iteration."""
-
-    mean: Tensor  # [H, W, C]
-    variance: Tensor  # [H, W, C]
 
 
 def photometric_loss(
@@ -51,7 +38,6 @@ def photometric_loss(
     lambda_l1: float = 0.8,
     *,
     normalisation: str = "mean",
-    statistics: SSIMStatistics | None = None,
 ) -> Tensor:
     """Return Eq. 16, a scalar; differentiable by `image`, and by `target` if it requires a gradient.
 
@@ -61,7 +47,6 @@ def photometric_loss(
         weight: [H, W], or [H, 1] where all pixels of a row weigh the same; >= 0, not 0 everywhere.
         lambda_l1: lambda of Eq. 16.
         normalisation: mean divides by 3 sum(W); channel_sum by sum(W), as the released code does (3 x the mean).
-        statistics: `ssim_statistics(target)` if already known; they stop the gradient with respect to the target.
 
     Raises:
         ValueError: unknown normalisation.
@@ -76,19 +61,7 @@ def photometric_loss(
             mirrored = fused_photometric_loss(target, image.detach(), weight, lambda_l1, total)
             loss = loss + (mirrored - mirrored.detach())
         return loss
-    return define_loss(image, target, weight, lambda_l1, total, statistics)
-
-
-def define_loss(
-    image: Tensor,
-    target: Tensor,
-    weight: Tensor,
-    lambda_l1: float,
-    total: Tensor,
-    statistics: SSIMStatistics | None = None,
-) -> Tensor:
-    """Return `photometric_loss` in torch, for any dtype and device; the weighted sum is divided by `total`."""
-    per_channel = lambda_l1 * (image - target).abs() + (1 - lambda_l1) * (1 - ssim_map(image, target, statistics))
+    per_channel = lambda_l1 * (image - target).abs() + (1 - lambda_l1) * (1 - ssim_map(image, target))
     return (weight[..., None] * per_channel).sum() / total
 
 
@@ -115,23 +88,17 @@ def pixel_weight(
     return rows * mask.to(rows)
 
 
-def ssim_map(image: Tensor, target: Tensor, statistics: SSIMStatistics | None = None) -> Tensor:
+def ssim_map(image: Tensor, target: Tensor) -> Tensor:
     """Return the structural similarity per pixel and channel, [H, W, C]; zeros outside the image, no wrap.
 
-    Variances are E[x^2] - E[x]^2 under the window. Arguments as in `photometric_loss`.
+    Variances are E[x^2] - E[x]^2 under the window.
     """
-    if statistics is None:
-        statistics = ssim_statistics(target)
-    mean_image, mean_square, mean_product = window_mean(torch.stack((image, image * image, image * target)))
-    cross, squares = mean_image * statistics.mean, mean_image * mean_image
-    similarity = (2 * cross + C1) * (2 * (mean_product - cross) + C2)
-    return similarity / ((squares + statistics.mean**2 + C1) * (mean_square - squares + statistics.variance + C2))
-
-
-def ssim_statistics(target: Tensor) -> SSIMStatistics:
-    """Return mean and variance of a target [H, W, C] under the SSIM window."""
-    mean, mean_square = window_mean(torch.stack((target, target * target)))
-    return SSIMStatistics(mean, mean_square - mean * mean)
+    images = torch.stack((image, image * image, image * target, target, target * target))
+    mean_image, square_image, product, mean_target, square_target = window_mean(images)
+    cross, squares = mean_image * mean_target, mean_image * mean_image
+    variance = square_target - mean_target * mean_target
+    similarity = (2 * cross + C1) * (2 * (product - cross) + C2)
+    return similarity / ((squares + mean_target**2 + C1) * (square_image - squares + variance + C2))
 
 
 def window_mean(images: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Training views in random order, and the targets of the loss: image, weight and SSIM statistics of each view."""
+"""Training views in random order, and the targets of the loss: image and weight of each view."""
 
 from __future__ import annotations
 
@@ -12,36 +12,32 @@ from torch.nn.functional import interpolate
 
 from padgs.geometry.camera import Panorama
 from padgs.scene import Scene, View
-from padgs.training.loss import SSIMStatistics, fits, photometric_loss, pixel_weight, ssim_statistics
+from padgs.training.loss import photometric_loss, pixel_weight
 from padgs.training.model import State
 
-CACHE_BYTES = 1 << 29  # weights and statistics of views beyond this are computed again at every iteration
+CACHE_BYTES = 1 << 29  # weights of views beyond this are computed again at every iteration
 MIN_WIDTH = 512  # pixels; smaller panoramas gain nothing from a smaller start
 
 
 @dataclass(frozen=True)
 class Target:
-    """Image, weight and SSIM statistics of one view."""
+    """Image and weight of one view."""
 
     image: Tensor  # [H, W, 3]
     weight: Tensor  # [H, W] or [H, 1]
-    statistics: SSIMStatistics | None  # None if the loss computes its own
 
     def loss(self, image: Tensor, lambda_l1: float, normalisation: str) -> Tensor:
         """Return the photometric loss of an image [H, W, 3], a scalar."""
-        return photometric_loss(
-            image, self.image, self.weight, lambda_l1, normalisation=normalisation, statistics=self.statistics
-        )
+        return photometric_loss(image, self.image, self.weight, lambda_l1, normalisation=normalisation)
 
 
 class Targets(Sequence[Target]):
-    """The targets of views, by index; weights and statistics are cached within `CACHE_BYTES`."""
+    """The targets of views, by index; weights are cached within `CACHE_BYTES`."""
 
     def __init__(self, views: Sequence[View], weight: str, device: torch.device | str = "cpu") -> None:
         """Load nothing yet; `weight` is a name of `padgs.training.loss.ROW_WEIGHTS`."""
         self._views, self._weight, self._device = views, weight, device
         self._weights: dict[int, Tensor] = {}
-        self._statistics: dict[int, SSIMStatistics] = {}
         self._bytes_left = CACHE_BYTES
 
     def __len__(self) -> int:
@@ -58,23 +54,10 @@ class Targets(Sequence[Target]):
         weight = self._weights.get(index)
         if weight is None:
             weight = weight_of(self._views[index], self._weight, self._device)
-            if self._is_cached(weight.nbytes):
+            if weight.nbytes <= self._bytes_left:
+                self._bytes_left -= weight.nbytes
                 self._weights[index] = weight
-        return Target(image, weight, None if fits(image) else self._statistics_of(index, image))
-
-    def _statistics_of(self, index: int, image: Tensor) -> SSIMStatistics:
-        if index in self._statistics:
-            return self._statistics[index]
-        statistics = ssim_statistics(image)
-        if self._is_cached(2 * image.nbytes):
-            self._statistics[index] = statistics
-        return statistics
-
-    def _is_cached(self, size: int) -> bool:
-        """Return whether `size` more bytes may be cached, and reserve them."""
-        cached = size <= self._bytes_left
-        self._bytes_left -= size if cached else 0
-        return cached
+        return Target(image, weight)
 
 
 def image_of(view: View, device: torch.device | str = "cpu") -> Tensor:

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from padgs.geometry.distortion import pixel_solid_angle
+from padgs.geometry.distortion import solid_angle_weight
 from padgs.geometry.harmonics import basis, dc_from_colors
 from padgs.geometry.panorama import rays
 
@@ -11,7 +11,8 @@ from padgs.geometry.panorama import rays
 def test_orthonormal_on_the_sphere():
     width, height = 128, 64
     values = basis(rays(width, height, dtype=torch.float64), 3)  # [H, W, 16]
-    area = pixel_solid_angle(width, height, dtype=torch.float64)
+    weight = solid_angle_weight(height, dtype=torch.float64)
+    area = 4 * math.pi * weight / (width * weight.sum())
     products = torch.einsum("hwa,hwb,h->ab", values, values, area)
     assert (products - torch.eye(16)).abs().max() < 1e-3  # what the sum over pixels misses of the integral
 
