@@ -78,12 +78,7 @@ def least_extent(depth: Tensor, truth: Tensor) -> Tensor:
 def yaw_error(render: Callable[[View], Rendering], view: View, image: Tensor) -> Tensor:
     """Return the largest difference between a panorama and one rendered after a yaw of 180 degrees, rolled back.
 
-    0 for a renderer without artefacts at the seam.
-
-    Args:
-        render: renders a view.
-        view: a panorama of even width.
-        image: the render of it, [H, W, 3].
+    0 for a renderer without artefacts at the seam. The panorama has an even width; the image [H, W, 3] is its render.
     """
     turn = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0], dtype=view.cam_from_world.dtype))
     back = render(replace(view, cam_from_world=turn.to(view.cam_from_world) @ view.cam_from_world)).image
@@ -113,12 +108,7 @@ def _mean(values: Tensor, truth: Tensor) -> Tensor:
 
 
 def pole_gap(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Return the WS-PSNR of the equator minus that of the poles, in dB; NaN if either has no weighted pixel.
-
-    Args:
-        image, target: panoramas [H, W, 3] in [0, 1].
-        mask: weights [H, W] in [0, 1].
-    """
+    """Return the WS-PSNR of the equator minus that of the poles, in dB; NaN if either has no weighted pixel."""
     equator, poles = (band_ws_psnr(image, target, mask, band=band) for band in ("equator", "pole"))
     return equator - poles
 
@@ -127,9 +117,6 @@ def oracle(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor 
     """Return the target [H, W, 3] blurred to the WS-PSNR of the image, by bisection; None if no blur has it.
 
     There is no oracle for images better than the finest blur or worse than the coarsest.
-
-    Args:
-        image, target, mask: as in `pole_gap`.
     """
     wanted = ws_psnr(image, target, mask)
     low, high = (math.log(sigma) for sigma in (SHARPEST * 2 * math.pi / target.shape[1], COARSEST))
@@ -154,9 +141,7 @@ def blurred(image: Tensor, sigma: float) -> Tensor:
     height, width = image.shape[:2]
     spectrum = torch.fft.rfft(image, dim=1)
     orders = torch.arange(spectrum.shape[1], device=image.device)
-    beyond = (1 - 2 * (orders % 2)).to(image.dtype)[
-        :, None
-    ]  # half a turn, as in `padgs.geometry.panorama.pad_panorama`
+    beyond = (1 - 2 * (orders % 2)).to(image.dtype)[:, None]  # half a turn, as in `pad_panorama`
     spectrum = torch.cat((beyond * spectrum[:1], spectrum, beyond * spectrum[-1:]))
     latitudes = row_latitudes(height, dtype=image.dtype, device=image.device)
     ahead = direction(torch.zeros_like(latitudes), latitudes)

@@ -39,11 +39,7 @@ def score(
 
 
 def _stability(render: Render, scene: Scene, protocol: Protocol, on_view: OnView | None) -> Scores:
-    """Return the scores under the stability protocol.
-
-    Besides image metrics: `padgs.evaluation.diagnostics`, and WS-PSNR of one constant colour, after fitting colours,
-    and of training views.
-    """
+    """Return image metrics, diagnostics, and WS-PSNR of one colour, after fitting colours, and of training views."""
 
     def more(view: View, rendering: Rendering) -> Metrics:
         truth, image = view.image(device=rendering.image.device), quantized(rendering.image)
@@ -71,12 +67,10 @@ def constant_color_quality(scene: Scene, protocol: Protocol) -> float:
 
 
 def probe(render: Render, view: View) -> dict[str, float]:
-    """Measure one test view during training.
+    """Return PSNR and polar transmittance of one test view during training.
 
-    Returns:
-        psnr: dB, over all pixels that the mask lets through.
-        polar_transmittance: mean share of the background in rows beyond `POLAR` degrees of latitude (at least the
-            first and the last row), where modulated opacities may let it through.
+    The latter is the mean share of the background in rows beyond `POLAR` degrees of latitude (at least the first and
+    the last row), where modulated opacities may let it through.
     """
     rendering = render(view)
     image = rendering.image.clamp(0, 1)

@@ -57,11 +57,7 @@ class Pinhole:
 
 
 def perspective(width: int, height: int, fov: float) -> Pinhole:
-    """Return a pinhole with a horizontal field of view of `fov` degrees, square pixels and a central axis.
-
-    Raises:
-        ValueError: the size or the field of view is out of range.
-    """
+    """Return a pinhole with a horizontal field of view of `fov` degrees, square pixels and a central axis."""
     if width < 1 or height < 1 or not 0 < fov < 180:
         raise ValueError(
             f"an image of {width}x{height} pixels and {fov:g} degrees is impossible; sizes must be at least 1, and the "

@@ -18,15 +18,10 @@ OMEGA_AXES = ("camera_y", "world_z")
 
 
 def polar_axis(name: str, cam_from_world: Tensor) -> Tensor:
-    """Return the polar axis [3] of latitudes, in the world frame.
+    """Return the polar axis [3] of latitudes, in the world frame, for a pose [4, 4].
 
-    Args:
-        name: camera_y, the polar axis of the panorama, as in the paper; world_z, as in the released code, which
-            agrees only if the z axis of the world is vertical and the camera is level.
-        cam_from_world: [4, 4].
-
-    Raises:
-        ValueError: unknown name.
+    camera_y is the polar axis of the panorama, as in the paper; world_z is that of the released code, which agrees only
+    if the z axis of the world is vertical and the camera is level.
     """
     if name == "camera_y":
         return cam_from_world[1, :3]
@@ -58,12 +53,8 @@ def distortion_map(
 def opacity_factor(omega: Tensor, tau: float, max_omega: float = 1.0) -> Tensor:
     """Return the factor of opacities at a distortion degree [N]: 1 - tau Omega (Eq. 15).
 
-    PaD-GS multiplies decoded opacities by it when rendering, with tau 0.9 (`PaDGSOptions`).
-
-    Args:
-        omega: [N] in [0, 1].
-        tau: strength in [0, 1].
-        max_omega: upper limit of Omega; the released code uses 1 - 1e-4.
+    PaD-GS multiplies decoded opacities by it when rendering, with tau 0.9 (`PaDGSOptions`). The released code limits
+    Omega to `max_omega` = 1 - 1e-4.
 
     >>> opacity_factor(torch.tensor([0.0, 1.0]), 0.9)
     tensor([1.0000, 0.1000])

@@ -18,9 +18,6 @@ DC = math.sqrt(1 / (4 * math.pi))  # the constant function of degree 0
 def basis(directions: Tensor, degree: int) -> Tensor:
     """Return the values [..., (degree + 1)^2] of all functions up to `degree` at unit directions [..., 3].
 
-    Raises:
-        ValueError: the degree is not 0, 1, 2 or 3.
-
     >>> [round(value, 4) for value in basis(torch.tensor([0.0, 0.0, 1.0]), 1).tolist()]
     [0.2821, -0.0, 0.4886, -0.0]
     """

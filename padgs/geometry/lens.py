@@ -14,11 +14,7 @@ AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}  # of 
 
 
 def axis_direction(name: str) -> Tensor:
-    """Return the axis [3] float64 of the first lens.
-
-    Raises:
-        ValueError: the name is not in `AXES`.
-    """
+    """Return the axis [3] float64 of the first lens, by a name of `AXES`."""
     if name not in AXES:
         raise ValueError(f"unknown lens axis {name!r}; known: {', '.join(AXES)}")
     return torch.tensor(AXES[name], dtype=torch.float64)
@@ -59,11 +55,7 @@ def hemisphere_weight(directions: Tensor, axis: Tensor, blend: float) -> Tensor:
 
 
 def check_blend(degrees: float) -> float:
-    """Return the half width of the blend band in radians.
-
-    Raises:
-        ValueError: it is not in [0, 90) degrees.
-    """
+    """Return the half width of the blend band in radians; a ValueError unless it is in [0, 90) degrees."""
     if not 0 <= degrees < 90:
         raise ValueError(f"the blend band of the lenses is {degrees} degrees to each side; it must be in [0, 90)")
     return math.radians(degrees)

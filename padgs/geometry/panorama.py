@@ -20,13 +20,8 @@ CUBIC_REACH = 2  # support of a bicubic sample in pixels
 def longitude_latitude(points: Tensor) -> tuple[Tensor, Tensor]:
     """Return longitude in (-pi, pi] and latitude in [-pi/2, pi/2] of camera-frame points (Eq. 6).
 
-    The latitude is atan2(y, rho), which is accurate near the poles, unlike asin(y / r).
-
-    Args:
-        points: [..., 3] camera frame, any length but zero.
-
-    Returns:
-        longitude [...], latitude [...], both in radians.
+    The latitude is atan2(y, rho), which is accurate near the poles, unlike asin(y / r). Points [..., 3] have any length
+    but zero.
 
     >>> longitude, latitude = longitude_latitude(torch.tensor([1.0, 0.0, 0.0]))
     >>> round(longitude.item() / math.pi, 6), latitude.item()
@@ -49,12 +44,6 @@ def pixel_from_angles(longitude: Tensor, latitude: Tensor, width: int, height: i
     return torch.stack(((longitude / (2 * math.pi) + 0.5) * width, (latitude / math.pi + 0.5) * height), dim=-1)
 
 
-def angles_from_pixel(pixels: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """Return longitude and latitude in radians of continuous pixel coordinates (u, v) [..., 2] (inverse of Eq. 7)."""
-    u, v = pixels.unbind(-1)
-    return (u / width - 0.5) * (2 * math.pi), (v / height - 0.5) * math.pi
-
-
 def project(points: Tensor, width: int, height: int) -> Tensor:
     """Return the pixel (u, v) [..., 2] of camera-frame points [..., 3] (Eq. 6 and 7).
 
@@ -62,11 +51,6 @@ def project(points: Tensor, width: int, height: int) -> Tensor:
     tensor([4., 2.])
     """
     return pixel_from_angles(*longitude_latitude(points), width, height)
-
-
-def unproject(pixels: Tensor, width: int, height: int) -> Tensor:
-    """Return the unit direction [..., 3] in the camera frame through continuous pixel coordinates (u, v) [..., 2]."""
-    return direction(*angles_from_pixel(pixels, width, height))
 
 
 def row_latitudes(height: int, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
@@ -94,12 +78,8 @@ def projection_jacobian(points: Tensor, width: int, height: int, *, min_cos_lati
     first row (W / 2 pi) east / (r c), second row (H / pi) down / r, where east = (z, 0, -x) / rho and
     down = (-x y, rho^2, -y z) / (rho r).
 
-    Args:
-        points: [..., 3] camera frame.
-        min_cos_latitude: lower limit of c in the first row, which is unbounded at the poles otherwise.
-
-    Returns:
-        [..., 2, 3]. On the polar axis, where east is undefined, camera x is used as east.
+    `min_cos_latitude` is the lower limit of c in the first row, which is unbounded at the poles otherwise. On the polar
+    axis, where east is undefined, camera x is used as east.
     """
     x, y, z = points.unbind(-1)
     rho_squared = x * x + z * z
@@ -123,24 +103,15 @@ def projection_jacobian(points: Tensor, width: int, height: int, *, min_cos_lati
 
 
 def sample(image: Tensor, directions: Tensor) -> Tensor:
-    """Return bilinear samples [..., C] of a panorama [H, W, C] as in `sample_pixels`.
-
-    Args:
-        image: any dtype.
-        directions: [..., 3] camera frame, any length but zero.
-    """
+    """Return bilinear samples [..., C] of a panorama [H, W, C] at directions [..., 3], as in `sample_pixels`."""
     height, width = image.shape[:2]
     return sample_pixels(image, project(directions, width, height))
 
 
 def sample_bicubic(image: Tensor, directions: Tensor) -> Tensor:
-    """Return bicubic samples [..., C] of a panorama [H, W, C], continued across the seam and the poles.
+    """Return bicubic samples [..., C] of a panorama [H, W, C] at directions [..., 3], across the seam and the poles.
 
     The convolution of Keys (1981) with a = -1/2, exact for parabolas and at pixel centres. It overshoots at edges.
-
-    Args:
-        image: any dtype.
-        directions: [..., 3] camera frame, any length but zero.
     """
     height, width = image.shape[:2]
     around = pad_panorama(image if image.is_floating_point() else image.float(), CUBIC_REACH)
@@ -185,11 +156,8 @@ def pad_panorama(image: Tensor, margin: int) -> Tensor:
 def sample_pixels(image: Tensor, pixels: Tensor) -> Tensor:
     """Return bilinear samples [..., C] of a panorama [H, W, C] at pixel coordinates, across the seam and the poles.
 
-    Differentiable by both. Samples have the dtype of the image, or float32 for integers.
-
-    Args:
-        image: any dtype.
-        pixels: (u, v) [..., 2], continuous; u any number of turns around, v within the image.
+    Differentiable by both. Samples have the dtype of the image, or float32 for integers. Pixels are continuous (u, v)
+    [..., 2]; u any number of turns around, v within the image.
     """
     height, width = image.shape[:2]
     image = image if image.is_floating_point() else image.float()

@@ -53,11 +53,7 @@ class PoseRefinement(nn.Module):
     given: Tensor
 
     def __init__(self, names: Sequence[str], given: Tensor, *, scale: float = 1.0) -> None:
-        """Begin without corrections; `given` is [V, 4, 4] cam_from_world.
-
-        Raises:
-            ValueError: two views have the same name.
-        """
+        """Begin without corrections; `given` is [V, 4, 4] cam_from_world. Two views of one name are a ValueError."""
         super().__init__()
         twice = sorted({name for name in names if list(names).count(name) > 1})
         if twice:
@@ -83,11 +79,7 @@ class PoseRefinement(nn.Module):
         ]
 
     def refined(self, view: View) -> View:
-        """Return the view at its corrected pose; differentiable.
-
-        Raises:
-            ValueError: the view has no pose correction.
-        """
+        """Return the view at its corrected pose; differentiable. A view without a correction is a ValueError."""
         if view.name not in self.names:
             raise ValueError(f"view {view.name!r} has no pose to refine; known: {', '.join(self.names)}")
         return replace(view, cam_from_world=self._pose(self.names.index(view.name)))
@@ -109,9 +101,9 @@ class PoseRefinement(nn.Module):
         growth = (moves * beside).sum() / beside.square().sum().clamp(min=torch.finfo(beside.dtype).tiny)
         imaginary = imaginary + 0.5 * real * _each(rotations, turn)
         shifts = -_each(rotations, moves - growth * beside) / self.scale
-        for mine, new in zip(self.quaternions, torch.cat((real, imaginary), dim=-1), strict=True):
-            mine.copy_(new)
-        for mine, new in zip(self.shifts, shifts, strict=True):
+        for mine, new in zip(
+            [*self.quaternions, *self.shifts], [*torch.cat((real, imaginary), -1), *shifts], strict=True
+        ):
             mine.copy_(new)
 
     @torch.no_grad()
@@ -133,72 +125,49 @@ def _each(rotations: Tensor, vectors: Tensor) -> Tensor:
 
 RATE = 3e-3  # of log-gains; it does not decay, because exposures that freeze early are wrong
 OFFSET_RATE = RATE / 5  # of offsets, in colours from 0 to 1
-
-
-class Exposures(nn.Module):
-    """Gain and offset of each colour channel of V views.
-
-    Attributes:
-        log_gains, offsets: V times [3], a parameter per view as for poses.
-    """
-
-    def __init__(self, views: int) -> None:
-        """Begin without corrections."""
-        super().__init__()
-        self.log_gains, self.offsets = (nn.ParameterList([torch.zeros(3) for _ in range(views)]) for _ in range(2))
-
-    def groups(self) -> list[ParameterGroup]:
-        """Return the parameters with their learning rates, which follow the pace of the run like those of the model."""
-        return [
-            ParameterGroup("exposure_log_gains", tuple(self.log_gains), Constant(RATE)),
-            ParameterGroup("exposure_offsets", tuple(self.offsets), Constant(OFFSET_RATE)),
-        ]
-
-    def exposed(self, image: Tensor, index: int) -> Tensor:
-        """Return an image [H, W, 3] under the exposure of view `index`; differentiable."""
-        return image * self.log_gains[index].exp() + self.offsets[index]
-
-    @torch.no_grad()
-    def center(self) -> None:
-        """Remove the mean over all views."""
-        for of_views in (self.log_gains, self.offsets):
-            mean = torch.stack(list(of_views)).mean(0)
-            for own in of_views:
-                own -= mean
-
-
 GIVEN, LEARNED = "given", "learned"
 CHOICES = (GIVEN, LEARNED)  # of exposures, and of poses
 
 
 class Corrections(nn.Module):
-    """Corrections of the training views of a scene; no parameters if nothing is corrected."""
+    """Corrections of the training views of a scene; no parameters if nothing is corrected.
+
+    Attributes:
+        poses: corrections of the poses; None if they are not learned.
+        log_gains, offsets: V times [3] for each colour channel, a parameter per view as for poses; empty if exposures
+            are not learned.
+    """
 
     def __init__(self, scene: Scene, *, exposures: bool, poses: bool) -> None:
-        """Begin without corrections.
-
-        Raises:
-            ValueError: poses are learned, but two views have the same name.
-        """
+        """Begin without corrections; learned poses of two views of one name are a ValueError."""
         super().__init__()
-        self.exposures = Exposures(len(scene.train)) if exposures else None
+        views = len(scene.train) if exposures else 0
+        self.log_gains, self.offsets = (nn.ParameterList([torch.zeros(3) for _ in range(views)]) for _ in range(2))
         self.poses = PoseRefinement.of(scene.train, scale=scene.scale) if poses else None
 
     def groups(self, iterations: int) -> list[ParameterGroup]:
-        """Return all parameters with their learning rates in a run of `iterations`."""
-        exposures = [] if self.exposures is None else self.exposures.groups()
-        return exposures + ([] if self.poses is None else self.poses.groups(SMALL, iterations))
+        """Return all parameters with their learning rates in a run of `iterations`; exposures follow its pace."""
+        exposures = [
+            ParameterGroup("exposure_log_gains", tuple(self.log_gains), Constant(RATE)),
+            ParameterGroup("exposure_offsets", tuple(self.offsets), Constant(OFFSET_RATE)),
+        ]
+        poses = self.poses.groups(SMALL, iterations) if self.poses else []
+        return (exposures if self.log_gains else []) + poses
 
     def posed(self, view: View) -> View:
         """Return a training view at its corrected pose; differentiable."""
-        return view if self.poses is None else self.poses.refined(view)
+        return self.poses.refined(view) if self.poses else view
 
     def exposed(self, image: Tensor, index: int) -> Tensor:
         """Return the render [H, W, 3] of training view `index` under its exposure; differentiable."""
-        return image if self.exposures is None else self.exposures.exposed(image, index)
+        return image * self.log_gains[index].exp() + self.offsets[index] if self.log_gains else image
 
+    @torch.no_grad()
     def center(self) -> None:
         """Remove what the corrections of all views have in common; called after each optimizer step."""
-        for part in (self.exposures, self.poses):
-            if part is not None:
-                part.center()
+        for of_views in (self.log_gains, self.offsets):
+            mean = torch.stack(list(of_views)).mean(0) if of_views else 0
+            for own in of_views:
+                own -= mean
+        if self.poses:
+            self.poses.center()

@@ -317,11 +317,7 @@ class Guard:
 
 
 def validation_split(views: Sequence[View]) -> tuple[int, ...]:
-    """Return the indices of evenly spread training views that are measured and not trained on.
-
-    Raises:
-        ValueError: there are too few views for both.
-    """
+    """Return the indices of evenly spread training views that are measured and not trained on."""
     count = max(MIN_VALIDATION, len(views) // VALIDATION_SHARE)
     if len(views) < count + MIN_VALIDATION:
         raise ValueError(
@@ -360,11 +356,7 @@ class EarlyStopping(_Remembering):
     """
 
     def __init__(self, views: Sequence[View], budget: Budget) -> None:
-        """Choose the validation views among the training views.
-
-        Raises:
-            ValueError: there are too few views.
-        """
+        """Choose the validation views among the training views."""
         iterations = budget.iterations
         self.held_out = validation_split(views) if budget.stop == "auto" else ()
         self.fade = min(round((1 - FADE) * iterations), iterations - 1)  # at least one step ends a run

@@ -15,11 +15,7 @@ NEIGHBOURS = 3  # nearest neighbours in the mean spacing, as 3DGS
 
 
 def refuse_unusable(points: Tensor, what: str) -> None:
-    """Refuse points [N, 3] that no model can start from; `what` names the models.
-
-    Raises:
-        ValueError: there are none, or one is not finite.
-    """
+    """Refuse points [N, 3] that no model can start from: none, or not finite; `what` names the models."""
     if len(points) == 0:
         raise ValueError(f"the point cloud is empty; {what} start from points, so the scene needs at least one")
     if not torch.isfinite(points).all():
@@ -52,11 +48,7 @@ class ExtentOptions:
         check(self, "a length >= 0 in scene scales", lambda least: 0 <= least < math.inf, "min_extent")
 
     def extent_of(self, scene: Scene) -> float:
-        """Return the extent of the training cameras of a scene, world units.
-
-        Raises:
-            ValueError: it is 0, because all cameras stand in one place.
-        """
+        """Return the extent of the training cameras of a scene, world units; 0 is refused."""
         if scene.has_single_center and self.min_extent == 0:
             raise ValueError(
                 f"the training cameras of scene {scene.name!r} stand in one place, so their extent is 0 and no "

@@ -59,9 +59,6 @@ class Trainer:
             views_each: views per iteration; Adam steps on the sum of their losses.
             coarse_share: share of the run in which views are smaller, see `padgs.training.targets.CoarseToFine`.
             stage: entered with the name of each part of an iteration, for timing.
-
-        Raises:
-            ValueError: early stopping is on, but there are too few views for a validation split.
         """
         self.iteration = self.step = self.skipped = 0
         self.ended = ""
@@ -84,13 +81,10 @@ class Trainer:
         self._monitor = Monitor(budget.iterations, max(model.counts().values()), pixels, active=options.monitor)
 
     def records(self) -> Iterator[Record]:
-        """Train to the end of the budget, yielding a record after each iteration.
-
-        Ends early, without an error, when the training time reaches `Budget.max_seconds`.
+        """Train to the end of the budget or to `Budget.max_seconds`, yielding a record after each iteration.
 
         Raises:
             Failure: nan (a loss, gradient or parameter is not finite), oom, collapsed, or a finding of the `Monitor`.
-                The model is of no use then.
         """
         budget, limit = self._budget, self._budget.max_seconds
         while self.step < budget.iterations and (limit is None or self.seconds < limit):
@@ -194,11 +188,7 @@ class Trainer:
         return State({name: tensor.detach().clone() for name, tensor in tensors.items()}, values)
 
     def load_state(self, state: State) -> None:
-        """Resume where `state` was taken; model, scene, budget and options must be those of that run.
-
-        Raises:
-            ValueError: the state is of a run on other data.
-        """
+        """Resume where `state` was taken; raises ValueError if it is of a run on other data."""
         self._order.load(state)
         self._model.load_state(state.of_model())
         self.corrections.load_state_dict(state.under(VIEWS))

@@ -140,16 +140,9 @@ def fits(image: Tensor) -> bool:
 
 
 def fused_photometric_loss(image: Tensor, target: Tensor, weight: Tensor, lambda_l1: float, total: Tensor) -> Tensor:
-    """Return Eq. 16 over float32 tensors on one device, a scalar; differentiable by `image`.
+    """Return Eq. 16 over float32 tensors on one device, differentiable by `image`, by the native library.
 
-    Args:
-        image, target: [H, W, 3].
-        weight: [H, W] or [H, 1].
-        lambda_l1: lambda of Eq. 16.
-        total: divisor of the weighted sum over pixels and channels, a scalar.
-
-    Raises:
-        ValueError: a target of another shape or type than the image, or tensors on several devices.
+    Arguments are as in `photometric_loss`; the weighted sum over pixels and channels is divided by `total`, a scalar.
     """
     if (target.shape, target.dtype) != (image.shape, image.dtype):  # the library gets bare pointers
         raise ValueError(

@@ -30,17 +30,10 @@ SLOWER = 0.6  # average speed over a run, relative to its beginning, as models g
 
 
 class Method(ABC):
-    """A panoramic view-synthesis method.
+    """A panoramic view-synthesis method."""
 
-    Attributes:
-        Options: dataclass with a default for every field; the group `method` of the configuration.
-        CUT_FINENESS: pixels of a perspective view are taken to be this much finer than those of a panorama.
-        RENDER, TRAIN: default settings of renderer and training.
-        options, render_config, train_options, seed: as constructed.
-    """
-
-    Options: ClassVar[type]
-    CUT_FINENESS: ClassVar[float] = 1.0
+    Options: ClassVar[type]  # dataclass with a default for every field; the group `method` of the configuration
+    CUT_FINENESS: ClassVar[float] = 1.0  # pixels of a perspective view are taken to be so much finer than a panorama's
     RENDER: ClassVar[RenderConfig] = RenderConfig()
     TRAIN: ClassVar[TrainOptions] = TrainOptions()
 
@@ -51,11 +44,7 @@ class Method(ABC):
         train: TrainOptions | None = None,
         seed: int = 0,
     ) -> None:
-        """Check the options; there is no model before `fit` or `load_state`.
-
-        Raises:
-            ValueError: these options can train on no scene.
-        """
+        """Check the options; those that can train on no scene are a ValueError."""
         self.options, self.seed = options or self.Options(), seed
         self.render_config, self.train_options = render or self.RENDER, train or self.TRAIN
         self._model: Model | None = None
@@ -67,11 +56,7 @@ class Method(ABC):
 
     @abstractmethod
     def build_model(self, scene: Scene, iterations: int) -> Model:
-        """Return the untrained model for a scene and a schedule length.
-
-        Raises:
-            ValueError: the method cannot train on this scene with these options.
-        """
+        """Return the untrained model for a scene and a schedule length; ValueError if it cannot train on the scene."""
 
     @abstractmethod
     def restore(self, state: State) -> Model:
@@ -152,11 +137,7 @@ class Method(ABC):
 
     @property
     def model(self) -> Any:
-        """The `Model`, of the type that `build_model` returns.
-
-        Raises:
-            RuntimeError: neither `fit` nor `load_state` has been called.
-        """
+        """The `Model`, of the type that `build_model` returns."""
         if self._model is None:
             raise RuntimeError(f"{type(self).__name__} has no model yet; call fit or load_state first")
         return self._model
@@ -170,11 +151,7 @@ class Method(ABC):
         return self.model.size()
 
     def state(self) -> State:
-        """Return model, optimizer, statistics, random state and data order.
-
-        Raises:
-            RuntimeError: neither `fit` nor `load_state` has been called.
-        """
+        """Return model, optimizer, statistics, random state and data order."""
         if self._trainer is not None:
             return self._trainer.state()
         if self._loaded_state is not None:
@@ -200,11 +177,7 @@ class Method(ABC):
         return False
 
     def refuse_budget(self, budget: Budget) -> None:
-        """Refuse a budget that this method cannot train within on any scene; subclasses add checks.
-
-        Raises:
-            ValueError: the budget does not fit the options.
-        """
+        """Refuse a budget that this method cannot train within on any scene; subclasses add checks."""
         if budget.stop == "auto" and self._views_learn:
             raise ValueError(
                 "budget.stop is auto, which measures validation views, but exposures or cameras are learned here, and "
@@ -212,11 +185,7 @@ class Method(ABC):
             )
 
     def refuse_search(self) -> None:
-        """Refuse the search for the smallest model (`padgs.runs.smallest`) on any scene; subclasses add checks.
-
-        Raises:
-            ValueError: with these options there is nothing to search.
-        """
+        """Refuse the search for the smallest model (`padgs.runs.smallest`) on any scene; subclasses add checks."""
         if self._views_learn:
             raise ValueError(
                 "the search for the smallest model compares renders with photographs, but exposures or cameras are "
@@ -233,11 +202,7 @@ class Method(ABC):
         return LEARNED in (self.train_options.exposures, self.train_options.poses)
 
     def _initial_model(self, scene: Scene, iterations: int) -> Model:
-        """Return `build_model`, with the parameters of the warm start if there is one, pruned to the budget.
-
-        Raises:
-            ValueError: as `build_model`, or the warm start does not fit the options or the budget.
-        """
+        """Return `build_model`, with the parameters of the warm start if there is one, pruned to the budget."""
         model = self.build_model(scene, iterations)
         if self._warm_start_state is None:
             return model

@@ -7,7 +7,7 @@ graph over the old rows may be alive when the next one is built.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -24,12 +24,7 @@ READ_EVERY = 10  # iterations between reads of the loss from a GPU
 def keep_rows(parameters: Mapping[str, nn.Parameter], optimizer: torch.optim.Adam | None, keep: Tensor) -> None:
     """Keep only some rows of every parameter, with their Adam moments if there are any.
 
-    Args:
-        parameters: name -> [N, ...], all with the same N.
-        keep: [N] bool, or row numbers [M] in the wanted order.
-
-    Raises:
-        ValueError: a parameter has another number of rows than `keep`.
+    `keep` is [N] bool, or row numbers [M] in the wanted order; all parameters have N rows.
     """
     count = _row_count(parameters)
     if keep.dtype == torch.bool and len(keep) != count:
@@ -37,18 +32,12 @@ def keep_rows(parameters: Mapping[str, nn.Parameter], optimizer: torch.optim.Ada
     for parameter in parameters.values():
         parameter.data = parameter.data[keep]
         parameter.grad = None
-        moments = {} if optimizer is None else optimizer.state.get(parameter, {})
-        for name in MOMENTS:
-            if name in moments:
-                moments[name] = moments[name][keep]
+        if optimizer is not None:
+            _change_moments(parameter, optimizer, lambda moment: moment[keep])
 
 
 def append_rows(parameters: Mapping[str, nn.Parameter], optimizer: torch.optim.Adam, new: Mapping[str, Tensor]) -> None:
-    """Append rows to every parameter; the Adam moments of new rows are 0.
-
-    Args:
-        parameters: name -> [N, ...], all with the same N.
-        new: the same names -> [M, ...], all with the same M.
+    """Append rows [M, ...] to every parameter [N, ...] of the same name; the Adam moments of new rows are 0.
 
     Raises:
         ValueError: a name is missing or unknown, or a shape does not fit; nothing is changed.
@@ -66,18 +55,18 @@ def append_rows(parameters: Mapping[str, nn.Parameter], optimizer: torch.optim.A
         rows = new[name].detach().to(parameter)
         parameter.data = torch.cat((parameter.data, rows))
         parameter.grad = None
-        moments = optimizer.state.get(parameter, {})
-        for moment in MOMENTS:
-            if moment in moments:
-                moments[moment] = torch.cat((moments[moment], torch.zeros_like(rows)))
+        none = torch.zeros_like(rows)
+        _change_moments(parameter, optimizer, lambda moment, none=none: torch.cat((moment, none)))
 
 
 def forget_moments(parameter: nn.Parameter, optimizer: torch.optim.Adam) -> None:
     """Set the Adam moments of a parameter to 0, if it has any."""
+    _change_moments(parameter, optimizer, Tensor.zero_)
+
+
+def _change_moments(parameter: nn.Parameter, optimizer: torch.optim.Adam, change: Callable[[Tensor], Tensor]) -> None:
     moments = optimizer.state.get(parameter, {})
-    for name in MOMENTS:
-        if name in moments:
-            moments[name].zero_()
+    moments.update({name: change(moments[name]) for name in MOMENTS if name in moments})
 
 
 def load_rows(model: nn.Module, tensors: Mapping[str, Tensor], growing: Collection[str]) -> None:
@@ -117,13 +106,7 @@ class Optimizer:
     """
 
     def __init__(self, groups: Sequence[ParameterGroup], check_every: int, **adam: Any) -> None:
-        """Prepare.
-
-        Args:
-            groups: the parameters.
-            check_every: iterations between checks of all gradients and parameters.
-            adam: betas and eps.
-        """
+        """Prepare; all values are checked every `check_every` iterations. `adam` are betas and eps."""
         self._groups, self._check_every = groups, check_every
         self.pace: Pace | None = None
         parameters = [{"params": list(group.parameters), "name": group.name} for group in groups]
@@ -144,10 +127,7 @@ class Optimizer:
         }
 
     def step(self, step: int, pace: Pace | None = None) -> None:
-        """Step Adam at the learning rates of a schedule step, and drop the gradients.
-
-        No graph may be alive if densification edits rows afterwards.
-        """
+        """Step Adam at the learning rates of a schedule step, and drop the gradients."""
         self.pace = pace
         for group, settings in zip(self._groups, self.adam.param_groups, strict=True):
             settings["lr"] = group.learning_rate(step) * (pace(step) if pace and group.paced else 1.0)
@@ -159,13 +139,7 @@ class Optimizer:
         return iteration % self._check_every == 0
 
     def check(self, iteration: int, step: int) -> None:
-        """Check all parameters and gradients if that is due; called after `backward`.
-
-        The schedule step decides which groups should learn.
-
-        Raises:
-            Failure: nan.
-        """
+        """Check all parameters and gradients if that is due, after `backward`; the step decides which should learn."""
         self.silent = None
         if self.is_checked(iteration):
             parameters = self.parameters()
@@ -186,11 +160,7 @@ class Optimizer:
         return value
 
     def refuse_non_finite(self, tensors: Mapping[str, Tensor | None], iteration: int) -> None:
-        """Refuse tensors that are not finite.
-
-        Raises:
-            Failure: nan; the reason names the first such tensor and entry.
-        """
+        """Raise a Failure (nan) that names the first tensor that is not finite, and its entry."""
         bad = first_non_finite(tensors)
         if bad is not None:
             every = self._check_every

@@ -45,11 +45,7 @@ class Targets(Sequence[Target]):
         return len(self._views)
 
     def __getitem__(self, index: int) -> Target:
-        """Return the target of view `index`.
-
-        Raises:
-            ValueError: image or mask have another size than the view, or there is no image, or the mask is 0.
-        """
+        """Return the target of view `index`; an unusable image or mask is a ValueError."""
         image = image_of(self._views[index], self._device)
         weight = self._weights.get(index)
         if weight is None:
@@ -61,11 +57,7 @@ class Targets(Sequence[Target]):
 
 
 def image_of(view: View, device: torch.device | str = "cpu") -> Tensor:
-    """Return the image [H, W, 3] of a view, in [0, 1].
-
-    Raises:
-        ValueError: the view has no image, or one of another size.
-    """
+    """Return the image [H, W, 3] of a view, in [0, 1]; ValueError if there is none, or one of another size."""
     return _checked_size(view, "image", view.image(device=device))
 
 
@@ -154,13 +146,7 @@ class TrainingViews:
         seed: int = 0,
         held_out: Collection[int] = (),
     ) -> None:
-        """Shuffle the views, except those `held_out` until `include_held_out`.
-
-        Args:
-            scene, seed: the views, and the seed of their order.
-            weight, device, coarse_share: of the targets, see `CoarseToFine`.
-            held_out: indices of training views.
-        """
+        """Shuffle the views, except those `held_out` until `include_held_out`; targets are as in `CoarseToFine`."""
         self._scene, self._held_out = scene, tuple(held_out)
         self._sizes = CoarseToFine(scene.train, weight, torch.device(device), coarse_share)
         self.halvings = self._sizes.halvings
@@ -204,11 +190,7 @@ class TrainingViews:
         return State({"random/views": self._generator.get_state(), "order": self._order}, values)
 
     def load(self, state: State) -> None:
-        """Resume where the whole state was taken.
-
-        Raises:
-            ValueError: it is of a run with other views.
-        """
+        """Resume where the whole state was taken; ValueError if it is of a run with other views."""
         views = state.values["views"]
         if views != len(self._scene.train):
             raise ValueError(

@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from torch.autograd.functional import jacobian
 
 from padgs.geometry.panorama import (
-    angles_from_pixel,
     direction,
     longitude_latitude,
     pad_panorama,
@@ -20,7 +19,6 @@ from padgs.geometry.panorama import (
     sample,
     sample_bicubic,
     sample_pixels,
-    unproject,
 )
 
 W, H = 64, 32
@@ -30,6 +28,12 @@ points = st.tuples(coordinates, coordinates, coordinates)
 
 def double(*values: float) -> torch.Tensor:
     return torch.tensor(values, dtype=torch.float64)
+
+
+def unproject(pixels: torch.Tensor, width: int = W, height: int = H) -> torch.Tensor:
+    """The direction through a pixel, the inverse of Eq. 7 and 6."""
+    u, v = pixels.unbind(-1)
+    return direction((u / width - 0.5) * (2 * math.pi), (v / height - 0.5) * math.pi)
 
 
 @pytest.mark.parametrize(
@@ -54,11 +58,12 @@ def test_known_directions(axis, longitude, latitude, pixel):
 
 
 def test_the_first_pixel_has_its_centre_at_a_half():
-    longitude, latitude = angles_from_pixel(double(0.5, 0.5), W, H)
+    first = rays(W, H, dtype=torch.float64)[0, 0]
+    longitude, latitude = longitude_latitude(first)
     assert longitude.item() == pytest.approx(-math.pi + math.pi / W)  # half a column inside the seam
     assert latitude.item() == pytest.approx(-math.pi / 2 + math.pi / (2 * H))  # half a row below the zenith
     assert row_latitudes(H, dtype=torch.float64)[0].item() == pytest.approx(latitude.item())
-    assert unproject(double(0.5, 0.5), W, H).tolist() == pytest.approx(rays(W, H, dtype=torch.float64)[0, 0].tolist())
+    assert unproject(double(0.5, 0.5)).tolist() == pytest.approx(first.tolist())
 
 
 @pytest.mark.parametrize("size", [(64, 32), (7, 5), (1, 1)])
@@ -99,18 +104,19 @@ def test_it_is_the_equirectangular_camera_of_colmap(generator):
 def test_unproject_undoes_project(point):
     point = double(*point)
     assume(point.norm() > 1e-3)
-    torch.testing.assert_close(unproject(project(point, W, H), W, H), point / point.norm(), rtol=0, atol=1e-12)
+    torch.testing.assert_close(unproject(project(point, W, H)), point / point.norm(), rtol=0, atol=1e-12)
 
 
 @given(st.floats(1e-6, W - 1e-6), st.floats(1e-3, H - 1e-3))
 def test_project_undoes_unproject(u, v):
     pixel = double(u, v)
-    torch.testing.assert_close(project(unproject(pixel, W, H), W, H), pixel, rtol=0, atol=1e-9)
+    torch.testing.assert_close(project(unproject(pixel), W, H), pixel, rtol=0, atol=1e-9)
 
 
 @given(st.floats(-math.pi, math.pi, exclude_min=True), st.floats(-math.pi / 2, math.pi / 2))
 def test_angles_round_trip(longitude, latitude):
-    angles = angles_from_pixel(pixel_from_angles(double(longitude), double(latitude), W, H), W, H)
+    u, v = pixel_from_angles(double(longitude), double(latitude), W, H)[0]
+    angles = [(u / W - 0.5) * 2 * math.pi, (v / H - 0.5) * math.pi]
     assert [angle.item() for angle in angles] == pytest.approx([longitude, latitude], abs=1e-14)
     assert direction(double(longitude), double(latitude)).norm().item() == pytest.approx(1, abs=1e-15)
 

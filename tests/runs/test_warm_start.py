@@ -160,10 +160,10 @@ def test_exposures_that_both_learn_are_taken_over():
     kind = lookup(METHODS, "omnigs", "method")
     first = kind(train=learned)
     list(first.fit(scene, Budget(10)))
-    gains = first.state().under("views/")["exposures.log_gains.0"]
+    gains = first.state().under("views/")["log_gains.0"]
     for train, expected in ((learned, gains), (TrainOptions(weight="uniform"), None)):
         second = kind(train=train)
         second.warm_start(first.state())
         second.fit(scene, Budget(10))
-        taken = second.state().under("views/").get("exposures.log_gains.0")
+        taken = second.state().under("views/").get("log_gains.0")
         assert taken is None if expected is None else torch.equal(taken, expected) and expected.any()

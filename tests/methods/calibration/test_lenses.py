@@ -8,7 +8,7 @@ from support.tiny_scene import tiny_scene, truth
 
 from padgs.gaussians import Gaussians
 from padgs.geometry.camera import Panorama, Pinhole, RayTable
-from padgs.geometry.panorama import rays, sample_pixels, unproject
+from padgs.geometry.panorama import direction, rays, sample_pixels
 from padgs.methods.calibration.lenses import CameraMap, DualLens
 from padgs.render import RenderOptions, render
 from padgs.scene import View
@@ -44,7 +44,8 @@ def test_ideal_pixels_invert_source_pixels(generator):
     """The inverse map, sampled at where the map leads, leads back: to a small share of a pixel away from the poles."""
     camera = distorted()
     there, back = camera.source_pixels(), camera.ideal_pixels()
-    found = torch.nn.functional.normalize(sample_pixels(unproject(back, W, H), there), dim=-1)
+    longitude, latitude = ((back / torch.tensor([W, H]) - 0.5) * torch.tensor([2 * torch.pi, torch.pi])).unbind(-1)
+    found = torch.nn.functional.normalize(sample_pixels(direction(longitude, latitude), there), dim=-1)
     off = (found - rays(W, H, dtype=torch.float64)).norm(dim=-1) * (W / (2 * torch.pi))
     moved = (camera.directions() - rays(W, H, dtype=torch.float64)).norm(dim=-1) * (W / (2 * torch.pi))
     assert moved.mean() > 0.2, "in pixels: the camera is distorted"
