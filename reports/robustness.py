@@ -7,14 +7,15 @@ has 0.
 
 from __future__ import annotations
 
+import ast
 import math
 from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.resources import files
+from typing import Any
 
 import pandas as pd
-import yaml
 from pandas import DataFrame
 
 from padgs.reports import methods
@@ -33,7 +34,6 @@ EQUATOR, POLE = f"{PROTOCOL}/ws_psnr_equator", f"{PROTOCOL}/ws_psnr_pole"
 SHARED = ("resolution", "learning_rates", "data", "machine")
 NOT_SCORED = {"textureless"}  # shown but not scored, because the scene becomes easier
 HALF = 0.5  # a condition breaks a method below this robustness
-LIMITS = yaml.safe_load(files("padgs").joinpath("data/perturb/conditions.yaml").read_text("utf-8"))
 LIMITS_ARE_FOR = ("256x128", 1500)  # resolution, and iterations without stress
 BEYOND = "beyond"
 UNITS = {"seam": "seam", "depth_error": "depth error", "ws_psnr_fitted": "dB after a fit of colours", "ws_psnr": "dB"}
@@ -64,6 +64,21 @@ LIMITS_NOTES = (
 )
 
 Stress = tuple[str, int]  # condition, level
+
+
+def _limits() -> dict[str, dict[str, Any]]:
+    """Return the keywords of each `@condition` in data/perturb, read from the source, because importing takes long."""
+    sources = [file.read_text("utf-8") for file in files("padgs").joinpath("data/perturb").iterdir() if file.is_file()]
+    functions = [node for text in sources for node in ast.parse(text).body if isinstance(node, ast.FunctionDef)]
+    return {
+        function.name: {keyword.arg: ast.literal_eval(keyword.value) for keyword in call.keywords if keyword.arg}
+        for function in functions
+        for call in function.decorator_list
+        if isinstance(call, ast.Call)
+    }
+
+
+LIMITS = _limits()
 
 
 @dataclass(frozen=True)

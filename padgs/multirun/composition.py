@@ -28,6 +28,7 @@ from padgs.runs.config import (
     method_choices,
     method_fields,
     scene_choices,
+    stress_conditions,
 )
 from padgs.runs.console import say
 from padgs.runs.run import Method, build_method
@@ -119,6 +120,7 @@ def register_choices() -> None:
 
     A method of another package that cannot be imported is reported once and removed from METHODS.
     """
+    OmegaConf.register_new_resolver("all_conditions", stress_conditions, replace=True)
     store = ConfigStore.instance()
     store.store(name="fields", node=default_fields())
     for method in [*METHODS]:

@@ -1,53 +1,22 @@
 """Conditions of the stress suite: functions scene -> scene that do what goes wrong with captures, at three levels.
 
-To add a condition, add a row to `conditions.yaml` and a function of that name to the module that the row names.
+A condition is a function of `geometry` or `images` with the decorator `condition`, which has levels, limits and text.
 """
 
 from __future__ import annotations
 
-import re
 import zlib
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from importlib import import_module
-from pathlib import Path
-from typing import Any
 
 import numpy as np
-import yaml
 
 from padgs.checks import check_known
+from padgs.data.perturb import geometry, images  # noqa: F401 - they register their conditions
+from padgs.data.perturb.condition import CONDITIONS
 from padgs.scene import Scene
 
 NONE = "none"
 LEVELS = (0, 1, 2, 3)  # 0: unperturbed
-
-
-@dataclass(frozen=True)
-class Condition:
-    """A row of `conditions.yaml`, which explains the fields."""
-
-    module: str
-    text: str
-    levels: tuple[Any, Any, Any]
-    test_views: bool = False
-    metric: str = "ws_psnr"
-    allowed: tuple[float, ...] = ()
-
-    def describe(self, level: int) -> str:
-        """Return what the condition does at a level from 1 on."""
-        return self.text.format(self.levels[level - 1])
-
-    def row(self) -> tuple[str, ...]:
-        """Return the cells of the docs' table: the text with a gap for the value, and the values of all levels."""
-        (field,) = re.findall(r"{.*?}", self.text)
-        return (self.text.replace(field, "…"), *(field.format(value) for value in self.levels))
-
-
-CONDITIONS: Mapping[str, Condition] = {
-    name: Condition(**row)
-    for name, row in yaml.safe_load(Path(__file__).with_name("conditions.yaml").read_text("utf-8")).items()
-}
 
 
 @dataclass(frozen=True)
@@ -80,7 +49,6 @@ class StressOptions:
         if not self.title:
             return scene
         condition = CONDITIONS[self.condition]
-        change = getattr(import_module(f"padgs.data.perturb.{condition.module}"), self.condition)
         random = np.random.default_rng((seed, zlib.crc32(self.condition.encode())))
-        scene = change(scene, condition.levels[self.level - 1], random)
+        scene = condition.change(scene, condition.levels[self.level - 1], random)
         return replace(scene, notes=(*scene.notes, f"stress: {condition.describe(self.level)}"))

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from padgs.data.perturb.condition import condition
 from padgs.scene import Scene, View
 
 DIAGONAL = (math.sqrt(0.5), math.sqrt(0.5), 0.0)  # horizontal; a rotation about it moves both the y and the z axis
@@ -23,6 +24,7 @@ GRAY = 128
 QUANTILES = (0.02, 0.98)  # of the points, between which the size of the cloud is measured
 
 
+@condition("the world is rotated by {}° about a tilted axis", 15, 45, 90, test_views=True, allowed=(0.2, 0.3, 0.5))
 def world_rotation(scene: Scene, degrees: float, random: np.random.Generator) -> Scene:
     """Rotate the world, cameras included; the images stay the same."""
     from scipy.spatial.transform import Rotation
@@ -38,6 +40,7 @@ def world_rotation(scene: Scene, degrees: float, random: np.random.Generator) ->
     return replace(change_views(scene, move), points=points)
 
 
+@condition("all lengths in world units are multiplied by {}", 0.1, 10, 100, test_views=True, allowed=(0.1, 0.1, 0.1))
 def world_scale(scene: Scene, factor: float, random: np.random.Generator) -> Scene:
     """Scale the world, cameras and depths included; the images stay the same."""
 
@@ -50,6 +53,7 @@ def world_scale(scene: Scene, factor: float, random: np.random.Generator) -> Sce
     return replace(change_views(scene, move), points=scene.points * factor)
 
 
+@condition("the world is {:g} scene scales away from its origin", 100, 10000, 1000000, test_views=True)
 def world_offset(scene: Scene, distance: float, random: np.random.Generator) -> Scene:
     """Move the world `distance` scene scales away from its origin, like georeferenced captures; points in float64."""
     offset = distance * scene.scale * torch.tensor(DIAGONAL, dtype=torch.float64)
@@ -57,6 +61,7 @@ def world_offset(scene: Scene, distance: float, random: np.random.Generator) -> 
     return replace(scene, points=scene.points.double() + offset.to(scene.points.device))
 
 
+@condition("training cameras are off by {:.1%} of the scene scale", 0.001, 0.005, 0.02, allowed=(0.5, 2.0, 6.0))
 def pose_noise(scene: Scene, sigma: float, random: np.random.Generator) -> Scene:
     """Move training cameras by a normal offset with a standard deviation of `sigma` scene scales on each axis."""
 
@@ -67,6 +72,7 @@ def pose_noise(scene: Scene, sigma: float, random: np.random.Generator) -> Scene
     return change_training_views(scene, move)
 
 
+@condition("training cameras are rotated by {}°", 0.05, 0.2, 1.0, allowed=(0.5, 3.0, 8.0))
 def pose_rotation(scene: Scene, sigma: float, random: np.random.Generator) -> Scene:
     """Rotate training cameras about random axes by a normal angle with a standard deviation of `sigma` degrees."""
 
@@ -80,12 +86,14 @@ def pose_rotation(scene: Scene, sigma: float, random: np.random.Generator) -> Sc
     return change_training_views(scene, move)
 
 
+@condition("one of {} training views is left", 2, 4, 8)
 def few_views(scene: Scene, every: int, random: np.random.Generator) -> Scene:
     """Keep one of `every` training views, evenly along the capture, and at least two."""
     kept = scene.train[::every] if len(scene.train) > every else (scene.train[0], scene.train[-1])
     return replace(scene, train=kept)
 
 
+@condition("{:.1%} of the points are left", 0.1, 0.01, 0.001, allowed=(0.5, 1.5, 4.0))
 def few_points(scene: Scene, share: float, random: np.random.Generator) -> Scene:
     """Keep a random share of the points, and at least `MIN_POINTS`."""
     count = min(len(scene.points), max(MIN_POINTS, round(share * len(scene.points))))
@@ -93,6 +101,7 @@ def few_points(scene: Scene, share: float, random: np.random.Generator) -> Scene
     return replace(scene, points=scene.points[kept], point_colors=scene.point_colors[kept])
 
 
+@condition("the points are gray and random in a {}", "box", "sphere", "sphere and a far shell", allowed=(2.0, 3.0, 5.0))
 def random_points(scene: Scene, shape: str, random: np.random.Generator) -> Scene:
     """Replace the points by as many gray ones: uniform in the box of the cloud, or in a sphere around the cameras, or
     there with one in ten in a shell that is `FAR` times as large.
@@ -111,6 +120,7 @@ def random_points(scene: Scene, shape: str, random: np.random.Generator) -> Scen
     )
 
 
+@condition("{:.0%} of the points are anywhere in a box 10 times as large", 0.01, 0.05, 0.2, allowed=(0.2, 0.5, 1.0))
 def outlier_points(scene: Scene, share: float, random: np.random.Generator) -> Scene:
     """Move a share of the points to anywhere in a box `FAR` times the size of the cloud."""
     low, high, _, _ = _cloud_size(scene)
@@ -118,6 +128,7 @@ def outlier_points(scene: Scene, share: float, random: np.random.Generator) -> S
     return _move_points(scene, share, lambda count: random.uniform(middle - half, middle + half, (count, 3)), random)
 
 
+@condition("{:.0%} of the points lie directly in front of the cameras", 0.01, 0.05, 0.1, allowed=(0.5, 0.5, 0.5))
 def near_points(scene: Scene, share: float, random: np.random.Generator) -> Scene:
     """Move a share of the points to directly in front of training cameras."""
     centers = np.stack([view.center.cpu().numpy() for view in scene.train])

@@ -15,6 +15,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from padgs.data.perturb.condition import condition
 from padgs.data.perturb.geometry import change_training_views, change_views, rotate_camera
 from padgs.files import open_image
 from padgs.geometry.panorama import pad_panorama, project, rays, sample, sample_bicubic
@@ -42,6 +43,15 @@ class Changed:
             start()
 
 
+@condition(
+    "all cameras turn about their vertical, so that the seam lies elsewhere (degrees: {})",
+    90,
+    180,
+    "random",
+    test_views=True,
+    metric="seam",
+    allowed=(1.1, 1.1, 1.1),
+)
 def seam(scene: Scene, degrees: float | str, random: np.random.Generator) -> Scene:
     """Turn all cameras about their vertical by whole pixels, each by a random angle if `degrees` is "random"."""
 
@@ -60,6 +70,7 @@ def seam(scene: Scene, degrees: float | str, random: np.random.Generator) -> Sce
     return change_views(scene, turn)
 
 
+@condition("all cameras look down by {}°: the horizon moves to the poles", 30, 60, 90, test_views=True)
 def pitch(scene: Scene, degrees: float, random: np.random.Generator) -> Scene:
     """Turn all cameras down, so that the horizon moves to the poles."""
     from scipy.spatial.transform import Rotation
@@ -84,6 +95,15 @@ def pitch(scene: Scene, degrees: float, random: np.random.Generator) -> Scene:
     return change_views(scene, turn)
 
 
+@condition(
+    "{:.0%} of the fine contrast is gone",
+    0.5,
+    0.8,
+    0.95,
+    test_views=True,
+    metric="depth_error",
+    allowed=(0.1, 0.15, 0.3),
+)
 def textureless(scene: Scene, share: float, random: np.random.Generator) -> Scene:
     """Remove a share of all fine contrast, as on bare walls."""
 
@@ -96,6 +116,14 @@ def textureless(scene: Scene, share: float, random: np.random.Generator) -> Scen
     return change_views(scene, lambda view: change_pixels(_panorama(view), fade))
 
 
+@condition(
+    "pixel values of each training view are multiplied or divided by up to 2^{}",
+    0.25,
+    0.5,
+    1.0,
+    metric="ws_psnr_fitted",
+    allowed=(0.5, 1.5, 3.0),
+)
 def exposure(scene: Scene, doublings: float, random: np.random.Generator) -> Scene:
     """Multiply the stored values of each training view by 2^e, e uniform in [-doublings, doublings]; in sRGB that is
     about 2e stops of light.
@@ -108,6 +136,7 @@ def exposure(scene: Scene, doublings: float, random: np.random.Generator) -> Sce
     return change_training_views(scene, expose)
 
 
+@condition("a person, different in each training view, hides the lowest {:.0%} of the rows", 0.03, 0.06, 0.15)
 def nadir(scene: Scene, share: float, random: np.random.Generator) -> Scene:
     """Hide the lowest rows of each training view behind a person in other colors."""
 
@@ -124,6 +153,7 @@ def nadir(scene: Scene, share: float, random: np.random.Generator) -> Scene:
     return change_training_views(scene, hide)
 
 
+@condition("training views are JPEGs of quality {}", 90, 70, 40)
 def jpeg(scene: Scene, quality: int, random: np.random.Generator) -> Scene:
     """Compress training views as JPEGs of that quality."""
 
@@ -135,6 +165,7 @@ def jpeg(scene: Scene, quality: int, random: np.random.Generator) -> Scene:
     return change_training_views(scene, lambda view: change_pixels(view, compress))
 
 
+@condition("training views have Gaussian noise with a standard deviation of {:.0%} of white", 0.02, 0.05, 0.1)
 def noise(scene: Scene, sigma: float, random: np.random.Generator) -> Scene:
     """Add normal noise to each channel of the training views; `sigma` is a share of white."""
 
@@ -150,6 +181,7 @@ def noise(scene: Scene, sigma: float, random: np.random.Generator) -> Scene:
     return change_training_views(scene, spoil)
 
 
+@condition("training views have 1/{} of the width and height", 2, 4, 8, allowed=(2.0,))
 def resolution(scene: Scene, factor: int, random: np.random.Generator) -> Scene:
     """Reduce the width and height of training views by a factor; test views keep theirs.
 
