@@ -89,14 +89,14 @@ def read_list(path: Path) -> tuple[str, ...]:
     return names
 
 
-def read_lines(path: Path) -> list[str]:
-    """Read the lines of a text file.
+def read_lines(path: Path, errors: str = "strict") -> list[str]:
+    """Read the lines of a text file; `errors` is that of `bytes.decode`.
 
     Raises:
         DataError: not UTF-8, or unreadable.
     """
     try:
-        return path.read_text(encoding="utf-8-sig").splitlines()
+        return path.read_text(encoding="utf-8-sig", errors=errors).splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"{path} cannot be read as UTF-8 text ({error}); save it as UTF-8") from error
 

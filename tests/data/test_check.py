@@ -88,7 +88,7 @@ BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
         "the test view pano_01 is the same image as the training view pano_00",
     ),
     "empty cloud": (lambda f: (f / "sparse/0/points3D.txt").write_text("\n"), "holds no points; training starts"),
-    "binary garbage": (lambda f: (f / "sparse/0/images.bin").write_bytes(b"\x07" * 99), "lacks cameras.bin"),
+    "binary garbage": (lambda f: (f / "sparse/0/images.bin").write_bytes(b"\x07" * 99), "images.bin ends early"),
     "other axes": (lambda f: _rotate_points(f), "colours correlate by -?0.* and by 0.9. under another convention"),
 }
 

@@ -1,38 +1,67 @@
-"""COLMAP models, text or binary, with or without rigs, of EQUIRECTANGULAR cameras (in forks: SPHERICAL).
+"""COLMAP models, text or binary, of EQUIRECTANGULAR cameras (in forks: SPHERICAL or SPHERE).
 
-COLMAP's panoramic camera has the axes of `padgs.geometry.panorama`, so poses are used unchanged.
+COLMAP's panoramic camera has the axes of `padgs.geometry.panorama`, so poses are used unchanged: those of the images
+file, which all versions write. Source: the description of COLMAP's output format, 3.x and 4.x.
 """
 
 from __future__ import annotations
 
-import re
 import struct
-import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from torch import Tensor
 
 from padgs.data.assemble import image_folder
-from padgs.data.capture import Capture, Cloud, DataError, DataOptions, Frame, Tracks, listed
-from padgs.data.formats.poses import cam_from_world, checked_quaternion
+from padgs.data.capture import Capture, Cloud, DataError, DataOptions, Frame, Tracks, color_bytes, listed
+from padgs.data.formats.poses import cam_from_world, rotation_from_quaternion
 from padgs.data.images import read_bytes
-from padgs.data.splits import check_inside
+from padgs.data.splits import check_inside, read_lines
 
 FILES = ("cameras", "images", "points3D")
-_ALIAS = re.compile(r"^(\s*\d+\s+)SPHERICAL\s+(\d+)\s+(\d+).*$", re.MULTILINE)
+PANORAMIC = ("EQUIRECTANGULAR", "SPHERICAL", "SPHERE")
+EQUIRECTANGULAR = 17  # id of the camera model in binary files
+SPHERE = 11  # its id in SphereSfM; in COLMAP a camera with 16 parameters
+PARAMETERS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12, 7: 5, 8: 4, 9: 5, 10: 12, 11: 16, 12: 4, 13: 5, 14: 3, 15: 4}
+PARAMETERS |= {16: 6, EQUIRECTANGULAR: 2}  # numbers of parameters of the camera models
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Camera:
+    """An entry of the cameras file."""
+
+    model: str
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class Image:
+    """An entry of the images file."""
+
+    id: int
+    pose: tuple[float, ...]  # quaternion w x y z, then translation; cam from world
+    camera: int
+    name: str
+    pixels: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))  # [K, 2] observations
+    points: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))  # [K] their point ids
 
 
 def find_model(path: Path) -> Path | None:
     """Find the folder with the model's files, in a data set's folder or itself; the largest of several parts."""
     for folder in (path / "sparse_equirectangular", path / "sparse", path / "colmap" / "sparse", path):
         parts = [folder, *sorted(part for part in folder.glob("*") if part.is_dir())] if folder != path else [folder]
-        found = [part for part in parts if _suffix(part)]
-        if found:
-            return max(found, key=lambda part: (part / f"images{_suffix(part)}").stat().st_size)
+        sizes = {part: file.stat().st_size for part in parts if (file := _file(part, "images"))}
+        if sizes:
+            return max(sizes, key=lambda part: sizes[part])
     return None
 
 
@@ -50,29 +79,22 @@ def read(path: Path, options: DataOptions, model: Path | None = None) -> Capture
     model = model or find_model(path)
     if model is None:
         raise DataError(f"{path} holds no COLMAP model (cameras, images and points3D as .bin or .txt in sparse/0)")
-    suffix = _suffix(model)
-    absent = [f"{name}{suffix}" for name in FILES if not (model / f"{name}{suffix}").is_file()]
+    files = [file for name in FILES if (file := _file(model, name))]
+    absent = sorted(set(FILES) - {file.stem for file in files})
     if absent:
-        raise DataError(f"the COLMAP model {model} lacks {listed(absent)}; export the whole model")
+        raise DataError(f"the COLMAP model {model} lacks {listed(absent)} (.bin or .txt); export the whole model")
     folder = image_folder(path, options.images)
-    reconstruction = _open(model, str(suffix))
-    images = [image for _, image in sorted(reconstruction.images.items()) if image.has_pose]
-    notes = _part_notes(path, model)
-    # pycolmap cuts names in text models at the first space.
-    names = {int(line[0]): line[9] for line in image_lines(model / "images.txt")} if suffix == ".txt" else {}
-    without = [image.name for image in reconstruction.images.values() if not image.has_pose]
-    if without:
-        notes.append(f"{len(without)} images of the model are not registered: {listed(sorted(without))}")
-    frames = tuple(_frame(image, names.get(image.image_id) or str(image.name), folder, model) for image in images)
-    cloud, row_of = cloud_of(reconstruction)
+    cameras = dict(read_cameras(files[0]))
+    images = sorted(read_images(files[1]), key=lambda image: image.id)
+    row_of, cloud = read_points(files[2])
     return Capture(
         format="colmap",
         folder=path,
         image_folder=folder,
-        frames=frames,
+        frames=tuple(_frame(image, cameras.get(image.camera), folder, model) for image in images),
         cloud=cloud,
         tracks=lambda: _tracks(images, row_of),
-        notes=tuple(notes),
+        notes=tuple(_part_notes(path, model)),
     )
 
 
@@ -85,173 +107,173 @@ def pycolmap_module() -> ModuleType:
     return pycolmap
 
 
-def cloud_of(reconstruction: Any) -> tuple[Cloud, dict[int, int]]:
-    """Return the points of a pycolmap.Reconstruction, and the row of each point id."""
-    ids = sorted(reconstruction.points3D.keys())
-    points = [reconstruction.points3D[point_id] for point_id in ids]
-    cloud = Cloud(
-        torch.from_numpy(np.array([point.xyz for point in points], np.float64).reshape(-1, 3)),
-        torch.from_numpy(np.array([point.color for point in points], np.uint8).reshape(-1, 3)),
-    )
-    return cloud, {point_id: row for row, point_id in enumerate(ids)}
+def read_cameras(file: Path) -> Iterator[tuple[int, Camera]]:
+    """Read the cameras file: id and camera."""
+    if file.suffix == ".txt":
+        for number, line in _lines(file):
+            kinds = (int, str, int, int)
+            key, model, width, height, *_ = _fields(file, number, line.split(), kinds, "ID MODEL WIDTH HEIGHT")
+            yield key, Camera(model, width, height)
+        return
+
+    def entry(cursor: _Cursor) -> tuple[int, Camera]:
+        key, model, width, height = cursor.take("IiQQ")
+        if model not in PARAMETERS:
+            raise DataError(f"{file} holds a camera of type {model}; only EQUIRECTANGULAR (17) can be used here")
+        center = struct.pack("<2d", width / 2, height / 2)
+        is_sphere = model == SPHERE and cursor.data[cursor.offset + 8 : cursor.offset + 24] == center
+        cursor.take("24x" if is_sphere else f"{8 * PARAMETERS[model]}x")
+        return key, Camera(PANORAMIC[0] if is_sphere or model == EQUIRECTANGULAR else f"type {model}", width, height)
+
+    yield from _entries(file, entry)
 
 
-def image_lines(file: Path) -> list[list[str]]:
-    """Read the ten fields of every image in images.txt; observations, on every second line, are skipped.
+def read_images(file: Path) -> Iterator[Image]:
+    """Read the images file. In text, the line of observations after an image may be empty or missing.
 
     Raises:
-        DataError: missing file, or a line with fewer fields.
+        DataError: a damaged file; the message names the line.
     """
-    lines = iter(read_bytes(file).decode("utf-8", "surrogateescape").splitlines())
-    found = []
-    for line in lines:
-        if line.strip() and not line.startswith("#"):
-            found.append(line.strip().split(None, 9))
-            next(lines, None)
-            if len(found[-1]) < 10:
-                raise DataError(f"{file}: the line {line[:60]!r} has {len(found[-1])} fields; an image has 10")
-    return found
+    if file.suffix == ".txt":
+        kinds, image = (int, *[float] * 7, int, str), None
+        for number, line in _lines(file):
+            seen = _observations(line) if image else None
+            if image:
+                yield image if seen is None else replace(image, pixels=seen[:, :2], points=seen[:, 2].astype(np.int64))
+                image = None
+            if seen is None:
+                fields = _fields(file, number, line.split(None, 9), kinds, "ID QW QX QY QZ TX TY TZ CAMERA NAME")
+                image = Image(fields[0], tuple(fields[1:8]), *fields[8:])
+        if image:
+            yield image
+        return
+
+    def entry(cursor: _Cursor) -> Image:
+        key, *pose, camera = cursor.take("I7dI")
+        name = cursor.text()
+        seen = cursor.array([("pixel", "<f8", 2), ("point", "<i8")])
+        return Image(key, tuple(pose), camera, name, seen["pixel"], seen["point"])
+
+    yield from _entries(file, entry)
 
 
-def _suffix(folder: Path) -> str | None:
-    return next((end for end in (".bin", ".txt") if (folder / f"images{end}").is_file()), None)
+def read_points(file: Path) -> tuple[dict[int, int], Cloud]:
+    """Read the points file: the cloud, and the row of each point id."""
+    if file.suffix == ".txt":
+        kinds = (int, *[float] * 6)
+        rows = [_fields(file, number, line.split(), kinds, "ID X Y Z R G B") for number, line in _lines(file)]
+    else:
+
+        def entry(cursor: _Cursor) -> tuple[Any, ...]:
+            values = cursor.take("Q3d3B8x")
+            cursor.array([("image", "<u4"), ("observation", "<u4")])
+            return values
+
+        rows = list(_entries(file, entry))
+    rows.sort(key=lambda row: row[0])
+    values = torch.tensor([row[1:] for row in rows], dtype=torch.float64).reshape(-1, 6)
+    return {row[0]: i for i, row in enumerate(rows)}, Cloud(values[:, :3], color_bytes(values[:, 3:], str(file)))
+
+
+def pose_of(image: Image, where: str) -> Tensor:
+    """Return cam_from_world [4, 4] of an image; `where` names it in errors."""
+    pose = torch.tensor(image.pose, dtype=torch.float64)
+    return cam_from_world(rotation_from_quaternion(pose[:4], where), pose[4:], where)
+
+
+def _file(model: Path, stem: str) -> Path | None:
+    return next((file for end in (".bin", ".txt") if (file := model / f"{stem}{end}").is_file()), None)
 
 
 def _part_notes(path: Path, model: Path) -> list[str]:
-    others = [part.name for part in sorted(model.parent.glob("*")) if part != model and part.is_dir() and _suffix(part)]
+    others = [part.name for part in sorted(model.parent.glob("*")) if part != model and _file(part, "images")]
     if model == path or not others:
         return []
     return [f"the model has several parts; the largest, {model.name}, is used, not {listed(others)}"]
 
 
-def _open(model: Path, suffix: str) -> Any:
-    pycolmap = pycolmap_module()
-    if suffix == ".bin":
-        check_whole(model)
-    reconstruction = pycolmap.Reconstruction()
-    try:
-        if suffix == ".bin":
-            reconstruction.read_binary(str(model))
-        elif _ALIAS.search(cameras := (model / "cameras.txt").read_text(encoding="utf-8", errors="replace")):
-            with tempfile.TemporaryDirectory() as folder:
-                for file in model.glob("*.txt"):
-                    (Path(folder) / file.name).symlink_to(file.absolute())
-                (Path(folder) / "cameras.txt").unlink()
-                (Path(folder) / "cameras.txt").write_text(_ALIAS.sub(r"\1EQUIRECTANGULAR \2 \3 \2 \3", cameras))
-                reconstruction.read_text(folder)
-        else:
-            reconstruction.read_text(str(model))
-    except (ValueError, IndexError, RuntimeError, OSError) as error:
-        raise DataError(f"pycolmap cannot read the COLMAP model {model}: {error}; export the model again") from error
-    return reconstruction
-
-
-def _frame(image: Any, name: str, folder: Path, model: Path) -> Frame:
-    camera = image.camera
-    if camera.model_name != "EQUIRECTANGULAR":
+def _frame(image: Image, camera: Camera | None, folder: Path, model: Path) -> Frame:
+    name = check_inside(image.name, str(model))
+    if camera is None or camera.model not in PANORAMIC:
         raise DataError(
-            f"{name} has a {camera.model_name} camera ({model}); only panoramas (EQUIRECTANGULAR) can be used: "
-            "reconstruct from the panoramas themselves (`padgs prepare`), or give the sparse_equirectangular model"
+            f"{name} has a {camera.model if camera else 'missing'} camera ({model}); only panoramas "
+            "(EQUIRECTANGULAR) can be used: reconstruct from the panoramas themselves (`padgs prepare`), or give the "
+            "sparse_equirectangular model"
         )
-    where = f"{name} in {model}"
-    checked_quaternion(
-        torch.tensor(image.cam_from_world().rotation.quat), where
-    )  # pycolmap turns 0 0 0 0 into the identity
-    pose = torch.from_numpy(np.asarray(image.cam_from_world().matrix(), np.float64))
-    return Frame(
-        name=check_inside(name, str(model)),
-        image=folder / name,
-        cam_from_world=cam_from_world(pose[:, :3], pose[:, 3], where),
-        width=camera.width,
-        height=camera.height,
-    )
+    return Frame(name, folder / name, pose_of(image, f"{name} in {model}"), camera.width, camera.height)
 
 
-def _tracks(images: list[Any], row_of: dict[int, int]) -> Tracks:
+def _tracks(images: list[Image], row_of: dict[int, int]) -> Tracks:
+    """Return the observations of points that exist."""
     return Tracks.from_observations(
-        (frame, row_of[seen.point3D_id], seen.xy)
+        (frame, row_of[point], pixel)
         for frame, image in enumerate(images)
-        for seen in image.get_observation_points2D()
+        for point, pixel in zip(image.points.tolist(), image.pixels, strict=True)
+        if point in row_of
     )
 
 
-_CAMERA_PARAMETERS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12, 7: 5, 8: 4, 9: 5, 10: 12}  # by model id
-_EQUIRECTANGULAR = 17
+def _lines(file: Path) -> Iterator[tuple[int, str]]:
+    """Yield the lines of a text file that are neither empty nor comments, with their numbers."""
+    for number, line in enumerate(read_lines(file, errors="surrogateescape"), 1):
+        if line.strip() and not line.startswith("#"):
+            yield number, line.strip()
 
 
-def check_whole(folder: Path) -> None:
-    """Check the structure of all .bin files of a model folder.
+def _fields(file: Path, number: int, fields: list[str], kinds: tuple[type, ...], names: str) -> list[Any]:
+    try:
+        return [kind(field) for kind, field in zip(kinds, fields[: len(kinds)], strict=True)]
+    except ValueError as error:
+        raise DataError(f"{file}, line {number}: {' '.join(fields)[:60]!r} is not {names}; export it again") from error
 
-    pycolmap does not return from some truncated files, because it reserves as many points as garbage says. Source: the
-    description of COLMAP's output format, 3.x and 4.x.
+
+def _observations(line: str) -> NDArray[np.float64] | None:
+    """Return observations [K, 3] (x, y, point), or None if the line is not of observations."""
+    try:
+        return np.array(line.split(), np.float64).reshape(-1, 3)
+    except ValueError:
+        return None
+
+
+class _Cursor:
+    """Position in a binary file."""
+
+    def __init__(self, file: Path) -> None:
+        self.data, self.offset = read_bytes(file), 0
+
+    def take(self, layout: str) -> tuple[Any, ...]:
+        values = struct.unpack_from(f"<{layout}", self.data, self.offset)
+        self.offset += struct.calcsize(f"<{layout}")
+        return values
+
+    def text(self) -> str:
+        start, self.offset = self.offset, self.data.find(b"\0", self.offset) + 1 or len(self.data)
+        return self.data[start : self.offset - 1].decode("utf-8", "surrogateescape")
+
+    def array(self, dtype: list[Any]) -> NDArray[Any]:
+        """Read a number of entries, then the entries."""
+        (count,) = self.take("Q")
+        if count > len(self.data):
+            raise IndexError
+        whole = self.data[self.offset : self.offset + count * np.dtype(dtype).itemsize]
+        self.take(f"{count * np.dtype(dtype).itemsize}x")
+        return np.frombuffer(whole, dtype)
+
+
+def _entries(file: Path, entry: Callable[[_Cursor], T]) -> list[T]:
+    """Read the entries of a binary file.
 
     Raises:
-        DataError: a file is truncated, or longer than its entries.
+        DataError: the file is truncated, or longer than its entries.
     """
-    for stem, skip in _ENTRIES.items():
-        path = folder / f"{stem}.bin"
-        if not path.is_file():
-            continue
-        data = path.read_bytes()
-        try:
-            (count,) = struct.unpack_from("<Q", data)
-            if count > len(data):  # every entry has more than one byte
-                raise struct.error
-            offset = 8
-            for _ in range(count):
-                offset = skip(data, offset)
-        except (struct.error, ValueError) as error:
-            raise DataError(
-                f"{path} ends early or is not a COLMAP {stem} file; copy it again or rebuild the model"
-            ) from error
-        if offset != len(data):
-            raise DataError(f"{path} has {len(data)} bytes but its {count} entries take {offset}; copy it again")
-
-
-def _advance(data: bytes, offset: int, size: int) -> int:
-    if offset + size > len(data):
-        raise struct.error
-    return offset + size
-
-
-def _skip_camera(data: bytes, offset: int) -> int:
-    (model,) = struct.unpack_from("<4xi", data, offset)
-    if model not in _CAMERA_PARAMETERS and model != _EQUIRECTANGULAR:
+    cursor = _Cursor(file)
+    try:
+        (count,) = cursor.take("Q")
+        found = [entry(cursor) for _ in range(count)]
+    except (struct.error, IndexError, OverflowError) as error:
+        raise DataError(f"{file} ends early or is not a COLMAP file; copy it again or rebuild the model") from error
+    if cursor.offset != len(cursor.data):
         raise DataError(
-            f"the model holds a camera of type {model}; only EQUIRECTANGULAR ({_EQUIRECTANGULAR}) can be used here"
+            f"{file} has {len(cursor.data)} bytes but its {count} entries take {cursor.offset}; copy it again"
         )
-    return _advance(data, offset, 24 + 8 * _CAMERA_PARAMETERS.get(model, 2))
-
-
-def _skip_image(data: bytes, offset: int) -> int:
-    offset = data.index(b"\0", _advance(data, offset, 64)) + 1
-    (count,) = struct.unpack_from("<Q", data, offset)
-    return _advance(data, offset, 8 + 24 * count)
-
-
-def _skip_point(data: bytes, offset: int) -> int:
-    (length,) = struct.unpack_from("<43xQ", data, offset)
-    return _advance(data, offset, 51 + 8 * length)
-
-
-def _skip_rig(data: bytes, offset: int) -> int:
-    (sensors,) = struct.unpack_from("<4xI", data, offset)
-    offset = _advance(data, offset, 16 if sensors else 8)
-    for _ in range(max(0, sensors - 1)):
-        (posed,) = struct.unpack_from("<8xB", data, offset)
-        offset = _advance(data, offset, 65 if posed else 9)
-    return offset
-
-
-def _skip_frame(data: bytes, offset: int) -> int:
-    (count,) = struct.unpack_from("<64xI", data, offset)
-    return _advance(data, offset, 68 + 16 * count)
-
-
-_ENTRIES: dict[str, Callable[[bytes, int], int]] = {
-    "cameras": _skip_camera,
-    "images": _skip_image,
-    "points3D": _skip_point,
-    "rigs": _skip_rig,
-    "frames": _skip_frame,
-}
+    return found

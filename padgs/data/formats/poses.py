@@ -59,22 +59,17 @@ def cam_from_opengl_pose(world_from_cam: Tensor, where: str) -> Tensor:
 
 def rotation_from_quaternion(quaternion: Tensor, where: str) -> Tensor:
     """Return the rotation [3, 3] of a quaternion (w, x, y, z), which must have unit length up to rounding."""
-    w, x, y, z = checked_quaternion(quaternion, where).tolist()
+    quaternion = _finite(quaternion, where)
+    length = quaternion.norm().item()
+    if abs(length - 1) > 0.01:
+        raise DataError(f"{where}: the quaternion has the length {length:.4g}; it must be 1")
+    w, x, y, z = (quaternion if abs(length - 1) < 1e-12 else quaternion / length).tolist()
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     return torch.tensor(rows, dtype=torch.float64)
-
-
-def checked_quaternion(quaternion: Tensor, where: str) -> Tensor:
-    """Normalise a quaternion [4], which must have unit length up to rounding."""
-    quaternion = _finite(quaternion, where)
-    length = quaternion.norm().item()
-    if abs(length - 1) > 0.01:
-        raise DataError(f"{where}: the quaternion has the length {length:.4g}; it must be 1")
-    return quaternion / length
 
 
 def rotation_from_vector(vector: Tensor, where: str) -> Tensor:

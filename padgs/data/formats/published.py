@@ -17,17 +17,15 @@ from __future__ import annotations
 
 from pathlib import Path, PurePosixPath
 
-import torch
-
 from padgs.data.assemble import image_folder, image_names
-from padgs.data.capture import Capture, Cloud, DataError, DataOptions, Frame, color_bytes
+from padgs.data.capture import Capture, DataError, DataOptions, Frame
 from padgs.data.cloud import first_ply
 from padgs.data.datasets import DATASETS
-from padgs.data.formats.colmap import image_lines
+from padgs.data.formats.colmap import pose_of, read_images, read_points
 from padgs.data.formats.json_file import Json, file_in, read_json
 from padgs.data.formats.openmvg import read_extrinsics, read_views
-from padgs.data.formats.poses import cam_from_opengl_pose, cam_from_pose, cam_from_world, rotation_from_quaternion
-from padgs.data.splits import check_inside, read_lines
+from padgs.data.formats.poses import cam_from_opengl_pose, cam_from_pose
+from padgs.data.splits import check_inside
 
 
 def read_roam360(path: Path, options: DataOptions) -> Capture:
@@ -65,34 +63,16 @@ def read_ricoh360(path: Path, options: DataOptions) -> Capture:
     mask = path / "imgs" / "mask.png"
     file = path / _RICOH360_MODEL / "images.txt"
     frames = []
-    for fields in image_lines(file):
-        name = check_inside(fields[9], str(file))
+    for image in read_images(file):
+        name = check_inside(image.name, str(file))
         name = files.get(str(PurePosixPath(name).with_suffix("")), name)
-        where = f"{name} in {file}"
-        try:
-            values = torch.tensor([float(field) for field in fields[1:8]], dtype=torch.float64)
-        except ValueError as error:
-            raise DataError(f"{where}: the pose is not numeric ({error})") from error
-        pose = cam_from_world(rotation_from_quaternion(values[:4], where), values[4:], where)
+        pose = pose_of(image, f"{name} in {file}")
         frames.append(Frame(name, images / name, pose, mask=mask if mask.is_file() else None))
     cloud = first_ply(path, ("openMVG/scene.ply", "scene.ply", "pcd.ply"))
     points = path / _RICOH360_MODEL / "points3D.txt"
     if cloud is None and points.is_file():
-        cloud = _ricoh360_cloud(points)
+        _, cloud = read_points(points)
     return Capture("ricoh360", path, images, tuple(frames), cloud)
-
-
-def _ricoh360_cloud(file: Path) -> Cloud | None:
-    rows = [line.split()[1:7] for line in read_lines(file) if line.strip() and not line.startswith("#")]
-    if not rows:
-        return None
-    try:
-        values = torch.tensor([[float(field) for field in row] for row in rows], dtype=torch.float64)
-    except ValueError as error:
-        raise DataError(f"{file}: a point is not 'id x y z red green blue error' ({error})") from error
-    if values.shape[1] < 6:
-        raise DataError(f"{file}: a point has {values.shape[1] + 1} fields; it must have id x y z red green blue")
-    return Cloud(values[:, :3], color_bytes(values[:, 3:6], str(file)))
 
 
 _OMNIBLENDER_CLOUDS = ("pcd.ply", "scene.ply", "openMVG/scene.ply", "openMVG/reconstruction/colorized.ply")

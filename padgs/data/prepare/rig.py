@@ -17,7 +17,7 @@ from PIL import Image
 from torch import Tensor
 
 from padgs.data.capture import Cloud, Frame, Tracks
-from padgs.data.formats.colmap import cloud_of, pycolmap_module
+from padgs.data.formats.colmap import pycolmap_module
 from padgs.data.formats.poses import rigid
 from padgs.data.images import decode
 from padgs.data.perspectives import looking_at
@@ -109,7 +109,12 @@ def rig_config() -> Any:
 def panoramas(model: Any, images: dict[str, Path], width: int) -> tuple[tuple[Frame, ...], Cloud, Tracks]:
     """Convert a pycolmap.Reconstruction of rig views to frames, points and observations of their panoramas."""
     rotations = cam_from_pano()
-    cloud, row_of = cloud_of(model)
+    points = dict(sorted(model.points3D.items()))
+    row_of = {point_id: row for row, point_id in enumerate(points)}
+    cloud = Cloud(
+        torch.from_numpy(np.array([point.xyz for point in points.values()], np.float64)),
+        torch.from_numpy(np.array([point.color for point in points.values()], np.uint8)),
+    )
     poses: dict[str, Tensor] = {}
     seen: list[tuple[str, Tensor, Tensor]] = []  # name, rows of points, pixels; per view
     for image in model.images.values():

@@ -43,7 +43,7 @@ def test_names_that_differ_in_case_are_reported(world: World, tmp_path: Path) ->
         load(tmp_path)
 
 
-@pytest.mark.parametrize("file", ["cameras", "images", "points3D", "rigs", "frames"])
+@pytest.mark.parametrize("file", ["cameras", "images", "points3D"])
 @pytest.mark.parametrize("damage", ["cut", "garbage", "longer"])
 def test_damaged_binary_files_are_named(file: str, damage: str, world: World, tmp_path: Path) -> None:
     write_colmap_binary(world, tmp_path)
@@ -66,14 +66,14 @@ def test_other_cameras_are_refused(world: World, tmp_path: Path) -> None:
 def test_unusable_points_are_refused(points: str, world: World, tmp_path: Path) -> None:
     write_colmap_text(world, tmp_path)
     (tmp_path / "sparse/0/points3D.txt").write_text(points)
-    with pytest.raises(DataError, match="holds no points|not finite|cannot read the COLMAP model"):
+    with pytest.raises(DataError, match="holds no points|not finite|is empty"):
         load(tmp_path)
 
 
 def test_a_model_with_a_file_missing(world: World, tmp_path: Path) -> None:
     write_colmap_text(world, tmp_path)
     (tmp_path / "sparse/0/points3D.txt").unlink()
-    with pytest.raises(DataError, match=r"lacks points3D.txt"):
+    with pytest.raises(DataError, match="lacks points3D"):
         load(tmp_path)
 
 
