@@ -192,9 +192,8 @@ def _check_fit(capture: Capture, scene: Scene, report: Report) -> None:
                 f"{limit:.1f} at this size"
             )
             fits = track_fit(poses, capture.cloud.points, tracks, width, height, conventions)
-            best = max(fits, key=lambda fit: fit.score)
-            if -best.score <= limit:
-                report.suggestion = best.convention.words
+            if max(fits) >= -limit:
+                report.suggestion = conventions[fits.index(max(fits))].words
     if any("random points" in note for note in scene.notes):
         return
     if report.suggestion is None:
@@ -208,17 +207,17 @@ def _check_fit(capture: Capture, scene: Scene, report: Report) -> None:
     )  # in the world of the data set
     points = scene.points.double() + scene.origin
     fits = colour_fit(poses, _small(views), points, scene.point_colors, conventions)
-    stated, best = fits[0], max(fits, key=lambda fit: fit.score)
-    report.colour_correlation = stated.score
-    if best.score > max(MIN_CORRELATION, stated.score + MIN_GAIN) and report.suggestion is None:
+    stated, best = fits[0], max(fits)
+    report.colour_correlation = stated
+    if best > max(MIN_CORRELATION, stated + MIN_GAIN) and report.suggestion is None:
         report.problems.append(
-            f"points and panoramas do not agree: their colours correlate by {stated.score:.2f} with the poses as "
-            f"stated, and by {best.score:.2f} under another convention"
+            f"points and panoramas do not agree: their colours correlate by {stated:.2f} with the poses as "
+            f"stated, and by {best:.2f} under another convention"
         )
-        report.suggestion = best.convention.words
-    elif stated.score < MIN_CORRELATION and report.suggestion is None:
+        report.suggestion = conventions[fits.index(best)].words
+    elif stated < MIN_CORRELATION and report.suggestion is None:
         report.notes.append(
-            f"the colours of points and panoramas correlate by only {stated.score:.2f}, and not better under any "
+            f"the colours of points and panoramas correlate by only {stated:.2f}, and not better under any "
             "other known convention; look at the overlay"
         )
 

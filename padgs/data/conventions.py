@@ -8,8 +8,8 @@ strongly only if axes, handedness and direction of the poses are right, even if 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from itertools import permutations, product
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -22,25 +22,16 @@ POINTS = 3000  # sampled for a comparison
 VIEWS = 8
 
 
-@dataclass(frozen=True)
-class Convention:
+class Convention(NamedTuple):
     """A pose convention: how to correct poses that were stated in it."""
 
     words: str  # instruction for users
     convert: Callable[[Tensor], Tensor]  # stated poses [F, 4, 4] -> cam_from_world [F, 4, 4]
 
 
-@dataclass(frozen=True)
-class Fit:
-    """Agreement of points and images under a convention."""
-
-    convention: Convention
-    score: float  # colour correlation, or negative median reprojection error in pixels
-
-
 def colour_fit(
     poses: Tensor, images: Tensor, points: Tensor, colors: Tensor, conventions: Sequence[Convention]
-) -> list[Fit]:
+) -> list[float]:
     """Return the correlation of point and pixel colours under each convention; 1 = equal, about 0 = unrelated.
 
     Args:
@@ -60,13 +51,13 @@ def colour_fit(
         seen = (points @ pose[:, :3, :3].mT + pose[:, None, :3, 3]).float()
         column, row = project(seen, width, height).long().unbind(-1)
         found = images[frame, row.clamp(0, height - 1), column % width].float()
-        fits.append(Fit(convention, _correlation(found, colors.expand_as(found)).mean().item()))
+        fits.append(_correlation(found, colors.expand_as(found)).mean().item())
     return fits
 
 
 def track_fit(
     poses: Tensor, points: Tensor, tracks: Tracks, width: int, height: int, conventions: Sequence[Convention]
-) -> list[Fit]:
+) -> list[float]:
     """Return the negative median reprojection error under each convention, in pixels of width x height."""
     step = max(1, len(tracks.frame) // POINTS)
     frame, point, pixels = tracks.frame[::step], tracks.point[::step], tracks.pixels[::step]
@@ -75,7 +66,7 @@ def track_fit(
     for convention in conventions:
         pose = convention.convert(poses.double())[frame]
         error = reprojection_error((pose[:, :3, :3] @ some[..., None])[..., 0] + pose[:, :3, 3], pixels, width, height)
-        fits.append(Fit(convention, -error.median().item()))
+        fits.append(-error.median().item())
     return fits
 
 
@@ -104,8 +95,8 @@ def known_conventions() -> list[Convention]:
     found = []
     for (correction, convert), (words, axes) in product(corrections.items(), (same, *others)):
         text = "; ".join(filter(None, (correction, words and f"camera axes: {words}")))
-        whole = text or "the poses are right as they are"
-        found.append(Convention(whole, lambda poses, convert=convert, axes=axes: axes @ convert(poses)))
+        text = text or "the poses are right as they are"
+        found.append(Convention(text, lambda poses, convert=convert, axes=axes: axes @ convert(poses)))
     for words, axes in others:
         text = f"poses and points are in different world frames: rotate the points, {words}"
         found.append(Convention(text, lambda poses, axes=axes: poses @ axes))

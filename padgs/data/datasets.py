@@ -84,14 +84,12 @@ def refuse_missing(path: Path, dataset: str | None) -> None:
             f"{path.absolute()} does not exist, and {path.name!r} is not a scene of {known.title}; "
             f"its scenes: {', '.join(known.scenes)}"
         )
+    what, folder, holds = f"the scene {path.name!r} of {known.title}", path, "this folder holds"
     if not path.parent.exists():  # the same message for all scenes, which a multirun prints once
-        raise DataError(
-            f"{known.title} is missing. Get it from {known.source}, and put it into {path.parent.absolute()}, so "
-            f"that the folder of each scene holds {known.contents}; or set data.path to the folder of a scene"
-        )
+        what, folder, holds = known.title, path.parent, "the folder of each scene holds"
     raise DataError(
-        f"the scene {path.name!r} of {known.title} is missing. Get it from {known.source}, and put it into "
-        f"{path.absolute()}, so that this folder holds {known.contents}; or set data.path to its folder"
+        f"{what} is missing. Get it from {known.source}, and put it into {folder.absolute()}, so that {holds} "
+        f"{known.contents}; or set data.path to the folder of a scene"
     )
 
 
