@@ -1,10 +1,15 @@
 """The committed tables and findings are those of the committed runs."""
 
+import re
+from collections import defaultdict
 from pathlib import Path
 
 import pytest
+import yaml
 from support.made_up import assert_apart
 
+from padgs.multirun.composition import composing, multirun
+from padgs.multirun.overrides import expand
 from padgs.reports import REPORTS, store
 from padgs.reports.charts import trade_off, trade_off_chart
 from padgs.reports.frame import frame
@@ -57,3 +62,53 @@ def test_labels_of_charts_do_not_overlap(found):
 def test_it_is_small(measured):
     paths = [path for path in measured.rglob("*") if path.is_file()]
     assert len(paths) <= 60 and sum(path.stat().st_size for path in paths) < 15e6
+
+
+def promised(readme: Path) -> list[dict[str, str]]:
+    """The settings of each run that the README names, and its line under ``line``."""
+    found = []
+    with composing() as loader:
+        for line in re.findall(r"^\w+: (\+.*)$", readme.read_text(), re.MULTILINE):
+            config = multirun(["-m", *line.split()])
+            for job in expand(config.hydra.sweeper.params or {}, config.hydra.overrides.task, loader):
+                found.append({"line": line, **dict(text.lstrip("+").split("=", 1) for text in job)})
+    return found
+
+
+def by_dotted_keys(config: dict, prefix: str = "") -> dict[str, object]:
+    """The values of a configuration."""
+    found = {}
+    for key, value in config.items():
+        found |= by_dotted_keys(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return found
+
+
+def missing(promises: list[dict[str, str]], runs) -> list[dict[str, str]]:
+    """The promises without a result."""
+    results = defaultdict(list)
+    for result in (run.result for run in runs):
+        settings = by_dotted_keys(result.config)
+        settings |= dict.fromkeys(("ablation", "deviation", "plus_ablation"), result.variant)
+        settings |= dict.fromkeys(("data.width", "data.generator.width"), result.width)
+        scene = result.scene.replace("-", "_").removeprefix("synthetic_room_")
+        settings |= {"data.path": result.scene, "scene": scene, "method": result.preset, "smallest": bool(result.smallest)}
+        for name in result.experiments:
+            results[name.partition("@")[0]].append(settings)
+    not_settings = ("line", "experiment", "sweep", "scale")
+
+    def kept(promise: dict[str, str]) -> bool:
+        wanted = {key: yaml.safe_load(text) for key, text in promise.items() if key not in not_settings}
+        if wanted.get("stress.condition") == "none":
+            wanted |= {"stress.condition": None, "stress.level": None}
+        found = results["smallest" if "smallest" in promise else promise.get("experiment") or promise["sweep"]]
+        return any(all(settings.get(key) == value for key, value in wanted.items()) for settings in found)
+
+    return [promise for promise in promises if not kept(promise)]
+
+
+def test_every_run_that_the_readme_names_is_there(measured):
+    runs, _ = store.read(measured / store.FILE_NAME)
+    promises = promised(measured / "README.md")
+    assert len(promises) > 1000
+    assert missing(promises, runs) == []
+    assert len(missing(promises, [run for run in runs if "capacity" not in run.result.experiments])) == 5
