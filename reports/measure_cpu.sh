@@ -144,7 +144,7 @@ padgs-run in $out/$step.log lists, and $out/$step.sitting, to measure it again" 
   status=0
   take "$step" || status=$?
   other=$(grep -L "\"commit\": \"$commit\"" "$out"/runs/*/result.json 2>/dev/null || true)
-  if [ -n "$other" ]; then refuse "of another commit than ${commit:0:10}, remove them:" $other; fi
+  if [ -n "$other" ]; then refuse "of another commit than ${commit:0:10}, remove them:" $(head -n 5 <<<"$other"); fi
   if [ $status -gt 1 ]; then echo "stopped; the same command resumes" >&2; exit $status; fi
   if [ $status = 0 ]; then touch "$out/$step.done"; else missing+=" $step"; fi
   total=$((total - $(commands | awk -v s="$step" '$1 == s { t += $2 * $3 } END { print t }')))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -58,7 +58,7 @@ def read(source: Path) -> tuple[list[Run], list[ResultError]]:
 
 
 def add(runs: Iterable[Run], store: Path) -> list[Run]:
-    """Add runs to a store, replacing those of the same name; return all runs in it.
+    """Add runs to a store, replacing those of the same name but for their experiments; return all runs in it.
 
     Raises:
         ResultError: a line of the store is damaged, and would be lost.
@@ -67,7 +67,13 @@ def add(runs: Iterable[Run], store: Path) -> list[Run]:
     stored, damaged = read(store) if store.exists() else ([], [])
     if damaged:
         raise damaged[0]
-    by_name = {run.result.run: run for run in (*stored, *runs)}
+    by_name: dict[str, Run] = {}
+    for run in (*stored, *runs):
+        if known := by_name.get(run.result.run):  # its tables need the run, too
+            experiments = results.joined(known.result.experiments, run.result.experiments)
+            if experiments != run.result.experiments:
+                run = replace(run, result=replace(run.result, experiments=experiments), document=None)
+        by_name[run.result.run] = run
     merged = [by_name[name] for name in sorted(by_name)]
     lines = ({**(run.document or results.encoded(run.result)), "log": run.log} for run in merged)
     texts = (json.dumps(line, separators=(",", ":"), allow_nan=False) for line in lines)

@@ -12,7 +12,7 @@ from padgs.multirun.composition import composing, configuration, multirun
 from padgs.multirun.overrides import expand
 
 SCRIPT = Path(__file__).parents[2] / "reports" / "measure_cpu.sh"
-STEPS = "A C D E F G J".split()
+STEPS = ["A", "C", "D", "E", "F", "G", "J"]
 FAKE = """#!/bin/bash
 echo "$*" >> "$CALLS"
 for setting; do case $setting in run.folder=*) runs=${setting#*=} ;; esac; done

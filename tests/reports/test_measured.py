@@ -91,7 +91,12 @@ def missing(promises: list[dict[str, str]], runs) -> list[dict[str, str]]:
         settings |= dict.fromkeys(("ablation", "deviation", "plus_ablation"), result.variant)
         settings |= dict.fromkeys(("data.width", "data.generator.width"), result.width)
         scene = result.scene.replace("-", "_").removeprefix("synthetic_room_")
-        settings |= {"data.path": result.scene, "scene": scene, "method": result.preset, "smallest": bool(result.smallest)}
+        settings |= {
+            "data.path": result.scene,
+            "scene": scene,
+            "method": result.preset,
+            "smallest": bool(result.smallest),
+        }
         for name in result.experiments:
             results[name.partition("@")[0]].append(settings)
     not_settings = ("line", "experiment", "sweep", "scale")

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import pytest
 from support.made_up import compared, small, write
@@ -71,6 +72,14 @@ def test_runs_that_are_added_twice_change_nothing_and_later_ones_join(tmp_path):
         27,
     ]
     assert set(once.splitlines()) < set(path.read_bytes().splitlines())
+
+
+def test_a_run_that_is_collected_from_two_folders_keeps_its_experiments(tmp_path):
+    path = tmp_path / "store.jsonl"
+    for name in ("capacity", "order"):
+        folder = write([replace(small(25.0), experiments=(name,))], tmp_path / name)
+        store.add(store.read(folder)[0], path)
+    assert [run.result.experiments for run in store.read(path)[0]] == [("capacity", "order")]
 
 
 def test_collected_runs_give_the_same_reports(runs, tmp_path):
