@@ -22,7 +22,7 @@ from padgs.render import RenderConfig, RenderOptions
 from padgs.render.contract import check_camera
 from padgs.render.cubemap import FACES, FINENESS
 from padgs.scene import Scene, View
-from padgs.training.corrections import GIVEN, LEARNED
+from padgs.training.corrections import GIVEN
 from padgs.training.loop import Record, Stage, Trainer
 from padgs.training.model import Model
 from padgs.training.options import Budget
@@ -74,10 +74,10 @@ class Cubemap3DGSMethod(SplatMethod):
                 f"train.weight is {self.train_options.weight}, but the rows of perspective views have no latitude; "
                 "set uniform"
             )
-        for learned in ("exposures", "poses"):
-            if getattr(self.train_options, learned) == LEARNED:
+        for learned in ("exposures", "poses", "lens"):
+            if (choice := getattr(self.train_options, learned)) != GIVEN:
                 raise ValueError(
-                    f"train.{learned} is {LEARNED}, but each of the views that are cut from one photograph would learn "
+                    f"train.{learned} is {choice}, but each of the views that are cut from one photograph would learn "
                     f"its own; leave it at {GIVEN}, or take omnigs"
                 )
         super()._refuse_impossible()

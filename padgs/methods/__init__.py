@@ -1,1 +1,1 @@
-"""Trainable models: PaD-GS (anchors), the 3DGS family (splats), padgs+ (plus), EgoNeRF, and calibration."""
+"""Trainable models: PaD-GS (anchors), the 3DGS family (splats), padgs+ (plus) and EgoNeRF."""

@@ -1,4 +1,6 @@
-"""Corrections that training learns for its views: poses and exposures. Held-out views and stored models have none.
+"""Corrections that training learns for its views: poses, exposures, and the camera that all views share.
+
+Held-out views have no correction of pose and exposure.
 
 A pose correction is a quaternion and a translation in the camera's own frame, so it turns the camera about its own
 center wherever the world's origin lies: x' = R(q) (R x + t) + scale * s. Exposures are gains and offsets per channel
@@ -8,33 +10,36 @@ views, so held-out views have the mean exposure.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 
 from padgs.gaussians import rotation_matrices
+from padgs.geometry.camera import Panorama
+from padgs.geometry.lens import AXES
 from padgs.scene import Scene, View
+from padgs.training.align import Similarity, align
+from padgs.training.lenses import ROUGHNESS_WEIGHT, CameraMap, DualLens
+from padgs.training.model import Model, TrainingRender
 from padgs.training.schedule import Constant, LogLinear, ParameterGroup
+from padgs.training.targets import Target
+
+if TYPE_CHECKING:
+    from padgs.training.options import TrainOptions
 
 
-@dataclass(frozen=True)
-class PoseRates:
-    """Learning rates of poses, log-linear over the run; defaults as published (SC-OmniGS)."""
-
-    rotation: float = 1e-2  # of unit quaternions, at the first iteration
-    rotation_end: float = 1.6e-4  # at the last iteration
-    translation: float = 1e-2  # scene scales, at the first iteration
-    translation_end: float = 6e-3  # at the last iteration
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            if not getattr(self, field.name) > 0:
-                raise ValueError(f"poses.{field.name} is {getattr(self, field.name)}; a learning rate must be > 0")
-
-
-SMALL = PoseRates(rotation=1e-3, rotation_end=1e-5, translation=2e-3, translation_end=2e-5)  # do no harm to exact poses
+GIVEN, LEARNED, LEARNED_FAST = "given", "learned", "learned_fast"
+CHOICES = (GIVEN, LEARNED)  # of exposures
+# Learning rates of poses at the first and the last iteration: of unit quaternions, and of translations in scene scales.
+POSE_RATES = {
+    LEARNED: ((1e-3, 1e-5), (2e-3, 2e-5)),  # do no harm to exact poses
+    LEARNED_FAST: ((1e-2, 1.6e-4), (1e-2, 6e-3)),  # as published (SC-OmniGS)
+}
+MAP, FISHEYES = "map", "fisheyes_"
+LENSES = (GIVEN, MAP, *(FISHEYES + axis for axis in AXES))
 
 
 class PoseRefinement(nn.Module):
@@ -47,10 +52,11 @@ class PoseRefinement(nn.Module):
         given: [V, 4, 4] float64 cam_from_world before the correction.
         quaternions: V times [4] (w, x, y, z), not normalised.
         shifts: V times [3], camera frame, scene scales.
-        scale: scene scale in world units.
+        scale: [] scene scale in world units.
     """
 
     given: Tensor
+    scale: Tensor
 
     def __init__(self, names: Sequence[str], given: Tensor, *, scale: float = 1.0) -> None:
         """Begin without corrections; `given` is [V, 4, 4] cam_from_world. Two views of one name are a ValueError."""
@@ -58,8 +64,9 @@ class PoseRefinement(nn.Module):
         twice = sorted({name for name in names if list(names).count(name) > 1})
         if twice:
             raise ValueError(f"several training views are called {twice[0]!r}; poses are kept by name, rename them")
-        self.names, self.scale = list(names), scale
+        self.names = list(names)
         self.register_buffer("given", given.double())
+        self.register_buffer("scale", torch.tensor(scale, dtype=torch.float64))
         identity = torch.tensor([1.0, 0.0, 0.0, 0.0])
         self.quaternions = nn.ParameterList([identity.clone() for _ in names])
         self.shifts = nn.ParameterList([torch.zeros(3) for _ in names])
@@ -69,10 +76,22 @@ class PoseRefinement(nn.Module):
         """Return the refinement of these views."""
         return cls([view.name for view in views], torch.stack([view.cam_from_world for view in views]), scale=scale)
 
-    def groups(self, rates: PoseRates, iterations: int) -> list[ParameterGroup]:
-        """Return the parameters with their learning rates in a run of `iterations`."""
-        turning = LogLinear(rates.rotation, rates.rotation_end, iterations)
-        moving = LogLinear(rates.translation, rates.translation_end, iterations)
+    @classmethod
+    def restored(cls, tensors: Mapping[str, Tensor]) -> PoseRefinement:
+        """Return the refinement of a `state_dict`, which has no names of views."""
+        names = [str(number) for number in range(len(tensors["given"]))]
+        poses = cls(names, tensors["given"]).to(tensors["given"].device)
+        poses.load_state_dict(tensors)
+        return poses
+
+    @torch.no_grad()
+    def world(self) -> Similarity:
+        """Return the similarity refined_from_given of all cameras."""
+        return align(self.poses(), self.given)[0]
+
+    def groups(self, choice: str, iterations: int) -> list[ParameterGroup]:
+        """Return the parameters with their `POSE_RATES` in a run of `iterations`."""
+        turning, moving = (LogLinear(*ends, iterations) for ends in POSE_RATES[choice])
         return [
             ParameterGroup("pose_quaternions", tuple(self.quaternions), turning, paced=False),
             ParameterGroup("pose_shifts", tuple(self.shifts), moving, paced=False),
@@ -82,7 +101,10 @@ class PoseRefinement(nn.Module):
         """Return the view at its corrected pose; differentiable. A view without a correction is a ValueError."""
         if view.name not in self.names:
             raise ValueError(f"view {view.name!r} has no pose to refine; known: {', '.join(self.names)}")
-        return replace(view, cam_from_world=self._pose(self.names.index(view.name)))
+        index = self.names.index(view.name)
+        shift = self.scale * self.shifts[index].double()
+        pose = _corrected(self.given[index], self.quaternions[index].double(), shift)
+        return replace(view, cam_from_world=pose)
 
     @torch.no_grad()
     def center(self) -> None:
@@ -109,13 +131,23 @@ class PoseRefinement(nn.Module):
     @torch.no_grad()
     def poses(self) -> Tensor:
         """Return all corrected poses, cam_from_world [V, 4, 4] float64."""
-        return torch.stack([self._pose(index) for index in range(len(self.names))])
+        quaternions, shifts = (torch.stack(list(own)).double() for own in (self.quaternions, self.shifts))
+        return _corrected(self.given, quaternions, self.scale * shifts)
 
-    def _pose(self, index: int) -> Tensor:
-        turn, given = rotation_matrices(self.quaternions[index].double()), self.given[index]
-        upper = turn @ given[:3]
-        shift = self.scale * self.shifts[index].double()
-        return torch.cat((torch.cat((upper[:, :3], upper[:, 3:] + shift[:, None]), dim=1), given[3:]))
+    @torch.no_grad()
+    def summary(self) -> str:
+        """Return the median correction as a sentence, without a similarity of the whole world."""
+        left = align(self.poses(), self.given)[1]
+        return (
+            f"poses moved by {left.distance.median():.3g} world units and {left.degrees.median():.3g} degrees (median)"
+        )
+
+
+def _corrected(given: Tensor, quaternions: Tensor, shifts: Tensor) -> Tensor:
+    """Return poses [..., 4, 4] turned by quaternions [..., 4] and shifted by shifts [..., 3], world units."""
+    upper = rotation_matrices(quaternions) @ given[..., :3, :]
+    upper = torch.cat((upper[..., :3], upper[..., 3:] + shifts[..., None]), dim=-1)
+    return torch.cat((upper, given[..., 3:, :]), dim=-2)
 
 
 def _each(rotations: Tensor, vectors: Tensor) -> Tensor:
@@ -125,25 +157,45 @@ def _each(rotations: Tensor, vectors: Tensor) -> Tensor:
 
 RATE = 3e-3  # of log-gains; it does not decay, because exposures that freeze early are wrong
 OFFSET_RATE = RATE / 5  # of offsets, in colours from 0 to 1
-GIVEN, LEARNED = "given", "learned"
-CHOICES = (GIVEN, LEARNED)  # of exposures, and of poses
 
 
 class Corrections(nn.Module):
     """Corrections of the training views of a scene; no parameters if nothing is corrected.
 
     Attributes:
-        poses: corrections of the poses; None if they are not learned.
+        poses, lens: corrections of the poses, and the camera of all views; None if not learned.
         log_gains, offsets: V times [3] for each colour channel, a parameter per view as for poses; empty if exposures
             are not learned.
     """
 
-    def __init__(self, scene: Scene, *, exposures: bool, poses: bool) -> None:
-        """Begin without corrections; learned poses of two views of one name are a ValueError."""
+    def __init__(self, scene: Scene, options: TrainOptions) -> None:
+        """Begin without corrections.
+
+        Raises:
+            ValueError: poses are learned, but two views have the same name, or all stand in one place; a lens is
+                learned, but of no panorama.
+        """
         super().__init__()
-        views = len(scene.train) if exposures else 0
+        if options.poses == LEARNED_FAST and scene.has_single_center:
+            raise ValueError(
+                f"the {len(scene.train)} training cameras of scene {scene.name!r} stand in one place, which has no "
+                f"scale to carry held-out views by; set train.poses={LEARNED} or {GIVEN}"
+            )
+        self._options = options
+        views = len(scene.train) if options.exposures == LEARNED else 0
         self.log_gains, self.offsets = (nn.ParameterList([torch.zeros(3) for _ in range(views)]) for _ in range(2))
-        self.poses = PoseRefinement.of(scene.train, scale=scene.scale) if poses else None
+        self.poses = None if options.poses == GIVEN else PoseRefinement.of(scene.train, scale=scene.scale)
+        self.lens: CameraMap | DualLens | None = None
+        if options.lens != GIVEN:
+            for view in scene.train:
+                if not isinstance(view.camera, Panorama):
+                    kind = type(view.camera).__name__
+                    raise ValueError(
+                        f"train.lens is {options.lens}, but view {view.name!r} is a {kind}, not a Panorama; set given"
+                    )
+            first, axis = scene.train[0], options.lens.removeprefix(FISHEYES)
+            is_map = options.lens == MAP
+            self.lens = CameraMap(first.width, first.height) if is_map else DualLens(axis, scene_scale=scene.scale)
 
     def groups(self, iterations: int) -> list[ParameterGroup]:
         """Return all parameters with their learning rates in a run of `iterations`; exposures follow its pace."""
@@ -151,12 +203,24 @@ class Corrections(nn.Module):
             ParameterGroup("exposure_log_gains", tuple(self.log_gains), Constant(RATE)),
             ParameterGroup("exposure_offsets", tuple(self.offsets), Constant(OFFSET_RATE)),
         ]
-        poses = self.poses.groups(SMALL, iterations) if self.poses else []
-        return (exposures if self.log_gains else []) + poses
+        groups = exposures if self.log_gains else []
+        groups += [] if self.poses is None else self.poses.groups(self._options.poses, iterations)
+        return groups + ([] if self.lens is None else self.lens.groups(iterations))
 
-    def posed(self, view: View) -> View:
-        """Return a training view at its corrected pose; differentiable."""
-        return self.poses.refined(view) if self.poses else view
+    def draw(self, model: Model, view: View) -> TrainingRender:
+        """Render a training view at its corrected pose and through its lenses; differentiable."""
+        view = view if self.poses is None else self.poses.refined(view)
+        if isinstance(self.lens, DualLens):
+            return self.lens.draw(model.draw, view)
+        drawing = model.draw(view)
+        if self.lens is None:
+            return drawing
+        rough = ROUGHNESS_WEIGHT * self.lens.roughness()
+        return replace(drawing, penalty=rough if drawing.penalty is None else drawing.penalty + rough)
+
+    def undistorted(self, view: View, target: Target) -> Target:
+        """Return the target of a training view as an ideal camera would take it; differentiable."""
+        return self.lens.undistorted(view, target, self._options.weight) if isinstance(self.lens, CameraMap) else target
 
     def exposed(self, image: Tensor, index: int) -> Tensor:
         """Return the render [H, W, 3] of training view `index` under its exposure; differentiable."""
@@ -169,5 +233,9 @@ class Corrections(nn.Module):
             mean = torch.stack(list(of_views)).mean(0) if of_views else 0
             for own in of_views:
                 own -= mean
-        if self.poses:
+        if self.poses is not None and self._options.poses == LEARNED:
             self.poses.center()
+
+    def summary(self) -> tuple[str, ...]:
+        """Return the results as sentences."""
+        return tuple(part.summary() for part in (self.poses, self.lens) if part is not None)

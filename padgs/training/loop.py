@@ -11,7 +11,7 @@ from torch import Tensor
 
 from padgs.clock import Lap
 from padgs.scene import Scene
-from padgs.training.corrections import LEARNED, Corrections
+from padgs.training.corrections import Corrections
 from padgs.training.health import EarlyStopping, Failure, Guard, Monitor, out_of_memory_as_failure
 from padgs.training.model import MODEL, Model, Record, State
 from padgs.training.optimizer import Optimizer
@@ -33,7 +33,7 @@ class Trainer:
         step_seconds: duration of the last iteration, on the clock of the budget.
         start: number of Gaussians, anchors or other parts at the beginning.
         skipped, ended: schedule steps that `request_stop` skipped, and its reason.
-        corrections: learned exposures and poses of the training views.
+        corrections: learned exposures, poses and lens of the training views.
 
     `state`, taken between two records, holds all that `load_state` needs to resume bit-identically (on the CPU).
     """
@@ -67,7 +67,7 @@ class Trainer:
         self.start = next(iter(model.counts().values()))
         self._model, self._budget, self._options, self._stage = model, budget, options, stage
         self._views_each = views_each
-        self.corrections = Corrections(scene, exposures=options.exposures == LEARNED, poses=options.poses == LEARNED)
+        self.corrections = Corrections(scene, options)
         groups = model.groups()
         self.corrections.to(groups[0].parameters[0].device)
         groups = [*groups, *self.corrections.groups(budget.iterations)]
@@ -138,13 +138,13 @@ class Trainer:
             with stage("target"):
                 index, view, target = self._views.next(step / self.schedule)
             with stage("draw"):
-                rendered = model.draw(self.corrections.posed(view))
+                rendered = self.corrections.draw(model, view)
                 image = self.corrections.exposed(rendered.rendering.image, index)
             if len(rendered.gaussians) == 0:
                 optimizer.refuse_non_finite(optimizer.parameters(), iteration)  # NaN parameters draw nothing either
                 raise Failure("collapsed", f"no Gaussian is left to draw at iteration {iteration}")
             with stage("loss"):
-                target = target if rendered.photo is None else rendered.photo(target)
+                target = self.corrections.undistorted(view, target)
                 loss = target.loss(image, options.lambda_l1, options.normalisation)
                 loss = loss if rendered.penalty is None else loss + rendered.penalty
                 losses.append(optimizer.read(loss, {**vars(rendered.gaussians), "image": image}, iteration))
@@ -175,7 +175,8 @@ class Trainer:
         with self._stage("adapt"), torch.no_grad():
             passed = range(self.step + 1, step + 1)  # each schedule step densifies once
             events = tuple(event for one in passed for event in self._model.adapt(one, optimizer.adam))
-        return events + (self._guard.report(iteration) if optimizer.is_checked(iteration) or step == length else ())
+        events += self._guard.report(iteration) if optimizer.is_checked(iteration) or step == length else ()
+        return events + (self.corrections.summary() if step == length else ())
 
     def state(self) -> State:
         """Copy model, optimizer, statistics, random state and data order; to be taken between two records."""

@@ -14,12 +14,14 @@ from typing import Any, ClassVar
 
 import torch
 
-from padgs.geometry.camera import Panorama
+from padgs.geometry.camera import Panorama, RayTable
 from padgs.render import RenderConfig, Rendering
 from padgs.render.contract import check_camera
 from padgs.scene import Scene, View
-from padgs.training.corrections import LEARNED
+from padgs.training.align import Similarity
+from padgs.training.corrections import FISHEYES, GIVEN, LEARNED_FAST, PoseRefinement
 from padgs.training.health import held_out, is_out_of_memory
+from padgs.training.lenses import CameraMap
 from padgs.training.loop import VIEWS, Stage, Trainer
 from padgs.training.model import Model, Prunable, Record, Refined, Size, State
 from padgs.training.options import Budget, TrainOptions
@@ -49,6 +51,8 @@ class Method(ABC):
         self.render_config, self.train_options = render or self.RENDER, train or self.TRAIN
         self._model: Model | None = None
         self._trainer: Trainer | None = None
+        self._camera: CameraMap | None = None  # that took all photographs, if it is learned
+        self._poses: PoseRefinement | None = None  # of training views, if held-out views follow them
         self._loaded_state: State | None = None
         self._warm_start_state: State | None = None
         self._gaussians: int | str | None = None  # `Budget.gaussians` of `fit`
@@ -105,11 +109,15 @@ class Method(ABC):
         self._trainer.seconds += spent[0]
         self._trainer.cpu_seconds += spent[1]
         if self._warm_start_state is not None:
-            corrections = self._warm_start_state.under(VIEWS)
-            self._trainer.corrections.load_state_dict(corrections, strict=False)
+            stored, own = self._warm_start_state.under(VIEWS), self._trainer.corrections.state_dict()
+            if all(tensor.shape == stored[name].shape for name, tensor in own.items() if name in stored):
+                self._trainer.corrections.load_state_dict(stored, strict=False)
         if self._loaded_state is not None:
             self._trainer.load_state(self._loaded_state)
             self._loaded_state = None
+        corrections = self._trainer.corrections
+        self._camera = corrections.lens if isinstance(corrections.lens, CameraMap) else None
+        self._poses = corrections.poses if self.train_options.poses == LEARNED_FAST else None
         return self._trainer.records()
 
     def warm_start(self, state: State) -> None:
@@ -143,12 +151,21 @@ class Method(ABC):
         return self._model
 
     def render(self, view: View) -> Rendering:
-        """Render a view without gradients."""
-        return self.model.render(view)
+        """Render a view of the given world without gradients; a panorama as the learned camera would take it."""
+        if (world := self.world) is not None:
+            view = view.at(world.pose(view.cam_from_world))
+        rendering = self.model.render(view)
+        if self._camera is None or not isinstance(view.camera, Panorama):
+            return rendering
+        return self._camera.photographed(rendering)
 
     def size(self) -> Size:
-        """Return counts and bytes of the model."""
-        return self.model.size()
+        """Return counts and bytes of the model, with a learned camera."""
+        size = self.model.size()
+        if self._camera is None:
+            return size
+        camera = Size.of({}, self._camera.parameters(), stored=self._camera.parameters())
+        return Size(size.counts, size.parameters + camera.parameters, size.bytes + camera.bytes)
 
     def state(self) -> State:
         """Return model, optimizer, statistics, random state and data order."""
@@ -162,6 +179,9 @@ class Method(ABC):
         """Load a state of this method; `render` works at once, `fit` resumes training."""
         self._model = self.restore(state)
         self._model.load_state(state.of_model())
+        lens, poses = (state.under(f"{VIEWS}{part}.") for part in ("lens", "poses"))
+        self._camera = CameraMap.restored(lens) if "offsets" in lens else None
+        self._poses = PoseRefinement.restored(poses) if self.train_options.poses == LEARNED_FAST else None
         self._trainer, self._loaded_state = None, state
 
     def with_renderer(self, render: RenderConfig) -> Method:
@@ -175,6 +195,11 @@ class Method(ABC):
     def has_smoothing_filter(self) -> bool:
         """True if renders stay as smooth as those of the training views, whatever the pixels of a view."""
         return False
+
+    @property
+    def world(self) -> Similarity | None:
+        """Similarity model_from_given of the world, if held-out views follow learned poses."""
+        return None if self._poses is None else self._poses.world()
 
     def refuse_budget(self, budget: Budget) -> None:
         """Refuse a budget that this method cannot train within on any scene; subclasses add checks."""
@@ -195,11 +220,14 @@ class Method(ABC):
     def _refuse_impossible(self) -> None:
         """Refuse options with which no scene can be trained or rendered; subclasses add checks."""
         check_camera(Panorama(8, 4), self.render_config.options(scene_scale=1.0))
+        if self.train_options.lens.startswith(FISHEYES):
+            check_camera(RayTable(torch.zeros(1, 1, 3), focal=1.0), self.render_config.options(scene_scale=1.0))
 
     @property
     def _views_learn(self) -> bool:
-        """True if exposures or poses of single views are learned; held-out views have none then."""
-        return LEARNED in (self.train_options.exposures, self.train_options.poses)
+        """True if exposures, poses or a lens are learned; held-out views have none then."""
+        options = self.train_options
+        return not options.exposures == options.poses == options.lens == GIVEN
 
     def _initial_model(self, scene: Scene, iterations: int) -> Model:
         """Return `build_model`, with the parameters of the warm start if there is one, pruned to the budget."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -13,9 +13,6 @@ from padgs.gaussians import Gaussians
 from padgs.render import Rendering, RenderOptions
 from padgs.scene import View
 from padgs.training.schedule import Pace, ParameterGroup
-
-if TYPE_CHECKING:
-    from padgs.training.targets import Target
 
 REPLAYED = 0.2  # share of a schedule, at its end, whose learning rates a refinement goes through
 MODEL = "model/"  # prefix of the model's own tensors in the state of a trainer
@@ -61,7 +58,6 @@ class TrainingRender:
     slots: Tensor  # [N] int64: row of the model's statistics for each drawn Gaussian
     _: KW_ONLY
     penalty: Tensor | None = None  # scalar, added to the loss
-    photo: Callable[[Target], Target] | None = None  # warps the target to the pose of the render; differentiable
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from padgs.checks import check, check_known
-from padgs.training.corrections import CHOICES, GIVEN
+from padgs.training.corrections import CHOICES, GIVEN, LENSES, POSE_RATES
 from padgs.training.loss import NORMALISATIONS, ROW_WEIGHTS
 from padgs.training.schedule import LEARNING_RATES
 
@@ -83,13 +83,19 @@ class TrainOptions:
     guard_gradients: bool = False  # set non-finite gradients of single rows to 0; see `padgs.training.health.Guard`
     guard_scales: bool = False  # keep scales within bounds; see `padgs.training.health.Guard`
     exposures: str = GIVEN  # learned: gain and offset of each training view; test views have the mean one
-    poses: str = GIVEN  # learned: a small correction of each training view; test views keep theirs
+    # learned: a small correction of each training view; test views keep theirs. learned_fast: at rates of SC-OmniGS,
+    # and test views follow the training views by a similarity.
+    poses: str = GIVEN
+    # Of all panoramas. map: a small distortion, a free map of directions (SC-OmniGS). fisheyes_x, _y, _z: two fisheye
+    # lenses apart along an axis of the camera, stitched as one; test views have one centre (Seam360GS).
+    lens: str = GIVEN
     refine: bool = False  # with init: neither densify nor prune; learning rates are those of the schedule's last fifth
     hold_out: bool = False  # train without the validation views, see `padgs.training.health`
 
     def __post_init__(self) -> None:
         check(self, "in [0, 1]", lambda share: 0 <= share <= 1, "lambda_l1")
-        check_known(self, weight=ROW_WEIGHTS, normalisation=NORMALISATIONS, exposures=CHOICES, poses=CHOICES)
+        check_known(self, weight=ROW_WEIGHTS, normalisation=NORMALISATIONS, exposures=CHOICES)
+        check_known(self, poses=(GIVEN, *POSE_RATES), lens=LENSES)
         if isinstance(self.learning_rates, str):
             check_known(self, learning_rates=LEARNING_RATES)
         else:

@@ -124,7 +124,10 @@ def test_going_on_changes_nothing():
     [
         (("train.exposures=some",), "unknown exposures 'some'; known: given, learned"),
         (("method=egonerf", "train.exposures=learned"), "so train.exposures=learned does not apply"),
-        (("method=sc_omnigs", "train.poses=learned"), "refines poses itself"),
+        (("train.lens=fisheyes_w",), "unknown lens 'fisheyes_w'; known: given, map, fisheyes_x"),
+        (("method=omnigs", "train.lens=fisheyes_z"), "requires a Panorama camera, not a RayTable"),
+        (("method=padgs_ray", "train.lens=fisheyes_z"), "PaD-GS decodes others for each"),
+        (("method=cubemap_3dgs", "train.lens=map"), "train.lens is map, but each of the views"),
         (
             ("method=egonerf", "method.environment_pretraining=7", "train.iterations=7"),
             "environment_pretraining is 7 of 7 iterations",

@@ -5,9 +5,10 @@ import pytest
 import torch
 from support.tiny_scene import tiny_scene, truth
 
-from padgs.methods.calibration.align import align
 from padgs.render import RenderOptions, render
-from padgs.training.corrections import PoseRefinement
+from padgs.training.align import Similarity, align
+from padgs.training.corrections import Corrections, PoseRefinement
+from padgs.training.options import TrainOptions
 
 VIEWS = tiny_scene().train
 
@@ -110,3 +111,23 @@ def test_names_decide():
         refinement().refined(replace(VIEWS[0], name="x"))
     with pytest.raises(ValueError, match="several training views are called '00'"):
         PoseRefinement.of([VIEWS[0], VIEWS[0]], scale=1.0)
+
+
+def test_alignment_finds_a_similarity_and_maps_poses_by_it(generator):
+    """Poses moved by a similarity: a point of the given world lands where the moved cameras say, exactly."""
+    turn = torch.tensor([[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]], dtype=torch.float64)
+    similarity = Similarity(1.7, turn, torch.randn(3, generator=generator, dtype=torch.float64))
+    given = torch.stack([view.cam_from_world for view in VIEWS])
+    found, left = align(torch.stack([similarity.pose(pose) for pose in given]), given)
+    assert found.scale == pytest.approx(1.7) and left.distance.max() < 1e-9 and left.degrees.max() < 1e-6
+    point = torch.randn(3, generator=generator, dtype=torch.float64)
+    torch.testing.assert_close(found.inverse()(found(point)), point)
+    for pose in given:
+        before, mapped = pose[:3, :3] @ point + pose[:3, 3], found.pose(pose)
+        torch.testing.assert_close(mapped[:3, :3] @ found(point) + mapped[:3, 3], 1.7 * before)
+
+
+def test_views_in_one_place_have_no_scale_to_follow():
+    views = tuple(replace(view, cam_from_world=torch.eye(4, dtype=torch.float64)) for view in VIEWS)
+    with pytest.raises(ValueError, match="the 5 training cameras of scene .* stand in one place, which has no scale"):
+        Corrections(replace(tiny_scene(), train=views), TrainOptions(poses="learned_fast"))

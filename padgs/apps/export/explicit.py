@@ -10,20 +10,19 @@ from torch import Tensor
 
 import padgs
 from padgs.apps.export.bake import bake, distill, sample_cameras
-from padgs.baselines.sc_omnigs import SCOmniGSMethod, aligned
 from padgs.data.camera_paths import gravity
 from padgs.data.capture import Cloud, DataError
 from padgs.evaluation.evaluate import evaluate
 from padgs.evaluation.protocols import PROTOCOLS
 from padgs.geometry import harmonics
 from padgs.methods.anchors.model import AnchorModel
-from padgs.methods.calibration.align import Similarity
 from padgs.methods.splats.model import SplatModel
 from padgs.methods.splats.smoothing_filter import cameras_of, smoothed
 from padgs.methods.splats.splats import Splats
 from padgs.render import Rendering, render
 from padgs.runs.load import LoadedRun
 from padgs.scene import View
+from padgs.training.align import Similarity
 
 DISTILLATION_STEPS = 300
 MIN_POINT_OPACITY = 0.5  # of Gaussians that are exported as points
@@ -66,8 +65,8 @@ def export_run(
     notes = [f"padgs {padgs.__version__}, run {run.folder.name}"]
     if isinstance(model, SplatModel):
         splats = model.baked()
-        if isinstance(run.method, SCOmniGSMethod):  # trained in the world of its refined poses
-            splats = transform_splats(splats, aligned(run.method.model.calibration.poses)[0].inverse())
+        if (world := run.method.world) is not None:
+            splats = transform_splats(splats, world.inverse())
         notes.append("Gaussians as trained")
         if smooth and config.low_pass > 0 and config.resolved_low_pass_kind == "solid":
             splats = smoothed(splats, cameras_of(run.scene.train), config.low_pass)

@@ -14,6 +14,7 @@ from padgs.methods.anchors.anchors import PaDGS, PaDGSOptions
 from padgs.methods.anchors.growth import GrowthOptions
 from padgs.methods.anchors.model import AnchorModel, LearningRates
 from padgs.scene import Scene
+from padgs.training.corrections import FISHEYES
 from padgs.training.loop import Record, Stage
 from padgs.training.method import Method
 from padgs.training.model import State
@@ -54,6 +55,14 @@ class PaDGSMethod(Method):
         """See `Method.load_state`."""
         self._scene_scale = state.values["scene_scale"]
         super().load_state(state)
+
+    def _refuse_impossible(self) -> None:
+        super()._refuse_impossible()
+        if self.train_options.lens.startswith(FISHEYES):
+            raise ValueError(
+                f"train.lens is {self.train_options.lens}, which renders the same Gaussians from two places, but "
+                "PaD-GS decodes others for each; set given or map, or take a method with explicit Gaussians"
+            )
 
     def refuse_budget(self, budget: Budget) -> None:
         """Refuse a budget without a number: `budget.gaussians` counts anchors here."""

@@ -15,14 +15,13 @@ from typer.testing import CliRunner
 import padgs
 from padgs.apps.export.explicit import export_run, harmonics_rotation, transform_splats, upright_rotation
 from padgs.apps.export.splat_file import read_splats
-from padgs.baselines.sc_omnigs import aligned, mapped_pose
 from padgs.cli.commands import app
 from padgs.data.cloud import read_ply
 from padgs.evaluation.evaluate import evaluate
 from padgs.evaluation.protocols import protocol_from_options
 from padgs.geometry import harmonics
-from padgs.methods.calibration.align import Similarity
 from padgs.render import RenderOptions, render
+from padgs.training.align import Similarity
 
 RULES = protocol_from_options("sphere", lpips="none", metrics=["ws_psnr"])
 
@@ -75,12 +74,12 @@ def test_smooth_includes_the_3d_smoothing_filter(splat_run, tmp_path):
 
 def test_refined_poses_are_aligned_with_the_scene(tmp_path_factory):
     run = padgs.load_run(tiny_run(tmp_path_factory, "method=sc_omnigs", "data.generator.train_views=4"))
-    poses = run.method.model.calibration.poses
+    poses = run.method._poses
     with torch.no_grad():
         for correction in poses.parameters():
             correction += 0.02 * torch.randn(correction.shape, generator=torch.Generator().manual_seed(1))
     splats, view = export_run(run).splats, run.scene.test[0]
-    mapped_view = view.at(mapped_pose(view.cam_from_world, aligned(poses)[0]))
+    mapped_view = view.at(run.method.world.pose(view.cam_from_world))
     options = run.config.render.options(run.scene.scale)
     own = run.method.model.render(mapped_view).image
     assert torch.allclose(render(splats.gaussians(view), view, options).image, own, atol=0.02)

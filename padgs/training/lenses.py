@@ -3,27 +3,30 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import lru_cache
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import normalize
+from torch.nn.functional import interpolate, normalize
 
 from padgs.geometry.camera import Panorama, RayTable
 from padgs.geometry.distortion import solid_angle_weight
 from padgs.geometry.lens import axis_direction, bend, check_blend, hemisphere_weight
 from padgs.geometry.panorama import project, rays, sample_pixels
-from padgs.methods.calibration.model import Calibration
 from padgs.render import Rendering
 from padgs.render.cubemap import SummedCounters
 from padgs.scene import View
+from padgs.training.loss import pixel_weight
 from padgs.training.model import TrainingRender
-from padgs.training.schedule import LogLinear, ParameterGroup
+from padgs.training.schedule import Constant, LogLinear, ParameterGroup
+from padgs.training.targets import Target
 
+MAP_RATE = 1e-5  # learning rate of a camera map, radians
+ROUGHNESS_WEIGHT = 1e-2  # loss weight of its total variation per radian
 INVERSE_STEPS = 8  # of a fixed-point iteration; each multiplies the error by about the derivative of D
-DECAY = 0.1  # learning rates of lenses decay to this share over a run
+LENS_RATE, DECAY = 1e-3, 0.1  # learning rate of gap (scene units) and coefficients; decays to this share over a run
 
 
 class CameraMap(nn.Module):
@@ -59,6 +62,50 @@ class CameraMap(nn.Module):
         )
         # The same arithmetic as below, so that an ideal camera moves no pixel by a bit.
         self.register_buffer("_pixels", project(normalize(directions, dim=-1), width, height), persistent=False)
+        self._inverse: tuple[Tensor, Tensor] | None = None  # `directions`, and `ideal_pixels` for them
+
+    @classmethod
+    def restored(cls, tensors: Mapping[str, Tensor]) -> CameraMap:
+        """Return the camera of a `state_dict`."""
+        height, width, _ = tensors["offsets"].shape
+        camera = cls(width, height).to(tensors["offsets"].device)
+        camera.load_state_dict(tensors)
+        return camera
+
+    def groups(self, iterations: int) -> list[ParameterGroup]:
+        """Return the learning rates, which are constant."""
+        return [
+            ParameterGroup("camera_focal", (self.focal,), Constant(MAP_RATE), paced=False),
+            ParameterGroup("camera_offsets", (self.offsets,), Constant(MAP_RATE), paced=False),
+        ]
+
+    def undistorted(self, view: View, target: Target, weight: str) -> Target:
+        """Return a training image and its mask as an ideal camera would take them; differentiable.
+
+        `weight` is a name of `padgs.training.loss.ROW_WEIGHTS`.
+        """
+        pixels = self._resized(self.source_pixels(), view.width, view.height)
+        mask = view.mask(device=pixels.device)
+        if mask is None:
+            return Target(sample_pixels(target.image, pixels), target.weight)
+        mask = mask[..., None]
+        layers = sample_pixels(torch.cat((target.image, target.image * mask, mask), dim=-1), pixels)
+        plain, kept, share = layers.split((3, 3, 1), dim=-1)
+        # Weighted by the mask, so that ignored pixels do not bleed into their neighbours.
+        image = torch.where(share > 0, kept / share.clamp(min=1e-6), plain)
+        return Target(image, pixel_weight(weight, view.height, share[..., 0].detach(), device=mask.device))
+
+    @torch.no_grad()
+    def photographed(self, ideal: Rendering) -> Rendering:
+        """Return a rendered panorama as this camera would take it."""
+        directions = self.directions()
+        if self._inverse is None or not torch.equal(self._inverse[0], directions):
+            self._inverse = directions, self.ideal_pixels()
+        height, width = ideal.depth.shape
+        layers = torch.cat((ideal.image, ideal.transmittance[..., None], ideal.depth[..., None]), dim=-1)
+        layers = sample_pixels(layers, self._resized(self._inverse[1], width, height))
+        image, transmittance, depth = layers.split((3, 1, 1), dim=-1)
+        return replace(ideal, image=image, transmittance=transmittance[..., 0], depth=depth[..., 0])
 
     def directions(self) -> Tensor:
         """Return unit directions [H, W, 3] in the image for each pixel of the ideal panorama."""
@@ -90,6 +137,20 @@ class CameraMap(nn.Module):
         weight = self._weight[:, 0, 0]
         return across + (down * (weight[1:] + weight[:-1]) / 2).sum()  # a step is between two rows
 
+    def summary(self) -> str:
+        """Return the result as a sentence."""
+        moved = (self.source_pixels() - self._centers).norm(dim=-1).mean()
+        return f"camera map moves pixels by {moved:.3g} on average"
+
+    def _resized(self, pixels: Tensor, width: int, height: int) -> Tensor:
+        """Return places (u, v) [H, W, 2] in an image of another size; both of the same camera."""
+        if (width, height) == (self.width, self.height):
+            return pixels
+        moved = (pixels - self._centers).permute(2, 0, 1)[None]
+        moved = interpolate(moved, (height, width), mode="bilinear")[0].permute(1, 2, 0) * (width / self.width)
+        columns, rows = (torch.arange(n, dtype=moved.dtype, device=moved.device) + 0.5 for n in (width, height))
+        return moved + torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)
+
     def _free_offsets(self) -> Tensor:
         """Return D without its mean rotation, which poses can express as well."""
         turn = 1.5 * (self._weight * torch.linalg.cross(self._rays, self.offsets)).mean(1).sum(0)
@@ -102,7 +163,7 @@ class CameraMap(nn.Module):
         return self._centers + moved - torch.stack((turns * self.width, torch.zeros_like(turns)), dim=-1)
 
 
-class DualLens(Calibration):
+class DualLens(nn.Module):
     """Two fisheye lenses at centre +- (gap / 2) axis, along +- axis, stitched as if they had one centre.
 
     The stitching causes parallax at the seam between the lenses. Here that camera is differentiable: two views with
@@ -119,54 +180,29 @@ class DualLens(Calibration):
 
     axis: Tensor
 
-    def __init__(
-        self,
-        *,
-        axis: str = "z",
-        order: int = 2,
-        blend: float = 5.0,
-        scene_scale: float = 1.0,
-        gap_rate: float = 1e-3,
-        coefficient_rate: float = 1e-3,
-    ) -> None:
-        """Build the ideal camera: no gap, no bending.
-
-        Args:
-            axis: x, y or z.
-            order: number K of coefficients per lens.
-            blend: degrees.
-            scene_scale: world units.
-            gap_rate: initial learning rate, scene units; it decays by `DECAY` over a run.
-            coefficient_rate: initial learning rate of the coefficients.
+    def __init__(self, axis: str = "z", *, order: int = 2, blend: float = 5.0, scene_scale: float = 1.0) -> None:
+        """Build the ideal camera, without gap and bending; `order` is the number K of coefficients, `blend` in degrees.
 
         Raises:
-            ValueError: unknown axis, or an invalid band or order.
+            ValueError: unknown axis, or an invalid band.
         """
         super().__init__()
-        if order < 1:
-            raise ValueError(f"the radial map has {order} coefficients; it must have at least 1")
         self.gap = nn.Parameter(torch.zeros(()))
         self.coefficients = nn.Parameter(torch.zeros(2, order))
         self.register_buffer("axis", axis_direction(axis), persistent=False)
         self.blend, self.scene_scale, self._axis_name = check_blend(blend), scene_scale, axis
-        self._rates = (gap_rate, coefficient_rate)
 
     def groups(self, iterations: int) -> list[ParameterGroup]:
         """Return the learning rates for a run of `iterations`."""
-        gap, coefficients = (LogLinear(rate, DECAY * rate, iterations) for rate in self._rates)
+        rate = LogLinear(LENS_RATE, DECAY * LENS_RATE, iterations)
         return [
-            ParameterGroup("lens_gap", (self.gap,), gap, paced=False),
-            ParameterGroup("lens_coefficients", (self.coefficients,), coefficients, paced=False),
+            ParameterGroup("lens_gap", (self.gap,), rate, paced=False),
+            ParameterGroup("lens_coefficients", (self.coefficients,), rate, paced=False),
         ]
 
     def lenses(self, view: View) -> tuple[View, View]:
-        """Return the views of both lenses on all pixels of a panorama; differentiable by gap and coefficients.
-
-        Raises:
-            ValueError: the view is no panorama.
-        """
-        if not isinstance(view.camera, Panorama):
-            raise ValueError(f"view {view.name!r} is a {type(view.camera).__name__}; two lenses make a Panorama")
+        """Return the views of both lenses on all pixels of a panorama; differentiable by gap and coefficients."""
+        assert isinstance(view.camera, Panorama)
         focal = view.camera.focal
         rays, weight = _sphere(view.camera, self._axis_name, self.blend, self.gap.device)
         given = view.cam_from_world.to(self.gap.device)
@@ -190,14 +226,6 @@ class DualLens(Calibration):
         assert isinstance(view.camera, Panorama)
         _, weight = _sphere(view.camera, self._axis_name, self.blend, self.gap.device)
         return replace(front, rendering=stitched(front.rendering, back.rendering, weight))
-
-    def counts(self) -> dict[str, int]:
-        """Return the number of lenses."""
-        return {"lenses": len(self.coefficients)}
-
-    def values(self) -> dict[str, float]:
-        """Return the scene scale."""
-        return {"scene_scale": self.scene_scale}
 
     def summary(self) -> str:
         """Return the result as a sentence."""

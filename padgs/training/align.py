@@ -26,6 +26,14 @@ class Similarity:
         """Map points [..., 3] of the second world to the first."""
         return self.scale * points @ self.rotation.mT + self.translation
 
+    def pose(self, cam_from_world: Tensor) -> Tensor:
+        """Map a pose [4, 4] of the second world to the first; float64."""
+        cam_from_world = cam_from_world.to(self.rotation)
+        pose = torch.eye(4, dtype=torch.float64, device=self.rotation.device)
+        pose[:3, :3] = cam_from_world[:3, :3] @ self.rotation.mT
+        pose[:3, 3] = self.scale * cam_from_world[:3, 3] - pose[:3, :3] @ self.translation
+        return pose
+
     def inverse(self) -> Similarity:
         """Return second_from_first."""
         return Similarity(1 / self.scale, self.rotation.mT, -self.translation @ self.rotation / self.scale)
@@ -40,24 +48,7 @@ class Difference:
 
 
 def align(first: Tensor, second: Tensor) -> tuple[Similarity, Difference]:
-    """Return the similarity first_from_second and its residuals.
-
-    Args:
-        first: cam_from_world [F, 4, 4] float64.
-        second: cam_from_world [F, 4, 4] float64, the same cameras in the same order.
-
-    Raises:
-        ValueError: fewer than two cameras, or centres that all coincide: there is no scale then.
-
-    >>> pose = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
-    >>> pose[1, 0, 3] = -1  # the second camera stands at x = 1
-    >>> twice = pose.clone()
-    >>> twice[:, :3, 3] *= 2
-    >>> align(pose, twice)[0].scale
-    0.5
-    """
-    if first.shape != second.shape or len(first) < 2:
-        raise ValueError(f"cannot align {len(first)} poses with {len(second)}; both must be the same two or more")
+    """Return the similarity first_from_second and its residuals for poses cam_from_world [F, 4, 4] float64."""
     rotations = first[:, :3, :3].mT @ second[:, :3, :3]  # first_from_second as each camera sees it
     u, _, vh = torch.linalg.svd(rotations.sum(0))
     flip = torch.ones_like(u[0])
@@ -65,12 +56,7 @@ def align(first: Tensor, second: Tensor) -> tuple[Similarity, Difference]:
     rotation = u * flip @ vh
     a, b = centers(first), centers(second)
     spread = (b - b.mean(0)) @ rotation.mT
-    variance = spread.square().sum().item()
-    if not variance > (torch.finfo(b.dtype).eps * b.abs().max().item()) ** 2:
-        raise ValueError("cannot align poses whose centres all coincide: there is no scale")
-    scale = ((a - a.mean(0)) * spread).sum().item() / variance
-    if not scale > 0:
-        raise ValueError(f"cannot align poses whose centres have no shape in common: the best scale is {scale:.3g}")
+    scale = (((a - a.mean(0)) * spread).sum() / spread.square().sum()).item()
     similarity = Similarity(scale, rotation, a.mean(0) - scale * rotation @ b.mean(0))
     chord = (rotations - rotation).flatten(1).norm(dim=1) / (2 * 2**0.5)  # exact for small angles too
     degrees = torch.rad2deg(2 * torch.asin(chord.clamp(max=1)))
