@@ -112,7 +112,7 @@ def peak_memory(device: Device = "cpu") -> dict[str, Any]:
     # reports its parent's peak.
     kilobytes = int(_linux("/proc/self/status", "VmHWM").partition(" ")[0] or 0)
     other = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
-    return {"host": 1024 * kilobytes or other, "device": on_device}
+    return {"peak_memory_bytes": 1024 * kilobytes or other, "peak_device_memory_bytes": on_device}
 
 
 def machine(device: Device = "cpu") -> dict[str, Any]:

@@ -51,30 +51,30 @@ def test_timed_returns_the_value():
 def test_peak_memory_sees_what_was_freed_again_and_can_be_reset():
     size = 200 * 2**20
     clock.reset_peak_memory()
-    before = clock.peak_memory()["host"]
+    before = clock.peak_memory()["peak_memory_bytes"]
     with mmap.mmap(-1, size) as block:  # pages of its own: a tensor may lie in memory that earlier tests left the heap
         for page in range(0, size, mmap.PAGESIZE):
             block[page] = 1
-    after = clock.peak_memory()["host"]
+    after = clock.peak_memory()["peak_memory_bytes"]
     assert size * 0.9 < after - before < size * 1.5
     clock.reset_peak_memory()
-    assert clock.peak_memory()["host"] < after - size * 0.5
-    assert clock.peak_memory()["device"] is None
+    assert clock.peak_memory()["peak_memory_bytes"] < after - size * 0.5
+    assert clock.peak_memory()["peak_device_memory_bytes"] is None
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs /proc")
 def test_peak_memory_of_a_child_is_its_own():
     block = torch.ones(100 * 2**20)  # 400 MB here
-    code = "import runpy, sys; from padgs.clock import peak_memory; print(peak_memory()['host'])"
+    code = "import runpy, sys; from padgs.clock import peak_memory; print(peak_memory()['peak_memory_bytes'])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=_root())
-    assert clock.peak_memory()["host"] > block.numel() * 4
-    assert int(done.stdout) < clock.peak_memory()["host"] - block.numel() * 2
+    assert clock.peak_memory()["peak_memory_bytes"] > block.numel() * 4
+    assert int(done.stdout) < clock.peak_memory()["peak_memory_bytes"] - block.numel() * 2
 
 
 def test_peak_memory_of_a_gpu_is_that_of_its_tensors(monkeypatch):
     held = {torch.device("cuda", 1): 7}
     monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda device: held[device])
-    assert clock.peak_memory(torch.device("cuda", 1))["device"] == 7
+    assert clock.peak_memory(torch.device("cuda", 1))["peak_device_memory_bytes"] == 7
 
 
 def test_the_machine_is_described_in_json():

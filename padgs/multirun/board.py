@@ -114,12 +114,7 @@ class BoardEntry(Callback):
 
 
 def status_line(before: Counter[str], states: Collection[JobState], seconds: float) -> str:
-    """Sum up a multirun in one line.
-
-    Args:
-        before: status -> number of runs that were finished when it started.
-        states: of the jobs.
-        seconds: since the start.
+    """Sum up a multirun in one line, from the statuses of runs finished before and the states of jobs.
 
     >>> states = [JobState("ok"), JobState("nan"), JobState("running"), JobState()]
     >>> status_line(Counter(ok=2), states, 60.0)

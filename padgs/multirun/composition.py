@@ -87,11 +87,7 @@ def composed_text(settings: Sequence[str], key: str) -> str:
 
 
 def typed_config(composed: DictConfig, choices: Mapping[str, object]) -> RunConfig:
-    """Return the typed configuration of what Hydra composed from these choices.
-
-    Raises:
-        ConfigError: an unknown key or name, or a value of the wrong type.
-    """
+    """Return the typed configuration of what Hydra composed from these choices; it may raise a ConfigError."""
     values: Any = {
         key: OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
         for key, value in composed.items()

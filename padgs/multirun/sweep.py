@@ -46,25 +46,18 @@ SECONDS_BETWEEN_LINES = 30.0  # without a terminal
 
 
 def sweep(config: DictConfig, loader: ConfigLoader) -> Counter[str]:
-    """Do the missing part of a multirun: each combination of the swept values once.
-
-    Args:
-        config: composed by Hydra without the swept values.
-        loader: composes the jobs.
+    """Do the missing part of a multirun, composed by Hydra without the swept values: each combination of these once.
 
     Returns:
         Status -> number of jobs, those finished before included.
 
     Raises:
+        ValueError: keys of `run` or `tracking` cannot be used.
         Interrupted: stopped from outside; the same command continues.
     """
-    try:
-        typed(RunOptions, OmegaConf.to_container(config.run, resolve=True), "run")  # type: ignore[arg-type]
-        jobs = expand(config.hydra.sweeper.params or {}, config.hydra.overrides.task, loader)
-        multirun = Multirun(config, jobs, Console())
-    except ValueError as error:
-        complain(str(error))
-        return Counter([REFUSED])
+    typed(RunOptions, OmegaConf.to_container(config.run, resolve=True), "run")  # type: ignore[arg-type]
+    jobs = expand(config.hydra.sweeper.params or {}, config.hydra.overrides.task, loader)
+    multirun = Multirun(config, jobs, Console())
     _refuse_unknown_choices(multirun.jobs, config, loader)
     context = HydraContext(config_loader=loader, callbacks=Callbacks())
     launcher = Plugins.instance().instantiate_launcher(hydra_context=context, task_function=job_of_many, config=config)
@@ -89,13 +82,7 @@ class Multirun:
     """The missing jobs of a sweep and their states."""
 
     def __init__(self, config: DictConfig, jobs: Sequence[list[str]], console: Console) -> None:
-        """Look up which of the jobs are finished.
-
-        Args:
-            config: composed by Hydra without the swept values.
-            jobs: the overrides of each job.
-            console: for the status line.
-        """
+        """Look up which of the jobs, given by their overrides, are finished; the console shows the status line."""
         self.runs = Path(config.run.folder)
         self.board = Board(Path(config.hydra.sweep.dir))
         self._in_process = not in_own_process(config.hydra)
@@ -116,15 +103,7 @@ class Multirun:
         self._began = self._looked = time.monotonic()
 
     def run(self, launcher: Any, batch_size: int | None) -> None:
-        """Launch the missing jobs.
-
-        Args:
-            launcher: of Hydra, set up.
-            batch_size: number of jobs to launch at a time; None: all.
-
-        Raises:
-            Interrupted: stopped from outside, after running jobs wrote their checkpoints.
-        """
+        """Launch the missing jobs, all or some at a time; if stopped from outside, running jobs write checkpoints."""
         if self.before and self.jobs:
             self._say(self.line())
         waiting, attempts, launched = list(self.states), Counter[int](), 0

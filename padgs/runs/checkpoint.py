@@ -38,21 +38,12 @@ def exists(folder: Path) -> bool:
 
 
 def digest(folder: Path) -> str:
-    """Return the SHA-256 of the tensors of a checkpoint.
-
-    Raises:
-        CheckpointError: it cannot be read.
-    """
+    """Return the SHA-256 of the tensors of a checkpoint; if it cannot be read, raise a CheckpointError."""
     return _manifest(folder)["sha256"]
 
 
 def save(state: State, folder: Path, run: Mapping[str, str] | None = None) -> None:
-    """Write a checkpoint; the previous one in the folder stays complete until it is replaced.
-
-    Args:
-        state: of a method.
-        folder: of the checkpoint.
-        run: identity of the run, see `padgs.runs.store.identity`.
+    """Write a checkpoint of a run with this identity; the previous one stays complete until it is replaced.
 
     Raises:
         CheckpointError: the disk is full, the folder is read-only, ...; the previous checkpoint is untouched.
@@ -79,12 +70,7 @@ def save(state: State, folder: Path, run: Mapping[str, str] | None = None) -> No
 
 
 def load(folder: Path, device: torch.device | str = "cpu", run: Mapping[str, str] | None = None) -> State:
-    """Read a checkpoint that `save` wrote, with all tensors on one device.
-
-    Args:
-        folder: of the checkpoint.
-        device: of the tensors.
-        run: the identity that the checkpoint must have; None or missing keys are not compared.
+    """Read a checkpoint that `save` wrote, with all tensors on one device; keys of `run` must be those of its identity.
 
     Raises:
         CheckpointError: a file is missing, truncated, changed, of another format, or of another run.
@@ -110,11 +96,7 @@ def load(folder: Path, device: torch.device | str = "cpu", run: Mapping[str, str
 
 @contextmanager
 def understood(folder: Path) -> Iterator[None]:
-    """Raise a CheckpointError for errors that a state of another method causes.
-
-    Raises:
-        CheckpointError: the work failed, and not for lack of memory.
-    """
+    """Raise a CheckpointError for errors that a state of another method causes; lack of memory is none."""
     try:
         yield
     except (LookupError, TypeError, ValueError, AttributeError, RuntimeError, safetensors.SafetensorError) as error:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -192,8 +191,12 @@ def meaning(metric: str) -> str:
     """
     words = metric.split("_")
     quantity = next((text for word, text in MEANINGS.items() if word in words), "")
-    band = BANDS.get(words[-1])
-    where = _where(band) if band else "by solid angle" if words[0] == "ws" else ""
+    where = "by solid angle" if words[0] == "ws" else ""
+    if band := BANDS.get(words[-1]):
+        first, last = band[-1]
+        low, high = sorted((abs(first), abs(last)))
+        side = "up and down" if len(band) > 1 else "up" if last < 0 else "down"
+        where = f"within {last}° of the horizon" if first == -last else f"{low} to {high}° {side}"
     return ", ".join(filter(None, (quantity, where)))
 
 
@@ -206,11 +209,3 @@ def number(metric: str, value: float | None) -> str:
     if value is None:
         return MISSING
     return f"{value:.2f}" if "psnr" in metric else f"{value:.3f}"
-
-
-def _where(band: Sequence[tuple[int, int]]) -> str:
-    first, last = band[-1]
-    if first == -last:
-        return f"within {last}° of the horizon"
-    low, high = sorted((abs(first), abs(last)))
-    return f"{low} to {high}° {'up and down' if len(band) > 1 else 'up' if last < 0 else 'down'}"

@@ -75,28 +75,19 @@ class LoadedRun:
             DataError: the data have moved; `load_run(folder, data_path=...)` says where they are.
         """
         scene = load_scene(self.config, choose_device(self.config.run.device, self.config.render))
-        if not self._was_trained_on(scene):
-            warnings.warn(f"{self.folder} was trained on other data than {self._place} holds", stacklevel=3)
+        if difference := self._difference(scene):
+            warnings.warn(difference, stacklevel=3)
         return scene
 
     def refuse_other_data(self) -> None:
-        """Refuse a data set that has changed since training.
+        """Refuse a data set that has changed since training with a DataError."""
+        if difference := self._difference(self.scene):
+            raise DataError(f"{difference}; pass the right folder with --data, or train again on these data")
 
-        Raises:
-            DataError: it has changed.
-        """
-        if not self._was_trained_on(self.scene):
-            raise DataError(
-                f"{self.folder} was trained on other data than {self._place} holds; pass the right folder with --data, "
-                "or train again on these data"
-            )
-
-    @property
-    def _place(self) -> str:
-        return str(self.config.data.path or "the generator")
-
-    def _was_trained_on(self, scene: Scene) -> bool:
-        return self.result is None or self.result.fingerprint == scene.fingerprint
+    def _difference(self, scene: Scene) -> str:
+        if self.result is None or self.result.fingerprint == scene.fingerprint:
+            return ""
+        return f"{self.folder} was trained on other data than {self.config.data.path or 'the generator'} holds"
 
     @property
     def scores(self) -> dict[str, Scores]:

@@ -102,7 +102,10 @@ def run(
                         line.update(record, _log(config, scene, store, record, method))
                         interrupted = interrupt.requested
                         ending = stop.requested and not method.ended and method.request_stop(STOP_REQUESTED)
-                        if interrupted or ending or _is_checkpoint_due(config, record, saved_at):
+                        every = config.run.checkpoint_every
+                        due = every is not None and record.iteration % every == 0
+                        due = due or time.monotonic() - saved_at > config.run.seconds_between_checkpoints
+                        if interrupted or ending or due:
                             store.save(method, progress)
                             callback.saved(store.path)
                             saved_at, saved = time.monotonic(), progress
@@ -143,7 +146,7 @@ class _Outcome:
             status, reason = "oom", f"out of memory: {memory_reason(error)}"
         else:
             return False
-        self.result = replace(self.result, status=status, reason=reason, **_peak_memory(self._scene))
+        self.result = replace(self.result, status=status, reason=reason, **clock.peak_memory(self._scene.points.device))
         return True
 
 
@@ -178,12 +181,7 @@ def build_method(config: RunConfig) -> Method:
 
 
 def _prepared(config: RunConfig, scene: Scene, store: RunStore, console: Console) -> tuple[Method, Progress]:
-    """Return the method of a run with its warm start or checkpoint, and its progress; write config.yaml.
-
-    Raises:
-        CheckpointError, RunFolderError: files cannot be read or written.
-        ConfigError: the run of the warm start does not fit this scene.
-    """
+    """Return the method of a run with its warm start or checkpoint, and its progress; write config.yaml."""
     method = build_method(config)
     if config.init is not None and not store.has_checkpoint:
         stress, device = config.values().get("stress"), scene.points.device
@@ -256,14 +254,6 @@ def _log(config: RunConfig, scene: Scene, store: RunStore, record: Record, metho
     return probed.get("psnr")
 
 
-def _is_checkpoint_due(config: RunConfig, record: Record, saved_at: float) -> bool:
-    """Return whether to write a checkpoint, the last one having been written at `saved_at` (monotonic seconds)."""
-    every = config.run.checkpoint_every
-    if every is not None and record.iteration % every == 0:
-        return True
-    return time.monotonic() - saved_at > config.run.seconds_between_checkpoints
-
-
 def _fingerprint_at(config: RunConfig, device: torch.device, width: int | None) -> str:
     """Return the fingerprint of the run's scene at another image width."""
     return load_scene(replace(config, data=replace(config.data, width=width)), device).fingerprint
@@ -280,13 +270,8 @@ def _trained(method: Method, scene: Scene, progress: Progress) -> dict[str, Any]
         "model_bytes": size.bytes,
         "ended": method.ended,
         "timing": {"train_seconds": progress.seconds, "cpu_seconds": progress.cpu_seconds},
-        **_peak_memory(scene),  # of training: scoring has networks of its own
+        **clock.peak_memory(scene.points.device),  # of training: scoring has networks of its own
     }
-
-
-def _peak_memory(scene: Scene) -> dict[str, int | None]:
-    peak = clock.peak_memory(scene.points.device)
-    return {"peak_memory_bytes": peak["host"], "peak_device_memory_bytes": peak["device"]}
 
 
 def judge(result: Result, scene: Scene, iterations: int) -> Result:
@@ -305,30 +290,25 @@ def judge(result: Result, scene: Scene, iterations: int) -> Result:
         if quality < (constant := constant_color_quality(scene, Protocol(**scores.protocol))):
             reason = f"WS-PSNR {quality:.2f} dB, and one colour for all would have {constant:.2f} dB"
             return replace(result, status="diverged", reason=reason)
-    depth, thickness = metrics.get("depth_error"), metrics.get("least_extent")
+    depth, thickness, reason = metrics.get("depth_error"), metrics.get("least_extent"), ""
     if depth is not None and depth > MAX_DEPTH_ERROR:
         reason = f"depths are off by {depth:.0%} on average (AbsRel), more than {MAX_DEPTH_ERROR:.0%}"
-        return replace(result, status="degenerate", reason=reason)
-    if thickness is not None and thickness < MIN_THICKNESS:
-        reason = (
-            f"surfaces are {thickness:.2%} as thick as the true ones along some axis, less than {MIN_THICKNESS:.0%}"
-        )
-        return replace(result, status="degenerate", reason=reason)
-    return result
+    elif thickness is not None and thickness < MIN_THICKNESS:
+        reason = f"surfaces are {thickness:.2%} as thick as the true ones, less than {MIN_THICKNESS:.0%}"
+    return replace(result, status="degenerate", reason=reason) if reason else result
 
 
 def _is_incomplete(config: RunConfig, result: Result) -> bool:
-    return _is_retried(config, result) or bool(_unscored(config, result)) or _experiments(config, result) is not None
+    return _is_retried(config, result) or bool(_unscored(config, result)) or _completed_labels(config, result) != result
 
 
 def _is_retried(config: RunConfig, result: Result) -> bool:
     return result.status in RETRIED and config.retry == "failed"
 
 
-def _experiments(config: RunConfig, result: Result) -> tuple[str, ...] | None:
-    """Return the experiments of a finished run including those that request it here; None if none is new."""
-    joined = results.joined(result.experiments, config.labels.experiments)
-    return None if joined == result.experiments else joined
+def _completed_labels(config: RunConfig, result: Result) -> Result:
+    """Return a finished result with the experiments that request it here."""
+    return replace(result, experiments=results.joined(result.experiments, config.labels.experiments))
 
 
 def _unscored(config: RunConfig, result: Result) -> dict[str, Protocol]:
@@ -348,7 +328,7 @@ def _completed(config: RunConfig, scene: Scene, store: RunStore, console: Consol
         if result is not None:
             store.forget(result)
         return None
-    complete = replace(result, experiments=_experiments(config, result) or result.experiments)
+    complete = _completed_labels(config, result)
     if unscored := _unscored(config, result):
         say(console, "finished before; only the new protocol is missing")
         if not store.has_checkpoint:  # an untrained method would be scored

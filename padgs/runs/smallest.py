@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
@@ -157,9 +158,7 @@ def knee(candidates: Sequence[Candidate]) -> Candidate | None:
 class Search:
     """The search on a finished run."""
 
-    def __init__(
-        self, run: LoadedRun, console: Console | None = None, stop_requested: Callable[[], bool] = lambda: False
-    ) -> None:
+    def __init__(self, run: LoadedRun, console: Console, stop_requested: Callable[[], bool] = lambda: False) -> None:
         """Prepare the search; `stop_requested` is asked besides signals.
 
         Raises:
@@ -170,18 +169,14 @@ class Search:
         run.method.refuse_search()
         run.refuse_other_data()
         self.run, self._result, self._stop_requested = run, run.result, stop_requested
-        self._console = console or Console(quiet=True)
+        self._console = console
+        self._load = partial(load_run, data_path=run.config.data.path, device=run.config.run.device)
         self.views, self.validation = held_out(run.scene.train)
         self.row, self.rows = next(iter(run.method.model.counts().items()))
         self.candidates: list[Candidate] = []
 
-    def complete(self, losses: Sequence[float] = SMALLEST_LOSSES) -> None:
-        """Train and measure all candidates.
-
-        Raises:
-            Interrupted: stopped from outside; a new search resumes.
-            ValueError: a candidate failed.
-        """
+    def complete(self) -> None:
+        """Train and measure all candidates; a new search resumes one that was interrupted."""
         with Interrupt(self._stop_requested) as stop:
             count: int | None = self.rows
             while count is not None:
@@ -192,7 +187,7 @@ class Search:
                     f"{len(self.candidates):3d} {one.rows:8d} {self.row}, {one.blended} Gaussians blended, "
                     f"{loss(self.candidates, one):5.2f} dB lost, {one.seconds:.1f} s",
                 )
-                count = next_count(self.candidates, losses)
+                count = next_count(self.candidates, SMALLEST_LOSSES)
 
     def _candidate(self, count: int, stop_requested: Callable[[], bool]) -> Candidate:
         """Train and measure a model of `count` rows, unless an earlier search did."""
@@ -224,11 +219,7 @@ class Search:
     def keep(self, epsilon: float) -> Result:
         """Search, and keep the smallest model for a loss, refined on all training views, as a run beside RUN.
 
-        Returns:
-            The result of RUN, with what was found in `smallest`.
-
-        Raises:
-            Interrupted, ValueError: as `complete`.
+        Returns the result of RUN, with what was found in `smallest`.
         """
         self.complete()
         count = smallest(self.candidates, epsilon).rows
@@ -303,10 +294,6 @@ class Search:
         if not result.ok:
             raise ValueError(f"{config.run.folder}/{result.run} ended with status {result.status} ({result.reason})")
         return result
-
-    def _load(self, folder: Path) -> LoadedRun:
-        config = self.run.config
-        return load_run(folder, data_path=config.data.path, device=config.run.device)
 
     @torch.no_grad()
     def _save_picture(self, path: Path) -> None:

@@ -62,15 +62,13 @@ class Progress:
 
 
 class RunStore:
-    """Reads and writes the files of one run; as a context manager, it holds the lock of the run folder."""
+    """Reads and writes the files of one run; as a context manager, it holds the lock of the run folder.
+
+    If a file cannot be written, a RunFolderError says so.
+    """
 
     def __init__(self, path: Path, run: Mapping[str, str] | None = None) -> None:
-        """Open a run folder; nothing is written yet.
-
-        Args:
-            path: the folder.
-            run: `identity` that its checkpoint must have; None reads checkpoints of any run.
-        """
+        """Open a run folder; `run` is the `identity` that its checkpoint must have, None for any."""
         self.path, self._run = path, run
         self.checkpoint, self.config = path / "checkpoint", path / results.CONFIG_NAME
         self.renders = path / results.PICTURES
@@ -137,22 +135,13 @@ class RunStore:
         return (self.path / results.FILE_NAME).exists()
 
     def prepare(self, values: Mapping[str, Any]) -> None:
-        """Make the folder and write config.yaml.
-
-        Raises:
-            RunFolderError: it cannot be written.
-        """
+        """Make the folder and write config.yaml."""
         with self._writing():
             self.renders.mkdir(parents=True, exist_ok=True)
-            content = OmegaConf.to_yaml(OmegaConf.create(dict(values))).encode()
-            write_atomically(self.config, content)
+            write_atomically(self.config, OmegaConf.to_yaml(OmegaConf.create(dict(values))).encode())
 
     def result(self) -> Result | None:
-        """Return the result if the run is finished.
-
-        Raises:
-            ResultError: the file cannot be used.
-        """
+        """Return the result if the run is finished; a damaged file raises a ResultError."""
         return results.read(self.path / results.FILE_NAME) if self.has_result else None
 
     def finish(self, result: Result) -> Result:
@@ -180,11 +169,7 @@ class RunStore:
             file.write(json.dumps(line) + "\n")
 
     def save(self, method: Method, progress: Progress) -> None:
-        """Write the checkpoint.
-
-        Raises:
-            CheckpointError: it cannot be written; the previous one stands.
-        """
+        """Write the checkpoint; if that raises a CheckpointError, the previous one stands."""
         state = method.state()
         checkpoint.save(State(state.tensors, {**state.values, PROGRESS: asdict(progress)}), self.checkpoint, self._run)
 
@@ -237,11 +222,7 @@ def cannot_write(path: Path, error: OSError) -> RunFolderError:
 
 
 def config_hash(values: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of the configuration keys that numbers depend on.
-
-    Args:
-        values: `RunConfig.values()`; typed, so that 1 and 1.0 of a float field are the same.
-    """
+    """Return the SHA-256 of the keys of `RunConfig.values()` that numbers depend on."""
     return hashlib.sha256(json.dumps(decisive(values), sort_keys=True).encode()).hexdigest()
 
 

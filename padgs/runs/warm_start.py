@@ -1,8 +1,4 @@
-"""Warm start: a run that begins with the model of a finished run instead of the points of its scene.
-
-The run has its own schedule and goes through all of it: learning rates rise again, and the model grows again if its
-method says so.
-"""
+"""Warm start: a run begins with the model of a finished run instead of points, and goes through its own schedule."""
 
 from __future__ import annotations
 
@@ -89,12 +85,7 @@ class WarmStart:
 
 
 def _finished(store: RunStore) -> Result:
-    """Return the result of a run that ended well.
-
-    Raises:
-        ConfigError: there is none.
-        ResultError: it cannot be read.
-    """
+    """Return the result of a run that ended well; if there is none, raise a ConfigError."""
     result = store.result()
     if result is None:
         what = "is not finished" if (store.path / results.CONFIG_NAME).exists() else "is no folder of a run"

@@ -85,7 +85,7 @@ def test_a_run_leaves_all_its_files_and_says_where(config):
 
 def test_the_memory_of_the_device_that_trains_is_in_the_result(config, monkeypatch):
     asked = []
-    peak = {"host": 3 * 10**9, "device": 2 * 10**9}
+    peak = {"peak_memory_bytes": 3 * 10**9, "peak_device_memory_bytes": 2 * 10**9}
     monkeypatch.setattr(pipeline.clock, "peak_memory", lambda device: asked.append(device) or peak)
     result, said = run(config)
     assert asked == [torch.device("cpu")]  # where the scene is

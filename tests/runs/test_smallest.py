@@ -169,7 +169,7 @@ def test_a_search_writes_what_it_found_and_keeps_the_smallest_model_as_a_run(loa
 
 
 def test_an_interrupted_search_resumes_to_the_same_candidates(load):
-    whole = Search(load("method=padgs"))
+    whole = Search(load("method=padgs"), Console(quiet=True))
     whole.complete()
     shutil.rmtree(whole.run.folder / "smallest")
     stops, looks = 0, 0
@@ -180,7 +180,7 @@ def test_an_interrupted_search_resumes_to_the_same_candidates(load):
         return looks % 3 == 0
 
     while True:
-        again = Search(load("method=padgs"), stop_requested=stop_requested)
+        again = Search(load("method=padgs"), Console(quiet=True), stop_requested)
         try:
             again.complete()
             break

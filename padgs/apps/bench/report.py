@@ -154,7 +154,7 @@ def _compiled_for(device: torch.device) -> str | None:
 
 
 def _peak_bytes(device: torch.device) -> int:
-    return clock.peak_memory(device)["host" if device.type == "cpu" else "device"]
+    return clock.peak_memory(device)["peak_memory_bytes" if device.type == "cpu" else "peak_device_memory_bytes"]
 
 
 def _frame(work: Workload) -> Rendering:
