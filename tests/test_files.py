@@ -1,11 +1,27 @@
+import os
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from padgs.files import atomic_path
+from padgs.files import DRAFT, atomic_path, draft_of
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from padgs.files import atomic_path, draft_of
+folder = Path(sys.argv[1])
+with atomic_path(folder / "splats.ply") as file, draft_of(folder / "frames") as images:
+    file.write_text("half of")
+    images.mkdir()
+    (images / "1.png").write_text("")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
 
 
-def test_a_file_takes_its_place_when_it_is_complete_or_not_at_all(tmp_path: Path) -> None:
+def test_a_file_is_replaced_when_the_new_one_is_complete(tmp_path: Path) -> None:
     path = tmp_path / "room.compressed.ply"
     path.write_text("the earlier one")
     with pytest.raises(KeyboardInterrupt), atomic_path(path) as draft:
@@ -17,3 +33,24 @@ def test_a_file_takes_its_place_when_it_is_complete_or_not_at_all(tmp_path: Path
         draft.write_text("the new one")
         assert path.read_text() == "the earlier one"
     assert path.read_text() == "the new one" and list(tmp_path.iterdir()) == [path]
+
+
+def test_drafts_of_killed_processes_are_removed_by_the_next_write(tmp_path: Path) -> None:
+    killed = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)])
+    assert killed.returncode == -signal.SIGKILL and len(list(tmp_path.iterdir())) == 2
+    names = (f"{DRAFT}another-host-1-x", f"{DRAFT}another-host-2-y", "video.mp4", ".hidden")
+    fresh, old, *others = (tmp_path / name for name in names)
+    for path in (fresh, old, *others):
+        path.write_text("")
+    os.utime(old, (0, 0))
+    with draft_of(tmp_path / "in work") as work, atomic_path(tmp_path / "points.ply") as draft:
+        work.mkdir()
+        draft.write_text("")
+    assert {*tmp_path.iterdir()} == {fresh, *others, tmp_path / "points.ply"}
+
+
+def test_long_names_leave_room_for_the_draft(tmp_path: Path) -> None:
+    path = tmp_path / f"{'n' * 240}.ply"
+    with atomic_path(path) as draft:
+        draft.write_text("")
+    assert list(tmp_path.iterdir()) == [path]

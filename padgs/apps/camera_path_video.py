@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from fractions import Fraction
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from uuid import UUID
 
 import numpy as np
@@ -24,7 +23,7 @@ from padgs.checks import install_command
 from padgs.data.camera_paths import PATHS, gravity, read_path
 from padgs.data.formats.transforms import transforms_file
 from padgs.evaluation.images import depth_image, to_uint8
-from padgs.files import atomic_path
+from padgs.files import atomic_path, draft_of
 from padgs.geometry.camera import Camera, Panorama, perspective
 from padgs.render import Rendering
 from padgs.runs.load import LoadedRun
@@ -140,13 +139,14 @@ def _png_folder(path: Path) -> Iterator[WriteFrame]:
     if stale := next(path.glob("*.png"), None):
         raise ValueError(f"{path} already holds images, such as {stale.name}; choose another folder with --to")
     numbers = iter(range(1, 1 << 30))
-    with TemporaryDirectory(prefix=".", dir=path) as draft:  # an interrupted call must not block the next
+    with draft_of(path / "frames") as draft:  # an interrupted call must not block the next
+        draft.mkdir()
 
         def write(frame: np.ndarray) -> None:
-            Image.fromarray(frame).save(Path(draft) / f"{next(numbers):05d}.png")
+            Image.fromarray(frame).save(draft / f"{next(numbers):05d}.png")
 
         yield write
-        for image in sorted(Path(draft).iterdir()):
+        for image in sorted(draft.iterdir()):
             image.replace(path / image.name)
 
 

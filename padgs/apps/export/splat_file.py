@@ -23,7 +23,7 @@ from torch import Tensor
 
 from padgs.data.capture import DataError
 from padgs.data.cloud import read_vertices
-from padgs.files import atomic_path
+from padgs.files import atomic_path, draft_of
 from padgs.methods.splats.splats import Splats
 
 CONVERTER = "splat-transform"
@@ -51,13 +51,14 @@ def write_splats(path: Path, splats: Splats, comments: Sequence[str] = (), *, st
     if not path.name.endswith(CONVERTED):
         _write_ply(path, splats, comments)
         return
-    with tempfile.TemporaryDirectory() as folder:
-        plain = Path(folder) / "splats.ply"
+    with draft_of(path.with_name(f"{path.name}-parts")) as folder:  # as large as the model
+        folder.mkdir()
+        plain = folder / "splats.ply"
         _write_ply(plain, splats, comments)
         settings = []
         if start is not None and path.suffix == ".html":
-            (Path(folder) / "viewer.json").write_text(json.dumps(_viewer_settings(start)))
-            settings = ["--viewer-settings", str(Path(folder) / "viewer.json")]
+            (folder / "viewer.json").write_text(json.dumps(_viewer_settings(start)))
+            settings = ["--viewer-settings", str(folder / "viewer.json")]
         _convert(plain, path, *settings)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -17,7 +16,7 @@ from padgs.data.cloud import initial_cloud
 from padgs.data.formats.writers import WRITERS, Content
 from padgs.data.images import save_png
 from padgs.data.masks import write_masks
-from padgs.files import open_image
+from padgs.files import draft_of, open_image
 from padgs.scene import Scene
 
 IMAGE_FOLDERS = {"ricoh360": "imgs"}  # default: images
@@ -59,24 +58,23 @@ def convert(
         raise DataError(f"{destination} exists; nothing is overwritten: remove it or choose another path")
     capture = padgs.data.read(source, format, options)
     scene = assemble(capture, options)
-    partial = destination.with_name(f".{destination.name}.partial-{os.getpid()}")
     try:
-        partial.mkdir(parents=True)
-        content = _write_images(capture, scene, partial, to, progress)
-        if options.points != "auto":
-            points, colors, _ = initial_cloud(
-                capture, options.points
-            )  # where the poses are: the scene may be recentered
-            content = replace(content, cloud=Cloud(points, colors), tracks=None)
-        write_masks({view.name: view.load_mask for view in (*scene.train, *scene.test)}, partial)
-        WRITERS[to](content, partial)
-        if destination.exists():
-            destination.rmdir()
-        partial.rename(destination)
+        destination.parent.mkdir(parents=True, exist_ok=True)
+        with draft_of(destination) as partial:
+            partial.mkdir()
+            content = _write_images(capture, scene, partial, to, progress)
+            if options.points != "auto":
+                points, colors, _ = initial_cloud(
+                    capture, options.points
+                )  # where the poses are: the scene may be recentered
+                content = replace(content, cloud=Cloud(points, colors), tracks=None)
+            write_masks({view.name: view.load_mask for view in (*scene.train, *scene.test)}, partial)
+            WRITERS[to](content, partial)
+            if destination.exists():
+                destination.rmdir()
+            partial.rename(destination)
     except OSError as error:
         raise DataError(f"cannot write {destination} ({error.strerror or error}); nothing was written") from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
     return scene
 
 

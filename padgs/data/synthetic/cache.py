@@ -11,7 +11,6 @@ import hashlib
 import json
 import os
 import shutil
-import tempfile
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -21,6 +20,7 @@ from PIL import Image
 
 from padgs.data.synthetic.options import SyntheticOptions
 from padgs.data.synthetic.textures import Array
+from padgs.files import draft_of
 
 
 @dataclass(frozen=True)
@@ -75,25 +75,21 @@ def read(options: SyntheticOptions) -> Stored | None:
 def write(options: SyntheticOptions, stored: Stored) -> str | None:
     """Cache a scene; returns the reason if that is impossible."""
     entry = folder() / key(options)
-    draft = None
     try:
         entry.parent.mkdir(parents=True, exist_ok=True)
-        draft = Path(tempfile.mkdtemp(prefix=f".{entry.name}-", dir=entry.parent))
-        for index, image in enumerate(stored.images):
-            assert isinstance(image, np.ndarray)
-            Image.fromarray(image).save(draft / f"{index:06d}.png", compress_level=2)
-        arrays = {name: getattr(stored, name) for name in ("poses", "points", "colors", "fingerprint")}
-        np.savez_compressed(draft / "scene.npz", **arrays)
-        (draft / "sha256").write_text(_digest(draft))
-        draft.chmod(0o755)
-        if entry.exists() and read(options) is None:
-            shutil.rmtree(entry)  # changed or damaged
-        draft.rename(entry)
+        with draft_of(entry) as draft:
+            draft.mkdir()
+            for index, image in enumerate(stored.images):
+                assert isinstance(image, np.ndarray)
+                Image.fromarray(image).save(draft / f"{index:06d}.png", compress_level=2)
+            arrays = {name: getattr(stored, name) for name in ("poses", "points", "colors", "fingerprint")}
+            np.savez_compressed(draft / "scene.npz", **arrays)
+            (draft / "sha256").write_text(_digest(draft))
+            if entry.exists() and read(options) is None:
+                shutil.rmtree(entry)  # changed or damaged
+            draft.rename(entry)
     except OSError as error:
         if read(options) is not None:
             return None  # another process was faster
         return f"generated scene not cached: {error}; set PADGS_CACHE to a folder that can be written"
-    finally:
-        if draft is not None:
-            shutil.rmtree(draft, ignore_errors=True)
     return None
